@@ -1,0 +1,1 @@
+"""Visible-light communication and positioning with event cameras."""

@@ -1,0 +1,127 @@
+"""The roles: one abstract class each, filled by plugins.
+
+An algorithm is a frozen dataclass whose fields are its parameters, each with a default, a unit in its name
+and a description. Pydantic checks the fields when a configuration is loaded; the dataclass itself stays plain,
+picklable and JSON-round-trippable. `compile` precomputes and returns a pure function over arrays; only
+synchronization keeps state, and that state is explicit.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.codebook import Codebook
+from evlcp_sdk.frames import PacketFormat
+from evlcp_sdk.geometry import BarLayout, CameraModel
+from evlcp_sdk.types import PresenceMap, Range, SoftSymbols, SyncLock
+
+__all__ = [
+    "ROLES",
+    "Decode",
+    "Decoding",
+    "Modulation",
+    "Pilots",
+    "Ranging",
+    "Separate",
+    "Separation",
+    "Synchronization",
+    "Synchronizer",
+]
+
+Separate = Callable[[NDArray[np.int16]], PresenceMap]
+"""Chip-aligned polarity sums of a pilot, int16 (chips, height, width) -> presence."""
+
+Decode = Callable[[PresenceMap, NDArray[np.int16]], SoftSymbols]
+"""Presence and the info segment's polarity sums, int16 (chips, height, width) -> soft symbols."""
+
+Measure = Callable[[NDArray[np.float32]], Range]
+"""Pixel maps of the clusters, float32 (K, height, width) -> distance."""
+
+
+class Pilots(ABC):
+    """Codes that find time and tell clusters apart."""
+
+    @abstractmethod
+    def preamble(self) -> NDArray[np.int8]:
+        """The code that finds time, int8 (P,)."""
+
+    @abstractmethod
+    def codes(self, clusters: int) -> NDArray[np.int8]:
+        """One code a cluster, int8 (clusters, N).
+
+        Raises:
+            ConfigError: The family has fewer codes.
+        """
+
+
+class Modulation(ABC):
+    """Bits to codewords."""
+
+    @abstractmethod
+    def codewords(self) -> NDArray[np.int8]:
+        """One bipolar codeword a symbol, int8 (2**m, M); row s carries the m bits of s, msb first."""
+
+
+class Synchronizer(Protocol):
+    """What `Synchronization.compile` returns: a step function over explicit state."""
+
+    def init(self) -> Any:
+        """State before the first event."""
+
+    def step(
+        self, state: Any, t_us: NDArray[np.int64], p: NDArray[np.uint8], until_us: int
+    ) -> tuple[Any, list[SyncLock]]:
+        """Take a region's events up to `until_us`; give one lock for each packet whose preamble was heard.
+
+        Args:
+            state: What `init` or the last `step` gave; not changed.
+            t_us: Event times, ascending, int64 (n,).
+            p: Polarities, uint8 (n,).
+            until_us: All events before this time have been given.
+        """
+
+
+class Synchronization(ABC):
+    """Region events to packet timing and clock rate, step by step."""
+
+    @abstractmethod
+    def compile(self, codebook: Codebook, packet: PacketFormat) -> Synchronizer:
+        """Precompute for a codebook's preamble and a packet format."""
+
+
+class Separation(ABC):
+    """Chip-aligned polarity sums to presence probability of each cluster."""
+
+    @abstractmethod
+    def compile(self, codebook: Codebook) -> Separate:
+        """Precompute for a codebook's pilots."""
+
+
+class Decoding(ABC):
+    """Presence and info chips to soft symbols."""
+
+    @abstractmethod
+    def compile(self, codebook: Codebook) -> Decode:
+        """Precompute for a codebook's codewords."""
+
+
+class Ranging(ABC):
+    """Pixel maps of the clusters to distance."""
+
+    @abstractmethod
+    def compile(self, camera: CameraModel, bar: BarLayout) -> Measure:
+        """Precompute for a camera and a bar."""
+
+
+ROLES: dict[str, type[ABC]] = {
+    "pilots": Pilots,
+    "modulation": Modulation,
+    "synchronization": Synchronization,
+    "separation": Separation,
+    "decoding": Decoding,
+    "ranging": Ranging,
+}
+"""The abstract class of each role name."""

@@ -1,0 +1,81 @@
+"""The exceptions of the SDK; each carries the exit code the command line ends with.
+
+```
+EvlcpError                     1   anything the SDK raises on purpose
+├── ConfigError                2   a configuration value; names its path, the value, what was expected
+│   ├── UnknownAlgorithmError  2   no algorithm of that role and id; suggests the nearest
+│   └── CodebookMismatchError  2   two ends that do not share one codebook
+├── PluginError                2   a plugin that cannot be loaded, or two that claim one (role, id)
+├── InputError                 3   a file or stream that cannot be read
+│   └── RawFormatError         3   a RAW file's header or words; names byte offset, found, expected
+└── StreamError                1   events fed in an order or shape the receiver cannot take
+```
+"""
+
+from pathlib import Path
+from typing import ClassVar
+
+__all__ = [
+    "CodebookMismatchError",
+    "ConfigError",
+    "EvlcpError",
+    "InputError",
+    "PluginError",
+    "RawFormatError",
+    "StreamError",
+    "UnknownAlgorithmError",
+]
+
+
+class EvlcpError(Exception):
+    """Anything the SDK raises on purpose; the message is one line a user can act on."""
+
+    exit_code: ClassVar[int] = 1
+
+
+class ConfigError(EvlcpError):
+    """A configuration value that cannot be used."""
+
+    exit_code = 2
+
+
+class UnknownAlgorithmError(ConfigError):
+    """No algorithm with that role and id is installed."""
+
+
+class CodebookMismatchError(ConfigError):
+    """Transmitter and receiver do not share one codebook."""
+
+
+class PluginError(EvlcpError):
+    """A plugin that cannot be loaded, or two plugins that claim one (role, id)."""
+
+    exit_code = 2
+
+
+class InputError(EvlcpError):
+    """A file or stream that cannot be read."""
+
+    exit_code = 3
+
+
+class RawFormatError(InputError):
+    """A RAW file whose header or words are not what they should be.
+
+    Args:
+        path: The file.
+        offset: Byte offset of the fault, counted from the start of the file.
+        found: What stands there.
+        expected: What should stand there.
+    """
+
+    def __init__(self, path: Path | str, offset: int, found: str, expected: str) -> None:
+        self.path = Path(path)
+        self.offset = offset
+        self.found = found
+        self.expected = expected
+        super().__init__(f"{path}: at byte {offset}: found {found}, expected {expected}")
+
+
+class StreamError(EvlcpError):
+    """Events in an order or shape the receiver cannot take."""

@@ -1,0 +1,95 @@
+"""The camera, and where a transmitter's LEDs and clusters stand."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Ge, Gt
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import ConfigError
+
+__all__ = ["BarLayout", "CameraModel"]
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """A pinhole camera: sensor size, pixel pitch, focal length.
+
+    >>> round(CameraModel().focal_px, 1)
+    7201.6
+    """
+
+    width: Annotated[int, Gt(0)] = 1280
+    height: Annotated[int, Gt(0)] = 720
+    focal_mm: Annotated[float, Gt(0)] = 35.0
+    pitch_um: Annotated[float, Gt(0)] = 4.86
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length in pixels."""
+        return self.focal_mm * 1e3 / self.pitch_um
+
+    def distance_m(self, spacing_m: float, spacing_px: float) -> float:
+        """Depth along the optical axis of two points parallel to the sensor: L = f S / (l' a).
+
+        arXiv 2510.17203, equation for L.
+
+        Args:
+            spacing_m: Their distance S from each other, m.
+            spacing_px: The same in the image, l', px.
+        """
+        return self.focal_px * spacing_m / spacing_px
+
+
+@dataclass(frozen=True)
+class BarLayout:
+    """LEDs on a grid of rows and columns, top left first, grouped row by row into equal clusters.
+
+    A bar is one column; a panel of many rows and columns is grouped into blocks of
+    `cluster_rows` x `cluster_columns` LEDs, numbered row by row from the top left.
+
+    Raises:
+        ConfigError: The blocks do not tile the grid.
+
+    >>> BarLayout().clusters
+    16
+    >>> BarLayout(rows=16, columns=16, cluster_rows=4, cluster_columns=4).cluster_centres_m()[1].round(3).tolist()
+    [-0.02, -0.06]
+    """
+
+    rows: Annotated[int, Gt(0)] = 96
+    columns: Annotated[int, Gt(0)] = 1
+    led_pitch_m: Annotated[float, Gt(0)] = 0.01
+    cluster_rows: Annotated[int, Ge(1)] = 6
+    cluster_columns: Annotated[int, Ge(1)] = 1
+
+    def __post_init__(self) -> None:
+        for name in ("rows", "columns"):
+            n, block = getattr(self, name), getattr(self, f"cluster_{name}")
+            if n % block:
+                raise ConfigError(f"bar.cluster_{name} = {block}: expected a divisor of bar.{name} = {n}")
+
+    @property
+    def clusters(self) -> int:
+        """Number of clusters K."""
+        return (self.rows // self.cluster_rows) * (self.columns // self.cluster_columns)
+
+    def led_positions_m(self) -> NDArray[np.float64]:
+        """LED centres (x right, y down) from the bar's centre, m, float64 (rows * columns, 2)."""
+        y, x = np.mgrid[: self.rows, : self.columns]
+        xy = np.stack([x - (self.columns - 1) / 2, y - (self.rows - 1) / 2], -1)
+        return xy.reshape(-1, 2) * self.led_pitch_m
+
+    def led_clusters(self) -> NDArray[np.int64]:
+        """Cluster of each LED, int64 (rows * columns,)."""
+        y, x = np.mgrid[: self.rows, : self.columns]
+        across = self.columns // self.cluster_columns
+        return ((y // self.cluster_rows) * across + x // self.cluster_columns).ravel()
+
+    def cluster_centres_m(self) -> NDArray[np.float64]:
+        """Cluster centres (x right, y down) from the bar's centre, m, float64 (K, 2)."""
+        which = self.led_clusters()
+        count = np.bincount(which)
+        led = self.led_positions_m()
+        return np.stack([np.bincount(which, led[:, i]) / count for i in (0, 1)], -1)

@@ -1,0 +1,133 @@
+"""The plugin manager: finds plugins by entry point, and algorithms by (role, id)."""
+
+import difflib
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+import pluggy
+
+from evlcp_sdk import hookspecs
+from evlcp_sdk.errors import PluginError, UnknownAlgorithmError
+from evlcp_sdk.hookspecs import ENTRY_POINT_GROUP, ROLE_NAMES, Algorithm
+
+__all__ = ["Installed", "Registry"]
+
+
+@dataclass(frozen=True)
+class Installed:
+    """An algorithm and the distribution that brought it."""
+
+    algorithm: Algorithm
+    distribution: str
+    version: str
+
+
+class Registry:
+    """The installed plugins; made by `Registry.load()`, passed to whoever needs it.
+
+    Args:
+        manager: A pluggy manager with its plugins registered.
+
+    Raises:
+        PluginError: Two algorithms with one (role, id), a record for an unknown role, or a hook that the
+            SDK does not know.
+    """
+
+    def __init__(self, manager: pluggy.PluginManager) -> None:
+        self.manager = manager
+        try:
+            manager.check_pending()
+        except pluggy.PluginValidationError as fault:
+            raise PluginError(f"plugin hook not known to this SDK: {fault}") from fault
+        self._installed = _collect(manager)
+
+    @classmethod
+    def load(cls, *plugins: object) -> "Registry":
+        """Find all installed plugins; `plugins` are objects with hooks to add, e.g. a probe.
+
+        Raises:
+            PluginError: A plugin fails to import.
+        """
+        manager = pluggy.PluginManager(ENTRY_POINT_GROUP)
+        manager.add_hookspecs(hookspecs)
+        try:
+            manager.load_setuptools_entrypoints(ENTRY_POINT_GROUP)
+        except Exception as fault:
+            raise PluginError(f"a plugin of group '{ENTRY_POINT_GROUP}' fails to load: {fault}") from fault
+        for plugin in plugins:
+            manager.register(plugin)
+        return cls(manager)
+
+    @property
+    def hook(self) -> pluggy.HookRelay:
+        """The hooks, to call."""
+        return self.manager.hook
+
+    def installed(self, role: str | None = None) -> list[Installed]:
+        """The algorithms, by role and id; of one role if given."""
+        return [entry for (r, _), entry in sorted(self._installed.items()) if role in (None, r)]
+
+    def find(self, role: str, id: str) -> Installed:
+        """The algorithm of a role and id.
+
+        Raises:
+            UnknownAlgorithmError: None is installed; the message suggests the nearest name.
+        """
+        entry = self._installed.get((role, id))
+        if entry is not None:
+            return entry
+        names = [e.algorithm.id for e in self.installed(role)]
+        near = difflib.get_close_matches(id, names, n=1)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        raise UnknownAlgorithmError(
+            f"no {role} algorithm named '{id}'{hint} (installed: {', '.join(names) or 'none'})"
+        )
+
+    def load_class(self, role: str, id: str) -> type[Any]:
+        """Import the class of an algorithm.
+
+        Raises:
+            UnknownAlgorithmError: None is installed.
+            PluginError: Its target cannot be imported, or does not fill the role.
+        """
+        from evlcp_sdk.abc import ROLES
+
+        entry = self.find(role, id)
+        module, _, name = entry.algorithm.target.partition(":")
+        try:
+            found: type[Any] = getattr(importlib.import_module(module), name)
+        except (ImportError, AttributeError, ValueError) as fault:
+            raise PluginError(
+                f"{role} algorithm '{id}' of {entry.distribution}: cannot import"
+                f" {entry.algorithm.target}: {fault}"
+            ) from fault
+        if not (isinstance(found, type) and issubclass(found, ROLES[role])):
+            raise PluginError(
+                f"{role} algorithm '{id}' of {entry.distribution}: {entry.algorithm.target}"
+                f" is no {ROLES[role].__name__}"
+            )
+        return found
+
+
+def _collect(manager: pluggy.PluginManager) -> dict[tuple[str, str], Installed]:
+    distributions: dict[int, tuple[str, str]] = {
+        id(plugin): (dist.project_name, dist.version) for plugin, dist in manager.list_plugin_distinfo()
+    }
+    found: dict[tuple[str, str], Installed] = {}
+    for impl in manager.hook.evlcp_algorithms.get_hookimpls():
+        name, version = distributions.get(id(impl.plugin), (impl.plugin_name, "-"))
+        for record in impl.function():
+            key = (record.role, record.id)
+            if record.role not in ROLE_NAMES:
+                raise PluginError(
+                    f"plugin {name}: algorithm '{record.id}' has role '{record.role}',"
+                    f" expected one of {', '.join(ROLE_NAMES)}"
+                )
+            if key in found:
+                raise PluginError(
+                    f"two {record.role} algorithms named '{record.id}':"
+                    f" one of {found[key].distribution}, one of {name}; uninstall one"
+                )
+            found[key] = Installed(record, name, version)
+    return found

@@ -1,0 +1,200 @@
+"""The values that flow through the receiver: events, regions, locks, presence, symbols, ranges, frames."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import StreamError
+
+__all__ = [
+    "EVENT_RECORD",
+    "Events",
+    "PresenceMap",
+    "Range",
+    "SoftSymbols",
+    "SyncLock",
+    "Triggers",
+]
+
+EVENT_RECORD = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
+"""The structured record of Prophesee's Metavision SDK (`EventCD`)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Events:
+    """Contrast-detection events in columns of equal length.
+
+    Attributes:
+        t_us: Camera clock, us, int64 (n,).
+        x: Column, uint16 (n,).
+        y: Row, uint16 (n,).
+        p: Polarity, uint8 (n,); 1 = brighter (ON), 0 = darker (OFF).
+
+    Raises:
+        StreamError: A column has another type or length.
+
+    >>> e = Events.of([5, 7], x=[1, 2], y=[3, 4], p=[1, 0])
+    >>> len(e), e[1:].t_us.tolist()
+    (2, [7])
+    """
+
+    t_us: NDArray[np.int64]
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    p: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("t_us", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.uint8)):
+            column = getattr(self, name)
+            if column.dtype != dtype or column.shape != self.t_us.shape or column.ndim != 1:
+                raise StreamError(
+                    f"events column {name}: {column.dtype} {column.shape},"
+                    f" expected {np.dtype(dtype)} ({len(self.t_us)},)"
+                )
+
+    @classmethod
+    def of(cls, t_us: Any, x: Any, y: Any, p: Any) -> Self:
+        """Events from array-likes, converted to the column types."""
+        return cls(
+            np.ascontiguousarray(t_us, np.int64),
+            np.ascontiguousarray(x, np.uint16),
+            np.ascontiguousarray(y, np.uint16),
+            np.ascontiguousarray(p, np.uint8),
+        )
+
+    @classmethod
+    def empty(cls) -> Self:
+        """No events."""
+        return cls.of([], [], [], [])
+
+    @classmethod
+    def concat(cls, parts: Iterable["Events"]) -> Self:
+        """All events of `parts`, in order."""
+        ps = list(parts)
+        if not ps:
+            return cls.empty()
+        return cls(*(np.concatenate([getattr(q, c) for q in ps]) for c in ("t_us", "x", "y", "p")))
+
+    @classmethod
+    def from_records(cls, records: NDArray[np.void]) -> Self:
+        """Events from Metavision records (fields x, y, p, t)."""
+        return cls.of(records["t"], records["x"], records["y"], records["p"])
+
+    def to_records(self) -> NDArray[np.void]:
+        """Metavision records (`EVENT_RECORD`)."""
+        out = np.empty(len(self), EVENT_RECORD)
+        out["x"], out["y"], out["p"], out["t"] = self.x, self.y, self.p, self.t_us
+        return out
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+    def __getitem__(self, rows: Any) -> "Events":
+        """The events of a slice or a mask (a view for a slice)."""
+        return Events(self.t_us[rows], self.x[rows], self.y[rows], self.p[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Triggers:
+    """Edges of the camera's external trigger inputs.
+
+    Attributes:
+        t_us: Camera clock, us, int64 (n,).
+        channel: Trigger input, uint8 (n,).
+        value: 1 = rising, 0 = falling, uint8 (n,).
+    """
+
+    t_us: NDArray[np.int64]
+    channel: NDArray[np.uint8]
+    value: NDArray[np.uint8]
+
+    @classmethod
+    def of(cls, t_us: Any, channel: Any, value: Any) -> Self:
+        """Triggers from array-likes, converted to the column types."""
+        return cls(np.asarray(t_us, np.int64), np.asarray(channel, np.uint8), np.asarray(value, np.uint8))
+
+    @classmethod
+    def empty(cls) -> Self:
+        """No triggers."""
+        return cls.of([], [], [])
+
+    @classmethod
+    def concat(cls, parts: Iterable["Triggers"]) -> Self:
+        """All triggers of `parts`, in order."""
+        ps = list(parts)
+        if not ps:
+            return cls.empty()
+        return cls(*(np.concatenate([getattr(q, c) for q in ps]) for c in ("t_us", "channel", "value")))
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+
+@dataclass(frozen=True)
+class SyncLock:
+    """Where a transmitter's packets stand on the camera's clock.
+
+    Attributes:
+        packet_t_us: Start of a packet's first preamble chip, us; other packets lie whole periods away.
+        chip_us: Length of a chip on the camera's clock, us.
+        delay_on_us: Delay of positive events after a rising edge, us, counted from `packet_t_us`'s grid.
+        delay_off_us: The same for negative events after a falling edge.
+        quality: Normalised preamble correlation, 0 to 1.
+    """
+
+    packet_t_us: float
+    chip_us: float
+    delay_on_us: float
+    delay_off_us: float
+    quality: float
+
+
+@dataclass(frozen=True, eq=False)
+class PresenceMap:
+    """Probability that a grid cell shows a cluster.
+
+    Attributes:
+        probability: float32 (K, rows, columns), 0 to 1.
+        grid_px: Side of a grid cell, px.
+        selected: Cells that show any cluster, bool (rows, columns).
+        pixels: Pilot correlation of each pixel inside the selected cells, float32 (K, height, width),
+            0 elsewhere; the maps that ranging needs.
+    """
+
+    probability: NDArray[np.float32]
+    grid_px: int
+    selected: NDArray[np.bool_]
+    pixels: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class SoftSymbols:
+    """What one frame says, with how sure.
+
+    Attributes:
+        symbols: Most likely symbol of each cluster, int64 (K,).
+        llr: Log-likelihood ratio ln P(bit 0) / P(bit 1) of each bit, most significant first, float32 (K, m).
+        quality: Share of the received energy that the decided codewords explain, 0 to 1.
+    """
+
+    symbols: NDArray[np.int64]
+    llr: NDArray[np.float32]
+    quality: float
+
+
+@dataclass(frozen=True)
+class Range:
+    """A distance along the optical axis.
+
+    Attributes:
+        distance_m: Depth, m; NaN when the maps do not allow one.
+        sigma_m: Its standard deviation, m.
+        pairs: Number of cluster pairs that entered.
+    """
+
+    distance_m: float
+    sigma_m: float
+    pairs: int

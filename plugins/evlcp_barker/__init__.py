@@ -1,0 +1,20 @@
+"""Barker codes: packet synchronization, and pilots from shifted Barker-13 words."""
+
+from collections.abc import Iterator
+
+from evlcp_sdk.hookspecs import Algorithm, hookimpl
+
+__all__ = ["evlcp_algorithms"]
+
+
+@hookimpl
+def evlcp_algorithms() -> Iterator[Algorithm]:
+    """The algorithms of this package."""
+    yield Algorithm(
+        "synchronization",
+        "barker",
+        "evlcp_barker.synchronization:BarkerSync",
+        1,
+        "sliding preamble correlation",
+    )
+    yield Algorithm("pilots", "barker13", "evlcp_barker.pilots:Barker13Pilots", 1, "shifted Barker-13 words")

@@ -1,0 +1,15 @@
+"""Ranging by phase-only correlation between the pixel maps of clusters (arXiv 2510.17203)."""
+
+from collections.abc import Iterator
+
+from evlcp_sdk.hookspecs import Algorithm, hookimpl
+
+__all__ = ["evlcp_algorithms"]
+
+
+@hookimpl
+def evlcp_algorithms() -> Iterator[Algorithm]:
+    """The algorithms of this package."""
+    yield Algorithm(
+        "ranging", "poc", "evlcp_poc.ranging:PocRanging", 1, "phase-only correlation of cluster pairs"
+    )

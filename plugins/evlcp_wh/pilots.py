@@ -1,0 +1,34 @@
+"""Walsh-Hadamard pilots."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.abc import Pilots
+from evlcp_sdk.codebook import BARKER13, hadamard
+
+__all__ = ["WhPilots"]
+
+
+@dataclass(frozen=True)
+class WhPilots(Pilots):
+    """Rows of a Hadamard matrix, then the same rows inverted (air interface 1, Codes).
+
+    The order is 8, as on air, for up to 16 clusters; above, the next power of two that is long enough.
+
+    >>> WhPilots().codes(16)[9].tolist()
+    [-1, 1, -1, 1, -1, 1, -1, 1]
+    """
+
+    def preamble(self) -> NDArray[np.int8]:
+        """Barker-13, int8 (13,)."""
+        return np.array(BARKER13, np.int8)
+
+    def codes(self, clusters: int) -> NDArray[np.int8]:
+        """int8 (clusters, N), N = 8 for up to 16 clusters."""
+        order = 8
+        while 2 * order < clusters:
+            order *= 2
+        rows = hadamard(order)
+        return np.concatenate([rows, -rows])[:clusters]

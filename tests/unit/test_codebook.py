@@ -1,0 +1,119 @@
+"""The codebook against the worked values of the air interface, and its JSON and C forms."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evlcp_barker.pilots import Barker13Pilots
+from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
+from evlcp_wh.pilots import WhPilots
+
+from evlcp_sdk.abc import Modulation
+from evlcp_sdk.codebook import Codebook, chips_of_values, hadamard
+from evlcp_sdk.errors import CodebookMismatchError, ConfigError
+from evlcp_sdk.frames import (
+    PacketFormat,
+    bits_of_symbols,
+    info_words,
+    packet_chips,
+    pilot_words,
+    symbols_of_bits,
+)
+
+VECTORS = json.loads((Path(__file__).parents[1] / "vectors" / "air-vectors.json").read_text())
+PROFILES: dict[str, Modulation] = {"wh4x2": Wh4x2(), "wh8": Wh8(), "raw8": Raw8()}
+
+
+def book_of(profile: str) -> Codebook:
+    pilots = WhPilots()
+    return Codebook(profile, pilots.preamble(), pilots.codes(16), PROFILES[profile].codewords())
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_words_are_the_vectors(profile: str) -> None:
+    book = book_of(profile)
+    assert [f"{w:04x}" for w in pilot_words(book)] == VECTORS["pilot_words"]
+    n = len(book.codewords)
+    words = info_words(np.arange(n).repeat(16).reshape(n, 16), book)[:, 0]
+    assert [f"{w:04x}" for w in words] == VECTORS["info_words"][profile]
+    assert "".join(map(str, chips_of_values(book.preamble))) == VECTORS["preamble_chips"]
+    assert book.preamble.tolist() == VECTORS["barker13"]
+
+
+def test_packet_is_the_vector() -> None:
+    want = VECTORS["example_packet"]
+    book = book_of(want["profile"])
+    chips = packet_chips(want["symbols"], book)
+    assert len(chips) == PacketFormat.of(book, want["frames"]).packet_chips
+    assert ["".join(map(str, row)) for row in chips] == [f"{int(m, 16):016b}" for m in want["cluster_masks"]]
+    bits = bits_of_symbols(want["symbols"], book.bits_per_symbol)
+    assert "".join(map(str, bits)) == want["bits"]
+    assert symbols_of_bits(bits, book.bits_per_symbol, 16).tolist() == want["symbols"]
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_json_round_trip_keeps_the_digest(profile: str) -> None:
+    book = book_of(profile)
+    again = Codebook.from_json(book.to_json())
+    assert again == book
+    assert hash(again) == hash(book)
+    assert len({book_of(p).digest for p in PROFILES}) == 3
+
+
+def test_a_changed_code_is_refused() -> None:
+    table = json.loads(book_of("wh8").to_json())
+    table["pilots"][3], table["pilots"][4] = table["pilots"][4], table["pilots"][3]
+    with pytest.raises(CodebookMismatchError, match="digest"):
+        Codebook.from_json(json.dumps(table))
+    with pytest.raises(CodebookMismatchError, match="air_interface 9, expected 1"):
+        Codebook.from_json(json.dumps(table | {"air_interface": 9}))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("{", "not a codebook"), ('{"air_interface": 1}', "'profile' is missing"), ("[]", "not a codebook")],
+)
+def test_bad_json_names_the_source(text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^book\.json.*{message}"):
+        Codebook.from_json(text, "book.json")
+
+
+def test_codes_are_checked() -> None:
+    with pytest.raises(ConfigError, match="two rows are equal"):
+        Codebook("x", hadamard(2)[0], np.ones((2, 8), np.int8), hadamard(8))
+    with pytest.raises(ConfigError, match="preamble"):
+        Codebook("x", np.zeros(13, np.int8), hadamard(8), hadamard(8))
+    with pytest.raises(ConfigError, match="power of two"):
+        Codebook("x", hadamard(2)[0], hadamard(8), hadamard(8)[:3])
+
+
+def test_c_table_holds_the_words() -> None:
+    book = book_of("wh4x2")
+    text = book.to_c()
+    words = re.findall(r"0x([0-9a-f]{4})u", text)
+    assert words == VECTORS["pilot_words"] + VECTORS["info_words"]["wh4x2"]
+    assert f"{int(VECTORS['preamble_chips'], 2):08x}" in text
+
+
+def test_more_clusters_need_longer_pilots() -> None:
+    codes = WhPilots().codes(20)
+    assert codes.shape == (20, 16)
+    assert len(np.unique(codes, axis=0)) == 20
+    assert Barker13Pilots().codes(26).shape == (26, 13)
+    with pytest.raises(ConfigError, match="at most 26"):
+        Barker13Pilots().codes(27)
+
+
+@pytest.mark.parametrize(
+    ("symbols", "message"),
+    [
+        ([[0] * 15], "expected \\(frames, 16 clusters\\)"),
+        ([[0] * 15 + [64]], "symbol 64 at frame 0, cluster 15: expected 0 to 63"),
+        ([[0.5] * 16], "expected integers"),
+    ],
+)
+def test_bad_symbols_are_named(symbols: list[list[float]], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        packet_chips(symbols, book_of("wh4x2"))
