@@ -22,6 +22,7 @@ __all__ = [
     "ROLES",
     "Decode",
     "Decoding",
+    "Measure",
     "Modulation",
     "Pilots",
     "Ranging",

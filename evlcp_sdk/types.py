@@ -12,6 +12,8 @@ from evlcp_sdk.errors import StreamError
 __all__ = [
     "EVENT_RECORD",
     "Events",
+    "Frame",
+    "Packet",
     "PresenceMap",
     "Range",
     "SoftSymbols",
@@ -198,3 +200,49 @@ class Range:
     distance_m: float
     sigma_m: float
     pairs: int
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One decoded frame: a row of `frames.csv`.
+
+    Attributes:
+        transmitter: Number of the transmitter in order of first lock, from 0.
+        packet: Number of the packet since the transmitter's first, from 0.
+        frame: Number of the frame in its packet, from 0.
+        t_us: Start of the frame's first pilot chip on the camera's clock, us.
+        soft: Symbols and log-likelihood ratios.
+        range: Distance; its values are NaN when the maps do not allow one.
+        x_px: Column of the bar's centre in the middle of the pilot, px.
+        y_px: Row of the same, px.
+    """
+
+    transmitter: int
+    packet: int
+    frame: int
+    t_us: float
+    soft: SoftSymbols
+    range: Range
+    x_px: float
+    y_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class Packet:
+    """The frames of one packet: a line of `packets.jsonl`.
+
+    Attributes:
+        transmitter: Number of the transmitter, as in `Frame`.
+        packet: Number of the packet, as in `Frame`.
+        t_us: Start of its first preamble chip on the camera's clock, us.
+        chip_us: Length of a chip on the camera's clock, us.
+        frames: The decoded frames in order; a frame that was not received is missing here.
+        sent: Number of frames that a packet has.
+    """
+
+    transmitter: int
+    packet: int
+    t_us: float
+    chip_us: float
+    frames: tuple[Frame, ...]
+    sent: int
