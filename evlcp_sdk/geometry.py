@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge, Gt
 from numpy.typing import NDArray
+from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
 
@@ -20,10 +20,10 @@ class CameraModel:
     7201.6
     """
 
-    width: Annotated[int, Gt(0)] = 1280
-    height: Annotated[int, Gt(0)] = 720
-    focal_mm: Annotated[float, Gt(0)] = 35.0
-    pitch_um: Annotated[float, Gt(0)] = 4.86
+    width: Annotated[int, Field(gt=0, description="Columns of the sensor.")] = 1280
+    height: Annotated[int, Field(gt=0, description="Rows of the sensor.")] = 720
+    focal_mm: Annotated[float, Field(gt=0, description="Focal length of the lens.")] = 35.0
+    pitch_um: Annotated[float, Field(gt=0, description="Spacing of the sensor's pixels.")] = 4.86
 
     @property
     def focal_px(self) -> float:
@@ -54,15 +54,16 @@ class BarLayout:
 
     >>> BarLayout().clusters
     16
-    >>> BarLayout(rows=16, columns=16, cluster_rows=4, cluster_columns=4).cluster_centres_m()[1].round(3).tolist()
+    >>> panel = BarLayout(rows=16, columns=16, cluster_rows=4, cluster_columns=4)
+    >>> panel.cluster_centres_m()[1].round(3).tolist()
     [-0.02, -0.06]
     """
 
-    rows: Annotated[int, Gt(0)] = 96
-    columns: Annotated[int, Gt(0)] = 1
-    led_pitch_m: Annotated[float, Gt(0)] = 0.01
-    cluster_rows: Annotated[int, Ge(1)] = 6
-    cluster_columns: Annotated[int, Ge(1)] = 1
+    rows: Annotated[int, Field(gt=0, description="LEDs from top to bottom.")] = 96
+    columns: Annotated[int, Field(gt=0, description="LEDs from left to right.")] = 1
+    led_pitch_m: Annotated[float, Field(gt=0, description="Spacing of neighbouring LEDs.")] = 0.01
+    cluster_rows: Annotated[int, Field(gt=0, description="LED rows of a cluster.")] = 6
+    cluster_columns: Annotated[int, Field(gt=0, description="LED columns of a cluster.")] = 1
 
     def __post_init__(self) -> None:
         for name in ("rows", "columns"):
