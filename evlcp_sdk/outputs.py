@@ -1,0 +1,336 @@
+"""What the receiver leaves behind: `frames.csv`, `packets.jsonl`, `summary.json`, Parquet on request.
+
+Rows are written as they come, in constant memory, to hidden files beside the final ones; `finish` moves them
+into place together, the summary last. Until then, and after a crash, an earlier result stays as it was; a run
+that is interrupted or meets unreadable input is finished too, and its summary says so in `status`.
+"""
+
+import csv
+import json
+import math
+import os
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self, TextIO
+
+from evlcp_sdk.config import Link
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.frames import bits_of_symbols
+from evlcp_sdk.types import Frame, Packet
+
+__all__ = ["FIGURE_NAMES", "FRAME_COLUMNS", "ResultWriter", "Status", "TransmitterTally"]
+
+FRAME_COLUMNS = (
+    "transmitter",
+    "packet",
+    "frame",
+    "t_us",
+    "symbols",
+    "quality",
+    "distance_m",
+    "distance_sigma_m",
+    "x_px",
+    "y_px",
+)
+"""Columns of `frames.csv` and `frames.parquet`."""
+
+FIGURE_NAMES = ("regions.png", "presence.png", "distance.png")
+"""Figures that a run may leave in its folder."""
+
+Status = Literal["complete", "interrupted", "failed"]
+"""How a run ended: read to the end, stopped by the user, or stopped by input that cannot be read."""
+
+_FILES = ("frames.csv", "packets.jsonl", "frames.parquet", "summary.json")
+_CELL_M = 0.01
+_FARTHEST_M = 10_000.0
+
+
+@dataclass
+class TransmitterTally:
+    """Running figures of one transmitter, in constant memory.
+
+    Args:
+        packet_frames: Frames that a packet has.
+        nominal_chip_us: Chip length that the configuration states, us.
+    """
+
+    packet_frames: int
+    nominal_chip_us: float
+    packets: int = 0
+    frames: int = 0
+    last_packet: int = 0
+    chip_us_sum: float = 0.0
+    quality_sum: float = 0.0
+    ranged: int = 0
+    first_m: float = math.nan
+    last_m: float = math.nan
+    cells: Counter[int] = field(default_factory=Counter)
+
+    def add(self, packet: Packet) -> None:
+        """Count a packet and its frames."""
+        self.packets += 1
+        self.frames += len(packet.frames)
+        self.last_packet = max(self.last_packet, packet.packet)
+        self.chip_us_sum += packet.chip_us
+        for frame in packet.frames:
+            self.quality_sum += frame.soft.quality
+            distance_m = frame.range.distance_m
+            if math.isfinite(distance_m):
+                self.ranged += 1
+                self.last_m = distance_m
+                if self.ranged == 1:
+                    self.first_m = distance_m
+                self.cells[round(min(distance_m, _FARTHEST_M) / _CELL_M)] += 1
+
+    def median_m(self) -> float:
+        """Median distance to the centimetre, m; NaN without any."""
+        seen = 0
+        for cell in sorted(self.cells):
+            seen += self.cells[cell]
+            if 2 * seen >= self.ranged:
+                return round(cell * _CELL_M, 2)
+        return math.nan
+
+    def to_dict(self) -> dict[str, Any]:
+        """The figures as JSON values; what was never measured is null.
+
+        `frames_expected` counts every packet from the transmitter's first to its last, heard or not;
+        `clock_ppm` is the transmitter's chip rate over the camera's clock.
+        """
+        clock_ppm = (
+            (self.nominal_chip_us * self.packets / self.chip_us_sum - 1) * 1e6 if self.packets else math.nan
+        )
+        return {
+            "packets": self.packets,
+            "frames_found": self.frames,
+            "frames_expected": (self.last_packet + 1) * self.packet_frames,
+            "quality": _number(self.quality_sum / self.frames if self.frames else math.nan, 4),
+            "clock_ppm": _number(clock_ppm, 2),
+            "frames_ranged": self.ranged,
+            "distance_first_m": _number(self.first_m, 4),
+            "distance_last_m": _number(self.last_m, 4),
+            "distance_median_m": _number(self.median_m(), 2),
+        }
+
+
+class ResultWriter:
+    """Writes one recording's result into a folder; use as a context manager, end with `finish`.
+
+    Args:
+        folder: Made if need be; an earlier result in it is replaced by `finish`.
+        link: The configuration that the receiver ran with.
+        parquet: Also write `frames.parquet` (needs the extra `parquet`).
+
+    Raises:
+        ConfigError: The folder cannot be written, or the extra is not installed.
+    """
+
+    def __init__(self, folder: Path, link: Link, *, parquet: bool = False) -> None:
+        self.folder = folder
+        self.transmitters: dict[int, TransmitterTally] = {}
+        self._link = link
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._frames_file = self._open("frames.csv")
+            self._packets_file = self._open("packets.jsonl")
+        except OSError as fault:
+            raise ConfigError(f"{folder}: cannot be written: {fault.strerror}") from fault
+        self._rows = csv.writer(self._frames_file, lineterminator="\n")
+        self._rows.writerow(FRAME_COLUMNS)
+        self._parquet = _ParquetRows(self._hidden("frames.parquet")) if parquet else None
+
+    def _hidden(self, name: str) -> Path:
+        return self.folder / f".{name}.{os.getpid()}.part"
+
+    def _open(self, name: str) -> TextIO:
+        return self._hidden(name).open("w", encoding="utf-8", newline="")
+
+    def write(self, packets: Iterable[Packet]) -> None:
+        """Append packets and their frames."""
+        for packet in packets:
+            tally = self.transmitters.get(packet.transmitter)
+            if tally is None:
+                tally = TransmitterTally(packet.sent, self._link.packet.chip_us)
+                self.transmitters[packet.transmitter] = tally
+            tally.add(packet)
+            self._packets_file.write(json.dumps(self._packet_line(packet)) + "\n")
+            for frame in packet.frames:
+                self._rows.writerow(_frame_row(frame))
+                if self._parquet is not None:
+                    self._parquet.add(frame)
+
+    def _packet_line(self, packet: Packet) -> dict[str, Any]:
+        book = self._link.codebook
+        symbols: list[list[int] | None] = [None] * packet.sent
+        bits = ["?" * (book.clusters * book.bits_per_symbol)] * packet.sent
+        for frame in packet.frames:
+            symbols[frame.frame] = frame.soft.symbols.tolist()
+            frame_bits = bits_of_symbols(frame.soft.symbols[None], book.bits_per_symbol)
+            bits[frame.frame] = "".join(map(str, frame_bits.tolist()))
+        return {
+            "transmitter": packet.transmitter,
+            "packet": packet.packet,
+            "t_us": round(packet.t_us, 2),
+            "chip_us": round(packet.chip_us, 6),
+            "frames_sent": packet.sent,
+            "frames_received": len(packet.frames),
+            "symbols": symbols,
+            "bits": "".join(bits),
+        }
+
+    def finish(
+        self,
+        status: Status,
+        recording: Mapping[str, Any],
+        processing: Mapping[str, Any],
+        counts: Mapping[str, int],
+        losses: Iterable[Mapping[str, Any]],
+        versions: Mapping[str, str],
+        error: str | None = None,
+    ) -> dict[str, Any]:
+        """Write the summary, move all files into place, and drop what an earlier run left.
+
+        Args:
+            status: How the run ended.
+            recording: What was read: path, format, size, duration, events.
+            processing: How long it took.
+            counts: The receiver's counts.
+            losses: What the reader skipped, with byte offsets.
+            versions: Installed versions.
+            error: The message, when `status` is `failed`.
+
+        Returns:
+            The content of `summary.json`.
+
+        Raises:
+            ConfigError: A file cannot be written.
+        """
+        table = {
+            "status": status,
+            "error": error,
+            "result": self.headline(),
+            "transmitters": [
+                {"transmitter": n} | tally.to_dict() for n, tally in sorted(self.transmitters.items())
+            ],
+            "recording": dict(recording),
+            "processing": dict(processing),
+            "counts": dict(counts),
+            "losses": [dict(loss) for loss in losses],
+            "digest": self._link.digest,
+            "codebook": {"digest": self._link.codebook.digest, "profile": self._link.codebook.profile},
+            "revisions": dict(self._link.revisions),
+            "configuration": {section: dict(keys) for section, keys in self._link.table.items()},
+            "versions": dict(versions),
+        }
+        try:
+            self._hidden("summary.json").write_text(json.dumps(table, indent=2) + "\n", encoding="utf-8")
+            self._close()
+            for name in FIGURE_NAMES:
+                (self.folder / name).unlink(missing_ok=True)
+            for name in _FILES:
+                if self._hidden(name).exists():
+                    self._hidden(name).replace(self.folder / name)
+                else:
+                    (self.folder / name).unlink(missing_ok=True)
+        except OSError as fault:
+            raise ConfigError(f"{self.folder}: cannot be written: {fault.strerror}") from fault
+        return table
+
+    def headline(self) -> str:
+        """What was found, in one sentence."""
+        if not self.transmitters:
+            return "no transmitter was found"
+        found = sum(tally.frames for tally in self.transmitters.values())
+        number = len(self.transmitters)
+        return f"{number} transmitter{'s' * (number > 1)}, {found} frame{'s' * (found != 1)}"
+
+    def _close(self) -> None:
+        self._frames_file.close()
+        self._packets_file.close()
+        if self._parquet is not None:
+            self._parquet.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Drop what `finish` has not moved into place."""
+        self._close()
+        for name in _FILES:
+            self._hidden(name).unlink(missing_ok=True)
+
+
+def _frame_row(frame: Frame) -> list[str]:
+    return [
+        str(frame.transmitter),
+        str(frame.packet),
+        str(frame.frame),
+        f"{frame.t_us:.2f}",
+        " ".join(map(str, frame.soft.symbols.tolist())),
+        f"{frame.soft.quality:.4f}",
+        _text(frame.range.distance_m),
+        _text(frame.range.sigma_m),
+        f"{frame.x_px:.3f}",
+        f"{frame.y_px:.3f}",
+    ]
+
+
+def _text(value: float) -> str:
+    return f"{value:.4f}" if math.isfinite(value) else ""
+
+
+def _number(value: float, digits: int) -> float | None:
+    return round(value, digits) if math.isfinite(value) else None
+
+
+class _ParquetRows:
+    """Rows of `frames.parquet`, one row group every `GROUP` frames."""
+
+    GROUP = 4096
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import pyarrow
+            import pyarrow.parquet
+        except ImportError as fault:
+            raise ConfigError(
+                "Parquet needs the extra: pip install 'evlcp-sdk[parquet]', or leave --parquet out"
+            ) from fault
+        whole, real = pyarrow.int64(), pyarrow.float64()
+        types = [whole, whole, whole, real, pyarrow.list_(whole), real, real, real, real, real]
+        self._schema = pyarrow.schema(list(zip(FRAME_COLUMNS, types, strict=True)))
+        self._arrow = pyarrow
+        self._writer = pyarrow.parquet.ParquetWriter(path, self._schema)
+        self._waiting: list[dict[str, Any]] = []
+
+    def add(self, frame: Frame) -> None:
+        values = (
+            frame.transmitter,
+            frame.packet,
+            frame.frame,
+            frame.t_us,
+            frame.soft.symbols.tolist(),
+            frame.soft.quality,
+            _number(frame.range.distance_m, 15),
+            _number(frame.range.sigma_m, 15),
+            frame.x_px,
+            frame.y_px,
+        )
+        self._waiting.append(dict(zip(FRAME_COLUMNS, values, strict=True)))
+        if len(self._waiting) == self.GROUP:
+            self._flush()
+
+    def _flush(self) -> None:
+        self._writer.write_table(self._arrow.Table.from_pylist(self._waiting, schema=self._schema))
+        self._waiting = []
+
+    def close(self) -> None:
+        if self._writer.is_open:
+            if self._waiting:
+                self._flush()
+            self._writer.close()

@@ -1,0 +1,189 @@
+"""The three files of a result: columns, values, streaming, and what is left after a stop or a crash."""
+
+import csv
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evlcp_wh.modulation import Wh8
+from evlcp_wh.pilots import WhPilots
+
+from evlcp_sdk.codebook import Codebook
+from evlcp_sdk.config import AirSpec, Link, RegionSpec
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.frames import PacketFormat, symbols_of_bits
+from evlcp_sdk.geometry import BarLayout, CameraModel
+from evlcp_sdk.outputs import FIGURE_NAMES, FRAME_COLUMNS, ResultWriter, TransmitterTally
+from evlcp_sdk.types import Frame, Packet, Range, SoftSymbols
+
+BOOK = Codebook("wh8", WhPilots().preamble(), WhPilots().codes(16), Wh8().codewords())
+LINK = Link(
+    camera=CameraModel(),
+    bar=BarLayout(),
+    air=AirSpec(frames_per_packet=3),
+    regions=RegionSpec(),
+    algorithms={},
+    revisions={"ranging": 1},
+    codebook=BOOK,
+    packet=PacketFormat.of(BOOK, 3),
+    table={"air": {"chip_rate_hz": 10_000.0, "frames_per_packet": 3}},
+    digest="0" * 64,
+)
+
+
+def frame(packet: int, number: int, distance_m: float = 50.0, transmitter: int = 0) -> Frame:
+    symbols = (np.arange(16) + number) % 16
+    soft = SoftSymbols(symbols, np.zeros((16, 4), np.float32), 0.875)
+    sigma = 0.05 if math.isfinite(distance_m) else math.nan
+    return Frame(
+        transmitter,
+        packet,
+        number,
+        12_345.678 + 3200 * number,
+        soft,
+        Range(distance_m, sigma, 20),
+        640.1234,
+        360.5,
+    )
+
+
+def packet(number: int, frames: tuple[Frame, ...], transmitter: int = 0, chip_us: float = 99.999) -> Packet:
+    return Packet(transmitter, number, 9_745.678, chip_us, frames, sent=3)
+
+
+def finish(writer: ResultWriter, **kw: Any) -> dict[str, Any]:
+    given: dict[str, Any] = {
+        "status": "complete",
+        "recording": {"path": "a.raw"},
+        "processing": {"elapsed_s": 1.0},
+        "counts": {"events": 3},
+        "losses": [{"offset": 7, "what": "odd byte"}],
+        "versions": {"evlcp-sdk": "0"},
+    }
+    return writer.finish(**(given | kw))
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / "frames.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_files_of_a_result(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path / "out", LINK) as writer:
+        writer.write([packet(0, (frame(0, 0), frame(0, 2, math.nan)))])
+        writer.write([packet(2, (frame(2, 1, 51.0),)), packet(0, (), transmitter=1)])
+        table = finish(writer)
+    out = tmp_path / "out"
+    assert sorted(p.name for p in out.iterdir()) == ["frames.csv", "packets.jsonl", "summary.json"]
+
+    rows = rows_of(out)
+    assert tuple(rows[0]) == FRAME_COLUMNS
+    assert list(rows[0].values()) == [
+        *("0", "0", "0", "12345.68", "0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15", "0.8750"),
+        *("50.0000", "0.0500", "640.123", "360.500"),
+    ]
+    assert (rows[1]["distance_m"], rows[1]["distance_sigma_m"]) == ("", "")
+
+    lines = [json.loads(line) for line in (out / "packets.jsonl").read_text().splitlines()]
+    first = lines[0]
+    assert (first["transmitter"], first["packet"], first["t_us"]) == (0, 0, 9745.68)
+    assert (first["frames_sent"], first["frames_received"]) == (3, 2)
+    assert first["symbols"][1] is None
+    assert first["bits"][64:128] == "?" * 64
+    heard = [int(b) for b in first["bits"][:64]]
+    assert symbols_of_bits(heard, 4, 16).tolist() == [first["symbols"][0]]
+
+    assert table == json.loads((out / "summary.json").read_text())
+    assert table["result"] == "2 transmitters, 3 frames"
+    assert table["digest"] == LINK.digest
+    assert table["codebook"] == {"digest": BOOK.digest, "profile": "wh8"}
+    assert table["losses"] == [{"offset": 7, "what": "odd byte"}]
+    assert table["transmitters"][0] == {
+        "transmitter": 0,
+        "packets": 2,
+        "frames_found": 3,
+        "frames_expected": 9,
+        "quality": 0.875,
+        "clock_ppm": 10.0,
+        "frames_ranged": 2,
+        "distance_first_m": 50.0,
+        "distance_last_m": 51.0,
+        "distance_median_m": 50.0,
+    }
+    assert table["transmitters"][1]["quality"] is None
+    assert table["transmitters"][1]["distance_median_m"] is None
+
+
+def test_no_transmitter_is_said_plainly(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, LINK) as writer:
+        table = finish(writer)
+    assert table["result"] == "no transmitter was found"
+    assert table["transmitters"] == []
+    assert (tmp_path / "frames.csv").read_text() == ",".join(FRAME_COLUMNS) + "\n"
+    assert (tmp_path / "packets.jsonl").read_text() == ""
+
+
+def test_a_new_result_replaces_all_of_the_old_one_and_only_at_the_end(tmp_path: Path) -> None:
+    for name in (*FIGURE_NAMES, "frames.parquet", "frames.csv", "notes.txt"):
+        (tmp_path / name).write_text("old")
+    with ResultWriter(tmp_path, LINK) as writer:
+        writer.write([packet(0, (frame(0, 0),))])
+        assert (tmp_path / "frames.csv").read_text() == "old"
+        finish(writer)
+    names = sorted(p.name for p in tmp_path.iterdir())
+    assert names == ["frames.csv", "notes.txt", "packets.jsonl", "summary.json"]
+    assert len(rows_of(tmp_path)) == 1
+
+
+def test_a_crash_leaves_the_old_result(tmp_path: Path) -> None:
+    (tmp_path / "frames.csv").write_text("old")
+
+    def crash() -> None:
+        with ResultWriter(tmp_path, LINK) as writer:
+            writer.write([packet(0, (frame(0, 0),))])
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        crash()
+    assert [p.name for p in tmp_path.iterdir()] == ["frames.csv"]
+    assert (tmp_path / "frames.csv").read_text() == "old"
+
+
+def test_a_failed_run_says_so_and_keeps_what_was_decoded(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, LINK) as writer:
+        writer.write([packet(0, (frame(0, 0),))])
+        finish(writer, status="failed", error="a.raw: at byte 9: found x, expected y")
+    table = json.loads((tmp_path / "summary.json").read_text())
+    assert (table["status"], table["error"]) == ("failed", "a.raw: at byte 9: found x, expected y")
+    assert len(rows_of(tmp_path)) == 1
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="file: cannot be written"):
+        ResultWriter(tmp_path / "file", LINK)
+
+
+def test_parquet_holds_the_same_frames(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
+    with ResultWriter(tmp_path, LINK, parquet=True) as writer:
+        writer.write([packet(0, (frame(0, 0), frame(0, 1, math.nan)))])
+        finish(writer)
+    table = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
+    assert tuple(table[0]) == FRAME_COLUMNS
+    assert table[0]["symbols"] == list(range(16))
+    assert [row["distance_m"] for row in table] == [50.0, None]
+    assert len(table) == len(rows_of(tmp_path))
+
+
+def test_the_median_needs_no_memory_of_every_frame() -> None:
+    tally = TransmitterTally(3, 100.0)
+    distances = np.random.default_rng(1).normal(60.0, 2.0, 999)
+    for i in range(0, 999, 3):
+        tally.add(packet(i // 3, tuple(frame(i // 3, k, float(distances[i + k])) for k in range(3))))
+    assert tally.median_m() == pytest.approx(np.median(distances), abs=0.006)
+    tally.add(packet(333, (frame(333, 0, 1e300),)))
+    assert max(tally.cells) == 1_000_000
