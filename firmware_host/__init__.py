@@ -1,0 +1,18 @@
+"""Transmitter of the EVLCP SDK: protocol, host tool, firmware and emulators of the 96-LED driver board."""
+
+from typing import TYPE_CHECKING
+
+from evlcp_sdk.hookspecs import hookimpl
+
+if TYPE_CHECKING:
+    import typer
+
+__all__ = ["evlcp_register_commands"]
+
+
+@hookimpl
+def evlcp_register_commands(app: "typer.Typer") -> None:
+    """Add `evlcp board` and `evlcp tx`."""
+    from firmware_host.commands import register
+
+    register(app)

@@ -1,0 +1,47 @@
+"""Where a command's symbols come from: a file, or random ones with a seed."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from evlcp_sdk.errors import ConfigError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from evlcp_sdk.codebook import Codebook
+
+__all__ = ["codebook", "symbols"]
+
+
+def codebook(profile: str) -> "Codebook":
+    """The codebook of a profile.
+
+    Raises:
+        UnknownAlgorithmError: No modulation has that name.
+    """
+    from firmware_host.generate import codebook_of
+
+    return codebook_of(profile)
+
+
+def symbols(
+    path: Path | None, random: int | None, seed: int, frames: int, book: "Codebook"
+) -> "NDArray[np.int64]":
+    """Symbols (packets, frames, clusters) of a file, or `random` packets.
+
+    Raises:
+        ConfigError: Neither is given, or both.
+        InputError: The file is wrong.
+    """
+    from firmware_host.payload import random_symbols, read_symbols
+
+    if (path is None) == (random is None):
+        raise ConfigError("give symbols as SYMBOLS.json or with --random N, one of the two")
+    if path is not None:
+        return read_symbols(path, book)
+    import numpy as np
+
+    if random is None or random < 1 or frames < 1:
+        raise ConfigError(f"--random {random} --frames {frames}: expected at least 1 of each")
+    return random_symbols(random, frames, book, np.random.default_rng(seed))

@@ -1,0 +1,700 @@
+/* Messages of the driver board; generated from protocol.toml, do not edit. */
+#ifndef EVLCP_PROTOCOL_H
+#define EVLCP_PROTOCOL_H
+#include <stdint.h>
+
+#define EVLCP_PROTOCOL_VERSION 1u
+#define EVLCP_HEADER_BYTES 6u
+#define EVLCP_CRC_BYTES 4u
+#define EVLCP_MAX_PAYLOAD 512u
+#define EVLCP_WINDOW 6u
+#define EVLCP_BAUD 1000000u
+#define EVLCP_BOARD_CLUSTERS 16u
+#define EVLCP_LEDS 96u
+#define EVLCP_ROW_BYTES 12u
+#define EVLCP_SCHEMA {0x54, 0xfb, 0x07, 0xbc, 0x00, 0x86, 0x12, 0xff}
+#define EVLCP_REPLY_BIT 0x80u /* Set in the type of a reply. */
+#define EVLCP_NO_BANK 0xffu /* No bank. */
+#define EVLCP_NO_SESSION 0x0u /* Session of a HELLO request, and of a board that knows no host. */
+#define EVLCP_CHIP_DARK 0xffffffffu /* Chip number in an LED record: output is dark, no chip. */
+#define EVLCP_CHIP_TEST 0xfffffffeu /* Chip number in an LED record: single-LED test, no chip. */
+
+enum evlcp_type {
+    EVLCP_TYPE_HELLO = 0x01,
+    EVLCP_TYPE_CONFIGURE = 0x02,
+    EVLCP_TYPE_CODEBOOK = 0x03,
+    EVLCP_TYPE_WRITE = 0x04,
+    EVLCP_TYPE_READ = 0x05,
+    EVLCP_TYPE_CRC = 0x06,
+    EVLCP_TYPE_COMMIT = 0x07,
+    EVLCP_TYPE_START = 0x08,
+    EVLCP_TYPE_STOP = 0x09,
+    EVLCP_TYPE_BLANK = 0x0a,
+    EVLCP_TYPE_LEVEL = 0x0b,
+    EVLCP_TYPE_STATUS = 0x0c,
+    EVLCP_TYPE_WATCHDOG = 0x0d,
+    EVLCP_TYPE_SAVE = 0x0e,
+    EVLCP_TYPE_RECALL = 0x0f,
+    EVLCP_TYPE_LED_TEST = 0x10,
+};
+
+/* How a request ended. */
+enum evlcp_status {
+    EVLCP_STATUS_OK = 0, /* Done. */
+    EVLCP_STATUS_UNKNOWN_TYPE = 1, /* The board does not know this request. */
+    EVLCP_STATUS_BAD_LENGTH = 2, /* The payload has another length than the request's; detail: expected length. */
+    EVLCP_STATUS_OUT_OF_RANGE = 3, /* A value the board cannot take; detail: the nearest value it can. */
+    EVLCP_STATUS_BUSY = 4, /* Not while playing, or the bank is playing or about to. */
+    EVLCP_STATUS_BAD_CRC = 5, /* The bank's content has another CRC; detail: the CRC found. */
+    EVLCP_STATUS_FOREIGN_CODEBOOK = 6, /* The codebook's digest is not the one that belongs here. */
+    EVLCP_STATUS_NO_SESSION = 7, /* The board was reset, or another host has said HELLO. */
+    EVLCP_STATUS_STALE = 8, /* Older than a request already done; not done. */
+    EVLCP_STATUS_NOTHING_COMMITTED = 9, /* No bank has been committed. */
+    EVLCP_STATUS_INCOMPATIBLE = 10, /* The host's schema is another one. */
+    EVLCP_STATUS_FLASH_FAULT = 11, /* The flash did not take or give the data. */
+    EVLCP_STATUS_NOT_SUPPORTED = 12, /* This board cannot do that. */
+    EVLCP_STATUS_EMPTY_SLOT = 13, /* No flash slot holds a valid setting. */
+    EVLCP_STATUS_HARDWARE_FAULT = 14, /* A fault holds the LEDs dark; detail: fault bits. */
+};
+
+/* What a bank holds. */
+enum evlcp_format {
+    EVLCP_FORMAT_WORDS = 0, /* Info words u16 [packet][frame][cluster]; the board adds preamble and pilots. */
+    EVLCP_FORMAT_MASKS = 1, /* Chip masks, row_bytes a chip, LED 0 the most significant bit of the first byte. */
+};
+
+/* Info-segment profiles of air interface 1. */
+enum evlcp_profile {
+    EVLCP_PROFILE_WH4X2 = 0, /* Two words of H_4, 6 bits a symbol. */
+    EVLCP_PROFILE_WH8 = 1, /* One word of H_8, 4 bits a symbol. */
+    EVLCP_PROFILE_RAW8 = 2, /* Eight plain values, 8 bits a symbol. */
+    EVLCP_PROFILE_CUSTOM = 255, /* A codebook the firmware was not built with. */
+};
+
+/* What the LEDs do. */
+enum evlcp_state {
+    EVLCP_STATE_DARK = 0, /* Dark; the chip timer stands. */
+    EVLCP_STATE_PLAYING = 1, /* Packets of the active bank. */
+    EVLCP_STATE_STOPPING = 2, /* The last packet before dark. */
+    EVLCP_STATE_IDLE_PATTERN = 3, /* The watchdog's idle pattern: every LED alternates chip by chip. */
+    EVLCP_STATE_TESTING = 4, /* Single-LED test. */
+    EVLCP_STATE_FAULT = 5, /* Dark because of a fault. */
+};
+
+/* What happens when the host falls silent. */
+enum evlcp_watchdog {
+    EVLCP_WATCHDOG_KEEP = 0, /* Go on playing. */
+    EVLCP_WATCHDOG_IDLE = 1, /* Idle pattern from the next packet boundary until the host is heard again. */
+    EVLCP_WATCHDOG_DARK = 2, /* Dark after the packet; START plays again. */
+};
+
+/* Bits of HELLO.capabilities. */
+enum evlcp_capability {
+    EVLCP_CAPABILITY_FLASH = 1, /* SAVE and RECALL. */
+    EVLCP_CAPABILITY_LEVEL = 2, /* LEVEL sets the LED current. */
+    EVLCP_CAPABILITY_TEMPERATURE = 4, /* STATUS.temperature_dc is measured. */
+    EVLCP_CAPABILITY_OPEN_LED = 8, /* STATUS.open_leds is measured. */
+    EVLCP_CAPABILITY_RECORDS = 16, /* LED outputs are recorded (emulators). */
+};
+
+/* Bits of STATUS.faults. */
+enum evlcp_fault {
+    EVLCP_FAULT_OVER_TEMPERATURE = 1, /* The drivers are too hot: LEDs dark until they cool and START. */
+    EVLCP_FAULT_OPEN_LED = 2, /* A LED or its wire is open; playing goes on. */
+    EVLCP_FAULT_CLOCK = 4, /* The crystal did not start: LEDs dark, timing would be wrong. */
+    EVLCP_FAULT_CHIP_LOST = 8, /* A chip interrupt came a whole chip late: LEDs dark. */
+    EVLCP_FAULT_WATCHDOG = 16, /* The host fell silent and the watchdog acted; cleared by the next request. */
+};
+
+static inline void evlcp_copy(uint8_t *to, const uint8_t *from, uint32_t n)
+{
+    for (uint32_t i = 0; i < n; i++)
+        to[i] = from[i];
+}
+
+static inline void evlcp_put8(uint8_t *p, uint8_t v)
+{
+    p[0] = v;
+}
+
+static inline void evlcp_put16(uint8_t *p, uint16_t v)
+{
+    p[0] = (uint8_t)v;
+    p[1] = (uint8_t)(v >> 8);
+}
+
+static inline void evlcp_put32(uint8_t *p, uint32_t v)
+{
+    evlcp_put16(p, (uint16_t)v);
+    evlcp_put16(p + 2, (uint16_t)(v >> 16));
+}
+
+static inline uint8_t evlcp_get8(const uint8_t *p)
+{
+    return p[0];
+}
+
+static inline uint16_t evlcp_get16(const uint8_t *p)
+{
+    return (uint16_t)(p[0] | (uint16_t)(p[1] << 8));
+}
+
+static inline uint32_t evlcp_get32(const uint8_t *p)
+{
+    return evlcp_get16(p) | (uint32_t)evlcp_get16(p + 2) << 16;
+}
+
+#define EVLCP_HELLO_REQUEST_BYTES 12u
+/* Open a session and learn the board. Its first two fields never change between versions. */
+struct evlcp_hello_request {
+    uint8_t schema[8]; /* First bytes of the SHA-256 of the host's protocol definition. */
+    uint32_t nonce; /* Random; the same nonce keeps the session. */
+};
+
+static inline void evlcp_hello_request_put(uint8_t *p, const struct evlcp_hello_request *m)
+{
+    evlcp_copy(p + 0, m->schema, 8u);
+    evlcp_put32(p + 8, m->nonce);
+}
+
+static inline void evlcp_hello_request_get(const uint8_t *p, struct evlcp_hello_request *m)
+{
+    evlcp_copy(m->schema, p + 0, 8u);
+    m->nonce = evlcp_get32(p + 8);
+}
+
+#define EVLCP_HELLO_REPLY_BYTES 66u
+/* Answer to hello. */
+struct evlcp_hello_reply {
+    uint8_t schema[8]; /* The board's schema. */
+    uint16_t session; /* Goes into the header of every further request. */
+    uint8_t version_major; /* Firmware version. */
+    uint8_t version_minor; /* Firmware version. */
+    uint8_t version_patch; /* Firmware version. */
+    uint8_t window; /* Requests the host may have under way. */
+    uint16_t max_payload; /* Largest payload, bytes. */
+    uint8_t banks; /* Number of banks. */
+    uint32_t bank_bytes; /* Size of a bank, bytes. */
+    uint8_t clusters; /* Clusters. */
+    uint16_t leds; /* LEDs. */
+    uint32_t tick_hz; /* Rate of the tick counter that times the chips. */
+    uint32_t chip_rate_max_hz; /* Fastest chip rate. */
+    uint16_t level_max_ma; /* Largest LED current, mA. */
+    uint32_t capabilities; /* Capability bits. */
+    uint8_t unique_id[12]; /* The part's own number. */
+    uint32_t uptime_ms; /* Time since reset; smaller than before means a reset. */
+    uint8_t hal[12]; /* Name of the hardware layer, ASCII, zero-padded. */
+};
+
+static inline void evlcp_hello_reply_put(uint8_t *p, const struct evlcp_hello_reply *m)
+{
+    evlcp_copy(p + 0, m->schema, 8u);
+    evlcp_put16(p + 8, m->session);
+    evlcp_put8(p + 10, m->version_major);
+    evlcp_put8(p + 11, m->version_minor);
+    evlcp_put8(p + 12, m->version_patch);
+    evlcp_put8(p + 13, m->window);
+    evlcp_put16(p + 14, m->max_payload);
+    evlcp_put8(p + 16, m->banks);
+    evlcp_put32(p + 17, m->bank_bytes);
+    evlcp_put8(p + 21, m->clusters);
+    evlcp_put16(p + 22, m->leds);
+    evlcp_put32(p + 24, m->tick_hz);
+    evlcp_put32(p + 28, m->chip_rate_max_hz);
+    evlcp_put16(p + 32, m->level_max_ma);
+    evlcp_put32(p + 34, m->capabilities);
+    evlcp_copy(p + 38, m->unique_id, 12u);
+    evlcp_put32(p + 50, m->uptime_ms);
+    evlcp_copy(p + 54, m->hal, 12u);
+}
+
+static inline void evlcp_hello_reply_get(const uint8_t *p, struct evlcp_hello_reply *m)
+{
+    evlcp_copy(m->schema, p + 0, 8u);
+    m->session = evlcp_get16(p + 8);
+    m->version_major = evlcp_get8(p + 10);
+    m->version_minor = evlcp_get8(p + 11);
+    m->version_patch = evlcp_get8(p + 12);
+    m->window = evlcp_get8(p + 13);
+    m->max_payload = evlcp_get16(p + 14);
+    m->banks = evlcp_get8(p + 16);
+    m->bank_bytes = evlcp_get32(p + 17);
+    m->clusters = evlcp_get8(p + 21);
+    m->leds = evlcp_get16(p + 22);
+    m->tick_hz = evlcp_get32(p + 24);
+    m->chip_rate_max_hz = evlcp_get32(p + 28);
+    m->level_max_ma = evlcp_get16(p + 32);
+    m->capabilities = evlcp_get32(p + 34);
+    evlcp_copy(m->unique_id, p + 38, 12u);
+    m->uptime_ms = evlcp_get32(p + 50);
+    evlcp_copy(m->hal, p + 54, 12u);
+}
+
+#define EVLCP_CONFIGURE_REQUEST_BYTES 7u
+/* Set what the next COMMIT plays with; playing goes on as it was. */
+struct evlcp_configure_request {
+    uint32_t chip_rate_hz; /* Chips per second; must divide the tick rate; not changed while playing. */
+    uint8_t profile; /* Info-segment profile. */
+    uint16_t frames; /* Frames per packet. */
+};
+
+static inline void evlcp_configure_request_put(uint8_t *p, const struct evlcp_configure_request *m)
+{
+    evlcp_put32(p + 0, m->chip_rate_hz);
+    evlcp_put8(p + 4, m->profile);
+    evlcp_put16(p + 5, m->frames);
+}
+
+static inline void evlcp_configure_request_get(const uint8_t *p, struct evlcp_configure_request *m)
+{
+    m->chip_rate_hz = evlcp_get32(p + 0);
+    m->profile = evlcp_get8(p + 4);
+    m->frames = evlcp_get16(p + 5);
+}
+
+#define EVLCP_CONFIGURE_REPLY_BYTES 8u
+/* Answer to configure. */
+struct evlcp_configure_reply {
+    uint32_t ticks_per_chip; /* Length of a chip in ticks. */
+    uint32_t packet_chips; /* Length of a packet in chips. */
+};
+
+static inline void evlcp_configure_reply_put(uint8_t *p, const struct evlcp_configure_reply *m)
+{
+    evlcp_put32(p + 0, m->ticks_per_chip);
+    evlcp_put32(p + 4, m->packet_chips);
+}
+
+static inline void evlcp_configure_reply_get(const uint8_t *p, struct evlcp_configure_reply *m)
+{
+    m->ticks_per_chip = evlcp_get32(p + 0);
+    m->packet_chips = evlcp_get32(p + 4);
+}
+
+#define EVLCP_CODEBOOK_REQUEST_BYTES 69u
+/* Set preamble and pilots for the next COMMIT; those of a built-in profile must be the firmware's own. */
+struct evlcp_codebook_request {
+    uint8_t preamble_chips; /* Chips of the preamble, at most 32. */
+    uint32_t preamble; /* Preamble, first chip on air the most significant of preamble_chips bits. */
+    uint16_t pilots[16]; /* Pilot words, first chip on air the most significant bit. */
+    uint8_t digest[32]; /* SHA-256 of the codebook. */
+};
+
+static inline void evlcp_codebook_request_put(uint8_t *p, const struct evlcp_codebook_request *m)
+{
+    evlcp_put8(p + 0, m->preamble_chips);
+    evlcp_put32(p + 1, m->preamble);
+    for (uint32_t i = 0; i < 16u; i++)
+        evlcp_put16(p + 5 + 2u * i, m->pilots[i]);
+    evlcp_copy(p + 37, m->digest, 32u);
+}
+
+static inline void evlcp_codebook_request_get(const uint8_t *p, struct evlcp_codebook_request *m)
+{
+    m->preamble_chips = evlcp_get8(p + 0);
+    m->preamble = evlcp_get32(p + 1);
+    for (uint32_t i = 0; i < 16u; i++)
+        m->pilots[i] = evlcp_get16(p + 5 + 2u * i);
+    evlcp_copy(m->digest, p + 37, 32u);
+}
+
+#define EVLCP_CODEBOOK_REPLY_BYTES 0u
+
+#define EVLCP_WRITE_REQUEST_BYTES 5u
+/* Write into a spare bank; voids what was committed in it. */
+struct evlcp_write_request {
+    uint8_t bank; /* Bank. */
+    uint32_t offset; /* First byte. */
+};
+
+static inline void evlcp_write_request_put(uint8_t *p, const struct evlcp_write_request *m)
+{
+    evlcp_put8(p + 0, m->bank);
+    evlcp_put32(p + 1, m->offset);
+}
+
+static inline void evlcp_write_request_get(const uint8_t *p, struct evlcp_write_request *m)
+{
+    m->bank = evlcp_get8(p + 0);
+    m->offset = evlcp_get32(p + 1);
+}
+
+#define EVLCP_WRITE_REPLY_BYTES 7u
+/* Answer to write. */
+struct evlcp_write_reply {
+    uint8_t bank; /* Bank. */
+    uint32_t offset; /* First byte. */
+    uint16_t count; /* Bytes written. */
+};
+
+static inline void evlcp_write_reply_put(uint8_t *p, const struct evlcp_write_reply *m)
+{
+    evlcp_put8(p + 0, m->bank);
+    evlcp_put32(p + 1, m->offset);
+    evlcp_put16(p + 5, m->count);
+}
+
+static inline void evlcp_write_reply_get(const uint8_t *p, struct evlcp_write_reply *m)
+{
+    m->bank = evlcp_get8(p + 0);
+    m->offset = evlcp_get32(p + 1);
+    m->count = evlcp_get16(p + 5);
+}
+
+#define EVLCP_READ_REQUEST_BYTES 7u
+/* Read from a bank. */
+struct evlcp_read_request {
+    uint8_t bank; /* Bank. */
+    uint32_t offset; /* First byte. */
+    uint16_t count; /* Bytes wanted. */
+};
+
+static inline void evlcp_read_request_put(uint8_t *p, const struct evlcp_read_request *m)
+{
+    evlcp_put8(p + 0, m->bank);
+    evlcp_put32(p + 1, m->offset);
+    evlcp_put16(p + 5, m->count);
+}
+
+static inline void evlcp_read_request_get(const uint8_t *p, struct evlcp_read_request *m)
+{
+    m->bank = evlcp_get8(p + 0);
+    m->offset = evlcp_get32(p + 1);
+    m->count = evlcp_get16(p + 5);
+}
+
+#define EVLCP_READ_REPLY_BYTES 5u
+/* Answer to read. */
+struct evlcp_read_reply {
+    uint8_t bank; /* Bank. */
+    uint32_t offset; /* First byte. */
+};
+
+static inline void evlcp_read_reply_put(uint8_t *p, const struct evlcp_read_reply *m)
+{
+    evlcp_put8(p + 0, m->bank);
+    evlcp_put32(p + 1, m->offset);
+}
+
+static inline void evlcp_read_reply_get(const uint8_t *p, struct evlcp_read_reply *m)
+{
+    m->bank = evlcp_get8(p + 0);
+    m->offset = evlcp_get32(p + 1);
+}
+
+#define EVLCP_CRC_REQUEST_BYTES 9u
+/* CRC-32/ISO-HDLC of a bank's bytes. */
+struct evlcp_crc_request {
+    uint8_t bank; /* Bank. */
+    uint32_t offset; /* First byte. */
+    uint32_t length; /* Bytes. */
+};
+
+static inline void evlcp_crc_request_put(uint8_t *p, const struct evlcp_crc_request *m)
+{
+    evlcp_put8(p + 0, m->bank);
+    evlcp_put32(p + 1, m->offset);
+    evlcp_put32(p + 5, m->length);
+}
+
+static inline void evlcp_crc_request_get(const uint8_t *p, struct evlcp_crc_request *m)
+{
+    m->bank = evlcp_get8(p + 0);
+    m->offset = evlcp_get32(p + 1);
+    m->length = evlcp_get32(p + 5);
+}
+
+#define EVLCP_CRC_REPLY_BYTES 4u
+/* Answer to crc. */
+struct evlcp_crc_reply {
+    uint32_t crc; /* CRC of the bytes. */
+};
+
+static inline void evlcp_crc_reply_put(uint8_t *p, const struct evlcp_crc_reply *m)
+{
+    evlcp_put32(p + 0, m->crc);
+}
+
+static inline void evlcp_crc_reply_get(const uint8_t *p, struct evlcp_crc_reply *m)
+{
+    m->crc = evlcp_get32(p + 0);
+}
+
+#define EVLCP_COMMIT_REQUEST_BYTES 44u
+/* Check a bank; play it from the next packet boundary, or, if the check fails, go on with the old one. */
+struct evlcp_commit_request {
+    uint8_t bank; /* Bank. */
+    uint8_t format; /* What the bank holds. */
+    uint16_t packets; /* Packets in the bank. */
+    uint32_t length; /* Bytes in the bank. */
+    uint32_t crc; /* CRC-32 of those bytes. */
+    uint8_t digest[32]; /* Digest of the codebook the content was made with. */
+};
+
+static inline void evlcp_commit_request_put(uint8_t *p, const struct evlcp_commit_request *m)
+{
+    evlcp_put8(p + 0, m->bank);
+    evlcp_put8(p + 1, m->format);
+    evlcp_put16(p + 2, m->packets);
+    evlcp_put32(p + 4, m->length);
+    evlcp_put32(p + 8, m->crc);
+    evlcp_copy(p + 12, m->digest, 32u);
+}
+
+static inline void evlcp_commit_request_get(const uint8_t *p, struct evlcp_commit_request *m)
+{
+    m->bank = evlcp_get8(p + 0);
+    m->format = evlcp_get8(p + 1);
+    m->packets = evlcp_get16(p + 2);
+    m->length = evlcp_get32(p + 4);
+    m->crc = evlcp_get32(p + 8);
+    evlcp_copy(m->digest, p + 12, 32u);
+}
+
+#define EVLCP_COMMIT_REPLY_BYTES 4u
+/* Answer to commit. */
+struct evlcp_commit_reply {
+    uint32_t commits; /* Commits accepted since reset. */
+};
+
+static inline void evlcp_commit_reply_put(uint8_t *p, const struct evlcp_commit_reply *m)
+{
+    evlcp_put32(p + 0, m->commits);
+}
+
+static inline void evlcp_commit_reply_get(const uint8_t *p, struct evlcp_commit_reply *m)
+{
+    m->commits = evlcp_get32(p + 0);
+}
+
+#define EVLCP_START_REQUEST_BYTES 0u
+
+#define EVLCP_START_REPLY_BYTES 0u
+
+#define EVLCP_STOP_REQUEST_BYTES 0u
+
+#define EVLCP_STOP_REPLY_BYTES 0u
+
+#define EVLCP_BLANK_REQUEST_BYTES 0u
+
+#define EVLCP_BLANK_REPLY_BYTES 0u
+
+#define EVLCP_LEVEL_REQUEST_BYTES 2u
+/* Set the LED current; above the board's maximum it is refused. */
+struct evlcp_level_request {
+    uint16_t level_ma; /* LED current, mA. */
+};
+
+static inline void evlcp_level_request_put(uint8_t *p, const struct evlcp_level_request *m)
+{
+    evlcp_put16(p + 0, m->level_ma);
+}
+
+static inline void evlcp_level_request_get(const uint8_t *p, struct evlcp_level_request *m)
+{
+    m->level_ma = evlcp_get16(p + 0);
+}
+
+#define EVLCP_LEVEL_REPLY_BYTES 0u
+
+#define EVLCP_STATUS_REQUEST_BYTES 0u
+
+#define EVLCP_STATUS_REPLY_BYTES 119u
+/* Answer to status. */
+struct evlcp_status_reply {
+    uint8_t state; /* State. */
+    uint8_t faults; /* Fault bits. */
+    uint8_t active_bank; /* Bank that plays or would play, or no_bank. */
+    uint8_t pending_bank; /* Bank waiting for the packet boundary, or no_bank. */
+    uint8_t format; /* Format of the active bank. */
+    uint8_t profile; /* Profile of the active bank. */
+    uint16_t frames; /* Frames per packet of the active bank. */
+    uint16_t packets; /* Packets in the active bank. */
+    uint32_t length; /* Bytes in the active bank. */
+    uint32_t crc; /* CRC-32 of the active bank. */
+    uint32_t chip_rate_hz; /* Chips per second, as configured. */
+    uint32_t commits; /* Commits accepted since reset. */
+    uint32_t packets_sent; /* Packets played to their end since reset. */
+    uint32_t chips_sent; /* Chips since reset. */
+    uint32_t lateness_ticks; /* Delay of the latest chip. */
+    uint32_t lateness_max_ticks; /* Largest delay since START. */
+    uint32_t crc_errors; /* Datagrams with a wrong CRC. */
+    uint32_t framing_errors; /* Datagrams too short, too long or no COBS. */
+    uint32_t overflow_errors; /* Bytes lost because the receive buffer was full. */
+    uint32_t requests; /* Good datagrams received. */
+    uint16_t level_ma; /* LED current, mA. */
+    int16_t temperature_dc; /* Driver temperature, 0.1 degree C. */
+    uint8_t open_leds[12]; /* A bit a LED: open. */
+    uint8_t watchdog; /* Watchdog action. */
+    uint32_t watchdog_ms; /* Watchdog time-out. */
+    uint32_t silence_ms; /* Time since the request before this one. */
+    uint32_t uptime_ms; /* Time since reset. */
+    uint8_t digest[32]; /* Digest of the active bank's codebook, or of the one set. */
+};
+
+static inline void evlcp_status_reply_put(uint8_t *p, const struct evlcp_status_reply *m)
+{
+    evlcp_put8(p + 0, m->state);
+    evlcp_put8(p + 1, m->faults);
+    evlcp_put8(p + 2, m->active_bank);
+    evlcp_put8(p + 3, m->pending_bank);
+    evlcp_put8(p + 4, m->format);
+    evlcp_put8(p + 5, m->profile);
+    evlcp_put16(p + 6, m->frames);
+    evlcp_put16(p + 8, m->packets);
+    evlcp_put32(p + 10, m->length);
+    evlcp_put32(p + 14, m->crc);
+    evlcp_put32(p + 18, m->chip_rate_hz);
+    evlcp_put32(p + 22, m->commits);
+    evlcp_put32(p + 26, m->packets_sent);
+    evlcp_put32(p + 30, m->chips_sent);
+    evlcp_put32(p + 34, m->lateness_ticks);
+    evlcp_put32(p + 38, m->lateness_max_ticks);
+    evlcp_put32(p + 42, m->crc_errors);
+    evlcp_put32(p + 46, m->framing_errors);
+    evlcp_put32(p + 50, m->overflow_errors);
+    evlcp_put32(p + 54, m->requests);
+    evlcp_put16(p + 58, m->level_ma);
+    evlcp_put16(p + 60, (uint16_t)m->temperature_dc);
+    evlcp_copy(p + 62, m->open_leds, 12u);
+    evlcp_put8(p + 74, m->watchdog);
+    evlcp_put32(p + 75, m->watchdog_ms);
+    evlcp_put32(p + 79, m->silence_ms);
+    evlcp_put32(p + 83, m->uptime_ms);
+    evlcp_copy(p + 87, m->digest, 32u);
+}
+
+static inline void evlcp_status_reply_get(const uint8_t *p, struct evlcp_status_reply *m)
+{
+    m->state = evlcp_get8(p + 0);
+    m->faults = evlcp_get8(p + 1);
+    m->active_bank = evlcp_get8(p + 2);
+    m->pending_bank = evlcp_get8(p + 3);
+    m->format = evlcp_get8(p + 4);
+    m->profile = evlcp_get8(p + 5);
+    m->frames = evlcp_get16(p + 6);
+    m->packets = evlcp_get16(p + 8);
+    m->length = evlcp_get32(p + 10);
+    m->crc = evlcp_get32(p + 14);
+    m->chip_rate_hz = evlcp_get32(p + 18);
+    m->commits = evlcp_get32(p + 22);
+    m->packets_sent = evlcp_get32(p + 26);
+    m->chips_sent = evlcp_get32(p + 30);
+    m->lateness_ticks = evlcp_get32(p + 34);
+    m->lateness_max_ticks = evlcp_get32(p + 38);
+    m->crc_errors = evlcp_get32(p + 42);
+    m->framing_errors = evlcp_get32(p + 46);
+    m->overflow_errors = evlcp_get32(p + 50);
+    m->requests = evlcp_get32(p + 54);
+    m->level_ma = evlcp_get16(p + 58);
+    m->temperature_dc = (int16_t)evlcp_get16(p + 60);
+    evlcp_copy(m->open_leds, p + 62, 12u);
+    m->watchdog = evlcp_get8(p + 74);
+    m->watchdog_ms = evlcp_get32(p + 75);
+    m->silence_ms = evlcp_get32(p + 79);
+    m->uptime_ms = evlcp_get32(p + 83);
+    evlcp_copy(m->digest, p + 87, 32u);
+}
+
+#define EVLCP_WATCHDOG_REQUEST_BYTES 5u
+/* What to do when the host falls silent. */
+struct evlcp_watchdog_request {
+    uint8_t action; /* Watchdog action. */
+    uint32_t timeout_ms; /* Silence before it acts, at least 100 ms. */
+};
+
+static inline void evlcp_watchdog_request_put(uint8_t *p, const struct evlcp_watchdog_request *m)
+{
+    evlcp_put8(p + 0, m->action);
+    evlcp_put32(p + 1, m->timeout_ms);
+}
+
+static inline void evlcp_watchdog_request_get(const uint8_t *p, struct evlcp_watchdog_request *m)
+{
+    m->action = evlcp_get8(p + 0);
+    m->timeout_ms = evlcp_get32(p + 1);
+}
+
+#define EVLCP_WATCHDOG_REPLY_BYTES 0u
+
+#define EVLCP_SAVE_REQUEST_BYTES 1u
+/* Save active bank and settings to the older of two flash slots; not while playing. */
+struct evlcp_save_request {
+    uint8_t autostart; /* 1: recall and play after a reset. */
+};
+
+static inline void evlcp_save_request_put(uint8_t *p, const struct evlcp_save_request *m)
+{
+    evlcp_put8(p + 0, m->autostart);
+}
+
+static inline void evlcp_save_request_get(const uint8_t *p, struct evlcp_save_request *m)
+{
+    m->autostart = evlcp_get8(p + 0);
+}
+
+#define EVLCP_SAVE_REPLY_BYTES 5u
+/* Answer to save. */
+struct evlcp_save_reply {
+    uint8_t slot; /* Slot written. */
+    uint32_t save_sequence; /* Its sequence number. */
+};
+
+static inline void evlcp_save_reply_put(uint8_t *p, const struct evlcp_save_reply *m)
+{
+    evlcp_put8(p + 0, m->slot);
+    evlcp_put32(p + 1, m->save_sequence);
+}
+
+static inline void evlcp_save_reply_get(const uint8_t *p, struct evlcp_save_reply *m)
+{
+    m->slot = evlcp_get8(p + 0);
+    m->save_sequence = evlcp_get32(p + 1);
+}
+
+#define EVLCP_RECALL_REQUEST_BYTES 0u
+
+#define EVLCP_RECALL_REPLY_BYTES 5u
+/* Answer to recall. */
+struct evlcp_recall_reply {
+    uint8_t slot; /* Slot read. */
+    uint32_t save_sequence; /* Its sequence number. */
+};
+
+static inline void evlcp_recall_reply_put(uint8_t *p, const struct evlcp_recall_reply *m)
+{
+    evlcp_put8(p + 0, m->slot);
+    evlcp_put32(p + 1, m->save_sequence);
+}
+
+static inline void evlcp_recall_reply_get(const uint8_t *p, struct evlcp_recall_reply *m)
+{
+    m->slot = evlcp_get8(p + 0);
+    m->save_sequence = evlcp_get32(p + 1);
+}
+
+#define EVLCP_LED_TEST_REQUEST_BYTES 4u
+/* Walk over LEDs one by one; not while playing. STOP or BLANK ends it early. */
+struct evlcp_led_test_request {
+    uint8_t first; /* First LED. */
+    uint8_t last; /* Last LED. */
+    uint16_t dwell_ms; /* Time a LED is on, at least 1 ms. */
+};
+
+static inline void evlcp_led_test_request_put(uint8_t *p, const struct evlcp_led_test_request *m)
+{
+    evlcp_put8(p + 0, m->first);
+    evlcp_put8(p + 1, m->last);
+    evlcp_put16(p + 2, m->dwell_ms);
+}
+
+static inline void evlcp_led_test_request_get(const uint8_t *p, struct evlcp_led_test_request *m)
+{
+    m->first = evlcp_get8(p + 0);
+    m->last = evlcp_get8(p + 1);
+    m->dwell_ms = evlcp_get16(p + 2);
+}
+
+#define EVLCP_LED_TEST_REPLY_BYTES 0u
+
+#endif

@@ -1,0 +1,121 @@
+"""Flicker and balance of a chip table.
+
+IEEE Std 1789-2015 bounds the modulation of the light below 3 kHz: no observable effect (practice 2) up to
+Mod% = 0.01 f / 0.3 = 0.0333 f for 90 Hz to 3 kHz and 0.01 f below 90 Hz; low risk (practice 1) up to 0.08 f for
+90 Hz to 1250 Hz and 0.025 f below 90 Hz. Above 3 kHz there is no bound, and from 1250 Hz none at low risk.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["ClusterFlicker", "check", "low_risk_percent", "no_effect_percent"]
+
+LIMIT_HZ = 3000.0
+"""Above this frequency the recommendation sets no bound."""
+
+
+@dataclass(frozen=True)
+class ClusterFlicker:
+    """One cluster's light.
+
+    Attributes:
+        cluster: Its number.
+        on_share: Share of chips that are on.
+        longest_run: Longest run of equal chips, the table played round and round.
+        line_hz: Frequency of the worst line below 3 kHz.
+        line_percent: Its modulation, percent of the mean light (sine of amplitude A on mean M: 100 A / M).
+        limit_percent: What is free of observable effect at that frequency.
+        low_risk: Whether every line is within the low-risk bound.
+        no_effect: Whether every line is within the no-effect bound.
+    """
+
+    cluster: int
+    on_share: float
+    longest_run: int
+    line_hz: float
+    line_percent: float
+    limit_percent: float
+    low_risk: bool
+    no_effect: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain values."""
+        return {
+            "cluster": self.cluster,
+            "on_share": self.on_share,
+            "longest_run": self.longest_run,
+            "line_hz": self.line_hz,
+            "line_percent": self.line_percent,
+            "limit_percent": self.limit_percent,
+            "low_risk": self.low_risk,
+            "no_effect": self.no_effect,
+        }
+
+
+def no_effect_percent(frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Largest modulation without observable effect at frequencies in Hz, percent.
+
+    >>> no_effect_percent(np.array([60.0, 1200.0, 4000.0])).round(2).tolist()
+    [0.6, 40.0, inf]
+    """
+    f = np.asarray(frequency_hz)
+    bound = np.where(f < 90.0, 0.01 * f, f / 30.0)
+    return np.where(f > LIMIT_HZ, np.inf, bound)
+
+
+def low_risk_percent(frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Largest modulation of low risk at frequencies in Hz, percent.
+
+    >>> low_risk_percent(np.array([60.0, 1000.0, 1300.0])).round(2).tolist()
+    [1.5, 80.0, inf]
+    """
+    f = np.asarray(frequency_hz)
+    bound = np.where(f < 90.0, 0.025 * f, 0.08 * f)
+    return np.where(f > 1250.0, np.inf, bound)
+
+
+def check(chips: NDArray[np.uint8], chip_rate_hz: float) -> list[ClusterFlicker]:
+    """Balance, runs and spectral lines of a chip table that repeats, uint8 (chips, clusters).
+
+    Played round and round the table is periodic: its light has lines at multiples of chip_rate / chips. A chip
+    is a rectangle, so a line at f is weakened by sinc(f / chip_rate).
+
+    >>> table = np.tile([[0], [1]], (100, 1)).astype(np.uint8)
+    >>> check(table, 10_000.0)[0].line_percent
+    0.0
+    """
+    n = len(chips)
+    frequency = np.fft.rfftfreq(n, 1.0 / chip_rate_hz)
+    spectrum = np.abs(np.fft.rfft(chips.astype(np.float64), axis=0)) / n
+    amplitude = 2.0 * spectrum * np.sinc(frequency / chip_rate_hz)[:, None]
+    low = (frequency > 0) & (frequency <= LIMIT_HZ)
+    found = []
+    for k in range(chips.shape[1]):
+        share = float(chips[:, k].mean())
+        percent = 100.0 * amplitude[low, k] / share if share else np.zeros(int(low.sum()))
+        percent[percent < 1e-9] = 0.0
+        bound = no_effect_percent(frequency[low])
+        worst = int(np.argmax(percent / bound)) if percent.size else -1
+        found.append(
+            ClusterFlicker(
+                cluster=k,
+                on_share=share,
+                longest_run=_longest_run(chips[:, k]),
+                line_hz=float(frequency[low][worst]) if percent.size else 0.0,
+                line_percent=float(percent[worst]) if percent.size else 0.0,
+                limit_percent=float(bound[worst]) if percent.size else float("inf"),
+                low_risk=bool((percent <= low_risk_percent(frequency[low])).all()),
+                no_effect=bool((percent <= bound).all()),
+            )
+        )
+    return found
+
+
+def _longest_run(chips: NDArray[np.uint8]) -> int:
+    edges = np.flatnonzero(chips != np.roll(chips, 1))
+    if not edges.size:
+        return len(chips)
+    return int(np.diff(np.append(edges, edges[0] + len(chips))).max())
