@@ -2,7 +2,9 @@
 
 import difflib
 import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from typing import Any
 
 import pluggy
@@ -54,9 +56,13 @@ class Registry:
         try:
             manager.load_setuptools_entrypoints(ENTRY_POINT_GROUP)
         except Exception as fault:
-            raise PluginError(f"a plugin of group '{ENTRY_POINT_GROUP}' fails to load: {fault}") from fault
+            raise PluginError(f"{_failing_plugin()} fails to load: {fault}") from fault
         for plugin in plugins:
-            manager.register(plugin)
+            name = getattr(plugin, "__name__", type(plugin).__name__)
+            try:
+                manager.register(plugin, name=f"{name}-{id(plugin):x}")
+            except pluggy.PluginValidationError as fault:
+                raise PluginError(f"plugin {name} fails to load: {fault}") from fault
         return cls(manager)
 
     @property
@@ -110,6 +116,15 @@ class Registry:
         return found
 
 
+def _failing_plugin() -> str:
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        try:
+            entry.load()
+        except Exception:
+            return f"plugin {entry.name} of {entry.dist.name if entry.dist else 'an unknown distribution'}"
+    return f"a plugin of group '{ENTRY_POINT_GROUP}'"
+
+
 def _collect(manager: pluggy.PluginManager) -> dict[tuple[str, str], Installed]:
     distributions: dict[int, tuple[str, str]] = {
         id(plugin): (dist.project_name, dist.version) for plugin, dist in manager.list_plugin_distinfo()
@@ -117,7 +132,7 @@ def _collect(manager: pluggy.PluginManager) -> dict[tuple[str, str], Installed]:
     found: dict[tuple[str, str], Installed] = {}
     for impl in manager.hook.evlcp_algorithms.get_hookimpls():
         name, version = distributions.get(id(impl.plugin), (impl.plugin_name, "-"))
-        for record in impl.function():
+        for record in _records(impl.function, name):
             key = (record.role, record.id)
             if record.role not in ROLE_NAMES:
                 raise PluginError(
@@ -131,3 +146,14 @@ def _collect(manager: pluggy.PluginManager) -> dict[tuple[str, str], Installed]:
                 )
             found[key] = Installed(record, name, version)
     return found
+
+
+def _records(algorithms: Callable[[], Any], name: str) -> list[Algorithm]:
+    try:
+        records = list(algorithms())
+    except Exception as fault:
+        raise PluginError(f"plugin {name}: evlcp_algorithms() fails: {fault}") from fault
+    for record in records:
+        if not isinstance(record, Algorithm):
+            raise PluginError(f"plugin {name}: evlcp_algorithms() gave {record!r}, expected an Algorithm")
+    return records

@@ -1,0 +1,108 @@
+"""The layers of the SDK, read from the imports."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+SDK = Path(__file__).parents[2] / "evlcp_sdk"
+
+LAYERS = (
+    {"errors"},
+    {"types"},
+    {"geometry", "codebook", "frames"},
+    {"abc", "hookspecs"},
+    {"registry", "config"},
+    {"io", "rx", "sim"},
+    {"rx.receiver"},
+    {"outputs", "figures", "campaign", "testing"},
+    {"cli"},
+)
+"""From the ground up: a module imports from its own layer and those below."""
+
+
+def layer_of(module: str) -> int:
+    """Layer of a module named from the package's root; the longest name decides."""
+    parts = module.split(".")
+    for n in range(len(parts), 0, -1):
+        for i, names in enumerate(LAYERS):
+            if ".".join(parts[:n]) in names:
+                return i
+    raise AssertionError(f"evlcp_sdk.{module}: put it in a layer")
+
+
+def imports_of(path: Path) -> Iterator[str]:
+    """Every absolute module name that a file imports, also inside functions."""
+    tree = ast.parse(path.read_text())
+    typing_only = {
+        inner
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        for inner in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+        if node in typing_only:
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            assert node.module
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                own = SDK.parent / inner.replace(".", "/")
+                yield inner if own.is_dir() or own.with_suffix(".py").exists() else node.module
+
+
+def modules() -> dict[str, Path]:
+    found = {}
+    for path in sorted(SDK.rglob("*.py")):
+        parts = path.relative_to(SDK).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        if name:
+            found[name] = path
+    return found
+
+
+MODULES = modules()
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_imports_go_down(module: str) -> None:
+    mine = layer_of(module)
+    for name in imports_of(MODULES[module]):
+        if name.startswith("evlcp_sdk."):
+            other = name.removeprefix("evlcp_sdk.")
+            assert layer_of(other) <= mine, f"evlcp_sdk.{module} imports {name}, which stands above it"
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_the_sdk_imports_no_plugin(module: str) -> None:
+    plugins = {p.name for p in (SDK.parent / "plugins").iterdir()} | {"firmware_host"}
+    assert not {name.split(".")[0] for name in imports_of(MODULES[module])} & plugins
+
+
+@pytest.mark.parametrize("package", ["io", "rx", "sim"])
+def test_the_middle_packages_do_not_import_one_another(package: str) -> None:
+    others = {"io", "rx", "sim"} - {package}
+    for module, path in MODULES.items():
+        if module.split(".")[0] == package:
+            for name in imports_of(path):
+                assert name.removeprefix("evlcp_sdk.").split(".")[0] not in others, f"{module} imports {name}"
+
+
+def test_receiver_stages_do_not_import_one_another() -> None:
+    stages = [m for m in MODULES if m.startswith("rx.") and m != "rx.receiver"]
+    for module in stages:
+        if module.split(".")[-1].startswith("_"):
+            continue
+        for name in imports_of(MODULES[module]):
+            other = name.removeprefix("evlcp_sdk.")
+            kernels = other.split(".")[-1].startswith("_")
+            assert kernels or not other.startswith("rx"), f"{module} imports {name}"
+
+
+def test_config_needs_no_stage() -> None:
+    for name in imports_of(MODULES["config"]):
+        assert not name.startswith(("evlcp_sdk.io", "evlcp_sdk.rx", "evlcp_sdk.cli"))
