@@ -1,0 +1,154 @@
+"""How events become words and words events: what EVT2 and EVT3 share, without any file."""
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.io import _words as words_
+from evlcp_sdk.io.sources import Loss
+from evlcp_sdk.types import Events, Triggers
+
+__all__ = ["Codec", "Columns", "Decoder"]
+
+MAX_SIDE = 2048
+"""Columns and rows that 11 bits can address."""
+
+
+@dataclass(frozen=True)
+class Codec:
+    """One encoding of events in words.
+
+    Attributes:
+        name: As after `% format`.
+        version: As after `% evt`.
+        word: Type of a word, little-endian.
+        burst: Most events that one word may bring.
+        types: The word types that exist; the top 4 bits of a word.
+        channels: Trigger inputs that a word can name.
+        decoder: Name of its decoding kernel in `evlcp_sdk.io._kernels`.
+        encoder: Name of its encoding kernel there.
+    """
+
+    name: str
+    version: str
+    word: np.dtype[Any]
+    burst: int
+    types: frozenset[int]
+    channels: int
+    decoder: str
+    encoder: str
+
+    def kernel(self, name: str) -> Callable[..., Any]:
+        """Return a kernel; compiles it, or loads it from the cache, when first called."""
+        kernel: Callable[..., Any] = getattr(importlib.import_module("evlcp_sdk.io._kernels"), name)
+        return kernel
+
+    def reserved_share(self, words: NDArray[Any]) -> tuple[int, float]:
+        """Return how many of `words` have a type that does not exist, and their share."""
+        kinds = np.bincount((words >> (8 * self.word.itemsize - 4)).astype(np.uint8), minlength=16)
+        reserved = int(sum(kinds[k] for k in range(16) if k not in self.types))
+        return reserved, reserved / max(len(words), 1)
+
+
+class Columns:
+    """Room for events and triggers, filled from the front by a decoder."""
+
+    def __init__(self, events: int, triggers: int) -> None:
+        self.events = 0
+        self.triggers = 0
+        self.t_us = np.empty(events, np.int64)
+        self.x = np.empty(events, np.uint16)
+        self.y = np.empty(events, np.uint16)
+        self.p = np.empty(events, np.uint8)
+        self.trigger_t_us = np.empty(triggers, np.int64)
+        self.channel = np.empty(triggers, np.uint8)
+        self.value = np.empty(triggers, np.uint8)
+
+    def taken(self) -> tuple[Events, Triggers]:
+        """Return what is filled, as views."""
+        n, m = self.events, self.triggers
+        return (
+            Events(self.t_us[:n], self.x[:n], self.y[:n], self.p[:n]),
+            Triggers(self.trigger_t_us[:m], self.channel[:m], self.value[:m]),
+        )
+
+
+class Decoder:
+    """The state of decoding one stream of words; the same for every split of the stream.
+
+    Args:
+        codec: The encoding.
+        width: Columns of the sensor; None accepts all that 11 bits can say.
+        height: Rows of the sensor, likewise.
+    """
+
+    def __init__(self, codec: Codec, width: int | None, height: int | None) -> None:
+        self.codec = codec
+        self._bounds = (width or MAX_SIDE, height or MAX_SIDE)
+        self._state = np.zeros(words_.STATE_SLOTS, np.int64)
+        self._state[words_.BASE] = words_.UNKNOWN_TIME
+        self._state[words_.ROW] = words_.UNKNOWN_ROW
+        self._state[words_.COLUMN] = words_.UNKNOWN_COLUMN
+        self._tally = np.zeros((words_.TALLY_ROWS, 2), np.int64)
+        self._kernel = codec.kernel(codec.decoder)
+
+    @property
+    def has_time(self) -> bool:
+        """Whether a TIME_HIGH has come by."""
+        return bool(self._state[words_.BASE] != words_.UNKNOWN_TIME)
+
+    def decode(self, words: NDArray[Any], at: int, out: Columns) -> int:
+        """Decode `words`, whose first is at byte `at`, behind what is in `out`; return how many were used.
+
+        It stops early when `out` has no room for another word's events (`codec.burst`) or trigger.
+        """
+        used, out.events, out.triggers = self._kernel(
+            words,
+            at,
+            *self._bounds,
+            self._state,
+            self._tally,
+            out.t_us,
+            out.x,
+            out.y,
+            out.p,
+            out.events,
+            out.trigger_t_us,
+            out.channel,
+            out.value,
+            out.triggers,
+        )
+        return int(used)
+
+    def finish(self, at: int, odd_bytes: int) -> None:
+        """Take note of how the stream ends: at byte `at`, with `odd_bytes` that make no word."""
+        if odd_bytes:
+            self.note(words_.ODD_BYTES, at, odd_bytes)
+        if self._state[words_.VECTOR_LEFT]:
+            self.note(words_.VECTOR_CUT, int(self._state[words_.VECTOR_AT]))
+            self._state[words_.VECTOR_LEFT] = 0
+
+    def note(self, row: int, at: int, count: int = 1) -> None:
+        """Count a loss, at byte `at`."""
+        if not self._tally[row, 0]:
+            self._tally[row, 1] = at
+        self._tally[row, 0] += count
+
+    @property
+    def losses(self) -> dict[str, Loss]:
+        """As `EventSource.losses`."""
+        return {
+            name: Loss(int(count), int(first), "byte", meaning)
+            for name, (row, meaning) in words_.LOSSES.items()
+            for count, first in [self._tally[row]]
+            if count
+        }
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """The format's own part of `EventSource.counts`."""
+        return {name: int(self._tally[row, 0]) for name, (row, _) in words_.COUNTS.items()}

@@ -1,0 +1,85 @@
+"""What the words of a RAW file are, and what a decoder remembers and counts about them.
+
+Plain integers, shared by the kernels and by the Python around them.
+"""
+
+from typing import Final
+
+# Word types of EVT3, the top 4 bits of 16. 1, 9, B, C and D are reserved.
+EVT3_ADDR_Y: Final = 0x0
+EVT3_ADDR_X: Final = 0x2
+EVT3_VECT_BASE_X: Final = 0x3
+EVT3_VECT_12: Final = 0x4
+EVT3_VECT_8: Final = 0x5
+EVT3_TIME_LOW: Final = 0x6
+EVT3_CONTINUED_4: Final = 0x7
+EVT3_TIME_HIGH: Final = 0x8
+EVT3_EXT_TRIGGER: Final = 0xA
+EVT3_OTHERS: Final = 0xE
+EVT3_CONTINUED_12: Final = 0xF
+
+# Word types of EVT2, the top 4 bits of 32. All others are reserved.
+EVT2_CD_OFF: Final = 0x0
+EVT2_CD_ON: Final = 0x1
+EVT2_TIME_HIGH: Final = 0x8
+EVT2_EXT_TRIGGER: Final = 0xA
+EVT2_OTHERS: Final = 0xE
+EVT2_CONTINUED: Final = 0xF
+
+# Slots of a decoder's state, int64. All of it; nothing else passes from one call to the next.
+BASE: Final = 0  # time of the last TIME_HIGH with the rollovers before it, us; UNKNOWN_TIME before the first
+LOW: Final = 1  # time since BASE, us
+LAST: Final = 2  # time of the last event or trigger given out, us
+ROW: Final = 3  # of the last ADDR_Y, or UNKNOWN_ROW
+COLUMN: Final = 4  # where the next vector word starts, or UNKNOWN_COLUMN or more
+POLARITY: Final = 5  # of the last VECT_BASE_X
+VECTOR_LEFT: Final = 6  # vector words still to come after the last VECT_BASE_X
+VECTOR_AT: Final = 7  # byte offset of that VECT_BASE_X
+STATE_SLOTS: Final = 8
+
+UNKNOWN_TIME: Final = -1
+UNKNOWN_ROW: Final = 0xFFFF
+UNKNOWN_COLUMN: Final = 0xF000
+
+# Rows of a decoder's tally, int64 (rows, 2): how many, and the byte offset of the first.
+BEFORE_TIME: Final = 0
+TIME_GLITCH: Final = 1
+TIME_BACKWARD: Final = 2
+OUTSIDE_SENSOR: Final = 3
+ROW_UNKNOWN: Final = 4
+COLUMN_UNKNOWN: Final = 5
+VECTOR_CUT: Final = 6
+RESERVED: Final = 7
+ODD_BYTES: Final = 8
+HEADER_OPEN: Final = 9
+ROLLOVERS: Final = 10
+TIME_GAPS: Final = 11
+OTHER_WORDS: Final = 12
+TALLY_ROWS: Final = 13
+
+LOSSES: Final = {
+    "words_before_time": (BEFORE_TIME, "words before the first TIME_HIGH, which have no time; skipped"),
+    "time_glitches": (TIME_GLITCH, "TIME_HIGH words that step back by less than half its range"),
+    "time_backward": (TIME_BACKWARD, "events and triggers earlier than the one before; dropped"),
+    "outside_sensor": (OUTSIDE_SENSOR, "events outside the sensor; dropped"),
+    "row_unknown": (ROW_UNKNOWN, "events before the first ADDR_Y, which have no row; dropped"),
+    "column_unknown": (
+        COLUMN_UNKNOWN,
+        "vector events before the first VECT_BASE_X, which have no column; dropped",
+    ),
+    "vectors_cut": (VECTOR_CUT, "vectors that are not whole (12 + 12 + 8 columns): words are missing"),
+    "reserved_words": (RESERVED, "words of a reserved type; skipped"),
+    "odd_bytes": (ODD_BYTES, "bytes at the end of the file that make no whole word; skipped"),
+    "header_without_end": (
+        HEADER_OPEN,
+        "header without '% end'; data taken to start at the first line without '% '",
+    ),
+}
+"""What a RAW file may lose: name -> (row of the tally, meaning)."""
+
+COUNTS: Final = {
+    "rollovers": (ROLLOVERS, "rollovers of the camera clock"),
+    "time_gaps": (TIME_GAPS, "steps of TIME_HIGH by more than one"),
+    "other_words": (OTHER_WORDS, "OTHERS and CONTINUED words, which carry no events"),
+}
+"""What is worth knowing about a RAW file and is no loss: name -> (row of the tally, meaning)."""
