@@ -187,7 +187,7 @@ class ResultWriter:
         recording: Mapping[str, Any],
         processing: Mapping[str, Any],
         counts: Mapping[str, int],
-        losses: Iterable[Mapping[str, Any]],
+        losses: Mapping[str, Mapping[str, Any]],
         versions: Mapping[str, str],
         error: str | None = None,
     ) -> dict[str, Any]:
@@ -198,7 +198,7 @@ class ResultWriter:
             recording: What was read: path, format, size, duration, events.
             processing: How long it took.
             counts: The receiver's counts.
-            losses: What the reader skipped, with byte offsets.
+            losses: What the reader skipped, by kind, with byte offsets.
             versions: Installed versions.
             error: The message, when `status` is `failed`.
 
@@ -218,7 +218,7 @@ class ResultWriter:
             "recording": dict(recording),
             "processing": dict(processing),
             "counts": dict(counts),
-            "losses": [dict(loss) for loss in losses],
+            "losses": {kind: dict(loss) for kind, loss in losses.items()},
             "digest": self._link.digest,
             "codebook": {"digest": self._link.codebook.digest, "profile": self._link.codebook.profile},
             "revisions": dict(self._link.revisions),

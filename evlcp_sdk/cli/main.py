@@ -5,19 +5,29 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["app", "main"]
+__all__ = ["main", "make_app"]
 
-app = typer.Typer(
-    name="evlcp",
-    no_args_is_help=True,
-    rich_markup_mode="rich",
-    pretty_exceptions_enable=False,
-    help="""Read data and distance from blinking LEDs with an event camera.
+HELP = """Read data and distance from blinking LEDs with an event camera.
 
-    Exit codes: [bold]0[/] done, [bold]1[/] failed, [bold]2[/] usage or configuration,
-    [bold]3[/] input that cannot be read.
-    """,
-)
+[bold]evlcp demo[/] decodes a small recording that comes with the package;
+[bold]evlcp receive REC.raw -o out[/] decodes yours.
+
+Exit codes: [bold]0[/] done (also when no transmitter was there), [bold]1[/] failed,
+[bold]2[/] usage or configuration, [bold]3[/] input that cannot be read, [bold]130[/] interrupted.
+"""
+
+
+def make_app() -> typer.Typer:
+    """The command line with its own commands; plugins add theirs by `evlcp_register_commands`."""
+    from evlcp_sdk.cli import config, demo, info, plugins, receive
+
+    app = typer.Typer(
+        name="evlcp", no_args_is_help=True, rich_markup_mode="rich", pretty_exceptions_enable=False, help=HELP
+    )
+    app.callback()(_root)
+    for module in (receive, info, demo, config, plugins):
+        module.register(app)
+    return app
 
 
 def _version(show: bool) -> None:
@@ -28,7 +38,6 @@ def _version(show: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def _root(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
@@ -38,16 +47,19 @@ def _root(
 
 
 def main() -> None:
-    """Run the command line; an SDK error becomes one line on stderr and its exit code."""
-    from evlcp_sdk.cli import plugins
+    """Run the command line; an SDK error becomes one line a fault on stderr and its exit code."""
+    from evlcp_sdk.cli._common import complain
     from evlcp_sdk.errors import EvlcpError
     from evlcp_sdk.registry import Registry
 
     try:
-        registry = Registry.load()
-        plugins.register(app)
-        registry.hook.evlcp_register_commands(app=app)
+        app = make_app()
+        Registry.load().hook.evlcp_register_commands(app=app)
         app()
     except EvlcpError as fault:
-        typer.echo(f"evlcp: {fault}", err=True)
+        complain(str(fault))
         sys.exit(fault.exit_code)
+    except SystemExit as end:
+        if end.code == 130:
+            complain("interrupted")
+        raise

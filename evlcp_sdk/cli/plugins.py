@@ -1,8 +1,8 @@
 """`evlcp plugins`."""
 
-from typing import Annotated
-
 import typer
+
+from evlcp_sdk.cli._common import Json
 
 __all__ = ["register"]
 
@@ -12,12 +12,10 @@ def register(app: typer.Typer) -> None:
     app.command("plugins")(plugins)
 
 
-def plugins(
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON array on stdout.")] = False,
-) -> None:
+def plugins(as_json: Json = False) -> None:
     """List the installed algorithms: role, id, distribution, version, summary.
 
-    Select one with --set, for example: [bold]evlcp receive REC.raw --set ranging.id=poc[/]
+    Select one by its id: [bold]evlcp receive REC.raw -o out --set modulation.id=wh8[/]
     """
     import json
 
@@ -38,6 +36,6 @@ def plugins(
         typer.echo(json.dumps(rows, indent=2))
         return
     keys = ("role", "id", "distribution", "version", "summary")
-    widths = [max(len(str(r[k])) for r in rows) for k in keys]
+    widths = [max((len(str(r[k])) for r in rows), default=0) for k in keys]
     for r in rows:
         typer.echo("  ".join(f"{r[k]!s:<{w}}" for k, w in zip(keys, widths, strict=True)).rstrip())

@@ -185,10 +185,10 @@ def test_every_fault_of_a_file_is_told(registry: Registry, tmp_path: Path) -> No
     focal_mm = "35"
     [air]
     frames_per_packet = 2.5
-    [bar]
-    cluster_rows = 7
     [modulation]
     id = 8
+    [regions]
+    block_us = "slow"
     [ranging]
     min_spaceing = 9
     min_spacing = 16
@@ -196,7 +196,7 @@ def test_every_fault_of_a_file_is_told(registry: Registry, tmp_path: Path) -> No
     kernel = "sink"
     window_px = nan
     """
-    assert faults_of(registry, text, tmp_path, "regions.block_us=-1", "lamp.on=1") == [
+    assert faults_of(registry, text, tmp_path, "bar.led_pitch_m=-1", "lamp.on=1") == [
         "link.toml: camra: unknown table; did you mean 'camera'? (known: camera, bar, air, regions, pilots,"
         " modulation, synchronization, separation, decoding, ranging)",
         "link.toml: decoding = 4: expected a table",
@@ -204,9 +204,9 @@ def test_every_fault_of_a_file_is_told(registry: Registry, tmp_path: Path) -> No
         " modulation, synchronization, separation, decoding, ranging)",
         "link.toml: camera.width = 0: expected greater than 0",
         'link.toml: camera.focal_mm = "35": expected a valid number',
-        "link.toml: bar.cluster_rows = 7: expected a divisor of bar.rows = 96",
+        "--set: bar.led_pitch_m = -1: expected greater than 0",
         "link.toml: air.frames_per_packet = 2.5: expected a valid integer",
-        "--set: regions.block_us = -1: expected greater than 0",
+        'link.toml: regions.block_us = "slow": expected a valid integer',
         "link.toml: modulation.id = 8: expected a string",
         "link.toml: ranging.min_spacing = 16: expected less than or equal to 15",
         "link.toml: ranging.window_px = nan: expected a finite number",
@@ -239,6 +239,14 @@ def test_what_is_no_toml(registry: Registry, tmp_path: Path) -> None:
         load_link(tmp_path / "none.toml", (), registry)
     with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
         load_link(tmp_path, (), registry)
+
+
+def test_values_that_do_not_fit_each_other(registry: Registry, tmp_path: Path) -> None:
+    text = "[bar]\ncluster_rows = 7\n[camera]\nwidth = 0\n"
+    assert faults_of(registry, text, tmp_path) == [
+        "link.toml: camera.width = 0: expected greater than 0",
+        "link.toml: bar.cluster_rows = 7: expected a divisor of bar.rows = 96",
+    ]
 
 
 def test_too_many_clusters_for_the_pilots(registry: Registry) -> None:

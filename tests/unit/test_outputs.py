@@ -60,7 +60,7 @@ def finish(writer: ResultWriter, **kw: Any) -> dict[str, Any]:
         "recording": {"path": "a.raw"},
         "processing": {"elapsed_s": 1.0},
         "counts": {"events": 3},
-        "losses": [{"offset": 7, "what": "odd byte"}],
+        "losses": {"odd_byte": {"count": 1, "first": 7}},
         "versions": {"evlcp-sdk": "0"},
     }
     return writer.finish(**(given | kw))
@@ -100,7 +100,7 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
     assert table["result"] == "2 transmitters, 3 frames"
     assert table["digest"] == LINK.digest
     assert table["codebook"] == {"digest": BOOK.digest, "profile": "wh8"}
-    assert table["losses"] == [{"offset": 7, "what": "odd byte"}]
+    assert table["losses"] == {"odd_byte": {"count": 1, "first": 7}}
     assert table["transmitters"][0] == {
         "transmitter": 0,
         "packets": 2,

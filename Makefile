@@ -1,0 +1,64 @@
+# `make demo` and `make test` do all set-up in .venv; run again, they set up only what has changed.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+TOOLCHAIN := firmware_host/firmware/install-toolchain.sh
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint format pictures clean
+
+help:  ## Show this list
+	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+demo: $(VENV)/.installed  ## Decode the recording that comes with the package; figures go to demo-out/
+	$(BIN)/evlcp demo
+
+test: $(VENV)/.dev lint toolchain  ## Format, lint, types, then every test
+	$(BIN)/pytest -q -n auto
+
+lint: $(VENV)/.dev  ## Format, lint and types only
+	$(BIN)/ruff format --check
+	$(BIN)/ruff check
+	$(BIN)/mypy
+
+format: $(VENV)/.dev  ## Format the code
+	$(BIN)/ruff format
+
+pictures: $(VENV)/.installed  ## Draw the pictures of the docs again
+	$(BIN)/evlcp demo
+	cp demo-out/regions.png demo-out/presence.png demo-out/distance.png docs/images/
+
+clean:  ## Remove .venv and everything that was generated
+	rm -rf $(VENV) demo-out .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Without it the firmware's tests would be skipped: CI takes that for a failure, a developer may go on.
+.PHONY: toolchain
+toolchain:
+	@if [ -f $(TOOLCHAIN) ]; then bash $(TOOLCHAIN) || { \
+	  echo "make: the firmware toolchain is not installed; its tests are skipped"; [ -z "$$CI" ]; }; fi
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	  echo "make: Python 3.11 or later is needed, found: $$($(PYTHON) --version 2>&1)."; \
+	  echo "make: name another one with: make PYTHON=/path/to/python3"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	  echo "make: this Python lacks the module venv (Debian and Ubuntu: package python3-venv)"; \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -q -y python3-venv; \
+	  else echo "make: install it with: sudo apt-get install python3-venv"; exit 1; fi; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.pip: | $(BIN)/python
+	$(BIN)/python -m pip install -q --upgrade 'pip>=25.1'
+	@touch $@
+
+$(VENV)/.installed: pyproject.toml $(VENV)/.pip
+	$(BIN)/python -m pip install -q -e .
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml $(VENV)/.pip
+	$(BIN)/python -m pip install -q -e '.[faery,parquet]' --group dev
+	@touch $@ $(VENV)/.installed

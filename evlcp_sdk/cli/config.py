@@ -1,0 +1,65 @@
+"""`evlcp config`."""
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides
+
+__all__ = ["register"]
+
+
+class CodebookForm(StrEnum):
+    """How `--codebook` prints the codes."""
+
+    JSON = "json"
+    C = "c"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("config")(config)
+
+
+def config(
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
+    digest: Annotated[bool, typer.Option("--digest", help="Only the SHA-256 of the link.")] = False,
+    as_json: Json = False,
+    codebook: Annotated[
+        CodebookForm | None,
+        typer.Option("--codebook", help="Only the codes that both ends share, as JSON or as a C header."),
+    ] = None,
+) -> None:
+    """Print the resolved link: every parameter with its meaning, unit, bounds and default.
+
+    Start your own:            [bold]evlcp config > link.toml[/]
+
+    See what a change does:    [bold]evlcp config -c link.toml --set modulation.id=wh8 --digest[/]
+
+    Codes for the transmitter: [bold]evlcp config --codebook c > codebook.h[/]
+    """
+    import json
+
+    from evlcp_sdk.config import load_link, to_toml
+    from evlcp_sdk.registry import Registry
+
+    if digest + as_json + (codebook is not None) > 1:
+        raise typer.BadParameter("give one of --digest, --json and --codebook", param_hint="--json")
+    registry = Registry.load()
+    link = load_link(link_file, overrides or [], registry)
+    if codebook is not None:
+        typer.echo(link.codebook.to_json() if codebook is CodebookForm.JSON else link.codebook.to_c())
+    elif digest:
+        typer.echo(link.digest)
+    elif as_json:
+        table = {
+            "digest": link.digest,
+            "codebook": {"digest": link.codebook.digest, "profile": link.codebook.profile},
+            "revisions": link.revisions,
+            "configuration": link.table,
+        }
+        typer.echo(json.dumps(table, indent=2))
+    else:
+        typer.echo(to_toml(link, registry), nl=False)

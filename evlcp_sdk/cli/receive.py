@@ -1,0 +1,302 @@
+"""`evlcp receive`."""
+
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import typer
+
+from evlcp_sdk.cli._common import LinkFile, Overrides, complain, console, open_source
+from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
+
+if TYPE_CHECKING:
+    from evlcp_sdk.config import Link
+    from evlcp_sdk.io import EventSource
+
+__all__ = ["InterruptedRunError", "decode", "register", "show"]
+
+Advance = Callable[[int, int | None], None]
+"""Told, after each piece, how many bytes are done, and of how many if that is known."""
+
+
+class InterruptedRunError(EvlcpError):
+    """The user stopped the run; what was decoded until then is written."""
+
+    exit_code: ClassVar[int] = 130
+
+
+@dataclass(frozen=True)
+class Job:
+    """One recording and the folder that its result goes to."""
+
+    url: str
+    folder: Path
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("receive")(receive)
+
+
+def receive(
+    recordings: Annotated[
+        list[str], typer.Argument(metavar="REC...", help="Recordings, or what a plugin can open.")
+    ],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="OUT", help="Folder of the result; made if need be.")
+    ],
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Each summary as one line of JSON.")] = False,
+    figures: Annotated[
+        bool, typer.Option("--figures", help="Draw regions.png, presence.png, distance.png.")
+    ] = False,
+    parquet: Annotated[bool, typer.Option("--parquet", help="Also write frames.parquet.")] = False,
+) -> None:
+    """Decode recordings: symbols and distances into OUT.
+
+    One recording:       [bold]evlcp receive REC.raw -o out[/]
+
+    With figures:        [bold]evlcp receive REC.raw -o out --figures[/]
+
+    Another profile:     [bold]evlcp receive REC.raw -o out --set modulation.id=wh8[/]
+
+    Your own link:       [bold]evlcp receive REC.raw -o out -c link.toml[/]
+
+    Several recordings:  [bold]evlcp receive a.raw b.raw -o out[/] writes out/a and out/b
+
+    OUT gets frames.csv (a row a frame), packets.jsonl (a line a packet) and summary.json.
+    An earlier result there is replaced when the new one is complete.
+    """
+    import json
+
+    from evlcp_sdk.config import load_link
+    from evlcp_sdk.registry import Registry
+
+    jobs = _jobs(recordings, out)
+    link = load_link(link_file, overrides or [], Registry.load())
+    worst = 0
+    for job in jobs:
+        try:
+            with _progress(Path(job.url).name) as advance, _stop_on_request() as stopped:
+                summary = decode(
+                    job.url, job.folder, link, advance, stopped, figures=figures, parquet=parquet
+                )
+        except (InputError, ConfigError) as fault:
+            complain(str(fault))
+            worst = max(worst, fault.exit_code)
+            if as_json:
+                failed = {"status": "failed", "error": str(fault), "recording": {"path": job.url}}
+                typer.echo(json.dumps(failed))
+            continue
+        if as_json:
+            typer.echo(json.dumps(summary))
+        else:
+            show(summary, job.folder)
+        if summary["status"] == "failed":
+            complain(summary["error"])
+            worst = max(worst, InputError.exit_code)
+        if summary["status"] == "interrupted":
+            raise InterruptedRunError(f"interrupted; what was decoded until then is in {job.folder}")
+    raise typer.Exit(worst)
+
+
+def decode(
+    url: str,
+    folder: Path,
+    link: "Link",
+    advance: Advance,
+    stopped: Callable[[], bool],
+    *,
+    figures: bool = False,
+    parquet: bool = False,
+) -> dict[str, Any]:
+    """Decode one recording into a folder, in constant memory.
+
+    Args:
+        url: The recording.
+        folder: Where the result goes.
+        link: The configuration.
+        advance: Told how far the reading is.
+        stopped: Asked after every piece whether to end early.
+        figures: Draw the figures.
+        parquet: Write Parquet, too.
+
+    Returns:
+        The summary; its `status` is `failed` when the recording cannot be read on.
+
+    Raises:
+        InputError: The recording cannot be opened; nothing is written.
+        ConfigError: The recording's sensor is not the link's, or the folder cannot be written.
+    """
+    from evlcp_sdk.config import installed_versions
+    from evlcp_sdk.outputs import ResultWriter, Status
+    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.rx.receiver import Receiver
+
+    probes: list[Any] = []
+    if figures:
+        from evlcp_sdk.figures import FigureProbe
+
+        probes.append(FigureProbe(link.camera))
+    registry = Registry.load(*probes)
+    with open_source(url, registry) as source:
+        _check_sensor(source, url, link)
+        with ResultWriter(folder, link, parquet=parquet) as writer:
+            receiver = Receiver(link, registry.hook)
+            status: Status = "complete"
+            error = None
+            first_us = last_us = None
+            began = time.perf_counter()
+            try:
+                for events in source.chunks():
+                    first_us = int(events.t_us[0]) if first_us is None else first_us
+                    last_us = int(events.t_us[-1])
+                    for probe in probes:
+                        probe.watch(events)
+                    writer.write(receiver.feed(events))
+                    advance(source.position_bytes, source.size_bytes)
+                    if stopped():
+                        status = "interrupted"
+                        break
+            except InputError as fault:
+                status, error = "failed", str(fault)
+            writer.write(receiver.close())
+            elapsed_s = time.perf_counter() - began
+            read = source.counts["events"]
+            duration_s = (last_us - first_us) * 1e-6 if first_us is not None and last_us is not None else 0.0
+            summary = writer.finish(
+                status,
+                recording={
+                    "path": url,
+                    "format": source.format,
+                    "bytes": source.size_bytes,
+                    "width": source.width,
+                    "height": source.height,
+                    "first_us": first_us,
+                    "last_us": last_us,
+                    "duration_s": round(duration_s, 6),
+                    "events_per_s": round(read / duration_s) if duration_s else None,
+                    "counts": dict(source.counts),
+                },
+                processing={
+                    "elapsed_s": round(elapsed_s, 6),
+                    "events_per_s": round(read / elapsed_s),
+                    "times_real_time": round(duration_s / elapsed_s, 3),
+                },
+                counts=receiver.counts,
+                losses={kind: asdict(loss) for kind, loss in source.losses.items()},
+                versions=installed_versions(registry),
+                error=error,
+            )
+    if figures:
+        from evlcp_sdk.figures import save_figures
+
+        for probe in probes:
+            save_figures(probe, Path(url).name, folder)
+    return summary
+
+
+def show(summary: dict[str, Any], folder: Path) -> None:
+    """Print what was found, what was lost, and where the result is."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    out = console()
+    recording, processing = summary["recording"], summary["processing"]
+    out.print(f"[bold]{escape(Path(recording['path']).name)}[/]: {summary['result']}")
+    if summary["transmitters"]:
+        table = Table(box=None, pad_edge=False, header_style="dim")
+        for name in ("transmitter", "frames", "quality", "clock", "distance"):
+            table.add_column(name, justify="right")
+        for t in summary["transmitters"]:
+            table.add_row(
+                str(t["transmitter"]),
+                f"{t['frames_found']} of {t['frames_expected']}",
+                _or_dash(t["quality"], "{:.2f}"),
+                _or_dash(t["clock_ppm"], "{:+.0f} ppm"),
+                _or_dash(t["distance_first_m"], "{:.2f}")
+                + " to "
+                + _or_dash(t["distance_last_m"], "{:.2f} m"),
+            )
+        out.print(table)
+    out.print(
+        f"{recording['counts']['events'] / 1e6:.2f} Mev of {recording['duration_s']:.3f} s"
+        f" in {processing['elapsed_s']:.2f} s:"
+        f" {processing['events_per_s'] / 1e6:.1f} Mev/s, {processing['times_real_time']:.2f} x real time"
+    )
+    for loss in summary["losses"].values():
+        out.print(
+            f"lost: {loss['count']} {loss['meaning']} (first at {loss['unit']} {loss['first']})",
+            style="yellow",
+        )
+    out.print(f"written: {escape(str(folder))}/frames.csv, packets.jsonl, summary.json", style="dim")
+
+
+def _or_dash(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)
+
+
+def _jobs(recordings: Sequence[str], out: Path) -> list[Job]:
+    if len(recordings) == 1:
+        return [Job(recordings[0], out)]
+    jobs = [Job(url, out / _stem(url)) for url in recordings]
+    folders = [job.folder for job in jobs]
+    for job in jobs:
+        if folders.count(job.folder) > 1:
+            raise typer.BadParameter(
+                f"two recordings would both be written to {job.folder}; receive them one by one",
+                param_hint="REC...",
+            )
+    return jobs
+
+
+def _stem(url: str) -> str:
+    """The recording's name without its kind: `night.csv.gz` gives `night`."""
+    name = Path(url).name
+    return name.removesuffix(".gz").rsplit(".", 1)[0] or name
+
+
+def _check_sensor(source: "EventSource", url: str, link: "Link") -> None:
+    camera = link.camera
+    size = (source.width, source.height)
+    if None not in size and size != (camera.width, camera.height):
+        raise ConfigError(
+            f"{url}: recorded with {size[0]} x {size[1]} pixels, but the link's camera has"
+            f" {camera.width} x {camera.height}; set camera.width, camera.height and camera.pitch_um"
+        )
+
+
+@contextmanager
+def _progress(name: str) -> Iterator[Advance]:
+    """A bar by bytes read, on a terminal only."""
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+    err = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task(name, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+@contextmanager
+def _stop_on_request() -> Iterator[Callable[[], bool]]:
+    """Let Ctrl-C end the run after the piece in hand; a second one ends it at once."""
+    asked = False
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield lambda: asked
+    finally:
+        signal.signal(signal.SIGINT, before)
