@@ -59,7 +59,31 @@ class AirSpec:
 class RegionSpec:
     """How blinking regions are found and followed in the image."""
 
-    block_us: Annotated[int, Field(gt=0, description="Time step of the detector.")] = 1000
+    block_us: Annotated[
+        int, Field(ge=200, le=10_000, description="Time step of the detector; results come once a step.")
+    ] = 1000
+    min_score: Annotated[
+        int,
+        Field(ge=2, le=40, description="Score at which a pixel is a candidate: 2 for each run of one chip."),
+    ] = 8
+    min_events: Annotated[
+        int, Field(ge=1, description="Candidate events in a step that a new region needs.")
+    ] = 30
+    margin_px: Annotated[
+        int, Field(ge=2, le=64, description="Seam around a region: how far it may move in a step, and blur.")
+    ] = 6
+    merge_px: Annotated[
+        int, Field(ge=8, le=256, description="Gap below which two blinking areas are one region.")
+    ] = 16
+    fade_us: Annotated[
+        int, Field(ge=1000, description="Time without blinking after which a region is released.")
+    ] = 50_000
+    min_clusters_share: Annotated[
+        float,
+        Field(
+            ge=0, le=1, description="Share of the clusters whose pilot must be seen for a frame to count."
+        ),
+    ] = 0.5
 
 
 _SPECS: dict[str, type[Any]] = {

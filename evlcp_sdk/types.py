@@ -16,6 +16,7 @@ __all__ = [
     "Packet",
     "PresenceMap",
     "Range",
+    "Region",
     "SoftSymbols",
     "SyncLock",
     "Triggers",
@@ -136,14 +137,37 @@ class Triggers:
 
 
 @dataclass(frozen=True)
+class Region:
+    """A blinking region of the image at one time.
+
+    Attributes:
+        id: Number of the region in order of appearance, from 0.
+        t_us: When it was measured, camera clock, us.
+        x_px: Column of its centre, px.
+        y_px: Row of its centre, px.
+        width_px: Its width, px.
+        height_px: Its height, px.
+    """
+
+    id: int
+    t_us: float
+    x_px: float
+    y_px: float
+    width_px: float
+    height_px: float
+
+
+@dataclass(frozen=True)
 class SyncLock:
     """Where a transmitter's packets stand on the camera's clock.
 
     Attributes:
-        packet_t_us: Start of a packet's first preamble chip, us; other packets lie whole periods away.
+        packet_t_us: Start of a packet's first preamble chip, us, as the earliest events of rising edges show
+            it; other packets lie whole periods away.
         chip_us: Length of a chip on the camera's clock, us.
-        delay_on_us: Delay of positive events after a rising edge, us, counted from `packet_t_us`'s grid.
-        delay_off_us: The same for negative events after a falling edge.
+        delay_on_us: What to add to a chip's start so that the window of one chip holds the positive events
+            of an edge at that start best, us; negative where these events last nearly a chip.
+        delay_off_us: The same for negative events.
         quality: Normalised preamble correlation, 0 to 1.
     """
 
@@ -161,9 +185,9 @@ class PresenceMap:
     Attributes:
         probability: float32 (K, rows, columns), 0 to 1.
         grid_px: Side of a grid cell, px.
-        selected: Cells that show any cluster, bool (rows, columns).
-        pixels: Pilot correlation of each pixel inside the selected cells, float32 (K, height, width),
-            0 elsewhere; the maps that ranging needs.
+        selected: Cells that show a cluster, bool (K, rows, columns).
+        pixels: Pilot correlation of the pixels in and around each cluster's selected cells, float32
+            (K, height, width), 0 elsewhere; the maps that ranging needs.
     """
 
     probability: NDArray[np.float32]

@@ -1,0 +1,354 @@
+"""The receiver: events in, packets out."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pluggy
+
+from evlcp_sdk.abc import Synchronizer
+from evlcp_sdk.config import Link
+from evlcp_sdk.errors import StreamError
+from evlcp_sdk.rx.chips import polarity_sums
+from evlcp_sdk.rx.payload import PacketAssembler
+from evlcp_sdk.rx.regions import RegionTracker, Track
+from evlcp_sdk.types import Events, Frame, Packet, SyncLock
+
+__all__ = ["Receiver"]
+
+_LOOKBACK_PACKETS = 2
+"""Packets of events kept while there is no lock: one to hear a preamble in, one to look back on."""
+
+
+@dataclass
+class _Transmitter:
+    """What the receiver knows of one region.
+
+    Attributes:
+        number: Transmitter number, None before the first lock.
+        lock: The newest lock; `packet` is the number of its packet, 0 the first with a frame here.
+        frame: Next frame to decode, counted from packet 0.
+    """
+
+    track: Track
+    sync: Any
+    assembler: PacketAssembler
+    number: int | None = None
+    lock: SyncLock | None = None
+    packet: int = 0
+    frame: int = 0
+
+
+class Receiver:
+    """Decodes a stream of events, whatever pieces it comes in.
+
+    The stream is cut into time steps on a fixed grid, so that any split of it gives the same packets.
+
+    Args:
+        link: The resolved configuration.
+        hook: Where finished stages are announced (`Registry.hook`); None for nowhere.
+
+    >>> from evlcp_sdk.config import load_link
+    >>> receiver = Receiver(load_link())
+    >>> receiver.feed(Events.of(t_us=[10, 20], x=[5, 5], y=[7, 7], p=[1, 0]))
+    []
+    >>> receiver.close()
+    []
+    >>> receiver.counts["events"]
+    2
+    """
+
+    def __init__(self, link: Link, hook: pluggy.HookRelay | None = None) -> None:
+        self._link = link
+        self._packet = link.packet
+        self._step_us = link.regions.block_us
+        self._announce: Callable[..., Any] | None = None
+        if hook is not None and hook.evlcp_stage_finished.get_hookimpls():
+            self._announce = hook.evlcp_stage_finished
+        self._synchronizer: Synchronizer = link.algorithm("synchronization").compile(link.codebook, link.packet)
+        self._separate = link.algorithm("separation").compile(link.codebook)
+        self._decode = link.algorithm("decoding").compile(link.codebook)
+        self._measure = link.algorithm("ranging").compile(link.camera, link.bar)
+        self._tracker = RegionTracker(link.regions, link.camera, link.packet.chip_us)
+        self._transmitters: dict[int, _Transmitter] = {}
+        self._pending: list[Events] = []
+        self._step_start_us: int | None = None
+        self._first_us = 0
+        self._last_us = -(2**62)
+        self._locked = 0
+        self._closed = False
+        self._counts = dict.fromkeys(
+            (
+                "events",
+                "dropped_time_backward",
+                "dropped_off_sensor",
+                "events_in_regions",
+                "regions_opened",
+                "regions_released",
+                "locks",
+                "preambles",
+                "frames",
+                "frames_rejected",
+                "packets",
+            ),
+            0,
+        )
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What was taken, found and dropped so far."""
+        return dict(self._counts)
+
+    def feed(self, events: Events) -> list[Packet]:
+        """Take the next events of the stream; return the packets that are complete.
+
+        Events before their predecessor in time, or off the sensor, are dropped and counted.
+
+        Raises:
+            StreamError: The stream was closed.
+        """
+        if self._closed:
+            raise StreamError("the receiver is closed: make a new one for a new stream")
+        events = self._checked(events)
+        if not len(events):
+            return []
+        if self._step_start_us is None:
+            self._first_us = int(events.t_us[0])
+            self._step_start_us = self._first_us // self._step_us * self._step_us
+        packets: list[Packet] = []
+        bounds = self._bounds(events)
+        begin = 0
+        for end in bounds:
+            self._pending.append(events[begin:end])
+            begin = end
+            packets += self._run_step()
+            packets += self._skip_gap(int(events.t_us[end]))
+        if begin < len(events):
+            self._pending.append(events[begin:])
+        return packets
+
+    def close(self) -> list[Packet]:
+        """End the stream; return the packets that were still incomplete."""
+        if self._closed:
+            return []
+        self._closed = True
+        packets = self._run_step(self._last_us) if self._pending else []
+        for transmitter in self._transmitters.values():
+            packets += self._end(transmitter)
+        self._transmitters = {}
+        return packets
+
+    def _checked(self, events: Events) -> Events:
+        from evlcp_sdk.rx import _kernels
+
+        keep = np.empty(len(events), np.bool_)
+        camera = self._link.camera
+        off, backward, self._last_us = _kernels.keep_ordered(
+            events.t_us, events.x, events.y, camera.width, camera.height, self._last_us, keep
+        )
+        self._counts["events"] += len(events)
+        self._counts["dropped_off_sensor"] += off
+        self._counts["dropped_time_backward"] += backward
+        return events[keep] if off or backward else events
+
+    def _bounds(self, events: Events) -> list[int]:
+        """Where each new time step begins among the events."""
+        assert self._step_start_us is not None
+        first = max(int(events.t_us[0]) // self._step_us * self._step_us, self._step_start_us)
+        if int(events.t_us[-1]) - first > self._step_us * len(events):
+            # Sparse events: look at each instead of at each step.
+            step = events.t_us // self._step_us
+            before = np.concatenate([[self._step_start_us // self._step_us], step[:-1]])
+            return [int(i) for i in np.flatnonzero(step > before)]
+        starts = np.arange(self._step_start_us + self._step_us, int(events.t_us[-1]) + 1, self._step_us)
+        return [int(i) for i in np.unique(np.searchsorted(events.t_us, starts))]
+
+    def _run_step(self, until_us: int | None = None) -> list[Packet]:
+        """Process the time step whose events are pending; `until_us` where the stream ends inside it."""
+        assert self._step_start_us is not None
+        events = self._pending[0] if len(self._pending) == 1 else Events.concat(self._pending)
+        self._pending = []
+        start_us = self._step_start_us
+        self._step_start_us += self._step_us
+        end_us = self._step_start_us if until_us is None else until_us
+        clock = time.perf_counter()
+        tracks = self._tracker.step(start_us, events)
+        elapsed = time.perf_counter() - clock
+        packets: list[Packet] = []
+        for track in tracks:
+            if track.id not in self._transmitters:
+                self._counts["regions_opened"] += 1
+                assembler = PacketAssembler(self._packet.frames)
+                self._transmitters[track.id] = _Transmitter(track, self._synchronizer.init(), assembler)
+                fresh = list(track.blocks)
+            else:
+                fresh = [track.blocks[-1]] if track.blocks and track.blocks[-1][0] == start_us else []
+            self._counts["events_in_regions"] += sum(len(e) for _, e in fresh)
+            self._tell("regions", track.latest, elapsed)
+            transmitter = self._transmitters[track.id]
+            for block_us, block in fresh:
+                self._synchronize(transmitter, block, min(block_us + self._step_us, end_us))
+            packets += self._decode_due(transmitter, end_us)
+            self._forget(transmitter, end_us)
+            if track.released:
+                packets += self._release(track)
+        return packets
+
+    def _skip_gap(self, next_us: int) -> list[Packet]:
+        """Move to the time step of the next event without visiting empty ones in which nothing can happen."""
+        assert self._step_start_us is not None
+        target = next_us // self._step_us * self._step_us
+        packets: list[Packet] = []
+        while self._step_start_us < target and self._tracker.tracks:
+            self._pending = [Events.empty()]
+            packets += self._run_step()
+        if self._step_start_us < target:
+            self._tracker.skip()
+            self._step_start_us = target
+        return packets
+
+    def _synchronize(self, transmitter: _Transmitter, events: Events, until_us: int) -> None:
+        clock = time.perf_counter()
+        transmitter.sync, locks = self._synchronizer.step(
+            transmitter.sync, events.t_us, events.p, until_us
+        )
+        elapsed = time.perf_counter() - clock
+        for lock in locks:
+            self._counts["preambles"] += 1
+            self._adopt(transmitter, lock)
+            self._tell("synchronization", lock, elapsed)
+
+    def _adopt(self, transmitter: _Transmitter, lock: SyncLock) -> None:
+        """Take a new lock; frames go on where they were, or begin with the first whole one of the region."""
+        packet, old = self._packet, transmitter.lock
+        period = packet.packet_chips * lock.chip_us
+        if old is not None:
+            apart = (lock.packet_t_us - old.packet_t_us) / period
+            if abs(apart - round(apart)) * packet.packet_chips < 1:
+                transmitter.packet += round(apart)
+                transmitter.lock = lock
+                return
+        self._counts["locks"] += 1
+        if transmitter.number is None:
+            transmitter.number = self._locked
+            self._locked += 1
+        # Half a chip before the first event is still within the first edge's delay.
+        earliest = max(transmitter.track.first_us, self._first_us - lock.chip_us / 2)
+        done = transmitter.frame
+        if old is not None:
+            earliest = max(earliest, self._frame_start_us(transmitter, done))
+        back = math.ceil((lock.packet_t_us - earliest) / period)
+        transmitter.lock = lock
+        transmitter.packet = back + (0 if old is None else -(-done // packet.frames))
+        transmitter.frame = (transmitter.packet - back) * packet.frames
+        while self._frame_start_us(transmitter, transmitter.frame) < earliest:
+            transmitter.frame += 1
+        if old is None:
+            # Packet 0 is the one of the first frame.
+            skip = transmitter.frame // packet.frames
+            transmitter.packet -= skip
+            transmitter.frame -= skip * packet.frames
+
+    def _frame_start_us(self, transmitter: _Transmitter, frame: int) -> float:
+        lock, packet = transmitter.lock, self._packet
+        assert lock is not None
+        number, index = divmod(frame, packet.frames)
+        chips = (number - transmitter.packet) * packet.packet_chips + packet.frame_start_chip(index)
+        return lock.packet_t_us + chips * lock.chip_us
+
+    def _decode_due(self, transmitter: _Transmitter, until_us: float) -> list[Packet]:
+        """Decode the frames that lie before a time, with the events after their last edge."""
+        packets: list[Packet] = []
+        while (lock := transmitter.lock) is not None:
+            start_us = self._frame_start_us(transmitter, transmitter.frame)
+            last_delay = max(lock.delay_on_us, lock.delay_off_us, 0.0)
+            end_us = start_us + self._packet.frame_chips * lock.chip_us + last_delay
+            if end_us > until_us:
+                break
+            frame = self._decode_frame(transmitter, start_us, end_us)
+            transmitter.frame += 1
+            if frame is None:
+                self._counts["frames_rejected"] += 1
+                continue
+            self._counts["frames"] += 1
+            packet_us = start_us - self._packet.frame_start_chip(frame.frame) * lock.chip_us
+            done = transmitter.assembler.add(frame, packet_us, lock.chip_us)
+            self._counts["packets"] += len(done)
+            packets += done
+        return packets
+
+    def _decode_frame(self, transmitter: _Transmitter, start_us: float, end_us: float) -> Frame | None:
+        clock = [time.perf_counter()]
+        lock, track, packet = transmitter.lock, transmitter.track, self._packet
+        assert lock is not None
+        assert transmitter.number is not None
+        middles = start_us + (np.arange(packet.frame_chips) + 0.5) * lock.chip_us
+        x, y = track.at(middles)
+        pilot_middle = packet.pilot_chips // 2
+        width, height = track.size_at(middles[pilot_middle])
+        margin = 2 * self._link.regions.margin_px
+        size = (_even(width + margin), _even(height + margin))
+        pieces = [e for t, e in track.blocks if t < end_us and t + self._step_us > start_us]
+        sums = polarity_sums(pieces, lock, start_us, (x, y), size)
+        presence = self._separate(sums[: packet.pilot_chips])
+        self._tell("separation", presence, _lap(clock))
+        seen = presence.selected.any((1, 2)).mean()
+        if seen < self._link.regions.min_clusters_share:
+            return None
+        soft = self._decode(presence, sums[packet.pilot_chips :])
+        self._tell("decoding", soft, _lap(clock))
+        distance = self._measure(presence.pixels)
+        self._tell("ranging", distance, _lap(clock))
+        number, index = divmod(transmitter.frame, packet.frames)
+        frame = Frame(
+            transmitter=transmitter.number,
+            packet=number,
+            frame=index,
+            t_us=start_us,
+            soft=soft,
+            range=distance,
+            x_px=float(x[pilot_middle]),
+            y_px=float(y[pilot_middle]),
+        )
+        self._tell("frame", frame, clock[-1] - clock[0])
+        return frame
+
+    def _forget(self, transmitter: _Transmitter, now_us: float) -> None:
+        """Drop what no frame can need any more."""
+        if transmitter.lock is None:
+            packet_us = self._packet.packet_chips * self._packet.chip_us
+            keep_us = now_us - _LOOKBACK_PACKETS * packet_us
+            transmitter.track.first_us = max(transmitter.track.first_us, int(keep_us))
+        else:
+            # A later lock may move the next frame's start by a chip.
+            keep_us = self._frame_start_us(transmitter, transmitter.frame) - transmitter.lock.chip_us
+        transmitter.track.forget_before(keep_us, self._step_us)
+
+    def _release(self, track: Track) -> list[Packet]:
+        self._counts["regions_released"] += 1
+        return self._end(self._transmitters.pop(track.id))
+
+    def _end(self, transmitter: _Transmitter) -> list[Packet]:
+        packets = self._decode_due(transmitter, min(self._last_us, transmitter.track.latest.t_us + self._step_us))
+        rest = transmitter.assembler.flush()
+        self._counts["packets"] += len(rest)
+        return packets + rest
+
+    def _tell(self, stage: str, value: object, elapsed_s: float) -> None:
+        if self._announce is not None:
+            self._announce(stage=stage, value=value, elapsed_s=elapsed_s)
+
+
+def _even(size: float) -> int:
+    return 2 * math.ceil(size / 2)
+
+
+def _lap(clock: list[float]) -> float:
+    """Seconds since the last lap; `clock` keeps the first and the last time."""
+    now = time.perf_counter()
+    elapsed = now - clock[-1]
+    clock.append(now)
+    return elapsed

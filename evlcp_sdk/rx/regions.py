@@ -1,0 +1,271 @@
+"""Finds regions that blink at the chip rate and follows them while the camera moves.
+
+The frequency filter works per pixel on runs: the time between two changes of polarity. A code of the air
+interface has runs of one or two chips only, as many of the one as of the other on average. A lamp on AC mains
+or a PWM lamp of up to 2 kHz changes polarity every 250 us or slower, that is after 2.5 chips; a moving edge and
+a hot pixel, slower still. So a run of one chip raises a pixel's score, a run longer than two chips lowers
+it, and a run of two chips, which both kinds may have, leaves it. One pass, two numbers a pixel.
+"""
+
+from bisect import bisect_left
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from evlcp_sdk.config import RegionSpec
+from evlcp_sdk.geometry import CameraModel
+from evlcp_sdk.types import Events, Region
+
+__all__ = ["RegionTracker", "Track"]
+
+_CELL_SHIFT = 3
+"""Cells of 8 x 8 px: smaller than any bar in range (34 px at 100 m), and few enough to label each step."""
+
+_RUN_CHIPS = (0.4, 1.5, 2.7)
+"""Bounds between runs of noise, one chip, two chips, and slower. ON and OFF differ in delay by up to 0.3 chip."""
+
+_MEASURE_CHIPS = 4
+"""A blinking pixel changes polarity at least once in two chips; twice that allows for a missed event."""
+
+_BACKFILL_STEPS = 12
+"""Steps kept from before a region was found: a pixel needs about 1 ms to score, a region two steps."""
+
+_LONG_AGO_US = -(10**12)
+
+Box = tuple[int, int, int, int]
+Block = tuple[int, Events]
+
+
+@dataclass
+class Track:
+    """A region followed over time, and its events since the first.
+
+    Attributes:
+        id: Number of the region, from 0.
+        positions: Where it was measured, oldest first.
+        blocks: Its events, one entry a time step: (start of the step, us; events).
+        first_us: Start of the first step of which it has events, us.
+        released: True once it has faded or was merged into another; it gets no more events.
+    """
+
+    id: int
+    positions: deque[Region]
+    first_us: int
+    blocks: deque[Block] = field(default_factory=deque)
+    released: bool = False
+
+    @property
+    def latest(self) -> Region:
+        """The newest position."""
+        return self.positions[-1]
+
+    def at(self, t_us: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Centre (column, row) at times within the track, interpolated, px."""
+        t, x, y = np.array([(r.t_us, r.x_px, r.y_px) for r in self.positions]).T
+        return np.interp(t_us, t, x), np.interp(t_us, t, y)
+
+    def size_at(self, t_us: float) -> tuple[float, float]:
+        """(width, height) measured nearest to a time, px."""
+        times = [r.t_us for r in self.positions]
+        i = min(bisect_left(times, t_us), len(times) - 1)
+        if i and t_us - times[i - 1] < times[i] - t_us:
+            i -= 1
+        return self.positions[i].width_px, self.positions[i].height_px
+
+    def forget_before(self, t_us: float, step_us: int) -> None:
+        """Drop events and positions older than a time."""
+        while self.blocks and self.blocks[0][0] + step_us <= t_us:
+            self.blocks.popleft()
+        while len(self.positions) > 2 and self.positions[1].t_us < t_us:
+            self.positions.popleft()
+
+
+class RegionTracker:
+    """Streams time steps of events into tracks.
+
+    Args:
+        spec: Parameters.
+        camera: For the size of the sensor.
+        chip_us: Nominal length of a chip, us.
+    """
+
+    def __init__(self, spec: RegionSpec, camera: CameraModel, chip_us: float) -> None:
+        self._spec = spec
+        self._camera = camera
+        self._run_us = tuple(r * chip_us for r in _RUN_CHIPS)
+        self._measure_us = _MEASURE_CHIPS * chip_us
+        shape = (camera.height, camera.width)
+        self._flip_us = np.full(shape, _LONG_AGO_US, np.int64)
+        self._state = np.zeros(shape, np.int16)
+        self._hits = np.zeros([-(-n >> _CELL_SHIFT) for n in (camera.height + 7, camera.width + 7)], np.int32)
+        self._fresh: list[Box] = []
+        self._recent: deque[Block] = deque(maxlen=_BACKFILL_STEPS)
+        self._next_id = 0
+        self.tracks: list[Track] = []
+
+    def step(self, start_us: int, events: Events) -> list[Track]:
+        """Take the events of one time step; return the tracks that are alive or ended in it."""
+        from evlcp_sdk.rx import _kernels
+
+        spec = self._spec
+        self._recent.append((start_us, events))
+        self._hits[:] = 0
+        _kernels.score_pixels(
+            events.t_us,
+            events.x,
+            events.y,
+            events.p,
+            self._flip_us,
+            self._state,
+            self._hits,
+            self._run_us,
+            spec.min_score,
+            _CELL_SHIFT,
+        )
+        end_us = start_us + spec.block_us
+        for track in self.tracks:
+            track.blocks.append((start_us, self._select(events, self._reach(track.latest))))
+            self._follow(track, end_us)
+        self._merge()
+        self._open(end_us)
+        seen = list(self.tracks)
+        for track in self.tracks:
+            track.released |= end_us - track.latest.t_us > spec.fade_us
+        self.tracks = [track for track in self.tracks if not track.released]
+        return seen
+
+    def skip(self) -> None:
+        """Pass over a gap in time, with no track alive."""
+        self._fresh = []
+        self._recent.clear()
+
+    def _reach(self, region: Region) -> Box:
+        """The box in which a region's events lie within the next step."""
+        m = self._spec.margin_px
+        half_w, half_h = region.width_px / 2 + m, region.height_px / 2 + m
+        return (
+            max(int(region.x_px - half_w), 0),
+            max(int(region.y_px - half_h), 0),
+            min(int(region.x_px + half_w) + 1, self._camera.width),
+            min(int(region.y_px + half_h) + 1, self._camera.height),
+        )
+
+    def _select(self, events: Events, box: Box) -> Events:
+        from evlcp_sdk.rx import _kernels
+
+        n = len(events)
+        t, x, y, p = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
+        n = _kernels.select_box(events.t_us, events.x, events.y, events.p, box, t, x, y, p)
+        return Events(t[:n], x[:n], y[:n], p[:n])
+
+    def _measure(self, id: int, box: Box, end_us: int) -> Region | None:
+        """Centre and size of what blinks in a box at the end of a step."""
+        from evlcp_sdk.rx import _kernels
+
+        left, top, right, bottom = box
+        rows, columns = np.empty(bottom - top, np.int64), np.empty(right - left, np.int64)
+        # Half the score suffices inside a region: its seam is new to the light as the bar moves.
+        _kernels.active_profile(
+            self._flip_us,
+            self._state,
+            box,
+            end_us - self._measure_us,
+            self._spec.min_score // 2,
+            rows,
+            columns,
+        )
+        total = int(rows.sum())
+        if total < 4:
+            return None
+        lit = np.flatnonzero(rows)
+        # The outermost rows of a bar hold fewer blinking pixels: count them by their share of a full row.
+        full = float(np.median(rows[lit]))
+        first = top + lit[0] + 1 - min(rows[lit[0]] / full, 1)
+        last = top + lit[-1] + min(rows[lit[-1]] / full, 1)
+        across = np.flatnonzero(columns)
+        centre = left + float(columns @ np.arange(len(columns))) / total
+        return Region(
+            id=id,
+            t_us=end_us - self._measure_us / 2,
+            x_px=centre,
+            y_px=float(first + last - 1) / 2,
+            width_px=float(across[-1] - across[0] + 1),
+            height_px=float(last - first),
+        )
+
+    def _follow(self, track: Track, end_us: int) -> None:
+        measured = self._measure(track.id, self._reach(track.latest), end_us)
+        if measured is not None:
+            track.positions.append(measured)
+
+    def _open(self, end_us: int) -> None:
+        """Open a region where something blinks in two steps on end outside those known."""
+        hits = self._hits
+        merge = self._spec.merge_px
+        for track in self.tracks:
+            left, top, right, bottom = _grown(self._reach(track.latest), merge)
+            hits[top >> _CELL_SHIFT : (bottom >> _CELL_SHIFT) + 1, left >> _CELL_SHIFT : (right >> _CELL_SHIFT) + 1] = 0
+        if not hits.any():
+            self._fresh = []
+            return
+        near = np.ones((3, 3), bool)
+        areas, _ = ndimage.label(ndimage.binary_dilation(hits > 0, near, merge >> (_CELL_SHIFT + 1)), near)
+        boxes = []
+        for number, where in enumerate(ndimage.find_objects(areas), 1):
+            inside = np.where(areas[where] == number, hits[where], 0)
+            if inside.sum() < self._spec.min_events:
+                continue
+            v, u = np.nonzero(inside)
+            v, u = v + where[0].start, u + where[1].start
+            boxes.append(
+                (
+                    int(u.min()) << _CELL_SHIFT,
+                    int(v.min()) << _CELL_SHIFT,
+                    min(int(u.max() + 1) << _CELL_SHIFT, self._camera.width),
+                    min(int(v.max() + 1) << _CELL_SHIFT, self._camera.height),
+                )
+            )
+        fresh, self._fresh = self._fresh, []
+        for box in boxes:
+            if any(_overlap(_grown(box, merge), other) for other in fresh):
+                self._start(box, end_us)
+            else:
+                self._fresh.append(box)
+
+    def _start(self, box: Box, end_us: int) -> None:
+        region = self._measure(self._next_id, box, end_us)
+        if region is None:
+            return
+        self._next_id += 1
+        reach = self._reach(region)
+        blocks = deque((start, self._select(events, reach)) for start, events in self._recent)
+        self.tracks.append(Track(region.id, deque([region]), blocks[0][0], blocks))
+
+    def _merge(self) -> None:
+        """Keep the older of two regions that have grown together."""
+        for i, older in enumerate(self.tracks):
+            for younger in self.tracks[i + 1 :]:
+                if not younger.released and _overlap(_tight(older.latest), _tight(younger.latest)):
+                    younger.released = True
+        # The survivor reaches over both within a few steps, as its seam finds the other's pixels.
+
+
+def _tight(region: Region) -> Box:
+    return (
+        int(region.x_px - region.width_px / 2),
+        int(region.y_px - region.height_px / 2),
+        int(region.x_px + region.width_px / 2) + 1,
+        int(region.y_px + region.height_px / 2) + 1,
+    )
+
+
+def _grown(box: Box, by: int) -> Box:
+    left, top, right, bottom = box
+    return max(left - by, 0), max(top - by, 0), right + by, bottom + by
+
+
+def _overlap(a: Box, b: Box) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

@@ -1,0 +1,99 @@
+"""Loops over pixels and grid cells, compiled."""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def _value(first, second):
+    """The value b' of a chip pair's polarity sums: sign of the second chip, else b'' = -sign of the first."""
+    if second != 0:
+        return 1 if second > 0 else -1
+    if first != 0:
+        return -1 if first > 0 else 1
+    return 0
+
+
+@njit(cache=True, nogil=True)
+def presence(sums, codes, grid, agree, disagree, min_seen, out):
+    """Posterior probability of each cluster in each cell, `out` (K, rows, columns), against `no cluster`.
+
+    `agree` and `disagree` are the log-likelihood ratios of one value that fits a code or not.
+    """
+    clusters, length = codes.shape
+    _, rows, columns = out.shape
+    values = np.empty(length, np.int64)
+    for r in range(rows):
+        for c in range(columns):
+            seen = 0
+            for i in range(length):
+                first = 0
+                second = 0
+                for v in range(r * grid, (r + 1) * grid):
+                    for u in range(c * grid, (c + 1) * grid):
+                        first += sums[2 * i, v, u]
+                        second += sums[2 * i + 1, v, u]
+                values[i] = _value(first, second)
+                seen += values[i] != 0
+            if seen < min_seen:
+                continue
+            top = 0.0
+            for k in range(clusters):
+                fit = 0
+                for i in range(length):
+                    fit += codes[k, i] * values[i]
+                likelihood = agree * (seen + fit) / 2 + disagree * (seen - fit) / 2
+                out[k, r, c] = likelihood
+                top = max(top, likelihood)
+            norm = clusters * np.exp(-top)
+            for k in range(clusters):
+                norm += np.exp(out[k, r, c] - top)
+            for k in range(clusters):
+                out[k, r, c] = np.exp(out[k, r, c] - top) / norm
+
+
+@njit(cache=True, nogil=True)
+def pixel_maps(sums, codes, grid, selected, out):
+    """Pilot correlation of the pixels in each cluster's selected cells and their neighbours, 0 to 1."""
+    clusters, length = codes.shape
+    _, rows, columns = selected.shape
+    for r in range(rows):
+        for c in range(columns):
+            for k in range(clusters):
+                wanted = False
+                for rr in range(max(r - 1, 0), min(r + 2, rows)):
+                    for cc in range(max(c - 1, 0), min(c + 2, columns)):
+                        wanted |= selected[k, rr, cc]
+                if not wanted:
+                    continue
+                for v in range(r * grid, (r + 1) * grid):
+                    for u in range(c * grid, (c + 1) * grid):
+                        fit = 0
+                        for i in range(length):
+                            fit += codes[k, i] * _value(sums[2 * i, v, u], sums[2 * i + 1, v, u])
+                        out[k, v, u] = max(fit, 0) / length
+
+
+@njit(cache=True, nogil=True)
+def weighted_values(sums, probability, grid, least, out):
+    """Presence-weighted sum of the values of the info chips, `out` (K, values)."""
+    clusters, rows, columns = probability.shape
+    length = out.shape[1]
+    values = np.empty(length, np.int64)
+    for r in range(rows):
+        for c in range(columns):
+            top = 0.0
+            for k in range(clusters):
+                top = max(top, probability[k, r, c])
+            if top < least:
+                continue
+            values[:] = 0
+            for v in range(r * grid, (r + 1) * grid):
+                for u in range(c * grid, (c + 1) * grid):
+                    for i in range(length):
+                        values[i] += _value(sums[2 * i, v, u], sums[2 * i + 1, v, u])
+            for k in range(clusters):
+                weight = probability[k, r, c]
+                if weight >= least:
+                    for i in range(length):
+                        out[k, i] += weight * values[i]

@@ -1,0 +1,56 @@
+"""What the info segment of each cluster says."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from evlcp_sdk.abc import Decode, Decoding
+from evlcp_sdk.codebook import Codebook
+from evlcp_sdk.types import PresenceMap, SoftSymbols
+
+__all__ = ["WhTransform"]
+
+
+@dataclass(frozen=True)
+class WhTransform(Decoding):
+    """Presence-weighted sum of the info values, correlated with every codeword (arXiv 2510.17203).
+
+    For the WH profiles that correlation is a Walsh-Hadamard transform. Log-likelihood ratios are those of
+    the best codewords (max-log) on a Gaussian channel whose amplitude and noise are taken from the frame.
+    """
+
+    min_weight: Annotated[
+        float, Field(gt=0, lt=1, description="Presence probability below which a cell is passed over.")
+    ] = 0.01
+
+    def compile(self, codebook: Codebook) -> Decode:
+        """Precompute for a codebook's codewords."""
+        words = codebook.codewords.astype(np.float64)
+        length, m = words.shape[1], codebook.bits_per_symbol
+        ones = (np.arange(len(words))[:, None] >> np.arange(m - 1, -1, -1) & 1).astype(bool)
+
+        def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
+            from evlcp_wh import _kernels
+
+            values = np.zeros((len(presence.probability), length))
+            _kernels.weighted_values(
+                sums, presence.probability, presence.grid_px, self.min_weight, values
+            )
+            fit = values @ words.T
+            symbols = fit.argmax(1)
+            energy = float((values**2).sum())
+            amplitude = fit.max(1) / length
+            explained = float((amplitude**2).sum()) * length
+            # One noise-to-signal ratio a frame: eight values a cluster are too few for one each.
+            noise = max(energy - explained, 1e-3 * energy) / max(explained, 1e-9)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                scale = np.where(amplitude > 0, 1 / (amplitude * noise), 0.0)
+            zero = np.stack([np.where(ones[:, b], -np.inf, fit).max(1) for b in range(m)], 1)
+            one = np.stack([np.where(ones[:, b], fit, -np.inf).max(1) for b in range(m)], 1)
+            llr = ((zero - one) * scale[:, None]).astype(np.float32)
+            return SoftSymbols(symbols, llr, explained / energy if energy else 0.0)
+
+        return decode

@@ -1,0 +1,54 @@
+"""Which cluster does a part of the image show."""
+
+from dataclasses import dataclass
+from math import log
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from evlcp_sdk.abc import Separate, Separation
+from evlcp_sdk.codebook import Codebook
+from evlcp_sdk.types import PresenceMap
+
+__all__ = ["WhCorrelation"]
+
+
+@dataclass(frozen=True)
+class WhCorrelation(Separation):
+    """Correlation of each grid cell's values with every pilot, as a probability (arXiv 2510.17203).
+
+    A cell shows one cluster or none. If one, each of its values agrees with that cluster's pilot but for
+    an error; if none, values are coin tosses. Bayes' rule with equal priors gives the probabilities.
+    """
+
+    grid_px: Annotated[int, Field(ge=2, le=16, description="Side of a grid cell.")] = 2
+    value_error: Annotated[
+        float, Field(gt=0, lt=0.5, description="Probability that a cell's value is seen wrong.")
+    ] = 0.1
+    min_values: Annotated[
+        int, Field(ge=1, description="Values that must be seen in a cell for it to show a cluster.")
+    ] = 4
+    min_probability: Annotated[
+        float, Field(gt=0, lt=1, description="Presence probability that selects a cell.")
+    ] = 0.5
+
+    def compile(self, codebook: Codebook) -> Separate:
+        """Precompute for a codebook's pilots."""
+        codes = codebook.pilots.astype(np.int64)
+        agree, disagree = log((1 - self.value_error) / 0.5), log(self.value_error / 0.5)
+
+        def separate(sums: NDArray[np.int16]) -> PresenceMap:
+            from evlcp_wh import _kernels
+
+            _, height, width = sums.shape
+            rows, columns = height // self.grid_px, width // self.grid_px
+            probability = np.zeros((len(codes), rows, columns), np.float32)
+            _kernels.presence(sums, codes, self.grid_px, agree, disagree, self.min_values, probability)
+            selected = probability >= self.min_probability
+            pixels = np.zeros((len(codes), height, width), np.float32)
+            _kernels.pixel_maps(sums, codes, self.grid_px, selected, pixels)
+            return PresenceMap(probability, self.grid_px, selected, pixels)
+
+        return separate
