@@ -1,7 +1,28 @@
 """Recordings and cameras in and out: EVT2 and EVT3 RAW files, tables, and other formats through `faery`."""
 
-from evlcp_sdk.io.files import open_events, read_events
-from evlcp_sdk.io.raw import RawSource
-from evlcp_sdk.io.sources import EventSource, Loss
+from evlcp_sdk.io.faery import FaerySource
+from evlcp_sdk.io.files import open_events, open_writer, read_events, write_events
+from evlcp_sdk.io.raw import RawHeader, RawSource, RawWriter
+from evlcp_sdk.io.sources import DEFAULT_MAX_EVENTS, EventSource, Loss, ReplaySource
+from evlcp_sdk.io.tables import CsvSource, CsvWriter, NpzSource, NpzWriter
+from evlcp_sdk.io.writers import EventWriter
 
-__all__ = ["EventSource", "Loss", "RawSource", "open_events", "read_events"]
+__all__ = [
+    "DEFAULT_MAX_EVENTS",
+    "CsvSource",
+    "CsvWriter",
+    "EventSource",
+    "EventWriter",
+    "FaerySource",
+    "Loss",
+    "NpzSource",
+    "NpzWriter",
+    "RawHeader",
+    "RawSource",
+    "RawWriter",
+    "ReplaySource",
+    "open_events",
+    "open_writer",
+    "read_events",
+    "write_events",
+]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.io import _words as words_
+from evlcp_sdk.io import _words
 from evlcp_sdk.io.sources import Loss
 from evlcp_sdk.types import Events, Triggers
 
@@ -29,6 +29,8 @@ class Codec:
         burst: Most events that one word may bring.
         types: The word types that exist; the top 4 bits of a word.
         channels: Trigger inputs that a word can name.
+        time_bits: Bits of TIME_HIGH, and of the time below it.
+        rollover: Words with which the clock rolls over once and stands at 0.
         decoder: Name of its decoding kernel in `evlcp_sdk.io._kernels`.
         encoder: Name of its encoding kernel there.
     """
@@ -39,6 +41,8 @@ class Codec:
     burst: int
     types: frozenset[int]
     channels: int
+    time_bits: tuple[int, int]
+    rollover: tuple[int, ...]
     decoder: str
     encoder: str
 
@@ -47,11 +51,15 @@ class Codec:
         kernel: Callable[..., Any] = getattr(importlib.import_module("evlcp_sdk.io._kernels"), name)
         return kernel
 
-    def reserved_share(self, words: NDArray[Any]) -> tuple[int, float]:
-        """Return how many of `words` have a type that does not exist, and their share."""
-        kinds = np.bincount((words >> (8 * self.word.itemsize - 4)).astype(np.uint8), minlength=16)
-        reserved = int(sum(kinds[k] for k in range(16) if k not in self.types))
-        return reserved, reserved / max(len(words), 1)
+    def prelude(self, first_us: int) -> tuple[NDArray[Any], int]:
+        """Return the words before a first time, and the number of the TIME_HIGH that they end with."""
+        high, low = self.time_bits
+        rollovers = first_us >> (high + low)
+        return np.array(self.rollover * rollovers, self.word), (first_us >> low) - 1
+
+    def reserved(self, words: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which of `words` are of a type that does not exist."""
+        return np.isin(words >> (8 * self.word.itemsize - 4), list(self.types), invert=True)
 
 
 class Columns:
@@ -89,17 +97,17 @@ class Decoder:
     def __init__(self, codec: Codec, width: int | None, height: int | None) -> None:
         self.codec = codec
         self._bounds = (width or MAX_SIDE, height or MAX_SIDE)
-        self._state = np.zeros(words_.STATE_SLOTS, np.int64)
-        self._state[words_.BASE] = words_.UNKNOWN_TIME
-        self._state[words_.ROW] = words_.UNKNOWN_ROW
-        self._state[words_.COLUMN] = words_.UNKNOWN_COLUMN
-        self._tally = np.zeros((words_.TALLY_ROWS, 2), np.int64)
+        self._state = np.zeros(_words.STATE_SLOTS, np.int64)
+        self._state[_words.BASE] = _words.UNKNOWN_TIME
+        self._state[_words.PACKED] = _words.UNKNOWN_ROW << _words.PACKED_ROW
+        self._state[_words.COLUMN] = _words.UNKNOWN_COLUMN
+        self._tally = np.zeros((_words.TALLY_ROWS, 2), np.int64)
         self._kernel = codec.kernel(codec.decoder)
 
     @property
     def has_time(self) -> bool:
         """Whether a TIME_HIGH has come by."""
-        return bool(self._state[words_.BASE] != words_.UNKNOWN_TIME)
+        return bool(self._state[_words.BASE] != _words.UNKNOWN_TIME)
 
     def decode(self, words: NDArray[Any], at: int, out: Columns) -> int:
         """Decode `words`, whose first is at byte `at`, behind what is in `out`; return how many were used.
@@ -127,10 +135,10 @@ class Decoder:
     def finish(self, at: int, odd_bytes: int) -> None:
         """Take note of how the stream ends: at byte `at`, with `odd_bytes` that make no word."""
         if odd_bytes:
-            self.note(words_.ODD_BYTES, at, odd_bytes)
-        if self._state[words_.VECTOR_LEFT]:
-            self.note(words_.VECTOR_CUT, int(self._state[words_.VECTOR_AT]))
-            self._state[words_.VECTOR_LEFT] = 0
+            self.note(_words.ODD_BYTES, at, odd_bytes)
+        if self._state[_words.VECTOR_LEFT]:
+            self.note(_words.VECTOR_CUT, int(self._state[_words.VECTOR_AT]))
+            self._state[_words.VECTOR_LEFT] = 0
 
     def note(self, row: int, at: int, count: int = 1) -> None:
         """Count a loss, at byte `at`."""
@@ -143,7 +151,7 @@ class Decoder:
         """As `EventSource.losses`."""
         return {
             name: Loss(int(count), int(first), "byte", meaning)
-            for name, (row, meaning) in words_.LOSSES.items()
+            for name, (row, meaning) in _words.LOSSES.items()
             for count, first in [self._tally[row]]
             if count
         }
@@ -151,4 +159,4 @@ class Decoder:
     @property
     def counts(self) -> dict[str, int]:
         """The format's own part of `EventSource.counts`."""
-        return {name: int(self._tally[row, 0]) for name, (row, _) in words_.COUNTS.items()}
+        return {name: int(self._tally[row, 0]) for name, (row, _) in _words.COUNTS.items()}

@@ -1,10 +1,13 @@
 """Every numba kernel of `evlcp_sdk.io`; imported only when a file is decoded or encoded.
 
-Indices that advance in a loop are `np.uintp`: numba then leaves out its test for negative indices.
+Indices that advance in a loop are `uintp`: numba then leaves out its test for negative indices.
 """
+
+from typing import Any
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from evlcp_sdk.io._words import (
     BASE,
@@ -28,13 +31,18 @@ from evlcp_sdk.io._words import (
     EVT3_VECT_12,
     EVT3_VECT_BASE_X,
     LAST,
-    LOW,
     OTHER_WORDS,
     OUTSIDE_SENSOR,
+    PACKED,
+    PACKED_CARRY,
+    PACKED_COLUMN,
+    PACKED_HIGH,
+    PACKED_LOW,
+    PACKED_POLARITY,
+    PACKED_ROW,
     POLARITY,
     RESERVED,
     ROLLOVERS,
-    ROW,
     ROW_UNKNOWN,
     TIME_BACKWARD,
     TIME_GAPS,
@@ -46,54 +54,150 @@ from evlcp_sdk.io._words import (
     VECTOR_LEFT,
 )
 
-__all__ = ["decode_evt2", "decode_evt3"]
+__all__ = ["decode_evt2", "decode_evt3", "encode_evt2", "encode_evt3", "format_csv", "parse_csv"]
 
-ONE = np.uintp(1)
+Column = NDArray[Any]
+Integer = Any  # int to Python, int64 to numba
+int64: Any = np.int64
+uint16: Any = np.uint16
+uint32: Any = np.uint32
+uintp: Any = np.uintp
+ONE = uintp(1)
+
+BLOCK_WORDS = 512
+BURST = 12
+
+# How a word of the three types that make up most of a file changes the packed event: what to keep and where
+# to put its 12 bits.
 COMMON = 1 << EVT3_ADDR_Y | 1 << EVT3_ADDR_X | 1 << EVT3_TIME_LOW
+KEEP = np.full(16, -1)
+SHIFT = np.zeros(16, int64)
+KEEP[EVT3_ADDR_Y], SHIFT[EVT3_ADDR_Y] = ~(0xFFFF << PACKED_ROW), PACKED_ROW
+KEEP[EVT3_ADDR_X], SHIFT[EVT3_ADDR_X] = ~(0xFFFF << PACKED_COLUMN), PACKED_COLUMN
+KEEP[EVT3_TIME_LOW], SHIFT[EVT3_TIME_LOW] = ~(0xFFF << PACKED_LOW), PACKED_LOW
 
 
 @njit(cache=True, nogil=True)
-def _note(tally, row, at):
+def _note(tally: Column, row: Integer, at: Integer) -> None:
     if tally[row, 0] == 0:
         tally[row, 1] = at
     tally[row, 0] += 1
 
 
 @njit(cache=True, nogil=True)
-def _next_base(base, high, high_bits, low_bits, at, tally):
-    """Return the time of a TIME_HIGH word that differs from the one before, us."""
-    before = (base >> low_bits) & ((1 << high_bits) - 1)
-    step = high - before
-    if step <= -(1 << (high_bits - 1)):
-        base += 1 << (high_bits + low_bits)
-        step += 1 << high_bits
-        _note(tally, ROLLOVERS, at)
-    if step < 0:
+def _rolls_over(before: Integer, high: Integer, bits: Integer, at: Integer, tally: Column) -> Any:
+    """Whether a TIME_HIGH below the one before is a rollover, noted as that or as a glitch."""
+    if before - high < 1 << (bits - 1):
         _note(tally, TIME_GLITCH, at)
-    elif step > 1:
-        _note(tally, TIME_GAPS, at)
-    return base + ((high - before) << low_bits)
+        return False
+    _note(tally, ROLLOVERS, at)
+    return True
 
 
 @njit(cache=True, nogil=True)
-def _sound(t, x, y, start, stop, width, height, last):
-    """Whether all of the events start..stop are on the sensor and none is earlier than the one before."""
-    if stop == start:
-        return True
-    first, end = np.uintp(start), np.uintp(stop)
-    right = bottom = np.uint16(0)
-    step = t[first] - last
-    for k in range(first, end):
-        right = max(right, x[k])
-    for k in range(first, end):
-        bottom = max(bottom, y[k])
-    for k in range(first + ONE, end):
-        step = min(step, t[k] - t[k - ONE])
-    return right < width and bottom < height and step >= 0
+def _pack_evt3(
+    words: Column, start: Integer, stop: Integer, at: Integer, state: Column, tally: Column, packed: Column
+) -> tuple[Integer, Integer]:
+    """Decode words start..stop to packed events, unchecked, up to the first that is not of the sensor's.
+
+    Those are all but events and times that do not step back. Returns where it stopped and how many events.
+    """
+    event, column, polarity = state[PACKED], state[COLUMN], state[POLARITY]
+    left, vector_at = state[VECTOR_LEFT], state[VECTOR_AT]
+    i, end, n = uintp(start), uintp(stop), uintp(0)
+    while i < end:
+        w = int64(words[i])
+        kind = uintp(w >> 12)
+        if (COMMON >> kind) & 1:
+            # Which of the three it is cannot be predicted, so nothing branches on it: each puts its bits in
+            # the packed event and writes that, and only an ADDR_X moves on.
+            event = (event & KEEP[kind]) | ((w & 0xFFF) << SHIFT[kind])
+            packed[n] = event
+            n += uintp(kind == EVT3_ADDR_X)
+        elif kind in (EVT3_VECT_12, EVT3_VECT_8):
+            size = 12 if kind == EVT3_VECT_12 else 8
+            mask = w & ((1 << size) - 1)
+            rest = (event & KEEP[EVT3_ADDR_X]) | polarity << PACKED_POLARITY
+            k = column
+            while mask:
+                packed[n] = rest | (k & 0x7FF) | (k >> 11) << PACKED_CARRY
+                n += uintp(mask & 1)
+                mask >>= 1
+                k += 1
+            column = min(column + size, UNKNOWN_COLUMN)
+            left = max(left - 1, 0) if size == 12 else 0
+        elif kind == EVT3_VECT_BASE_X:
+            if left:
+                _note(tally, VECTOR_CUT, vector_at)
+            column = w & 0x7FF
+            polarity = (w >> 11) & 1
+            left = 3
+            vector_at = at + 2 * int64(i)
+        elif kind == EVT3_TIME_HIGH and w & 0xFFF >= event >> PACKED_HIGH:
+            step = (w & 0xFFF) - (event >> PACKED_HIGH)
+            if step > 1:
+                _note(tally, TIME_GAPS, at + 2 * int64(i))
+            if step:
+                event = (event & 0xFFFFFFFF) | (w & 0xFFF) << PACKED_HIGH
+        else:
+            break
+        i += ONE
+    state[PACKED], state[COLUMN], state[POLARITY] = event, column, polarity
+    state[VECTOR_LEFT], state[VECTOR_AT] = left, vector_at
+    return int64(i), int64(n)
 
 
 @njit(cache=True, nogil=True)
-def _sift(words, word, at, t, x, y, p, start, stop, width, height, last, tally):
+def _unpack_evt3(
+    packed: Column,
+    count: Integer,
+    base: Integer,
+    t: Column,
+    x: Column,
+    y: Column,
+    p: Column,
+    first: Integer,
+    width: Integer,
+    height: Integer,
+    last: Integer,
+) -> Any:
+    """Write packed events to the columns from row `first` on.
+
+    Returns whether all of them are on the sensor and none is earlier than the one before.
+    """
+    row, end = uintp(first), uintp(count)
+    right = bottom = uint16(0)
+    for k in range(end):
+        t[row + k] = base + (packed[k] >> PACKED_LOW)
+    for k in range(end):
+        e = uint32(packed[k])
+        p[row + k] = (e >> PACKED_POLARITY) & 1
+        x[row + k] = (e & 0x7FF) | ((e >> PACKED_CARRY) & 0xF) << 11
+        y[row + k] = (e >> PACKED_ROW) & 0x87FF
+        right = max(right, x[row + k])
+        bottom = max(bottom, y[row + k])
+    step = t[row] - last if count else int64(0)
+    for k in range(ONE, end):
+        step = min(step, t[row + k] - t[row + k - ONE])
+    return (right < width and bottom < height and step >= 0) or count == 0
+
+
+@njit(cache=True, nogil=True)
+def _sift(
+    words: Column,
+    word: Integer,
+    at: Integer,
+    t: Column,
+    x: Column,
+    y: Column,
+    p: Column,
+    start: Integer,
+    stop: Integer,
+    width: Integer,
+    height: Integer,
+    last: Integer,
+    tally: Column,
+) -> Integer:
     """Close up the events start..stop (from words[word] on) over those to drop; return the new end."""
     n = start
     for k in range(start, stop):
@@ -118,14 +222,14 @@ def _sift(words, word, at, t, x, y, p, start, stop, width, height, last, tally):
 
 
 @njit(cache=True, nogil=True)
-def _word_of_event(words, word, event):
+def _word_of_event(words: Column, word: Integer, event: Integer) -> Integer:
     """Return the index of the word that brings an event, counted from words[word] on."""
     while True:
-        w = np.int64(words[word])
+        w = int64(words[word])
         kind = w >> 12
-        bits = 0
+        bits = int64(0)
         if kind == EVT3_ADDR_X:
-            bits = 1
+            bits = int64(1)
         elif kind == EVT3_VECT_12:
             bits = w & 0xFFF
         elif kind == EVT3_VECT_8:
@@ -139,65 +243,24 @@ def _word_of_event(words, word, event):
 
 
 @njit(cache=True, nogil=True)
-def _decode_evt3_run(words, start, stop, at, state, tally, t, x, y, p, n):
-    """Decode words start..stop without a check, up to the first that is neither an event nor a time.
-
-    Returns where it stopped and the new number of events. The columns need room for 12 events a word.
-    """
-    base, low, row = state[BASE], state[LOW], state[ROW]
-    column, polarity = state[COLUMN], state[POLARITY]
-    left, vector_at = state[VECTOR_LEFT], state[VECTOR_AT]
-    i, end, n = np.uintp(start), np.uintp(stop), np.uintp(n)
-    while i < end:
-        w = np.int64(words[i])
-        kind = w >> 12
-        if (COMMON >> kind) & 1:
-            # Which of the three it is cannot be predicted, so there is no branch on it: every word is
-            # written as an event, and only an ADDR_X moves on. Types 0, 2, 6 differ in bits 13 and 14.
-            row ^= (row ^ (w & 0x7FF)) & (((w >> 13) & 1) - 1)
-            low = w & 0xFFF if w & 0x4000 else low
-            t[n] = base + low
-            x[n] = w & 0x7FF
-            y[n] = row
-            p[n] = (w >> 11) & 1
-            n += np.uintp((w & 0x6000) == 0x2000)
-        elif kind == EVT3_VECT_12 or kind == EVT3_VECT_8:
-            size = 12 if kind == EVT3_VECT_12 else 8
-            mask = w & ((1 << size) - 1)
-            k = column
-            while mask:
-                t[n] = base + low
-                x[n] = k
-                y[n] = row
-                p[n] = polarity
-                n += np.uintp(mask & 1)
-                mask >>= 1
-                k += 1
-            column = min(column + size, UNKNOWN_COLUMN)
-            left = max(left - 1, 0) if size == 12 else 0
-        elif kind == EVT3_VECT_BASE_X:
-            if left:
-                _note(tally, VECTOR_CUT, vector_at)
-            column = w & 0x7FF
-            polarity = (w >> 11) & 1
-            left = 3
-            vector_at = at + 2 * np.int64(i)
-        elif kind == EVT3_TIME_HIGH:
-            if (base >> 12) & 0xFFF != w & 0xFFF:
-                base = _next_base(base, w & 0xFFF, 12, 12, at + 2 * np.int64(i), tally)
-                low = 0
-        else:
-            break
-        i += ONE
-    state[BASE], state[LOW], state[ROW] = base, low, row
-    state[COLUMN], state[POLARITY] = column, polarity
-    state[VECTOR_LEFT], state[VECTOR_AT] = left, vector_at
-    return np.int64(i), np.int64(n)
-
-
-@njit(cache=True, nogil=True)
-def decode_evt3(words, at, width, height, state, tally, t, x, y, p, n, trigger_t, channel, value, m):
-    """Decode EVT3 words until they or the columns' room run out.
+def decode_evt3(
+    words: Column,
+    at: Integer,
+    width: Integer,
+    height: Integer,
+    state: Column,
+    tally: Column,
+    t: Column,
+    x: Column,
+    y: Column,
+    p: Column,
+    n: Integer,
+    trigger_t: Column,
+    channel: Column,
+    value: Column,
+    m: Integer,
+) -> tuple[Integer, Integer, Integer]:
+    """Decode EVT3 words until they run out, or the columns' room for 12 events or for a trigger does.
 
     Args:
         words: uint16 (k,).
@@ -219,49 +282,77 @@ def decode_evt3(words, at, width, height, state, tally, t, x, y, p, n, trigger_t
     Returns:
         Words used, events and triggers now in the columns.
     """
+    packed = np.empty(BLOCK_WORDS * BURST, int64)
     i = 0
     if state[BASE] < 0:
         while i < len(words) and words[i] >> 12 != EVT3_TIME_HIGH:
             _note(tally, BEFORE_TIME, at + 2 * i)
             i += 1
         if i < len(words):
-            state[BASE] = (np.int64(words[i]) & 0xFFF) << 12
+            state[BASE] = 0
+            state[PACKED] |= (int64(words[i]) & 0xFFF) << PACKED_HIGH
             i += 1
-    while i < len(words) and n <= len(t) - 12 and m < len(trigger_t):
+    while i < len(words) and n <= len(t) - BURST and m < len(trigger_t):
         start, first = i, n
-        stop = i + min(len(words) - i, (len(t) - n) // 12)
-        i, n = _decode_evt3_run(words, start, stop, at, state, tally, t, x, y, p, n)
-        if not _sound(t, x, y, first, n, width, height, state[LAST]):
+        stop = i + min(len(words) - i, (len(t) - n) // BURST, BLOCK_WORDS)
+        i, count = _pack_evt3(words, start, stop, at, state, tally, packed)
+        n += count
+        if not _unpack_evt3(packed, count, state[BASE], t, x, y, p, first, width, height, state[LAST]):
             n = _sift(words, start, at, t, x, y, p, first, n, width, height, state[LAST], tally)
         if n > first:
             state[LAST] = t[n - 1]
         if i == stop:
             continue
-        w = np.int64(words[i])
+        w = int64(words[i])
         kind = w >> 12
-        if kind == EVT3_EXT_TRIGGER:
-            clock = state[BASE] + state[LOW]
+        here = at + 2 * i
+        if kind == EVT3_TIME_HIGH:
+            high = w & 0xFFF
+            before = state[PACKED] >> PACKED_HIGH
+            if _rolls_over(before, high, 12, here, tally):
+                state[BASE] += 1 << 24
+                if high + 4096 - before > 1:
+                    _note(tally, TIME_GAPS, here)
+            state[PACKED] = (state[PACKED] & 0xFFFFFFFF) | high << PACKED_HIGH
+        elif kind == EVT3_EXT_TRIGGER:
+            clock = state[BASE] + (state[PACKED] >> PACKED_LOW)
             if clock < state[LAST]:
-                _note(tally, TIME_BACKWARD, at + 2 * i)
+                _note(tally, TIME_BACKWARD, here)
             else:
                 trigger_t[m], channel[m], value[m] = clock, (w >> 8) & 0xF, w & 1
                 state[LAST] = clock
                 m += 1
-        elif kind == EVT3_OTHERS or kind == EVT3_CONTINUED_4 or kind == EVT3_CONTINUED_12:
-            _note(tally, OTHER_WORDS, at + 2 * i)
+        elif kind in (EVT3_OTHERS, EVT3_CONTINUED_4, EVT3_CONTINUED_12):
+            _note(tally, OTHER_WORDS, here)
         else:
-            _note(tally, RESERVED, at + 2 * i)
+            _note(tally, RESERVED, here)
         i += 1
     return i, n, m
 
 
 @njit(cache=True, nogil=True)
-def decode_evt2(words, at, width, height, state, tally, t, x, y, p, n, trigger_t, channel, value, m):
+def decode_evt2(
+    words: Column,
+    at: Integer,
+    width: Integer,
+    height: Integer,
+    state: Column,
+    tally: Column,
+    t: Column,
+    x: Column,
+    y: Column,
+    p: Column,
+    n: Integer,
+    trigger_t: Column,
+    channel: Column,
+    value: Column,
+    m: Integer,
+) -> tuple[Integer, Integer, Integer]:
     """Decode EVT2 words (uint32) until they or the columns' room run out; as `decode_evt3`."""
     base, last = state[BASE], state[LAST]
     i = 0
     while i < len(words) and n < len(t) and m < len(trigger_t):
-        w = np.int64(words[i])
+        w = int64(words[i])
         kind = w >> 28
         here = at + 4 * i
         clock = base + ((w >> 22) & 0x3F)
@@ -272,8 +363,11 @@ def decode_evt2(words, at, width, height, state, tally, t, x, y, p, n, trigger_t
             high = w & 0xFFFFFFF
             if base < 0:
                 base = high << 6
-            elif (base >> 6) & 0xFFFFFFF != high:
-                base = _next_base(base, high, 28, 6, here, tally)
+                continue
+            before = (base >> 6) & 0xFFFFFFF
+            if high < before and _rolls_over(before, high, 28, here, tally):
+                base += 1 << 34
+            base += (high - before) << 6
         elif base < 0:
             _note(tally, BEFORE_TIME, here)
         elif kind <= EVT2_CD_ON:
@@ -292,9 +386,225 @@ def decode_evt2(words, at, width, height, state, tally, t, x, y, p, n, trigger_t
                 trigger_t[m], channel[m], value[m] = clock, (w >> 8) & 0x1F, w & 1
                 last = clock
                 m += 1
-        elif kind == EVT2_OTHERS or kind == EVT2_CONTINUED:
+        elif kind in (EVT2_OTHERS, EVT2_CONTINUED):
             _note(tally, OTHER_WORDS, here)
         else:
             _note(tally, RESERVED, here)
     state[BASE], state[LAST] = base, last
     return i, n, m
+
+
+@njit(cache=True, nogil=True)
+def encode_evt3(
+    words: Column,
+    width: Integer,
+    state: Column,
+    t: Column,
+    x: Column,
+    y: Column,
+    p: Column,
+    i: Integer,
+    trigger_t: Column,
+    channel: Column,
+    value: Column,
+    j: Integer,
+) -> tuple[Integer, Integer, Integer]:
+    """Encode the events from i and the triggers from j on, by time, until they or `words` run out.
+
+    Args:
+        words: uint16 (k,) to fill; k >= 8.
+        width: Columns of the sensor.
+        state: int64 (3,), carried from call to call: the number of the last TIME_HIGH, the last TIME_LOW
+            and the last ADDR_Y, each -1 if there was none.
+        t: Column of events, int64, sorted; so x, y (uint16), p (uint8).
+        x: See t.
+        y: See t.
+        p: See t.
+        i: First event to encode.
+        trigger_t: Column of triggers, int64, sorted; so channel, value (uint8).
+        channel: See trigger_t.
+        value: See trigger_t.
+        j: First trigger to encode.
+
+    Returns:
+        Words written, the events and the triggers done.
+    """
+    step, low, row = state[0], state[1], state[2]
+    n = 0
+    while (i < len(t) or j < len(trigger_t)) and n <= len(words) - 8:
+        is_trigger = j < len(trigger_t) and (i == len(t) or trigger_t[j] <= t[i])
+        clock = trigger_t[j] if is_trigger else t[i]
+        stepped = step < clock >> 12
+        if stepped:
+            step += 1
+            words[n] = EVT3_TIME_HIGH << 12 | (step & 0xFFF)
+            n += 1
+        due = clock & 0xFFF if step == clock >> 12 else 0
+        if stepped or low != due:
+            low = due
+            row = -1
+            words[n] = EVT3_TIME_LOW << 12 | low
+            n += 1
+        if step < clock >> 12:
+            continue
+        if is_trigger:
+            words[n] = EVT3_EXT_TRIGGER << 12 | int64(channel[j]) << 8 | value[j]
+            n += 1
+            j += 1
+            continue
+        if row != y[i]:
+            row = int64(y[i])
+            words[n] = EVT3_ADDR_Y << 12 | row
+            n += 1
+        base = min(int64(x[i]), width - 32)
+        stop = i + 1
+        while (
+            stop < len(t)
+            and t[stop] == clock
+            and y[stop] == row
+            and p[stop] == p[i]
+            and x[stop - 1] < x[stop] < base + 32
+        ):
+            stop += 1
+        if stop - i <= 4 or base < 0:  # a vector takes 4 words
+            words[n] = EVT3_ADDR_X << 12 | int64(p[i]) << 11 | x[i]
+            n += 1
+            i += 1
+            continue
+        mask = 0
+        while i < stop:
+            mask |= 1 << (x[i] - base)
+            i += 1
+        words[n] = EVT3_VECT_BASE_X << 12 | int64(p[i - 1]) << 11 | base
+        words[n + 1] = EVT3_VECT_12 << 12 | (mask & 0xFFF)
+        words[n + 2] = EVT3_VECT_12 << 12 | ((mask >> 12) & 0xFFF)
+        words[n + 3] = EVT3_VECT_8 << 12 | (mask >> 24)
+        n += 4
+    state[0], state[1], state[2] = step, low, row
+    return n, i, j
+
+
+@njit(cache=True, nogil=True)
+def encode_evt2(
+    words: Column,
+    _width: Integer,
+    state: Column,
+    t: Column,
+    x: Column,
+    y: Column,
+    p: Column,
+    i: Integer,
+    trigger_t: Column,
+    channel: Column,
+    value: Column,
+    j: Integer,
+) -> tuple[Integer, Integer, Integer]:
+    """Encode to EVT2 words (uint32); as `encode_evt3`, but the last TIME_HIGH is all the state."""
+    step = state[0]
+    n = 0
+    while (i < len(t) or j < len(trigger_t)) and n <= len(words) - 2:
+        is_trigger = j < len(trigger_t) and (i == len(t) or trigger_t[j] <= t[i])
+        clock = trigger_t[j] if is_trigger else t[i]
+        if step < clock >> 6:
+            far = (
+                step >= 0 and (clock >> 6) - step > 1 << 26
+            )  # further on, a rollover would look like a glitch
+            step = step + (1 << 26) if far else clock >> 6
+            words[n] = EVT2_TIME_HIGH << 28 | (step & 0xFFFFFFF)
+            n += 1
+            if far:
+                continue
+        stamp = (clock & 0x3F) << 22
+        if is_trigger:
+            words[n] = EVT2_EXT_TRIGGER << 28 | stamp | int64(channel[j]) << 8 | value[j]
+            j += 1
+        else:
+            words[n] = int64(p[i]) << 28 | stamp | int64(x[i]) << 11 | y[i]
+            i += 1
+        n += 1
+    state[0] = step
+    return n, i, j
+
+
+@njit(cache=True, nogil=True)
+def parse_csv(
+    text: Column, t: Column, x: Column, y: Column, p: Column
+) -> tuple[Integer, Integer, Integer, bool]:
+    """Parse whole lines `t_us,x,y,p` until they or the columns' room run out; empty lines are skipped.
+
+    Args:
+        text: uint8 (k,).
+        t: Column of events to fill, int64; so x, y (uint16), p (uint8).
+        x: See t.
+        y: See t.
+        p: See t.
+
+    Returns:
+        Bytes used, lines used, events, and whether the line behind these is good.
+    """
+    limits = (int64(1) << 62, int64(0xFFFF), int64(0xFFFF), int64(1))
+    values = np.zeros(4, int64)
+    used = lines = n = 0
+    while n < len(t):
+        i = used
+        column = digits = number = 0
+        sign = 1
+        good: Any = True
+        while i < len(text) and text[i] != 10:
+            c = int64(text[i])
+            if 48 <= c <= 57:
+                number = number * 10 + (c - 48)
+                digits += 1
+                good &= digits <= 18
+            elif c == 44:
+                good &= digits > 0 and column < 3 and number <= limits[min(column, 3)]
+                values[min(column, 3)] = sign * number
+                column += 1
+                digits = number = 0
+                sign = 1
+            elif c == 45 and column == 0 and digits == 0 and sign == 1:
+                sign = -1
+            elif c != 13 or i + 1 == len(text) or text[i + 1] != 10:
+                good = False
+            i += 1
+        if i == len(text):
+            break
+        if column or digits or not good or sign < 0:
+            if not good or column != 3 or digits == 0 or number > 1:
+                return used, lines, n, False
+            t[n], x[n], y[n], p[n] = values[0], values[1], values[2], number
+            n += 1
+        used = i + 1
+        lines += 1
+    return used, lines, n, True
+
+
+@njit(cache=True, nogil=True)
+def _put_number(text: Column, i: Integer, number: Integer, end: Integer) -> Integer:
+    """Write a number and the byte `end` to text[i] on; return where they stop."""
+    if number < 0:
+        text[i] = 45
+        i += 1
+        number = -number
+    size = 1
+    power = 10
+    while size < 19 and number >= power:
+        size += 1
+        power *= 10
+    for k in range(i + size - 1, i - 1, -1):
+        text[k] = 48 + number % 10
+        number //= 10
+    text[i + size] = end
+    return i + size + 1
+
+
+@njit(cache=True, nogil=True)
+def format_csv(text: Column, t: Column, x: Column, y: Column, p: Column) -> Integer:
+    """Write events as lines `t_us,x,y,p` to `text`, uint8, 40 bytes an event; return the bytes used."""
+    i = 0
+    for k in range(len(t)):
+        i = _put_number(text, i, t[k], 44)
+        i = _put_number(text, i, int64(x[k]), 44)
+        i = _put_number(text, i, int64(y[k]), 44)
+        i = _put_number(text, i, int64(p[k]), 10)
+    return i

@@ -27,19 +27,26 @@ EVT2_OTHERS: Final = 0xE
 EVT2_CONTINUED: Final = 0xF
 
 # Slots of a decoder's state, int64. All of it; nothing else passes from one call to the next.
-BASE: Final = 0  # time of the last TIME_HIGH with the rollovers before it, us; UNKNOWN_TIME before the first
-LOW: Final = 1  # time since BASE, us
-LAST: Final = 2  # time of the last event or trigger given out, us
-ROW: Final = 3  # of the last ADDR_Y, or UNKNOWN_ROW
-COLUMN: Final = 4  # where the next vector word starts, or UNKNOWN_COLUMN or more
-POLARITY: Final = 5  # of the last VECT_BASE_X
-VECTOR_LEFT: Final = 6  # vector words still to come after the last VECT_BASE_X
-VECTOR_AT: Final = 7  # byte offset of that VECT_BASE_X
-STATE_SLOTS: Final = 8
+BASE: Final = 0  # EVT3: 2^24 a rollover; EVT2: time of the last TIME_HIGH; UNKNOWN_TIME before the first, us
+LAST: Final = 1  # time of the last event or trigger given out, us
+PACKED: Final = 2  # EVT3 only, as all below: the last event with its time and row, see below
+COLUMN: Final = 3  # where the next vector word starts, or UNKNOWN_COLUMN or more
+POLARITY: Final = 4  # of the last VECT_BASE_X
+VECTOR_LEFT: Final = 5  # vector words still to come after the last VECT_BASE_X
+VECTOR_AT: Final = 6  # byte offset of that VECT_BASE_X
+STATE_SLOTS: Final = 7
 
 UNKNOWN_TIME: Final = -1
-UNKNOWN_ROW: Final = 0xFFFF
-UNKNOWN_COLUMN: Final = 0xF000
+UNKNOWN_ROW: Final = 0x8000
+UNKNOWN_COLUMN: Final = 0x7000
+
+# An EVT3 event in one integer: where each of its fields starts.
+PACKED_COLUMN: Final = 0  # 11 bits
+PACKED_POLARITY: Final = 11
+PACKED_CARRY: Final = 12  # 4 bits: what of a column exceeds 11 bits, which a vector's may
+PACKED_ROW: Final = 16  # 16 bits, of which bit 11 means nothing
+PACKED_LOW: Final = 32  # 12 bits
+PACKED_HIGH: Final = 44  # 12 bits
 
 # Rows of a decoder's tally, int64 (rows, 2): how many, and the byte offset of the first.
 BEFORE_TIME: Final = 0

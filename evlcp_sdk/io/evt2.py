@@ -25,6 +25,8 @@ EVT2: Final = Codec(
         }
     ),
     channels=32,
+    time_bits=(28, 6),
+    rollover=(0x8FFFFFFF, 0x80000000),
     decoder="decode_evt2",
     encoder="encode_evt2",
 )

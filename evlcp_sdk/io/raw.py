@@ -1,27 +1,31 @@
 """Prophesee RAW files: a header of text lines, then the words of EVT2 or EVT3."""
 
-from collections.abc import Iterator, Mapping
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from evlcp_sdk.errors import InputError, RawFormatError
+from evlcp_sdk.errors import InputError, RawFormatError, StreamError
 from evlcp_sdk.io import _words
 from evlcp_sdk.io._codec import MAX_SIDE, Codec, Columns, Decoder
 from evlcp_sdk.io.evt2 import EVT2
 from evlcp_sdk.io.evt3 import EVT3
-from evlcp_sdk.io.sources import DEFAULT_MAX_EVENTS, EventSource, Loss, check_max_events
+from evlcp_sdk.io.sources import EventSource, Loss
+from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.types import Events, Triggers
 
-__all__ = ["CODECS", "RawHeader", "RawSource", "parse_header"]
+__all__ = ["CODECS", "RawHeader", "RawSource", "RawWriter", "format_header", "parse_header"]
 
 CODECS: Final = {codec.name: codec for codec in (EVT2, EVT3)}
 """The encodings that can be read and written, by name."""
 
 MAX_HEADER_BYTES = 1 << 16
 BUFFER_BYTES = 1 << 20
+WRITE_WORDS = 1 << 15
+MIN_READ, MAX_READ = 1 << 20, 1 << 27
 
 # Another encoding read as the declared one has a reserved type in a third of its words or more, and a camera
 # never sends one. An eighth is far from both; and fewer than 16 words are not enough to say.
@@ -88,6 +92,27 @@ def parse_header(data: bytes, path: Path | str) -> RawHeader:
         at = end + 1
     codec, width, height = _interpret(fields, offsets, path)
     return RawHeader(fields, codec, width, height, at, closed)
+
+
+def format_header(codec: Codec, width: int, height: int) -> bytes:
+    """Return the header of a RAW file, as Prophesee's own reader accepts it.
+
+    >>> print(format_header(EVT3, 1280, 720).decode(), end="")
+    % evt 3.0
+    % format EVT3;height=720;width=1280
+    % geometry 1280x720
+    % integrator_name Prophesee
+    % system_ID 49
+    % end
+    """
+    return (
+        f"% evt {codec.version}\n"
+        f"% format {codec.name};height={height};width={width}\n"
+        f"% geometry {width}x{height}\n"
+        "% integrator_name Prophesee\n"
+        "% system_ID 49\n"
+        "% end\n"
+    ).encode()
 
 
 def _interpret(
@@ -166,47 +191,44 @@ class RawSource(EventSource):
     """
 
     def __init__(self, path: Path | str, buffer_bytes: int = BUFFER_BYTES) -> None:
-        self.path = Path(path)
+        self._path = Path(path)
         self._buffer = np.empty(max(buffer_bytes, MAX_HEADER_BYTES), np.uint8)
         self._position = 0  # byte offset in the file of the first byte not decoded
         self._start = self._end = 0  # the bytes of the buffer not decoded
         self._exhausted = False
-        self._events = self._triggers = 0
         try:
-            self._file = self.path.open("rb", buffering=0)
+            self._file = self._path.open("rb", buffering=0)
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}") from error
         try:
-            self._open()
+            self._fill()
+            header = parse_header(self._buffer[: self._end].tobytes(), self._path)
+            size = os.fstat(self._file.fileno()).st_size
+            super().__init__(
+                self._path, header.codec.name, header.width, header.height, header.fields, size or None
+            )
+            self._codec = header.codec
+            self._decoder = Decoder(header.codec, header.width, header.height)
+            if not header.closed:
+                self._decoder.note(_words.HEADER_OPEN, header.size_bytes)
+            self._start = self._position = self._data_start = header.size_bytes
+            self._fill()
+            self._probe()
         except BaseException:
             self._file.close()
             raise
 
-    def _open(self) -> None:
-        self._fill()
-        header = parse_header(self._buffer[: self._end].tobytes(), self.path)
-        self.format = header.codec.name
-        self.width, self.height = header.width, header.height
-        self.header = header.fields
-        size = self.path.stat().st_size if self.path.is_file() else 0
-        self.size_bytes = size or None
-        self._codec = header.codec
-        self._decoder = Decoder(header.codec, header.width, header.height)
-        if not header.closed:
-            self._decoder.note(_words.HEADER_OPEN, header.size_bytes)
-        self._start = self._position = self._data_start = header.size_bytes
-        self._fill()
+    def _probe(self) -> None:
+        """Raise RawFormatError if the first words look like another encoding."""
         words = self._words()[:RESERVED_PROBE_WORDS]
-        reserved, share = self._codec.reserved_share(words)
-        if reserved >= RESERVED_LEAST and share > RESERVED_SHARE:
-            first = int(
-                np.flatnonzero(~np.isin(words >> (8 * words.itemsize - 4), list(self._codec.types)))[0]
-            )
+        reserved = self._codec.reserved(words)
+        share = np.count_nonzero(reserved) / max(len(words), 1)
+        if share > RESERVED_SHARE and share * len(words) >= RESERVED_LEAST:
             raise RawFormatError(
                 self.path,
-                self._position + first * words.itemsize,
-                f"a word of a reserved type, as are {share:.0%} of the first {len(words)}",
-                f"{self.format} words, as the header says",
+                self._position + int(reserved.argmax()) * words.itemsize,
+                f"a word of a reserved type, as are {share:.0%} of the first {len(words)} words",
+                f"{self.format}, as the header says",
             )
 
     def _fill(self) -> None:
@@ -214,12 +236,14 @@ class RawSource(EventSource):
         left = self._end - self._start
         self._buffer[:left] = self._buffer[self._start : self._end]
         self._start, self._end = 0, left
-        view = memoryview(self._buffer)
+        view = self._buffer.data
         while not self._exhausted and self._end < len(self._buffer):
             try:
                 size = self._file.readinto(view[self._end :])
             except OSError as error:
-                raise InputError(f"{self.path}: at byte {self._position + left}: {error.strerror}") from error
+                raise InputError(
+                    f"{self._path}: at byte {self._position + left}: {error.strerror}"
+                ) from error
             self._exhausted = not size
             self._end += size or 0
 
@@ -229,28 +253,28 @@ class RawSource(EventSource):
         count = (self._end - self._start) // size
         return self._buffer[self._start : self._start + count * size].view(self._codec.word)
 
-    def stream(self, max_events: int = DEFAULT_MAX_EVENTS) -> Iterator[tuple[Events, Triggers]]:
-        """As `EventSource.stream`.
+    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
+        """As `EventSource.take`.
 
         Raises:
             InputError: The file cannot be read on.
             RawFormatError: No word gives a time.
         """
-        check_max_events(max_events)
-        capacity = max(max_events, self._codec.burst)
-        done = False
-        while not done:
-            out = Columns(capacity, max(capacity // 16, 1024))
-            done = self._decode_into(out)
-            self._events += out.events
-            self._triggers += out.triggers
-            events, triggers = out.taken()
-            if len(events) <= max_events:
-                if len(events) or len(triggers):
-                    yield events, triggers
-                continue
-            for k in range(0, len(events), max_events):
-                yield events[k : k + max_events], triggers if k == 0 else Triggers.empty()
+        out = Columns(max(max_events, self._codec.burst), max(max_events // 16, 1024))
+        if self._decode_into(out) and not out.events and not out.triggers:
+            return None
+        return out.taken()
+
+    def read(self) -> tuple[Events, Triggers]:
+        """As `EventSource.read`.
+
+        Raises:
+            InputError: The file cannot be read on.
+            RawFormatError: No word gives a time.
+        """
+        # Room for an event a word is seldom filled, and what is not filled takes no memory.
+        words = ((self.size_bytes or 0) - self._position) // self._codec.word.itemsize
+        return self._join(min(max(words, MIN_READ), MAX_READ) + self._codec.burst)
 
     def _decode_into(self, out: Columns) -> bool:
         """Decode until `out` is full, and return False, or to the end of the file, and return True."""
@@ -294,8 +318,70 @@ class RawSource(EventSource):
     @property
     def counts(self) -> dict[str, int]:
         """`events`, `triggers`, `rollovers`, `time_gaps` and `other_words`."""
-        return {"events": self._events, "triggers": self._triggers, **self._decoder.counts}
+        return super().counts | self._decoder.counts
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+class RawWriter(EventWriter):
+    """A RAW file being written.
+
+    What is read back is what was written, in the same order, triggers too. Where triggers share their time
+    with events, they come first.
+
+    Args:
+        path: The file.
+        width: Columns of the sensor.
+        height: Rows of the sensor.
+        codec: `EVT3` or `EVT2`.
+
+    Raises:
+        EvlcpError: The file cannot be written.
+        StreamError: The sensor is larger than the words can address.
+    """
+
+    # A word does not tell how often the clock has rolled over. Before a first time beyond its range (EVT3:
+    # 16.8 s) the writer lets it roll over that often; this keeps those words below 1 MB.
+    times_us = (0, (1 << 40) - 1)
+
+    def __init__(self, path: Path | str, width: int, height: int, codec: Codec = EVT3) -> None:
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+            raise StreamError(f"{path}: sensor of {width}x{height}, expected 1 to {MAX_SIDE} each")
+        super().__init__(path, width, height)
+        self.channels = codec.channels
+        self._columns = width
+        self._codec = codec
+        self._kernel = codec.kernel(codec.encoder)
+        self._state = np.full(3, -1, np.int64)
+        self._words = np.empty(WRITE_WORDS, codec.word)
+        self._file.write(format_header(codec, width, height))
+
+    def _write(self, events: Events, triggers: Triggers) -> None:
+        if not len(events) and not len(triggers):
+            return
+        if self._last_us is None:
+            first = min(int(column[0]) for column in (events.t_us, triggers.t_us) if len(column))
+            words, self._state[0] = self._codec.prelude(first)
+            self._file.write(words.tobytes())
+        i = j = 0
+        while i < len(events) or j < len(triggers):
+            n, i, j = self._kernel(
+                self._words,
+                self._columns,
+                self._state,
+                events.t_us,
+                events.x,
+                events.y,
+                events.p,
+                i,
+                triggers.t_us,
+                triggers.channel,
+                triggers.value,
+                j,
+            )
+            self._file.write(self._words[:n].tobytes())
+
+    def _finish(self) -> None:
+        """Every word is in the file already."""

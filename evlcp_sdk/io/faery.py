@@ -1,0 +1,80 @@
+"""AEDAT4, DAT and Event Stream files, through the optional package `faery`."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.io._sieve import Sieve
+from evlcp_sdk.io.sources import EventSource, Loss
+from evlcp_sdk.types import Events, Triggers
+
+__all__ = ["FORMATS", "FaerySource"]
+
+FORMATS: Final = {".aedat4": "AEDAT4", ".aedat": "AEDAT4", ".dat": "DAT", ".es": "ES"}
+"""The formats read this way, by the suffix of the file's name."""
+
+UNKNOWN_SIZE = (0xFFFF, 0xFFFF)
+
+
+class FaerySource(EventSource):
+    """A file that `faery` reads; contrast-detection events only, no triggers.
+
+    Args:
+        path: The file; its suffix tells the format.
+
+    Raises:
+        InputError: `faery` is not installed, or cannot read the file.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        target = Path(path)
+        name = FORMATS[target.suffix.lower()]
+        if not target.is_file():
+            raise InputError(f"{path}: {'not a file' if target.exists() else 'No such file or directory'}")
+        try:
+            import faery
+        except ImportError as error:
+            raise InputError(
+                f"{path}: reading {name} takes the package faery: pip install 'evlcp-sdk[faery]'"
+            ) from error
+        kind = {"AEDAT4": "aedat", "DAT": "dat", "ES": "es"}[name]
+        try:
+            stream = faery.events_stream_from_file(target, dimensions_fallback=UNKNOWN_SIZE, file_type=kind)
+            size = stream.dimensions()
+        except Exception as error:
+            raise InputError(f"{path}: found no {name} file, expected one ({error})") from error
+        width, height = (None, None) if size == UNKNOWN_SIZE else size
+        super().__init__(target, name, width, height, None, target.stat().st_size)
+        self._packets: Iterator[Any] = iter(stream)
+        self._sieve = Sieve("row", width, height)
+        self._row = 1
+
+    def take(self, max_events: int) -> tuple[Events, Triggers] | None:  # noqa: ARG002
+        """Return the next packet of the file, of whatever size it has, or None at the end.
+
+        Raises:
+            InputError: The file cannot be read on.
+        """
+        try:
+            packet = next(self._packets, None)
+        except Exception as error:
+            raise InputError(f"{self.path}: at event {self._row}: {error}") from error
+        if packet is None:
+            return None
+        first = self._row
+        self._row += len(packet)
+        columns = (packet["t"], packet["x"], packet["y"], packet["on"])
+        events = Events.of(*(np.array(column) for column in columns))  # copies: faery may reuse the packet
+        return self._sieve.sift(events, first), Triggers.empty()
+
+    @property
+    def losses(self) -> dict[str, Loss]:
+        """As `EventSource.losses`, with the numbers of the events."""
+        return self._sieve.losses
+
+    def close(self) -> None:
+        """Close the file."""
+        self._packets = iter(())

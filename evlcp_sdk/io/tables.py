@@ -1,0 +1,372 @@
+"""Tables of events: NPZ with one array a column, and CSV, plain or gzipped."""
+
+import gzip
+import shutil
+import tempfile
+import zipfile
+import zlib
+from contextlib import ExitStack
+from io import BufferedIOBase
+from pathlib import Path
+from typing import IO, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import InputError, StreamError
+from evlcp_sdk.io._sieve import Sieve
+from evlcp_sdk.io.sources import EventSource, Loss
+from evlcp_sdk.io.writers import EventWriter
+from evlcp_sdk.types import Events, Triggers
+
+__all__ = ["CsvSource", "CsvWriter", "NpzSource", "NpzWriter"]
+
+COLUMNS: Final = ("t_us", "x", "y", "p")
+TRIGGER_COLUMNS: Final = ("trigger_t_us", "trigger_channel", "trigger_value")
+WIRE_TYPES: Final[dict[str, np.dtype[Any]]] = {
+    "t_us": np.dtype("<i8"),
+    "x": np.dtype("<u2"),
+    "y": np.dtype("<u2"),
+    "p": np.dtype("u1"),
+    "trigger_t_us": np.dtype("<i8"),
+    "trigger_channel": np.dtype("u1"),
+    "trigger_value": np.dtype("u1"),
+}
+LAST_VALUES: Final = {
+    "t_us": 1 << 62,
+    "x": 0xFFFF,
+    "y": 0xFFFF,
+    "p": 1,
+    "trigger_t_us": 1 << 62,
+    "trigger_channel": 0xFF,
+    "trigger_value": 1,
+}
+
+CSV_HEADER = b"t_us,x,y,p"
+CSV_ROW = "four integers t_us,x,y,p with x and y from 0 to 65535 and p 0 or 1"
+CSV_ROW_BYTES = 40
+BUFFER_BYTES = 1 << 20
+LEAST_ROWS = 1 << 12
+
+
+class _Column:
+    """One array of an NPZ file, read from front to back.
+
+    Raises:
+        InputError: There is no such array, or it is not one of integers in one dimension.
+    """
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile, name: str, stack: ExitStack) -> None:
+        self.name = name
+        self.row = 0
+        self._path = path
+        try:
+            self._file = stack.enter_context(archive.open(f"{name}.npy"))
+        except KeyError:
+            found = ", ".join(sorted(member.removesuffix(".npy") for member in archive.namelist()))
+            raise InputError(
+                f"{path}: found the arrays {found or 'none'}, expected {', '.join(COLUMNS)}"
+            ) from None
+        try:
+            version = np.lib.format.read_magic(self._file)
+            read = np.lib.format.read_array_header_1_0
+            if version != (1, 0):
+                read = np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(self._file)
+        except ValueError as error:
+            raise InputError(f"{path}: array {name}: {error}") from error
+        if dtype.kind not in "iub" or len(shape) > 1:
+            raise InputError(f"{path}: array {name}: found {dtype} {shape}, expected integers (n,)")
+        self.dtype = dtype
+        self.is_scalar = not shape
+        self.rows = shape[0] if shape else 1
+
+    def take(self, rows: int) -> NDArray[Any]:
+        """Return the next values, as many as there are up to `rows`, in the column's type.
+
+        Raises:
+            InputError: A value has no place in the column, or the array ends too early.
+        """
+        rows = min(rows, self.rows - self.row)
+        data = self._file.read(rows * self.dtype.itemsize)
+        if len(data) < rows * self.dtype.itemsize:
+            found = self.row + len(data) // self.dtype.itemsize
+            raise InputError(f"{self._path}: array {self.name}: found {found} values, expected {self.rows}")
+        values = np.frombuffer(data, self.dtype)
+        last = LAST_VALUES.get(self.name, 1 << 62)
+        first = -last if self.name == "t_us" else 0
+        if rows and not (first <= values.min() and values.max() <= last):
+            k = int(((values < first) | (values > last)).argmax())
+            raise InputError(
+                f"{self._path}: array {self.name}: row {self.row + k + 1}: found {values[k]},"
+                f" expected {first} to {last}"
+            )
+        self.row += rows
+        return values.astype(WIRE_TYPES.get(self.name, np.dtype(np.int64)))
+
+
+class NpzSource(EventSource):
+    """An NPZ file: arrays `t_us`, `x`, `y`, `p`, and where known the numbers `width` and `height`.
+
+    External triggers are in `trigger_t_us`, `trigger_channel`, `trigger_value`, if there are any. The events
+    are read in pieces, compressed or not; the triggers at once.
+
+    Args:
+        path: The file.
+
+    Raises:
+        InputError: The file cannot be read, or its arrays are not these.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        target = Path(path)
+        with ExitStack() as stack:
+            try:
+                self._file = stack.enter_context(target.open("rb"))
+                archive = stack.enter_context(zipfile.ZipFile(self._file))
+            except OSError as error:
+                raise InputError(f"{path}: {error.strerror}") from error
+            except zipfile.BadZipFile as error:
+                raise InputError(f"{path}: found no NPZ file, expected one ({error})") from error
+            try:
+                self._columns = [_Column(target, archive, name, stack) for name in COLUMNS]
+                sizes = {column.name: column.rows for column in self._columns if not column.is_scalar}
+                if len(sizes) < len(COLUMNS) or len(set(sizes.values())) > 1:
+                    raise InputError(f"{path}: found arrays of the lengths {sizes}, expected one length")
+                names = archive.namelist()
+                width, height = (
+                    int(_Column(target, archive, name, stack).take(1)[0]) if f"{name}.npy" in names else None
+                    for name in ("width", "height")
+                )
+                self._triggers = Triggers.empty()
+                if "trigger_t_us.npy" in names:
+                    columns = [_Column(target, archive, name, stack) for name in TRIGGER_COLUMNS]
+                    lengths = {column.name: column.rows for column in columns}
+                    if len(set(lengths.values())) > 1:
+                        raise InputError(
+                            f"{path}: found arrays of the lengths {lengths}, expected one length"
+                        )
+                    self._triggers = Triggers(*(column.take(column.rows) for column in columns))
+            except (OSError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+                raise InputError(f"{path}: damaged NPZ file: {error}") from error
+            super().__init__(target, "NPZ", width, height, None, target.stat().st_size)
+            self._sieve = Sieve("row", width, height)
+            self._stack = stack.pop_all()
+
+    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
+        """As `EventSource.take`.
+
+        Raises:
+            InputError: The file cannot be read on, or a value has no place in its column.
+        """
+        row = self._columns[0].row
+        try:
+            events = Events(*(column.take(max_events) for column in self._columns))
+        except (OSError, EOFError, ValueError, zlib.error, zipfile.BadZipFile) as error:
+            raise InputError(f"{self.path}: damaged NPZ file at row {row + 1}: {error}") from error
+        triggers = self._triggers
+        if not len(events) and not len(triggers):
+            return None
+        due = int(np.searchsorted(triggers.t_us, events.t_us[-1], "right")) if len(events) else len(triggers)
+        self._triggers = Triggers(triggers.t_us[due:], triggers.channel[due:], triggers.value[due:])
+        return (
+            self._sieve.sift(events, row + 1),
+            Triggers(triggers.t_us[:due], triggers.channel[:due], triggers.value[:due]),
+        )
+
+    @property
+    def position_bytes(self) -> int:
+        """How much of the file is read."""
+        column = self._columns[0]
+        return round((self.size_bytes or 0) * (column.row / column.rows if column.rows else 1))
+
+    @property
+    def losses(self) -> dict[str, Loss]:
+        """As `EventSource.losses`, with row numbers."""
+        return self._sieve.losses
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stack.close()
+
+
+class NpzWriter(EventWriter):
+    """An NPZ file being written, with the arrays that `NpzSource` reads; not compressed.
+
+    The columns grow in temporary files and are put together at the end.
+
+    Args:
+        path: The file.
+        width: Columns of the sensor, or None if unknown.
+        height: Rows of the sensor, or None.
+
+    Raises:
+        EvlcpError: The file cannot be written.
+    """
+
+    def __init__(self, path: Path | str, width: int | None = None, height: int | None = None) -> None:
+        super().__init__(path, width, height)
+        self._stack = ExitStack()
+        self._spools: dict[str, IO[bytes]] = {
+            name: self._stack.enter_context(tempfile.TemporaryFile(dir=self._target.parent))  # noqa: SIM115
+            for name in WIRE_TYPES
+        }
+
+    def _write(self, events: Events, triggers: Triggers) -> None:
+        event_columns = (events.t_us, events.x, events.y, events.p)
+        trigger_columns = (triggers.t_us, triggers.channel, triggers.value)
+        columns: tuple[NDArray[Any], ...] = event_columns + trigger_columns
+        for (name, spool), column in zip(self._spools.items(), columns, strict=True):
+            spool.write(column.astype(WIRE_TYPES[name]).tobytes())
+
+    def _finish(self) -> None:
+        with zipfile.ZipFile(self._file, "w") as archive:
+            for name, size in (("width", self.width), ("height", self.height)):
+                if size is not None:
+                    with archive.open(f"{name}.npy", "w") as member:
+                        np.lib.format.write_array(member, np.array(size))
+            for name, spool in self._spools.items():
+                rows = spool.tell() // WIRE_TYPES[name].itemsize
+                if name in TRIGGER_COLUMNS and not rows:
+                    continue
+                spool.seek(0)
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    descr = np.lib.format.dtype_to_descr(WIRE_TYPES[name])
+                    header = {"descr": descr, "fortran_order": False, "shape": (rows,)}
+                    np.lib.format.write_array_header_1_0(member, header)
+                    shutil.copyfileobj(spool, member, BUFFER_BYTES)
+        self._stack.close()
+
+    def discard(self) -> None:
+        """Remove what has been written."""
+        self._stack.close()
+        super().discard()
+
+
+class CsvSource(EventSource):
+    """A CSV file with the header `t_us,x,y,p`, plain or gzipped.
+
+    Args:
+        path: The file.
+
+    Raises:
+        InputError: The file cannot be read, or its first line is not this header.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        target = Path(path)
+        try:
+            self._raw = target.open("rb")
+        except OSError as error:
+            raise InputError(f"{path}: {error.strerror}") from error
+        is_gzip = self._raw.read(2) == b"\x1f\x8b"
+        self._raw.seek(0)
+        self._file: BufferedIOBase = gzip.GzipFile(fileobj=self._raw) if is_gzip else self._raw
+        super().__init__(target, "CSV", size_bytes=target.stat().st_size)
+        self._text = b""
+        self._line = 1
+        self._exhausted = False
+        self._sieve = Sieve("line", None, None)
+        try:
+            header = self._more(4096).partition(b"\n")
+        except InputError:
+            self.close()
+            raise
+        if header[0].removeprefix(b"\xef\xbb\xbf").rstrip(b"\r") != CSV_HEADER:
+            self.close()
+            raise InputError(f"{path}: line 1: found {_show(header[0])}, expected '{CSV_HEADER.decode()}'")
+        self._text = header[2]
+        self._line = 2
+
+    def _more(self, size: int) -> bytes:
+        """Return what follows, at most `size` bytes."""
+        try:
+            text = self._file.read(size)
+        except (OSError, EOFError, ValueError, zlib.error) as error:
+            raise InputError(f"{self.path}: line {self._line}: damaged or closed file: {error}") from error
+        self._exhausted = not text
+        return text
+
+    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
+        """As `EventSource.take`.
+
+        Raises:
+            InputError: The file cannot be read on, or a line is not a row of the table.
+        """
+        from evlcp_sdk.io._kernels import parse_csv
+
+        while len(self._text) < BUFFER_BYTES // 2 and not self._exhausted:
+            more = self._more(BUFFER_BYTES)
+            if not more and self._text and not self._text.endswith(b"\n"):
+                more = b"\n"
+            self._text += more
+        if not self._text:
+            return None
+        rows = max(max_events, LEAST_ROWS)
+        t_us, x, y = np.empty(rows, np.int64), np.empty(rows, np.uint16), np.empty(rows, np.uint16)
+        p = np.empty(rows, np.uint8)
+        used, lines, rows, good = parse_csv(np.frombuffer(self._text, np.uint8), t_us, x, y, p)
+        first = self._line
+        self._text = self._text[used:]
+        self._line += lines
+        if not good or (used == 0 and rows == 0):
+            line = self._text.partition(b"\n")[0].rstrip(b"\r")
+            raise InputError(f"{self.path}: line {self._line}: found {_show(line)}, expected {CSV_ROW}")
+        return self._sieve.sift(Events(t_us[:rows], x[:rows], y[:rows], p[:rows]), first), Triggers.empty()
+
+    @property
+    def position_bytes(self) -> int:
+        """How much of the file is read."""
+        return self._raw.tell() if not self._raw.closed else self.size_bytes or 0
+
+    @property
+    def losses(self) -> dict[str, Loss]:
+        """As `EventSource.losses`, with line numbers."""
+        return self._sieve.losses
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+        self._raw.close()
+
+
+def _show(line: bytes) -> str:
+    """Return the start of a line for a message."""
+    text = line[:60].decode("utf-8", "replace")
+    return repr(text + ("..." if len(line) > 60 else ""))
+
+
+class CsvWriter(EventWriter):
+    """A CSV file being written; gzipped if its name ends in `.gz`. It has no place for triggers.
+
+    Args:
+        path: The file.
+        width: Columns of the sensor, or None if unknown; only checked, the file does not say it.
+        height: Rows of the sensor, or None.
+
+    Raises:
+        EvlcpError: The file cannot be written.
+    """
+
+    def __init__(self, path: Path | str, width: int | None = None, height: int | None = None) -> None:
+        super().__init__(path, width, height)
+        self._out: IO[bytes] | gzip.GzipFile = self._file
+        if self.path.suffix == ".gz":
+            self._out = gzip.GzipFile("", "wb", 6, self._file, 0)  # no name, no time: same events, same bytes
+        self._out.write(CSV_HEADER + b"\n")
+
+    def _write(self, events: Events, triggers: Triggers) -> None:
+        from evlcp_sdk.io._kernels import format_csv
+
+        if len(triggers):
+            raise StreamError(f"{self.path}: {len(triggers)} triggers, which a CSV file has no place for")
+        rows = BUFFER_BYTES // CSV_ROW_BYTES
+        text = np.empty(min(rows, len(events)) * CSV_ROW_BYTES, np.uint8)
+        for k in range(0, len(events), rows):
+            piece = events[k : k + rows]
+            size = format_csv(text, piece.t_us, piece.x, piece.y, piece.p)
+            self._out.write(text[:size].tobytes())
+
+    def _finish(self) -> None:
+        if self._out is not self._file:
+            self._out.close()

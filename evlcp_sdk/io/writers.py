@@ -1,0 +1,142 @@
+"""What every file that events are written to has in common."""
+
+import os
+from abc import ABC, abstractmethod
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import EvlcpError, StreamError
+from evlcp_sdk.types import Events, Triggers
+
+__all__ = ["EventWriter"]
+
+
+class EventWriter(ABC):
+    """A recording being written, piece by piece; a context manager.
+
+    The file appears under its name only when it is complete: it grows beside it, as `.NAME.PID.part`, and
+    an exception in the `with` block removes it. What is not a regular file (a pipe) is written directly.
+
+    Args:
+        path: The file; an existing one is replaced.
+        width: Columns of the sensor, or None if unknown; no event may lie outside.
+        height: Rows of the sensor, or None.
+
+    Raises:
+        EvlcpError: The file cannot be written.
+    """
+
+    times_us = (-(1 << 62), 1 << 62)
+    """Earliest and latest time that can be written, us."""
+    channels = 256
+    """Trigger inputs that can be written."""
+
+    def __init__(self, path: Path | str, width: int | None, height: int | None) -> None:
+        self.path = Path(path)
+        self.width = width
+        self.height = height
+        self._last_us: int | None = None
+        self._target = Path(os.path.realpath(path))
+        special = self._target.exists() and not self._target.is_file()
+        part = self._target.with_name(f".{self._target.name}.{os.getpid()}.part")
+        self._part = self._target if special else part
+        try:
+            self._file = self._part.open("wb")
+        except OSError as error:
+            raise EvlcpError(f"{path}: cannot be written: {error.strerror}") from error
+
+    def write(self, events: Events, triggers: Triggers | None = None) -> None:
+        """Append events and triggers, each sorted by time and none before what was written before.
+
+        Raises:
+            EvlcpError: The file cannot be written.
+            StreamError: Times run backward, or a value has no place in the file; nothing is written then.
+        """
+        if triggers is None:
+            triggers = Triggers.empty()
+        if self._file.closed:
+            raise StreamError(f"{self.path}: written to after it was closed")
+        self._check_times(events.t_us, "event")
+        self._check_times(triggers.t_us, "trigger")
+        self._check("event", "x", events.x, self.width)
+        self._check("event", "y", events.y, self.height)
+        self._check("event", "p", events.p, 2)
+        self._check("trigger", "channel", triggers.channel, self.channels)
+        self._check("trigger", "value", triggers.value, 2)
+        try:
+            self._write(events, triggers)
+        except OSError as error:
+            raise EvlcpError(f"{self.path}: cannot be written: {error.strerror}") from error
+        lasts = [int(column[-1]) for column in (events.t_us, triggers.t_us) if len(column)]
+        if lasts:
+            self._last_us = max(lasts)
+
+    @abstractmethod
+    def _write(self, events: Events, triggers: Triggers) -> None:
+        """Append what has been checked to `_file`."""
+
+    @abstractmethod
+    def _finish(self) -> None:
+        """Append what belongs at the end."""
+
+    def close(self) -> None:
+        """Complete the file and give it its name; twice does no harm.
+
+        Raises:
+            EvlcpError: The file cannot be written.
+        """
+        if self._file.closed:
+            return
+        try:
+            self._finish()
+            self._file.close()
+            if self._part != self._target:
+                self._part.replace(self._target)
+        except OSError as error:
+            self.discard()
+            raise EvlcpError(f"{self.path}: cannot be written: {error.strerror}") from error
+
+    def discard(self) -> None:
+        """Remove what has been written; a file that had the name before stays as it was."""
+        self._file.close()
+        if self._part != self._target:
+            self._part.unlink(missing_ok=True)
+
+    def _check_times(self, t_us: NDArray[np.int64], what: str) -> None:
+        if not len(t_us):
+            return
+        back = t_us[1:] < t_us[:-1]
+        if back.any():
+            k = int(back.argmax())
+            raise StreamError(
+                f"{self.path}: {what} at {t_us[k + 1]} us after one at {t_us[k]} us, expected sorted times"
+            )
+        if self._last_us is not None and t_us[0] < self._last_us:
+            raise StreamError(
+                f"{self.path}: {what} at {t_us[0]} us after {self._last_us} us, expected sorted times"
+            )
+        first, last = self.times_us
+        for t in (t_us[0], t_us[-1]):
+            if not first <= t <= last:
+                raise StreamError(f"{self.path}: {what} at {t} us, expected {first} to {last} us")
+
+    def _check(self, what: str, name: str, column: NDArray[Any], size: int | None) -> None:
+        if size is None or not len(column) or column.max() < size:
+            return
+        k = int((column >= size).argmax())
+        raise StreamError(f"{self.path}: {what} {k}: {name} is {column[k]}, expected 0 to {size - 1}")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.close()
+        else:
+            self.discard()
