@@ -167,6 +167,8 @@ def draw_regions(probe: FigureProbe, title: str) -> Figure:
     whole = axes[0]
     whole.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), ylabel="row, px")
     many = f"{len(probe.regions)} region{'s' * (len(probe.regions) != 1)}"
+    if zooms:
+        many += " (beside: dotted where first seen, solid where last)"
     _title(whole, f"{title}: {probe.image.sum():,} events, {many}")
     for n, (number, places) in enumerate(sorted(probe.regions.items())):
         colour = transmitter_colour(n)
@@ -224,12 +226,13 @@ def _draw_one_presence(part: SubFigure, best: _Shown) -> None:
     colours = cluster_colours(len(presence.probability))
     height, width = presence.pixels.shape[1:]
     size = presence.grid_px
-    rows, columns = presence.selected.shape
-    where = np.argwhere(presence.selected) * size
+    selected = presence.selected.any(0)
+    rows, columns = selected.shape
+    where = np.argwhere(selected) * size
     upper, left = (where.min(0) if len(where) else np.zeros(2)) - 3
     lower, right = (where.max(0) + size if len(where) else np.array([height, width])) + 2
 
-    strength = np.where(presence.selected, presence.probability.max(0), 0)
+    strength = np.where(selected, presence.probability.max(0), 0)
     cells.imshow(
         _coloured(presence.probability, strength, colours),
         extent=(-0.5, columns * size - 0.5, rows * size - 0.5, -0.5),

@@ -54,15 +54,17 @@ class TransmitterTally:
 
     Args:
         packet_frames: Frames that a packet has.
-        nominal_chip_us: Chip length that the configuration states, us.
+        nominal_packet_us: Length of a packet that the configuration states, us.
     """
 
     packet_frames: int
-    nominal_chip_us: float
+    nominal_packet_us: float
     packets: int = 0
     frames: int = 0
-    last_packet: int = 0
-    chip_us_sum: float = 0.0
+    first_frame: int = -1
+    last_frame: int = -1
+    first_packet: tuple[int, float] = (0, math.nan)
+    last_packet: tuple[int, float] = (0, math.nan)
     quality_sum: float = 0.0
     ranged: int = 0
     first_m: float = math.nan
@@ -73,9 +75,13 @@ class TransmitterTally:
         """Count a packet and its frames."""
         self.packets += 1
         self.frames += len(packet.frames)
-        self.last_packet = max(self.last_packet, packet.packet)
-        self.chip_us_sum += packet.chip_us
+        self.last_packet = (packet.packet, packet.t_us)
+        if self.packets == 1:
+            self.first_packet = self.last_packet
         for frame in packet.frames:
+            number = frame.packet * self.packet_frames + frame.frame
+            self.first_frame = number if self.first_frame < 0 else self.first_frame
+            self.last_frame = number
             self.quality_sum += frame.soft.quality
             distance_m = frame.range.distance_m
             if math.isfinite(distance_m):
@@ -94,21 +100,27 @@ class TransmitterTally:
                 return round(cell * _CELL_M, 2)
         return math.nan
 
+    def clock_ppm(self) -> float:
+        """The transmitter's chip rate against the camera's clock, ppm; NaN before the second packet.
+
+        Taken from the times of the first and the last packet, so it is the surer the longer the recording.
+        """
+        (first, first_us), (last, last_us) = self.first_packet, self.last_packet
+        if last == first:
+            return math.nan
+        return ((last - first) * self.nominal_packet_us / (last_us - first_us) - 1) * 1e6
+
     def to_dict(self) -> dict[str, Any]:
         """The figures as JSON values; what was never measured is null.
 
-        `frames_expected` counts every packet from the transmitter's first to its last, heard or not;
-        `clock_ppm` is the transmitter's chip rate over the camera's clock.
+        `frames_expected` counts what was sent from the first decoded frame to the last.
         """
-        clock_ppm = (
-            (self.nominal_chip_us * self.packets / self.chip_us_sum - 1) * 1e6 if self.packets else math.nan
-        )
         return {
             "packets": self.packets,
             "frames_found": self.frames,
-            "frames_expected": (self.last_packet + 1) * self.packet_frames,
+            "frames_expected": self.last_frame - self.first_frame + 1 if self.frames else 0,
             "quality": _number(self.quality_sum / self.frames if self.frames else math.nan, 4),
-            "clock_ppm": _number(clock_ppm, 2),
+            "clock_ppm": _number(self.clock_ppm(), 2),
             "frames_ranged": self.ranged,
             "distance_first_m": _number(self.first_m, 4),
             "distance_last_m": _number(self.last_m, 4),
@@ -153,7 +165,8 @@ class ResultWriter:
         for packet in packets:
             tally = self.transmitters.get(packet.transmitter)
             if tally is None:
-                tally = TransmitterTally(packet.sent, self._link.packet.chip_us)
+                form = self._link.packet
+                tally = TransmitterTally(packet.sent, form.packet_chips * form.chip_us)
                 self.transmitters[packet.transmitter] = tally
             tally.add(packet)
             self._packets_file.write(json.dumps(self._packet_line(packet)) + "\n")

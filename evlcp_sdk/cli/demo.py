@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -128,23 +128,20 @@ def _show_frames(rows: "Sequence[Mapping[str, str]]") -> None:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in ("packet", "frame", "time"):
-        table.add_column(name, justify="right")
-    table.add_column("symbols of clusters 0 to 15", justify="left", no_wrap=True)
-    for name in ("quality", "distance"):
-        table.add_column(name, justify="right")
+    columns: tuple[tuple[str, Literal["left", "right"]], ...] = (
+        ("frame", "right"),
+        ("ms", "right"),
+        ("symbols of clusters 0 to 15", "left"),
+        ("distance, m", "right"),
+    )
+    for name, side in columns:
+        table.add_column(name, justify=side, no_wrap=True)
     for row in rows:
-        distance = (
-            f"{float(row['distance_m']):.2f} m ± {float(row['distance_sigma_m']):.2f}"
-            if row["distance_m"]
-            else "-"
-        )
+        sigma = f"{float(row['distance_sigma_m']):.2f}" if row["distance_sigma_m"] else "?"
         table.add_row(
-            row["packet"],
-            row["frame"],
-            f"{float(row['t_us']) / 1e3:.1f} ms",
+            f"{row['packet']}/{row['frame']}",
+            f"{float(row['t_us']) / 1e3:.1f}",
             " ".join(f"{int(s):2}" for s in row["symbols"].split()),
-            f"{float(row['quality']):.2f}",
-            distance,
+            f"{float(row['distance_m']):.2f} ± {sigma}" if row["distance_m"] else "-",
         )
     console().print(table)

@@ -51,7 +51,7 @@ def frame(packet: int, number: int, distance_m: float = 50.0, transmitter: int =
 
 
 def packet(number: int, frames: tuple[Frame, ...], transmitter: int = 0, chip_us: float = 99.999) -> Packet:
-    return Packet(transmitter, number, 9_745.678, chip_us, frames, sent=3)
+    return Packet(transmitter, number, 9_745.678 + 12_200 * number * chip_us / 100, chip_us, frames, sent=3)
 
 
 def finish(writer: ResultWriter, **kw: Any) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
         "transmitter": 0,
         "packets": 2,
         "frames_found": 3,
-        "frames_expected": 9,
+        "frames_expected": 8,
         "quality": 0.875,
         "clock_ppm": 10.0,
         "frames_ranged": 2,
@@ -114,6 +114,7 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
         "distance_median_m": 50.0,
     }
     assert table["transmitters"][1]["quality"] is None
+    assert table["transmitters"][1]["clock_ppm"] is None
     assert table["transmitters"][1]["distance_median_m"] is None
 
 
