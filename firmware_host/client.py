@@ -24,7 +24,7 @@ from firmware_host.wire import Payload
 __all__ = ["TRIES", "Client", "Outcome", "Timing"]
 
 TRIES = 5
-"""How often a request is sent before it is given up."""
+"""How often a request is sent before it is given up, unless the caller says otherwise."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,10 @@ class Client:
     Args:
         timing: How long an answer may take.
         window: Requests under way at once; HELLO tells how many the board takes.
+        session: Session that HELLO gave.
         first: First sequence number, by default drawn at random.
+        tries: How often a request is sent before it is given up.
+        retries: Counts the requests sent again.
 
     >>> from firmware_host.messages import StatusRequest
     >>> client = Client(Timing())
@@ -109,6 +112,7 @@ class Client:
     window: int = 1
     session: int = NO_SESSION
     first: int = field(default_factory=lambda: random.SystemRandom().randrange(1 << 16))
+    tries: int = TRIES
     retries: int = 0
     decoder: Decoder = field(default_factory=Decoder)
     _tokens: int = 0
@@ -169,7 +173,7 @@ class Client:
         for sequence, waiting in list(self._flight.items()):
             if waiting.due > now:
                 continue
-            if waiting.tries >= TRIES:
+            if waiting.tries >= self.tries:
                 del self._flight[sequence]
                 self._outcomes.append(Outcome(waiting.token, None, None, 0, waiting.tries))
             else:

@@ -1,8 +1,8 @@
 """Flicker and balance of a chip table.
 
 IEEE Std 1789-2015 bounds the modulation of the light below 3 kHz: no observable effect (practice 2) up to
-Mod% = 0.01 f / 0.3 = 0.0333 f for 90 Hz to 3 kHz and 0.01 f below 90 Hz; low risk (practice 1) up to 0.08 f for
-90 Hz to 1250 Hz and 0.025 f below 90 Hz. Above 3 kHz there is no bound, and from 1250 Hz none at low risk.
+Mod% = f / 30 for 90 Hz to 3 kHz and 0.01 f below 90 Hz; low risk (practice 1) up to 0.08 f for 90 Hz to
+1250 Hz and 0.025 f below 90 Hz. Above 3 kHz there is no bound, and from 1250 Hz none at low risk.
 """
 
 from dataclasses import dataclass
@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = ["ClusterFlicker", "check", "low_risk_percent", "no_effect_percent"]
+
+Floats = NDArray[np.floating[Any]]
 
 LIMIT_HZ = 3000.0
 """Above this frequency the recommendation sets no bound."""
@@ -55,7 +57,7 @@ class ClusterFlicker:
         }
 
 
-def no_effect_percent(frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
+def no_effect_percent(frequency_hz: Floats) -> Floats:
     """Largest modulation without observable effect at frequencies in Hz, percent.
 
     >>> no_effect_percent(np.array([60.0, 1200.0, 4000.0])).round(2).tolist()
@@ -66,7 +68,7 @@ def no_effect_percent(frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(f > LIMIT_HZ, np.inf, bound)
 
 
-def low_risk_percent(frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
+def low_risk_percent(frequency_hz: Floats) -> Floats:
     """Largest modulation of low risk at frequencies in Hz, percent.
 
     >>> low_risk_percent(np.array([60.0, 1000.0, 1300.0])).round(2).tolist()
@@ -80,8 +82,8 @@ def low_risk_percent(frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
 def check(chips: NDArray[np.uint8], chip_rate_hz: float) -> list[ClusterFlicker]:
     """Balance, runs and spectral lines of a chip table that repeats, uint8 (chips, clusters).
 
-    Played round and round the table is periodic: its light has lines at multiples of chip_rate / chips. A chip
-    is a rectangle, so a line at f is weakened by sinc(f / chip_rate).
+    Played round and round the table is periodic: its light has lines at multiples of chip_rate / chips. A
+    chip is a rectangle, so a line at f is weakened by sinc(f / chip_rate).
 
     >>> table = np.tile([[0], [1]], (100, 1)).astype(np.uint8)
     >>> check(table, 10_000.0)[0].line_percent

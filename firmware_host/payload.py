@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.codebook import Codebook
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.frames import info_words, packet_chips, pilot_words
-from firmware_host.messages import LEDS, ROW_BYTES, Format
+from evlcp_sdk.frames import PacketFormat, info_words, packet_chips, pilot_words
+from firmware_host.messages import LEDS, Format
 
 __all__ = [
     "Payload",
@@ -86,7 +86,7 @@ class Payload:
 
 
 def _packet_chips(codebook: Codebook, frames: int) -> int:
-    return 2 * len(codebook.preamble) + frames * 2 * (codebook.pilots.shape[1] + codebook.codewords.shape[1])
+    return PacketFormat.of(codebook, frames).packet_chips
 
 
 def random_symbols(packets: int, frames: int, codebook: Codebook, generator: np.random.Generator) -> Symbols:
@@ -217,7 +217,8 @@ def read_masks(path: Path, frames: int, codebook: Codebook) -> Payload:
     length = _packet_chips(codebook, frames)
     if chips.ndim != 2 or not len(chips) or len(chips) % length:
         raise InputError(
-            f"{path}: array of shape {chips.shape}, expected whole packets of {length} chips ({frames} frames)"
+            f"{path}: array of shape {chips.shape},"
+            f" expected whole packets of {length} chips ({frames} frames)"
         )
     try:
         return Payload.of_masks(chips, len(chips) // length, frames, codebook)

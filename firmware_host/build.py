@@ -1,0 +1,90 @@
+"""Builds the firmware on demand, into the user's cache, keyed by the sources."""
+
+import fcntl
+import hashlib
+import os
+import shutil
+import subprocess
+from functools import cache
+from pathlib import Path
+
+from firmware_host.errors import ToolchainError
+
+__all__ = ["FIRMWARE", "arm_image", "build_folder", "make", "native_library", "native_program"]
+
+FIRMWARE = Path(__file__).parent / "firmware"
+"""The firmware's source tree."""
+
+
+@cache
+def build_folder() -> Path:
+    """Where the firmware is built: `evlcp/firmware-HASH` in the user's cache."""
+    digest = hashlib.sha256()
+    for path in sorted(
+        p for p in FIRMWARE.rglob("*") if p.suffix in (".c", ".h", ".ld") or p.name == "Makefile"
+    ):
+        digest.update(path.relative_to(FIRMWARE).as_posix().encode() + b"\0" + path.read_bytes())
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return root / "evlcp" / f"firmware-{digest.hexdigest()[:16]}"
+
+
+def make(*targets: str) -> Path:
+    """Run make in the firmware tree; returns the build folder.
+
+    Raises:
+        ToolchainError: A tool is missing, or a step fails.
+    """
+    if shutil.which("make") is None:
+        raise ToolchainError("make is missing: apt-get install make gcc, then run this again")
+    folder = build_folder()
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        # Two programs may want the same image at once.
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        done = subprocess.run(
+            ["make", "-s", "-C", str(FIRMWARE), f"BUILD={folder}", *targets],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    if done.returncode:
+        last = (done.stderr or done.stdout).strip().splitlines()
+        raise ToolchainError(
+            f"building the firmware ({' '.join(targets)}) failed: {last[0] if last else '?'}"
+        )
+    return folder
+
+
+def _compiler(name: str, package: str) -> None:
+    if shutil.which(name) is None:
+        raise ToolchainError(f"{name} is missing: apt-get install --no-install-recommends {package}")
+
+
+def native_program() -> Path:
+    """The board as a program for this machine.
+
+    Raises:
+        ToolchainError: No C compiler, or it fails.
+    """
+    _compiler(os.environ.get("CC", "cc"), "gcc")
+    return make("native") / "evlcp-board"
+
+
+def native_library() -> Path:
+    """The board as a shared library for this machine.
+
+    Raises:
+        ToolchainError: No C compiler, or it fails.
+    """
+    _compiler(os.environ.get("CC", "cc"), "gcc")
+    return make("library") / "libevlcp-board.so"
+
+
+def arm_image(board: str) -> Path:
+    """The ARM image of a board: `mps2-an385`, `stm32f405` or `stm32f405-netduinoplus2`.
+
+    Raises:
+        ToolchainError: The cross compiler is missing, or fails.
+    """
+    _compiler("arm-none-eabi-gcc", "gcc-arm-none-eabi")
+    return make("mps2" if board == "mps2-an385" else "stm32") / f"{board}.elf"

@@ -1,0 +1,124 @@
+#include "banks.h"
+
+#include "codebook.h"
+#include "crc32.h"
+#include "profiles.h"
+
+_Static_assert(EVLCP_CLUSTERS == EVLCP_BOARD_CLUSTERS, "codebook and board have other clusters");
+
+void evlcp_banks_init(struct evlcp_banks *banks)
+{
+    for (uint32_t i = 0; i < EVLCP_BANKS; i++)
+        banks->plan[i].valid = false;
+    atomic_store(&banks->active, EVLCP_NO_BANK);
+    atomic_store(&banks->pending, EVLCP_NO_BANK);
+    banks->commits = 0u;
+}
+
+void evlcp_setup_init(struct evlcp_setup *setup, uint32_t tick_hz)
+{
+    setup->profile = EVLCP_PROFILE_WH4X2;
+    setup->preamble_chips = EVLCP_PREAMBLE_CHIPS;
+    setup->preamble = evlcp_preamble;
+    setup->frames = 10u;
+    setup->chip_rate_hz = 10000u;
+    setup->ticks_per_chip = tick_hz / setup->chip_rate_hz;
+    for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
+        setup->pilots[k] = evlcp_pilots[k];
+    evlcp_copy(setup->digest, evlcp_digest, 32u);
+}
+
+static bool equal(const uint8_t *a, const uint8_t *b, uint32_t count)
+{
+    uint32_t differ = 0u;
+    for (uint32_t i = 0; i < count; i++)
+        differ |= (uint32_t)(a[i] ^ b[i]);
+    return differ == 0u;
+}
+
+bool evlcp_profile_digest_ok(uint8_t profile, const uint8_t digest[32])
+{
+    if (profile == EVLCP_PROFILE_CUSTOM)
+        return true;
+    return profile < EVLCP_PROFILES && equal(digest, evlcp_profile_digests[profile], 32u);
+}
+
+bool evlcp_banks_range_ok(uint8_t bank, uint32_t offset, uint32_t count)
+{
+    return bank < EVLCP_BANKS && offset <= EVLCP_BANK_BYTES && count <= EVLCP_BANK_BYTES - offset;
+}
+
+bool evlcp_banks_held(const struct evlcp_banks *banks, uint8_t bank)
+{
+    /* Pending first: the chip interrupt moves a bank from pending to active between the two reads. */
+    return bank == atomic_load(&banks->pending) || bank == atomic_load(&banks->active);
+}
+
+/* Whether a held bank is already what is asked for. */
+static bool already(const struct evlcp_plan *plan, const struct evlcp_setup *setup,
+                    const struct evlcp_commit_request *request)
+{
+    return plan->valid && plan->format == request->format && plan->packets == request->packets &&
+           plan->length == request->length && plan->crc == request->crc &&
+           equal(plan->digest, request->digest, 32u) && equal(setup->digest, request->digest, 32u) &&
+           plan->frames == setup->frames && plan->ticks_per_chip == setup->ticks_per_chip;
+}
+
+enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlcp_setup *setup,
+                                    const struct evlcp_commit_request *request, uint32_t *detail)
+{
+    if (request->bank >= EVLCP_BANKS) {
+        *detail = EVLCP_BANKS - 1u;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    struct evlcp_plan *plan = &banks->plan[request->bank];
+    if (evlcp_banks_held(banks, request->bank))
+        return already(plan, setup, request) ? EVLCP_STATUS_OK : EVLCP_STATUS_BUSY;
+    plan->valid = false;
+    if (request->format > EVLCP_FORMAT_MASKS || request->packets == 0u || setup->frames == 0u)
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    uint32_t chips = evlcp_packet_chips(setup->preamble_chips, setup->frames);
+    uint32_t packet_bytes = request->format == EVLCP_FORMAT_WORDS ? setup->frames * EVLCP_FRAME_BYTES
+                                                                  : chips * EVLCP_ROW_BYTES;
+    if (packet_bytes > EVLCP_BANK_BYTES || request->packets > EVLCP_BANK_BYTES / packet_bytes) {
+        *detail = EVLCP_BANK_BYTES / packet_bytes;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    if (request->length != packet_bytes * request->packets) {
+        *detail = packet_bytes * request->packets;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    if (!equal(request->digest, setup->digest, 32u) || !evlcp_profile_digest_ok(setup->profile, setup->digest))
+        return EVLCP_STATUS_FOREIGN_CODEBOOK;
+    uint32_t crc = evlcp_crc32(0u, banks->content[request->bank], request->length);
+    if (crc != request->crc) {
+        *detail = crc;
+        return EVLCP_STATUS_BAD_CRC;
+    }
+    plan->format = request->format;
+    plan->profile = setup->profile;
+    plan->preamble_chips = setup->preamble_chips;
+    plan->preamble = setup->preamble;
+    plan->frames = setup->frames;
+    plan->packets = request->packets;
+    plan->length = request->length;
+    plan->crc = crc;
+    plan->chip_rate_hz = setup->chip_rate_hz;
+    plan->ticks_per_chip = setup->ticks_per_chip;
+    plan->packet_chips = chips;
+    for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
+        plan->pilots[k] = setup->pilots[k];
+    evlcp_copy(plan->digest, setup->digest, 32u);
+    plan->valid = true;
+    return EVLCP_STATUS_OK;
+}
+
+bool evlcp_banks_swap(struct evlcp_banks *banks)
+{
+    uint8_t bank = atomic_load(&banks->pending);
+    if (bank == EVLCP_NO_BANK)
+        return false;
+    atomic_store(&banks->active, bank);
+    atomic_store(&banks->pending, EVLCP_NO_BANK);
+    return true;
+}

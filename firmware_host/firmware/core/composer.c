@@ -1,0 +1,71 @@
+#include "composer.h"
+
+_Static_assert(EVLCP_BOARD_CLUSTERS == 16u && EVLCP_LEDS == 96u && EVLCP_ROW_BYTES == 12u,
+               "the row tables are made for 16 clusters of 6 LEDs");
+
+uint32_t evlcp_packet_chips(uint8_t preamble_chips, uint16_t frames)
+{
+    return preamble_chips + (uint32_t)frames * EVLCP_FRAME_CHIPS;
+}
+
+void evlcp_cursor_seek(struct evlcp_cursor *cursor, const struct evlcp_plan *plan, const uint8_t *content,
+                       uint32_t packet)
+{
+    cursor->plan = plan;
+    cursor->content = content;
+    cursor->packet = packet;
+    cursor->chip = 0u;
+    cursor->in_frame = 0u;
+    if (plan->format == EVLCP_FORMAT_WORDS)
+        cursor->at = content + packet * plan->frames * EVLCP_FRAME_BYTES;
+    else
+        cursor->at = content + packet * plan->packet_chips * EVLCP_ROW_BYTES;
+}
+
+void evlcp_row_of_mask(uint16_t mask, uint8_t row[EVLCP_ROW_BYTES])
+{
+    /* Four clusters are 24 LEDs are three bytes. */
+    for (uint32_t group = 0; group < 4u; group++) {
+        uint32_t four = (uint32_t)mask >> (12u - 4u * group) & 15u;
+        uint32_t leds = ((four & 8u) ? 0xfc0000u : 0u) | ((four & 4u) ? 0x03f000u : 0u) |
+                        ((four & 2u) ? 0x000fc0u : 0u) | ((four & 1u) ? 0x00003fu : 0u);
+        row[3u * group] = (uint8_t)(leds >> 16);
+        row[3u * group + 1u] = (uint8_t)(leds >> 8);
+        row[3u * group + 2u] = (uint8_t)leds;
+    }
+}
+
+/* Mask of a frame's chip: bit `shift` of each cluster's word. */
+static uint16_t frame_mask(const struct evlcp_cursor *c)
+{
+    uint32_t mask = 0u;
+    if (c->in_frame < 16u) {
+        uint32_t shift = 15u - c->in_frame;
+        for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
+            mask = mask << 1 | ((uint32_t)c->plan->pilots[k] >> shift & 1u);
+    } else {
+        uint32_t shift = 31u - c->in_frame;
+        for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
+            mask = mask << 1 | ((uint32_t)evlcp_get16(c->at + 2u * k) >> shift & 1u);
+    }
+    return (uint16_t)mask;
+}
+
+bool evlcp_cursor_row(struct evlcp_cursor *cursor, uint8_t row[EVLCP_ROW_BYTES])
+{
+    const struct evlcp_plan *plan = cursor->plan;
+    if (plan->format == EVLCP_FORMAT_MASKS) {
+        evlcp_copy(row, cursor->at, EVLCP_ROW_BYTES);
+        cursor->at += EVLCP_ROW_BYTES;
+    } else if (cursor->chip < plan->preamble_chips) {
+        uint32_t on = plan->preamble >> (plan->preamble_chips - 1u - cursor->chip) & 1u;
+        evlcp_row_of_mask(on ? 0xffffu : 0u, row);
+    } else {
+        evlcp_row_of_mask(frame_mask(cursor), row);
+        if (++cursor->in_frame == EVLCP_FRAME_CHIPS) {
+            cursor->in_frame = 0u;
+            cursor->at += EVLCP_FRAME_BYTES;
+        }
+    }
+    return ++cursor->chip == plan->packet_chips;
+}

@@ -1,0 +1,54 @@
+/* Chips from a bank's content: preamble, pilots and info words become LED rows. */
+#ifndef EVLCP_COMPOSER_H
+#define EVLCP_COMPOSER_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "protocol.h"
+
+#define EVLCP_FRAME_CHIPS 32u
+#define EVLCP_FRAME_BYTES (2u * EVLCP_BOARD_CLUSTERS)
+
+/* How a bank's content is played; fixed from COMMIT on. */
+struct evlcp_plan {
+    bool valid;
+    uint8_t format;
+    uint8_t profile;
+    uint8_t preamble_chips;
+    uint16_t frames;
+    uint16_t packets;
+    uint32_t preamble;
+    uint32_t length;
+    uint32_t crc;
+    uint32_t chip_rate_hz;
+    uint32_t ticks_per_chip;
+    uint32_t packet_chips;
+    uint16_t pilots[EVLCP_BOARD_CLUSTERS];
+    uint8_t digest[32];
+};
+
+/* A place in the content. */
+struct evlcp_cursor {
+    const struct evlcp_plan *plan;
+    const uint8_t *content;
+    uint32_t packet;
+    uint32_t chip;      /* of the packet */
+    const uint8_t *at;  /* words of the frame, or row of the chip */
+    uint32_t in_frame;  /* chip of the frame */
+};
+
+/* Chips of a packet. */
+uint32_t evlcp_packet_chips(uint8_t preamble_chips, uint16_t frames);
+
+/* Go to the first chip of a packet. */
+void evlcp_cursor_seek(struct evlcp_cursor *cursor, const struct evlcp_plan *plan, const uint8_t *content,
+                       uint32_t packet);
+
+/* The row of the chip at the cursor; the cursor moves on. True if it was the packet's last. */
+bool evlcp_cursor_row(struct evlcp_cursor *cursor, uint8_t row[EVLCP_ROW_BYTES]);
+
+/* Spread a mask, cluster 0 its most significant bit, over the LEDs. */
+void evlcp_row_of_mask(uint16_t mask, uint8_t row[EVLCP_ROW_BYTES]);
+
+#endif

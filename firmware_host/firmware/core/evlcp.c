@@ -1,0 +1,680 @@
+#include "evlcp.h"
+
+#include "crc32.h"
+
+#define HEALTH_EVERY_MS 100u
+#define WATCHDOG_MIN_MS 100u
+#define HOLDS_DARK (EVLCP_FAULT_OVER_TEMPERATURE | EVLCP_FAULT_CLOCK)
+
+static const uint8_t schema[8] = EVLCP_SCHEMA;
+static const uint8_t dark[EVLCP_ROW_BYTES];
+
+/* A request on its way through its handler. */
+struct exchange {
+    const uint8_t *in;
+    uint32_t in_length;
+    uint8_t *out;
+    uint32_t out_length;
+    uint32_t detail;
+};
+
+static bool running(struct evlcp *e)
+{
+    return atomic_load(&e->player.running);
+}
+
+static uint8_t faults(struct evlcp *e)
+{
+    uint32_t bits = e->health.faults | e->latched;
+    if (atomic_load(&e->player.chip_lost))
+        bits |= EVLCP_FAULT_CHIP_LOST;
+    if (e->watch.fired)
+        bits |= EVLCP_FAULT_WATCHDOG;
+    return (uint8_t)bits;
+}
+
+static void test_end(struct evlcp *e)
+{
+    if (e->test.on)
+        hal_leds(dark, EVLCP_CHIP_DARK);
+    e->test.on = false;
+}
+
+static void test_show(const struct evlcp *e)
+{
+    uint8_t row[EVLCP_ROW_BYTES] = {0};
+    row[e->test.led / 8u] = (uint8_t)(0x80u >> (e->test.led % 8u));
+    hal_leds(row, EVLCP_CHIP_TEST);
+}
+
+void evlcp_activate(struct evlcp *e, uint8_t bank)
+{
+    e->banks.commits++;
+    atomic_store(&e->banks.pending, bank);
+    /* While chips run the chip interrupt swaps; if it has just ended, evlcp_poll does. */
+    if (!running(e))
+        (void)evlcp_banks_swap(&e->banks);
+}
+
+/* ---- requests ---- */
+
+static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x, uint16_t sequence)
+{
+    struct evlcp_hello_request request;
+    struct evlcp_hello_reply reply = {0};
+    evlcp_hello_request_get(x->in, &request);
+    for (uint32_t i = 0; i < sizeof schema; i++) {
+        if (request.schema[i] != schema[i]) {
+            evlcp_copy(x->out, schema, sizeof schema);
+            x->out_length = sizeof schema;
+            return EVLCP_STATUS_INCOMPATIBLE;
+        }
+    }
+    if (e->session == EVLCP_NO_SESSION || request.nonce != e->nonce) {
+        uint16_t session = (uint16_t)(request.nonce ^ request.nonce >> 16);
+        while (session == EVLCP_NO_SESSION || session == e->session)
+            session++;
+        e->session = session;
+        e->nonce = request.nonce;
+        e->control.known = false;
+        e->control.newest = sequence;
+        e->control.sequence = sequence;
+    }
+    evlcp_copy(reply.schema, schema, sizeof schema);
+    reply.session = e->session;
+    reply.version_major = EVLCP_VERSION_MAJOR;
+    reply.version_minor = EVLCP_VERSION_MINOR;
+    reply.version_patch = EVLCP_VERSION_PATCH;
+    reply.window = EVLCP_WINDOW;
+    reply.max_payload = EVLCP_MAX_PAYLOAD;
+    reply.banks = EVLCP_BANKS;
+    reply.bank_bytes = EVLCP_BANK_BYTES;
+    reply.clusters = EVLCP_BOARD_CLUSTERS;
+    reply.leds = EVLCP_LEDS;
+    reply.tick_hz = e->info.tick_hz;
+    reply.chip_rate_max_hz = e->info.chip_rate_max_hz;
+    reply.level_max_ma = e->info.level_max_ma;
+    reply.capabilities = e->info.capabilities;
+    evlcp_copy(reply.unique_id, e->info.unique_id, sizeof reply.unique_id);
+    evlcp_copy(reply.hal, e->info.name, sizeof reply.hal);
+    reply.uptime_ms = hal_millis();
+    evlcp_hello_reply_put(x->out, &reply);
+    x->out_length = EVLCP_HELLO_REPLY_BYTES;
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_configure(struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_configure_request request;
+    evlcp_configure_request_get(x->in, &request);
+    if (request.chip_rate_hz == 0u || request.chip_rate_hz > e->info.chip_rate_max_hz ||
+        e->info.tick_hz % request.chip_rate_hz != 0u) {
+        x->detail = e->info.chip_rate_max_hz;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    uint32_t most = EVLCP_BANK_BYTES / EVLCP_FRAME_BYTES;
+    if (request.frames == 0u || request.frames > most) {
+        x->detail = most;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    if (request.profile > EVLCP_PROFILE_RAW8 && request.profile != EVLCP_PROFILE_CUSTOM) {
+        x->detail = EVLCP_PROFILE_CUSTOM;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    e->setup.chip_rate_hz = request.chip_rate_hz;
+    e->setup.ticks_per_chip = e->info.tick_hz / request.chip_rate_hz;
+    e->setup.profile = request.profile;
+    e->setup.frames = request.frames;
+    const struct evlcp_configure_reply reply = {
+        .ticks_per_chip = e->setup.ticks_per_chip,
+        .packet_chips = evlcp_packet_chips(e->setup.preamble_chips, request.frames)};
+    evlcp_configure_reply_put(x->out, &reply);
+    x->out_length = EVLCP_CONFIGURE_REPLY_BYTES;
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_codebook(struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_codebook_request request;
+    evlcp_codebook_request_get(x->in, &request);
+    if (request.preamble_chips == 0u || request.preamble_chips > 32u) {
+        x->detail = 32u;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    if (!evlcp_profile_digest_ok(e->setup.profile, request.digest))
+        return EVLCP_STATUS_FOREIGN_CODEBOOK;
+    if (e->setup.profile != EVLCP_PROFILE_CUSTOM) {
+        struct evlcp_setup own;
+        evlcp_setup_init(&own, e->info.tick_hz);
+        bool same = own.preamble == request.preamble && own.preamble_chips == request.preamble_chips;
+        for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
+            same = same && own.pilots[k] == request.pilots[k];
+        if (!same)
+            return EVLCP_STATUS_FOREIGN_CODEBOOK;
+    }
+    e->setup.preamble_chips = request.preamble_chips;
+    e->setup.preamble = request.preamble;
+    for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
+        e->setup.pilots[k] = request.pilots[k];
+    evlcp_copy(e->setup.digest, request.digest, sizeof e->setup.digest);
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_write(struct evlcp *e, struct exchange *x)
+{
+    uint8_t bank = evlcp_get8(x->in);
+    uint32_t offset = evlcp_get32(x->in + 1);
+    uint32_t count = x->in_length - EVLCP_WRITE_REQUEST_BYTES;
+    if (!evlcp_banks_range_ok(bank, offset, count)) {
+        x->detail = EVLCP_BANK_BYTES;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    if (evlcp_banks_held(&e->banks, bank))
+        return EVLCP_STATUS_BUSY;
+    e->banks.plan[bank].valid = false;
+    evlcp_copy(e->banks.content[bank] + offset, x->in + EVLCP_WRITE_REQUEST_BYTES, count);
+    const struct evlcp_write_reply reply = {.bank = bank, .offset = offset, .count = (uint16_t)count};
+    evlcp_write_reply_put(x->out, &reply);
+    x->out_length = EVLCP_WRITE_REPLY_BYTES;
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_read(const struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_read_request request;
+    evlcp_read_request_get(x->in, &request);
+    if (!evlcp_banks_range_ok(request.bank, request.offset, request.count) ||
+        request.count > EVLCP_MAX_PAYLOAD - EVLCP_READ_REPLY_BYTES) {
+        x->detail = EVLCP_MAX_PAYLOAD - EVLCP_READ_REPLY_BYTES;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    x->out[0] = request.bank;
+    evlcp_put32(x->out + 1, request.offset);
+    evlcp_copy(x->out + EVLCP_READ_REPLY_BYTES, e->banks.content[request.bank] + request.offset, request.count);
+    x->out_length = EVLCP_READ_REPLY_BYTES + request.count;
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_crc(const struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_crc_request request;
+    evlcp_crc_request_get(x->in, &request);
+    if (!evlcp_banks_range_ok(request.bank, request.offset, request.length)) {
+        x->detail = EVLCP_BANK_BYTES;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    const struct evlcp_crc_reply reply = {
+        .crc = evlcp_crc32(0u, e->banks.content[request.bank] + request.offset, request.length)};
+    evlcp_crc_reply_put(x->out, &reply);
+    x->out_length = EVLCP_CRC_REPLY_BYTES;
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_commit(struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_commit_request request;
+    evlcp_commit_request_get(x->in, &request);
+    uint8_t active = atomic_load(&e->banks.active);
+    bool held = request.bank < EVLCP_BANKS && evlcp_banks_held(&e->banks, request.bank);
+    /* Another bank waits for its packet boundary. */
+    if (atomic_load(&e->banks.pending) != EVLCP_NO_BANK && !held)
+        return EVLCP_STATUS_BUSY;
+    /* The chip timer is not changed while it runs: a chip of another length would be torn. */
+    if (running(e) && e->setup.ticks_per_chip != e->banks.plan[active].ticks_per_chip) {
+        x->detail = e->banks.plan[active].chip_rate_hz;
+        return EVLCP_STATUS_BUSY;
+    }
+    enum evlcp_status status = evlcp_banks_check(&e->banks, &e->setup, &request, &x->detail);
+    if (status != EVLCP_STATUS_OK)
+        return status;
+    if (!held)
+        evlcp_activate(e, request.bank);
+    const struct evlcp_commit_reply reply = {.commits = e->banks.commits};
+    evlcp_commit_reply_put(x->out, &reply);
+    x->out_length = EVLCP_COMMIT_REPLY_BYTES;
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status start(struct evlcp *e, uint32_t *detail)
+{
+    if (atomic_load(&e->banks.active) == EVLCP_NO_BANK && atomic_load(&e->banks.pending) == EVLCP_NO_BANK)
+        return EVLCP_STATUS_NOTHING_COMMITTED;
+    hal_health(&e->health);
+    e->latched = 0u;
+    if ((e->health.faults & HOLDS_DARK) != 0u) {
+        *detail = e->health.faults;
+        return EVLCP_STATUS_HARDWARE_FAULT;
+    }
+    test_end(e);
+    /* evlcp_poll begins; so a START that meets the end of a STOP is not lost. */
+    atomic_store(&e->player.want_play, true);
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_level(struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_level_request request;
+    evlcp_level_request_get(x->in, &request);
+    if ((e->info.capabilities & EVLCP_CAPABILITY_LEVEL) == 0u)
+        return EVLCP_STATUS_NOT_SUPPORTED;
+    if (request.level_ma > e->info.level_max_ma) {
+        x->detail = e->info.level_max_ma;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    if (!hal_level(request.level_ma))
+        return EVLCP_STATUS_HARDWARE_FAULT;
+    e->level_ma = request.level_ma;
+    return EVLCP_STATUS_OK;
+}
+
+static uint8_t state(struct evlcp *e)
+{
+    if (running(e)) {
+        if (!atomic_load(&e->player.want_play))
+            return EVLCP_STATE_STOPPING;
+        return e->player.idle ? EVLCP_STATE_IDLE_PATTERN : EVLCP_STATE_PLAYING;
+    }
+    if (e->test.on)
+        return EVLCP_STATE_TESTING;
+    if ((faults(e) & (HOLDS_DARK | EVLCP_FAULT_CHIP_LOST)) != 0u)
+        return EVLCP_STATE_FAULT;
+    /* Between START and its first chip. */
+    return atomic_load(&e->player.want_play) ? EVLCP_STATE_PLAYING : EVLCP_STATE_DARK;
+}
+
+static enum evlcp_status on_status(struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_status_reply reply = {0};
+    reply.state = state(e);
+    reply.faults = faults(e);
+    /* Pending first, as in evlcp_banks_held. */
+    reply.pending_bank = atomic_load(&e->banks.pending);
+    reply.active_bank = atomic_load(&e->banks.active);
+    evlcp_copy(reply.digest, e->setup.digest, sizeof reply.digest);
+    reply.chip_rate_hz = e->setup.chip_rate_hz;
+    reply.profile = e->setup.profile;
+    reply.frames = e->setup.frames;
+    if (reply.active_bank != EVLCP_NO_BANK) {
+        const struct evlcp_plan *plan = &e->banks.plan[reply.active_bank];
+        reply.format = plan->format;
+        reply.profile = plan->profile;
+        reply.frames = plan->frames;
+        reply.packets = plan->packets;
+        reply.length = plan->length;
+        reply.crc = plan->crc;
+        reply.chip_rate_hz = plan->chip_rate_hz;
+        evlcp_copy(reply.digest, plan->digest, sizeof reply.digest);
+    }
+    reply.commits = e->banks.commits;
+    reply.packets_sent = atomic_load(&e->player.packets_sent);
+    reply.chips_sent = atomic_load(&e->player.chips_sent);
+    reply.lateness_ticks = atomic_load(&e->player.lateness);
+    reply.lateness_max_ticks = atomic_load(&e->player.lateness_max);
+    reply.crc_errors = e->link.crc_errors;
+    reply.framing_errors = e->link.framing_errors;
+    reply.overflow_errors = atomic_load(&e->link.overflow_errors);
+    reply.requests = e->requests;
+    reply.level_ma = e->level_ma;
+    reply.temperature_dc = e->health.temperature_dc;
+    evlcp_copy(reply.open_leds, e->health.open_leds, sizeof reply.open_leds);
+    reply.watchdog = e->watch.action;
+    reply.watchdog_ms = e->watch.timeout_ms;
+    reply.silence_ms = e->watch.silence_ms;
+    reply.uptime_ms = hal_millis();
+    evlcp_status_reply_put(x->out, &reply);
+    x->out_length = EVLCP_STATUS_REPLY_BYTES;
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_watchdog(struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_watchdog_request request;
+    evlcp_watchdog_request_get(x->in, &request);
+    if (request.action > EVLCP_WATCHDOG_DARK) {
+        x->detail = EVLCP_WATCHDOG_DARK;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    if (request.action != EVLCP_WATCHDOG_KEEP && request.timeout_ms < WATCHDOG_MIN_MS) {
+        x->detail = WATCHDOG_MIN_MS;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    e->watch.action = request.action;
+    e->watch.timeout_ms = request.timeout_ms;
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_save(struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_save_reply reply = {0};
+    uint8_t autostart = evlcp_get8(x->in);
+    if (autostart > 1u) {
+        x->detail = 1u;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    enum evlcp_status status = evlcp_settings_save(e, autostart == 1u, &reply);
+    if (status == EVLCP_STATUS_OK) {
+        evlcp_save_reply_put(x->out, &reply);
+        x->out_length = EVLCP_SAVE_REPLY_BYTES;
+    }
+    return status;
+}
+
+static enum evlcp_status on_recall(struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_recall_reply reply = {0};
+    enum evlcp_status status = evlcp_settings_recall(e, false, &reply);
+    if (status == EVLCP_STATUS_OK) {
+        evlcp_recall_reply_put(x->out, &reply);
+        x->out_length = EVLCP_RECALL_REPLY_BYTES;
+    }
+    return status;
+}
+
+static enum evlcp_status on_led_test(struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_led_test_request request;
+    evlcp_led_test_request_get(x->in, &request);
+    if (running(e) || atomic_load(&e->player.want_play))
+        return EVLCP_STATUS_BUSY;
+    if (request.last >= EVLCP_LEDS || request.first > request.last) {
+        x->detail = EVLCP_LEDS - 1u;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    if (request.dwell_ms == 0u) {
+        x->detail = 1u;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    hal_health(&e->health);
+    if ((e->health.faults & HOLDS_DARK) != 0u) {
+        x->detail = e->health.faults;
+        return EVLCP_STATUS_HARDWARE_FAULT;
+    }
+    e->test.on = true;
+    e->test.led = request.first;
+    e->test.last = request.last;
+    e->test.dwell_ms = request.dwell_ms;
+    e->test.since_ms = hal_millis();
+    test_show(e);
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_control(struct evlcp *e, uint8_t type, struct exchange *x)
+{
+    switch (type) {
+    case EVLCP_TYPE_CONFIGURE:
+        return on_configure(e, x);
+    case EVLCP_TYPE_CODEBOOK:
+        return on_codebook(e, x);
+    case EVLCP_TYPE_COMMIT:
+        return on_commit(e, x);
+    case EVLCP_TYPE_START:
+        return start(e, &x->detail);
+    case EVLCP_TYPE_STOP:
+        atomic_store(&e->player.want_play, false);
+        test_end(e);
+        return EVLCP_STATUS_OK;
+    case EVLCP_TYPE_BLANK:
+        atomic_store(&e->player.want_play, false);
+        evlcp_player_blank(&e->player);
+        e->test.on = false;
+        return EVLCP_STATUS_OK;
+    case EVLCP_TYPE_LEVEL:
+        return on_level(e, x);
+    case EVLCP_TYPE_WATCHDOG:
+        return on_watchdog(e, x);
+    case EVLCP_TYPE_SAVE:
+        return on_save(e, x);
+    case EVLCP_TYPE_RECALL:
+        return on_recall(e, x);
+    default:
+        return on_led_test(e, x);
+    }
+}
+
+struct shape {
+    uint8_t type;
+    bool control;
+    bool open_ended;
+    uint16_t bytes;
+};
+
+static const struct shape shapes[] = {
+    {EVLCP_TYPE_HELLO, false, false, EVLCP_HELLO_REQUEST_BYTES},
+    {EVLCP_TYPE_CONFIGURE, true, false, EVLCP_CONFIGURE_REQUEST_BYTES},
+    {EVLCP_TYPE_CODEBOOK, true, false, EVLCP_CODEBOOK_REQUEST_BYTES},
+    {EVLCP_TYPE_WRITE, false, true, EVLCP_WRITE_REQUEST_BYTES},
+    {EVLCP_TYPE_READ, false, false, EVLCP_READ_REQUEST_BYTES},
+    {EVLCP_TYPE_CRC, false, false, EVLCP_CRC_REQUEST_BYTES},
+    {EVLCP_TYPE_COMMIT, true, false, EVLCP_COMMIT_REQUEST_BYTES},
+    {EVLCP_TYPE_START, true, false, EVLCP_START_REQUEST_BYTES},
+    {EVLCP_TYPE_STOP, true, false, EVLCP_STOP_REQUEST_BYTES},
+    {EVLCP_TYPE_BLANK, true, false, EVLCP_BLANK_REQUEST_BYTES},
+    {EVLCP_TYPE_LEVEL, true, false, EVLCP_LEVEL_REQUEST_BYTES},
+    {EVLCP_TYPE_STATUS, false, false, EVLCP_STATUS_REQUEST_BYTES},
+    {EVLCP_TYPE_WATCHDOG, true, false, EVLCP_WATCHDOG_REQUEST_BYTES},
+    {EVLCP_TYPE_SAVE, true, false, EVLCP_SAVE_REQUEST_BYTES},
+    {EVLCP_TYPE_RECALL, true, false, EVLCP_RECALL_REQUEST_BYTES},
+    {EVLCP_TYPE_LED_TEST, true, false, EVLCP_LED_TEST_REQUEST_BYTES},
+};
+
+static const struct shape *shape_of(uint8_t type)
+{
+    for (uint32_t i = 0; i < sizeof shapes / sizeof shapes[0]; i++) {
+        if (shapes[i].type == type)
+            return &shapes[i];
+    }
+    return 0;
+}
+
+/* Sequence numbers wrap; half of them count as after `than`. */
+static bool after(uint16_t sequence, uint16_t than)
+{
+    return (int16_t)(uint16_t)(sequence - than) > 0;
+}
+
+static enum evlcp_status controlled(struct evlcp *e, const struct evlcp_datagram *d, struct exchange *x)
+{
+    struct evlcp_control *c = &e->control;
+    if (c->known && d->sequence == c->sequence && d->type == c->type) {
+        evlcp_copy(x->out, c->reply, c->length);
+        x->out_length = c->length;
+        x->detail = evlcp_get32(c->reply);
+        return (enum evlcp_status)c->status;
+    }
+    if (!after(d->sequence, c->sequence))
+        return EVLCP_STATUS_STALE;
+    enum evlcp_status status = on_control(e, d->type, x);
+    c->known = true;
+    c->type = d->type;
+    c->status = (uint8_t)status;
+    c->sequence = d->sequence;
+    c->length = x->out_length;
+    evlcp_copy(c->reply, x->out, x->out_length);
+    if (status != EVLCP_STATUS_OK)
+        evlcp_put32(c->reply, x->detail);
+    return status;
+}
+
+static void heard(struct evlcp *e)
+{
+    uint32_t now = hal_millis();
+    e->watch.silence_ms = now - e->watch.heard_ms;
+    e->watch.heard_ms = now;
+    e->watch.fired = false;
+    atomic_store(&e->player.want_idle, false);
+}
+
+static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *d, struct exchange *x)
+{
+    const struct shape *shape = shape_of(d->type);
+    if (shape == 0)
+        return EVLCP_STATUS_UNKNOWN_TYPE;
+    if (d->length < shape->bytes || (d->length > shape->bytes && !shape->open_ended)) {
+        x->detail = shape->bytes;
+        return EVLCP_STATUS_BAD_LENGTH;
+    }
+    if (d->type == EVLCP_TYPE_HELLO) {
+        enum evlcp_status status = on_hello(e, x, d->sequence);
+        if (status == EVLCP_STATUS_OK)
+            heard(e);
+        return status;
+    }
+    if (d->session != e->session || e->session == EVLCP_NO_SESSION)
+        return EVLCP_STATUS_NO_SESSION;
+    if (d->type != EVLCP_TYPE_STATUS)
+        heard(e);
+    struct evlcp_control *c = &e->control;
+    if (after(d->sequence, c->newest)) {
+        c->newest = d->sequence;
+        /* Keep the last control request within the half of the numbers that counts as before. */
+        if ((uint16_t)(c->newest - c->sequence) > 0x4000u) {
+            c->sequence = (uint16_t)(c->newest - 0x4000u);
+            c->known = false;
+        }
+    }
+    if (shape->control)
+        return controlled(e, d, x);
+    switch (d->type) {
+    case EVLCP_TYPE_WRITE:
+        return after(d->sequence, c->sequence) ? on_write(e, x) : EVLCP_STATUS_STALE;
+    case EVLCP_TYPE_READ:
+        return on_read(e, x);
+    case EVLCP_TYPE_CRC:
+        return on_crc(e, x);
+    default: {
+        enum evlcp_status status = on_status(e, x);
+        heard(e); /* after, so that the status still tells of a watchdog that fired */
+        return status;
+    }
+    }
+}
+
+static void answer(struct evlcp *e, const struct evlcp_datagram *d)
+{
+    struct exchange x = {.in = d->payload, .in_length = d->length, .out = e->payload};
+    /* Replies go to hosts; one that comes here was echoed by the line. */
+    if ((d->type & EVLCP_REPLY_BIT) != 0u)
+        return;
+    e->requests++;
+    enum evlcp_status status = dispatch(e, d, &x);
+    if (status != EVLCP_STATUS_OK && status != EVLCP_STATUS_INCOMPATIBLE) {
+        evlcp_put32(e->payload, x.detail);
+        x.out_length = 4u;
+    }
+    const struct evlcp_datagram reply = {.type = (uint8_t)(d->type | EVLCP_REPLY_BIT),
+                                         .status = (uint8_t)status,
+                                         .sequence = d->sequence,
+                                         .session = e->session,
+                                         .payload = e->payload,
+                                         .length = x.out_length};
+    evlcp_link_put(&e->link, &reply);
+}
+
+/* ---- what happens by itself ---- */
+
+static void watch(struct evlcp *e, uint32_t now)
+{
+    if (e->watch.action == EVLCP_WATCHDOG_KEEP || e->watch.fired ||
+        now - e->watch.heard_ms < e->watch.timeout_ms || !atomic_load(&e->player.want_play))
+        return;
+    e->watch.fired = true;
+    if (e->watch.action == EVLCP_WATCHDOG_IDLE)
+        atomic_store(&e->player.want_idle, true);
+    else
+        atomic_store(&e->player.want_play, false);
+}
+
+static void check_health(struct evlcp *e, uint32_t now)
+{
+    if (now - e->health_ms < HEALTH_EVERY_MS)
+        return;
+    e->health_ms = now;
+    hal_health(&e->health);
+    if ((e->health.faults & HOLDS_DARK) != 0u && (e->latched & e->health.faults & HOLDS_DARK) == 0u) {
+        e->latched |= e->health.faults & HOLDS_DARK;
+        atomic_store(&e->player.want_play, false);
+        e->test.on = false;
+        evlcp_player_blank(&e->player);
+    }
+}
+
+static void walk(struct evlcp *e, uint32_t now)
+{
+    if (!e->test.on || now - e->test.since_ms < e->test.dwell_ms)
+        return;
+    e->test.since_ms += e->test.dwell_ms;
+    if (e->test.led == e->test.last) {
+        test_end(e);
+        return;
+    }
+    e->test.led++;
+    test_show(e);
+}
+
+void evlcp_init(struct evlcp *e)
+{
+    /* The LEDs first: nothing may light them before a COMMIT. */
+    evlcp_player_init(&e->player);
+    hal_info(&e->info);
+    atomic_store(&e->link.head, 0u);
+    atomic_store(&e->link.tail, 0u);
+    atomic_store(&e->link.overflow_errors, 0u);
+    e->link.length = 0u;
+    e->link.left = 0u;
+    e->link.open = false;
+    e->link.broken = false;
+    e->link.full_block = true;
+    e->link.crc_errors = 0u;
+    e->link.framing_errors = 0u;
+    e->link.wire_length = 0u;
+    e->link.wire_sent = 0u;
+    evlcp_banks_init(&e->banks);
+    evlcp_setup_init(&e->setup, e->info.tick_hz);
+    e->watch = (struct evlcp_watch){.action = EVLCP_WATCHDOG_KEEP, .heard_ms = hal_millis()};
+    e->test.on = false;
+    e->control = (struct evlcp_control){.known = false};
+    e->session = EVLCP_NO_SESSION;
+    e->nonce = 0u;
+    e->requests = 0u;
+    e->latched = 0u;
+    e->level_ma = hal_level(e->info.level_default_ma) ? e->info.level_default_ma : 0u;
+    hal_health(&e->health);
+    e->health_ms = hal_millis();
+    struct evlcp_recall_reply recalled;
+    uint32_t detail;
+    if (evlcp_settings_recall(e, true, &recalled) == EVLCP_STATUS_OK)
+        (void)start(e, &detail);
+}
+
+void evlcp_receive(struct evlcp *e, const uint8_t *bytes, uint32_t count)
+{
+    evlcp_link_push(&e->link, bytes, count);
+}
+
+void evlcp_chip(struct evlcp *e)
+{
+    evlcp_player_chip(&e->player, &e->banks);
+}
+
+void evlcp_poll(struct evlcp *e)
+{
+    struct evlcp_datagram datagram;
+    uint32_t now = hal_millis();
+    if (evlcp_link_flush(&e->link) && evlcp_link_next(&e->link, &datagram)) {
+        answer(e, &datagram);
+        (void)evlcp_link_flush(&e->link);
+    }
+    uint32_t lost = hal_lost();
+    if (lost != 0u)
+        atomic_fetch_add(&e->link.overflow_errors, lost);
+    if (!running(e)) {
+        (void)evlcp_banks_swap(&e->banks);
+        if (atomic_load(&e->player.chip_lost))
+            atomic_store(&e->player.want_play, false);
+        if (atomic_load(&e->player.want_play) && atomic_load(&e->banks.active) != EVLCP_NO_BANK)
+            evlcp_player_begin(&e->player, &e->banks);
+    }
+    watch(e, now);
+    check_health(e, now);
+    walk(e, now);
+}

@@ -1,0 +1,84 @@
+/* The board: answers requests, plays chips. The HAL owns one, calls evlcp_init once, evlcp_receive from the
+   receive interrupt, evlcp_chip from the chip interrupt (the highest priority) and evlcp_poll without pause. */
+#ifndef EVLCP_H
+#define EVLCP_H
+
+#include "banks.h"
+#include "hal.h"
+#include "link.h"
+#include "player.h"
+
+#define EVLCP_VERSION_MAJOR 1u
+#define EVLCP_VERSION_MINOR 0u
+#define EVLCP_VERSION_PATCH 0u
+
+#define EVLCP_SLOTS 2u
+#define EVLCP_SLOT_HEADER_BYTES 128u
+#define EVLCP_SLOT_BYTES (EVLCP_SLOT_HEADER_BYTES + EVLCP_BANK_BYTES)
+
+struct evlcp_watch {
+    uint8_t action;
+    uint32_t timeout_ms;
+    uint32_t heard_ms;
+    uint32_t silence_ms; /* between the last two requests */
+    bool fired;
+};
+
+struct evlcp_test {
+    bool on;
+    uint8_t led;
+    uint8_t last;
+    uint16_t dwell_ms;
+    uint32_t since_ms;
+};
+
+/* The last control request, to answer a repeated one and to refuse an older one. */
+struct evlcp_control {
+    bool known;
+    uint8_t type;
+    uint8_t status;
+    uint16_t sequence; /* requests not after it are stale */
+    uint16_t newest;
+    uint8_t reply[8];
+    uint32_t length;
+};
+
+struct evlcp {
+    struct evlcp_hal_info info;
+    struct evlcp_link link;
+    struct evlcp_banks banks;
+    struct evlcp_player player;
+    struct evlcp_setup setup;
+    struct evlcp_watch watch;
+    struct evlcp_test test;
+    struct evlcp_control control;
+    struct evlcp_health health;
+    uint32_t health_ms;
+    uint32_t nonce;
+    uint16_t session;
+    uint16_t level_ma;
+    uint8_t latched; /* faults that hold the LEDs dark until START finds them gone */
+    uint32_t requests;
+    uint8_t payload[EVLCP_MAX_PAYLOAD];
+};
+
+/* Begin: LEDs dark, no session; a flash slot saved with autostart is recalled and played. */
+void evlcp_init(struct evlcp *e);
+
+/* Bytes came in. */
+void evlcp_receive(struct evlcp *e, const uint8_t *bytes, uint32_t count);
+
+/* A chip is due. */
+void evlcp_chip(struct evlcp *e);
+
+/* Everything that is not urgent. */
+void evlcp_poll(struct evlcp *e);
+
+/* Storing settings; see settings.c. */
+enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct evlcp_save_reply *reply);
+enum evlcp_status evlcp_settings_recall(struct evlcp *e, bool only_autostart, struct evlcp_recall_reply *reply);
+
+/* Make a checked bank active: now if nothing plays, else at the packet boundary. */
+void evlcp_activate(struct evlcp *e, uint8_t bank);
+
+#endif

@@ -1,0 +1,62 @@
+/* What the core asks of the hardware: the only way from the core to the outside. */
+#ifndef EVLCP_HAL_H
+#define EVLCP_HAL_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "protocol.h"
+
+/* Facts of a board that do not change. */
+struct evlcp_hal_info {
+    uint32_t tick_hz;          /* rate of the timer that times the chips */
+    uint32_t chip_rate_max_hz; /* fastest chip rate */
+    uint16_t level_max_ma;     /* largest LED current */
+    uint16_t level_default_ma; /* LED current after reset */
+    uint32_t capabilities;     /* enum evlcp_capability */
+    uint8_t unique_id[12];
+    uint8_t name[12]; /* of the hardware layer, ASCII, zero-padded */
+};
+
+/* What the sensors tell; `faults` holds over_temperature, open_led and clock of enum evlcp_fault. */
+struct evlcp_health {
+    int16_t temperature_dc;
+    uint8_t faults;
+    uint8_t open_leds[EVLCP_ROW_BYTES];
+};
+
+/* Facts of the board. */
+void hal_info(struct evlcp_hal_info *info);
+
+/* Show a row of LEDs, LED 0 the most significant bit of row[0]. `chip` is its number since START, or
+   EVLCP_CHIP_DARK (blank at once) or EVLCP_CHIP_TEST. The only output; nothing else lights a LED. */
+void hal_leds(const uint8_t *row, uint32_t chip);
+
+/* Call evlcp_chip every `ticks` from now on; 0 stops it, and no call comes after the return. Never called
+   while it runs except to stop it. */
+void hal_chips(uint32_t ticks);
+
+/* Ticks between the moment the running chip call was due and now. */
+uint32_t hal_lateness(void);
+
+/* Milliseconds since reset, free to wrap. */
+uint32_t hal_millis(void);
+
+/* Take bytes to send; returns how many were taken, and never waits. */
+uint32_t hal_send(const uint8_t *bytes, uint32_t count);
+
+/* Bytes that the receiver hardware lost since the last call. */
+uint32_t hal_lost(void);
+
+/* Set the LED current; false if the hardware does not follow. */
+bool hal_level(uint16_t level_ma);
+
+/* Read the sensors. */
+void hal_health(struct evlcp_health *health);
+
+/* Two flash slots of at least EVLCP_SLOT_BYTES each. Called only while no chip call runs. */
+bool hal_flash_erase(uint8_t slot);
+bool hal_flash_write(uint8_t slot, uint32_t offset, const uint8_t *bytes, uint32_t count);
+bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t count);
+
+#endif

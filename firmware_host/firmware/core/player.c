@@ -1,0 +1,107 @@
+#include "player.h"
+
+#include "hal.h"
+
+static const uint8_t dark[EVLCP_ROW_BYTES];
+
+void evlcp_player_init(struct evlcp_player *player)
+{
+    atomic_store(&player->want_play, false);
+    atomic_store(&player->want_idle, false);
+    atomic_store(&player->running, false);
+    atomic_store(&player->chip_lost, false);
+    atomic_store(&player->packets_sent, 0u);
+    atomic_store(&player->chips_sent, 0u);
+    atomic_store(&player->lateness, 0u);
+    atomic_store(&player->lateness_max, 0u);
+    player->idle = false;
+    player->halt = false;
+    hal_leds(dark, EVLCP_CHIP_DARK);
+}
+
+static void seek(struct evlcp_player *player, const struct evlcp_banks *banks, uint32_t packet)
+{
+    uint8_t bank = atomic_load(&banks->active);
+    evlcp_cursor_seek(&player->cursor, &banks->plan[bank], banks->content[bank], packet);
+}
+
+/* Row of the next chip. */
+static void compose(struct evlcp_player *player)
+{
+    if (player->idle) {
+        evlcp_row_of_mask(player->idle_left & 1u ? 0xffffu : 0u, player->row);
+        player->packet_done = --player->idle_left == 0u;
+    } else {
+        player->packet_done = evlcp_cursor_row(&player->cursor, player->row);
+    }
+}
+
+/* What follows a packet: the pending bank's first, the next of the active bank, the idle pattern, or dark. */
+static void next_packet(struct evlcp_player *player, struct evlcp_banks *banks)
+{
+    /* During the idle pattern the cursor stands at the packet that comes after it. */
+    uint32_t next = player->idle ? player->cursor.packet : player->cursor.packet + 1u;
+    if (evlcp_banks_swap(banks))
+        next = 0u;
+    if (!atomic_load(&player->want_play)) {
+        player->halt = true;
+        return;
+    }
+    const struct evlcp_plan *plan = &banks->plan[atomic_load(&banks->active)];
+    seek(player, banks, next < plan->packets ? next : 0u);
+    player->idle = atomic_load(&player->want_idle);
+    player->idle_left = plan->packet_chips;
+}
+
+void evlcp_player_begin(struct evlcp_player *player, struct evlcp_banks *banks)
+{
+    const struct evlcp_plan *plan = &banks->plan[atomic_load(&banks->active)];
+    player->chip = 0u;
+    player->halt = false;
+    player->idle = false;
+    player->ticks_per_chip = plan->ticks_per_chip;
+    atomic_store(&player->chip_lost, false);
+    atomic_store(&player->lateness, 0u);
+    atomic_store(&player->lateness_max, 0u);
+    seek(player, banks, 0u);
+    compose(player);
+    atomic_store(&player->running, true);
+    hal_chips(plan->ticks_per_chip);
+}
+
+void evlcp_player_blank(struct evlcp_player *player)
+{
+    hal_chips(0u);
+    hal_leds(dark, EVLCP_CHIP_DARK);
+    atomic_store(&player->running, false);
+}
+
+void evlcp_player_chip(struct evlcp_player *player, struct evlcp_banks *banks)
+{
+    if (player->halt) {
+        evlcp_player_blank(player);
+        return;
+    }
+    /* First the output, so that its delay does not depend on what follows. */
+    hal_leds(player->row, player->chip);
+    uint32_t late = hal_lateness();
+    atomic_store(&player->lateness, late);
+    if (late > atomic_load(&player->lateness_max))
+        atomic_store(&player->lateness_max, late);
+    if (late >= player->ticks_per_chip) {
+        atomic_store(&player->chip_lost, true);
+        evlcp_player_blank(player);
+        return;
+    }
+    atomic_store(&player->chips_sent, atomic_load(&player->chips_sent) + 1u);
+    /* The two topmost numbers have a meaning of their own. */
+    player->chip = player->chip + 1u == EVLCP_CHIP_TEST ? 0u : player->chip + 1u;
+    if (player->packet_done) {
+        if (!player->idle)
+            atomic_store(&player->packets_sent, atomic_load(&player->packets_sent) + 1u);
+        next_packet(player, banks);
+        if (player->halt)
+            return;
+    }
+    compose(player);
+}

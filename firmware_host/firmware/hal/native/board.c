@@ -1,0 +1,151 @@
+#include "board.h"
+
+#include <string.h>
+
+/* The HAL has no context argument, as on a board; here it is the board that runs on this thread. */
+static _Thread_local struct native *self;
+
+void hal_info(struct evlcp_hal_info *info)
+{
+    *info = (struct evlcp_hal_info){
+        .tick_hz = NATIVE_TICK_HZ,
+        .chip_rate_max_hz = 20000u,
+        .level_max_ma = 60u,
+        .level_default_ma = 20u,
+        .capabilities = EVLCP_CAPABILITY_FLASH | EVLCP_CAPABILITY_LEVEL | EVLCP_CAPABILITY_RECORDS,
+        .name = "native"};
+    memcpy(info->unique_id, self->unique_id, sizeof info->unique_id);
+}
+
+void hal_leds(const uint8_t *row, uint32_t chip)
+{
+    uint8_t record[NATIVE_RECORD_BYTES];
+    memcpy(self->shown, row, EVLCP_ROW_BYTES);
+    if (self->record == NULL)
+        return;
+    evlcp_put32(record, (uint32_t)self->now);
+    evlcp_put32(record + 4, chip);
+    memcpy(record + 8, row, EVLCP_ROW_BYTES);
+    self->record(self->record_context, record);
+}
+
+void hal_chips(uint32_t ticks)
+{
+    self->period = ticks;
+    self->due = self->now + ticks;
+}
+
+uint32_t hal_lateness(void)
+{
+    return self->late;
+}
+
+uint32_t hal_millis(void)
+{
+    return (uint32_t)((self->now - self->reset_at) / (NATIVE_TICK_HZ / 1000u));
+}
+
+uint32_t hal_send(const uint8_t *bytes, uint32_t count)
+{
+    size_t room = self->output_room > self->output_length ? self->output_room - self->output_length : 0u;
+    if (count > room)
+        count = (uint32_t)room;
+    memcpy(self->output + self->output_length, bytes, count);
+    self->output_length += count;
+    return count;
+}
+
+uint32_t hal_lost(void)
+{
+    return 0u;
+}
+
+bool hal_level(uint16_t level_ma)
+{
+    (void)level_ma;
+    return !self->level_fails;
+}
+
+void hal_health(struct evlcp_health *health)
+{
+    *health = self->health;
+}
+
+bool hal_flash_erase(uint8_t slot)
+{
+    memset(self->flash[slot], 0xff, sizeof self->flash[slot]);
+    return !self->flash_fails;
+}
+
+bool hal_flash_write(uint8_t slot, uint32_t offset, const uint8_t *bytes, uint32_t count)
+{
+    /* Like NOR flash: bits only go from one to zero until the next erase. */
+    for (uint32_t i = 0; i < count; i++)
+        self->flash[slot][offset + i] &= bytes[i];
+    return !self->flash_fails;
+}
+
+bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t count)
+{
+    memcpy(bytes, self->flash[slot] + offset, count);
+    return true;
+}
+
+void native_init(struct native *board)
+{
+    memset(board, 0, sizeof *board);
+    memset(board->flash, 0xff, sizeof board->flash);
+    board->output_room = sizeof board->output;
+    board->health.temperature_dc = 250;
+    native_reset(board);
+}
+
+void native_reset(struct native *board)
+{
+    self = board;
+    board->reset_at = board->now;
+    board->period = 0u;
+    board->late = 0u;
+    board->output_length = 0u;
+    memset(&board->core, 0, sizeof board->core);
+    evlcp_init(&board->core);
+}
+
+static void serve(struct native *board)
+{
+    uint32_t before;
+    do {
+        before = board->core.requests;
+        evlcp_poll(&board->core);
+    } while (board->core.requests != before);
+}
+
+void native_run(struct native *board, uint64_t until)
+{
+    self = board;
+    serve(board);
+    while (board->period != 0u && board->due <= until) {
+        board->now = board->due;
+        board->due += board->period;
+        evlcp_chip(&board->core);
+        serve(board);
+    }
+    if (board->now < until)
+        board->now = until;
+    serve(board);
+}
+
+void native_input(struct native *board, const uint8_t *bytes, size_t count)
+{
+    self = board;
+    evlcp_receive(&board->core, bytes, (uint32_t)count);
+}
+
+size_t native_output(struct native *board, uint8_t *bytes, size_t room)
+{
+    size_t count = board->output_length < room ? board->output_length : room;
+    memcpy(bytes, board->output, count);
+    memmove(board->output, board->output + count, board->output_length - count);
+    board->output_length -= count;
+    return count;
+}

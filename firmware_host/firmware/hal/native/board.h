@@ -1,0 +1,51 @@
+/* The driver board in a process: HAL over memory and a virtual tick counter. Time moves only in
+   native_run, so a test decides when chips fall due; main.c lets it follow the clock. */
+#ifndef EVLCP_NATIVE_BOARD_H
+#define EVLCP_NATIVE_BOARD_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "evlcp.h"
+
+#define NATIVE_TICK_HZ 10000000u
+#define NATIVE_RECORD_BYTES 20u
+
+struct native {
+    struct evlcp core;
+    uint64_t now;       /* ticks since the process began */
+    uint64_t reset_at;  /* ticks at the last reset */
+    uint64_t due;       /* next chip */
+    uint32_t period;    /* ticks a chip; 0: no chips */
+    uint32_t late;      /* what hal_lateness tells, to test a chip that comes late */
+    uint8_t unique_id[12];
+    struct evlcp_health health;
+    bool level_fails;
+    bool flash_fails;
+    uint8_t flash[EVLCP_SLOTS][EVLCP_SLOT_BYTES];
+    uint8_t output[1u << 16]; /* sent, not yet collected */
+    size_t output_length;
+    size_t output_room; /* bytes the line takes now; at most the buffer */
+    uint8_t shown[EVLCP_ROW_BYTES];
+    /* LED records: u32 tick, u32 chip, row; little-endian. */
+    void (*record)(void *context, const uint8_t record[NATIVE_RECORD_BYTES]);
+    void *record_context;
+};
+
+/* Power on: empty flash. */
+void native_init(struct native *board);
+
+/* Reset: everything but the flash is lost. */
+void native_reset(struct native *board);
+
+/* Let time go on to `until`: chips fall due, requests are answered between them. */
+void native_run(struct native *board, uint64_t until);
+
+/* Bytes arrive. */
+void native_input(struct native *board, const uint8_t *bytes, size_t count);
+
+/* Collect up to `room` bytes that were sent. */
+size_t native_output(struct native *board, uint8_t *bytes, size_t room);
+
+#endif
