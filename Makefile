@@ -28,7 +28,7 @@ format: $(VENV)/.dev  ## Format the code
 
 pictures: $(VENV)/.installed  ## Draw the pictures of the docs again
 	$(BIN)/evlcp demo
-	cp demo-out/regions.png demo-out/presence.png demo-out/distance.png docs/images/
+	cp demo-out/presence.png demo-out/distance.png docs/images/
 
 clean:  ## Remove .venv and everything that was generated
 	rm -rf $(VENV) demo-out .mypy_cache .pytest_cache .ruff_cache .hypothesis

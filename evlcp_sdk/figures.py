@@ -168,7 +168,7 @@ def draw_regions(probe: FigureProbe, title: str) -> Figure:
     whole.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), ylabel="row, px")
     many = f"{len(probe.regions)} region{'s' * (len(probe.regions) != 1)}"
     if zooms:
-        many += " (beside: dotted where first seen, solid where last)"
+        many += " (beside: dotted at first, solid at last)"
     _title(whole, f"{title}: {probe.image.sum():,} events, {many}")
     for n, (number, places) in enumerate(sorted(probe.regions.items())):
         colour = transmitter_colour(n)

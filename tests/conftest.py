@@ -1,0 +1,45 @@
+"""What tests share: the shipped recording and how the command line is run."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def evlcp(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Run]:
+    """Run the command line in this process, plugins and error handling included."""
+
+    def run(*args: str | Path) -> Run:
+        from evlcp_sdk.cli.main import main
+
+        monkeypatch.setattr(sys, "argv", ["evlcp", *map(str, args)])
+        capsys.readouterr()
+        code = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        said = capsys.readouterr()
+        return Run(code, said.out, said.err)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def demo_raw() -> Path:
+    """The recording that comes with the package."""
+    return ROOT / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
