@@ -110,7 +110,8 @@ def demo(
         typer.echo(json.dumps(summary | {"score": asdict(result)}))
         return
     _show_frames(rows)
-    show(summary, out)
+    # Most of so short a run is the loading of kernels: its speed says nothing.
+    show(summary, out, speed=False)
     print_score(result)
     console().print(f"figures: {out}/regions.png, presence.png, distance.png", style="dim")
 

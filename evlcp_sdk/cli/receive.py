@@ -202,8 +202,8 @@ def decode(
     return summary
 
 
-def show(summary: dict[str, Any], folder: Path) -> None:
-    """Print what was found, what was lost, and where the result is."""
+def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
+    """Print what was found, what was lost, where the result is, and unless told otherwise how fast it went."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -225,11 +225,12 @@ def show(summary: dict[str, Any], folder: Path) -> None:
                 + _or_dash(t["distance_last_m"], "{:.2f} m"),
             )
         out.print(table)
-    out.print(
-        f"{recording['counts']['events'] / 1e6:.2f} Mev of {recording['duration_s']:.3f} s"
-        f" in {processing['elapsed_s']:.2f} s:"
-        f" {processing['events_per_s'] / 1e6:.1f} Mev/s, {processing['times_real_time']:.2f} x real time"
-    )
+    if speed:
+        out.print(
+            f"{recording['counts']['events'] / 1e6:.2f} Mev of {recording['duration_s']:.3f} s"
+            f" in {processing['elapsed_s']:.2f} s:"
+            f" {processing['events_per_s'] / 1e6:.1f} Mev/s, {processing['times_real_time']:.2f} x real time"
+        )
     for loss in summary["losses"].values():
         out.print(
             f"lost: {loss['count']} {loss['meaning']} (first at {loss['unit']} {loss['first']})",
