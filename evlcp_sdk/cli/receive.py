@@ -203,7 +203,7 @@ def decode(
 
 
 def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
-    """Print what was found, what was lost, where the result is, and unless told otherwise how fast it went."""
+    """Print what was found, what was lost, where the result is, and how fast it went."""
     from rich.markup import escape
     from rich.table import Table
 
