@@ -542,7 +542,7 @@ def parse_csv(
     Returns:
         Bytes used, lines used, events, and whether the line behind these is good.
     """
-    limits = (int64(1) << 62, int64(0xFFFF), int64(0xFFFF), int64(1))
+    limits = (int64(10**18 - 1), int64(0xFFFF), int64(0xFFFF), int64(1))
     values = np.zeros(4, int64)
     used = lines = n = 0
     while n < len(t):

@@ -240,10 +240,8 @@ class RawSource(EventSource):
         while not self._exhausted and self._end < len(self._buffer):
             try:
                 size = self._file.readinto(view[self._end :])
-            except OSError as error:
-                raise InputError(
-                    f"{self._path}: at byte {self._position + left}: {error.strerror}"
-                ) from error
+            except (OSError, ValueError) as error:  # ValueError: the file is closed
+                raise InputError(f"{self._path}: at byte {self._position + left}: {error}") from error
             self._exhausted = not size
             self._end += size or 0
 
@@ -365,20 +363,17 @@ class RawWriter(EventWriter):
             first = min(int(column[0]) for column in (events.t_us, triggers.t_us) if len(column))
             words, self._state[0] = self._codec.prelude(first)
             self._file.write(words.tobytes())
+        event_columns = [np.ascontiguousarray(c) for c in (events.t_us, events.x, events.y, events.p)]
+        trigger_columns = [np.ascontiguousarray(c) for c in (triggers.t_us, triggers.channel, triggers.value)]
         i = j = 0
         while i < len(events) or j < len(triggers):
             n, i, j = self._kernel(
                 self._words,
                 self._columns,
                 self._state,
-                events.t_us,
-                events.x,
-                events.y,
-                events.p,
+                *event_columns,
                 i,
-                triggers.t_us,
-                triggers.channel,
-                triggers.value,
+                *trigger_columns,
                 j,
             )
             self._file.write(self._words[:n].tobytes())

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import InputError, StreamError
 from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.io.sources import EventSource, Loss
-from evlcp_sdk.io.writers import EventWriter
+from evlcp_sdk.io.writers import LAST_TIME_US, EventWriter
 from evlcp_sdk.types import Events, Triggers
 
 __all__ = ["CsvSource", "CsvWriter", "NpzSource", "NpzWriter"]
@@ -33,11 +33,11 @@ WIRE_TYPES: Final[dict[str, np.dtype[Any]]] = {
     "trigger_value": np.dtype("u1"),
 }
 LAST_VALUES: Final = {
-    "t_us": 1 << 62,
+    "t_us": LAST_TIME_US,
     "x": 0xFFFF,
     "y": 0xFFFF,
     "p": 1,
-    "trigger_t_us": 1 << 62,
+    "trigger_t_us": LAST_TIME_US,
     "trigger_channel": 0xFF,
     "trigger_value": 1,
 }
@@ -64,9 +64,7 @@ class _Column:
             self._file = stack.enter_context(archive.open(f"{name}.npy"))
         except KeyError:
             found = ", ".join(sorted(member.removesuffix(".npy") for member in archive.namelist()))
-            raise InputError(
-                f"{path}: found the arrays {found or 'none'}, expected {', '.join(COLUMNS)}"
-            ) from None
+            raise InputError(f"{path}: found the arrays {found or 'none'}, expected {name} too") from None
         try:
             version = np.lib.format.read_magic(self._file)
             read = np.lib.format.read_array_header_1_0
@@ -93,8 +91,8 @@ class _Column:
             found = self.row + len(data) // self.dtype.itemsize
             raise InputError(f"{self._path}: array {self.name}: found {found} values, expected {self.rows}")
         values = np.frombuffer(data, self.dtype)
-        last = LAST_VALUES.get(self.name, 1 << 62)
-        first = -last if self.name == "t_us" else 0
+        last = LAST_VALUES.get(self.name, 0xFFFF)
+        first = -last if self.name in ("t_us", "trigger_t_us") else 0
         if rows and not (first <= values.min() and values.max() <= last):
             k = int(((values < first) | (values > last)).argmax())
             raise InputError(
@@ -364,7 +362,8 @@ class CsvWriter(EventWriter):
         text = np.empty(min(rows, len(events)) * CSV_ROW_BYTES, np.uint8)
         for k in range(0, len(events), rows):
             piece = events[k : k + rows]
-            size = format_csv(text, piece.t_us, piece.x, piece.y, piece.p)
+            columns = (np.ascontiguousarray(c) for c in (piece.t_us, piece.x, piece.y, piece.p))
+            size = format_csv(text, *columns)
             self._out.write(text[:size].tobytes())
 
     def _finish(self) -> None:

@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import EvlcpError, StreamError
 from evlcp_sdk.types import Events, Triggers
 
-__all__ = ["EventWriter"]
+__all__ = ["LAST_TIME_US", "EventWriter"]
+
+LAST_TIME_US = 10**18 - 1
+"""Latest time, and with a minus earliest, that a table holds: 18 digits, us."""
 
 
 class EventWriter(ABC):
@@ -30,7 +33,7 @@ class EventWriter(ABC):
         EvlcpError: The file cannot be written.
     """
 
-    times_us = (-(1 << 62), 1 << 62)
+    times_us = (-LAST_TIME_US, LAST_TIME_US)
     """Earliest and latest time that can be written, us."""
     channels = 256
     """Trigger inputs that can be written."""

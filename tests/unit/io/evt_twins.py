@@ -1,0 +1,126 @@
+"""EVT2 and EVT3 decoded word by word in plain Python, straight from the description of the formats."""
+
+import struct
+from dataclasses import dataclass, field
+
+
+@dataclass
+class Decoded:
+    """What a stream holds: events (t, x, y, p), triggers (t, channel, value), and what went wrong."""
+
+    events: list[tuple[int, int, int, int]] = field(default_factory=list)
+    triggers: list[tuple[int, int, int]] = field(default_factory=list)
+    losses: dict[str, tuple[int, int]] = field(
+        default_factory=dict
+    )  # kind -> count, byte offset of the first
+    rollovers: int = 0
+    last: int = 0
+
+    def lose(self, kind: str, at: int, count: int = 1) -> None:
+        before, first = self.losses.get(kind, (0, at))
+        self.losses[kind] = (before + count, first)
+
+    def add_event(self, t: int, x: int, y: int, p: int, at: int, width: int, height: int) -> None:
+        if x >= width or y >= height:
+            self.lose("outside_sensor", at)
+        elif t < self.last:
+            self.lose("time_backward", at)
+        else:
+            self.last = t
+            self.events.append((t, x, y, p))
+
+    def add_trigger(self, t: int, channel: int, value: int, at: int) -> None:
+        if t < self.last:
+            self.lose("time_backward", at)
+        else:
+            self.last = t
+            self.triggers.append((t, channel, value))
+
+
+def decode_evt3(data: bytes, width: int, height: int, start: int = 0) -> Decoded:
+    out = Decoded()
+    high = row = base = None
+    low = polarity = 0
+    vector_at, vector_left = 0, 0
+    for k, (word,) in enumerate(struct.iter_unpack("<H", data[: len(data) // 2 * 2])):
+        at = start + 2 * k
+        kind, value = word >> 12, word & 0xFFF
+        if high is None:
+            if kind == 0x8:
+                high = value
+            else:
+                out.lose("words_before_time", at)
+            continue
+        t = out.rollovers * 2**24 + high * 2**12 + low
+        if kind == 0x0:
+            row = value & 0x7FF
+        elif kind == 0x2:
+            if row is None:
+                out.lose("row_unknown", at)
+            else:
+                out.add_event(t, value & 0x7FF, row, value >> 11, at, width, height)
+        elif kind == 0x3:
+            if vector_left:
+                out.lose("vectors_cut", vector_at)
+            base, polarity = value & 0x7FF, value >> 11
+            vector_at, vector_left = at, 3
+        elif kind in (0x4, 0x5):
+            size = 12 if kind == 0x4 else 8
+            vector_left = max(vector_left - 1, 0) if kind == 0x4 else 0
+            for bit in range(size):
+                if not value >> bit & 1:
+                    continue
+                if row is None:
+                    out.lose("row_unknown", at)
+                elif base is None:
+                    out.lose("column_unknown", at)
+                else:
+                    out.add_event(t, base + bit, row, polarity, at, width, height)
+            if base is not None:
+                base += size
+        elif kind == 0x6:
+            low = value
+        elif kind == 0x8:
+            if value != high:
+                if high - value >= 2048:
+                    out.rollovers += 1
+                elif value < high:
+                    out.lose("time_glitches", at)
+                high, low = value, 0
+        elif kind == 0xA:
+            out.add_trigger(t, value >> 8 & 0xF, value & 1, at)
+        elif kind in (0x1, 0x9, 0xB, 0xC, 0xD):
+            out.lose("reserved_words", at)
+    if vector_left:
+        out.lose("vectors_cut", vector_at)
+    return out
+
+
+def decode_evt2(data: bytes, width: int, height: int, start: int = 0) -> Decoded:
+    out = Decoded()
+    high = None
+    for k, (word,) in enumerate(struct.iter_unpack("<I", data[: len(data) // 4 * 4])):
+        at = start + 4 * k
+        kind = word >> 28
+        if kind == 0x8:
+            value = word & 0xFFFFFFF
+            if high is not None and high - value >= 2**27:
+                out.rollovers += 1
+            elif high is not None and value < high:
+                out.lose("time_glitches", at)
+            high = value
+            continue
+        if high is None:
+            out.lose("words_before_time", at)
+            continue
+        t = out.rollovers * 2**34 + high * 64 + (word >> 22 & 0x3F)
+        if kind in (0x0, 0x1):
+            out.add_event(t, word >> 11 & 0x7FF, word & 0x7FF, kind, at, width, height)
+        elif kind == 0xA:
+            out.add_trigger(t, word >> 8 & 0x1F, word & 1, at)
+        elif kind not in (0xE, 0xF):
+            out.lose("reserved_words", at)
+    return out
+
+
+TWINS = {"EVT3": decode_evt3, "EVT2": decode_evt2}

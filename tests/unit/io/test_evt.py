@@ -1,0 +1,285 @@
+"""EVT2 and EVT3: the kernels against their twins, any split of the words, and round trips."""
+
+import itertools
+
+import numpy as np
+import pytest
+from evt_twins import TWINS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evlcp_sdk.errors import StreamError
+from evlcp_sdk.io import RawSource, RawWriter, open_events, read_events, write_events
+from evlcp_sdk.io._codec import Columns, Decoder
+from evlcp_sdk.io.raw import CODECS
+from evlcp_sdk.types import Events, Triggers
+
+WIDTH, HEIGHT = 640, 480
+
+types3 = st.sampled_from([0, 0, 2, 2, 2, 2, 3, 4, 4, 5, 6, 6, 8, 10, 14, 15, 7, 1, 9, 11, 12, 13])
+words3 = st.builds(
+    lambda kind, value, plain: kind << 12 | (value & 0x80F if plain and kind not in (4, 5) else value),
+    types3,
+    st.integers(0, 0xFFF),
+    st.booleans(),
+)
+words2 = st.builds(
+    lambda kind, high, value, plain: (
+        (kind << 28 | (value & 0x3FF if plain else high << 27 | value)) & 0xFFFFFFFF
+    ),
+    st.sampled_from([0, 1, 0, 1, 8, 8, 10, 14, 15, 2, 7, 9, 11, 13]),
+    st.integers(0, 1),
+    st.integers(0, 2**22 - 1).map(lambda v: v | (v & 7) << 24),
+    st.booleans(),
+)
+
+
+def decode(name, words, splits, capacity=64, at=0):
+    """Decode words in the pieces that `splits` makes, into columns of `capacity`."""
+    decoder = Decoder(CODECS[name], WIDTH, HEIGHT)
+    events, triggers = [], []
+    edges = sorted({0, len(words), *(s % (len(words) + 1) for s in splits)})
+    for start, stop in itertools.pairwise(edges):
+        while start < stop:
+            out = Columns(capacity, 3)
+            start += decoder.decode(words[start:stop], at + start * words.itemsize, out)
+            events.append(out.taken()[0])
+            triggers.append(out.taken()[1])
+    decoder.finish(at + words.nbytes, 0)
+    return Events.concat(events), Triggers.concat(triggers), decoder
+
+
+def rows(table, names):
+    return list(zip(*(getattr(table, name).tolist() for name in names), strict=True))
+
+
+@pytest.mark.parametrize(("name", "words"), [("EVT3", words3), ("EVT2", words2)])
+def test_kernel_equals_its_twin_for_any_words_and_splits(name, words):
+    @settings(max_examples=300, deadline=None)
+    @given(st.lists(words, max_size=120), st.lists(st.integers(0, 200), max_size=4), st.integers(12, 80))
+    def check(values, splits, capacity):
+        codec = CODECS[name]
+        array = np.array(values, codec.word)
+        events, triggers, decoder = decode(name, array, splits, capacity, at=100)
+        twin = TWINS[name](array.tobytes(), WIDTH, HEIGHT, 100)
+        assert rows(events, ("t_us", "x", "y", "p")) == twin.events
+        assert rows(triggers, ("t_us", "channel", "value")) == twin.triggers
+        assert {kind: (loss.count, loss.first) for kind, loss in decoder.losses.items()} == twin.losses
+        assert decoder.counts["rollovers"] == twin.rollovers
+
+    check()
+
+
+def test_low_time_is_zero_after_time_high_changes_and_stays_when_it_is_repeated():
+    words = np.array([0x8001, 0x6123, 0x8001, 0x0005, 0x2007, 0x8002, 0x2007], "<u2")
+    events, _, _ = decode("EVT3", words, [])
+    assert events.t_us.tolist() == [0x1123, 0x2000]
+
+
+def test_rollover_is_a_drop_by_half_the_range_and_less_is_a_glitch():
+    words = np.array([0x8800, 0x0001, 0x2001, 0x8000, 0x2002, 0x87FF, 0x2003, 0x8000, 0x2004], "<u2")
+    events, _, decoder = decode("EVT3", words, [])
+    assert events.t_us.tolist() == [0x800000, 1 << 24, (1 << 24) + 0x7FF000]
+    assert decoder.losses["time_glitches"].count == 1
+    assert decoder.losses["time_backward"].count == 1
+    assert decoder.counts["rollovers"] == 1
+    words = np.array([0x88000000, 0x00000001, 0x80000000, 0x00000002], "<u4")
+    assert decode("EVT2", words, [])[0].t_us.tolist() == [1 << 33, 1 << 34]
+
+
+def test_steps_of_time_high_by_more_than_one_are_counted_as_gaps():
+    words = np.array([0x8001, 0x8002, 0x8005, 0x8FFF, 0x8000, 0x87FF, 0x8FFE, 0x8001], "<u2")
+    assert decode("EVT3", words, [])[2].counts == {"rollovers": 2, "time_gaps": 5, "other_words": 0}
+
+
+def test_others_are_followed_by_any_number_of_continued_words():
+    words = np.array([0x8001, 0x0001, 0xE014, 0xF015, 0xF000, 0x7000, 0x2001, 0xE0FF, 0x2002], "<u2")
+    events, _, decoder = decode("EVT3", words, [])
+    assert events.x.tolist() == [1, 2]
+    assert decoder.counts["other_words"] == 5
+    assert decoder.losses == {}
+
+
+@st.composite
+def recordings(draw, width, height, channels):
+    """Events and triggers in any valid order, with runs that fit a vector, and their split into writes."""
+    base = draw(st.sampled_from([0, 4090, (1 << 24) - 5, 1 << 24, 3 << 24, (1 << 34) - 9, (1 << 36) + 77]))
+    columns = [[], [], [], []]
+    t = base
+    for _ in range(draw(st.integers(0, 12))):
+        t += draw(st.sampled_from([0, 0, 1, 40, 64, 4096, 5000, 300_000]))
+        y, p = draw(st.integers(0, height - 1)), draw(st.integers(0, 1))
+        if draw(st.booleans()):
+            start = draw(st.integers(0, width - 1))
+            steps = draw(st.lists(st.sampled_from([0, 1, 1, 1, 2, 7]), max_size=40))
+            xs = [x for x in np.cumsum([start, *steps]).tolist() if x < width]
+        else:
+            xs = draw(st.lists(st.integers(0, width - 1), min_size=1, max_size=3))
+        for column, values in zip(columns, ([t] * len(xs), xs, [y] * len(xs), [p] * len(xs)), strict=True):
+            column.extend(values)
+    edges = sorted(base + draw(st.integers(0, 400_000)) for _ in range(draw(st.integers(0, 4))))
+    ids = [draw(st.integers(0, channels - 1)) for _ in edges]
+    values = [draw(st.integers(0, 1)) for _ in edges]
+    cuts = sorted(draw(st.lists(st.integers(base, base + 400_000), max_size=3)))
+    return Events.of(*columns), Triggers.of(edges, ids, values), cuts
+
+
+def pieces(events, triggers, cuts):
+    """The recording cut at times, as pairs."""
+    n = [0, *np.searchsorted(events.t_us, cuts).tolist(), len(events)]
+    m = [0, *np.searchsorted(triggers.t_us, cuts).tolist(), len(triggers)]
+    for a, b, c, d in zip(n, n[1:], m, m[1:], strict=False):
+        yield (
+            events[a:b],
+            Triggers(triggers.t_us[c:d], triggers.channel[c:d], triggers.value[c:d]),
+        )
+
+
+@pytest.mark.parametrize("name", ["EVT3", "EVT2"])
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (33, 2), (7, 2048)])
+def test_round_trip_is_the_identity(name, width, height, tmp_path_factory):
+    path = tmp_path_factory.mktemp("round") / "trip.raw"
+    codec = CODECS[name]
+
+    @settings(max_examples=120, deadline=None)
+    @given(recordings(width, height, codec.channels), st.integers(1, 50))
+    def check(recording, max_events):
+        events, triggers, cuts = recording
+        with RawWriter(path, width, height, codec) as writer:
+            for piece in pieces(events, triggers, cuts):
+                writer.write(*piece)
+        with open_events(path) as source:
+            got = list(source.stream(max_events))
+            assert all(len(e) <= max_events and len(g) <= max_events for e, g in got)
+            assert (source.format, source.width, source.height) == (name, width, height)
+            assert source.losses == {}
+            assert source.position_bytes == source.size_bytes
+            assert source.counts["events"] == len(events)
+            assert source.counts["triggers"] == len(triggers)
+        names = ("t_us", "x", "y", "p")
+        assert rows(Events.concat(e for e, _ in got), names) == rows(events, names)
+        names = ("t_us", "channel", "value")
+        assert rows(Triggers.concat(g for _, g in got), names) == rows(triggers, names)
+
+    check()
+
+
+def test_evt2_keeps_a_gap_of_hours(tmp_path):
+    t = [0, (1 << 34) - 1, (1 << 34) + (1 << 33) - 1, 5 << 34]
+    events = Events.of(t, [1, 2, 3, 4], [0] * 4, [1] * 4)
+    write_events(tmp_path / "a.raw", events, 640, 480, format="EVT2")
+    assert read_events(tmp_path / "a.raw").t_us.tolist() == t
+
+
+def evt3_words(path):
+    data = path.read_bytes()
+    return np.frombuffer(data[data.index(b"% end\n") + 6 :], "<u2").tolist()
+
+
+def test_evt3_writer_states_every_time_step_and_only_whole_vectors(tmp_path):
+    x = [10, 11, 12, 15, 41, 42, 1279, 1270, 1271, 1272, 1273, 1279]
+    t = [4090] * 6 + [12289] * 6
+    path = tmp_path / "a.raw"
+    write_events(path, Events.of(t, x, [3] * 12, [1] * 12), 1280, 720)
+    assert evt3_words(path) == [
+        0x8000,
+        0x6000 | 4090,
+        0x0003,
+        *(0x3800 | 10, 0x4000 | 0b100111, 0x4000, 0x5000 | 1 << 7),
+        0x2800 | 42,
+        *(0x8001, 0x6000, 0x8002, 0x6000, 0x8003, 0x6001),
+        0x0003,
+        0x2800 | 1279,
+        *(0x3800 | 1248, 0x4000, 0x4000 | 0b11 << 10, 0x5000 | 0b10000011),
+    ]
+
+
+def test_header_of_a_written_file(tmp_path):
+    write_events(tmp_path / "a.raw", Events.empty(), 1280, 720)
+    assert (tmp_path / "a.raw").read_text().splitlines() == [
+        "% evt 3.0",
+        "% format EVT3;height=720;width=1280",
+        "% geometry 1280x720",
+        "% integrator_name Prophesee",
+        "% system_ID 49",
+        "% end",
+    ]
+    assert len(read_events(tmp_path / "a.raw")) == 0
+
+
+BAD_WRITES = {
+    "an event earlier than the one before": (Events.of([5, 4], [0, 0], [0, 0], [0, 0]), None, "4 us after"),
+    "a trigger earlier than the one before": (
+        Events.empty(),
+        Triggers.of([5, 4], [0, 0], [0, 0]),
+        "4 us after",
+    ),
+    "an event before what was written": (Events.of([1], [0], [0], [0]), None, "at 1 us after 3 us"),
+    "a time before 0": (Events.of([-1], [0], [0], [0]), None, "-1 us"),
+    "a time past 12 days": (Events.of([1 << 40], [0], [0], [0]), None, "expected 0 to"),
+    "x outside": (Events.of([9], [1280], [0], [0]), None, "event 0: x is 1280, expected 0 to 1279"),
+    "y outside": (Events.of([9], [0], [720], [0]), None, "y is 720, expected 0 to 719"),
+    "polarity": (Events.of([9], [0], [0], [2]), None, "p is 2, expected 0 to 1"),
+    "channel": (Events.empty(), Triggers.of([9], [16], [0]), "channel is 16, expected 0 to 15"),
+    "value": (Events.empty(), Triggers.of([9], [0], [2]), "value is 2, expected 0 to 1"),
+}
+
+
+@pytest.mark.parametrize(("events", "triggers", "message"), BAD_WRITES.values(), ids=BAD_WRITES.keys())
+def test_writer_refuses(events, triggers, message, tmp_path):
+    path = tmp_path / "a.raw"
+    with RawWriter(path, 1280, 720) as writer:
+        if "at 1 us" in message:
+            writer.write(Events.of([3], [0], [0], [0]))
+        with pytest.raises(StreamError, match=message) as caught:
+            writer.write(events, triggers)
+    assert str(path) in str(caught.value)
+    assert len(read_events(path)) == (1 if "at 1 us" in message else 0)  # nothing of the refused piece
+
+
+def test_writer_leaves_what_was_there_when_it_fails(tmp_path):
+    path = tmp_path / "a.raw"
+    path.write_bytes(b"before")
+    with pytest.raises(StreamError), RawWriter(path, 10, 10) as writer:
+        writer.write(Events.of([1], [10], [0], [0]))
+    assert path.read_bytes() == b"before"
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(StreamError, match="closed"):
+        writer.write(Events.empty())
+
+
+def test_any_buffer_and_any_piece_give_the_same_events(tmp_path):
+    rng = np.random.default_rng(1)
+    n = 60_000
+    events = Events.of(
+        np.sort(rng.integers(0, 9_000_000, n)),
+        rng.integers(0, 640, n),
+        rng.integers(0, 480, n),
+        rng.integers(0, 2, n),
+    )
+    write_events(tmp_path / "a.raw", events, 640, 480)
+    for buffer_bytes in (1, 65_537, 100_000):
+        for max_events in (1000, 1 << 20):
+            with RawSource(tmp_path / "a.raw", buffer_bytes) as source:
+                got = Events.concat(source.chunks(max_events))
+            assert all(np.array_equal(getattr(got, c), getattr(events, c)) for c in ("t_us", "x", "y", "p"))
+
+
+def test_a_second_stream_goes_on_where_the_first_stopped(tmp_path):
+    events = Events.of(range(10), range(10), [0] * 10, [1] * 10)
+    write_events(tmp_path / "a.raw", events, 640, 480)
+    with open_events(tmp_path / "a.raw") as source:
+        first = next(source.chunks(3))
+        second = next(source.chunks(2))
+        rest, _ = source.read()
+        assert source.read()[0].t_us.tolist() == []
+    assert [*first.t_us, *second.t_us, *rest.t_us] == list(range(10))
+
+
+def test_pieces_stay_valid(tmp_path):
+    events = Events.of(range(100), range(100), [0] * 100, [1] * 100)
+    write_events(tmp_path / "a.raw", events, 640, 480)
+    with open_events(tmp_path / "a.raw") as source:
+        got = list(source.chunks(20))
+    assert len(got) >= 5
+    assert Events.concat(got).t_us.tolist() == list(range(100))

@@ -1,0 +1,283 @@
+"""Bad RAW input: each fault is an error that says where, what and what else, or a counted loss."""
+
+import os
+import threading
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.errors import EvlcpError, InputError, RawFormatError, StreamError
+from evlcp_sdk.io import RawWriter, open_events, write_events
+from evlcp_sdk.io.raw import CODECS, format_header, parse_header
+from evlcp_sdk.types import Events
+
+HEADER = format_header(CODECS["EVT3"], 640, 480)
+GOOD = [0x8001, 0x6002, 0x0003, 0x2804]
+
+
+def raw(path, words, header=HEADER, tail=b"", dtype="<u2"):
+    path.write_bytes(header + np.array(words, dtype).tobytes() + tail)
+    return path
+
+
+def some_events(n=3000):
+    rng = np.random.default_rng(2)
+    return Events.of(
+        np.sort(rng.integers(0, 10_000, n)),
+        rng.integers(0, 640, n),
+        rng.integers(0, 480, n),
+        rng.integers(0, 2, n),
+    )
+
+
+BAD_HEADERS = {
+    "empty file": (b"", 0, "an empty file", "a RAW header"),
+    "PNG": (b"\x89PNG\r\n\x1a\n" + bytes(50), 0, "a PNG image", "'% '"),
+    "no header": (np.array(GOOD * 10, "<u2").tobytes(), 0, "01 80 02 60", "'% '"),
+    "text": (b"hello\n", 0, "68 65 6c 6c 6f 0a", "'% '"),
+    "no encoding": (b"% date today\n% end\n", 0, "a header without encoding", "'% evt 3.0'"),
+    "empty header": (b"% end\n", 0, "a header without encoding", "'% evt 3.0'"),
+    "EVT 2.1": (b"% evt 2.1\n% end\n", 0, "EVT version '2.1'", "2.0 or 3.0"),
+    "EVT4": (b"% date x\n% format EVT4;height=1;width=1\n% end\n", 9, "encoding 'EVT4'", "EVT2 or EVT3"),
+    "two encodings": (b"% evt 2.0\n% format EVT3\n% end\n", 0, "'% evt 2.0' beside '% format EVT3'", "one"),
+    "two sizes": (
+        b"% evt 3.0\n% format EVT3;height=720;width=1280\n% geometry 640x480\n% end\n",
+        46,
+        "'% geometry 640x480' beside",
+        "one width",
+    ),
+    "a line twice": (
+        b"% evt 3.0\n% geometry 4x4\n% geometry 5x4\n% end\n",
+        25,
+        "a second",
+        "'% geometry 4x4'",
+    ),
+    "zero width": (b"% evt 3.0\n% geometry 0x4\n% end\n", 10, "'0x4'", "from 1 to 2048"),
+    "negative height": (b"% evt 3.0\n% geometry 4x-5\n% end\n", 10, "'4x-5'", "from 1 to 2048"),
+    "half a geometry": (b"% evt 3.0\n% geometry 1280\n% end\n", 10, "'1280'", "from 1 to 2048"),
+    "huge width": (b"% format EVT3;height=720;width=99999\n% end\n", 0, "width=99999", "from 1 to 2048"),
+    "digits of another script": (
+        "% evt 3.0\n% geometry \u0661x4\n% end\n".encode(),
+        10,
+        "'\u0661x4'",
+        "from 1 to 2048",
+    ),
+    "binary in the header": (
+        b"% evt 3.0\n% date \xff\xfe\x00\n% end\n",
+        10,
+        r"b'% date \xff",
+        "a header line",
+    ),
+    "header cut": (b"% evt 3.0\n% forma", 10, "b'% forma'", "ended by a line feed"),
+    "endless line": (b"% evt 3.0\n% " + b"x" * 100_000, 10, "b'% xxx", "ended by a line feed"),
+}
+
+
+@pytest.mark.parametrize(
+    ("data", "offset", "found", "expected"), BAD_HEADERS.values(), ids=BAD_HEADERS.keys()
+)
+def test_bad_header_is_an_error_with_offset_found_expected(data, offset, found, expected, tmp_path):
+    path = tmp_path / "bad.raw"
+    path.write_bytes(data)
+    with pytest.raises(RawFormatError) as caught:
+        open_events(path)
+    assert caught.value.path == path
+    assert caught.value.offset == offset
+    assert found in caught.value.found
+    assert expected in caught.value.expected
+    assert str(caught.value).startswith(f"{path}: at byte {offset}: found ")
+
+
+def test_header_without_end_is_counted(tmp_path):
+    header = HEADER.removesuffix(b"% end\n")
+    with open_events(raw(tmp_path / "a.raw", GOOD, header)) as source:
+        events, _ = source.read()
+    assert events.x.tolist() == [4]
+    assert source.losses.keys() == {"header_without_end"}
+    assert source.losses["header_without_end"].first == len(header)
+
+
+def test_header_lines_of_a_real_camera():
+    lines = b"% evt 3.0\r\n% date 2024-01-01 10:00:00\n% geometry 1280x720\n% plugin\n% end\n\x01\x80"
+    header = parse_header(lines, "a.raw")
+    assert header.fields == {
+        "evt": "3.0",
+        "date": "2024-01-01 10:00:00",
+        "geometry": "1280x720",
+        "plugin": "",
+    }
+    assert (header.codec.name, header.width, header.height) == ("EVT3", 1280, 720)
+    assert (header.size_bytes, header.closed) == (len(lines) - 2, True)
+
+
+def test_size_of_the_sensor_may_be_missing(tmp_path):
+    with open_events(raw(tmp_path / "a.raw", [0x8001, 0x07FF, 0x27FF], b"% evt 3.0\n% end\n")) as source:
+        events, _ = source.read()
+    assert (source.width, source.height) == (None, None)
+    assert (events.x.tolist(), events.y.tolist()) == ([2047], [2047])
+
+
+@pytest.mark.parametrize(("written", "declared"), [("EVT2", "EVT3"), ("EVT3", "EVT2")])
+@pytest.mark.parametrize("n", [100, 3000])
+def test_another_encoding_than_declared(written, declared, n, tmp_path):
+    path = tmp_path / "a.raw"
+    write_events(path, some_events(n), 640, 480, format=written)
+    data = path.read_bytes()
+    header = format_header(CODECS[declared], 640, 480)
+    path.write_bytes(header + data[data.index(b"% end\n") + 6 :])
+    with pytest.raises(RawFormatError) as caught, open_events(path):
+        pass
+    assert "a word of a reserved type" in caught.value.found
+    assert f"{declared}, as the header says" in caught.value.expected
+    assert caught.value.offset >= len(header)
+
+
+def test_noise_behind_a_header(tmp_path):
+    noise = np.random.default_rng(3).integers(0, 1 << 16, 5000)
+    with pytest.raises(RawFormatError, match="reserved type"):
+        open_events(raw(tmp_path / "a.raw", noise))
+
+
+@pytest.mark.parametrize("size", [3, 9_000_000])
+def test_words_without_any_time(size, tmp_path):
+    path = raw(tmp_path / "a.raw", np.full(size, 0x2001))
+    with open_events(path) as source, pytest.raises(RawFormatError) as caught:
+        source.read()
+    assert "no TIME_HIGH in" in caught.value.found
+    assert caught.value.offset == len(HEADER)
+
+
+LOSSES = {
+    "words before the first TIME_HIGH": ([0x0003, 0x2804, 0x6001, *GOOD], b"", "words_before_time", 3, 0, 1),
+    "odd trailing byte": (GOOD, b"\x01", "odd_bytes", 1, 8, 1),
+    "cut after the base of a vector": ([*GOOD, 0x3010], b"", "vectors_cut", 1, 8, 1),
+    "cut in the middle of a vector": ([*GOOD, 0x3010, 0x4001, 0x4002], b"", "vectors_cut", 1, 8, 3),
+    "a vector that is not whole": (
+        [*GOOD, 0x3010, 0x4001, 0x3020, 0x4000, 0x4000, 0x5001],
+        b"",
+        "vectors_cut",
+        1,
+        8,
+        3,
+    ),
+    "x outside": ([*GOOD, 0x2000 | 640, 0x2000 | 639, 0x2000 | 700], b"", "outside_sensor", 2, 8, 2),
+    "y outside": ([*GOOD, 480, 0x2001], b"", "outside_sensor", 1, 10, 1),
+    "a vector over the edge": (
+        [*GOOD, 0x3000 | 638, 0x4007, 0x4000, 0x5000],
+        b"",
+        "outside_sensor",
+        1,
+        10,
+        3,
+    ),
+    "time running backward": ([*GOOD, 0x6001, 0x2005, 0x6002, 0x2006], b"", "time_backward", 1, 10, 2),
+    "a trigger running backward": ([*GOOD, 0x6001, 0xA001], b"", "time_backward", 1, 10, 1),
+    "a glitch of TIME_HIGH": ([*GOOD, 0x8000, 0x8001, 0x6002, 0x2005], b"", "time_glitches", 1, 8, 2),
+    "reserved words": ([*GOOD, 0x1000, 0x9000, 0xB000, 0xC000, 0xD000], b"", "reserved_words", 5, 8, 1),
+    "an event before any row": ([0x8001, 0x2004, 0x0003, 0x2804], b"", "row_unknown", 1, 2, 1),
+    "a vector before any base": ([*GOOD, 0x4003, 0x5001], b"", "column_unknown", 3, 8, 1),
+}
+
+
+@pytest.mark.parametrize(
+    ("words", "tail", "kind", "count", "first", "events"), LOSSES.values(), ids=LOSSES.keys()
+)
+def test_loss_is_counted_with_its_first_offset(words, tail, kind, count, first, events, tmp_path):
+    with open_events(raw(tmp_path / "a.raw", words, tail=tail)) as source:
+        got, _ = source.read()
+    assert len(got) == events
+    assert source.losses.keys() == {kind}
+    loss = source.losses[kind]
+    assert (loss.count, loss.first, loss.unit) == (count, len(HEADER) + first, "byte")
+    assert str(loss) == f"{count} {loss.meaning} (first at byte {len(HEADER) + first})"
+    assert source.position_bytes == source.size_bytes
+
+
+LOSSES_EVT2 = {
+    "words before the first TIME_HIGH": ([0x0, 0x80000001, 0x1], b"", "words_before_time", 1, 0, 1),
+    "odd trailing bytes": ([0x80000001, 0x1], b"\x01\x02\x03", "odd_bytes", 3, 8, 1),
+    "x outside": ([0x80000001, 640 << 11], b"", "outside_sensor", 1, 4, 0),
+    "y outside": ([0x80000001, 480], b"", "outside_sensor", 1, 4, 0),
+    "time running backward": ([0x80000001, 5 << 22, 4 << 22], b"", "time_backward", 1, 8, 1),
+    "a glitch of TIME_HIGH": ([0x80000002, 0x80000001, 0x1], b"", "time_glitches", 1, 4, 1),
+    "reserved words": ([0x80000001, 0x20000000, 0xD0000000, 0x1], b"", "reserved_words", 2, 4, 1),
+}
+
+
+@pytest.mark.parametrize(
+    ("words", "tail", "kind", "count", "first", "events"), LOSSES_EVT2.values(), ids=LOSSES_EVT2.keys()
+)
+def test_loss_in_evt2(words, tail, kind, count, first, events, tmp_path):
+    header = format_header(CODECS["EVT2"], 640, 480)
+    with open_events(raw(tmp_path / "a.raw", words, header, tail, "<u4")) as source:
+        got, _ = source.read()
+    assert len(got) == events
+    assert source.losses.keys() == {kind}
+    assert (source.losses[kind].count, source.losses[kind].first) == (count, len(header) + first)
+
+
+def test_first_offset_is_found_across_buffers(tmp_path):
+    words = np.full(2_000_000, 0x2001)
+    words[:2] = 0x8001, 0x0003
+    words[1_500_000] = 0x2000 | 700
+    with open_events(raw(tmp_path / "a.raw", words)) as source:
+        events, _ = source.read()
+    assert len(events) == 2_000_000 - 3
+    assert source.losses["outside_sensor"].first == len(HEADER) + 3_000_000
+
+
+@pytest.mark.parametrize("name", ["missing.raw", "missing.npz", "missing.csv", "missing.dat", "no-suffix"])
+def test_missing_file(name, tmp_path):
+    with pytest.raises(InputError, match=f"{name}: No such file"):
+        open_events(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["dir.raw", "dir.npz", "dir.es"])
+def test_directory(name, tmp_path):
+    (tmp_path / name).mkdir()
+    with pytest.raises(InputError, match=f"{name}: "):
+        open_events(tmp_path / name)
+
+
+def test_closed_source_is_an_error(tmp_path):
+    with open_events(raw(tmp_path / "a.raw", np.full(2_000_000, 0x8001))) as source:
+        pass
+    with pytest.raises(InputError, match="closed"):
+        source.read()
+
+
+def test_pieces_of_no_events_are_refused(tmp_path):
+    with (
+        open_events(raw(tmp_path / "a.raw", GOOD)) as source,
+        pytest.raises(StreamError, match="max_events is 0"),
+    ):
+        next(source.stream(0))
+
+
+def test_pipe_is_read_without_its_size(tmp_path):
+    path = tmp_path / "pipe.raw"
+    os.mkfifo(path)
+    data = HEADER + np.array(GOOD * 100_000, "<u2").tobytes()
+    writer = threading.Thread(target=path.write_bytes, args=(data,))
+    writer.start()
+    with open_events(path) as source:
+        assert source.size_bytes is None
+        assert len(source.read()[0]) == 100_000
+    writer.join()
+
+
+def test_file_that_cannot_be_written(tmp_path):
+    with pytest.raises(EvlcpError, match="cannot be written: No such file"):
+        RawWriter(tmp_path / "no" / "a.raw", 640, 480)
+    with pytest.raises(StreamError, match="sensor of 4000x480"):
+        RawWriter(tmp_path / "a.raw", 4000, 480)
+
+
+def test_formats_that_cannot_be_written(tmp_path):
+    with pytest.raises(StreamError, match=r"suffix '\.txt', expected \.raw"):
+        write_events(tmp_path / "a.txt", Events.empty())
+    with pytest.raises(StreamError, match="format 'EVT4'"):
+        write_events(tmp_path / "a.raw", Events.empty(), 1, 1, format="EVT4")
+    with pytest.raises(StreamError, match="expected a width and a height for EVT3"):
+        write_events(tmp_path / "a.raw", Events.empty())
+    assert list(tmp_path.iterdir()) == []

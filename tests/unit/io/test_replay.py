@@ -1,0 +1,77 @@
+"""A replay gives out a recording at its own pace, changed in nothing else."""
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.errors import StreamError
+from evlcp_sdk.io import ReplaySource, open_events, write_events
+from evlcp_sdk.types import Events, Triggers
+
+
+class Clock:
+    """A clock that only sleeping moves."""
+
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.now += seconds
+
+
+@pytest.fixture
+def recording(tmp_path):
+    events = Events.of([500, 700, 1499, 1500, 2600, 9000], range(6), [0] * 6, [1] * 6)
+    write_events(tmp_path / "a.npz", events, 640, 480, Triggers.of([400, 2700, 12_000], [1, 2, 3], [1, 1, 1]))
+    return tmp_path / "a.npz"
+
+
+def test_each_slice_comes_when_its_time_is_over(recording):
+    clock = Clock()
+    got = []
+    with ReplaySource(open_events(recording), speed=2.0, clock=clock, sleep=clock.sleep) as source:
+        for events, triggers in source.stream():
+            got.append((round((clock.now - 100) * 2e6), events.t_us.tolist(), triggers.t_us.tolist()))
+        assert (source.format, source.width, source.height) == ("NPZ", 640, 480)
+        assert source.counts == {"events": 6, "triggers": 3}
+        assert source.position_bytes == source.size_bytes
+        assert source.losses == {}
+        assert source.lag_s == 0
+    assert got == [
+        (1000, [500, 700], [400]),
+        (2000, [1499, 1500], []),
+        (3000, [2600], [2700]),
+        (9000, [9000], []),
+        (12_000, [], [12_000]),
+    ]
+
+
+def test_any_slices_give_the_same_events(recording):
+    clock = Clock()
+    for slice_us in (1, 300, 100_000):
+        for max_events in (1, 4):
+            with ReplaySource(
+                open_events(recording), slice_us=slice_us, clock=clock, sleep=clock.sleep
+            ) as source:
+                pieces = list(source.stream(max_events))
+            events = Events.concat(e for e, _ in pieces)
+            assert events.x.tolist() == list(range(6))
+            assert np.concatenate([g.channel for _, g in pieces]).tolist() == [1, 2, 3]
+
+
+def test_lag_tells_that_the_receiver_is_too_slow(recording):
+    clock = Clock()
+    with ReplaySource(open_events(recording), clock=clock, sleep=clock.sleep) as source:
+        stream = source.stream()
+        next(stream)
+        clock.now += 0.5
+        next(stream)
+        assert source.lag_s == pytest.approx(0.499)
+
+
+@pytest.mark.parametrize(("speed", "slice_us"), [(0, 1000), (-1, 1000), (float("nan"), 1000), (1, 0)])
+def test_pace_must_be_positive(speed, slice_us, recording):
+    with open_events(recording) as source, pytest.raises(StreamError, match="expected both positive"):
+        ReplaySource(source, speed, slice_us)

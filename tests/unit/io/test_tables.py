@@ -1,0 +1,252 @@
+"""NPZ and CSV tables: round trips, streaming, and a fault for every kind of bad content."""
+
+import gzip
+import io
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evlcp_sdk.errors import InputError, StreamError
+from evlcp_sdk.io import CsvSource, NpzSource, open_events, open_writer, read_events, write_events
+from evlcp_sdk.types import Events, Triggers
+
+tables = st.lists(
+    st.tuples(
+        st.integers(-(10**18) + 1, 10**18 - 1),
+        st.integers(0, 65535),
+        st.integers(0, 65535),
+        st.integers(0, 1),
+    ),
+    max_size=60,
+).map(sorted)
+
+
+def rows(events):
+    return list(
+        zip(events.t_us.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist(), strict=True)
+    )
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.csv", "a.csv.gz"])
+def test_round_trip_is_the_identity(name, tmp_path_factory):
+    path = tmp_path_factory.mktemp("tables") / name
+
+    @settings(max_examples=100, deadline=None)
+    @given(tables, st.integers(0, 60), st.integers(1, 50))
+    def check(table, cut, max_events):
+        events = Events.of(*(zip(*table, strict=True) if table else ([], [], [], [])))
+        with open_writer(path) as writer:
+            writer.write(events[:cut])
+            writer.write(events[cut:])
+        with open_events(path) as source:
+            got = list(source.chunks(max_events))
+            assert all(len(piece) <= max_events for piece in got)
+            assert source.losses == {}
+            assert source.counts == {"events": len(table), "triggers": 0}
+            assert source.position_bytes == source.size_bytes
+        assert rows(Events.concat(got)) == table
+
+    check()
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.csv", "a.csv.gz"])
+def test_large_table_in_pieces(name, tmp_path):
+    rng = np.random.default_rng(4)
+    n = 150_000
+    events = Events.of(
+        np.cumsum(rng.integers(0, 1000, n)),
+        rng.integers(0, 1280, n),
+        rng.integers(0, 720, n),
+        rng.integers(0, 2, n),
+    )
+    write_events(tmp_path / name, events)
+    with open_events(tmp_path / name) as source:
+        half = next(source.chunks(20_000))
+        assert 0 < source.position_bytes <= source.size_bytes
+        rest, _ = source.read()
+    got = Events.concat([half, rest])
+    assert all(np.array_equal(getattr(got, c), getattr(events, c)) for c in ("t_us", "x", "y", "p"))
+
+
+def test_npz_keeps_size_and_triggers(tmp_path):
+    events = Events.of([1, 5, 9], [1, 2, 3], [4, 5, 6], [1, 0, 1])
+    triggers = Triggers.of([0, 5, 7, 11], [1, 1, 6, 6], [1, 0, 1, 0])
+    write_events(tmp_path / "a.npz", events, 640, 480, triggers)
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert int(arrays["width"]) == 640
+        assert arrays["t_us"].dtype == np.int64
+    with open_events(tmp_path / "a.npz") as source:
+        assert (source.width, source.height) == (640, 480)
+        pieces = list(source.stream(2))
+    assert [g.t_us.tolist() for _, g in pieces] == [[0, 5], [7], [11]]
+    assert np.concatenate([g.channel for _, g in pieces]).tolist() == [1, 1, 6, 6]
+    assert np.concatenate([g.value for _, g in pieces]).tolist() == [1, 0, 1, 0]
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_npz_of_other_integer_types(save, tmp_path):
+    save(
+        tmp_path / "a.npz",
+        t_us=np.array([1, 2], np.uint64),
+        x=np.array([3, 4], ">i4"),
+        y=np.array([5, 6], np.uint8),
+        p=np.array([True, False]),
+    )
+    assert rows(read_events(tmp_path / "a.npz")) == [(1, 3, 5, 1), (2, 4, 6, 0)]
+
+
+def npz(**changes):
+    arrays = {"t_us": [1, 2], "x": [3, 4], "y": [5, 6], "p": [1, 0], **changes}
+    file = io.BytesIO()
+    np.savez(file, **{name: np.array(value) for name, value in arrays.items() if value is not None})
+    return file.getvalue()
+
+
+def npz_of_text():
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("t_us.npy", "1, 2")
+    return file.getvalue()
+
+
+BAD_NPZ = {
+    "empty": (b"", "found no NPZ file, expected one"),
+    "not a ZIP": (b"hello", "found no NPZ file, expected one"),
+    "cut": (npz()[:-300], "found no NPZ file, expected one"),
+    "a column missing": (npz(p=None), "found the arrays t_us, x, y, expected p too"),
+    "floats": (npz(x=[1.5, 2.0]), r"array x: found float64 \(2,\), expected integers \(n,\)"),
+    "objects": (npz(x=[None, 1]), r"array x: found object \(2,\), expected integers"),
+    "two dimensions": (npz(x=[[1, 2]]), r"array x: found int64 \(1, 2\), expected integers"),
+    "unequal lengths": (npz(y=[1]), "'y': 1.*expected one length"),
+    "scalars": (npz(t_us=1, x=1, y=1, p=1), "expected one length"),
+    "x too large": (npz(x=[1, 70_000]), "array x: row 2: found 70000, expected 0 to 65535"),
+    "y negative": (npz(y=[-1, 0]), "array y: row 1: found -1, expected 0 to 65535"),
+    "polarity": (npz(p=[-1, 1]), "array p: row 1: found -1, expected 0 to 1"),
+    "a huge time": (
+        npz(t_us=np.array([1, 1 << 63], np.uint64)),
+        "array t_us: row 2: found 9223372036854775808",
+    ),
+    "bad width": (npz(width="wide"), "array width: found <U4"),
+    "triggers of unequal lengths": (
+        npz(trigger_t_us=[1], trigger_channel=[1, 2], trigger_value=[0]),
+        "'trigger_channel': 2.*expected one length",
+    ),
+    "no trigger channels": (
+        npz(trigger_t_us=[1]),
+        "found the arrays p, t_us, trigger_t_us, x, y, expected trigger_channel too",
+    ),
+    "a flipped byte": (npz().replace(b"\x03\x00\x00\x00\x00", b"\x03\x00\x01\x00\x00", 1), "Bad CRC-32"),
+    "no NPY in it": (npz_of_text(), "array t_us: .*magic string"),
+}
+
+
+@pytest.mark.parametrize(("data", "message"), BAD_NPZ.values(), ids=BAD_NPZ.keys())
+def test_bad_npz_is_an_error(data, message, tmp_path):
+    path = tmp_path / "bad.npz"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=message) as caught:
+        read_events(path)
+    assert str(path) in str(caught.value)
+
+
+HEAD = b"t_us,x,y,p\n"
+BAD_CSV = {
+    "empty": (b"", r"line 1: found '', expected 't_us,x,y,p'"),
+    "another header": (b"t,x,y,p\n1,2,3,1\n", r"line 1: found 't,x,y,p', expected 't_us,x,y,p'"),
+    "no header": (b"1,2,3,1\n", "line 1: found '1,2,3,1'"),
+    "a column missing": (HEAD + b"1,2,3\n", "line 2: found '1,2,3', expected four integers"),
+    "a column more": (HEAD + b"1,2,3,1\n1,2,3,1,5\n", "line 3: found '1,2,3,1,5', expected"),
+    "a word": (HEAD + b"1,2,3,1\n\n1,two,3,1\n", "line 4: found '1,two,3,1', expected"),
+    "a fraction": (HEAD + b"1.5,2,3,1\n", "line 2: found '1.5,2,3,1', expected"),
+    "a blank": (HEAD + b"1, 2,3,1\n", "line 2: found '1, 2,3,1', expected"),
+    "nothing between commas": (HEAD + b"1,,3,1\n", "line 2: found '1,,3,1', expected"),
+    "nothing at the end": (HEAD + b"1,2,3,\n", "line 2: found '1,2,3,', expected"),
+    "only a sign": (HEAD + b"-\n", "line 2: found '-', expected"),
+    "a negative x": (HEAD + b"1,-2,3,1\n", "line 2: found '1,-2,3,1', expected"),
+    "x too large": (HEAD + b"1,65536,3,1\n", "line 2: found '1,65536,3,1', expected.* 0 to 65535"),
+    "polarity": (HEAD + b"1,2,3,2", "line 2: found '1,2,3,2', expected.*p 0 or 1"),
+    "a number without end": (HEAD + b"9" * 30 + b",2,3,1\n", "line 2: found '9{30},2,3,1', expected"),
+    "a line without end": (HEAD + b"1" * 3_000_000, r"line 2: found '1{60}\.\.\.', expected"),
+    "bytes": (HEAD + b"\xff\xfe\n", "line 2: found '\ufffd\ufffd', expected"),
+}
+
+
+@pytest.mark.parametrize("zipped", [False, True], ids=["plain", "gz"])
+@pytest.mark.parametrize(("data", "message"), BAD_CSV.values(), ids=BAD_CSV.keys())
+def test_bad_csv_is_an_error(data, message, zipped, tmp_path):
+    path = tmp_path / ("bad.csv.gz" if zipped else "bad.csv")
+    path.write_bytes(gzip.compress(data) if zipped else data)
+    with pytest.raises(InputError, match=message) as caught:
+        read_events(path)
+    assert str(path) in str(caught.value)
+
+
+def test_damaged_gzip_is_an_error(tmp_path):
+    data = gzip.compress(HEAD + b"".join(b"%d,1,1,1\n" % t for t in range(100_000)))
+    for bad in (data[: len(data) // 2], data[:50_000] + bytes(100) + data[50_100:]):
+        (tmp_path / "a.csv.gz").write_bytes(bad)
+        with pytest.raises(InputError, match=r"a\.csv\.gz: line \d+: "):
+            read_events(tmp_path / "a.csv.gz")
+    (tmp_path / "a.csv.gz").write_bytes(b"\x1f\x8bnothing")
+    with pytest.raises(InputError, match="line 1: damaged or closed file"):
+        read_events(tmp_path / "a.csv.gz")
+
+
+def test_csv_of_another_system(tmp_path):
+    (tmp_path / "a.csv").write_bytes(b"\xef\xbb\xbft_us,x,y,p\r\n-5,1,2,1\r\n7,3,4,0")
+    assert rows(read_events(tmp_path / "a.csv")) == [(-5, 1, 2, 1), (7, 3, 4, 0)]
+
+
+def test_csv_is_the_same_bytes_each_time(tmp_path):
+    events = Events.of([1, 22, 333], [0, 10, 65535], [9, 99, 100], [1, 0, 1])
+    write_events(tmp_path / "a.csv", events)
+    assert (tmp_path / "a.csv").read_bytes() == HEAD + b"1,0,9,1\n22,10,99,0\n333,65535,100,1\n"
+    write_events(tmp_path / "a.csv.gz", events)
+    write_events(tmp_path / "b.csv.gz", events)
+    assert (tmp_path / "a.csv.gz").read_bytes() == (tmp_path / "b.csv.gz").read_bytes()
+
+
+def test_csv_has_no_place_for_triggers(tmp_path):
+    with pytest.raises(StreamError, match=r"a\.csv: 1 triggers, which a CSV file has no place for"):
+        write_events(tmp_path / "a.csv", Events.empty(), triggers=Triggers.of([1], [0], [1]))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_events_that_no_receiver_may_see_are_dropped_and_counted(tmp_path):
+    table = {"t_us": [5, 9, 4, 8, 9, 10], "x": [1, 700, 2, 3, 4, 5], "y": [1] * 6, "p": [1] * 6}
+    np.savez(tmp_path / "a.npz", width=640, height=480, **{k: np.array(v) for k, v in table.items()})
+    for max_events in (1, 2, 10):
+        with NpzSource(tmp_path / "a.npz") as source:
+            got = Events.concat(source.chunks(max_events))
+        assert got.t_us.tolist() == [5, 8, 9, 10]
+        assert {k: (v.count, v.first, v.unit) for k, v in source.losses.items()} == {
+            "outside_sensor": (1, 2, "row"),
+            "time_backward": (1, 3, "row"),
+        }
+    (tmp_path / "a.csv").write_bytes(HEAD + b"5,1,1,1\n4,2,1,1\n3,2,1,1\n6,3,1,1\n")
+    with CsvSource(tmp_path / "a.csv") as source:
+        assert source.read()[0].t_us.tolist() == [5, 6]
+    assert (source.losses["time_backward"].count, source.losses["time_backward"].first) == (2, 3)
+    assert str(source.losses["time_backward"]).endswith("(first at line 3)")
+
+
+def test_content_tells_the_format_whatever_the_name(tmp_path):
+    events = Events.of([1], [2], [3], [1])
+    for name in ("NPZ", "CSV", "EVT3", "EVT2"):
+        write_events(tmp_path / "a.bin", events, 640, 480, format=name.lower())
+        with open_events(tmp_path / "a.bin") as source:
+            assert source.format == name
+            assert rows(source.read()[0]) == [(1, 2, 3, 1)]
+
+
+def test_closed_tables_are_errors(tmp_path):
+    for name in ("a.npz", "a.csv"):
+        write_events(tmp_path / name, Events.of(range(500_000), [1] * 500_000, [1] * 500_000, [1] * 500_000))
+        with open_events(tmp_path / name) as source:
+            next(source.chunks(10))
+        source.close()
+        with pytest.raises(InputError, match=name):
+            source.read()
