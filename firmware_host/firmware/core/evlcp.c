@@ -240,11 +240,12 @@ static enum evlcp_status start(struct evlcp *e, uint32_t *detail)
     if (atomic_load(&e->banks.active) == EVLCP_NO_BANK && atomic_load(&e->banks.pending) == EVLCP_NO_BANK)
         return EVLCP_STATUS_NOTHING_COMMITTED;
     hal_health(&e->health);
-    e->latched = 0u;
     if ((e->health.faults & HOLDS_DARK) != 0u) {
         *detail = e->health.faults;
         return EVLCP_STATUS_HARDWARE_FAULT;
     }
+    e->latched = 0u;
+    atomic_store(&e->player.chip_lost, false);
     test_end(e);
     /* evlcp_poll begins; so a START that meets the end of a STOP is not lost. */
     atomic_store(&e->player.want_play, true);

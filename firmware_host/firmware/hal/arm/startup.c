@@ -12,8 +12,11 @@ int main(void);
 void reset_handler(void)
 {
     const uint32_t *from = link_data_load;
+    /* The linker script makes each pair of symbols the ends of one region. */
+    // cppcheck-suppress comparePointers
     for (uint32_t *to = link_data_start; to < link_data_end; to++)
         *to = *from++;
+    // cppcheck-suppress comparePointers
     for (uint32_t *to = link_bss_start; to < link_bss_end; to++)
         *to = 0u;
     (void)main();

@@ -1,0 +1,58 @@
+/* libFuzzer: any bytes on the line, and any payloads in good datagrams, leave the board sound.
+
+   The first byte chooses: raw bytes, or a sequence of (type, length, payload) sent as good datagrams. */
+#include <string.h>
+
+#include "board.h"
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
+
+static void drain(struct native *board)
+{
+    native_run(board, board->now + NATIVE_TICK_HZ / 1000u);
+    board->output_length = 0u;
+}
+
+static void send_datagram(struct native *board, uint16_t sequence, uint16_t session, uint8_t type,
+                          const uint8_t *payload, uint32_t length)
+{
+    static struct evlcp_link link;
+    const struct evlcp_datagram d = {
+        .type = type, .sequence = sequence, .session = session, .payload = payload, .length = length};
+    evlcp_link_put(&link, &d);
+    native_input(board, link.wire, link.wire_length);
+    drain(board);
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
+{
+    static struct native board;
+    native_init(&board);
+    if (size == 0u)
+        return 0;
+    uint8_t hello[EVLCP_HELLO_REQUEST_BYTES];
+    const struct evlcp_hello_request request = {.schema = EVLCP_SCHEMA, .nonce = 1u};
+    evlcp_hello_request_put(hello, &request);
+    send_datagram(&board, 0u, EVLCP_NO_SESSION, EVLCP_TYPE_HELLO, hello, sizeof hello);
+    if ((data[0] & 1u) == 0u) {
+        for (size_t at = 1; at < size; at += 512u) {
+            native_input(&board, data + at, size - at < 512u ? size - at : 512u);
+            drain(&board);
+        }
+        return 0;
+    }
+    uint16_t sequence = 1u;
+    size_t at = 1u;
+    while (at + 2u <= size) {
+        uint8_t type = data[at];
+        size_t length = 2u * data[at + 1u];
+        at += 2u;
+        if (length > size - at)
+            length = size - at;
+        send_datagram(&board, sequence++, board.core.session, type, data + at, (uint32_t)length);
+        at += length;
+    }
+    for (uint32_t i = 0; i < 400u; i++)
+        drain(&board);
+    return 0;
+}
