@@ -66,9 +66,9 @@ class RegionSpec:
         int,
         Field(ge=2, le=40, description="Score at which a pixel is a candidate: 2 for each run of one chip."),
     ] = 8
-    min_events: Annotated[
-        int, Field(ge=1, description="Candidate events in a step that a new region needs.")
-    ] = 30
+    min_runs: Annotated[
+        int, Field(ge=1, description="Runs of candidate pixels in a step that a new region needs.")
+    ] = 20
     margin_px: Annotated[
         int, Field(ge=2, le=64, description="Seam around a region: how far it may move in a step, and blur.")
     ] = 6
@@ -80,9 +80,7 @@ class RegionSpec:
     ] = 50_000
     min_clusters_share: Annotated[
         float,
-        Field(
-            ge=0, le=1, description="Share of the clusters whose pilot must be seen for a frame to count."
-        ),
+        Field(ge=0, le=1, description="Share of the clusters whose pilot must be seen for a frame to count."),
     ] = 0.5
 
 

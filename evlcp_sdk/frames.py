@@ -111,7 +111,8 @@ def info_words(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.uint16]:
         ConfigError: Symbols of another shape or outside the codebook, or codes of another length.
     """
     words = _words(chips_of_values(codebook.codewords))
-    return words[_checked(symbols, codebook)]
+    found: NDArray[np.uint16] = words[_checked(symbols, codebook)]
+    return found
 
 
 def bits_of_symbols(symbols: ArrayLike, bits_per_symbol: int) -> NDArray[np.uint8]:
@@ -138,4 +139,5 @@ def symbols_of_bits(bits: ArrayLike, bits_per_symbol: int, clusters: int) -> NDA
     if b.size % (bits_per_symbol * clusters):
         raise ConfigError(f"{b.size} bits: expected a multiple of {bits_per_symbol * clusters} (one frame)")
     weights = 1 << np.arange(bits_per_symbol - 1, -1, -1)
-    return (b.reshape(-1, clusters, bits_per_symbol) * weights).sum(-1)
+    symbols: NDArray[np.int64] = (b.reshape(-1, clusters, bits_per_symbol) * weights).sum(-1)
+    return symbols

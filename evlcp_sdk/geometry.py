@@ -86,7 +86,8 @@ class BarLayout:
         """Cluster of each LED, int64 (rows * columns,)."""
         y, x = np.mgrid[: self.rows, : self.columns]
         across = self.columns // self.cluster_columns
-        return ((y // self.cluster_rows) * across + x // self.cluster_columns).ravel()
+        which: NDArray[np.int64] = (y // self.cluster_rows) * across + x // self.cluster_columns
+        return which.ravel()
 
     def cluster_centres_m(self) -> NDArray[np.float64]:
         """Cluster centres (x right, y down) from the bar's centre, m, float64 (K, 2)."""

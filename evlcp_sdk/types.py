@@ -26,6 +26,14 @@ EVENT_RECORD = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")]
 """The structured record of Prophesee's Metavision SDK (`EventCD`)."""
 
 
+_COLUMNS = (
+    ("t_us", np.dtype(np.int64)),
+    ("x", np.dtype(np.uint16)),
+    ("y", np.dtype(np.uint16)),
+    ("p", np.dtype(np.uint8)),
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Events:
     """Contrast-detection events in columns of equal length.
@@ -50,12 +58,13 @@ class Events:
     p: NDArray[np.uint8]
 
     def __post_init__(self) -> None:
-        for name, dtype in (("t_us", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.uint8)):
+        shape = self.t_us.shape
+        for name, dtype in _COLUMNS:
             column = getattr(self, name)
-            if column.dtype != dtype or column.shape != self.t_us.shape or column.ndim != 1:
+            if column.dtype != dtype or column.shape != shape or len(shape) != 1:
                 raise StreamError(
                     f"events column {name}: {column.dtype} {column.shape},"
-                    f" expected {np.dtype(dtype)} ({len(self.t_us)},)"
+                    f" expected {dtype} ({len(self.t_us)},)"
                 )
 
     @classmethod

@@ -1,11 +1,18 @@
 """Loops over events, compiled."""
 
+from typing import Any
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
 
 
 @njit(cache=True, nogil=True)
-def keep_ordered(t_us, x, y, width, height, last_us, keep):
+def keep_ordered(
+    t_us: Array, x: Array, y: Array, width: int, height: int, last_us: int, keep: Array
+) -> tuple[int, int, int]:
     """Mark events inside the sensor and not before their predecessor; count the others.
 
     Returns:
@@ -28,70 +35,149 @@ def keep_ordered(t_us, x, y, width, height, last_us, keep):
 
 
 @njit(cache=True, nogil=True)
-def score_pixels(t_us, x, y, p, flip_us, state, hits, run_us, min_score, cell_shift):
-    """Update each pixel's score of runs at the chip rate; count candidate events in cells.
+def score_pixels(
+    t_us: Array,
+    x: Array,
+    y: Array,
+    p: Array,
+    pixels: Array,
+    hits: Array,
+    run_us: tuple[int, int, int],
+    min_score: int,
+    cell_shift: int,
+) -> None:
+    """Update each pixel's score of runs at the chip rate; count the runs of candidate pixels in cells.
 
-    `state` packs score and last polarity: 2 * score + polarity. `run_us` holds the bounds of a run's length:
-    below [0] noise, to [1] one chip, to [2] two chips, above: slower than any code of the air interface.
+    `pixels` (height, width) packs a pixel into one number, since memory sets the pace here: the time of its
+    last change of polarity in the upper bits, then 7 bits of score, 1 bit of polarity. `run_us` holds the
+    bounds of a run's length: below [0] noise, to [1] one chip, to [2] two chips, above: slower than any code
+    of the air interface.
     """
     shortest, single, double = run_us
     for i in range(t_us.size):
-        s = state[y[i], x[i]]
-        if (s & 1) != p[i]:
-            run = t_us[i] - flip_us[y[i], x[i]]
-            score = s >> 1
-            if run >= double:
-                score = max(score - 3, 0)
-            elif shortest <= run < single:
-                score = min(score + 2, 40)
-            flip_us[y[i], x[i]] = t_us[i]
-            s = (score << 1) | p[i]
-            state[y[i], x[i]] = s
-        if (s >> 1) >= min_score:
-            hits[y[i] >> cell_shift, x[i] >> cell_shift] += 1
-
-
-@njit(cache=True, nogil=True)
-def active_profile(flip_us, state, box, since_us, min_score, rows, columns):
-    """Count pixels of a box that blink at the chip rate and flipped since `since_us`, by row and column."""
-    left, top, right, bottom = box
-    rows[:] = 0
-    columns[:] = 0
-    for v in range(top, bottom):
-        for u in range(left, right):
-            if flip_us[v, u] >= since_us and (state[v, u] >> 1) >= min_score:
-                rows[v - top] += 1
-                columns[u - left] += 1
-
-
-@njit(cache=True, nogil=True)
-def select_box(t_us, x, y, p, box, out_t, out_x, out_y, out_p):
-    """Copy the events inside a box (left, top, right, bottom); return how many."""
-    left, top, right, bottom = box
-    n = 0
-    for i in range(t_us.size):
-        if left <= x[i] < right and top <= y[i] < bottom:
-            out_t[n] = t_us[i]
-            out_x[n] = x[i]
-            out_y[n] = y[i]
-            out_p[n] = p[i]
-            n += 1
-    return n
-
-
-@njit(cache=True, nogil=True)
-def add_polarity(t_us, x, y, p, start_on_us, start_off_us, chip_us, shift_x, shift_y, sums):
-    """Add events to polarity sums (chips, height, width); pixel (0, 0) of chip c is (shift_x[c], shift_y[c])."""
-    chips, height, width = sums.shape
-    rate = 1.0 / chip_us
-    for i in range(t_us.size):
-        since = t_us[i] - (start_on_us if p[i] else start_off_us)
-        if since < 0:
+        u, v, polarity = np.int64(x[i]), np.int64(y[i]), np.int64(p[i])
+        state = pixels[v, u]
+        if (state & 1) == polarity:
             continue
-        c = int(since * rate)
+        run = t_us[i] - (state >> 8)
+        score = (state >> 1) & 127
+        score += 2 * (np.int64(run >= shortest) & np.int64(run < single)) - 3 * np.int64(run >= double)
+        score = min(max(score, 0), 40)
+        pixels[v, u] = (t_us[i] << 8) | (score << 1) | polarity
+        if score >= min_score:
+            hits[v >> cell_shift, u >> cell_shift] += 1
+
+
+@njit(cache=True, nogil=True)
+def measure_box(
+    pixels: Array, box: tuple[int, int, int, int], since_us: int, min_score: int, rows: Array
+) -> tuple[int, float, int, int, float, float]:
+    """Where in a box pixels blink at the chip rate and changed polarity since `since_us`.
+
+    Returns:
+        (pixels, mean column, first column, last column, upper edge, lower edge); an edge row that holds
+        fewer pixels than a full one counts by its share.
+    """
+    left, top, right, bottom = box
+    total = 0
+    weighted = 0
+    first_column, last_column = right, left
+    lit = 0
+    for v in range(top, bottom):
+        n = 0
+        for u in range(left, right):
+            state = pixels[v, u]
+            if (state >> 8) >= since_us and ((state >> 1) & 127) >= min_score:
+                n += 1
+                weighted += u
+                first_column = min(first_column, u)
+                last_column = max(last_column, u)
+        rows[v - top] = n
+        total += n
+        lit += n > 0
+    if total == 0:
+        return 0, 0.0, 0, 0, 0.0, 0.0
+    full = total / lit
+    v = top
+    while rows[v - top] == 0:
+        v += 1
+    upper = v + 1 - min(rows[v - top] / full, 1.0)
+    v = bottom - 1
+    while rows[v - top] == 0:
+        v -= 1
+    lower = v + min(rows[v - top] / full, 1.0)
+    return total, weighted / total, first_column, last_column, upper, lower
+
+
+@njit(cache=True, nogil=True)
+def select_boxes(
+    t_us: Array,
+    x: Array,
+    y: Array,
+    p: Array,
+    boxes: Array,
+    out_t: Array,
+    out_x: Array,
+    out_y: Array,
+    out_p: Array,
+    taken: Array,
+) -> None:
+    """Copy the events inside each box (left, top, right, bottom) to that box's row; count them in `taken`."""
+    for b in range(boxes.shape[0]):
+        left, top, right, bottom = boxes[b, 0], boxes[b, 1], boxes[b, 2], boxes[b, 3]
+        n = 0
+        for i in range(t_us.size):
+            u = np.int64(x[i])
+            v = np.int64(y[i])
+            # Written always, kept if inside: between two bars, a branch would be a coin toss.
+            out_t[b, n] = t_us[i]
+            out_x[b, n] = x[i]
+            out_y[b, n] = y[i]
+            out_p[b, n] = p[i]
+            n += int(u >= left) & int(u < right) & int(v >= top) & int(v < bottom)
+        taken[b] = n
+
+
+@njit(cache=True, nogil=True)
+def add_polarity(
+    t_us: Array,
+    x: Array,
+    y: Array,
+    p: Array,
+    start_on_us: float,
+    start_off_us: float,
+    chip_us: float,
+    shift_x: Array,
+    shift_y: Array,
+    sums: Array,
+) -> None:
+    """Add events to polarity sums (chips, height, width); a shift is the sensor pixel of (0, 0) in a chip."""
+    chips, height, width = sums.shape
+    begin = np.searchsorted(t_us, min(start_on_us, start_off_us))
+    # Time never runs backward, so each polarity's chip only moves on.
+    chip_on, next_on = -1, start_on_us
+    chip_off, next_off = -1, start_off_us
+    for i in range(begin, t_us.size):
+        t = t_us[i]
+        if p[i]:
+            while t >= next_on:
+                chip_on += 1
+                next_on = start_on_us + (chip_on + 1) * chip_us
+            c = chip_on
+            sign = 1
+        else:
+            while t >= next_off:
+                chip_off += 1
+                next_off = start_off_us + (chip_off + 1) * chip_us
+            c = chip_off
+            sign = -1
         if c >= chips:
+            if min(chip_on, chip_off) >= chips:
+                break
+            continue
+        if c < 0:
             continue
         u = np.int64(x[i]) - shift_x[c]
         v = np.int64(y[i]) - shift_y[c]
         if 0 <= u < width and 0 <= v < height:
-            sums[c, v, u] += 2 * np.int16(p[i]) - 1
+            sums[c, v, u] += sign

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pluggy
+from numpy.typing import NDArray
 
 from evlcp_sdk.abc import Synchronizer
 from evlcp_sdk.config import Link
@@ -68,7 +69,9 @@ class Receiver:
         self._announce: Callable[..., Any] | None = None
         if hook is not None and hook.evlcp_stage_finished.get_hookimpls():
             self._announce = hook.evlcp_stage_finished
-        self._synchronizer: Synchronizer = link.algorithm("synchronization").compile(link.codebook, link.packet)
+        self._synchronizer: Synchronizer = link.algorithm("synchronization").compile(
+            link.codebook, link.packet
+        )
         self._separate = link.algorithm("separation").compile(link.codebook)
         self._decode = link.algorithm("decoding").compile(link.codebook)
         self._measure = link.algorithm("ranging").compile(link.camera, link.bar)
@@ -212,9 +215,7 @@ class Receiver:
 
     def _synchronize(self, transmitter: _Transmitter, events: Events, until_us: int) -> None:
         clock = time.perf_counter()
-        transmitter.sync, locks = self._synchronizer.step(
-            transmitter.sync, events.t_us, events.p, until_us
-        )
+        transmitter.sync, locks = self._synchronizer.step(transmitter.sync, events.t_us, events.p, until_us)
         elapsed = time.perf_counter() - clock
         for lock in locks:
             self._counts["preambles"] += 1
@@ -285,7 +286,7 @@ class Receiver:
         lock, track, packet = transmitter.lock, transmitter.track, self._packet
         assert lock is not None
         assert transmitter.number is not None
-        middles = start_us + (np.arange(packet.frame_chips) + 0.5) * lock.chip_us
+        middles: NDArray[np.float64] = start_us + (np.arange(packet.frame_chips) + 0.5) * lock.chip_us
         x, y = track.at(middles)
         pilot_middle = packet.pilot_chips // 2
         width, height = track.size_at(middles[pilot_middle])
@@ -332,7 +333,9 @@ class Receiver:
         return self._end(self._transmitters.pop(track.id))
 
     def _end(self, transmitter: _Transmitter) -> list[Packet]:
-        packets = self._decode_due(transmitter, min(self._last_us, transmitter.track.latest.t_us + self._step_us))
+        packets = self._decode_due(
+            transmitter, min(self._last_us, transmitter.track.latest.t_us + self._step_us)
+        )
         rest = transmitter.assembler.flush()
         self._counts["packets"] += len(rest)
         return packets + rest

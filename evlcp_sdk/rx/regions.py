@@ -2,9 +2,9 @@
 
 The frequency filter works per pixel on runs: the time between two changes of polarity. A code of the air
 interface has runs of one or two chips only, as many of the one as of the other on average. A lamp on AC mains
-or a PWM lamp of up to 2 kHz changes polarity every 250 us or slower, that is after 2.5 chips; a moving edge and
-a hot pixel, slower still. So a run of one chip raises a pixel's score, a run longer than two chips lowers
-it, and a run of two chips, which both kinds may have, leaves it. One pass, two numbers a pixel.
+or a PWM lamp of up to 2 kHz changes polarity every 250 us or slower, that is after 2.5 chips; a moving edge
+and a hot pixel, slower still. So a run of one chip raises a pixel's score, a run longer than two chips lowers
+it, and a run of two chips, which both kinds may have, leaves it. One pass, one number a pixel.
 """
 
 from bisect import bisect_left
@@ -25,10 +25,13 @@ _CELL_SHIFT = 3
 """Cells of 8 x 8 px: smaller than any bar in range (34 px at 100 m), and few enough to label each step."""
 
 _RUN_CHIPS = (0.4, 1.5, 2.7)
-"""Bounds between runs of noise, one chip, two chips, and slower. ON and OFF differ in delay by up to 0.3 chip."""
+"""Bounds between runs of noise, one chip, two chips, and slower; ON and OFF delays differ by up to 0.3."""
 
 _MEASURE_CHIPS = 4
 """A blinking pixel changes polarity at least once in two chips; twice that allows for a missed event."""
+
+_MIN_PIXELS = 4
+"""Blinking pixels below which a region has no position: one cluster at 100 m has a dozen."""
 
 _BACKFILL_STEPS = 12
 """Steps kept from before a region was found: a pixel needs about 1 ms to score, a region two steps."""
@@ -95,11 +98,11 @@ class RegionTracker:
     def __init__(self, spec: RegionSpec, camera: CameraModel, chip_us: float) -> None:
         self._spec = spec
         self._camera = camera
-        self._run_us = tuple(r * chip_us for r in _RUN_CHIPS)
-        self._measure_us = _MEASURE_CHIPS * chip_us
+        shortest, single, double = _RUN_CHIPS
+        self._run_us = (round(shortest * chip_us), round(single * chip_us), round(double * chip_us))
+        self._measure_us = round(_MEASURE_CHIPS * chip_us)
         shape = (camera.height, camera.width)
-        self._flip_us = np.full(shape, _LONG_AGO_US, np.int64)
-        self._state = np.zeros(shape, np.int16)
+        self._pixels = np.full(shape, _LONG_AGO_US << 8, np.int64)
         self._hits = np.zeros([-(-n >> _CELL_SHIFT) for n in (camera.height + 7, camera.width + 7)], np.int32)
         self._fresh: list[Box] = []
         self._recent: deque[Block] = deque(maxlen=_BACKFILL_STEPS)
@@ -118,16 +121,16 @@ class RegionTracker:
             events.x,
             events.y,
             events.p,
-            self._flip_us,
-            self._state,
+            self._pixels,
             self._hits,
             self._run_us,
             spec.min_score,
             _CELL_SHIFT,
         )
         end_us = start_us + spec.block_us
-        for track in self.tracks:
-            track.blocks.append((start_us, self._select(events, self._reach(track.latest))))
+        selected = _select(events, [self._reach(track.latest) for track in self.tracks])
+        for track, inside in zip(self.tracks, selected, strict=True):
+            track.blocks.append((start_us, inside))
             self._follow(track, end_us)
         self._merge()
         self._open(end_us)
@@ -153,47 +156,24 @@ class RegionTracker:
             min(int(region.y_px + half_h) + 1, self._camera.height),
         )
 
-    def _select(self, events: Events, box: Box) -> Events:
-        from evlcp_sdk.rx import _kernels
-
-        n = len(events)
-        t, x, y, p = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
-        n = _kernels.select_box(events.t_us, events.x, events.y, events.p, box, t, x, y, p)
-        return Events(t[:n], x[:n], y[:n], p[:n])
-
     def _measure(self, id: int, box: Box, end_us: int) -> Region | None:
         """Centre and size of what blinks in a box at the end of a step."""
         from evlcp_sdk.rx import _kernels
 
-        left, top, right, bottom = box
-        rows, columns = np.empty(bottom - top, np.int64), np.empty(right - left, np.int64)
+        rows = np.empty(box[3] - box[1], np.int64)
         # Half the score suffices inside a region: its seam is new to the light as the bar moves.
-        _kernels.active_profile(
-            self._flip_us,
-            self._state,
-            box,
-            end_us - self._measure_us,
-            self._spec.min_score // 2,
-            rows,
-            columns,
+        total, column, left, right, upper, lower = _kernels.measure_box(
+            self._pixels, box, end_us - self._measure_us, self._spec.min_score // 2, rows
         )
-        total = int(rows.sum())
-        if total < 4:
+        if total < _MIN_PIXELS:
             return None
-        lit = np.flatnonzero(rows)
-        # The outermost rows of a bar hold fewer blinking pixels: count them by their share of a full row.
-        full = float(np.median(rows[lit]))
-        first = top + lit[0] + 1 - min(rows[lit[0]] / full, 1)
-        last = top + lit[-1] + min(rows[lit[-1]] / full, 1)
-        across = np.flatnonzero(columns)
-        centre = left + float(columns @ np.arange(len(columns))) / total
         return Region(
             id=id,
             t_us=end_us - self._measure_us / 2,
-            x_px=centre,
-            y_px=float(first + last - 1) / 2,
-            width_px=float(across[-1] - across[0] + 1),
-            height_px=float(last - first),
+            x_px=column,
+            y_px=(upper + lower - 1) / 2,
+            width_px=right - left + 1.0,
+            height_px=lower - upper,
         )
 
     def _follow(self, track: Track, end_us: int) -> None:
@@ -207,7 +187,10 @@ class RegionTracker:
         merge = self._spec.merge_px
         for track in self.tracks:
             left, top, right, bottom = _grown(self._reach(track.latest), merge)
-            hits[top >> _CELL_SHIFT : (bottom >> _CELL_SHIFT) + 1, left >> _CELL_SHIFT : (right >> _CELL_SHIFT) + 1] = 0
+            hits[
+                top >> _CELL_SHIFT : (bottom >> _CELL_SHIFT) + 1,
+                left >> _CELL_SHIFT : (right >> _CELL_SHIFT) + 1,
+            ] = 0
         if not hits.any():
             self._fresh = []
             return
@@ -216,7 +199,7 @@ class RegionTracker:
         boxes = []
         for number, where in enumerate(ndimage.find_objects(areas), 1):
             inside = np.where(areas[where] == number, hits[where], 0)
-            if inside.sum() < self._spec.min_events:
+            if inside.sum() < self._spec.min_runs:
                 continue
             v, u = np.nonzero(inside)
             v, u = v + where[0].start, u + where[1].start
@@ -241,7 +224,7 @@ class RegionTracker:
             return
         self._next_id += 1
         reach = self._reach(region)
-        blocks = deque((start, self._select(events, reach)) for start, events in self._recent)
+        blocks = deque((start, _select(events, [reach])[0]) for start, events in self._recent)
         self.tracks.append(Track(region.id, deque([region]), blocks[0][0], blocks))
 
     def _merge(self) -> None:
@@ -251,6 +234,19 @@ class RegionTracker:
                 if not younger.released and _overlap(_tight(older.latest), _tight(younger.latest)):
                     younger.released = True
         # The survivor reaches over both within a few steps, as its seam finds the other's pixels.
+
+
+def _select(events: Events, boxes: list[Box]) -> list[Events]:
+    """The events inside each box."""
+    from evlcp_sdk.rx import _kernels
+
+    if not boxes:
+        return []
+    shape = (len(boxes), len(events) + 1)
+    t, x, y = np.empty(shape, np.int64), np.empty(shape, np.uint16), np.empty(shape, np.uint16)
+    p, taken = np.empty(shape, np.uint8), np.empty(len(boxes), np.int64)
+    _kernels.select_boxes(events.t_us, events.x, events.y, events.p, np.array(boxes), t, x, y, p, taken)
+    return [Events(t[i, :n], x[i, :n], y[i, :n], p[i, :n]) for i, n in enumerate(taken)]
 
 
 def _tight(region: Region) -> Box:

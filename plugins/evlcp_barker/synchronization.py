@@ -71,11 +71,10 @@ class _Heard:
 
 @dataclass(frozen=True, eq=False)
 class SyncState:
-    """What synchronization remembers: recent event counts, and the preambles of its lock."""
+    """What synchronization remembers: recent event counts (OFF, ON) a step, and the preambles of its lock."""
 
     first_bin: int | None = None
-    on: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    off: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    counts: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 0)))
     next_bin: int = 0
     heard: tuple[_Heard, ...] = ()
     stray: _Heard | None = None
@@ -102,6 +101,8 @@ class BarkerSynchronizer:
         self, state: SyncState, t_us: NDArray[np.int64], p: NDArray[np.uint8], until_us: int
     ) -> tuple[SyncState, list[SyncLock]]:
         """Count events, correlate what is complete, give a lock for each preamble (see `Synchronizer`)."""
+        from evlcp_barker import _kernels
+
         n = self._spec.steps_per_chip
         span = n * len(self._chips)
         guard = n * _GUARD_CHIPS
@@ -110,67 +111,48 @@ class BarkerSynchronizer:
             first = int(t_us[0] // self._bin_us) if len(t_us) else until_bin
             state = replace(state, first_bin=first, next_bin=first + guard)
         assert state.first_bin is not None
-        known = len(state.on)
-        fresh = max(until_bin - state.first_bin - known, 0)
-        bins = (t_us / self._bin_us).astype(np.int64) - state.first_bin - known
-        inside = (bins >= 0) & (bins < fresh)
-        lit = p.astype(bool)
-        on = np.concatenate([state.on, np.bincount(bins[inside & lit], minlength=fresh)])
-        off = np.concatenate([state.off, np.bincount(bins[inside & ~lit], minlength=fresh)])
+        bins = max(until_bin - state.first_bin, state.counts.shape[1])
+        counts = np.zeros((2, bins))
+        counts[:, : state.counts.shape[1]] = state.counts
+        _kernels.count_bins(t_us, p, state.first_bin, self._bin_us, counts)
 
-        cum_on, cum_off = np.concatenate([[0.0], np.cumsum(on)]), np.concatenate([[0.0], np.cumsum(off)])
         locks: list[SyncLock] = []
         heard, stray = state.heard, state.stray
-        lags = len(on) - span + 1
+        lags = bins - span + 1
         lo = state.next_bin - state.first_bin
         if lags - guard > lo:
-            both = self._correlate(cum_on - cum_off, lags)
-            total = (cum_on + cum_off)[span:] - (cum_on + cum_off)[:lags]
-            rho = np.where(total >= self._spec.min_events, both / np.maximum(total, 1), 0)
-            for lag in range(lo, lags - guard):
-                near = rho[lag - guard : lag + guard + 1]
+            rho = np.zeros(lags)
+            _kernels.correlate(counts, self._chips, n, self._spec.min_events, rho)
+            for lag in lo + np.flatnonzero(rho[lo : lags - guard] >= self._spec.min_correlation):
                 # The first of equals, so that a tie gives one peak.
-                if rho[lag] >= self._spec.min_correlation and np.argmax(near) == guard:
-                    found = self._refine(lag, on, cum_on, cum_off, state.first_bin, float(rho[lag]))
+                if np.argmax(rho[lag - guard : lag + guard + 1]) == guard:
+                    found = self._refine(int(lag), counts, state.first_bin, float(rho[lag]))
                     heard, stray = self._accept(heard, stray, found)
-                    if heard and stray is None:
+                    if stray is None:
                         locks.append(self._lock(heard))
             lo = lags - guard
         drop = max(lo - guard, 0)
-        return (
-            SyncState(state.first_bin + drop, on[drop:], off[drop:], state.first_bin + lo, heard, stray),
-            locks,
-        )
+        first = state.first_bin + drop
+        return SyncState(first, counts[:, drop:], state.first_bin + lo, heard, stray), locks
 
-    def _correlate(self, cumulative: NDArray[np.float64], lags: int) -> NDArray[np.float64]:
-        n = self._spec.steps_per_chip
-        windows = np.lib.stride_tricks.sliding_window_view(cumulative, n * len(self._chips) + 1)
-        out: NDArray[np.float64] = windows[:lags, ::n] @ self._weights
-        return out
-
-    def _refine(
-        self,
-        lag: int,
-        on: NDArray[np.float64],
-        cum_on: NDArray[np.float64],
-        cum_off: NDArray[np.float64],
-        first_bin: int,
-        quality: float,
-    ) -> _Heard:
+    def _refine(self, lag: int, counts: NDArray[np.float64], first_bin: int, quality: float) -> _Heard:
         """Times of one preamble, for positive and negative events apart, us."""
         n = self._spec.steps_per_chip
         start = max(lag - n, 0)
-        stop = min(lag + n + 1, len(on) - n * len(self._chips) + 1)
+        stop = min(lag + n + 1, counts.shape[1] - n * len(self._chips) + 1)
 
-        def centre(cumulative: NDArray[np.float64], sign: float) -> float:
-            part = sign * self._correlate(cumulative[start:], stop - start)
+        def centre(count: NDArray[np.float64], sign: float) -> float:
+            running = np.concatenate([[0.0], np.cumsum(count)])
+            windows = np.lib.stride_tricks.sliding_window_view(running, n * len(self._chips) + 1)
+            part = sign * (windows[start:stop, ::n] @ self._weights)
             # The top is flat where a window holds all events of an edge: its middle is the best window.
             weight = np.maximum(part - 0.9 * part.max(), 0) if part.max() > 0 else np.zeros(len(part))
             if weight.sum() == 0:
                 return float(lag)
             return start + float(weight @ np.arange(len(part)) / weight.sum())
 
-        middle_on, middle_off = centre(cum_on, 1), centre(cum_off, -1)
+        off, on = counts
+        middle_on, middle_off = centre(on, 1), centre(off, -1)
         # The onset of the positive events, averaged over the rising edges inside the preamble.
         edges = lag + n * self._rising
         steps = np.arange(-n, n)
@@ -181,7 +163,7 @@ class BarkerSynchronizer:
         rise = (half - below) / (response[k] - below) if response[k] > below else 0.0
         onset = lag + float(steps[k]) - 0.5 + rise
         at = [(first_bin + v) * self._bin_us for v in (middle_on, middle_off, onset)]
-        return _Heard(0, *at, quality)
+        return _Heard(0, at[0], at[1], at[2], quality)
 
     def _accept(
         self, heard: tuple[_Heard, ...], stray: _Heard | None, found: _Heard

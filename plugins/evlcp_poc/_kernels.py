@@ -1,12 +1,17 @@
-"""Sub-pixel peak fit, compiled."""
+"""Cuts of maps, cross-spectra, sub-pixel peak fit, robust mean: compiled."""
+
+from typing import Any
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
 
 
 @njit(cache=True, nogil=True)
-def dirichlet(x, size, band):
-    """The Dirichlet kernel of `band` (odd) harmonics out of `size`, 1 * band / size at x = 0; and its slope."""
+def dirichlet(x: float, size: int, band: int) -> tuple[float, float]:
+    """The Dirichlet kernel of `band` (odd) harmonics out of `size`, band / size at x = 0; and its slope."""
     a = np.pi * x / size
     s = np.sin(a)
     if abs(s) < 1e-9:
@@ -18,8 +23,12 @@ def dirichlet(x, size, band):
 
 
 @njit(cache=True, nogil=True)
-def fit_peak(samples, size, band):
-    """Shift of the Dirichlet kernel that fits samples around the middle one best (least squares), px."""
+def fit_peak(samples: Array, size: int, band: int) -> float:
+    """Shift of the Dirichlet kernel that fits samples around the middle one best (least squares), px.
+
+    The gain that fits best follows from the shift, so Gauss-Newton steps run over the shift alone
+    (variable projection).
+    """
     half = samples.size // 2
     left, middle, right = samples[half - 1], samples[half], samples[half + 1]
     # For a kernel between two samples, the neighbours' ratio is that of their distances.
@@ -31,44 +40,51 @@ def fit_peak(samples, size, band):
             shift = -shift
     for _ in range(12):
         mm = 0.0
+        ms = 0.0
+        ss = 0.0
         mv = 0.0
-        for i in range(samples.size):
-            m, _slope = dirichlet(i - half - shift, size, band)
-            mm += m * m
-            mv += m * samples[i]
-        gain = mv / mm
-        gg = 0.0
-        gr = 0.0
+        sv = 0.0
         for i in range(samples.size):
             m, slope = dirichlet(i - half - shift, size, band)
-            g = -gain * slope
-            gg += g * g
-            gr += g * (samples[i] - gain * m)
-        if gg < 1e-30:
+            mm += m * m
+            ms += m * slope
+            ss += slope * slope
+            mv += m * samples[i]
+            sv += slope * samples[i]
+        gain = mv / mm
+        # The slope with its part along the kernel removed: what the gain cannot explain.
+        curvature = gain * (ss - ms * ms / mm)
+        if gain <= 0 or curvature < 1e-30:
             break
-        move = min(max(gr / gg, -0.25), 0.25)
+        move = -(sv - gain * ms) / curvature
+        move = min(max(move, -0.25), 0.25)
         shift = min(max(shift + move, -1.0), 1.0)
-        if abs(move) < 1e-6:
+        # Steps shrink quadratically: the next one would be some 1e-6 px.
+        if abs(move) < 1e-3:
             break
     return shift
 
 
 @njit(cache=True, nogil=True)
-def pair_shifts(correlation, reach, samples, shifts):
+def pair_shifts(correlation: Array, reach: int, samples: int, shifts: Array) -> None:
     """Peak of each pair's phase-only correlation near zero shift, `shifts` (pairs, 2): down, right, px."""
     pairs, height, width = correlation.shape
     column = np.empty(2 * samples + 1)
     row = np.empty(2 * samples + 1)
     band_y = height - 1 + height % 2
     band_x = width - 1 + width % 2
+    reach_y = min(reach, height // 2 - 1)
+    reach_x = min(reach, width // 2 - 1)
     for q in range(pairs):
-        best = -np.inf
+        best = correlation[q, 0, 0]
         peak_v = 0
         peak_u = 0
-        for v in range(-min(reach, height // 2), min(reach, height // 2) + 1):
-            for u in range(-min(reach, width // 2), min(reach, width // 2) + 1):
-                if correlation[q, v % height, u % width] > best:
-                    best = correlation[q, v % height, u % width]
+        for v in range(-reach_y, reach_y + 1):
+            vv = v if v >= 0 else v + height
+            for u in range(-reach_x, reach_x + 1):
+                uu = u if u >= 0 else u + width
+                if correlation[q, vv, uu] > best:
+                    best = correlation[q, vv, uu]
                     peak_v = v
                     peak_u = u
         for i in range(-samples, samples + 1):
@@ -76,3 +92,150 @@ def pair_shifts(correlation, reach, samples, shifts):
             row[i + samples] = correlation[q, peak_v % height, (peak_u + i) % width]
         shifts[q, 0] = peak_v + fit_peak(column, height, band_y)
         shifts[q, 1] = peak_u + fit_peak(row, width, band_x)
+
+
+@njit(cache=True, nogil=True)
+def middles(maps: Array, used: Array, min_pixels: int, out: Array) -> None:
+    """Weighted median (row, column) of the maps used, -1 where a map has too few lit pixels.
+
+    Unlike the mean, the median is deaf to stray pixels.
+    """
+    _, height, width = maps.shape
+    rows = np.empty(height)
+    columns = np.empty(width)
+    for n in range(used.size):
+        k = used[n]
+        rows[:] = 0.0
+        columns[:] = 0.0
+        lit = 0
+        for v in range(height):
+            for u in range(width):
+                w = maps[k, v, u]
+                if w > 0:
+                    rows[v] += w
+                    columns[u] += w
+                    lit += 1
+        out[n, 0] = -1
+        out[n, 1] = -1
+        if lit < min_pixels:
+            continue
+        half = rows.sum() / 2
+        total = 0.0
+        for v in range(height):
+            total += rows[v]
+            if total >= half:
+                out[n, 0] = v
+                break
+        total = 0.0
+        for u in range(width):
+            total += columns[u]
+            if total >= half:
+                out[n, 1] = u
+                break
+
+
+@njit(cache=True, nogil=True)
+def cut_maps(maps: Array, used: Array, middle: Array, out: Array) -> None:
+    """Windows of the maps around their middles, zero outside a map, `out` (used, height, width)."""
+    _, height, width = maps.shape
+    _, rows, columns = out.shape
+    for n in range(used.size):
+        if middle[n, 0] < 0:
+            continue
+        top = middle[n, 0] - rows // 2
+        left = middle[n, 1] - columns // 2
+        for v in range(max(top, 0), min(top + rows, height)):
+            for u in range(max(left, 0), min(left + columns, width)):
+                out[n, v - top, u - left] = maps[used[n], v, u]
+
+
+@njit(cache=True, nogil=True)
+def unit_phases(spectra: Array) -> None:
+    """Divide spectra by their size, in place; what is far below the largest has no phase and becomes 0."""
+    n, height, width = spectra.shape
+    for k in range(n):
+        top = 0.0
+        for v in range(height):
+            for u in range(width):
+                z = spectra[k, v, u]
+                top = max(top, z.real * z.real + z.imag * z.imag)
+        least = 1e-10 * top
+        for v in range(height):
+            for u in range(width):
+                z = spectra[k, v, u]
+                power = z.real * z.real + z.imag * z.imag
+                if power > least:
+                    spectra[k, v, u] = z * np.float32(1 / np.sqrt(power))
+                else:
+                    spectra[k, v, u] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def cross_spectra(
+    phases: Array, first: Array, second: Array, height_even: bool, width_even: bool, out: Array
+) -> None:
+    """Conj(first) * second of pairs, without the Nyquist frequencies, which have no phase."""
+    _, height, width = phases.shape
+    for q in range(first.size):
+        for v in range(height):
+            for u in range(width):
+                nyquist = (height_even and v == height // 2) or (width_even and u == width - 1)
+                if nyquist:
+                    out[q, v, u] = 0.0
+                else:
+                    out[q, v, u] = phases[second[q], v, u] * np.conj(phases[first[q], v, u])
+
+
+@njit(cache=True, nogil=True)
+def _quantile(ordered: Array, share: float) -> float:
+    at = share * (ordered.size - 1)
+    low = int(at)
+    high = min(low + 1, ordered.size - 1)
+    return float(ordered[low] + (at - low) * (ordered[high] - ordered[low]))
+
+
+@njit(cache=True, nogil=True)
+def robust_mean(
+    values: Array, weights: Array, first: Array, second: Array, clusters: int, drop: int, iqr: float
+) -> tuple[float, float, int]:
+    """Weighted mean of pair values without extremes and outliers, and its delete-one-cluster jackknife sigma.
+
+    Returns:
+        (mean, sigma, values kept); sigma is NaN when fewer than two clusters can be left out.
+    """
+    n = values.size
+    order = np.argsort(values)
+    begin, end = 0, n
+    if n > 2 * drop + 1:
+        begin, end = drop, n - drop
+    ordered = values[order[begin:end]]
+    low = _quantile(ordered, 0.25)
+    high = _quantile(ordered, 0.75)
+    room = iqr * (high - low)
+    total = 0.0
+    mass = 0.0
+    kept = 0
+    by_mass = np.zeros(clusters)
+    by_total = np.zeros(clusters)
+    for i in range(begin, end):
+        q = order[i]
+        if low - room <= values[q] <= high + room:
+            kept += 1
+            w = weights[q]
+            mass += w
+            total += w * values[q]
+            for k in (first[q], second[q]):
+                by_mass[k] += w
+                by_total[k] += w * values[q]
+    m = 0
+    mean = 0.0
+    square = 0.0
+    for k in range(clusters):
+        if by_mass[k] > 0 and mass - by_mass[k] > 1e-9 * mass:
+            left = (total - by_total[k]) / (mass - by_mass[k])
+            m += 1
+            step = left - mean
+            mean += step / m
+            square += step * (left - mean)
+    sigma = np.sqrt((m - 1) / m * square) if m > 1 else np.nan
+    return total / mass, sigma, kept

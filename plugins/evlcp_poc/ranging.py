@@ -1,5 +1,6 @@
 """Distance from the shifts between clusters in the image."""
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -18,21 +19,22 @@ __all__ = ["PocRanging", "phase_only_correlation"]
 _NONE = Range(float("nan"), float("nan"), 0)
 
 
-def phase_only_correlation(spectra_a: NDArray[np.complex128], spectra_b: NDArray[np.complex128], width: int) -> NDArray[np.float64]:
-    """Phase-only correlation of images given by `rfft2`, float64 (..., height, width).
+def phase_only_correlation(
+    images: NDArray[np.float32], first: NDArray[np.int64], second: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Phase-only correlation of pairs of images, float32 (n, height, width) -> (pairs, height, width).
 
-    Its peak lies where image b lies relative to image a (down, right), and has the shape of the Dirichlet
-    kernel of the band kept; the Nyquist frequency, which has no phase, is left out.
+    The peak of a pair lies where its second image lies relative to its first (down, right), and has the shape
+    of the Dirichlet kernel of the band kept: all frequencies but Nyquist's.
     """
-    height = spectra_a.shape[-2]
-    cross = spectra_b * np.conj(spectra_a)
-    size = np.abs(cross)
-    cross = np.where(size > 1e-9 * size.max(initial=1e-30), cross / np.maximum(size, 1e-30), 0)
-    if height % 2 == 0:
-        cross[..., height // 2, :] = 0
-    if width % 2 == 0:
-        cross[..., :, width // 2] = 0
-    out: NDArray[np.float64] = fft.irfft2(cross, (height, width))
+    from evlcp_poc import _kernels
+
+    _, height, width = images.shape
+    phases = fft.rfft2(images)
+    _kernels.unit_phases(phases)
+    cross = np.empty((len(first), *phases.shape[1:]), phases.dtype)
+    _kernels.cross_spectra(phases, first, second, height % 2 == 0, width % 2 == 0, cross)
+    out: NDArray[np.float64] = fft.irfft2(cross, (height, width), overwrite_x=True)
     return out
 
 
@@ -87,26 +89,40 @@ class PocRanging(Ranging):
         first, second, spacing = used[i[far]], used[j[far]], spacing[far]
         neighbour = float(np.min(np.hypot(*(centres[1:] - centres[:-1]).T)))
 
+        place = np.searchsorted(used, np.stack([first, second]))
+
         def measure(maps: NDArray[np.float32]) -> Range:
-            usable = np.flatnonzero((maps[used] > 0).sum((1, 2)) >= self.min_pixels)
-            if len(usable) < 2:
+            from evlcp_poc import _kernels
+
+            middle = np.empty((len(used), 2), np.int64)
+            _kernels.middles(maps, used, self.min_pixels, middle)
+            known = middle[:, 0] >= 0
+            pairs = known[place[0]] & known[place[1]]
+            if not pairs.any():
                 return _NONE
-            middle = np.full((len(maps), 2), -1)
-            middle[used[usable]] = _middles(maps[used[usable]])
-            known = (middle[first, 0] >= 0) & (middle[second, 0] >= 0)
-            if not known.any():
-                return _NONE
-            a, b, apart_m = first[known], second[known], spacing[known]
+            a, b, apart_m = place[0][pairs], place[1][pairs], spacing[pairs]
             apart_px = (middle[b] - middle[a]).astype(np.float64)
-            scale = float(np.median(np.hypot(*apart_px.T) / apart_m))
-            if scale <= 0:
+            px_per_m = float(np.median(np.hypot(apart_px[:, 0], apart_px[:, 1]) / apart_m))
+            if px_per_m <= 0:
                 return _NONE
-            apart_px += self._residuals(maps, middle, a, b, scale * neighbour)
-            distance = camera.focal_px * apart_m / np.maximum(np.hypot(*apart_px.T), 1e-9)
-            keep = self._keep(distance)
-            weight = np.where(keep, apart_m**self.weight_power, 0.0)
-            estimate = float(weight @ distance / weight.sum())
-            return Range(estimate, _jackknife(distance, weight, a, b), int(keep.sum()))
+            neighbour_px = px_per_m * neighbour
+            # A cut of two spacings and a seam holds a cluster's blob with its blur, wherever it sits in it.
+            height = _cut_size(2 * neighbour_px + 8)
+            width = min(height, _cut_size(maps.shape[2]))
+            cuts = np.zeros((len(used), height, width), np.float32)
+            _kernels.cut_maps(maps, used, middle, cuts)
+            correlation = phase_only_correlation(cuts, a, b)
+            beyond = np.empty((len(a), 2))
+            # Two medians of blobs of one spacing are wrong by half a spacing at the most.
+            reach = max(int(neighbour_px / 2), 2)
+            _kernels.pair_shifts(correlation, reach, self.peak_samples, beyond)
+            apart_px += beyond
+            distance = camera.focal_px * apart_m / np.maximum(np.hypot(apart_px[:, 0], apart_px[:, 1]), 1e-9)
+            weight = apart_m**self.weight_power
+            mean, sigma, kept = _kernels.robust_mean(
+                distance, weight, a, b, len(used), self.drop_extremes, self.outlier_iqr
+            )
+            return Range(float(mean), float(sigma), int(kept))
 
         return measure
 
@@ -119,75 +135,7 @@ class PocRanging(Ranging):
             )
         return np.sort(used)
 
-    def _residuals(
-        self,
-        maps: NDArray[np.float32],
-        middle: NDArray[np.int64],
-        a: NDArray[np.int64],
-        b: NDArray[np.int64],
-        neighbour_px: float,
-    ) -> NDArray[np.float64]:
-        """Shifts (down, right) of each pair beyond that of the middles, px."""
-        from evlcp_poc import _kernels
-
-        # A cut of three spacings holds a cluster's blob with its blur, and half its neighbours' room.
-        height = _cut_size(3 * neighbour_px)
-        width = min(height, _cut_size(maps.shape[2]))
-        which = np.unique(np.concatenate([a, b]))
-        cuts = np.stack([_cut(maps[k], middle[k], height, width) for k in which])
-        spectra = fft.rfft2(cuts)
-        index = np.full(len(maps), -1)
-        index[which] = np.arange(len(which))
-        correlation = phase_only_correlation(spectra[index[a]], spectra[index[b]], width)
-        shifts = np.empty((len(a), 2))
-        reach = max(int(neighbour_px / 2), 2)
-        _kernels.pair_shifts(correlation, reach, self.peak_samples, shifts)
-        return shifts
-
-    def _keep(self, distance: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Pairs that remain after the extremes and the outliers are dropped."""
-        keep = np.ones(len(distance), bool)
-        d = self.drop_extremes
-        if d and len(distance) > 2 * d + 1:
-            order = np.argsort(distance, kind="stable")
-            keep[order[:d]] = keep[order[-d:]] = False
-        low, high = np.percentile(distance[keep], (25, 75))
-        room = self.outlier_iqr * (high - low)
-        return keep & (distance >= low - room) & (distance <= high + room)
-
 
 def _cut_size(least: float) -> int:
-    size = 16
-    while size < least:
-        size *= 2
-    return size
-
-
-def _middles(maps: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Weighted median (row, column) of each map: unlike the mean, deaf to stray pixels."""
-    out = []
-    for axis in (2, 1):
-        total = np.cumsum(maps.sum(axis), 1)
-        out.append((total >= total[:, -1:] / 2).argmax(1))
-    return np.stack(out, 1)
-
-
-def _cut(map_: NDArray[np.float32], middle: NDArray[np.int64], height: int, width: int) -> NDArray[np.float32]:
-    """A window of a map around its middle, zero outside."""
-    out = np.zeros((height, width), np.float32)
-    top, left = middle[0] - height // 2, middle[1] - width // 2
-    v0, v1 = max(top, 0), min(top + height, map_.shape[0])
-    u0, u1 = max(left, 0), min(left + width, map_.shape[1])
-    out[v0 - top : v1 - top, u0 - left : u1 - left] = map_[v0:v1, u0:u1]
-    return out
-
-
-def _jackknife(
-    distance: NDArray[np.float64], weight: NDArray[np.float64], a: NDArray[np.int64], b: NDArray[np.int64]
-) -> float:
-    """Standard deviation of the weighted mean when one cluster at a time, with its pairs, is left out."""
-    names = np.unique(np.concatenate([a[weight > 0], b[weight > 0]]))
-    left = [weight * ((a != k) & (b != k)) for k in names]
-    means = np.array([w @ distance / w.sum() for w in left if w.sum() > 0])
-    n = len(means)
-    return float(np.sqrt((n - 1) / n * ((means - means.mean()) ** 2).sum())) if n > 1 else float("nan")
+    """An even length that transforms fast."""
+    return 2 * fft.next_fast_len(math.ceil(least / 2), real=True)

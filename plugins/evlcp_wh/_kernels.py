@@ -1,11 +1,16 @@
 """Loops over pixels and grid cells, compiled."""
 
+from typing import Any
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
 
 
 @njit(cache=True, nogil=True)
-def _value(first, second):
+def _value(first: int, second: int) -> int:
     """The value b' of a chip pair's polarity sums: sign of the second chip, else b'' = -sign of the first."""
     if second != 0:
         return 1 if second > 0 else -1
@@ -15,7 +20,9 @@ def _value(first, second):
 
 
 @njit(cache=True, nogil=True)
-def presence(sums, codes, grid, agree, disagree, min_seen, out):
+def presence(
+    sums: Array, codes: Array, grid: int, agree: float, disagree: float, min_seen: int, out: Array
+) -> None:
     """Posterior probability of each cluster in each cell, `out` (K, rows, columns), against `no cluster`.
 
     `agree` and `disagree` are the log-likelihood ratios of one value that fits a code or not.
@@ -53,29 +60,31 @@ def presence(sums, codes, grid, agree, disagree, min_seen, out):
 
 
 @njit(cache=True, nogil=True)
-def pixel_maps(sums, codes, grid, selected, out):
+def pixel_maps(sums: Array, codes: Array, grid: int, selected: Array, out: Array) -> None:
     """Pilot correlation of the pixels in each cluster's selected cells and their neighbours, 0 to 1."""
     clusters, length = codes.shape
     _, rows, columns = selected.shape
-    for r in range(rows):
-        for c in range(columns):
-            for k in range(clusters):
-                wanted = False
-                for rr in range(max(r - 1, 0), min(r + 2, rows)):
-                    for cc in range(max(c - 1, 0), min(c + 2, columns)):
-                        wanted |= selected[k, rr, cc]
-                if not wanted:
+    done = np.zeros(selected.shape, np.bool_)
+    for k in range(clusters):
+        for row in range(rows):
+            for column in range(columns):
+                if not selected[k, row, column]:
                     continue
-                for v in range(r * grid, (r + 1) * grid):
-                    for u in range(c * grid, (c + 1) * grid):
-                        fit = 0
-                        for i in range(length):
-                            fit += codes[k, i] * _value(sums[2 * i, v, u], sums[2 * i + 1, v, u])
-                        out[k, v, u] = max(fit, 0) / length
+                for r in range(max(row - 1, 0), min(row + 2, rows)):
+                    for c in range(max(column - 1, 0), min(column + 2, columns)):
+                        if done[k, r, c]:
+                            continue
+                        done[k, r, c] = True
+                        for v in range(r * grid, (r + 1) * grid):
+                            for u in range(c * grid, (c + 1) * grid):
+                                fit = 0
+                                for i in range(length):
+                                    fit += codes[k, i] * _value(sums[2 * i, v, u], sums[2 * i + 1, v, u])
+                                out[k, v, u] = max(fit, 0) / length
 
 
 @njit(cache=True, nogil=True)
-def weighted_values(sums, probability, grid, least, out):
+def weighted_values(sums: Array, probability: Array, grid: int, least: float, out: Array) -> None:
     """Presence-weighted sum of the values of the info chips, `out` (K, values)."""
     clusters, rows, columns = probability.shape
     length = out.shape[1]
@@ -97,3 +106,19 @@ def weighted_values(sums, probability, grid, least, out):
                 if weight >= least:
                     for i in range(length):
                         out[k, i] += weight * values[i]
+
+
+@njit(cache=True, nogil=True)
+def max_log(fit: Array, bits: int, zero: Array, one: Array) -> None:
+    """Best correlation among the codewords with each bit 0 and with each bit 1, `zero`, `one` (K, bits)."""
+    clusters, words = fit.shape
+    zero[:] = -np.inf
+    one[:] = -np.inf
+    for k in range(clusters):
+        for s in range(words):
+            f = fit[k, s]
+            for b in range(bits):
+                if (s >> (bits - 1 - b)) & 1:
+                    one[k, b] = max(one[k, b], f)
+                else:
+                    zero[k, b] = max(zero[k, b], f)

@@ -30,15 +30,12 @@ class WhTransform(Decoding):
         """Precompute for a codebook's codewords."""
         words = codebook.codewords.astype(np.float64)
         length, m = words.shape[1], codebook.bits_per_symbol
-        ones = (np.arange(len(words))[:, None] >> np.arange(m - 1, -1, -1) & 1).astype(bool)
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             from evlcp_wh import _kernels
 
             values = np.zeros((len(presence.probability), length))
-            _kernels.weighted_values(
-                sums, presence.probability, presence.grid_px, self.min_weight, values
-            )
+            _kernels.weighted_values(sums, presence.probability, presence.grid_px, self.min_weight, values)
             fit = values @ words.T
             symbols = fit.argmax(1)
             energy = float((values**2).sum())
@@ -46,10 +43,9 @@ class WhTransform(Decoding):
             explained = float((amplitude**2).sum()) * length
             # One noise-to-signal ratio a frame: eight values a cluster are too few for one each.
             noise = max(energy - explained, 1e-3 * energy) / max(explained, 1e-9)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                scale = np.where(amplitude > 0, 1 / (amplitude * noise), 0.0)
-            zero = np.stack([np.where(ones[:, b], -np.inf, fit).max(1) for b in range(m)], 1)
-            one = np.stack([np.where(ones[:, b], fit, -np.inf).max(1) for b in range(m)], 1)
+            scale = 1 / (np.maximum(amplitude, 1e-9) * noise)
+            zero, one = np.empty((2, len(values), m))
+            _kernels.max_log(fit, m, zero, one)
             llr = ((zero - one) * scale[:, None]).astype(np.float32)
             return SoftSymbols(symbols, llr, explained / energy if energy else 0.0)
 

@@ -1,0 +1,48 @@
+"""Counting events in time, and the sliding correlation, compiled."""
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+@njit(cache=True, nogil=True)
+def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, counts: Array) -> None:
+    """Count events by polarity (row) and time (column: bins of `bin_us` from `first_bin` on)."""
+    bins = counts.shape[1]
+    b = -1
+    upper = first_bin * bin_us
+    for i in range(t_us.size):
+        # Time never runs backward, so the bin only moves on.
+        while t_us[i] >= upper and b < bins:
+            b += 1
+            upper = (first_bin + b + 1) * bin_us
+        if b >= bins:
+            break
+        if b >= 0:
+            counts[p[i], b] += 1
+
+
+@njit(cache=True, nogil=True)
+def correlate(counts: Array, chips: Array, steps: int, min_events: int, rho: Array) -> None:
+    """Normalised correlation of signed counts in windows of one chip (`steps` bins) with chips (-1, +1)."""
+    bins = counts.shape[1]
+    signed = np.empty(bins + 1)
+    total = np.empty(bins + 1)
+    signed[0] = 0.0
+    total[0] = 0.0
+    for b in range(bins):
+        signed[b + 1] = signed[b] + counts[1, b] - counts[0, b]
+        total[b + 1] = total[b] + counts[1, b] + counts[0, b]
+    for lag in range(rho.size):
+        seen = total[lag + steps * chips.size] - total[lag]
+        if seen < min_events:
+            continue
+        fit = 0.0
+        for c in range(chips.size):
+            at = lag + steps * c
+            fit += chips[c] * (signed[at + steps] - signed[at])
+        rho[lag] = fit / seen
