@@ -6,6 +6,7 @@ figures of a recording of any length take constant memory; `save_figures` draws 
 
 import colorsys
 import math
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
+from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.geometry import CameraModel
 from evlcp_sdk.hookspecs import hookimpl
 from evlcp_sdk.types import Events, Frame, PresenceMap, Region
@@ -125,6 +127,9 @@ def save_figures(probe: FigureProbe, title: str, folder: Path) -> list[Path]:
 
     Returns:
         The files written.
+
+    Raises:
+        EvlcpError: A file cannot be written.
     """
     written = []
     drawn: list[tuple[str, Figure]] = [("regions.png", draw_regions(probe, title))]
@@ -133,9 +138,14 @@ def save_figures(probe: FigureProbe, title: str, folder: Path) -> list[Path]:
     if probe.frames:
         drawn.append(("distance.png", draw_distance(probe, title)))
     for name, figure in drawn:
-        part = folder / f".{name}.part"
-        figure.savefig(part, format="png", dpi=_DPI)
-        part.replace(folder / name)
+        part = folder / f".{name}.{os.getpid()}.part"
+        try:
+            figure.savefig(part, format="png", dpi=_DPI)
+            part.replace(folder / name)
+        except OSError as fault:
+            raise EvlcpError(f"{folder / name}: cannot be written: {fault.strerror}") from fault
+        finally:
+            part.unlink(missing_ok=True)
         written.append(folder / name)
     return written
 

@@ -11,13 +11,15 @@ import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self, TextIO
 
 from evlcp_sdk.config import Link
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.frames import bits_of_symbols
 from evlcp_sdk.types import Frame, Packet
 
@@ -144,15 +146,19 @@ class ResultWriter:
         self.folder = folder
         self.transmitters: dict[int, TransmitterTally] = {}
         self._link = link
+        self._parquet: _ParquetRows | None = None
+        if parquet:
+            _check_parquet()
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._frames_file = self._open("frames.csv")
             self._packets_file = self._open("packets.jsonl")
+            if parquet:
+                self._parquet = _ParquetRows(self._hidden("frames.parquet"))
         except OSError as fault:
             raise ConfigError(f"{folder}: cannot be written: {fault.strerror}") from fault
         self._rows = csv.writer(self._frames_file, lineterminator="\n")
         self._rows.writerow(FRAME_COLUMNS)
-        self._parquet = _ParquetRows(self._hidden("frames.parquet")) if parquet else None
 
     def _hidden(self, name: str) -> Path:
         return self.folder / f".{name}.{os.getpid()}.part"
@@ -161,19 +167,29 @@ class ResultWriter:
         return self._hidden(name).open("w", encoding="utf-8", newline="")
 
     def write(self, packets: Iterable[Packet]) -> None:
-        """Append packets and their frames."""
-        for packet in packets:
-            tally = self.transmitters.get(packet.transmitter)
-            if tally is None:
-                form = self._link.packet
-                tally = TransmitterTally(packet.sent, form.packet_chips * form.chip_us)
-                self.transmitters[packet.transmitter] = tally
-            tally.add(packet)
-            self._packets_file.write(json.dumps(self._packet_line(packet)) + "\n")
-            for frame in packet.frames:
-                self._rows.writerow(_frame_row(frame))
-                if self._parquet is not None:
-                    self._parquet.add(frame)
+        """Append packets and their frames.
+
+        Raises:
+            EvlcpError: A file cannot be written, e.g. the disk is full.
+        """
+        try:
+            for packet in packets:
+                self._write(packet)
+        except OSError as fault:
+            raise EvlcpError(f"{self.folder}: cannot be written: {fault.strerror}") from fault
+
+    def _write(self, packet: Packet) -> None:
+        tally = self.transmitters.get(packet.transmitter)
+        if tally is None:
+            form = self._link.packet
+            tally = TransmitterTally(packet.sent, form.packet_chips * form.chip_us)
+            self.transmitters[packet.transmitter] = tally
+        tally.add(packet)
+        self._packets_file.write(json.dumps(self._packet_line(packet)) + "\n")
+        for frame in packet.frames:
+            self._rows.writerow(_frame_row(frame))
+            if self._parquet is not None:
+                self._parquet.add(frame)
 
     def _packet_line(self, packet: Packet) -> dict[str, Any]:
         book = self._link.codebook
@@ -219,7 +235,7 @@ class ResultWriter:
             The content of `summary.json`.
 
         Raises:
-            ConfigError: A file cannot be written.
+            EvlcpError: A file cannot be written, e.g. the disk is full.
         """
         table = {
             "status": status,
@@ -249,7 +265,7 @@ class ResultWriter:
                 else:
                     (self.folder / name).unlink(missing_ok=True)
         except OSError as fault:
-            raise ConfigError(f"{self.folder}: cannot be written: {fault.strerror}") from fault
+            raise EvlcpError(f"{self.folder}: cannot be written: {fault.strerror}") from fault
         return table
 
     def headline(self) -> str:
@@ -273,7 +289,9 @@ class ResultWriter:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Drop what `finish` has not moved into place."""
-        self._close()
+        # A file that could not be written cannot be flushed either, and is dropped.
+        with suppress(OSError):
+            self._close()
         for name in _FILES:
             self._hidden(name).unlink(missing_ok=True)
 
@@ -301,19 +319,20 @@ def _number(value: float, digits: int) -> float | None:
     return round(value, digits) if math.isfinite(value) else None
 
 
+def _check_parquet() -> None:
+    if find_spec("pyarrow") is None:
+        raise ConfigError("Parquet needs the extra: pip install 'evlcp-sdk[parquet]', or leave --parquet out")
+
+
 class _ParquetRows:
     """Rows of `frames.parquet`, one row group every `GROUP` frames."""
 
     GROUP = 4096
 
     def __init__(self, path: Path) -> None:
-        try:
-            import pyarrow
-            import pyarrow.parquet
-        except ImportError as fault:
-            raise ConfigError(
-                "Parquet needs the extra: pip install 'evlcp-sdk[parquet]', or leave --parquet out"
-            ) from fault
+        import pyarrow
+        import pyarrow.parquet
+
         whole, real = pyarrow.int64(), pyarrow.float64()
         types = [whole, whole, whole, real, pyarrow.list_(whole), real, real, real, real, real]
         self._schema = pyarrow.schema(list(zip(FRAME_COLUMNS, types, strict=True)))

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from evlcp_wh.pilots import WhPilots
 
 from evlcp_sdk.codebook import Codebook
 from evlcp_sdk.config import AirSpec, Link, RegionSpec
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.frames import PacketFormat, symbols_of_bits
 from evlcp_sdk.geometry import BarLayout, CameraModel
 from evlcp_sdk.outputs import FIGURE_NAMES, FRAME_COLUMNS, ResultWriter, TransmitterTally
@@ -166,6 +167,30 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="file: cannot be written"):
         ResultWriter(tmp_path / "file", LINK)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("packets", [1, 100])
+def test_a_full_disk_is_told_and_leaves_the_old_result(tmp_path: Path, packets: int) -> None:
+    (tmp_path / "frames.csv").write_text("old")
+    (tmp_path / f".packets.jsonl.{os.getpid()}.part").symlink_to("/dev/full")
+
+    def fill() -> None:
+        with ResultWriter(tmp_path, LINK) as writer:
+            writer.write([packet(i, (frame(i, 0), frame(i, 1))) for i in range(packets)])
+            finish(writer)
+
+    with pytest.raises(EvlcpError, match="cannot be written: No space left on device") as caught:
+        fill()
+    assert caught.value.exit_code == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["frames.csv"]
+
+
+def test_parquet_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("evlcp_sdk.outputs.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match="needs the extra: pip install"):
+        ResultWriter(tmp_path / "out", LINK, parquet=True)
+    assert not (tmp_path / "out").exists()
 
 
 def test_parquet_holds_the_same_frames(tmp_path: Path) -> None:
