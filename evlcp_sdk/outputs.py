@@ -48,6 +48,7 @@ Status = Literal["complete", "interrupted", "failed"]
 _FILES = ("frames.csv", "packets.jsonl", "frames.parquet", "summary.json")
 _CELL_M = 0.01
 _FARTHEST_M = 10_000.0
+_MOST_CLOCK_ERROR = 0.01
 
 
 @dataclass
@@ -65,8 +66,9 @@ class TransmitterTally:
     frames: int = 0
     first_frame: int = -1
     last_frame: int = -1
-    first_packet: tuple[int, float] = (0, math.nan)
     last_packet: tuple[int, float] = (0, math.nan)
+    steps_us: float = 0.0
+    nominal_steps_us: float = 0.0
     quality_sum: float = 0.0
     ranged: int = 0
     first_m: float = math.nan
@@ -77,9 +79,12 @@ class TransmitterTally:
         """Count a packet and its frames."""
         self.packets += 1
         self.frames += len(packet.frames)
+        number, t_us = self.last_packet
+        step_us, nominal_us = packet.t_us - t_us, (packet.packet - number) * self.nominal_packet_us
+        if abs(step_us - nominal_us) < _MOST_CLOCK_ERROR * nominal_us:
+            self.steps_us += step_us
+            self.nominal_steps_us += nominal_us
         self.last_packet = (packet.packet, packet.t_us)
-        if self.packets == 1:
-            self.first_packet = self.last_packet
         for frame in packet.frames:
             number = frame.packet * self.packet_frames + frame.frame
             self.first_frame = number if self.first_frame < 0 else self.first_frame
@@ -105,12 +110,10 @@ class TransmitterTally:
     def clock_ppm(self) -> float:
         """The transmitter's chip rate against the camera's clock, ppm; NaN before the second packet.
 
-        Taken from the times of the first and the last packet, so it is the surer the longer the recording.
+        Taken from the times of the packets, so it is the surer the longer the recording; a step from one
+        packet to the next that no clock explains, as after a loss of lock, is left out.
         """
-        (first, first_us), (last, last_us) = self.first_packet, self.last_packet
-        if last == first:
-            return math.nan
-        return ((last - first) * self.nominal_packet_us / (last_us - first_us) - 1) * 1e6
+        return (self.nominal_steps_us / self.steps_us - 1) * 1e6 if self.steps_us else math.nan
 
     def to_dict(self) -> dict[str, Any]:
         """The figures as JSON values; what was never measured is null.

@@ -213,3 +213,10 @@ def test_the_median_needs_no_memory_of_every_frame() -> None:
     assert tally.median_m() == pytest.approx(np.median(distances), abs=0.006)
     tally.add(packet(333, (frame(333, 0, 1e300),)))
     assert max(tally.cells) == 1_000_000
+
+
+def test_a_jump_in_time_is_no_clock_error() -> None:
+    tally = TransmitterTally(3, 12_200.0)
+    for number, t_us in enumerate([0.0, 12_200.1, 24_400.2, 30_000.0, 42_200.1]):
+        tally.add(Packet(0, number, t_us, 100.0, (), sent=3))
+    assert tally.clock_ppm() == pytest.approx(-0.1 / 12_200 * 1e6, rel=1e-3)
