@@ -108,7 +108,8 @@ static enum evlcp_status on_configure(struct evlcp *e, struct exchange *x)
     struct evlcp_configure_request request;
     evlcp_configure_request_get(x->in, &request);
     if (request.chip_rate_hz == 0u || request.chip_rate_hz > e->info.chip_rate_max_hz ||
-        e->info.tick_hz % request.chip_rate_hz != 0u) {
+        e->info.tick_hz % request.chip_rate_hz != 0u ||
+        e->info.tick_hz / request.chip_rate_hz > e->info.ticks_per_chip_max) {
         x->detail = e->info.chip_rate_max_hz;
         return EVLCP_STATUS_OUT_OF_RANGE;
     }

@@ -9,16 +9,17 @@
 
 /* Facts of a board that do not change. */
 struct evlcp_hal_info {
-    uint32_t tick_hz;          /* rate of the timer that times the chips */
-    uint32_t chip_rate_max_hz; /* fastest chip rate */
-    uint16_t level_max_ma;     /* largest LED current */
-    uint16_t level_default_ma; /* LED current after reset */
-    uint32_t capabilities;     /* enum evlcp_capability */
+    uint32_t tick_hz;            /* rate of the timer that times the chips */
+    uint32_t ticks_per_chip_max; /* longest chip */
+    uint32_t chip_rate_max_hz;   /* fastest chip rate */
+    uint16_t level_max_ma;       /* largest LED current */
+    uint16_t level_default_ma;   /* LED current after reset */
+    uint32_t capabilities;       /* enum evlcp_capability */
     uint8_t unique_id[12];
     uint8_t name[12]; /* of the hardware layer, ASCII, zero-padded */
 };
 
-/* What the sensors tell; `faults` holds over_temperature, open_led and clock of enum evlcp_fault. */
+/* What the sensors tell; a temperature of INT16_MIN is not measured. `faults` holds over_temperature, open_led and clock of enum evlcp_fault. */
 struct evlcp_health {
     int16_t temperature_dc;
     uint8_t faults;
@@ -29,7 +30,8 @@ struct evlcp_health {
 void hal_info(struct evlcp_hal_info *info);
 
 /* Show a row of LEDs, LED 0 the most significant bit of row[0]. `chip` is its number since START, or
-   EVLCP_CHIP_DARK (blank at once) or EVLCP_CHIP_TEST. The only output; nothing else lights a LED. */
+   EVLCP_CHIP_DARK (blank: at once, or from the chip call when the rows before have had their time) or
+   EVLCP_CHIP_TEST. The only output; nothing else lights a LED. */
 void hal_leds(const uint8_t *row, uint32_t chip);
 
 /* Call evlcp_chip every `ticks` from now on; 0 stops it, and no call comes after the return. Never called

@@ -9,6 +9,7 @@ void hal_info(struct evlcp_hal_info *info)
 {
     *info = (struct evlcp_hal_info){
         .tick_hz = NATIVE_TICK_HZ,
+        .ticks_per_chip_max = 0xffffffffu,
         .chip_rate_max_hz = 20000u,
         .level_max_ma = 60u,
         .level_default_ma = 20u,

@@ -1,0 +1,507 @@
+/* HAL of the driver board: STM32F405 at 168 MHz, six 16-channel constant-current shift registers in a chain.
+
+   | pin      | function                                             |
+   |----------|------------------------------------------------------|
+   | PA9 PA10 | USART1 to the host                                   |
+   | PA5 PA7  | SPI1 clock and data of the chain                     |
+   | PA6      | latch (LE), TIM3 channel 1                           |
+   | PA4      | DAC 1: reference of the LED current                  |
+   | PB0      | output enable of the drivers, high is dark; pulled up on the board, so dark through reset |
+   | PB1      | thermal flag of the drivers, high is too hot         |
+
+   A chip of t ticks (a tick is 12 cycles) has six slots of 2 t cycles. At the end of each slot TIM1's update
+   makes DMA2 stream 5 move one 16-bit word of the row to SPI1, which shifts it out in 1.5 us. TIM3 runs on the
+   same clock, one period a chip, started by TIM1: it lifts the latch from 4 us to 5 us after the sixth word, when
+   the chain is at rest. So the moment of a change is the hardware's; no instruction takes part in it.
+
+   The stream goes round and round over two rows and interrupts after each: the core fills the row that has just
+   gone. The other one is on its way already, for in direct mode the stream fetches a word ahead. So a row has a
+   whole chip of time to be handed in, and is on show two chips later. */
+#include "evlcp.h"
+#include "startup.h"
+
+#define CORE_HZ 168000000u
+#define HSI_HZ 16000000u
+#define TICK_CYCLES 12u
+#define SLOTS_PER_CHIP 6u
+#define LATCH_AT_US 4u
+#define LATCH_US 1u
+#define TIM3_PER_US 84u
+
+#define RCC 0x40023800u
+#define RCC_CR REGISTER(RCC + 0x00u)
+#define RCC_PLLCFGR REGISTER(RCC + 0x04u)
+#define RCC_CFGR REGISTER(RCC + 0x08u)
+#define RCC_AHB1ENR REGISTER(RCC + 0x30u)
+#define RCC_APB1ENR REGISTER(RCC + 0x40u)
+#define RCC_APB2ENR REGISTER(RCC + 0x44u)
+#define HSE_ON 0x00010000u
+#define HSE_READY 0x00020000u
+#define PLL_ON 0x01000000u
+#define PLL_READY 0x02000000u
+
+#define FLASH 0x40023c00u
+#define FLASH_ACR REGISTER(FLASH + 0x00u)
+#define FLASH_KEYR REGISTER(FLASH + 0x04u)
+#define FLASH_SR REGISTER(FLASH + 0x0cu)
+#define FLASH_CR REGISTER(FLASH + 0x10u)
+#define FLASH_BUSY 0x00010000u
+#define FLASH_ERRORS 0x000000f2u
+#define FLASH_PROGRAM 0x00000001u
+#define FLASH_SECTOR_ERASE 0x00000002u
+#define FLASH_WORDS 0x00000200u
+#define FLASH_START 0x00010000u
+#define FLASH_LOCK 0x80000000u
+
+#define GPIOA 0x40020000u
+#define GPIOB 0x40020400u
+#define GPIO_MODER(p) REGISTER((p) + 0x00u)
+#define GPIO_OSPEEDR(p) REGISTER((p) + 0x08u)
+#define GPIO_PUPDR(p) REGISTER((p) + 0x0cu)
+#define GPIO_IDR(p) REGISTER((p) + 0x10u)
+#define GPIO_BSRR(p) REGISTER((p) + 0x18u)
+#define GPIO_AFRL(p) REGISTER((p) + 0x20u)
+#define GPIO_AFRH(p) REGISTER((p) + 0x24u)
+#define PIN(n) (1u << (n))
+#define PIN_CLEAR(n) (1u << ((n) + 16u))
+#define MODE(n, m) ((uint32_t)(m) << 2u * (n))
+#define MODE_OUTPUT 1u
+#define MODE_ALTERNATE 2u
+#define MODE_ANALOG 3u
+
+#define USART1 0x40011000u
+#define USART_SR REGISTER(USART1 + 0x00u)
+#define USART_DR REGISTER(USART1 + 0x04u)
+#define USART_BRR REGISTER(USART1 + 0x08u)
+#define USART_CR1 REGISTER(USART1 + 0x0cu)
+#define USART_OVERRUN 0x08u
+#define USART_RECEIVED 0x20u
+#define USART_EMPTY 0x80u
+
+#define SPI1 0x40013000u
+#define SPI_CR1 REGISTER(SPI1 + 0x00u)
+#define SPI_CR2 REGISTER(SPI1 + 0x04u)
+#define SPI_SR REGISTER(SPI1 + 0x08u)
+#define SPI_DR REGISTER(SPI1 + 0x0cu)
+#define SPI_EMPTY 0x02u
+#define SPI_BUSY 0x80u
+
+#define TIM1 0x40010000u
+#define TIM2 0x40000000u
+#define TIM3 0x40000400u
+#define TIM_CR1(t) REGISTER((t) + 0x00u)
+#define TIM_CR2(t) REGISTER((t) + 0x04u)
+#define TIM_SMCR(t) REGISTER((t) + 0x08u)
+#define TIM_DIER(t) REGISTER((t) + 0x0cu)
+#define TIM_SR(t) REGISTER((t) + 0x10u)
+#define TIM_EGR(t) REGISTER((t) + 0x14u)
+#define TIM_CCMR1(t) REGISTER((t) + 0x18u)
+#define TIM_CCER(t) REGISTER((t) + 0x20u)
+#define TIM_CNT(t) REGISTER((t) + 0x24u)
+#define TIM_PSC(t) REGISTER((t) + 0x28u)
+#define TIM_ARR(t) REGISTER((t) + 0x2cu)
+#define TIM_CCR1(t) REGISTER((t) + 0x34u)
+
+#define DMA2 0x40026400u
+#define DMA_HISR REGISTER(DMA2 + 0x04u)
+#define DMA_HIFCR REGISTER(DMA2 + 0x0cu)
+#define DMA_S5CR REGISTER(DMA2 + 0x88u)
+#define DMA_S5NDTR REGISTER(DMA2 + 0x8cu)
+#define DMA_S5PAR REGISTER(DMA2 + 0x90u)
+#define DMA_S5M0AR REGISTER(DMA2 + 0x94u)
+#define DMA_S5FCR REGISTER(DMA2 + 0x9cu)
+#define DMA_ENABLE 0x1u
+#define DMA_S5_HALF 0x00000400u
+#define DMA_S5_ALL 0x00000800u
+#define DMA_S5_FLAGS 0x00000f40u
+
+#define DAC_CR REGISTER(0x40007400u)
+#define DAC_DHR12R1 REGISTER(0x40007408u)
+
+#define UNIQUE_ID 0x1fff7a10u
+#define SLOT_ADDRESS(slot) (0x080c0000u + 0x20000u * (slot))
+#define SLOT_SECTOR(slot) (10u + (slot))
+
+#define IRQ_USART1 37u
+#define IRQ_DMA2_STREAM5 68u
+
+#define LEVEL_MAX_MA 60u
+#define DAC_FULL 4095u
+#define WAIT_LOOPS 1000000u
+
+extern uint32_t link_stack[];
+
+static struct evlcp board;
+static volatile uint16_t words[2][SLOTS_PER_CHIP]; /* two rows on their way to the chain */
+static uint32_t gone;                              /* the row that may be filled */
+static bool clock_failed;
+static volatile bool in_chip;      /* the chip interrupt runs the core */
+static volatile uint32_t draining; /* chips until the chain is at rest after the core has stopped */
+static volatile uint32_t served;   /* chip interrupts since the start, up to 2 */
+static bool overrun;               /* the chip interrupt missed a row */
+static uint32_t slot_cycles;
+static uint32_t last_count;
+static uint32_t count_rest;
+static uint32_t millis;
+static volatile uint32_t lost;
+static uint32_t lost_told;
+
+void hal_info(struct evlcp_hal_info *info)
+{
+    *info = (struct evlcp_hal_info){.tick_hz = CORE_HZ / TICK_CYCLES,
+                                    .ticks_per_chip_max = 65536u / SLOTS_PER_CHIP,
+                                    .chip_rate_max_hz = 20000u,
+                                    .level_max_ma = LEVEL_MAX_MA,
+                                    .level_default_ma = 20u,
+                                    .capabilities = EVLCP_CAPABILITY_FLASH | EVLCP_CAPABILITY_LEVEL,
+                                    .name = "stm32f405"};
+#ifndef EVLCP_NETDUINOPLUS2
+    evlcp_copy(info->unique_id, (const uint8_t *)UNIQUE_ID, sizeof info->unique_id);
+#endif
+}
+
+static void outputs_off(void)
+{
+    GPIO_BSRR(GPIOB) = PIN(0);
+}
+
+static void outputs_on(void)
+{
+    GPIO_BSRR(GPIOB) = PIN_CLEAR(0);
+}
+
+/* LED 0 leaves first and ends at the far end of the chain: it is output 15 of the last register. */
+static void load(const uint8_t *row)
+{
+    for (uint32_t i = 0; i < SLOTS_PER_CHIP; i++)
+        words[gone][i] = (uint16_t)(row[2u * i] << 8 | row[2u * i + 1u]);
+}
+
+/* Shift a row out by hand while no chips run: the single-LED test. */
+static void shift_now(void)
+{
+    for (uint32_t i = 0; i < SLOTS_PER_CHIP; i++) {
+        for (uint32_t n = 0; n < WAIT_LOOPS && (SPI_SR & SPI_EMPTY) == 0u; n++) {
+        }
+        SPI_DR = words[gone][i];
+    }
+    for (uint32_t n = 0; n < WAIT_LOOPS && (SPI_SR & SPI_BUSY) != 0u; n++) {
+    }
+    GPIO_MODER(GPIOA) = (GPIO_MODER(GPIOA) & ~MODE(6, 3)) | MODE(6, MODE_OUTPUT);
+    GPIO_BSRR(GPIOA) = PIN(6);
+    GPIO_BSRR(GPIOA) = PIN(6); /* a second write: the latch pulse is longer than the drivers' 20 ns */
+    GPIO_BSRR(GPIOA) = PIN_CLEAR(6);
+}
+
+void hal_leds(const uint8_t *row, uint32_t chip)
+{
+    if (chip == EVLCP_CHIP_DARK && !in_chip) {
+        outputs_off();
+        return;
+    }
+    load(row);
+    if (chip == EVLCP_CHIP_TEST) {
+        shift_now();
+        outputs_on();
+    }
+}
+
+static void chips_stop(void)
+{
+    TIM_CR1(TIM1) = 0u;
+    TIM_CR1(TIM3) = 0u;
+    DMA_S5CR = 0u;
+    for (uint32_t n = 0; n < WAIT_LOOPS && (DMA_S5CR & DMA_ENABLE) != 0u; n++) {
+    }
+    DMA_HIFCR = DMA_S5_FLAGS;
+    irq_forget(IRQ_DMA2_STREAM5);
+    draining = 0u;
+}
+
+static void chips_start(uint32_t ticks)
+{
+    slot_cycles = TICK_CYCLES / SLOTS_PER_CHIP * ticks;
+    static const uint8_t dark[EVLCP_ROW_BYTES];
+    for (gone = 0u; gone < 2u; gone++)
+        load(dark);
+    gone = 0u;
+    served = 0u;
+    overrun = false;
+    GPIO_MODER(GPIOA) = (GPIO_MODER(GPIOA) & ~MODE(6, 3)) | MODE(6, MODE_ALTERNATE);
+
+    /* TIM1: a slot; its update asks for a word, its start lets TIM3 go. */
+    TIM_CR2(TIM1) = 0x10u; /* TRGO is the enable bit */
+    TIM_PSC(TIM1) = 0u;
+    TIM_ARR(TIM1) = slot_cycles - 1u;
+    TIM_EGR(TIM1) = 1u;
+    TIM_SR(TIM1) = 0u;
+    TIM_DIER(TIM1) = 0x100u; /* update -> DMA */
+
+    /* TIM3: a chip, at half TIM1's clock; counter 0 is the latch. The words go at the ends of slots 1 to 6, so the
+       sixth is six slots after the start, and the latch LATCH_AT_US after that. The first time round, the counter
+       starts so that it wraps then. */
+    uint32_t chip_counts = SLOTS_PER_CHIP * slot_cycles / 2u;
+    TIM_PSC(TIM3) = 0u;
+    TIM_ARR(TIM3) = chip_counts - 1u;
+    TIM_CCR1(TIM3) = LATCH_US * TIM3_PER_US;
+    TIM_CCMR1(TIM3) = 0x60u; /* PWM mode 1: high below CCR1 */
+    TIM_CCER(TIM3) = 1u;
+    TIM_EGR(TIM3) = 1u;
+    TIM_CNT(TIM3) = chip_counts - LATCH_AT_US * TIM3_PER_US;
+    TIM_SMCR(TIM3) = 0x06u; /* started by ITR0 = TIM1 */
+
+    DMA_HIFCR = DMA_S5_FLAGS;
+    DMA_S5PAR = SPI1 + 0x0cu;
+    DMA_S5M0AR = (uint32_t)(uintptr_t)words;
+    DMA_S5NDTR = 2u * SLOTS_PER_CHIP;
+    DMA_S5FCR = 0u;
+    /* Channel 6 (TIM1_UP), very high priority, 16 bits both sides, memory counts up, circular, memory to
+       peripheral, interrupts when half and when all have gone. */
+    DMA_S5CR = 6u << 25 | 3u << 16 | 1u << 13 | 1u << 11 | 1u << 10 | 1u << 8 | 1u << 6 | 1u << 4 | 1u << 3;
+    DMA_S5CR |= DMA_ENABLE;
+    TIM_CR1(TIM1) = 1u;
+}
+
+void hal_chips(uint32_t ticks)
+{
+    if (ticks == 0u && in_chip) {
+        /* The last row goes next, and stays its chip; the dark row follows, then rest. */
+        draining = 3u;
+        return;
+    }
+    if (ticks == 0u) {
+        chips_stop();
+        return;
+    }
+    while (draining != 0u) { /* at most three chips */
+    }
+    chips_start(ticks);
+}
+
+uint32_t hal_lateness(void)
+{
+    uint32_t moved = (2u * SLOTS_PER_CHIP - DMA_S5NDTR) % SLOTS_PER_CHIP;
+    if (overrun)
+        moved += SLOTS_PER_CHIP;
+    return (moved * slot_cycles + TIM_CNT(TIM1)) / TICK_CYCLES;
+}
+
+uint32_t hal_millis(void)
+{
+    /* Called far more often than the 51 s in which TIM2 wraps. */
+    uint32_t per_ms = (clock_failed ? HSI_HZ : CORE_HZ / 2u) / 1000u;
+    uint32_t count = TIM_CNT(TIM2);
+    count_rest += count - last_count;
+    last_count = count;
+    millis += count_rest / per_ms;
+    count_rest %= per_ms;
+    return millis;
+}
+
+uint32_t hal_send(const uint8_t *bytes, uint32_t count)
+{
+    uint32_t sent = 0u;
+    while (sent < count && (USART_SR & USART_EMPTY) != 0u)
+        USART_DR = bytes[sent++];
+    return sent;
+}
+
+uint32_t hal_lost(void)
+{
+    uint32_t total = lost;
+    uint32_t since = total - lost_told;
+    lost_told = total;
+    return since;
+}
+
+bool hal_level(uint16_t level_ma)
+{
+    DAC_DHR12R1 = level_ma * DAC_FULL / LEVEL_MAX_MA;
+    return true;
+}
+
+void hal_health(struct evlcp_health *health)
+{
+    *health = (struct evlcp_health){.temperature_dc = INT16_MIN};
+    if ((GPIO_IDR(GPIOB) & PIN(1)) != 0u)
+        health->faults |= EVLCP_FAULT_OVER_TEMPERATURE;
+    if (clock_failed)
+        health->faults |= EVLCP_FAULT_CLOCK;
+}
+
+static bool flash_done(void)
+{
+    /* A sector takes up to two seconds to erase. */
+    for (uint32_t n = 0; n < 100u * WAIT_LOOPS && (FLASH_SR & FLASH_BUSY) != 0u; n++) {
+    }
+    return (FLASH_SR & (FLASH_BUSY | FLASH_ERRORS)) == 0u;
+}
+
+static void flash_unlock(void)
+{
+    FLASH_KEYR = 0x45670123u;
+    FLASH_KEYR = 0xcdef89abu;
+    FLASH_SR = FLASH_ERRORS;
+}
+
+bool hal_flash_erase(uint8_t slot)
+{
+    flash_unlock();
+    FLASH_CR = FLASH_WORDS | FLASH_SECTOR_ERASE | SLOT_SECTOR(slot) << 3;
+    FLASH_CR |= FLASH_START;
+    bool done = flash_done();
+    FLASH_CR = FLASH_LOCK;
+    return done;
+}
+
+bool hal_flash_write(uint8_t slot, uint32_t offset, const uint8_t *bytes, uint32_t count)
+{
+    bool good = true;
+    flash_unlock();
+    FLASH_CR = FLASH_WORDS | FLASH_PROGRAM;
+    for (uint32_t i = 0; good && i < count; i += 4u) {
+        uint8_t last[4] = {0xff, 0xff, 0xff, 0xff};
+        evlcp_copy(last, bytes + i, count - i < 4u ? count - i : 4u);
+        REGISTER(SLOT_ADDRESS(slot) + offset + i) = evlcp_get32(last);
+        good = flash_done();
+    }
+    FLASH_CR = FLASH_LOCK;
+    return good;
+}
+
+bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t count)
+{
+    evlcp_copy(bytes, (const uint8_t *)(SLOT_ADDRESS(slot) + offset), count);
+    return true;
+}
+
+void hal_panic(void)
+{
+    outputs_off();
+    chips_stop();
+}
+
+static void chip_handler(void)
+{
+    static const uint8_t dark[EVLCP_ROW_BYTES];
+    uint32_t flags = DMA_HISR & (DMA_S5_HALF | DMA_S5_ALL);
+    DMA_HIFCR = DMA_S5_FLAGS;
+    gone = flags == DMA_S5_HALF ? 0u : 1u;
+    overrun = flags == (DMA_S5_HALF | DMA_S5_ALL);
+    /* The first row shifted was dark; once it is latched the outputs may be let on. */
+    if (served == 1u)
+        outputs_on();
+    if (served < 2u)
+        served++;
+    if (draining != 0u) {
+        if (draining == 1u) {
+            outputs_off();
+            chips_stop();
+        } else {
+            load(dark);
+            draining--;
+        }
+        return;
+    }
+    in_chip = true;
+    evlcp_chip(&board);
+    in_chip = false;
+}
+
+static void receive_handler(void)
+{
+    uint32_t status = USART_SR;
+    if ((status & USART_OVERRUN) != 0u)
+        lost++;
+    if ((status & (USART_RECEIVED | USART_OVERRUN)) != 0u) {
+        uint8_t byte = (uint8_t)USART_DR; /* the read clears both flags */
+        if ((status & USART_RECEIVED) != 0u)
+            evlcp_receive(&board, &byte, 1u);
+    }
+}
+
+static bool ready(const volatile uint32_t *where, uint32_t mask, uint32_t value)
+{
+#ifdef EVLCP_NETDUINOPLUS2
+    (void)where;
+    (void)mask;
+    (void)value;
+    return true;
+#else
+    for (uint32_t n = 0; n < WAIT_LOOPS; n++) {
+        if ((*where & mask) == value)
+            return true;
+    }
+    return false;
+#endif
+}
+
+/* 8 MHz crystal -> PLL -> 168 MHz; buses at 42 and 84 MHz. False: still on the 16 MHz RC oscillator. */
+static bool clock_start(void)
+{
+    RCC_CR |= HSE_ON;
+    if (!ready(&RCC_CR, HSE_READY, HSE_READY))
+        return false;
+    FLASH_ACR = 0x705u; /* five wait states, caches and prefetch on */
+    RCC_PLLCFGR = 7u << 24 | 1u << 22 | 336u << 6 | 8u;
+    RCC_CR |= PLL_ON;
+    if (!ready(&RCC_CR, PLL_READY, PLL_READY))
+        return false;
+    RCC_CFGR = 5u << 10 | 4u << 13; /* APB1 by 4, APB2 by 2 */
+    RCC_CFGR |= 2u;
+    return ready(&RCC_CFGR, 0xcu, 8u);
+}
+
+static void pins_start(void)
+{
+    RCC_AHB1ENR |= 1u << 22 | 1u << 1 | 1u << 0;             /* DMA2, GPIOB, GPIOA */
+    RCC_APB1ENR |= 1u << 29 | 1u << 1 | 1u << 0;             /* DAC, TIM3, TIM2 */
+    RCC_APB2ENR |= 1u << 12 | 1u << 4 | 1u << 0;             /* SPI1, USART1, TIM1 */
+    GPIO_BSRR(GPIOB) = PIN(0);                               /* dark before the pin drives */
+    GPIO_MODER(GPIOB) |= MODE(0, MODE_OUTPUT);
+    GPIO_PUPDR(GPIOB) |= 2u << 2;                            /* PB1 down */
+    GPIO_AFRL(GPIOA) = 5u << 20 | 2u << 24 | 5u << 28;       /* SPI1, TIM3, SPI1 */
+    GPIO_AFRH(GPIOA) = 7u << 4 | 7u << 8;                    /* USART1 */
+    GPIO_OSPEEDR(GPIOA) |= MODE(5, 2) | MODE(6, 2) | MODE(7, 2);
+    GPIO_PUPDR(GPIOA) |= 1u << 20;                           /* PA10 up: an open line is idle */
+    GPIO_MODER(GPIOA) |= MODE(4, MODE_ANALOG) | MODE(5, MODE_ALTERNATE) | MODE(6, MODE_ALTERNATE) |
+                         MODE(7, MODE_ALTERNATE) | MODE(9, MODE_ALTERNATE) | MODE(10, MODE_ALTERNATE);
+}
+
+int main(void)
+{
+    clock_failed = !clock_start();
+    pins_start();
+    DAC_CR = 1u;
+    /* 16 bits, master, most significant first, data taken on the rising edge, 84 MHz / 8. */
+    SPI_CR2 = 0u;
+    SPI_CR1 = 1u << 11 | 1u << 9 | 1u << 8 | 2u << 3 | 1u << 2;
+    SPI_CR1 |= 1u << 6;
+    TIM_ARR(TIM2) = 0xffffffffu;
+    TIM_EGR(TIM2) = 1u;
+    TIM_CR1(TIM2) = 1u;
+    last_count = TIM_CNT(TIM2);
+    evlcp_init(&board);
+    irq_enable(IRQ_DMA2_STREAM5, 0x00u); /* the highest: nothing delays a row */
+    irq_enable(IRQ_USART1, 0x80u);
+    USART_BRR = (clock_failed ? HSI_HZ : CORE_HZ / 2u) / EVLCP_BAUD;
+    USART_CR1 = 1u << 13 | 1u << 5 | 1u << 3 | 1u << 2; /* on, receive interrupt, transmitter, receiver */
+    for (;;)
+        evlcp_poll(&board);
+}
+
+union vector {
+    uint32_t *stack;
+    void (*handler)(void);
+};
+
+__attribute__((section(".vectors"), used)) static const union vector vectors[16 + 82] = {
+    {.stack = link_stack},      {.handler = reset_handler}, {.handler = fault_handler},
+    {.handler = fault_handler}, {.handler = fault_handler}, {.handler = fault_handler},
+    {.handler = fault_handler}, {.handler = fault_handler}, {.handler = fault_handler},
+    {.handler = fault_handler}, {.handler = fault_handler}, {.handler = fault_handler},
+    {.handler = fault_handler}, {.handler = fault_handler}, {.handler = fault_handler},
+    {.handler = fault_handler},
+    [16 + IRQ_USART1] = {.handler = receive_handler},
+    [16 + IRQ_DMA2_STREAM5] = {.handler = chip_handler},
+};
