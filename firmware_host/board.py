@@ -50,7 +50,7 @@ from firmware_host.messages import (
 from firmware_host.payload import Payload
 from firmware_host.wire import Payload as Message
 
-__all__ = ["Board", "Programmed"]
+__all__ = ["Board", "Programmed", "Settings", "profile_number", "provision"]
 
 _BLOCK = 2048
 """Bytes of a bank whose CRC decides together whether they are there."""
@@ -81,6 +81,25 @@ class Programmed:
     swapped: bool
     bank: int
     retries: int
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a board is set to besides its payload.
+
+    Attributes:
+        chip_rate_hz: Chips per second.
+        level_ma: LED current, mA; None leaves it.
+        watchdog: What to do when the host falls silent; None leaves it.
+        watchdog_ms: After which silence, ms.
+        start: Whether to play when all is done.
+    """
+
+    chip_rate_hz: int = 10_000
+    level_ma: int | None = None
+    watchdog: Watchdog | None = None
+    watchdog_ms: int = 5_000
+    start: bool = True
 
 
 class Board:
@@ -344,6 +363,30 @@ class Board:
                 )
             self.link.transport.read(0.005)
         return status
+
+
+def provision(
+    board: Board, payload: Payload, settings: Settings, verify: bool = True, progress: Progress | None = None
+) -> Programmed:
+    """Bring a board to payload and settings; what is so already is left alone.
+
+    The level comes first: a board that cannot take it keeps its old payload.
+
+    Raises:
+        BoardError: See `Board.program` and `Board.level`.
+        ConfigError: The payload does not fit the board.
+    """
+    board.check_fits(payload)
+    status = board.status()
+    if settings.level_ma is not None and status.level_ma != settings.level_ma:
+        board.level(settings.level_ma)
+    wanted = (settings.watchdog, settings.watchdog_ms)
+    if settings.watchdog is not None and (status.watchdog, status.watchdog_ms) != wanted:
+        board.watchdog(settings.watchdog, settings.watchdog_ms)
+    done = board.program(payload, settings.chip_rate_hz, verify, progress)
+    if settings.start and status.state != State.PLAYING:
+        board.start()
+    return done
 
 
 def _silent(done: int, total: int) -> None:

@@ -89,11 +89,13 @@ def qemu_command(listen: str, leds: Path | None = None, wait: bool = False) -> l
         raise ToolchainError(
             "qemu-system-arm is missing: apt-get install --no-install-recommends qemu-system-arm"
         )
-    serial = f"{listen},server=on,wait={'on' if wait else 'off'}"
+    # A comma in a name stands doubled in QEMU's options.
+    serial = f"{listen.replace(',', ',,')},server=on,wait={'on' if wait else 'off'}"
+    record = "null" if leds is None else f"file:{str(leds).replace(',', ',,')}"
     return [
         *("qemu-system-arm", "-M", "mps2-an385", "-kernel", str(build.arm_image("mps2-an385"))),
         *("-icount", "shift=3,sleep=off", "-display", "none", "-monitor", "none", "-nodefaults"),
-        *("-serial", serial, "-serial", f"file:{leds}" if leds is not None else "null"),
+        *("-serial", serial, "-serial", record),
     ]
 
 

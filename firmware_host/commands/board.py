@@ -1,7 +1,632 @@
 """`evlcp board`: program and watch driver boards."""
 
+import contextlib
+from collections.abc import Iterator
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
 import typer
+
+from firmware_host.commands import _source
+from firmware_host.commands.tx import Frames, ProfileName, RandomPackets, Seed, SymbolsFile
+
+if TYPE_CHECKING:
+    from firmware_host.board import Board
+    from firmware_host.messages import HelloReply, StatusReply
+    from firmware_host.payload import Payload
 
 __all__ = ["app"]
 
-app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", help="Program and watch driver boards.")
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    help="""Program and watch driver boards.
+
+    Exit codes: [bold]2[/] usage, [bold]3[/] input file, [bold]4[/] no board, [bold]5[/] refused,
+    [bold]6[/] link, [bold]7[/] verify, [bold]8[/] incompatible.
+    """,
+)
+
+Port = Annotated[
+    str | None,
+    typer.Option(
+        envvar="EVLCP_PORT",
+        help="Device, pyserial URL, unix:PATH, tcp:HOST:PORT, native: or qemu:; by default all ports are asked.",
+    ),
+]
+Baud = Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)]
+Trace = Annotated[Path | None, typer.Option(metavar="FILE", help="Record the wire.")]
+Replay = Annotated[Path | None, typer.Option(metavar="FILE", help="Play a recorded wire back; no board.")]
+AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
+Masks = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE.npy", help="Instead of symbols: chips, uint8, one column an LED or a cluster."
+    ),
+]
+DEFAULT_BAUD = 1_000_000
+
+
+class Silence(StrEnum):
+    """What a board does when the host falls silent."""
+
+    KEEP = "keep"
+    IDLE = "idle"
+    DARK = "dark"
+
+
+class Emulator(StrEnum):
+    """Emulated boards."""
+
+    NATIVE = "native"
+    QEMU = "qemu"
+
+
+@contextlib.contextmanager
+def _board(port: str | None, baud: int, trace: Path | None, replay: Path | None) -> "Iterator[Board]":
+    from evlcp_sdk.errors import ConfigError, InputError
+    from firmware_host.board import Board
+    from firmware_host.client import Timing
+    from firmware_host.link import Link
+    from firmware_host.ports import find
+    from firmware_host.transport import ReplayTransport, TraceTransport, Transport, open_transport
+
+    transport: Transport
+    first = nonce = None
+    if replay is not None:
+        if trace is not None:
+            raise ConfigError("--trace and --replay: give one of the two")
+        transport = played = ReplayTransport(replay)
+        first, nonce, baud = played.first, played.nonce, played.baud
+    else:
+        transport = open_transport(port or find(baud), baud)
+        if trace is not None:
+            import random
+
+            draw = random.SystemRandom()
+            first, nonce = draw.randrange(1 << 16), draw.randrange(1 << 32)
+            try:
+                file = trace.open("w", encoding="utf-8")
+            except OSError as fault:
+                transport.close()
+                raise InputError(f"{trace}: cannot be written: {fault.strerror}") from fault
+            transport = TraceTransport(transport, file, baud, first, nonce)
+    with Link(transport, Timing(baud), first, nonce) as link:
+        yield Board(link)
+
+
+def _payload(
+    symbols: Path | None, random: int | None, masks: Path | None, seed: int, frames: int, profile: str
+) -> "Payload":
+    from evlcp_sdk.errors import ConfigError
+    from firmware_host.payload import Payload, read_masks
+
+    book = _source.codebook(profile)
+    if masks is not None:
+        if symbols is not None or random is not None:
+            raise ConfigError("--masks, --random and SYMBOLS.json: give one of them")
+        return read_masks(masks, frames, book)
+    return Payload.of_symbols(_source.symbols(symbols, random, seed, frames, book), book)
+
+
+@contextlib.contextmanager
+def _progress(what: str) -> "Iterator[Any]":
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _about(about: "HelloReply") -> dict[str, Any]:
+    from firmware_host.messages import Capability
+
+    return {
+        "hal": about.hal.rstrip(b"\0").decode("ascii", "replace"),
+        "unique_id": about.unique_id.hex(),
+        "firmware": f"{about.version_major}.{about.version_minor}.{about.version_patch}",
+        "schema": about.schema.hex(),
+        "clusters": about.clusters,
+        "leds": about.leds,
+        "banks": about.banks,
+        "bank_bytes": about.bank_bytes,
+        "window": about.window,
+        "max_payload": about.max_payload,
+        "tick_hz": about.tick_hz,
+        "chip_rate_max_hz": about.chip_rate_max_hz,
+        "level_max_ma": about.level_max_ma,
+        "capabilities": [c.name.lower() for c in Capability if c & about.capabilities and c.name],
+        "uptime_ms": about.uptime_ms,
+    }
+
+
+def _name(enum: Any, value: int) -> str:
+    try:
+        return str(enum(value).name).lower()
+    except ValueError:
+        return str(value)
+
+
+def _status(status: "StatusReply") -> dict[str, Any]:
+    from firmware_host.messages import NO_BANK, Fault, Format, Profile, State, Watchdog
+
+    def bank(number: int) -> int | None:
+        return None if number == NO_BANK else number
+
+    open_leds = int.from_bytes(status.open_leds, "big")
+    table: dict[str, Any] = {
+        "state": _name(State, status.state),
+        "faults": [f.name.lower() for f in Fault if f & status.faults and f.name],
+        "active_bank": bank(status.active_bank),
+        "pending_bank": bank(status.pending_bank),
+    }
+    if status.active_bank != NO_BANK:
+        table |= {
+            "format": _name(Format, status.format),
+            "profile": _name(Profile, status.profile),
+            "frames": status.frames,
+            "packets": status.packets,
+            "length": status.length,
+            "crc": f"{status.crc:08x}",
+        }
+    return table | {
+        "codebook": status.digest.hex(),
+        "chip_rate_hz": status.chip_rate_hz,
+        "commits": status.commits,
+        "packets_sent": status.packets_sent,
+        "chips_sent": status.chips_sent,
+        "lateness_ticks": status.lateness_ticks,
+        "lateness_max_ticks": status.lateness_max_ticks,
+        "crc_errors": status.crc_errors,
+        "framing_errors": status.framing_errors,
+        "overflow_errors": status.overflow_errors,
+        "requests": status.requests,
+        "level_ma": status.level_ma,
+        "temperature_c": None if status.temperature_dc == -(1 << 15) else status.temperature_dc / 10,
+        "open_leds": [led for led in range(96) if open_leds >> (95 - led) & 1],
+        "watchdog": _name(Watchdog, status.watchdog),
+        "watchdog_ms": status.watchdog_ms,
+        "silence_ms": status.silence_ms,
+        "uptime_ms": status.uptime_ms,
+    }
+
+
+def _show(table: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        import json
+
+        typer.echo(json.dumps(table))
+        return
+    for key, value in table.items():
+        text = ", ".join(map(str, value)) if isinstance(value, list) else value
+        typer.echo(f"{key:20} {'-' if text in ('', None) else text}")
+
+
+@app.command()
+def ports(baud: Baud = DEFAULT_BAUD, as_json: AsJson = False) -> None:
+    """List the serial ports, and which have a board.
+
+    For example: [bold]evlcp board ports[/]
+    """
+    from firmware_host.ports import survey
+
+    found = survey(baud)
+    if as_json:
+        import json
+
+        rows = [
+            {"port": f.port, "description": f.description, "board": _about(f.about) if f.about else None}
+            for f in found
+        ]
+        typer.echo(json.dumps(rows))
+        return
+    for f in found:
+        what = "no board answers"
+        if f.about:
+            about = _about(f.about)
+            what = f"{about['hal']} {about['unique_id']}, firmware {about['firmware']}"
+        typer.echo(f"{f.port}  {f.description}  {what}")
+    if not found:
+        typer.echo("no serial ports; emulated boards: --port native: or --port qemu:")
+
+
+@app.command()
+def hello(
+    port: Port = None,
+    baud: Baud = DEFAULT_BAUD,
+    trace: Trace = None,
+    replay: Replay = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show what a board is and what it can.
+
+    For example: [bold]evlcp board hello --port native:[/]
+    """
+    with _board(port, baud, trace, replay) as board:
+        _show(_about(board.about), as_json)
+
+
+@app.command()
+def program(
+    symbols: SymbolsFile = None,
+    random: RandomPackets = None,
+    masks: Masks = None,
+    seed: Seed = 0,
+    frames: Frames = 10,
+    profile: ProfileName = "wh4x2",
+    inventory: Annotated[
+        Path | None, typer.Option(metavar="FILE.toml", help="Program all boards of an inventory at once.")
+    ] = None,
+    chip_rate: Annotated[int, typer.Option(help="Chips per second.", min=1, max=1_000_000)] = 10_000,
+    level: Annotated[int | None, typer.Option(help="LED current, mA.", min=0, max=65535)] = None,
+    watchdog: Annotated[Silence | None, typer.Option(help="What to do when the host is silent.")] = None,
+    watchdog_ms: Annotated[int, typer.Option(help="After which silence, ms.", min=100)] = 5000,
+    verify: Annotated[bool, typer.Option(help="Compare what the board holds.")] = True,
+    start: Annotated[bool, typer.Option(help="Play when done.")] = True,
+    port: Port = None,
+    baud: Baud = DEFAULT_BAUD,
+    trace: Trace = None,
+    replay: Replay = None,
+    as_json: AsJson = False,
+) -> None:
+    """Program a board, or all boards of an inventory: codebook, settings and payload.
+
+    What is there already is not sent again. A board that plays changes between two packets, without a dark
+    chip.
+
+    For example: [bold]evlcp board program SYMBOLS.json --port /dev/ttyUSB0[/]
+    """
+    if inventory is not None:
+        from evlcp_sdk.errors import ConfigError
+
+        if any(v is not None for v in (symbols, random, masks, trace, replay)):
+            raise ConfigError("--inventory names ports and payloads itself: give no other, and no --trace")
+        _program_fleet(inventory, verify, as_json)
+        return
+    from firmware_host.board import Settings, provision
+    from firmware_host.messages import Watchdog
+
+    action = None if watchdog is None else Watchdog[watchdog.name]
+    payload = _payload(symbols, random, masks, seed, frames, profile)
+    settings = Settings(chip_rate, level, action, watchdog_ms, start)
+    with _board(port, baud, trace, replay) as board, _progress("programming") as progress:
+        done = provision(board, payload, settings, verify, progress)
+    _tell(done, as_json)
+
+
+def _tell(done: Any, as_json: bool) -> None:
+    if as_json:
+        import dataclasses
+        import json
+
+        typer.echo(json.dumps(dataclasses.asdict(done)))
+    elif not done.swapped:
+        typer.echo(f"was there already: {done.length} bytes in bank {done.bank}")
+    else:
+        typer.echo(f"sent {done.written} of {done.length} bytes; bank {done.bank} is active")
+
+
+def _program_fleet(path: Path, verify: bool, as_json: bool) -> None:
+    import json
+
+    from firmware_host.fleet import Result, program_fleet, raise_failures, read_inventory
+
+    inventory = read_inventory(path)
+
+    def report(result: Result) -> None:
+        typer.echo(json.dumps(result.to_dict()) if as_json else result.line)
+
+    raise_failures(inventory, program_fleet(inventory, verify, report))
+
+
+@app.command()
+def send(
+    symbols: SymbolsFile = None,
+    random: RandomPackets = None,
+    masks: Masks = None,
+    seed: Seed = 0,
+    frames: Frames = 10,
+    profile: ProfileName = "wh4x2",
+    verify: Annotated[bool, typer.Option(help="Compare what the board holds.")] = True,
+    port: Port = None,
+    baud: Baud = DEFAULT_BAUD,
+    trace: Trace = None,
+    replay: Replay = None,
+    as_json: AsJson = False,
+) -> None:
+    """Replace the payload of a programmed board, and nothing else.
+
+    For example: [bold]evlcp board send --random 4 --seed 7 --port unix:/tmp/board[/]
+    """
+    from firmware_host.errors import RefusedError
+    from firmware_host.messages import NO_BANK, Status
+
+    payload = _payload(symbols, random, masks, seed, frames, profile)
+    with _board(port, baud, trace, replay) as board, _progress("sending") as progress:
+        status = board.status()
+        if status.active_bank == NO_BANK:
+            raise RefusedError(
+                f"{board.link.name}: nothing is programmed; 'evlcp board program' first",
+                Status.NOTHING_COMMITTED,
+            )
+        _check_codebook(board, payload, status)
+        done = board.program(payload, status.chip_rate_hz, verify, progress)
+    _tell(done, as_json)
+
+
+def _check_codebook(board: "Board", payload: "Payload", status: "StatusReply") -> None:
+    from firmware_host.errors import IncompatibleError
+
+    if status.digest.hex() != payload.codebook.digest:
+        raise IncompatibleError(
+            f"{board.link.name}: plays codebook {status.digest.hex()[:16]}, this payload is of"
+            f" {payload.codebook.digest[:16]} ({payload.codebook.profile}); choose its --profile, or"
+            " 'evlcp board program' to change it"
+        )
+
+
+@app.command()
+def start(port: Port = None, baud: Baud = DEFAULT_BAUD, trace: Trace = None, replay: Replay = None) -> None:
+    """Play what is programmed."""
+    with _board(port, baud, trace, replay) as board:
+        board.start()
+
+
+@app.command()
+def stop(port: Port = None, baud: Baud = DEFAULT_BAUD, trace: Trace = None, replay: Replay = None) -> None:
+    """Finish the packet, then dark."""
+    with _board(port, baud, trace, replay) as board:
+        board.stop()
+        board.wait_dark()
+
+
+@app.command()
+def blank(port: Port = None, baud: Baud = DEFAULT_BAUD, trace: Trace = None, replay: Replay = None) -> None:
+    """Dark at once."""
+    with _board(port, baud, trace, replay) as board:
+        board.blank()
+
+
+@app.command()
+def level(
+    level_ma: Annotated[int, typer.Argument(metavar="MA", help="LED current, mA.", min=0, max=65535)],
+    port: Port = None,
+    baud: Baud = DEFAULT_BAUD,
+    trace: Trace = None,
+    replay: Replay = None,
+) -> None:
+    """Set the LED current; above the board's maximum it is refused.
+
+    For example: [bold]evlcp board level 20 --port /dev/ttyUSB0[/]
+    """
+    with _board(port, baud, trace, replay) as board:
+        board.level(level_ma)
+
+
+@app.command()
+def watchdog(
+    action: Annotated[Silence, typer.Argument(help="What to do when the host is silent.")],
+    after_ms: Annotated[int, typer.Option(help="After which silence, ms.", min=100, max=2**32 - 1)] = 5000,
+    port: Port = None,
+    baud: Baud = DEFAULT_BAUD,
+    trace: Trace = None,
+    replay: Replay = None,
+) -> None:
+    """Choose what the board does when the host falls silent: keep playing, idle pattern, or dark."""
+    from firmware_host.messages import Watchdog
+
+    with _board(port, baud, trace, replay) as board:
+        board.watchdog(Watchdog[action.name], after_ms)
+
+
+@app.command()
+def status(
+    port: Port = None,
+    baud: Baud = DEFAULT_BAUD,
+    trace: Trace = None,
+    replay: Replay = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show what a board does, and what went wrong since its reset."""
+    with _board(port, baud, trace, replay) as board:
+        _show(_status(board.status()), as_json)
+
+
+@app.command()
+def monitor(
+    interval: Annotated[float, typer.Option(help="Seconds between lines.", min=0.01)] = 1.0,
+    count: Annotated[int | None, typer.Option(help="End after so many lines.", min=1)] = None,
+    port: Port = None,
+    baud: Baud = DEFAULT_BAUD,
+    trace: Trace = None,
+    replay: Replay = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show a line of status again and again; end with Ctrl-C."""
+    import itertools
+    import json
+
+    from firmware_host.messages import State
+
+    with _board(port, baud, trace, replay) as board, contextlib.suppress(KeyboardInterrupt):
+        for n in itertools.count(1):
+            s = board.status()
+            if as_json:
+                typer.echo(json.dumps(_status(s)))
+            else:
+                typer.echo(
+                    f"{s.uptime_ms / 1e3:10.1f} s  {_name(State, s.state):12} packets {s.packets_sent:8}"
+                    f"  late {s.lateness_ticks:5} (max {s.lateness_max_ticks}) ticks"
+                    f"  errors crc {s.crc_errors} framing {s.framing_errors} overflow {s.overflow_errors}"
+                    f"  faults {s.faults:#04x}"
+                )
+            if n == count:
+                return
+            board.link.transport.read(interval)
+
+
+@app.command()
+def verify(
+    symbols: SymbolsFile = None,
+    random: RandomPackets = None,
+    masks: Masks = None,
+    seed: Seed = 0,
+    frames: Frames = 10,
+    profile: ProfileName = "wh4x2",
+    port: Port = None,
+    baud: Baud = DEFAULT_BAUD,
+    trace: Trace = None,
+    replay: Replay = None,
+) -> None:
+    """Read the active bank back and compare it with a payload; ends with 7 if it differs.
+
+    For example: [bold]evlcp board verify SYMBOLS.json --port /dev/ttyUSB0[/]
+    """
+    from firmware_host.errors import VerifyError
+    from firmware_host.messages import NO_BANK
+
+    payload = _payload(symbols, random, masks, seed, frames, profile)
+    with _board(port, baud, trace, replay) as board:
+        s = board.status()
+        again = "'evlcp board program' brings it there"
+        if s.active_bank == NO_BANK:
+            raise VerifyError(f"{board.link.name}: nothing is programmed; {again}")
+        _check_codebook(board, payload, s)
+        shape = (s.format, s.packets, s.frames, s.length)
+        expected = (payload.format, payload.packets, payload.frames, len(payload.content))
+        if shape != expected:
+            raise VerifyError(
+                f"{board.link.name}: holds {s.packets} packets of {s.frames} frames, {s.length} bytes;"
+                f" expected {payload.packets} of {payload.frames}, {len(payload.content)} bytes; {again}"
+            )
+        held = board.read(s.active_bank, 0, s.length)
+        differ = next((i for i, (a, b) in enumerate(zip(held, payload.content, strict=True)) if a != b), None)
+        if differ is not None:
+            raise VerifyError(
+                f"{board.link.name}: byte {differ} of bank {s.active_bank} is {held[differ]:#04x},"
+                f" expected {payload.content[differ]:#04x}; {again}"
+            )
+    typer.echo(f"same: {len(held)} bytes in bank {s.active_bank}, CRC {payload.crc:08x}")
+
+
+@app.command("test-leds")
+def walk_leds(
+    first: Annotated[int, typer.Option(help="First LED.", min=0, max=95)] = 0,
+    last: Annotated[int, typer.Option(help="Last LED.", min=0, max=95)] = 95,
+    dwell_ms: Annotated[int, typer.Option(help="Time each LED is on, ms.", min=1, max=65535)] = 100,
+    wait: Annotated[bool, typer.Option(help="Wait until the walk has ended.")] = True,
+    port: Port = None,
+    baud: Baud = DEFAULT_BAUD,
+    trace: Trace = None,
+    replay: Replay = None,
+) -> None:
+    """Light the LEDs one by one.
+
+    For example: [bold]evlcp board test-leds --dwell-ms 50 --port /dev/ttyUSB0[/]
+    """
+    with _board(port, baud, trace, replay) as board:
+        board.test_leds(first, last, dwell_ms)
+        if wait:
+            board.wait_dark(10.0 + (last - first + 1) * dwell_ms * 2e-3)
+
+
+@app.command()
+def save(
+    autostart: Annotated[bool, typer.Option(help="Recall and play after a reset.")] = False,
+    port: Port = None,
+    baud: Baud = DEFAULT_BAUD,
+    trace: Trace = None,
+    replay: Replay = None,
+) -> None:
+    """Save payload and settings to the board's flash; stop it first.
+
+    For example: [bold]evlcp board save --autostart --port /dev/ttyUSB0[/]
+    """
+    with _board(port, baud, trace, replay) as board:
+        reply = board.save(autostart)
+    typer.echo(f"saved in slot {reply.slot}, number {reply.save_sequence}")
+
+
+@app.command()
+def recall(port: Port = None, baud: Baud = DEFAULT_BAUD, trace: Trace = None, replay: Replay = None) -> None:
+    """Take payload and settings from the board's flash."""
+    with _board(port, baud, trace, replay) as board:
+        reply = board.recall()
+    typer.echo(f"recalled slot {reply.slot}, number {reply.save_sequence}")
+
+
+@app.command()
+def emulate(
+    emulator: Annotated[Emulator, typer.Argument(help="native: a program; qemu: the ARM image.")],
+    listen: Annotated[
+        str, typer.Option(metavar="WHERE", help="unix:PATH, tcp:HOST:PORT, or (native) pty.")
+    ] = "pty",
+    leds: Annotated[Path | None, typer.Option(metavar="FILE", help="Record the LED outputs.")] = None,
+    flash: Annotated[Path | None, typer.Option(metavar="FILE", help="(native) keep SAVE slots here.")] = None,
+    link: Annotated[Path | None, typer.Option(metavar="PATH", help="(native) name for the pty.")] = None,
+    baud: Annotated[int, typer.Option(help="(native) keep to a line rate; 0 as fast as it goes.", min=0)] = 0,
+    unique_id: Annotated[int, typer.Option(help="(native) the board's number.", min=0)] = 0,
+) -> None:
+    """Run an emulated board in the foreground; end with Ctrl-C.
+
+    For example: [bold]evlcp board emulate qemu --listen unix:/tmp/board --leds leds.bin[/]
+    """
+    import signal
+    import subprocess
+
+    from evlcp_sdk.errors import ConfigError
+    from firmware_host.emulators import native_command, qemu_command
+    from firmware_host.errors import ToolchainError
+
+    scheme = listen.partition(":")[0]
+    known = ("unix", "tcp") if emulator is Emulator.QEMU else ("unix", "tcp", "pty")
+    if scheme not in known:
+        raise ConfigError(f"--listen {listen}: expected {' or '.join(known)} for {emulator}")
+    if emulator is Emulator.QEMU:
+        command = qemu_command(listen, leds)
+    else:
+        command = native_command(listen, leds, flash, link, baud, unique_id)
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    # The emulator ends with this command, however that is told to end.
+    signal.signal(signal.SIGTERM, lambda *_: process.terminate())
+    if emulator is Emulator.QEMU:
+        typer.echo(f"listening on {listen}")
+    try:
+        code = process.wait()
+    except KeyboardInterrupt:
+        process.terminate()
+        process.wait()
+        return
+    if code not in (0, -signal.SIGTERM, -signal.SIGINT):
+        raise ToolchainError(f"the {emulator} board ended with {code}; see its message above")
+
+
+@app.command()
+def leds(
+    record: Annotated[Path, typer.Argument(metavar="FILE", help="LED record of an emulator.")],
+    chips: Annotated[
+        Path, typer.Option(metavar="OUT.npy", help="Chips: uint8, one row a chip, one column a cluster.")
+    ],
+    per_led: Annotated[bool, typer.Option("--per-led", help="One column an LED instead.")] = False,
+) -> None:
+    """Turn an LED record into a chip table; the ticks go into OUT.ticks.npy.
+
+    Rows that are no chip (dark, single-LED test) are left out.
+
+    For example: [bold]evlcp board leds leds.bin --chips chips.npy[/]
+    """
+    from evlcp_sdk.errors import ConfigError, InputError
+    from firmware_host.commands.tx import save_array
+    from firmware_host.recording import Recording
+
+    played = Recording.read(record).played()
+    try:
+        table = played.chips(96 if per_led else 16)
+    except ConfigError as fault:
+        raise InputError(f"{record}: {fault}") from fault
+    save_array(chips, table)
+    save_array(chips.with_suffix(".ticks.npy"), played.ticks)
+    typer.echo(f"{len(played)} chips")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.codebook import Codebook
 
-__all__ = ["app"]
+__all__ = ["app", "save_array"]
 
 app = typer.Typer(
     no_args_is_help=True, rich_markup_mode="rich", help="Show and check what goes on air; no board."
@@ -63,15 +63,18 @@ def frames(
     book = _source.codebook(profile)
     table = _source.symbols(symbols, random, seed, frames, book)
     if chips is not None:
-        import numpy as np
-
         from firmware_host.payload import symbol_chips
 
-        _save(chips, np.asarray(symbol_chips(table, book)))
+        save_array(chips, symbol_chips(table, book))
     typer.echo(_FORMS[form](table, book))
 
 
-def _save(path: Path, array: "NDArray[np.generic]") -> None:
+def save_array(path: Path, array: "NDArray[np.generic]") -> None:
+    """Write an array as `.npy` under exactly this name.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
     import numpy as np
 
     from evlcp_sdk.errors import InputError
