@@ -71,7 +71,7 @@ class RegionSpec:
     ] = 20
     margin_px: Annotated[
         int, Field(ge=2, le=64, description="Seam around a region: how far it may move in a step, and blur.")
-    ] = 6
+    ] = 5
     merge_px: Annotated[
         int, Field(ge=8, le=256, description="Gap below which two blinking areas are one region.")
     ] = 16

@@ -10,9 +10,12 @@ Array = NDArray[Any]
 
 
 @njit(cache=True, nogil=True)
-def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, counts: Array) -> None:
-    """Count events by polarity (row) and time (column: bins of `bin_us` from `first_bin` on)."""
+def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, known: Array, counts: Array) -> None:
+    """Add events to `known` counts: by polarity (row) and time (column, `bin_us` each from `first_bin` on)."""
     bins = counts.shape[1]
+    for row in range(2):
+        for b in range(bins):
+            counts[row, b] = known[row, b] if b < known.shape[1] else 0.0
     b = -1
     upper = first_bin * bin_us
     for i in range(t_us.size):
@@ -27,9 +30,13 @@ def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, counts: Arr
 
 
 @njit(cache=True, nogil=True)
-def correlate(counts: Array, chips: Array, steps: int, min_events: int, rho: Array) -> None:
-    """Normalised correlation of signed counts in windows of one chip (`steps` bins) with chips (-1, +1)."""
+def correlate(counts: Array, chips: Array, steps: int, min_events: int, rho: Array) -> float:
+    """Normalised correlation of signed counts in windows of one chip (`steps` bins) with chips (-1, +1).
+
+    Lags at which fewer than `min_events` were counted get 0. Returns the largest.
+    """
     bins = counts.shape[1]
+    top = 0.0
     signed = np.empty(bins + 1)
     total = np.empty(bins + 1)
     signed[0] = 0.0
@@ -38,6 +45,7 @@ def correlate(counts: Array, chips: Array, steps: int, min_events: int, rho: Arr
         signed[b + 1] = signed[b] + counts[1, b] - counts[0, b]
         total[b + 1] = total[b] + counts[1, b] + counts[0, b]
     for lag in range(rho.size):
+        rho[lag] = 0.0
         seen = total[lag + steps * chips.size] - total[lag]
         if seen < min_events:
             continue
@@ -46,3 +54,5 @@ def correlate(counts: Array, chips: Array, steps: int, min_events: int, rho: Arr
             at = lag + steps * c
             fit += chips[c] * (signed[at + steps] - signed[at])
         rho[lag] = fit / seen
+        top = max(top, rho[lag])
+    return top

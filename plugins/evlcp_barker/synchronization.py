@@ -112,28 +112,30 @@ class BarkerSynchronizer:
             state = replace(state, first_bin=first, next_bin=first + guard)
         assert state.first_bin is not None
         bins = max(until_bin - state.first_bin, state.counts.shape[1])
-        counts = np.zeros((2, bins))
-        counts[:, : state.counts.shape[1]] = state.counts
-        _kernels.count_bins(t_us, p, state.first_bin, self._bin_us, counts)
+        counts = np.empty((2, bins))
+        _kernels.count_bins(t_us, p, state.first_bin, self._bin_us, state.counts, counts)
 
         locks: list[SyncLock] = []
         heard, stray = state.heard, state.stray
         lags = bins - span + 1
         lo = state.next_bin - state.first_bin
         if lags - guard > lo:
-            rho = np.zeros(lags)
-            _kernels.correlate(counts, self._chips, n, self._spec.min_events, rho)
-            for lag in lo + np.flatnonzero(rho[lo : lags - guard] >= self._spec.min_correlation):
-                # The first of equals, so that a tie gives one peak.
-                if np.argmax(rho[lag - guard : lag + guard + 1]) == guard:
-                    found = self._refine(int(lag), counts, state.first_bin, float(rho[lag]))
-                    heard, stray = self._accept(heard, stray, found)
-                    if stray is None:
-                        locks.append(self._lock(heard))
+            rho = np.empty(lags)
+            top = _kernels.correlate(counts, self._chips, n, self._spec.min_events, rho)
+            for lag in self._peaks(rho, lo, guard) if top >= self._spec.min_correlation else ():
+                found = self._refine(lag, counts, state.first_bin, float(rho[lag]))
+                heard, stray = self._accept(heard, stray, found)
+                if stray is None:
+                    locks.append(self._lock(heard))
             lo = lags - guard
         drop = max(lo - guard, 0)
         first = state.first_bin + drop
         return SyncState(first, counts[:, drop:], state.first_bin + lo, heard, stray), locks
+
+    def _peaks(self, rho: NDArray[np.float64], lo: int, guard: int) -> list[int]:
+        """Lags from `lo` on that correlate best within `guard` on both sides; the first of equals."""
+        high = lo + np.flatnonzero(rho[lo : len(rho) - guard] >= self._spec.min_correlation)
+        return [int(lag) for lag in high if np.argmax(rho[lag - guard : lag + guard + 1]) == guard]
 
     def _refine(self, lag: int, counts: NDArray[np.float64], first_bin: int, quality: float) -> _Heard:
         """Times of one preamble, for positive and negative events apart, us."""

@@ -10,16 +10,25 @@ Array = NDArray[Any]
 
 
 @njit(cache=True, nogil=True)
-def dirichlet(x: float, size: int, band: int) -> tuple[float, float]:
-    """The Dirichlet kernel of `band` (odd) harmonics out of `size`, band / size at x = 0; and its slope."""
-    a = np.pi * x / size
-    s = np.sin(a)
-    if abs(s) < 1e-9:
-        return band / size, 0.0
-    n = np.sin(band * a)
-    value = n / (size * s)
-    slope = np.pi / size * (band * np.cos(band * a) * s - n * np.cos(a)) / (size * s * s)
-    return value, slope
+def dirichlet(start: float, size: int, band: int, values: Array, slopes: Array) -> None:
+    """The Dirichlet kernel of `band` (odd) harmonics out of `size`, and its slope, at start, start + 1, ...
+
+    It is band / size at 0. The sines of the steps follow from those of the start by rotation.
+    """
+    step = np.pi / size
+    s, c = np.sin(start * step), np.cos(start * step)
+    sb, cb = np.sin(band * start * step), np.cos(band * start * step)
+    ds, dc = np.sin(step), np.cos(step)
+    dsb, dcb = np.sin(band * step), np.cos(band * step)
+    for i in range(values.size):
+        if abs(s) < 1e-9:
+            values[i] = band / size
+            slopes[i] = 0.0
+        else:
+            values[i] = sb / (size * s)
+            slopes[i] = step * (band * cb * s - sb * c) / (size * s * s)
+        s, c = s * dc + c * ds, c * dc - s * ds
+        sb, cb = sb * dcb + cb * dsb, cb * dcb - sb * dsb
 
 
 @njit(cache=True, nogil=True)
@@ -30,6 +39,8 @@ def fit_peak(samples: Array, size: int, band: int) -> float:
     (variable projection).
     """
     half = samples.size // 2
+    values = np.empty(samples.size)
+    slopes = np.empty(samples.size)
     left, middle, right = samples[half - 1], samples[half], samples[half + 1]
     # For a kernel between two samples, the neighbours' ratio is that of their distances.
     side = right if right > left else left
@@ -44,8 +55,9 @@ def fit_peak(samples: Array, size: int, band: int) -> float:
         ss = 0.0
         mv = 0.0
         sv = 0.0
+        dirichlet(-half - shift, size, band, values, slopes)
         for i in range(samples.size):
-            m, slope = dirichlet(i - half - shift, size, band)
+            m, slope = values[i], slopes[i]
             mm += m * m
             ms += m * slope
             ss += slope * slope
@@ -192,6 +204,18 @@ def _quantile(ordered: Array, share: float) -> float:
     low = int(at)
     high = min(low + 1, ordered.size - 1)
     return float(ordered[low] + (at - low) * (ordered[high] - ordered[low]))
+
+
+@njit(cache=True, nogil=True)
+def middle_shifts(middle: Array, first: Array, second: Array, apart_m: Array, shifts: Array) -> float:
+    """Whole-pixel shifts between the middles of pairs, `shifts` (pairs, 2); return their median px a metre."""
+    scale = np.empty(first.size)
+    for q in range(first.size):
+        for axis in range(2):
+            shifts[q, axis] = middle[second[q], axis] - middle[first[q], axis]
+        scale[q] = np.hypot(shifts[q, 0], shifts[q, 1]) / apart_m[q]
+    scale.sort()
+    return _quantile(scale, 0.5)
 
 
 @njit(cache=True, nogil=True)

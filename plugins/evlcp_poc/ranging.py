@@ -101,8 +101,8 @@ class PocRanging(Ranging):
             if not pairs.any():
                 return _NONE
             a, b, apart_m = place[0][pairs], place[1][pairs], spacing[pairs]
-            apart_px = (middle[b] - middle[a]).astype(np.float64)
-            px_per_m = float(np.median(np.hypot(apart_px[:, 0], apart_px[:, 1]) / apart_m))
+            apart_px = np.empty((len(a), 2))
+            px_per_m = _kernels.middle_shifts(middle, a, b, apart_m, apart_px)
             if px_per_m <= 0:
                 return _NONE
             neighbour_px = px_per_m * neighbour
@@ -117,7 +117,8 @@ class PocRanging(Ranging):
             reach = max(int(neighbour_px / 2), 2)
             _kernels.pair_shifts(correlation, reach, self.peak_samples, beyond)
             apart_px += beyond
-            distance = camera.focal_px * apart_m / np.maximum(np.hypot(apart_px[:, 0], apart_px[:, 1]), 1e-9)
+            length_px = np.hypot(apart_px[:, 0], apart_px[:, 1])
+            distance = camera.focal_px * apart_m / np.maximum(length_px, 1e-9)
             weight = apart_m**self.weight_power
             mean, sigma, kept = _kernels.robust_mean(
                 distance, weight, a, b, len(used), self.drop_extremes, self.outlier_iqr

@@ -54,9 +54,12 @@ def presence(
                 top = max(top, likelihood)
             norm = clusters * np.exp(-top)
             for k in range(clusters):
-                norm += np.exp(out[k, r, c] - top)
+                # Ratios below 1e-9 are nothing beside the largest.
+                ratio = out[k, r, c] - top
+                out[k, r, c] = np.exp(ratio) if ratio > -20.0 else 0.0
+                norm += out[k, r, c]
             for k in range(clusters):
-                out[k, r, c] = np.exp(out[k, r, c] - top) / norm
+                out[k, r, c] /= norm
 
 
 @njit(cache=True, nogil=True)

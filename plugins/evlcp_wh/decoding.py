@@ -42,7 +42,7 @@ class WhTransform(Decoding):
             amplitude = fit.max(1) / length
             explained = float((amplitude**2).sum()) * length
             # One noise-to-signal ratio a frame: eight values a cluster are too few for one each.
-            noise = max(energy - explained, 1e-3 * energy) / max(explained, 1e-9)
+            noise = max(energy - explained, 1e-3 * energy, 1e-9) / max(explained, 1e-9)
             scale = 1 / (np.maximum(amplitude, 1e-9) * noise)
             zero, one = np.empty((2, len(values), m))
             _kernels.max_log(fit, m, zero, one)
