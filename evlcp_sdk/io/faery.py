@@ -22,6 +22,8 @@ UNKNOWN_SIZE = (0xFFFF, 0xFFFF)
 class FaerySource(EventSource):
     """A file that `faery` reads; contrast-detection events only, no triggers.
 
+    What `faery` skips without a word, such as the rest of a DAT file cut within an event, is in no loss.
+
     Args:
         path: The file; its suffix tells the format.
 

@@ -46,7 +46,8 @@ class EventSource(ABC):
     """A recording or a camera, read once from front to back; a context manager.
 
     Time never runs backward in what a source gives out: an event or trigger earlier than the one before is
-    dropped and counted as the loss `time_backward`.
+    dropped and counted as the loss `time_backward`. So a clock that leaps ahead for a moment, by a word gone
+    wrong, costs all events until it is caught up; the count shows it.
 
     A source of your own calls `super().__init__` and implements `take` and `close`.
 
