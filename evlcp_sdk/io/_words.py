@@ -1,6 +1,7 @@
 """What the words of a RAW file are, and what a decoder remembers and counts about them.
 
-Plain integers, shared by the kernels and by the Python around them.
+Plain integers, shared by the kernels and by the Python around them. The kernels keep the values they were
+compiled with: after a change here touch `_kernels.py`, the only file whose age numba's cache looks at.
 """
 
 from typing import Final
