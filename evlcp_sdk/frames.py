@@ -96,7 +96,9 @@ def packet_chips(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.uint8]:
 def _words(chips: NDArray[np.uint8]) -> NDArray[np.uint16]:
     if chips.shape[-1] != 16:
         raise ConfigError(f"a driver-board word has 16 chips, these codes have {chips.shape[-1]}")
-    return (chips.astype(np.uint16) << np.arange(15, -1, -1, dtype=np.uint16)).sum(-1, dtype=np.uint16)
+    shifted = chips.astype(np.uint16) << np.arange(15, -1, -1, dtype=np.uint16)
+    words: NDArray[np.uint16] = shifted.sum(-1, dtype=np.uint16)
+    return words
 
 
 def pilot_words(codebook: Codebook) -> NDArray[np.uint16]:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pluggy
-from numpy.typing import NDArray
 
 from evlcp_sdk.abc import Synchronizer
 from evlcp_sdk.config import Link
@@ -22,6 +21,13 @@ __all__ = ["Receiver"]
 
 _LOOKBACK_PACKETS = 2
 """Packets of events kept while there is no lock: one to hear a preamble in, one to look back on."""
+
+
+_REMEMBER_US = 1e6
+"""How long a transmitter that is lost from sight is remembered: clocks 100 ppm apart drift by a chip in it."""
+
+_UNSEEN_STEPS = 5
+"""Steps without a position after which a region counts as lost: it blinks in every chip otherwise."""
 
 
 @dataclass
@@ -77,6 +83,7 @@ class Receiver:
         self._measure = link.algorithm("ranging").compile(link.camera, link.bar)
         self._tracker = RegionTracker(link.regions, link.camera, link.packet.chip_us)
         self._transmitters: dict[int, _Transmitter] = {}
+        self._released: list[_Transmitter] = []
         self._pending: list[Events] = []
         self._step_start_us: int | None = None
         self._first_us = 0
@@ -147,15 +154,21 @@ class Receiver:
     def _checked(self, events: Events) -> Events:
         from evlcp_sdk.rx import _kernels
 
-        keep = np.empty(len(events), np.bool_)
         camera = self._link.camera
-        off, backward, self._last_us = _kernels.keep_ordered(
-            events.t_us, events.x, events.y, camera.width, camera.height, self._last_us, keep
-        )
+        t_us, x, y = events.t_us, events.x, events.y
         self._counts["events"] += len(events)
+        if not len(events):
+            return events
+        if t_us[0] >= self._last_us and _kernels.all_ordered(t_us, x, y, camera.width, camera.height):
+            self._last_us = int(t_us[-1])
+            return events
+        keep = np.empty(len(events), np.bool_)
+        off, backward, self._last_us = _kernels.keep_ordered(
+            t_us, x, y, camera.width, camera.height, self._last_us, keep
+        )
         self._counts["dropped_off_sensor"] += off
         self._counts["dropped_time_backward"] += backward
-        return events[keep] if off or backward else events
+        return events[keep]
 
     def _bounds(self, events: Events) -> list[int]:
         """Where each new time step begins among the events."""
@@ -233,11 +246,15 @@ class Receiver:
                 transmitter.lock = lock
                 return
         self._counts["locks"] += 1
+        # Half a chip before the first event is still within the first edge's delay.
+        earliest = max(transmitter.track.first_us, self._first_us - lock.chip_us / 2)
+        if old is None and self._inherit(transmitter, lock):
+            while self._frame_start_us(transmitter, transmitter.frame) < earliest:
+                transmitter.frame += 1
+            return
         if transmitter.number is None:
             transmitter.number = self._locked
             self._locked += 1
-        # Half a chip before the first event is still within the first edge's delay.
-        earliest = max(transmitter.track.first_us, self._first_us - lock.chip_us / 2)
         done = transmitter.frame
         if old is not None:
             earliest = max(earliest, self._frame_start_us(transmitter, done))
@@ -252,6 +269,25 @@ class Receiver:
             skip = transmitter.frame // packet.frames
             transmitter.packet -= skip
             transmitter.frame -= skip * packet.frames
+
+    def _inherit(self, transmitter: _Transmitter, lock: SyncLock) -> bool:
+        """Go on as a transmitter that was lost from sight, if the packets stand on its grid."""
+        packet = self._packet
+        period = packet.packet_chips * lock.chip_us
+        for lost in [*self._transmitters.values(), *self._released]:
+            unseen_us = lock.packet_t_us - lost.track.latest.t_us
+            if lost is transmitter or lost.lock is None or not 0 < unseen_us < _REMEMBER_US:
+                continue
+            if unseen_us < _UNSEEN_STEPS * self._step_us:
+                continue
+            apart = (lock.packet_t_us - lost.lock.packet_t_us) / period
+            if abs(apart - round(apart)) * packet.packet_chips < 1:
+                transmitter.number, transmitter.frame = lost.number, lost.frame
+                transmitter.packet = lost.packet + round(apart)
+                transmitter.assembler, lost.assembler = lost.assembler, transmitter.assembler
+                transmitter.lock, lost.lock = lock, None
+                return True
+        return False
 
     def _frame_start_us(self, transmitter: _Transmitter, frame: int) -> float:
         lock, packet = transmitter.lock, self._packet
@@ -286,7 +322,7 @@ class Receiver:
         lock, track, packet = transmitter.lock, transmitter.track, self._packet
         assert lock is not None
         assert transmitter.number is not None
-        middles: NDArray[np.float64] = start_us + (np.arange(packet.frame_chips) + 0.5) * lock.chip_us
+        middles = start_us + (np.arange(packet.frame_chips, dtype=np.float64) + 0.5) * lock.chip_us
         x, y = track.at(middles)
         pilot_middle = packet.pilot_chips // 2
         width, height = track.size_at(middles[pilot_middle])
@@ -330,7 +366,12 @@ class Receiver:
 
     def _release(self, track: Track) -> list[Packet]:
         self._counts["regions_released"] += 1
-        return self._end(self._transmitters.pop(track.id))
+        lost = self._transmitters.pop(track.id)
+        packets = self._end(lost)
+        lost.track.blocks.clear()
+        oldest_us = track.latest.t_us - _REMEMBER_US
+        self._released = [r for r in self._released if r.track.latest.t_us > oldest_us] + [lost]
+        return packets
 
     def _end(self, transmitter: _Transmitter) -> list[Packet]:
         packets = self._decode_due(

@@ -65,6 +65,19 @@ class Track:
         """The newest position."""
         return self.positions[-1]
 
+    def expected(self, t_us: float) -> Region:
+        """Where the region should be at a time soon, if it goes on as between the two newest positions."""
+        last = self.positions[-1]
+        if len(self.positions) < 2:
+            return last
+        before = self.positions[-2]
+        ahead = (t_us - last.t_us) / (last.t_us - before.t_us)
+        # Further ahead than that, a shaking camera has turned back.
+        ahead = min(ahead, 1.0)
+        x = last.x_px + ahead * (last.x_px - before.x_px)
+        y = last.y_px + ahead * (last.y_px - before.y_px)
+        return Region(last.id, t_us, x, y, last.width_px, last.height_px)
+
     def at(self, t_us: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Centre (column, row) at times within the track, interpolated, px."""
         t, x, y = np.array([(r.t_us, r.x_px, r.y_px) for r in self.positions]).T
@@ -128,10 +141,12 @@ class RegionTracker:
             _CELL_SHIFT,
         )
         end_us = start_us + spec.block_us
-        selected = _select(events, [self._reach(track.latest) for track in self.tracks])
-        for track, inside in zip(self.tracks, selected, strict=True):
+        boxes = [self._reach(track.expected(start_us + spec.block_us / 2)) for track in self.tracks]
+        for track, box, inside in zip(self.tracks, boxes, _select(events, boxes), strict=True):
             track.blocks.append((start_us, inside))
-            self._follow(track, end_us)
+            measured = self._measure(track.id, box, end_us)
+            if measured is not None:
+                track.positions.append(measured)
         self._merge()
         self._open(end_us)
         seen = list(self.tracks)
@@ -175,11 +190,6 @@ class RegionTracker:
             width_px=right - left + 1.0,
             height_px=lower - upper,
         )
-
-    def _follow(self, track: Track, end_us: int) -> None:
-        measured = self._measure(track.id, self._reach(track.latest), end_us)
-        if measured is not None:
-            track.positions.append(measured)
 
     def _open(self, end_us: int) -> None:
         """Open a region where something blinks in two steps on end outside those known."""

@@ -1,0 +1,100 @@
+"""The whole receiver, from RAW file to frames.csv, ranging included: events a second, and real time.
+
+    python benchmarks/receive.py [RECORDING ...] [--events 20000000] [--bytes 2000000000]
+
+Without names, all recordings of `../shared`. Each is received in turn by what `evlcp receive` calls, in one
+process, one thread, kernels warm; the best of the rounds counts. Then the first is tiled in time to `--events`
+and received once, beside the plain decoding of the same file, and a file of `--bytes` is received in a
+fresh process for its peak resident memory (0 leaves either out).
+"""
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from evt3_decode import tile
+
+from evlcp_sdk.cli.receive import decode
+from evlcp_sdk.config import Link, load_link
+from evlcp_sdk.io import open_events, read_events
+
+SHARED = Path(__file__).parents[2] / "shared" / "recordings"
+FIRST = "night-50m-30kmh.raw"
+
+
+def link_of(path: Path) -> Link:
+    """Return the configuration that fits a recording's name: its profile, if it says one."""
+    profile = next((p for p in ("wh8", "raw8") if path.name.startswith(p)), "wh4x2")
+    return load_link(overrides=[f"modulation.id={profile}"])
+
+
+def receive(path: Path, folder: Path) -> dict[str, float]:
+    """Receive a recording; return its times."""
+    summary = decode(str(path), folder, link_of(path), lambda _done, _all: None, lambda: False)
+    return summary["processing"] | {"events": summary["recording"]["counts"]["events"]}
+
+
+def plain_decoding(path: Path) -> float:
+    """Seconds to read a file's events and drop them: the part of the receiver's time that is the file's."""
+    began = time.perf_counter()
+    with open_events(path) as source:
+        for _ in source.chunks():
+            pass
+    return time.perf_counter() - began
+
+
+def peak_memory(path: Path, folder: Path) -> float:
+    """Peak resident memory of `evlcp receive`, MB."""
+    code = (
+        "import resource, sys; from evlcp_sdk.cli.main import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+    )
+    command = [sys.executable, "-c", code, "receive", str(path), "-o", str(folder)]
+    return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("recordings", nargs="*", type=Path)
+    parser.add_argument("--events", type=int, default=20_000_000)
+    parser.add_argument("--bytes", type=int, default=2_000_000_000)
+    parser.add_argument("--rounds", type=int, default=5)
+    args = parser.parse_args()
+    recordings = args.recordings or sorted(SHARED.glob("*.raw"), key=lambda p: (p.name != FIRST, p.name))
+    if not recordings:
+        sys.exit("no recording named, and ../shared/recordings is not there")
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "out"
+        for path in recordings:
+            receive(path, out)
+            best = min((receive(path, out) for _ in range(args.rounds)), key=lambda r: r["elapsed_s"])
+            print(
+                f"{path.name:32} {best['events'] / best['elapsed_s'] / 1e6:6.1f} Mev/s"
+                f"  {best['times_real_time']:6.2f} x real time",
+                flush=True,
+            )
+        big = Path(folder) / recordings[0].name
+        if args.events:
+            tile(read_events(recordings[0]), big, args.events)
+            file_s = min(plain_decoding(big) for _ in range(2))
+            result = receive(big, out)
+            rate = result["events"] / result["elapsed_s"] / 1e6
+            print(
+                f"{big.name} tiled to {result['events'] / 1e6:.0f} Mev: {rate:.1f} Mev/s,"
+                f" {result['times_real_time']:.2f} x real time; decoding alone is"
+                f" {file_s / result['elapsed_s']:.0%} of the time"
+            )
+        if args.bytes:
+            events = read_events(recordings[0])
+            tile(events, big, int(args.bytes * len(events) / recordings[0].stat().st_size))
+            size = big.stat().st_size / 1e9
+            print(f"{size:.2f} GB received in {peak_memory(big, out):.0f} MB of memory")
+
+
+if __name__ == "__main__":
+    main()
