@@ -1,6 +1,6 @@
 """What the commands share: their options, how a source is opened, what goes to stderr."""
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.io import EventSource
     from evlcp_sdk.registry import Registry
 
-__all__ = ["Json", "LinkFile", "Overrides", "complain", "console", "loss_lines", "open_source"]
+__all__ = ["Json", "LinkFile", "Overrides", "complain", "console", "open_source"]
 
 LinkFile = Annotated[
     str | None, typer.Option("-c", "--config", metavar="link.toml", help="The link; all defaults without it.")
@@ -45,8 +45,3 @@ def open_source(url: str, registry: "Registry") -> "EventSource":
 
     source = registry.hook.evlcp_open_events(url=url)
     return source if isinstance(source, EventSource) else open_events(url)
-
-
-def loss_lines(losses: dict[str, Any]) -> list[str]:
-    """What a source lost, one line a kind."""
-    return [str(loss) for loss in losses.values()]
