@@ -32,7 +32,7 @@ Port = Annotated[
     str | None,
     typer.Option(
         envvar="EVLCP_PORT",
-        help="Device, pyserial URL, unix:PATH, tcp:HOST:PORT, native: or qemu:; by default all ports are asked.",
+        help="Device, pyserial URL, unix:PATH, tcp:HOST:PORT, native: or qemu:; by default all are asked.",
     ),
 ]
 Baud = Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)]
@@ -41,9 +41,7 @@ Replay = Annotated[Path | None, typer.Option(metavar="FILE", help="Play a record
 AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
 Masks = Annotated[
     Path | None,
-    typer.Option(
-        metavar="FILE.npy", help="Instead of symbols: chips, uint8, one column an LED or a cluster."
-    ),
+    typer.Option(metavar="FILE.npy", help="Chips instead: uint8, a column an LED or a cluster."),
 ]
 DEFAULT_BAUD = 1_000_000
 
@@ -263,7 +261,7 @@ def program(
     chip_rate: Annotated[int, typer.Option(help="Chips per second.", min=1, max=1_000_000)] = 10_000,
     level: Annotated[int | None, typer.Option(help="LED current, mA.", min=0, max=65535)] = None,
     watchdog: Annotated[Silence | None, typer.Option(help="What to do when the host is silent.")] = None,
-    watchdog_ms: Annotated[int, typer.Option(help="After which silence, ms.", min=100)] = 5000,
+    watchdog_ms: Annotated[int, typer.Option(help="After which silence, ms.", min=100, max=2**32 - 1)] = 5000,
     verify: Annotated[bool, typer.Option(help="Compare what the board holds.")] = True,
     start: Annotated[bool, typer.Option(help="Play when done.")] = True,
     port: Port = None,

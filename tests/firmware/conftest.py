@@ -1,0 +1,50 @@
+"""What the tests of the transmitter share: codebook, tools that may be missing, boards."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+
+import pytest
+
+from evlcp_sdk.codebook import Codebook
+from firmware_host.generate import codebook_of
+
+INSTALL = "sh firmware_host/firmware/install-toolchain.sh installs it (as root)"
+
+
+def tool(*names: str) -> None:
+    """Skip, loudly, unless all these programs are there."""
+    missing = [n for n in names if shutil.which(n) is None]
+    if missing:
+        pytest.skip(f"{', '.join(missing)} missing: {INSTALL}")
+
+
+@pytest.fixture(scope="session")
+def book() -> Codebook:
+    return codebook_of("wh4x2")
+
+
+@pytest.fixture(scope="session")
+def needs() -> Callable[..., None]:
+    return tool
+
+
+@pytest.fixture(autouse=True)
+def _compiler() -> None:
+    tool("cc", "make")
+
+
+@pytest.fixture(scope="session")
+def cli() -> Callable[..., "subprocess.CompletedProcess[str]"]:
+    """Run `evlcp` with these arguments."""
+
+    def run(*arguments: object, **options: object) -> "subprocess.CompletedProcess[str]":
+        command = [sys.executable, "-c", "from evlcp_sdk.cli.main import main; main()", *map(str, arguments)]
+        env = {k: v for k, v in os.environ.items() if k != "EVLCP_PORT"} | {"COLUMNS": "200"}
+        return subprocess.run(
+            command, capture_output=True, text=True, timeout=120, check=False, env=env, **options
+        )
+
+    return run

@@ -1,0 +1,97 @@
+"""The client's state machine: window, time-outs, tries, and what it ignores."""
+
+from itertools import pairwise
+
+import pytest
+
+from firmware_host.client import TRIES, Client, Timing
+from firmware_host.datagram import Datagram, Decoder
+from firmware_host.messages import (
+    MAX_PAYLOAD,
+    CrcReply,
+    CrcRequest,
+    Status,
+    StatusRequest,
+    StopReply,
+    StopRequest,
+    WriteRequest,
+)
+
+
+def reply(request: Datagram, payload: bytes = b"", status: int = 0) -> bytes:
+    return Datagram(request.type | 0x80, status, request.sequence, request.session, payload).encode()
+
+
+def sent(wire: bytes) -> list[Datagram]:
+    return Decoder().feed(wire)
+
+
+def test_window_bounds_what_is_under_way() -> None:
+    client = Client(Timing(), window=3)
+    tokens = [client.submit(CrcRequest(0, i, 1)) for i in range(5)]
+    first = sent(client.poll(0.0)[0])
+    assert len(first) == 3
+    assert not client.room
+    done = client.receive(reply(first[1], CrcReply(9).pack()))
+    assert [(o.token, o.reply) for o in done] == [(tokens[1], CrcReply(9))]
+    assert len(sent(client.poll(0.0)[0])) == 1
+    assert not client.idle
+
+
+def test_tries_back_off_and_end() -> None:
+    client = Client(Timing(1_000_000, latency_s=0.1))
+    token = client.submit(StopRequest())
+    now, times = 0.0, []
+    while True:
+        wire, deadline = client.poll(now)
+        done = client.receive(b"")
+        if done:
+            break
+        assert sent(wire)
+        times.append(now)
+        assert deadline is not None
+        now = deadline
+    assert len(times) == TRIES == 5
+    waits = [b - a for a, b in pairwise(times)]
+    assert all(b == pytest.approx(2 * a) for a, b in pairwise(waits))
+    assert (done[0].token, done[0].status, done[0].tries) == (token, None, 5)
+    assert client.idle
+    assert client.retries == 4
+
+
+def test_time_out_follows_the_line_rate() -> None:
+    def wait(baud: int) -> float:
+        client = Client(Timing(baud, latency_s=0.0))
+        client.submit(WriteRequest(0, 0, bytes(500)))
+        return client.poll(0.0)[1] or 0.0
+
+    assert wait(1_000_000) == pytest.approx(wait(115_200) * 115_200 / 1_000_000)
+    # at least the request and its answer must fit the line
+    assert wait(115_200) > 10 * 550 / 115_200
+    assert wait(1_000_000) < 10 * 4 * MAX_PAYLOAD / 1_000_000
+
+
+def test_late_doubled_and_foreign_answers_are_ignored() -> None:
+    client = Client(Timing(), first=0xFFFF)
+    client.submit(StopRequest())
+    request = sent(client.poll(0.0)[0])[0]
+    assert request.sequence == 0xFFFF
+    other = Datagram(request.type, 0, 5, 0, b"")
+    assert client.receive(reply(other)) == []
+    wrong_type = Datagram(0x01, 0, request.sequence, 0, b"")
+    assert client.receive(reply(wrong_type)) == []
+    assert client.receive(reply(request, b"too long")) == []
+    assert client.receive(request.encode()) == []  # an echo
+    assert client.receive(reply(request))[0].reply == StopReply()
+    assert client.receive(reply(request)) == []
+    client.submit(StatusRequest())
+    assert sent(client.poll(1.0)[0])[0].sequence == 0
+
+
+def test_refusal_carries_status_and_detail() -> None:
+    client = Client(Timing())
+    for status in (Status.OUT_OF_RANGE, 99):
+        client.submit(StopRequest())
+        request = sent(client.poll(0.0)[0])[0]
+        outcome = client.receive(reply(request, (60).to_bytes(4, "little"), int(status)))[0]
+        assert (outcome.status, outcome.detail, outcome.reply) == (status, 60, None)

@@ -1,0 +1,90 @@
+"""The firmware itself: builds without warnings, lint, C unit tests under sanitizers, fuzzing."""
+
+import os
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from firmware_host import build
+
+
+def run(*command: str, timeout: float = 300) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+
+
+def make(folder: Path, *targets: str) -> "subprocess.CompletedProcess[str]":
+    return run("make", "-s", "-C", str(build.FIRMWARE), f"BUILD={folder}", *targets)
+
+
+def test_unit_tests_under_sanitizers(tmp_path: Path) -> None:
+    done = make(tmp_path, "check-c")
+    assert done.returncode == 0, done.stdout + done.stderr
+    counts = re.search(r"^(\d+) passed, (\d+) failed$", done.stdout, re.M)
+    assert counts
+    assert int(counts[1]) > 1000
+    assert counts[2] == "0"
+
+
+def test_fuzzer_finds_no_fault(tmp_path: Path, needs) -> None:
+    needs("clang")
+    probe = tmp_path / "probe.c"
+    probe.write_text("int LLVMFuzzerTestOneInput(const char *d, unsigned long n) { return d && n > 9; }")
+    if run("clang", "-fsanitize=fuzzer", str(probe), "-o", str(tmp_path / "probe")).returncode:
+        pytest.skip("clang has no libFuzzer: sh firmware_host/firmware/install-toolchain.sh installs it")
+    done = make(tmp_path, "fuzz", "FUZZ_SECONDS=8")
+    assert done.returncode == 0, done.stderr[-2000:]
+    executed = re.search(r"number_of_executed_units: (\d+)", done.stderr)
+    assert executed
+    assert int(executed[1]) >= 10_000
+
+
+def test_lint(needs) -> None:
+    needs("cppcheck")
+    done = make(Path("unused"), "lint")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_arm_images_build_without_warnings(tmp_path: Path, needs) -> None:
+    needs("arm-none-eabi-gcc", "arm-none-eabi-nm")
+    done = make(tmp_path, "mps2", "stm32")
+    assert (done.returncode, done.stderr) == (0, "")
+    size = run("arm-none-eabi-size", str(tmp_path / "stm32f405.elf")).stdout.split()
+    text, data, bss = (int(n) for n in size[6:9])
+    assert text < 64 * 1024
+    assert data + bss < 120 * 1024
+    for image in ("mps2-an385", "stm32f405"):
+        code = run("arm-none-eabi-objdump", "-d", str(tmp_path / f"{image}.elf")).stdout
+        # no sleep while chips play, and no call into a C library
+        assert not re.search(r"\bwf[ie]\b", code)
+        names = run("arm-none-eabi-nm", str(tmp_path / f"{image}.elf")).stdout
+        assert not re.search(r" [Tt] (malloc|printf|free)$", names, re.M)
+
+
+def test_core_calls_only_the_hal(tmp_path: Path) -> None:
+    core = sorted((build.FIRMWARE / "core").glob("*.c"))
+    assert len(core) >= 6
+    defined, wanted = set(), set()
+    for source in core:
+        made = tmp_path / f"{source.stem}.o"
+        flags = ["-std=c11", "-ffreestanding", "-O2", "-Wall", "-Wextra", "-Werror"]
+        include = [f"-I{build.FIRMWARE / 'core'}", f"-I{build.FIRMWARE / 'generated'}"]
+        done = run(os.environ.get("CC", "cc"), *flags, *include, "-c", str(source), "-o", str(made))
+        assert done.returncode == 0, done.stderr
+        for line in run("nm", str(made)).stdout.splitlines():
+            kind, name = line.split()[-2:]
+            (wanted if kind == "U" else defined).add(name)
+        included = re.findall(r'#include [<"](.+?)[>"]', source.read_text())
+        assert not {"stdio.h", "stdlib.h", "string.h"} & set(included)
+    outside = wanted - defined
+    # struct copies may become calls of these two; each HAL brings them along
+    assert {n for n in outside if not n.startswith("hal_")} <= {"memcpy", "memset"}
+    hal = {n for n in outside if n.startswith("hal_")}
+    header = (build.FIRMWARE / "core" / "hal.h").read_text()
+    assert hal == set(re.findall(r"\b(hal_\w+)\(", header))
+    assert len(hal) == 12
+    # hal_leds is the only output, and comes first in the chip interrupt
+    player = (build.FIRMWARE / "core" / "player.c").read_text()
+    chip = player[player.index("void evlcp_player_chip(") :]
+    assert chip.index("hal_leds(player->row") < chip.index("hal_lateness") < chip.index("next_packet(")

@@ -1,0 +1,175 @@
+"""The protocol: one definition, golden vectors, datagrams, messages."""
+
+import copy
+import dataclasses
+import tomllib
+import zlib
+from itertools import pairwise
+
+import pytest
+from cobs import cobs
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_host import generate, messages
+from firmware_host.datagram import MAX_WIRE_BYTES, Datagram, Decoder
+from firmware_host.errors import DatagramError
+from firmware_host.vectors import read_vectors
+from firmware_host.wire import Payload
+
+VECTORS = list(read_vectors())
+PAYLOADS = [
+    value
+    for name, value in vars(messages).items()
+    if isinstance(value, type) and issubclass(value, Payload) and value is not Payload
+]
+
+
+def definition() -> dict:
+    return tomllib.loads((generate.HERE / "protocol.toml").read_text())
+
+
+def test_generated_files_are_fresh() -> None:
+    stale = [p.name for p, text in generate.generated_files().items() if p.read_text() != text]
+    assert not stale, "run python -m firmware_host.generate"
+
+
+def test_generator_names_a_stale_file(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    assert generate.main(["--check"]) == 0
+    files = generate.generated_files()
+    first = next(iter(files))
+    monkeypatch.setattr(generate, "generated_files", lambda: files | {first: "other"})
+    assert generate.main(["--check"]) == 1
+    assert first.name in capsys.readouterr().err
+
+
+def test_schema_hash_sees_meaning_and_not_prose() -> None:
+    first = definition()
+    assert generate.schema_hash(first) == messages.SCHEMA_HEX
+    prose = copy.deepcopy(first)
+    prose["message"][0]["doc"] = "other words"
+    prose["message"][0]["request"][0]["doc"] = "other words"
+    assert generate.schema_hash(prose) == messages.SCHEMA_HEX
+    meaning = copy.deepcopy(first)
+    meaning["message"][0]["request"][1]["type"] = "u16"
+    assert generate.schema_hash(meaning) != messages.SCHEMA_HEX
+
+
+def test_types_and_names_are_unique() -> None:
+    table = definition()["message"]
+    assert len({m["type"] for m in table}) == len({m["name"] for m in table}) == len(table)
+    assert all(m["type"] < messages.REPLY_BIT for m in table)
+
+
+@pytest.mark.parametrize("vector", VECTORS, ids=lambda v: v.name)
+def test_golden_vector(vector) -> None:
+    d = vector.datagram
+    head = bytes([d.type, d.status]) + d.sequence.to_bytes(2, "little") + d.session.to_bytes(2, "little")
+    body = head + d.payload
+    assert vector.wire == cobs.encode(body + zlib.crc32(body).to_bytes(4, "little")) + b"\0"
+    assert d.encode() == vector.wire
+    assert Decoder().feed(vector.wire) == [d]
+
+
+def test_golden_vectors_carry_real_messages() -> None:
+    requests = {p.TYPE: p for p in PAYLOADS if p.__name__.endswith("Request")}
+    seen = set()
+    for vector in VECTORS:
+        if not vector.datagram.type & messages.REPLY_BIT and not vector.name.startswith("write-"):
+            requests[vector.datagram.type].unpack(vector.datagram.payload)
+            seen.add(vector.datagram.type)
+    assert len(seen) >= 10
+
+
+def test_c_header_has_the_same_sizes() -> None:
+    header = (generate.HERE / "firmware" / "generated" / "protocol.h").read_text()
+    for message in definition()["message"]:
+        for kind in ("request", "reply"):
+            cls = next(
+                p for p in PAYLOADS if p.__name__.lower() == f"{message['name'].replace('_', '')}{kind}"
+            )
+            line = f"#define EVLCP_{message['name'].upper()}_{kind.upper()}_BYTES {cls.fixed_bytes()}u"
+            assert line in header
+
+
+@st.composite
+def payloads(draw: st.DrawFn) -> Payload:
+    cls = draw(st.sampled_from(PAYLOADS))
+    values = []
+    for code, count in cls.LAYOUT:
+        if code == "*":
+            values.append(draw(st.binary(max_size=64)))
+        elif code.endswith("s"):
+            values.append(draw(st.binary(min_size=int(code[:-1]), max_size=int(code[:-1]))))
+        else:
+            bits = {"B": 8, "H": 16, "I": 32, "h": 16}[code[0]]
+            low = -(1 << bits - 1) if code[0] == "h" else 0
+            number = st.integers(low, low + (1 << bits) - 1)
+            values.append(draw(number) if count == 1 else tuple(draw(number) for _ in range(count)))
+    return cls(*values)
+
+
+@given(payloads())
+def test_message_round_trip(message: Payload) -> None:
+    assert type(message).unpack(message.pack()) == message
+
+
+@given(payloads(), st.integers(1, 3))
+def test_message_of_another_length_is_refused(message: Payload, cut: int) -> None:
+    data = message.pack()
+    cls = type(message)
+    if len(data) >= cut and data[:-cut] and len(data) - cut < cls.fixed_bytes():
+        with pytest.raises(DatagramError):
+            cls.unpack(data[:-cut])
+    if not (cls.LAYOUT and cls.LAYOUT[-1][0] == "*"):
+        with pytest.raises(DatagramError):
+            cls.unpack(data + b"x" * cut)
+
+
+def test_values_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(DatagramError, match="LevelRequest"):
+        messages.LevelRequest(1 << 16).pack()
+    with pytest.raises(DatagramError, match="schema"):
+        messages.HelloRequest(b"short", 0).pack()
+    with pytest.raises(DatagramError, match="at most 512"):
+        Datagram(4, 0, 0, 0, bytes(513)).encode()
+    assert dataclasses.is_dataclass(messages.LevelRequest)
+
+
+@settings(max_examples=200)
+@given(
+    st.lists(st.binary(max_size=600), min_size=1, max_size=5),
+    st.lists(st.integers(0, 2000), max_size=8),
+    st.binary(max_size=100),
+)
+def test_decoder_does_not_care_about_portions(bodies: list[bytes], cuts: list[int], noise: bytes) -> None:
+    sent = [Datagram(12, 0, i, 7, body[:512]) for i, body in enumerate(bodies)]
+    wire = noise + b"\0" + b"".join(d.encode() for d in sent)
+    whole = Decoder()
+    expected = whole.feed(wire)
+    assert [d for d in expected if d.session == 7][-len(sent) :] == sent
+    parts = Decoder()
+    found = []
+    edges = sorted({0, len(wire), *(c for c in cuts if c < len(wire))})
+    for a, b in pairwise(edges):
+        found += parts.feed(wire[a:b])
+    assert found == expected
+    assert parts.counts.bad == whole.counts.bad
+
+
+@given(st.binary(min_size=1, max_size=80), st.data())
+def test_a_flipped_byte_is_never_accepted_as_the_same(body: bytes, data: st.DataObject) -> None:
+    wire = bytearray(Datagram(4, 0, 1, 2, body).encode())
+    at = data.draw(st.integers(0, len(wire) - 2))
+    wire[at] ^= data.draw(st.integers(1, 255))
+    assert not Decoder().feed(bytes(wire))
+
+
+def test_endless_line_does_not_fill_memory() -> None:
+    decoder = Decoder()
+    for _ in range(100):
+        assert decoder.feed(b"\x55" * 1000) == []
+    assert decoder.counts.too_long == 1
+    assert len(decoder._open) <= MAX_WIRE_BYTES + 1000
+    good = Datagram(12, 0, 1, 2, b"")
+    assert decoder.feed(b"\0" + good.encode()) == [good]

@@ -1,0 +1,178 @@
+"""`evlcp tx`: frames without a board, and what a wrong file is answered."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.codebook import Codebook
+from evlcp_sdk.errors import ConfigError, InputError
+from firmware_host import flicker
+from firmware_host.payload import (
+    Payload,
+    chips_of_rows,
+    random_symbols,
+    read_masks,
+    read_symbols,
+    rows_of_chips,
+    symbol_chips,
+)
+
+AIR = json.loads((Path(__file__).parents[1] / "vectors" / "air-vectors.json").read_text())
+EXAMPLE = AIR["example_packet"]
+
+
+def masks_of(chips: np.ndarray) -> list[str]:
+    return [f"{int(''.join(map(str, row)), 2):04x}" for row in chips]
+
+
+@pytest.fixture
+def example(tmp_path: Path) -> Path:
+    path = tmp_path / "symbols.json"
+    path.write_text(json.dumps([EXAMPLE["symbols"]]))
+    return path
+
+
+def test_chips_are_the_air_vectors(cli, example: Path, tmp_path: Path) -> None:
+    out = tmp_path / "chips.npy"
+    assert cli("tx", "frames", example, "--chips", out).returncode == 0
+    chips = np.load(out)
+    assert chips.dtype == np.uint8
+    assert chips.shape == (90, 16)
+    assert masks_of(chips) == EXAMPLE["cluster_masks"]
+
+
+def test_every_form_has_the_same_words(cli, example: Path) -> None:
+    table = json.loads(cli("tx", "frames", example, "--format", "json").stdout)
+    assert table["pilot_words"] == AIR["pilot_words"]
+    info = [w for frame in table["info_words"][0] for w in frame]
+    expected = [AIR["info_words"]["wh4x2"][s] for frame in EXAMPLE["symbols"] for s in frame]
+    assert info == expected
+    hexed = cli("tx", "frames", example, "--format", "hex").stdout.split()
+    assert [h[4:] for h in hexed] == expected
+    assert [h[:4] for h in hexed] == 2 * AIR["pilot_words"]
+    c = cli("tx", "frames", example, "--format", "c").stdout
+    assert [w for w in expected if f"0x{w}u" not in c] == []
+    rows = cli("tx", "frames", example).stdout.splitlines()[1:]
+    assert [r.split()[5] for r in rows] == expected
+
+
+@pytest.mark.parametrize("profile", ["wh4x2", "wh8", "raw8"])
+def test_random_is_a_seed(cli, profile: str, tmp_path: Path) -> None:
+    def run(seed: int) -> str:
+        options = ("--random", 2, "--seed", seed, "--profile", profile, "--format", "hex")
+        return str(cli("tx", "frames", *options).stdout)
+
+    assert run(1) == run(1) != run(2)
+    assert len(run(1).splitlines()) == 20
+
+
+def test_payload_is_what_the_chips_say(book: Codebook) -> None:
+    symbols = random_symbols(3, 2, book, np.random.default_rng(0))
+    words = Payload.of_symbols(symbols, book)
+    masks = Payload.of_masks(symbol_chips(symbols, book), 3, 2, book)
+    assert len(words.content) == 3 * 2 * 16 * 2
+    assert len(masks.content) == 3 * 90 * 12
+    rows = np.frombuffer(masks.content, np.uint8).reshape(-1, 12)
+    assert (chips_of_rows(rows) == symbol_chips(symbols, book)).all()
+    leds = np.unpackbits(rows, axis=1)
+    assert (rows_of_chips(leds) == rows).all()
+
+
+def test_torn_cluster_is_told() -> None:
+    rows = np.zeros((3, 12), np.uint8)
+    rows[1, 0] = 0x80
+    with pytest.raises(ConfigError, match=r"chip 1: the LEDs of cluster 0 differ.*--per-led"):
+        chips_of_rows(rows)
+    assert chips_of_rows(rows, 96)[1].tolist() == [1] + [0] * 95
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[", "not JSON"),
+        ("3", "symbols: found 3, expected a list of packets"),
+        ("[]", "symbols: found 0 elements"),
+        ("[3]", "symbols[0]: found 3, expected a list of frames"),
+        ("[[[1]]]", "symbols[0][0]: found 1 elements, expected 16 symbols, one a cluster"),
+        ('{"symbol": []}', "key symbols is missing"),
+        ('{"profile": "wh8", "symbols": []}', "profile = 'wh8', expected 'wh4x2'"),
+        (json.dumps([[[0] * 15 + [64]]]), "symbols[0][0][15] = 64, expected an integer 0 to 63"),
+        (json.dumps([[[0] * 15 + [True]]]), "symbols[0][0][15] = true, expected an integer"),
+        (json.dumps([[[0] * 15 + [1.5]]]), "symbols[0][0][15] = 1.5, expected an integer"),
+        (json.dumps([[[0] * 16], [[0] * 16] * 2]), "symbols[1]: found 2 elements, expected 1 frames"),
+    ],
+)
+def test_wrong_symbols_are_one_line(cli, tmp_path: Path, text: str, expected: str) -> None:
+    path = tmp_path / "s.json"
+    path.write_text(text)
+    done = cli("tx", "frames", path)
+    assert done.returncode == 3
+    assert done.stderr.startswith(f"evlcp: {path}: ")
+    assert expected in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_missing_files_and_usage(cli, tmp_path: Path) -> None:
+    missing = cli("tx", "frames", tmp_path / "no.json")
+    assert missing.returncode == 3
+    assert "cannot be read" in missing.stderr
+    assert cli("tx", "frames").returncode == 2
+    assert cli("tx", "frames", "--random", 1, "--profile", "wh9").returncode == 2
+    assert "did you mean" in cli("tx", "frames", "--random", 1, "--profile", "wh9").stderr
+    unwritable = cli("tx", "frames", "--random", 1, "--chips", tmp_path / "no" / "x.npy")
+    assert unwritable.returncode == 3
+
+
+def test_wrong_masks_are_told(book: Codebook, tmp_path: Path) -> None:
+    path = tmp_path / "m.npy"
+    for array, expected in (
+        (np.zeros((345, 16), np.uint8), "whole packets of 346 chips"),
+        (np.zeros((346, 17), np.uint8), "one column for each of 96 LEDs or 16 clusters"),
+        (np.full((346, 16), 2, np.uint8), "integers 0 and 1"),
+        (np.zeros((346, 16), np.float64), "integers 0 and 1"),
+    ):
+        np.save(path, array)
+        with pytest.raises(InputError, match=expected):
+            read_masks(path, 10, book)
+    path.write_text("no array")
+    with pytest.raises(InputError, match=r"not a \.npy file"):
+        read_masks(path, 10, book)
+    loaded = symbol_chips(random_symbols(2, 10, book, np.random.default_rng(0)), book)
+    np.save(path, loaded)
+    payload = read_masks(path, 10, book)
+    assert (payload.packets, payload.frames, len(payload.content)) == (2, 10, 2 * 346 * 12)
+    assert Payload.of_symbols(random_symbols(1, 1, book, np.random.default_rng(0)), book)
+    assert read_symbols  # the JSON reader has its own test above
+
+
+def test_codebook_packets_are_balanced_and_do_not_flicker(cli) -> None:
+    done = cli("tx", "check", "--random", 40, "--json")
+    assert done.returncode == 0
+    rows = json.loads(done.stdout)["clusters"]
+    assert len(rows) == 16
+    assert all(r["on_share"] == 0.5 and r["longest_run"] == 2 and r["low_risk"] for r in rows)
+
+
+def test_flicker_of_known_waves() -> None:
+    # a 100 Hz square wave of full modulation: its fundamental is 4/pi of the mean
+    wave = np.tile(np.repeat([[1], [0]], 50, axis=0), (10, 1)).astype(np.uint8)
+    row = flicker.check(wave, 10_000.0)[0]
+    assert row.line_hz == 100.0
+    assert row.line_percent == pytest.approx(100 * 4 / np.pi, rel=1e-3)
+    assert (row.on_share, row.longest_run, row.low_risk) == (0.5, 50, False)
+    # 5 kHz alternation has no line below 3 kHz
+    fast = np.tile([[0], [1]], (500, 1)).astype(np.uint8)
+    row = flicker.check(fast, 10_000.0)[0]
+    assert (row.line_percent, row.longest_run, row.no_effect) == (0.0, 1, True)
+    # constant light does not flicker, darkness neither
+    for level in (0, 1):
+        assert flicker.check(np.full((100, 1), level, np.uint8), 10_000.0)[0].no_effect
+
+
+def test_a_flickering_payload_ends_with_one(cli, tmp_path: Path) -> None:
+    # at 300 chips/s the codes themselves are slow enough to see
+    done = cli("tx", "check", "--random", 10, "--chip-rate", 300)
+    assert done.returncode == 1
+    assert "FLICKERS" in done.stdout

@@ -1,0 +1,396 @@
+"""Host and firmware together in virtual time: programming, swaps, noise, dying hosts, resets."""
+
+import zlib
+
+import numpy as np
+import pytest
+from board_lines import (
+    PACKET,
+    FatalLine,
+    HostDiedError,
+    NoisyLine,
+    board_on,
+    check_order,
+    packet_sequence,
+)
+
+from evlcp_sdk.codebook import Codebook, hadamard
+from evlcp_sdk.errors import ConfigError
+from firmware_host.board import Board, Settings, profile_number, provision
+from firmware_host.client import Timing
+from firmware_host.errors import (
+    BoardResetError,
+    IncompatibleError,
+    LinkError,
+    NoBoardError,
+    RefusedError,
+    VerifyError,
+)
+from firmware_host.generate import codebook_of
+from firmware_host.link import Link
+from firmware_host.messages import (
+    NO_BANK,
+    CodebookReply,
+    CodebookRequest,
+    CommitReply,
+    CommitRequest,
+    ConfigureReply,
+    ConfigureRequest,
+    CrcReply,
+    CrcRequest,
+    Fault,
+    LevelReply,
+    LevelRequest,
+    Profile,
+    ReadReply,
+    ReadRequest,
+    State,
+    StatusReply,
+    StatusRequest,
+    Watchdog,
+    WriteReply,
+    WriteRequest,
+)
+from firmware_host.payload import Payload, random_symbols, symbol_chips
+from firmware_host.simulated import SimulatedBoard, SimulatedLine
+
+
+def symbols_of(packets: int, seed: int, book: Codebook) -> np.ndarray:
+    return random_symbols(packets, 10, book, np.random.default_rng(seed))
+
+
+@pytest.fixture
+def device() -> SimulatedBoard:
+    return SimulatedBoard()
+
+
+@pytest.fixture
+def board(device: SimulatedBoard) -> Board:
+    return board_on(SimulatedLine(device))
+
+
+@pytest.mark.parametrize("profile", ["wh4x2", "wh8", "raw8"])
+def test_plays_what_tx_frames_says(profile: str, device: SimulatedBoard, board: Board) -> None:
+    book = codebook_of(profile)
+    symbols = symbols_of(4, 0, book)
+    provision(board, Payload.of_symbols(symbols, book), Settings())
+    device.run(200_000)
+    played = device.records().played()
+    expected = symbol_chips(symbols, book)
+    table = np.tile(expected, (3, 1))[: len(played)]
+    assert len(played) > len(expected)
+    assert (played.chips() == table).all()
+    assert (np.diff(played.ticks) == device.TICK_HZ // 10_000).all()
+    assert (played.numbers == np.arange(len(played))).all()
+
+
+def test_masks_play_as_they_are(device: SimulatedBoard, board: Board, book: Codebook) -> None:
+    random = np.random.default_rng(0)
+    leds = random.integers(0, 2, (2 * PACKET, 96), dtype=np.uint8)
+    provision(board, Payload.of_masks(leds, 2, 10, book), Settings(chip_rate_hz=20_000))
+    device.run(100_000)
+    played = device.records().played()
+    assert (played.chips(96)[: len(leds)] == leds).all()
+    assert (np.diff(played.ticks) == device.TICK_HZ // 20_000).all()
+
+
+def test_a_codebook_of_ones_own(device: SimulatedBoard, board: Board) -> None:
+    rows = hadamard(8)
+    book = Codebook("barker5", np.array([1, 1, 1, -1, 1], np.int8), np.concatenate([-rows, rows]), rows)
+    assert profile_number(book) == Profile.CUSTOM
+    symbols = random_symbols(2, 3, book, np.random.default_rng(0))
+    provision(board, Payload.of_symbols(symbols, book), Settings())
+    device.run(100_000)
+    expected = symbol_chips(symbols, book)
+    assert (device.records().played().chips()[: len(expected)] == expected).all()
+
+
+def test_what_is_there_is_not_sent_again(device: SimulatedBoard, board: Board, book: Codebook) -> None:
+    symbols = symbols_of(64, 0, book)
+    payload = Payload.of_symbols(symbols, book)
+    seen: list[tuple[int, int]] = []
+    done = board.program(payload, progress=lambda a, b: seen.append((a, b)))
+    assert (done.written, done.length, done.swapped, done.bank) == (20480, 20480, True, 0)
+    assert seen[0] == (0, 20480)
+    assert seen[-1] == (20480, 20480)
+    assert [a for a, _ in seen] == sorted(a for a, _ in seen)
+    again = board.program(payload)
+    assert (again.written, again.swapped) == (0, False)
+    assert board.program(Payload.of_symbols(symbols[:32], book)).bank == 1
+    # bank 0 still holds the first payload: only the commit is needed
+    back = board.program(payload)
+    assert (back.written, back.swapped, back.bank) == (0, True, 0)
+    changed = symbols.copy()
+    changed[40, 3, 5] ^= 1
+    board.program(Payload.of_symbols(symbols[:32], book))
+    assert board.program(Payload.of_symbols(changed, book)).written == 2048
+
+
+def test_hitless_swap_800_packets(device: SimulatedBoard, board: Board, book: Codebook) -> None:
+    payloads = {}
+    for n in range(60):
+        name = f"p{n}"
+        payloads[name] = symbols_of(1 + n % 4, 100 + n, book)
+        provision(board, Payload.of_symbols(payloads[name], book), Settings())
+        device.run(int(np.random.default_rng(n).integers(200_000, 500_000)))
+    device.run(28_000_000 - device.now_us if device.now_us < 28_000_000 else 0)
+    played = device.records().played()
+    assert (np.diff(played.ticks) == 1000).all(), "a chip was lost or late"
+    assert (played.numbers == np.arange(len(played))).all()
+    sequence = packet_sequence(played, payloads, book)
+    assert len(sequence) >= 800
+    order = check_order(sequence, {n: len(s) for n, s in payloads.items()})
+    assert order == list(payloads)
+
+
+def test_wrong_crc_or_codebook_never_plays(device: SimulatedBoard, board: Board, book: Codebook) -> None:
+    old = symbols_of(2, 1, book)
+    provision(board, Payload.of_symbols(old, book), Settings())
+    payload = Payload.of_symbols(symbols_of(2, 2, book), book)
+    board.prepare(payload, 10_000)
+    board.fill(1, payload.content)
+    length, digest = len(payload.content), bytes.fromhex(book.digest)
+    foreign = bytes.fromhex(codebook_of("wh8").digest)
+    for commit, error in (
+        (CommitRequest(1, 0, 2, length, payload.crc ^ 1, digest), VerifyError),
+        (CommitRequest(1, 0, 2, length, payload.crc, foreign), IncompatibleError),
+        (CommitRequest(1, 0, 2, length, payload.crc, bytes(32)), IncompatibleError),
+        (CommitRequest(1, 0, 3, length, payload.crc, digest), RefusedError),
+        (CommitRequest(1, 1, 2, length, payload.crc, digest), RefusedError),
+        (CommitRequest(2, 0, 2, length, payload.crc, digest), RefusedError),
+    ):
+        with pytest.raises(error):
+            board.link.call(commit, CommitReply)
+        device.run(100_000)
+        status = board.status()
+        assert (status.active_bank, status.pending_bank, status.commits) == (0, NO_BANK, 1)
+    pilots = tuple(range(16))
+    with pytest.raises(IncompatibleError, match="built with another codebook"):
+        board.link.call(CodebookRequest(26, 0, pilots, digest), CodebookReply)
+    board.link.call(ConfigureRequest(10_000, Profile.WH8, 10), ConfigureReply)
+    with pytest.raises(IncompatibleError):
+        board.link.call(CommitRequest(1, 0, 2, length, payload.crc, digest), CommitReply)
+    device.run(500_000)
+    sequence = packet_sequence(device.records().played(), {"old": old}, book)
+    assert len(sequence) > 20
+
+
+def test_ten_thousand_requests_over_a_noisy_line(device: SimulatedBoard) -> None:
+    line = NoisyLine(device, flips=5e-4, drops=0.005, doubles=0.01, seed=3)
+    board = board_on(line)
+    random = np.random.default_rng(4)
+    bank = bytearray(board.read(1, 0, 4096))
+    level, link, retried = board.status().level_ma, board.link, 0
+    for _ in range(10_000):
+        what = random.integers(5)
+        at = int(random.integers(4000))
+        n = int(random.integers(1, 64))
+        if what == 0:
+            data = random.bytes(n)
+            assert link.call(WriteRequest(1, at, data), WriteReply) == WriteReply(1, at, n)
+            bank[at : at + n] = data
+        elif what == 1:
+            assert link.call(ReadRequest(1, at, n), ReadReply).data == bank[at : at + n]
+        elif what == 2:
+            expected = zlib.crc32(bytes(bank[at : at + n]))
+            assert link.call(CrcRequest(1, at, n), CrcReply).crc == expected
+        elif what == 3:
+            level = int(random.integers(61))
+            link.call(LevelRequest(level), LevelReply)
+        else:
+            assert link.call(StatusRequest(), StatusReply).level_ma == level
+    retried = link.client.retries
+    status = board.status()
+    assert board.read(1, 0, 4096) == bytes(bank)
+    assert retried > 300
+    assert status.crc_errors + status.framing_errors > 50
+    assert line.counts["flipped"] > 100
+    assert min(line.counts.values()) > 50
+
+
+def test_programming_over_a_very_noisy_line(device: SimulatedBoard, book: Codebook) -> None:
+    board = board_on(NoisyLine(device, flips=2e-3, drops=0.01, doubles=0.01, seed=5))
+    symbols = symbols_of(64, 6, book)
+    payload = Payload.of_symbols(symbols, book)
+    done = provision(board, payload, Settings())
+    assert done.retries > 20
+    device.run(3_000_000)
+    assert board.crc(0, 0, len(payload.content)) == payload.crc
+    sequence = packet_sequence(device.records().played(), {"new": symbols}, book)
+    assert check_order(sequence, {"new": 64}) == ["new"]
+    assert len(sequence) > 64
+
+
+def _bytes_of_programming(old: np.ndarray, new: np.ndarray, book: Codebook) -> int:
+    device = SimulatedBoard()
+    provision(board_on(SimulatedLine(device)), Payload.of_symbols(old, book), Settings())
+    device.run(50_000)
+    line = FatalLine(device, 1 << 30, lambda: None)
+    provision(board_on(line, nonce=7), Payload.of_symbols(new, book), Settings())
+    return line.written
+
+
+def test_host_killed_at_100_moments(book: Codebook) -> None:
+    old, new = symbols_of(2, 1, book), symbols_of(24, 2, book)
+    total = _bytes_of_programming(old, new, book)
+    random = np.random.default_rng(7)
+    # the commit and the wait for it are the last bytes: a third of the moments lie there
+    moments = [*random.integers(1, total, 65), *random.integers(total - 320, total, 35)]
+    ends = {"old": 0, "new": 0}
+
+    def die() -> None:
+        raise HostDiedError
+
+    for moment in moments:
+        device = SimulatedBoard()
+        provision(board_on(SimulatedLine(device)), Payload.of_symbols(old, book), Settings())
+        device.run(50_000)
+        with pytest.raises(HostDiedError):
+            provision(
+                board_on(FatalLine(device, int(moment), die), nonce=7),
+                Payload.of_symbols(new, book),
+                Settings(),
+            )
+        device.run(400_000)
+        sequence = packet_sequence(device.records().played(), {"old": old, "new": new}, book)
+        order = check_order(sequence, {"old": 2, "new": 24})
+        assert order in (["old"], ["old", "new"])
+        ends[order[-1]] += 1
+        # the next host finishes the work
+        board = board_on(SimulatedLine(device))
+        done = provision(board, Payload.of_symbols(new, book), Settings())
+        assert board.holds(Payload.of_symbols(new, book), 10_000, board.status())
+        assert done.swapped == (order[-1] == "old")
+    assert min(ends.values()) > 5
+
+
+def _fault_of(line: SimulatedLine, payload: Payload) -> str | None:
+    try:
+        provision(board_on(line, nonce=7), payload, Settings())
+    except BoardResetError as fault:
+        return str(fault)
+    return None
+
+
+def test_board_reset_at_100_moments(book: Codebook) -> None:
+    payload = Payload.of_symbols(symbols_of(12, 2, book), book)
+    total = _bytes_of_programming(symbols_of(2, 1, book), symbols_of(12, 2, book), book)
+    random = np.random.default_rng(8)
+    told = 0
+    for moment in random.integers(1, total, 100):
+        device = SimulatedBoard()
+        first = Payload.of_symbols(symbols_of(2, 1, book), book)
+        provision(board_on(SimulatedLine(device)), first, Settings())
+        device.run(50_000)
+        fault = _fault_of(FatalLine(device, int(moment), device.reset), payload)
+        if fault is not None:
+            told += 1
+            assert "was reset" in fault
+            assert "run the command again" in fault
+        board = board_on(SimulatedLine(device))
+        if board.status().state == State.PLAYING:
+            assert board.holds(payload, 10_000, board.status())
+        provision(board, payload, Settings())
+        assert board.holds(payload, 10_000, board.status())
+        assert board.status().state == State.PLAYING
+    # a reset before HELLO arrives, or after the last request, goes unnoticed by right
+    assert told > 80
+
+
+def test_silence_is_told(device: SimulatedBoard, board: Board) -> None:
+    class Deaf(SimulatedLine):
+        def to_board(self, data: bytes) -> bytes:
+            del data
+            return b""
+
+    with pytest.raises(NoBoardError, match="no board answers; check power, cable and --baud"):
+        board_on(Deaf(device))
+    board.link.transport = Deaf(device)
+    with pytest.raises(LinkError, match="no answer to STATUS after 5 tries"):
+        board.status()
+    assert NoBoardError.exit_code == 4
+    assert LinkError.exit_code == 6
+
+
+def test_another_schema_is_incompatible(device: SimulatedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("firmware_host.link.SCHEMA", b"12345678")
+    with pytest.raises(IncompatibleError, match="update firmware or host"):
+        Board(Link(SimulatedLine(device), Timing()))
+
+
+def test_too_much_is_told_before_anything_is_sent(board: Board, book: Codebook) -> None:
+    payload = Payload.of_symbols(symbols_of(129, 0, book), book)
+    with pytest.raises(ConfigError, match="send at most 128 packets"):
+        board.program(payload)
+    assert board.status().requests <= 3
+
+
+def test_level_above_the_maximum_is_refused(board: Board, book: Codebook) -> None:
+    with pytest.raises(RefusedError, match="limit is 60") as refused:
+        provision(board, Payload.of_symbols(symbols_of(1, 0, book), book), Settings(level_ma=61))
+    assert refused.value.detail == 60
+    assert refused.value.exit_code == 5
+    status = board.status()
+    assert (status.level_ma, status.active_bank) == (20, NO_BANK)
+
+
+def test_save_survives_reset_and_damage(device: SimulatedBoard, book: Codebook) -> None:
+    first, second = symbols_of(1, 1, book), symbols_of(2, 2, book)
+    board = board_on(SimulatedLine(device))
+    settings = Settings(level_ma=33, watchdog=Watchdog.IDLE, watchdog_ms=700, start=False)
+    for symbols in (first, second):
+        provision(board, Payload.of_symbols(symbols, book), settings)
+        board.save()
+    device.reset()
+    board = board_on(SimulatedLine(device))
+    assert board.recall().slot == 1
+    status = board.status()
+    assert board.holds(Payload.of_symbols(second, book), 10_000, status)
+    assert (status.level_ma, status.watchdog, status.watchdog_ms) == (33, Watchdog.IDLE, 700)
+    device.flip_flash(1, 200)
+    device.reset()
+    board = board_on(SimulatedLine(device))
+    assert board.recall().slot == 0
+    assert board.holds(Payload.of_symbols(first, book), 10_000, board.status())
+    board.save(autostart=True)
+    device.reset()
+    device.records()
+    device.run(100_000)
+    assert packet_sequence(device.records().played(), {"first": first}, book)
+    device.set_failures(flash=True)
+    board = board_on(SimulatedLine(device))
+    board.blank()
+    with pytest.raises(RefusedError, match="flash"):
+        board.save()
+
+
+def test_faults_show_and_darken(device: SimulatedBoard, board: Board, book: Codebook) -> None:
+    provision(board, Payload.of_symbols(symbols_of(1, 0, book), book), Settings())
+    device.set_health(30.0, Fault.OPEN_LED, open_led=95)
+    device.run(300_000)
+    status = board.status()
+    assert (status.temperature_dc, status.faults, status.open_leds[-1]) == (300, Fault.OPEN_LED, 1)
+    device.set_health(120.0, Fault.OVER_TEMPERATURE)
+    device.run(300_000)
+    assert board.status().state == State.FAULT
+    assert not device.shown().any()
+    with pytest.raises(RefusedError, match="a fault holds the LEDs dark"):
+        board.start()
+    device.set_health()
+    board.start()
+    device.run(10_000)
+    assert board.status().state == State.PLAYING
+    device.set_late(1000)
+    device.run(1000)
+    status = board.status()
+    assert status.state == State.FAULT
+    assert status.faults & Fault.CHIP_LOST
+    assert not device.shown().any()
+
+
+def test_led_test_walks_all(device: SimulatedBoard, board: Board) -> None:
+    board.test_leds(0, 95, 2)
+    board.wait_dark()
+    rows = device.records().rows
+    lit = np.unpackbits(rows[rows.any(1)], axis=1)
+    assert (lit == np.eye(96, dtype=np.uint8)).all()
