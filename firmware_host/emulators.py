@@ -44,6 +44,8 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
+    if process.stderr is not None:
+        process.stderr.close()
 
 
 def native_command(
@@ -130,7 +132,8 @@ def start_qemu(leds: Path | None = None) -> ProcessTransport:
             connected = SocketTransport.connect(listen)
             return ProcessTransport("qemu:", connected.detach(), process, folder)
         time.sleep(0.02)
-    _end(process)
+    process.kill()
     said = process.stderr.read().decode(errors="replace").strip() if process.stderr else ""
+    _end(process)
     shutil.rmtree(folder, ignore_errors=True)
     raise LinkError(f"qemu: does not come up: {said or 'no socket'}; try 'evlcp board emulate qemu'")

@@ -267,7 +267,9 @@ class ReplayTransport:
             LinkError: It is something else.
         """
         while data:
-            if not self._events or self._events[0][1] != "tx":
+            if not self._events:
+                raise LinkError(f"{self.name}: the trace ends here; record it again with --trace")
+            if self._events[0][1] != "tx":
                 raise LinkError(f"{self.name}: sends more than was recorded; {self._advice}")
             at, _, expected = self._events[0]
             n = min(len(data), len(expected))

@@ -1,0 +1,42 @@
+"""Time to program one board with 64 packets, against the time its bytes take at 1 Mbit/s.
+
+The native board keeps to the line rate in both directions. Prints the time, the wire time and their ratio.
+"""
+
+import time
+
+import numpy as np
+
+from firmware_host.board import Board, Settings, provision
+from firmware_host.client import Timing
+from firmware_host.emulators import start_native
+from firmware_host.generate import codebook_of
+from firmware_host.link import Link
+from firmware_host.payload import Payload, random_symbols
+
+BAUD = 1_000_000
+RUNS = 5
+
+
+def once(payload: Payload, settings: Settings) -> float:
+    with Link(start_native(baud=BAUD), Timing(BAUD)) as link:
+        start = time.perf_counter()
+        done = provision(Board(link), payload, settings)
+        elapsed = time.perf_counter() - start
+    assert done.written == len(payload.content)
+    return elapsed
+
+
+def main() -> None:
+    book = codebook_of("wh4x2")
+    payload = Payload.of_symbols(random_symbols(64, 10, book, np.random.default_rng(0)), book)
+    times = sorted(once(payload, Settings()) for _ in range(RUNS))
+    wire = 10 * len(payload.content) / BAUD
+    best, median = times[0], times[RUNS // 2]
+    print(f"64 packets, {len(payload.content)} bytes, verified and playing, {BAUD} bit/s")
+    print(f"wire time {wire * 1e3:.1f} ms; median {median * 1e3:.1f} ms, best {best * 1e3:.1f} ms")
+    print(f"ratio {median / wire:.3f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,251 @@
+"""`evlcp board` against running boards: commands, exit codes, traces, hosts that are killed."""
+
+import json
+import os
+import pty
+import random
+import signal
+import subprocess
+import sys
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from board_lines import check_order, packet_sequence
+
+from evlcp_sdk.codebook import Codebook
+from firmware_host.payload import random_symbols
+from firmware_host.recording import Recording
+
+EVLCP = [sys.executable, "-c", "from evlcp_sdk.cli.main import main; main()"]
+
+
+class Emulated:
+    """`evlcp board emulate` in the background."""
+
+    def __init__(self, *options: object) -> None:
+        command = [*EVLCP, "board", "emulate", *map(str, options)]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL)
+        assert self.process.stdout is not None
+        self.said = self.process.stdout.readline()
+
+    def end(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
+        code = self.process.wait(10)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        return code
+
+
+@pytest.fixture
+def native(tmp_path: Path) -> Iterator[str]:
+    emulated = Emulated(
+        *("native", "--listen", f"unix:{tmp_path / 'board'}", "--leds", tmp_path / "leds.bin"),
+        *("--flash", tmp_path / "flash.bin"),
+    )
+    yield f"unix:{tmp_path / 'board'}"
+    assert emulated.end() == 0
+
+
+def test_a_users_first_hour(cli, native: str, tmp_path: Path) -> None:
+    def board(*arguments: object) -> "subprocess.CompletedProcess[str]":
+        return cli("board", *arguments, "--port", native)
+
+    about = json.loads(board("hello", "--json").stdout)
+    assert (about["hal"], about["clusters"], about["leds"]) == ("native", 16, 96)
+    assert board("start").returncode == 5
+    assert "'evlcp board program' first" in board("send", "--random", 1).stderr
+    done = board("program", "--random", 8, "--seed", 3, "--level", 25, "--watchdog", "idle")
+    assert (done.returncode, done.stdout) == (0, "sent 2560 of 2560 bytes; bank 0 is active\n")
+    status = json.loads(board("status", "--json").stdout)
+    assert (status["state"], status["level_ma"], status["watchdog"]) == ("playing", 25, "idle")
+    assert "was there already" in board("program", "--random", 8, "--seed", 3).stdout
+    assert board("verify", "--random", 8, "--seed", 3).returncode == 0
+    other = board("verify", "--random", 8, "--seed", 4)
+    assert other.returncode == 7
+    assert "byte 0 of bank 0" in other.stderr
+    assert board("verify", "--random", 9, "--seed", 4).returncode == 7
+    foreign = board("send", "--random", 1, "--profile", "wh8")
+    assert foreign.returncode == 8
+    assert board("send", "--random", 2, "--seed", 9, "--json").returncode == 0
+    lines = board("monitor", "--count", 2, "--interval", 0.05).stdout.splitlines()
+    assert len(lines) == 2
+    assert "playing" in lines[0]
+    refused = board("level", 61)
+    assert refused.returncode == 5
+    assert "the board's limit is 60" in refused.stderr
+    assert board("watchdog", "dark", "--after-ms", 60_000).returncode == 0
+    assert board("save").returncode == 5
+    assert board("stop").returncode == 0
+    assert board("save").stdout == "saved in slot 0, number 1\n"
+    assert board("test-leds", "--dwell-ms", 1).returncode == 0
+    assert board("recall").stdout == "recalled slot 0, number 1\n"
+    assert board("start").returncode == 0
+    assert board("blank").returncode == 0
+    assert json.loads(board("status", "--json").stdout)["state"] == "dark"
+    assert (tmp_path / "flash.bin").stat().st_size > 80_000
+
+
+def test_masks_and_leds(cli, native: str, tmp_path: Path) -> None:
+    chips = tmp_path / "chips.npy"
+    cli("tx", "frames", "--random", 3, "--seed", 1, "--chips", chips)
+    done = cli("board", "program", "--masks", chips, "--port", native)
+    assert done.returncode == 0, done.stderr
+    time.sleep(0.3)
+    cli("board", "stop", "--port", native)
+    out = tmp_path / "out.npy"
+    assert cli("board", "leds", tmp_path / "leds.bin", "--chips", out).returncode == 0
+    assert (np.load(out)[: 3 * 346] == np.load(chips)).all()
+    assert len(np.load(tmp_path / "out.ticks.npy")) == len(np.load(out))
+    assert cli("board", "leds", tmp_path / "leds.bin", "--chips", out, "--per-led").returncode == 0
+    assert np.load(out).shape[1] == 96
+
+
+def test_wrong_records_are_told(cli, tmp_path: Path) -> None:
+    torn = tmp_path / "leds.bin"
+    torn.write_bytes(bytes(21))
+    done = cli("board", "leds", torn, "--chips", tmp_path / "c.npy")
+    assert done.returncode == 3
+    assert "expected whole records of 20" in done.stderr
+    assert cli("board", "leds", tmp_path / "no", "--chips", tmp_path / "c.npy").returncode == 3
+
+
+def test_trace_and_replay(cli, tmp_path: Path) -> None:
+    trace = tmp_path / "wire.jsonl"
+    arguments = ("board", "program", "--random", 8, "--seed", 3)
+    live = cli(*arguments, "--port", "native:", "--trace", trace)
+    assert live.returncode == 0, live.stderr
+    lines = [json.loads(x) for x in trace.read_text().splitlines()]
+    assert lines[0]["evlcp_trace"] == 1
+    assert {x["dir"] for x in lines[1:]} == {"tx", "rx"}
+    replayed = cli(*arguments, "--replay", trace)
+    assert (replayed.returncode, replayed.stdout) == (0, live.stdout)
+    other = cli("board", "program", "--random", 8, "--seed", 4, "--replay", trace)
+    assert other.returncode == 6
+    assert "is another one" in other.stderr
+    trace.write_text("\n".join(trace.read_text().splitlines()[:5]) + "\n")
+    assert "the trace ends here" in cli(*arguments, "--replay", trace).stderr
+    trace.write_text('{"evlcp_trace": 1, "first": 1, "nonce": 2, "baud": 9600}\n{"dir": "up"}\n')
+    wrong = cli(*arguments, "--replay", trace)
+    assert wrong.returncode == 3
+    assert f"{trace}: line 2: not a trace" in wrong.stderr
+    both = cli(*arguments, "--replay", trace, "--trace", trace)
+    assert both.returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("port", "says"),
+    [
+        ("unix:/nowhere/at/all", "no board listens there"),
+        ("tcp:127.0.0.1:1", "no board listens there"),
+        ("tcp:what", "no board listens there"),
+        ("/dev/nowhere", "cannot be opened"),
+        ("what://ever", "cannot be opened"),
+        ("loop://", "no board answers; check power"),
+    ],
+)
+def test_no_board_is_four(cli, port: str, says: str) -> None:
+    done = cli("board", "hello", "--port", port)
+    assert done.returncode == 4
+    assert says in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_usage_is_two(cli) -> None:
+    for arguments in (
+        ("program", "--port", "native:"),
+        ("program", "--random", 1, "--masks", "x.npy", "--port", "native:"),
+        ("program", "--random", 129, "--port", "native:"),
+        ("program", "--inventory", "x.toml", "--random", 1),
+        ("emulate", "qemu", "--listen", "pty"),
+        ("emulate", "native", "--listen", "smoke:signals"),
+        ("level", "much"),
+    ):
+        done = cli("board", *arguments)
+        assert done.returncode == 2, (arguments, done.stderr)
+        assert "Traceback" not in done.stderr
+
+
+def test_port_from_the_environment(native: str) -> None:
+    env = os.environ | {"EVLCP_PORT": native}
+    done = subprocess.run([*EVLCP, "board", "hello"], env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert "native" in done.stdout
+
+
+def test_pty_and_tcp(cli, tmp_path: Path) -> None:
+    emulated = Emulated("native", "--listen", "pty", "--link", tmp_path / "tty")
+    assert emulated.said == f"listening on {tmp_path / 'tty'}\n"
+    done = cli("board", "program", "--random", 64, "--port", tmp_path / "tty")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert cli("board", "verify", "--random", 64, "--port", tmp_path / "tty").returncode == 0
+    assert emulated.end() == 0
+    emulated = Emulated("native", "--listen", "tcp:127.0.0.1:47391")
+    assert cli("board", "hello", "--port", "tcp:127.0.0.1:47391").returncode == 0
+    assert cli("board", "hello", "--port", "socket://127.0.0.1:47391").returncode == 0
+    assert emulated.end() == 0
+
+
+def test_ports_are_asked(native: str, tmp_path: Path) -> None:
+    from firmware_host.errors import NoBoardError
+    from firmware_host.ports import find, survey
+
+    silent, other = pty.openpty()
+    tty.setraw(other)
+    listed = [(os.ttyname(other), "silent"), (native, "a board"), ("/dev/nowhere", "gone")]
+    found = survey(1_000_000, listed)
+    assert [f.about is not None for f in found] == [False, True, False]
+    assert find(1_000_000, listed) == native
+    with pytest.raises(NoBoardError, match=r"no board answers on any serial port \(.*gone|nowhere"):
+        find(1_000_000, [listed[0], listed[2]])
+    second = Emulated("native", "--listen", f"unix:{tmp_path / 'second'}")
+    with pytest.raises(NoBoardError, match="2 boards answer"):
+        find(1_000_000, [listed[1], (f"unix:{tmp_path / 'second'}", "another")])
+    second.end()
+    os.close(silent)
+    os.close(other)
+
+
+def test_host_processes_killed(native: str, tmp_path: Path, book: Codebook, cli) -> None:
+    payloads = {"0": random_symbols(2, 10, book, np.random.default_rng(0))}
+    assert cli("board", "program", "--random", 2, "--seed", 0, "--port", native).returncode == 0
+    draw = random.Random(5)
+    killed = 0
+    for n in range(1, 9):
+        payloads[str(n)] = random_symbols(100, 10, book, np.random.default_rng(n))
+        command = [*EVLCP, "board", "program", "--random", "100", "--seed", str(n), "--port", native]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(draw.uniform(0.3, 0.9))
+        process.kill()
+        killed += process.wait() == -signal.SIGKILL
+    assert killed
+    last = cli("board", "program", "--random", 2, "--seed", 0, "--port", native)
+    assert last.returncode == 0, last.stderr
+    cli("board", "stop", "--port", native)
+    played = Recording.read(tmp_path / "leds.bin").played()
+    assert (np.diff(played.ticks) == 1000).all()
+    sequence = packet_sequence(played, payloads, book)
+    assert check_order(sequence, {n: len(s) for n, s in payloads.items()})[0] == "0"
+
+
+def test_board_that_hangs_up_is_told(cli, tmp_path: Path) -> None:
+    emulated = Emulated("native", "--listen", f"unix:{tmp_path / 'b'}")
+    command = [*EVLCP, "board", "monitor", "--interval", "0.05", "--port", f"unix:{tmp_path / 'b'}"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    process.stdout.readline()
+    emulated.end()
+    said = process.communicate(timeout=20)[1]
+    assert process.returncode == 6
+    assert "the board hung up; start it again" in said
+
+
+def test_programming_is_near_the_wire_time() -> None:
+    benchmark = Path(__file__).parents[2] / "benchmarks" / "board_program.py"
+    done = subprocess.run([sys.executable, str(benchmark)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    ratio = float(done.stdout.rsplit("ratio", 1)[1].split()[0])
+    assert ratio <= 1.5

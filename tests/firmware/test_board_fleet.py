@@ -1,0 +1,119 @@
+"""Fleets: one inventory, many boards, some of which fail."""
+
+import json
+import socket
+import subprocess
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from firmware_host.emulators import native_command
+
+
+@pytest.fixture
+def boards(tmp_path: Path) -> Iterator[list[str]]:
+    """32 native boards on unix sockets."""
+    with ExitStack() as stack:
+        ports = []
+        for n in range(32):
+            port = f"unix:{tmp_path / f'b{n}'}"
+            process = subprocess.Popen(
+                native_command(port, unique_id=n), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE
+            )
+            stack.callback(process.wait)
+            stack.callback(process.terminate)
+            assert process.stdout is not None
+            stack.callback(process.stdout.close)
+            assert process.stdout.readline().startswith(b"listening")
+            ports.append(port)
+        yield ports
+
+
+def inventory(path: Path, ports: list[str], extra: dict[int, str]) -> Path:
+    tables = ["[defaults]\nrandom = 16\nframes = 10"]
+    for n, port in enumerate(ports):
+        line = f'[[board]]\nid = "T{n:02}"\nport = "{port}"\nposition_m = [0.0, {n}.5, 5]\nseed = {n}\n'
+        tables.append(line + extra.get(n, ""))
+    path.write_text("\n".join(tables))
+    return path
+
+
+def test_thirty_of_thirty_two(cli, boards: list[str], tmp_path: Path) -> None:
+    # one port has nobody, one board cannot take the level
+    silent = socket.socket(socket.AF_UNIX)
+    silent.bind(str(tmp_path / "silent"))
+    silent.listen()
+    ports = [*boards[:7], f"unix:{tmp_path / 'silent'}", *boards[8:]]
+    file = inventory(tmp_path / "tunnel.toml", ports, {20: "level_ma = 500\n"})
+    done = cli("board", "program", "--inventory", file)
+    silent.close()
+    lines = done.stdout.splitlines()
+    assert len(lines) == 32
+    good = [x for x in lines if "programmed 5120 of 5120 bytes" in x]
+    bad = sorted(x for x in lines if "FAILED" in x)
+    assert (len(good), len(bad)) == (30, 2)
+    assert bad[0].startswith("T07")
+    assert "FAILED (4)" in bad[0]
+    assert bad[1].startswith("T20")
+    assert "FAILED (5)" in bad[1]
+    assert "limit is 60" in bad[1]
+    assert done.returncode == 4
+    assert done.stderr.startswith(f"evlcp: {file}: 2 of 32 boards failed (T07, T20)")
+    for n in (0, 31):
+        same = cli("board", "verify", "--random", 16, "--seed", n, "--port", boards[n])
+        assert same.returncode == 0, same.stderr
+
+    # repaired, the next run does only what is missing
+    file = inventory(tmp_path / "tunnel.toml", boards, {})
+    again = cli("board", "program", "--inventory", file, "--json")
+    assert again.returncode == 0, again.stderr
+    rows = [json.loads(x) for x in again.stdout.splitlines()]
+    assert sorted(r["id"] for r in rows if r["written_bytes"]) == ["T07", "T20"]
+    assert all(r["ok"] for r in rows)
+    assert len(rows) == 32
+    assert rows[0]["position_m"][0] == 0.0
+
+
+GOOD = 'id = "a"\nport = "native:"\nposition_m = [0, 0, 0]\nrandom = 1\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("board = 3", "expected at least one [[board]]"),
+        ("[[board", "not TOML"),
+        ("", "expected at least one [[board]]"),
+        ("[other]\n", "other: unknown table"),
+        ("defaults = 3\n[[board]]\n" + GOOD, "defaults = 3"),
+        ("[[board]]\n" + GOOD.replace("random = 1", ""), "give payload or random"),
+        ("[[board]]\n" + GOOD + 'colour = "red"', "board[0].colour = 'red'"),
+        ("[[board]]\n" + GOOD.replace("[0, 0, 0]", "[0, 0]"), "board[0].position_m = [0, 0]"),
+        ("[[board]]\n" + GOOD.replace("[0, 0, 0]", "[0, 0, nan]"), "board[0].position_m.2"),
+        ("[[board]]\n" + GOOD.replace("random = 1", 'random = "1"'), "board[0].random = '1'"),
+        ("[[board]]\n" + GOOD + 'watchdog = "sleep"', "board[0].watchdog = 'sleep'"),
+        ("[[board]]\n" + GOOD + 'profile = "wh9"', "board[0]: no modulation algorithm named 'wh9'"),
+        ("[[board]]\n" + GOOD + "[[board]]\n" + GOOD, "board[1].id = 'a', expected another than board[0]'s"),
+        ("[[board]]\n" + GOOD.replace("random = 1", 'payload = "no.json"'), "no.json: cannot be read"),
+    ],
+)
+def test_wrong_inventory_is_one_line(cli, tmp_path: Path, text: str, expected: str) -> None:
+    file = tmp_path / "tunnel.toml"
+    file.write_text(text)
+    done = cli("board", "program", "--inventory", file)
+    assert done.returncode == 3
+    assert done.stdout == ""
+    assert done.stderr.startswith(f"evlcp: {file}: ")
+    assert expected in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_another_board_on_the_port_is_refused(cli, tmp_path: Path) -> None:
+    file = tmp_path / "tunnel.toml"
+    file.write_text("[[board]]\n" + GOOD + f'unique_id = "{"0" * 23}7"\n')
+    done = cli("board", "program", "--inventory", file)
+    assert done.returncode == 8
+    assert "the inventory expects" in done.stdout
+    file.write_text("[[board]]\n" + GOOD + f'unique_id = "{"0" * 24}"\n')
+    assert cli("board", "program", "--inventory", file).returncode == 0

@@ -1,0 +1,253 @@
+"""The ARM images in QEMU: chip timing on the mps2-an385, register writes on the netduinoplus2."""
+
+import hashlib
+import json
+import re
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.codebook import Codebook
+from firmware_host import build
+from firmware_host.board import Board, Settings, provision
+from firmware_host.emulators import start_qemu
+from firmware_host.errors import RefusedError
+from firmware_host.link import Link
+from firmware_host.messages import State, StatusReply, StatusRequest
+from firmware_host.payload import Payload, random_symbols
+from firmware_host.recording import Recording
+from firmware_host.transport import SocketTransport
+
+CHIPS = 20_000
+VECTORS = Path(__file__).parents[1] / "vectors" / "air-vectors.json"
+
+
+@pytest.fixture(autouse=True)
+def _tools(needs) -> None:
+    needs("qemu-system-arm", "arm-none-eabi-gcc")
+
+
+def play(leds: Path, payload: Payload, chips: int) -> tuple[int, StatusReply]:
+    """Play in QEMU while the host asks without pause; returns how often it asked, and the last status."""
+    with Link(start_qemu(leds)) as link:
+        board = Board(link)
+        provision(board, payload, Settings())
+        asked = 0
+        last = board.status()
+
+        def requests() -> Iterator[StatusRequest]:
+            while last.chips_sent < chips:
+                yield StatusRequest()
+
+        def handle(request: object, outcome: object) -> None:
+            nonlocal asked, last
+            asked += 1
+            last = link.checked(request, outcome)  # type: ignore[arg-type,assignment]
+
+        link.run(requests(), handle)
+        return asked, last
+
+
+def test_chips_are_exact_while_the_host_asks_without_pause(cli, tmp_path: Path, book: Codebook) -> None:
+    file = tmp_path / "chips.npy"
+    assert cli("tx", "frames", "--random", 8, "--seed", 5, "--chips", file).returncode == 0
+    expected = np.load(file)
+    symbols = random_symbols(8, 10, book, np.random.default_rng(5))
+    hashes = set()
+    for n in range(5):
+        leds = tmp_path / f"leds{n}.bin"
+        asked, status = play(leds, Payload.of_symbols(symbols, book), CHIPS)
+        played = Recording.read(leds).played()
+        assert len(played) >= CHIPS
+        chips, ticks = played.chips()[:CHIPS], played.ticks[:CHIPS]
+        assert (played.numbers[:CHIPS] == np.arange(CHIPS)).all()
+        assert (chips == np.resize(expected, (CHIPS, 16))).all()
+        intervals_us = np.diff(ticks) / 25.0  # ticks of 25 MHz
+        assert (intervals_us == 100.0).all()
+        assert asked > 1000
+        assert status.crc_errors == status.framing_errors == status.overflow_errors == 0
+        assert status.lateness_max_ticks < 250
+        hashes.add(hashlib.sha256((ticks - ticks[0]).tobytes() + played.rows[:CHIPS].tobytes()).hexdigest())
+    assert len(hashes) == 1
+
+
+def test_recorded_stream_is_the_air_vectors(cli, tmp_path: Path, book: Codebook) -> None:
+    example = json.loads(VECTORS.read_text())["example_packet"]
+    leds = tmp_path / "leds.bin"
+    play(leds, Payload.of_symbols([example["symbols"]], book), 200)
+    out = tmp_path / "chips.npy"
+    assert cli("board", "leds", leds, "--chips", out).returncode == 0
+    chips, ticks = np.load(out), np.load(tmp_path / "chips.ticks.npy")
+    masks = [f"{int(''.join(map(str, row)), 2):04x}" for row in chips[:90]]
+    assert masks == example["cluster_masks"]
+    assert (np.diff(ticks) == 2500).all()
+    (tmp_path / "symbols.json").write_text(json.dumps([example["symbols"]]))
+    frames = tmp_path / "frames.npy"
+    cli("tx", "frames", tmp_path / "symbols.json", "--chips", frames)
+    assert (np.load(frames) == chips[:90]).all()
+
+
+def test_swap_in_qemu_is_hitless(tmp_path: Path, book: Codebook) -> None:
+    from board_lines import check_order, packet_sequence
+
+    payloads = {f"p{n}": random_symbols(2, 10, book, np.random.default_rng(n)) for n in range(4)}
+    leds = tmp_path / "leds.bin"
+    with Link(start_qemu(leds)) as link:
+        board = Board(link)
+        for symbols in payloads.values():
+            provision(board, Payload.of_symbols(symbols, book), Settings())
+            until = board.status().packets_sent + 5
+            while board.status().packets_sent < until:
+                pass
+        board.stop()
+        board.wait_dark()
+        assert board.status().state == State.DARK
+    played = Recording.read(leds).played()
+    assert (np.diff(played.ticks) == 2500).all()
+    sequence = packet_sequence(played, payloads, book)
+    assert check_order(sequence, dict.fromkeys(payloads, 2)) == list(payloads)
+
+
+def test_led_test_and_save_in_qemu(tmp_path: Path, book: Codebook) -> None:
+    leds = tmp_path / "leds.bin"
+    with Link(start_qemu(leds)) as link:
+        board = Board(link)
+        board.test_leds(0, 95, 1)
+        board.wait_dark()
+        payload = Payload.of_symbols(random_symbols(2, 10, book, np.random.default_rng(0)), book)
+        provision(board, payload, Settings(start=False))
+        assert board.save().save_sequence == 1
+        other = Payload.of_symbols(random_symbols(2, 10, book, np.random.default_rng(1)), book)
+        provision(board, other, Settings(start=False))
+        assert board.recall().slot == 0
+        assert board.holds(payload, 10_000, board.status())
+    rows = Recording.read(leds).rows
+    assert (np.unpackbits(rows[rows.any(1)], axis=1) == np.eye(96, dtype=np.uint8)).all()
+
+
+# -- the real part, as far as QEMU goes
+
+
+class Netduino:
+    """The STM32F405 image in QEMU: its line, its registers, and the log of writes QEMU has no device for."""
+
+    def __init__(self, folder: Path) -> None:
+        self.log = folder / "unimplemented.log"
+        self.process = subprocess.Popen(
+            [
+                *("qemu-system-arm", "-M", "netduinoplus2", "-display", "none", "-nodefaults"),
+                *("-kernel", str(build.arm_image("stm32f405-netduinoplus2"))),
+                *("-serial", f"unix:{folder / 'uart'},server=on,wait=off"),
+                *("-monitor", f"unix:{folder / 'monitor'},server=on,wait=off"),
+                *("-d", "unimp,guest_errors", "-D", str(self.log)),
+            ],
+            stdin=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        self.line = self.connect(folder / "uart")
+        self.monitor = self.connect(folder / "monitor")
+
+    def connect(self, path: Path) -> SocketTransport:
+        from firmware_host.errors import NoBoardError
+
+        for _ in range(200):
+            try:
+                return SocketTransport.connect(f"unix:{path}")
+            except NoBoardError:
+                time.sleep(0.05)
+        raise AssertionError("QEMU does not come up")
+
+    def register(self, address: int) -> int:
+        self.monitor.write(f"xp /1wx {address:#x}\n".encode())
+        text, end = "", time.monotonic() + 10.0
+        while not (found := re.search(rf"{address:016x}: 0x([0-9a-f]{{8}})", text)):
+            assert time.monotonic() < end, text
+            text += self.monitor.read(0.5).decode()
+        return int(found[1], 16)
+
+    def writes(self) -> list[tuple[str, int, int]]:
+        pattern = r"^(.+): unimplemented device write \(size 4, offset (0x[0-9a-f]+), value (0x[0-9a-f]+)\)"
+        found = re.findall(pattern, self.log.read_text(), re.M)
+        return [(name, int(offset, 16), int(value, 16)) for name, offset, value in found]
+
+    def close(self) -> None:
+        self.line.close()
+        self.monitor.close()
+        self.process.terminate()
+        self.process.wait()
+
+
+def test_stm32f405_register_writes(tmp_path: Path, book: Codebook) -> None:
+    netduino = Netduino(tmp_path)
+    try:
+        board = Board(Link(netduino.line))
+        assert board.about.hal.rstrip(b"\0") == b"stm32f405"
+        assert board.about.tick_hz == 14_000_000
+        boot = netduino.writes()
+
+        def at(device: str, offset: int, writes: list[tuple[str, int, int]]) -> list[int]:
+            return [v for d, o, v in writes if d == device and o == offset]
+
+        # dark comes first: output enable high before its pin drives, and nothing lights a LED before START
+        first_gpio = next(w for w in boot if w[0].startswith("GPIO"))
+        assert first_gpio == ("GPIOB", 0x18, 1)
+        assert 0x10000 not in at("GPIOB", 0x18, boot)
+        # crystal, PLL 8 MHz / 8 * 336 / 2, five wait states, APB1 / 4, APB2 / 2, switch
+        assert at("RCC", 0x00, boot) == [0x00010000, 0x01000000]
+        assert at("RCC", 0x04, boot) == [7 << 24 | 1 << 22 | 336 << 6 | 8]
+        assert at("Flash Int", 0x00, boot) == [0x705]
+        assert at("RCC", 0x08, boot)[0] == 5 << 10 | 4 << 13
+        assert at("RCC", 0x08, boot)[1] & 3 == 2
+        # SPI1 and TIM3 on PA5 PA6 PA7, USART1 on PA9 PA10, DAC on PA4
+        assert at("GPIOA", 0x20, boot) == [0x52500000]
+        assert at("GPIOA", 0x24, boot) == [0x00000770]
+        assert at("GPIOA", 0x00, boot)[0] == 3 << 8 | 2 << 10 | 2 << 12 | 2 << 14 | 2 << 18 | 2 << 20
+        # devices that QEMU has: 1 Mbit/s, SPI master 16 bits at 10.5 MHz
+        assert netduino.register(0x40011008) == 84
+        assert netduino.register(0x40013000) == 1 << 11 | 1 << 9 | 1 << 8 | 1 << 6 | 2 << 3 | 1 << 2
+
+        board.level(30)
+        assert at("DAC", 0x08, netduino.writes())[-1] == 30 * 4095 // 60
+        with pytest.raises(RefusedError, match="limit is 60"):
+            board.level(61)
+
+        payload = Payload.of_symbols(random_symbols(2, 10, book, np.random.default_rng(0)), book)
+        before = len(netduino.writes())
+        provision(board, payload, Settings())
+        assert board.status().state == State.PLAYING
+        run = netduino.writes()[before:]
+        timer = [(o, v) for d, o, v in run if d == "timer[0]" or d.lower().startswith("tim")]
+        dma = [(o, v) for d, o, v in run if d == "DMA2"]
+        assert dict(dma)[0x90] == 0x4001300C  # to SPI1's data register
+        assert dict(dma)[0x8C] == 12  # two rows of six words
+        control = [v for o, v in dma if o == 0x88]
+        assert control[0] == (
+            6 << 25 | 3 << 16 | 1 << 13 | 1 << 11 | 1 << 10 | 1 << 8 | 1 << 6 | 1 << 4 | 1 << 3
+        )
+        assert 0x20000000 <= dict(dma)[0x94] < 0x20020000
+        # TIM1: a slot of 2800 cycles (six a chip of 100 us), update -> DMA, enable as trigger; started last
+        assert (0x2C, 2799) in timer
+        assert (0x0C, 0x100) in timer
+        assert (0x04, 0x10) in timer
+        assert timer[-1] == (0x00, 1)
+        last = [i for i, w in enumerate(run) if w[0] == "DMA2"][-1]
+        starts = [i for i, w in enumerate(run) if (w[1], w[2]) == (0x00, 1) and w[0] != "DMA2"]
+        assert starts[-1] > last
+        # TIM3: a chip at 84 MHz, latch 1 us, started by TIM1
+        assert netduino.register(0x4000042C) == 8399
+        assert netduino.register(0x40000434) == 84
+        assert netduino.register(0x40000408) == 6
+        # the two rows begin dark, and the outputs stay off until a dark row is latched
+        words = dict(dma)[0x94]
+        assert [netduino.register(words + 4 * i) for i in range(6)] == [0] * 6
+        assert 0x10000 not in at("GPIOB", 0x18, run)
+        board.blank()
+        off = netduino.writes()[before + len(run) :]
+        assert 1 in at("GPIOB", 0x18, off)
+        assert 0 in [v for d, o, v in off if d == "DMA2" and o == 0x88]
+    finally:
+        netduino.close()
