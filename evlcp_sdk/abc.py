@@ -1,8 +1,8 @@
 """The roles: one abstract class each, filled by plugins.
 
 An algorithm is a frozen dataclass whose fields are its parameters, each with a default, a unit in its name
-and a description. Pydantic checks the fields when a configuration is loaded; the dataclass itself stays plain,
-picklable and JSON-round-trippable. `compile` precomputes and returns a pure function over arrays; only
+and a description. Pydantic checks the fields when a configuration is loaded; the dataclass itself stays
+plain, picklable and JSON-round-trippable. `compile` precomputes and returns a pure function over arrays; only
 synchronization keeps state, and that state is explicit.
 """
 

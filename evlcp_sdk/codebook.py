@@ -190,7 +190,8 @@ class Codebook:
         digest = ", ".join(f"0x{b:02x}u" for b in bytes.fromhex(self.digest))
         return "\n".join(
             [
-                f"/* Codebook of air interface {AIR_INTERFACE}, profile {self.profile}; generated, do not edit. */",
+                f"/* Codebook of air interface {AIR_INTERFACE}, profile {self.profile}."
+                " Generated, do not edit. */",
                 "#ifndef EVLCP_CODEBOOK_H",
                 "#define EVLCP_CODEBOOK_H",
                 "#include <stdint.h>",

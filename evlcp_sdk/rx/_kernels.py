@@ -72,7 +72,7 @@ def score_pixels(
             continue
         run = t_us[i] - (state >> 8)
         score = (state >> 1) & 127
-        score += 2 * (np.int64(run >= shortest) & np.int64(run < single)) - 3 * np.int64(run >= double)
+        score += 2 * (np.int64(run >= shortest) & np.int64(run < single)) - 2 * np.int64(run >= double)
         score = min(max(score, 0), 40)
         pixels[v, u] = (t_us[i] << 8) | (score << 1) | polarity
         if score >= min_score:

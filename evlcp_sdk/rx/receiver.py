@@ -14,6 +14,7 @@ from evlcp_sdk.config import Link
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.rx.chips import polarity_sums
 from evlcp_sdk.rx.payload import PacketAssembler
+from evlcp_sdk.rx.presence import clusters_in_place
 from evlcp_sdk.rx.regions import RegionTracker, Track
 from evlcp_sdk.types import Events, Frame, Packet, SyncLock
 
@@ -36,8 +37,10 @@ class _Transmitter:
 
     Attributes:
         number: Transmitter number, None before the first lock.
-        lock: The newest lock; `packet` is the number of its packet, 0 the first with a frame here.
-        frame: Next frame to decode, counted from packet 0.
+        lock: The newest lock.
+        packet: Number of the lock's packet, counted from the first that may have a frame here.
+        frame: Next frame to decode, counted from that packet's first.
+        first: Number of the first packet that had a frame, None before.
     """
 
     track: Track
@@ -47,6 +50,7 @@ class _Transmitter:
     lock: SyncLock | None = None
     packet: int = 0
     frame: int = 0
+    first: int | None = None
 
 
 class Receiver:
@@ -81,6 +85,7 @@ class Receiver:
         self._separate = link.algorithm("separation").compile(link.codebook)
         self._decode = link.algorithm("decoding").compile(link.codebook)
         self._measure = link.algorithm("ranging").compile(link.camera, link.bar)
+        self._centres_m = link.bar.cluster_centres_m()
         self._tracker = RegionTracker(link.regions, link.camera, link.packet.chip_us)
         self._transmitters: dict[int, _Transmitter] = {}
         self._released: list[_Transmitter] = []
@@ -264,11 +269,6 @@ class Receiver:
         transmitter.frame = (transmitter.packet - back) * packet.frames
         while self._frame_start_us(transmitter, transmitter.frame) < earliest:
             transmitter.frame += 1
-        if old is None:
-            # Packet 0 is the one of the first frame.
-            skip = transmitter.frame // packet.frames
-            transmitter.packet -= skip
-            transmitter.frame -= skip * packet.frames
 
     def _inherit(self, transmitter: _Transmitter, lock: SyncLock) -> bool:
         """Go on as a transmitter that was lost from sight, if the packets stand on its grid."""
@@ -283,7 +283,7 @@ class Receiver:
             apart = (lock.packet_t_us - lost.lock.packet_t_us) / period
             if abs(apart - round(apart)) * packet.packet_chips < 1:
                 transmitter.number, transmitter.frame = lost.number, lost.frame
-                transmitter.packet = lost.packet + round(apart)
+                transmitter.packet, transmitter.first = lost.packet + round(apart), lost.first
                 transmitter.assembler, lost.assembler = lost.assembler, transmitter.assembler
                 transmitter.lock, lost.lock = lock, None
                 return True
@@ -332,17 +332,19 @@ class Receiver:
         sums = polarity_sums(pieces, lock, start_us, (x, y), size)
         presence = self._separate(sums[: packet.pilot_chips])
         self._tell("separation", presence, _lap(clock))
-        seen = presence.selected.any((1, 2)).mean()
-        if seen < self._link.regions.min_clusters_share:
+        in_place = clusters_in_place(presence, self._centres_m)
+        if in_place < self._link.regions.min_clusters_share * len(self._centres_m):
             return None
         soft = self._decode(presence, sums[packet.pilot_chips :])
         self._tell("decoding", soft, _lap(clock))
         distance = self._measure(presence.pixels)
         self._tell("ranging", distance, _lap(clock))
         number, index = divmod(transmitter.frame, packet.frames)
+        if transmitter.first is None:
+            transmitter.first = number
         frame = Frame(
             transmitter=transmitter.number,
-            packet=number,
+            packet=number - transmitter.first,
             frame=index,
             t_us=start_us,
             soft=soft,

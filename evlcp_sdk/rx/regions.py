@@ -3,8 +3,9 @@
 The frequency filter works per pixel on runs: the time between two changes of polarity. A code of the air
 interface has runs of one or two chips only, as many of the one as of the other on average. A lamp on AC mains
 or a PWM lamp of up to 2 kHz changes polarity every 250 us or slower, that is after 2.5 chips; a moving edge
-and a hot pixel, slower still. So a run of one chip raises a pixel's score, a run longer than two chips lowers
-it, and a run of two chips, which both kinds may have, leaves it. One pass, one number a pixel.
+and a hot pixel, slower still. So a run of one chip raises a pixel's score by two, a run longer than two chips
+lowers it by two, and a run of two chips, which both kinds may have, leaves it: a lamp of short pulses gains
+nothing on balance. One pass, one number a pixel.
 """
 
 from bisect import bisect_left

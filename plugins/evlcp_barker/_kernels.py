@@ -33,7 +33,9 @@ def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, known: Arra
 def correlate(counts: Array, chips: Array, steps: int, min_events: int, rho: Array) -> float:
     """Normalised correlation of signed counts in windows of one chip (`steps` bins) with chips (-1, +1).
 
-    Lags at which fewer than `min_events` were counted get 0. Returns the largest.
+    The lesser of two norms: by the number of events, which is small unless all clusters blink in phase, and
+    by the length of the vector of chips (a cosine), which is small where few chips hold all events, as in
+    a flash. Lags at which fewer than `min_events` were counted get 0. Returns the largest.
     """
     bins = counts.shape[1]
     top = 0.0
@@ -50,9 +52,13 @@ def correlate(counts: Array, chips: Array, steps: int, min_events: int, rho: Arr
         if seen < min_events:
             continue
         fit = 0.0
+        power = 0.0
         for c in range(chips.size):
             at = lag + steps * c
-            fit += chips[c] * (signed[at + steps] - signed[at])
-        rho[lag] = fit / seen
+            chip = signed[at + steps] - signed[at]
+            fit += chips[c] * chip
+            power += chip * chip
+        if fit > 0:
+            rho[lag] = min(fit / seen, fit / np.sqrt(chips.size * power))
         top = max(top, rho[lag])
     return top

@@ -42,7 +42,7 @@ class BarkerSync(Synchronization):
             gt=0,
             lt=1,
             description="Normalised correlation that makes a preamble; 16 clusters of random data give"
-            " 0.07 rms, a preamble above 0.7.",
+            " 0.07 rms, a preamble 0.7 or more.",
         ),
     ] = 0.5
     min_events: Annotated[int, Field(ge=26, description="Events in a preamble that count as heard.")] = 100
@@ -108,8 +108,9 @@ class BarkerSynchronizer:
         guard = n * _GUARD_CHIPS
         until_bin = int(until_us // self._bin_us)
         if state.first_bin is None:
-            first = int(t_us[0] // self._bin_us) if len(t_us) else until_bin
-            state = replace(state, first_bin=first, next_bin=first + guard)
+            # A preamble begins with a dark chip: the first event may already be the edge at its end.
+            first = (int(t_us[0] // self._bin_us) if len(t_us) else until_bin) - guard
+            state = replace(state, first_bin=first, next_bin=first)
         assert state.first_bin is not None
         bins = max(until_bin - state.first_bin, state.counts.shape[1])
         counts = np.empty((2, bins))
@@ -135,7 +136,7 @@ class BarkerSynchronizer:
     def _peaks(self, rho: NDArray[np.float64], lo: int, guard: int) -> list[int]:
         """Lags from `lo` on that correlate best within `guard` on both sides; the first of equals."""
         high = lo + np.flatnonzero(rho[lo : len(rho) - guard] >= self._spec.min_correlation)
-        return [int(lag) for lag in high if np.argmax(rho[lag - guard : lag + guard + 1]) == guard]
+        return [lag for lag in high.tolist() if lag == _first_maximum(rho, lag - guard, lag + guard + 1)]
 
     def _refine(self, lag: int, counts: NDArray[np.float64], first_bin: int, quality: float) -> _Heard:
         """Times of one preamble, for positive and negative events apart, us."""
@@ -213,3 +214,8 @@ class BarkerSynchronizer:
             delay_off_us=apart - onset,
             quality=heard[-1].quality,
         )
+
+
+def _first_maximum(values: NDArray[np.float64], start: int, stop: int) -> int:
+    start = max(start, 0)
+    return start + int(np.argmax(values[start:stop]))

@@ -208,7 +208,7 @@ def _quantile(ordered: Array, share: float) -> float:
 
 @njit(cache=True, nogil=True)
 def middle_shifts(middle: Array, first: Array, second: Array, apart_m: Array, shifts: Array) -> float:
-    """Whole-pixel shifts between the middles of pairs, `shifts` (pairs, 2); return their median px a metre."""
+    """Whole-pixel shifts between the middles of pairs, `shifts` (pairs, 2); their median in px a metre."""
     scale = np.empty(first.size)
     for q in range(first.size):
         for axis in range(2):

@@ -1,0 +1,265 @@
+"""The whole receiver on ideal recordings: what it must decode, and the laws it keeps."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from evlcp_sdk.config import Link, load_link
+from evlcp_sdk.errors import StreamError
+from evlcp_sdk.hookspecs import hookimpl
+from evlcp_sdk.registry import Registry
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.types import Events, Packet
+from tests.synthetic import Bar, events_of, lamp, merged, noise, random_symbols
+
+LINK = load_link()
+
+
+def received(link: Link, events: Events, pieces: Iterator[slice] | None = None) -> list[Packet]:
+    receiver = Receiver(link)
+    packets: list[Packet] = []
+    for piece in pieces or [slice(None)]:
+        packets += receiver.feed(events[piece])
+    return packets + receiver.close()
+
+
+def rows(packets: list[Packet]) -> list[tuple[Any, ...]]:
+    """Everything that the receiver says, to the last bit."""
+    return [
+        (
+            *(f.transmitter, f.packet, f.frame, f.t_us, f.x_px, f.y_px, repr(f.range), p.t_us, p.chip_us),
+            *(tuple(f.soft.symbols.tolist()), f.soft.llr.tobytes(), f.soft.quality),
+        )
+        for p in packets
+        for f in p.frames
+    ]
+
+
+def check_symbols(packets: list[Packet], bar: Bar, link: Link, *, t0_us: int = 0) -> int:
+    """Compare every frame with the sent one that began at its time; return how many."""
+    chip_us = link.packet.chip_us / (1 + bar.ppm * 1e-6)
+    frames = [f for p in packets for f in p.frames]
+    for f in frames:
+        chip = (f.t_us - t0_us - bar.start_us) / chip_us
+        packet = int((chip - 13) // link.packet.packet_chips)
+        index = round((chip - packet * link.packet.packet_chips - 26) / link.packet.frame_chips)
+        late_us = f.t_us - t0_us - bar.start_us
+        late_us -= (packet * link.packet.packet_chips + link.packet.frame_start_chip(index)) * chip_us
+        assert 0 < late_us < 60, "the first event of an edge comes 20 us late"
+        assert f.soft.symbols.tolist() == bar.symbols[packet, index].tolist()
+    return len(frames)
+
+
+@pytest.mark.parametrize("profile", ["wh4x2", "wh8", "raw8"])
+@pytest.mark.parametrize("ppm", [-100, 0, 100])
+def test_every_profile_with_both_clocks_off(profile: str, ppm: float) -> None:
+    link = load_link(overrides=[f"modulation.id={profile}"])
+    bar = Bar(random_symbols(link, 5), ppm=ppm)
+    packets = received(link, events_of(link, bar))
+    assert check_symbols(packets, bar, link) == 50
+    assert [p.packet for p in packets] == [0, 1, 2, 3, 4]
+    # Two packets of 2 us jitter tell the rate to 40 ppm, five to 20.
+    assert (link.packet.chip_us / packets[-1].chip_us - 1) * 1e6 == pytest.approx(ppm, abs=20)
+
+
+def test_distance_is_that_of_the_spacing() -> None:
+    bar = Bar(random_symbols(LINK, 3), cluster_px=9.0)
+    ranges = [f.range for p in received(LINK, events_of(LINK, bar)) for f in p.frames]
+    want = LINK.camera.focal_px * 0.06 / 9.0
+    # Whole pixels, still bar: every cluster's map is the same, so the shift is exact.
+    assert_allclose([r.distance_m for r in ranges], want, rtol=2e-3)
+    assert all(r.sigma_m < 0.005 * want for r in ranges)
+
+
+def test_frames_before_the_first_preamble_are_decoded() -> None:
+    bar = Bar(random_symbols(LINK, 3), start_us=-15_000.0)
+    packets = received(LINK, events_of(LINK, bar))
+    # Of the packet that began before the recording, the frames from chip 154 = 26 + 4 * 32 on.
+    assert [f.frame for f in packets[0].frames] == [4, 5, 6, 7, 8, 9]
+    assert check_symbols(packets, bar, LINK) == 26
+
+
+def test_the_centre_is_followed() -> None:
+    # 16 px at 15 Hz: up to 1.5 px/ms.
+    bar = Bar(random_symbols(LINK, 4), shake_px=16, shake_hz=15)
+    packets = received(LINK, events_of(LINK, bar))
+    assert check_symbols(packets, bar, LINK) == 40
+    for f in (f for p in packets for f in p.frames):
+        x, y = bar.centre(np.array([f.t_us + 850]))
+        assert f.x_px == pytest.approx(x[0] - 0.5, abs=1.0)
+        assert f.y_px == pytest.approx(y[0] - 0.5, abs=1.5)
+
+
+def test_two_bars_and_lamps() -> None:
+    one = Bar(random_symbols(LINK, 4, 1), ppm=40)
+    two = Bar(random_symbols(LINK, 4, 2), x_px=900, y_px=250, cluster_px=5, ppm=-25, start_us=11_234)
+    lamps = [
+        lamp(600, 300, 12, hz, 150_000, duty=duty) for hz, duty in ((100, 0.5), (1000, 0.2), (2000, 0.5))
+    ]
+    events = merged(events_of(LINK, one), events_of(LINK, two), *lamps, noise(50_000, 150_000))
+    packets = received(LINK, events)
+    by_number = [[p for p in packets if p.frames[0].transmitter == n] for n in (0, 1)]
+    assert check_symbols(by_number[0], one, LINK) == 40
+    assert check_symbols(by_number[1], two, LINK) == 40
+    assert len(packets) == 8
+
+
+@pytest.mark.parametrize("hz", [100, 120, 400, 1000, 2000])
+@pytest.mark.parametrize("duty", [0.1, 0.5])
+def test_a_lamp_is_no_transmitter(hz: float, duty: float) -> None:
+    receiver = Receiver(LINK)
+    assert receiver.feed(merged(lamp(500, 300, 15, hz, 120_000, duty=duty), noise(200_000, 120_000))) == []
+    assert receiver.close() == []
+    assert receiver.counts["regions_opened"] == 0
+
+
+def test_random_blinking_at_the_chip_rate_is_no_transmitter() -> None:
+    rng = np.random.default_rng(5)
+    chips = np.repeat(rng.integers(0, 2, (1500, 1)), 64 * 4, axis=1)
+    edges = np.diff(chips, axis=0, prepend=0)
+    when, pixel = np.nonzero(edges)
+    t = when * 100 + rng.integers(20, 60, len(when))
+    first = np.argsort(t, kind="stable")
+    columns = t, 300 + pixel % 4, 200 + pixel // 4, edges[when, pixel] > 0
+    assert received(LINK, Events.of(*(c[first] for c in columns))) == []
+
+
+def test_a_dark_cluster_costs_only_itself() -> None:
+    bar = Bar(random_symbols(LINK, 2))
+    events = events_of(LINK, bar)
+    top = 350.7 - 64 + 5 * 8
+    lit = (events.y < np.floor(top)) | (events.y > np.ceil(top + 8))
+    frames = [f for p in received(LINK, events[lit]) for f in p.frames]
+    assert len(frames) == 20
+    for f, want in zip(frames, bar.symbols.reshape(-1, 16), strict=True):
+        assert np.delete(f.soft.symbols, 5).tolist() == np.delete(want, 5).tolist()
+        assert f.range.distance_m == pytest.approx(LINK.camera.focal_px * 0.06 / 8, rel=5e-3)
+
+
+def test_a_bar_lost_from_sight_goes_on_as_the_same() -> None:
+    bar = Bar(random_symbols(LINK, 6), ppm=30)
+    events = events_of(LINK, bar)
+    hidden = (events.t_us >= 80_000) & (events.t_us < 150_000)
+    moved = Events.of(events.t_us, events.x + np.where(events.t_us < 150_000, 0, 70), events.y, events.p)
+    packets = received(LINK, moved[~hidden])
+    assert {f.transmitter for p in packets for f in p.frames} == {0}
+    numbers = [p.packet for p in packets]
+    assert numbers == sorted(set(numbers))
+    assert numbers[0] == 0
+    assert numbers[-1] == 5
+    # Packets 0 and 1, one frame of 2 that ends as the bar vanishes, 8 of packet 4, and packet 5.
+    assert check_symbols(packets, bar, LINK) == 20 + 1 + 8 + 10
+
+
+def test_a_transmitter_that_starts_anew_is_followed() -> None:
+    before, after = Bar(random_symbols(LINK, 3, 1)), Bar(random_symbols(LINK, 5, 2), start_us=127_777)
+    events = merged(events_of(LINK, before), events_of(LINK, after))
+    packets = received(LINK, events)
+    # One preamble off the old grid may be chance; the second one is believed.
+    late = [p for p in packets if p.t_us > after.start_us + 30_000]
+    assert check_symbols(late, after, LINK) == 40
+    numbers = [p.packet for p in packets]
+    assert numbers == sorted(set(numbers)), "no packet number twice"
+
+
+STREAM = merged(
+    events_of(LINK, Bar(random_symbols(LINK, 3, 3), shake_px=5, ppm=35), seed=3),
+    events_of(LINK, Bar(random_symbols(LINK, 3, 4), x_px=800, start_us=9000, cluster_px=5), seed=4),
+    noise(30_000, 130_000),
+)
+WHOLE = rows(received(LINK, STREAM))
+
+
+@settings(deadline=None, max_examples=12)
+@given(st.lists(st.integers(0, len(STREAM)), max_size=40))
+def test_any_split_gives_the_same(cuts: list[int]) -> None:
+    bounds = sorted({0, len(STREAM), *cuts})
+    assert rows(received(LINK, STREAM, (slice(a, b) for a, b in pairwise(bounds)))) == WHOLE
+
+
+@pytest.mark.parametrize("size", [1000, 4096, 65_536])
+def test_even_pieces_give_the_same(size: int) -> None:
+    pieces = (slice(a, a + size) for a in range(0, len(STREAM), size))
+    assert rows(received(LINK, STREAM, pieces)) == WHOLE
+    assert len(WHOLE) == 60
+
+
+def test_the_clock_may_begin_anywhere() -> None:
+    later = Events.of(STREAM.t_us + 16_777_000, STREAM.x, STREAM.y, STREAM.p)
+    shifted = rows(received(LINK, later))
+    assert [r[9] for r in shifted] == [r[9] for r in WHOLE]
+    assert_allclose([r[3] - 16_777_000 for r in shifted], [r[3] for r in WHOLE], atol=10)
+
+
+def test_what_is_dropped_is_counted() -> None:
+    receiver = Receiver(LINK)
+    receiver.feed(Events.of([10, 20, 15, 30], [1, 1280, 1, 1], [1, 1, 1, 720], [0, 1, 0, 1]))
+    receiver.feed(Events.of([9, 40], [1, 1], [1, 1], [0, 1]))
+    assert receiver.counts["events"] == 6
+    assert receiver.counts["dropped_off_sensor"] == 2
+    assert receiver.counts["dropped_time_backward"] == 1
+    receiver.close()
+    with pytest.raises(StreamError, match="closed"):
+        receiver.feed(Events.empty())
+
+
+def test_a_long_gap_costs_nothing() -> None:
+    bar = Bar(random_symbols(LINK, 2))
+    first = events_of(LINK, bar)
+    hour = 3_600_000_000
+    packets = received(LINK, Events.concat([first, events_of(LINK, bar, t0_us=hour)]))
+    assert [f.transmitter for p in packets for f in p.frames] == [0] * 20 + [1] * 20
+    assert check_symbols(packets[2:], bar, LINK, t0_us=hour) == 20
+
+
+def test_memory_does_not_grow() -> None:
+    receiver = Receiver(LINK)
+    bar = Bar(random_symbols(LINK, 2), cluster_px=4, width_px=2)
+    period = 2 * LINK.packet.packet_chips * 100
+    for n in range(12):
+        receiver.feed(events_of(LINK, bar, t0_us=n * period))
+    (track,) = receiver._tracker.tracks
+    assert len(track.blocks) < 10
+    assert len(track.positions) < 10
+
+
+def test_probes_see_every_stage() -> None:
+    class Probe:
+        def __init__(self) -> None:
+            self.seen: dict[str, int] = {}
+
+        @hookimpl
+        def evlcp_stage_finished(self, stage: str, value: object, elapsed_s: float) -> None:
+            assert value is not None
+            assert elapsed_s >= 0
+            self.seen[stage] = self.seen.get(stage, 0) + 1
+
+    probe = Probe()
+    receiver = Receiver(LINK, Registry.load(probe).hook)
+    receiver.feed(events_of(LINK, Bar(random_symbols(LINK, 2))))
+    receiver.close()
+    assert probe.seen["frame"] == probe.seen["ranging"] == probe.seen["decoding"] == 20
+    assert probe.seen["synchronization"] == 2
+    assert probe.seen["separation"] >= 20
+    assert probe.seen["regions"] >= 60
+
+
+def test_other_codes_work() -> None:
+    link = load_link(overrides=["pilots.id=barker13", "bar.rows=78", "air.frames_per_packet=4"])
+    assert link.packet.frame_chips == 26 + 16
+    bar = Bar(random_symbols(link, 4))
+    packets = received(link, events_of(link, bar))
+    got = [f.soft.symbols.tolist() for p in packets for f in p.frames]
+    assert got == bar.symbols.reshape(-1, 13).tolist()
+
+
+def test_another_chip_rate_works() -> None:
+    link = load_link(overrides=["air.chip_rate_hz=5000"])
+    bar = Bar(random_symbols(link, 3))
+    assert check_symbols(received(link, events_of(link, bar)), bar, link) == 30

@@ -1,0 +1,116 @@
+"""Finding and following blinking regions."""
+
+from collections.abc import Iterable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.config import RegionSpec, load_link
+from evlcp_sdk.geometry import CameraModel
+from evlcp_sdk.rx.regions import RegionTracker, Track
+from evlcp_sdk.types import Events
+from tests.synthetic import Bar, events_of, lamp, merged, noise, random_symbols
+
+LINK = load_link()
+STEP_US = RegionSpec().block_us
+
+
+def tracker() -> RegionTracker:
+    return RegionTracker(RegionSpec(), CameraModel(), LINK.packet.chip_us)
+
+
+def steps(events: Events, until_us: int) -> Iterable[tuple[int, Events]]:
+    bounds = np.searchsorted(events.t_us, np.arange(0, until_us + 1, STEP_US))
+    return ((n * STEP_US, events[a:b]) for n, (a, b) in enumerate(pairwise(bounds)))
+
+
+def followed(events: Events, until_us: int) -> dict[int, list[Track]]:
+    """The tracks of each step, by its start."""
+    regions = tracker()
+    return {start: regions.step(start, part) for start, part in steps(events, until_us)}
+
+
+def test_a_bar_is_found_within_three_steps_and_measured() -> None:
+    bar = Bar(random_symbols(LINK, 1), start_us=3000)
+    tracks = followed(events_of(LINK, bar), 30_000)
+    first = next(start for start, found in tracks.items() if found)
+    assert first <= 3000 + 3 * STEP_US
+    (track,) = tracks[29_000]
+    assert track.latest.x_px == pytest.approx(bar.x_px - 0.5, abs=0.6)
+    assert track.latest.y_px == pytest.approx(bar.y_px - 0.5, abs=0.6)
+    assert track.latest.height_px == pytest.approx(128, abs=1.5)
+    assert track.latest.width_px == bar.width_px
+
+
+def test_events_from_before_it_was_found_are_kept() -> None:
+    bar = Bar(random_symbols(LINK, 1), start_us=3000)
+    events = events_of(LINK, bar)
+    tracks = followed(events, 20_000)
+    (track,) = tracks[19_000]
+    kept = sum(len(e) for _, e in track.blocks)
+    assert kept == np.searchsorted(events.t_us, 20_000)
+
+
+@pytest.mark.parametrize(("shake_px", "shake_hz"), [(16, 15), (4, 60)])
+def test_a_shaking_bar_is_followed(shake_px: float, shake_hz: float) -> None:
+    """1.5 px/ms is the most that the paper has seen."""
+    bar = Bar(random_symbols(LINK, 3), shake_px=shake_px, shake_hz=shake_hz, start_us=0)
+    tracks = followed(events_of(LINK, bar), 100_000)
+    assert {t.id for found in tracks.values() for t in found} == {0}
+    (track,) = tracks[99_000]
+    at = np.arange(5000.0, 99_000.0, 500.0)
+    (x, y), (true_x, true_y) = track.at(at), bar.centre(at)
+    assert np.sqrt(np.mean((x - true_x + 0.5) ** 2)) < 0.6
+    assert np.sqrt(np.mean((y - true_y + 0.5) ** 2)) < 0.8
+
+
+def test_two_bars_are_two_regions() -> None:
+    one, two = Bar(random_symbols(LINK, 1)), Bar(random_symbols(LINK, 1), x_px=450, start_us=5300)
+    tracks = followed(merged(events_of(LINK, one), events_of(LINK, two)), 30_000)
+    assert sorted(round(t.latest.x_px) for t in tracks[29_000]) == [400, 450]
+
+
+def test_a_bar_in_two_pieces_is_one_region() -> None:
+    bar = Bar(random_symbols(LINK, 1))
+    events = events_of(LINK, bar)
+    middle = (events.y >= 345) & (events.y < 355)
+    tracks = followed(events[~middle], 30_000)
+    (track,) = tracks[29_000]
+    assert track.latest.height_px == pytest.approx(128, abs=1.5)
+
+
+def test_what_fades_is_released() -> None:
+    bar = Bar(random_symbols(LINK, 1), start_us=0)
+    ends = 34_600
+    regions = tracker()
+    events = events_of(LINK, bar)
+    alive = {
+        start: [not t.released for t in regions.step(start, part)]
+        for start, part in steps(events, ends + RegionSpec().fade_us + 5000)
+    }
+    (gone,) = [start for start, tracks in alive.items() if tracks == [False]]
+    assert gone == pytest.approx(ends + RegionSpec().fade_us, abs=2 * STEP_US)
+    assert alive[gone + STEP_US] == []
+
+
+@pytest.mark.parametrize("hz", [100, 300, 1000, 2000])
+@pytest.mark.parametrize("duty", [0.05, 0.2, 0.5])
+def test_lamps_and_noise_are_no_regions(hz: float, duty: float) -> None:
+    tracks = followed(merged(lamp(300, 300, 20, hz, 60_000, duty=duty), noise(500_000, 60_000)), 60_000)
+    assert not any(tracks.values())
+
+
+def test_a_moving_edge_is_no_region() -> None:
+    """A bright post that crosses the image at 3 px/ms: each pixel sees it come and go once."""
+    column, row = np.meshgrid(np.arange(100, 400), np.arange(100, 500))
+    comes, goes = (column - 100) * 333, (column - 100) * 333 + 3000
+    t = np.concatenate([comes.ravel() + d for d in (0, 20, 40)] + [goes.ravel() + d for d in (0, 20, 40)])
+    order = np.argsort(t, kind="stable")
+    events = Events.of(
+        t[order],
+        np.tile(column.ravel(), 6)[order],
+        np.tile(row.ravel(), 6)[order],
+        np.repeat([1, 0], 3 * column.size)[order],
+    )
+    assert not any(followed(events, 100_000).values())
