@@ -339,16 +339,55 @@ def profiles_header() -> str:
     return "\n".join([*out, "};", "#endif", ""])
 
 
+_MARK = "<!-- What follows is generated from protocol.toml by firmware_host.generate. -->\n"
+
+
+def markdown(definition: dict[str, Any]) -> str:
+    """The messages and numbers as Markdown tables."""
+    out = ["", "## Messages", ""]
+    out += ["| type | message | kind | meaning |", "|---|---|---|---|"]
+    for m, _, _ in _messages(definition):
+        out.append(f"| 0x{m['type']:02x} | [{m['name'].upper()}](#{m['name']}) | {m['kind']} | {m['doc']} |")
+    for m, request, reply in _messages(definition):
+        out += ["", f"### {m['name'].upper()}", "", m["doc"], ""]
+        if not request and not reply:
+            out.append("Request and reply are empty.")
+            continue
+        out += ["| | field | type | meaning |", "|---|---|---|---|"]
+        for kind, fields in (("request", request), ("reply", reply)):
+            for f in fields:
+                many = f"[{f.count}]" if f.count > 1 else ""
+                rest = ", the rest" if f.base == "bytes" and not f.count else ""
+                out.append(f"| {kind} | `{f.name}` | {f.base}{many}{rest} | {f.doc} |")
+    for name, table in definition["enums"].items():
+        out += [
+            "",
+            f"## Numbers of {name}",
+            "",
+            table["doc"],
+            "",
+            "| value | name | meaning |",
+            "|---|---|---|",
+        ]
+        out += [f"| {e['value']} | {k.upper()} | {e['doc']} |" for k, e in table.items() if k != "doc"]
+    return "\n".join([*out, ""])
+
+
 def generated_files() -> dict[Path, str]:
     """Every generated file and what it should hold."""
     definition = tomllib.loads((HERE / "protocol.toml").read_text())
     generated = HERE / "firmware" / "generated"
-    return {
+    files = {
         HERE / "messages.py": python_module(definition),
         generated / "protocol.h": c_header(definition),
         generated / "codebook.h": codebook_of("wh4x2").to_c(),
         generated / "profiles.h": profiles_header(),
     }
+    page = HERE.parent / "docs" / "protocol.md"
+    if page.exists():  # in a checkout; an installed package has no docs
+        head = page.read_text().partition(_MARK)[0]
+        files[page] = head + _MARK + markdown(definition)
+    return files
 
 
 def main(arguments: list[str] | None = None) -> int:

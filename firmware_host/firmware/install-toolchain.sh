@@ -7,7 +7,8 @@ packages=""
 need() {
     command -v "$1" >/dev/null 2>&1 || packages="$packages $2"
 }
-need cc gcc
+need cc "gcc libc6-dev"
+need c++ g++
 need make make
 need arm-none-eabi-gcc gcc-arm-none-eabi
 need qemu-system-arm qemu-system-arm

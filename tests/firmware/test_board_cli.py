@@ -5,6 +5,7 @@ import os
 import pty
 import random
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -21,6 +22,28 @@ from firmware_host.payload import random_symbols
 from firmware_host.recording import Recording
 
 EVLCP = [sys.executable, "-c", "from evlcp_sdk.cli.main import main; main()"]
+
+
+def test_qemu_in_the_foreground(cli, needs, tmp_path: Path) -> None:
+    needs("qemu-system-arm", "arm-none-eabi-gcc")
+    port, leds, out = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin", tmp_path / "out.npy"
+    emulated = Emulated("qemu", "--listen", port, "--leds", leds)
+    assert emulated.said == f"listening on {port}\n"
+    for _ in range(100):
+        if (tmp_path / "board").exists():
+            break
+        time.sleep(0.05)
+    done = cli("board", "program", "--random", 3, "--seed", 2, "--port", port)
+    assert done.returncode == 0, done.stderr
+    assert cli("board", "verify", "--random", 3, "--seed", 2, "--port", port).returncode == 0
+    assert cli("board", "stop", "--port", port).returncode == 0
+    assert emulated.end() == 0
+    assert cli("board", "leds", leds, "--chips", out).returncode == 0
+    frames = tmp_path / "frames.npy"
+    cli("tx", "frames", "--random", 3, "--seed", 2, "--chips", frames)
+    played, expected = np.load(out), np.load(frames)
+    assert len(played) >= 346
+    assert (played == np.resize(expected, played.shape)).all()
 
 
 class Emulated:
@@ -183,9 +206,11 @@ def test_pty_and_tcp(cli, tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert cli("board", "verify", "--random", 64, "--port", tmp_path / "tty").returncode == 0
     assert emulated.end() == 0
-    emulated = Emulated("native", "--listen", "tcp:127.0.0.1:47391")
-    assert cli("board", "hello", "--port", "tcp:127.0.0.1:47391").returncode == 0
-    assert cli("board", "hello", "--port", "socket://127.0.0.1:47391").returncode == 0
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        place = f"127.0.0.1:{free.getsockname()[1]}"
+    emulated = Emulated("native", "--listen", f"tcp:{place}")
+    assert cli("board", "hello", "--port", f"tcp:{place}").returncode == 0
+    assert cli("board", "hello", "--port", f"socket://{place}").returncode == 0
     assert emulated.end() == 0
 
 

@@ -216,9 +216,10 @@ static enum evlcp_status on_commit(struct evlcp *e, struct exchange *x)
     struct evlcp_commit_request request;
     evlcp_commit_request_get(x->in, &request);
     uint8_t active = atomic_load(&e->banks.active);
+    uint8_t pending = atomic_load(&e->banks.pending);
     bool held = request.bank < EVLCP_BANKS && evlcp_banks_held(&e->banks, request.bank);
     /* Another bank waits for its packet boundary. */
-    if (atomic_load(&e->banks.pending) != EVLCP_NO_BANK && !held)
+    if (pending != EVLCP_NO_BANK && pending != request.bank)
         return EVLCP_STATUS_BUSY;
     /* The chip timer is not changed while it runs: a chip of another length would be torn. */
     if (running(e) && e->setup.ticks_per_chip != e->banks.plan[active].ticks_per_chip) {
@@ -321,7 +322,7 @@ static enum evlcp_status on_status(struct evlcp *e, struct exchange *x)
     evlcp_copy(reply.open_leds, e->health.open_leds, sizeof reply.open_leds);
     reply.watchdog = e->watch.action;
     reply.watchdog_ms = e->watch.timeout_ms;
-    reply.silence_ms = e->watch.silence_ms;
+    reply.silence_ms = hal_millis() - e->watch.heard_ms;
     reply.uptime_ms = hal_millis();
     evlcp_status_reply_put(x->out, &reply);
     x->out_length = EVLCP_STATUS_REPLY_BYTES;
@@ -499,9 +500,7 @@ static enum evlcp_status controlled(struct evlcp *e, const struct evlcp_datagram
 
 static void heard(struct evlcp *e)
 {
-    uint32_t now = hal_millis();
-    e->watch.silence_ms = now - e->watch.heard_ms;
-    e->watch.heard_ms = now;
+    e->watch.heard_ms = hal_millis();
     e->watch.fired = false;
     atomic_store(&e->player.want_idle, false);
 }

@@ -20,7 +20,6 @@ struct evlcp_watch {
     uint8_t action;
     uint32_t timeout_ms;
     uint32_t heard_ms;
-    uint32_t silence_ms; /* between the last two requests */
     bool fired;
 };
 

@@ -1,4 +1,4 @@
-/* Codebook of air interface 1, profile wh4x2; generated, do not edit. */
+/* Codebook of air interface 1, profile wh4x2. Generated, do not edit. */
 #ifndef EVLCP_CODEBOOK_H
 #define EVLCP_CODEBOOK_H
 #include <stdint.h>

@@ -369,6 +369,8 @@ static void test_banks_are_held(void)
     EXPECT(ask_status(&h).pending_bank == EVLCP_NO_BANK && ask_status(&h).active_bank == 0u);
     EXPECT(commit(&h, 1, 1, 320u, other) == EVLCP_STATUS_OK);
     EXPECT(ask_status(&h).pending_bank == 1u && ask_status(&h).active_bank == 0u);
+    EXPECT(commit(&h, 0, 1, 320u, crc) == EVLCP_STATUS_BUSY); /* bank 1 waits */
+    EXPECT(commit(&h, 1, 1, 320u, other) == EVLCP_STATUS_OK); /* idempotent */
     write[0] = 1u;
     EXPECT(ask(&h, EVLCP_TYPE_WRITE, write, sizeof write) == EVLCP_STATUS_BUSY);
     run_chips(board, 346u);

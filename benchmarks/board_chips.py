@@ -1,0 +1,67 @@
+"""Chip timing of the ARM image in QEMU while the host asks for STATUS without pause.
+
+Prints the intervals between LED outputs in virtual time, how often the host asked, the delay of the latest chip,
+and a hash of the trace that is the same in every run.
+"""
+
+import hashlib
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from firmware_host.board import Board, Settings, provision
+from firmware_host.client import Outcome
+from firmware_host.emulators import start_qemu
+from firmware_host.generate import codebook_of
+from firmware_host.link import Link
+from firmware_host.messages import StatusReply, StatusRequest
+from firmware_host.payload import Payload, random_symbols, symbol_chips
+from firmware_host.recording import Recording
+from firmware_host.wire import Payload as Message
+
+CHIPS = 20_000
+TICKS_PER_US = 25.0
+
+
+def play(leds: Path, payload: Payload) -> tuple[int, StatusReply]:
+    with Link(start_qemu(leds)) as link:
+        board = Board(link)
+        provision(board, payload, Settings())
+        asked, last = 0, board.status()
+
+        def requests() -> Iterator[StatusRequest]:
+            while last.chips_sent < CHIPS:
+                yield StatusRequest()
+
+        def handle(request: Message, outcome: Outcome) -> None:
+            nonlocal asked, last
+            reply = link.checked(request, outcome)
+            if isinstance(reply, StatusReply):
+                asked, last = asked + 1, reply
+
+        link.run(requests(), handle)
+        return asked, last
+
+
+def main() -> None:
+    book = codebook_of("wh4x2")
+    symbols = random_symbols(8, 10, book, np.random.default_rng(5))
+    with tempfile.TemporaryDirectory() as folder:
+        leds = Path(folder) / "leds.bin"
+        asked, status = play(leds, Payload.of_symbols(symbols, book))
+        played = Recording.read(leds).played()
+    ticks, rows = played.ticks[:CHIPS], played.rows[:CHIPS]
+    expected = np.resize(symbol_chips(symbols, book), (CHIPS, 16))
+    wrong = int((played.chips()[:CHIPS] != expected).any(1).sum())
+    intervals = np.diff(ticks) / TICKS_PER_US
+    trace = hashlib.sha256((ticks - ticks[0]).tobytes() + rows.tobytes()).hexdigest()
+    print(f"{len(ticks)} chips, {wrong} of them wrong, {asked} requests answered meanwhile")
+    print(f"intervals {intervals.min():.2f} to {intervals.max():.2f} us")
+    print(f"largest delay of a chip {status.lateness_max_ticks / TICKS_PER_US:.2f} us")
+    print(f"trace {trace[:16]}")
+
+
+if __name__ == "__main__":
+    main()
