@@ -1,7 +1,7 @@
 """Chip timing of the ARM image in QEMU while the host asks for STATUS without pause.
 
-Prints the intervals between LED outputs in virtual time, how often the host asked, the delay of the latest chip,
-and a hash of the trace that is the same in every run.
+Prints the intervals between LED outputs in virtual time, how often the host asked, the delay of the latest
+chip, and a hash of the trace that is the same in every run.
 """
 
 import hashlib

@@ -1,0 +1,44 @@
+"""The transmitter's page holds: its commands run, its inventory is valid, its tables are complete."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from firmware_host.fleet import read_inventory
+
+PAGE = (Path(__file__).parents[2] / "docs" / "transmitter.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("block", blocks("console"), ids=["tx", "board"])
+def test_commands_run(cli, block: str, tmp_path: Path) -> None:
+    for line in block.splitlines():
+        done = cli(*line.removeprefix("$ evlcp ").split(), cwd=tmp_path)
+        assert (done.returncode, done.stderr) == (0, ""), line
+
+
+def test_inventory_is_valid(tmp_path: Path) -> None:
+    (tmp_path / "t01.json").write_text(str([[[0] * 16]]))
+    (tmp_path / "tunnel.toml").write_text(blocks("toml")[0])
+    boards = read_inventory(tmp_path / "tunnel.toml").boards
+    assert [(e.id, e.level_ma, p.packets) for e, p in boards] == [("T01", 20, 1), ("T02", 20, 16)]
+
+
+def test_every_command_is_told() -> None:
+    from firmware_host.commands.board import app
+
+    table = PAGE.split("| command | does |")[1].split("\n\n")[0]
+    for command in app.registered_commands:
+        name = command.name or command.callback.__name__  # type: ignore[union-attr]
+        assert f"`{name}" in table
+
+
+def test_every_key_of_an_inventory_is_told() -> None:
+    from firmware_host.fleet import Entry
+
+    section = PAGE.split("## Many boards")[1].split("## Emulated")[0]
+    assert [k for k in Entry.model_fields if k not in section] == []
