@@ -192,3 +192,48 @@ def add_polarity(
         v = np.int64(y[i]) - shift_y[c]
         if 0 <= u < width and 0 <= v < height:
             sums[c, v, u] += sign
+
+
+@njit(cache=True, nogil=True)
+def cell_centres(selected: Array, centres: Array, area: Array) -> None:
+    """Mean (column, row) and number of each cluster's selected cells; `centres` (K, 2)."""
+    clusters, rows, columns = selected.shape
+    for k in range(clusters):
+        area[k] = 0
+        centres[k, :] = 0.0
+        for r in range(rows):
+            for c in range(columns):
+                if selected[k, r, c]:
+                    area[k] += 1
+                    centres[k, 0] += c
+                    centres[k, 1] += r
+        if area[k]:
+            centres[k, :] /= area[k]
+
+
+@njit(cache=True, nogil=True)
+def most_in_place(image: Array, area: Array, layout: Array, spacing: float, least_spacing: float) -> int:
+    """Most clusters that one similarity of the layout brings to within half a spacing of the image's.
+
+    Each pair of seen clusters half the layout apart proposes a similarity (as complex numbers: a turn and
+    scale `s`, then a shift); those that bring neighbours nearer than `least_spacing` do not count.
+    """
+    clusters = area.size
+    best = 0
+    for i in range(clusters - clusters // 2):
+        j = i + clusters // 2
+        if area[i] == 0 or area[j] == 0 or i == j:
+            continue
+        a = complex(layout[i, 0], layout[i, 1])
+        origin = complex(image[i, 0], image[i, 1])
+        s = (complex(image[j, 0], image[j, 1]) - origin) / (complex(layout[j, 0], layout[j, 1]) - a)
+        if abs(s) * spacing < least_spacing:
+            continue
+        fits = 0
+        for k in range(clusters):
+            if area[k] > 0:
+                placed = origin + s * (complex(layout[k, 0], layout[k, 1]) - a)
+                off = abs(placed - complex(image[k, 0], image[k, 1]))
+                fits += int(off <= abs(s) * spacing / 2 + 0.5)
+        best = max(best, fits)
+    return best

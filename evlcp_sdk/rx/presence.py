@@ -19,24 +19,11 @@ def clusters_in_place(presence: PresenceMap, centres_m: NDArray[np.float64]) -> 
         presence: Of one frame.
         centres_m: Cluster centres of the layout, m, float64 (K, 2).
     """
-    clusters = len(centres_m)
-    area = presence.selected.sum((1, 2))
-    seen = area > 0
-    rows, columns = presence.selected.shape[1:]
-    with np.errstate(invalid="ignore"):
-        down = presence.selected.sum(2) @ np.arange(rows) / area
-        right = presence.selected.sum(1) @ np.arange(columns) / area
-    image = presence.grid_px * (right + 1j * down)
-    layout = centres_m[:, 0] + 1j * centres_m[:, 1]
-    first = np.flatnonzero(seen[: clusters - clusters // 2] & seen[clusters // 2 :])
-    second = first + clusters // 2
-    if not len(first):
-        return 0
-    scale = (image[second] - image[first]) / (layout[second] - layout[first])
-    shift = image[first] - scale * layout[first]
-    off = np.abs(image[seen] - (scale[:, None] * layout[seen] + shift[:, None]))
-    spacing = np.abs(scale) * np.abs(np.diff(layout)).min()
-    room = spacing[:, None] / 2 + presence.grid_px / 2
+    from evlcp_sdk.rx import _kernels
+
+    image = np.empty((len(centres_m), 2))
+    area = np.empty(len(centres_m), np.int64)
+    _kernels.cell_centres(presence.selected, image, area)
+    spacing_m = float(np.abs(np.diff(centres_m, axis=0)).max(1).min())
     # A placement that puts neighbours into one pixel would fit anything.
-    fits = (off <= room) & (spacing[:, None] >= 1)
-    return int(fits.sum(1).max())
+    return int(_kernels.most_in_place(image, area, centres_m, spacing_m, 1 / presence.grid_px))
