@@ -4,7 +4,7 @@ A record is 20 bytes, little-endian: u32 tick, u32 chip, 12 bytes of 96 LEDs (LE
 of the first byte). Chip numbers count from START; two of them mean no chip: dark, and the single-LED test.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,11 +28,13 @@ class Recording:
         ticks: Tick of each output, unwrapped, int64 (n,).
         numbers: Chip number of each, uint32 (n,).
         rows: LEDs, uint8 (n, 12).
+        cut_bytes: Bytes of a last record that an emulator, ended while it played, did not finish; left out.
     """
 
     ticks: NDArray[np.int64]
     numbers: NDArray[np.uint32]
     rows: NDArray[np.uint8]
+    cut_bytes: int = 0
 
     @classmethod
     def of_records(cls, records: NDArray[np.void]) -> "Recording":
@@ -48,22 +50,34 @@ class Recording:
         """Read a file that an emulator wrote.
 
         Raises:
-            InputError: It cannot be read, or its length is no multiple of a record.
+            InputError: It cannot be read, or its chips do not follow one another.
         """
         try:
             data = path.read_bytes()
         except OSError as fault:
             raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
-        if len(data) % RECORD.itemsize:
+        whole, cut = divmod(len(data), RECORD.itemsize)
+        records = np.frombuffer(data, RECORD, whole)
+        chip = records["chip"].astype(np.int64)
+        is_chip = chip < CHIP_TEST
+        places, chip = np.flatnonzero(is_chip), chip[is_chip]
+        # within one START each chip follows the one before
+        wrong = np.flatnonzero((chip[1:] != chip[:-1] + 1) & (chip[1:] != 0)) + 1
+        if len(chip) and chip[0] != 0:
+            wrong = np.array([0])
+        if len(wrong):
+            at = int(wrong[0])
+            before = f"after chip {chip[at - 1]}" if at else "at the start"
             raise InputError(
-                f"{path}: {len(data)} bytes, expected whole records of {RECORD.itemsize}; was it cut off?"
+                f"{path}: at byte {places[at] * RECORD.itemsize}: chip {chip[at]} {before}:"
+                " not an LED record, or a part of it is missing"
             )
-        return cls.of_records(np.frombuffer(data, RECORD))
+        return replace(cls.of_records(records), cut_bytes=cut)
 
     def played(self) -> "Recording":
         """Without the records that are no chip: dark, and the single-LED test."""
         keep = (self.numbers != CHIP_DARK) & (self.numbers != CHIP_TEST)
-        return Recording(self.ticks[keep], self.numbers[keep], self.rows[keep])
+        return Recording(self.ticks[keep], self.numbers[keep], self.rows[keep], self.cut_bytes)
 
     def chips(self, clusters: int = 16) -> NDArray[np.uint8]:
         """The chip table, uint8 (n, clusters); 96 clusters give every LED.

@@ -627,4 +627,6 @@ def leds(
         raise InputError(f"{record}: {fault}") from fault
     save_array(chips, table)
     save_array(chips.with_suffix(".ticks.npy"), played.ticks)
+    if played.cut_bytes:
+        typer.echo(f"{record}: the last record is cut off ({played.cut_bytes} bytes) and left out", err=True)
     typer.echo(f"{len(played)} chips")

@@ -31,8 +31,9 @@ def needs() -> Callable[..., None]:
     return tool
 
 
-@pytest.fixture(autouse=True)
-def _compiler() -> None:
+@pytest.fixture(scope="session")
+def compiler() -> None:
+    """Skip without what builds the native board."""
     tool("cc", "make")
 
 

@@ -19,7 +19,9 @@ from board_lines import check_order, packet_sequence
 
 from evlcp_sdk.codebook import Codebook
 from firmware_host.payload import random_symbols
-from firmware_host.recording import Recording
+from firmware_host.recording import RECORD, Recording
+
+pytestmark = pytest.mark.usefixtures("compiler")
 
 EVLCP = [sys.executable, "-c", "from evlcp_sdk.cli.main import main; main()"]
 
@@ -129,10 +131,16 @@ def test_masks_and_leds(cli, native: str, tmp_path: Path) -> None:
 
 def test_wrong_records_are_told(cli, tmp_path: Path) -> None:
     torn = tmp_path / "leds.bin"
-    torn.write_bytes(bytes(21))
+    records = np.zeros(3, RECORD)
+    records["chip"] = (0, 1, 3)
+    torn.write_bytes(records.tobytes())
     done = cli("board", "leds", torn, "--chips", tmp_path / "c.npy")
     assert done.returncode == 3
-    assert "expected whole records of 20" in done.stderr
+    assert "at byte 40: chip 3 after chip 1: not an LED record" in done.stderr
+    torn.write_bytes(records.tobytes()[:45])
+    cut = cli("board", "leds", torn, "--chips", tmp_path / "c.npy")
+    assert (cut.returncode, cut.stdout) == (0, "2 chips\n")
+    assert "the last record is cut off (5 bytes)" in cut.stderr
     assert cli("board", "leds", tmp_path / "no", "--chips", tmp_path / "c.npy").returncode == 3
 
 

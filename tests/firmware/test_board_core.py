@@ -9,6 +9,8 @@ import pytest
 
 from firmware_host import build
 
+pytestmark = pytest.mark.usefixtures("compiler")
+
 
 def run(*command: str, timeout: float = 300) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)

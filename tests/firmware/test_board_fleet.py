@@ -11,6 +11,8 @@ import pytest
 
 from firmware_host.emulators import native_command
 
+pytestmark = pytest.mark.usefixtures("compiler")
+
 
 @pytest.fixture
 def boards(tmp_path: Path) -> Iterator[list[str]]:

@@ -22,6 +22,8 @@ from firmware_host.payload import Payload, random_symbols
 from firmware_host.recording import Recording
 from firmware_host.transport import SocketTransport
 
+pytestmark = pytest.mark.usefixtures("compiler")
+
 CHIPS = 20_000
 VECTORS = Path(__file__).parents[1] / "vectors" / "air-vectors.json"
 

@@ -54,6 +54,8 @@ from firmware_host.messages import (
 from firmware_host.payload import Payload, random_symbols, symbol_chips
 from firmware_host.simulated import SimulatedBoard, SimulatedLine
 
+pytestmark = pytest.mark.usefixtures("compiler")
+
 
 def symbols_of(packets: int, seed: int, book: Codebook) -> np.ndarray:
     return random_symbols(packets, 10, book, np.random.default_rng(seed))
