@@ -12,7 +12,7 @@ from firmware_host import build
 from firmware_host.errors import LinkError, NoBoardError, ToolchainError
 from firmware_host.transport import SocketTransport
 
-__all__ = ["ProcessTransport", "native_command", "qemu_command", "start_native", "start_qemu"]
+__all__ = ["ProcessTransport", "native_command", "qemu_command", "start_native", "start_qemu", "wait_for"]
 
 
 class ProcessTransport(SocketTransport):
@@ -101,6 +101,18 @@ def qemu_command(listen: str, leds: Path | None = None, wait: bool = False) -> l
     ]
 
 
+def wait_for(
+    listen: str, process: "subprocess.Popen[bytes]", timeout_s: float = 10.0
+) -> SocketTransport | None:
+    """Connect to an emulator that is coming up; None if it ends or takes longer than `timeout_s`."""
+    end = time.monotonic() + timeout_s
+    while time.monotonic() < end and process.poll() is None:
+        with contextlib.suppress(NoBoardError):
+            return SocketTransport.connect(listen)
+        time.sleep(0.02)
+    return None
+
+
 def start_native(
     leds: Path | None = None, flash: Path | None = None, baud: int = 0, unique_id: int = 0
 ) -> ProcessTransport:
@@ -126,12 +138,9 @@ def start_qemu(leds: Path | None = None) -> ProcessTransport:
     folder = Path(tempfile.mkdtemp(prefix="evlcp-qemu-"))
     listen = f"unix:{folder / 'uart0'}"
     process = subprocess.Popen(qemu_command(listen, leds), stdin=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    end = time.monotonic() + 10.0
-    while time.monotonic() < end and process.poll() is None:
-        with contextlib.suppress(NoBoardError):
-            connected = SocketTransport.connect(listen)
-            return ProcessTransport("qemu:", connected.detach(), process, folder)
-        time.sleep(0.02)
+    connected = wait_for(listen, process)
+    if connected is not None:
+        return ProcessTransport("qemu:", connected.detach(), process, folder)
     process.kill()
     said = process.stderr.read().decode(errors="replace").strip() if process.stderr else ""
     _end(process)

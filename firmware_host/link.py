@@ -110,6 +110,8 @@ class Link:
         """
         self.client.session = NO_SESSION
         self.client.window = 1
+        # Ends what a host before this one may have left half sent.
+        self.transport.write(b"\0")
         found: list[Outcome] = []
         self.run([HelloRequest(SCHEMA, self._nonce)], lambda _, outcome: found.append(outcome))
         outcome = found[0]

@@ -576,7 +576,7 @@ def emulate(
     import subprocess
 
     from evlcp_sdk.errors import ConfigError
-    from firmware_host.emulators import native_command, qemu_command
+    from firmware_host.emulators import native_command, qemu_command, wait_for
     from firmware_host.errors import ToolchainError
 
     scheme = listen.partition(":")[0]
@@ -590,9 +590,10 @@ def emulate(
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     # The emulator ends with this command, however that is told to end.
     signal.signal(signal.SIGTERM, lambda *_: process.terminate())
-    if emulator is Emulator.QEMU:
-        typer.echo(f"listening on {listen}")
     try:
+        if emulator is Emulator.QEMU and (line := wait_for(listen, process)) is not None:
+            line.close()
+            typer.echo(f"listening on {listen}")
         code = process.wait()
     except KeyboardInterrupt:
         process.terminate()

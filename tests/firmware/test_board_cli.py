@@ -31,10 +31,6 @@ def test_qemu_in_the_foreground(cli, needs, tmp_path: Path) -> None:
     port, leds, out = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin", tmp_path / "out.npy"
     emulated = Emulated("qemu", "--listen", port, "--leds", leds)
     assert emulated.said == f"listening on {port}\n"
-    for _ in range(100):
-        if (tmp_path / "board").exists():
-            break
-        time.sleep(0.05)
     done = cli("board", "program", "--random", 3, "--seed", 2, "--port", port)
     assert done.returncode == 0, done.stderr
     assert cli("board", "verify", "--random", 3, "--seed", 2, "--port", port).returncode == 0
@@ -142,6 +138,13 @@ def test_wrong_records_are_told(cli, tmp_path: Path) -> None:
     assert (cut.returncode, cut.stdout) == (0, "2 chips\n")
     assert "the last record is cut off (5 bytes)" in cut.stderr
     assert cli("board", "leds", tmp_path / "no", "--chips", tmp_path / "c.npy").returncode == 3
+
+
+def test_ticks_unwrap() -> None:
+    records = np.zeros(4, RECORD)
+    records["tick"] = (2**32 - 2500, 0, 2500, 5000)
+    assert Recording.of_records(records).ticks.tolist() == [2**32 + n for n in (-2500, 0, 2500, 5000)]
+    assert len(Recording.of_records(records[:0])) == 0
 
 
 def test_trace_and_replay(cli, tmp_path: Path) -> None:

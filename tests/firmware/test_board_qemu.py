@@ -96,13 +96,13 @@ def test_recorded_stream_is_the_air_vectors(cli, tmp_path: Path, book: Codebook)
 def test_swap_in_qemu_is_hitless(tmp_path: Path, book: Codebook) -> None:
     from board_lines import check_order, packet_sequence
 
-    payloads = {f"p{n}": random_symbols(2, 10, book, np.random.default_rng(n)) for n in range(4)}
+    payloads = {f"p{n}": random_symbols(2, 10, book, np.random.default_rng(n)) for n in range(20)}
     leds = tmp_path / "leds.bin"
     with Link(start_qemu(leds)) as link:
         board = Board(link)
         for symbols in payloads.values():
             provision(board, Payload.of_symbols(symbols, book), Settings())
-            until = board.status().packets_sent + 5
+            until = board.status().packets_sent + 2
             while board.status().packets_sent < until:
                 pass
         board.stop()
