@@ -37,7 +37,14 @@ def make(*targets: str) -> Path:
     if shutil.which("make") is None:
         raise ToolchainError("make is missing: apt-get install make gcc, then run this again")
     folder = build_folder()
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "lock").touch()
+    except OSError as fault:
+        raise ToolchainError(
+            f"{folder}: the firmware cannot be built there ({fault.strerror}); set XDG_CACHE_HOME to a folder"
+            " that can be written"
+        ) from fault
     with (folder / "lock").open("w") as lock:
         # Two programs may want the same image at once.
         fcntl.flock(lock, fcntl.LOCK_EX)

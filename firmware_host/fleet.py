@@ -145,7 +145,7 @@ def read_inventory(path: Path) -> Inventory:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as fault:
         raise InputError(f"{path}: cannot be read: {fault}") from fault
-    except tomllib.TOMLDecodeError as fault:
+    except (tomllib.TOMLDecodeError, RecursionError) as fault:
         raise InputError(f"{path}: not TOML: {fault}") from fault
     unknown = sorted(set(table) - {"defaults", "board"})
     if unknown:

@@ -166,7 +166,7 @@ def read_symbols(path: Path, codebook: Codebook) -> Symbols:
         table = json.loads(path.read_text(encoding="utf-8"))
     except OSError as fault:
         raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
-    except ValueError as fault:
+    except (ValueError, RecursionError) as fault:
         raise InputError(f"{path}: not JSON: {fault}") from fault
     place = "symbols"
     if isinstance(table, dict):
@@ -212,8 +212,10 @@ def read_masks(path: Path, frames: int, codebook: Codebook) -> Payload:
         chips = np.load(path, allow_pickle=False)
     except OSError as fault:
         raise InputError(f"{path}: cannot be read: {fault}") from fault
-    except ValueError as fault:
+    except (ValueError, EOFError) as fault:
         raise InputError(f"{path}: not a .npy file of plain numbers: {fault}") from fault
+    if not isinstance(chips, np.ndarray):
+        raise InputError(f"{path}: not a .npy file, but an archive of several")
     length = _packet_chips(codebook, frames)
     if chips.ndim != 2 or not len(chips) or len(chips) % length:
         raise InputError(

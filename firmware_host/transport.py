@@ -78,7 +78,7 @@ class SocketTransport:
                 host, _, port = place.rpartition(":")
                 connected = socket.create_connection((host, int(port)), timeout=5.0)
                 connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        except (OSError, ValueError) as fault:
+        except (OSError, ValueError, OverflowError) as fault:
             raise NoBoardError(
                 f"{spec}: no board listens there ({fault}); start one with"
                 f" 'evlcp board emulate native --listen {spec}' or name another --port"
@@ -233,6 +233,8 @@ class ReplayTransport:
         try:
             head = json.loads(lines[0])
             self.first, self.nonce, self.baud = int(head["first"]), int(head["nonce"]), int(head["baud"])
+            if not (0 <= self.nonce < 1 << 32 and self.baud > 0):
+                raise ValueError(f"nonce {self.nonce}, baud {self.baud}")
             for self._number, line in enumerate(lines[1:], 1):
                 event = json.loads(line)
                 if event["dir"] not in ("tx", "rx"):

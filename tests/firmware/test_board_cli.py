@@ -176,6 +176,7 @@ def test_trace_and_replay(cli, tmp_path: Path) -> None:
         ("unix:/nowhere/at/all", "no board listens there"),
         ("tcp:127.0.0.1:1", "no board listens there"),
         ("tcp:what", "no board listens there"),
+        ("tcp:127.0.0.1:99999", "no board listens there"),
         ("/dev/nowhere", "cannot be opened"),
         ("what://ever", "cannot be opened"),
         ("loop://", "no board answers; check power"),
@@ -208,6 +209,16 @@ def test_port_from_the_environment(native: str) -> None:
     done = subprocess.run([*EVLCP, "board", "hello"], env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0
     assert "native" in done.stdout
+
+
+def test_no_place_to_build_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    env = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "file")}
+    command = [*EVLCP, "board", "hello", "--port", "native:"]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "set XDG_CACHE_HOME" in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_pty_and_tcp(cli, tmp_path: Path) -> None:
