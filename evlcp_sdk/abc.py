@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.codebook import Codebook
 from evlcp_sdk.frames import PacketFormat
 from evlcp_sdk.geometry import BarLayout, CameraModel
-from evlcp_sdk.types import PresenceMap, Range, SoftSymbols, SyncLock
+from evlcp_sdk.types import FrameView, PresenceMap, Range, SoftSymbols, SyncLock
 
 __all__ = [
     "ROLES",
@@ -38,8 +38,8 @@ Separate = Callable[[NDArray[np.int16]], PresenceMap]
 Decode = Callable[[PresenceMap, NDArray[np.int16]], SoftSymbols]
 """Presence and the info segment's polarity sums, int16 (chips, height, width) -> soft symbols."""
 
-Measure = Callable[[NDArray[np.float32]], Range]
-"""Pixel maps of the clusters, float32 (K, height, width) -> distance."""
+Measure = Callable[[FrameView], Range]
+"""A decoded frame's image -> distance."""
 
 
 class Pilots(ABC):
@@ -110,11 +110,15 @@ class Decoding(ABC):
 
 
 class Ranging(ABC):
-    """Pixel maps of the clusters to distance."""
+    """A decoded frame's image to distance."""
 
     @abstractmethod
-    def compile(self, camera: CameraModel, bar: BarLayout) -> Measure:
-        """Precompute for a camera and a bar."""
+    def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
+        """Precompute for a camera, a bar and its codes.
+
+        Raises:
+            ConfigError: The parameters do not fit the bar.
+        """
 
 
 ROLES: dict[str, type[ABC]] = {

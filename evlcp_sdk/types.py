@@ -13,6 +13,7 @@ __all__ = [
     "EVENT_RECORD",
     "Events",
     "Frame",
+    "FrameView",
     "Packet",
     "PresenceMap",
     "Range",
@@ -218,6 +219,24 @@ class SoftSymbols:
     symbols: NDArray[np.int64]
     llr: NDArray[np.float32]
     quality: float
+
+
+@dataclass(frozen=True, eq=False)
+class FrameView:
+    """What a decoded frame shows: all that ranging may use.
+
+    Attributes:
+        sums: Polarity sums of pilot and info segment with the bar held still, int16 (chips, height, width).
+        offset_px: What is left of the bar's motion in each chip: (right, down) of its centre from the middle
+            of the image, float64 (2, chips), px, within half a pixel.
+        presence: Where each cluster is.
+        soft: What each cluster says.
+    """
+
+    sums: NDArray[np.int16]
+    offset_px: NDArray[np.float64]
+    presence: PresenceMap
+    soft: SoftSymbols
 
 
 @dataclass(frozen=True)

@@ -16,15 +16,18 @@ def polarity_sums(
     start_us: float,
     centre_px: tuple[NDArray[np.float64], NDArray[np.float64]],
     size_px: tuple[int, int],
-) -> NDArray[np.int16]:
-    """Sum polarities (+1, -1) by chip and pixel, int16 (chips, height, width).
+) -> tuple[NDArray[np.int16], NDArray[np.float64]]:
+    """Sum polarities (+1, -1) by chip and pixel, the bar held still in the middle to within half a pixel.
+
+    Returns:
+        The sums, int16 (chips, height, width); and the rest of the motion, (right, down) of the bar's centre
+        from the middle of the image in each chip, float64 (2, chips), px.
 
     Args:
         events: Pieces of the stream that hold the chips; events outside them are passed over.
         lock: Length of a chip, and the delays of positive and negative events.
         start_us: Start of the first chip, us.
-        centre_px: Column and row of the bar's centre in each chip, float64 (chips,) each, px; it comes to
-            lie in the middle of the image.
+        centre_px: Column and row of the bar's centre in each chip, float64 (chips,) each, px.
         size_px: (width, height) of the image, px.
     """
     from evlcp_sdk.rx import _kernels
@@ -47,4 +50,4 @@ def polarity_sums(
             shift_y,
             sums,
         )
-    return sums
+    return sums, np.stack([x - (width - 1) / 2 - shift_x, y - (height - 1) / 2 - shift_y])

@@ -16,7 +16,7 @@ from evlcp_sdk.rx.chips import polarity_sums
 from evlcp_sdk.rx.payload import PacketAssembler
 from evlcp_sdk.rx.presence import clusters_in_place
 from evlcp_sdk.rx.regions import RegionTracker, Track
-from evlcp_sdk.types import Events, Frame, Packet, SyncLock
+from evlcp_sdk.types import Events, Frame, FrameView, Packet, SyncLock
 
 __all__ = ["Receiver"]
 
@@ -84,7 +84,7 @@ class Receiver:
         )
         self._separate = link.algorithm("separation").compile(link.codebook)
         self._decode = link.algorithm("decoding").compile(link.codebook)
-        self._measure = link.algorithm("ranging").compile(link.camera, link.bar)
+        self._measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
         self._centres_m = link.bar.cluster_centres_m()
         self._tracker = RegionTracker(link.regions, link.camera, link.packet.chip_us)
         self._transmitters: dict[int, _Transmitter] = {}
@@ -329,7 +329,7 @@ class Receiver:
         margin = 2 * self._link.regions.margin_px
         size = (_even(width + margin), _even(height + margin))
         pieces = [e for t, e in track.blocks if t < end_us and t + self._step_us > start_us]
-        sums = polarity_sums(pieces, lock, start_us, (x, y), size)
+        sums, offset_px = polarity_sums(pieces, lock, start_us, (x, y), size)
         presence = self._separate(sums[: packet.pilot_chips])
         self._tell("separation", presence, _lap(clock))
         in_place = clusters_in_place(presence, self._centres_m)
@@ -337,7 +337,7 @@ class Receiver:
             return None
         soft = self._decode(presence, sums[packet.pilot_chips :])
         self._tell("decoding", soft, _lap(clock))
-        distance = self._measure(presence.pixels)
+        distance = self._measure(FrameView(sums, offset_px, presence, soft))
         self._tell("ranging", distance, _lap(clock))
         number, index = divmod(transmitter.frame, packet.frames)
         if transmitter.first is None:

@@ -10,9 +10,10 @@ from pydantic import Field
 from scipy import fft
 
 from evlcp_sdk.abc import Measure, Ranging
+from evlcp_sdk.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.geometry import BarLayout, CameraModel
-from evlcp_sdk.types import Range
+from evlcp_sdk.types import FrameView, Range
 
 __all__ = ["PocRanging", "phase_only_correlation"]
 
@@ -75,7 +76,7 @@ class PocRanging(Ranging):
         int, Field(ge=1, description="Lit pixels that a cluster's map needs to be used.")
     ] = 4
 
-    def compile(self, camera: CameraModel, bar: BarLayout) -> Measure:
+    def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
         """Precompute the pairs of a bar.
 
         Raises:
@@ -91,9 +92,10 @@ class PocRanging(Ranging):
 
         place = np.searchsorted(used, np.stack([first, second]))
 
-        def measure(maps: NDArray[np.float32]) -> Range:
+        def measure(view: FrameView) -> Range:
             from evlcp_poc import _kernels
 
+            maps = view.presence.pixels
             middle = np.empty((len(used), 2), np.int64)
             _kernels.middles(maps, used, self.min_pixels, middle)
             known = middle[:, 0] >= 0

@@ -81,7 +81,7 @@ class FakeRanging(Ranging):
     trim: bool = True
     limit_m: Annotated[float | None, Field(description="Farthest distance told.")] = None
 
-    def compile(self, camera: CameraModel, bar: BarLayout) -> Measure:
+    def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
         raise NotImplementedError
 
 
