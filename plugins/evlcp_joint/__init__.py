@@ -1,0 +1,19 @@
+"""Ranging by one fit of scale and position over all boundaries between neighbouring clusters."""
+
+from collections.abc import Iterator
+
+from evlcp_sdk.hookspecs import Algorithm, hookimpl
+
+__all__ = ["evlcp_algorithms"]
+
+
+@hookimpl
+def evlcp_algorithms() -> Iterator[Algorithm]:
+    """The algorithms of this package."""
+    yield Algorithm(
+        "ranging",
+        "joint-scale",
+        "evlcp_joint.ranging:JointScaleRanging",
+        1,
+        "one fit over all cluster boundaries",
+    )
