@@ -1,0 +1,203 @@
+"""Statistics that add: what a task measured, exact in any order of summation."""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Self
+
+__all__ = [
+    "BIN_M",
+    "HALF_METRE_M",
+    "SEGMENT_M",
+    "Statistics",
+    "Tally",
+    "segment_of",
+]
+
+SEGMENT_M = 10
+"""Length of the segments of distance that figures are told for, m."""
+
+BIN_M = 0.02
+"""Width of a bin of the histogram of distance errors, m."""
+
+HALF_METRE_M = 0.5
+"""Distance error from which on an error counts as gross, m."""
+
+_FARTHEST_BIN = 150
+
+
+def segment_of(distance_m: float) -> int:
+    """Where the segment of a distance begins, m.
+
+    >>> segment_of(49.9)
+    40
+    """
+    return math.floor(distance_m / SEGMENT_M) * SEGMENT_M
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What was counted in one segment of distance. Every field adds; all are integers, so sums are exact.
+
+    Attributes:
+        frames_sent: Frames that were sent whole while the recording ran.
+        frames_found: Those of them that were decoded.
+        bits: Bits of the found frames.
+        bit_errors: Wrong bits among them.
+        ranged: Found frames with a distance.
+        sum_um: Sum of their distance errors, um.
+        squares_um2: Sum of the squares of these errors, um^2.
+        gross: Errors of half a metre or more.
+        histogram: (bin, count) in order of the bin; bin b holds errors from `b * BIN_M` up to the next, the
+            outermost ones also everything beyond.
+    """
+
+    frames_sent: int = 0
+    frames_found: int = 0
+    bits: int = 0
+    bit_errors: int = 0
+    ranged: int = 0
+    sum_um: int = 0
+    squares_um2: int = 0
+    gross: int = 0
+    histogram: tuple[tuple[int, int], ...] = ()
+
+    @classmethod
+    def sent(cls) -> Self:
+        """One frame that was sent."""
+        return cls(frames_sent=1)
+
+    @classmethod
+    def found(cls, bits: int, bit_errors: int, error_m: float | None) -> Self:
+        """One frame that was decoded; `error_m` is None where it has no distance.
+
+        >>> Tally.found(96, 1, -0.05).histogram
+        ((-3, 1),)
+        """
+        if error_m is None:
+            return cls(frames_found=1, bits=bits, bit_errors=bit_errors)
+        error_um = round(error_m * 1e6)
+        bin = max(-_FARTHEST_BIN, min(_FARTHEST_BIN, error_um // round(BIN_M * 1e6)))
+        return cls(
+            frames_found=1,
+            bits=bits,
+            bit_errors=bit_errors,
+            ranged=1,
+            sum_um=error_um,
+            squares_um2=error_um**2,
+            gross=int(abs(error_um) >= HALF_METRE_M * 1e6),
+            histogram=((bin, 1),),
+        )
+
+    def __add__(self, other: "Tally") -> "Tally":
+        bins = Counter(dict(self.histogram))
+        bins.update(dict(other.histogram))
+        numbers = {
+            f.name: getattr(self, f.name) + getattr(other, f.name)
+            for f in fields(self)
+            if f.name != "histogram"
+        }
+        return Tally(**numbers, histogram=tuple(sorted(bins.items())))
+
+    @property
+    def ber(self) -> float:
+        """Share of wrong bits; NaN without bits."""
+        return self.bit_errors / self.bits if self.bits else math.nan
+
+    @property
+    def rmse_m(self) -> float:
+        """Root mean square of the distance errors, m; NaN without any."""
+        return math.sqrt(self.squares_um2 / self.ranged) * 1e-6 if self.ranged else math.nan
+
+    @property
+    def bias_m(self) -> float:
+        """Mean of the distance errors, m; NaN without any."""
+        return self.sum_um / self.ranged * 1e-6 if self.ranged else math.nan
+
+    @property
+    def gross_share(self) -> float:
+        """Share of distance errors of half a metre or more; NaN without any."""
+        return self.gross / self.ranged if self.ranged else math.nan
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What one task or many measured together.
+
+    Attributes:
+        tasks: Number of tasks.
+        events: Events that the sensor sent.
+        duration_us: Simulated time, us.
+        unmatched: Decoded frames that match no sent one.
+        segments: (beginning of the segment in m, tally), in order.
+
+    >>> one = Statistics.of(1, 1000, 100_000, 0, [(30, Tally.found(96, 2, 0.1))])
+    >>> (one + one).total().bit_errors
+    4
+    """
+
+    tasks: int = 0
+    events: int = 0
+    duration_us: int = 0
+    unmatched: int = 0
+    segments: tuple[tuple[int, Tally], ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        tasks: int,
+        events: int,
+        duration_us: int,
+        unmatched: int,
+        tallies: Iterable[tuple[int, Tally]],
+    ) -> Self:
+        """Statistics from tallies in any order, several a segment."""
+        return cls(tasks, events, duration_us, unmatched, _by_segment(tallies))
+
+    def __add__(self, other: "Statistics") -> "Statistics":
+        return Statistics(
+            self.tasks + other.tasks,
+            self.events + other.events,
+            self.duration_us + other.duration_us,
+            self.unmatched + other.unmatched,
+            _by_segment([*self.segments, *other.segments]),
+        )
+
+    def total(self) -> Tally:
+        """The tally of all segments."""
+        return _sum(tally for _, tally in self.segments)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, as for JSON."""
+        return {
+            "tasks": self.tasks,
+            "events": self.events,
+            "duration_us": self.duration_us,
+            "unmatched": self.unmatched,
+            "segments": {
+                str(begin): {f.name: getattr(tally, f.name) for f in fields(tally) if f.name != "histogram"}
+                | {"histogram": {str(b): n for b, n in tally.histogram}}
+                for begin, tally in self.segments
+            },
+        }
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> Self:
+        """What `to_dict` gave."""
+        tallies = []
+        for begin, values in table["segments"].items():
+            bins = tuple(sorted((int(b), n) for b, n in values["histogram"].items()))
+            tallies.append((int(begin), Tally(**{**values, "histogram": bins})))
+        return cls.of(table["tasks"], table["events"], table["duration_us"], table["unmatched"], tallies)
+
+
+def _sum(tallies: Iterable[Tally]) -> Tally:
+    return sum(tallies, Tally())
+
+
+def _by_segment(tallies: Iterable[tuple[int, Tally]]) -> tuple[tuple[int, Tally], ...]:
+    found: dict[int, list[Tally]] = {}
+    for begin, tally in tallies:
+        found.setdefault(begin, []).append(tally)
+    return tuple((begin, _sum(found[begin])) for begin in sorted(found))
