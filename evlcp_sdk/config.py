@@ -80,7 +80,7 @@ class RegionSpec:
     ] = 50_000
     min_clusters_share: Annotated[
         float,
-        Field(ge=0, le=1, description="Share of the clusters that must be seen in their place for a frame to count."),
+        Field(ge=0, le=1, description="Share of the clusters that must be in their place in a frame."),
     ] = 0.5
 
 

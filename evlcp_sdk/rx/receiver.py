@@ -25,7 +25,7 @@ _LOOKBACK_PACKETS = 2
 
 
 _REMEMBER_US = 1e6
-"""How long a transmitter that is lost from sight is remembered: clocks 100 ppm apart drift by a chip in it."""
+"""How long a transmitter lost from sight is remembered: clocks 100 ppm apart drift by a chip in it."""
 
 _UNSEEN_STEPS = 5
 """Steps without a position after which a region counts as lost: it blinks in every chip otherwise."""

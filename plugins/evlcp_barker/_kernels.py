@@ -11,7 +11,7 @@ Array = NDArray[Any]
 
 @njit(cache=True, nogil=True)
 def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, known: Array, counts: Array) -> None:
-    """Add events to `known` counts: by polarity (row) and time (column, `bin_us` each from `first_bin` on)."""
+    """Add events to `known` counts: by polarity (row) and time (column, `bin_us` each from `first_bin`)."""
     bins = counts.shape[1]
     for row in range(2):
         for b in range(bins):

@@ -15,5 +15,5 @@ def evlcp_algorithms() -> Iterator[Algorithm]:
         "joint-scale",
         "evlcp_joint.ranging:JointScaleRanging",
         1,
-        "one fit over all cluster boundaries",
+        "one fit over all boundaries",
     )

@@ -26,12 +26,12 @@ _STARTING_GAIN = 0.8
 
 @dataclass(frozen=True)
 class JointScaleRanging(Ranging):
-    """Least-squares fit of spacing, position, drift and gain to every row's values, pilot and info chips together.
+    """Least-squares fit of spacing, position, drift and gain to the values of all rows, pilot and info.
 
-    A pixel across a boundary sees light of both clusters, shares f and 1 - f. Where their codes differ,
-    its log signal moves by ln(f / (1 - f)) at the edge in a value's middle, and so the sum of its events crosses
-    zero at the boundary with a slope: that says where the boundary lies, to a fraction of a pixel. All rows and
-    values are fitted by one straight scale. Rows beyond the middles of the outermost clusters, where
+    A pixel across a boundary sees light of both clusters, shares f and 1 - f. Where their codes differ, its
+    log signal moves by ln(f / (1 - f)) at the edge in a value's middle, and so the sum of its events crosses
+    zero at the boundary with a slope: that says where the boundary lies, to a fraction of a pixel. All rows
+    and values are fitted by one straight scale. Rows beyond the middles of the outermost clusters, where
     there is no neighbour, are left out, so that an outer edge cannot bias it. What remains of the
     motion within the frame is known from the track, and its rate is fitted.
 

@@ -1,0 +1,13 @@
+"""Ranging by the centres of gravity of the clusters: the simple way, to compare with."""
+
+from collections.abc import Iterator
+
+from evlcp_sdk.hookspecs import Algorithm, hookimpl
+
+__all__ = ["evlcp_algorithms"]
+
+
+@hookimpl
+def evlcp_algorithms() -> Iterator[Algorithm]:
+    """The algorithms of this package."""
+    yield Algorithm("ranging", "centroid", "evlcp_centroid.ranging:CentroidRanging", 1, "centres of gravity")
