@@ -53,7 +53,7 @@ def events_of(
     edges = np.diff(chips, axis=0, prepend=0)
     chip_us = link.packet.chip_us / (1 + bar.ppm * 1e-6)
     clusters = link.codebook.clusters
-    rows = int(round(clusters * bar.cluster_px))
+    rows = round(clusters * bar.cluster_px)
     of_row = np.minimum((np.arange(rows) + 0.5) / bar.cluster_px, clusters - 1).astype(np.int64)
     when, row = np.nonzero(edges[:, of_row])
     sign = edges[when, of_row[row]]

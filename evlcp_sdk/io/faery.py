@@ -54,7 +54,7 @@ class FaerySource(EventSource):
         self._sieve = Sieve("row", width, height)
         self._row = 1
 
-    def take(self, max_events: int) -> tuple[Events, Triggers] | None:  # noqa: ARG002
+    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
         """Return the next packet of the file, of whatever size it has, or None at the end.
 
         Raises:

@@ -48,7 +48,7 @@ def test_code_and_commands_run(path: Path, workplace: Path, evlcp: Callable[...,
             if line.startswith("$ evlcp "):
                 done = evlcp(*line.removeprefix("$ evlcp ").split())
                 assert done.code == 0, f"{line}\n{done.err}"
-    for name in ("centroid_plugin",):
+    for name in ("line_plugin",):
         sys.modules.pop(name, None)
 
 
