@@ -1,0 +1,188 @@
+"""The receiver's compiled loops against their twins."""
+
+import numpy as np
+import pytest
+import rx_twins as twins
+from numpy.testing import assert_allclose, assert_array_equal
+
+from evlcp_sdk.rx import _kernels
+from evlcp_sdk.types import Events
+
+WIDTH, HEIGHT = 24, 16
+SEEDS = range(8)
+LONG_AGO_US = -(10**12)
+RUN_US = (40, 150, 270)
+
+
+def random_events(rng, n, step_us=3, width=WIDTH, height=HEIGHT):
+    """Events in order; many share their time."""
+    t = 1000 + rng.integers(0, step_us + 1, n).cumsum()
+    return Events.of(t, rng.integers(0, width, n), rng.integers(0, height, n), rng.integers(0, 2, n))
+
+
+def frozen(events, step=1):
+    """The same events as read-only columns; `step` > 1: not contiguous in memory."""
+    columns = [np.repeat(c, step)[::step] for c in (events.t_us, events.x, events.y, events.p)]
+    for column in columns:
+        column.setflags(write=False)
+    return Events(*columns)
+
+
+def clock_faults(rng, n):
+    """Events of which some run backward and some are off the sensor."""
+    t = np.arange(n) + rng.integers(-2, 2, n)
+    return Events.of(t, rng.integers(0, WIDTH + 2, n), rng.integers(0, HEIGHT + 2, n), np.ones(n))
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 40])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_order_is_checked_event_by_event(seed, n):
+    rng = np.random.default_rng(seed)
+    for e in (clock_faults(rng, n), random_events(rng, n)):
+        want = twins.ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT)
+        assert _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT) == want
+        keep = np.empty(n, np.bool_)
+        got = _kernels.keep_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, 1, keep)
+        kept, counts = twins.keep_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, 1)
+        assert (keep.tolist(), got) == (kept, counts)
+        assert twins.ordered(e.t_us[keep], e.x[keep], e.y[keep], WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize(("x", "y"), [(WIDTH, 0), (0, HEIGHT), (65_535, 65_535)])
+def test_the_first_event_too_may_be_off_the_sensor(x, y):
+    e = Events.of([5], [x], [y], [1])
+    assert not _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT)
+
+
+def scored(events, pixels, min_score=8, cell_shift=2):
+    hits = np.zeros((HEIGHT >> cell_shift, WIDTH >> cell_shift), np.int32)
+    _kernels.score_pixels(
+        events.t_us, events.x, events.y, events.p, pixels, hits, RUN_US, min_score, cell_shift
+    )
+    return hits
+
+
+@pytest.mark.parametrize("freeze", [1, 2])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_scores_of_pixels(seed, freeze):
+    rng = np.random.default_rng(seed)
+    # Few pixels and many events, so that scores reach both of their ends.
+    events = random_events(rng, 4000, step_us=[3, 8, 20][seed % 3], width=6, height=4)
+    pixels = np.full((HEIGHT, WIDTH), LONG_AGO_US << 8, np.int64)
+    start = (np.full(pixels.shape, LONG_AGO_US), np.zeros(pixels.shape, int), np.zeros(pixels.shape, int))
+    hits = scored(frozen(events, freeze), pixels)
+    rows = zip(*(c.tolist() for c in (events.t_us, events.x, events.y, events.p)), strict=True)
+    (changed, score, polarity), want = twins.score_pixels(rows, pixels.shape, start, RUN_US, 8, 2)
+    assert_array_equal(pixels >> 8, changed)
+    assert_array_equal(pixels >> 1 & 127, score)
+    assert_array_equal(pixels & 1, polarity)
+    assert {tuple(c): hits[tuple(c)] for c in np.argwhere(hits).tolist()} == want
+    assert 0 <= score.min() <= score.max() <= 40
+
+
+@pytest.mark.parametrize(
+    ("run_us", "score"), [(39, 0), (40, 2), (149, 2), (150, 0), (269, 0), (270, -2), (10**9, -2)]
+)
+def test_a_run_counts_by_its_length(run_us, score):
+    pixels = np.full((HEIGHT, WIDTH), (1000 << 8) | (10 << 1), np.int64)
+    assert not scored(Events.of([1000 + run_us], [3], [2], [1]), pixels, min_score=13).any()
+    assert pixels[2, 3] >> 1 & 127 == 10 + score
+
+
+def test_scores_do_not_care_how_the_stream_is_cut():
+    events = random_events(np.random.default_rng(0), 1000, step_us=8, width=4, height=4)
+    whole, parts = np.full((2, HEIGHT, WIDTH), LONG_AGO_US << 8, np.int64)
+    want = scored(events, whole)
+    got = sum(scored(events[a:b], parts) for a, b in [(0, 0), (0, 1), (1, 700), (700, 1000)])
+    assert_array_equal(parts, whole)
+    assert_array_equal(got, want)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 1.0])
+@pytest.mark.parametrize("box", [(0, 0, WIDTH, HEIGHT), (5, 3, 20, 12), (7, 7, 8, 8), (0, 15, 24, 16)])
+def test_what_blinks_in_a_box(box, share):
+    rng = np.random.default_rng(round(100 * share))
+    changed = rng.integers(900, 1100, (HEIGHT, WIDTH))
+    score = np.where(rng.random(changed.shape) < share, 5, 3)
+    pixels = changed << 8 | score << 1 | rng.integers(0, 2, changed.shape)
+    since_us = 1000 if share < 1 else 900
+    rows = np.empty(box[3] - box[1], np.int64)
+    got = _kernels.measure_box(pixels, box, since_us, 5, rows)
+    want, want_rows = twins.measure_box((changed >= since_us) & (score >= 5), box)
+    assert_allclose(got, want, rtol=1e-12)
+    assert_array_equal(rows, want_rows)
+
+
+def test_an_edge_row_counts_by_its_share():
+    pixels = np.zeros((HEIGHT, WIDTH), np.int64)
+    pixels[4:8, 2:10] = pixels[8, 2:4] = 1000 << 8 | 40 << 1
+    *_, upper, lower = _kernels.measure_box(
+        pixels, (0, 0, WIDTH, HEIGHT), 1000, 5, np.empty(HEIGHT, np.int64)
+    )
+    # 34 pixels in five rows: a full row counts as 6.8.
+    assert (upper, lower) == pytest.approx((4, 8 + 2 / 6.8))
+
+
+@pytest.mark.parametrize("n", [0, 1, 500])
+@pytest.mark.parametrize("freeze", [1, 2])
+def test_events_in_boxes(n, freeze):
+    events = random_events(np.random.default_rng(n), n)
+    boxes = np.array([(0, 0, WIDTH, HEIGHT), (0, 0, 1, 1), (3, 2, 17, 9), (10, 5, 30, 20), (4, 4, 4, 9)])
+    columns = [np.empty((len(boxes), n + 1), c.dtype) for c in (events.t_us, events.x, events.y, events.p)]
+    taken = np.empty(len(boxes), np.int64)
+    e = frozen(events, freeze)
+    _kernels.select_boxes(e.t_us, e.x, e.y, e.p, boxes, *columns, taken)
+    for i, box in enumerate(boxes.tolist()):
+        want = twins.select_box(events, box)
+        for got, name in zip(columns, ("t_us", "x", "y", "p"), strict=True):
+            assert_array_equal(got[i, : taken[i]], getattr(want, name))
+    assert taken[0] == n
+
+
+@pytest.mark.parametrize("freeze", [1, 2])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_polarity_sums(seed, freeze):
+    rng = np.random.default_rng(seed)
+    events = random_events(rng, 3000)
+    # Eighths of us are exact in binary: the twin may divide where the kernel compares.
+    start_on, start_off = 1000 + rng.integers(0, 8 * 400, 2) / 8
+    chip_us = rng.integers(8 * 60, 8 * 140) / 8
+    shape = (24, 9, 7)
+    shifts = rng.integers(-3, 12, (2, shape[0]))
+    sums = np.zeros(shape, np.int16)
+    e = frozen(events, freeze)
+    _kernels.add_polarity(e.t_us, e.x, e.y, e.p, start_on, start_off, chip_us, *shifts, sums)
+    assert_array_equal(sums, twins.polarity_sums(events, start_on, start_off, chip_us, *shifts, shape))
+    assert sums.any()
+
+
+@pytest.mark.parametrize("clusters", [1, 2, 5, 16])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_centres_of_selected_cells(seed, clusters):
+    rng = np.random.default_rng(seed)
+    selected = rng.random((clusters, 11, 5)) < 0.1
+    selected[rng.integers(clusters)] = False
+    centres, area = np.empty((clusters, 2)), np.empty(clusters, np.int64)
+    _kernels.cell_centres(selected, centres, area)
+    want, count = twins.cell_centres(selected)
+    assert_allclose(centres, want, rtol=1e-12)
+    assert area.tolist() == count
+
+
+@pytest.mark.parametrize("clusters", [1, 2, 3, 8, 15, 16])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_most_clusters_in_place(seed, clusters):
+    rng = np.random.default_rng(seed)
+    layout = np.stack([rng.normal(0, 0.01, clusters), 0.06 * np.arange(clusters)], 1)
+    angle, scale = rng.uniform(0, 2 * np.pi), rng.uniform(10, 60)
+    turn = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    image = layout @ turn.T + rng.uniform(-50, 50, 2)
+    least = rng.uniform(0, 1.5)
+    area = (rng.random(clusters) < 0.9).astype(np.int64)
+    lit = int(area.sum())
+    pairs = (area[: clusters - clusters // 2] * area[clusters // 2 :]).any() and clusters > 1
+    exact = _kernels.most_in_place(image, area, layout, 0.06, least)
+    assert exact == (lit if pairs and scale * 0.06 >= least else 0)
+    image[rng.random(clusters) < 0.4] += rng.normal(0, 5, 2)
+    got = _kernels.most_in_place(image, area, layout, 0.06, least)
+    assert got == twins.most_in_place(image, area, layout, 0.06, least)
