@@ -3,9 +3,9 @@
     python benchmarks/receive.py [RECORDING ...] [--events 20000000] [--bytes 2000000000]
 
 Without names, all recordings of `../shared`. Each is received in turn by what `evlcp receive` calls, in
-one process, one thread, kernels warm; the best of the rounds counts. Then the first is tiled in time to `--events`
-and received once, beside the plain decoding of the same file, and a file of `--bytes` is received in a
-fresh process for its peak resident memory (0 leaves either out).
+one process, one thread, kernels warm; the best of the rounds counts. Then the first is tiled in time to
+`--events` and received once, beside the plain decoding of the same file, and a file of `--bytes` is received
+in a fresh process for its peak resident memory (0 leaves either out).
 """
 
 import argparse
