@@ -1,0 +1,247 @@
+"""Walsh-Hadamard separation and decoding: kernels against twins; what was sent comes back."""
+
+import numpy as np
+import pytest
+import wh_twins as twins
+from evlcp_wh import _kernels
+from evlcp_wh.decoding import WhTransform
+from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
+from evlcp_wh.pilots import WhPilots
+from evlcp_wh.separation import WhCorrelation
+from numpy.testing import assert_allclose, assert_array_equal
+
+from evlcp_sdk.codebook import Codebook, chips_of_values
+from evlcp_sdk.types import PresenceMap
+
+PROFILES = {"wh4x2": Wh4x2(), "wh8": Wh8(), "raw8": Raw8()}
+SEEDS = range(6)
+CLUSTERS = 16
+CODES = WhPilots().codes(CLUSTERS)
+
+
+def book_of(profile="wh4x2", pilots=CODES):
+    return Codebook(profile, WhPilots().preamble(), pilots, PROFILES[profile].codewords())
+
+
+def image_of(values, where, cell_px=2, strength=3):
+    """Sums of a bar whose cluster k fills row `where[k]` of cells with its values (K, n)."""
+    chips = chips_of_values(values)[:, :, None].astype(np.int16) * 2 - 1
+    image = np.zeros((chips.shape[1], CLUSTERS * cell_px, 3 * cell_px), np.int16)
+    for k, row in enumerate(where):
+        image[:, row * cell_px : (row + 1) * cell_px, cell_px : 2 * cell_px] = strength * chips[k][:, :, None]
+    return image
+
+
+def random_sums(rng, shape, density=0.5):
+    return (rng.integers(-3, 4, shape) * (rng.random(shape) < density)).astype(np.int16)
+
+
+def presence_of(rng, clusters, rows, columns, grid):
+    probability = np.where(
+        rng.random((clusters, rows, columns)) < 0.3, rng.random((clusters, rows, columns)), 0
+    )
+    probability = probability.astype(np.float32)
+    return PresenceMap(probability, grid, probability > 0.5, np.zeros(0, np.float32))
+
+
+# Kernels
+
+
+@pytest.mark.parametrize("shape", [(5, 4), (2, 2), (0, 3), (33, 7)])
+@pytest.mark.parametrize("grid", [2, 3])
+@pytest.mark.parametrize("density", [0.0, 0.1, 0.7])
+def test_presence_is_bayes_rule(shape, grid, density):
+    rng = np.random.default_rng(grid)
+    sums = random_sums(rng, (16, *shape), density)
+    rule = WhCorrelation(grid_px=grid, value_error=0.15, min_values=3)
+    found = rule.compile(book_of())(sums)
+    want = twins.posterior(sums, CODES, grid, 0.15, 3)
+    # Ratios below 1e-9 count as nothing, and the result is float32.
+    assert_allclose(found.probability, want, rtol=1e-5, atol=2e-9)
+    assert found.probability.shape == (CLUSTERS, shape[0] // grid, shape[1] // grid)
+    assert_array_equal(found.selected, found.probability >= 0.5)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("pilots", [CODES, WhPilots().codes(32), WhPilots().codes(3)], ids=len)
+def test_presence_of_few_and_many_clusters(seed, pilots):
+    rng = np.random.default_rng(seed)
+    sums = np.repeat(-(pilots[rng.integers(len(pilots), size=12)].T), 2, 0)
+    sums[1::2] *= -1
+    sums = (
+        (sums * (rng.random(sums.shape) < 0.8)).astype(np.int16).reshape(-1, 3, 4).repeat(2, 1).repeat(2, 2)
+    )
+    found = WhCorrelation().compile(book_of(pilots=pilots))(sums).probability
+    assert_allclose(found, twins.posterior(sums, pilots, 2, 0.1, 4), rtol=1e-5, atol=2e-9)
+    assert (found > 0.5).any()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("grid", [2, 3])
+def test_pixel_maps(seed, grid):
+    rng = np.random.default_rng(seed)
+    sums = random_sums(rng, (16, 13, 10))
+    selected = rng.random((CLUSTERS, 13 // grid, 10 // grid)) < 0.1
+    codes, out = CODES.astype(np.int64), np.zeros((CLUSTERS, 13, 10), np.float32)
+    _kernels.pixel_maps(sums, codes, grid, selected, out)
+    assert_array_equal(out, twins.pixel_maps(sums, codes, grid, selected).astype(np.float32))
+    assert out.max() > 0
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("grid", [2, 3])
+def test_weighted_values(seed, grid):
+    rng = np.random.default_rng(seed)
+    sums = random_sums(rng, (16, 13, 10))
+    presence = presence_of(rng, CLUSTERS, 13 // grid, 10 // grid, grid)
+    out = np.zeros((CLUSTERS, 8))
+    _kernels.weighted_values(sums, presence.probability, grid, 0.2, out)
+    assert_allclose(out, twins.weighted_values(sums, presence.probability, grid, 0.2), rtol=1e-6)
+    assert out.any()
+
+
+@pytest.mark.parametrize(("clusters", "bits"), [(16, 6), (1, 1), (3, 8), (0, 4)])
+def test_max_log(clusters, bits):
+    fit = np.random.default_rng(bits).normal(size=(clusters, 2**bits))
+    zero, one = np.empty((2, clusters, bits))
+    _kernels.max_log(fit, bits, zero, one)
+    assert_array_equal([zero, one], twins.max_log(fit, bits))
+
+
+# Separation
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_presence_follows_a_permutation_of_the_clusters(seed):
+    rng = np.random.default_rng(seed)
+    where = rng.permutation(CLUSTERS)
+    sums = image_of(CODES, where)
+    found = WhCorrelation().compile(book_of())(sums)
+    want = np.zeros((CLUSTERS, CLUSTERS, 3), bool)
+    want[np.arange(CLUSTERS), where, 1] = True
+    assert_array_equal(found.selected, want)
+    assert_array_equal(found.probability == 0, np.broadcast_to(~want.any(0), want.shape))
+    assert_array_equal(found.pixels == 1, want.repeat(2, 1).repeat(2, 2))
+    # And the other way round: other pilots in the same picture.
+    order = rng.permutation(CLUSTERS)
+    other = WhCorrelation().compile(book_of(pilots=CODES[order]))(sums)
+    assert_allclose(other.probability, found.probability[order], rtol=1e-6)
+    assert_array_equal(other.selected, found.selected[order])
+
+
+@pytest.mark.parametrize("silent", ["second", "first", "some"])
+def test_a_value_is_read_from_the_chip_that_is_seen(silent):
+    sums = image_of(CODES, range(CLUSTERS))
+    whole = WhCorrelation().compile(book_of())(sums)
+    halves = sums.reshape(8, 2, *sums.shape[1:])
+    if silent == "some":
+        halves[[1, 4, 6], 1] = halves[[0, 2, 5], 0] = 0
+    else:
+        halves[:, int(silent == "second")] = 0
+    found = WhCorrelation().compile(book_of())(sums)
+    assert_array_equal(found.probability, whole.probability)
+    assert_array_equal(found.pixels, whole.pixels)
+
+
+def test_the_second_chip_outvotes_the_first():
+    sums = image_of(CODES, range(CLUSTERS))
+    whole = WhCorrelation().compile(book_of())(sums)
+    sums[::2] *= -1
+    assert_array_equal(WhCorrelation().compile(book_of())(sums).probability, whole.probability)
+
+
+@pytest.mark.parametrize(("seen", "shown"), [(0, False), (3, False), (4, True), (8, True)])
+def test_a_cell_shows_no_cluster_until_enough_values_are_seen(seen, shown):
+    sums = image_of(CODES, range(CLUSTERS))
+    sums[2 * seen :] = 0
+    found = WhCorrelation(min_values=4).compile(book_of())(sums)
+    assert found.probability.any() == shown
+    # Four values are half a code: the two clusters that begin with it share the probability.
+    assert found.selected.any() == (seen == 8)
+
+
+def test_read_only_and_strided_sums_are_taken():
+    sums = image_of(CODES, range(CLUSTERS))
+    want = WhCorrelation().compile(book_of())(sums)
+    strided = np.repeat(sums, 2, 2)[:, :, ::2]
+    strided.setflags(write=False)
+    found = WhCorrelation().compile(book_of())(strided)
+    assert_array_equal(found.probability, want.probability)
+    assert_array_equal(found.pixels, want.pixels)
+    symbols = WhTransform().compile(book_of())(found, strided).symbols
+    assert_array_equal(symbols, WhTransform().compile(book_of())(want, sums).symbols)
+
+
+# Decoding
+
+
+def bits_of(symbols, bits):
+    return np.array([[int(b) for b in f"{s:0{bits}b}"] for s in symbols])
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("silent", [None, 0, 1])
+def test_every_symbol_comes_back(profile, silent):
+    book = book_of(profile)
+    presence = WhCorrelation().compile(book)(image_of(CODES, range(CLUSTERS)))
+    decode = WhTransform().compile(book)
+    n = len(book.codewords)
+    for first in range(0, n, CLUSTERS):
+        symbols = np.arange(first, first + CLUSTERS) * 5 % n
+        sums = image_of(book.codewords[symbols], range(CLUSTERS))
+        if silent is not None:
+            sums[silent::2] = 0
+        soft = decode(presence, sums)
+        assert_array_equal(soft.symbols, symbols)
+        assert_array_equal(soft.llr < 0, bits_of(symbols, book.bits_per_symbol) == 1)
+        assert soft.quality == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_llr_is_the_brute_force_max_log(profile, seed):
+    rng = np.random.default_rng(seed)
+    book = book_of(profile)
+    sums = random_sums(rng, (16, 12, 8))
+    presence = presence_of(rng, CLUSTERS, 6, 4, 2)
+    presence.probability[:, 0, 0] = 0.7
+    soft = WhTransform().compile(book)(presence, sums)
+    values = twins.weighted_values(sums, presence.probability, 2, 0.01)
+    symbols, llr, quality = twins.llr(values, book.codewords.astype(float))
+    assert_array_equal(soft.symbols, symbols)
+    assert_allclose(soft.llr, llr, rtol=1e-4, atol=1e-4)
+    assert soft.quality == pytest.approx(quality)
+    assert soft.quality < 0.99
+
+
+def test_a_dark_cluster_says_nothing():
+    book = book_of()
+    sums = image_of(book.codewords[np.arange(CLUSTERS)], range(CLUSTERS))
+    presence = WhCorrelation().compile(book)(image_of(CODES, range(CLUSTERS)))
+    presence.probability[5] = 0
+    soft = WhTransform().compile(book)(presence, sums)
+    assert_array_equal(soft.llr[5], np.zeros(6))
+    assert (soft.llr[np.arange(CLUSTERS) != 5] != 0).all()
+    assert_array_equal(np.delete(soft.symbols, 5), np.delete(np.arange(CLUSTERS), 5))
+
+
+def test_no_events_are_no_certainty():
+    book = book_of()
+    presence = WhCorrelation().compile(book)(image_of(CODES, range(CLUSTERS)))
+    soft = WhTransform().compile(book)(presence, np.zeros((16, 32, 6), np.int16))
+    assert soft.quality == 0
+    assert not soft.llr.any()
+
+
+def test_noise_lowers_certainty_and_quality():
+    book = book_of("raw8")
+    symbols = np.arange(CLUSTERS)
+    presence = WhCorrelation().compile(book)(image_of(CODES, range(CLUSTERS), 4))
+    clean = image_of(book.codewords[symbols], range(CLUSTERS), 4)
+    last = np.inf
+    for share in (0.05, 0.2, 0.4):
+        noisy = np.where(np.random.default_rng(1).random(clean.shape) < share, -clean, clean)
+        soft = WhTransform().compile(book)(presence, noisy)
+        sure = float(np.median(np.abs(soft.llr)))
+        assert sure < last
+        last = sure
