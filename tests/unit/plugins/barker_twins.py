@@ -1,0 +1,43 @@
+"""The Barker kernels once more in NumPy, and the events of a region whose clusters blink as told."""
+
+import numpy as np
+
+CHIP_US = 100.0
+
+
+def count_bins(t_us, p, first_bin, bin_us, known, bins):
+    counts = np.zeros((2, bins))
+    counts[:, : known.shape[1]] = known[:, :bins]
+    b = np.floor(t_us / bin_us).astype(int) - first_bin
+    for polarity in (0, 1):
+        inside = b[(b >= 0) & (b < bins) & (p == polarity)]
+        counts[polarity] += np.bincount(inside, minlength=bins)
+    return counts
+
+
+def correlate(counts, chips, steps, min_events, lags):
+    """The windows of each lag laid out as a table of chips."""
+    rho = np.zeros(lags)
+    for lag in range(lags):
+        window = counts[:, lag : lag + steps * len(chips)].reshape(2, len(chips), steps).sum(2)
+        signed, seen = window[1] - window[0], window.sum()
+        fit = signed @ chips
+        if seen >= min_events and fit > 0:
+            rho[lag] = min(fit / seen, fit / np.linalg.norm(signed) / np.linalg.norm(chips))
+    return rho
+
+
+def events_of(
+    chips, rng, start_us=5000.0, ppm=0.0, delay_us=(20.0, 45.0), missing_off=0.0, per_edge=2, jitter_us=4.0
+):
+    """(times, polarities) of clusters that blink as `chips` (n, K): each edge sends a few late events."""
+    edges = np.diff(chips.astype(int), axis=0, prepend=0)
+    when, cluster = (np.repeat(v, per_edge) for v in np.nonzero(edges))
+    p = (edges[when, cluster] > 0).astype(np.uint8)
+    late = (
+        np.where(p, *delay_us) + 12 * (np.arange(len(when)) % per_edge) + rng.normal(0, jitter_us, len(when))
+    )
+    t = np.floor(start_us + when * CHIP_US * (1 + ppm * 1e-6) + late).astype(np.int64)
+    keep = (p > 0) | (rng.random(len(t)) >= missing_off)
+    order = np.argsort(t[keep], kind="stable")
+    return t[keep][order], p[keep][order]

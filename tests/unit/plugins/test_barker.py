@@ -1,0 +1,319 @@
+"""Barker codes and packet synchronization, on events whose timing is known."""
+
+from dataclasses import astuple, replace
+from itertools import pairwise
+
+import barker_twins as twins
+import numpy as np
+import pytest
+from evlcp_barker import _kernels
+from evlcp_barker.pilots import Barker13Pilots
+from evlcp_barker.synchronization import BarkerSync
+from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
+from evlcp_wh.pilots import WhPilots
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from evlcp_sdk.codebook import BARKER13, Codebook, chips_of_values
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.frames import PacketFormat, packet_chips
+
+PROFILES = {"wh4x2": Wh4x2(), "wh8": Wh8(), "raw8": Raw8()}
+CLUSTERS, FRAMES, START_US = 16, 10, 5000.0
+BOOKS = {
+    name: Codebook(name, WhPilots().preamble(), WhPilots().codes(CLUSTERS), modulation.codewords())
+    for name, modulation in PROFILES.items()
+}
+FORMAT = PacketFormat.of(BOOKS["wh4x2"], FRAMES)
+PERIOD_US = FORMAT.packet_chips * twins.CHIP_US
+NO_EVENTS = np.empty(0, np.int64), np.empty(0, np.uint8)
+
+
+def packets_of(rng, n, profile="wh4x2"):
+    """Chips of packets with random symbols, (chips, K)."""
+    book = BOOKS[profile]
+    symbols = rng.integers(0, len(book.codewords), (n, FRAMES, CLUSTERS))
+    return np.concatenate([packet_chips(s, book) for s in symbols])
+
+
+def synchronizer():
+    return BarkerSync().compile(BOOKS["wh4x2"], FORMAT)
+
+
+def locks_of(t_us, p, cuts=None):
+    """Locks, and the state at the end; steps of 1 ms unless `cuts` are given."""
+    sync, locks, begin = synchronizer(), [], 0
+    state = sync.init()
+    for until in range(0, int(t_us[-1]) + 5000, 1000) if cuts is None else cuts:
+        end = int(np.searchsorted(t_us, until))
+        state, found = sync.step(state, t_us[begin:end], p[begin:end], until)
+        locks += found
+        begin = end
+    return locks, state
+
+
+def numbers(locks):
+    """Which packet each lock is, as a real number: whole where it is right."""
+    return np.array([(lock.packet_t_us - START_US) / PERIOD_US for lock in locks])
+
+
+# Codes and kernels
+
+
+def test_the_preamble_correlates_with_nothing_but_itself():
+    lags = np.correlate(BARKER13, BARKER13, "full")
+    assert lags[12] == 13
+    assert np.abs(np.delete(lags, 12)).max() == 1
+    assert_array_equal(WhPilots().preamble(), Barker13Pilots().preamble())
+
+
+def test_barker_pilots_are_told_apart():
+    codes = Barker13Pilots().codes(26).astype(int)
+    fit = codes @ codes.T
+    assert_array_equal(np.diag(fit), np.full(26, 13))
+    assert np.abs(fit[:13, :13] - 13 * np.eye(13)).max() == 1
+    assert_array_equal(codes[13:], -codes[:13])
+    assert_array_equal(Barker13Pilots().codes(5), codes[:5])
+    with pytest.raises(ConfigError, match="27 clusters, expected at most 26"):
+        Barker13Pilots().codes(27)
+
+
+@pytest.mark.parametrize("n", [0, 1, 400])
+@pytest.mark.parametrize(("first", "known", "bins"), [(0, 0, 50), (90, 7, 40), (105, 40, 40), (-20, 3, 0)])
+@pytest.mark.parametrize("frozen", [False, True])
+def test_counts(n, first, known, bins, frozen):
+    rng = np.random.default_rng(n)
+    t = 1000 + rng.integers(0, 4, n).cumsum()
+    p = rng.integers(0, 2, n).astype(np.uint8)
+    before = rng.integers(0, 9, (2, known)).astype(float)
+    # Quarters of us are exact in binary: the twin may divide where the kernel compares.
+    want = twins.count_bins(t, p, first, 11.25, before, bins)
+    if frozen:
+        t, p = np.repeat(t, 2)[::2], np.repeat(p, 2)[::2]
+        t.setflags(write=False)
+        p.setflags(write=False)
+    counts = np.empty((2, bins))
+    _kernels.count_bins(t, p, first, 11.25, before, counts)
+    assert_array_equal(counts, want)
+
+
+@pytest.mark.parametrize(("steps", "min_events"), [(4, 0), (10, 0), (10, 520)])
+@pytest.mark.parametrize("seed", range(4))
+def test_correlation(seed, steps, min_events):
+    rng = np.random.default_rng(seed)
+    chips = 2.0 * chips_of_values(BARKER13) - 1
+    counts = rng.poisson(rng.choice([0.1, 1, 3], (1, 90 * steps)), (2, 90 * steps)).astype(float)
+    at = 20 * steps + seed
+    counts[1, at : at + steps * 26] += 2 * np.repeat(chips > 0, steps)
+    lags = counts.shape[1] - 26 * steps + 1
+    rho = np.empty(lags)
+    top = _kernels.correlate(counts, chips, steps, min_events, rho)
+    want = twins.correlate(counts, chips, steps, min_events, lags)
+    assert_allclose(rho, want, rtol=1e-12, atol=1e-12)
+    assert top == rho.max()
+    assert abs(int(rho.argmax()) - at) <= 1
+
+
+# Timing
+
+
+@pytest.mark.parametrize("ppm", [-50, 0, 50])
+@pytest.mark.parametrize("delay_us", [(20, 45), (45, 20), (60, 10)])
+@pytest.mark.parametrize("seed", range(2))
+def test_packet_start_clock_and_delays(seed, ppm, delay_us):
+    rng = np.random.default_rng(seed)
+    events = twins.events_of(packets_of(rng, 12), rng, START_US, ppm=ppm, delay_us=delay_us, missing_off=0.2)
+    locks, _ = locks_of(*events)
+    assert len(locks) == 12
+    start = START_US + delay_us[0] + PERIOD_US * (1 + ppm * 1e-6) * np.arange(12)
+    early = start - [lock.packet_t_us for lock in locks]
+    # The earliest events of an edge come 1 to 2 sigma (4 us each) before the mean of its first.
+    assert 3 <= early.min() <= early.max() <= 9
+    # Eight packets, each known to 1 us, give 4 ppm (sigma); the first lock has the nominal rate.
+    error_ppm = 1e6 * (np.array([lock.chip_us for lock in locks]) / twins.CHIP_US - 1) - ppm
+    assert np.abs(error_ppm[7:]).max() < 10
+    assert abs(error_ppm[0] + ppm) < 1e-6
+    for lock in locks:
+        assert lock.delay_off_us - lock.delay_on_us == pytest.approx(delay_us[1] - delay_us[0], abs=3)
+        # The window of a chip that holds all events of an edge: they last from -1 to 28 us after the first.
+        assert -100 + 28 - 5 < lock.delay_on_us < 5
+        assert 0.8 < lock.quality <= 1
+
+
+@pytest.mark.parametrize("rate_hz", [5_000, 20_000])
+def test_other_chip_rates(rate_hz):
+    rng = np.random.default_rng(0)
+    t, p = twins.events_of(packets_of(rng, 4), rng, START_US)
+    scale = FORMAT.chip_rate_hz / rate_hz
+    sync = BarkerSync().compile(BOOKS["wh4x2"], replace(FORMAT, chip_rate_hz=rate_hz))
+    t = np.rint(t * scale).astype(np.int64)
+    _, locks = sync.step(sync.init(), t, p, int(160_000 * scale))
+    assert len(locks) == 4
+    apart = np.diff([lock.packet_t_us for lock in locks])
+    assert_allclose(apart, PERIOD_US * scale, atol=3 * scale)
+
+
+# Steps
+
+
+RNG = np.random.default_rng(3)
+STREAM = twins.events_of(packets_of(RNG, 4), RNG, START_US, ppm=30, missing_off=0.2)
+END_US = int(STREAM[0][-1]) // 1000 * 1000 + 5000
+BIN_US = 10
+WHOLE, _ = locks_of(*STREAM, cuts=[END_US])
+
+
+def assert_same(locks):
+    """Equal locks but for rounding: times are counted from the oldest step that is remembered."""
+    assert_allclose([astuple(k) for k in locks], [astuple(k) for k in WHOLE], atol=1e-9)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.lists(st.integers(0, END_US // BIN_US), max_size=60))
+def test_any_steps_give_the_same_locks(cuts):
+    locks, _ = locks_of(*STREAM, cuts=[*sorted(BIN_US * c for c in cuts), END_US])
+    assert_same(locks)
+    assert len(WHOLE) == 4
+
+
+@pytest.mark.xfail(
+    raises=AssertionError, reason="events after the last whole correlation step of a time step are dropped"
+)
+@pytest.mark.parametrize("step_us", [213, 1005])
+def test_steps_need_not_be_whole_correlation_steps(step_us):
+    locks, _ = locks_of(*STREAM, cuts=range(0, END_US + step_us, step_us))
+    assert_same(locks)
+
+
+def test_a_lock_does_not_wait_for_the_next_packet():
+    sync = synchronizer()
+    # The preamble, the guard of the peak behind it, and one step.
+    heard_us = int(START_US + (26 + 3 + 2) * twins.CHIP_US)
+    before = STREAM[0] < heard_us
+    _, locks = sync.step(sync.init(), STREAM[0][before], STREAM[1][before], heard_us)
+    assert len(locks) == 1
+
+
+def told(state):
+    """All that a state holds, as plain values."""
+    return state.first_bin, state.counts.tolist(), state.next_bin, state.heard, state.stray
+
+
+def test_the_state_passed_in_is_not_changed():
+    sync = synchronizer()
+    state = sync.init()
+    for begin, end in pairwise(range(0, END_US + 1, 5000)):
+        part = (STREAM[0] >= begin) & (STREAM[0] < end)
+        t, p = STREAM[0][part], STREAM[1][part]
+        for array in (state.counts, t, p):
+            array.setflags(write=False)
+        before = told(state)
+        after, locks = sync.step(state, t, p, end)
+        again, locks_again = sync.step(state, t, p, end)
+        assert told(state) == before
+        assert (told(after), locks) == (told(again), locks_again)
+        state = after
+    assert len(state.heard) == 4
+
+
+def test_memory_does_not_grow():
+    rng = np.random.default_rng(0)
+    _, state = locks_of(*twins.events_of(packets_of(rng, 12), rng, START_US))
+    assert len(state.heard) == 8
+    # A preamble, a guard on both sides, and a time step.
+    assert state.counts.shape[1] < 10 * (26 + 2 * 3 + 10) + 10
+
+
+# What is no preamble
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("pilots", [True, False])
+def test_random_data_has_no_preamble(profile, pilots):
+    rng = np.random.default_rng(1)
+    chips = packets_of(rng, 150, profile).reshape(150, -1, CLUSTERS)[:, 26:]
+    if not pilots:
+        chips = chips.reshape(150, FRAMES, 32, CLUSTERS)[:, :, 16:]
+    locks, _ = locks_of(*twins.events_of(chips.reshape(-1, CLUSTERS), rng, START_US))
+    assert locks == []
+
+
+@pytest.mark.parametrize("events", [50, 5000])
+def test_a_flash_is_no_preamble(events):
+    rng = np.random.default_rng(1)
+    t = np.sort(rng.integers(20_000, 20_100, events))
+    t = np.concatenate([[0], t, t + 300, [90_000]])
+    assert locks_of(t, np.ones(len(t), np.uint8))[0] == []
+
+
+def test_too_few_events_are_no_preamble():
+    t, p = STREAM
+    few = np.random.default_rng(0).random(len(t)) < 0.05
+    in_preamble = few & (t < START_US + 2600)
+    assert 0 < in_preamble.sum() < 100
+    assert locks_of(t[few], p[few])[0] == []
+
+
+def test_no_events_no_lock():
+    sync = synchronizer()
+    state = sync.init()
+    for until in (0, 10, 1000, 100_000):
+        state, locks = sync.step(state, *NO_EVENTS, until)
+        assert locks == []
+    # An empty start does not spoil what follows.
+    _, locks = sync.step(state, STREAM[0] + 100_000, STREAM[1], END_US + 100_000)
+    assert_allclose([k.packet_t_us - 100_000 for k in locks], [k.packet_t_us for k in WHOLE], atol=1e-6)
+
+
+@pytest.mark.xfail(
+    raises=AssertionError,
+    reason="an equal symbol on all clusters can pass for the preamble, packet after packet",
+)
+@pytest.mark.parametrize("symbol", [3, 38])
+def test_constant_data_is_no_preamble(symbol):
+    rng = np.random.default_rng(1)
+    one = packet_chips(np.full((FRAMES, CLUSTERS), symbol), BOOKS["wh4x2"])
+    t, p = twins.events_of(np.concatenate([one] * 12), rng, START_US)
+    begun = t > START_US + 10_000
+    right = numbers(locks_of(t[begun], p[begun])[0])
+    assert_allclose(right[4:], np.rint(right[4:]), atol=1e-3)
+
+
+# Keeping a lock and finding it again
+
+
+def test_the_lock_is_kept_across_missing_preambles():
+    rng = np.random.default_rng(5)
+    t, p = twins.events_of(packets_of(rng, 14), rng, START_US, ppm=-40)
+    number = (t - START_US) / PERIOD_US
+    hidden = (number > 4.9) & (number < 9.5)
+    locks, state = locks_of(t[~hidden], p[~hidden])
+    assert_allclose(numbers(locks), [0, 1, 2, 3, 4, 10, 11, 12, 13], atol=2e-3)
+    assert [h.packet for h in state.heard] == [1, 2, 3, 4, 10, 11, 12, 13]
+    # Times known to 1 us, 0.3 s apart.
+    assert locks[-1].chip_us == pytest.approx(twins.CHIP_US * (1 - 40e-6), rel=6e-6)
+
+
+def test_one_stray_preamble_does_not_move_the_lock():
+    rng = np.random.default_rng(6)
+    chips = packets_of(rng, 8)
+    at = 3 * FORMAT.packet_chips + 150
+    chips[at : at + 26] = chips[:26]
+    locks, state = locks_of(*twins.events_of(chips, rng, START_US))
+    assert_allclose(numbers(locks), np.arange(8), atol=2e-3)
+    assert [h.packet for h in state.heard] == list(range(8))
+
+
+@pytest.mark.parametrize("jump_us", [1_234, 17_300, -9_000])
+def test_the_second_preamble_after_a_jump_is_believed(jump_us):
+    rng = np.random.default_rng(7)
+    chips = packets_of(rng, 9)
+    cut = 4 * FORMAT.packet_chips
+    before = twins.events_of(chips[:cut], rng, START_US)
+    after = twins.events_of(chips[cut:], rng, START_US + 5 * PERIOD_US + jump_us)
+    locks, state = locks_of(*(np.concatenate(c) for c in zip(before, after, strict=True)))
+    want = np.r_[0:4, 6:10] + np.r_[np.zeros(4), np.full(4, jump_us / PERIOD_US)]
+    assert_allclose(numbers(locks), want, atol=2e-3)
+    assert len(state.heard) == 5
+    assert state.stray is None
