@@ -73,20 +73,15 @@ class DaskCluster:
             while waiting:
                 future = next(done)
                 job, deaths = waiting.pop(future)
-                if future.status == "finished":
+                try:
+                    # A result whose worker died since is computed again meanwhile.
                     outcome = future.result()
                     yield Outcome(job, outcome.value, outcome.fault)
-                elif client.status != "running" or future.cancelled():
-                    raise self._gone()
-                elif isinstance(future.exception(), dask.scheduler.KilledWorker):
+                except dask.scheduler.KilledWorker:
                     if deaths + 1 < ATTEMPTS:
                         give(job, deaths + 1)
                     else:
                         yield Outcome(job, fault=Fault(f"its worker died {ATTEMPTS} times"))
-                else:
-                    yield Outcome(
-                        job, fault=Fault(f"{type(future.exception()).__name__}: {future.exception()}")
-                    )
                 del future
                 fill()
         except TimeoutError as fault:

@@ -8,7 +8,7 @@ from evlcp_sdk.campaign.plan import Job, Plan, StopRule
 from evlcp_sdk.campaign.statistics import Statistics
 from evlcp_sdk.campaign.store import Store
 
-__all__ = ["Counted", "Progress", "RunJob", "collect"]
+__all__ = ["Counted", "Progress", "RunJob", "collect", "progress_of"]
 
 RunJob = Callable[[Job], Sequence[tuple[str, Statistics]]]
 """Runs a job; gives the statistics of each of its tasks."""
@@ -167,3 +167,8 @@ def collect(
             collection.take(outcome.value or ())
         watch(collection.progress())
     return collection.progress()
+
+
+def progress_of(plan: Plan, results: Mapping[str, Statistics]) -> Progress:
+    """How far a campaign is with these results."""
+    return _Collection(plan, dict(results)).progress()

@@ -104,7 +104,7 @@ class Store:
                 f"{self.path}: holds the campaign '{row[0]}', not '{plan.name}'; give another file"
             )
         with self._writing():
-            body = json.dumps(plan.to_dict(), sort_keys=True)
+            body = json.dumps(plan.to_dict())
             self._base.execute("INSERT OR REPLACE INTO plan VALUES (1, ?, ?)", (plan.name, body))
 
     def plan(self) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """What the commands share: their options, how a source is opened, what goes to stderr."""
 
+import os
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -7,10 +8,21 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from evlcp_sdk.campaign.executor import Executor
     from evlcp_sdk.io import EventSource
     from evlcp_sdk.registry import Registry
 
-__all__ = ["Json", "LinkFile", "Overrides", "complain", "console", "open_source"]
+__all__ = [
+    "Dask",
+    "Json",
+    "LinkFile",
+    "Overrides",
+    "Workers",
+    "complain",
+    "console",
+    "make_executor",
+    "open_source",
+]
 
 LinkFile = Annotated[
     str | None, typer.Option("-c", "--config", metavar="link.toml", help="The link; all defaults without it.")
@@ -20,6 +32,25 @@ Overrides = Annotated[
     typer.Option("--set", metavar="TABLE.KEY=VALUE", help="Override one value; may be repeated."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="JSON on stdout, nothing else.")]
+
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        "--workers",
+        min=0,
+        metavar="N",
+        help="Local processes, one a core without it; 0: this one.",
+        show_default=False,
+    ),
+]
+Dask = Annotated[
+    str | None,
+    typer.Option(
+        "--dask",
+        metavar="ADDRESS",
+        help="Run on the workers of a Dask scheduler, e.g. tcp://host:8786; needs the extra cluster.",
+    ),
+]
 
 
 def complain(text: str) -> None:
@@ -45,3 +76,22 @@ def open_source(url: str, registry: "Registry") -> "EventSource":
 
     source = registry.hook.evlcp_open_events(url=url)
     return source if isinstance(source, EventSource) else open_events(url)
+
+
+def make_executor(workers: int | None, dask: str | None) -> "Executor":
+    """Where jobs run: on a cluster, in processes (None: one a core), or in this one for 0.
+
+    Raises:
+        ConfigError: The cluster is not there.
+    """
+    from evlcp_sdk.campaign.executor import Inline, Processes
+
+    if dask is not None:
+        if workers is not None:
+            raise typer.BadParameter("give one of --workers and --dask", param_hint="--dask")
+        from evlcp_sdk.campaign.cluster import DaskCluster
+
+        return DaskCluster(dask)
+    if workers == 0:
+        return Inline()
+    return Processes(workers or os.cpu_count() or 1)

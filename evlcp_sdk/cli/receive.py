@@ -1,17 +1,19 @@
 """`evlcp receive`."""
 
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
-from evlcp_sdk.cli._common import LinkFile, Overrides, complain, console, open_source
+from evlcp_sdk.cli._common import Dask, LinkFile, Overrides, complain, console, make_executor, open_source
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
 
 if TYPE_CHECKING:
@@ -57,6 +59,10 @@ def receive(
         bool, typer.Option("--figures", help="Draw regions.png, presence.png, distance.png.")
     ] = False,
     parquet: Annotated[bool, typer.Option("--parquet", help="Also write frames.parquet.")] = False,
+    workers: Annotated[
+        int, typer.Option("--workers", min=0, metavar="N", help="Processes for many recordings; 0: this one.")
+    ] = 0,
+    dask: Dask = None,
 ) -> None:
     """Decode recordings: symbols and distances into OUT.
 
@@ -70,6 +76,8 @@ def receive(
 
     Several recordings:  [bold]evlcp receive a.raw b.raw -o out[/] writes out/a and out/b
 
+    Two at a time:       [bold]evlcp receive *.raw -o out --workers 2[/]
+
     OUT gets frames.csv (a row a frame), packets.jsonl (a line a packet) and summary.json.
     An earlier result there is replaced when the new one is complete.
     """
@@ -80,30 +88,60 @@ def receive(
 
     jobs = _jobs(recordings, out)
     link = load_link(link_file, overrides or [], Registry.load())
+    here = dask is None and (not workers or len(jobs) == 1)
+    executor = make_executor(0 if here else workers or None, dask)
     worst = 0
-    for job in jobs:
-        try:
-            with _progress(Path(job.url).name) as advance, _stop_on_request() as stopped:
-                summary = decode(
-                    job.url, job.folder, link, advance, stopped, figures=figures, parquet=parquet
-                )
-        except (InputError, ConfigError) as fault:
-            complain(str(fault))
-            worst = max(worst, fault.exit_code)
+    interrupted: list[Path] = []
+    with _stop_on_request() as stopped, _recordings_bar(0 if here else len(jobs)) as count:
+        run = partial(
+            _decode_job, link=link, figures=figures, parquet=parquet, stopped=stopped if here else None
+        )
+        for outcome in executor.run(run, _until(stopped, jobs)):
+            count()
+            job, summary, fault = outcome.job, outcome.value, outcome.fault
+            if summary is None:
+                message = fault.message if fault else "no result"
+                complain(f"{fault.trace}{message}" if fault else message)
+                worst = max(worst, fault.exit_code if fault else 1)
+                if as_json:
+                    failed = {"status": "failed", "error": message, "recording": {"path": job.url}}
+                    typer.echo(json.dumps(failed))
+                continue
             if as_json:
-                failed = {"status": "failed", "error": str(fault), "recording": {"path": job.url}}
-                typer.echo(json.dumps(failed))
-            continue
-        if as_json:
-            typer.echo(json.dumps(summary))
-        else:
-            show(summary, job.folder)
-        if summary["status"] == "failed":
-            complain(summary["error"])
-            worst = max(worst, InputError.exit_code)
-        if summary["status"] == "interrupted":
-            raise InterruptedRunError(f"interrupted; what was decoded until then is in {job.folder}")
+                typer.echo(json.dumps(summary))
+            else:
+                show(summary, job.folder)
+            if summary["status"] == "failed":
+                complain(summary["error"])
+                worst = max(worst, InputError.exit_code)
+            if summary["status"] == "interrupted":
+                interrupted.append(job.folder)
+        if stopped():
+            folder = interrupted[0] if len(interrupted) == 1 else out
+            raise InterruptedRunError(f"interrupted; what was decoded until then is in {folder}")
     raise typer.Exit(worst)
+
+
+def _decode_job(
+    job: Job, *, link: "Link", figures: bool, parquet: bool, stopped: Callable[[], bool] | None
+) -> dict[str, Any]:
+    """Decode a recording here, with a bar; or, without `stopped`, quietly in a worker."""
+    if stopped is not None:
+        with _progress(Path(job.url).name) as advance:
+            return decode(job.url, job.folder, link, advance, stopped, figures=figures, parquet=parquet)
+    # A terminal sends Ctrl-C to workers, too; only a main thread can listen to it.
+    main = threading.current_thread() is threading.main_thread()
+    listening: AbstractContextManager[Callable[[], bool]]
+    listening = _stop_on_request() if main else nullcontext(lambda: False)
+    with listening as asked:
+        return decode(job.url, job.folder, link, lambda _a, _b: None, asked, figures=figures, parquet=parquet)
+
+
+def _until(stopped: Callable[[], bool], jobs: Sequence[Job]) -> Iterator[Job]:
+    for job in jobs:
+        if stopped():
+            return
+        yield job
 
 
 def decode(
@@ -284,6 +322,18 @@ def _progress(name: str) -> Iterator[Advance]:
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task(name, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+@contextmanager
+def _recordings_bar(number: int) -> Iterator[Callable[[], None]]:
+    """A bar by recordings, on a terminal only; none for 0."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    err = Console(stderr=True)
+    with Progress(console=err, transient=True, disable=not (number and err.is_terminal)) as bar:
+        task = bar.add_task("recordings", total=number)
+        yield lambda: bar.advance(task)
 
 
 @contextmanager

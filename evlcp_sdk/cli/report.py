@@ -1,0 +1,141 @@
+"""`evlcp report`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from evlcp_sdk.cli._common import Json, console
+
+if TYPE_CHECKING:
+    from evlcp_sdk.campaign.summary import Summary
+
+__all__ = ["register", "report", "show_paper", "show_series"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("report")(report)
+
+
+def report(
+    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="What evlcp sweep wrote.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--out", metavar="REPORT.html", help="The page; needs the extra report.", show_default=False
+        ),
+    ] = None,
+    figures: Annotated[
+        Path | None,
+        typer.Option(
+            "--figures",
+            metavar="DIR",
+            help="Folder of PNG and SVG; beside the page without it.",
+            show_default=False,
+        ),
+    ] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Tables as Markdown on stdout.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Show what a campaign found: tables here, one self-contained page and figures for others.
+
+    Tables only:        [bold]evlcp report paper.sqlite[/]
+
+    Page and figures:   [bold]evlcp report paper.sqlite -o report.html[/]
+
+    The page needs no network. A campaign that still runs can be looked at, too.
+    """
+    import json
+
+    from evlcp_sdk.campaign.charts import charts_of, save_charts
+    from evlcp_sdk.campaign.report import save_page
+    from evlcp_sdk.campaign.store import Store
+    from evlcp_sdk.campaign.summary import summarize
+
+    if markdown and as_json:
+        raise typer.BadParameter("give one of --markdown and --json", param_hint="--json")
+    with Store(results) as store:
+        summary = summarize(store)
+    if out is not None:
+        save_page(summary, out)
+    folder = figures or (out.parent / f"{out.stem}-figures" if out is not None else None)
+    if folder is not None:
+        save_charts(charts_of(summary), summary.name, folder)
+    if as_json:
+        typer.echo(json.dumps(summary.to_dict(), indent=1))
+    elif markdown:
+        typer.echo(as_markdown(summary))
+    else:
+        if summary.done < summary.tasks:
+            console().print(f"{summary.done} of {summary.tasks} tasks are done", style="yellow")
+        show_series(summary)
+        show_paper(summary)
+        if out is not None:
+            console().print(f"written: {out}, {folder}/*.png, *.svg", style="dim")
+
+
+def show_series(summary: "Summary") -> None:
+    """Print BER, RMSE and gross errors of every series, a row a segment."""
+    _print_table(*_series_table(summary))
+
+
+def show_paper(summary: "Summary") -> None:
+    """Print the paper's figures beside those of the campaign."""
+    head, rows = _paper_table(summary)
+    if rows:
+        console().print()
+        _print_table(head, rows)
+
+
+def as_markdown(summary: "Summary") -> str:
+    """The same tables as Markdown."""
+    parts = []
+    for head, rows in (_paper_table(summary), _series_table(summary)):
+        if rows:
+            lines = [head, ["---"] * len(head), *rows]
+            parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
+    return "\n\n".join(parts)
+
+
+def _series_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
+    from evlcp_sdk.campaign.statistics import SEGMENT_M
+    from evlcp_sdk.campaign.summary import measure
+
+    def shown(value: float, low: float, high: float, form: str) -> str:
+        return f"{value:{form}} [{low:{form}}, {high:{form}}]"
+
+    rows = []
+    for one in summary.series:
+        for begin, tally in reversed(one.statistics.segments):
+            ber, rmse, gross = (measure(tally, kind) for kind in ("ber", "rmse_m", "gross_share"))
+            rows.append(
+                [
+                    one.name,
+                    f"{begin} to {begin + SEGMENT_M} m",
+                    f"{tally.frames_found} of {tally.frames_sent}",
+                    shown(ber.value, ber.low, ber.high, ".1e") if ber.count else "-",
+                    shown(rmse.value, rmse.low, rmse.high, ".3f") if rmse.count else "-",
+                    f"{gross.value:.2%}" if gross.count else "-",
+                ]
+            )
+    return ["series", "distance", "frames", "BER [95 %]", "RMSE, m [95 %]", "0.5 m or more"], rows
+
+
+def _paper_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
+    from evlcp_sdk.campaign.report import comparison_rows
+    from evlcp_sdk.campaign.summary import compare
+
+    rows = [list(row) for row in comparison_rows(compare(summary.series))]
+    return ["figure", "distance", "series", "paper", "here", "95 %", "agrees"], rows
+
+
+def _print_table(head: list[str], rows: list[list[str]]) -> None:
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for number, name in enumerate(head):
+        table.add_column(name, justify="left" if number < 2 else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    console().print(table)

@@ -1,0 +1,112 @@
+"""Headless Chromium without a driver: the DevTools protocol over a pair of pipes."""
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+CHROMIUM = shutil.which("chromium")
+
+_FLAGS = (
+    "--headless",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--host-resolver-rules=MAP * ~NOTFOUND",
+    "--window-size=1200,900",
+    "--remote-debugging-pipe",
+)
+
+
+class Browser:
+    """One page of a fresh browser; use as a context manager."""
+
+    def __init__(self, profile: Path) -> None:
+        assert CHROMIUM is not None
+        theirs_in, self._out = os.pipe()
+        self._in, theirs_out = os.pipe()
+        flags = [*_FLAGS, f"--user-data-dir={profile}"]
+        if os.geteuid() == 0:
+            flags.append("--no-sandbox")
+        script = f'exec "$0" "$@" 3<&{theirs_in} 4>&{theirs_out}'
+        self._process = subprocess.Popen(
+            ["bash", "-c", script, CHROMIUM, *flags, "about:blank"],
+            pass_fds=(theirs_in, theirs_out),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env=os.environ | {"HOME": str(profile)},
+        )
+        os.close(theirs_in)
+        os.close(theirs_out)
+        self._buffer = b""
+        self._number = 0
+        self._session: str | None = None
+        self.heard: list[dict[str, Any]] = []
+        targets = self.say("Target.getTargets")["targetInfos"]
+        target = next(t["targetId"] for t in targets if t["type"] == "page")
+        self._session = self.say("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Network", "Runtime", "Log"):
+            self.say(f"{domain}.enable")
+
+    def say(self, method: str, **params: Any) -> dict[str, Any]:
+        """Send a command, wait for its answer; what is heard meanwhile is kept."""
+        self._number += 1
+        command = {"id": self._number, "method": method, "params": params}
+        if self._session is not None:
+            command["sessionId"] = self._session
+        os.write(self._out, json.dumps(command).encode() + b"\0")
+        while True:
+            message = self._read()
+            if message.get("id") == self._number:
+                assert "error" not in message, message
+                result: dict[str, Any] = message["result"]
+                return result
+            self.heard.append(message)
+
+    def _read(self) -> dict[str, Any]:
+        while b"\0" not in self._buffer:
+            piece = os.read(self._in, 1 << 20)
+            assert piece, "the browser is gone"
+            self._buffer += piece
+        text, _, self._buffer = self._buffer.partition(b"\0")
+        message: dict[str, Any] = json.loads(text)
+        return message
+
+    def open(self, path: Path) -> None:
+        """Load a file and wait until it is there."""
+        self.heard.clear()
+        self.say("Page.navigate", url=path.as_uri())
+        while not any(m.get("method") == "Page.loadEventFired" for m in self.heard):
+            self.heard.append(self._read())
+
+    def value(self, expression: str) -> Any:
+        """What a JavaScript expression or promise gives."""
+        answer = self.say("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
+
+    def point_at(self, x: float, y: float) -> None:
+        """Move the mouse there."""
+        for dx in (-3, 0):
+            self.say("Input.dispatchMouseEvent", type="mouseMoved", x=x + dx, y=y)
+
+    def screenshot(self) -> str:
+        """A PNG of what is seen, base64."""
+        return str(self.say("Page.captureScreenshot")["data"])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._process.kill()
+        self._process.wait()
+        os.close(self._in)
+        os.close(self._out)

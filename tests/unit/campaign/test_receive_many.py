@@ -1,0 +1,72 @@
+"""`evlcp receive` over many recordings runs on the executors of campaigns."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+Evlcp = Callable[..., Any]
+
+
+@pytest.fixture
+def three(tmp_path: Path, demo_raw: Path) -> list[Path]:
+    return [Path(shutil.copy(demo_raw, tmp_path / f"{name}.raw")) for name in "abc"]
+
+
+def test_processes_give_what_this_one_gives(
+    evlcp: Evlcp, three: list[Path], demo_raw: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "bad.raw").write_bytes(b"\x89PNG" + bytes(60))
+    done = evlcp("receive", *three, tmp_path / "bad.raw", "-o", tmp_path / "out", "--workers", "2", "--json")
+    assert done.code == 3
+    assert done.err.startswith(f"evlcp: {tmp_path}/bad.raw: ")
+    assert len(done.err.splitlines()) == 1
+    told = [json.loads(line) for line in done.out.splitlines()]
+    assert sorted(t["status"] for t in told) == ["complete"] * 3 + ["failed"]
+    assert evlcp("receive", demo_raw, "-o", tmp_path / "one").code == 0
+    expected = (tmp_path / "one" / "frames.csv").read_bytes()
+    for path in three:
+        assert (tmp_path / "out" / path.stem / "frames.csv").read_bytes() == expected
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
+def test_ctrl_c_ends_all_of_them(three: list[Path], tmp_path: Path) -> None:
+    """A terminal's Ctrl-C reaches workers, too: what they decoded is written, and nothing is begun."""
+    many = [Path(shutil.copy(three[0], tmp_path / f"r{n}.raw")) for n in range(40)]
+    out = tmp_path / "out"
+    code = "from evlcp_sdk.cli.main import main; main()"
+    command = [sys.executable, "-c", code, "receive", *many, "-o", out, "--workers", "2"]
+    process = subprocess.Popen(
+        [str(c) for c in command],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    until = time.monotonic() + 60
+    while len(list(out.glob("*/summary.json"))) < 2 and time.monotonic() < until:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert err.startswith("evlcp: interrupted; what was decoded until then is in ")
+    assert len(err.splitlines()) == 1
+    folders = list(out.iterdir())
+    assert 2 <= len(folders) < 40
+    for folder in folders:
+        assert {p.name for p in folder.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
+
+
+def test_dask_that_is_not_there(evlcp: Evlcp, three: list[Path], tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    done = evlcp("receive", *three, "-o", tmp_path / "out", "--dask", "nonsense://x")
+    assert (done.code, done.err) == (2, "evlcp: --dask nonsense://x: no Dask scheduler answers there\n")
+    assert not (tmp_path / "out").exists()
