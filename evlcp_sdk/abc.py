@@ -8,6 +8,7 @@ synchronization keeps state, and that state is explicit.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -22,6 +23,7 @@ __all__ = [
     "ROLES",
     "Decode",
     "Decoding",
+    "Filter",
     "Measure",
     "Modulation",
     "Pilots",
@@ -30,6 +32,8 @@ __all__ = [
     "Separation",
     "Synchronization",
     "Synchronizer",
+    "Tracker",
+    "Tracking",
 ]
 
 Separate = Callable[[NDArray[np.int16]], PresenceMap]
@@ -121,6 +125,48 @@ class Ranging(ABC):
         """
 
 
+class Filter(ABC):
+    """Follows values that change smoothly, step by step, over explicit state."""
+
+    @abstractmethod
+    def init(self) -> Any:
+        """State before the first measurement."""
+
+    @abstractmethod
+    def predict(self, state: Any, t_us: float) -> tuple[NDArray[np.float64], float] | None:
+        """Values float64 (n,) and sigma expected at a time; None before the first measurement."""
+
+    @abstractmethod
+    def step(
+        self, state: Any, t_us: float, value: NDArray[np.float64], sigma: float
+    ) -> tuple[Any, NDArray[np.float64], float]:
+        """Take a measurement, float64 (n,); give the new state, the filtered values and their sigma.
+
+        The state that is given is not changed.
+        """
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """The filters that `Tracking.compile` returns; None leaves a quantity as measured.
+
+    Attributes:
+        position: Of a region's centre (column, row), px, at every time step.
+        distance: Of a transmitter's distance, m, at every frame.
+    """
+
+    position: Filter | None
+    distance: Filter | None
+
+
+class Tracking(ABC):
+    """Distance and image position over time."""
+
+    @abstractmethod
+    def compile(self) -> Tracker:
+        """Make the filters."""
+
+
 ROLES: dict[str, type[ABC]] = {
     "pilots": Pilots,
     "modulation": Modulation,
@@ -128,5 +174,6 @@ ROLES: dict[str, type[ABC]] = {
     "separation": Separation,
     "decoding": Decoding,
     "ranging": Ranging,
+    "tracking": Tracking,
 }
 """The abstract class of each role name."""

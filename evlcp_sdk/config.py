@@ -43,6 +43,7 @@ DEFAULT_IDS = {
     "separation": "wh-correlation",
     "decoding": "wh-transform",
     "ranging": "poc",
+    "tracking": "none",
 }
 """The algorithm of each role when the configuration names none."""
 

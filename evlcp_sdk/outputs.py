@@ -23,7 +23,7 @@ from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.frames import bits_of_symbols
 from evlcp_sdk.types import Frame, Packet
 
-__all__ = ["FIGURE_NAMES", "FRAME_COLUMNS", "ResultWriter", "Status", "TransmitterTally"]
+__all__ = ["FIGURE_NAMES", "FILTERED_COLUMNS", "FRAME_COLUMNS", "ResultWriter", "Status", "TransmitterTally"]
 
 FRAME_COLUMNS = (
     "transmitter",
@@ -38,6 +38,9 @@ FRAME_COLUMNS = (
     "y_px",
 )
 """Columns of `frames.csv` and `frames.parquet`."""
+
+FILTERED_COLUMNS = ("distance_filtered_m", "distance_filtered_sigma_m")
+"""Columns that follow where a tracking algorithm filters the distance."""
 
 FIGURE_NAMES = ("regions.png", "presence.png", "distance.png")
 """Figures that a run may leave in its folder."""
@@ -149,6 +152,7 @@ class ResultWriter:
         self.folder = folder
         self.transmitters: dict[int, TransmitterTally] = {}
         self._link = link
+        self._filtered = link.algorithm("tracking").compile().distance is not None
         self._parquet: _ParquetRows | None = None
         if parquet:
             _check_parquet()
@@ -157,11 +161,11 @@ class ResultWriter:
             self._frames_file = self._open("frames.csv")
             self._packets_file = self._open("packets.jsonl")
             if parquet:
-                self._parquet = _ParquetRows(self._hidden("frames.parquet"))
+                self._parquet = _ParquetRows(self._hidden("frames.parquet"), self._filtered)
         except OSError as fault:
             raise ConfigError(f"{folder}: cannot be written: {fault.strerror}") from fault
         self._rows = csv.writer(self._frames_file, lineterminator="\n")
-        self._rows.writerow(FRAME_COLUMNS)
+        self._rows.writerow(FRAME_COLUMNS + (FILTERED_COLUMNS if self._filtered else ()))
 
     def _hidden(self, name: str) -> Path:
         return self.folder / f".{name}.{os.getpid()}.part"
@@ -190,7 +194,7 @@ class ResultWriter:
         tally.add(packet)
         self._packets_file.write(json.dumps(self._packet_line(packet)) + "\n")
         for frame in packet.frames:
-            self._rows.writerow(_frame_row(frame))
+            self._rows.writerow(_frame_row(frame) + (_filtered_row(frame) if self._filtered else []))
             if self._parquet is not None:
                 self._parquet.add(frame)
 
@@ -314,6 +318,12 @@ def _frame_row(frame: Frame) -> list[str]:
     ]
 
 
+def _filtered_row(frame: Frame) -> list[str]:
+    if frame.filtered is None:
+        return ["", ""]
+    return [_text(frame.filtered.distance_m), _text(frame.filtered.sigma_m)]
+
+
 def _text(value: float) -> str:
     return f"{value:.4f}" if math.isfinite(value) else ""
 
@@ -332,18 +342,25 @@ class _ParquetRows:
 
     GROUP = 4096
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, filtered: bool) -> None:
         import pyarrow
         import pyarrow.parquet
 
         whole, real = pyarrow.int64(), pyarrow.float64()
         types = [whole, whole, whole, real, pyarrow.list_(whole), real, real, real, real, real]
-        self._schema = pyarrow.schema(list(zip(FRAME_COLUMNS, types, strict=True)))
+        self._columns = FRAME_COLUMNS + (FILTERED_COLUMNS if filtered else ())
+        types += [real] * (len(self._columns) - len(types))
+        self._schema = pyarrow.schema(list(zip(self._columns, types, strict=True)))
         self._arrow = pyarrow
         self._writer = pyarrow.parquet.ParquetWriter(path, self._schema)
         self._waiting: list[dict[str, Any]] = []
 
     def add(self, frame: Frame) -> None:
+        distances = (
+            [frame.range, frame.filtered] if len(self._columns) > len(FRAME_COLUMNS) else [frame.range]
+        )
+        found = [(None, None) if r is None else (r.distance_m, r.sigma_m) for r in distances]
+        numbers = [[None if v is None else _number(v, 15) for v in pair] for pair in found]
         values = (
             frame.transmitter,
             frame.packet,
@@ -351,12 +368,12 @@ class _ParquetRows:
             frame.t_us,
             frame.soft.symbols.tolist(),
             frame.soft.quality,
-            _number(frame.range.distance_m, 15),
-            _number(frame.range.sigma_m, 15),
+            *numbers[0],
             frame.x_px,
             frame.y_px,
+            *(numbers[1] if len(numbers) > 1 else ()),
         )
-        self._waiting.append(dict(zip(FRAME_COLUMNS, values, strict=True)))
+        self._waiting.append(dict(zip(self._columns, values, strict=True)))
         if len(self._waiting) == self.GROUP:
             self._flush()
 

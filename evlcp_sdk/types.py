@@ -265,6 +265,7 @@ class Frame:
         t_us: Start of the frame's first pilot chip on the camera's clock, us.
         soft: Symbols and log-likelihood ratios.
         range: Distance; its values are NaN when the maps do not allow one.
+        filtered: Distance filtered over time; None without tracking.
         x_px: Column of the bar's centre in the middle of the pilot, px.
         y_px: Row of the same, px.
     """
@@ -275,6 +276,7 @@ class Frame:
     t_us: float
     soft: SoftSymbols
     range: Range
+    filtered: Range | None
     x_px: float
     y_px: float
 

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pluggy
 
-from evlcp_sdk.abc import Synchronizer
+from evlcp_sdk.abc import Synchronizer, Tracker
 from evlcp_sdk.config import Link
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.rx.chips import polarity_sums
 from evlcp_sdk.rx.payload import PacketAssembler
 from evlcp_sdk.rx.presence import clusters_in_place
 from evlcp_sdk.rx.regions import RegionTracker, Track
-from evlcp_sdk.types import Events, Frame, FrameView, Packet, SyncLock
+from evlcp_sdk.types import Events, Frame, FrameView, Packet, Range, SyncLock
 
 __all__ = ["Receiver"]
 
@@ -41,6 +41,7 @@ class _Transmitter:
         packet: Number of the lock's packet, counted from the first that may have a frame here.
         frame: Next frame to decode, counted from that packet's first.
         first: Number of the first packet that had a frame, None before.
+        distance: State of the distance filter.
     """
 
     track: Track
@@ -51,6 +52,7 @@ class _Transmitter:
     packet: int = 0
     frame: int = 0
     first: int | None = None
+    distance: Any = None
 
 
 class Receiver:
@@ -85,8 +87,10 @@ class Receiver:
         self._separate = link.algorithm("separation").compile(link.codebook)
         self._decode = link.algorithm("decoding").compile(link.codebook)
         self._measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+        tracker: Tracker = link.algorithm("tracking").compile()
+        self._distance = tracker.distance
         self._centres_m = link.bar.cluster_centres_m()
-        self._tracker = RegionTracker(link.regions, link.camera, link.packet.chip_us)
+        self._tracker = RegionTracker(link.regions, link.camera, link.packet.chip_us, tracker.position)
         self._transmitters: dict[int, _Transmitter] = {}
         self._released: list[_Transmitter] = []
         self._pending: list[Events] = []
@@ -284,6 +288,7 @@ class Receiver:
             if abs(apart - round(apart)) * packet.packet_chips < 1:
                 transmitter.number, transmitter.frame = lost.number, lost.frame
                 transmitter.packet, transmitter.first = lost.packet + round(apart), lost.first
+                transmitter.distance = lost.distance
                 transmitter.assembler, lost.assembler = lost.assembler, transmitter.assembler
                 transmitter.lock, lost.lock = lock, None
                 return True
@@ -349,11 +354,25 @@ class Receiver:
             t_us=start_us,
             soft=soft,
             range=distance,
+            filtered=self._filter(transmitter, start_us, distance),
             x_px=float(x[pilot_middle]),
             y_px=float(y[pilot_middle]),
         )
         self._tell("frame", frame, clock[-1] - clock[0])
         return frame
+
+    def _filter(self, transmitter: _Transmitter, t_us: float, measured: Range) -> Range | None:
+        """The distance filtered over time; the prediction where a frame allows none."""
+        if self._distance is None:
+            return None
+        if np.isnan(measured.distance_m) or np.isnan(measured.sigma_m):
+            expected = self._distance.predict(transmitter.distance, t_us)
+            return None if expected is None else Range(float(expected[0][0]), expected[1], 0)
+        value = np.array([measured.distance_m])
+        transmitter.distance, value, sigma = self._distance.step(
+            transmitter.distance, t_us, value, measured.sigma_m
+        )
+        return Range(float(value[0]), sigma, measured.pairs)
 
     def _forget(self, transmitter: _Transmitter, now_us: float) -> None:
         """Drop what no frame can need any more."""

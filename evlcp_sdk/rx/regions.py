@@ -10,12 +10,14 @@ nothing on balance. One pass, one number a pixel.
 
 from bisect import bisect_left
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from evlcp_sdk.abc import Filter
 from evlcp_sdk.config import RegionSpec
 from evlcp_sdk.geometry import CameraModel
 from evlcp_sdk.types import Events, Region
@@ -33,6 +35,9 @@ _MEASURE_CHIPS = 4
 
 _MIN_PIXELS = 4
 """Blinking pixels below which a region has no position: one cluster at 100 m has a dozen."""
+
+_CENTRE_SIGMA_PX = 0.25
+"""Error of a measured centre: the edge of a row of pixels, a third of one, at the top and at the bottom."""
 
 _BACKFILL_STEPS = 12
 """Steps kept from before a region was found: a pixel needs about 1 ms to score, a region two steps."""
@@ -52,6 +57,7 @@ class Track:
         positions: Where it was measured, oldest first.
         blocks: Its events, one entry a time step: (start of the step, us; events).
         first_us: Start of the first step of which it has events, us.
+        filter: State of the filter of its centre.
         released: True once it has faded or was merged into another; it gets no more events.
     """
 
@@ -60,6 +66,7 @@ class Track:
     first_us: int
     blocks: deque[Block] = field(default_factory=deque)
     released: bool = False
+    filter: Any = None
 
     @property
     def latest(self) -> Region:
@@ -107,10 +114,14 @@ class RegionTracker:
         spec: Parameters.
         camera: For the size of the sensor.
         chip_us: Nominal length of a chip, us.
+        position: Filter of the centres; None for centres as measured.
     """
 
-    def __init__(self, spec: RegionSpec, camera: CameraModel, chip_us: float) -> None:
+    def __init__(
+        self, spec: RegionSpec, camera: CameraModel, chip_us: float, position: Filter | None = None
+    ) -> None:
         self._spec = spec
+        self._position = position
         self._camera = camera
         shortest, single, double = _RUN_CHIPS
         self._run_us = (round(shortest * chip_us), round(single * chip_us), round(double * chip_us))
@@ -142,12 +153,12 @@ class RegionTracker:
             _CELL_SHIFT,
         )
         end_us = start_us + spec.block_us
-        boxes = [self._reach(track.expected(start_us + spec.block_us / 2)) for track in self.tracks]
+        boxes = [self._reach(self._expected(track, start_us + spec.block_us / 2)) for track in self.tracks]
         for track, box, inside in zip(self.tracks, boxes, _select(events, boxes), strict=True):
             track.blocks.append((start_us, inside))
             measured = self._measure(track.id, box, end_us)
             if measured is not None:
-                track.positions.append(measured)
+                track.positions.append(self._filtered(track, measured))
         self._merge()
         self._open(end_us)
         seen = list(self.tracks)
@@ -160,6 +171,20 @@ class RegionTracker:
         """Pass over a gap in time, with no track alive."""
         self._fresh = []
         self._recent.clear()
+
+    def _expected(self, track: Track, t_us: float) -> Region:
+        """Where a region should be soon: by its filter, or else straight on."""
+        expected = self._position.predict(track.filter, t_us) if self._position else None
+        if expected is None:
+            return track.expected(t_us)
+        return replace(track.latest, x_px=float(expected[0][0]), y_px=float(expected[0][1]))
+
+    def _filtered(self, track: Track, measured: Region) -> Region:
+        if self._position is None:
+            return measured
+        centre = np.array([measured.x_px, measured.y_px])
+        track.filter, centre, _ = self._position.step(track.filter, measured.t_us, centre, _CENTRE_SIGMA_PX)
+        return replace(measured, x_px=float(centre[0]), y_px=float(centre[1]))
 
     def _reach(self, region: Region) -> Box:
         """The box in which a region's events lie within the next step."""

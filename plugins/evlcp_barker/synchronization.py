@@ -21,6 +21,9 @@ one and two chips away."""
 _TIMING_SIGMA_US = 2.0
 """Spread of one packet's time, from the grid of the correlation and the jitter of the pixels."""
 
+_CLEARLY = 0.1
+"""Difference in correlation that tells a preamble from data: from packet to packet it varies by 0.02."""
+
 _FIT_PACKETS = 8
 """Packets of the clock fit: 0.3 s, in which a quartz does not drift by 0.1 us."""
 
@@ -41,7 +44,7 @@ class BarkerSync(Synchronization):
         Field(
             gt=0,
             lt=1,
-            description="Normalised correlation that makes a preamble; 16 clusters of random data give"
+            description="Normalised correlation that makes a preamble; random data on 16 clusters have"
             " 0.07 rms, a preamble 0.7 or more.",
         ),
     ] = 0.5
@@ -112,8 +115,9 @@ class BarkerSynchronizer:
             first = (int(t_us[0] // self._bin_us) if len(t_us) else until_bin) - guard
             state = replace(state, first_bin=first, next_bin=first)
         assert state.first_bin is not None
-        bins = max(until_bin - state.first_bin, state.counts.shape[1])
-        counts = np.empty((2, bins))
+        bins = max(until_bin - state.first_bin, state.counts.shape[1] - 1)
+        # The last bin is still open: its events count, but it is not correlated yet.
+        counts = np.empty((2, bins + 1))
         _kernels.count_bins(t_us, p, state.first_bin, self._bin_us, state.counts, counts)
 
         locks: list[SyncLock] = []
@@ -122,7 +126,7 @@ class BarkerSynchronizer:
         lo = state.next_bin - state.first_bin
         if lags - guard > lo:
             rho = np.empty(lags)
-            top = _kernels.correlate(counts, self._chips, n, self._spec.min_events, rho)
+            top = _kernels.correlate(counts[:, :bins], self._chips, n, self._spec.min_events, rho)
             for lag in self._peaks(rho, lo, guard) if top >= self._spec.min_correlation else ():
                 found = self._refine(lag, counts, state.first_bin, float(rho[lag]))
                 heard, stray = self._accept(heard, stray, found)
@@ -171,12 +175,18 @@ class BarkerSynchronizer:
     def _accept(
         self, heard: tuple[_Heard, ...], stray: _Heard | None, found: _Heard
     ) -> tuple[tuple[_Heard, ...], _Heard | None]:
-        """Add a preamble to the lock it fits; a second one off the lock that fits the first starts anew."""
-        if not heard:
+        """Add a preamble to the lock it fits; a better one, or a second one as good, off it starts anew.
+
+        One symbol on all clusters at once blinks in phase, too, but can agree with 16 chips of 26 only.
+        """
+        quality = float(np.mean([h.quality for h in heard])) if heard else 0.0
+        if found.quality > quality + _CLEARLY:
             return (found,), None
         steps = self._packets_between(heard, found)
         if steps is not None:
             return (*heard, replace(found, packet=heard[-1].packet + steps))[-_FIT_PACKETS:], None
+        if found.quality < quality - _CLEARLY:
+            return heard, stray
         if stray is not None:
             steps = self._packets_between((stray,), found)
             if steps is not None:

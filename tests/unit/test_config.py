@@ -25,6 +25,8 @@ from evlcp_sdk.abc import (
     Separation,
     Synchronization,
     Synchronizer,
+    Tracker,
+    Tracking,
 )
 from evlcp_sdk.codebook import BARKER13, Codebook, hadamard
 from evlcp_sdk.config import DEFAULT_IDS, Link, installed_versions, load_link, resolve, to_toml
@@ -85,6 +87,12 @@ class FakeRanging(Ranging):
         raise NotImplementedError
 
 
+@dataclass(frozen=True)
+class FakeTracking(Tracking):
+    def compile(self) -> Tracker:
+        raise NotImplementedError
+
+
 class Fakes:
     def __init__(self, revision: int = 1) -> None:
         self.revision = revision
@@ -123,7 +131,7 @@ def test_defaults_are_all_written_out(registry: Registry) -> None:
     link = load_link(None, (), registry)
     assert list(link.table) == [
         *("camera", "bar", "air", "regions"),
-        *("pilots", "modulation", "synchronization", "separation", "decoding", "ranging"),
+        *("pilots", "modulation", "synchronization", "separation", "decoding", "ranging", "tracking"),
     ]
     assert link.table["air"] == {"chip_rate_hz": 10_000.0, "frames_per_packet": 10}
     assert link.table["ranging"] == {
@@ -198,10 +206,10 @@ def test_every_fault_of_a_file_is_told(registry: Registry, tmp_path: Path) -> No
     """
     assert faults_of(registry, text, tmp_path, "bar.led_pitch_m=-1", "lamp.on=1") == [
         "link.toml: camra: unknown table; did you mean 'camera'? (known: camera, bar, air, regions, pilots,"
-        " modulation, synchronization, separation, decoding, ranging)",
+        " modulation, synchronization, separation, decoding, ranging, tracking)",
         "link.toml: decoding = 4: expected a table",
         "--set: lamp.on: unknown table (known: camera, bar, air, regions, pilots,"
-        " modulation, synchronization, separation, decoding, ranging)",
+        " modulation, synchronization, separation, decoding, ranging, tracking)",
         "link.toml: camera.width = 0: expected greater than 0",
         'link.toml: camera.focal_mm = "35": expected a valid number',
         "--set: bar.led_pitch_m = -1: expected greater than 0",

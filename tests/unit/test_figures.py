@@ -31,7 +31,7 @@ def presence(fill: float) -> PresenceMap:
 
 def frame(transmitter: int, number: int, distance_m: float, quality: float = 0.9) -> Frame:
     soft = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), quality)
-    return Frame(transmitter, 0, number, 3200.0 * number, soft, Range(distance_m, 0.1, 9), 100.0, 200.0)
+    return Frame(transmitter, 0, number, 3200.0 * number, soft, Range(distance_m, 0.1, 9), None, 100.0, 200.0)
 
 
 def told(probe: FigureProbe, transmitters: int, frames: int, fill: float = 1.0) -> FigureProbe:

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from evlcp_kalman.tracking import NoTracking
 from evlcp_wh.modulation import Wh8
 from evlcp_wh.pilots import WhPilots
 
 from evlcp_sdk.codebook import Codebook
-from evlcp_sdk.config import AirSpec, Link, RegionSpec
+from evlcp_sdk.config import AirSpec, Link, RegionSpec, load_link
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.frames import PacketFormat, symbols_of_bits
 from evlcp_sdk.geometry import BarLayout, CameraModel
@@ -26,7 +27,7 @@ LINK = Link(
     bar=BarLayout(),
     air=AirSpec(frames_per_packet=3),
     regions=RegionSpec(),
-    algorithms={},
+    algorithms={"tracking": NoTracking()},
     revisions={"ranging": 1},
     codebook=BOOK,
     packet=PacketFormat.of(BOOK, 3),
@@ -46,6 +47,7 @@ def frame(packet: int, number: int, distance_m: float = 50.0, transmitter: int =
         12_345.678 + 3200 * number,
         soft,
         Range(distance_m, sigma, 20),
+        Range(distance_m + 1, sigma / 2, 20) if math.isfinite(distance_m) else None,
         640.1234,
         360.5,
     )
@@ -220,3 +222,22 @@ def test_a_jump_in_time_is_no_clock_error() -> None:
     for number, t_us in enumerate([0.0, 12_200.1, 24_400.2, 30_000.0, 42_200.1]):
         tally.add(Packet(0, number, t_us, 100.0, (), sent=3))
     assert tally.clock_ppm() == pytest.approx(-0.1 / 12_200 * 1e6, rel=1e-3)
+
+
+@pytest.mark.parametrize("parquet", [False, True])
+def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path, parquet: bool) -> None:
+    if parquet:
+        pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
+    link = load_link(overrides=["tracking.id=kalman"])
+    with ResultWriter(tmp_path, link, parquet=parquet) as writer:
+        writer.write([packet(0, (frame(0, 0), frame(0, 1, math.nan)))])
+        finish(writer)
+    with (tmp_path / "frames.csv").open() as file:
+        first, second = csv.DictReader(file)
+    assert (first["distance_filtered_m"], first["distance_filtered_sigma_m"]) == ("51.0000", "0.0250")
+    assert (second["distance_filtered_m"], second["distance_filtered_sigma_m"]) == ("", "")
+    if parquet:
+        import pyarrow.parquet
+
+        table = pyarrow.parquet.read_table(tmp_path / "frames.parquet").to_pylist()
+        assert [row["distance_filtered_m"] for row in table] == [51.0, None]

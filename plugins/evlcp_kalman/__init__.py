@@ -1,0 +1,16 @@
+"""Tracking of distance and image position over time, by Kalman filters; and none."""
+
+from collections.abc import Iterator
+
+from evlcp_sdk.hookspecs import Algorithm, hookimpl
+
+__all__ = ["evlcp_algorithms"]
+
+
+@hookimpl
+def evlcp_algorithms() -> Iterator[Algorithm]:
+    """The algorithms of this package."""
+    yield Algorithm("tracking", "none", "evlcp_kalman.tracking:NoTracking", 1, "each frame by itself")
+    yield Algorithm(
+        "tracking", "kalman", "evlcp_kalman.tracking:KalmanTracking", 1, "constant-velocity Kalman filters"
+    )

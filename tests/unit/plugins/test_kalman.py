@@ -1,0 +1,113 @@
+"""The tracking filters against the textbook's matrices, and their consistency by simulation."""
+
+import numpy as np
+import pytest
+from evlcp_kalman.tracking import KalmanTracking, NoTracking
+from numpy.testing import assert_allclose
+from scipy import stats
+
+from evlcp_sdk.abc import Filter
+from evlcp_sdk.config import load_link
+from evlcp_sdk.rx.receiver import Receiver
+from tests.synthetic import Bar, events_of, random_symbols
+
+FRAME_US = 3460.0
+
+
+def distance_filter(**parameters: float) -> Filter:
+    found = KalmanTracking(**parameters).compile().distance
+    assert found is not None
+    return found
+
+
+def run(filter_: Filter, t_us: np.ndarray, values: np.ndarray, sigma: float) -> np.ndarray:
+    state, out = filter_.init(), []
+    for t, v in zip(t_us, values, strict=True):
+        state, value, s = filter_.step(state, t, np.array([v]), sigma)
+        out.append((value[0], s))
+    return np.array(out)
+
+
+def test_it_is_the_textbook_filter() -> None:
+    """Step by step with full matrices, covariance in Joseph's form."""
+    q, speed, sigma = 2.0, 15.0, 0.1
+    rng = np.random.default_rng(0)
+    t_us = np.cumsum(rng.uniform(2000, 8000, 40))
+    z = 50 - 8 * t_us * 1e-6 + rng.normal(0, sigma, 40)
+    got = run(distance_filter(acceleration_m2_s3=q, speed_m_s=speed), t_us, z, sigma)
+    x, P, H = np.array([z[0], 0.0]), np.diag([sigma**2, speed**2]), np.array([[1.0, 0.0]])
+    want = [(x[0], np.sqrt(P[0, 0]))]
+    for dt, value in zip(np.diff(t_us) * 1e-6, z[1:], strict=True):
+        F = np.array([[1, dt], [0, 1]])
+        P = F @ P @ F.T + q * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        x = F @ x
+        K = P @ H.T / (H @ P @ H.T + sigma**2)
+        x = x + K[:, 0] * (value - x[0])
+        J = np.eye(2) - K @ H
+        P = J @ P @ J.T + K @ K.T * sigma**2
+        want.append((x[0], np.sqrt(P[0, 0])))
+    assert_allclose(got, want, rtol=1e-9)
+
+
+def test_sigmas_are_consistent() -> None:
+    """The normalised error squared of 200 drives lies in its 95 % band (Bar-Shalom, section 5.4)."""
+    q, sigma, n = 1.0, 0.08, 60
+    rng = np.random.default_rng(1)
+    dt = FRAME_US * 1e-6
+    noise = np.linalg.cholesky(q * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]))
+    last = []
+    for _ in range(200):
+        x, path = np.array([60.0, rng.normal(0, 20)]), []
+        for _ in range(n):
+            path.append(x[0])
+            x = np.array([x[0] + dt * x[1], x[1]]) + noise @ rng.normal(size=2)
+        t_us = np.arange(n) * FRAME_US
+        out = run(distance_filter(acceleration_m2_s3=q), t_us, path + rng.normal(0, sigma, n), sigma)
+        last.append(((out[-1, 0] - path[-1]) / out[-1, 1]) ** 2)
+    low, high = stats.chi2.ppf([0.025, 0.975], 200) / 200
+    assert low < np.mean(last) < high
+
+
+def test_filtering_pays_and_an_outlier_is_left_out() -> None:
+    rng = np.random.default_rng(2)
+    t_us = np.arange(80) * FRAME_US
+    true = 45 - 8.3 * t_us * 1e-6
+    z = true + rng.normal(0, 0.1, 80)
+    z[50] += 5
+    out = run(distance_filter(), t_us, z, 0.1)
+    assert np.abs(out[30:, 0] - true[30:]).max() < 0.15
+    assert np.sqrt(np.mean((out[20:, 0] - true[20:]) ** 2)) < 0.5 * 0.1
+
+
+def test_what_changed_for_good_is_believed() -> None:
+    t_us = np.arange(60) * FRAME_US
+    z = np.where(np.arange(60) < 30, 40.0, 70.0)
+    assert run(distance_filter(), t_us, z, 0.1)[-1, 0] == pytest.approx(70, abs=0.1)
+
+
+def test_states_are_not_changed_and_predict_goes_straight_on() -> None:
+    filter_ = distance_filter()
+    assert filter_.predict(filter_.init(), 0) is None
+    state = filter_.init()
+    for k in range(50):
+        state, _, _ = filter_.step(state, k * 1000.0, np.array([10 + 0.01 * k]), 0.01)
+    before = state.mean.copy(), state.covariance.copy()
+    expected = filter_.predict(state, 60_000.0)
+    assert expected is not None
+    assert expected[0][0] == pytest.approx(10.6, abs=0.02)
+    filter_.step(state, 51_000.0, np.array([20.0]), 0.01)
+    assert_allclose(state.mean, before[0])
+    assert_allclose(state.covariance, before[1])
+
+
+def test_the_receiver_filters_only_when_asked() -> None:
+    assert NoTracking().compile().distance is None
+    for override, filtered in (("tracking.id=none", False), ("tracking.id=kalman", True)):
+        link = load_link(overrides=[override])
+        bar = Bar(random_symbols(link, 2), shake_px=10, shake_hz=12)
+        receiver = Receiver(link)
+        frames = [f for p in receiver.feed(events_of(link, bar)) + receiver.close() for f in p.frames]
+        assert len(frames) == 20
+        assert all((f.filtered is not None) == filtered for f in frames)
+        got = [f.soft.symbols.tolist() for f in frames]
+        assert got == bar.symbols.reshape(-1, 16).tolist()
