@@ -15,7 +15,7 @@ SOFT = SoftSymbols(np.zeros(1, np.int64), np.zeros((1, 1), np.float32), 1.0)
 
 
 def frame(packet, number):
-    return Frame(2, packet, number, 0.0, SOFT, Range(1.0, 0.1, 3), 0.0, 0.0)
+    return Frame(2, packet, number, 0.0, SOFT, Range(1.0, 0.1, 3), None, 0.0, 0.0)
 
 
 def start_us(packet, number):
