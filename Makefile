@@ -39,6 +39,12 @@ clean:  ## Remove .venv and everything that was generated
 toolchain:
 	@if [ -f $(TOOLCHAIN) ]; then bash $(TOOLCHAIN) || { \
 	  echo "make: the firmware toolchain is not installed; its tests are skipped"; [ -z "$$CI" ]; }; fi
+	@command -v chromium >/dev/null || { \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then echo "installing chromium"; \
+	    apt-get update -qq >/dev/null 2>&1; \
+	    DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium >/dev/null; fi; \
+	  command -v chromium >/dev/null || { \
+	    echo "make: chromium is not installed; the test of the report's page is skipped"; [ -z "$$CI" ]; }; }
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
@@ -56,9 +62,9 @@ $(VENV)/.pip: | $(BIN)/python
 	@touch $@
 
 $(VENV)/.installed: pyproject.toml $(VENV)/.pip
-	$(BIN)/python -m pip install -q -e .
+	$(BIN)/python -m pip install -q -e '.[report]'
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.pip
-	$(BIN)/python -m pip install -q -e '.[faery,parquet]' --group dev
+	$(BIN)/python -m pip install -q -e '.[faery,parquet,cluster,report]' --group dev
 	@touch $@ $(VENV)/.installed
