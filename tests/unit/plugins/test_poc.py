@@ -1,0 +1,379 @@
+"""Ranging by phase-only correlation: kernels against twins, exact shifts, ideal images."""
+
+from pathlib import Path
+
+import numpy as np
+import poc_twins as twins
+import pytest
+from evlcp_poc import _kernels
+from evlcp_poc.ranging import PocRanging, phase_only_correlation
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from evlcp_sdk.config import load_link
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.geometry import BarLayout, CameraModel
+from evlcp_sdk.types import FrameView, PresenceMap, SoftSymbols
+
+SEEDS = range(10)
+CAMERA, BAR = CameraModel(), BarLayout()
+PANEL = BarLayout(rows=16, columns=16, cluster_rows=4, cluster_columns=4)
+LINK = load_link()
+EXAMPLES = Path(__file__).parents[3] / "examples"
+SHAPES = [(24, 20), (25, 21), (16, 17), (48, 40)]
+
+
+# Kernels
+
+
+@pytest.mark.parametrize("size", [5, 8, 21, 24, 64])
+@pytest.mark.parametrize("start", [-8.3, -3.0, -0.5, 0.0, 1e-7, 0.999])
+def test_dirichlet_is_the_sum_of_cosines(size, start):
+    values, slopes = np.empty((2, min(size, 17)))
+    for band in {1, 3, size - 1 + size % 2}:
+        _kernels.dirichlet(start, size, band, values, slopes)
+        want, slope = twins.dirichlet(start + np.arange(len(values)), size, band)
+        assert_allclose(values, want, atol=1e-13)
+        # Near zero the slope is a small difference: 1e-16 / 1e-7.
+        assert_allclose(slopes, slope, atol=1e-8)
+
+
+@pytest.mark.parametrize(("size", "samples"), [(8, 1), (21, 2), (24, 2), (40, 8)])
+@pytest.mark.parametrize("gain", [1e-3, 1.0, 40.0])
+def test_an_exact_peak_is_fitted_exactly(size, samples, gain):
+    band = size - 1 + size % 2
+    for shift in np.linspace(-0.7, 0.7, 29):
+        kernel, _ = twins.dirichlet(np.arange(-samples, samples + 1) - shift, size, band)
+        # The last step is below 1e-3 px, and what it leaves its square.
+        assert _kernels.fit_peak(gain * kernel, size, band) == pytest.approx(shift, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_noisy_peak_is_fitted_by_least_squares(seed):
+    rng = np.random.default_rng(seed)
+    size, samples = int(rng.integers(12, 50)), int(rng.integers(1, 5))
+    band = size - 1 + size % 2
+    kernel, _ = twins.dirichlet(np.arange(-samples, samples + 1) - rng.uniform(-0.6, 0.6), size, band)
+    noisy = kernel + rng.normal(0, 0.05, len(kernel))
+    # Steps end below 1e-3 px, the next would be quadratically smaller.
+    assert _kernels.fit_peak(noisy, size, band) == pytest.approx(
+        twins.peak_shift(noisy, size, band), abs=1e-4
+    )
+
+
+@pytest.mark.parametrize("samples", [[0, 0, 0], [-1, -2, -1], [0, 1, 0]])
+def test_no_peak_is_no_shift(samples):
+    assert _kernels.fit_peak(np.array(samples, float), 24, 23) == 0
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_phase_only_correlation(shape, dtype):
+    rng = np.random.default_rng(shape[1])
+    images = rng.normal(size=(4, *shape)).astype(dtype)
+    first, second = np.array([0, 0, 2, 3]), np.array([1, 0, 0, 2])
+    got = phase_only_correlation(images, first, second)
+    for q, (i, j) in enumerate(zip(first, second, strict=True)):
+        want = twins.phase_only_correlation(images[i], images[j])
+        assert_allclose(got[q], want, atol=1e-6)
+    # An image with itself: the kernel of the band kept.
+    down, right = (twins.dirichlet(np.arange(n), n, n - 1 + n % 2)[0] for n in shape)
+    assert_allclose(got[1], np.outer(down, right), atol=1e-6)
+
+
+def test_phase_only_correlation_takes_views():
+    rng = np.random.default_rng(1)
+    images = rng.normal(size=(3, 12, 20)).astype(np.float32)
+    pairs = np.array([0, 1]), np.array([2, 2])
+    want = phase_only_correlation(images, *pairs)
+    kept = images.copy()
+    for array in (images, *pairs):
+        array.setflags(write=False)
+    strided = np.repeat(images, 2, 2)[:, :, ::2]
+    assert_array_equal(phase_only_correlation(images, *pairs), want)
+    assert_allclose(phase_only_correlation(strided, *pairs), want, atol=1e-6)
+    assert_array_equal(images, kept)
+    assert phase_only_correlation(images, pairs[0][:0], pairs[1][:0]).shape == (0, 12, 20)
+
+
+def test_what_has_no_phase_counts_for_nothing():
+    spectra = np.array([[[3 + 4j, 1e-5, 0], [0, -2e-3, 1j]], [[0, 0, 0], [0, 0, 0]]], np.complex64)
+    _kernels.unit_phases(spectra)
+    assert_allclose(spectra[0], [[0.6 + 0.8j, 0, 0], [0, -1, 1j]], rtol=1e-6)
+    assert not spectra[1].any()
+
+
+@pytest.mark.parametrize("even", [(False, False), (True, False), (False, True), (True, True)])
+def test_cross_spectra(even):
+    rng = np.random.default_rng(0)
+    phases = (rng.normal(size=(3, 6, 4)) + 1j * rng.normal(size=(3, 6, 4))).astype(np.complex64)
+    first, second = np.array([0, 2]), np.array([1, 1])
+    out = np.empty((2, 6, 4), np.complex64)
+    _kernels.cross_spectra(phases, first, second, *even, out)
+    want = phases[second] * phases[first].conj()
+    want[:, 3] *= not even[0]
+    want[:, :, -1] *= not even[1]
+    assert_allclose(out, want, rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_medians_and_cuts_of_maps(seed):
+    rng = np.random.default_rng(seed)
+    maps = (rng.integers(0, 9, (6, 11, 7)) / 8 * (rng.random((6, 11, 7)) < 0.2)).astype(np.float32)
+    maps[1] = 0
+    maps[2], maps[2, 0, :4] = 0, 1
+    maps[3], maps[3, -1, -3:] = 0, 1
+    used = np.array([0, 1, 2, 3, 5])
+    middle = np.empty((5, 2), np.int64)
+    _kernels.middles(maps, used, 4, middle)
+    want = [twins.middle(maps[k], 4) for k in used]
+    assert middle.tolist() == want
+    assert want[1] == want[3] == [-1, -1]
+    # Larger and smaller than the maps, even and odd.
+    for rows, columns in [(4, 3), (14, 12), (5, 8), (30, 30)]:
+        out = np.zeros((5, rows, columns), np.float32)
+        _kernels.cut_maps(maps, used, middle, out)
+        for n, k in enumerate(used):
+            assert_array_equal(out[n], twins.cut(maps[k], middle[n], rows, columns))
+
+
+def test_whole_pixel_shifts_and_their_scale():
+    rng = np.random.default_rng(0)
+    middle = rng.integers(0, 90, (6, 2))
+    first, second = np.triu_indices(6, 1)
+    apart = rng.uniform(0.1, 1, 15)
+    shifts = np.empty((15, 2))
+    scale = _kernels.middle_shifts(middle, first, second, apart, shifts)
+    assert_array_equal(shifts, middle[second] - middle[first])
+    assert scale == pytest.approx(np.median(np.linalg.norm(shifts, axis=1) / apart))
+
+
+@pytest.mark.parametrize("clusters", [2, 3, 4, 14])
+@pytest.mark.parametrize("drop", [0, 1, 3])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_robust_mean_and_jackknife(seed, drop, clusters):
+    rng = np.random.default_rng(seed)
+    first, second = np.triu_indices(clusters, 1)
+    kept = rng.random(len(first)) < 0.7
+    kept[0] = True
+    first, second = first[kept], second[kept]
+    # Heavy tails, so that there are outliers.
+    values = 50 + 0.1 * rng.standard_t(1.5, len(first))
+    weights = (second - first) ** rng.uniform(0, 4)
+    mean, sigma, n = _kernels.robust_mean(values, weights, first, second, clusters, drop, 1.5)
+    want = twins.robust_mean(values, weights, first, second, clusters, drop, 1.5)
+    assert n == want[2]
+    assert_allclose([mean, sigma], want[:2], rtol=1e-9)
+
+
+# Exact shifts
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("samples", [1, 2, 4])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_exact_shifts_are_recovered(seed, samples, shape):
+    rng = np.random.default_rng(seed)
+    spectrum = twins.band_limited(rng, *shape)
+    by = np.array([[0, 0], *rng.uniform(-4, 4, (3, 2)), [1, -2], [0.5, -0.5]])
+    images = np.stack([twins.shifted(spectrum, shape, *d) for d in by])
+    first, second = np.triu_indices(len(by), 1)
+    near = np.abs(by[second] - by[first]).max(1) < 5
+    first, second = first[near], second[near]
+    shifts = np.empty((len(first), 2))
+    _kernels.pair_shifts(phase_only_correlation(images, first, second), 5, samples, shifts)
+    # The images are float32: 3e-7 px were seen.
+    assert_allclose(shifts, by[second] - by[first], atol=2e-6)
+
+
+def test_a_peak_out_of_reach_is_not_found():
+    rng = np.random.default_rng(2)
+    spectrum = twins.band_limited(rng, 32, 32)
+    images = np.stack([twins.shifted(spectrum, (32, 32), *d) for d in [(0, 0), (0, 7.2)]])
+    correlation = phase_only_correlation(images, np.array([0]), np.array([1]))
+    far, near = np.empty((2, 1, 2))
+    _kernels.pair_shifts(correlation, 8, 2, far)
+    _kernels.pair_shifts(correlation, 4, 2, near)
+    assert_allclose(far, [[0, 7.2]], atol=2e-6)
+    assert np.abs(near).max() <= 5
+
+
+# Ideal images
+
+
+def view_of(maps):
+    """A frame of which only the pixel maps are told."""
+    clusters = len(maps)
+    presence = PresenceMap(
+        np.zeros((clusters, 1, 1), np.float32), 2, np.zeros((clusters, 1, 1), bool), maps.astype(np.float32)
+    )
+    soft = SoftSymbols(np.zeros(clusters, np.int64), np.zeros((clusters, 6), np.float32), 1.0)
+    return FrameView(np.zeros((32, *maps.shape[1:]), np.int16), np.zeros((2, 32)), presence, soft)
+
+
+def image_of(bar, distance_m, *, tilt_deg=0.0, blob="gaussian", offset=(0.2, -0.3), moved=None):
+    """Maps of a bar rolled by an angle: a blob a cluster, integrated over each pixel's area."""
+    scale = CAMERA.focal_px / distance_m
+    metres = bar.cluster_centres_m()
+    pitch = scale * np.linalg.norm(metres[1] - metres[0])
+    angle = np.radians(tilt_deg)
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    centres = scale * metres @ turn
+    columns, rows = np.ceil(np.ptp(centres, axis=0) + 2 * pitch + 20).astype(int)
+    centres += [(columns - 1) / 2 + offset[0], (rows - 1) / 2 + offset[1]]
+    for cluster, by in (moved or {}).items():
+        centres[cluster] += by
+    if blob == "gaussian":
+        maps = [
+            np.outer(twins.gaussian(y, 0.3 * pitch, rows), twins.gaussian(x, 0.3 * pitch, columns))
+            for x, y in centres
+        ]
+    else:
+        maps = [np.outer(twins.box(y, pitch, rows), twins.box(x, 4.0, columns)) for x, y in centres]
+    maps = np.array(maps)
+    # A map is zero away from its cluster.
+    return np.where(maps > 1e-4 * maps.max(), maps / maps.max(), 0)
+
+
+def measured(maps, bar=BAR, **parameters):
+    return PocRanging(**parameters).compile(CAMERA, bar, LINK.codebook)(view_of(maps))
+
+
+# Relative errors seen are a third of this. Gaussians are all but band-limited; boxes are not, and edges that
+# fall between pixels shift their peaks by some 0.01 px. A panel is a quarter as long as the bar.
+@pytest.mark.parametrize("tilt_deg", [0, 7, -30, 90])
+@pytest.mark.parametrize(
+    ("bar", "blob", "tolerance"), [(BAR, "gaussian", 1e-3), (BAR, "box", 5e-3), (PANEL, "gaussian", 5e-3)]
+)
+def test_distance_of_ideal_images(bar, blob, tolerance, tilt_deg):
+    measure = PocRanging().compile(CAMERA, bar, LINK.codebook)
+    distances = np.arange(30, 101, 5.0)
+    got = [measure(view_of(image_of(bar, d, tilt_deg=tilt_deg, blob=blob))) for d in distances]
+    found = np.array([r.distance_m for r in got])
+    assert_allclose(found, distances, rtol=tolerance)
+    assert (np.diff(found) > 0).all()
+    assert max(r.sigma_m for r in got) < tolerance * 100
+    assert min(r.pairs for r in got) >= 18
+
+
+def test_a_horizontal_bar_is_a_bar():
+    bar = BarLayout(rows=1, columns=96, cluster_rows=1, cluster_columns=6)
+    upright = measured(image_of(BAR, 50, tilt_deg=0, offset=(0.2, 0.1)))
+    lying = measured(image_of(bar, 50, offset=(0.1, 0.2)), bar)
+    assert lying.distance_m == pytest.approx(upright.distance_m, rel=1e-5)
+    assert lying.pairs == upright.pairs
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.floats(60, 100), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-45, 45))
+def test_twice_the_size_is_half_the_distance(distance_m, right, down, tilt_deg):
+    far = measured(image_of(BAR, distance_m, tilt_deg=tilt_deg, offset=(right, down)))
+    near = measured(image_of(BAR, distance_m / 2, tilt_deg=tilt_deg, offset=(2 * right, 2 * down)))
+    assert far.distance_m / near.distance_m == pytest.approx(2, rel=2e-3)
+
+
+def test_distance_is_linear_in_focal_length():
+    view = view_of(image_of(BAR, 50))
+    one, two = (PocRanging().compile(CameraModel(focal_mm=f), BAR, LINK.codebook)(view) for f in (35.0, 70.0))
+    assert two.distance_m == pytest.approx(2 * one.distance_m, rel=1e-12)
+    assert two.sigma_m == pytest.approx(2 * one.sigma_m, rel=1e-9)
+
+
+def test_read_only_and_strided_maps_are_taken():
+    maps = image_of(BAR, 50).astype(np.float32)
+    strided = np.repeat(maps, 2, 2)[:, :, ::2]
+    strided.setflags(write=False)
+    view = view_of(maps)
+    presence = PresenceMap(view.presence.probability, 2, view.presence.selected, strided)
+    measure = PocRanging().compile(CAMERA, BAR, LINK.codebook)
+    assert measure(FrameView(view.sums, view.offset_px, presence, view.soft)) == measure(view)
+
+
+# What is left out
+
+
+@pytest.mark.parametrize("lit", [[], [7], [0, 15], [7, 8], [0, 1, 2, 3]])
+def test_no_distance_without_a_pair(lit):
+    maps = image_of(BAR, 50)
+    maps[[k for k in range(16) if k not in lit]] = 0
+    found = measured(maps)
+    assert np.isnan([found.distance_m, found.sigma_m]).all()
+    assert found.pairs == 0
+
+
+def test_all_clusters_in_one_place_have_no_distance():
+    maps = np.repeat(image_of(BAR, 50)[5:6], 16, 0)
+    assert np.isnan(measured(maps).distance_m)
+
+
+@pytest.mark.parametrize("dark", [[1], [4, 9], [1, 2, 3, 12, 13, 14]])
+def test_dark_clusters_cost_only_their_pairs(dark):
+    maps = image_of(BAR, 50)
+    maps[dark] = 0
+    found = measured(maps, drop_extremes=0, outlier_iqr=1e6)
+    lit = [k for k in range(1, 15) if k not in dark]
+    assert found.pairs == sum(j - i >= 6.5 for i in lit for j in lit)
+    assert found.distance_m == pytest.approx(50, rel=1e-3)
+
+
+@pytest.mark.parametrize("cluster", [2, 5, 12])
+@pytest.mark.parametrize("down", [3, -3])
+def test_a_cluster_out_of_place_is_dropped(cluster, down):
+    maps = image_of(BAR, 50, moved={cluster: (0, down)})
+    found = measured(maps)
+    everything = measured(maps, drop_extremes=0, outlier_iqr=1e6)
+    assert found.distance_m == pytest.approx(50, rel=1.5e-3)
+    assert abs(everything.distance_m / 50 - 1) > 2.5e-3
+    assert everything.sigma_m > 2 * found.sigma_m
+
+
+def test_outermost_clusters_do_not_matter():
+    want = measured(image_of(BAR, 50))
+    assert measured(image_of(BAR, 50, moved={0: (5, -3), 15: (-4, 6)})) == want
+
+
+def test_sigma_is_the_error_that_noise_makes():
+    rng = np.random.default_rng(8)
+    maps = image_of(BAR, 70)
+    noisy = [
+        measured(np.where(maps > 0, np.clip(maps + rng.normal(0, 0.1, maps.shape), 0, 1), 0))
+        for _ in range(60)
+    ]
+    error = np.std([r.distance_m for r in noisy])
+    sigma = np.mean([r.sigma_m for r in noisy])
+    assert 0.5 < sigma / error < 2
+
+
+def test_two_clusters_are_one_pair():
+    link = load_link(EXAMPLES / "two-clusters.toml")
+    measure = link.algorithm("ranging").compile(CAMERA, link.bar, link.codebook)
+    maps = image_of(BAR, 50)
+    found = measure(view_of(maps))
+    assert found.pairs == 1
+    assert np.isnan(found.sigma_m)
+    assert found.distance_m == pytest.approx(50, rel=2e-3)
+    others = np.delete(np.arange(16), link.algorithm("ranging").clusters)
+    maps[others] = 0
+    assert measure(view_of(maps)).distance_m == found.distance_m
+
+
+@pytest.mark.parametrize("clusters", [(3,), (3, 3), (2, 5, 2), (-1, 5), (2, 16)])
+def test_clusters_that_the_bar_has_not_are_refused(clusters):
+    with pytest.raises(ConfigError, match=r"ranging\.clusters = .*two or more different clusters of 0 to 15"):
+        PocRanging(clusters=clusters).compile(CAMERA, BAR, LINK.codebook)
+
+
+@pytest.mark.parametrize(
+    ("bar", "skip"), [(BAR, 8), (BAR, 20), (BarLayout(rows=12), 1), (BarLayout(rows=6), 0)]
+)
+def test_too_few_clusters_are_refused(bar, skip):
+    with pytest.raises(ConfigError, match="skip_outer"):
+        PocRanging(skip_outer=skip).compile(CAMERA, bar, LINK.codebook)
+
+
+@pytest.mark.xfail(raises=ZeroDivisionError, reason="two pairs that differ are both outliers of each other")
+@pytest.mark.parametrize("outlier_iqr", [0.1, 0.4])
+def test_narrow_outlier_bounds_leave_a_distance(outlier_iqr):
+    found = measured(image_of(BAR, 50), clusters=(0, 7, 15), outlier_iqr=outlier_iqr)
+    assert found.distance_m == pytest.approx(50, rel=5e-3)
