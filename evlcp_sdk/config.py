@@ -62,7 +62,7 @@ class RegionSpec:
 
     block_us: Annotated[
         int, Field(ge=200, le=10_000, description="Time step of the detector; results come once a step.")
-    ] = 1000
+    ] = 1500
     min_score: Annotated[
         int,
         Field(ge=2, le=40, description="Score at which a pixel is a candidate: 2 for each run of one chip."),

@@ -170,28 +170,23 @@ def add_polarity(
     chip_off, next_off = -1, start_off_us
     for i in range(begin, t_us.size):
         t = t_us[i]
-        if p[i]:
-            while t >= next_on:
-                chip_on += 1
-                next_on = start_on_us + (chip_on + 1) * chip_us
-            c = chip_on
-            sign = 1
-        else:
-            while t >= next_off:
-                chip_off += 1
-                next_off = start_off_us + (chip_off + 1) * chip_us
-            c = chip_off
-            sign = -1
-        if c >= chips:
+        while t >= next_on:
+            chip_on += 1
+            next_on = start_on_us + (chip_on + 1) * chip_us
+        while t >= next_off:
+            chip_off += 1
+            next_off = start_off_us + (chip_off + 1) * chip_us
+        # Arithmetic, not a branch: polarity is as good as random.
+        on = np.int64(p[i])
+        c = chip_off + (chip_on - chip_off) * on
+        if c < 0 or c >= chips:
             if min(chip_on, chip_off) >= chips:
                 break
-            continue
-        if c < 0:
             continue
         u = np.int64(x[i]) - shift_x[c]
         v = np.int64(y[i]) - shift_y[c]
         if 0 <= u < width and 0 <= v < height:
-            sums[c, v, u] += sign
+            sums[c, v, u] += np.int16(2 * on - 1)
 
 
 @njit(cache=True, nogil=True)

@@ -13,11 +13,12 @@ from evlcp_sdk.types import Events
 from tests.synthetic import Bar, events_of, lamp, merged, noise, random_symbols
 
 LINK = load_link()
-STEP_US = RegionSpec().block_us
+SPEC = RegionSpec(block_us=1000)
+STEP_US = SPEC.block_us
 
 
 def tracker() -> RegionTracker:
-    return RegionTracker(RegionSpec(), CameraModel(), LINK.packet.chip_us)
+    return RegionTracker(SPEC, CameraModel(), LINK.packet.chip_us)
 
 
 def steps(events: Events, until_us: int) -> Iterable[tuple[int, Events]]:
@@ -87,10 +88,10 @@ def test_what_fades_is_released() -> None:
     events = events_of(LINK, bar)
     alive = {
         start: [not t.released for t in regions.step(start, part)]
-        for start, part in steps(events, ends + RegionSpec().fade_us + 5000)
+        for start, part in steps(events, ends + SPEC.fade_us + 5000)
     }
     (gone,) = [start for start, tracks in alive.items() if tracks == [False]]
-    assert gone == pytest.approx(ends + RegionSpec().fade_us, abs=2 * STEP_US)
+    assert gone == pytest.approx(ends + SPEC.fade_us, abs=2 * STEP_US)
     assert alive[gone + STEP_US] == []
 
 
