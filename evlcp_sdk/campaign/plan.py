@@ -229,7 +229,7 @@ class _Campaign(_Strict):
     first_seed: Annotated[int, Field(ge=0)] = 0
     max_bits: Annotated[int | None, Field(ge=1)] = None
     max_errors: Annotated[int | None, Field(ge=1)] = None
-    merge: list[str] = ["scene.distance_m"]
+    merge: list[str] | None = None
 
 
 class _Grid(_Strict):
@@ -281,12 +281,13 @@ def load_plan(
     links = _cases("link", file.link, folder, link_of, faults, path)
     varied = {"scene." + key for s in scenes for key, _ in s.labels}
     varied |= {"link." + key for k in links for key, _ in k.labels}
-    default = _Campaign.model_fields["merge"].default
-    for key in file.campaign.merge:
-        if file.campaign.merge != default and key not in varied:
-            faults.append(
-                f"{path}: campaign.merge: '{key}' is not varied (varied: {', '.join(sorted(varied))})"
-            )
+    merge = file.campaign.merge
+    if merge is None:
+        merge = sorted(key for key in varied if key.endswith("distance_m"))
+    for key in merge:
+        if key not in varied:
+            known = ", ".join(sorted(varied)) or "nothing"
+            faults.append(f"{path}: campaign.merge: '{key}' is not varied (varied: {known})")
     if faults:
         raise ConfigError("\n".join(dict.fromkeys(faults)))
     head = file.campaign
@@ -296,7 +297,7 @@ def load_plan(
         links,
         range(head.first_seed, head.first_seed + head.seeds),
         rule=StopRule(head.max_bits, head.max_errors),
-        merge=[key for key in head.merge if key in varied],
+        merge=merge,
         environment=environment,
     )
 

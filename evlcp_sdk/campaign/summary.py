@@ -118,7 +118,7 @@ def _speed_kmh(scene: Any) -> float | None:
             if key == "speed_kmh" and isinstance(value, int | float):
                 return float(value)
             if key == "speed_mps" and isinstance(value, int | float):
-                return round(value * 3.6, 3)
+                return round(value * 3.6, 1)
         for value in scene.values():
             if (found := _speed_kmh(value)) is not None:
                 return found

@@ -1,0 +1,102 @@
+"""Decoded frames held against the truth: what was found, which bits are wrong, how far distances are off."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from evlcp_sdk.campaign.statistics import Statistics, Tally, segment_of
+from evlcp_sdk.types import Frame
+
+__all__ = ["statistics_of"]
+
+_MOST_LATE_US = 800.0
+_MOST_APART_PX = 60.0
+_TAIL_US = 200.0
+_MIDDLE_OF_PILOT_US = 800.0
+
+
+def statistics_of(frames: Iterable[Frame], known: Mapping[str, Any], events: int) -> Statistics:
+    """Hold decoded frames against the truth, each beside the sent one that began nearest on the nearest bar.
+
+    Args:
+        frames: The decoded frames.
+        known: The truth of the scene.
+        events: Events that the sensor sent.
+    """
+    duration_us = known["scene"]["duration_s"] * 1e6
+    bars = [_Sent(known, i) for i, bar in enumerate(known["bars"]) if _sends_frames(bar)]
+    tallies: list[tuple[int, Tally]] = [
+        (segment_of(at), Tally.sent()) for bar in bars for at in bar.distance_m.tolist()
+    ]
+    unmatched = 0
+    for frame in frames:
+        t_us = frame.t_us - known["scene"]["t0_us"]
+        near = min(bars, key=lambda bar: bar.apart_px(t_us, frame), default=None)
+        place = None if near is None else near.take(t_us, frame)
+        if near is None or place is None:
+            cut = near is not None and near.apart_px(t_us, frame) <= _MOST_APART_PX
+            unmatched += not (cut and (t_us < _TAIL_US or t_us + 3400 > duration_us))
+            continue
+        heard = frame.soft.symbols.tolist()
+        sent = near.symbols[place]
+        errors = sum((a ^ b).bit_count() for a, b in zip(heard, sent, strict=True))
+        distance_m, true_m = frame.range.distance_m, float(near.distance_m[place])
+        error_m = distance_m - true_m if np.isfinite(distance_m) else None
+        bits = near.bits_per_symbol(frame) * len(sent)
+        tallies.append((segment_of(true_m), Tally.found(bits, errors, error_m)))
+    return Statistics.of(1, events, round(duration_us), unmatched, tallies)
+
+
+def _sends_frames(bar: Mapping[str, Any]) -> bool:
+    """Whether the bar is lit and sends packets, not just any chips."""
+    lit = bar.get("led_w_m2") is None or bar["led_w_m2"] > 1e-6
+    return lit and bar.get("chips_file") is None
+
+
+class _Sent:
+    """The frames that a bar sent whole while the recording ran, each of which may be found once."""
+
+    def __init__(self, known: Mapping[str, Any], number: int) -> None:
+        bar = known["bars"][number]
+        self._t_us = np.array(known["t_s"]) * 1e6
+        self._centre_px = np.array(known["bar_centre_px"][number])
+        rate_hz = bar.get("chip_rate_hz", 1e4) * (1 + bar["ppm"] * 1e-6)
+        end_us = known["scene"]["duration_s"] * 1e6
+        starts, self.symbols = [], []
+        for start_us, symbols in _frames_of(bar, rate_hz):
+            if start_us >= 0 and start_us + 32 / rate_hz * 1e6 + _TAIL_US < end_us:
+                starts.append(start_us)
+                self.symbols.append(symbols)
+        self._start_us = np.array(starts)
+        depth_m = np.array(known["distance_m"][number])
+        self.distance_m = np.interp(self._start_us + _MIDDLE_OF_PILOT_US, self._t_us, depth_m)
+        self._taken: set[int] = set()
+
+    def apart_px(self, t_us: float, frame: Frame) -> float:
+        """How far the frame's bar lies from this one."""
+        x, y = (float(np.interp(t_us, self._t_us, c)) for c in self._centre_px)
+        return float(np.hypot(frame.x_px - x, frame.y_px - y))
+
+    def take(self, t_us: float, frame: Frame) -> int | None:
+        """Number of the sent frame that this is; None if it is none, or was found before."""
+        if not len(self._start_us) or self.apart_px(t_us, frame) > _MOST_APART_PX:
+            return None
+        nearest = int(np.argmin(np.abs(self._start_us - t_us)))
+        if abs(self._start_us[nearest] - t_us) > _MOST_LATE_US or nearest in self._taken:
+            return None
+        self._taken.add(nearest)
+        return nearest
+
+    @staticmethod
+    def bits_per_symbol(frame: Frame) -> int:
+        """Bits of each symbol of the frame."""
+        return int(frame.soft.llr.shape[1])
+
+
+def _frames_of(bar: Mapping[str, Any], rate_hz: float) -> Iterator[tuple[float, Sequence[int]]]:
+    preamble = bar["packet_chips"] - 32 * bar["frames"]
+    for packet, frames in enumerate(bar["symbols"]):
+        for frame, symbols in enumerate(frames):
+            chip = packet * bar["packet_chips"] + preamble + 32 * frame
+            yield (chip - bar["start_chip"]) / rate_hz * 1e6, symbols
