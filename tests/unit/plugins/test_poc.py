@@ -345,6 +345,17 @@ def test_sigma_is_the_error_that_noise_makes():
     assert 0.5 < sigma / error < 2
 
 
+@pytest.mark.parametrize("power", [0.0, 1.0, 2.0, 4.0])
+def test_a_pair_weighs_by_its_spacing(power):
+    maps = image_of(BAR, 50, moved={7: (0, 1)})
+    plain = {"drop_extremes": 0, "outlier_iqr": 1e6}
+    long, short = (measured(maps, clusters=pair, **plain).distance_m for pair in ((0, 15), (7, 15)))
+    both = measured(maps, clusters=(0, 7, 15), weight_power=power, **plain)
+    weights = 15**power, 8**power
+    assert both.pairs == 2
+    assert both.distance_m == pytest.approx(np.average([long, short], weights=weights), rel=1e-6)
+
+
 def test_two_clusters_are_one_pair():
     link = load_link(EXAMPLES / "two-clusters.toml")
     measure = link.algorithm("ranging").compile(CAMERA, link.bar, link.codebook)
