@@ -1,0 +1,150 @@
+"""`evlcp simulate`."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from evlcp_sdk.cli._common import Json, console
+from evlcp_sdk.errors import EvlcpError
+
+__all__ = ["register", "simulate"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("simulate")(simulate)
+
+
+def simulate(
+    scene_file: Annotated[
+        str | None, typer.Argument(metavar="[scene.toml]", help="The scene; or use --preset.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="REC.raw", help="The recording to write.")
+    ] = None,
+    preset: Annotated[
+        str | None, typer.Option("--preset", metavar="NAME", help="A scene that comes with the package.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, help="Seed of everything random, instead of the scene's.")
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="TABLE.KEY=VALUE", help="Override one value; may be repeated."),
+    ] = None,
+    threads: Annotated[
+        int, typer.Option("--threads", min=1, max=256, help="Threads; the recording is the same.")
+    ] = 1,
+    presets: Annotated[bool, typer.Option("--presets", help="List the presets and end.")] = False,
+    show: Annotated[
+        bool, typer.Option("--show", help="Print the preset's TOML, to begin a scene with, and end.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Render a scene: REC.raw (EVT3) and its truth, REC.truth.json.
+
+    A scene of yours:      [bold]evlcp simulate scene.toml -o REC.raw[/]
+
+    A preset, varied:      [bold]evlcp simulate --preset night -o REC.raw --set motion.distance_m=70[/]
+
+    What presets there are: [bold]evlcp simulate --presets[/]
+
+    A scene to begin with:  [bold]evlcp simulate --preset night --show > scene.toml[/]
+    """
+    import json
+    import time
+
+    from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.io import open_writer
+    from evlcp_sdk.sim import Simulation, load_scene, preset_names, preset_text, truth_of
+
+    if presets:
+        if as_json:
+            typer.echo(json.dumps(preset_names()))
+            return
+        for name in preset_names():
+            about = next(
+                (line.lstrip("# ") for line in preset_text(name).splitlines() if line.startswith("#")), ""
+            )
+            console().print(f"{name:14} {about}")
+        return
+    if (scene_file is None) == (preset is None):
+        raise typer.BadParameter("name either a scene.toml or a --preset", param_hint="scene.toml")
+    if show:
+        if preset is None:
+            raise typer.BadParameter("--show prints a --preset", param_hint="--show")
+        typer.echo(preset_text(preset), nl=False)
+        return
+    if preset is not None:
+        preset_text(preset)  # a file of that name is not meant
+    source: Path | str = preset if preset is not None else Path(scene_file or "")
+    if out is None:
+        raise typer.BadParameter("where should the recording go?", param_hint="-o REC.raw")
+    if out.suffix != ".raw":
+        raise ConfigError(f"{out}: a recording is written as NAME.raw")
+    scene = load_scene(source, overrides or [])
+    simulation = Simulation(scene, seed, threads)
+    truth_path = out.with_suffix(".truth.json")
+    began = time.perf_counter()
+    with _progress(out.name, scene.duration_s) as advance:
+        camera = scene.camera
+        with open_writer(out, camera.width, camera.height, "EVT3") as writer:
+            for events in simulation.stream():
+                writer.write(events)
+                advance(simulation.done_s)
+    truth = truth_of(simulation) | {"bytes": out.stat().st_size}
+    _write_text(truth_path, json.dumps(truth))
+    elapsed_s = time.perf_counter() - began
+    counts = simulation.counts
+    summary = {
+        "recording": str(out),
+        "truth": str(truth_path),
+        "name": scene.name,
+        "seed": simulation.scene.seed,
+        "duration_s": scene.duration_s,
+        "bytes": truth["bytes"],
+        **counts,
+        "elapsed_s": round(elapsed_s, 6),
+        "events_per_s": round(counts["events"] / elapsed_s),
+    }
+    if as_json:
+        typer.echo(json.dumps(summary))
+        return
+    screen = console()
+    screen.print(
+        f"{out.name}: {counts['events'] / 1e6:.2f} Mev in {scene.duration_s:g} s of time,"
+        f" {truth['bytes'] / 1e6:.1f} MB; rendered in {elapsed_s:.1f} s"
+        f" ({summary['events_per_s'] / 1e6:.1f} Mev/s)"
+    )
+    if counts["dropped_by_rate_cap"]:
+        screen.print(f"lost to the event-rate limit: {counts['dropped_by_rate_cap']} events", style="yellow")
+    screen.print(f"written: {out}, {truth_path}", style="dim")
+
+
+def _write_text(path: Path, text: str) -> None:
+    """Write a file that is never there by half."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as fault:
+        raise EvlcpError(f"{path}: cannot be written: {fault.strerror}") from fault
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextmanager
+def _progress(name: str, duration_s: float) -> Iterator[Callable[[float], None]]:
+    """A bar by seconds of the scene, on a terminal only."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    err = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task(name, total=duration_s)
+        yield lambda done_s: bar.update(task, completed=done_s)

@@ -1,0 +1,566 @@
+"""Pixels and readout, compiled.
+
+Every random number is a hash of (seed, pixel, number of the draw, purpose).
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+ON_FACTOR, OFF_FACTOR, U_BASE, T_BASE, REFERENCE, T_READY, T_LAST_OUT, LIGHT = range(8)
+"""Columns of a pixel's state: its thresholds as factors, the receptor, the comparator, the light on it."""
+
+DRAW, ARMED, BLOCK = range(3)
+"""Columns of a pixel's counters."""
+
+NOISE_LIMIT = 4.0
+"""Where the normal distribution of every draw is cut off, standard deviations."""
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _mix(z: Any) -> Any:
+    """Return the finalizer of splitmix64: a bijection of 64-bit words that scatters them."""
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@njit(cache=True, nogil=True)
+def hash_uniform(seed: Any, pixel: int, draw: int, purpose: int) -> float:
+    """Uniform number in [0, 1) of one (seed, pixel, draw, purpose)."""
+    z = _mix(seed + np.uint64(pixel) * np.uint64(0x9E3779B97F4A7C15))
+    z = _mix(z + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03) + np.uint64(purpose))
+    return float(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+
+
+@njit(cache=True, nogil=True)
+def hash_normal(seed: Any, pixel: int, draw: int, purpose: int, quantiles: Array) -> float:
+    """Normal number, cut off at `NOISE_LIMIT`, from a table of the quantiles."""
+    z = hash_uniform(seed, pixel, draw, purpose) * (quantiles.size - 1)
+    i = int(z)
+    return float(quantiles[i] + (z - i) * (quantiles[i + 1] - quantiles[i]))
+
+
+@njit(cache=True, nogil=True)
+def _run_piece(
+    until: float,
+    light: float,
+    u_base: float,
+    t_base: float,
+    reference: float,
+    t_ready: float,
+    t_last_out: float,
+    armed: int,
+    draw: int,
+    on_factor: float,
+    off_factor: float,
+    pixel: int,
+    seed: Any,
+    quantiles: Array,
+    sensor: Array,
+    out_t: Array,
+    out_code: Array,
+    out_cross: Array,
+    n: int,
+) -> tuple[float, float, float, float, int, int, int]:
+    """Let one pixel see constant light from `t_base` to `until`; write its events.
+
+    With u = exp(-y) the receptor is u(t) = 1/I + (u0 - 1/I) exp(-I t / Q), which is monotonic; so a threshold
+    is crossed in the piece when u at its end lies beyond, and the time follows from one logarithm.
+    """
+    charge, refractory = sensor[0], sensor[1]
+    delay_on, delay_off, jitter = sensor[2], sensor[3], sensor[4]
+    miss_on, miss_off, noise = sensor[5], sensor[6], sensor[7]
+    rest = 1.0 / light
+    rate = light / charge
+    u_end = rest + (u_base - rest) * math.exp(-rate * (until - t_base))
+    widest_on = on_factor * sensor[8]
+    widest_off = off_factor / sensor[8]
+    while True:
+        if armed == 0:
+            if t_ready >= until:
+                break
+            # An event's delay may outlast a piece, never the order of pieces: t_ready is not before t_base.
+            reference = rest + (u_base - rest) * math.exp(-rate * (t_ready - t_base))
+            armed = 1
+            draw += 1
+        if u_end > reference * widest_on and u_end < reference * widest_off:
+            break
+        shift = 1.0
+        if noise > 0.0:
+            shift = math.exp(noise * hash_normal(seed, pixel, draw, 0, quantiles))
+        low = reference * on_factor * shift
+        high = reference * off_factor * shift
+        t = max(t_base, t_ready)
+        if u_end <= low:
+            on = 1
+            if u_base > low:
+                t = max(t, t_base + math.log((u_base - rest) / (low - rest)) / rate)
+        elif u_end >= high:
+            on = 0
+            if u_base < high:
+                t = max(t, t_base + math.log((rest - u_base) / (rest - high)) / rate)
+        else:
+            break
+        t = min(t, until)
+        armed = 0
+        t_ready = t + refractory
+        late = delay_on if on else delay_off
+        if jitter > 0.0:
+            late = max(0.0, late + jitter * hash_normal(seed, pixel, draw, 2, quantiles))
+        request = max(t + late, t_last_out + refractory)
+        t_last_out = request
+        miss = miss_on if on else miss_off
+        if miss > 0.0 and hash_uniform(seed, pixel, draw, 1) < miss:
+            continue
+        out_t[n] = request
+        out_code[n] = 2 * pixel + on
+        if out_cross.size:
+            out_cross[n] = t
+        n += 1
+    return u_end, reference, t_ready, t_last_out, armed, draw, n
+
+
+@njit(cache=True, nogil=True)
+def pixel_factors(seed: Any, pixel: int, sensor: Array, quantiles: Array) -> tuple[float, float]:
+    """exp(-threshold) for ON and exp(threshold) for OFF of one pixel, with its spread."""
+    on = sensor[9] * (1.0 + sensor[11] * hash_normal(seed, pixel, 0, 3, quantiles))
+    off = sensor[10] * (1.0 + sensor[11] * hash_normal(seed, pixel, 0, 4, quantiles))
+    return math.exp(-on), math.exp(off)
+
+
+@njit(cache=True, nogil=True)
+def run_given_light(
+    pixel: int,
+    edge_us: Array,
+    light: Array,
+    end_us: float,
+    seed: Any,
+    quantiles: Array,
+    sensor: Array,
+    out_t: Array,
+    out_code: Array,
+    out_cross: Array,
+) -> int:
+    """Run one pixel, at rest in light[0], through light[i] from edge_us[i] on; return how many events."""
+    on_factor, off_factor = pixel_factors(seed, pixel, sensor, quantiles)
+    u_base = 1.0 / light[0]
+    t_base = edge_us[0]
+    reference = u_base
+    t_ready = t_base
+    t_last_out = -1e18
+    armed = 1
+    draw = 1
+    n = 0
+    for i in range(light.size):
+        until = edge_us[i + 1] if i + 1 < light.size else end_us
+        if i:
+            draw += 1
+        u_base, reference, t_ready, t_last_out, armed, draw, n = _run_piece(
+            until, light[i], u_base, t_base, reference, t_ready, t_last_out, armed, draw, on_factor,
+            off_factor, pixel, seed, quantiles, sensor, out_t, out_code, out_cross, n,
+        )  # fmt: skip
+        t_base = until
+    return n
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _step(table: Array, per_px: float, z: float) -> float:
+    """Share of a pixel at `z` px beyond a blurred edge: 0 far before, 1 far behind; linear between nodes."""
+    half = 0.5 * (table.size - 1)
+    at = z * per_px + half
+    if at <= 0.0:
+        return 0.0
+    if at >= table.size - 1:
+        return 1.0
+    i = int(at)
+    return float(table[i] + (at - i) * (table[i + 1] - table[i]))
+
+
+@njit(cache=True, nogil=True)
+def texture_at(field: Array, u: float, v: float) -> float:
+    """Bilinear value of the periodic texture (size a power of two) at column u, row v."""
+    size = field.shape[0]
+    i, j = math.floor(v), math.floor(u)
+    a, b = v - i, u - j
+    i0, j0 = int(i) & (size - 1), int(j) & (size - 1)
+    i1, j1 = (i0 + 1) & (size - 1), (j0 + 1) & (size - 1)
+    top = field[i0, j0] + b * (field[i0, j1] - field[i0, j0])
+    low = field[i1, j0] + b * (field[i1, j1] - field[i1, j0])
+    return float(top + a * (low - top))
+
+
+@njit(cache=True, nogil=True)
+def run_pixels(
+    first: int,
+    last: int,
+    pixels: Array,
+    masks: Array,
+    width: int,
+    state: Array,
+    counters: Array,
+    block: int,
+    begin_us: float,
+    end_us: float,
+    line_t: Array,
+    line_source: Array,
+    line_row: Array,
+    first_rows: Array,
+    origin: Array,
+    axis: Array,
+    bounds: Array,
+    strip_px: Array,
+    clusters: Array,
+    gain: Array,
+    levels: Array,
+    halo: Array,
+    halo_first: Array,
+    halo_per_px: Array,
+    halo_share: float,
+    core_table: Array,
+    core_per_px: Array,
+    wide_table: Array,
+    wide_per_px: float,
+    turn_px: Array,
+    field: Array,
+    background: Array,
+    seed: Any,
+    quantiles: Array,
+    sensor: Array,
+    out_t: Array,
+    out_code: Array,
+    most_events: int,
+) -> tuple[int, int]:
+    """Run pixels [first, last) through one block of time; return (next pixel, number of events).
+
+    The light on a pixel is constant between the entries of the time line: an entry with `line_source` >= 0
+    switches that source to row `line_row` of `levels`; one with -1 moves the image to pose `line_row`.
+    It ends early, at a pixel for which the output might have no room.
+
+    Bit i of `masks[j]` says that source i lights pixel j. `first_rows` are the rows of `levels` in force when
+    the block begins; pose 0 holds then. (pose, source) arrays tell where each strip is: `origin`, its first
+    end, px; `axis`, the unit vector along it; `bounds`, where its clusters begin and end along it, px;
+    `strip_px`, its width; `turn_px` is how far the texture has moved. `halo` is the halo's light of each row
+    of `levels` on a grid along the strip, as a share of full light. `background` is (irradiance on the
+    sensor, dark current as light), W/m2; `sensor` comes from `sensor_vector`.
+    """
+    sources = gain.size
+    none = np.empty(0)
+    most_clusters = levels.shape[1]
+    weight = np.zeros((sources, most_clusters))
+    weights = np.zeros(sources, np.int64)
+    weight_first = np.zeros(sources, np.int64)
+    near = np.zeros(sources)
+    far = np.zeros(sources)
+    grid = np.zeros(sources, np.int64)
+    between = np.zeros(sources)
+    row = np.zeros(sources, np.int64)
+    part = np.zeros(sources)
+    n = 0
+    for j in range(first, last):
+        if n + most_events > out_t.size:
+            return j, n
+        pixel = pixels[j]
+        mask = masks[j]
+        y = float(pixel // width)
+        x = float(pixel % width)
+        s = state[pixel]
+        c = counters[pixel]
+        new = c[BLOCK] != block - 1
+        c[BLOCK] = block
+        if new and s[ON_FACTOR] == 0.0:
+            s[ON_FACTOR], s[OFF_FACTOR] = pixel_factors(seed, pixel, sensor, quantiles)
+            s[T_LAST_OUT] = -1e18
+        on_factor, off_factor = s[ON_FACTOR], s[OFF_FACTOR]
+        u_base, t_base, reference = s[U_BASE], s[T_BASE], s[REFERENCE]
+        t_ready, t_last_out, light = s[T_READY], s[T_LAST_OUT], s[LIGHT]
+        draw, armed = c[DRAW], c[ARMED]
+        around = 0.0
+        for g in range(sources):
+            row[g] = first_rows[g]
+            part[g] = 0.0
+        for e in range(-1, line_t.size):
+            source = line_source[e] if e >= 0 else -1
+            t = line_t[e] if e >= 0 else begin_us
+            if source < 0:
+                pose = line_row[e] if e >= 0 else 0
+                around = background[1] + background[0] * texture_at(
+                    field, x + turn_px[pose, 0], y + turn_px[pose, 1]
+                )
+                for g in range(sources):
+                    if not (mask >> np.uint64(g)) & np.uint64(1):
+                        continue
+                    dx, dy = x - origin[pose, g, 0], y - origin[pose, g, 1]
+                    ax, ay = axis[pose, g, 0], axis[pose, g, 1]
+                    along = dx * ax + dy * ay
+                    across = dx * ay - dy * ax
+                    half = 0.5 * strip_px[pose, g]
+                    per_px = core_per_px[g]
+                    near[g] = (
+                        gain[g]
+                        * (1.0 - halo_share)
+                        * (
+                            _step(core_table[g], per_px, across + half)
+                            - _step(core_table[g], per_px, across - half)
+                        )
+                    )
+                    far[g] = (
+                        gain[g]
+                        * halo_share
+                        * (
+                            _step(wide_table, wide_per_px, across + half)
+                            - _step(wide_table, wide_per_px, across - half)
+                        )
+                    )
+                    weights[g] = 0
+                    if near[g] > 0.0:
+                        reach = 0.5 * (core_table.shape[1] - 1) / per_px
+                        edges = bounds[pose, g]
+                        k = 0
+                        while k < clusters[g] and edges[k + 1] <= along - reach:
+                            k += 1
+                        weight_first[g] = k
+                        before = _step(core_table[g], per_px, along - edges[k]) if k < clusters[g] else 0.0
+                        m = 0
+                        while k < clusters[g] and edges[k] < along + reach:
+                            behind = _step(core_table[g], per_px, along - edges[k + 1])
+                            weight[g, m] = before - behind
+                            before = behind
+                            m += 1
+                            k += 1
+                        weights[g] = m
+                    at = (along - halo_first[g]) * halo_per_px[g]
+                    at = min(max(at, 0.0), halo.shape[1] - 1.001)
+                    grid[g] = int(at)
+                    between[g] = at - grid[g]
+            total = around
+            switched = False
+            for g in range(sources):
+                if not (mask >> np.uint64(g)) & np.uint64(1):
+                    continue
+                if source < 0 or source == g:
+                    if source == g:
+                        row[g] = line_row[e]
+                    r = row[g]
+                    core = 0.0
+                    for m in range(weights[g]):
+                        core += weight[g, m] * levels[r, weight_first[g] + m]
+                    h = halo[r, grid[g]] + between[g] * (halo[r, grid[g] + 1] - halo[r, grid[g]])
+                    now = near[g] * core + far[g] * h
+                    if source == g and now != part[g]:
+                        switched = True
+                    part[g] = now
+                total += part[g]
+            if new:
+                new = False
+                light = total
+                u_base, t_base = 1.0 / light, t
+                reference, t_ready, armed = u_base, t, 1
+                draw += 1
+                continue
+            if total == light:
+                continue
+            if t > t_base:
+                u_base, reference, t_ready, t_last_out, armed, draw, n = _run_piece(
+                    t, light, u_base, t_base, reference, t_ready, t_last_out, armed, draw, on_factor,
+                    off_factor, pixel, seed, quantiles, sensor, out_t, out_code, none, n,
+                )  # fmt: skip
+                t_base = t
+            light = total
+            if switched:
+                draw += 1
+        u_base, reference, t_ready, t_last_out, armed, draw, n = _run_piece(
+            end_us, light, u_base, t_base, reference, t_ready, t_last_out, armed, draw, on_factor, off_factor,
+            pixel, seed, quantiles, sensor, out_t, out_code, none, n,
+        )  # fmt: skip
+        s[U_BASE], s[T_BASE], s[REFERENCE] = u_base, end_us, reference
+        s[T_READY], s[T_LAST_OUT], s[LIGHT] = t_ready, t_last_out, light
+        c[DRAW], c[ARMED] = draw, armed
+    return last, n
+
+
+@njit(cache=True, nogil=True)
+def background_events(
+    begin_us: float,
+    end_us: float,
+    rate_hz: float,
+    hot: Array,
+    hot_rate_hz: float,
+    pixels: int,
+    slot: int,
+    seed: Any,
+    out_t: Array,
+    out_code: Array,
+) -> int:
+    """Poisson events of all pixels (`rate_hz` together), then of the hot ones; return how many.
+
+    Ends early when the output is full: the caller gives room enough.
+    """
+    n = 0
+    for kind in range(2):
+        total = (rate_hz if kind == 0 else hot_rate_hz) * 1e-6
+        if total <= 0.0:
+            continue
+        t = begin_us
+        k = 0
+        while n < out_t.size:
+            t -= math.log(1.0 - hash_uniform(seed, slot, k, 10 + 3 * kind)) / total
+            if t >= end_us:
+                break
+            which = hash_uniform(seed, slot, k, 11 + 3 * kind)
+            pixel = int(which * pixels) if kind == 0 else hot[int(which * hot.size)]
+            on = int(hash_uniform(seed, slot, k, 12 + 3 * kind) < 0.5)
+            out_t[n] = t
+            out_code[n] = 2 * pixel + on
+            n += 1
+            k += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def find_hot_pixels(pixels: int, share: float, seed: Any, out: Array) -> int:
+    """Mark the hot pixels, each by its own hash; return how many."""
+    n = 0
+    for pixel in range(pixels):
+        if hash_uniform(seed, pixel, 0, 9) < share:
+            out[n] = pixel
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def sort_events(t: Array, code: Array, out_t: Array, out_code: Array) -> None:
+    """Sort by (time, pixel): buckets of 1 us, then insertion within."""
+    n = t.size
+    if n == 0:
+        return
+    first = math.floor(t.min())
+    buckets = int(t.max() - first) + 1
+    begin = np.zeros(buckets + 1, np.int64)
+    for i in range(n):
+        begin[int(t[i] - first) + 1] += 1
+    for b in range(buckets):
+        begin[b + 1] += begin[b]
+    fill = begin[:-1].copy()
+    for i in range(n):
+        b = int(t[i] - first)
+        j = fill[b]
+        fill[b] += 1
+        while j > begin[b] and (out_t[j - 1] > t[i] or (out_t[j - 1] == t[i] and out_code[j - 1] > code[i])):
+            out_t[j] = out_t[j - 1]
+            out_code[j] = out_code[j - 1]
+            j -= 1
+        out_t[j] = t[i]
+        out_code[j] = code[i]
+
+
+@njit(cache=True, nogil=True)
+def drop_blind(t: Array, code: Array, last_us: Array, refractory_us: float) -> int:
+    """Drop, in place, events of pixels that are still blind from their last one; return how many stay."""
+    kept = 0
+    for i in range(t.size):
+        pixel = code[i] >> 1
+        # The smallest part of a us stands for the rounding of sums.
+        if t[i] - last_us[pixel] >= refractory_us - 1e-6:
+            last_us[pixel] = t[i]
+            t[kept] = t[i]
+            code[kept] = code[i]
+            kept += 1
+    return kept
+
+
+@njit(cache=True, nogil=True)
+def read_out(
+    t: Array,
+    code: Array,
+    width: int,
+    height: int,
+    row_us: float,
+    safe_us: float,
+    cap: int,
+    cap_window_us: int,
+    memory: Array,
+    out_t: Array,
+    out_x: Array,
+    out_y: Array,
+    out_p: Array,
+) -> tuple[int, int, int]:
+    """Serve requests row by row until `safe_us`; what is not served yet moves to the front of `t` and `code`.
+
+    One row is served at a time, which takes `row_us` and takes all its requests along; the next is the next
+    one below with a request, and after the last row the first. More than `cap` events in a window of
+    `cap_window_us` are dropped. `t` is sorted; `memory` holds (time when free, last row, number of the
+    window, events in it) and is updated.
+
+    Returns:
+        (events written, events dropped, requests left).
+    """
+    head = np.full(height, -1, np.int64)
+    tail = np.full(height, -1, np.int64)
+    follow = np.full(t.size, -1, np.int64)
+    served = np.zeros(t.size, np.bool_)
+    free, at_row = memory[0], int(memory[1])
+    window, used = int(memory[2]), int(memory[3])
+    n = 0
+    dropped = 0
+    waiting = 0
+    i = 0
+    while True:
+        if waiting == 0:
+            if i >= t.size:
+                break
+            free = max(free, t[i])
+        if free >= safe_us:
+            break
+        while i < t.size and t[i] <= free:
+            y = (code[i] >> 1) // width
+            if head[y] < 0:
+                head[y] = i
+            else:
+                follow[tail[y]] = i
+            tail[y] = i
+            waiting += 1
+            i += 1
+        at_row += 1
+        while True:
+            if at_row >= height:
+                at_row = 0
+            if head[at_row] >= 0:
+                break
+            at_row += 1
+        free += row_us
+        stamp = math.floor(free)
+        begin = n
+        k = head[at_row]
+        head[at_row] = -1
+        while k >= 0:
+            waiting -= 1
+            served[k] = True
+            if stamp // cap_window_us != window:
+                window = stamp // cap_window_us
+                used = 0
+            if cap > 0 and used >= cap:
+                dropped += 1
+            else:
+                used += 1
+                x = (code[k] >> 1) % width
+                j = n
+                while j > begin and out_x[j - 1] > x:
+                    out_t[j], out_x[j], out_y[j], out_p[j] = stamp, out_x[j - 1], at_row, out_p[j - 1]
+                    j -= 1
+                out_t[j], out_x[j], out_y[j], out_p[j] = stamp, x, at_row, code[k] & 1
+                n += 1
+            k = follow[k]
+    left = 0
+    for k in range(t.size):
+        if not served[k]:
+            t[left] = t[k]
+            code[left] = code[k]
+            left += 1
+    memory[0], memory[1], memory[2], memory[3] = free, at_row, window, used
+    return n, dropped, left

@@ -1,0 +1,247 @@
+"""What the sources send: strips of light whose parts switch at exact times."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.codebook import Codebook
+from evlcp_sdk.config import resolve
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.frames import PacketFormat, packet_chips
+from evlcp_sdk.sim.motion import Strip
+from evlcp_sdk.sim.optics import led_light_w_m2
+from evlcp_sdk.sim.scene import BarSpec, LampSpec, Scene
+
+__all__ = ["BarLight", "LampLight", "Source", "sources_of"]
+
+Floats = NDArray[np.float64]
+
+_SINE_STEPS = 32
+
+
+class Source(Protocol):
+    """A strip of light."""
+
+    @property
+    def strip(self) -> Strip:
+        """Where it is."""
+        ...
+
+    @property
+    def light_w_m2(self) -> float:
+        """Irradiance of a pixel that it fills."""
+        ...
+
+    @property
+    def longest_us(self) -> float:
+        """How long it keeps its light at most."""
+        ...
+
+    def switches(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
+        """Return times of switching after `begin_us` and before `end_us`, and the levels 0 to 1 from each on.
+
+        Returns:
+            Times float64 (n,), us; levels float64 (n + 1, clusters), the first those at `begin_us`.
+        """
+        ...
+
+
+@lru_cache(maxsize=16)
+def _codebook(profile: str, clusters: int) -> Codebook:
+    table = {"modulation": {"id": profile}, "bar": {"rows": clusters, "cluster_rows": 1}}
+    return resolve(table).codebook
+
+
+class BarLight:
+    """A transmitter's light: packets, one after another, or the chips of a file.
+
+    Args:
+        bar: The bar.
+        light_w_m2: Irradiance of a pixel that it fills.
+        seed: Of its payload and its start, where the bar has none of its own.
+        source: What faults name.
+
+    Raises:
+        ConfigError: Its profile, symbols or chips cannot be sent.
+        InputError: The file of chips cannot be read.
+    """
+
+    def __init__(self, bar: BarSpec, light_w_m2: float, seed: int, source: str = "bars") -> None:
+        self.bar = bar
+        self.light_w_m2 = light_w_m2
+        lean, tilt = math.radians(bar.lean_deg), math.radians(bar.tilt_deg)
+        along = (-math.sin(lean) * math.cos(tilt), math.cos(lean) * math.cos(tilt), -math.sin(tilt))
+        x, y, z = (bar.length_m * part for part in along)
+        self.strip = Strip((bar.x_m, bar.y_m, bar.z_m), (x, y, z), bar.width_m, bar.clusters)
+        self.rate_hz = bar.chip_rate_hz * (1 + bar.ppm * 1e-6)
+        self.longest_us = 2e6 / self.rate_hz
+        self.payload_seed = seed if bar.seed is None else bar.seed
+        self._chips: NDArray[np.uint8] | None = None
+        self._packets: dict[int, NDArray[np.uint8]] = {}
+        if bar.chips_file is not None:
+            self._chips = _read_chips(Path(bar.chips_file), bar.clusters)
+            self.packet_chips = len(self._chips)
+        else:
+            try:
+                self._codebook = _codebook(bar.profile, bar.clusters)
+            except ConfigError as refused:
+                raise ConfigError(f"{source}: {refused}") from refused
+            self.packet_chips = PacketFormat.of(self._codebook, bar.frames).packet_chips
+            if bar.symbols is not None:
+                self._check(bar, source)
+        start = bar.start_chip
+        if start is None:
+            start = round(
+                float(np.random.default_rng([self.payload_seed, 1]).uniform(0, self.packet_chips)), 1
+            )
+        self.start_chip = start
+
+    def _check(self, bar: BarSpec, source: str) -> None:
+        assert bar.symbols is not None
+        for q, packet in enumerate(bar.symbols):
+            if len(packet) != bar.frames:
+                raise ConfigError(f"{source}.symbols.{q}: {len(packet)} frames, expected {bar.frames}")
+            try:
+                packet_chips(np.array(packet, np.int64), self._codebook)
+            except (ConfigError, ValueError) as refused:
+                raise ConfigError(f"{source}.symbols.{q}: {refused}") from refused
+        if not bar.symbols:
+            raise ConfigError(f"{source}.symbols: expected at least one packet")
+
+    def symbols(self, packet: int) -> NDArray[np.int64]:
+        """Symbols of a packet, counted from the one that `start_chip` is in: int64 (frames, clusters)."""
+        if self.bar.symbols is not None:
+            return np.array(self.bar.symbols[packet % len(self.bar.symbols)], np.int64)
+        rng = np.random.default_rng([self.payload_seed, 2, packet])
+        return rng.integers(0, len(self._codebook.codewords), (self.bar.frames, self.bar.clusters))
+
+    def sent_symbols(self, duration_s: float) -> list[list[list[int]]]:
+        """Symbols [packet][frame][cluster] of every packet that is at least begun in the scene."""
+        if self._chips is not None:
+            return []
+        packets = math.floor((self.start_chip + duration_s * self.rate_hz) / self.packet_chips) + 1
+        return [self.symbols(q).tolist() for q in range(packets)]
+
+    def chips(self, first: int, last: int) -> NDArray[np.uint8]:
+        """Chips [first, last) as the transmitter counts them: uint8 (n, clusters)."""
+        if self._chips is not None:
+            return self._chips[np.arange(first, last) % len(self._chips)]
+        begin, end = first // self.packet_chips, (last - 1) // self.packet_chips + 1
+        self._packets = {
+            q: self._packets[q] if q in self._packets else packet_chips(self.symbols(q), self._codebook)
+            for q in range(begin, end)
+        }
+        rows = np.concatenate([self._packets[q] for q in range(begin, end)])
+        return rows[first - begin * self.packet_chips : last - begin * self.packet_chips]
+
+    def switches(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
+        """See `Source.switches`."""
+        first = math.floor(self.start_chip + begin_us * 1e-6 * self.rate_hz) - 1
+        last = math.ceil(self.start_chip + end_us * 1e-6 * self.rate_hz) + 2
+        first = max(first, 0)
+        when: Floats = (np.arange(first, last, dtype=np.float64) - self.start_chip) / self.rate_hz * 1e6
+        inside = (when > begin_us) & (when < end_us)
+        begin = first + int((when <= begin_us).sum()) - 1
+        end = begin + 1 + int(inside.sum())
+        return when[inside], self.chips(begin, end).astype(np.float64)
+
+
+def _read_chips(path: Path, clusters: int) -> NDArray[np.uint8]:
+    try:
+        with path.open("rb") as file:
+            chips = np.load(file, allow_pickle=False)
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be read: {fault.strerror or fault}") from fault
+    except (ValueError, EOFError) as fault:
+        raise InputError(f"{path}: not an array file (.npy): {fault}") from fault
+    if chips.ndim != 2 or chips.shape[1] != clusters or not len(chips) or not np.isin(chips, (0, 1)).all():
+        raise ConfigError(
+            f"{path}: {chips.dtype} {chips.shape}, expected 0 and 1 in an array (chips, {clusters} clusters)"
+        )
+    found: NDArray[np.uint8] = chips.astype(np.uint8)
+    return found
+
+
+@dataclass(frozen=True)
+class LampLight:
+    """A lamp's light: a square wave, or the square of a sine in steps."""
+
+    lamp: LampSpec
+
+    @property
+    def strip(self) -> Strip:
+        """Where it is."""
+        lamp = self.lamp
+        return Strip((lamp.x_m, lamp.y_m, lamp.z_m), (0, lamp.height_m, 0), lamp.width_m, 1)
+
+    @property
+    def light_w_m2(self) -> float:
+        """Irradiance of a pixel that it fills, at its peak."""
+        return self.lamp.light_w_m2
+
+    @property
+    def longest_us(self) -> float:
+        """How long its light may do the same."""
+        return 1e6 / self.lamp.flicker_hz
+
+    def switches(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
+        """See `Source.switches`."""
+        lamp = self.lamp
+        if lamp.waveform == "square":
+            offsets, values = np.array([0.0, lamp.duty]), np.array([1.0, 0.0])
+        else:
+            offsets = np.arange(_SINE_STEPS) / _SINE_STEPS
+            values = np.sin(math.pi * (offsets + 0.5 / _SINE_STEPS)) ** 2
+        n = len(offsets)
+        first = math.floor(begin_us * 1e-6 * lamp.flicker_hz + lamp.phase) - 1
+        last = math.ceil(end_us * 1e-6 * lamp.flicker_hz + lamp.phase) + 1
+        periods = np.arange(first, last)
+        when = ((periods[:, None] + offsets - lamp.phase) / lamp.flicker_hz * 1e6).ravel()
+        inside = (when > begin_us) & (when < end_us)
+        begin = int((when <= begin_us).sum()) - 1
+        which = np.arange(begin, begin + 1 + int(inside.sum())) % n
+        return when[inside], (1 - lamp.depth + lamp.depth * values[which])[:, None]
+
+
+def _random_lamps(scene: Scene) -> list[LampSpec]:
+    """Lamps as streets have them, at random places in view: mains lamps, LEDs, signs."""
+    rng = np.random.default_rng([scene.seed, 0x1A])
+    lamps = []
+    for _ in range(scene.flicker_lamps):
+        depth = rng.uniform(0.5, 1.5) * scene.motion.distance_m
+        half = scene.camera.width / 2 / scene.camera.focal_px * depth
+        flicker_hz = float(rng.choice([100.0, 120.0, 400.0, 1000.0, 2000.0]))
+        lamps.append(
+            LampSpec(
+                x_m=float(rng.uniform(-0.9, 0.9) * half),
+                y_m=float(-rng.uniform(0.1, 0.5) * half),
+                z_m=float(depth - scene.motion.distance_m),
+                width_m=float(rng.uniform(0.02, 0.3)),
+                height_m=float(rng.uniform(0.02, 0.3)),
+                light_w_m2=float(10 ** rng.uniform(0, 1.5)),
+                flicker_hz=flicker_hz,
+                waveform="sine" if flicker_hz < 200 else "square",
+                duty=float(rng.uniform(0.2, 0.8)),
+                phase=float(rng.random()),
+            )
+        )
+    return lamps
+
+
+def sources_of(scene: Scene) -> tuple[list[BarLight], list[LampLight]]:
+    """The bars and the lamps of a scene, ready to send.
+
+    Raises:
+        ConfigError: A bar cannot send what it should.
+        InputError: A file of chips cannot be read.
+    """
+    bars = [
+        BarLight(bar, led_light_w_m2(bar, scene.lens), scene.seed + i, f"bars.{i}")
+        for i, bar in enumerate(scene.bars)
+    ]
+    return bars, [LampLight(lamp) for lamp in (*scene.lamps, *_random_lamps(scene))]

@@ -1,0 +1,190 @@
+"""How the camera moves, and where that puts a strip of light in the image."""
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
+
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.geometry import CameraModel
+from evlcp_sdk.sim.scene import NEAREST_M, MotionSpec
+
+__all__ = ["CameraPath", "Strip", "Vibration", "project"]
+
+Floats = NDArray[np.float64]
+
+_SINES = 128
+
+
+@dataclass(frozen=True, eq=False)
+class Vibration:
+    """Gaussian pitch and yaw rates as a sum of sines, so that any time can be asked for.
+
+    The spectrum (a guess, after the sensor model): 45 % of the power around 1.5 Hz (the body on its springs),
+    40 % around 12 Hz (the wheels), 15 % in a tail that falls with the square of frequency to 200 Hz.
+
+    Attributes:
+        frequency_hz: float64 (2, n): of yaw, of pitch.
+        phase: The same shape, radians.
+        amplitude_rad_s: Of each sine of the rate.
+    """
+
+    frequency_hz: Floats
+    phase: Floats
+    amplitude_rad_s: float
+
+    @classmethod
+    def of(cls, rate_rad_s: float, seed: int) -> "Vibration":
+        """A vibration whose rates have this rms over long times.
+
+        >>> v = Vibration.of(0.06, seed=1)
+        >>> rate = v.rate_rad_s(np.linspace(0, 1e8, 100_000))
+        >>> np.abs(rate.std(1) / 0.06 - 1).max() < 0.05
+        np.True_
+        """
+        rng = np.random.default_rng([seed, 0x71B])
+        share = (np.arange(_SINES) + rng.random((2, _SINES))) / _SINES
+        body, wheels, tail = share < 0.45, share < 0.85, share >= 0.85
+        frequency = np.empty((2, _SINES))
+        frequency[body] = np.clip(rng.normal(1.5, 0.35, body.sum()), 0.5, 3)
+        wheels &= ~body
+        frequency[wheels] = np.clip(rng.normal(12, 2, wheels.sum()), 6, 18)
+        u = (share[tail] - 0.85) / 0.15
+        frequency[tail] = 1 / (1 / 15 - u * (1 / 15 - 1 / 200))
+        phase = rng.random((2, _SINES)) * 2 * math.pi
+        return cls(frequency, phase, rate_rad_s * math.sqrt(2 / _SINES))
+
+    def rate_rad_s(self, t_us: ArrayLike) -> Floats:
+        """Yaw and pitch rate at times (n,): float64 (2, n)."""
+        angle = self._angle(t_us)
+        rate: Floats = self.amplitude_rad_s * np.cos(angle).sum(1)
+        return rate
+
+    def angle_rad(self, t_us: ArrayLike) -> Floats:
+        """Yaw and pitch at times (n,): float64 (2, n)."""
+        if self.amplitude_rad_s == 0:
+            return np.zeros((2, np.size(t_us)))
+        scale = self.amplitude_rad_s / (2 * math.pi * self.frequency_hz)
+        turned: Floats = (scale[:, :, None] * np.sin(self._angle(t_us))).sum(1)
+        return turned
+
+    def _angle(self, t_us: ArrayLike) -> Floats:
+        t_s = np.asarray(t_us, np.float64) * 1e-6
+        angle: Floats = 2 * math.pi * self.frequency_hz[:, :, None] * t_s + self.phase[:, :, None]
+        return angle
+
+
+class CameraPath:
+    """Position and attitude of the camera at any time.
+
+    Args:
+        motion: The approach, or the file of a path.
+        duration_s: How long the path must last.
+        seed: Of the vibration.
+
+    Raises:
+        InputError: The file cannot be read.
+        ConfigError: It is no path, or too short.
+    """
+
+    def __init__(self, motion: MotionSpec, duration_s: float, seed: int) -> None:
+        self._motion = motion
+        self._vibration = Vibration.of(motion.vib_rate_rad_s, seed)
+        self._spline: CubicSpline | None = None
+        if motion.path_file is not None:
+            self._spline = _read_path(Path(motion.path_file), duration_s)
+
+    def at(self, t_us: ArrayLike) -> tuple[Floats, Floats]:
+        """Positions (n, 3), m, and attitudes (yaw, pitch, roll) (n, 3), radians, at times (n,)."""
+        t_us = np.atleast_1d(np.asarray(t_us, np.float64))
+        m = self._motion
+        if self._spline is None:
+            t_s = t_us * 1e-6
+            position = np.stack([m.lateral_mps * t_s, 0 * t_s, m.speed_mps * t_s - m.distance_m], 1)
+            attitude = np.tile(np.radians([m.yaw_deg, m.pitch_deg, m.roll_deg]), (len(t_s), 1))
+        else:
+            values: Floats = self._spline(t_us * 1e-6)
+            position, attitude = values[:, :3], np.radians(values[:, 3:])
+        attitude[:, :2] += self._vibration.angle_rad(t_us).T
+        return position, attitude
+
+
+def _read_path(path: Path, duration_s: float) -> CubicSpline:
+    names = ("t_s", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+    except (UnicodeDecodeError, csv.Error) as fault:
+        raise InputError(f"{path}: not a CSV file: {fault}") from fault
+    table = np.empty((len(rows), len(names)))
+    for i, row in enumerate(rows):
+        for j, name in enumerate(names):
+            try:
+                table[i, j] = float(row[name])
+            except (KeyError, TypeError, ValueError) as fault:
+                raise ConfigError(
+                    f"{path}: line {i + 2}: no number in column {name} (columns: {', '.join(names)})"
+                ) from fault
+    if len(table) < 2 or not np.isfinite(table).all() or (np.diff(table[:, 0]) <= 0).any():
+        raise ConfigError(f"{path}: expected two or more lines of finite numbers with rising t_s")
+    if table[0, 0] > 0 or table[-1, 0] < duration_s:
+        raise ConfigError(
+            f"{path}: lasts from {table[0, 0]} to {table[-1, 0]} s, the scene to {duration_s} s"
+        )
+    return CubicSpline(table[:, 0], table[:, 1:])
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A straight strip of light in the world, cut into clusters from its first end.
+
+    Attributes:
+        centre_m: x, y, z of its middle.
+        along_m: From its first end to its last.
+        width_m: Its width.
+        clusters: Parts of equal length.
+    """
+
+    centre_m: tuple[float, float, float]
+    along_m: tuple[float, float, float]
+    width_m: float
+    clusters: int
+
+    def cuts_m(self) -> Floats:
+        """Where its clusters begin and end: float64 (clusters + 1, 3)."""
+        share = np.linspace(-0.5, 0.5, self.clusters + 1)
+        cuts: Floats = np.asarray(self.centre_m) + share[:, None] * np.asarray(self.along_m)
+        return cuts
+
+
+def project(
+    points_m: Floats, position_m: Floats, attitude_rad: Floats, camera: CameraModel
+) -> tuple[Floats, Floats]:
+    """Where points fall in the image at several times; the middle of pixel (i, j) is at (i, j).
+
+    Args:
+        points_m: float64 (p, 3), m.
+        position_m: The camera's, float64 (n, 3), m.
+        attitude_rad: Its (yaw, pitch, roll), float64 (n, 3): first turned right, then up, then rolled so
+            that its top leans right.
+        camera: Its optical axis meets the image at (width / 2, height / 2).
+
+    Returns:
+        Places, px, float64 (n, p, 2), and depths along the optical axis, m, float64 (n, p). Places of points
+        nearer than 0.5 m are not to be used.
+    """
+    yaw, pitch, roll = attitude_rad.T[:, :, None]
+    offset = points_m[None] - position_m[:, None]
+    x, y, z = offset[..., 0], offset[..., 1], offset[..., 2]
+    x, z = x * np.cos(yaw) - z * np.sin(yaw), x * np.sin(yaw) + z * np.cos(yaw)
+    y, z = y * np.cos(pitch) + z * np.sin(pitch), z * np.cos(pitch) - y * np.sin(pitch)
+    x, y = x * np.cos(roll) + y * np.sin(roll), y * np.cos(roll) - x * np.sin(roll)
+    scale = camera.focal_px / np.maximum(z, NEAREST_M)
+    centre = np.array([camera.width / 2, camera.height / 2])
+    return np.stack([x * scale, y * scale], -1) + centre, z

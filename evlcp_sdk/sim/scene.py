@@ -1,0 +1,398 @@
+"""The scene: bars, lamps, lens, motion, background and sensor, from TOML to checked objects.
+
+Coordinates: x right, y down, z forward, m. The camera's path begins at the origin of x and y, looking along
+z; a bar with `z_m = 0` then stands `motion.distance_m` ahead. Defaults are those of the sensor model; where a
+number is an engineering guess, its description says so.
+"""
+
+import difflib
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.geometry import CameraModel
+
+__all__ = [
+    "BackgroundSpec",
+    "BarSpec",
+    "LampSpec",
+    "LensSpec",
+    "MotionSpec",
+    "Scene",
+    "SensorSpec",
+    "load_scene",
+    "preset_names",
+    "preset_text",
+    "resolve_scene",
+]
+
+_STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_default=False)
+
+MOST_SOURCES = 64
+"""Bars and lamps of one scene."""
+
+
+@dataclass(frozen=True)
+class BarSpec:
+    """A transmitter: a strip of light, cut into clusters from its top, that sends packets without end."""
+
+    __pydantic_config__ = _STRICT
+
+    x_m: Annotated[float, Field(description="Its centre, to the right of the path's begin.")] = -1.5
+    y_m: Annotated[float, Field(description="The same, downward.")] = 0.0
+    z_m: Annotated[float, Field(description="The same, beyond `motion.distance_m`.")] = 0.0
+    length_m: Annotated[float, Field(gt=0, description="From its first to its last LED's outer edge.")] = 0.96
+    width_m: Annotated[float, Field(gt=0, description="Width of the lit strip.")] = 0.005
+    lean_deg: Annotated[float, Field(gt=-90, lt=90, description="Its top leans to the right.")] = 0.0
+    tilt_deg: Annotated[float, Field(gt=-90, lt=90, description="Its top leans away from the camera.")] = 0.0
+    clusters: Annotated[int, Field(ge=1, le=64, description="Clusters that it is cut into.")] = 16
+    profile: Annotated[str, Field(description="Modulation of its symbols, as in `link.toml`.")] = "wh4x2"
+    frames: Annotated[int, Field(ge=1, description="Frames of a packet.")] = 10
+    chip_rate_hz: Annotated[float, Field(gt=0, description="Chips sent a second, by its own clock.")] = 1e4
+    ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="How much faster its clock runs.")] = 0.0
+    start_chip: Annotated[
+        float | None, Field(ge=0, description="Chip of a packet on air as the scene begins; none: random.")
+    ] = None
+    seed: Annotated[int | None, Field(ge=0, description="Seed of its payload; none: the scene's.")] = None
+    symbols: Annotated[
+        tuple[tuple[tuple[int, ...], ...], ...] | None,
+        Field(description="Symbols [packet][frame][cluster], sent again and again; none: random."),
+    ] = None
+    chips_file: Annotated[
+        str | None,
+        Field(description="Instead of packets: .npy of 0 and 1 (chips, clusters), sent again and again."),
+    ] = None
+    led_w_m2: Annotated[
+        float | None,
+        Field(ge=0, description="Light of a fully lit pixel; none: from the LED's intensity and the lens."),
+    ] = None
+    led_mw_sr: Annotated[float, Field(gt=0, description="Intensity of one LED.")] = 20.0
+    led_pitch_m: Annotated[float, Field(gt=0, description="Spacing of the LEDs.")] = 0.01
+
+
+@dataclass(frozen=True)
+class LampSpec:
+    """A rectangle of flickering light."""
+
+    __pydantic_config__ = _STRICT
+
+    x_m: Annotated[float, Field(description="Its centre, to the right of the path's begin.")] = 4.0
+    y_m: Annotated[float, Field(description="The same, downward.")] = -3.0
+    z_m: Annotated[float, Field(description="The same, beyond `motion.distance_m`.")] = 0.0
+    width_m: Annotated[float, Field(gt=0, description="Its width.")] = 0.2
+    height_m: Annotated[float, Field(gt=0, description="Its height.")] = 0.2
+    light_w_m2: Annotated[float, Field(ge=0, description="Light of a fully lit pixel at its peak.")] = 20.0
+    flicker_hz: Annotated[float, Field(gt=0, le=1e5, description="Periods a second.")] = 100.0
+    waveform: Annotated[
+        Literal["square", "sine"],
+        Field(description="On and off, or the square of a sine in 32 steps (mains light)."),
+    ] = "square"
+    duty: Annotated[float, Field(gt=0, lt=1, description="Share of a period that a square is on.")] = 0.5
+    depth: Annotated[float, Field(gt=0, le=1, description="Share of its light that flickers.")] = 1.0
+    phase: Annotated[float, Field(ge=0, lt=1, description="Share of a period gone as the scene begins.")] = (
+        0.0
+    )
+
+
+@dataclass(frozen=True)
+class LensSpec:
+    """What the lens does beside projecting: its light, its blur, its halo."""
+
+    __pydantic_config__ = _STRICT
+
+    f_number: Annotated[float, Field(gt=0, description="Focal length over aperture.")] = 2.0
+    focus_m: Annotated[float, Field(gt=0, description="Distance that is sharp.")] = 50.0
+    transmission: Annotated[
+        float, Field(gt=0, le=1, description="Share of the light that arrives; a guess.")
+    ] = 0.65
+    wavelength_nm: Annotated[float, Field(gt=0, description="For the diffraction.")] = 630.0
+    blur_px: Annotated[
+        float, Field(ge=0.05, description="Sigma of the blur that is left in focus; a guess.")
+    ] = 0.36
+    halo: Annotated[float, Field(ge=0, lt=1, description="Share of the light in the halo; a guess.")] = 0.02
+    halo_px: Annotated[float, Field(ge=2, le=400, description="Sigma of the halo; a guess.")] = 40.0
+
+
+@dataclass(frozen=True)
+class MotionSpec:
+    """How the camera moves: an approach along z or a path from a file, and the vehicle's vibration."""
+
+    __pydantic_config__ = _STRICT
+
+    distance_m: Annotated[
+        float, Field(gt=0, le=10_000, description="Depth of z_m = 0 as the scene begins.")
+    ] = 50.0
+    speed_mps: Annotated[float, Field(ge=-100, le=100, description="Speed towards it.")] = 8.333
+    lateral_mps: Annotated[float, Field(ge=-100, le=100, description="Speed to the right.")] = 0.0
+    yaw_deg: Annotated[float, Field(ge=-60, le=60, description="The camera looks to the right.")] = 0.0
+    pitch_deg: Annotated[float, Field(ge=-60, le=60, description="The camera looks up.")] = 0.0
+    roll_deg: Annotated[float, Field(ge=-180, le=180, description="The camera's top leans right.")] = 0.0
+    vib_rate_rad_s: Annotated[
+        float, Field(ge=0, le=2, description="Rms of the vibration's pitch and yaw rates; a guess.")
+    ] = 0.06
+    path_file: Annotated[
+        str | None,
+        Field(
+            description="CSV of t_s,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg instead of the straight approach."
+        ),
+    ] = None
+
+
+@dataclass(frozen=True)
+class BackgroundSpec:
+    """The light of everything else."""
+
+    __pydantic_config__ = _STRICT
+
+    light_w_m2: Annotated[
+        float, Field(gt=0, le=100, description="On the sensor: night 1e-4, tunnel 0.1, sun 3 to 12.")
+    ] = 0.05
+    texture: Annotated[
+        float, Field(ge=0, le=1, description="Rms of its logarithm over the image; a guess.")
+    ] = 0.3
+    texture_px: Annotated[float, Field(ge=2, le=64, description="Size of its patches; a guess.")] = 12.0
+
+
+@dataclass(frozen=True)
+class SensorSpec:
+    """Pixels and readout; a logarithmic receptor, solved exactly for light constant between edges."""
+
+    __pydantic_config__ = _STRICT
+
+    th_on: Annotated[float, Field(gt=0, le=2, description="ON threshold, ln units.")] = 0.223
+    th_off: Annotated[float, Field(gt=0, le=2, description="OFF threshold, ln units.")] = 0.223
+    th_spread: Annotated[
+        float, Field(ge=0, le=0.2, description="Relative sigma between pixels; a guess.")
+    ] = 0.10
+    charge_us_w_m2: Annotated[float, Field(gt=0, description="Receptor charge Q, us W/m2.")] = 14.6
+    dark_w_m2: Annotated[float, Field(gt=0, description="Dark current as light; a guess.")] = 1e-4
+    dly_on_us: Annotated[float, Field(ge=0, le=1000, description="Fixed delay of ON events.")] = 22.0
+    dly_off_us: Annotated[float, Field(ge=0, le=1000, description="Fixed delay of OFF events.")] = 33.0
+    jitter_us: Annotated[float, Field(ge=0, le=100, description="Sigma of the delays.")] = 0.0
+    refr_us: Annotated[float, Field(ge=1, le=10_000, description="Refractory time; a guess.")] = 10.0
+    noise_ln: Annotated[float, Field(ge=0, le=0.2, description="Rms noise of the log signal.")] = 0.03
+    noise_hz: Annotated[
+        float, Field(ge=0, le=1000, description="Background events a pixel, each sign; a guess.")
+    ] = 0.1
+    hot_share: Annotated[float, Field(ge=0, le=0.1, description="Share of hot pixels; a guess.")] = 1e-4
+    hot_hz: Annotated[float, Field(ge=0, le=1e5, description="Events of a hot pixel; a guess.")] = 100.0
+    p_on_miss: Annotated[
+        float, Field(ge=0, lt=1, description="Share of ON events that go missing; a guess.")
+    ] = 0.05
+    p_off_miss: Annotated[
+        float, Field(ge=0, lt=1, description="Share of OFF events that go missing; a guess.")
+    ] = 0.2
+    t_row_us: Annotated[float, Field(ge=0, le=10, description="Readout's time for a row.")] = 0.2
+    cap_mev_s: Annotated[
+        float, Field(ge=0, description="Events a second, in millions, that pass at most; 0: no limit.")
+    ] = 100.0
+    cap_window_us: Annotated[int, Field(ge=1, description="Time over which they are counted; a guess.")] = 200
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything that determines a recording.
+
+    Raises:
+        ConfigError: It asks for what cannot be: a bar behind the camera, too many sources.
+
+    >>> Scene().bars[0].clusters
+    16
+    """
+
+    __pydantic_config__ = _STRICT
+
+    name: Annotated[str, Field(pattern=r"^[\w.+-]+$", description="Name of the recording.")] = "scene"
+    duration_s: Annotated[float, Field(gt=0, le=86_400, description="Its length.")] = 0.25
+    t0_us: Annotated[int, Field(ge=0, le=10**15, description="Camera clock as it begins.")] = 0
+    seed: Annotated[int, Field(ge=0, lt=2**63, description="Seed of everything random.")] = 0
+    flicker_lamps: Annotated[
+        int, Field(ge=0, le=48, description="Lamps at random places, beside those listed.")
+    ] = 0
+    camera: CameraModel = field(default_factory=CameraModel)
+    lens: LensSpec = field(default_factory=LensSpec)
+    motion: MotionSpec = field(default_factory=MotionSpec)
+    background: BackgroundSpec = field(default_factory=BackgroundSpec)
+    sensor: SensorSpec = field(default_factory=SensorSpec)
+    bars: tuple[BarSpec, ...] = (BarSpec(),)
+    lamps: tuple[LampSpec, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.bars) + len(self.lamps) + self.flicker_lamps > MOST_SOURCES:
+            raise ConfigError(f"bars and lamps: expected at most {MOST_SOURCES} together")
+        if self.lens.focus_m * 1e3 <= self.camera.focal_mm:
+            raise ConfigError(f"lens.focus_m = {self.lens.focus_m}: expected beyond the focal length")
+        for i, bar in enumerate(self.bars):
+            if self.motion.path_file is None and self.motion.distance_m + bar.z_m <= NEAREST_M:
+                raise ConfigError(
+                    f"bars.{i}.z_m = {bar.z_m}: the bar is behind the camera, which begins"
+                    f" {self.motion.distance_m} m before z_m = 0"
+                )
+
+
+NEAREST_M = 0.5
+"""Depth from which a source is rendered."""
+
+_TABLES = ("camera", "lens", "motion", "background", "sensor")
+_LISTS = ("bars", "lamps")
+
+
+def preset_names() -> list[str]:
+    """Names of the scenes that come with the package."""
+    folder = resources.files("evlcp_sdk.sim") / "presets"
+    return sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml"))
+
+
+def preset_text(name: str) -> str:
+    """The TOML of a preset.
+
+    Raises:
+        ConfigError: There is none of that name.
+    """
+    known = preset_names()
+    if name not in known:
+        raise ConfigError(f"no preset named '{name}'{_nearest(name, known)}")
+    return (resources.files("evlcp_sdk.sim") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
+
+
+def load_scene(source: Path | str, overrides: Sequence[str] | Mapping[str, Any] = ()) -> Scene:
+    """Read a scene from a TOML file or a preset.
+
+    Args:
+        source: The file, or a preset's name.
+        overrides: `"table.key=value"` texts, or a mapping from `"table.key"` to values; `bars.ppm` is that
+            of every bar, `bars.1.ppm` that of the second, `duration_s` a key without a table.
+
+    Raises:
+        ConfigError: The file cannot be read, is no TOML, or does not describe a scene; one line a fault.
+
+    >>> load_scene("drive-30kmh", ["motion.distance_m=60"]).motion.distance_m
+    60.0
+    """
+    name = str(source)
+    folder: Path | None = None
+    if isinstance(source, str) and source in preset_names():
+        text, where = preset_text(source), f"preset {name}"
+    else:
+        path = Path(source)
+        folder = path.parent
+        where = name
+        if not path.exists() and not path.suffix:
+            raise ConfigError(
+                f"{name}: no such file, and no preset of that name{_nearest(name, preset_names())}"
+            )
+        try:
+            text = path.read_text(encoding="utf-8")
+        except OSError as fault:
+            raise ConfigError(f"{name}: cannot be read: {fault.strerror}") from fault
+        except UnicodeDecodeError as fault:
+            raise ConfigError(f"{name}: at byte {fault.start}: not UTF-8 text") from fault
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as fault:
+        raise ConfigError(f"{name}: not TOML: {fault}") from fault
+    pairs = overrides.items() if isinstance(overrides, Mapping) else map(_parse_override, overrides)
+    for key, value in pairs:
+        _set(table, key, value)
+    return resolve_scene(table, source=where, folder=folder)
+
+
+def resolve_scene(table: Mapping[str, Any], *, source: str = "", folder: Path | None = None) -> Scene:
+    """Check a scene's table, with every default.
+
+    Args:
+        table: As read from TOML.
+        source: What faults name as their place.
+        folder: What `path_file` and `chips_file` are relative to; None for the current folder.
+
+    Raises:
+        ConfigError: One line a fault, each with its path.
+    """
+    before = f"{source}: " if source else ""
+    try:
+        scene = _ADAPTER.validate_json(json.dumps(table, default=str))
+    except ValidationError as refused:
+        lines = []
+        for error in refused.errors():
+            where = [str(part) for part in error["loc"]]
+            shown = f" = {error['input']!r}" if not isinstance(error["input"], dict) else ""
+            if error["type"] == "unexpected_keyword_argument":
+                lines.append(
+                    f"{before}{'.'.join(where)}{shown}: unknown key{_nearest(where[-1], _keys(where))}"
+                )
+            else:
+                text = error["msg"].replace("Input should be", "expected", 1)
+                lines.append(f"{before}{'.'.join(where)}{shown}: {text}")
+        raise ConfigError("\n".join(lines)) from refused
+    except ConfigError as refused:
+        raise ConfigError(f"{before}{refused}") from refused
+    if folder is not None:
+        scene = _with_folder(scene, folder)
+    return scene
+
+
+_ADAPTER: TypeAdapter[Scene] = TypeAdapter(Scene)
+
+
+def _with_folder(scene: Scene, folder: Path) -> Scene:
+    """File names, which are relative to the scene's own folder, made good."""
+
+    def found(name: str | None) -> str | None:
+        return None if name is None else str(folder / name)
+
+    bars = tuple(replace(bar, chips_file=found(bar.chips_file)) for bar in scene.bars)
+    motion = replace(scene.motion, path_file=found(scene.motion.path_file))
+    return replace(scene, bars=bars, motion=motion)
+
+
+def _keys(where: Sequence[str]) -> list[str]:
+    """Known keys beside the one at a path."""
+    cls: Any = Scene
+    for part in where[:-1]:
+        if not part.isdigit():
+            cls = {"bars": BarSpec, "lamps": LampSpec}.get(part) or type(getattr(Scene(), part))
+    return list(cls.__dataclass_fields__)
+
+
+def _nearest(word: str, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(word, known, n=1)
+    return (f"; did you mean '{near[0]}'?" if near else "") + f" (known: {', '.join(known) or 'none'})"
+
+
+def _parse_override(text: str) -> tuple[str, Any]:
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise ConfigError(f"--set {text}: expected table.key=value, e.g. motion.distance_m=60")
+    try:
+        return key.strip(), tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key.strip(), value.strip()
+
+
+def _set(table: dict[str, Any], key: str, value: Any) -> None:
+    parts = key.split(".")
+    if isinstance(value, np.generic):
+        value = value.item()
+    if len(parts) == 1:
+        table[parts[0]] = value
+    elif len(parts) == 2 and parts[0] in _TABLES:
+        table.setdefault(parts[0], {})[parts[1]] = value
+    elif len(parts) in (2, 3) and parts[0] in _LISTS:
+        rows = table.setdefault(parts[0], [{}] if parts[0] == "bars" else [])
+        if len(parts) == 2:
+            for row in rows:
+                row[parts[1]] = value
+        elif parts[1].isdigit() and int(parts[1]) < len(rows):
+            rows[int(parts[1])][parts[2]] = value
+        else:
+            raise ConfigError(f"--set {key}: there are {len(rows)} {parts[0]}, counted from 0")
+    else:
+        raise ConfigError(f"--set {key}: unknown table{_nearest(parts[0], [*_TABLES, *_LISTS])}")

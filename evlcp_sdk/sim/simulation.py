@@ -1,0 +1,425 @@
+"""The simulator: a scene in, events out, block by block of time in constant memory."""
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from evlcp_sdk.sim import _kernels
+from evlcp_sdk.sim.light import Source, sources_of
+from evlcp_sdk.sim.motion import CameraPath, project
+from evlcp_sdk.sim.optics import blur_sigma_px, step_table
+from evlcp_sdk.sim.scene import NEAREST_M, Scene, SensorSpec
+from evlcp_sdk.types import Events
+
+__all__ = ["ACTIVITY_FLOOR", "MOTION_STEP_PX", "Simulation", "quantile_table", "sensor_vector", "simulate"]
+
+Floats = NDArray[np.float64]
+
+ACTIVITY_FLOOR = 0.1
+"""Log signal by which a source must be able to move a pixel for the pixel to be simulated, ln units."""
+
+MOTION_STEP_PX = 0.05
+"""How far the image moves before the light on the pixels is computed anew, px."""
+
+_CELL_US = 1000.0
+_CELLS = 4
+_BLOCK_US = _CELLS * _CELL_US
+_MOST_MOVES = 40
+_CORE_NODES = 513
+_WIDE_NODES = 1025
+_ROOM = 1 << 17
+_TEXTURE_SIZE = 512
+_MASK64 = 2**64 - 1
+
+
+def sensor_vector(sensor: SensorSpec) -> Floats:
+    """What the kernels need of a sensor, float64 (12,): see `_kernels`."""
+    s = sensor
+    widest = math.exp(_kernels.NOISE_LIMIT * s.noise_ln)
+    return np.array(
+        [
+            *(s.charge_us_w_m2, s.refr_us, s.dly_on_us, s.dly_off_us, s.jitter_us, s.p_on_miss, s.p_off_miss),
+            *(s.noise_ln, widest, s.th_on, s.th_off, s.th_spread),
+        ]
+    )
+
+
+def quantile_table(nodes: int = 16_385) -> Floats:
+    """Quantiles of the normal distribution between its cut-offs, evenly spaced in probability."""
+    edge = ndtr(-_kernels.NOISE_LIMIT)
+    table: Floats = ndtri(edge + np.linspace(0, 1, nodes) * (1 - 2 * edge))
+    return table
+
+
+def seed_key(seed: int) -> np.uint64:
+    """A seed as the key of the kernels' hash."""
+    return np.uint64((seed * 0x9E3779B97F4A7C15 + 0x632BE59BD9B4E019) & _MASK64)
+
+
+def _texture(scene: Scene) -> Floats:
+    """Background light relative to its mean: a periodic log-normal field, float64 (512, 512)."""
+    n = _TEXTURE_SIZE
+    rng = np.random.default_rng([scene.seed, 0x7E])
+    frequency = np.hypot(np.fft.fftfreq(n)[:, None], np.fft.rfftfreq(n)[None, :])
+    spectrum = np.fft.rfft2(rng.normal(size=(n, n))) * np.exp(
+        -0.5 * (2 * math.pi * frequency * scene.background.texture_px / 2) ** 2
+    )
+    field = np.fft.irfft2(spectrum, s=(n, n))
+    field -= field.mean()
+    field *= scene.background.texture / field.std()
+    light = np.exp(field)
+    return np.ascontiguousarray(light / light.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Everything about a block of time that all pixels share: the arguments of `run_pixels`."""
+
+    pixels: NDArray[np.int32]
+    masks: NDArray[np.uint64]
+    shared: tuple[Any, ...]
+
+
+class Simulation:
+    """Renders a scene; made once, streamed once.
+
+    Time passes in blocks of 4 ms. In each, the pixels that a source may excite are run one by one from edge
+    to edge of the light, and their events go, sorted, through the readout. The light on a pixel changes when
+    a source switches and when the image has moved by `MOTION_STEP_PX`; there is no other time step.
+
+    Args:
+        scene: What to render.
+        seed: Instead of the scene's.
+        threads: Threads that share the pixels; the events do not depend on it.
+
+    Raises:
+        ConfigError: The scene cannot be rendered.
+        InputError: One of its files cannot be read.
+    """
+
+    def __init__(self, scene: Scene, seed: int | None = None, threads: int = 1) -> None:
+        self.scene = scene if seed is None else replace(scene, seed=seed)
+        scene = self.scene
+        self.bars, self.lamps = sources_of(scene)
+        self._sources: list[Source] = [*self.bars, *self.lamps]
+        self.path = CameraPath(scene.motion, scene.duration_s, scene.seed)
+        self._threads = max(1, threads)
+        self._key = seed_key(scene.seed)
+        self._sensor = sensor_vector(scene.sensor)
+        self._quantiles = quantile_table()
+        self._texture = _texture(scene)
+        size = scene.camera.width * scene.camera.height
+        self._state = np.zeros((size, 8))
+        self._counters = np.zeros((size, 3), np.int64)
+        self._counters[:, _kernels.BLOCK] = -2
+        hot = np.empty(size, np.int64)
+        self._hot = hot[: _kernels.find_hot_pixels(size, scene.sensor.hot_share, self._key, hot)].copy()
+        self._wide_reach = 4.5 * scene.lens.halo_px + 1
+        self._wide_table = step_table(scene.lens.halo_px, self._wide_reach, _WIDE_NODES)
+        self._counts = dict.fromkeys(("events", "signal_events", "dropped_by_rate_cap", "dropped_blind"), 0)
+        self._done_us = 0.0
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Events written and dropped so far; signal events are counted before the readout."""
+        return dict(self._counts)
+
+    @property
+    def hot_pixels(self) -> int:
+        """How many pixels are hot."""
+        return len(self._hot)
+
+    @property
+    def done_s(self) -> float:
+        """How much of the scene is rendered, s."""
+        return self._done_us * 1e-6
+
+    def stream(self) -> Iterator[Events]:
+        """Yield the events in order of time, in pieces of up to a block."""
+        scene = self.scene
+        sensor, camera = scene.sensor, scene.camera
+        end_us = scene.duration_s * 1e6
+        early_us = min(sensor.dly_on_us, sensor.dly_off_us)
+        if sensor.jitter_us > 0:
+            early_us = max(0.0, early_us - _kernels.NOISE_LIMIT * sensor.jitter_us)
+        later: list[tuple[Floats, NDArray[np.int32]]] = []
+        queue = (np.empty(0), np.empty(0, np.int32))
+        last_us = np.full(camera.width * camera.height, -1e18)
+        memory = np.array([-1e18, -1.0, -1.0, 0.0])
+        noise_from = 0.0
+        with ThreadPoolExecutor(self._threads) as pool:
+            for number in range(math.ceil(end_us / _BLOCK_US)):
+                begin, end = number * _BLOCK_US, min((number + 1) * _BLOCK_US, end_us)
+                signal = self._run(number, begin, end, pool)
+                over = end == end_us
+                noise_to = end if over else end + early_us
+                noise = self._noise(number, noise_from, min(noise_to, end_us))
+                noise_from = noise_to
+                self._counts["signal_events"] += sum(len(t) for t, _ in signal)
+                parts = [*later, *signal, noise]
+                t, code = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+                out_t, out_code = np.empty_like(t), np.empty_like(code)
+                _kernels.sort_events(t, code, out_t, out_code)
+                safe = math.inf if over else end + early_us
+                cut = len(out_t) if over else int(np.searchsorted(out_t, safe))
+                later = [(out_t[cut:].copy(), out_code[cut:].copy())]
+                kept = _kernels.drop_blind(out_t[:cut], out_code[:cut], last_us, sensor.refr_us)
+                self._counts["dropped_blind"] += cut - kept
+                queue = (
+                    np.concatenate([queue[0], out_t[:kept]]),
+                    np.concatenate([queue[1], out_code[:kept]]),
+                )
+                events, queue = self._read_out(queue, safe, memory)
+                self._done_us = end
+                if len(events):
+                    yield events
+
+    def _read_out(
+        self, queue: tuple[Floats, NDArray[np.int32]], safe_us: float, memory: Floats
+    ) -> tuple[Events, tuple[Floats, NDArray[np.int32]]]:
+        camera, sensor = self.scene.camera, self.scene.sensor
+        t, code = queue
+        n = len(t)
+        columns = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
+        cap = round(sensor.cap_mev_s * sensor.cap_window_us)
+        cap = max(cap, 1) if sensor.cap_mev_s > 0 else 0
+        written, dropped, left = _kernels.read_out(
+            t, code, camera.width, camera.height, sensor.t_row_us, safe_us, cap, sensor.cap_window_us, memory,
+            *columns,
+        )  # fmt: skip
+        self._counts["events"] += written
+        self._counts["dropped_by_rate_cap"] += dropped
+        columns[0][:written] += self.scene.t0_us
+        events = Events(
+            columns[0][:written], columns[1][:written], columns[2][:written], columns[3][:written]
+        )
+        return events, (t[:left].copy(), code[:left].copy())
+
+    def _noise(self, number: int, begin_us: float, end_us: float) -> tuple[Floats, NDArray[np.int32]]:
+        """Background activity and hot pixels from `begin_us` to `end_us`."""
+        camera, sensor = self.scene.camera, self.scene.sensor
+        size = camera.width * camera.height
+        rate = 2 * sensor.noise_hz * size
+        hot_rate = sensor.hot_hz * len(self._hot)
+        expected = (rate + hot_rate) * max(end_us - begin_us, 0.0) * 1e-6
+        room = int(expected + 12 * math.sqrt(expected) + 64)
+        t, code = np.empty(room), np.empty(room, np.int32)
+        n = _kernels.background_events(
+            begin_us, end_us, rate, self._hot, hot_rate, size, number, self._key, t, code
+        )
+        return t[:n], code[:n]
+
+    def _run(
+        self, number: int, begin_us: float, end_us: float, pool: ThreadPoolExecutor
+    ) -> list[tuple[Floats, NDArray[np.int32]]]:
+        """Run the active pixels through a block; return their events' requests, unsorted."""
+        block = self._prepare(begin_us, end_us)
+        if block is None:
+            return []
+        most = int((end_us - begin_us) / self.scene.sensor.refr_us) + 8
+        cuts = np.linspace(0, len(block.pixels), self._threads + 1).astype(int)
+
+        def run(first: int, last: int) -> list[tuple[Floats, NDArray[np.int32]]]:
+            found = []
+            while first < last:
+                t, code = np.empty(max(_ROOM, most)), np.empty(max(_ROOM, most), np.int32)
+                room: tuple[Any, ...] = (self._key, self._quantiles, self._sensor, t, code, most)
+                state = (self.scene.camera.width, self._state, self._counters, number, begin_us, end_us)
+                arguments = (block.pixels, block.masks, *state, *block.shared, *room)
+                first, n = _kernels.run_pixels(first, last, *arguments)
+                found.append((t[:n], code[:n]))
+            return found
+
+        if self._threads == 1:
+            return run(0, len(block.pixels))
+        jobs = [pool.submit(run, int(a), int(b)) for a, b in pairwise(cuts)]
+        return [part for job in jobs for part in job.result()]
+
+    def _moves(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
+        """When the image has moved by a step: begins and middles of the poses, us, float64 (n,)."""
+        begins = []
+        ends = np.array([s.strip.cuts_m()[[0, -1]] for s in self._sources]).reshape(-1, 3)
+        for cell in np.arange(begin_us, end_us, _CELL_US):
+            t = cell + np.array([0, 0.5, 1]) * min(_CELL_US, end_us - cell)
+            position, attitude = self.path.at(t)
+            moved = np.abs(np.diff(attitude[:, :2], axis=0)).max() * self.scene.camera.focal_px
+            if len(ends):
+                place, depth = project(ends, position, attitude, self.scene.camera)
+                shown = (depth > NEAREST_M).all(0)
+                shown &= (np.abs(place) < 4 * self.scene.camera.width).all((0, 2))
+                if shown.any():
+                    moved = max(moved, np.hypot(*np.diff(place[:, shown], axis=0).transpose(2, 0, 1)).max())
+            n = min(max(math.ceil(2 * moved / MOTION_STEP_PX), 1), _MOST_MOVES)
+            begins.append(t[0] + np.arange(n) / n * (t[-1] - t[0]))
+        starts = np.concatenate(begins)
+        middles = 0.5 * (starts + np.append(starts[1:], end_us))
+        return starts, middles
+
+    def _prepare(self, begin_us: float, end_us: float) -> _Block | None:
+        """Where the sources are in a block, how they switch, and which pixels they may excite."""
+        scene = self.scene
+        camera, lens, sensor = scene.camera, scene.lens, scene.sensor
+        starts, middles = self._moves(begin_us, end_us)
+        position, attitude = self.path.at(middles)
+        turn = np.stack([attitude[:, 0], -attitude[:, 1]], 1) * camera.focal_px
+        darkest = sensor.dark_w_m2 + scene.background.light_w_m2 * float(self._texture.min())
+        shown: list[tuple[Source, Floats, Floats, float]] = []
+        width, height = camera.width, camera.height
+        mask = np.zeros((height, width), np.uint64)
+        for source in self._sources:
+            place, depth = project(source.strip.cuts_m(), position, attitude, camera)
+            if depth.min() <= NEAREST_M:
+                continue
+            middle_depth = depth.mean(1)
+            strip_px = camera.focal_px * source.strip.width_m / middle_depth
+            sigma = blur_sigma_px(float(middle_depth[len(middle_depth) // 2]), lens, camera)
+            least = ACTIVITY_FLOOR * max(darkest, sensor.charge_us_w_m2 / source.longest_us)
+            box = self._mark(mask, len(shown), place, float(strip_px.max()), sigma, source.light_w_m2, least)
+            if box:
+                shown.append((source, place, strip_px, sigma))
+        if not shown:
+            return None
+        rows, columns = np.nonzero(mask)
+        pixels = (rows * width + columns).astype(np.int32)
+        masks = mask[rows, columns]
+
+        g = len(shown)
+        most = max(source.strip.clusters for source, *_ in shown)
+        poses = len(starts)
+        origin, axis = np.empty((poses, g, 2)), np.empty((poses, g, 2))
+        bounds, strips = np.zeros((poses, g, most + 1)), np.empty((poses, g))
+        clusters, gain = np.empty(g, np.int64), np.empty(g)
+        core, core_per_px = np.empty((g, _CORE_NODES)), np.empty(g)
+        halo_first, halo_per_px = np.empty(g), np.full(g, 8 / lens.halo_px)
+        first_rows = np.empty(g, np.int64)
+        lines_t, lines_source, lines_row = [starts[1:]], [np.full(poses - 1, -1)], [np.arange(1, poses)]
+        levels_of, halo_of = [], []
+        total = 0
+        for i, (source, place, strip_px, sigma) in enumerate(shown):
+            k = source.strip.clusters
+            vector = place[:, -1] - place[:, 0]
+            axis[:, i] = vector / np.hypot(*vector.T)[:, None]
+            origin[:, i] = place[:, 0]
+            bounds[:, i, : k + 1] = ((place - place[:, :1]) * axis[:, i, None]).sum(-1)
+            strips[:, i], clusters[i], gain[i] = strip_px, k, source.light_w_m2
+            reach = 5 * sigma + 0.5
+            core[i] = step_table(sigma, reach, _CORE_NODES)
+            core_per_px[i] = (_CORE_NODES - 1) / (2 * reach)
+            when, levels = source.switches(begin_us, end_us)
+            lines_t.append(when)
+            lines_source.append(np.full(len(when), i))
+            lines_row.append(total + np.arange(1, len(levels)))
+            first_rows[i] = total
+            total += len(levels)
+            levels_of.append(np.pad(levels, ((0, 0), (0, most - k))))
+            cut = bounds[poses // 2, i, : k + 1]
+            halo_first[i] = -self._wide_reach
+            grid = np.arange(halo_first[i], cut[-1] + self._wide_reach, 1 / halo_per_px[i])
+            edge = np.interp(
+                grid[:, None] - cut,
+                np.linspace(-self._wide_reach, self._wide_reach, _WIDE_NODES),
+                self._wide_table,
+            )
+            halo_of.append(levels @ (edge[:, :-1] - edge[:, 1:]).T)
+        longest = max(h.shape[1] for h in halo_of) + 1
+        halo = np.concatenate([np.pad(h, ((0, 0), (0, longest - h.shape[1]))) for h in halo_of])
+        when = np.concatenate(lines_t)
+        order = np.argsort(when, kind="stable")
+        shared = (
+            when[order],
+            np.concatenate(lines_source)[order].astype(np.int64),
+            np.concatenate(lines_row)[order].astype(np.int64),
+            first_rows, origin, axis, bounds, strips, clusters, gain, np.concatenate(levels_of), halo,
+            halo_first, halo_per_px, lens.halo, core, core_per_px, self._wide_table,
+            (_WIDE_NODES - 1) / (2 * self._wide_reach), turn, self._texture,
+            np.array([scene.background.light_w_m2, sensor.dark_w_m2]),
+        )  # fmt: skip
+        return _Block(pixels, masks, shared)
+
+    def _mark(
+        self,
+        mask: NDArray[np.uint64],
+        number: int,
+        place: Floats,
+        strip_px: float,
+        sigma: float,
+        light_w_m2: float,
+        least_w_m2: float,
+    ) -> bool:
+        """Mark the pixels that a source lights by `least_w_m2` or more at any pose; say whether there are."""
+        lens = self.scene.lens
+        z = np.arange(0, self._wide_reach, 0.25)
+        half = strip_px / 2
+        wide = np.linspace(-self._wide_reach, self._wide_reach, _WIDE_NODES)
+        table = step_table(sigma, 5 * sigma + 0.5, _CORE_NODES)
+        near = np.linspace(-5 * sigma - 0.5, 5 * sigma + 0.5, _CORE_NODES)
+
+        def step(at: Floats, core: bool) -> Floats:
+            return np.interp(at, near, table) if core else np.interp(at, wide, self._wide_table)
+
+        across_core = step(z + half, True) - step(z - half, True)
+        across_halo = step(z + half, False) - step(z - half, False)
+        across = light_w_m2 * ((1 - lens.halo) * across_core + lens.halo * across_halo)
+        if across[0] < least_w_m2:
+            return False
+        along = light_w_m2 * (
+            (1 - lens.halo) * across_core[0] * step(-z, True) + lens.halo * across_halo[0] * step(-z, False)
+        )
+        reach_across = float(z[across >= least_w_m2].max(initial=0)) + 0.5
+        reach_along = float(z[along >= least_w_m2].max(initial=0)) + 0.5
+        first, last = place[:, 0], place[:, -1]
+        middle = place[len(place) // 2]
+        wander = max(float(np.abs(end - end[len(end) // 2]).max()) for end in (first, last))
+        reach = max(reach_across, reach_along) + wander
+        height, width = mask.shape
+        left, top = np.floor(np.minimum(middle[0], middle[-1]) - reach).astype(int)
+        right, low = np.ceil(np.maximum(middle[0], middle[-1]) + reach).astype(int) + 1
+        left, top, right, low = max(left, 0), max(top, 0), min(right, width), min(low, height)
+        if left >= right or top >= low:
+            return False
+        vector = middle[-1] - middle[0]
+        length = float(np.hypot(*vector))
+        axis = vector / length
+        y, x = np.mgrid[top:low, left:right]
+        dx, dy = x - middle[0, 0], y - middle[0, 1]
+        s, n = dx * axis[0] + dy * axis[1], dx * axis[1] - dy * axis[0]
+        # How far the strip wanders across itself and along itself, from its place in the middle pose.
+        away = place[:, [0, -1]] - middle[[0, -1]]
+        wander_along = float(np.abs(away @ axis).max())
+        wander_across = float(np.abs(away @ np.array([axis[1], -axis[0]])).max())
+        inside = np.abs(n) <= reach_across + wander_across
+        inside &= (s >= -reach_along - wander_along) & (s <= length + reach_along + wander_along)
+        mask[top:low, left:right] |= inside.astype(np.uint64) << np.uint64(number)
+        return bool(inside.any())
+
+
+def simulate(
+    scene: Scene, seed: int | None = None, *, threads: int = 1, max_events: int = 1 << 16
+) -> Iterator[Events]:
+    """Yield a scene's events in order of time, in pieces of at most `max_events`.
+
+    Args:
+        scene: What to render.
+        seed: Instead of the scene's.
+        threads: Threads that share the pixels; the events do not depend on it.
+        max_events: Length of a piece; the events do not depend on it.
+
+    Raises:
+        ConfigError: The scene cannot be rendered.
+        InputError: One of its files cannot be read.
+    """
+    for events in Simulation(scene, seed, threads).stream():
+        for begin in range(0, len(events), max_events):
+            yield events[begin : begin + max_events]
+
+
+def scene_table(scene: Scene) -> dict[str, Any]:
+    """The scene as plain values, every default written out; `resolve_scene` takes it back."""
+    return asdict(scene)

@@ -1,0 +1,112 @@
+"""The truth beside a recording: what was sent, and where the bars were."""
+
+from typing import Any
+
+import numpy as np
+
+from evlcp_sdk.sim.motion import project
+from evlcp_sdk.sim.optics import blur_sigma_px
+from evlcp_sdk.sim.scene import Scene
+from evlcp_sdk.sim.simulation import Simulation, scene_table
+
+__all__ = ["truth", "truth_of"]
+
+
+def truth(scene: Scene, seed: int | None = None) -> dict[str, Any]:
+    """The truth of a scene without rendering it: all but the counts of events.
+
+    Raises:
+        ConfigError: The scene cannot be rendered.
+        InputError: One of its files cannot be read.
+    """
+    return truth_of(Simulation(scene, seed))
+
+
+def truth_of(simulation: Simulation) -> dict[str, Any]:
+    """What `REC.truth.json` holds, as JSON values; with the counts when the simulation has run.
+
+    `scene` holds its parameters; `bars` what each sent: symbols [packet][frame][cluster] and the chip of the
+    first packet that was on air at the scene's begin; `t_s`, `distance_m` and `bar_centre_px`, every
+    millisecond, the depth along the optical axis and the place of each bar's centre; `simulator` the
+    resolved scene, which renders the recording again.
+    """
+    scene = simulation.scene
+    camera, sensor, motion = scene.camera, scene.sensor, scene.motion
+    t_s = np.arange(max(1, round(scene.duration_s * 1000))) / 1000
+    position, attitude = simulation.path.at(t_s * 1e6)
+    centres = np.array([b.strip.centre_m for b in simulation.bars]).reshape(-1, 3)
+    place, depth = project(centres, position, attitude, camera)
+    bars = []
+    for light in simulation.bars:
+        bar = light.bar
+        bars.append(
+            {
+                "x_m": bar.x_m,
+                "y_m": bar.y_m,
+                "z_m": bar.z_m,
+                "length_m": bar.length_m,
+                "width_m": bar.width_m,
+                "clusters": bar.clusters,
+                "profile": bar.profile,
+                "frames": bar.frames,
+                "seed": light.payload_seed,
+                "ppm": bar.ppm,
+                "start_chip": light.start_chip,
+                "led_w_m2": bar.led_w_m2,
+                "chips_file": bar.chips_file,
+                "symbols": light.sent_symbols(scene.duration_s),
+                "packet_chips": light.packet_chips,
+            }
+        )
+    found: dict[str, Any] = {
+        "scene": {
+            "name": scene.name,
+            "duration_s": scene.duration_s,
+            "distance_m": motion.distance_m,
+            "speed_mps": motion.speed_mps,
+            "vib_rate_rad_s": motion.vib_rate_rad_s,
+            "background_w_m2": scene.background.light_w_m2,
+            "background_texture": scene.background.texture,
+            "noise_hz": sensor.noise_hz,
+            "hot_pixels": simulation.hot_pixels,
+            "focus_m": scene.lens.focus_m,
+            "f_number": scene.lens.f_number,
+            "refr_us": sensor.refr_us,
+            "th_on": sensor.th_on,
+            "th_off": sensor.th_off,
+            "noise_ln": sensor.noise_ln,
+            "p_on_miss": sensor.p_on_miss,
+            "p_off_miss": sensor.p_off_miss,
+            "dly_on_us": sensor.dly_on_us,
+            "dly_off_us": sensor.dly_off_us,
+            "jitter_us": sensor.jitter_us,
+            "tau_sf_us": 0.0,
+            "hpf_us": 0.0,
+            "t_row_us": sensor.t_row_us,
+            "cap_mev_s": sensor.cap_mev_s,
+            "halo": scene.lens.halo,
+            "seed": scene.seed,
+            "flicker_lamps": scene.flicker_lamps,
+            "t0_us": scene.t0_us,
+        },
+        "bars": bars,
+        "camera": {
+            "focal_mm": camera.focal_mm,
+            "pitch_um": camera.pitch_um,
+            "width": camera.width,
+            "height": camera.height,
+            "cx": camera.width / 2,
+            "cy": camera.height / 2,
+        },
+        "t_s": [round(float(t), 3) for t in t_s],
+        "distance_m": [[round(float(v), 5) for v in column] for column in depth.T],
+        "bar_centre_px": [
+            [[round(float(v), 3) for v in place[:, i, axis]] for axis in (0, 1)] for i in range(len(bars))
+        ],
+        "psf_sigma_px": [blur_sigma_px(float(d), scene.lens, camera) for d in depth[0]],
+        "e_led": [light.light_w_m2 for light in simulation.bars],
+        "simulator": scene_table(scene),
+    }
+    if simulation.done_s:
+        found |= simulation.counts
+    return found
