@@ -40,7 +40,7 @@ Separate = Callable[[NDArray[np.int16]], PresenceMap]
 """Chip-aligned polarity sums of a pilot, int16 (chips, height, width) -> presence."""
 
 Decode = Callable[[PresenceMap, NDArray[np.int16]], SoftSymbols]
-"""Presence and the info segment's polarity sums, int16 (chips, height, width) -> soft symbols."""
+"""Presence and a frame's polarity sums, pilot then info, int16 (chips, height, width) -> soft symbols."""
 
 Measure = Callable[[FrameView], Range]
 """A decoded frame's image -> distance."""
@@ -106,7 +106,7 @@ class Separation(ABC):
 
 
 class Decoding(ABC):
-    """Presence and info chips to soft symbols."""
+    """Presence and a frame's chips to soft symbols."""
 
     @abstractmethod
     def compile(self, codebook: Codebook) -> Decode:

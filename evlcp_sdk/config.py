@@ -79,6 +79,9 @@ class RegionSpec:
     fade_us: Annotated[
         int, Field(ge=1000, description="Time without blinking after which a region is released.")
     ] = 50_000
+    positive_only: Annotated[
+        bool, Field(description="The camera sends positive events only: tell blinking from their times.")
+    ] = False
     min_clusters_share: Annotated[
         float,
         Field(ge=0, le=1, description="Share of the clusters that must be in their place in a frame."),

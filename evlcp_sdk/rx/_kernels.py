@@ -80,6 +80,36 @@ def score_pixels(
 
 
 @njit(cache=True, nogil=True)
+def score_rises(
+    t_us: Array,
+    x: Array,
+    y: Array,
+    pixels: Array,
+    hits: Array,
+    run_us: tuple[int, int],
+    min_score: int,
+    cell_shift: int,
+) -> None:
+    """Do as `score_pixels` for a camera that sends positive events only: runs go from rise to rise.
+
+    `run_us` holds the bounds: below [0] events of one rise, to [1] the codes of the air interface (two to
+    four chips), above: slower.
+    """
+    shortest, longest = run_us
+    for i in range(t_us.size):
+        u, v = np.int64(x[i]), np.int64(y[i])
+        state = pixels[v, u]
+        run = t_us[i] - (state >> 8)
+        if run < shortest:
+            continue
+        score = (state >> 1) & 127
+        score = min(score + 2, 40) if run < longest else max(score - 2, 0)
+        pixels[v, u] = (t_us[i] << 8) | (score << 1) | 1
+        if score >= min_score:
+            hits[v >> cell_shift, u >> cell_shift] += 1
+
+
+@njit(cache=True, nogil=True)
 def measure_box(
     pixels: Array, box: tuple[int, int, int, int], since_us: int, min_score: int, rows: Array
 ) -> tuple[int, float, int, int, float, float]:

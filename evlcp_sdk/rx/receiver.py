@@ -340,7 +340,7 @@ class Receiver:
         in_place = clusters_in_place(presence, self._centres_m)
         if in_place < self._link.regions.min_clusters_share * len(self._centres_m):
             return None
-        soft = self._decode(presence, sums[packet.pilot_chips :])
+        soft = self._decode(presence, sums)
         self._tell("decoding", soft, _lap(clock))
         distance = self._measure(FrameView(sums, offset_px, presence, soft))
         self._tell("ranging", distance, _lap(clock))

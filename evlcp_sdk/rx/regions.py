@@ -30,6 +30,12 @@ _CELL_SHIFT = 3
 _RUN_CHIPS = (0.4, 1.5, 2.7)
 """Bounds between runs of noise, one chip, two chips, and slower; ON and OFF delays differ by up to 0.3."""
 
+_RISE_CHIPS = (1.5, 4.5)
+"""Bounds of the time from rise to rise: two to four chips in any code, five for a lamp of 2 kHz."""
+
+_RISE_MEASURE_CHIPS = 5
+"""A blinking pixel rises at least once in four chips."""
+
 _MEASURE_CHIPS = 4
 """A blinking pixel changes polarity at least once in two chips; twice that allows for a missed event."""
 
@@ -125,7 +131,9 @@ class RegionTracker:
         self._camera = camera
         shortest, single, double = _RUN_CHIPS
         self._run_us = (round(shortest * chip_us), round(single * chip_us), round(double * chip_us))
-        self._measure_us = round(_MEASURE_CHIPS * chip_us)
+        shortest, longest = _RISE_CHIPS
+        self._rise_us = (round(shortest * chip_us), round(longest * chip_us))
+        self._measure_us = round((_RISE_MEASURE_CHIPS if spec.positive_only else _MEASURE_CHIPS) * chip_us)
         shape = (camera.height, camera.width)
         self._pixels = np.full(shape, _LONG_AGO_US << 8, np.int64)
         self._hits = np.zeros([-(-n >> _CELL_SHIFT) for n in (camera.height + 7, camera.width + 7)], np.int32)
@@ -141,17 +149,15 @@ class RegionTracker:
         spec = self._spec
         self._recent.append((start_us, events))
         self._hits[:] = 0
-        _kernels.score_pixels(
-            events.t_us,
-            events.x,
-            events.y,
-            events.p,
-            self._pixels,
-            self._hits,
-            self._run_us,
-            spec.min_score,
-            _CELL_SHIFT,
-        )
+        t_us, x, y, p = events.t_us, events.x, events.y, events.p
+        score = self._pixels, self._hits
+        if spec.positive_only:
+            lit = p == 1
+            _kernels.score_rises(
+                t_us[lit], x[lit], y[lit], *score, self._rise_us, spec.min_score, _CELL_SHIFT
+            )
+        else:
+            _kernels.score_pixels(t_us, x, y, p, *score, self._run_us, spec.min_score, _CELL_SHIFT)
         end_us = start_us + spec.block_us
         boxes = [self._reach(self._expected(track, start_us + spec.block_us / 2)) for track in self.tracks]
         for track, box, inside in zip(self.tracks, boxes, _select(events, boxes), strict=True):

@@ -37,8 +37,8 @@ class KalmanTracking(Tracking):
     speed_m_s: Annotated[float, Field(gt=0, description="Speeds that are likely at first (sigma).")] = 20.0
     acceleration_px2_s3: Annotated[
         float,
-        Field(gt=0, description="The same in the image: vibration of 430 px/s at 10 to 15 Hz has about 1e7."),
-    ] = 1e7
+        Field(gt=0, description="The same in the image: 430 px/s at 15 Hz, for 10 ms, have 3e7, peaks more."),
+    ] = 1e8
     speed_px_s: Annotated[float, Field(gt=0, description="Image speeds that are likely at first.")] = 600.0
     gate: Annotated[
         float, Field(gt=1, description="Sigmas from the prediction beyond which a measurement is left out.")

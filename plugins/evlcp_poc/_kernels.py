@@ -235,7 +235,10 @@ def robust_mean(
     ordered = values[order[begin:end]]
     low = _quantile(ordered, 0.25)
     high = _quantile(ordered, 0.75)
+    # Narrow bounds may call all of a few values outliers of one another: keep the middle half then.
     room = iqr * (high - low)
+    if ordered[np.searchsorted(ordered, low - room) :][0] > high + room:
+        room = high - low
     total = 0.0
     mass = 0.0
     kept = 0

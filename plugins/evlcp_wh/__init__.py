@@ -23,3 +23,6 @@ def evlcp_algorithms() -> Iterator[Algorithm]:
     yield Algorithm(
         "decoding", "wh-transform", "evlcp_wh.decoding:WhTransform", 1, "presence-weighted WH transform"
     )
+    yield Algorithm(
+        "decoding", "ml-soft", "evlcp_wh.ml_soft:MlSoft", 1, "likelihoods learned from the pilots"
+    )

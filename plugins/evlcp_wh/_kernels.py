@@ -125,3 +125,57 @@ def max_log(fit: Array, bits: int, zero: Array, one: Array) -> None:
                     one[k, b] = max(one[k, b], f)
                 else:
                     zero[k, b] = max(zero[k, b], f)
+
+
+@njit(cache=True, nogil=True)
+def count_pairs(sums: Array, codes: Array, probability: Array, grid: int, most: int, counts: Array) -> None:
+    """Histograms of a value's two polarity sums where the value is known, `counts` (value, first, second).
+
+    Each pixel counts for its likeliest cluster by that cluster's probability.
+    """
+    clusters, length = codes.shape
+    _, rows, columns = probability.shape
+    for r in range(rows):
+        for c in range(columns):
+            k = 0
+            for other in range(1, clusters):
+                if probability[other, r, c] > probability[k, r, c]:
+                    k = other
+            weight = probability[k, r, c]
+            if weight < 0.5:
+                continue
+            for v in range(r * grid, (r + 1) * grid):
+                for u in range(c * grid, (c + 1) * grid):
+                    for i in range(length):
+                        first = min(max(sums[2 * i, v, u], -most), most) + most
+                        second = min(max(sums[2 * i + 1, v, u], -most), most) + most
+                        counts[(codes[k, i] + 1) // 2, first, second] += weight
+
+
+@njit(cache=True, nogil=True)
+def sum_worth(
+    sums: Array, probability: Array, grid: int, least: float, most: int, worth: Array, out: Array
+) -> None:
+    """Presence-weighted sum of what each pixel's pair of sums is worth, `out` (K, values)."""
+    clusters, rows, columns = probability.shape
+    length = out.shape[1]
+    values = np.empty(length)
+    for r in range(rows):
+        for c in range(columns):
+            top = 0.0
+            for k in range(clusters):
+                top = max(top, probability[k, r, c])
+            if top < least:
+                continue
+            values[:] = 0.0
+            for v in range(r * grid, (r + 1) * grid):
+                for u in range(c * grid, (c + 1) * grid):
+                    for i in range(length):
+                        first = min(max(sums[2 * i, v, u], -most), most) + most
+                        second = min(max(sums[2 * i + 1, v, u], -most), most) + most
+                        values[i] += worth[first, second]
+            for k in range(clusters):
+                weight = probability[k, r, c]
+                if weight >= least:
+                    for i in range(length):
+                        out[k, i] += weight * values[i]

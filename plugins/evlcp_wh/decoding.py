@@ -29,21 +29,24 @@ class WhTransform(Decoding):
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's codewords."""
         words = codebook.codewords.astype(np.float64)
+        pilot_chips = 2 * codebook.pilots.shape[1]
         length, m = words.shape[1], codebook.bits_per_symbol
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             from evlcp_wh import _kernels
 
             values = np.zeros((len(presence.probability), length))
-            _kernels.weighted_values(sums, presence.probability, presence.grid_px, self.min_weight, values)
+            info = sums[pilot_chips:]
+            _kernels.weighted_values(info, presence.probability, presence.grid_px, self.min_weight, values)
             fit = values @ words.T
             symbols = fit.argmax(1)
             energy = float((values**2).sum())
             amplitude = fit.max(1) / length
             explained = float((amplitude**2).sum()) * length
-            # One noise-to-signal ratio a frame: eight values a cluster are too few for one each.
-            noise = max(energy - explained, 1e-3 * energy, 1e-9) / max(explained, 1e-9)
-            scale = 1 / (np.maximum(amplitude, 1e-9) * noise)
+            # One noise for all clusters of a frame: eight values are too few for one each. A dim cluster,
+            # whose amplitude is small beside it, is unsure.
+            rest = max(energy - explained, 1e-3 * energy, 1e-9)
+            scale = np.maximum(amplitude, 0) * values.size / rest
             zero, one = np.empty((2, len(values), m))
             _kernels.max_log(fit, m, zero, one)
             llr = ((zero - one) * scale[:, None]).astype(np.float32)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evlcp_sdk.io import read_events, write_events
 from tests.conftest import ROOT, Run
 
 SHARED = ROOT.parent / "shared"
@@ -89,3 +90,47 @@ def test_two_clusters_are_worse(tmp_path: Path, evlcp: Callable[..., Run]) -> No
         assert evlcp("receive", RECORDINGS / f"{name}.raw", "-o", out, *options).code == 0
         rmse_m[method] = scored(out, name)["bars"][0]["rmse_m"]
     assert rmse_m["two"] > 1.5 * rmse_m["all"]
+
+
+def scored_with(out: Path, name: str, raw: Path, evlcp: Callable[..., Run], *settings: str) -> dict[str, Any]:
+    """The score of a recording's first bar with some settings."""
+    options = [word for setting in settings for word in ("--set", setting)]
+    assert evlcp("receive", raw, "-o", out, *options).code == 0
+    bar: dict[str, Any] = scored(out, name)["bars"][0]
+    return bar
+
+
+def test_one_fit_over_all_boundaries_is_better(tmp_path: Path, evlcp: Callable[..., Run]) -> None:
+    """The best variant has at most 0.75 of the paper's error, filtered 0.4 of it."""
+    for name in ("night-50m-30kmh", "day-35m-20kmh", "tunnel-90m-30kmh", "lamps-60m-40kmh-rollover"):
+        raw = RECORDINGS / f"{name}.raw"
+        poc = scored_with(tmp_path / "poc", name, raw, evlcp)
+        joint = scored_with(
+            tmp_path / "joint", name, raw, evlcp, "ranging.id=joint-scale", "tracking.id=kalman"
+        )
+        assert joint["rmse_m"] <= 0.75 * poc["rmse_m"]
+        assert joint["ber"] <= 1e-3
+        truth = json.loads((RECORDINGS / f"{name}.truth.json").read_text())
+        with (tmp_path / "joint" / "frames.csv").open() as file:
+            off = [
+                float(row["distance_filtered_m"])
+                - np.interp(
+                    (float(row["t_us"]) + 800 - truth["scene"]["t0_us"]) * 1e-6,
+                    truth["t_s"],
+                    truth["distance_m"][0],
+                )
+                for row in csv.DictReader(file)
+            ]
+        assert np.sqrt(np.mean(np.square(off))) <= 0.4 * poc["rmse_m"]
+
+
+@pytest.mark.parametrize("name", ["night-50m-30kmh", "day-35m-20kmh", "lamps-60m-40kmh-rollover"])
+def test_positive_events_suffice(name: str, tmp_path: Path, evlcp: Callable[..., Run]) -> None:
+    """A camera that sends no negative events is still read, within the paper's bit error rate."""
+    events = read_events(RECORDINGS / f"{name}.raw")
+    raw = tmp_path / "positive.raw"
+    write_events(raw, events[events.p == 1], 1280, 720)
+    settings = ("regions.positive_only=true", "decoding.id=ml-soft")
+    bar = scored_with(tmp_path / "out", name, raw, evlcp, *settings)
+    assert bar["frames_found"] >= 0.9 * bar["frames_sent"]
+    assert bar["ber"] <= 0.01

@@ -383,7 +383,6 @@ def test_too_few_clusters_are_refused(bar, skip):
         PocRanging(skip_outer=skip).compile(CAMERA, bar, LINK.codebook)
 
 
-@pytest.mark.xfail(raises=ZeroDivisionError, reason="two pairs that differ are both outliers of each other")
 @pytest.mark.parametrize("outlier_iqr", [0.1, 0.4])
 def test_narrow_outlier_bounds_leave_a_distance(outlier_iqr):
     found = measured(image_of(BAR, 50), clusters=(0, 7, 15), outlier_iqr=outlier_iqr)

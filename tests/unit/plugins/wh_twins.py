@@ -62,17 +62,17 @@ def max_log(fit, bits):
 def llr(values, words):
     """Symbols, ln P(bit 0) / P(bit 1), and share of energy explained: nearest words at each one's amplitude.
 
-    The amplitude is that of the least-squares fit; all clusters have one signal-to-noise ratio.
+    The amplitude is that of the least-squares fit; all clusters have one noise.
     """
     amplitude = np.array([max(w @ v / len(w) for w in words) for v in values])
     cost = np.array(
         [[((v - a * w) ** 2).sum() for w in words] for v, a in zip(values, amplitude, strict=True)]
     )
     rest, kept = cost.min(1).sum(), (amplitude**2).sum() * words.shape[1]
-    variance = amplitude**2 * rest / kept
+    variance = rest / values.size
     bits = len(words).bit_length() - 1
     out = np.empty((len(values), bits))
     for k, b in np.ndindex(out.shape):
         zeros = [f"{s:0{bits}b}"[b] == "0" for s in range(len(words))]
-        out[k, b] = (cost[k, np.invert(zeros)].min() - cost[k, zeros].min()) / (2 * variance[k])
+        out[k, b] = (cost[k, np.invert(zeros)].min() - cost[k, zeros].min()) / (2 * variance)
     return cost.argmin(1), out, kept / (kept + rest)
