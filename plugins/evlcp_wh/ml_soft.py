@@ -16,7 +16,7 @@ __all__ = ["MlSoft"]
 
 @dataclass(frozen=True)
 class MlSoft(Decoding):
-    """Sum of per-pixel log-likelihood ratios, from how many events of which sign a value has in its two chips.
+    """Sum of per-pixel log-likelihood ratios, by how many events of which sign a value's two chips have.
 
     Pilots are known, so each frame shows how often a value of +1 or -1 comes with which pair of polarity
     sums, missed and late events included: two histograms over the pixels of all clusters. Their
