@@ -12,7 +12,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 help:  ## Show this list
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-demo: $(VENV)/.installed  ## Decode the recording that comes with the package; figures go to demo-out/
+demo: $(VENV)/.installed  ## Simulate four stretches of a drive, receive them, compare with the paper; demo-out/
 	$(BIN)/evlcp demo
 
 test: $(VENV)/.dev lint toolchain  ## Format, lint, types, then every test
@@ -27,7 +27,7 @@ format: $(VENV)/.dev  ## Format the code
 	$(BIN)/ruff format
 
 pictures: $(VENV)/.installed  ## Draw the pictures of the docs again
-	$(BIN)/evlcp demo
+	$(BIN)/evlcp demo --recording
 	cp demo-out/presence.png demo-out/distance.png docs/images/
 
 clean:  ## Remove .venv and everything that was generated

@@ -323,10 +323,13 @@ def _override(table: dict[str, Any], text: str) -> None:
     except tomllib.TOMLDecodeError:
         parsed = value.strip()
     keys = table.setdefault(section, {})
-    if section != "campaign":
-        keys.get("grid", {}).pop(key, None)
-        keys = keys.setdefault("set", {})
-    keys[key] = parsed
+    if section != "campaign" and isinstance(keys, dict):
+        for name in ("grid", "set"):
+            if isinstance(inner := keys.get(name, {}), dict):
+                keys[name] = {k: v for k, v in _flat(inner).items() if k != key}
+        keys = keys["set"]
+    if isinstance(keys, dict):
+        keys[key] = parsed
 
 
 def _fault_line(path: Path | str, error: Any) -> str:

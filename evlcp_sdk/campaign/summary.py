@@ -169,7 +169,9 @@ class Summary:
                 for s in self.series
             ],
             "paper": [
-                asdict(c.reference) | {"series": c.series, "ours": _plain(asdict(c.ours)), "agrees": c.agrees}
+                asdict(c.reference)
+                | {"series": c.series, "ours": _plain(asdict(c.ours)), "ours_at_m": [c.from_m, c.to_m]}
+                | {"agrees": c.agrees}
                 for c in compare(self.series)
             ],
         }
@@ -225,13 +227,17 @@ class Comparison:
     Attributes:
         reference: The paper's.
         series: Name of the series that it is held against.
-        ours: The measured one.
+        ours: The measured one; where the paper gives a bound, that of the worst segment.
+        from_m: Begin of the distances that ours was measured at, m.
+        to_m: Their end, m.
         agrees: Ours keeps the paper's bound, or lies within 30 % of its figure.
     """
 
     reference: Reference
     series: str
     ours: Figure
+    from_m: int
+    to_m: int
     agrees: bool
 
 
@@ -248,12 +254,26 @@ def compare(series: Iterable[Series], references: Iterable[Reference] = PAPER) -
                 continue
             if reference.speed_kmh is not None and one.speed_kmh != reference.speed_kmh:
                 continue
-            ours = measure(one.between(reference.from_m, reference.to_m), reference.measure)
+            tally, at = one.between(reference.from_m, reference.to_m), (reference.from_m, reference.to_m)
+            if reference.bound:
+                tally, at = _worst(one, reference)
+            ours = measure(tally, reference.measure)
             if ours.count:
                 ratio = ours.value / reference.value
                 agrees = ratio <= 1 if reference.bound else abs(ratio - 1) <= AGREEMENT
-                found.append(Comparison(reference, one.name, ours, agrees))
+                found.append(Comparison(reference, one.name, ours, *at, agrees))
     return found
+
+
+def _worst(series: Series, reference: Reference) -> tuple[Tally, tuple[int, int]]:
+    """The segment within a reference's distances whose figure is largest, and where it lies."""
+    worst, at = Tally(), (reference.from_m, reference.to_m)
+    for begin in range(reference.from_m, reference.to_m, SEGMENT_M):
+        tally = series.between(begin, begin + SEGMENT_M)
+        value, most = (measure(t, reference.measure) for t in (tally, worst))
+        if value.count and (not most.count or value.value > most.value):
+            worst, at = tally, (begin, begin + SEGMENT_M)
+    return worst, at
 
 
 def reference_marks(kind: Measure) -> list[Reference]:

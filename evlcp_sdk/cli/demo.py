@@ -7,14 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from evlcp_sdk.cli._common import Json, console
+from evlcp_sdk.cli._common import Json, Workers, console
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-__all__ = ["Score", "demo", "demo_files", "register", "score"]
+    from evlcp_sdk.campaign.summary import Summary
+
+__all__ = ["Score", "demo", "demo_campaign", "demo_files", "register", "score"]
 
 DEMO_NAME = "night-50m-30kmh-cut"
+CAMPAIGN_NAME = "demo"
 
 
 @dataclass(frozen=True)
@@ -45,14 +48,23 @@ def register(app: typer.Typer) -> None:
 
 def demo_files() -> tuple[Path, Path]:
     """The demo's recording and its truth: in the wheel, or in a checkout's `examples/recordings`."""
+    raw = _shipped("recordings", f"{DEMO_NAME}.raw")
+    return raw, raw.with_name(f"{DEMO_NAME}.truth.json")
+
+
+def demo_campaign() -> Path:
+    """The demo's campaign: in the wheel, or in a checkout's `examples/campaigns`."""
+    return _shipped("campaigns", f"{CAMPAIGN_NAME}.toml")
+
+
+def _shipped(folder: str, name: str) -> Path:
     import evlcp_sdk
 
     package = Path(evlcp_sdk.__file__).parent
-    for folder in (package / "data", package.parent / "examples" / "recordings"):
-        raw = folder / f"{DEMO_NAME}.raw"
-        if raw.exists():
-            return raw, folder / f"{DEMO_NAME}.truth.json"
-    raise FileNotFoundError(f"{DEMO_NAME}.raw: missing from the installation")
+    for path in (package / "data" / name, package.parent / "examples" / folder / name):
+        if path.exists():
+            return path
+    raise FileNotFoundError(f"{name}: missing from the installation")
 
 
 def score(rows: "Sequence[Mapping[str, str]]", truth: "Mapping[str, Any]") -> Score:
@@ -81,13 +93,100 @@ def demo(
     out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder of the result.")] = Path(
         "demo-out"
     ),
+    recording: Annotated[
+        bool, typer.Option("--recording", help="Decode the recording that comes with the package instead.")
+    ] = False,
+    workers: Workers = None,
     as_json: Json = False,
 ) -> None:
-    """Decode a small recording that comes with the package, and draw its figures.
+    """Drive towards a bar of LEDs, simulated; receive it, and compare with the paper.
 
-    A 96-LED bar, 50 m ahead of a car that drives towards it at 30 km/h by night:
-    [bold]evlcp demo[/] or [bold]evlcp demo -o somewhere[/]
+    Four stretches of 0.3 s at 30 km/h:   [bold]evlcp demo[/] or [bold]evlcp demo -o somewhere[/]
+
+    A shipped recording, frame by frame:  [bold]evlcp demo --recording[/]
     """
+    if recording:
+        _decode_recording(out, as_json)
+    else:
+        _drive(out, workers, as_json)
+
+
+def _drive(out: Path, workers: int | None, as_json: bool) -> None:
+    import json
+    from contextlib import suppress
+
+    from evlcp_sdk.campaign.charts import charts_of, save_charts
+    from evlcp_sdk.campaign.collect import collect
+    from evlcp_sdk.campaign.report import save_page
+    from evlcp_sdk.campaign.store import Store
+    from evlcp_sdk.campaign.summary import summarize
+    from evlcp_sdk.campaign.task import plan_of, run_job
+    from evlcp_sdk.cli._common import make_executor
+    from evlcp_sdk.cli.sweep import progress_bar, tell_faults
+    from evlcp_sdk.errors import ConfigError
+
+    plan = plan_of(demo_campaign())
+    if not as_json:
+        console().print(
+            f"simulating and receiving {len(plan.jobs)} stretches of a drive"
+            " (the first run also compiles the kernels) ...",
+            style="dim",
+        )
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as fault:
+        raise ConfigError(f"{out}: cannot be written: {fault.strerror}") from fault
+    results = out / f"{CAMPAIGN_NAME}.sqlite"
+    for name in (results, *(results.with_name(results.name + end) for end in ("-wal", "-shm"))):
+        with suppress(FileNotFoundError):
+            name.unlink()
+    with Store(results, create=True) as store:
+        with progress_bar(plan.name) as show_progress:
+            progress = collect(plan, store, make_executor(workers, None), run_job, show_progress)
+        summary = summarize(store)
+    tell_faults(progress)
+    if progress.faults:
+        raise typer.Exit(max(fault.exit_code for _, fault in progress.faults))
+    save_charts(charts_of(summary), summary.name, out)
+    save_page(summary, out / "report.html")
+    if as_json:
+        typer.echo(json.dumps(summary.to_dict()))
+        return
+    show_drive(summary)
+    console().print(f"written: {out}/report.html, ber.png, rmse.png and more, {results}", style="dim")
+
+
+def show_drive(summary: "Summary") -> None:
+    """Print BER and RMSE of each segment of distance beside the paper's."""
+    from rich.table import Table
+
+    from evlcp_sdk.campaign.statistics import SEGMENT_M
+    from evlcp_sdk.campaign.summary import compare, measure
+
+    (series,) = summary.series
+    paper = {
+        (c.reference.measure, begin): f"{'at most ' if c.reference.bound else ''}{c.reference.value:g}"
+        for c in compare([series])
+        for begin in range(c.reference.from_m, c.reference.to_m, SEGMENT_M)
+    }
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for number, name in enumerate(("distance", "frames", "BER", "paper", "RMSE, m", "paper")):
+        table.add_column(name, justify="right" if number else "left", no_wrap=True)
+    for begin, tally in reversed(series.statistics.segments):
+        ber, rmse = measure(tally, "ber"), measure(tally, "rmse_m")
+        none = ber.count and not ber.value
+        table.add_row(
+            f"{begin} to {begin + SEGMENT_M} m",
+            f"{tally.frames_found} of {tally.frames_sent}",
+            f"below {ber.high:.1g}" if none else f"{ber.value:.2g}" if ber.count else "-",
+            paper.get(("ber", begin), "-"),
+            f"{rmse.value:.3f}" if rmse.count else "-",
+            paper.get(("rmse_m", begin), "-"),
+        )
+    console().print(table)
+
+
+def _decode_recording(out: Path, as_json: bool) -> None:
     import csv
     import json
     from dataclasses import asdict

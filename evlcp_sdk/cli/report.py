@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 __all__ = ["register", "report", "show_paper", "show_series"]
 
+_PIPE_WIDTH = 200
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -138,4 +140,8 @@ def _print_table(head: list[str], rows: list[list[str]]) -> None:
         table.add_column(name, justify="left" if number < 2 else "right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
-    console().print(table)
+    out = console()
+    if not out.is_terminal:
+        # A pipe has no width that a table should be cut to.
+        out.width = _PIPE_WIDTH
+    out.print(table)

@@ -321,7 +321,7 @@ def test_examples_are_links(evlcp: Evlcp) -> None:
 
 
 def test_demo_against_the_truth(evlcp: Evlcp, tmp_path: Path) -> None:
-    done = evlcp("demo", "-o", tmp_path, "--json")
+    done = evlcp("demo", "--recording", "-o", tmp_path, "--json")
     assert done.code == 0
     result = json.loads(done.out)["score"]
     assert result["found"] >= 0.9 * result["sent"]
@@ -329,7 +329,7 @@ def test_demo_against_the_truth(evlcp: Evlcp, tmp_path: Path) -> None:
     assert result["bit_errors"] <= 1e-3 * result["bits"]
     assert result["rmse_m"] <= 0.12
     assert names_in(tmp_path) == FILES | set(FIGURE_NAMES)
-    shown = evlcp("demo", "-o", tmp_path).out
+    shown = evlcp("demo", "--recording", "-o", tmp_path).out
     assert "against the truth: " in shown
     assert all(len(line) <= 80 for line in shown.splitlines() if "±" in line)
 

@@ -1,0 +1,132 @@
+"""One job of a campaign: render a scene, receive it with every link, hold what came out against the truth."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from evlcp_sdk.campaign.measure import statistics_of
+from evlcp_sdk.campaign.plan import Job, Plan, load_plan
+from evlcp_sdk.campaign.statistics import Statistics
+from evlcp_sdk.config import installed_versions, load_link, resolve
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.hookspecs import ROLE_NAMES
+from evlcp_sdk.registry import Registry
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.sim import Scene, load_scene, simulate, truth
+from evlcp_sdk.types import Frame
+
+__all__ = ["environment_of", "plan_of", "run_job"]
+
+_SOURCES = ("abc.py", "codebook.py", "config.py", "frames.py", "geometry.py", "types.py")
+_PACKAGES = ("rx", "sim")
+_CAMPAIGN = ("measure.py", "statistics.py", "task.py")
+
+
+def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
+    """Read a campaign file; scenes and links resolved, code and versions of this installation.
+
+    Args:
+        path: The file.
+        overrides: What `--set` takes, e.g. `"campaign.seeds=2"`.
+
+    Raises:
+        ConfigError: All faults of the file, one line each.
+    """
+    registry = Registry.load()
+
+    def scene_of(base: str | None, settings: Sequence[str]) -> tuple[Any, Any]:
+        if base is None:
+            raise ConfigError("base: missing; expected a preset or a scene file")
+        scene = load_scene(base, settings)
+        return scene, _identity(scene)
+
+    def link_of(base: str | None, settings: Sequence[str]) -> tuple[Any, Any]:
+        link = load_link(base, settings, registry)
+        table = {section: dict(keys) for section, keys in link.table.items()}
+        identity = {
+            "digest": link.digest,
+            "codebook": link.codebook.digest,
+            "revisions": dict(link.revisions),
+            "table": table,
+        }
+        return (table, link.digest), json.loads(json.dumps(identity))
+
+    return load_plan(path, scene_of, link_of, environment_of(registry), overrides)
+
+
+def environment_of(registry: Registry) -> dict[str, Any]:
+    """What of the installation determines a result: versions, and the digest of the code that computes it."""
+    import evlcp_sdk
+
+    root = Path(evlcp_sdk.__file__).parent
+    files = {root / name for name in _SOURCES} | {root / "campaign" / name for name in _CAMPAIGN}
+    files |= {path for name in _PACKAGES for path in (root / name).rglob("*.py")}
+    for installed in registry.installed():
+        if installed.distribution == "evlcp-sdk" and installed.algorithm.role in ROLE_NAMES:
+            spec = find_spec(installed.algorithm.target.partition(":")[0].partition(".")[0])
+            if spec is not None and spec.origin is not None:
+                files |= set(Path(spec.origin).parent.rglob("*.py"))
+    digest = hashlib.sha256()
+    for path in sorted(files, key=lambda p: (p.parent.name, p.name)):
+        digest.update(f"{path.parent.name}/{path.name}\0".encode() + path.read_bytes() + b"\0")
+    return {"source": digest.hexdigest(), "versions": installed_versions(registry)}
+
+
+def _identity(scene: Scene) -> Any:
+    """The scene as JSON values; of the files it names, what is in them instead of where they are."""
+    table = json.loads(json.dumps(asdict(scene)))
+    for section, key in [(table["motion"], "path_file"), *((bar, "chips_file") for bar in table["bars"])]:
+        if section[key] is not None:
+            try:
+                section[key] = hashlib.sha256(Path(section[key]).read_bytes()).hexdigest()
+            except OSError as fault:
+                raise ConfigError(f"{section[key]}: cannot be read: {fault.strerror}") from fault
+    return table
+
+
+def run_job(job: Job) -> list[tuple[str, Statistics]]:
+    """Render the job's scene once, receive it with the link of every task, hold it against the truth.
+
+    Raises:
+        ConfigError: This installation would not give what the task's id promises, or transmitter and
+            receiver do not share a modulation.
+    """
+    registry = Registry.load()
+    if environment_of(registry) != job.environment:
+        raise ConfigError(
+            "the code or a version here is not that of the campaign's plan; install the same everywhere"
+        )
+    scene: Scene = job.scene
+    known = truth(scene, job.seed)
+    receivers = []
+    for task in job.tasks:
+        table, digest = task.link
+        link = resolve(table, registry)
+        if link.digest != digest:
+            raise ConfigError(f"link {digest[:12]} resolves to {link.digest[:12]} here")
+        _check_shared(known, table["modulation"]["id"])
+        receivers.append(Receiver(link))
+    frames: list[list[Frame]] = [[] for _ in receivers]
+    number = 0
+    for events in simulate(scene, job.seed):
+        number += len(events)
+        for receiver, found in zip(receivers, frames, strict=True):
+            found += [frame for packet in receiver.feed(events) for frame in packet.frames]
+    results = []
+    for task, receiver, found in zip(job.tasks, receivers, frames, strict=True):
+        found += [frame for packet in receiver.close() for frame in packet.frames]
+        results.append((task.id, statistics_of(found, known, number)))
+    return results
+
+
+def _check_shared(known: Mapping[str, Any], modulation: str) -> None:
+    for bar in known["bars"]:
+        if bar.get("chips_file") is None and bar["profile"] != modulation:
+            raise ConfigError(
+                f"the scene's bar sends '{bar['profile']}', but the link receives '{modulation}';"
+                " set bars.profile or modulation.id"
+            )

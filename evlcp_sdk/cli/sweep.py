@@ -1,0 +1,137 @@
+"""`evlcp sweep`."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from evlcp_sdk.cli._common import Dask, Json, Workers, complain, console, make_executor
+
+if TYPE_CHECKING:
+    from evlcp_sdk.campaign.collect import Progress
+
+__all__ = ["progress_bar", "register", "sweep", "tell_faults"]
+
+_MOST_FAULTS = 5
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("sweep")(sweep)
+
+
+def sweep(
+    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN.toml", help="The campaign.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="RESULTS.sqlite",
+            help="Results; NAME.sqlite without it.",
+            show_default=False,
+        ),
+    ] = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="TABLE.KEY=VALUE", help="Override campaign.KEY, scene.KEY or link.KEY."
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say what there is to do and what is done.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Simulate, receive and score every point of a campaign; go on where an earlier run stopped.
+
+    A campaign:            [bold]evlcp sweep examples/paper.toml -o paper.sqlite[/]
+
+    A quick look at it:    [bold]evlcp sweep examples/paper.toml -o look.sqlite --set campaign.seeds=1[/]
+
+    On a Dask cluster:     [bold]evlcp sweep examples/paper.toml --dask tcp://host:8786[/]
+
+    What came out:         [bold]evlcp report paper.sqlite -o report.html[/]
+
+    A result is kept as soon as it is there: stopped or killed at any moment, the same command goes on.
+    One process a core unless told otherwise.
+    """
+    import json
+    from dataclasses import asdict
+
+    from evlcp_sdk.campaign.collect import collect, progress_of
+    from evlcp_sdk.campaign.store import Store
+    from evlcp_sdk.campaign.task import plan_of, run_job
+    from evlcp_sdk.cli.receive import InterruptedRunError
+
+    plan = plan_of(campaign, overrides or [])
+    path = out or Path(f"{plan.name}.sqlite")
+    if dry_run:
+        kept = {}
+        if path.exists():
+            with Store(path) as store:
+                kept = store.results()
+        progress = progress_of(plan, kept)
+    else:
+        with Store(path, create=True) as store:
+            executor = make_executor(workers, dask)
+            try:
+                with progress_bar(plan.name) as show:
+                    progress = collect(plan, store, executor, run_job, show)
+            except KeyboardInterrupt:
+                so_far = progress_of(plan, store.results())
+                done = f"{so_far.done} of {so_far.tasks} tasks are in {path}"
+                raise InterruptedRunError(f"interrupted; {done}; the same command goes on") from None
+    tell_faults(progress)
+    if as_json:
+        numbers = {k: v for k, v in asdict(progress).items() if k != "faults"}
+        typer.echo(json.dumps({"results": str(path), **numbers, "failed": len(progress.faults)}))
+    else:
+        console().print(
+            f"{plan.name}: {progress.done} of {progress.tasks} tasks,"
+            f" {progress.points_done} of {progress.points} points,"
+            f" {progress.bit_errors:,} of {progress.bits:,} bits wrong"
+        )
+        if not dry_run:
+            console().print(f"written: {path}; look at it: evlcp report {path} -o report.html", style="dim")
+    raise typer.Exit(max((fault.exit_code for _, fault in progress.faults), default=0))
+
+
+def tell_faults(progress: "Progress") -> None:
+    """Say which jobs failed, one line each, equal faults once."""
+    lines = dict.fromkeys(fault.message for _, fault in progress.faults)
+    for line in list(lines)[:_MOST_FAULTS]:
+        number = sum(fault.message == line for _, fault in progress.faults)
+        complain(f"{number} job{'s' * (number > 1)} failed: {line}")
+    if len(lines) > _MOST_FAULTS:
+        complain(f"{len(lines) - _MOST_FAULTS} more kinds of failure")
+
+
+@contextmanager
+def progress_bar(name: str) -> "Iterator[Callable[[Progress], None]]":
+    """A bar by tasks, with the errors so far, on a terminal only."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    err = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[errors]}"),
+        TimeRemainingColumn(),
+    )
+    with Bar(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task(name, total=None, errors="")
+
+        def show(progress: "Progress") -> None:
+            failed = f", {len(progress.faults)} failed" if progress.faults else ""
+            errors = f"{progress.bit_errors:,} errors in {progress.bits:,} bits{failed}"
+            bar.update(task, completed=progress.done, total=progress.tasks, errors=errors)
+
+        yield show
