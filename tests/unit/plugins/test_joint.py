@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from evlcp_joint import _kernels
+from evlcp_joint.bound import cramer_rao_sigma_m
 from evlcp_joint.ranging import JointScaleRanging
 from numpy.testing import assert_allclose
 from scipy.stats import norm
@@ -194,3 +195,47 @@ def test_normal_equations_are_huber_s() -> None:
     scores = (slope * clipped).sum(1)
     assert_allclose(meat, scores @ scores.T)
     assert rows == 12
+
+
+def noisy_fit(distance_m: float, noise: float, seed: int) -> tuple[float, np.ndarray]:
+    """The fit's distance for a frame made of the model plus Gaussian noise, and the symbols."""
+    rng = np.random.default_rng(seed)
+    symbols = rng.integers(0, 64, K)
+    codes = np.concatenate([PILOTS, WORDS[symbols]], axis=1).astype(np.int64)
+    spacing = LINK.camera.focal_px * 0.06 / distance_m
+    rows = 2 * int(spacing * 8 + 4)
+    fit = np.array([spacing, 0.0, 0.0, 0.8])
+    value, slope = np.empty((16, rows)), np.empty((4, 16, rows))
+    seen, when = np.ones(K, bool), np.arange(16) / 16 - 0.5
+    _kernels.model(codes, seen, np.zeros(16), when, 0.45, fit, value, slope)
+    seen_values = np.nan_to_num(value) + rng.normal(0, noise / np.sqrt(5), value.shape)
+    start = fit * [1.005, 1, 1, 1] + [0, 0.1, 0, 0]
+    found = JointScaleRanging(huber=9.0)._fit(codes, seen, np.zeros(16), seen_values, start)
+    assert found is not None
+    return LINK.camera.focal_px * 0.06 / found[0][0], symbols
+
+
+def test_the_fit_reaches_the_cramer_rao_bound() -> None:
+    noise, errors, bounds = 0.4, [], []
+    for seed in range(80):
+        distance_m, symbols = noisy_fit(55.0, noise, seed)
+        errors.append(distance_m - 55)
+        bounds.append(
+            cramer_rao_sigma_m(LINK.camera, LINK.bar, LINK.codebook, 55.0, symbols, blur_px=0.45, noise=noise)
+        )
+    ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(bounds)))
+    # The error of 80 draws is known to 8 %: three of these.
+    assert 0.76 < ratio < 1.24
+
+
+def test_the_bound_follows_noise_and_distance() -> None:
+    def bound(**how: float) -> float:
+        given = {"distance_m": 50.0, "blur_px": 0.45, "noise": 0.3} | how
+        return cramer_rao_sigma_m(LINK.camera, LINK.bar, LINK.codebook, symbols=np.arange(K), **given)
+
+    assert bound(noise=0.6) == pytest.approx(2 * bound())
+    assert bound(columns=20.0) == pytest.approx(bound() / 2)
+    # A boundary is as sure at any distance: the error grows with its square.
+    assert bound(distance_m=100.0) == pytest.approx(4 * bound(), rel=0.2)
+    with pytest.raises(ConfigError, match="noise = 0"):
+        bound(noise=0)
