@@ -98,7 +98,8 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
     registry = Registry.load()
     if environment_of(registry) != job.environment:
         raise ConfigError(
-            "the code or a version here is not that of the campaign's plan; install the same everywhere"
+            "code or versions here are not those of the campaign's plan: changed since it began"
+            " (run it again), or other than on the machine that asks (install the same)"
         )
     scene: Scene = job.scene
     known = truth(scene, job.seed)
