@@ -18,11 +18,20 @@ ON_FACTOR, OFF_FACTOR, U_BASE, T_BASE, REFERENCE, T_READY, T_LAST_OUT, LIGHT = r
 DRAW, ARMED, BLOCK = range(3)
 """Columns of a pixel's counters."""
 
+TEXTURE_STEPS = 8
+"""Poses after which the texture is looked up anew: it changes slowly over the image."""
+
+LIGHT_STEP = 1e-3
+"""Relative change of a pixel's light that is not worth a new piece: the light stays until it is more."""
+
+COLUMN_BITS = 12
+"""A request's code is (row << COLUMN_BITS | column) << 1 | polarity."""
+
 NOISE_LIMIT = 4.0
 """Where the normal distribution of every draw is cut off, standard deviations."""
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _mix(z: Any) -> Any:
     """Return the finalizer of splitmix64: a bijection of 64-bit words that scatters them."""
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -30,7 +39,7 @@ def _mix(z: Any) -> Any:
     return z ^ (z >> np.uint64(31))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def hash_uniform(seed: Any, pixel: int, draw: int, purpose: int) -> float:
     """Uniform number in [0, 1) of one (seed, pixel, draw, purpose)."""
     z = _mix(seed + np.uint64(pixel) * np.uint64(0x9E3779B97F4A7C15))
@@ -38,15 +47,27 @@ def hash_uniform(seed: Any, pixel: int, draw: int, purpose: int) -> float:
     return float(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _table_at(table: Array, share: float) -> float:
+    """Linear interpolation in a table of quantiles, `share` in [0, 1)."""
+    z = share * (table.size - 1)
+    i = int(z)
+    return float(table[i] + (z - i) * (table[i + 1] - table[i]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def hash_normal(seed: Any, pixel: int, draw: int, purpose: int, quantiles: Array) -> float:
     """Normal number, cut off at `NOISE_LIMIT`, from a table of the quantiles."""
-    z = hash_uniform(seed, pixel, draw, purpose) * (quantiles.size - 1)
-    i = int(z)
-    return float(quantiles[i] + (z - i) * (quantiles[i + 1] - quantiles[i]))
+    return float(_table_at(quantiles, hash_uniform(seed, pixel, draw, purpose)))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _receptor(u_base: float, rest: float, ages: float) -> float:
+    """Receptor after so many time constants; at rest after 60, when nothing of the difference is left."""
+    return rest if ages > 60.0 else rest + (u_base - rest) * math.exp(-ages)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _run_piece(
     until: float,
     light: float,
@@ -59,9 +80,10 @@ def _run_piece(
     draw: int,
     on_factor: float,
     off_factor: float,
-    pixel: int,
-    seed: Any,
+    code: int,
+    key: Any,
     quantiles: Array,
+    shifts: Array,
     sensor: Array,
     out_t: Array,
     out_code: Array,
@@ -71,14 +93,16 @@ def _run_piece(
     """Let one pixel see constant light from `t_base` to `until`; write its events.
 
     With u = exp(-y) the receptor is u(t) = 1/I + (u0 - 1/I) exp(-I t / Q), which is monotonic; so a threshold
-    is crossed in the piece when u at its end lies beyond, and the time follows from one logarithm.
+    is crossed in the piece when u at its end lies beyond, and the time follows from one logarithm. `shifts`
+    are the quantiles of the factor by which noise moves both thresholds. One word of random bits a draw, from
+    the pixel's `key`: the upper half decides on the noise, the lower on whether the event goes missing.
     """
     charge, refractory = sensor[0], sensor[1]
     delay_on, delay_off, jitter = sensor[2], sensor[3], sensor[4]
-    miss_on, miss_off, noise = sensor[5], sensor[6], sensor[7]
+    miss_on, miss_off = sensor[5], sensor[6]
     rest = 1.0 / light
     rate = light / charge
-    u_end = rest + (u_base - rest) * math.exp(-rate * (until - t_base))
+    u_end = _receptor(u_base, rest, rate * (until - t_base))
     widest_on = on_factor * sensor[8]
     widest_off = off_factor / sensor[8]
     while True:
@@ -86,14 +110,13 @@ def _run_piece(
             if t_ready >= until:
                 break
             # An event's delay may outlast a piece, never the order of pieces: t_ready is not before t_base.
-            reference = rest + (u_base - rest) * math.exp(-rate * (t_ready - t_base))
+            reference = _receptor(u_base, rest, rate * (t_ready - t_base))
             armed = 1
             draw += 1
         if u_end > reference * widest_on and u_end < reference * widest_off:
             break
-        shift = 1.0
-        if noise > 0.0:
-            shift = math.exp(noise * hash_normal(seed, pixel, draw, 0, quantiles))
+        word = _mix(key + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03))
+        shift = _table_at(shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10)
         low = reference * on_factor * shift
         high = reference * off_factor * shift
         t = max(t_base, t_ready)
@@ -112,21 +135,20 @@ def _run_piece(
         t_ready = t + refractory
         late = delay_on if on else delay_off
         if jitter > 0.0:
-            late = max(0.0, late + jitter * hash_normal(seed, pixel, draw, 2, quantiles))
+            late = max(0.0, late + jitter * hash_normal(key, 0, draw, 2, quantiles))
         request = max(t + late, t_last_out + refractory)
         t_last_out = request
-        miss = miss_on if on else miss_off
-        if miss > 0.0 and hash_uniform(seed, pixel, draw, 1) < miss:
+        if float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10 < (miss_on if on else miss_off):
             continue
         out_t[n] = request
-        out_code[n] = 2 * pixel + on
+        out_code[n] = code + on
         if out_cross.size:
             out_cross[n] = t
         n += 1
     return u_end, reference, t_ready, t_last_out, armed, draw, n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def pixel_factors(seed: Any, pixel: int, sensor: Array, quantiles: Array) -> tuple[float, float]:
     """exp(-threshold) for ON and exp(threshold) for OFF of one pixel, with its spread."""
     on = sensor[9] * (1.0 + sensor[11] * hash_normal(seed, pixel, 0, 3, quantiles))
@@ -134,7 +156,7 @@ def pixel_factors(seed: Any, pixel: int, sensor: Array, quantiles: Array) -> tup
     return math.exp(-on), math.exp(off)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def run_given_light(
     pixel: int,
     edge_us: Array,
@@ -142,6 +164,7 @@ def run_given_light(
     end_us: float,
     seed: Any,
     quantiles: Array,
+    shifts: Array,
     sensor: Array,
     out_t: Array,
     out_code: Array,
@@ -149,6 +172,7 @@ def run_given_light(
 ) -> int:
     """Run one pixel, at rest in light[0], through light[i] from edge_us[i] on; return how many events."""
     on_factor, off_factor = pixel_factors(seed, pixel, sensor, quantiles)
+    key = _mix(seed + np.uint64(pixel) * np.uint64(0x9E3779B97F4A7C15))
     u_base = 1.0 / light[0]
     t_base = edge_us[0]
     reference = u_base
@@ -163,13 +187,13 @@ def run_given_light(
             draw += 1
         u_base, reference, t_ready, t_last_out, armed, draw, n = _run_piece(
             until, light[i], u_base, t_base, reference, t_ready, t_last_out, armed, draw, on_factor,
-            off_factor, pixel, seed, quantiles, sensor, out_t, out_code, out_cross, n,
+            off_factor, 0, key, quantiles, shifts, sensor, out_t, out_code, out_cross, n,
         )  # fmt: skip
         t_base = until
     return n
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _step(table: Array, per_px: float, z: float) -> float:
     """Share of a pixel at `z` px beyond a blurred edge: 0 far before, 1 far behind; linear between nodes."""
     half = 0.5 * (table.size - 1)
@@ -182,7 +206,7 @@ def _step(table: Array, per_px: float, z: float) -> float:
     return float(table[i] + (at - i) * (table[i + 1] - table[i]))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def texture_at(field: Array, u: float, v: float) -> float:
     """Bilinear value of the periodic texture (size a power of two) at column u, row v."""
     size = field.shape[0]
@@ -195,7 +219,7 @@ def texture_at(field: Array, u: float, v: float) -> float:
     return float(top + a * (low - top))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def run_pixels(
     first: int,
     last: int,
@@ -231,6 +255,7 @@ def run_pixels(
     background: Array,
     seed: Any,
     quantiles: Array,
+    shifts: Array,
     sensor: Array,
     out_t: Array,
     out_code: Array,
@@ -246,10 +271,11 @@ def run_pixels(
     the block begins; pose 0 holds then. (pose, source) arrays tell where each strip is: `origin`, its first
     end, px; `axis`, the unit vector along it; `bounds`, where its clusters begin and end along it, px;
     `strip_px`, its width; `turn_px` is how far the texture has moved. `halo` is the halo's light of each row
-    of `levels` on a grid along the strip, as a share of full light. `background` is (irradiance on the
-    sensor, dark current as light), W/m2; `sensor` comes from `sensor_vector`.
+    of `levels` on a grid along the strip, as a share of full light, for the pose in the middle. `background`
+    is (irradiance on the sensor, dark current as light), W/m2; `sensor` comes from `sensor_vector`.
     """
     sources = gain.size
+    halfway = origin.shape[0] // 2
     none = np.empty(0)
     most_clusters = levels.shape[1]
     weight = np.zeros((sources, most_clusters))
@@ -267,6 +293,7 @@ def run_pixels(
             return j, n
         pixel = pixels[j]
         mask = masks[j]
+        code = ((pixel // width) << COLUMN_BITS | (pixel % width)) << 1
         y = float(pixel // width)
         x = float(pixel % width)
         s = state[pixel]
@@ -277,6 +304,7 @@ def run_pixels(
             s[ON_FACTOR], s[OFF_FACTOR] = pixel_factors(seed, pixel, sensor, quantiles)
             s[T_LAST_OUT] = -1e18
         on_factor, off_factor = s[ON_FACTOR], s[OFF_FACTOR]
+        key = _mix(seed + np.uint64(pixel) * np.uint64(0x9E3779B97F4A7C15))
         u_base, t_base, reference = s[U_BASE], s[T_BASE], s[REFERENCE]
         t_ready, t_last_out, light = s[T_READY], s[T_LAST_OUT], s[LIGHT]
         draw, armed = c[DRAW], c[ARMED]
@@ -284,14 +312,33 @@ def run_pixels(
         for g in range(sources):
             row[g] = first_rows[g]
             part[g] = 0.0
+            if not (mask >> np.uint64(g)) & np.uint64(1):
+                continue
+            dx, dy = x - origin[halfway, g, 0], y - origin[halfway, g, 1]
+            ax, ay = axis[halfway, g, 0], axis[halfway, g, 1]
+            across = dx * ay - dy * ax
+            half = 0.5 * strip_px[halfway, g]
+            far[g] = (
+                gain[g]
+                * halo_share
+                * (
+                    _step(wide_table, wide_per_px, across + half)
+                    - _step(wide_table, wide_per_px, across - half)
+                )
+            )
+            at = (dx * ax + dy * ay - halo_first[g]) * halo_per_px[g]
+            at = min(max(at, 0.0), halo.shape[1] - 1.001)
+            grid[g] = int(at)
+            between[g] = at - grid[g]
         for e in range(-1, line_t.size):
             source = line_source[e] if e >= 0 else -1
             t = line_t[e] if e >= 0 else begin_us
             if source < 0:
                 pose = line_row[e] if e >= 0 else 0
-                around = background[1] + background[0] * texture_at(
-                    field, x + turn_px[pose, 0], y + turn_px[pose, 1]
-                )
+                if pose % TEXTURE_STEPS == 0:
+                    around = background[1] + background[0] * texture_at(
+                        field, x + turn_px[pose, 0], y + turn_px[pose, 1]
+                    )
                 for g in range(sources):
                     if not (mask >> np.uint64(g)) & np.uint64(1):
                         continue
@@ -309,19 +356,13 @@ def run_pixels(
                             - _step(core_table[g], per_px, across - half)
                         )
                     )
-                    far[g] = (
-                        gain[g]
-                        * halo_share
-                        * (
-                            _step(wide_table, wide_per_px, across + half)
-                            - _step(wide_table, wide_per_px, across - half)
-                        )
-                    )
                     weights[g] = 0
                     if near[g] > 0.0:
                         reach = 0.5 * (core_table.shape[1] - 1) / per_px
                         edges = bounds[pose, g]
-                        k = 0
+                        k = weight_first[g]
+                        while k > 0 and edges[k] > along - reach:
+                            k -= 1
                         while k < clusters[g] and edges[k + 1] <= along - reach:
                             k += 1
                         weight_first[g] = k
@@ -334,12 +375,7 @@ def run_pixels(
                             m += 1
                             k += 1
                         weights[g] = m
-                    at = (along - halo_first[g]) * halo_per_px[g]
-                    at = min(max(at, 0.0), halo.shape[1] - 1.001)
-                    grid[g] = int(at)
-                    between[g] = at - grid[g]
             total = around
-            switched = False
             for g in range(sources):
                 if not (mask >> np.uint64(g)) & np.uint64(1):
                     continue
@@ -352,8 +388,6 @@ def run_pixels(
                         core += weight[g, m] * levels[r, weight_first[g] + m]
                     h = halo[r, grid[g]] + between[g] * (halo[r, grid[g] + 1] - halo[r, grid[g]])
                     now = near[g] * core + far[g] * h
-                    if source == g and now != part[g]:
-                        switched = True
                     part[g] = now
                 total += part[g]
             if new:
@@ -363,20 +397,20 @@ def run_pixels(
                 reference, t_ready, armed = u_base, t, 1
                 draw += 1
                 continue
-            if total == light:
+            if abs(total - light) <= LIGHT_STEP * light:
                 continue
             if t > t_base:
                 u_base, reference, t_ready, t_last_out, armed, draw, n = _run_piece(
                     t, light, u_base, t_base, reference, t_ready, t_last_out, armed, draw, on_factor,
-                    off_factor, pixel, seed, quantiles, sensor, out_t, out_code, none, n,
+                    off_factor, code, key, quantiles, shifts, sensor, out_t, out_code, none, n,
                 )  # fmt: skip
                 t_base = t
             light = total
-            if switched:
+            if source >= 0:
                 draw += 1
         u_base, reference, t_ready, t_last_out, armed, draw, n = _run_piece(
-            end_us, light, u_base, t_base, reference, t_ready, t_last_out, armed, draw, on_factor, off_factor,
-            pixel, seed, quantiles, sensor, out_t, out_code, none, n,
+            end_us, light, u_base, t_base, reference, t_ready, t_last_out, armed, draw, on_factor,
+            off_factor, code, key, quantiles, shifts, sensor, out_t, out_code, none, n,
         )  # fmt: skip
         s[U_BASE], s[T_BASE], s[REFERENCE] = u_base, end_us, reference
         s[T_READY], s[T_LAST_OUT], s[LIGHT] = t_ready, t_last_out, light
@@ -384,14 +418,15 @@ def run_pixels(
     return last, n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def background_events(
     begin_us: float,
     end_us: float,
     rate_hz: float,
     hot: Array,
     hot_rate_hz: float,
-    pixels: int,
+    width: int,
+    height: int,
     slot: int,
     seed: Any,
     out_t: Array,
@@ -413,16 +448,16 @@ def background_events(
             if t >= end_us:
                 break
             which = hash_uniform(seed, slot, k, 11 + 3 * kind)
-            pixel = int(which * pixels) if kind == 0 else hot[int(which * hot.size)]
+            pixel = int(which * (width * height)) if kind == 0 else hot[int(which * hot.size)]
             on = int(hash_uniform(seed, slot, k, 12 + 3 * kind) < 0.5)
             out_t[n] = t
-            out_code[n] = 2 * pixel + on
+            out_code[n] = ((pixel // width) << COLUMN_BITS | (pixel % width)) << 1 | on
             n += 1
             k += 1
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def find_hot_pixels(pixels: int, share: float, seed: Any, out: Array) -> int:
     """Mark the hot pixels, each by its own hash; return how many."""
     n = 0
@@ -433,38 +468,46 @@ def find_hot_pixels(pixels: int, share: float, seed: Any, out: Array) -> int:
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def sort_events(t: Array, code: Array, out_t: Array, out_code: Array) -> None:
-    """Sort by (time, pixel): buckets of 1 us, then insertion within."""
+    """Sort by (time, pixel): buckets of 1/8 us, then insertion within."""
     n = t.size
     if n == 0:
         return
-    first = math.floor(t.min())
-    buckets = int(t.max() - first) + 1
-    begin = np.zeros(buckets + 1, np.int64)
+    per_us = 8.0
+    first = t[0]
+    last = t[0]
     for i in range(n):
-        begin[int(t[i] - first) + 1] += 1
+        first = min(first, t[i])
+        last = max(last, t[i])
+    buckets = int((last - first) * per_us) + 1
+    place = np.zeros(buckets + 1, np.int64)
+    for i in range(n):
+        place[int((t[i] - first) * per_us) + 1] += 1
     for b in range(buckets):
-        begin[b + 1] += begin[b]
-    fill = begin[:-1].copy()
+        place[b + 1] += place[b]
     for i in range(n):
-        b = int(t[i] - first)
-        j = fill[b]
-        fill[b] += 1
-        while j > begin[b] and (out_t[j - 1] > t[i] or (out_t[j - 1] == t[i] and out_code[j - 1] > code[i])):
+        b = int((t[i] - first) * per_us)
+        out_t[place[b]] = t[i]
+        out_code[place[b]] = code[i]
+        place[b] += 1
+    for i in range(1, n):
+        when, what = out_t[i], out_code[i]
+        j = i
+        while j > 0 and (out_t[j - 1] > when or (out_t[j - 1] == when and out_code[j - 1] > what)):
             out_t[j] = out_t[j - 1]
             out_code[j] = out_code[j - 1]
             j -= 1
-        out_t[j] = t[i]
-        out_code[j] = code[i]
+        out_t[j] = when
+        out_code[j] = what
 
 
-@njit(cache=True, nogil=True)
-def drop_blind(t: Array, code: Array, last_us: Array, refractory_us: float) -> int:
+@njit(cache=True, nogil=True, error_model="numpy")
+def drop_blind(t: Array, code: Array, last_us: Array, width: int, refractory_us: float) -> int:
     """Drop, in place, events of pixels that are still blind from their last one; return how many stay."""
     kept = 0
     for i in range(t.size):
-        pixel = code[i] >> 1
+        pixel = (code[i] >> (COLUMN_BITS + 1)) * width + ((code[i] >> 1) & ((1 << COLUMN_BITS) - 1))
         # The smallest part of a us stands for the rounding of sums.
         if t[i] - last_us[pixel] >= refractory_us - 1e-6:
             last_us[pixel] = t[i]
@@ -474,11 +517,10 @@ def drop_blind(t: Array, code: Array, last_us: Array, refractory_us: float) -> i
     return kept
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def read_out(
     t: Array,
     code: Array,
-    width: int,
     height: int,
     row_us: float,
     safe_us: float,
@@ -504,8 +546,10 @@ def read_out(
     tail = np.full(height, -1, np.int64)
     follow = np.full(t.size, -1, np.int64)
     served = np.zeros(t.size, np.bool_)
+    group = np.zeros((height >> 4) + 1, np.int64)
     free, at_row = memory[0], int(memory[1])
     window, used = int(memory[2]), int(memory[3])
+    window_end = (window + 1) * cap_window_us
     n = 0
     dropped = 0
     waiting = 0
@@ -518,9 +562,10 @@ def read_out(
         if free >= safe_us:
             break
         while i < t.size and t[i] <= free:
-            y = (code[i] >> 1) // width
+            y = code[i] >> (COLUMN_BITS + 1)
             if head[y] < 0:
                 head[y] = i
+                group[y >> 4] += 1
             else:
                 follow[tail[y]] = i
             tail[y] = i
@@ -532,23 +577,25 @@ def read_out(
                 at_row = 0
             if head[at_row] >= 0:
                 break
-            at_row += 1
+            at_row = at_row + 1 if group[at_row >> 4] else ((at_row >> 4) + 1) << 4
         free += row_us
         stamp = math.floor(free)
+        if stamp >= window_end:
+            window = stamp // cap_window_us
+            window_end = (window + 1) * cap_window_us
+            used = 0
         begin = n
         k = head[at_row]
         head[at_row] = -1
+        group[at_row >> 4] -= 1
         while k >= 0:
             waiting -= 1
             served[k] = True
-            if stamp // cap_window_us != window:
-                window = stamp // cap_window_us
-                used = 0
             if cap > 0 and used >= cap:
                 dropped += 1
             else:
                 used += 1
-                x = (code[k] >> 1) % width
+                x = (code[k] >> 1) & ((1 << COLUMN_BITS) - 1)
                 j = n
                 while j > begin and out_x[j - 1] > x:
                     out_t[j], out_x[j], out_y[j], out_p[j] = stamp, out_x[j - 1], at_row, out_p[j - 1]

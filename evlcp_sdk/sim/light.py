@@ -39,7 +39,7 @@ class Source(Protocol):
 
     @property
     def longest_us(self) -> float:
-        """How long it keeps its light at most."""
+        """How long its light may move a slow pixel the same way at full swing, us."""
         ...
 
     def switches(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
@@ -79,7 +79,8 @@ class BarLight:
         x, y, z = (bar.length_m * part for part in along)
         self.strip = Strip((bar.x_m, bar.y_m, bar.z_m), (x, y, z), bar.width_m, bar.clusters)
         self.rate_hz = bar.chip_rate_hz * (1 + bar.ppm * 1e-6)
-        self.longest_us = 2e6 / self.rate_hz
+        # The codes rest for two chips at most, and by half their swing from their mean.
+        self.longest_us = 1e6 / self.rate_hz
         self.payload_seed = seed if bar.seed is None else bar.seed
         self._chips: NDArray[np.uint8] | None = None
         self._packets: dict[int, NDArray[np.uint8]] = {}
@@ -221,13 +222,14 @@ def _random_lamps(scene: Scene) -> list[LampSpec]:
                 x_m=float(rng.uniform(-0.9, 0.9) * half),
                 y_m=float(-rng.uniform(0.1, 0.5) * half),
                 z_m=float(depth - scene.motion.distance_m),
-                width_m=float(rng.uniform(0.02, 0.3)),
-                height_m=float(rng.uniform(0.02, 0.3)),
+                width_m=float(rng.uniform(0.02, 0.1)),
+                height_m=float(rng.uniform(0.02, 0.1)),
                 light_w_m2=float(10 ** rng.uniform(0, 1.5)),
                 flicker_hz=flicker_hz,
                 waveform="sine" if flicker_hz < 200 else "square",
                 duty=float(rng.uniform(0.2, 0.8)),
                 phase=float(rng.random()),
+                depth=float(rng.uniform(0.2, 0.95)),
             )
         )
     return lamps

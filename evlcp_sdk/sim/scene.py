@@ -36,6 +36,9 @@ __all__ = [
 
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_default=False)
 
+MOST_PIXELS = 4096
+"""Columns and rows of a sensor."""
+
 MOST_SOURCES = 64
 """Bars and lamps of one scene."""
 
@@ -228,6 +231,8 @@ class Scene:
     def __post_init__(self) -> None:
         if len(self.bars) + len(self.lamps) + self.flicker_lamps > MOST_SOURCES:
             raise ConfigError(f"bars and lamps: expected at most {MOST_SOURCES} together")
+        if max(self.camera.width, self.camera.height) > MOST_PIXELS:
+            raise ConfigError(f"camera: expected at most {MOST_PIXELS} columns and rows")
         if self.lens.focus_m * 1e3 <= self.camera.focal_mm:
             raise ConfigError(f"lens.focus_m = {self.lens.focus_m}: expected beyond the focal length")
         for i, bar in enumerate(self.bars):

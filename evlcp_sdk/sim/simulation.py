@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 ACTIVITY_FLOOR = 0.1
 """Log signal by which a source must be able to move a pixel for the pixel to be simulated, ln units."""
 
-MOTION_STEP_PX = 0.05
+MOTION_STEP_PX = 0.1
 """How far the image moves before the light on the pixels is computed anew, px."""
 
 _CELL_US = 1000.0
@@ -78,6 +78,18 @@ def _texture(scene: Scene) -> Floats:
     return np.ascontiguousarray(light / light.mean())
 
 
+def _merge(marked: list[NDArray[np.int64]]) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
+    """All pixels of several lists, sorted, each with the set of lists that it is in."""
+    pixels = np.concatenate(marked)
+    bits = np.repeat(np.uint64(1) << np.arange(len(marked), dtype=np.uint64), [len(m) for m in marked])
+    if len(marked) > 1:
+        order = np.argsort(pixels, kind="stable")
+        pixels, bits = pixels[order], bits[order]
+        first = np.flatnonzero(np.append(True, pixels[1:] != pixels[:-1]))
+        pixels, bits = pixels[first], np.bitwise_or.reduceat(bits, first)
+    return pixels.astype(np.int32), bits
+
+
 @dataclass(frozen=True, eq=False)
 class _Block:
     """Everything about a block of time that all pixels share: the arguments of `run_pixels`."""
@@ -114,6 +126,7 @@ class Simulation:
         self._key = seed_key(scene.seed)
         self._sensor = sensor_vector(scene.sensor)
         self._quantiles = quantile_table()
+        self._shifts = np.exp(scene.sensor.noise_ln * self._quantiles)
         self._texture = _texture(scene)
         size = scene.camera.width * scene.camera.height
         self._state = np.zeros((size, 8))
@@ -170,7 +183,7 @@ class Simulation:
                 safe = math.inf if over else end + early_us
                 cut = len(out_t) if over else int(np.searchsorted(out_t, safe))
                 later = [(out_t[cut:].copy(), out_code[cut:].copy())]
-                kept = _kernels.drop_blind(out_t[:cut], out_code[:cut], last_us, sensor.refr_us)
+                kept = _kernels.drop_blind(out_t[:cut], out_code[:cut], last_us, camera.width, sensor.refr_us)
                 self._counts["dropped_blind"] += cut - kept
                 queue = (
                     np.concatenate([queue[0], out_t[:kept]]),
@@ -191,7 +204,7 @@ class Simulation:
         cap = round(sensor.cap_mev_s * sensor.cap_window_us)
         cap = max(cap, 1) if sensor.cap_mev_s > 0 else 0
         written, dropped, left = _kernels.read_out(
-            t, code, camera.width, camera.height, sensor.t_row_us, safe_us, cap, sensor.cap_window_us, memory,
+            t, code, camera.height, sensor.t_row_us, safe_us, cap, sensor.cap_window_us, memory,
             *columns,
         )  # fmt: skip
         self._counts["events"] += written
@@ -212,7 +225,17 @@ class Simulation:
         room = int(expected + 12 * math.sqrt(expected) + 64)
         t, code = np.empty(room), np.empty(room, np.int32)
         n = _kernels.background_events(
-            begin_us, end_us, rate, self._hot, hot_rate, size, number, self._key, t, code
+            begin_us,
+            end_us,
+            rate,
+            self._hot,
+            hot_rate,
+            camera.width,
+            camera.height,
+            number,
+            self._key,
+            t,
+            code,
         )
         return t[:n], code[:n]
 
@@ -230,7 +253,15 @@ class Simulation:
             found = []
             while first < last:
                 t, code = np.empty(max(_ROOM, most)), np.empty(max(_ROOM, most), np.int32)
-                room: tuple[Any, ...] = (self._key, self._quantiles, self._sensor, t, code, most)
+                room: tuple[Any, ...] = (
+                    self._key,
+                    self._quantiles,
+                    self._shifts,
+                    self._sensor,
+                    t,
+                    code,
+                    most,
+                )
                 state = (self.scene.camera.width, self._state, self._counters, number, begin_us, end_us)
                 arguments = (block.pixels, block.masks, *state, *block.shared, *room)
                 first, n = _kernels.run_pixels(first, last, *arguments)
@@ -244,21 +275,22 @@ class Simulation:
 
     def _moves(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
         """When the image has moved by a step: begins and middles of the poses, us, float64 (n,)."""
-        begins = []
         ends = np.array([s.strip.cuts_m()[[0, -1]] for s in self._sources]).reshape(-1, 3)
-        for cell in np.arange(begin_us, end_us, _CELL_US):
-            t = cell + np.array([0, 0.5, 1]) * min(_CELL_US, end_us - cell)
-            position, attitude = self.path.at(t)
-            moved = np.abs(np.diff(attitude[:, :2], axis=0)).max() * self.scene.camera.focal_px
-            if len(ends):
-                place, depth = project(ends, position, attitude, self.scene.camera)
-                shown = (depth > NEAREST_M).all(0)
-                shown &= (np.abs(place) < 4 * self.scene.camera.width).all((0, 2))
-                if shown.any():
-                    moved = max(moved, np.hypot(*np.diff(place[:, shown], axis=0).transpose(2, 0, 1)).max())
-            n = min(max(math.ceil(2 * moved / MOTION_STEP_PX), 1), _MOST_MOVES)
-            begins.append(t[0] + np.arange(n) / n * (t[-1] - t[0]))
-        starts = np.concatenate(begins)
+        cells = np.append(np.arange(begin_us, end_us, _CELL_US), end_us)
+        t = np.linspace(cells[:-1], cells[1:], 3, axis=1)
+        position, attitude = self.path.at(t.ravel())
+        turned = np.diff(attitude[:, :2].reshape(-1, 3, 2), axis=1)
+        moved = np.abs(turned).max((1, 2)) * self.scene.camera.focal_px
+        if len(ends):
+            place, depth = project(ends, position, attitude, self.scene.camera)
+            shown = (depth > NEAREST_M).all(0) & (np.abs(place) < 4 * self.scene.camera.width).all((0, 2))
+            if shown.any():
+                step = np.diff(place[:, shown].reshape(len(t), 3, -1, 2), axis=1)
+                moved = np.maximum(moved, np.hypot(step[..., 0], step[..., 1]).max((1, 2)))
+        moves = np.clip(np.ceil(2 * moved / MOTION_STEP_PX), 1, _MOST_MOVES).astype(int)
+        starts = np.concatenate(
+            [a + np.arange(n) / n * (b - a) for a, b, n in zip(cells, cells[1:], moves, strict=False)]
+        )
         middles = 0.5 * (starts + np.append(starts[1:], end_us))
         return starts, middles
 
@@ -271,8 +303,7 @@ class Simulation:
         turn = np.stack([attitude[:, 0], -attitude[:, 1]], 1) * camera.focal_px
         darkest = sensor.dark_w_m2 + scene.background.light_w_m2 * float(self._texture.min())
         shown: list[tuple[Source, Floats, Floats, float]] = []
-        width, height = camera.width, camera.height
-        mask = np.zeros((height, width), np.uint64)
+        marked: list[NDArray[np.int64]] = []
         for source in self._sources:
             place, depth = project(source.strip.cuts_m(), position, attitude, camera)
             if depth.min() <= NEAREST_M:
@@ -281,14 +312,13 @@ class Simulation:
             strip_px = camera.focal_px * source.strip.width_m / middle_depth
             sigma = blur_sigma_px(float(middle_depth[len(middle_depth) // 2]), lens, camera)
             least = ACTIVITY_FLOOR * max(darkest, sensor.charge_us_w_m2 / source.longest_us)
-            box = self._mark(mask, len(shown), place, float(strip_px.max()), sigma, source.light_w_m2, least)
-            if box:
+            lit = self._lit_pixels(place, float(strip_px.max()), sigma, source.light_w_m2, least)
+            if len(lit):
+                marked.append(lit)
                 shown.append((source, place, strip_px, sigma))
         if not shown:
             return None
-        rows, columns = np.nonzero(mask)
-        pixels = (rows * width + columns).astype(np.int32)
-        masks = mask[rows, columns]
+        pixels, masks = _merge(marked)
 
         g = len(shown)
         most = max(source.strip.clusters for source, *_ in shown)
@@ -343,17 +373,11 @@ class Simulation:
         )  # fmt: skip
         return _Block(pixels, masks, shared)
 
-    def _mark(
-        self,
-        mask: NDArray[np.uint64],
-        number: int,
-        place: Floats,
-        strip_px: float,
-        sigma: float,
-        light_w_m2: float,
-        least_w_m2: float,
-    ) -> bool:
-        """Mark the pixels that a source lights by `least_w_m2` or more at any pose; say whether there are."""
+    def _lit_pixels(
+        self, place: Floats, strip_px: float, sigma: float, light_w_m2: float, least_w_m2: float
+    ) -> NDArray[np.int64]:
+        """Pixels, row by row, that a source lights by `least_w_m2` or more at any pose."""
+        nothing = np.empty(0, np.int64)
         lens = self.scene.lens
         z = np.arange(0, self._wide_reach, 0.25)
         half = strip_px / 2
@@ -368,7 +392,7 @@ class Simulation:
         across_halo = step(z + half, False) - step(z - half, False)
         across = light_w_m2 * ((1 - lens.halo) * across_core + lens.halo * across_halo)
         if across[0] < least_w_m2:
-            return False
+            return nothing
         along = light_w_m2 * (
             (1 - lens.halo) * across_core[0] * step(-z, True) + lens.halo * across_halo[0] * step(-z, False)
         )
@@ -378,12 +402,12 @@ class Simulation:
         middle = place[len(place) // 2]
         wander = max(float(np.abs(end - end[len(end) // 2]).max()) for end in (first, last))
         reach = max(reach_across, reach_along) + wander
-        height, width = mask.shape
+        height, width = self.scene.camera.height, self.scene.camera.width
         left, top = np.floor(np.minimum(middle[0], middle[-1]) - reach).astype(int)
         right, low = np.ceil(np.maximum(middle[0], middle[-1]) + reach).astype(int) + 1
         left, top, right, low = max(left, 0), max(top, 0), min(right, width), min(low, height)
         if left >= right or top >= low:
-            return False
+            return nothing
         vector = middle[-1] - middle[0]
         length = float(np.hypot(*vector))
         axis = vector / length
@@ -396,8 +420,8 @@ class Simulation:
         wander_across = float(np.abs(away @ np.array([axis[1], -axis[0]])).max())
         inside = np.abs(n) <= reach_across + wander_across
         inside &= (s >= -reach_along - wander_along) & (s <= length + reach_along + wander_along)
-        mask[top:low, left:right] |= inside.astype(np.uint64) << np.uint64(number)
-        return bool(inside.any())
+        found: NDArray[np.int64] = (y * width + x)[inside]
+        return found
 
 
 def simulate(

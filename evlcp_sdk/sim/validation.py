@@ -1,0 +1,180 @@
+"""Measurements on single pixels and on the readout, for the tests and the figures of `docs/simulator.md`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evlcp_sdk.sim import _kernels
+from evlcp_sdk.sim.scene import SensorSpec
+from evlcp_sdk.sim.simulation import quantile_table, seed_key, sensor_vector
+
+__all__ = [
+    "MEASURED_AREA",
+    "MEASURED_LATENCY",
+    "PixelEvents",
+    "crossing_by_steps",
+    "events_per_edge",
+    "latency_us",
+    "latency_with_readout_us",
+    "pixel_events",
+    "step_response",
+]
+
+Floats = NDArray[np.float64]
+
+MEASURED_LATENCY = {0.006: (555, 635), 0.046: (95, 117), 0.166: (42, 55), 0.277: (32, 43), 0.398: (27, 40)}
+"""Measured mean latency of the first ON and OFF event, us, at an irradiance, W/m2: the sensor model's table,
+from usnistgov/pixel_latency_eventcameras."""
+
+MEASURED_AREA = {32: 37, 64: 40, 128: 45, 256: 62, 420: 90}
+"""Measured mean latency, us, of a lit square of this side, px; the same source."""
+
+
+@dataclass(frozen=True, eq=False)
+class PixelEvents:
+    """Events of pixels that all saw the same light, before the readout, pixel by pixel.
+
+    Attributes:
+        pixel: Number of the pixel, int64 (n,).
+        request_us: When each asked to be read out, float64 (n,).
+        cross_us: When its signal crossed the threshold, float64 (n,).
+        on: Whether it is an ON event, bool (n,).
+    """
+
+    pixel: NDArray[np.int64]
+    request_us: Floats
+    cross_us: Floats
+    on: NDArray[np.bool_]
+
+
+def pixel_events(
+    sensor: SensorSpec,
+    edge_us: ArrayLike,
+    light_w_m2: ArrayLike,
+    end_us: float,
+    *,
+    pixels: int = 1,
+    seed: int = 0,
+) -> PixelEvents:
+    """Run pixels, at rest in the first light, through light that changes at given times.
+
+    Args:
+        sensor: Its pixels.
+        edge_us: When each light begins, rising, (n,).
+        light_w_m2: The lights, background and dark current included, (n,).
+        end_us: End of the last.
+        pixels: How many pixels, each with its own thresholds and noise.
+        seed: Of thresholds and noise.
+    """
+    edges = np.ascontiguousarray(edge_us, np.float64)
+    light = np.ascontiguousarray(light_w_m2, np.float64)
+    quantiles = quantile_table()
+    shifts = np.exp(sensor.noise_ln * quantiles)
+    room = int((end_us - edges[0]) / sensor.refr_us) + 8
+    request, code, cross = np.empty(room), np.empty(room, np.int32), np.empty(room)
+    found = []
+    for pixel in range(pixels):
+        n = _kernels.run_given_light(
+            pixel, edges, light, end_us, seed_key(seed), quantiles, shifts, sensor_vector(sensor), request,
+            code, cross,
+        )  # fmt: skip
+        found.append((np.full(n, pixel), request[:n].copy(), cross[:n].copy(), code[:n] % 2 == 1))
+    return PixelEvents(*(np.concatenate(column) for column in zip(*found, strict=True)))
+
+
+def latency_us(
+    sensor: SensorSpec, light_w_m2: float, dark_w_m2: float, *, pixels: int = 400, seed: int = 0
+) -> tuple[float, float]:
+    """Mean latency of the first ON event after a step up, and of the first OFF event after a step down, us.
+
+    Before each step the pixels are at rest, and so are their references; no event goes missing.
+    """
+    sensor = replace(sensor, p_on_miss=0.0, p_off_miss=0.0)
+    light = light_w_m2 + dark_w_m2
+    means = []
+    for before, after in ((dark_w_m2, light), (light, dark_w_m2)):
+        events = pixel_events(sensor, [-1.0, 0.0], [before, after], 1e5, pixels=pixels, seed=seed)
+        first = np.append(True, np.diff(events.pixel) > 0)
+        means.append(float(events.request_us[first].mean()))
+    return means[0], means[1]
+
+
+def latency_with_readout_us(sensor: SensorSpec, light_w_m2: float, side_px: int, *, seed: int = 0) -> float:
+    """Mean latency of the first ON event, readout included, of a square of pixels that light up at once."""
+    sensor = replace(sensor, p_on_miss=0.0)
+    one = pixel_events(
+        sensor, [-1e5, 0.0], [1e-4, light_w_m2], sensor.refr_us / 2 + 1000, pixels=side_px**2, seed=seed
+    )
+    first = np.flatnonzero(np.append(True, np.diff(one.pixel) > 0))
+    code = ((one.pixel[first] // side_px) << _kernels.COLUMN_BITS | one.pixel[first] % side_px) << 1 | 1
+    t, order = np.empty(len(first)), np.empty(len(first), np.int32)
+    _kernels.sort_events(one.request_us[first], code.astype(np.int32), t, order)
+    n = len(first)
+    out = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
+    memory = np.array([-1e18, -1.0, -1.0, 0.0])
+    _kernels.read_out(t, order, side_px, sensor.t_row_us, np.inf, 0, 200, memory, *out)
+    return float(out[0].mean() + 0.5)
+
+
+def crossing_by_steps(
+    sensor: SensorSpec, light: Callable[[float], float], begin_us: float, end_us: float, step_us: float = 0.01
+) -> list[tuple[float, bool]]:
+    """Threshold crossings (us, ON) of one noiseless pixel, by integrating its log signal in small steps.
+
+    dy/dt = (I - exp(y)) / Q by the classical Runge-Kutta method: the brute-force twin of the closed form.
+    """
+    charge = sensor.charge_us_w_m2
+    y = float(np.log(light(begin_us)))
+    reference = y
+    blind_until = begin_us
+    blind = False
+    found = []
+    for i in range(round((end_us - begin_us) / step_us)):
+        t = begin_us + i * step_us
+        now = light(t + 0.5 * step_us)
+        k1 = (now - np.exp(y)) / charge
+        k2 = (now - np.exp(y + 0.5 * step_us * k1)) / charge
+        k3 = (now - np.exp(y + 0.5 * step_us * k2)) / charge
+        k4 = (now - np.exp(y + step_us * k3)) / charge
+        before = y
+        y += step_us * (k1 + 2 * k2 + 2 * k3 + k4) / 6
+        if blind and t + step_us >= blind_until:
+            blind = False
+            reference = before + (y - before) * (blind_until - t) / step_us
+        if blind:
+            continue
+        for on, level in ((True, reference + sensor.th_on), (False, reference - sensor.th_off)):
+            if (y >= level) if on else (y <= level):
+                when = t + step_us * (level - before) / (y - before)
+                found.append((when, on))
+                blind, blind_until = True, when + sensor.refr_us
+                break
+    return found
+
+
+def step_response(
+    sensor: SensorSpec, contrast: ArrayLike, light_w_m2: float = 20.0, *, pixels: int = 4000, seed: int = 0
+) -> Floats:
+    """Share of pixels that send an ON event upon one step of log contrast: the S-curve, float64 (n,)."""
+    shares = []
+    for delta in np.atleast_1d(np.asarray(contrast, np.float64)):
+        events = pixel_events(
+            sensor, [0.0, 1000.0], [light_w_m2, light_w_m2 * np.exp(delta)], 3000.0, pixels=pixels, seed=seed
+        )
+        shares.append(len(np.unique(events.pixel[events.on])) / pixels)
+    return np.array(shares)
+
+
+def events_per_edge(sensor: SensorSpec, contrast: float, *, rising: bool, steps: int = 4000) -> int:
+    """Events of one noiseless pixel while its light changes slowly by a log contrast.
+
+    The light climbs a stair of `steps` steps, 1 ms each, at 100 W/m2 and less: the receptor is at rest at the
+    end of each.
+    """
+    ladder = np.linspace(0, contrast, steps + 1)
+    light = 100.0 * np.exp(-contrast) * np.exp(ladder if rising else ladder[::-1])
+    edges = np.arange(steps + 1) * 1000.0
+    events = pixel_events(sensor, edges, light, float(edges[-1] + 1000))
+    return int((events.on == rising).sum())
