@@ -1,0 +1,201 @@
+"""Laws of whole simulations: invariances, and a receiver that hears them."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.config import load_link
+from evlcp_sdk.geometry import CameraModel
+from evlcp_sdk.io import read_events
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.score import score_frames
+from evlcp_sdk.sim import (
+    BackgroundSpec,
+    BarSpec,
+    LampSpec,
+    MotionSpec,
+    Scene,
+    SensorSpec,
+    Simulation,
+    load_scene,
+    simulate,
+    truth,
+    truth_of,
+)
+from evlcp_sdk.types import Events
+
+SHARED = Path(__file__).parents[4] / "shared" / "recordings"
+SHORT = replace(load_scene("two-bars"), duration_s=0.03, lamps=(LampSpec(x_m=-1.4, y_m=-0.6, z_m=3.0),))
+QUIET = SensorSpec(noise_hz=0.0, hot_share=0.0)
+
+
+def every(scene: Scene, seed: int | None = None, threads: int = 1) -> Events:
+    return Events.concat(list(simulate(scene, seed, threads=threads)))
+
+
+def same(a: Events, b: Events) -> bool:
+    return all(np.array_equal(getattr(a, c), getattr(b, c)) for c in ("t_us", "x", "y", "p"))
+
+
+def shape(events: Events) -> set[tuple[int, int, int, int]]:
+    columns = (events.t_us, events.x, events.y, events.p)
+    return set(zip(*(c.tolist() for c in columns), strict=True))
+
+
+def test_threads_pieces_and_runs_do_not_matter() -> None:
+    events = every(SHORT)
+    assert len(events) > 50_000
+    assert (np.diff(events.t_us) >= 0).all()
+    assert same(events, every(SHORT))
+    assert same(events, every(SHORT, threads=3))
+    pieces = list(simulate(SHORT, max_events=777))
+    assert max(map(len, pieces)) == 777
+    assert same(events, Events.concat(pieces))
+    assert not same(events, every(SHORT, seed=1))
+
+
+def test_a_longer_scene_begins_with_the_shorter() -> None:
+    long, short = every(replace(SHORT, duration_s=0.04)), every(SHORT)
+    until = 27_900  # whole blocks of time: the last one is prepared for its own length
+    a, b = (e[: int(np.searchsorted(e.t_us, until))] for e in (long, short))
+    assert same(a, b)
+
+
+def test_the_clock_shifts_all_stamps() -> None:
+    a, b = every(SHORT), every(replace(SHORT, t0_us=16_770_000))
+    assert (b.t_us - 16_770_000 == a.t_us).all()
+    assert np.array_equal(a.x, b.x)
+
+
+def test_the_mirrored_scene_is_the_mirrored_recording() -> None:
+    # One column more to the left than to the right of the axis: mirror about it, with an odd width.
+    camera = replace(Scene().camera, width=1279)
+    sensor = replace(QUIET, th_spread=0.0, noise_ln=0.0, p_on_miss=0.0, p_off_miss=0.0, t_row_us=0.0)
+    motion = MotionSpec(vib_rate_rad_s=0.0)
+    bar = BarSpec(start_chip=10.0, seed=1)
+    scene = Scene(
+        duration_s=0.01, camera=camera, sensor=sensor, motion=motion, background=BackgroundSpec(texture=0.0)
+    )
+    left = every(replace(scene, bars=(bar,)))
+    # The axis meets the image at width / 2 = 639.5, between the columns 639 and 640.
+    right = every(replace(scene, bars=(replace(bar, x_m=-bar.x_m),)))
+    assert len(left) == len(right) > 10_000
+    # A crossing at the turn of a microsecond may be stamped on either side: rounding of sums.
+    mirrored = {(t, 1279 - x, y, p) for t, x, y, p in shape(left)}
+    assert len(mirrored & shape(right)) > 0.999 * len(right)
+
+
+def test_swapped_polarity_is_not_a_symmetry() -> None:
+    """Rises are quicker than falls: the receptor's own asymmetry, more so on a dark background."""
+    shares = []
+    for light in (3.0, 0.3, 0.03):
+        scene = Scene(
+            duration_s=0.02,
+            background=BackgroundSpec(light_w_m2=light, texture=0.0),
+            sensor=replace(QUIET, p_on_miss=0.0, p_off_miss=0.0),
+        )
+        p = every(scene).p
+        shares.append((p == 0).sum() / (p == 1).sum())
+    assert shares[0] < shares[1] < shares[2]
+
+
+def test_dark_and_passed_bars_give_nothing() -> None:
+    dark = Scene(duration_s=0.02, sensor=QUIET, bars=(BarSpec(led_w_m2=1e-9),))
+    assert len(every(dark)) == 0
+    passing = Scene(
+        duration_s=0.1,
+        sensor=QUIET,
+        camera=CameraModel(width=160, height=120, focal_mm=1.0),
+        motion=MotionSpec(distance_m=1.2, speed_mps=30.0, yaw_deg=-50.0, vib_rate_rad_s=0.0),
+    )
+    events = every(passing)
+    assert len(events) > 0
+    # 74 ms on it is nearer than 50 cm, and behind the camera soon after; it leaves the image before.
+    assert events.t_us[-1] < 74_000
+
+
+def test_only_the_lit_part_of_the_sensor_is_active() -> None:
+    scene = Scene(duration_s=0.02, sensor=QUIET)
+    events = every(scene)
+    place = np.array(truth(scene)["bar_centre_px"])[0]
+    assert np.abs(events.x - place[0].mean()).max() < 30
+    assert np.abs(events.y - place[1].mean()).max() < 69 + 30
+
+
+def test_a_bar_that_leans_is_seen_leaning() -> None:
+    still = MotionSpec(vib_rate_rad_s=0.0)
+    scene = Scene(duration_s=0.01, sensor=QUIET, motion=still, bars=(BarSpec(lean_deg=20.0),))
+    events = every(scene)
+    slope = np.polyfit(events.y.astype(float), events.x.astype(float), 1)[0]
+    assert slope == pytest.approx(-np.tan(np.radians(20)), rel=0.02)
+    rolled = Scene(duration_s=0.01, sensor=QUIET, motion=replace(still, roll_deg=-20.0))
+    events = every(rolled)
+    assert np.polyfit(events.y.astype(float), events.x.astype(float), 1)[0] == pytest.approx(slope, rel=0.02)
+
+
+def received(scene: Scene, profile: str = "wh4x2") -> tuple[list[dict[str, str]], Simulation]:
+    simulation = Simulation(scene)
+    receiver = Receiver(load_link(overrides=[f"modulation.id={profile}"]))
+    packets = [p for events in simulation.stream() for p in receiver.feed(events)]
+    packets += receiver.close()
+    rows = [
+        {
+            "t_us": str(f.t_us),
+            "symbols": " ".join(map(str, f.soft.symbols.tolist())),
+            "distance_m": "" if np.isnan(f.range.distance_m) else str(f.range.distance_m),
+            "x_px": str(f.x_px),
+            "y_px": str(f.y_px),
+        }
+        for p in packets
+        for f in p.frames
+    ]
+    return rows, simulation
+
+
+def test_the_receiver_hears_the_simulated_bar() -> None:
+    scene = load_scene("drive-30kmh", ["motion.distance_m=50.0", "duration_s=0.1"])
+    rows, simulation = received(scene)
+    result = score_frames(rows, truth_of(simulation))
+    (bar,) = result.bars
+    assert result.unmatched == 0
+    assert bar.frames_found == bar.frames_sent > 20
+    assert bar.bit_errors == 0
+    assert bar.rmse_m is not None
+    assert 0.01 < bar.rmse_m < 0.2
+
+
+def test_the_truth_counts_what_was_rendered() -> None:
+    simulation = Simulation(SHORT)
+    assert "events" not in truth_of(simulation)
+    events = sum(map(len, simulation.stream()))
+    found = truth_of(simulation)
+    assert found["events"] == events
+    assert found["signal_events"] + 30_000 > events
+    assert len(found["t_s"]) == len(found["distance_m"][1]) == len(found["bar_centre_px"][1][0]) == 30
+    json.dumps(found)
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="the recordings of ../shared are not there")
+def test_the_truth_has_the_schema_of_the_recordings() -> None:
+    theirs = json.loads((SHARED / "two-bars-60m-75m.truth.json").read_text())
+    simulation = Simulation(SHORT)
+    for _ in simulation.stream():
+        pass
+    ours = truth_of(simulation) | {"bytes": 0}
+    assert set(theirs) <= set(ours)
+    assert set(theirs["scene"]) == set(ours["scene"])
+    assert set(theirs["bars"][0]) == set(ours["bars"][0])
+    assert theirs["camera"] == ours["camera"]
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="the recordings of ../shared are not there")
+def test_statistics_are_near_those_of_the_independent_recording() -> None:
+    theirs = read_events(SHARED / "night-50m-30kmh.raw")
+    scene = Scene(duration_s=0.1, background=BackgroundSpec(light_w_m2=0.05))
+    ours = every(scene)
+    rate = [len(e) / (e.t_us[-1] - e.t_us[0]) for e in (ours, theirs)]
+    assert rate[0] == pytest.approx(rate[1], rel=0.3)
+    assert abs(float(ours.p.mean()) - float(theirs.p.mean())) < 0.15

@@ -1,0 +1,217 @@
+"""Pixels and readout against brute force, closed forms and the sensor model's table."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import binomtest, chisquare, kstest, norm
+
+from evlcp_sdk.sim import BarSpec, MotionSpec, Scene, SensorSpec, Simulation, _kernels
+from evlcp_sdk.sim.simulation import quantile_table, seed_key
+from evlcp_sdk.sim.validation import (
+    MEASURED_AREA,
+    MEASURED_LATENCY,
+    crossing_by_steps,
+    events_per_edge,
+    latency_us,
+    latency_with_readout_us,
+    pixel_events,
+    step_response,
+)
+from evlcp_sdk.types import Events
+
+SENSOR = SensorSpec()
+IDEAL = replace(SENSOR, noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0)
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(500, 8000), st.floats(0.02, 60.0)), min_size=2, max_size=6),
+    st.floats(3.0, 40.0),
+)
+def test_crossings_are_those_of_brute_force_at_10_ns(
+    pieces: list[tuple[int, float]], refractory: float
+) -> None:
+    sensor = replace(IDEAL, refr_us=refractory)
+    lengths = np.array([length for length, _ in pieces])
+    edges = np.concatenate([[0], np.cumsum(lengths)[:-1]])  # in 10 ns, so that no step has two lights
+    light = np.array([value for _, value in pieces])
+    end = float(lengths.sum()) / 100
+
+    def light_at(t_us: float) -> float:
+        return float(light[np.searchsorted(edges, t_us * 100 + 0.25, side="right") - 1])
+
+    stepped = crossing_by_steps(sensor, light_at, 0.0, end)
+    exact = pixel_events(sensor, edges / 100, light, end)
+    # The last moment of a run and a signal that just touches a threshold may fall on either side.
+    both = min(len(stepped), len(exact.cross_us))
+    assert max(len(stepped), len(exact.cross_us)) - both <= 1
+    assert [on for _, on in stepped[:both]] == exact.on[:both].tolist()
+    np.testing.assert_allclose([t for t, _ in stepped[:both]], exact.cross_us[:both], atol=0.02)
+
+
+@pytest.mark.parametrize("light", MEASURED_LATENCY)
+def test_latency_is_the_measured_one_within_15_percent(light: float) -> None:
+    measured_on, measured_off = MEASURED_LATENCY[light]
+    on, off = latency_us(SENSOR, light, SENSOR.dark_w_m2)
+    assert on == pytest.approx(measured_on, rel=0.15)
+    assert off == pytest.approx(measured_off, rel=0.15)
+
+
+def test_latency_beyond_the_fixed_delay_falls_as_one_over_light() -> None:
+    lights = np.array([0.005, 0.02, 0.08, 0.32])
+    both = np.array([latency_us(IDEAL, light, 1e-7, pixels=1) for light in lights])
+    own = both - [SENSOR.dly_on_us, SENSOR.dly_off_us]
+    for column in own.T:
+        slope = np.polyfit(np.log(lights), np.log(column), 1)[0]
+        assert slope == pytest.approx(-1, abs=0.002)
+    charge, theta = SENSOR.charge_us_w_m2, SENSOR.th_on
+    np.testing.assert_allclose(own[:, 0] * lights, charge * theta, rtol=2e-3)
+    np.testing.assert_allclose(own[:, 1] * lights, charge * math.expm1(theta), rtol=2e-3)
+
+
+@pytest.mark.parametrize("rising", [True, False])
+@pytest.mark.parametrize("contrast", [0.2, 0.5, 1.0, 2.3, 4.5])
+def test_a_slow_edge_gives_an_event_a_threshold(contrast: float, rising: bool) -> None:
+    assert events_per_edge(IDEAL, contrast, rising=rising) == math.floor(contrast / IDEAL.th_on)
+
+
+def test_nothing_below_the_threshold_and_the_s_curve_at_it() -> None:
+    sensor = replace(SENSOR, p_on_miss=0.0)
+    pixels = 4000
+    sigma = math.hypot(sensor.noise_ln, sensor.th_spread * sensor.th_on)
+    contrast = sensor.th_on + sigma * np.array([-1.5, -0.5, 0.0, 0.5, 1.5])
+    shares = step_response(sensor, contrast, pixels=pixels)
+    for share, p in zip(shares, norm.cdf((contrast - sensor.th_on) / sigma), strict=True):
+        interval = binomtest(round(share * pixels), pixels).proportion_ci(0.999)
+        assert interval.low <= p <= interval.high
+    assert step_response(sensor, sensor.th_on - 6.5 * sigma, pixels=pixels) == 0
+    assert step_response(IDEAL, IDEAL.th_on - 1e-6, pixels=3) == 0
+    assert step_response(IDEAL, IDEAL.th_on + 1e-6, pixels=3) == 1
+
+
+def test_an_interval_is_a_refractory_time_or_more() -> None:
+    for refractory in (3.0, 10.0, 50.0):
+        sensor = replace(SENSOR, refr_us=refractory, jitter_us=3.0)
+        edges = np.arange(400) * 50.0
+        light = np.where(np.arange(400) % 2, 40.0, 0.05)
+        events = pixel_events(sensor, edges, light, 2e4, pixels=20)
+        same = np.diff(events.pixel) == 0
+        assert np.diff(events.request_us)[same].min() >= refractory - 1e-9
+        assert np.diff(events.cross_us)[same].min() >= refractory - 1e-9
+        # A slow fall keeps some pixel crossing as soon as it sees again.
+        assert np.diff(events.cross_us)[same].min() < refractory + 1
+
+
+def test_missing_events_are_missing_in_the_share_asked_for() -> None:
+    edges = np.arange(4000) * 400.0
+    light = np.where(np.arange(4000) % 2, 20.0, 5.0)
+    full = pixel_events(replace(SENSOR, p_on_miss=0.0, p_off_miss=0.0), edges, light, 1.6e6)
+    some = pixel_events(SENSOR, edges, light, 1.6e6)
+    for on, p in ((True, SENSOR.p_on_miss), (False, SENSOR.p_off_miss)):
+        sent, all_ = int((some.on == on).sum()), int((full.on == on).sum())
+        interval = binomtest(all_ - sent, all_).proportion_ci(0.999)
+        assert interval.low <= p <= interval.high
+
+
+def test_falls_are_slower_than_rises_the_more_the_darker_it_is() -> None:
+    edges = np.arange(200) * 100.0
+    spans = []
+    for background in (5.0, 0.5, 0.05):
+        light = np.where(np.arange(200) % 2, 20.0 + background, background)
+        events = pixel_events(IDEAL, edges, light, 2e4)
+        after = events.cross_us % 100
+        spans.append(after[~events.on].mean() / max(after[events.on].mean(), 1e-9))
+    assert spans[0] < spans[1] < spans[2]
+
+
+def background_only(seconds: float, **sensor: float) -> tuple[Scene, Events]:
+    scene = Scene(
+        duration_s=seconds,
+        bars=(),
+        motion=MotionSpec(vib_rate_rad_s=0.0),
+        sensor=replace(SENSOR, t_row_us=0.0, cap_mev_s=0.0, **sensor),
+    )
+    return scene, Events.concat(list(Simulation(scene).stream()))
+
+
+def test_background_activity_is_poisson() -> None:
+    scene, events = background_only(1.0, noise_hz=0.1, hot_share=0.0)
+    expected = 2 * 0.1 * 1280 * 720
+    assert abs(len(events) - expected) < 4 * math.sqrt(expected)
+    assert abs(int(events.p.sum()) - len(events) / 2) < 4 * math.sqrt(len(events) / 4)
+    counts = np.histogram(events.t_us, 500, (0, 1e6))[0]
+    exact = events.t_us + np.random.default_rng(0).random(len(events))
+    gaps = np.diff(np.sort(exact))
+    assert kstest(gaps, "expon", args=(0, 1e6 / expected)).pvalue > 1e-3
+    assert counts.var(ddof=1) / counts.mean() == pytest.approx(1, abs=0.3)
+    tiles = np.histogram2d(events.x, events.y, (16, 9), ((0, 1280), (0, 720)))[0]
+    assert chisquare(tiles.ravel()).pvalue > 1e-3
+    assert scene.bars == ()
+
+
+def test_hot_pixels_fire_at_their_rate() -> None:
+    _, events = background_only(1.0, noise_hz=0.0, hot_share=1e-4, hot_hz=100.0)
+    counts = np.bincount(events.y.astype(int) * 1280 + events.x)
+    counts = counts[counts > 0]
+    assert 50 < len(counts) < 140
+    assert counts.mean() == pytest.approx(100, rel=0.05)
+
+
+@pytest.mark.parametrize("side", [32, 128, 256])
+def test_latency_grows_with_the_lit_area(side: int) -> None:
+    assert latency_with_readout_us(SENSOR, 0.277, side) == pytest.approx(MEASURED_AREA[side], rel=0.1)
+
+
+def read_out(
+    t: np.ndarray, y: np.ndarray, x: np.ndarray, row_us: float, cap: int = 0, window: int = 200
+) -> tuple[Events, int]:
+    code = (((y << _kernels.COLUMN_BITS) | x) << 1 | 1).astype(np.int32)
+    n = len(t)
+    out = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
+    memory = np.array([-1e18, -1.0, -1.0, 0.0])
+    written, dropped, left = _kernels.read_out(
+        t.astype(float), code, 720, row_us, math.inf, cap, window, memory, *out
+    )
+    assert left == 0
+    return Events(*(c[:written] for c in out)), dropped
+
+
+def test_rows_are_read_one_after_another() -> None:
+    y = np.repeat(np.arange(100), 5)
+    events, _ = read_out(np.full(500, 10.0), y, np.tile(np.arange(5), 100), 1.0)
+    # The row of the first request begins; each row takes all its requests along, a row a us.
+    assert events.t_us.tolist() == (11 + y).tolist()
+    assert events.y.tolist() == y.tolist()
+    assert events.x.tolist() == np.tile(np.arange(5), 100).tolist()
+
+
+def test_more_than_the_event_rate_limit_is_dropped() -> None:
+    t = np.sort(np.random.default_rng(0).uniform(0, 1000, 5000))
+    events, dropped = read_out(t, np.arange(5000) % 700, np.arange(5000) // 700, 0.0, cap=300)
+    assert len(events) + dropped == 5000
+    assert np.bincount(events.t_us // 200).max() == 300
+    assert dropped == 5000 - 5 * 300
+
+
+def test_sorting_is_by_time_and_pixel() -> None:
+    rng = np.random.default_rng(1)
+    t = np.round(rng.uniform(0, 50, 3000), 1)
+    code = rng.integers(0, 1000, 3000).astype(np.int32)
+    out_t, out_code = np.empty_like(t), np.empty_like(code)
+    _kernels.sort_events(t, code, out_t, out_code)
+    order = np.lexsort((code, t))
+    assert np.array_equal(out_t, t[order])
+    assert np.array_equal(out_code, code[order])
+
+
+def test_random_numbers_are_those_of_a_normal_distribution() -> None:
+    table = quantile_table()
+    numbers = [_kernels.hash_normal(seed_key(3), k, d, 0, table) for k in range(200) for d in range(50)]
+    assert kstest(numbers, "norm").pvalue > 1e-3
+    again = [_kernels.hash_normal(seed_key(3), k, d, 0, table) for k in range(2) for d in range(50)]
+    assert numbers[:100] == again
+    assert Scene().bars == (BarSpec(),)

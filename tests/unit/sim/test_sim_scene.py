@@ -1,0 +1,299 @@
+"""Scenes: what is read, what is refused, where light falls."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
+from evlcp_sdk.frames import packet_chips
+from evlcp_sdk.geometry import CameraModel
+from evlcp_sdk.sim import (
+    BarSpec,
+    LampSpec,
+    MotionSpec,
+    Scene,
+    Simulation,
+    load_scene,
+    preset_names,
+    resolve_scene,
+    scene_table,
+    truth,
+)
+from evlcp_sdk.sim.light import BarLight, LampLight
+from evlcp_sdk.sim.motion import CameraPath, Vibration, project
+from evlcp_sdk.sim.optics import blur_sigma_px, lit_share, step_table
+
+EXAMPLES = Path(__file__).parents[3] / "examples" / "scenes"
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_presets_are_scenes(name: str) -> None:
+    scene = load_scene(name)
+    assert scene.name == name
+    assert resolve_scene(json.loads(json.dumps(scene_table(scene)))) == scene
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda p: p.stem)
+def test_examples_can_be_rendered(path: Path) -> None:
+    events = next(Simulation(load_scene(path)).stream())
+    assert len(events)
+
+
+@pytest.mark.parametrize(
+    ("table", "says"),
+    [
+        ({"motion": {"distance_m": -3.0}}, "motion.distance_m = -3.0: expected greater than 0"),
+        ({"motion": {"distnce_m": 3.0}}, "motion.distnce_m = 3.0: unknown key; did you mean 'distance_m'?"),
+        ({"bars": [{}, {"ppm": "fast"}]}, "bars.1.ppm = 'fast': expected a valid number"),
+        ({"bars": [{"z_m": -60.0}]}, "bars.0.z_m = -60.0: the bar is behind the camera"),
+        ({"lamps": [{"waveform": "saw"}]}, "lamps.0.waveform = 'saw': expected 'square' or 'sine'"),
+        ({"camra": {}}, "camra: unknown key; did you mean 'camera'?"),
+        ({"sensor": {"refr_us": 0}}, "sensor.refr_us = 0: expected greater than or equal to 1"),
+        ({"lens": {"focus_m": 0.01}}, "lens.focus_m = 0.01: expected beyond the focal length"),
+        ({"camera": {"width": 5000}}, "camera: expected at most 4096"),
+        ({"bars": [{}] * 65}, "bars and lamps: expected at most 64"),
+        ({"duration_s": float("inf")}, "duration_s"),
+    ],
+)
+def test_faults_are_told_with_their_path(table: dict[str, Any], says: str) -> None:
+    with pytest.raises(ConfigError) as fault:
+        resolve_scene(table, source="scene.toml")
+    assert says in str(fault.value)
+    assert "scene.toml: " in str(fault.value)
+
+
+def test_every_fault_is_told() -> None:
+    with pytest.raises(ConfigError) as fault:
+        resolve_scene({"motion": {"distance_m": 0.0}, "sensor": {"th_on": -1.0}})
+    assert len(str(fault.value).splitlines()) == 2
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("nonsense", "expected table.key=value"),
+        ("mation.x=1", "unknown table; did you mean 'motion'?"),
+        ("bars.7.ppm=1", "there are 1 bars"),
+    ],
+)
+def test_wrong_overrides_are_told(override: str, says: str) -> None:
+    with pytest.raises(ConfigError, match="--set") as fault:
+        load_scene("night", [override])
+    assert says in str(fault.value)
+
+
+def test_overrides_reach_their_place() -> None:
+    scene = load_scene("two-bars", ["bars.ppm=3.0", "bars.1.x_m=2.5", "duration_s=0.1", "name=other"])
+    assert [bar.ppm for bar in scene.bars] == [3.0, 3.0]
+    assert (scene.bars[1].x_m, scene.duration_s, scene.name) == (2.5, 0.1, "other")
+    assert load_scene("night", {"motion.distance_m": np.float64(70)}).motion.distance_m == 70
+    assert load_scene("night", {"lens.halo": 0.0}).lens.halo == 0
+
+
+def test_files_that_are_no_scenes_are_told(tmp_path: Path) -> None:
+    with pytest.raises(
+        ConfigError, match=r"nigt: no such file, and no preset of that name; did you .*'night'"
+    ):
+        load_scene("nigt")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_scene(tmp_path / "missing.toml")
+    (tmp_path / "a.toml").write_text("x = ")
+    with pytest.raises(ConfigError, match="not TOML"):
+        load_scene(tmp_path / "a.toml")
+    (tmp_path / "b.toml").write_bytes(b"\xff")
+    with pytest.raises(ConfigError, match="not UTF-8"):
+        load_scene(tmp_path / "b.toml")
+
+
+def test_a_bar_sends_what_the_air_interface_says() -> None:
+    light = BarLight(BarSpec(ppm=50.0, start_chip=300.4), 1.0, seed=4)
+    rate = 1e4 * (1 + 50e-6)
+    book_chips = np.concatenate([packet_chips(light.symbols(q), light._codebook) for q in range(3)])
+    when, levels = light.switches(2000.0, 12_000.0)
+    assert len(levels) == len(when) + 1
+    at = (300.4 + when * 1e-6 * rate).round(6)
+    assert (at == at.round()).all()
+    assert (levels[1:] == book_chips[at.astype(int)]).all()
+    assert (levels[0] == book_chips[int(300.4 + 2000e-6 * rate)]).all()
+    split = np.concatenate([light.switches(2000.0, 7001.3)[0], light.switches(7001.3, 12_000.0)[0]])
+    assert (split == when).all()
+
+
+def test_a_bar_sends_given_symbols_and_chips(tmp_path: Path) -> None:
+    symbols = ((tuple(range(16)),) * 10,)
+    light = BarLight(BarSpec(symbols=symbols, start_chip=0.0), 1.0, seed=0)
+    assert light.sent_symbols(0.05) == [[list(range(16))] * 10] * 2
+    with pytest.raises(ConfigError, match=r"bars\.0\.symbols\.0: 1 frames, expected 10"):
+        BarLight(BarSpec(symbols=((tuple(range(16)),),)), 1.0, 0, "bars.0")
+    with pytest.raises(ConfigError, match=r"symbol 99 .*expected 0 to 63"):
+        BarLight(BarSpec(symbols=(((99,) * 16,) * 10,)), 1.0, 0, "bars.0")
+    chips = np.random.default_rng(0).integers(0, 2, (50, 16))
+    np.save(tmp_path / "chips.npy", chips)
+    sent = BarLight(BarSpec(chips_file=str(tmp_path / "chips.npy"), start_chip=40.0), 1.0, seed=0)
+    assert (sent.switches(0.0, 3000.0)[1] == np.concatenate([chips[40:], chips[:20]])).all()
+    assert sent.sent_symbols(1.0) == []
+    with pytest.raises(ConfigError, match="8 clusters"):
+        BarLight(BarSpec(chips_file=str(tmp_path / "chips.npy"), clusters=8), 1.0, seed=0)
+    with pytest.raises(InputError, match="cannot be read"):
+        BarLight(BarSpec(chips_file=str(tmp_path / "no.npy")), 1.0, seed=0)
+    (tmp_path / "text.npy").write_text("chips")
+    with pytest.raises(InputError, match="not an array file"):
+        BarLight(BarSpec(chips_file=str(tmp_path / "text.npy")), 1.0, seed=0)
+    with pytest.raises(ConfigError, match="no modulation"):
+        BarLight(BarSpec(profile="wh9"), 1.0, seed=0)
+
+
+def test_lamps_keep_their_period_and_duty() -> None:
+    square = LampLight(LampSpec(flicker_hz=1000.0, duty=0.3, depth=0.8, phase=0.5))
+    when, levels = square.switches(0.0, 10_000.0)
+    assert np.diff(when[::2]) == pytest.approx(1000)
+    assert sorted({round(float(v), 9) for v in levels.ravel()}) == [0.2, 1.0]
+    on = np.diff(np.concatenate([[0], when, [10_000]]))[levels[:, 0] == 1].sum()
+    assert on == pytest.approx(3000, rel=0.1)
+    sine = LampLight(LampSpec(flicker_hz=100.0, waveform="sine"))
+    when, levels = sine.switches(0.0, 10_000.0)
+    assert len(when) == 31
+    assert levels.max() > 0.99
+    assert levels.min() < 0.01
+
+
+def test_the_step_table_is_the_formula() -> None:
+    sigma, width = 0.4, 0.7
+    reach = 5 * sigma + 0.5
+    table = step_table(sigma, reach, 513)
+    z = np.linspace(-2, 2, 41)
+    nodes = np.linspace(-reach, reach, 513)
+    found = np.interp(z + width / 2, nodes, table) - np.interp(z - width / 2, nodes, table)
+    np.testing.assert_allclose(found, lit_share(z, width, sigma), atol=1e-4)
+    # All the strip's light arrives.
+    many = np.arange(-20, 21, dtype=float)
+    assert lit_share(many, width, sigma).sum() == pytest.approx(width)
+    assert blur_sigma_px(20.0, Scene().lens, CameraModel()) > blur_sigma_px(50.0, Scene().lens, CameraModel())
+
+
+def test_projection_is_the_pinhole() -> None:
+    camera = CameraModel()
+    point = np.array([[-1.5, 0.48, 0.0]])
+    still = np.array([[0.0, 0.0, -50.0]])
+    place, depth = project(point, still, np.zeros((1, 3)), camera)
+    assert depth[0, 0] == 50
+    f = camera.focal_px
+    assert place[0, 0] == pytest.approx([640 - 1.5 / 50 * f, 360 + 0.48 / 50 * f])
+    for attitude, sign in (((1e-4, 0, 0), (-1, 0)), ((0, 1e-4, 0), (0, 1))):
+        moved, _ = project(point, still, np.array([attitude]), camera)
+        assert (moved - place)[0, 0] == pytest.approx(np.array(sign) * 1e-4 * f, abs=1e-2)
+    upper, _ = project(np.array([[0, -1.0, 0]]), still, np.array([[0, 0, 0.1]]), camera)
+    assert upper[0, 0, 0] < 640, "a camera that leans right sees the world lean left"
+
+
+def test_a_path_of_a_file_is_followed(tmp_path: Path) -> None:
+    t = np.linspace(0, 0.2, 9)
+    lines = ["t_s,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg"]
+    lines += [f"{s},{3 * s},0.1,{-40 + 10 * s},{5 * s},{-2 * s},{20 * s}" for s in t]
+    (tmp_path / "path.csv").write_text("\n".join(lines))
+    (tmp_path / "scene.toml").write_text('[motion]\npath_file = "path.csv"\nvib_rate_rad_s = 0.0\n')
+    scene = load_scene(tmp_path / "scene.toml", ["duration_s=0.2"])
+    position, attitude = CameraPath(scene.motion, 0.2, 0).at([1e5])
+    assert position[0] == pytest.approx([0.3, 0.1, -39])
+    assert np.degrees(attitude[0]) == pytest.approx([0.5, -0.2, 2])
+    assert truth(scene)["distance_m"][0][100] == pytest.approx(39, abs=0.05)
+    with pytest.raises(ConfigError, match=r"lasts from 0\.0 to 0\.2 s"):
+        Simulation(load_scene(tmp_path / "scene.toml", ["duration_s=0.3"]))
+    (tmp_path / "path.csv").write_text("\n".join([lines[0], "0,0,0,x,0,0,0"]))
+    with pytest.raises(ConfigError, match="line 2: no number in column z_m"):
+        Simulation(scene)
+    (tmp_path / "path.csv").write_text("\n".join([lines[0], lines[2], lines[1]]))
+    with pytest.raises(ConfigError, match="rising t_s"):
+        Simulation(scene)
+    (tmp_path / "path.csv").unlink()
+    with pytest.raises(InputError, match="cannot be read"):
+        Simulation(scene)
+
+
+def test_the_vibration_has_its_rate_and_its_spectrum() -> None:
+    vibration = Vibration.of(0.06, 3)
+    t_us = np.arange(0, 60e6, 1000.0)
+    rate = vibration.rate_rad_s(t_us)
+    assert rate.std(1) == pytest.approx(0.06, rel=0.1)
+    assert 0.13 < np.abs(rate).max() < 0.4
+    derived = np.gradient(vibration.angle_rad(t_us), 1e-3, axis=1)
+    assert np.abs(derived - rate)[:, 1:-1].max() < 0.01
+    power = np.abs(np.fft.rfft(rate[0])) ** 2
+    frequency = np.fft.rfftfreq(len(t_us), 1e-3)
+
+    def share(low: float, high: float) -> float:
+        return float(power[(frequency >= low) & (frequency < high)].sum() / power.sum())
+
+    assert share(0.4, 3.2) == pytest.approx(0.45, abs=0.1)
+    assert share(5, 20) > 0.35
+    assert 0.02 < share(20, 200) < 0.2
+    assert (Vibration.of(0.0, 1).angle_rad([0.0, 1.0]) == 0).all()
+
+
+def test_simulate_writes_a_recording_and_its_truth(
+    tmp_path: Path, evlcp: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    first = evlcp("simulate", "--preset", "night", "-o", "a.raw", "--set", "duration_s=0.02", "--json")
+    assert first.code == 0, first.err
+    summary = json.loads(first.out)
+    found = json.loads((tmp_path / "a.truth.json").read_text())
+    assert summary["bytes"] == found["bytes"] == (tmp_path / "a.raw").stat().st_size
+    assert found["events"] == summary["events"] > 1000
+    assert evlcp("info", "a.raw").code == 0
+    # The truth holds the scene, which gives the recording again.
+    again = Simulation(resolve_scene(found["simulator"]))
+    assert sum(map(len, again.stream())) == found["events"]
+    second = evlcp("simulate", "--preset", "night", "--seed", "5", "-o", "b.raw", "--set", "duration_s=0.02")
+    assert second.code == 0
+    assert "written: b.raw, b.truth.json" in second.out
+    assert (tmp_path / "b.raw").read_bytes() != (tmp_path / "a.raw").read_bytes()
+    shown = evlcp("simulate", "--preset", "night", "--show")
+    (tmp_path / "c.toml").write_text(shown.out)
+    third = evlcp("simulate", "c.toml", "-o", "c.raw", "--set", "duration_s=0.02", "--threads", "2")
+    assert third.code == 0
+    body = [(tmp_path / f"{n}.raw").read_bytes().split(b"% end\n", 1)[1] for n in "ac"]
+    assert body[0] == body[1]
+    assert set(json.loads(evlcp("simulate", "--presets", "--json").out)) == set(preset_names())
+    assert "drive-30kmh" in evlcp("simulate", "--presets").out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (("--preset", "nigt", "-o", "a.raw"), 2, "no preset named 'nigt'; did you mean 'night'?"),
+        (("--preset", "night", "-o", "no/a.raw"), 1, "no/a.raw: cannot be written"),
+        (("--preset", "night", "-o", "a.csv"), 2, "a.csv: a recording is written as NAME.raw"),
+        (("none.toml", "-o", "a.raw"), 2, "none.toml: cannot be read"),
+        (("--preset", "night", "-o", "a.raw", "--set", "motion.distance_m=-1"), 2, "motion.distance_m = -1"),
+        (("-o", "a.raw"), 2, ""),
+        (("--preset", "night"), 2, ""),
+        (("x.toml", "--show"), 2, ""),
+    ],
+)
+def test_simulate_tells_what_is_wrong(
+    arguments: tuple[str, ...], code: int, says: str, tmp_path: Path, evlcp: Callable[..., Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    done = evlcp("simulate", *arguments)
+    assert done.code == code
+    assert says in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_leaves_no_half_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from evlcp_sdk.cli.simulate import _write_text
+
+    def full(*_args: object, **_kwargs: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(EvlcpError, match="No space left"):
+        _write_text(tmp_path / "a.truth.json", "x")
+    assert list(tmp_path.iterdir()) == []
+    assert MotionSpec().distance_m == 50
