@@ -67,8 +67,9 @@ def page(summary: Summary) -> str:
     data = json.dumps(drawn, allow_nan=False).replace("</", "<\\/")
     script = (
         f"const charts = {data};\n"
-        "for (const [id, c] of Object.entries(charts))\n"
-        "  Plotly.newPlot(id, c.data, c.layout, {displaylogo: false, responsive: true});"
+        # The library would offer to upload a chart.
+        "const config = {displaylogo: false, responsive: true, showSendToCloud: false, plotlyServerURL: ''};\n"
+        "for (const [id, c] of Object.entries(charts)) Plotly.newPlot(id, c.data, c.layout, config);"
     )
     return "\n".join(
         [

@@ -86,7 +86,7 @@ class Series:
                 )
             else:
                 parts.append(f"{word} {value}")
-        return ", ".join(parts) or "all"
+        return ", ".join(parts) or "simulated"
 
     @property
     def clusters(self) -> int | None:

@@ -158,6 +158,9 @@ def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) ->
         assert drawn["histogram"] == 4
         assert drawn["rmse"] > 4, "the paper's figures are missing"
         assert browser.value("document.querySelectorAll('table tr').length") > 20
+        offers = browser.value("[...document.querySelectorAll('.modebar-btn')].map(b => b.dataset.title)")
+        assert offers
+        assert not [title for title in offers if "loud" in title], "the page offers an upload"
         for chart in CHARTS:
             told = hovered(browser, chart)
             assert "km/h" in told, f"{chart}: nothing is told where the pointer is"
