@@ -68,7 +68,8 @@ def page(summary: Summary) -> str:
     script = (
         f"const charts = {data};\n"
         # The library would offer to upload a chart.
-        "const config = {displaylogo: false, responsive: true, showSendToCloud: false, plotlyServerURL: ''};\n"
+        "const config = {displaylogo: false, responsive: true,"
+        " showSendToCloud: false, plotlyServerURL: ''};\n"
         "for (const [id, c] of Object.entries(charts)) Plotly.newPlot(id, c.data, c.layout, config);"
     )
     return "\n".join(
