@@ -1,0 +1,120 @@
+"""The simulator: events a second of one core, beside simulators that step through time.
+
+    python benchmarks/simulate.py [--seconds 0.25] [--rounds 3]
+
+Whole scenes, kernels warm, one thread, the best of the rounds: a bar at 30, 50 and 90 m, rendered to sorted
+events. Then the same pixels' worth of work three ways, in events a second: the closed form; a compiled loop
+that steps one pixel through the same light by 1 us and by 10 ns (what it takes to be as exact); and whole
+frames in NumPy, all pixels of the sensor, 1 us a step.
+"""
+
+import argparse
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numba import njit
+
+from evlcp_sdk.sim import SensorSpec, Simulation, _kernels, load_scene
+from evlcp_sdk.sim.simulation import quantile_table, seed_key, sensor_vector
+
+
+def best(work: Callable[[], int], rounds: int) -> float:
+    """Events a second of the quickest round, in millions."""
+    rates = []
+    for _ in range(rounds):
+        began = time.perf_counter()
+        events = work()
+        rates.append(events / (time.perf_counter() - began) / 1e6)
+    return max(rates)
+
+
+def scene_rate(distance_m: float, seconds: float, rounds: int) -> float:
+    scene = load_scene(
+        "drive-30kmh",
+        {"motion.distance_m": distance_m, "duration_s": seconds, "background.light_w_m2": 0.05},
+    )
+    return best(lambda: sum(map(len, Simulation(scene).stream())), rounds)
+
+
+@njit
+def step_pixel(light: np.ndarray, piece_us: float, step_us: float, sensor: np.ndarray) -> int:
+    """Events of one noiseless pixel, its receptor advanced and compared step by step."""
+    u = 1 / light[0]
+    reference = u
+    low, high = math.exp(-sensor[9]), math.exp(sensor[10])
+    blind = 0
+    steps = round(piece_us / step_us)
+    blind_steps = round(sensor[1] / step_us)
+    n = 0
+    for i in range(light.size):
+        rest = 1 / light[i]
+        kept = math.exp(-light[i] / sensor[0] * step_us)
+        for _ in range(steps):
+            u = rest + (u - rest) * kept
+            if blind > 0:
+                blind -= 1
+                if blind == 0:
+                    reference = u
+            elif u <= reference * low or u >= reference * high:
+                n += 1
+                blind = blind_steps
+    return n
+
+
+def frame_steps(sensor: np.ndarray, steps: int = 20) -> int:
+    """Events of a bar's 700 pixels when whole frames are stepped by 1 us."""
+    light = np.full((720, 1280), 0.05)
+    u = 1 / light
+    reference = u.copy()
+    n = 0
+    for i in range(steps):
+        light[300:440, 400:405] = 51.0 if i % 10 < 5 else 0.05
+        u = 1 / light + (u - 1 / light) * np.exp(-light / sensor[0])
+        fired = np.abs(np.log(u / reference)) > sensor[9]
+        reference[fired] = u[fired]
+        n += int(fired.sum())
+    return n
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=0.25)
+    parser.add_argument("--rounds", type=int, default=3)
+    args = parser.parse_args()
+    for _ in Simulation(load_scene("drive-30kmh", ["duration_s=0.004"])).stream():
+        pass
+    for distance_m in (30.0, 50.0, 90.0):
+        rate = scene_rate(distance_m, args.seconds, args.rounds)
+        print(f"scene at {distance_m:.0f} m, one core       {rate:8.2f} Mev/s", flush=True)
+
+    spec = SensorSpec(noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0)
+    sensor, table = sensor_vector(spec), quantile_table()
+    bits = np.random.default_rng(0).integers(0, 2, 2000)
+    light = np.where(np.stack([1 - bits, bits], 1).ravel(), 51.0, 0.05)
+    edges = np.arange(light.size) * 100.0
+    room = np.empty(1 << 16), np.empty(1 << 16, np.int32), np.empty(0)
+
+    def closed_form() -> int:
+        return sum(
+            _kernels.run_given_light(
+                k, edges, light, light.size * 100.0, seed_key(0), table, np.ones_like(table), sensor, *room
+            )
+            for k in range(50)
+        )
+
+    closed_form()
+    print(f"pixels, closed form           {best(closed_form, args.rounds):8.2f} Mev/s")
+    for step_us, repeat in ((1.0, 20), (0.01, 1)):
+        step_pixel(light[:2], 100.0, step_us, sensor)
+        rate = best(
+            lambda s=step_us, r=repeat: sum(step_pixel(light, 100.0, s, sensor) for _ in range(r)),
+            args.rounds,
+        )
+        print(f"pixels, steps of {step_us:4g} us      {rate:8.3f} Mev/s")
+    print(f"frames, steps of 1 us, NumPy  {best(lambda: frame_steps(sensor), 1):8.4f} Mev/s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,205 @@
+"""The figures and the tables of docs/simulator.md: the simulator against measurement and closed forms.
+
+    python benchmarks/simulator_figures.py [-o docs/images]
+
+Writes simulator-pixel.png and simulator-scene.png, prints the tables. The comparison with the independent
+recording needs ../shared/recordings and is left out without it.
+"""
+
+import argparse
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.stats import binomtest, norm
+
+from evlcp_sdk.io import read_events
+from evlcp_sdk.sim import BackgroundSpec, BarSpec, MotionSpec, Scene, SensorSpec, simulate, truth
+from evlcp_sdk.sim.validation import (
+    MEASURED_AREA,
+    MEASURED_LATENCY,
+    events_per_edge,
+    latency_us,
+    latency_with_readout_us,
+    pixel_events,
+    step_response,
+)
+from evlcp_sdk.types import Events
+
+SHARED = Path(__file__).parents[2] / "shared" / "recordings"
+SENSOR = SensorSpec()
+IDEAL = replace(SENSOR, noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0)
+ON, OFF, INK = "#d55e00", "#0072b2", "#333333"
+
+
+def plain(axis: Axes, title: str, x: str, y: str) -> None:
+    axis.set_title(title, loc="left", fontsize=10, color=INK)
+    axis.set(xlabel=x, ylabel=y)
+    for side in ("top", "right"):
+        axis.spines[side].set_visible(False)
+
+
+def draw_latency(axis: Axes) -> None:
+    lights = np.geomspace(0.005, 0.5, 13)
+    both = np.array([latency_us(SENSOR, e, SENSOR.dark_w_m2) for e in lights])
+    for column, colour, name in ((0, ON, "ON"), (1, OFF, "OFF")):
+        axis.loglog(lights, both[:, column], color=colour, label=f"{name}, simulated")
+        axis.plot(
+            list(MEASURED_LATENCY), [m[column] for m in MEASURED_LATENCY.values()], "o", color=colour, ms=4,
+            label=f"{name}, measured",
+        )  # fmt: skip
+    axis.legend(frameon=False, fontsize=8)
+    plain(axis, "latency of the first event", "light, W/m2", "us")
+    print("| W/m2 | ON us | measured | OFF us | measured |\n|---|---|---|---|---|")
+    for light, (on, off) in MEASURED_LATENCY.items():
+        a, b = latency_us(SENSOR, light, SENSOR.dark_w_m2)
+        print(f"| {light} | {a:.0f} | {on} ({a / on - 1:+.0%}) | {b:.0f} | {off} ({b / off - 1:+.0%}) |")
+
+
+def draw_area(axis: Axes) -> None:
+    sides = list(MEASURED_AREA)
+    for row_us, style in ((0.2, "-"), (0.25, "--")):
+        found = [latency_with_readout_us(replace(SENSOR, t_row_us=row_us), 0.277, n) for n in sides]
+        axis.plot(sides, found, style, color=ON, label=f"simulated, {row_us} us a row")
+        told = ", ".join(
+            f"{n} px {f:.0f} ({f / m - 1:+.0%})"
+            for (n, m), f in zip(MEASURED_AREA.items(), found, strict=True)
+        )
+        print(f"area, {row_us} us a row: {told}")
+    axis.plot(sides, list(MEASURED_AREA.values()), "o", color=INK, ms=4, label="measured")
+    axis.legend(frameon=False, fontsize=8)
+    plain(axis, "latency of a lit square, 0.277 W/m2", "side, px", "us")
+
+
+def draw_edges(axis: Axes) -> None:
+    contrast = np.linspace(0.05, 2.5, 50)
+    found = [events_per_edge(IDEAL, c, rising=True, steps=1000) for c in contrast]
+    axis.step(
+        contrast, np.floor(contrast / IDEAL.th_on), where="post", color=INK, label="floor(ln C / threshold)"
+    )
+    axis.plot(contrast, found, ".", color=ON, label="simulated")
+    axis.legend(frameon=False, fontsize=8)
+    plain(axis, "events of a slow, noiseless edge", "ln contrast", "events")
+
+
+def draw_s_curve(axis: Axes) -> None:
+    sigma = math.hypot(SENSOR.noise_ln, SENSOR.th_spread * SENSOR.th_on)
+    contrast = SENSOR.th_on + sigma * np.linspace(-4, 4, 17)
+    share = step_response(replace(SENSOR, p_on_miss=0.0), contrast, pixels=2000)
+    bounds = np.array([binomtest(round(s * 2000), 2000).proportion_ci() for s in share])
+    axis.plot(contrast, norm.cdf((contrast - SENSOR.th_on) / sigma), color=INK, label="normal distribution")
+    axis.errorbar(contrast, share, np.abs(bounds.T - share), fmt=".", color=ON, lw=1, label="simulated, 95 %")
+    axis.legend(frameon=False, fontsize=8)
+    plain(axis, "share of pixels that answer a step", "ln contrast", "")
+
+
+def draw_asymmetry(axis: Axes) -> None:
+    lights = np.geomspace(0.01, 10, 10)
+    counts = []
+    for light in lights:
+        edges = np.arange(1000) * 100.0
+        chips = np.random.default_rng(0).integers(0, 2, 500)
+        lit = np.stack([1 - chips, chips], 1).ravel()
+        sensor = replace(SENSOR, p_on_miss=0.0, p_off_miss=0.0)
+        events = pixel_events(sensor, edges, light + 20.0 * lit, 1e5, pixels=40)
+        on = int(events.on.sum())
+        counts.append((len(events.on) - on) / max(on, 1))
+    axis.semilogx(lights, counts, ".-", color=OFF)
+    plain(axis, "OFF events for one ON event, chips at 20 W/m2", "background, W/m2", "")
+
+
+def draw_intervals(axis: Axes) -> None:
+    edges = np.arange(2000) * 100.0
+    light = np.where(np.arange(2000) % 2, 20.0, 0.05)
+    events = pixel_events(SENSOR, edges, light, 2e5, pixels=20)
+    gaps = np.diff(events.request_us)[np.diff(events.pixel) == 0]
+    axis.hist(gaps, np.arange(0, 121, 1), color=OFF)
+    axis.axvline(SENSOR.refr_us, color=INK, lw=1)
+    plain(axis, f"intervals in a pixel; refractory time {SENSOR.refr_us:g} us", "us", "events")
+    print(f"shortest interval {gaps.min():.3f} us, refractory time {SENSOR.refr_us:g} us")
+
+
+def statistics(events: Events, centre: np.ndarray, duration_s: float) -> dict[str, float]:
+    """Rate, share of ON events, busy pixels and their events, width of the bar in events."""
+    per_pixel = np.bincount(events.y.astype(int) * 1280 + events.x, minlength=1280 * 720) / duration_s
+    busy = per_pixel > 1000
+    t_us = events.t_us.astype(float)
+    off = events.x - np.interp(t_us, np.arange(len(centre[0])) * 1000.0, centre[0])
+    near = np.abs(off) < 8
+    return {
+        "Mev/s": len(events) / duration_s / 1e6,
+        "share of ON events": float(events.p.mean()),
+        "pixels with over 1000 events/s": float(busy.sum()),
+        "their median events/s": float(np.median(per_pixel[busy])),
+        "rms distance from the bar's axis, px": float(np.sqrt((off[near] ** 2).mean())),
+    }
+
+
+def compare() -> None:
+    path = SHARED / "night-50m-30kmh.raw"
+    if not path.exists():
+        print("no ../shared/recordings: comparison left out")
+        return
+    told = json.loads(path.with_suffix(".truth.json").read_text())
+    recorded = told["scene"]
+    bar = told["bars"][0]
+    scene = Scene(
+        duration_s=recorded["duration_s"],
+        motion=MotionSpec(distance_m=float(recorded["distance_m"]), speed_mps=recorded["speed_mps"]),
+        background=BackgroundSpec(light_w_m2=recorded["background_w_m2"]),
+        bars=(BarSpec(ppm=float(bar["ppm"]), start_chip=bar["start_chip"]),),
+    )
+    same = replace(SENSOR, **{k: recorded[k] for k in ("refr_us", "dly_on_us", "dly_off_us", "jitter_us")})
+    columns = [statistics(read_events(path), np.array(told["bar_centre_px"][0]), scene.duration_s)]
+    for sensor in (same, SENSOR):
+        made = replace(scene, sensor=sensor)
+        found = truth(made)
+        events = Events.concat(list(simulate(made)))
+        columns.append(statistics(events, np.array(found["bar_centre_px"][0]), scene.duration_s))
+    print("| | recording | its parameters here | defaults here |\n|---|---|---|---|")
+    for key in columns[0]:
+        print(f"| {key} | " + " | ".join(f"{c[key]:.4g}" for c in columns) + " |")
+
+
+def draw_scene(figure: Figure) -> None:
+    image, chips = figure.subplots(1, 2, width_ratios=[1, 2.2])
+    scene = Scene(duration_s=0.02, background=BackgroundSpec(light_w_m2=0.05))
+    events = Events.concat(list(simulate(scene)))
+    counts = np.zeros((720, 1280))
+    np.add.at(counts, (events.y, events.x), 1)
+    x, y = (int(np.median(v)) for v in (events.x, events.y))
+    image.imshow(
+        np.log1p(counts[y - 90 : y + 90, x - 25 : x + 25]), cmap="Greys", interpolation="nearest",
+        extent=(x - 25.5, x + 24.5, y + 89.5, y - 90.5),
+    )  # fmt: skip
+    plain(image, "events of 20 ms, 50 m ahead", "column, px", "row, px")
+    shown = (events.t_us >= 8000) & (events.t_us < 10_000)
+    for on, colour in ((1, ON), (0, OFF)):
+        some = shown & (events.p == on)
+        chips.plot(events.t_us[some] / 1e3, events.y[some], ",", color=colour)
+    chips.set(ylim=(y + 90, y - 90))
+    plain(chips, "the same, ON red, OFF blue", "ms", "row, px")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("-o", "--out", type=Path, default=Path(__file__).parents[1] / "docs" / "images")
+    args = parser.parse_args()
+    figure = Figure(figsize=(11, 6.2), layout="constrained")
+    axes = figure.subplots(2, 3).ravel()
+    draws = (draw_latency, draw_area, draw_edges, draw_s_curve, draw_asymmetry, draw_intervals)
+    for axis, draw in zip(axes, draws, strict=True):
+        draw(axis)
+    figure.savefig(args.out / "simulator-pixel.png", dpi=110)
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    draw_scene(figure)
+    figure.savefig(args.out / "simulator-scene.png", dpi=110)
+    compare()
+
+
+if __name__ == "__main__":
+    main()
