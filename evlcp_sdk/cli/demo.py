@@ -148,12 +148,16 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     if progress.faults:
         raise typer.Exit(max(fault.exit_code for _, fault in progress.faults))
     save_charts(charts_of(summary), summary.name, out)
-    save_page(summary, out / "report.html")
+    try:
+        save_page(summary, out / "report.html")
+        written = f"{out}/report.html, ber.png, rmse.png and more, {results}"
+    except ConfigError as fault:
+        written = f"{out}/ber.png, rmse.png and more, {results}; {fault}"
     if as_json:
         typer.echo(json.dumps(summary.to_dict()))
         return
     show_drive(summary)
-    console().print(f"written: {out}/report.html, ber.png, rmse.png and more, {results}", style="dim")
+    console().print(f"written: {written}", style="dim")
 
 
 def show_drive(summary: "Summary") -> None:

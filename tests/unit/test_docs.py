@@ -15,7 +15,18 @@ from evlcp_sdk.config import resolve
 from evlcp_sdk.registry import Registry
 
 ROOT = Path(__file__).parents[2]
-PAGES = ("index", "quickstart", "cli", "outputs", "configuration", "roles", "hooks")
+PAGES = (
+    "index",
+    "quickstart",
+    "cli",
+    "outputs",
+    "configuration",
+    "simulator",
+    "campaigns",
+    "paper",
+    "roles",
+    "hooks",
+)
 FILES = [ROOT / "README.md", *(ROOT / "docs" / f"{page}.md" for page in PAGES)]
 HOOKS = [name for name in vars(hookspecs) if name.startswith("evlcp_")]
 
