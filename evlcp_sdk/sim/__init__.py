@@ -14,7 +14,7 @@ from evlcp_sdk.sim.scene import (
     resolve_scene,
 )
 from evlcp_sdk.sim.simulation import Simulation, scene_table, simulate
-from evlcp_sdk.sim.truth import truth, truth_of
+from evlcp_sdk.sim.truth import scene_of_truth, truth, truth_of
 
 __all__ = [
     "BackgroundSpec",
@@ -29,6 +29,7 @@ __all__ = [
     "preset_names",
     "preset_text",
     "resolve_scene",
+    "scene_of_truth",
     "scene_table",
     "simulate",
     "truth",

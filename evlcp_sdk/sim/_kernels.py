@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-ON_FACTOR, OFF_FACTOR, U_BASE, T_BASE, REFERENCE, T_READY, T_LAST_OUT, LIGHT = range(8)
-"""Columns of a pixel's state: its thresholds as factors, the receptor, the comparator, the light on it."""
+ON_FACTOR, OFF_FACTOR, U_BASE, T_BASE, REFERENCE, T_READY, T_LAST_OUT, LIGHT, FOLLOWER = range(9)
+"""Columns of a pixel's state: its thresholds as factors, the receptor, the comparator, the light on it, and
+the log signal behind the source follower, where that has a time constant."""
 
 DRAW, ARMED, BLOCK = range(3)
 """Columns of a pixel's counters."""
@@ -149,6 +150,128 @@ def _run_piece(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _follow(y_from: float, y_to: float, z: float, whole: float, part: float, tau: float) -> float:
+    """Return a low-pass filter's output after `part` of a ramp of `whole` us from y_from to y_to."""
+    slope = (y_to - y_from) / whole
+    return y_from + slope * (part - tau) + (z - y_from + slope * tau) * math.exp(-part / tau)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _run_piece_followed(
+    until: float,
+    light: float,
+    u_base: float,
+    t_base: float,
+    z: float,
+    reference: float,
+    t_ready: float,
+    t_last_out: float,
+    armed: int,
+    draw: int,
+    on_factor: float,
+    off_factor: float,
+    code: int,
+    key: Any,
+    quantiles: Array,
+    shifts: Array,
+    sensor: Array,
+    out_t: Array,
+    out_code: Array,
+    out_cross: Array,
+    n: int,
+) -> tuple[float, float, float, float, float, int, int, int]:
+    """Do as `_run_piece`, with a low-pass filter of the log signal between receptor and comparator.
+
+    The receptor is exact; between its values, as near to one another as they must be for a ramp to hit the
+    middle between them to 0.002, the filter is solved for ramps. `reference` and `z` are log signals.
+    """
+    charge, refractory = sensor[0], sensor[1]
+    delay_on, delay_off, jitter = sensor[2], sensor[3], sensor[4]
+    miss_on, miss_off, tau = sensor[5], sensor[6], sensor[12]
+    threshold_on, threshold_off = -math.log(on_factor), math.log(off_factor)
+    rest = 1.0 / light
+    settled = math.log(light)
+    rate = light / charge
+    t = t_base
+    y = -math.log(u_base)
+    length = 0.25 * tau
+    word = _mix(key + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03))
+    noise = math.log(_table_at(shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10))
+    fire = 0
+    while True:
+        if armed == 1:
+            if z >= reference + threshold_on - noise:
+                fire = 1
+            elif z <= reference - threshold_off - noise:
+                fire = -1
+            if fire != 0:
+                armed = 0
+                t_ready = t + refractory
+                late = delay_on if fire > 0 else delay_off
+                if jitter > 0.0:
+                    late = max(0.0, late + jitter * hash_normal(key, 0, draw, 2, quantiles))
+                request = max(t + late, t_last_out + refractory)
+                t_last_out = request
+                missed = float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10
+                if missed >= (miss_on if fire > 0 else miss_off):
+                    out_t[n] = request
+                    out_code[n] = code + int(fire > 0)
+                    if out_cross.size:
+                        out_cross[n] = t
+                    n += 1
+                fire = 0
+        elif t >= t_ready:
+            reference = z
+            armed = 1
+            draw += 1
+            word = _mix(key + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03))
+            noise = math.log(_table_at(shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10))
+        if t >= until:
+            break
+        limit = until if armed == 1 else min(until, t_ready)
+        if abs(y - settled) < 1e-5 and abs(z - settled) < 1e-5:
+            t = limit
+            continue
+        whole = min(length, limit - t)
+        last = whole == limit - t
+        middle = -math.log(_receptor(u_base, rest, rate * (t + 0.5 * whole - t_base)))
+        end = -math.log(_receptor(u_base, rest, rate * (t + whole - t_base)))
+        if abs(middle - 0.5 * (y + end)) > 2e-3 and whole > 1e-3:
+            length = 0.5 * whole
+            continue
+        length = min(2.0 * whole, tau)
+        half = 0.5 * whole
+        y_from, z_from, crossed = y, z, False
+        for k in range(2):
+            y_to = middle if k == 0 else end
+            z_to = _follow(y_from, y_to, z_from, half, half, tau)
+            if armed == 1:
+                high, low = reference + threshold_on - noise, reference - threshold_off - noise
+                if z_to >= high or z_to <= low:
+                    level = high if z_to >= high else low
+                    rising = z_to >= high
+                    before, after = 0.0, half
+                    for _ in range(20):
+                        guess = 0.5 * (before + after)
+                        beyond = _follow(y_from, y_to, z_from, half, guess, tau) >= level
+                        if beyond == rising:
+                            after = guess
+                        else:
+                            before = guess
+                    t += k * half + after
+                    z = level
+                    y = -math.log(_receptor(u_base, rest, rate * (t - t_base)))
+                    crossed = True
+                    break
+            y_from, z_from = y_to, z_to
+        if not crossed:
+            t = limit if last else t + whole
+            y, z = end, z_from
+    u_end = _receptor(u_base, rest, rate * (until - t_base))
+    return u_end, z, reference, t_ready, t_last_out, armed, draw, n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def pixel_factors(seed: Any, pixel: int, sensor: Array, quantiles: Array) -> tuple[float, float]:
     """exp(-threshold) for ON and exp(threshold) for OFF of one pixel, with its spread."""
     on = sensor[9] * (1.0 + sensor[11] * hash_normal(seed, pixel, 0, 3, quantiles))
@@ -175,7 +298,9 @@ def run_given_light(
     key = _mix(seed + np.uint64(pixel) * np.uint64(0x9E3779B97F4A7C15))
     u_base = 1.0 / light[0]
     t_base = edge_us[0]
-    reference = u_base
+    followed = sensor[12] > 0.0
+    z = math.log(light[0])
+    reference = z if followed else u_base
     t_ready = t_base
     t_last_out = -1e18
     armed = 1
@@ -185,6 +310,13 @@ def run_given_light(
         until = edge_us[i + 1] if i + 1 < light.size else end_us
         if i:
             draw += 1
+        if followed:
+            u_base, z, reference, t_ready, t_last_out, armed, draw, n = _run_piece_followed(
+                until, light[i], u_base, t_base, z, reference, t_ready, t_last_out, armed, draw, on_factor,
+                off_factor, 0, key, quantiles, shifts, sensor, out_t, out_code, out_cross, n,
+            )  # fmt: skip
+            t_base = until
+            continue
         u_base, reference, t_ready, t_last_out, armed, draw, n = _run_piece(
             until, light[i], u_base, t_base, reference, t_ready, t_last_out, armed, draw, on_factor,
             off_factor, 0, key, quantiles, shifts, sensor, out_t, out_code, out_cross, n,
@@ -276,6 +408,7 @@ def run_pixels(
     """
     sources = gain.size
     halfway = origin.shape[0] // 2
+    followed = sensor[12] > 0.0
     none = np.empty(0)
     most_clusters = levels.shape[1]
     weight = np.zeros((sources, most_clusters))
@@ -306,7 +439,7 @@ def run_pixels(
         on_factor, off_factor = s[ON_FACTOR], s[OFF_FACTOR]
         key = _mix(seed + np.uint64(pixel) * np.uint64(0x9E3779B97F4A7C15))
         u_base, t_base, reference = s[U_BASE], s[T_BASE], s[REFERENCE]
-        t_ready, t_last_out, light = s[T_READY], s[T_LAST_OUT], s[LIGHT]
+        t_ready, t_last_out, light, z = s[T_READY], s[T_LAST_OUT], s[LIGHT], s[FOLLOWER]
         draw, armed = c[DRAW], c[ARMED]
         around = 0.0
         for g in range(sources):
@@ -394,12 +527,19 @@ def run_pixels(
                 new = False
                 light = total
                 u_base, t_base = 1.0 / light, t
-                reference, t_ready, armed = u_base, t, 1
+                z = math.log(light)
+                reference, t_ready, armed = (z if followed else u_base), t, 1
                 draw += 1
                 continue
             if abs(total - light) <= LIGHT_STEP * light:
                 continue
-            if t > t_base:
+            if followed and t > t_base:
+                u_base, z, reference, t_ready, t_last_out, armed, draw, n = _run_piece_followed(
+                    t, light, u_base, t_base, z, reference, t_ready, t_last_out, armed, draw, on_factor,
+                    off_factor, code, key, quantiles, shifts, sensor, out_t, out_code, none, n,
+                )  # fmt: skip
+                t_base = t
+            elif t > t_base:
                 u_base, reference, t_ready, t_last_out, armed, draw, n = _run_piece(
                     t, light, u_base, t_base, reference, t_ready, t_last_out, armed, draw, on_factor,
                     off_factor, code, key, quantiles, shifts, sensor, out_t, out_code, none, n,
@@ -408,12 +548,19 @@ def run_pixels(
             light = total
             if source >= 0:
                 draw += 1
-        u_base, reference, t_ready, t_last_out, armed, draw, n = _run_piece(
-            end_us, light, u_base, t_base, reference, t_ready, t_last_out, armed, draw, on_factor,
-            off_factor, code, key, quantiles, shifts, sensor, out_t, out_code, none, n,
-        )  # fmt: skip
+        if followed:
+            u_base, z, reference, t_ready, t_last_out, armed, draw, n = _run_piece_followed(
+                end_us, light, u_base, t_base, z, reference, t_ready, t_last_out, armed, draw, on_factor,
+                off_factor, code, key, quantiles, shifts, sensor, out_t, out_code, none, n,
+            )  # fmt: skip
+        else:
+            u_base, reference, t_ready, t_last_out, armed, draw, n = _run_piece(
+                end_us, light, u_base, t_base, reference, t_ready, t_last_out, armed, draw, on_factor,
+                off_factor, code, key, quantiles, shifts, sensor, out_t, out_code, none, n,
+            )  # fmt: skip
         s[U_BASE], s[T_BASE], s[REFERENCE] = u_base, end_us, reference
         s[T_READY], s[T_LAST_OUT], s[LIGHT] = t_ready, t_last_out, light
+        s[FOLLOWER] = z
         c[DRAW], c[ARMED] = draw, armed
     return last, n
 

@@ -179,6 +179,15 @@ class SensorSpec:
     dark_w_m2: Annotated[float, Field(gt=0, description="Dark current as light; a guess.")] = 1e-4
     dly_on_us: Annotated[float, Field(ge=0, le=1000, description="Fixed delay of ON events.")] = 22.0
     dly_off_us: Annotated[float, Field(ge=0, le=1000, description="Fixed delay of OFF events.")] = 33.0
+    tau_sf_us: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=1000,
+            description="Time constant of a source follower behind the receptor; 0, the default, for none:"
+            " with one, crossing times are computed in adaptive steps and rendering is ten times slower.",
+        ),
+    ] = 0.0
     jitter_us: Annotated[float, Field(ge=0, le=100, description="Sigma of the delays.")] = 0.0
     refr_us: Annotated[float, Field(ge=1, le=10_000, description="Refractory time; a guess.")] = 10.0
     noise_ln: Annotated[float, Field(ge=0, le=0.2, description="Rms noise of the log signal.")] = 0.03

@@ -40,13 +40,13 @@ _MASK64 = 2**64 - 1
 
 
 def sensor_vector(sensor: SensorSpec) -> Floats:
-    """What the kernels need of a sensor, float64 (12,): see `_kernels`."""
+    """What the kernels need of a sensor, float64 (13,): see `_kernels`."""
     s = sensor
     widest = math.exp(_kernels.NOISE_LIMIT * s.noise_ln)
     return np.array(
         [
             *(s.charge_us_w_m2, s.refr_us, s.dly_on_us, s.dly_off_us, s.jitter_us, s.p_on_miss, s.p_off_miss),
-            *(s.noise_ln, widest, s.th_on, s.th_off, s.th_spread),
+            *(s.noise_ln, widest, s.th_on, s.th_off, s.th_spread, s.tau_sf_us),
         ]
     )
 
@@ -129,7 +129,7 @@ class Simulation:
         self._shifts = np.exp(scene.sensor.noise_ln * self._quantiles)
         self._texture = _texture(scene)
         size = scene.camera.width * scene.camera.height
-        self._state = np.zeros((size, 8))
+        self._state = np.zeros((size, 9))
         self._counters = np.zeros((size, 3), np.int64)
         self._counters[:, _kernels.BLOCK] = -2
         hot = np.empty(size, np.int64)

@@ -1,15 +1,17 @@
 """The truth beside a recording: what was sent, and where the bars were."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.sim.motion import project
 from evlcp_sdk.sim.optics import blur_sigma_px
-from evlcp_sdk.sim.scene import Scene
+from evlcp_sdk.sim.scene import Scene, resolve_scene
 from evlcp_sdk.sim.simulation import Simulation, scene_table
 
-__all__ = ["truth", "truth_of"]
+__all__ = ["scene_of_truth", "truth", "truth_of"]
 
 
 def truth(scene: Scene, seed: int | None = None) -> dict[str, Any]:
@@ -80,7 +82,7 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
             "dly_on_us": sensor.dly_on_us,
             "dly_off_us": sensor.dly_off_us,
             "jitter_us": sensor.jitter_us,
-            "tau_sf_us": 0.0,
+            "tau_sf_us": sensor.tau_sf_us,
             "hpf_us": 0.0,
             "t_row_us": sensor.t_row_us,
             "cap_mev_s": sensor.cap_mev_s,
@@ -110,3 +112,69 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
     if simulation.done_s:
         found |= simulation.counts
     return found
+
+
+def scene_of_truth(truth: Mapping[str, Any]) -> Scene:
+    """The scene of a recording, from its truth: the same bars, symbols, light and sensor; another vibration.
+
+    A truth written here gives exactly its scene. Of another generator's, with the same keys, everything is
+    taken over that both know; lamps are as many, but at other places.
+
+    Raises:
+        ConfigError: Keys are missing, or ask for what is not modelled (`hpf_us`).
+    """
+    if "simulator" in truth:
+        return resolve_scene(truth["simulator"], source="truth")
+    try:
+        told, camera = truth["scene"], truth["camera"]
+        if told["hpf_us"] != 0:
+            raise ConfigError(f"truth: scene.hpf_us = {told['hpf_us']}: a high-pass filter is not modelled")
+        same = (
+            *(
+                "th_on",
+                "th_off",
+                "noise_ln",
+                "noise_hz",
+                "p_on_miss",
+                "p_off_miss",
+                "dly_on_us",
+                "dly_off_us",
+            ),
+            *("jitter_us", "tau_sf_us", "refr_us", "t_row_us", "cap_mev_s"),
+        )
+        shape = (
+            "x_m",
+            "y_m",
+            "z_m",
+            "length_m",
+            "width_m",
+            "clusters",
+            "profile",
+            "frames",
+            "ppm",
+            "led_w_m2",
+        )
+        pixels = camera["width"] * camera["height"]
+        table = {
+            "name": told["name"],
+            "duration_s": told["duration_s"],
+            "t0_us": told["t0_us"],
+            "seed": told["seed"],
+            "flicker_lamps": told["flicker_lamps"],
+            "camera": {key: camera[key] for key in ("width", "height", "focal_mm", "pitch_um")},
+            "lens": {key: told[key] for key in ("f_number", "focus_m", "halo")},
+            "motion": {key: told[key] for key in ("distance_m", "speed_mps", "vib_rate_rad_s")},
+            "background": {
+                "light_w_m2": told["background_w_m2"],
+                "texture": told["background_texture"],
+            },
+            "sensor": {key: told[key] for key in same} | {"hot_share": told["hot_pixels"] / pixels},
+            "bars": [
+                {key: bar[key] for key in (*shape, "start_chip", "chips_file")}
+                | ({"symbols": bar["symbols"]} if bar["symbols"] else {})
+                for bar in truth["bars"]
+            ],
+        }
+    except (KeyError, TypeError) as fault:
+        raise ConfigError(f"truth: not a scene's truth: {fault}") from fault
+    return resolve_scene(table, source="truth")

@@ -124,10 +124,11 @@ def crossing_by_steps(
     """Threshold crossings (us, ON) of one noiseless pixel, by integrating its log signal in small steps.
 
     dy/dt = (I - exp(y)) / Q by the classical Runge-Kutta method: the brute-force twin of the closed form.
+    With a source follower, dz/dt = (y - z) / tau behind it, and z is compared.
     """
-    charge = sensor.charge_us_w_m2
-    y = float(np.log(light(begin_us)))
-    reference = y
+    charge, tau = sensor.charge_us_w_m2, sensor.tau_sf_us
+    y = z = float(np.log(light(begin_us)))
+    reference = z
     blind_until = begin_us
     blind = False
     found = []
@@ -138,16 +139,17 @@ def crossing_by_steps(
         k2 = (now - np.exp(y + 0.5 * step_us * k1)) / charge
         k3 = (now - np.exp(y + 0.5 * step_us * k2)) / charge
         k4 = (now - np.exp(y + step_us * k3)) / charge
-        before = y
+        before, ramp_from = z, y
         y += step_us * (k1 + 2 * k2 + 2 * k3 + k4) / 6
+        z = y if tau == 0 else z + (0.5 * (ramp_from + y) - z) * -np.expm1(-step_us / tau)
         if blind and t + step_us >= blind_until:
             blind = False
-            reference = before + (y - before) * (blind_until - t) / step_us
+            reference = before + (z - before) * (blind_until - t) / step_us
         if blind:
             continue
         for on, level in ((True, reference + sensor.th_on), (False, reference - sensor.th_off)):
-            if (y >= level) if on else (y <= level):
-                when = t + step_us * (level - before) / (y - before)
+            if (z >= level) if on else (z <= level):
+                when = t + step_us * (level - before) / (z - before)
                 found.append((when, on))
                 blind, blind_until = True, when + sensor.refr_us
                 break

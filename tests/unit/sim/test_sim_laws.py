@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.config import load_link
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.geometry import CameraModel
 from evlcp_sdk.io import read_events
 from evlcp_sdk.rx.receiver import Receiver
@@ -21,6 +22,7 @@ from evlcp_sdk.sim import (
     SensorSpec,
     Simulation,
     load_scene,
+    scene_of_truth,
     simulate,
     truth,
     truth_of,
@@ -192,10 +194,28 @@ def test_the_truth_has_the_schema_of_the_recordings() -> None:
 
 
 @pytest.mark.skipif(not SHARED.exists(), reason="the recordings of ../shared are not there")
-def test_statistics_are_near_those_of_the_independent_recording() -> None:
-    theirs = read_events(SHARED / "night-50m-30kmh.raw")
-    scene = Scene(duration_s=0.1, background=BackgroundSpec(light_w_m2=0.05))
-    ours = every(scene)
+@pytest.mark.parametrize("name", ["night-50m-30kmh", "day-35m-20kmh", "tunnel-90m-30kmh"])
+def test_statistics_are_near_those_of_the_independent_recording(name: str) -> None:
+    theirs = read_events(SHARED / f"{name}.raw")
+    told = json.loads((SHARED / f"{name}.truth.json").read_text())
+    ours = every(replace(scene_of_truth(told), duration_s=0.05), threads=2)
     rate = [len(e) / (e.t_us[-1] - e.t_us[0]) for e in (ours, theirs)]
-    assert rate[0] == pytest.approx(rate[1], rel=0.3)
-    assert abs(float(ours.p.mean()) - float(theirs.p.mean())) < 0.15
+    assert rate[0] == pytest.approx(rate[1], rel=0.15)
+    assert abs(float(ours.p.mean()) - float(theirs.p.mean())) < 0.05
+
+
+def test_a_truth_gives_its_scene_again() -> None:
+    found = json.loads(json.dumps(truth(SHORT)))
+    assert scene_of_truth(found) == SHORT
+    # Without its own record, all that the shared keys tell.
+    del found["simulator"]
+    again = scene_of_truth(found)
+    assert [b.x_m for b in again.bars] == [b.x_m for b in SHORT.bars]
+    assert truth(again)["bars"][0]["symbols"] == found["bars"][0]["symbols"]
+    assert truth(again)["bars"][1]["start_chip"] == found["bars"][1]["start_chip"]
+    assert again.sensor == replace(SHORT.sensor, hot_share=found["scene"]["hot_pixels"] / (1280 * 720))
+    found["scene"]["hpf_us"] = 3.0
+    with pytest.raises(ConfigError, match="high-pass"):
+        scene_of_truth(found)
+    with pytest.raises(ConfigError, match="not a scene's truth"):
+        scene_of_truth({"scene": {}})

@@ -53,6 +53,22 @@ def test_crossings_are_those_of_brute_force_at_10_ns(
     np.testing.assert_allclose([t for t, _ in stepped[:both]], exact.cross_us[:both], atol=0.02)
 
 
+@pytest.mark.parametrize("tau_us", [2.0, 12.0])
+def test_a_source_follower_is_that_of_brute_force(tau_us: float) -> None:
+    sensor = replace(IDEAL, tau_sf_us=tau_us, refr_us=20.0)
+    light = np.array([0.05, 51.0, 0.05, 3.0, 51.0, 0.05, 1.0])
+    edges = np.arange(7) * 100.0
+    stepped = crossing_by_steps(sensor, lambda t: float(light[int(t // 100)]), 0.0, 700.0)
+    exact = pixel_events(sensor, edges, light, 700.0)
+    assert [on for _, on in stepped] == exact.on.tolist()
+    np.testing.assert_allclose([t for t, _ in stepped], exact.cross_us, atol=0.2)
+    # It smears a steep rise over more than a refractory time: more than one event.
+    assert exact.on[exact.cross_us < 200].sum() > (tau_us > 5)
+    without = pixel_events(replace(sensor, tau_sf_us=0.0), edges, light, 700.0)
+    hardly = pixel_events(replace(sensor, tau_sf_us=1e-3), edges, light, 700.0)
+    np.testing.assert_allclose(hardly.cross_us, without.cross_us, atol=0.05)
+
+
 @pytest.mark.parametrize("light", MEASURED_LATENCY)
 def test_latency_is_the_measured_one_within_15_percent(light: float) -> None:
     measured_on, measured_off = MEASURED_LATENCY[light]
