@@ -77,8 +77,8 @@ def sweep(
                 kept = store.results()
         progress = progress_of(plan, kept)
     else:
+        executor = make_executor(workers, dask)
         with Store(path, create=True) as store:
-            executor = make_executor(workers, dask)
             try:
                 with progress_bar(plan.name) as show:
                     progress = collect(plan, store, executor, run_job, show)

@@ -44,7 +44,7 @@ def names_in(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-COMMANDS = ["receive", "info", "demo", "config", "plugins"]
+COMMANDS = ["receive", "info", "sweep", "report", "demo", "config", "plugins"]
 
 
 def test_help_lists_commands_and_exit_codes(evlcp: Evlcp) -> None:
