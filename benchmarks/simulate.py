@@ -1,15 +1,17 @@
 """The simulator: events a second of one core, beside simulators that step through time.
 
-    python benchmarks/simulate.py [--seconds 0.25] [--rounds 3]
+    python benchmarks/simulate.py [--seconds 0.25] [--rounds 3] [--memory 60]
 
 Whole scenes, kernels warm, one thread, the best of the rounds: a bar at 30, 50 and 90 m, rendered to sorted
 events. Then the same pixels' worth of work three ways, in events a second: the closed form; a compiled loop
 that steps one pixel through the same light by 1 us and by 10 ns (what it takes to be as exact); and whole
-frames in NumPy, all pixels of the sensor, 1 us a step.
+frames in NumPy, all pixels of the sensor, 1 us a step. `--memory` renders a drive of so many seconds and
+prints the peak of the resident memory.
 """
 
 import argparse
 import math
+import resource
 import time
 from collections.abc import Callable
 
@@ -82,6 +84,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--seconds", type=float, default=0.25)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--memory", type=float, default=0.0)
     args = parser.parse_args()
     for _ in Simulation(load_scene("drive-30kmh", ["duration_s=0.004"])).stream():
         pass
@@ -114,6 +117,14 @@ def main() -> None:
         )
         print(f"pixels, steps of {step_us:4g} us      {rate:8.3f} Mev/s")
     print(f"frames, steps of 1 us, NumPy  {best(lambda: frame_steps(sensor), 1):8.4f} Mev/s")
+
+    if args.memory:
+        drive = {"motion.distance_m": 8.333 * args.memory + 30, "duration_s": args.memory}
+        began = time.perf_counter()
+        events = sum(map(len, Simulation(load_scene("drive-30kmh", drive)).stream()))
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        elapsed = time.perf_counter() - began
+        print(f"{args.memory:g} s of driving: {events / 1e6:.0f} Mev in {elapsed:.0f} s, peak {peak:.0f} MB")
 
 
 if __name__ == "__main__":

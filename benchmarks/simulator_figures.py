@@ -9,16 +9,21 @@ recording needs ../shared/recordings and is left out without it.
 import argparse
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.stats import binomtest, norm
+from scipy.stats import binomtest, chi2, norm
 
+from evlcp_sdk.config import load_link
 from evlcp_sdk.io import read_events
-from evlcp_sdk.sim import BackgroundSpec, BarSpec, MotionSpec, Scene, SensorSpec, simulate, truth
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.score import BarScore, score_frames
+from evlcp_sdk.sim import BackgroundSpec, Scene, SensorSpec, scene_of_truth, simulate, truth
 from evlcp_sdk.sim.validation import (
     MEASURED_AREA,
     MEASURED_LATENCY,
@@ -139,30 +144,66 @@ def statistics(events: Events, centre: np.ndarray, duration_s: float) -> dict[st
     }
 
 
+def receive(pieces: Iterable[Events], told: dict[str, Any]) -> BarScore:
+    """What the receiver finds of the first bar."""
+    receiver = Receiver(load_link(overrides=[f"modulation.id={told['bars'][0]['profile']}"]))
+    packets = [packet for piece in pieces for packet in receiver.feed(piece)] + receiver.close()
+    rows = [
+        {
+            "t_us": str(f.t_us),
+            "symbols": " ".join(map(str, f.soft.symbols.tolist())),
+            "distance_m": "" if math.isnan(f.range.distance_m) else str(f.range.distance_m),
+            "x_px": str(f.x_px),
+            "y_px": str(f.y_px),
+        }
+        for packet in packets
+        for f in packet.frames
+    ]
+    return score_frames(rows, told).bars[0]
+
+
+def rmse_bounds(score: BarScore) -> tuple[float, float]:
+    """95 % bounds of the RMSE, by the chi-square distribution."""
+    n = len(score.error_m)
+    total = float((score.error_m**2).sum())
+    return math.sqrt(total / chi2.ppf(0.975, n)), math.sqrt(total / chi2.ppf(0.025, n))
+
+
 def compare() -> None:
-    path = SHARED / "night-50m-30kmh.raw"
-    if not path.exists():
+    paths = sorted(SHARED.glob("*-*m-*kmh.raw"))
+    if not paths:
         print("no ../shared/recordings: comparison left out")
         return
-    told = json.loads(path.with_suffix(".truth.json").read_text())
-    recorded = told["scene"]
-    bar = told["bars"][0]
-    scene = Scene(
-        duration_s=recorded["duration_s"],
-        motion=MotionSpec(distance_m=float(recorded["distance_m"]), speed_mps=recorded["speed_mps"]),
-        background=BackgroundSpec(light_w_m2=recorded["background_w_m2"]),
-        bars=(BarSpec(ppm=float(bar["ppm"]), start_chip=bar["start_chip"]),),
-    )
-    same = replace(SENSOR, **{k: recorded[k] for k in ("refr_us", "dly_on_us", "dly_off_us", "jitter_us")})
-    columns = [statistics(read_events(path), np.array(told["bar_centre_px"][0]), scene.duration_s)]
-    for sensor in (same, SENSOR):
-        made = replace(scene, sensor=sensor)
-        found = truth(made)
-        events = Events.concat(list(simulate(made)))
-        columns.append(statistics(events, np.array(found["bar_centre_px"][0]), scene.duration_s))
+    told = json.loads((SHARED / "night-50m-30kmh.truth.json").read_text())
+    scene = scene_of_truth(told)
+    columns = []
+    for events, truth_ in (
+        (read_events(SHARED / "night-50m-30kmh.raw"), told),
+        *(
+            (Events.concat(list(simulate(made))), truth(made))
+            for made in (scene, replace(scene, sensor=SENSOR))
+        ),
+    ):
+        columns.append(statistics(events, np.array(truth_["bar_centre_px"][0]), scene.duration_s))
     print("| | recording | its parameters here | defaults here |\n|---|---|---|---|")
     for key in columns[0]:
         print(f"| {key} | " + " | ".join(f"{c[key]:.4g}" for c in columns) + " |")
+    print("| | Mev/s | ON share | frames | wrong bits | RMSE m (95 %) |\n|---|---|---|---|---|---|")
+    for path in paths:
+        told = json.loads(path.with_suffix(".truth.json").read_text())
+        made = scene_of_truth(told)
+        for name, events, truth_ in (
+            (path.stem, read_events(path), told),
+            ("simulated", Events.concat(list(simulate(made))), truth(made)),
+        ):
+            score = receive([events], truth_)
+            low, high = rmse_bounds(score)
+            print(
+                f"| {name} | {len(events) / made.duration_s / 1e6:.2f} | {events.p.mean():.3f}"
+                f" | {score.frames_found}/{score.frames_sent} | {score.bit_errors}"
+                f" | {score.rmse_m:.3f} ({low:.3f} to {high:.3f}) |",
+                flush=True,
+            )
 
 
 def draw_scene(figure: Figure) -> None:
