@@ -43,6 +43,7 @@ def phase_only_correlation(
 class PocRanging(Ranging):
     """Phase-only correlation between the maps of cluster pairs, L = f S / (l' a) (arXiv 2510.17203).
 
+    A pair whose clusters lie a spacing off the scale that all clusters agree on is left out first.
     The shift of each pair comes from the Dirichlet kernel that fits the correlation's peak best. A shift
     has the same error whatever its length, so a pair's distance is the better the farther apart its clusters:
     the variance falls with the spacing squared, which gives the weights. The spread over clusters (delete-one
@@ -90,29 +91,39 @@ class PocRanging(Ranging):
         first, second, spacing = used[i[far]], used[j[far]], spacing[far]
         neighbour = float(np.min(np.hypot(*(centres[1:] - centres[:-1]).T)))
 
-        place = np.searchsorted(used, np.stack([first, second]))
+        # The scale that all clusters agree on tells which ones are out of place.
+        every = np.arange(bar.clusters)
+        i, j = np.triu_indices(bar.clusters, 1)
+        apart = np.hypot(*(centres[j] - centres[i]).T)
+        wide = apart >= 0.5 * apart.max()
+        wide_a, wide_b, wide_m = i[wide], j[wide], apart[wide]
 
         def measure(view: FrameView) -> Range:
             from evlcp_poc import _kernels
 
             maps = view.presence.pixels
-            middle = np.empty((len(used), 2), np.int64)
-            _kernels.middles(maps, used, self.min_pixels, middle)
+            middle = np.empty((len(every), 2), np.int64)
+            _kernels.middles(maps, every, self.min_pixels, middle)
             known = middle[:, 0] >= 0
-            pairs = known[place[0]] & known[place[1]]
+            pairs = known[wide_a] & known[wide_b]
             if not pairs.any():
                 return _NONE
-            a, b, apart_m = place[0][pairs], place[1][pairs], spacing[pairs]
-            apart_px = np.empty((len(a), 2))
-            px_per_m = _kernels.middle_shifts(middle, a, b, apart_m, apart_px)
+            a, b, apart_m = wide_a[pairs], wide_b[pairs], wide_m[pairs]
+            px_per_m = _kernels.middle_shifts(middle, a, b, apart_m, np.empty((len(a), 2)))
             if px_per_m <= 0:
                 return _NONE
             neighbour_px = px_per_m * neighbour
+            apart_px = (middle[second] - middle[first]).astype(np.float64)
+            off_px = np.hypot(apart_px[:, 0], apart_px[:, 1]) - px_per_m * spacing
+            pairs = known[first] & known[second] & (np.abs(off_px) <= neighbour_px)
+            if not pairs.any():
+                return _NONE
+            a, b, apart_m, apart_px = first[pairs], second[pairs], spacing[pairs], apart_px[pairs]
             # A cut of two spacings and a seam holds a cluster's blob with its blur, wherever it sits in it.
             height = _cut_size(2 * neighbour_px + 8)
             width = min(height, _cut_size(maps.shape[2]))
-            cuts = np.zeros((len(used), height, width), np.float32)
-            _kernels.cut_maps(maps, used, middle, cuts)
+            cuts = np.zeros((len(every), height, width), np.float32)
+            _kernels.cut_maps(maps, every, middle, cuts)
             correlation = phase_only_correlation(cuts, a, b)
             beyond = np.empty((len(a), 2))
             # Two medians of blobs of one spacing are wrong by half a spacing at the most.
@@ -123,7 +134,7 @@ class PocRanging(Ranging):
             distance = camera.focal_px * apart_m / np.maximum(length_px, 1e-9)
             weight = apart_m**self.weight_power
             mean, sigma, kept = _kernels.robust_mean(
-                distance, weight, a, b, len(used), self.drop_extremes, self.outlier_iqr
+                distance, weight, a, b, len(every), self.drop_extremes, self.outlier_iqr
             )
             return Range(float(mean), float(sigma), int(kept))
 
