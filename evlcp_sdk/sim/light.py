@@ -87,6 +87,7 @@ class BarLight:
         if bar.chips_file is not None:
             self._chips = _read_chips(Path(bar.chips_file), bar.clusters)
             self.packet_chips = len(self._chips)
+            self.longest_us *= _longest_run(self._chips)
         else:
             try:
                 self._codebook = _codebook(bar.profile, bar.clusters)
@@ -166,6 +167,16 @@ def _read_chips(path: Path, clusters: int) -> NDArray[np.uint8]:
         )
     found: NDArray[np.uint8] = chips.astype(np.uint8)
     return found
+
+
+def _longest_run(chips: NDArray[np.uint8]) -> int:
+    """The longest run of equal chips in any cluster, chips; sent again and again."""
+    twice = np.concatenate([chips, chips])
+    longest = 1
+    for cluster in twice.T:
+        cuts = np.flatnonzero(np.diff(cluster)) + 1
+        longest = max(longest, int(np.diff(np.concatenate([[0], cuts, [len(twice)]])).max()))
+    return longest
 
 
 @dataclass(frozen=True)

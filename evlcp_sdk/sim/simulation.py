@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.sim import _kernels
 from evlcp_sdk.sim.light import Source, sources_of
 from evlcp_sdk.sim.motion import CameraPath, project
@@ -122,6 +123,7 @@ class Simulation:
         self.bars, self.lamps = sources_of(scene)
         self._sources: list[Source] = [*self.bars, *self.lamps]
         self.path = CameraPath(scene.motion, scene.duration_s, scene.seed)
+        self._check_ahead()
         self._threads = max(1, threads)
         self._key = seed_key(scene.seed)
         self._sensor = sensor_vector(scene.sensor)
@@ -138,6 +140,14 @@ class Simulation:
         self._wide_table = step_table(scene.lens.halo_px, self._wide_reach, _WIDE_NODES)
         self._counts = dict.fromkeys(("events", "signal_events", "dropped_by_rate_cap", "dropped_blind"), 0)
         self._done_us = 0.0
+
+    def _check_ahead(self) -> None:
+        centres = np.array([bar.strip.centre_m for bar in self.bars]).reshape(-1, 3)
+        _, depth = project(centres, *self.path.at([0.0]), self.scene.camera)
+        for i in np.flatnonzero(depth[0] <= NEAREST_M):
+            raise ConfigError(
+                f"bars.{i}: the bar is behind the camera as the scene begins (depth {depth[0, i]:.2f} m)"
+            )
 
     @property
     def counts(self) -> dict[str, int]:

@@ -1,6 +1,7 @@
 """Scenes: what is read, what is refused, where light falls."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -136,6 +137,9 @@ def test_a_bar_sends_given_symbols_and_chips(tmp_path: Path) -> None:
     sent = BarLight(BarSpec(chips_file=str(tmp_path / "chips.npy"), start_chip=40.0), 1.0, seed=0)
     assert (sent.switches(0.0, 3000.0)[1] == np.concatenate([chips[40:], chips[:20]])).all()
     assert sent.sent_symbols(1.0) == []
+    assert sent.longest_us == 100 * max(
+        len(run) for row in np.tile(chips, (2, 1)).T for run in re.findall("0+|1+", "".join(map(str, row)))
+    )
     with pytest.raises(ConfigError, match="8 clusters"):
         BarLight(BarSpec(chips_file=str(tmp_path / "chips.npy"), clusters=8), 1.0, seed=0)
     with pytest.raises(InputError, match="cannot be read"):
@@ -203,6 +207,9 @@ def test_a_path_of_a_file_is_followed(tmp_path: Path) -> None:
     assert truth(scene)["distance_m"][0][100] == pytest.approx(39, abs=0.05)
     with pytest.raises(ConfigError, match=r"lasts from 0\.0 to 0\.2 s"):
         Simulation(load_scene(tmp_path / "scene.toml", ["duration_s=0.3"]))
+    (tmp_path / "path.csv").write_text("\n".join([line.replace("-", "") for line in lines]))
+    with pytest.raises(ConfigError, match=r"bars\.0: the bar is behind the camera .*depth -40\.00 m"):
+        Simulation(scene)
     (tmp_path / "path.csv").write_text("\n".join([lines[0], "0,0,0,x,0,0,0"]))
     with pytest.raises(ConfigError, match="line 2: no number in column z_m"):
         Simulation(scene)
