@@ -1,0 +1,103 @@
+"""`evlcp check`."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from evlcp_sdk.cli._common import Json, console
+
+if TYPE_CHECKING:
+    from evlcp_sdk.testing import Outcome
+
+__all__ = ["check", "register"]
+
+_STYLES = {"ok": "green", "failed": "bold red", "skipped": "dim", "excused": "yellow"}
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("check")(check)
+
+
+def check(
+    role: Annotated[str, typer.Argument(metavar="ROLE", help="What the algorithm does, e.g. ranging.")],
+    id: Annotated[str, typer.Argument(metavar="ID", help="Its id, as `evlcp plugins` lists it.")],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Check with another parameter; may be repeated."),
+    ] = None,
+    excuses: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--excuse",
+            metavar="LAW=REASON",
+            help="A law that is known to be broken, and why; may be repeated.",
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Hold an installed algorithm, yours or ours, against the laws of its role.
+
+    A built-in one:      [bold]evlcp check ranging poc[/]
+
+    With a parameter:    [bold]evlcp check ranging poc --set min_pixels=6[/]
+
+    For a script:        [bold]evlcp check decoding ml-soft --json[/]
+
+    One line a law: ok, failed (what was expected), skipped (why it does not apply), excused (by you).
+    An excused law that holds is a failure. Exit code 0: no failure, 1: a law is broken.
+    """
+    import json
+
+    from evlcp_sdk.config import load_link
+    from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.testing import check as hold
+    from evlcp_sdk.testing import laws_of
+
+    laws_of(role)
+    registry = Registry.load()
+    entry = registry.find(role, id)
+    reasons = {}
+    for text in excuses or []:
+        law, equals, reason = text.partition("=")
+        if not equals:
+            raise ConfigError(f"--excuse {text}: expected LAW=REASON")
+        reasons[law.strip()] = reason.strip()
+    parameters = [f"{role}.{override}" for override in overrides or []]
+    link = load_link(None, [f"{role}.id={json.dumps(id)}", *parameters], registry)
+    outcomes = hold(role, link.algorithm(role), reasons)
+    failed = sum(outcome.status == "failed" for outcome in outcomes)
+    if as_json:
+        typer.echo(
+            json.dumps(
+                {
+                    "role": role,
+                    "id": id,
+                    "distribution": entry.distribution,
+                    "version": entry.version,
+                    "parameters": {k: v for k, v in link.table[role].items() if k != "id"},
+                    "failed": failed,
+                    "laws": [
+                        {"law": o.law.name, "says": o.law.says, "status": o.status, "detail": o.detail}
+                        for o in outcomes
+                    ],
+                },
+                indent=2,
+            )
+        )
+    else:
+        _show(outcomes)
+        counts = [f"{n} {s}" for s in _STYLES if (n := sum(o.status == s for o in outcomes))]
+        console().print(f"{role} '{id}' of {entry.distribution} {entry.version}: {', '.join(counts)}")
+    raise typer.Exit(1 if failed else 0)
+
+
+def _show(outcomes: "list[Outcome]") -> None:
+    from rich.markup import escape
+
+    out = console()
+    width = max(len(o.law.name) for o in outcomes)
+    for o in outcomes:
+        text = o.law.says if o.status == "ok" else " ".join(o.detail.split())
+        out.print(f"[{_STYLES[o.status]}]{o.status:<7}[/]  {o.law.name:<{width}}  {escape(text)}")

@@ -1,0 +1,132 @@
+"""What a law is, and how an algorithm is held against one."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from evlcp_sdk.errors import ConfigError
+
+__all__ = [
+    "InapplicableLawError",
+    "Law",
+    "LawError",
+    "Outcome",
+    "Status",
+    "Subject",
+    "compiled",
+    "expect",
+    "judge",
+]
+
+Status = Literal["ok", "failed", "skipped", "excused"]
+"""`excused`: fails, as the author said it would, with a reason."""
+
+
+class LawError(AssertionError):
+    """An algorithm breaks a law; the message says what was expected."""
+
+
+class InapplicableLawError(Exception):
+    """A law does not concern an algorithm; the message is the reason."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An algorithm under test.
+
+    Attributes:
+        role: The role that it fills.
+        algorithm: The algorithm, with the parameters to be tested.
+    """
+
+    role: str
+    algorithm: Any
+
+    def __str__(self) -> str:
+        return f"{self.role} {type(self.algorithm).__name__}"
+
+
+@dataclass(frozen=True)
+class Law:
+    """What every algorithm of a role must do.
+
+    Attributes:
+        name: Short name, unique within a role.
+        says: The law in one line.
+        test: Raises `LawError` where the subject breaks it, `InapplicableLawError` where it does not concern
+            the subject.
+    """
+
+    name: str
+    says: str
+    test: Callable[[Subject], None]
+
+    def hold(self, subject: Subject) -> None:
+        """Hold a subject against the law.
+
+        Raises:
+            LawError: It breaks the law; any exception of the algorithm counts as that.
+            InapplicableLawError: The law does not concern it.
+        """
+        try:
+            self.test(subject)
+        except (LawError, InapplicableLawError):
+            raise
+        except Exception as fault:
+            raise LawError(f"expected no exception, got {type(fault).__name__}: {fault}") from fault
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a law was kept.
+
+    Attributes:
+        law: The law.
+        status: Whether it was kept.
+        detail: What was expected and found, or why the law was passed over; empty if it was kept.
+    """
+
+    law: Law
+    status: Status
+    detail: str = ""
+
+
+def expect(holds: object, what: str) -> None:
+    """Raise `LawError` with `what` was expected unless `holds`."""
+    if not holds:
+        raise LawError(f"expected {what}")
+
+
+def compiled(make: Callable[[], Any]) -> Any:
+    """What `make` compiles.
+
+    Raises:
+        InapplicableLawError: The algorithm refuses the test's bar or codes; that alone is for the law
+            `compiles` to judge.
+    """
+    try:
+        return make()
+    except ConfigError as refused:
+        raise InapplicableLawError(f"refused: {refused}") from refused
+
+
+def judge(law: Law, subject: Subject, excuses: Mapping[str, str]) -> Outcome:
+    """Hold a subject against a law; an excuse must be needed, or it is a failure itself.
+
+    Args:
+        law: The law.
+        subject: The algorithm.
+        excuses: Name of a law to the reason why it is known to be broken.
+    """
+    reason = excuses.get(law.name)
+    try:
+        law.hold(subject)
+    except InapplicableLawError as why:
+        if reason is not None:
+            return Outcome(law, "failed", f"excused ({reason}), but the law does not apply: {why}")
+        return Outcome(law, "skipped", str(why))
+    except LawError as fault:
+        return Outcome(law, "failed", str(fault)) if reason is None else Outcome(law, "excused", reason)
+    if reason is not None:
+        return Outcome(law, "failed", f"excused ({reason}), but it holds: drop the excuse")
+    return Outcome(law, "ok")

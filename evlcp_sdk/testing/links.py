@@ -1,0 +1,54 @@
+"""The law of the link: the whole receiver, with one algorithm exchanged, on a clean recording."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.testing.exercises import link_of
+from evlcp_sdk.testing.law import Law, Subject, compiled, expect
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
+from evlcp_sdk.types import Frame
+
+__all__ = ["LINK"]
+
+_PACKETS = 3
+_CLUSTER_PX = 8.0
+_NEAR = 0.05
+"""Half a pixel of the image's edges in 8 px."""
+
+
+def clean_link(subject: Subject) -> None:
+    """Hold the law."""
+    link = link_of(subject)
+    bar = IdealBar(random_symbols(link, _PACKETS), cluster_px=_CLUSTER_PX)
+    receiver = compiled(lambda: Receiver(link))
+    packets = receiver.feed(ideal_events(link, bar, missing=0.0)) + receiver.close()
+    frames = [frame for packet in packets for frame in packet.frames]
+    expect(
+        len(frames) == bar.symbols[..., 0].size,
+        f"all {bar.symbols[..., 0].size} frames of a clean recording, got {len(frames)}",
+    )
+    sent = bar.symbols.reshape(-1, link.codebook.clusters)
+    heard = np.array([frame.soft.symbols for frame in frames])
+    wrong = int((heard != sent).sum())
+    expect(wrong == 0, f"no wrong symbol in a clean recording, got {wrong} of {sent.size}")
+    centres = link.bar.cluster_centres_m()
+    true_m = link.camera.distance_m(float(np.hypot(*(centres[1] - centres[0]))), _CLUSTER_PX)
+    _expect_near(frames, true_m)
+
+
+def _expect_near(frames: Sequence[Frame], true_m: float) -> None:
+    for frame in frames:
+        ranges = [("distance", frame.range)] + ([("filtered", frame.filtered)] if frame.filtered else [])
+        for name, found in ranges:
+            expect(
+                abs(found.distance_m / true_m - 1) <= _NEAR,
+                f"{name} {true_m:.2f} m within {_NEAR:.0%}, got {found.distance_m:.2f} m",
+            )
+
+
+LINK = (
+    Law("clean-link", "no error in a clean recording with this algorithm in the default link", clean_link),
+)
+"""The law of the link, for every role."""

@@ -1,0 +1,148 @@
+"""Ideal recordings: a bar whose every pixel sends a few events after each edge; lamps; noise."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.config import Link
+from evlcp_sdk.frames import packet_chips
+from evlcp_sdk.types import Events
+
+__all__ = ["IdealBar", "ideal_events", "lamp_events", "merged", "noise_events", "random_symbols"]
+
+
+@dataclass(frozen=True, eq=False)
+class IdealBar:
+    """A transmitter in the image that sends given symbols; its centre moves on a circle.
+
+    Attributes:
+        symbols: What it says, int64 (packets, frames, clusters).
+        x_px: Column of its centre, px.
+        y_px: Row of its centre, px.
+        cluster_px: Spacing of its clusters in the image, px.
+        width_px: Its width, px.
+        ppm: How much faster than nominal its clock runs.
+        start_us: When its first packet begins, us.
+        shake_px: Radius of the circle, px.
+        shake_hz: Turns a second.
+    """
+
+    symbols: NDArray[np.int64]
+    x_px: float = 400.3
+    y_px: float = 350.7
+    cluster_px: float = 8.0
+    width_px: int = 4
+    ppm: float = 0.0
+    start_us: float = 5000.0
+    shake_px: float = 0.0
+    shake_hz: float = 10.0
+
+    def centre(self, t_us: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Column and row of the centre, px."""
+        phase = 2 * np.pi * self.shake_hz * t_us * 1e-6
+        return self.x_px + self.shake_px * np.sin(phase), self.y_px + self.shake_px * np.cos(phase)
+
+
+def random_symbols(link: Link, packets: int, seed: int = 0) -> NDArray[np.int64]:
+    """Random symbols of a link, int64 (packets, frames, clusters)."""
+    shape = (packets, link.packet.frames, link.codebook.clusters)
+    return np.random.default_rng(seed).integers(0, len(link.codebook.codewords), shape)
+
+
+def ideal_events(
+    link: Link,
+    bar: IdealBar,
+    *,
+    seed: int = 0,
+    events_per_edge: int = 3,
+    delay_on_us: float = 20.0,
+    delay_off_us: float = 40.0,
+    missing: float = 0.1,
+    t0_us: int = 0,
+) -> Events:
+    """What an ideal sensor sends: for each edge some events a pixel, late, jittered, some missing.
+
+    Args:
+        link: For codebook, packet format and the size of the sensor.
+        bar: The transmitter.
+        seed: Of jitter and missing events.
+        events_per_edge: Events that a pixel sends for each edge.
+        delay_on_us: From a rising edge to its first event, us.
+        delay_off_us: From a falling edge to its first event, us.
+        missing: Share of the events that are missing.
+        t0_us: Time of the camera's clock at the start of the recording, us.
+    """
+    rng = np.random.default_rng(seed)
+    chips = np.concatenate([packet_chips(s, link.codebook) for s in bar.symbols]).astype(np.int64)
+    edges = np.diff(chips, axis=0, prepend=0)
+    chip_us = link.packet.chip_us / (1 + bar.ppm * 1e-6)
+    clusters = link.codebook.clusters
+    rows = round(clusters * bar.cluster_px)
+    of_row = np.minimum((np.arange(rows) + 0.5) / bar.cluster_px, clusters - 1).astype(np.int64)
+    when, row = np.nonzero(edges[:, of_row])
+    sign = edges[when, of_row[row]]
+    count = bar.width_px * events_per_edge
+    when, row, sign = (np.repeat(v, count) for v in (when, row, sign))
+    column = np.tile(np.arange(count) % bar.width_px, len(when) // count)
+    order = np.tile(np.arange(count) // bar.width_px, len(when) // count)
+    t = bar.start_us + when * chip_us
+    t = t + np.where(sign > 0, delay_on_us, delay_off_us) + 12 * order + rng.normal(0, 4, len(t))
+    x, y = bar.centre(t)
+    u = np.floor(x - bar.width_px / 2 + 0.5 + column)
+    v = np.floor(y - rows / 2 + 0.5 + row)
+    keep = (rng.random(len(t)) >= missing) & (t >= 0)
+    keep &= (u >= 0) & (v >= 0) & (u < link.camera.width) & (v < link.camera.height)
+    t_us = np.floor(t[keep]).astype(np.int64) + t0_us
+    first = np.argsort(t_us, kind="stable")
+    seen = Events.of(t_us[first], u[keep][first], v[keep][first], (sign[keep] > 0)[first])
+    # A recording goes on for a while: its last event is noise in a corner.
+    end_us = bar.start_us + len(chips) * chip_us + t0_us
+    return Events.concat([seen, Events.of([end_us + 1000], [0], [0], [1])])
+
+
+def merged(*parts: Events) -> Events:
+    """All events in order of time."""
+    every = Events.concat(parts)
+    return every[np.argsort(every.t_us, kind="stable")]
+
+
+def lamp_events(
+    x: int, y: int, size: int, flicker_hz: float, duration_us: int, *, duty: float = 0.5, seed: int = 0
+) -> Events:
+    """A square lamp that flickers: its pixels send three events at each change of its light.
+
+    Args:
+        x: Its first column.
+        y: Its first row.
+        size: Its side, px.
+        flicker_hz: Flashes a second.
+        duration_us: How long, us.
+        duty: Share of a period that it shines.
+        seed: Of the jitter.
+    """
+    rng = np.random.default_rng(seed)
+    period_us = 1e6 / flicker_hz
+    starts = np.arange(0, duration_us, period_us)
+    edges = np.concatenate([starts, starts + duty * period_us])
+    on = np.concatenate([np.ones(len(starts)), np.zeros(len(starts))])
+    v, u = np.mgrid[y : y + size, x : x + size]
+    n = v.size * 3
+    t = np.repeat(edges, n) + np.tile(np.repeat([0, 12, 24], v.size), len(edges))
+    t = np.floor(t + rng.normal(25, 5, len(t)))
+    order = np.argsort(t, kind="stable")
+    columns = (
+        t,
+        np.tile(u.ravel(), 3 * len(edges)),
+        np.tile(v.ravel(), 3 * len(edges)),
+        np.repeat(on, n),
+    )
+    return Events.of(*(c[order] for c in columns))
+
+
+def noise_events(rate_hz: float, duration_us: int, seed: int = 0) -> Events:
+    """Random events all over a 1280x720 sensor."""
+    rng = np.random.default_rng(seed)
+    n = rng.poisson(rate_hz * duration_us * 1e-6)
+    t = np.sort(rng.integers(0, duration_us, n))
+    return Events.of(t, rng.integers(0, 1280, n), rng.integers(0, 720, n), rng.integers(0, 2, n))

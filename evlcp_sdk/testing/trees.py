@@ -1,0 +1,91 @@
+"""Arrays within tuples, lists and frozen dataclasses: copy, compare, replace."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["arrays_of", "copied", "difference", "mapped", "read_only", "strided"]
+
+Array = NDArray[Any]
+
+
+def mapped(value: Any, change: Callable[[Array], Array]) -> Any:
+    """The same structure with every array changed."""
+    if isinstance(value, np.ndarray):
+        return change(value)
+    if isinstance(value, tuple | list):
+        return type(value)(mapped(v, change) for v in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return type(value)(**{f.name: mapped(getattr(value, f.name), change) for f in fields(value)})
+    return value
+
+
+def arrays_of(value: Any) -> Iterator[Array]:
+    """Every array in it."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, tuple | list):
+        for v in value:
+            yield from arrays_of(v)
+    elif is_dataclass(value) and not isinstance(value, type):
+        for f in fields(value):
+            yield from arrays_of(getattr(value, f.name))
+
+
+def copied(array: Array) -> Array:
+    """A copy, writeable and contiguous."""
+    return array.copy()
+
+
+def read_only(array: Array) -> Array:
+    """A copy that cannot be written."""
+    out = array.copy()
+    out.setflags(write=False)
+    return out
+
+
+def strided(array: Array) -> Array:
+    """A copy whose elements lie two apart in memory."""
+    out = np.zeros((*array.shape[:-1], 2 * array.shape[-1]), array.dtype)[..., ::2]
+    out[...] = array
+    return out
+
+
+def difference(got: Any, wanted: Any, tolerance: float = 0.0, name: str = "result") -> str | None:
+    """Where two values differ, None where they do not; NaN equals NaN.
+
+    Args:
+        got: A value.
+        wanted: What it should be.
+        tolerance: Relative and absolute tolerance of floats; 0 for equal.
+        name: What the value is called.
+    """
+    if isinstance(wanted, np.ndarray):
+        if not isinstance(got, np.ndarray):
+            return f"{name}: {type(got).__name__}, not an array"
+        if got.shape != wanted.shape or got.dtype != wanted.dtype:
+            return f"{name}: {got.dtype} {got.shape}, not {wanted.dtype} {wanted.shape}"
+        floats = got.dtype.kind == "f"
+        near = np.isclose(got, wanted, tolerance, tolerance, equal_nan=True) if floats else got == wanted
+        if near.all():
+            return None
+        at = tuple(int(i) for i in np.argwhere(~near)[0])
+        return f"{name}{list(at)}: {got[at]}, not {wanted[at]}"
+    if isinstance(wanted, tuple | list):
+        if len(got) != len(wanted):
+            return f"{name}: {len(got)} entries, not {len(wanted)}"
+        parts = ((g, w, f"{name}[{i}]") for i, (g, w) in enumerate(zip(got, wanted, strict=True)))
+    elif is_dataclass(wanted) and not isinstance(wanted, type):
+        if type(got) is not type(wanted):
+            return f"{name}: {type(got).__name__}, not {type(wanted).__name__}"
+        names = [f.name for f in fields(wanted)]
+        parts = ((getattr(got, n), getattr(wanted, n), f"{name}.{n}") for n in names)
+    elif isinstance(wanted, float):
+        same = bool(np.isclose(got, wanted, tolerance, tolerance, equal_nan=True))
+        return None if same else f"{name}: {got}, not {wanted}"
+    else:
+        return None if got == wanted else f"{name}: {got!r}, not {wanted!r}"
+    return next((d for g, w, n in parts if (d := difference(g, w, tolerance, n)) is not None), None)

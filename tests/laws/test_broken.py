@@ -1,0 +1,464 @@
+"""The laws themselves: a deliberately broken algorithm for each must fail it, and for the right reason."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any
+
+import numpy as np
+import pytest
+from evlcp_barker.synchronization import BarkerSync
+from evlcp_centroid.ranging import CentroidRanging
+from evlcp_kalman.tracking import KalmanTracking
+from evlcp_wh.decoding import WhTransform
+from evlcp_wh.modulation import Wh8
+from evlcp_wh.pilots import WhPilots
+from evlcp_wh.separation import WhCorrelation
+from pydantic import Field
+
+from evlcp_sdk.abc import (
+    Decoding,
+    Modulation,
+    Pilots,
+    Ranging,
+    Separation,
+    Synchronization,
+    Tracker,
+    Tracking,
+)
+from evlcp_sdk.config import load_link
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.geometry import CameraModel
+from evlcp_sdk.hookspecs import ROLE_NAMES
+from evlcp_sdk.testing import LawError, laws_of
+from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
+from evlcp_sdk.testing.law import Subject
+from evlcp_sdk.testing.links import LINK
+from evlcp_sdk.types import PresenceMap, Range, SyncLock
+
+Change = Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class TamperedPilots(Pilots):
+    """Walsh-Hadamard pilots, tampered with."""
+
+    change_codes: Change | None = None
+    change_preamble: Change | None = None
+
+    def preamble(self) -> Any:
+        code = WhPilots().preamble()
+        return self.change_preamble(code) if self.change_preamble else code
+
+    def codes(self, clusters: int) -> Any:
+        codes = WhPilots().codes(clusters)
+        return self.change_codes(codes) if self.change_codes else codes
+
+
+@dataclass(frozen=True)
+class TamperedModulation(Modulation):
+    """Profile wh8, tampered with."""
+
+    change: Change
+
+    def codewords(self) -> Any:
+        return self.change(Wh8().codewords())
+
+
+def tampered(abstract: type, inner: Any) -> Callable[[Change], Any]:
+    """A role whose compiled function is changed; `change(function) -> function`."""
+
+    @dataclass(frozen=True)
+    class Tampered(abstract):  # type: ignore[misc]
+        """A built-in algorithm, tampered with."""
+
+        change: Change
+
+        def compile(self, *given: Any) -> Any:
+            return self.change(inner.compile(*given))
+
+    return Tampered
+
+
+synchronization = tampered(Synchronization, BarkerSync())
+separation = tampered(Separation, WhCorrelation())
+decoding = tampered(Decoding, WhTransform())
+ranging = tampered(Ranging, CentroidRanging())
+tracking = tampered(Tracking, KalmanTracking())
+
+
+def after(change: Change) -> Change:
+    """Tamper with the result."""
+    return lambda function: lambda *given: change(function(*given))
+
+
+def before(act: Change) -> Change:
+    """Do something to the inputs first."""
+
+    def tamper(function: Change) -> Change:
+        def call(*given: Any) -> Any:
+            act(*given)
+            return function(*given)
+
+        return call
+
+    return tamper
+
+
+# Form.
+
+
+@dataclass(frozen=True)
+class NoDefault(CentroidRanging):
+    """A parameter without a default."""
+
+    focus_m: float = field(kw_only=True)
+
+
+@dataclass
+class Thawed(Ranging):
+    """Parameters that can be assigned."""
+
+    def compile(self, *given: Any) -> Any:
+        return CentroidRanging().compile(*given)
+
+
+@dataclass(frozen=True)
+class Mute(CentroidRanging):
+    pass
+
+
+@dataclass(frozen=True)
+class MuteField(CentroidRanging):
+    """A parameter that nobody explains."""
+
+    knob: float = 1.0
+
+
+@dataclass(frozen=True)
+class NoJson(CentroidRanging):
+    """A parameter that JSON has no word for."""
+
+    knob: Annotated[complex, Field(description="A phase.")] = 1j
+
+
+@dataclass(frozen=True)
+class Forgetful(CentroidRanging):
+    """A parameter that is lost."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "min_clusters", self.min_clusters + 1)
+
+
+@dataclass(frozen=True)
+class Refusing(Ranging):
+    """Fits no bar."""
+
+    def compile(self, *given: Any) -> Any:
+        raise ConfigError("a panel of 7 x 3 clusters only")
+
+
+def one_buffer(function: Change) -> Change:
+    kept: dict[str, PresenceMap] = {}
+
+    def separate(sums: Any) -> PresenceMap:
+        found = kept.setdefault("map", function(sums))
+        new = function(sums)
+        found.pixels[...] = new.pixels
+        return found
+
+    return separate
+
+
+def spoil(view: Any) -> None:
+    view.sums[...] = 0
+
+
+def in_place(view: Any) -> None:
+    view.presence.pixels[...] = view.presence.pixels * np.float32(1)
+
+
+def as_bytes(view: Any) -> None:
+    view.sums.data.cast("b")
+
+
+# Codes.
+
+
+def star(codes: Any) -> Any:
+    """One code, and others that differ from it in one value."""
+    out = np.ones((len(codes), 32), np.int8)
+    out[np.arange(1, len(codes)), np.arange(1, len(codes))] = -1
+    return out
+
+
+def twins(codes: Any) -> Any:
+    out = codes.copy()
+    out[1] = out[0]
+    return out
+
+
+# Streams.
+
+
+@dataclass(frozen=True)
+class Sync:
+    """A synchronizer whose `step` is changed."""
+
+    inner: Any
+    change: Change
+
+    def init(self) -> Any:
+        return self.inner.init()
+
+    def step(self, state: Any, *given: Any) -> Any:
+        return self.change(self.inner, state, *given)
+
+
+def stepping(change: Change) -> Any:
+    return synchronization(lambda inner: Sync(inner, change))
+
+
+def locks_changed(change: Change) -> Any:
+    def step(inner: Any, state: Any, *given: Any) -> Any:
+        state, locks = inner.step(state, *given)
+        return state, [change(lock) for lock in locks]
+
+    return stepping(step)
+
+
+def amnesic(inner: Any, state: Any, *given: Any) -> Any:
+    return inner.step(inner.init(), *given)
+
+
+@dataclass(frozen=True)
+class MutatingSync:
+    """A synchronizer that keeps its state in one box."""
+
+    inner: Any
+
+    def init(self) -> Any:
+        return [self.inner.init()]
+
+    def step(self, state: Any, *given: Any) -> Any:
+        state[0], locks = self.inner.step(state[0], *given)
+        return state, locks
+
+
+def credulous(inner: Any, state: Any, t_us: Any, p: Any, until_us: int) -> Any:
+    state, locks = inner.step(state, t_us, p, until_us)
+    return state, [*locks, *([SyncLock(float(until_us), 100.0, 0.0, 0.0, 0.9)] if len(t_us) > 10 else [])]
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """Exponential smoothing, which lags; parts of it broken on demand."""
+
+    early: bool = False
+    nosy: bool = False
+
+    def init(self) -> Any:
+        return {"at": None, "looked": 0}
+
+    def predict(self, state: Any, t_us: float) -> Any:
+        if self.nosy:
+            state["looked"] += 1
+        if state["at"] is None:
+            return (np.zeros(1), 1.0) if self.early else None
+        return state["at"], 1.0
+
+    def step(self, state: Any, t_us: float, value: Any, sigma: float) -> Any:
+        at = value.copy() if state["at"] is None else state["at"] + 0.02 * (value - state["at"])
+        at = at + state["looked"]
+        return {"at": at, "looked": state["looked"]}, at, sigma
+
+
+def smoothing(**how: Any) -> Any:
+    return tracking(lambda _: Tracker(position=None, distance=Smoothing(**how)))  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Biased:
+    """A filter that is 10 m off."""
+
+    inner: Any
+
+    def init(self) -> Any:
+        return self.inner.init()
+
+    def predict(self, state: Any, t_us: float) -> Any:
+        return self.inner.predict(state, t_us)
+
+    def step(self, state: Any, t_us: float, value: Any, sigma: float) -> Any:
+        state, at, sigma = self.inner.step(state, t_us, value, sigma)
+        return state, at + 10.0, sigma
+
+
+# Images.
+
+
+def without_events(found: PresenceMap) -> PresenceMap:
+    return found if found.selected.any() else replace(found, selected=~found.selected)
+
+
+def leaning(function: Change) -> Change:
+    def measure(view: Any) -> Range:
+        rows = np.nonzero(view.presence.selected.any((0, 2)))[0]
+        found = function(view)
+        return replace(found, distance_m=found.distance_m * (1 + 0.01 * float(rows.mean())))
+
+    return measure
+
+
+def no_nan(found: Range) -> Range:
+    return Range(0.0, 0.0, 0) if np.isnan(found.distance_m) else found
+
+
+@dataclass(frozen=True)
+class OneCamera(CentroidRanging):
+    """Knows one lens."""
+
+    def compile(self, camera: CameraModel, bar: Any, codebook: Any) -> Any:
+        return CentroidRanging().compile(CameraModel(), bar, codebook)
+
+
+@dataclass(frozen=True)
+class OneOrder(Separation):
+    """Knows one order of pilots."""
+
+    def compile(self, codebook: Any) -> Any:
+        return WhCorrelation().compile(load_link().codebook)
+
+
+def numbered(soft: Any) -> Any:
+    return replace(soft, llr=soft.llr * np.arange(1, len(soft.llr) + 1, dtype=np.float32)[:, None])
+
+
+def constant(found: Range) -> Range:
+    return replace(found, distance_m=50.0)
+
+
+BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
+    "form": [
+        ("defaults", NoDefault(focus_m=1.0), "a default of field 'focus_m'"),
+        ("defaults", WhPilots(), "an instance of Ranging"),
+        ("frozen", Thawed(), "frozen=True"),
+        ("described", Mute(), "a docstring of class Mute"),
+        ("described", MuteField(), "field 'knob' as Annotated"),
+        ("round-trip", NoJson(), "got TypeError"),
+        ("round-trip", Forgetful(), "min_clusters=7"),
+        ("picklable", ranging(lambda function: function), "pickle"),
+        ("compiles", Refusing(), "got: a panel of 7 x 3 clusters only"),
+        ("inputs-kept", ranging(before(spoil)), "inputs to stay as they were"),
+        ("read-only", ranging(before(in_place)), "read-only"),
+        ("non-contiguous", ranging(before(as_bytes)), "contiguous"),
+        (
+            "deterministic",
+            ranging(after(lambda r: replace(r, distance_m=r.distance_m + np.random.random()))),  # noqa: NPY002
+            "the same result when called again",
+        ),
+        ("deterministic", ranging(before(lambda _: np.random.random())), "take a Generator"),  # noqa: NPY002
+    ],
+    "pilots": [
+        ("shapes", TamperedPilots(lambda codes: codes.astype(float)), "int8"),
+        ("shapes", TamperedPilots(lambda codes: codes[:3]), "to have 4 rows"),
+        ("pilots-apart", TamperedPilots(star), "correlate by 0.25 at most"),
+        ("sharp-preamble", TamperedPilots(change_preamble=np.abs), "sidelobes"),
+        ("tells-apart", TamperedPilots(star), "of cluster 0"),
+    ],
+    "modulation": [
+        ("shapes", TamperedModulation(lambda words: words[:3]), "codewords, got 3"),
+        ("shapes", TamperedModulation(lambda words: 0 * words), "-1 and \\+1"),
+        ("codewords-distinct", TamperedModulation(twins), "16 different codewords, got 15"),
+        ("comes-back", TamperedModulation(twins), "two rows are equal"),
+    ],
+    "synchronization": [
+        ("shapes", locks_changed(lambda lock: replace(lock, quality=2.0)), "quality from 0 to 1"),
+        (
+            "finds-time",
+            locks_changed(lambda lock: replace(lock, packet_t_us=lock.packet_t_us + 70)),
+            "to half a chip",
+        ),
+        (
+            "finds-time",
+            locks_changed(lambda lock: replace(lock, chip_us=lock.chip_us * 1.0001)),
+            "within 30 ppm",
+        ),
+        ("finds-time", stepping(lambda inner, state, *given: (state, [])), "one lock a packet"),
+        ("any-split", stepping(amnesic), "the same locks from events fed"),
+        ("state-kept", synchronization(MutatingSync), "not to change the state"),
+        ("no-lock-in-noise", stepping(credulous), "no lock in noise"),
+    ],
+    "separation": [
+        (
+            "shapes",
+            separation(after(lambda m: replace(m, probability=m.probability.astype(float)))),
+            "probability as float32",
+        ),
+        (
+            "finds-clusters",
+            separation(after(lambda m: replace(m, selected=np.roll(m.selected, 1, 0)))),
+            "of each cluster's pixels",
+        ),
+        ("sees-nothing", separation(after(without_events)), "no cell selected without events"),
+        ("permutes", OneOrder(), "in another order"),
+        ("results-owned", separation(one_buffer), "not to change the next"),
+    ],
+    "decoding": [
+        ("shapes", decoding(after(lambda s: replace(s, llr=s.llr.astype(float)))), "llr as float32"),
+        (
+            "inverts",
+            decoding(after(lambda s: replace(s, symbols=s.symbols ^ 1))),
+            "profile raw8: symbol 0, got 1",
+        ),
+        ("llr-agrees", decoding(after(lambda s: replace(s, llr=-s.llr))), "llr > 0 where a bit is 0"),
+        ("permutes", decoding(after(numbered)), "llr in the order"),
+        ("knows-nothing", decoding(after(lambda s: replace(s, llr=s.llr + 5))), "llr of 0"),
+        ("clean-link", decoding(after(lambda s: replace(s, symbols=s.symbols ^ 1))), "no wrong symbol"),
+    ],
+    "ranging": [
+        ("shapes", ranging(after(lambda r: replace(r, pairs=0))), "pairs as a count"),
+        ("exact", ranging(after(lambda r: replace(r, distance_m=r.distance_m * 1.01))), "exactly 4 px apart"),
+        ("monotone", ranging(after(constant)), "distances that fall"),
+        ("moved", ranging(leaning), "wherever the bar stands"),
+        ("focal-length", OneCamera(), "twice the distance"),
+        ("sees-nothing", ranging(after(no_nan)), "a distance of NaN from no cluster"),
+        (
+            "clean-link",
+            ranging(after(lambda r: replace(r, distance_m=r.distance_m * 1.1))),
+            "distance 54.01 m within 5%",
+        ),
+    ],
+    "tracking": [
+        ("shapes", smoothing(early=True), "a prediction of None"),
+        ("any-split", smoothing(nosy=True), "not to change what follows"),
+        ("straight-line", smoothing(), "no more error than measured"),
+        (
+            "clean-link",
+            tracking(lambda t: Tracker(position=None, distance=Biased(t.distance))),  # type: ignore[arg-type]
+            "filtered 54.01 m within 5%",
+        ),
+    ],
+}
+"""Role (or form) to (law, algorithm that breaks it, what is said)."""
+
+CASES = [
+    pytest.param("ranging" if role == "form" else role, *case, id=f"{role}-{case[0]}-{i}")
+    for role, cases in BROKEN.items()
+    for i, case in enumerate(cases)
+]
+
+
+@pytest.mark.parametrize(("role", "name", "algorithm", "said"), CASES)
+def test_the_law_finds_the_fault(role: str, name: str, algorithm: Any, said: str) -> None:
+    law = next(law for law in laws_of(role) if law.name == name)
+    with pytest.raises(LawError, match=said):
+        law.hold(Subject(role, algorithm))
+
+
+@pytest.mark.parametrize("role", ROLE_NAMES)
+def test_every_law_has_a_broken_algorithm(role: str) -> None:
+    of_form = {law.name for law in (*DESCRIPTION, *FUNCTION, *RESULT)}
+    assert of_form <= {name for cases in BROKEN.values() for name, _, _ in cases}
+    own = {law.name for law in laws_of(role)} - of_form - {law.name for law in LINK}
+    assert own <= {name for name, _, _ in BROKEN[role]}
+    assert len({law.name for law in laws_of(role)}) == len(laws_of(role))

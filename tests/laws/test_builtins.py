@@ -1,0 +1,46 @@
+"""Every algorithm of the SDK keeps every law of its role."""
+
+import pytest
+
+from evlcp_sdk.registry import Registry
+from evlcp_sdk.testing import Law, laws_of
+from evlcp_sdk.testing.law import Subject, judge
+
+REGISTRY = Registry.load()
+EXCUSES: dict[tuple[str, str], dict[str, str]] = {
+    ("tracking", "kalman"): {"results-owned": "the first filtered value is the measurement's own array"},
+}
+"""Algorithm to the laws that it is known to break, each with its reason."""
+
+CASES = [
+    pytest.param(entry.algorithm.role, entry.algorithm.id, law, id=f"{entry.algorithm.id}-{law.name}")
+    for entry in REGISTRY.installed()
+    if entry.distribution == "evlcp-sdk"
+    for law in laws_of(entry.algorithm.role)
+]
+
+
+@pytest.mark.parametrize(("role", "id", "law"), CASES)
+def test_law(role: str, id: str, law: Law) -> None:
+    algorithm = REGISTRY.load_class(role, id)()
+    outcome = judge(law, Subject(role, algorithm), EXCUSES.get((role, id), {}))
+    if outcome.status == "skipped":
+        pytest.skip(outcome.detail)
+    if outcome.status == "excused":
+        pytest.xfail(outcome.detail)
+    assert outcome.status == "ok", outcome.detail
+
+
+def test_only_what_does_nothing_is_passed_over() -> None:
+    """A law that is skipped for a reason of its own making would hide a fault."""
+    skipped = {
+        (role, id)
+        for role, id, law in (case.values for case in CASES)
+        if judge(law, Subject(role, REGISTRY.load_class(role, id)()), {}).status == "skipped"  # type: ignore[attr-defined,arg-type]
+    }
+    assert skipped == {("tracking", "none")}
+
+
+def test_excuses_name_what_is_there() -> None:
+    for role, id in EXCUSES:
+        assert REGISTRY.find(role, id)
