@@ -169,7 +169,7 @@ def assert_same(locks):
     assert_allclose([astuple(k) for k in locks], [astuple(k) for k in WHOLE], atol=1e-9)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.lists(st.integers(0, END_US // BIN_US), max_size=60))
 def test_any_steps_give_the_same_locks(cuts):
     locks, _ = locks_of(*STREAM, cuts=[*sorted(BIN_US * c for c in cuts), END_US])

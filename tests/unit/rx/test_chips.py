@@ -54,7 +54,7 @@ def test_a_blob_that_moves_stays_where_it_is():
     assert_array_equal(offset, np.zeros((2, CHIPS)))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.lists(st.integers(0, 4000), max_size=12))
 def test_any_split_of_the_stream_gives_the_same(cuts):
     events = stream(0)

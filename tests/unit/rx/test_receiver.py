@@ -176,7 +176,7 @@ STREAM = merged(
 WHOLE = rows(received(LINK, STREAM))
 
 
-@settings(deadline=None, max_examples=12)
+@settings(max_examples=12)
 @given(st.lists(st.integers(0, len(STREAM)), max_size=40))
 def test_any_split_gives_the_same(cuts: list[int]) -> None:
     bounds = sorted({0, len(STREAM), *cuts})
