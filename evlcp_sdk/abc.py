@@ -21,8 +21,11 @@ from evlcp_sdk.types import FrameView, PresenceMap, Range, SoftSymbols, SyncLock
 
 __all__ = [
     "ROLES",
+    "Code",
+    "Corrected",
     "Decode",
     "Decoding",
+    "ErrorCorrection",
     "Filter",
     "Measure",
     "Modulation",
@@ -165,6 +168,59 @@ class Tracking(ABC):
     @abstractmethod
     def compile(self) -> Tracker:
         """Make the filters."""
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """A block as the code understands it.
+
+    Attributes:
+        bits: Message bits, uint8 (message_bits,); the best guess where the check fails.
+        ok: The check against undetected errors holds.
+        flipped: Received bits (the signs of the LLRs) that differ from the coded bits decided for.
+    """
+
+    bits: NDArray[np.uint8]
+    ok: bool
+    flipped: int
+
+
+class Code(Protocol):
+    """What `ErrorCorrection.compile` returns: message bits to coded bits and back.
+
+    Attributes:
+        message_bits: Bits of a message that a block carries.
+        coded_bits: Bits of the block on air.
+    """
+
+    message_bits: int
+    coded_bits: int
+
+    def encode(self, bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Message bits uint8 (message_bits,), 0 or 1 -> coded bits uint8 (coded_bits,).
+
+        Raises:
+            ConfigError: Bits of another number.
+        """
+
+    def decode(self, llr: NDArray[np.float32]) -> Corrected:
+        """LLRs ln P(bit 0) / P(bit 1) of the coded bits, float32 (coded_bits,), 0 for a bit not received.
+
+        Raises:
+            ConfigError: LLRs of another number.
+        """
+
+
+class ErrorCorrection(ABC):
+    """Message bits to coded bits and back, with a check against undetected errors."""
+
+    @abstractmethod
+    def compile(self, coded_bits: int) -> Code:
+        """Precompute for blocks of so many bits on air.
+
+        Raises:
+            ConfigError: The block is too short to carry anything.
+        """
 
 
 ROLES: dict[str, type[ABC]] = {
