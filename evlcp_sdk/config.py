@@ -54,6 +54,9 @@ class AirSpec:
 
     chip_rate_hz: Annotated[float, Field(gt=0, description="Chips sent a second.")] = 10_000.0
     frames_per_packet: Annotated[int, Field(gt=0, description="Frames between two preambles.")] = 10
+    pilot_every: Annotated[
+        int, Field(gt=0, le=64, description="Frames from one pilot to the next; 1: every frame has one.")
+    ] = 1
 
 
 @dataclass(frozen=True)
@@ -278,7 +281,7 @@ def resolve(
         algorithms={role: built[role] for role in ROLE_NAMES},
         revisions=revisions,
         codebook=codebook,
-        packet=PacketFormat.of(codebook, air.frames_per_packet, air.chip_rate_hz),
+        packet=PacketFormat.of(codebook, air.frames_per_packet, air.chip_rate_hz, air.pilot_every),
         table=resolved,
         digest=_digest(resolved, codebook, revisions),
     )

@@ -1,7 +1,8 @@
 """Frames and packets: symbols and bits to chips on air, and back.
 
 A packet is the preamble followed by F frames; a frame is a pilot and an info segment; packets follow one
-another without a gap (air interface 1).
+another without a gap (air interface 1). At a higher rate only every N-th frame of a packet, from its first
+on, has a pilot; the others are the info segment alone.
 """
 
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ class PacketFormat:
     >>> book = Codebook("demo", hadamard(2)[1], hadamard(8), hadamard(8))
     >>> PacketFormat.of(book, frames=10).frame_chips
     32
+    >>> PacketFormat.of(book, frames=10, pilot_every=4).packet_chips
+    212
     """
 
     preamble_chips: int = 26
@@ -30,9 +33,12 @@ class PacketFormat:
     info_chips: int = 16
     frames: int = 10
     chip_rate_hz: float = 10_000.0
+    pilot_every: int = 1
 
     @classmethod
-    def of(cls, codebook: Codebook, frames: int, chip_rate_hz: float = 10_000.0) -> "PacketFormat":
+    def of(
+        cls, codebook: Codebook, frames: int, chip_rate_hz: float = 10_000.0, pilot_every: int = 1
+    ) -> "PacketFormat":
         """The format that a codebook's code lengths imply."""
         return cls(
             preamble_chips=2 * len(codebook.preamble),
@@ -40,26 +46,40 @@ class PacketFormat:
             info_chips=2 * codebook.codewords.shape[1],
             frames=frames,
             chip_rate_hz=chip_rate_hz,
+            pilot_every=pilot_every,
         )
 
     @property
     def frame_chips(self) -> int:
-        """Chips of one frame: pilot and info segment."""
+        """Chips of a frame with a pilot: pilot and info segment."""
         return self.pilot_chips + self.info_chips
 
     @property
     def packet_chips(self) -> int:
         """Chips of one packet: preamble and frames."""
-        return self.preamble_chips + self.frames * self.frame_chips
+        return self.frame_start_chip(self.frames)
 
     @property
     def chip_us(self) -> float:
         """Nominal length of a chip, us."""
         return 1e6 / self.chip_rate_hz
 
+    def has_pilot(self, frame: int) -> bool:
+        """Whether a frame of the packet begins with a pilot."""
+        return frame % self.pilot_every == 0
+
     def frame_start_chip(self, frame: int) -> int:
-        """Chip of the packet at which a frame's pilot begins."""
-        return self.preamble_chips + frame * self.frame_chips
+        """Chip of the packet at which a frame begins: with its pilot, or with its info segment."""
+        pilots = -(-frame // self.pilot_every)
+        return self.preamble_chips + frame * self.info_chips + pilots * self.pilot_chips
+
+    def gross_bit_s(self, bits_per_symbol: int, clusters: int) -> float:
+        """Bits on air a second, the share of preamble and pilots taken off.
+
+        >>> round(PacketFormat().gross_bit_s(6, 16))
+        27746
+        """
+        return self.frames * clusters * bits_per_symbol * self.chip_rate_hz / self.packet_chips
 
 
 def _checked(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.int64]:
@@ -77,8 +97,13 @@ def _checked(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.int64]:
     return s.astype(np.int64)
 
 
-def packet_chips(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.uint8]:
+def packet_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -> NDArray[np.uint8]:
     """Chips of one packet: symbols (F, K) to uint8 (chips, K), 1 = on.
+
+    Args:
+        symbols: The packet's symbols.
+        codebook: What they mean.
+        pilot_every: Frames from one pilot to the next.
 
     Raises:
         ConfigError: Symbols of another shape or outside the codebook.
@@ -88,8 +113,8 @@ def packet_chips(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.uint8]:
     pilot = chips_of_values(codebook.pilots).T
     info = chips_of_values(codebook.codewords)
     parts = [preamble]
-    for row in s:
-        parts += [pilot, info[row].T]
+    for frame, row in enumerate(s):
+        parts += [pilot, info[row].T] if frame % pilot_every == 0 else [info[row].T]
     return np.concatenate(parts)
 
 

@@ -54,6 +54,42 @@ def test_packet_is_the_vector() -> None:
 
 
 @pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize(("frames", "every"), [(10, 1), (10, 4), (8, 4), (9, 4), (3, 5)])
+def test_a_sparse_packet_is_the_full_one_without_some_pilots(profile: str, frames: int, every: int) -> None:
+    book = book_of(profile)
+    symbols = np.random.default_rng(frames).integers(0, len(book.codewords), (frames, 16))
+    full = packet_chips(symbols, book)
+    form = PacketFormat.of(book, frames, pilot_every=every)
+    bare = [f for f in range(frames) if f % every]
+    dropped = [26 + 32 * f + chip for f in bare for chip in range(16)]
+    kept = np.delete(full, dropped, axis=0)
+    assert packet_chips(symbols, book, every).tolist() == kept.tolist()
+    assert form.packet_chips == len(kept)
+    for f in range(frames):
+        assert form.has_pilot(f) == (f not in bare)
+        begin = form.frame_start_chip(f)
+        at = 26 + 32 * f + (0 if form.has_pilot(f) else 16)
+        assert kept[begin : begin + 16].tolist() == full[at : at + 16].tolist()
+
+
+@pytest.mark.parametrize(
+    ("profile", "frames", "every", "bit_s"),
+    # Air interface 1 for every frame with its pilot; beyond, bits over chips by hand.
+    [
+        ("wh4x2", 10, 1, 27_746),
+        ("wh8", 10, 1, 18_497),
+        ("raw8", 10, 1, 36_994),
+        ("raw8", 10, 4, 1280 / 234 * 1e4),
+        ("raw8", 20, 4, 2560 / 426 * 1e4),
+    ],
+)
+def test_gross_rate(profile: str, frames: int, every: int, bit_s: float) -> None:
+    book = book_of(profile)
+    form = PacketFormat.of(book, frames, pilot_every=every)
+    assert form.gross_bit_s(book.bits_per_symbol, 16) == pytest.approx(bit_s, abs=0.5)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
 def test_json_round_trip_keeps_the_digest(profile: str) -> None:
     book = book_of(profile)
     again = Codebook.from_json(book.to_json())

@@ -133,7 +133,7 @@ def test_defaults_are_all_written_out(registry: Registry) -> None:
         *("camera", "bar", "air", "regions"),
         *("pilots", "modulation", "synchronization", "separation", "decoding", "ranging", "tracking"),
     ]
-    assert link.table["air"] == {"chip_rate_hz": 10_000.0, "frames_per_packet": 10}
+    assert link.table["air"] == {"chip_rate_hz": 10_000.0, "frames_per_packet": 10, "pilot_every": 1}
     assert link.table["ranging"] == {
         "id": "poc",
         "min_spacing": 8,
