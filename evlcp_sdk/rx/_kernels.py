@@ -117,9 +117,9 @@ def measure_box(
 
     Returns:
         (pixels, mean column, first column, last column, upper edge, lower edge). The edges are those of the
-        run of rows that exceeds a quarter of the mean lit row most, with the next row beyond; an edge row of fewer
-        pixels than the mean counts by its share. What lies further out are strays, such as a fast bar leaves
-        behind where noise wakes them; the quarter keeps stretches together where few pixels are awake yet.
+        run of rows that exceeds a quarter of the mean lit row most, with the next row beyond; an edge row of
+        fewer pixels than the mean counts by its share. What lies further out are strays, such as a fast bar
+        leaves behind where noise wakes them; the quarter keeps stretches together where few pixels are awake.
     """
     left, top, right, bottom = box
     total = 0
