@@ -16,13 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError
+from evlcp_sdk.frames import PacketFormat
 
 __all__ = ["BarScore", "Score", "Segment", "read_frames", "read_truth", "score_frames"]
 
 BITS_PER_SYMBOL = {"wh4x2": 6, "wh8": 4, "raw8": 8}
 
 _PREAMBLE_CHIPS = 26
-_FRAME_CHIPS = 32
+_SEGMENT_CHIPS = 16
+"""Of a pilot, and of an info segment."""
 _CHIP_RATE_HZ = 1e4
 _LATE_US = 200.0
 """A frame counts as sent when the scene goes on for this long after its end."""
@@ -140,12 +142,15 @@ class Score:
 def _sent_frames(bar: Mapping[str, Any], duration_us: float) -> list[tuple[float, int, int]]:
     """(begin, us, packet, frame) of every frame that is wholly inside the scene."""
     rate = _CHIP_RATE_HZ * (1 + bar["ppm"] * 1e-6)
+    form = PacketFormat(
+        _PREAMBLE_CHIPS, _SEGMENT_CHIPS, _SEGMENT_CHIPS, bar["frames"], pilot_every=bar.get("pilot_every", 1)
+    )
     sent = []
     for q in range(len(bar["symbols"])):
         for f in range(bar["frames"]):
-            chip = q * bar["packet_chips"] + _PREAMBLE_CHIPS + _FRAME_CHIPS * f
-            begin = (chip - bar["start_chip"]) / rate * 1e6
-            if begin >= 0 and begin + _FRAME_CHIPS / rate * 1e6 + _LATE_US < duration_us:
+            first, last = form.frame_start_chip(f), form.frame_start_chip(f + 1)
+            begin = (q * bar["packet_chips"] + first - bar["start_chip"]) / rate * 1e6
+            if begin >= 0 and begin + (last - first) / rate * 1e6 + _LATE_US < duration_us:
                 sent.append((begin, q, f))
     return sent
 

@@ -262,11 +262,11 @@ class Frame:
         transmitter: Number of the transmitter in order of first lock, from 0.
         packet: Number of the packet since the transmitter's first, from 0.
         frame: Number of the frame in its packet, from 0.
-        t_us: Start of the frame's first pilot chip on the camera's clock, us.
+        t_us: Start of the frame's first chip on the camera's clock, us: of its pilot, if it has one.
         soft: Symbols and log-likelihood ratios.
-        range: Distance; its values are NaN when the maps do not allow one.
+        range: Distance; its values are NaN when the maps do not allow one, or the frame has no pilot.
         filtered: Distance filtered over time; None without tracking.
-        x_px: Column of the bar's centre in the middle of the pilot, px.
+        x_px: Column of the bar's centre in the middle of the pilot, or of the info segment without one, px.
         y_px: Row of the same, px.
     """
 

@@ -1,11 +1,13 @@
 """Decoded frames held against the truth: what was found, which bits are wrong, how far distances are off."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from evlcp_sdk.campaign.statistics import Statistics, Tally, segment_of
+from evlcp_sdk.frames import PacketFormat
 from evlcp_sdk.types import Frame
 
 __all__ = ["statistics_of"]
@@ -64,8 +66,8 @@ class _Sent:
         rate_hz = bar.get("chip_rate_hz", 1e4) * (1 + bar["ppm"] * 1e-6)
         end_us = known["scene"]["duration_s"] * 1e6
         starts, self.symbols = [], []
-        for start_us, symbols in _frames_of(bar, rate_hz):
-            if start_us >= 0 and start_us + 32 / rate_hz * 1e6 + _TAIL_US < end_us:
+        for start_us, chips, symbols in _frames_of(bar, rate_hz):
+            if start_us >= 0 and start_us + chips / rate_hz * 1e6 + _TAIL_US < end_us:
                 starts.append(start_us)
                 self.symbols.append(symbols)
         self._start_us = np.array(starts)
@@ -94,9 +96,12 @@ class _Sent:
         return int(frame.soft.llr.shape[1])
 
 
-def _frames_of(bar: Mapping[str, Any], rate_hz: float) -> Iterator[tuple[float, Sequence[int]]]:
-    preamble = bar["packet_chips"] - 32 * bar["frames"]
+def _frames_of(bar: Mapping[str, Any], rate_hz: float) -> Iterator[tuple[float, int, Sequence[int]]]:
+    """Start (us), chips and symbols of every frame."""
+    bare = PacketFormat(0, 16, 16, bar["frames"], pilot_every=bar.get("pilot_every", 1))
+    form = replace(bare, preamble_chips=bar["packet_chips"] - bare.packet_chips)
     for packet, frames in enumerate(bar["symbols"]):
         for frame, symbols in enumerate(frames):
-            chip = packet * bar["packet_chips"] + preamble + 32 * frame
-            yield (chip - bar["start_chip"]) / rate_hz * 1e6, symbols
+            first, last = form.frame_start_chip(frame), form.frame_start_chip(frame + 1)
+            chip = packet * bar["packet_chips"] + first
+            yield (chip - bar["start_chip"]) / rate_hz * 1e6, last - first, symbols

@@ -11,7 +11,7 @@ from typing import Any
 from evlcp_sdk.campaign.measure import statistics_of
 from evlcp_sdk.campaign.plan import Job, Plan, load_plan
 from evlcp_sdk.campaign.statistics import Statistics
-from evlcp_sdk.config import installed_versions, load_link, resolve
+from evlcp_sdk.config import Link, installed_versions, load_link, resolve
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.hookspecs import ROLE_NAMES
 from evlcp_sdk.registry import Registry
@@ -109,7 +109,7 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
         link = resolve(table, registry)
         if link.digest != digest:
             raise ConfigError(f"link {digest[:12]} resolves to {link.digest[:12]} here")
-        _check_shared(known, table["modulation"]["id"])
+        _check_shared(known, link)
         receivers.append(Receiver(link))
     frames: list[list[Frame]] = [[] for _ in receivers]
     number = 0
@@ -124,10 +124,17 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
     return results
 
 
-def _check_shared(known: Mapping[str, Any], modulation: str) -> None:
+def _check_shared(known: Mapping[str, Any], link: Link) -> None:
     for bar in known["bars"]:
-        if bar.get("chips_file") is None and bar["profile"] != modulation:
-            raise ConfigError(
-                f"the scene's bar sends '{bar['profile']}', but the link receives '{modulation}';"
-                " set bars.profile or modulation.id"
-            )
+        if bar.get("chips_file") is not None:
+            continue
+        for key, sent, expected, setting in (
+            ("profile", bar["profile"], link.codebook.profile, "modulation.id"),
+            ("frames", bar["frames"], link.air.frames_per_packet, "air.frames_per_packet"),
+            ("pilot_every", bar.get("pilot_every", 1), link.air.pilot_every, "air.pilot_every"),
+        ):
+            if sent != expected:
+                raise ConfigError(
+                    f"the scene's bar has {key} = {sent!r}, but the link {setting} = {expected!r};"
+                    f" set bars.{key} or {setting}"
+                )

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pluggy
+from numpy.typing import NDArray
 
 from evlcp_sdk.abc import Synchronizer, Tracker
 from evlcp_sdk.config import Link
@@ -16,7 +17,7 @@ from evlcp_sdk.rx.chips import polarity_sums
 from evlcp_sdk.rx.payload import PacketAssembler
 from evlcp_sdk.rx.presence import clusters_in_place
 from evlcp_sdk.rx.regions import RegionTracker, Track
-from evlcp_sdk.types import Events, Frame, FrameView, Packet, Range, SyncLock
+from evlcp_sdk.types import Events, Frame, FrameView, Packet, PresenceMap, Range, SyncLock
 
 __all__ = ["Receiver"]
 
@@ -27,8 +28,29 @@ _LOOKBACK_PACKETS = 2
 _REMEMBER_US = 1e6
 """How long a transmitter lost from sight is remembered: clocks 100 ppm apart drift by a chip in it."""
 
+_NO_RANGE = Range(math.nan, math.nan, 0)
+
 _UNSEEN_STEPS = 5
 """Steps without a position after which a region counts as lost: it blinks in every chip otherwise."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Pilot:
+    """The pilot that the frames up to the next one go by.
+
+    Attributes:
+        frame: Number of its frame, counted as `_Transmitter.frame`.
+        size_px: (width, height) of the image, px.
+        sums: Its polarity sums, int16 (chips, height, width).
+        offset_px: The rest of the motion in it, float64 (2, chips), px.
+        presence: What it shows; the bar is held still, so it shows the same in the frames after it.
+    """
+
+    frame: int
+    size_px: tuple[int, int]
+    sums: NDArray[np.int16]
+    offset_px: NDArray[np.float64]
+    presence: PresenceMap
 
 
 @dataclass
@@ -41,6 +63,7 @@ class _Transmitter:
         packet: Number of the lock's packet, counted from the first that may have a frame here.
         frame: Next frame to decode, counted from that packet's first.
         first: Number of the first packet that had a frame, None before.
+        pilot: The newest pilot, None where it showed no bar.
         distance: State of the distance filter.
     """
 
@@ -52,6 +75,7 @@ class _Transmitter:
     packet: int = 0
     frame: int = 0
     first: int | None = None
+    pilot: _Pilot | None = None
     distance: Any = None
 
 
@@ -255,6 +279,7 @@ class Receiver:
                 transmitter.lock = lock
                 return
         self._counts["locks"] += 1
+        transmitter.pilot = None
         # Half a chip before the first event is still within the first edge's delay.
         earliest = max(transmitter.track.first_us, self._first_us - lock.chip_us / 2)
         if old is None and self._inherit(transmitter, lock):
@@ -307,7 +332,8 @@ class Receiver:
         while (lock := transmitter.lock) is not None:
             start_us = self._frame_start_us(transmitter, transmitter.frame)
             last_delay = max(lock.delay_on_us, lock.delay_off_us, 0.0)
-            end_us = start_us + self._packet.frame_chips * lock.chip_us + last_delay
+            chips = len(self._chips_of(transmitter.frame))
+            end_us = start_us + chips * lock.chip_us + last_delay
             if end_us > until_us:
                 break
             frame = self._decode_frame(transmitter, start_us, end_us)
@@ -322,29 +348,56 @@ class Receiver:
             packets += done
         return packets
 
+    def _chips_of(self, frame: int) -> range:
+        """The chips of a frame with a pilot that this frame has: all, or those of the info segment."""
+        packet = self._packet
+        first = 0 if packet.has_pilot(frame % packet.frames) else packet.pilot_chips
+        return range(first, packet.frame_chips)
+
     def _decode_frame(self, transmitter: _Transmitter, start_us: float, end_us: float) -> Frame | None:
         clock = [time.perf_counter()]
         lock, track, packet = transmitter.lock, transmitter.track, self._packet
         assert lock is not None
         assert transmitter.number is not None
-        middles = start_us + (np.arange(packet.frame_chips, dtype=np.float64) + 0.5) * lock.chip_us
+        number, index = divmod(transmitter.frame, packet.frames)
+        has_pilot = packet.has_pilot(index)
+        chips = len(self._chips_of(transmitter.frame))
+        middles = start_us + (np.arange(chips, dtype=np.float64) + 0.5) * lock.chip_us
         x, y = track.at(middles)
-        pilot_middle = packet.pilot_chips // 2
-        width, height = track.size_at(middles[pilot_middle])
-        margin = 2 * self._link.regions.margin_px
-        size = (_even(width + margin), _even(height + margin))
+        middle = min(chips, packet.pilot_chips) // 2
+        pilot = transmitter.pilot
+        if has_pilot:
+            width, height = track.size_at(middles[middle])
+            margin = 2 * self._link.regions.margin_px
+            size = (_even(width + margin), _even(height + margin))
+        elif pilot is None or pilot.frame != transmitter.frame - index % packet.pilot_every:
+            return None
+        else:
+            size = pilot.size_px
         pieces = [e for t, e in track.blocks if t < end_us and t + self._step_us > start_us]
         sums, offset_px = polarity_sums(pieces, lock, start_us, (x, y), size)
-        presence = self._separate(sums[: packet.pilot_chips])
-        self._tell("separation", presence, _lap(clock))
-        in_place = clusters_in_place(presence, self._centres_m)
-        if in_place < self._link.regions.min_clusters_share * len(self._centres_m):
-            return None
+        if has_pilot:
+            heard, moved = sums[: packet.pilot_chips], offset_px[:, : packet.pilot_chips]
+            presence = self._separate(heard)
+            self._tell("separation", presence, _lap(clock))
+            in_place = clusters_in_place(presence, self._centres_m)
+            if in_place < self._link.regions.min_clusters_share * len(self._centres_m):
+                transmitter.pilot = None
+                return None
+            if packet.pilot_every > 1:
+                transmitter.pilot = _Pilot(transmitter.frame, size, heard, moved, presence)
+        else:
+            assert pilot is not None
+            presence = pilot.presence
+            sums = np.concatenate([pilot.sums, sums])
+            offset_px = np.concatenate([pilot.offset_px, offset_px], axis=1)
         soft = self._decode(presence, sums)
         self._tell("decoding", soft, _lap(clock))
-        distance = self._measure(FrameView(sums, offset_px, presence, soft))
-        self._tell("ranging", distance, _lap(clock))
-        number, index = divmod(transmitter.frame, packet.frames)
+        distance = _NO_RANGE
+        if has_pilot:
+            # Another distance of the same pilot would say nothing new.
+            distance = self._measure(FrameView(sums, offset_px, presence, soft))
+            self._tell("ranging", distance, _lap(clock))
         if transmitter.first is None:
             transmitter.first = number
         frame = Frame(
@@ -355,8 +408,8 @@ class Receiver:
             soft=soft,
             range=distance,
             filtered=self._filter(transmitter, start_us, distance),
-            x_px=float(x[pilot_middle]),
-            y_px=float(y[pilot_middle]),
+            x_px=float(x[middle]),
+            y_px=float(y[middle]),
         )
         self._tell("frame", frame, clock[-1] - clock[0])
         return frame

@@ -93,7 +93,8 @@ class BarLight:
                 self._codebook = _codebook(bar.profile, bar.clusters)
             except ConfigError as refused:
                 raise ConfigError(f"{source}: {refused}") from refused
-            self.packet_chips = PacketFormat.of(self._codebook, bar.frames).packet_chips
+            form = PacketFormat.of(self._codebook, bar.frames, pilot_every=bar.pilot_every)
+            self.packet_chips = form.packet_chips
             if bar.symbols is not None:
                 self._check(bar, source)
         start = bar.start_chip
@@ -135,7 +136,9 @@ class BarLight:
             return self._chips[np.arange(first, last) % len(self._chips)]
         begin, end = first // self.packet_chips, (last - 1) // self.packet_chips + 1
         self._packets = {
-            q: self._packets[q] if q in self._packets else packet_chips(self.symbols(q), self._codebook)
+            q: self._packets[q]
+            if q in self._packets
+            else packet_chips(self.symbols(q), self._codebook, self.bar.pilot_every)
             for q in range(begin, end)
         }
         rows = np.concatenate([self._packets[q] for q in range(begin, end)])

@@ -59,6 +59,7 @@ class BarSpec:
     clusters: Annotated[int, Field(ge=1, le=64, description="Clusters that it is cut into.")] = 16
     profile: Annotated[str, Field(description="Modulation of its symbols, as in `link.toml`.")] = "wh4x2"
     frames: Annotated[int, Field(ge=1, description="Frames of a packet.")] = 10
+    pilot_every: Annotated[int, Field(ge=1, le=64, description="Frames from one pilot to the next.")] = 1
     chip_rate_hz: Annotated[float, Field(gt=0, description="Chips sent a second, by its own clock.")] = 1e4
     ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="How much faster its clock runs.")] = 0.0
     start_chip: Annotated[

@@ -27,10 +27,10 @@ def truth(scene: Scene, seed: int | None = None) -> dict[str, Any]:
 def truth_of(simulation: Simulation) -> dict[str, Any]:
     """What `REC.truth.json` holds, as JSON values; with the counts when the simulation has run.
 
-    `scene` holds its parameters; `bars` what each sent: symbols [packet][frame][cluster] and the chip of the
-    first packet that was on air at the scene's begin; `t_s`, `distance_m` and `bar_centre_px`, every
-    millisecond, the depth along the optical axis and the place of each bar's centre; `simulator` the
-    resolved scene, which renders the recording again.
+    `scene` holds its parameters; `bars` what each sent: symbols [packet][frame][cluster], the chip of the
+    first packet that was on air at the scene's begin, and `pilot_every` where not every frame has a pilot;
+    `t_s`, `distance_m` and `bar_centre_px`, every millisecond, the depth along the optical axis and the place
+    of each bar's centre; `simulator` the resolved scene, which renders the recording again.
     """
     scene = simulation.scene
     camera, sensor, motion = scene.camera, scene.sensor, scene.motion
@@ -58,6 +58,7 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
                 "chips_file": bar.chips_file,
                 "symbols": light.sent_symbols(scene.duration_s),
                 "packet_chips": light.packet_chips,
+                **({"pilot_every": bar.pilot_every} if bar.pilot_every > 1 else {}),
             }
         )
     found: dict[str, Any] = {

@@ -1,6 +1,6 @@
 """One plain task a role: what the laws of form give an algorithm to do."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,20 +29,21 @@ class Exercise:
     prepare: Callable[[], Callable[[tuple[Any, ...]], Any]]
 
 
-def link_of(subject: Subject) -> Link:
-    """The default link with the subject in its role.
+def link_of(subject: Subject, overrides: Sequence[str] = ()) -> Link:
+    """The default link, but for what is overridden, with the subject in its role.
 
     Raises:
         InapplicableLawError: The subject has no code for the default bar.
     """
-    link = load_link()
+    link = load_link(overrides=overrides)
     algorithms = {**link.algorithms, subject.role: subject.algorithm}
     codebook = link.codebook
     if subject.role in ("pilots", "modulation"):
         pilots, modulation = algorithms["pilots"], algorithms["modulation"]
         codes = compiled(lambda: pilots.codes(link.bar.clusters))
         codebook = Codebook("conformance", pilots.preamble(), codes, modulation.codewords())
-    packet = PacketFormat.of(codebook, link.air.frames_per_packet, link.air.chip_rate_hz)
+    air = link.air
+    packet = PacketFormat.of(codebook, air.frames_per_packet, air.chip_rate_hz, air.pilot_every)
     return replace(link, algorithms=algorithms, codebook=codebook, packet=packet, digest="conformance")
 
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from evlcp_sdk.config import Link
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.exercises import link_of
 from evlcp_sdk.testing.law import Law, Subject, compiled, expect
@@ -18,9 +19,21 @@ _NEAR = 0.05
 """Half a pixel of the image's edges in 8 px."""
 
 
+_SPARSE = 4
+"""Frames from pilot to pilot, as in the fast profile."""
+
+
 def clean_link(subject: Subject) -> None:
     """Hold the law."""
-    link = link_of(subject)
+    _expect_clean(link_of(subject))
+
+
+def sparse_pilots(subject: Subject) -> None:
+    """Hold the law."""
+    _expect_clean(link_of(subject, [f"air.pilot_every={_SPARSE}"]))
+
+
+def _expect_clean(link: Link) -> None:
     bar = IdealBar(random_symbols(link, _PACKETS), cluster_px=_CLUSTER_PX)
     receiver = compiled(lambda: Receiver(link))
     packets = receiver.feed(ideal_events(link, bar, missing=0.0)) + receiver.close()
@@ -35,7 +48,8 @@ def clean_link(subject: Subject) -> None:
     expect(wrong == 0, f"no wrong symbol in a clean recording, got {wrong} of {sent.size}")
     centres = link.bar.cluster_centres_m()
     true_m = link.camera.distance_m(float(np.hypot(*(centres[1] - centres[0]))), _CLUSTER_PX)
-    _expect_near(frames, true_m)
+    ranged = [frame for frame in frames if link.packet.has_pilot(frame.frame)]
+    _expect_near(ranged, true_m)
 
 
 def _expect_near(frames: Sequence[Frame], true_m: float) -> None:
@@ -50,5 +64,10 @@ def _expect_near(frames: Sequence[Frame], true_m: float) -> None:
 
 LINK = (
     Law("clean-link", "no error in a clean recording with this algorithm in the default link", clean_link),
+    Law(
+        "sparse-pilots",
+        f"no error in a clean recording with the pilot in every {_SPARSE}th frame only",
+        sparse_pilots,
+    ),
 )
 """The law of the link, for every role."""

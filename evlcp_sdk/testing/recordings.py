@@ -74,8 +74,8 @@ def ideal_events(
         t0_us: Time of the camera's clock at the start of the recording, us.
     """
     rng = np.random.default_rng(seed)
-    chips = np.concatenate([packet_chips(s, link.codebook) for s in bar.symbols]).astype(np.int64)
-    edges = np.diff(chips, axis=0, prepend=0)
+    chips = np.concatenate([packet_chips(s, link.codebook, link.packet.pilot_every) for s in bar.symbols])
+    edges = np.diff(chips.astype(np.int64), axis=0, prepend=0)
     chip_us = link.packet.chip_us / (1 + bar.ppm * 1e-6)
     clusters = link.codebook.clusters
     rows = round(clusters * bar.cluster_px)

@@ -22,7 +22,7 @@ def laws_of(role: str) -> tuple[Law, ...]:
         ConfigError: There is no such role.
 
     >>> [law.name for law in laws_of("ranging")][-3:]
-    ['focal-length', 'sees-nothing', 'clean-link']
+    ['sees-nothing', 'clean-link', 'sparse-pilots']
     """
     if role not in ROLE_NAMES:
         raise ConfigError(f"no role named '{role}' (known: {', '.join(ROLE_NAMES)})")

@@ -24,6 +24,7 @@ PAGES = (
     "simulator",
     "campaigns",
     "paper",
+    "rates",
     "roles",
     "hooks",
 )

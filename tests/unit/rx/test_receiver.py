@@ -45,12 +45,13 @@ def check_symbols(packets: list[Packet], bar: Bar, link: Link, *, t0_us: int = 0
     """Compare every frame with the sent one that began at its time; return how many."""
     chip_us = link.packet.chip_us / (1 + bar.ppm * 1e-6)
     frames = [f for p in packets for f in p.frames]
+    starts = np.array([link.packet.frame_start_chip(index) for index in range(link.packet.frames)])
     for f in frames:
         chip = (f.t_us - t0_us - bar.start_us) / chip_us
         packet = int((chip - 13) // link.packet.packet_chips)
-        index = round((chip - packet * link.packet.packet_chips - 26) / link.packet.frame_chips)
+        index = int(np.abs(chip - packet * link.packet.packet_chips - starts).argmin())
         late_us = f.t_us - t0_us - bar.start_us
-        late_us -= (packet * link.packet.packet_chips + link.packet.frame_start_chip(index)) * chip_us
+        late_us -= (packet * link.packet.packet_chips + starts[index]) * chip_us
         assert 0 < late_us < 60, "the first event of an edge comes 20 us late"
         assert f.soft.symbols.tolist() == bar.symbols[packet, index].tolist()
     return len(frames)
@@ -66,6 +67,41 @@ def test_every_profile_with_both_clocks_off(profile: str, ppm: float) -> None:
     assert [p.packet for p in packets] == [0, 1, 2, 3, 4]
     # Two packets of 2 us jitter tell the rate to 40 ppm, five to 20.
     assert (link.packet.chip_us / packets[-1].chip_us - 1) * 1e6 == pytest.approx(ppm, abs=20)
+
+
+@pytest.mark.parametrize("profile", ["wh4x2", "wh8", "raw8"])
+@pytest.mark.parametrize(("frames", "every"), [(10, 4), (20, 4), (8, 64)])
+def test_pilots_in_some_frames_only(profile: str, frames: int, every: int) -> None:
+    air = [f"air.frames_per_packet={frames}", f"air.pilot_every={every}"]
+    link = load_link(overrides=[f"modulation.id={profile}", *air])
+    # It moves by a spacing while a pilot of eight frames holds.
+    bar = Bar(random_symbols(link, 3), shake_px=16, shake_hz=10)
+    packets = received(link, events_of(link, bar))
+    assert check_symbols(packets, bar, link) == 3 * frames
+    for f in (f for p in packets for f in p.frames):
+        assert np.isnan(f.range.distance_m) == (f.frame % every != 0)
+
+
+def test_frames_without_their_pilot_are_rejected() -> None:
+    link = load_link(overrides=["air.pilot_every=4"])
+    bar = Bar(random_symbols(link, 3), start_us=-8_300.0)
+    # Frame 2 began before the recording, and so did the pilot of frame 3.
+    packets = received(link, events_of(link, bar))
+    assert [f.frame for f in packets[0].frames] == [4, 5, 6, 7, 8, 9]
+    assert check_symbols(packets, bar, link) == 26
+
+
+def test_a_pilot_in_the_dark_takes_its_frames_with_it() -> None:
+    link = load_link(overrides=["air.pilot_every=4"])
+    bar = Bar(random_symbols(link, 3))
+    events = events_of(link, bar)
+    begin_us = bar.start_us + 100 * (link.packet.packet_chips + link.packet.frame_start_chip(4))
+    dark = (events.t_us >= begin_us) & (events.t_us < begin_us + 1600)
+    receiver = Receiver(link)
+    packets = receiver.feed(events[~dark]) + receiver.close()
+    assert [f.frame for f in packets[1].frames] == [0, 1, 2, 3, 8, 9]
+    assert check_symbols(packets, bar, link) == 26
+    assert receiver.counts["frames_rejected"] == 4
 
 
 def test_distance_is_that_of_the_spacing() -> None:
@@ -181,6 +217,16 @@ WHOLE = rows(received(LINK, STREAM))
 def test_any_split_gives_the_same(cuts: list[int]) -> None:
     bounds = sorted({0, len(STREAM), *cuts})
     assert rows(received(LINK, STREAM, (slice(a, b) for a, b in pairwise(bounds)))) == WHOLE
+
+
+def test_any_split_gives_the_same_with_few_pilots() -> None:
+    link = load_link(overrides=["air.pilot_every=4"])
+    events = events_of(link, Bar(random_symbols(link, 3), shake_px=5))
+    whole = rows(received(link, events))
+    assert len(whole) == 30
+    cuts = np.random.default_rng(0).integers(0, len(events), 60)
+    bounds = sorted({0, len(events), *cuts.tolist()})
+    assert rows(received(link, events, (slice(a, b) for a, b in pairwise(bounds)))) == whole
 
 
 @pytest.mark.parametrize("size", [1000, 4096, 65_536])
