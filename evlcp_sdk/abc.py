@@ -186,15 +186,15 @@ class Corrected:
 
 
 class Code(Protocol):
-    """What `ErrorCorrection.compile` returns: message bits to coded bits and back.
+    """What `ErrorCorrection.compile` returns: message bits to coded bits and back."""
 
-    Attributes:
-        message_bits: Bits of a message that a block carries.
-        coded_bits: Bits of the block on air.
-    """
+    @property
+    def message_bits(self) -> int:
+        """Bits of a message that a block carries."""
 
-    message_bits: int
-    coded_bits: int
+    @property
+    def coded_bits(self) -> int:
+        """Bits of the block on air."""
 
     def encode(self, bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Message bits uint8 (message_bits,), 0 or 1 -> coded bits uint8 (coded_bits,).
@@ -231,5 +231,6 @@ ROLES: dict[str, type[ABC]] = {
     "decoding": Decoding,
     "ranging": Ranging,
     "tracking": Tracking,
+    "error-correction": ErrorCorrection,
 }
 """The abstract class of each role name."""

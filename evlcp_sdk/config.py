@@ -44,6 +44,7 @@ DEFAULT_IDS = {
     "decoding": "wh-transform",
     "ranging": "poc",
     "tracking": "none",
+    "error-correction": "polar",
 }
 """The algorithm of each role when the configuration names none."""
 

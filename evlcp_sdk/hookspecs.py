@@ -20,7 +20,16 @@ __all__ = ["ENTRY_POINT_GROUP", "ROLE_NAMES", "Algorithm", "hookimpl", "hookspec
 ENTRY_POINT_GROUP = "evlcp"
 """Entry-point group, and pluggy project name."""
 
-ROLE_NAMES = ("pilots", "modulation", "synchronization", "separation", "decoding", "ranging", "tracking")
+ROLE_NAMES = (
+    "pilots",
+    "modulation",
+    "synchronization",
+    "separation",
+    "decoding",
+    "ranging",
+    "tracking",
+    "error-correction",
+)
 """The roles that algorithms fill, in the order of the signal's flow."""
 
 hookspec = pluggy.HookspecMarker(ENTRY_POINT_GROUP)

@@ -13,7 +13,7 @@ from evlcp_sdk.testing.law import InapplicableLawError, Subject, compiled
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.testing.views import ideal_presence, ideal_sums, ideal_view
 
-__all__ = ["Exercise", "exercise_of", "filters_of", "link_of", "symbols_of"]
+__all__ = ["Exercise", "coded_bits_of", "exercise_of", "filters_of", "link_of", "symbols_of"]
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,11 @@ def link_of(subject: Subject, overrides: Sequence[str] = ()) -> Link:
     air = link.air
     packet = PacketFormat.of(codebook, air.frames_per_packet, air.chip_rate_hz, air.pilot_every)
     return replace(link, algorithms=algorithms, codebook=codebook, packet=packet, digest="conformance")
+
+
+def coded_bits_of(link: Link) -> int:
+    """Bits of a link's packet."""
+    return link.packet.frames * link.codebook.clusters * link.codebook.bits_per_symbol
 
 
 def symbols_of(codebook: Codebook, seed: int = 0) -> np.ndarray[Any, np.dtype[np.int64]]:
@@ -97,6 +102,17 @@ def exercise_of(subject: Subject) -> Exercise:
 
         return Exercise((events.t_us, events.p), synchronize)
     rng = np.random.default_rng(0)
+    if subject.role == "error-correction":
+        code = compiled(lambda: algorithm.compile(coded_bits_of(link)))
+        bits = rng.integers(0, 2, code.message_bits).astype(np.uint8)
+        llr = (4 * (1 - 2 * code.encode(bits).astype(np.float32))).astype(np.float32)
+        llr[::50] = 0
+
+        def correct() -> Callable[[tuple[Any, ...]], Any]:
+            again = compiled(lambda: algorithm.compile(coded_bits_of(link)))
+            return lambda given: (again.encode(given[0]), again.decode(given[1]))
+
+        return Exercise((bits, llr), correct)
     values = tuple(rng.normal(50.0, 0.1, (20, n)) for _, _, n in filters_of(subject))
 
     def track() -> Callable[[tuple[Any, ...]], Any]:

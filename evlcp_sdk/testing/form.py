@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 from evlcp_sdk.abc import ROLES
 from evlcp_sdk.config import _spec_model
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.testing.exercises import exercise_of, link_of
+from evlcp_sdk.testing.exercises import coded_bits_of, exercise_of, link_of
 from evlcp_sdk.testing.law import Law, LawError, Subject, expect
 from evlcp_sdk.testing.trees import arrays_of, copied, difference, mapped, read_only, strided
 
@@ -85,6 +85,7 @@ def compiles(subject: Subject) -> None:
         "decoding": (link.codebook,),
         "ranging": (link.camera, link.bar, link.codebook),
         "tracking": (),
+        "error-correction": (coded_bits_of(link),),
     }
     try:
         algorithm.compile(*arguments[subject.role])

@@ -6,6 +6,7 @@ from typing import Any
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.hookspecs import ROLE_NAMES
 from evlcp_sdk.testing.codes import MODULATION, PILOTS
+from evlcp_sdk.testing.corrections import ERROR_CORRECTION
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
 from evlcp_sdk.testing.images import DECODING, RANGING, SEPARATION
 from evlcp_sdk.testing.law import Law, Outcome, Subject, judge
@@ -30,6 +31,8 @@ def laws_of(role: str) -> tuple[Law, ...]:
         return DESCRIPTION + RESULT + PILOTS + LINK
     if role == "modulation":
         return DESCRIPTION + RESULT + MODULATION + LINK
+    if role == "error-correction":
+        return DESCRIPTION + FUNCTION + RESULT + ERROR_CORRECTION
     own = {
         "synchronization": SYNCHRONIZATION,
         "separation": SEPARATION,

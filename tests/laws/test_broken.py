@@ -9,6 +9,7 @@ import pytest
 from evlcp_barker.synchronization import BarkerSync
 from evlcp_centroid.ranging import CentroidRanging
 from evlcp_kalman.tracking import KalmanTracking
+from evlcp_polar.correction import Polar
 from evlcp_wh.decoding import WhTransform
 from evlcp_wh.modulation import Wh8
 from evlcp_wh.pilots import WhPilots
@@ -17,6 +18,7 @@ from pydantic import Field
 
 from evlcp_sdk.abc import (
     Decoding,
+    ErrorCorrection,
     Modulation,
     Pilots,
     Ranging,
@@ -84,6 +86,7 @@ separation = tampered(Separation, WhCorrelation())
 decoding = tampered(Decoding, WhTransform())
 ranging = tampered(Ranging, CentroidRanging())
 tracking = tampered(Tracking, KalmanTracking())
+correction = tampered(ErrorCorrection, Polar())
 
 
 def after(change: Change) -> Change:
@@ -337,6 +340,81 @@ def constant(found: Range) -> Range:
     return replace(found, distance_m=50.0)
 
 
+# Error correction.
+
+
+@dataclass(frozen=True)
+class TamperedCode:
+    """A code whose ends are changed."""
+
+    inner: Any
+    change_coded: Change
+    change_llr: Change
+    change_found: Change
+    message_bits: int
+    coded_bits: int
+
+    def encode(self, bits: Any) -> Any:
+        return self.change_coded(self.inner.encode(bits))
+
+    def decode(self, llr: Any) -> Any:
+        return self.change_found(self.inner.decode(self.change_llr(llr)))
+
+
+def code_changed(
+    coded: Change = lambda coded: coded, llr: Change = lambda llr: llr, found: Change = lambda found: found
+) -> Any:
+    return correction(
+        lambda inner: TamperedCode(inner, coded, llr, found, inner.message_bits, inner.coded_bits)
+    )
+
+
+def credulous_code(found: Any) -> Any:
+    """The check is not asked."""
+    return replace(found, ok=True)
+
+
+def gullible_code(found: Any) -> Any:
+    """The check is not asked where some bits were put right."""
+    return replace(found, ok=found.ok or found.flipped > 0)
+
+
+@dataclass(frozen=True)
+class Deaf(ErrorCorrection):
+    """The first bit of a message is not sent."""
+
+    def compile(self, coded_bits: int) -> Any:
+        @dataclass(frozen=True)
+        class Code:
+            inner: Any
+            message_bits: int
+            coded_bits: int
+
+            def encode(self, bits: Any) -> Any:
+                sent = bits.copy()
+                sent[:1] = 0
+                return self.inner.encode(sent)
+
+            def decode(self, llr: Any) -> Any:
+                return self.inner.decode(llr)
+
+        inner = Polar().compile(coded_bits)
+        return Code(inner, inner.message_bits, inner.coded_bits)
+
+
+@dataclass(frozen=True)
+class Uncorrected(ErrorCorrection):
+    """A polar code from which only a word without errors is read."""
+
+    def compile(self, coded_bits: int) -> Any:
+        inner = Polar().compile(coded_bits)
+
+        def found(of: Any) -> Any:
+            return replace(of, ok=of.ok and not of.flipped)
+
+        return TamperedCode(inner, lambda x: x, lambda x: x, found, inner.message_bits, inner.coded_bits)
+
+
 BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
     "form": [
         ("defaults", NoDefault(focus_m=1.0), "a default of field 'focus_m'"),
@@ -437,6 +515,22 @@ BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
             tracking(lambda t: Tracker(position=None, distance=Biased(t.distance))),  # type: ignore[arg-type]
             "filtered 54.01 m within 5%",
         ),
+    ],
+    "error-correction": [
+        ("shapes", code_changed(coded=lambda x: x.astype(int)), "coded bits as a uint8 array"),
+        ("shapes", code_changed(coded=lambda x: x[:-1]), r"coded bits of shape \(960,\)"),
+        ("shapes", code_changed(found=lambda f: replace(f, flipped=np.int64(0))), "flipped as an int"),
+        ("shapes", code_changed(llr=lambda x: np.resize(x, 960)), "ConfigError from decode"),
+        ("comes-back", code_changed(found=lambda f: replace(f, bits=f.bits ^ 1)), "bits wrong"),
+        ("comes-back", code_changed(found=lambda f: replace(f, flipped=1)), "no bit flipped"),
+        ("comes-back", code_changed(llr=lambda x: -x), "ok from clean LLRs"),
+        ("every-bit", Deaf(), "message bit 0 of 456"),
+        ("knows-nothing", code_changed(found=credulous_code), "not ok where none of 960"),
+        ("no-message-in-noise", code_changed(found=gullible_code), "no message in random LLRs"),
+        ("errors-found", code_changed(found=gullible_code), "a message of 456 bits that was not sent"),
+        ("corrects", Uncorrected(), "the message with 9 of 960 bits wrong"),
+        ("corrects", code_changed(found=lambda f: replace(f, flipped=0)), "9 flipped with 9 of 960"),
+        ("clean-link", code_changed(llr=lambda x: x[::-1]), "message 0 of a clean recording"),
     ],
 }
 """Role (or form) to (law, algorithm that breaks it, what is said)."""

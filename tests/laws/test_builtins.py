@@ -38,7 +38,7 @@ def test_only_what_does_nothing_is_passed_over() -> None:
         for role, id, law in (case.values for case in CASES)
         if judge(law, Subject(role, REGISTRY.load_class(role, id)()), {}).status == "skipped"  # type: ignore[attr-defined,arg-type]
     }
-    assert skipped == {("tracking", "none")}
+    assert skipped == {("tracking", "none"), ("error-correction", "none")}
 
 
 def test_excuses_name_what_is_there() -> None:

@@ -15,8 +15,10 @@ from pydantic import Field
 
 from evlcp_sdk import hookspecs
 from evlcp_sdk.abc import (
+    Code,
     Decode,
     Decoding,
+    ErrorCorrection,
     Measure,
     Modulation,
     Pilots,
@@ -93,6 +95,12 @@ class FakeTracking(Tracking):
         raise NotImplementedError
 
 
+@dataclass(frozen=True)
+class FakeErrorCorrection(ErrorCorrection):
+    def compile(self, coded_bits: int) -> Code:
+        raise NotImplementedError
+
+
 class Fakes:
     def __init__(self, revision: int = 1) -> None:
         self.revision = revision
@@ -100,7 +108,7 @@ class Fakes:
     @hookimpl
     def evlcp_algorithms(self) -> Iterator[Algorithm]:
         for role, name in DEFAULT_IDS.items():
-            target = f"{__name__}:Fake{role.capitalize()}"
+            target = f"{__name__}:Fake{role.title().replace('-', '')}"
             yield Algorithm(role, name, target, self.revision if role == "ranging" else 1, "a fake")
         yield Algorithm("ranging", "centroid", f"{__name__}:FakeRanging", 3, "another fake")
 
@@ -132,6 +140,7 @@ def test_defaults_are_all_written_out(registry: Registry) -> None:
     assert list(link.table) == [
         *("camera", "bar", "air", "regions"),
         *("pilots", "modulation", "synchronization", "separation", "decoding", "ranging", "tracking"),
+        "error-correction",
     ]
     assert link.table["air"] == {"chip_rate_hz": 10_000.0, "frames_per_packet": 10, "pilot_every": 1}
     assert link.table["ranging"] == {
@@ -206,10 +215,10 @@ def test_every_fault_of_a_file_is_told(registry: Registry, tmp_path: Path) -> No
     """
     assert faults_of(registry, text, tmp_path, "bar.led_pitch_m=-1", "lamp.on=1") == [
         "link.toml: camra: unknown table; did you mean 'camera'? (known: camera, bar, air, regions, pilots,"
-        " modulation, synchronization, separation, decoding, ranging, tracking)",
+        " modulation, synchronization, separation, decoding, ranging, tracking, error-correction)",
         "link.toml: decoding = 4: expected a table",
         "--set: lamp.on: unknown table (known: camera, bar, air, regions, pilots,"
-        " modulation, synchronization, separation, decoding, ranging, tracking)",
+        " modulation, synchronization, separation, decoding, ranging, tracking, error-correction)",
         "link.toml: camera.width = 0: expected greater than 0",
         'link.toml: camera.focal_mm = "35": expected a valid number',
         "--set: bar.led_pitch_m = -1: expected greater than 0",

@@ -1,0 +1,39 @@
+"""CRC-24 of a message's bits, by which an error-correction algorithm knows that it decoded what was sent.
+
+Polynomial CRC24C of 3GPP TS 38.212, 5.1: x^24 + x^23 + x^21 + x^20 + x^17 + x^15 + x^13 + x^12 + x^8 + x^4 +
+x^2 + x + 1. The register begins with ones, so that zeros alone, a block of which nothing was received, do not
+pass; bits enter as they are, first bit first, and the register is sent as it is, highest power first.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["CRC24C", "CRC_BITS", "crc24"]
+
+CRC_BITS = 24
+"""Bits of the check."""
+
+CRC24C = 0xB2B117
+"""The polynomial without its x^24, highest power in the highest bit."""
+
+_ONES = 0xFFFFFF
+
+
+def crc24(bits: NDArray[np.uint8], polynomial: int = CRC24C, start: int = _ONES) -> NDArray[np.uint8]:
+    """The 24 check bits of a message, uint8 (24,), in the order in which they are sent.
+
+    Args:
+        bits: The message, uint8 (n,), 0 or 1, in the order in which it is sent.
+        polynomial: Generator without its x^24.
+        start: What the register holds before the first bit.
+
+    >>> "".join(map(str, crc24(np.ones(8, np.uint8))))
+    '111111111111111100000000'
+    """
+    register = start
+    for bit in bits.tolist():
+        feedback = (register >> 23) ^ bit
+        register = (register << 1) & _ONES
+        if feedback:
+            register ^= polynomial
+    return np.array([register >> i & 1 for i in range(CRC_BITS - 1, -1, -1)], np.uint8)

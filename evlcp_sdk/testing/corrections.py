@@ -1,0 +1,199 @@
+"""Laws of error correction."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.abc import Corrected
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.frames import symbols_of_bits
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.testing.exercises import coded_bits_of, link_of
+from evlcp_sdk.testing.law import InapplicableLawError, Law, Subject, compiled, expect
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events
+
+__all__ = ["ERROR_CORRECTION"]
+
+_LENGTHS = (1, 24, 31, 64, 100, 256, 333, 640, 960, 1024, 1025, 1280, 2047)
+"""Blocks on air: of the built-in profiles, powers of two, and lengths that are neither."""
+
+_SURE = np.float32(8.0)
+"""LLR of a bit received well: wrong once in 3000."""
+
+_BLOCKS = 200
+_MOST_RATE = 0.9
+"""Message bits a coded bit above which no room is left to correct anything but a bit or two."""
+
+
+def _codes(subject: Subject) -> list[Any]:
+    """The code of each length that is not refused; that of the default packet among them."""
+    found = [compiled(lambda: subject.algorithm.compile(coded_bits_of(link_of(subject))))]
+    for n in _LENGTHS:
+        try:
+            found.append(subject.algorithm.compile(n))
+        except ConfigError:
+            continue
+        expect(found[-1].coded_bits == n, f"compile({n}).coded_bits == {n}, got {found[-1].coded_bits}")
+    return found
+
+
+def _message(code: Any, seed: int = 0) -> NDArray[np.uint8]:
+    return np.random.default_rng(seed).integers(0, 2, int(code.message_bits)).astype(np.uint8)
+
+
+def _llr(coded: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return ((1 - 2 * coded.astype(np.float32)) * _SURE).astype(np.float32)
+
+
+def _well_formed(bits: Any, length: int, name: str) -> None:
+    expect(isinstance(bits, np.ndarray) and bits.dtype == np.uint8, f"{name} as a uint8 array")
+    expect(bits.shape == (length,), f"{name} of shape ({length},), got {bits.shape}")
+    expect((bits <= 1).all(), f"{name} of 0 and 1 only")
+
+
+def _refuses(call: Any, given: NDArray[Any], what: str) -> None:
+    try:
+        call(given)
+    except ConfigError:
+        return
+    expect(False, f"ConfigError from {what}")
+
+
+def shapes(subject: Subject) -> None:
+    """Hold the law."""
+    for code in _codes(subject):
+        expect(0 < code.message_bits <= code.coded_bits, f"1 to {code.coded_bits} message bits")
+        coded = code.encode(_message(code))
+        _well_formed(coded, code.coded_bits, "coded bits")
+        for llr in (_llr(coded), np.zeros(code.coded_bits, np.float32)):
+            found = code.decode(llr)
+            expect(isinstance(found, Corrected), f"decode() to give Corrected, got {type(found).__name__}")
+            _well_formed(found.bits, code.message_bits, "message bits")
+            expect(isinstance(found.ok, bool), f"ok as a bool, got {type(found.ok).__name__}")
+            expect(isinstance(found.flipped, int), f"flipped as an int, got {type(found.flipped).__name__}")
+        m, n = code.message_bits, code.coded_bits
+        for wrong in (m - 1, m + 1):
+            _refuses(code.encode, np.zeros(wrong, np.uint8), f"encode() of {wrong} bits, not {m}")
+        for wrong in (n - 1, n + 1):
+            _refuses(code.decode, np.zeros(wrong, np.float32), f"decode() of {wrong} LLRs, not {n}")
+
+
+def round_trip(subject: Subject) -> None:
+    """Hold the law."""
+    for code in _codes(subject):
+        for seed in range(3):
+            sent = _message(code, seed)
+            found = code.decode(_llr(code.encode(sent)))
+            what = f"from clean LLRs of {code.coded_bits} bits"
+            expect(found.ok, f"ok {what}")
+            wrong = int((found.bits != sent).sum())
+            expect(not wrong, f"the message {what}, got {wrong} bits wrong")
+            expect(found.flipped == 0, f"no bit flipped {what}, got {found.flipped}")
+
+
+def every_bit(subject: Subject) -> None:
+    """Hold the law."""
+    for code in _codes(subject):
+        sent = _message(code)
+        coded = code.encode(sent)
+        for i in range(code.message_bits):
+            other = sent.copy()
+            other[i] ^= 1
+            changed = (code.encode(other) != coded).any()
+            expect(changed, f"message bit {i} of {code.message_bits} to change the coded bits")
+
+
+def knows_nothing(subject: Subject) -> None:
+    """Hold the law."""
+    for code in _codes(subject):
+        found = code.decode(np.zeros(code.coded_bits, np.float32))
+        expect(not found.ok, f"not ok where none of {code.coded_bits} bits was received")
+        expect(found.flipped == 0, f"no bit flipped of none received, got {found.flipped}")
+
+
+def no_message_in_noise(subject: Subject) -> None:
+    """Hold the law."""
+    rng = np.random.default_rng(0)
+    for code in _codes(subject):
+        for spread in (0.0, 1.0):
+            llr = rng.choice([-1.0, 1.0], (_BLOCKS, code.coded_bits)) * np.exp(
+                spread * rng.normal(size=(_BLOCKS, code.coded_bits))
+            )
+            ok = sum(code.decode(row.astype(np.float32)).ok for row in llr)
+            expect(not ok, f"no message in random LLRs of {code.coded_bits} bits, got {ok} of {_BLOCKS}")
+
+
+def errors_found(subject: Subject) -> None:
+    """Hold the law."""
+    rng = np.random.default_rng(0)
+    for code in _codes(subject):
+        for seed in range(_BLOCKS):
+            sent = _message(code, seed)
+            coded = code.encode(sent)
+            coded[rng.random(code.coded_bits) < 10 ** rng.uniform(-3, 0)] ^= 1
+            found = code.decode(_llr(coded))
+            passed = found.ok and (found.bits != sent).any()
+            expect(not passed, f"not ok with a message of {code.message_bits} bits that was not sent")
+
+
+def corrects(subject: Subject) -> None:
+    """Hold the law."""
+    code = compiled(lambda: subject.algorithm.compile(coded_bits_of(link_of(subject))))
+    if code.message_bits > _MOST_RATE * code.coded_bits:
+        raise InapplicableLawError(
+            f"{code.message_bits} message bits of {code.coded_bits}: no room to correct anything"
+        )
+    rng = np.random.default_rng(0)
+    n = code.coded_bits
+    for seed in range(20):
+        sent = _message(code, seed)
+        llr = _llr(code.encode(sent))
+        wrong = rng.choice(n, n // 100, replace=False)
+        llr[wrong] *= np.float32(-0.5)
+        found = code.decode(llr)
+        what = f"with {len(wrong)} of {n} bits wrong"
+        expect(found.ok and (found.bits == sent).all(), f"the message {what}")
+        expect(found.flipped == len(wrong), f"{len(wrong)} flipped {what}, got {found.flipped}")
+        llr = _llr(code.encode(sent))
+        llr[rng.choice(n, n // 50, replace=False)] = 0
+        found = code.decode(llr)
+        what = f"with {n // 50} of {n} bits not received"
+        expect(found.ok and (found.bits == sent).all(), f"the message {what}")
+        expect(found.flipped == 0, f"no bit flipped {what}, got {found.flipped}")
+
+
+def clean_link(subject: Subject) -> None:
+    """Hold the law."""
+    link = link_of(subject)
+    code = compiled(lambda: subject.algorithm.compile(coded_bits_of(link)))
+    sent = [_message(code, seed) for seed in range(3)]
+    book = link.codebook
+    symbols = np.stack(
+        [symbols_of_bits(code.encode(bits), book.bits_per_symbol, book.clusters) for bits in sent]
+    )
+    receiver = Receiver(link)
+    packets = receiver.feed(ideal_events(link, IdealBar(symbols))) + receiver.close()
+    expect(len(packets) == len(sent), f"{len(sent)} packets of a clean recording, got {len(packets)}")
+    for i, (packet, bits) in enumerate(zip(packets, sent, strict=True)):
+        llr = np.concatenate([frame.soft.llr.ravel() for frame in packet.frames])
+        found = code.decode(llr.astype(np.float32))
+        expect(found.ok, f"message {i} of a clean recording to pass the check")
+        expect((found.bits == bits).all(), f"message {i} of a clean recording as it was sent")
+
+
+ERROR_CORRECTION = (
+    Law("shapes", "uint8 bits of the lengths stated, at any length that is not refused", shapes),
+    Law("comes-back", "a message comes back from the LLRs of its coded bits, none flipped", round_trip),
+    Law("every-bit", "each message bit changes the coded bits", every_bit),
+    Law("knows-nothing", "nothing received gives no message", knows_nothing),
+    Law("no-message-in-noise", "LLRs of random signs give no message", no_message_in_noise),
+    Law("errors-found", "what passes the check is what was sent, however many bits are wrong", errors_found),
+    Law("corrects", "one bit in 100 wrong, or one in 50 not received, is put right and counted", corrects),
+    Law(
+        "clean-link",
+        "messages pass through a clean recording, sent by packets of the default link",
+        clean_link,
+    ),
+)
+"""Laws of error correction."""

@@ -1,0 +1,15 @@
+"""Messages as they are, with a check only."""
+
+from collections.abc import Iterator
+
+from evlcp_sdk.hookspecs import Algorithm, hookimpl
+
+__all__ = ["evlcp_algorithms"]
+
+
+@hookimpl
+def evlcp_algorithms() -> Iterator[Algorithm]:
+    """The algorithms of this package."""
+    yield Algorithm(
+        "error-correction", "none", "evlcp_crc.correction:NoCorrection", 1, "errors are detected only"
+    )

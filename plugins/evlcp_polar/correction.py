@@ -1,0 +1,178 @@
+"""CRC-aided polar code."""
+
+from dataclasses import dataclass
+from math import log
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from evlcp_polar.sequence import RELIABILITY
+from evlcp_sdk.abc import Code, Corrected, ErrorCorrection
+from evlcp_sdk.crc import CRC24C, CRC_BITS, crc24
+from evlcp_sdk.errors import ConfigError
+
+__all__ = ["Polar", "information_set", "sent_bits"]
+
+_MOST_BITS = 1024
+"""Longest codeword: what the reliability sequence is given for."""
+
+_PIECES = (
+    *(0, 1, 2, 4, 3, 5, 6, 7, 8, 16, 9, 17, 10, 18, 11, 19),
+    *(12, 20, 13, 21, 14, 22, 15, 23, 24, 25, 26, 28, 27, 29, 30, 31),
+)
+"""Order in which the 32 pieces of a mother codeword are sent (3GPP TS 38.212, Table 5.4.1.1-1)."""
+
+_PUNCTURED_UP_TO = 7 / 16
+"""Rate up to which code bits are punctured, above which they are shortened (3GPP TS 38.212, 5.4.1.2)."""
+
+
+@dataclass(frozen=True)
+class Polar(ErrorCorrection):
+    """CRC-aided polar code (Arikan 2009) with successive-cancellation list decoding (Tal and Vardy 2015).
+
+    Reliability order, shortening, puncturing and CRC are those of 5G NR (3GPP TS 38.212). A block of more
+    than 1024 bits is split into codewords of equal length, each with its own CRC; see
+    `docs/error-correction.md`. Decoding begins with one path and goes on to `list_size` and, doubled each
+    time, `max_list_size`, until a path passes.
+
+    A path passes if its CRC holds and it explains the LLRs so well that a word of random signs would come as
+    near to any codeword with a probability of `undetected` at most, a proven bound.
+    """
+
+    rate: Annotated[float, Field(gt=0, lt=1, description="Message and CRC bits a coded bit.")] = 0.5
+    list_size: Annotated[int, Field(ge=1, le=128, description="Paths of the first list.")] = 8
+    max_list_size: Annotated[int, Field(ge=1, le=128, description="Paths of the last list.")] = 32
+    undetected: Annotated[
+        float,
+        Field(gt=0, lt=1, description="Probability that a codeword of noise alone is taken for a message."),
+    ] = 1e-9
+
+    def compile(self, coded_bits: int) -> Code:
+        """Choose the code's inputs and the bits that are sent.
+
+        Raises:
+            ConfigError: A codeword has no room for a byte beside the CRC.
+        """
+        words = max(-(-coded_bits // _MOST_BITS), 1)
+        length = coded_bits // words
+        message_bits = int((self.rate * length - CRC_BITS) // 8 * 8)
+        if message_bits < 8:
+            need = int(np.ceil((CRC_BITS + 8) / self.rate))
+            raise ConfigError(
+                f"error-correction 'polar': a block of {coded_bits} bits, expected at least {need}"
+                f" at rate {self.rate:g}"
+            )
+        sizes = {self.max_list_size}
+        size = self.list_size
+        while size < self.max_list_size:
+            sizes.add(size)
+            size *= 2
+        information = information_set(length, message_bits + CRC_BITS)
+        sent = sent_bits(length, message_bits + CRC_BITS)
+        # Of 2**message_bits codewords one each is as likely as another to lie near a word of random signs.
+        log_share = log(self.undetected) - message_bits * log(2)
+        return _PolarCode(
+            words * message_bits, coded_bits, words, length, information, sent, (1, *sorted(sizes)), log_share
+        )
+
+
+def sent_bits(length: int, information_bits: int) -> NDArray[np.int64]:
+    """Code bits of the mother code in the order in which they are sent, int64 (length,).
+
+    The mother code has the next power of two of bits; 3GPP TS 38.212, 5.4.1.1 and 5.4.1.2.
+    """
+    n = max(1 << (length - 1).bit_length(), 32)
+    order = np.arange(n).reshape(32, -1)[list(_PIECES)].ravel()
+    if information_bits / length <= _PUNCTURED_UP_TO:
+        return order[n - length :]
+    return order[:length]
+
+
+def information_set(length: int, information_bits: int) -> NDArray[np.bool_]:
+    """Which inputs of the mother code carry information, bool (N,); 3GPP TS 38.212, 5.4.1.1.
+
+    Shortened and punctured code bits are no information bits, nor are the first inputs of a punctured code;
+    of the others the most reliable are chosen.
+    """
+    n = max(1 << (length - 1).bit_length(), 32)
+    order = np.array(RELIABILITY)
+    order = order[order < n]
+    barred = np.ones(n, bool)
+    barred[sent_bits(length, information_bits)] = False
+    if information_bits / length <= _PUNCTURED_UP_TO and length < n:
+        early = 3 * n / 4 - length / 2 if 4 * length >= 3 * n else 9 * n / 16 - length / 4
+        barred[: int(np.ceil(early))] = True
+    information = np.zeros(n, bool)
+    information[order[~barred[order]][-information_bits:]] = True
+    return information
+
+
+@dataclass(frozen=True, eq=False)
+class _PolarCode:
+    message_bits: int
+    coded_bits: int
+    words: int
+    length: int
+    information: NDArray[np.bool_]
+    sent: NDArray[np.int64]
+    list_sizes: tuple[int, ...]
+    log_share: float
+
+    def encode(self, bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        from evlcp_polar import _kernels
+
+        if bits.shape != (self.message_bits,):
+            raise ConfigError(f"message of shape {bits.shape}: expected ({self.message_bits},) bits")
+        coded = np.zeros(self.coded_bits, np.uint8)
+        for word, message in enumerate(bits.reshape(self.words, -1)):
+            code = np.zeros(len(self.information), np.uint8)
+            code[self.information] = np.concatenate([message, crc24(message)])
+            _kernels.transform(code)
+            coded[word * self.length : (word + 1) * self.length] = code[self.sent]
+        return coded
+
+    def decode(self, llr: NDArray[np.float32]) -> Corrected:
+        if llr.shape != (self.coded_bits,):
+            raise ConfigError(f"LLRs of shape {llr.shape}: expected ({self.coded_bits},)")
+        parts = [
+            self._decode_word(llr[word * self.length : (word + 1) * self.length])
+            for word in range(self.words)
+        ]
+        return Corrected(
+            np.concatenate([part.bits for part in parts]),
+            all(part.ok for part in parts),
+            sum(part.flipped for part in parts),
+        )
+
+    def _decode_word(self, llr: NDArray[np.float32]) -> Corrected:
+        from evlcp_polar import _kernels
+
+        n = len(self.information)
+        punctured = self.length < n and self.sent[-1] == n - 1
+        weight = np.abs(llr).astype(np.float64)
+        limit = _kernels.discrepancy_limit(weight, self.log_share)
+        mother = np.full(n, 0.0 if punctured else 4 * weight.sum() + 1, np.float32)
+        mother[self.sent] = llr
+        best: NDArray[np.uint8] | None = None
+        code = np.zeros(n, np.uint8)
+        for size in self.list_sizes:
+            codewords = np.empty((size, n), np.uint8)
+            inputs = np.empty((size, int(self.information.sum())), np.uint8)
+            metric = np.empty(size)
+            most = np.inf if size == 1 else limit
+            found = _kernels.list_decode(mother, self.information, size, most, codewords, inputs, metric)
+            for path in np.argsort(metric[:found], kind="stable"):
+                if metric[path] <= limit and _kernels.crc_holds(inputs[path], CRC24C):
+                    return self._corrected(llr, codewords[path], inputs[path], ok=True)
+            if best is None:
+                best, code = inputs[0], codewords[0]
+        assert best is not None
+        return self._corrected(llr, code, best, ok=False)
+
+    def _corrected(
+        self, llr: NDArray[np.float32], code: NDArray[np.uint8], inputs: NDArray[np.uint8], *, ok: bool
+    ) -> Corrected:
+        flipped = int(((llr < 0) != code[self.sent].astype(bool))[llr != 0].sum())
+        return Corrected(inputs[:-CRC_BITS].copy(), ok, flipped)
