@@ -78,13 +78,18 @@ def fit_peak(samples: Array, size: int, band: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def pair_shifts(correlation: Array, reach: int, samples: int, shifts: Array) -> None:
-    """Peak of each pair's phase-only correlation near zero shift, `shifts` (pairs, 2): down, right, px."""
+def pair_shifts(
+    correlation: Array, most_y: int, most_x: int, reach: int, samples: int, shifts: Array
+) -> None:
+    """Peak of each pair's phase-only correlation near zero shift, `shifts` (pairs, 2): down, right, px.
+
+    The correlation holds the harmonics up to `most_y` down and `most_x` across.
+    """
     pairs, height, width = correlation.shape
     column = np.empty(2 * samples + 1)
     row = np.empty(2 * samples + 1)
-    band_y = height - 1 + height % 2
-    band_x = width - 1 + width % 2
+    band_y = 2 * most_y + 1
+    band_x = 2 * most_x + 1
     reach_y = min(reach, height // 2 - 1)
     reach_x = min(reach, width // 2 - 1)
     for q in range(pairs):
@@ -183,19 +188,38 @@ def unit_phases(spectra: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def cross_spectra(
-    phases: Array, first: Array, second: Array, height_even: bool, width_even: bool, out: Array
-) -> None:
-    """Conj(first) * second of pairs, without the Nyquist frequencies, which have no phase."""
+def cross_spectra(phases: Array, first: Array, second: Array, most_y: int, most_x: int, out: Array) -> None:
+    """Conj(first) * second of pairs, harmonics up to `most_y` down and `most_x` across; 0 beyond."""
     _, height, width = phases.shape
     for q in range(first.size):
         for v in range(height):
+            inside = min(v, height - v) <= most_y
             for u in range(width):
-                nyquist = (height_even and v == height // 2) or (width_even and u == width - 1)
-                if nyquist:
-                    out[q, v, u] = 0.0
-                else:
+                if inside and u <= most_x:
                     out[q, v, u] = phases[second[q], v, u] * np.conj(phases[first[q], v, u])
+                else:
+                    out[q, v, u] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def blob_size(cuts: Array, size: Array) -> None:
+    """Height and width, `size` (2,), of the box with the mean distance from its middle that cuts have, px.
+
+    The middle of a cut of n pixels is n // 2. A box of h pixels has a mean distance of h / 4, which a stray
+    pixel moves less than it moves a variance.
+    """
+    total = 0.0
+    size[:] = 0.0
+    n, height, width = cuts.shape
+    for k in range(n):
+        for v in range(height):
+            for u in range(width):
+                w = cuts[k, v, u]
+                total += w
+                size[0] += w * abs(v - height // 2)
+                size[1] += w * abs(u - width // 2)
+    for axis in range(2):
+        size[axis] = 4 * size[axis] / total if total > 0 else 0.0
 
 
 @njit(cache=True, nogil=True)

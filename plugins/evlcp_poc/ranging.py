@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +19,28 @@ __all__ = ["PocRanging", "phase_only_correlation"]
 
 _NONE = Range(float("nan"), float("nan"), 0)
 
+_CYCLES = 0.5
+"""End of the band that blobs fill, cycles a blob size: half the main lobe of a box's spectrum, where its
+amplitude is still 2 / pi of the peak. The noise of a phase is inverse to the amplitude, and all phases weigh
+the same."""
+
 
 def phase_only_correlation(
-    images: NDArray[np.float32], first: NDArray[np.int64], second: NDArray[np.int64]
+    images: NDArray[np.float32],
+    first: NDArray[np.int64],
+    second: NDArray[np.int64],
+    most: tuple[int, int] | None = None,
 ) -> NDArray[np.float64]:
     """Phase-only correlation of pairs of images, float32 (n, height, width) -> (pairs, height, width).
 
     The peak of a pair lies where its second image lies relative to its first (down, right), and has the shape
-    of the Dirichlet kernel of the band kept: all frequencies but Nyquist's.
+    of the Dirichlet kernel of the band kept.
+
+    Args:
+        images: The images.
+        first: First image of each pair.
+        second: Second image of each pair.
+        most: Highest harmonics kept, down and across; None for all but Nyquist's, which have no phase.
     """
     from evlcp_poc import _kernels
 
@@ -34,7 +48,8 @@ def phase_only_correlation(
     phases = fft.rfft2(images)
     _kernels.unit_phases(phases)
     cross = np.empty((len(first), *phases.shape[1:]), phases.dtype)
-    _kernels.cross_spectra(phases, first, second, height % 2 == 0, width % 2 == 0, cross)
+    most_y, most_x = most or _full_band(height, width)
+    _kernels.cross_spectra(phases, first, second, most_y, most_x, cross)
     out: NDArray[np.float64] = fft.irfft2(cross, (height, width), overwrite_x=True)
     return out
 
@@ -48,8 +63,17 @@ class PocRanging(Ranging):
     has the same error whatever its length, so a pair's distance is the better the farther apart its clusters:
     the variance falls with the spacing squared, which gives the weights. The spread over clusters (delete-one
     jackknife, since pairs share clusters) gives sigma.
+
+    The spectrum of a map falls off beyond half a cycle a blob size, and the phases there are the noise's, but
+    count as much in the paper's method, `band = "full"`. With `band = "blob"` only the frequencies that the
+    blobs fill are correlated: on ideal blobs in noise, the error of a shift is 1.3 to 2.5 times the
+    Cramer-Rao bound instead of 5 to 7.
     """
 
+    band: Annotated[
+        Literal["full", "blob"],
+        Field(description="Frequencies correlated: all, as in the paper, or up to half a cycle a blob size."),
+    ] = "full"
     clusters: Annotated[
         tuple[int, ...], Field(description="Clusters to use; empty for all but the outermost.")
     ] = ()
@@ -124,11 +148,12 @@ class PocRanging(Ranging):
             width = min(height, _cut_size(maps.shape[2]))
             cuts = np.zeros((len(every), height, width), np.float32)
             _kernels.cut_maps(maps, every, middle, cuts)
-            correlation = phase_only_correlation(cuts, a, b)
+            most = _full_band(height, width) if self.band == "full" else _blob_band(cuts)
+            correlation = phase_only_correlation(cuts, a, b, most)
             beyond = np.empty((len(a), 2))
             # Two medians of blobs of one spacing are wrong by half a spacing at the most.
             reach = max(int(neighbour_px / 2), 2)
-            _kernels.pair_shifts(correlation, reach, self.peak_samples, beyond)
+            _kernels.pair_shifts(correlation, *most, reach, self.peak_samples, beyond)
             apart_px += beyond
             length_px = np.hypot(apart_px[:, 0], apart_px[:, 1])
             distance = camera.focal_px * apart_m / np.maximum(length_px, 1e-9)
@@ -148,6 +173,24 @@ class PocRanging(Ranging):
                 f" expected two or more different clusters of 0 to {clusters - 1}"
             )
         return np.sort(used)
+
+
+def _full_band(height: int, width: int) -> tuple[int, int]:
+    """Highest harmonics, down and across, that have a phase."""
+    return (height - 1) // 2, (width - 1) // 2
+
+
+def _blob_band(cuts: NDArray[np.float32]) -> tuple[int, int]:
+    """Highest harmonics, down and across, that blobs fill; one at the least."""
+    from evlcp_poc import _kernels
+
+    size = np.empty(2)
+    _kernels.blob_size(cuts, size)
+    down, across = (
+        min(max(round(_CYCLES * n / max(blob, 1.0)), 1), most)
+        for n, blob, most in zip(cuts.shape[1:], size, _full_band(*cuts.shape[1:]), strict=True)
+    )
+    return down, across
 
 
 def _cut_size(least: float) -> int:

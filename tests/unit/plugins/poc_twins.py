@@ -40,16 +40,21 @@ def shifted(spectrum, shape, down, right):
     return np.fft.irfft2(spectrum * np.exp(-2j * np.pi * (down * v + right * u)), shape).astype(np.float32)
 
 
-def phase_only_correlation(a, b):
-    """All by complex transforms of double precision; Nyquist's frequencies left out."""
+def harmonics(size):
+    """Number of each frequency of a transform, without its sign."""
+    return np.abs(np.fft.fftfreq(size, 1 / size))
+
+
+def phase_only_correlation(a, b, most=None):
+    """All by complex transforms of double precision; harmonics above `most`, or Nyquist's, left out."""
+    if most is None:
+        most = [(n - 1) // 2 for n in a.shape]
     fa, fb = np.fft.fft2(a.astype(float)), np.fft.fft2(b.astype(float))
     cross = fb * fa.conj()
     with np.errstate(invalid="ignore", divide="ignore"):
         cross = np.where(np.abs(cross) > 0, cross / np.abs(cross), 0)
-    if a.shape[0] % 2 == 0:
-        cross[a.shape[0] // 2] = 0
-    if a.shape[1] % 2 == 0:
-        cross[:, a.shape[1] // 2] = 0
+    cross[harmonics(a.shape[0]) > most[0]] = 0
+    cross[:, harmonics(a.shape[1]) > most[1]] = 0
     return np.fft.ifft2(cross).real
 
 
@@ -69,6 +74,13 @@ def cut(image, at, rows, columns):
     padded = np.pad(image, ((rows, rows), (columns, columns)))
     top, left = at[0] + rows - rows // 2, at[1] + columns - columns // 2
     return padded[top : top + rows, left : left + columns]
+
+
+def blob_size(cuts):
+    """Four times the mean distance from the middle, down and across."""
+    v, u = np.mgrid[: cuts.shape[1], : cuts.shape[2]]
+    off = [np.abs(v - cuts.shape[1] // 2), np.abs(u - cuts.shape[2] // 2)]
+    return [4 * np.average(np.broadcast_to(d, cuts.shape), weights=cuts) for d in off]
 
 
 def robust_mean(values, weights, first, second, clusters, drop, iqr):
@@ -98,3 +110,18 @@ def box(centre, width, size):
     """The part of each pixel of a line that a box covers."""
     edges = np.clip(np.arange(size + 1) - 0.5, centre - width / 2, centre + width / 2)
     return np.diff(edges)
+
+
+def soft_box(centre, width, blur, size):
+    """A box blurred by a Gaussian, the mean over each pixel of a line by 16 samples; and its slope."""
+    x = (np.arange(16 * size) + 0.5) / 16 - 0.5 - centre
+
+    def edge(at):
+        return erf((x - at) / (np.sqrt(2) * blur)) / 2
+
+    def bell(at):
+        return np.exp(-((x - at) ** 2) / (2 * blur**2)) / (np.sqrt(2 * np.pi) * blur)
+
+    value = edge(-width / 2) - edge(width / 2)
+    slope = bell(width / 2) - bell(-width / 2)
+    return value.reshape(size, 16).mean(1), slope.reshape(size, 16).mean(1)
