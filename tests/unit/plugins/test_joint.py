@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from evlcp_joint import _kernels
-from evlcp_joint.bound import cramer_rao_sigma_m
 from evlcp_joint.ranging import JointScaleRanging
 from numpy.testing import assert_allclose
 from scipy.stats import norm
 
+from evlcp_sdk.bound import cramer_rao_sigma_m
 from evlcp_sdk.config import load_link
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.geometry import BarLayout, CameraModel
@@ -226,16 +226,3 @@ def test_the_fit_reaches_the_cramer_rao_bound() -> None:
     ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(bounds)))
     # The error of 80 draws is known to 8 %: three of these.
     assert 0.76 < ratio < 1.24
-
-
-def test_the_bound_follows_noise_and_distance() -> None:
-    def bound(**how: float) -> float:
-        given = {"distance_m": 50.0, "blur_px": 0.45, "noise": 0.3} | how
-        return cramer_rao_sigma_m(LINK.camera, LINK.bar, LINK.codebook, symbols=np.arange(K), **given)
-
-    assert bound(noise=0.6) == pytest.approx(2 * bound())
-    assert bound(columns=20.0) == pytest.approx(bound() / 2)
-    # A boundary is as sure at any distance: the error grows with its square.
-    assert bound(distance_m=100.0) == pytest.approx(4 * bound(), rel=0.2)
-    with pytest.raises(ConfigError, match="noise = 0"):
-        bound(noise=0)
