@@ -30,7 +30,8 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
     `scene` holds its parameters; `bars` what each sent: symbols [packet][frame][cluster], the chip of the
     first packet that was on air at the scene's begin, and `pilot_every` where not every frame has a pilot;
     `t_s`, `distance_m` and `bar_centre_px`, every millisecond, the depth along the optical axis and the place
-    of each bar's centre; `simulator` the resolved scene, which renders the recording again.
+    of each bar's centre; `camera_path`, every millisecond, the camera's place (x, y, z; m) and attitude (yaw,
+    pitch, roll; degrees) in the scene; `simulator` the resolved scene, which renders the recording again.
     """
     scene = simulation.scene
     camera, sensor, motion = scene.camera, scene.sensor, scene.motion
@@ -106,6 +107,10 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
         "bar_centre_px": [
             [[round(float(v), 3) for v in place[:, i, axis]] for axis in (0, 1)] for i in range(len(bars))
         ],
+        "camera_path": {
+            "position_m": [[round(float(v), 5) for v in axis] for axis in position.T],
+            "attitude_deg": [[round(float(v), 5) for v in axis] for axis in np.degrees(attitude).T],
+        },
         "psf_sigma_px": [blur_sigma_px(float(d), scene.lens, camera) for d in depth[0]],
         "e_led": [light.light_w_m2 for light in simulation.bars],
         "simulator": scene_table(scene),
