@@ -11,7 +11,7 @@ SDK = Path(__file__).parents[2] / "evlcp_sdk"
 LAYERS = (
     {"errors"},
     {"types"},
-    {"geometry", "codebook", "frames", "crc"},
+    {"geometry", "codebook", "frames", "crc", "sites"},
     {"abc", "hookspecs"},
     {"registry", "config"},
     {"io", "rx", "sim"},
