@@ -185,13 +185,12 @@ def resolve_sites(table: Mapping[str, Any], *, source: str = "") -> tuple[BarSit
                     faults.append(f"{before}{where} = {error['input']!r}: {expected}")
     if not faults:
         for name in ("transmitter_id", "transmitter"):
-            seen: dict[int, int] = {}
+            first: dict[int, int] = {}
             for i, site in enumerate(sites):
                 number = getattr(site, name)
-                if number is not None and seen.setdefault(number, i) != i:
-                    faults.append(
-                        f"{before}bar.{i}.{name} = {number}: bar.{seen[number]} has it, too; expected one each"
-                    )
+                if number is not None and first.setdefault(number, i) != i:
+                    same = f"bar.{first[number]} has it, too; expected one each"
+                    faults.append(f"{before}bar.{i}.{name} = {number}: {same}")
     if faults:
         raise ConfigError("\n".join(faults))
     return tuple(sites)
