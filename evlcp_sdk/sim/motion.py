@@ -173,7 +173,7 @@ def project(
         position_m: The camera's, float64 (n, 3), m.
         attitude_rad: Its (yaw, pitch, roll), float64 (n, 3): first turned right, then up, then rolled so
             that its top leans right.
-        camera: Its optical axis meets the image at (width / 2, height / 2).
+        camera: With its principal point and distortion.
 
     Returns:
         Places, px, float64 (n, p, 2), and depths along the optical axis, m, float64 (n, p). Places of points
@@ -185,6 +185,4 @@ def project(
     x, z = x * np.cos(yaw) - z * np.sin(yaw), x * np.sin(yaw) + z * np.cos(yaw)
     y, z = y * np.cos(pitch) + z * np.sin(pitch), z * np.cos(pitch) - y * np.sin(pitch)
     x, y = x * np.cos(roll) + y * np.sin(roll), y * np.cos(roll) - x * np.sin(roll)
-    scale = camera.focal_px / np.maximum(z, NEAREST_M)
-    centre = np.array([camera.width / 2, camera.height / 2])
-    return np.stack([x * scale, y * scale], -1) + centre, z
+    return camera.distort(np.stack([x, y], -1) / np.maximum(z, NEAREST_M)[..., None]), z

@@ -304,3 +304,11 @@ def test_a_full_disk_leaves_no_half_recording(tmp_path: Path, monkeypatch: pytes
         _write_text(tmp_path / "a.truth.json", "x")
     assert list(tmp_path.iterdir()) == []
     assert MotionSpec().distance_m == 50
+
+
+def test_the_simulator_sees_through_the_camera_model() -> None:
+    camera = CameraModel(centre_x_px=600.0, centre_y_px=380.0, k1=-0.2, p1=1e-3)
+    points = np.array([[1.0, -0.5, 20.0], [-3.0, 1.0, 60.0]])
+    place, depth = project(points, np.zeros((1, 3)), np.zeros((1, 3)), camera)
+    np.testing.assert_allclose(place[0], camera.project(points))
+    np.testing.assert_allclose(depth[0], [20, 60])
