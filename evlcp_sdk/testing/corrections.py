@@ -15,13 +15,13 @@ from evlcp_sdk.testing.recordings import IdealBar, ideal_events
 
 __all__ = ["ERROR_CORRECTION"]
 
-_LENGTHS = (1, 24, 31, 64, 100, 256, 333, 640, 960, 1024, 1025, 1280, 2047)
+_LENGTHS = (1, 31, 64, 100, 256, 333, 640, 1025, 1280)
 """Blocks on air: of the built-in profiles, powers of two, and lengths that are neither."""
 
 _SURE = np.float32(8.0)
 """LLR of a bit received well: wrong once in 3000."""
 
-_BLOCKS = 200
+_BLOCKS = 40
 _MOST_RATE = 0.9
 """Message bits a coded bit above which no room is left to correct anything but a bit or two."""
 

@@ -1,6 +1,6 @@
 """Successive-cancellation list decoding and the plausibility of its result: compiled."""
 
-from math import exp, log, log1p
+from math import exp, inf, log
 from typing import Any
 
 import numpy as np
@@ -39,7 +39,7 @@ def discrepancy_limit(weight: Array, log_share: float) -> float:
 
     A word of random signs lies within D of a given codeword with a probability of at most
     exp(z D) prod((1 + exp(-z w)) / 2) for every z > 0 (Chernoff). The D is found at which the least of these
-    is exp(`log_share`). The bound falls with z, and D is the mean of the tilted weights there.
+    is exp(`log_share`), or a little less. The bound falls with z, and D is the mean of the tilted weights.
     """
     total, received = 0.0, 0
     for w in weight:
@@ -48,45 +48,86 @@ def discrepancy_limit(weight: Array, log_share: float) -> float:
             received += 1
     if received * log(2.0) <= -log_share:
         return -1.0
-    low, high = 0.0, 0.0
-    z = received / total
-    for _ in range(60):
-        d, bound, slope = 0.0, 0.0, 0.0
+    low, high = 0.0, inf
+    z = 2.0 * received / total
+    for _ in range(100):
+        d, bound, slope, product = 0.0, -received * log(2.0), 0.0, 1.0
         for w in weight:
             if w > 0.0:
                 e = exp(-z * w)
                 p = e / (1.0 + e)
                 d += w * p
-                bound += log1p(e)
                 slope += w * w * p * (1.0 - p)
-        bound += z * d - received * log(2.0)
+                product *= 1.0 + e
+                if product > 1e250:
+                    bound += log(product)
+                    product = 1.0
+        bound += log(product) + z * d
         if bound > log_share:
             low = z
+        elif bound > log_share - 0.05:
+            return d
         else:
             high = z
-        if abs(bound - log_share) < 1e-3:
-            break
-        z += (bound - log_share) / (z * slope) if slope > 0.0 else -z
-        if z <= low or (high > 0.0 and z >= high):
-            z = (low + high) / 2 if high > 0.0 else 2 * low
-    return d
+        z += (bound - log_share + 0.02) / (z * slope) if slope > 0.0 else inf
+        if not low < z < high:
+            z = (low + high) / 2 if high < inf else 2.0 * low
+    return -1.0
+
+
+FROZEN, REPEATED, FREE = 0, 1, 2
+"""Kinds of nodes: inputs that are all 0; all 0 but the last; all information."""
 
 
 @njit(cache=True, nogil=True)
-def list_decode(
-    llr: Array, information: Array, size: int, limit: float, codewords: Array, inputs: Array, metric: Array
-) -> int:
-    """Successive-cancellation list decoding (Tal and Vardy 2015), min-sum, metric by LLRs; the paths kept.
+def schedule(information: Array, free: bool, nodes: Array) -> int:
+    """Split the inputs into the largest nodes that are decided at once; their number.
+
+    Args:
+        information: Which inputs carry information, bool (N,).
+        free: Whether nodes of information only are decided at once; else input by input.
+        nodes: Filled with (first input, stage, kind) of each, int64 (N, 3).
+    """
+    n, at, first = len(information), 0, 0
+    while first < n:
+        stage = 0
+        kind = REPEATED if information[first] else FROZEN
+        while first >> stage & 1 == 0 and first + (2 << stage) <= n:
+            size = 2 << stage
+            inside = 0
+            for i in range(first, first + size):
+                inside += information[i]
+            if inside == 0:
+                kind = FROZEN
+            elif inside == 1 and information[first + size - 1]:
+                kind = REPEATED
+            elif free and inside == size:
+                kind = FREE
+            else:
+                break
+            stage += 1
+        nodes[at, 0], nodes[at, 1], nodes[at, 2] = first, stage, kind
+        at += 1
+        first += 1 << stage
+    return at
+
+
+@njit(cache=True, nogil=True)
+def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Array, metric: Array) -> int:
+    """Successive-cancellation list decoding; the paths kept, none if all exceed the limit.
+
+    Tal and Vardy (2015), by LLRs and min-sum (Balatsoukas-Stimming et al. 2015): the metric of a whole path
+    is the total of |llr| where its codeword differs from the sign of the LLR, and only grows along the path.
+    Nodes whose inputs are all 0, or all but the last, are decided at once (Sarkis et al. 2014), with the same
+    result.
 
     Args:
         llr: LLRs of the N code bits, float32.
-        information: Which of the N inputs carry information, bool; the others are 0.
+        nodes: What `schedule` gives, int64 (nodes, 3); FREE nodes only with one path.
         size: Most paths; 1 is successive cancellation.
-        limit: A path whose metric exceeds it is dropped; none may be left.
+        limit: A path whose metric exceeds it is dropped.
         codewords: Filled with each path's code bits, uint8 (size, N).
-        inputs: Filled with each path's information bits, uint8 (size, K).
-        metric: Filled with each path's metric, the total of |llr| where its codeword differs from the sign of
-            the LLR, float64 (size,).
+        metric: Filled with each path's metric, float64 (size,).
     """
     n = len(llr)
     stages = 0
@@ -94,60 +135,68 @@ def list_decode(
         stages += 1
     # Stage s of a path lies at [2**s, 2**(s + 1)) of a row. All paths write a stage at one time, and read
     # only the stages above (LLRs) or below (partial sums), so that a clone can share rows with its parent.
-    alpha = np.empty((size, n), np.float32)
+    alpha = np.empty((size, 2 * n), np.float32)
     beta = np.empty((size, n), np.uint8)
     alpha_row = np.zeros((size, stages + 1), np.int64)
     beta_row = np.zeros((size, stages + 1), np.int64)
+    alpha[0, n:] = llr
     alive = np.zeros(size, np.bool_)
     alive[0] = True
     count = 1
-    k = inputs.shape[1]
-    parent = np.empty((k, size), np.uint8)
-    choice = np.empty((k, size), np.uint8)
-    decided = 0
+    zero, one = np.zeros(size), np.zeros(size)
     bit = np.zeros(size, np.uint8)
     cost = np.empty(2 * size, np.float64)
     which = np.empty(2 * size, np.int64)
     keep = np.empty((size, 2), np.bool_)
     metric[:] = 0.0
-    for phi in range(n):
+    for node in range(len(nodes)):
+        first, stage, kind = nodes[node, 0], nodes[node, 1], nodes[node, 2]
+        length = 1 << stage
         top = stages - 1
-        if phi:
+        if first:
             top = 0
-            while not phi >> top & 1:
+            while not first >> top & 1:
                 top += 1
         for path in range(size):
             if not alive[path]:
                 continue
-            for s in range(top, -1, -1):
+            for s in range(top, stage - 1, -1):
                 half = 1 << s
-                above = llr if s + 1 == stages else alpha[alpha_row[path, s + 1], 2 * half : 4 * half]
-                out = alpha[path, half : 2 * half]
-                if s == top and phi:
-                    left = beta[beta_row[path, s], half : 2 * half]
-                    for i in range(half):
-                        out[i] = above[half + i] - above[i] if left[i] else above[half + i] + above[i]
+                up = alpha_row[path, s + 1]
+                if s == top and first:
+                    row = beta_row[path, s]
+                    for i in range(half, 2 * half):
+                        a, b = alpha[up, half + i], alpha[up, 2 * half + i]
+                        alpha[path, i] = b - a if beta[row, i] else b + a
                 else:
-                    for i in range(half):
-                        a, b = above[i], above[half + i]
+                    for i in range(half, 2 * half):
+                        a, b = alpha[up, half + i], alpha[up, 2 * half + i]
                         least = min(abs(a), abs(b))
-                        out[i] = -least if (a < 0) != (b < 0) else least
+                        alpha[path, i] = -least if (a < 0) != (b < 0) else least
                 alpha_row[path, s] = path
-        if not information[phi]:
+            row = alpha_row[path, stage]
+            zero[path], one[path] = 0.0, 0.0
+            if kind != FREE:
+                for i in range(length, 2 * length):
+                    a = alpha[row, i]
+                    if a < 0:
+                        zero[path] -= a
+                    else:
+                        one[path] += a
+        if kind == FROZEN:
+            count = 0
             for path in range(size):
                 if alive[path]:
                     bit[path] = 0
-                    leaf = alpha[path, 1]
-                    if leaf < 0:
-                        metric[path] -= leaf
-        else:
+                    metric[path] += zero[path]
+                    alive[path] = metric[path] <= limit
+                    count += alive[path]
+        elif kind == REPEATED:
             found = 0
             for path in range(size):
                 if alive[path]:
-                    leaf = alpha[path, 1]
-                    bit[path] = leaf < 0
-                    for other in range(2):
-                        c = metric[path] + (abs(leaf) if other else 0.0)
+                    for value in range(2):
+                        c = metric[path] + (one[path] if value else zero[path])
                         # Insertion: equal ones keep their order, so that the result is determined.
                         i = found
                         while i > 0 and cost[i - 1] > c:
@@ -155,66 +204,60 @@ def list_decode(
                             which[i] = which[i - 1]
                             i -= 1
                         cost[i] = c
-                        which[i] = 2 * path + other
+                        which[i] = 2 * path + value
                         found += 1
             keep[:] = False
+            count = 0
             for i in range(min(found, size)):
                 if cost[i] <= limit:
                     keep[which[i] >> 1, which[i] & 1] = True
-            count = 0
+                    count += 1
             for path in range(size):
-                alive[path] = alive[path] and (keep[path, 0] or keep[path, 1])
-                parent[decided, path] = path
+                alive[path] = keep[path, 0] or keep[path, 1]
             free = 0
             for path in range(size):
-                if not (keep[path, 0] or keep[path, 1]):
-                    continue
-                count += keep[path, 0]
-                count += keep[path, 1]
                 if keep[path, 0] and keep[path, 1]:
                     while alive[free]:
                         free += 1
                     alive[free] = True
                     alpha_row[free] = alpha_row[path]
                     beta_row[free] = beta_row[path]
-                    metric[free] = metric[path] + abs(alpha[path, 1])
-                    bit[free] = 1 - bit[path]
-                    parent[decided, free] = path
+                    metric[free] = metric[path] + one[path]
+                    bit[free] = 1
+                if keep[path, 0]:
+                    metric[path] += zero[path]
+                    bit[path] = 0
                 elif keep[path, 1]:
-                    metric[path] += abs(alpha[path, 1])
-                    bit[path] = 1 - bit[path]
-            choice[decided] = bit
-            decided += 1
-        if size == 1 and metric[0] > limit:
-            return 0
+                    metric[path] += one[path]
+                    bit[path] = 1
         if count == 0:
             return 0
         for path in range(size):
             if not alive[path]:
                 continue
-            x = codewords[path]
-            x[0] = bit[path]
-            s = 0
-            while phi >> s & 1:
-                left = beta[beta_row[path, s], 1 << s : 2 << s]
-                for i in range(1 << s):
-                    x[(1 << s) + i] = x[i]
-                    x[i] ^= left[i]
+            if kind == FREE:
+                row = alpha_row[path, stage]
+                for i in range(length):
+                    codewords[path, i] = alpha[row, length + i] < 0
+            else:
+                for i in range(length):
+                    codewords[path, i] = bit[path]
+            s = stage
+            while first >> s & 1:
+                half = 1 << s
+                row = beta_row[path, s]
+                for i in range(half):
+                    codewords[path, half + i] = codewords[path, i]
+                    codewords[path, i] ^= beta[row, half + i]
                 s += 1
             if s < stages:
                 for i in range(1 << s):
-                    beta[path, (1 << s) + i] = x[i]
+                    beta[path, (1 << s) + i] = codewords[path, i]
                 beta_row[path, s] = path
-    # Traced back into other rows only after every path's codeword is complete.
     at = 0
     for path in range(size):
-        if not alive[path] or metric[path] > limit:
-            continue
-        row = path
-        for i in range(k - 1, -1, -1):
-            inputs[at, i] = choice[i, row]
-            row = parent[i, row]
-        codewords[at] = codewords[path]
-        metric[at] = metric[path]
-        at += 1
+        if alive[path]:
+            codewords[at] = codewords[path]
+            metric[at] = metric[path]
+            at += 1
     return at

@@ -1,7 +1,7 @@
 """CRC-aided polar code."""
 
 from dataclasses import dataclass
-from math import log
+from math import ceil, log
 from typing import Annotated
 
 import numpy as np
@@ -49,33 +49,64 @@ class Polar(ErrorCorrection):
         Field(gt=0, lt=1, description="Probability that a codeword of noise alone is taken for a message."),
     ] = 1e-9
 
+    def __post_init__(self) -> None:
+        if self.max_list_size < self.list_size:
+            raise ConfigError(
+                f"error-correction.max_list_size = {self.max_list_size}:"
+                f" expected at least list_size = {self.list_size}"
+            )
+
     def compile(self, coded_bits: int) -> Code:
         """Choose the code's inputs and the bits that are sent.
 
         Raises:
             ConfigError: A codeword has no room for a byte beside the CRC.
         """
+        from evlcp_polar import _kernels
+
         words = max(-(-coded_bits // _MOST_BITS), 1)
         length = coded_bits // words
-        message_bits = int((self.rate * length - CRC_BITS) // 8 * 8)
+        # A rate such as 0.35 has no exact double: the little more keeps 0.35 * 320 from being 111.99.
+        message_bits = (int(self.rate * length + 1e-6) - CRC_BITS) // 8 * 8
         if message_bits < 8:
-            need = int(np.ceil((CRC_BITS + 8) / self.rate))
+            need = ceil((CRC_BITS + 8) / self.rate)
             raise ConfigError(
                 f"error-correction 'polar': a block of {coded_bits} bits, expected at least {need}"
                 f" at rate {self.rate:g}"
             )
-        sizes = {self.max_list_size}
+        sizes = [1]
         size = self.list_size
         while size < self.max_list_size:
-            sizes.add(size)
+            sizes.append(size)
             size *= 2
+        sizes.append(self.max_list_size)
         information = information_set(length, message_bits + CRC_BITS)
-        sent = sent_bits(length, message_bits + CRC_BITS)
-        # Of 2**message_bits codewords one each is as likely as another to lie near a word of random signs.
-        log_share = log(self.undetected) - message_bits * log(2)
+        nodes = []
+        for free in (True, False):
+            table = np.empty((len(information), 3), np.int64)
+            nodes.append(table[: _kernels.schedule(information, free, table)].copy())
         return _PolarCode(
-            words * message_bits, coded_bits, words, length, information, sent, (1, *sorted(sizes)), log_share
+            message_bits=words * message_bits,
+            coded_bits=coded_bits,
+            words=words,
+            length=length,
+            information=information,
+            sent=sent_bits(length, message_bits + CRC_BITS),
+            punctured=_punctured(length, message_bits + CRC_BITS),
+            nodes=nodes[0],
+            list_nodes=nodes[1],
+            list_sizes=tuple(dict.fromkeys(sizes)),
+            # One of the 2**message_bits codewords is as likely as the other to lie near a random word.
+            log_share=log(self.undetected) - message_bits * log(2),
         )
+
+
+def _mother_bits(length: int) -> int:
+    return max(1 << (length - 1).bit_length(), len(_PIECES))
+
+
+def _punctured(length: int, information_bits: int) -> bool:
+    return length < _mother_bits(length) and information_bits / length <= _PUNCTURED_UP_TO
 
 
 def sent_bits(length: int, information_bits: int) -> NDArray[np.int64]:
@@ -83,11 +114,9 @@ def sent_bits(length: int, information_bits: int) -> NDArray[np.int64]:
 
     The mother code has the next power of two of bits; 3GPP TS 38.212, 5.4.1.1 and 5.4.1.2.
     """
-    n = max(1 << (length - 1).bit_length(), 32)
-    order = np.arange(n).reshape(32, -1)[list(_PIECES)].ravel()
-    if information_bits / length <= _PUNCTURED_UP_TO:
-        return order[n - length :]
-    return order[:length]
+    n = _mother_bits(length)
+    order = np.arange(n).reshape(len(_PIECES), -1)[list(_PIECES)].ravel()
+    return order[n - length :] if _punctured(length, information_bits) else order[:length]
 
 
 def information_set(length: int, information_bits: int) -> NDArray[np.bool_]:
@@ -96,14 +125,14 @@ def information_set(length: int, information_bits: int) -> NDArray[np.bool_]:
     Shortened and punctured code bits are no information bits, nor are the first inputs of a punctured code;
     of the others the most reliable are chosen.
     """
-    n = max(1 << (length - 1).bit_length(), 32)
+    n = _mother_bits(length)
     order = np.array(RELIABILITY)
     order = order[order < n]
     barred = np.ones(n, bool)
     barred[sent_bits(length, information_bits)] = False
-    if information_bits / length <= _PUNCTURED_UP_TO and length < n:
+    if _punctured(length, information_bits):
         early = 3 * n / 4 - length / 2 if 4 * length >= 3 * n else 9 * n / 16 - length / 4
-        barred[: int(np.ceil(early))] = True
+        barred[: ceil(early)] = True
     information = np.zeros(n, bool)
     information[order[~barred[order]][-information_bits:]] = True
     return information
@@ -111,12 +140,17 @@ def information_set(length: int, information_bits: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class _PolarCode:
+    """A block of codewords; `nodes` for one path, `list_nodes` for lists, `log_share` of random words."""
+
     message_bits: int
     coded_bits: int
     words: int
     length: int
     information: NDArray[np.bool_]
     sent: NDArray[np.int64]
+    punctured: bool
+    nodes: NDArray[np.int64]
+    list_nodes: NDArray[np.int64]
     list_sizes: tuple[int, ...]
     log_share: float
 
@@ -136,43 +170,58 @@ class _PolarCode:
     def decode(self, llr: NDArray[np.float32]) -> Corrected:
         if llr.shape != (self.coded_bits,):
             raise ConfigError(f"LLRs of shape {llr.shape}: expected ({self.coded_bits},)")
-        parts = [
-            self._decode_word(llr[word * self.length : (word + 1) * self.length])
-            for word in range(self.words)
-        ]
+        values = llr.astype(np.float64)
+        if not np.isfinite(values).all():
+            # Surer than the others, but not so much that nothing is left of them in single precision.
+            sure = 2 * np.abs(values[np.isfinite(values)]).max(initial=1.0)
+            values = np.nan_to_num(values, nan=0.0, posinf=sure, neginf=-sure)
+        words = values[: self.words * self.length].reshape(self.words, -1)
+        parts = [self._decode_word(word) for word in words]
         return Corrected(
             np.concatenate([part.bits for part in parts]),
             all(part.ok for part in parts),
             sum(part.flipped for part in parts),
         )
 
-    def _decode_word(self, llr: NDArray[np.float32]) -> Corrected:
+    def _decode_word(self, llr: NDArray[np.float64]) -> Corrected:
         from evlcp_polar import _kernels
 
-        n = len(self.information)
-        punctured = self.length < n and self.sent[-1] == n - 1
-        weight = np.abs(llr).astype(np.float64)
+        weight = np.abs(llr)
+        mean = weight.mean()
+        if mean > 0:
+            weight /= mean
+            llr = llr / mean
         limit = _kernels.discrepancy_limit(weight, self.log_share)
-        mother = np.full(n, 0.0 if punctured else 4 * weight.sum() + 1, np.float32)
+        n = len(self.information)
+        # A shortened bit is known to be 0: surer than all that is received.
+        mother = np.full(n, 0.0 if self.punctured else 4.0 * n, np.float32)
         mother[self.sent] = llr
-        best: NDArray[np.uint8] | None = None
-        code = np.zeros(n, np.uint8)
+        guess, least = np.zeros(n, np.uint8), np.inf
         for size in self.list_sizes:
             codewords = np.empty((size, n), np.uint8)
-            inputs = np.empty((size, int(self.information.sum())), np.uint8)
             metric = np.empty(size)
-            most = np.inf if size == 1 else limit
-            found = _kernels.list_decode(mother, self.information, size, most, codewords, inputs, metric)
+            nodes, most = (self.nodes, np.inf) if size == 1 else (self.list_nodes, limit)
+            found = _kernels.list_decode(mother, nodes, size, most, codewords, metric)
             for path in np.argsort(metric[:found], kind="stable"):
-                if metric[path] <= limit and _kernels.crc_holds(inputs[path], CRC24C):
-                    return self._corrected(llr, codewords[path], inputs[path], ok=True)
-            if best is None:
-                best, code = inputs[0], codewords[0]
-        assert best is not None
-        return self._corrected(llr, code, best, ok=False)
+                inputs = self._inputs(codewords[path])
+                if metric[path] <= limit and _kernels.crc_holds(inputs, CRC24C):
+                    return self._corrected(llr, codewords[path], inputs, ok=True)
+                if metric[path] < least:
+                    guess, least = codewords[path], metric[path]
+            # Whatever a longer list found would most likely be as far off as all that this one has found.
+            if limit < 0 or found == 0:
+                break
+        return self._corrected(llr, guess, self._inputs(guess), ok=False)
+
+    def _inputs(self, codeword: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        from evlcp_polar import _kernels
+
+        inputs = codeword.copy()
+        _kernels.transform(inputs)
+        return inputs[self.information]
 
     def _corrected(
-        self, llr: NDArray[np.float32], code: NDArray[np.uint8], inputs: NDArray[np.uint8], *, ok: bool
+        self, llr: NDArray[np.float64], codeword: NDArray[np.uint8], inputs: NDArray[np.uint8], *, ok: bool
     ) -> Corrected:
-        flipped = int(((llr < 0) != code[self.sent].astype(bool))[llr != 0].sum())
+        flipped = int(((llr < 0) != codeword[self.sent].astype(bool))[llr != 0].sum())
         return Corrected(inputs[:-CRC_BITS].copy(), ok, flipped)

@@ -1,0 +1,19 @@
+"""Reed-Solomon codes over bytes, to compare with."""
+
+from collections.abc import Iterator
+
+from evlcp_sdk.hookspecs import Algorithm, hookimpl
+
+__all__ = ["evlcp_algorithms"]
+
+
+@hookimpl
+def evlcp_algorithms() -> Iterator[Algorithm]:
+    """The algorithms of this package."""
+    yield Algorithm(
+        "error-correction",
+        "reed-solomon",
+        "evlcp_reed_solomon.correction:ReedSolomon",
+        1,
+        "interleaved RS codes over bytes, erasures by reliability",
+    )

@@ -1,0 +1,454 @@
+"""The polar code against its matrix, brute force, plain twins of its kernels and the bounds of theory."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from evlcp_polar import _kernels
+from evlcp_polar.correction import Polar, information_set, sent_bits
+from evlcp_polar.sequence import RELIABILITY
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+from scipy import integrate, optimize, stats
+
+from evlcp_sdk.abc import Code
+from evlcp_sdk.campaign.intervals import proportion_interval
+from evlcp_sdk.crc import CRC24C, crc24
+from evlcp_sdk.errors import ConfigError
+
+Bits = NDArray[np.uint8]
+
+
+def matrix(n: int) -> NDArray[np.int64]:
+    found = np.ones((1, 1), np.int64)
+    while len(found) < n:
+        found = np.kron(found, [[1, 0], [1, 1]])
+    return found
+
+
+def every_word(k: int) -> Bits:
+    return np.array(list(product((0, 1), repeat=k)), np.uint8)
+
+
+def best_inputs(n: int, k: int) -> NDArray[np.bool_]:
+    order = [i for i in RELIABILITY if i < n]
+    found = np.zeros(n, bool)
+    found[order[-k:]] = True
+    return found
+
+
+def nodes_of(information: NDArray[np.bool_], free: bool = False) -> NDArray[np.int64]:
+    table = np.empty((len(information), 3), np.int64)
+    return table[: _kernels.schedule(information, free, table)]
+
+
+def decoded(llr: NDArray[np.float32], nodes: NDArray[np.int64], size: int, limit: float = np.inf):
+    codewords, metric = np.empty((size, len(llr)), np.uint8), np.empty(size)
+    found = _kernels.list_decode(llr, nodes, size, limit, codewords, metric)
+    order = np.argsort(metric[:found])
+    return codewords[order], metric[order]
+
+
+def discrepancy(llr: NDArray[np.floating], codewords: Bits) -> NDArray[np.float64]:
+    return (np.abs(llr) * ((llr < 0) != codewords)).sum(-1).astype(float)
+
+
+def received(coded: Bits, bit_error_rate: float, rng: np.random.Generator, hard: bool) -> NDArray[np.float32]:
+    """LLRs of an AWGN channel with a hard-decision error rate, or of a BSC."""
+    sign = 1.0 - 2.0 * coded
+    if hard:
+        return (sign * np.where(rng.random(len(coded)) < bit_error_rate, -3, 3)).astype(np.float32)
+    sigma = -1 / stats.norm.ppf(bit_error_rate)
+    return (2 * (sign + sigma * rng.normal(size=len(coded))) / sigma**2).astype(np.float32)
+
+
+# The code.
+
+
+def test_the_sequence_is_in_order() -> None:
+    """A permutation that keeps the partial order of all channels (Schuerch 2016).
+
+    An input with one binary digit more is better, in the sequence too. So is one with a digit moved up by
+    one: there the sequence, which was made for lists, differs in 20 of 2304 pairs.
+    """
+    place = np.empty(1024, int)
+    place[list(RELIABILITY)] = np.arange(1024)
+    assert sorted(RELIABILITY) == list(range(1024))
+    moved, against = 0, 0
+    for i in range(1024):
+        for b in range(10):
+            if not i >> b & 1:
+                assert place[i] < place[i | 1 << b]
+                if b and i >> (b - 1) & 1:
+                    moved += 1
+                    against += bool(place[i] > place[i ^ (3 << (b - 1))])
+    assert moved == 2304
+    assert against == 20
+
+
+@pytest.mark.parametrize(("n", "k"), [(64, 32), (256, 128), (1024, 480)])
+def test_the_sequence_is_near_the_best_by_gaussian_approximation(n: int, k: int) -> None:
+    """The sum of the inputs' error rates, at which density evolution aims, against the least there is.
+
+    Means of LLRs by phi of Chung et al. (2001), here by integration of its definition.
+    """
+
+    def phi(mean: float) -> float:
+        def density(x: float) -> float:
+            return float(np.tanh(x / 2) * stats.norm.pdf(x, mean, np.sqrt(2 * mean)))
+
+        spread = 10 * np.sqrt(2 * mean)
+        return 1 - integrate.quad(density, mean - spread, mean + spread, limit=200)[0]
+
+    grid = np.geomspace(1e-4, 300, 250)
+    table = np.log([max(phi(m), 1e-300) for m in grid])
+    mean = np.array([2 / (1 / 1.6)])
+    while len(mean) < n:
+        log_phi = np.interp(np.log(mean), np.log(grid), table)
+        worse = np.exp(np.interp(-(log_phi + np.log(2 - np.exp(log_phi))), -table, np.log(grid)))
+        mean = np.stack([worse, 2 * mean], 1).ravel()
+    error = stats.norm.sf(np.sqrt(mean / 2))
+    assert error[best_inputs(n, k)].sum() < 1.6 * np.sort(error)[:k].sum()
+
+
+@pytest.mark.parametrize("n", [1, 2, 8, 64, 256])
+def test_transform_is_the_kronecker_power(n: int) -> None:
+    words = np.random.default_rng(n).integers(0, 2, (20, n)).astype(np.uint8)
+    for word in words:
+        out = word.copy()
+        _kernels.transform(out)
+        assert_array_equal(out, word @ matrix(n) % 2)
+
+
+@pytest.mark.parametrize(
+    ("length", "rate"), [(64, 0.5), (256, 0.5), (960, 0.5), (100, 0.4), (333, 0.3), (40, 0.9)]
+)
+def test_encoding_by_the_matrix(length: int, rate: float) -> None:
+    code = Polar(rate=rate).compile(length)
+    rng = np.random.default_rng(0)
+    message = rng.integers(0, 2, code.message_bits).astype(np.uint8)
+    k = code.message_bits + 24
+    n = 1 << (length - 1).bit_length()
+    inputs = np.zeros(n, np.uint8)
+    inputs[information_set(length, k)] = [*message, *crc24(message)]
+    codeword = inputs @ matrix(n) % 2
+    sent = sent_bits(length, k)
+    assert len(set(sent.tolist())) == length
+    assert_array_equal(code.encode(message), codeword[sent])
+    if k / length > 7 / 16:
+        assert not np.delete(codeword, sent).any(), "a bit that is not sent is 0: shortened"
+
+
+def test_a_code_of_half_rate_carries_whole_bytes() -> None:
+    sizes = {n: Polar().compile(n).message_bits for n in (64, 256, 640, 960, 1024, 1280, 4000)}
+    assert sizes == {64: 8, 256: 104, 640: 296, 960: 456, 1024: 488, 1280: 592, 4000: 4 * 472}
+    assert Polar(rate=0.35).compile(320).message_bits == 88
+
+
+@pytest.mark.parametrize("length", [1025, 1280, 2047, 4001])
+def test_long_blocks_are_codewords_side_by_side(length: int) -> None:
+    code = Polar().compile(length)
+    words = -(-length // 1024)
+    one = Polar().compile(length // words)
+    message = np.random.default_rng(length).integers(0, 2, code.message_bits).astype(np.uint8)
+    coded = code.encode(message)
+    assert code.message_bits == words * one.message_bits
+    for i, part in enumerate(message.reshape(words, -1)):
+        assert_array_equal(coded[i * one.coded_bits : (i + 1) * one.coded_bits], one.encode(part))
+    assert not coded[words * one.coded_bits :].any()
+    llr = (1 - 2 * coded.astype(np.float32)) * 5
+    assert code.decode(llr).ok
+    llr[: one.coded_bits] = 5
+    found = code.decode(llr)
+    assert not found.ok
+    assert_array_equal(found.bits[one.message_bits :], message[one.message_bits :])
+
+
+@pytest.mark.parametrize("rate", [0.05, 0.2, 0.4, 0.45, 0.6, 0.9])
+def test_every_length_has_its_information_bits(rate: float) -> None:
+    for length in range(33, 1025, 13):
+        try:
+            code = Polar(rate=rate).compile(length)
+        except ConfigError:
+            assert rate * length < 32
+            continue
+        k = code.message_bits + 24
+        assert information_set(length, k).sum() == k
+        assert rate * length - 8 < k <= rate * length + 1e-6
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    with pytest.raises(ConfigError, match="a block of 63 bits, expected at least 64 at rate"):
+        Polar().compile(63)
+    with pytest.raises(ConfigError, match="max_list_size = 4: expected at least list_size = 8"):
+        Polar(max_list_size=4)
+
+
+def test_crc_of_the_kernel() -> None:
+    rng = np.random.default_rng(0)
+    for length in (1, 8, 104, 456):
+        message = rng.integers(0, 2, length).astype(np.uint8)
+        whole = np.concatenate([message, crc24(message)])
+        assert _kernels.crc_holds(whole, CRC24C)
+        for i in range(len(whole)):
+            whole[i] ^= 1
+            assert not _kernels.crc_holds(whole, CRC24C)
+            whole[i] ^= 1
+
+
+# The decoder.
+
+
+@pytest.mark.parametrize(("n", "k"), [(8, 4), (8, 7), (16, 5), (16, 7), (32, 6)])
+def test_a_list_of_all_is_maximum_likelihood(n: int, k: int) -> None:
+    information = best_inputs(n, k)
+    inputs = np.zeros((1 << k, n), np.uint8)
+    inputs[:, information] = every_word(k)
+    codewords = (inputs @ matrix(n) % 2).astype(np.uint8)
+    rng = np.random.default_rng(n + k)
+    for _ in range(50):
+        llr = rng.normal(0.5, 1.0, n).astype(np.float32)
+        found, metric = decoded(llr, nodes_of(information), 1 << k)
+        wanted = discrepancy(llr, codewords)
+        assert_array_equal(found[0], codewords[wanted.argmin()])
+        assert_allclose(metric, np.sort(wanted), rtol=1e-5, atol=1e-5)
+
+
+def twin(llr: NDArray[np.float64], information: NDArray[np.bool_], size: int) -> list[tuple[float, Bits]]:
+    """Successive-cancellation list decoding as it is defined: every LLR from the start, input by input."""
+
+    def leaf(values: NDArray[np.float64], before: Bits) -> float:
+        half = len(values) // 2
+        if not half:
+            return float(values[0])
+        a, b = values[:half], values[half:]
+        if len(before) < half:
+            return leaf(np.sign(a) * np.sign(b) * np.minimum(np.abs(a), np.abs(b)), before)
+        left = before[:half] @ matrix(half) % 2
+        return leaf(b + (1 - 2 * left) * a, before[half:])
+
+    paths = [(0.0, np.zeros(0, np.uint8))]
+    for i in range(len(llr)):
+        grown = []
+        for metric, before in paths:
+            value = leaf(llr, before)
+            for bit in (0, 1) if information[i] else (0,):
+                penalty = abs(value) if (value < 0) != bit else 0.0
+                grown.append((metric + penalty, np.append(before, np.uint8(bit))))
+        paths = sorted(grown, key=lambda path: path[0])[:size]
+    return [(metric, (inputs @ matrix(len(llr)) % 2).astype(np.uint8)) for metric, inputs in paths]
+
+
+@pytest.mark.parametrize("size", [1, 2, 4, 8])
+@pytest.mark.parametrize(("n", "k"), [(16, 9), (32, 16), (64, 24), (64, 50)])
+def test_list_decoding_against_its_twin(n: int, k: int, size: int) -> None:
+    information = best_inputs(n, k)
+    rng = np.random.default_rng(n + k + size)
+    for mean in (0.0, 1.0):
+        for _ in range(4):
+            llr = rng.normal(mean, 1.0, n).astype(np.float32)
+            wanted = twin(llr.astype(float), information, size)
+            for free in (False, True) if size == 1 else (False,):
+                codewords, metric = decoded(llr, nodes_of(information, free), size)
+                assert_allclose(metric, [m for m, _ in wanted], rtol=1e-4, atol=1e-5)
+                assert_array_equal(codewords, [c for _, c in wanted])
+
+
+def test_nodes_cover_all_inputs_once() -> None:
+    rng = np.random.default_rng(0)
+    sets = [best_inputs(256, 128), information_set(960, 480), rng.random(128) < 0.5, np.ones(32, bool)]
+    for information in sets:
+        for free in (False, True):
+            at = 0
+            for first, stage, kind in nodes_of(information, free):
+                inside = information[first : first + (1 << stage)]
+                assert first == at
+                assert first % (1 << stage) == 0
+                expected = {0: 0, 1: 1, 2: len(inside)}[int(kind)]
+                assert inside.sum() == expected
+                assert kind != 1 or inside[-1]
+                at += len(inside)
+            assert at == len(information)
+
+
+def test_a_limit_only_drops_what_exceeds_it() -> None:
+    information = best_inputs(64, 30)
+    rng = np.random.default_rng(0)
+    dropped = 0
+    for _ in range(100):
+        llr = rng.normal(0.7, 1.0, 64).astype(np.float32)
+        codewords, metric = decoded(llr, nodes_of(information), 8)
+        limit = float(np.median(metric))
+        kept, within = decoded(llr, nodes_of(information), 8, limit)
+        assert (within <= limit).all()
+        # What is left has more room: it holds all that was within the limit before.
+        assert {w.tobytes() for w in codewords[metric <= limit]} <= {w.tobytes() for w in kept}
+        dropped += int((metric > limit).sum())
+    assert dropped > 100
+
+
+@pytest.mark.parametrize(("length", "rate"), [(40, 0.9), (80, 0.4), (90, 0.4), (64, 0.5)])
+def test_shortened_and_punctured_codes_against_brute_force(length: int, rate: float) -> None:
+    """All 256 messages of a byte: what is decoded is the most likely one."""
+    code = Polar(rate=rate, undetected=0.999, list_size=32).compile(length)
+    assert code.message_bits == 8
+    messages = every_word(8)
+    codewords = np.array([code.encode(message) for message in messages])
+    rng = np.random.default_rng(length)
+    decided = 0
+    for i in range(150):
+        llr = received(codewords[i], 0.06 if rate > 0.5 else 0.12, rng, hard=False)
+        llr[rng.integers(length)] = 0
+        found = code.decode(llr)
+        likely = int(discrepancy(llr, codewords).argmin())
+        decided += found.ok
+        if found.ok:
+            assert_array_equal(found.bits, messages[likely])
+            wrong = (llr < 0) != codewords[likely]
+            assert found.flipped == wrong[llr != 0].sum()
+    assert decided > 75
+
+
+# Plausibility.
+
+
+def chernoff(weight: NDArray[np.float64], total: float) -> float:
+    def bound(log_z: float) -> float:
+        z = np.exp(log_z)
+        return float(z * total + np.logaddexp(0, -z * weight).sum() - len(weight) * np.log(2))
+
+    return float(optimize.minimize_scalar(bound, bounds=(-8, 8), method="bounded").fun)
+
+
+@pytest.mark.parametrize("kind", ["equal", "normal", "wide", "one"])
+@pytest.mark.parametrize(("n", "share"), [(40, -10.0), (256, -93.0), (960, -337.0)])
+def test_the_limit_solves_the_bound(n: int, share: float, kind: str) -> None:
+    rng = np.random.default_rng(n)
+    weight = {
+        "equal": np.full(n, 0.3),
+        "normal": np.abs(rng.normal(4, 2, n)),
+        "wide": np.exp(1.5 * rng.normal(size=n)),
+        "one": np.where(np.arange(n) == 3, 1e4, 1.0),
+    }[kind]
+    limit = _kernels.discrepancy_limit(weight, share)
+    assert share - 0.051 <= chernoff(weight, limit) <= share + 1e-3
+    assert_allclose(_kernels.discrepancy_limit(7 * weight, share), 7 * limit, rtol=1e-6)
+    padded = np.concatenate([weight, np.zeros(50)])
+    assert _kernels.discrepancy_limit(padded, share) == limit
+
+
+def test_nothing_is_plausible_with_too_few_bits() -> None:
+    assert _kernels.discrepancy_limit(np.ones(100), -100 * np.log(2)) == -1
+    assert _kernels.discrepancy_limit(np.zeros(100), -1.0) == -1
+
+
+@pytest.mark.parametrize(("n", "k"), [(256, 104), (960, 456)])
+def test_equal_weights_against_the_binomial(n: int, k: int) -> None:
+    """So many words lie within the limit of any of 2**k codewords: less than a billionth, not much less."""
+    limit = _kernels.discrepancy_limit(np.ones(n), np.log(1e-9) - k * np.log(2))
+    exact = stats.binom.logcdf(np.floor(limit), n, 0.5) + k * np.log(2)
+    assert np.log(1e-9) - 8 < exact < np.log(1e-9)
+
+
+def test_random_words_are_taken_no_more_often_than_stated() -> None:
+    """The bound at work: (48, 8) words, 256 codewords, one in 100 random words may come near."""
+    code = Polar(rate=0.7, undetected=0.01, list_size=128, max_list_size=128).compile(48)
+    assert code.message_bits == 8
+    codewords = np.array([code.encode(message) for message in every_word(8)])
+    rng = np.random.default_rng(0)
+    near, trials = 0, 20_000
+    for _ in range(trials):
+        llr = rng.normal(size=48).astype(np.float32)
+        limit = _kernels.discrepancy_limit(np.abs(llr).astype(float), np.log(0.01 / 256))
+        near += bool((discrepancy(llr, codewords) <= limit).any())
+    low, high = proportion_interval(near, trials)
+    assert high > 0.0005
+    assert low < 0.01
+    assert near / trials < 0.01
+
+
+def test_nothing_is_taken_for_a_message() -> None:
+    rng = np.random.default_rng(0)
+    for length in (256, 1280):
+        code = Polar().compile(length)
+        for llr in rng.normal(size=(300, length)) * np.exp(rng.normal(size=(300, length))):
+            assert not code.decode(llr.astype(np.float32)).ok
+    for value in (0.0, np.inf, -np.inf, np.nan, 1e38, 1e-38):
+        assert not code.decode(np.full(1280, value, np.float32)).ok
+
+
+def test_a_scale_of_the_llrs_changes_nothing() -> None:
+    code = Polar().compile(256)
+    rng = np.random.default_rng(0)
+    message = rng.integers(0, 2, 104).astype(np.uint8)
+    llr = received(code.encode(message), 0.05, rng, hard=False)
+    for scale in (1e-20, 1.0, 1e20):
+        found = code.decode(llr * np.float32(scale))
+        assert found.ok
+        assert_array_equal(found.bits, message)
+    sure = (np.abs(llr) > 3) & ((llr < 0) == code.encode(message))
+    assert_array_equal(code.decode(np.where(sure, np.inf * np.sign(llr), llr)).bits, message)
+
+
+# Frame errors.
+
+
+def lost(code: Code, blocks: int, bit_error_rate: float, hard: bool, seed: int = 0) -> int:
+    rng = np.random.default_rng(seed)
+    missed = 0
+    for _ in range(blocks):
+        message = rng.integers(0, 2, code.message_bits).astype(np.uint8)
+        found = code.decode(received(code.encode(message), bit_error_rate, rng, hard))
+        assert not found.ok or (found.bits == message).all()
+        missed += not found.ok
+    return missed
+
+
+@pytest.mark.parametrize(("length", "blocks"), [(256, 4000), (960, 1000)])
+@pytest.mark.parametrize("bit_error_rate", [0.04, 0.06])
+def test_no_message_is_lost_where_the_link_works(length: int, blocks: int, bit_error_rate: float) -> None:
+    """Soft input; none of 4000 is a frame error rate below 1e-3 with 95 % confidence."""
+    assert lost(Polar().compile(length), blocks, bit_error_rate, hard=False) == 0
+
+
+def converse(n: int, k: float, sigma: float) -> float:
+    """Normal approximation of the least frame error rate (Polyanskiy et al. 2010), binary-input AWGN."""
+    y, w = np.polynomial.hermite_e.hermegauss(200)
+    density = np.log2(2) - np.logaddexp(0, -2 * (1 + sigma * y) / sigma**2) / np.log(2)
+    w = w / w.sum()
+    capacity = float(w @ density)
+    dispersion = float(w @ (density - capacity) ** 2)
+    return float(stats.norm.sf((n * capacity - k + np.log2(n) / 2) / np.sqrt(n * dispersion)))
+
+
+def test_frame_errors_between_bounds() -> None:
+    """(256, 104 + 24) near its end: no better than any code can be, as good as that with 1.5 dB less."""
+    code = Polar(undetected=0.5).compile(256)
+    bit_error_rate = 0.115
+    sigma = -1 / stats.norm.ppf(bit_error_rate)
+    low, high = proportion_interval(lost(code, 1500, bit_error_rate, hard=False), 1500)
+    assert converse(256, 104, sigma) < high
+    assert low < converse(256, 104, sigma * 10 ** (1.5 / 20))
+
+
+def test_giving_up_early_loses_nothing() -> None:
+    """A list of which all paths are implausible ends the search; the longest list from the start does not."""
+    patient = Polar(list_size=32).compile(256)
+    hasty = Polar().compile(256)
+    for bit_error_rate, hard, most in ((0.06, False, 0), (0.04, True, 0), (0.06, True, 8)):
+        extra = lost(hasty, 1500, bit_error_rate, hard) - lost(patient, 1500, bit_error_rate, hard)
+        assert extra <= most
+
+
+def test_erasures() -> None:
+    """One of 16 clusters dark, one frame of ten not received: both at once."""
+    code = Polar().compile(960)
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        message = rng.integers(0, 2, 456).astype(np.uint8)
+        llr = received(code.encode(message), 0.04, rng, hard=False).reshape(10, 16, 6)
+        llr[:, rng.integers(16)] = 0
+        llr[rng.integers(10)] = 0
+        found = code.decode(llr.ravel())
+        assert found.ok
+        assert_array_equal(found.bits, message)
