@@ -23,7 +23,16 @@ from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.frames import bits_of_symbols
 from evlcp_sdk.types import Frame, Packet
 
-__all__ = ["FIGURE_NAMES", "FILTERED_COLUMNS", "FRAME_COLUMNS", "ResultWriter", "Status", "TransmitterTally"]
+__all__ = [
+    "FIGURE_NAMES",
+    "FILTERED_COLUMNS",
+    "FRAME_COLUMNS",
+    "ResultWriter",
+    "Status",
+    "TransmitterTally",
+    "filtered_row",
+    "frame_row",
+]
 
 FRAME_COLUMNS = (
     "transmitter",
@@ -194,7 +203,7 @@ class ResultWriter:
         tally.add(packet)
         self._packets_file.write(json.dumps(self._packet_line(packet)) + "\n")
         for frame in packet.frames:
-            self._rows.writerow(_frame_row(frame) + (_filtered_row(frame) if self._filtered else []))
+            self._rows.writerow(frame_row(frame) + (filtered_row(frame) if self._filtered else []))
             if self._parquet is not None:
                 self._parquet.add(frame)
 
@@ -303,7 +312,8 @@ class ResultWriter:
             self._hidden(name).unlink(missing_ok=True)
 
 
-def _frame_row(frame: Frame) -> list[str]:
+def frame_row(frame: Frame) -> list[str]:
+    """The frame's values of `FRAME_COLUMNS` as text; empty where there is none."""
     return [
         str(frame.transmitter),
         str(frame.packet),
@@ -318,7 +328,8 @@ def _frame_row(frame: Frame) -> list[str]:
     ]
 
 
-def _filtered_row(frame: Frame) -> list[str]:
+def filtered_row(frame: Frame) -> list[str]:
+    """The frame's values of `FILTERED_COLUMNS` as text; empty where there is none."""
     if frame.filtered is None:
         return ["", ""]
     return [_text(frame.filtered.distance_m), _text(frame.filtered.sigma_m)]

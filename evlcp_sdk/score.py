@@ -61,6 +61,7 @@ class BarScore:
         bits: Bits of the found frames.
         true_m: True distance of each ranged frame, m, float64 (n,).
         error_m: Error of each, m, float64 (n,).
+        filtered_error_m: Errors of the filtered distances, m, float64 (f,); none without a filter.
     """
 
     frames_sent: int
@@ -69,6 +70,7 @@ class BarScore:
     bits: int
     true_m: NDArray[np.float64]
     error_m: NDArray[np.float64]
+    filtered_error_m: NDArray[np.float64]
 
     @property
     def ber(self) -> float | None:
@@ -81,9 +83,14 @@ class BarScore:
         return math.sqrt(float((self.error_m**2).mean())) if len(self.error_m) else None
 
     @property
+    def gross(self) -> int:
+        """Distances that are half a metre off or more."""
+        return int((np.abs(self.error_m) >= _HALF_METRE).sum())
+
+    @property
     def over_half_metre(self) -> float | None:
         """Share of the distances that are half a metre off or more; None without any."""
-        return float((np.abs(self.error_m) >= _HALF_METRE).mean()) if len(self.error_m) else None
+        return self.gross / len(self.error_m) if len(self.error_m) else None
 
     def segments(self) -> dict[str, Segment]:
         """Errors of every 10 m stretch up to 200 m that has a distance, by name, e.g. `40-50m`."""
@@ -159,7 +166,8 @@ def score_frames(rows: Iterable[Mapping[str, str]], truth: Mapping[str, Any]) ->
     """Hold rows of `frames.csv` against a recording's truth.
 
     Args:
-        rows: Columns t_us, symbols, distance_m, x_px, y_px, as text; others are ignored.
+        rows: Columns t_us, symbols, distance_m, x_px, y_px, distance_filtered_m if there, as text; others are
+            ignored.
         truth: What `REC.truth.json` holds.
 
     Raises:
@@ -185,6 +193,7 @@ def _score(rows: list[Mapping[str, str]], truth: Mapping[str, Any]) -> Score:
     hits: list[set[int]] = [set() for _ in bars]
     errors, bits = [0] * len(bars), [0] * len(bars)
     ranged: list[list[tuple[float, float]]] = [[] for _ in bars]
+    filtered: list[list[float]] = [[] for _ in bars]
     unmatched = 0
     for row in rows:
         t = float(row["t_us"]) - t0_us
@@ -212,13 +221,16 @@ def _score(rows: list[Mapping[str, str]], truth: Mapping[str, Any]) -> Score:
         for k, symbol in enumerate(wanted):
             errors[i] += (symbol ^ heard[k]).bit_count() if k < len(heard) else width
         bits[i] += width * len(wanted)
+        true_m = float(np.interp(begin + _RANGED_AT_US, ts_us, depths[i]))
+        if row.get("distance_filtered_m"):
+            filtered[i].append(float(row["distance_filtered_m"]) - true_m)
         if row.get("distance_m"):
-            true_m = float(np.interp(begin + _RANGED_AT_US, ts_us, depths[i]))
             ranged[i].append((true_m, float(row["distance_m"]) - true_m))
     found = []
     for i in range(len(bars)):
         pairs = np.array(ranged[i]).reshape(-1, 2)
-        found.append(BarScore(len(sent[i]), len(hits[i]), errors[i], bits[i], pairs[:, 0], pairs[:, 1]))
+        counts = len(sent[i]), len(hits[i]), errors[i], bits[i]
+        found.append(BarScore(*counts, pairs[:, 0], pairs[:, 1], np.array(filtered[i], np.float64)))
     return Score(len(rows), unmatched, tuple(found))
 
 

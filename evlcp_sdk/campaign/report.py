@@ -7,33 +7,21 @@ network for anything.
 import html
 import json
 import math
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.campaign.charts import Chart, charts_of, decades
+from evlcp_sdk.campaign.markup import details, document, save_text, table
 from evlcp_sdk.campaign.paper import PAPER_NAME
 from evlcp_sdk.campaign.plan import digest_of
 from evlcp_sdk.campaign.statistics import SEGMENT_M
 from evlcp_sdk.campaign.summary import Comparison, Figure, Summary, compare, measure
-from evlcp_sdk.errors import ConfigError, EvlcpError
+from evlcp_sdk.errors import ConfigError
 
 __all__ = ["comparison_rows", "page", "save_page"]
 
 _INK = "#333333"
-_CSS = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #333; max-width: 70rem; margin: 2rem auto;
-  padding: 0 1rem }
-h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin: 2.5rem 0 0.3rem }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.87rem; margin: 0.6rem 0 }
-th, td { padding: 0.15rem 0.7rem; text-align: right; border-bottom: 1px solid #e6e6e6; white-space: nowrap }
-th { color: #666; font-weight: 600 } td:first-child, th:first-child { text-align: left }
-.chart { height: 430px } .note, .digest { color: #666; font-size: 0.87rem }
-.digest { overflow-wrap: anywhere }
-.yes { color: #00694b } .no { color: #a03c00; font-weight: 600 } .wide { overflow-x: auto }
-pre { background: #f6f6f6; padding: 0.7rem; overflow-x: auto; font-size: 0.8rem } summary { cursor: pointer }
-"""
 
 
 def page(summary: Summary) -> str:
@@ -72,17 +60,8 @@ def page(summary: Summary) -> str:
         " showSendToCloud: false, plotlyServerURL: ''};\n"
         "for (const [id, c] of Object.entries(charts)) Plotly.newPlot(id, c.data, c.layout, config);"
     )
-    return "\n".join(
-        [
-            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            '<link rel="icon" href="data:,">',
-            f"<title>{html.escape(summary.name)}</title>\n<style>{_CSS}</style>",
-            f"<script>{get_plotlyjs()}</script>\n</head>\n<body>",
-            *body,
-            f"<script>\n{script}\n</script>\n</body>\n</html>\n",
-        ]
-    )
+    body.append(f"<script>\n{script}\n</script>")
+    return document(summary.name, body, f"<script>{get_plotlyjs()}</script>\n")
 
 
 def save_page(summary: Summary, path: Path) -> None:
@@ -92,15 +71,7 @@ def save_page(summary: Summary, path: Path) -> None:
         ConfigError: The extra is not installed.
         EvlcpError: The file cannot be written.
     """
-    text = page(summary)
-    part = path.parent / f".{path.name}.{os.getpid()}.part"
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as fault:
-        raise EvlcpError(f"{path}: cannot be written: {fault.strerror}") from fault
-    finally:
-        part.unlink(missing_ok=True)
+    save_text(page(summary), path)
 
 
 def _plotly(chart: Chart) -> dict[str, Any]:
@@ -177,14 +148,6 @@ def _plotly(chart: Chart) -> dict[str, Any]:
     return {"data": data, "layout": layout}
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    def cells(tag: str, values: Sequence[str]) -> str:
-        return "".join(f"<{tag}>{v}</{tag}>" for v in values)
-
-    lines = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    return f'<div class="wide"><table><tr>{cells("th", head)}</tr>\n{lines}</table></div>'
-
-
 def _paper_table(comparisons: Sequence[Comparison]) -> str:
     if not comparisons:
         return ""
@@ -194,7 +157,7 @@ def _paper_table(comparisons: Sequence[Comparison]) -> str:
         rows.append([*map(html.escape, cells[:-1]), f'<span class="{kind}">{html.escape(cells[-1])}</span>'])
     return (
         f"<h2>Beside {PAPER_NAME}</h2>"
-        + _table(("figure", "distance", "series", "paper", "here", "95 %", "agrees"), rows)
+        + table(("figure", "distance", "series", "paper", "here", "95 %", "agrees"), rows)
         + '<p class="note">A bound agrees when the worst segment of 10 m keeps it, a figure when ours lies'
         " within 30 % of it.</p>"
     )
@@ -244,7 +207,7 @@ def _figures_table(summary: Summary) -> str:
                 )
             )
     head = ("series", "distance", "frames", "bit errors", "BER", "RMSE, m", "bias, m", "0.5 m or more")
-    return f"<h2>All figures</h2>{_table(head, rows)}"
+    return f"<h2>All figures</h2>{table(head, rows)}"
 
 
 def _shown(figure: Figure, form: str) -> str:
@@ -261,7 +224,7 @@ def _configuration(summary: Summary) -> str:
         f'<p class="digest">campaign {summary.digest}</p>',
         f"<p>Seeds {plan['seeds'][0]} to {plan['seeds'][-1]}; a point ends at"
         f" {_limit(rule['max_bits'], 'bits')} or {_limit(rule['max_errors'], 'wrong bits')}.</p>",
-        _details("code and versions", plan["environment"]),
+        details("code and versions", plan["environment"]),
     ]
     for kind, cases in (("scene", plan["scenes"]), ("link", plan["links"])):
         for case in cases:
@@ -272,14 +235,9 @@ def _configuration(summary: Summary) -> str:
                 if isinstance(identity, dict) and "digest" in identity
                 else digest_of(identity)
             )
-            parts.append(_details(f"{kind}: {labels}; SHA-256 {digest}", identity))
+            parts.append(details(f"{kind}: {labels}; SHA-256 {digest}", identity))
     return "\n".join(parts)
 
 
 def _limit(value: int | None, what: str) -> str:
     return f"any number of {what}" if value is None else f"{value:,} {what}"
-
-
-def _details(title: str, table: Any) -> str:
-    text = html.escape(json.dumps(table, indent=1, sort_keys=True))
-    return f'<details><summary class="digest">{html.escape(title)}</summary><pre>{text}</pre></details>'

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.config import Link
     from evlcp_sdk.io import EventSource
 
-__all__ = ["InterruptedRunError", "decode", "register", "show"]
+__all__ = ["InterruptedRunError", "bytes_bar", "check_sensor", "decode", "register", "show"]
 
 Advance = Callable[[int, int | None], None]
 """Told, after each piece, how many bytes are done, and of how many if that is known."""
@@ -127,7 +127,7 @@ def _decode_job(
 ) -> dict[str, Any]:
     """Decode a recording here, with a bar; or, without `stopped`, quietly in a worker."""
     if stopped is not None:
-        with _progress(Path(job.url).name) as advance:
+        with bytes_bar(Path(job.url).name) as advance:
             return decode(job.url, job.folder, link, advance, stopped, figures=figures, parquet=parquet)
     # A terminal sends Ctrl-C to workers, too; only a main thread can listen to it.
     main = threading.current_thread() is threading.main_thread()
@@ -184,7 +184,7 @@ def decode(
         probes.append(FigureProbe(link.camera))
     registry = Registry.load(*probes)
     with open_source(url, registry) as source:
-        _check_sensor(source, url, link)
+        check_sensor(source, url, link)
         with ResultWriter(folder, link, parquet=parquet) as writer:
             receiver = Receiver(link, registry.hook)
             status: Status = "complete"
@@ -301,7 +301,12 @@ def _stem(url: str) -> str:
     return name.removesuffix(".gz").rsplit(".", 1)[0] or name
 
 
-def _check_sensor(source: "EventSource", url: str, link: "Link") -> None:
+def check_sensor(source: "EventSource", url: str, link: "Link") -> None:
+    """Refuse a recording of another sensor than the link's camera has.
+
+    Raises:
+        ConfigError: The sizes differ.
+    """
     camera = link.camera
     size = (source.width, source.height)
     if None not in size and size != (camera.width, camera.height):
@@ -312,7 +317,7 @@ def _check_sensor(source: "EventSource", url: str, link: "Link") -> None:
 
 
 @contextmanager
-def _progress(name: str) -> Iterator[Advance]:
+def bytes_bar(name: str) -> Iterator[Advance]:
     """A bar by bytes read, on a terminal only."""
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn

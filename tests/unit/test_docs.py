@@ -23,6 +23,7 @@ PAGES = (
     "configuration",
     "simulator",
     "campaigns",
+    "compare",
     "paper",
     "rates",
     "roles",

@@ -16,7 +16,7 @@ LAYERS = (
     {"registry", "config"},
     {"io", "rx", "sim"},
     {"rx.receiver"},
-    {"bound", "outputs", "figures", "score", "campaign", "testing"},
+    {"bound", "outputs", "figures", "score", "campaign", "compare", "testing"},
     {"cli"},
 )
 """From the ground up: a module imports from its own layer and those below."""

@@ -1,0 +1,242 @@
+"""`evlcp compare`."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, complain, console, make_executor, open_source
+from evlcp_sdk.errors import ConfigError
+
+if TYPE_CHECKING:
+    from evlcp_sdk.compare.table import Comparison, Table
+    from evlcp_sdk.compare.variants import Variant
+    from evlcp_sdk.io import EventSource
+
+__all__ = ["compare", "register"]
+
+_SQLITE = b"SQLite format 3\0"
+_PIPE_WIDTH = 200
+
+
+@dataclass(frozen=True)
+class Job:
+    """One recording, and whether it is received in this process."""
+
+    url: str
+    here: bool
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("compare")(compare)
+
+
+def compare(
+    recordings: Annotated[
+        list[str], typer.Argument(metavar="REC...", help="Recordings, or the RESULTS of one evlcp sweep.")
+    ],
+    variants: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--variant",
+            metavar="NAME:TABLE.KEY=VALUE,...",
+            help="A variant; repeat it. NAME: alone is the link as it is.",
+        ),
+    ] = None,
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
+    out: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "-o", "--out", metavar="FILE", help="Also write FILE.csv, .html or .json; may be repeated."
+        ),
+    ] = None,
+    jobs: Annotated[
+        int,
+        typer.Option("-j", "--jobs", min=0, metavar="N", help="Processes for many recordings; 0: this one."),
+    ] = 0,
+    as_json: Json = False,
+) -> None:
+    """Run variants of the receiver on the same recordings; one table each, and one over all.
+
+    Two rangings:     [bold]evlcp compare REC.raw --variant paper: --variant joint:ranging.id=joint-scale[/]
+
+    Several settings: [bold]--variant best:ranging.id=joint-scale,decoding.id=ml-soft,tracking.id=kalman[/]
+
+    As a page:        [bold]evlcp compare *.raw --variant a: --variant b:ranging.id=centroid -o table.html[/]
+
+    A campaign:       [bold]evlcp compare paper.sqlite[/] holds its links against each other, a table a scene
+
+    Truth is taken from REC.truth.json beside REC.raw; without it there is no BER and no distance error. -c
+    and --set hold for all variants. The best of each column has a *. The last row is the Cramer-Rao bound of
+    the frames' distances: no unbiased ranging from one frame can do better.
+    """
+    names = [path for path in out or [] if path.suffix not in (".csv", ".html", ".json")]
+    if names:
+        raise typer.BadParameter(
+            f"{names[0]}: expected a name that ends in .csv, .html or .json", param_hint="-o"
+        )
+    for path in out or []:
+        if not path.parent.is_dir():
+            raise ConfigError(f"{path}: cannot be written: no folder {path.parent}")
+    if any(map(_is_campaign, recordings)):
+        if variants or link_file or overrides or len(recordings) > 1:
+            raise typer.BadParameter(
+                "results of a campaign stand alone: their variants are the campaign's links",
+                param_hint="REC...",
+            )
+        code, comparison = 0, _of_results(Path(recordings[0]))
+    else:
+        code, comparison = _of_recordings(recordings, variants or [], link_file, overrides or [], jobs)
+    if comparison.tables:
+        _write(comparison, out or [])
+        if as_json:
+            typer.echo(comparison.to_json(), nl=False)
+        else:
+            _show(comparison, out or [])
+    raise typer.Exit(code)
+
+
+def _is_campaign(url: str) -> bool:
+    path = Path(url)
+    if path.suffix == ".toml":
+        raise ConfigError(
+            f"{url}: a campaign is compared by its results: evlcp sweep {url} -o R.sqlite,"
+            " then evlcp compare R.sqlite"
+        )
+    if path.suffix == ".sqlite" or not path.is_file():
+        return path.suffix == ".sqlite"
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_SQLITE)) == _SQLITE
+    except OSError:
+        return False
+
+
+def _of_results(path: Path) -> "Comparison":
+    from evlcp_sdk.campaign.store import Store
+    from evlcp_sdk.campaign.summary import summarize
+    from evlcp_sdk.compare.campaigns import of_campaign
+
+    with Store(path) as store:
+        return of_campaign(summarize(store))
+
+
+def _of_recordings(
+    urls: Sequence[str], texts: Sequence[str], link_file: str | None, overrides: Sequence[str], workers: int
+) -> tuple[int, "Comparison"]:
+    from evlcp_sdk.cli.receive import InterruptedRunError
+    from evlcp_sdk.compare.run import truth_path
+    from evlcp_sdk.compare.table import Comparison, total_of
+    from evlcp_sdk.compare.variants import load_variants
+    from evlcp_sdk.config import installed_versions
+    from evlcp_sdk.registry import Registry
+
+    if not texts:
+        raise typer.BadParameter("name at least one, e.g. --variant paper:", param_hint="--variant")
+    if twice := {url for url in urls if urls.count(url) > 1}:
+        raise typer.BadParameter(f"{min(twice)} is named twice", param_hint="REC...")
+    registry = Registry.load()
+    variants = load_variants(texts, link_file, overrides, registry)
+    here = not workers or len(urls) == 1
+    executor = make_executor(0 if here else workers, None)
+    tables: dict[str, Table] = {}
+    notes: list[str] = []
+    code = 0
+    try:
+        for outcome in executor.run(partial(_run, variants=variants), [Job(url, here) for url in urls]):
+            if outcome.value is not None:
+                tables[outcome.job.url] = outcome.value
+            elif outcome.fault is not None:
+                complain(f"{outcome.fault.trace}{outcome.fault.message}")
+                code = max(code, outcome.fault.exit_code)
+    except KeyboardInterrupt:
+        raise InterruptedRunError("interrupted; nothing is written") from None
+    ordered = [tables[url] for url in urls if url in tables]
+    for url in urls:
+        if url in tables and not truth_path(url).exists():
+            notes.append(f"{url}: no {truth_path(url).name} beside it, so no BER and no distance error")
+    ghosts = {v.name: sum(t.rows[i].measured.unmatched for t in ordered) for i, v in enumerate(variants)}
+    notes += [f"{name}: {n} frames match no true one" for name, n in ghosts.items() if n]
+    if len(ordered) > 1:
+        ordered.append(total_of(ordered))
+    about = {v.name: v.to_dict() for v in variants}
+    return code, Comparison(about, tuple(ordered), tuple(notes), installed_versions(registry))
+
+
+def _run(job: Job, *, variants: "tuple[Variant, ...]") -> "Table":
+    """Receive a recording with every variant, in this process or in a worker."""
+    from evlcp_sdk.cli.receive import check_sensor
+    from evlcp_sdk.compare.run import measure_recording, truth_path
+    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.score import read_truth
+
+    def opened() -> "EventSource":
+        source = open_source(job.url, registry)
+        try:
+            for variant in variants:
+                check_sensor(source, job.url, variant.link)
+        except ConfigError:
+            source.close()
+            raise
+        return source
+
+    registry = Registry.load()
+    path = truth_path(job.url)
+    known = read_truth(path) if path.exists() else None
+    with _bar(job) as advance:
+        return measure_recording(
+            job.url, opened, variants, known, lambda s: advance(s.position_bytes, s.size_bytes)
+        )
+
+
+@contextmanager
+def _bar(job: Job) -> Iterator[Callable[[int, int | None], None]]:
+    from evlcp_sdk.cli.receive import bytes_bar
+
+    if not job.here:
+        yield lambda _done, _total: None
+        return
+    with bytes_bar(Path(job.url).name) as advance:
+        yield advance
+
+
+def _write(comparison: "Comparison", paths: Sequence[Path]) -> None:
+    from evlcp_sdk.campaign.markup import save_text
+
+    for path in paths:
+        texts = {".csv": comparison.to_csv, ".html": comparison.to_html, ".json": comparison.to_json}
+        save_text(texts[path.suffix](), path)
+
+
+def _show(comparison: "Comparison", paths: Sequence[Path]) -> None:
+    from rich.markup import escape
+    from rich.table import Table as Grid
+
+    from evlcp_sdk.compare.table import LEGEND
+
+    out = console()
+    if not out.is_terminal:
+        # A pipe has no width that a table should be cut to.
+        out.width = _PIPE_WIDTH
+    for one in comparison.tables:
+        head, lines = one.cells()
+        out.print(f"[bold]{escape(one.name)}[/]")
+        grid = Grid(box=None, pad_edge=False, header_style="dim")
+        for number, title in enumerate(head):
+            grid.add_column(title, justify="left" if number == 0 else "right")
+        for line in lines:
+            texts = [escape(text) + ("" if best else " ") for text, best in line]
+            grid.add_row(*(f"[bold]{t}[/]" if best else t for t, (_, best) in zip(texts, line, strict=True)))
+        out.print(grid)
+        out.print()
+    for note in comparison.notes:
+        out.print(escape(note), style="yellow")
+    out.print(LEGEND, style="dim")
+    if paths:
+        out.print(f"written: {escape(', '.join(map(str, paths)))}", style="dim")
