@@ -8,6 +8,7 @@ from evlcp_sdk.sim.scene import (
     MotionSpec,
     Scene,
     SensorSpec,
+    WorldSpec,
     load_scene,
     preset_names,
     preset_text,
@@ -15,6 +16,7 @@ from evlcp_sdk.sim.scene import (
 )
 from evlcp_sdk.sim.simulation import Simulation, scene_table, simulate
 from evlcp_sdk.sim.truth import scene_of_truth, truth, truth_of
+from evlcp_sdk.sim.world import sites_of
 
 __all__ = [
     "BackgroundSpec",
@@ -25,6 +27,7 @@ __all__ = [
     "Scene",
     "SensorSpec",
     "Simulation",
+    "WorldSpec",
     "load_scene",
     "preset_names",
     "preset_text",
@@ -32,6 +35,7 @@ __all__ = [
     "scene_of_truth",
     "scene_table",
     "simulate",
+    "sites_of",
     "truth",
     "truth_of",
 ]

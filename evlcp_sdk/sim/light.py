@@ -16,6 +16,7 @@ from evlcp_sdk.frames import PacketFormat, packet_chips
 from evlcp_sdk.sim.motion import Strip
 from evlcp_sdk.sim.optics import led_light_w_m2
 from evlcp_sdk.sim.scene import BarSpec, LampSpec, Scene
+from evlcp_sdk.sim.world import bar_axis
 
 __all__ = ["BarLight", "LampLight", "Source", "sources_of"]
 
@@ -74,9 +75,7 @@ class BarLight:
     def __init__(self, bar: BarSpec, light_w_m2: float, seed: int, source: str = "bars") -> None:
         self.bar = bar
         self.light_w_m2 = light_w_m2
-        lean, tilt = math.radians(bar.lean_deg), math.radians(bar.tilt_deg)
-        along = (-math.sin(lean) * math.cos(tilt), math.cos(lean) * math.cos(tilt), -math.sin(tilt))
-        x, y, z = (bar.length_m * part for part in along)
+        x, y, z = (bar.length_m * part for part in bar_axis(bar))
         self.strip = Strip((bar.x_m, bar.y_m, bar.z_m), (x, y, z), bar.width_m, bar.clusters)
         self.rate_hz = bar.chip_rate_hz * (1 + bar.ppm * 1e-6)
         # The codes rest for two chips at most, and by half their swing from their mean.

@@ -65,6 +65,9 @@ class BarSpec:
     start_chip: Annotated[
         float | None, Field(ge=0, description="Chip of a packet on air as the scene begins; none: random.")
     ] = None
+    transmitter_id: Annotated[
+        int | None, Field(ge=0, lt=2**32, description="Its number as a site; none: 1 for the first bar.")
+    ] = None
     seed: Annotated[int | None, Field(ge=0, description="Seed of its payload; none: the scene's.")] = None
     symbols: Annotated[
         tuple[tuple[tuple[int, ...], ...], ...] | None,
@@ -148,6 +151,18 @@ class MotionSpec:
             description="CSV of t_s,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg instead of the straight approach."
         ),
     ] = None
+
+
+@dataclass(frozen=True)
+class WorldSpec:
+    """Where the scene's origin, x_m = y_m = z_m = 0, is on earth, and where its z axis points."""
+
+    __pydantic_config__ = _STRICT
+
+    latitude_deg: Annotated[float, Field(ge=-90, le=90, description="WGS-84.")] = 0.0
+    longitude_deg: Annotated[float, Field(ge=-180, le=180, description="The same.")] = 0.0
+    height_m: Annotated[float, Field(ge=-12_000, le=20_000, description="Above the WGS-84 ellipsoid.")] = 0.0
+    heading_deg: Annotated[float, Field(ge=0, lt=360, description="Of z, clockwise from north.")] = 0.0
 
 
 @dataclass(frozen=True)
@@ -235,6 +250,7 @@ class Scene:
     motion: MotionSpec = field(default_factory=MotionSpec)
     background: BackgroundSpec = field(default_factory=BackgroundSpec)
     sensor: SensorSpec = field(default_factory=SensorSpec)
+    world: WorldSpec | None = None
     bars: tuple[BarSpec, ...] = (BarSpec(),)
     lamps: tuple[LampSpec, ...] = ()
 
@@ -256,7 +272,7 @@ class Scene:
 NEAREST_M = 0.5
 """Depth from which a source is rendered."""
 
-_TABLES = ("camera", "lens", "motion", "background", "sensor")
+_TABLES = ("camera", "lens", "motion", "background", "sensor", "world")
 _LISTS = ("bars", "lamps")
 
 
@@ -373,7 +389,9 @@ def _keys(where: Sequence[str]) -> list[str]:
     cls: Any = Scene
     for part in where[:-1]:
         if not part.isdigit():
-            cls = {"bars": BarSpec, "lamps": LampSpec}.get(part) or type(getattr(Scene(), part))
+            cls = {"bars": BarSpec, "lamps": LampSpec, "world": WorldSpec}.get(part) or type(
+                getattr(Scene(), part)
+            )
     return list(cls.__dataclass_fields__)
 
 

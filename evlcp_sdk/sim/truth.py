@@ -1,6 +1,7 @@
 """The truth beside a recording: what was sent, and where the bars were."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from evlcp_sdk.sim.motion import project
 from evlcp_sdk.sim.optics import blur_sigma_px
 from evlcp_sdk.sim.scene import Scene, resolve_scene
 from evlcp_sdk.sim.simulation import Simulation, scene_table
+from evlcp_sdk.sim.world import camera_on_earth, sites_of
 
 __all__ = ["scene_of_truth", "truth", "truth_of"]
 
@@ -31,7 +33,8 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
     first packet that was on air at the scene's begin, and `pilot_every` where not every frame has a pilot;
     `t_s`, `distance_m` and `bar_centre_px`, every millisecond, the depth along the optical axis and the place
     of each bar's centre; `camera_path`, every millisecond, the camera's place (x, y, z; m) and attitude (yaw,
-    pitch, roll; degrees) in the scene; `simulator` the resolved scene, which renders the recording again.
+    pitch, roll; degrees) in the scene and, with a `[world]`, on earth; `sites`, with a `[world]`, where the
+    bars stand (`BarSite`); `simulator` the resolved scene, which renders the recording again.
     """
     scene = simulation.scene
     camera, sensor, motion = scene.camera, scene.sensor, scene.motion
@@ -115,6 +118,9 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
         "e_led": [light.light_w_m2 for light in simulation.bars],
         "simulator": scene_table(scene),
     }
+    if scene.world is not None:
+        found["sites"] = [asdict(site) for site in sites_of(scene)]
+        found["camera_path"] |= camera_on_earth(scene, position, attitude)
     if simulation.done_s:
         found |= simulation.counts
     return found

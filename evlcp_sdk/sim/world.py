@@ -1,0 +1,103 @@
+"""Where a scene is on earth: its bars as sites, its camera's path as geodetic positions and attitudes.
+
+A scene's axes are x to the right, y down and z ahead, with its origin at `[world]`, z level and towards
+`world.heading_deg`.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.sim.scene import BarSpec, Scene, WorldSpec
+from evlcp_sdk.sites import BarSite, LocalFrame
+
+__all__ = ["bar_axis", "camera_on_earth", "scene_to_enu", "sites_of"]
+
+Floats = NDArray[np.float64]
+
+
+def bar_axis(bar: BarSpec) -> tuple[float, float, float]:
+    """Unit vector from a bar's top to its bottom in the scene's axes."""
+    lean, tilt = math.radians(bar.lean_deg), math.radians(bar.tilt_deg)
+    return -math.sin(lean) * math.cos(tilt), math.cos(lean) * math.cos(tilt), -math.sin(tilt)
+
+
+def scene_to_enu(vectors: Floats, heading_deg: float) -> Floats:
+    """Vectors in the scene's axes, float64 (..., 3), as east, north, up.
+
+    >>> scene_to_enu(np.array([0.0, -1.0, 10.0]), 90.0).round(6).tolist()
+    [10.0, 0.0, 1.0]
+    """
+    heading = math.radians(heading_deg)
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    east = x * math.cos(heading) + z * math.sin(heading)
+    north = z * math.cos(heading) - x * math.sin(heading)
+    return np.stack([east, north, -y], -1)
+
+
+def sites_of(scene: Scene) -> tuple[BarSite, ...]:
+    """The bars of a scene as sites; the first bar is transmitter 1 unless it has an id.
+
+    Raises:
+        ConfigError: The scene has no `[world]`.
+    """
+    world, frame = _world(scene)
+    sites = []
+    for i, bar in enumerate(scene.bars):
+        latitude, longitude, height = frame.to_geodetic(
+            scene_to_enu(np.array([bar.x_m, bar.y_m, bar.z_m]), world.heading_deg)
+        )
+        east, north, up = -scene_to_enu(np.array(bar_axis(bar)), world.heading_deg)
+        lean = math.hypot(east, north)
+        # A bar that stands upright leans nowhere.
+        heading = math.degrees(math.atan2(east, north)) % 360 if lean > 1e-9 else 0.0
+        sites.append(
+            BarSite(
+                transmitter_id=i + 1 if bar.transmitter_id is None else bar.transmitter_id,
+                latitude_deg=float(latitude),
+                longitude_deg=float(longitude),
+                height_m=float(height),
+                heading_deg=heading,
+                tilt_deg=math.degrees(math.atan2(lean, up)),
+                length_m=bar.length_m,
+            )
+        )
+    return tuple(sites)
+
+
+def camera_on_earth(scene: Scene, position_m: Floats, attitude_rad: Floats) -> dict[str, Any]:
+    """Where the camera is and looks, as lists, one entry a time.
+
+    Keys latitude_deg, longitude_deg, height_m; heading_deg clockwise from north, pitch_deg up, roll_deg with
+    the camera's top to the right.
+
+    Args:
+        scene: With its `[world]`.
+        position_m: In the scene's axes, float64 (n, 3).
+        attitude_rad: Yaw, pitch, roll in the scene, float64 (n, 3).
+
+    Raises:
+        ConfigError: The scene has no `[world]`.
+    """
+    world, frame = _world(scene)
+    latitude, longitude, height = frame.to_geodetic(scene_to_enu(position_m, world.heading_deg))
+    yaw, pitch, roll = np.degrees(attitude_rad).T
+    # 1e-9 degrees are 0.1 mm.
+    return {
+        "latitude_deg": [round(float(v), 10) for v in latitude],
+        "longitude_deg": [round(float(v), 10) for v in longitude],
+        "height_m": [round(float(v), 5) for v in height],
+        "heading_deg": [round(float(v), 5) for v in (world.heading_deg + yaw) % 360],
+        "pitch_deg": [round(float(v), 5) for v in pitch],
+        "roll_deg": [round(float(v), 5) for v in roll],
+    }
+
+
+def _world(scene: Scene) -> tuple[WorldSpec, LocalFrame]:
+    world = scene.world
+    if world is None:
+        raise ConfigError("the scene has no [world]: nothing says where on earth it is")
+    return world, LocalFrame(world.latitude_deg, world.longitude_deg, world.height_m)

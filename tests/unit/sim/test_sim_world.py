@@ -1,0 +1,81 @@
+"""Scenes on earth: bars as sites, the camera's path, against the image itself."""
+
+import numpy as np
+import pymap3d
+import pytest
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.sim import Simulation, load_scene, resolve_scene, sites_of, truth_of
+from evlcp_sdk.sim.motion import project
+from evlcp_sdk.sites import LocalFrame
+
+WORLD = {"latitude_deg": 35.1, "longitude_deg": 137.2, "height_m": 40.0, "heading_deg": 30.0}
+SCENE = resolve_scene(
+    {
+        "duration_s": 0.02,
+        "world": WORLD,
+        "motion": {"distance_m": 50.0, "yaw_deg": 2.0, "pitch_deg": -1.0, "roll_deg": 4.0},
+        "bars": [
+            {"x_m": -2.0, "y_m": -0.5, "lean_deg": 10.0},
+            {"x_m": 2.5, "z_m": 6.0, "tilt_deg": 20.0, "transmitter_id": 77},
+            {"x_m": 0.5, "y_m": -2.0, "z_m": 3.0},
+        ],
+    }
+)
+
+
+def turned(heading_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarray:
+    """Rows: the camera's right, down and ahead in east, north, up, from the attitude's definition."""
+    h, p, r = np.radians([heading_deg, pitch_deg, roll_deg])
+    ahead = np.array([np.sin(h) * np.cos(p), np.cos(h) * np.cos(p), np.sin(p)])
+    level = np.array([np.cos(h), -np.sin(h), 0.0])
+    above = np.cross(level, ahead)
+    # The top leans right: the camera's right sinks.
+    right = level * np.cos(r) - above * np.sin(r)
+    return np.stack([right, np.cross(ahead, right), ahead])
+
+
+def test_sites_and_camera_say_what_the_image_shows() -> None:
+    simulation = Simulation(SCENE)
+    truth = truth_of(simulation)
+    sites, path = sites_of(SCENE), truth["camera_path"]
+    assert [s.transmitter_id for s in sites] == [1, 77, 3]
+    camera = SCENE.camera
+    for i in (0, 19):
+        here = tuple(path[key][i] for key in ("latitude_deg", "longitude_deg", "height_m"))
+        axes = turned(path["heading_deg"][i], path["pitch_deg"][i], path["roll_deg"][i])
+        frame = LocalFrame(*here)
+        position, attitude = simulation.path.at(truth["t_s"][i] * 1e6)
+        for site, light in zip(sites, simulation.bars, strict=True):
+            seen = camera.project(site.cluster_positions_m(16, frame) @ axes.T)
+            strip = light.strip
+            parts = (np.arange(16) + 0.5) / 16 - 0.5
+            ends = np.array(strip.centre_m) + parts[:, None] * np.array(strip.along_m)
+            places, _ = project(ends, position, attitude, camera)
+            # A level plane is level at its origin only: 50 m away the earth has turned by 8 urad.
+            np.testing.assert_allclose(seen, places[0], atol=0.15)
+
+
+def test_the_origin_is_the_worlds() -> None:
+    scene = resolve_scene({"world": WORLD, "bars": [{"x_m": 3.0, "y_m": -1.0, "z_m": 4.0}]})
+    (site,) = sites_of(scene)
+    east, north, up = pymap3d.geodetic2enu(
+        site.latitude_deg, site.longitude_deg, site.height_m, 35.1, 137.2, 40.0
+    )
+    c, s = np.cos(np.radians(30)), np.sin(np.radians(30))
+    np.testing.assert_allclose([east, north, up], [3 * c + 4 * s, 4 * c - 3 * s, 1.0], atol=1e-6)
+    assert site.tilt_deg == pytest.approx(0.0)
+    assert site.heading_deg == 0.0
+
+
+def test_without_a_world_there_are_no_sites() -> None:
+    scene = load_scene("drive-30kmh", ["duration_s=0.01"])
+    assert "sites" not in truth_of(Simulation(scene))
+    with pytest.raises(ConfigError, match=r"no \[world\]"):
+        sites_of(scene)
+
+
+def test_a_wrong_key_is_told() -> None:
+    with pytest.raises(ConfigError, match=r"world\.lattitude_deg"):
+        resolve_scene({"world": {"lattitude_deg": 1.0}})
+    assert load_scene("night", ["world.heading_deg=90"]).world.heading_deg == 90.0  # type: ignore[union-attr]
