@@ -26,3 +26,10 @@ def evlcp_algorithms() -> Iterator[Algorithm]:
     yield Algorithm(
         "decoding", "ml-soft", "evlcp_wh.ml_soft:MlSoft", 1, "likelihoods learned from the pilots"
     )
+    yield Algorithm(
+        "decoding",
+        "motion-feedback",
+        "evlcp_wh.motion_feedback:MotionFeedback",
+        1,
+        "ml-soft again after the motion is known",
+    )

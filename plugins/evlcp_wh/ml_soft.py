@@ -11,7 +11,7 @@ from evlcp_sdk.abc import Decode, Decoding
 from evlcp_sdk.codebook import Codebook
 from evlcp_sdk.types import PresenceMap, SoftSymbols
 
-__all__ = ["MlSoft"]
+__all__ = ["MlSoft", "combined_values", "learned_worth", "soft_symbols"]
 
 
 @dataclass(frozen=True)
@@ -46,32 +46,83 @@ class MlSoft(Decoding):
         """Precompute for a codebook's pilots and codewords."""
         words = codebook.codewords.astype(np.float64)
         pilots = codebook.pilots.astype(np.int64)
-        m, pilot_chips = codebook.bits_per_symbol, 2 * pilots.shape[1]
-        side = 2 * self.max_events + 1
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
-            from evlcp_wh import _kernels
-
-            clusters = len(presence.probability)
-            pilot, info = sums[:pilot_chips], sums[pilot_chips:]
-            counts = np.full((2, side, side), self.prior_count)
-            _kernels.count_pairs(
-                pilot, pilots, presence.probability, presence.grid_px, self.max_events, counts
-            )
-            share = counts / counts.sum((1, 2), keepdims=True)
-            worth = np.log(share[1] / share[0])
-            values = np.zeros((clusters, words.shape[1]))
-            _kernels.sum_worth(
-                info, presence.probability, presence.grid_px, self.min_weight, self.max_events, worth, values
-            )
-            fit = values @ words.T / 2 * self.independent_pixels
-            zero, one = np.empty((2, clusters, m))
-            _kernels.max_log(fit, m, zero, one)
-            symbols = fit.argmax(1)
-            signs = np.sign(values) * words[symbols]
-            size = np.abs(values)
-            total = float(size.sum())
-            quality = float((size * (signs > 0)).sum()) / total if total else 0.0
-            return SoftSymbols(symbols, (zero - one).astype(np.float32), quality)
+            worth = learned_worth(presence, sums, pilots, self.max_events, self.prior_count)
+            values = combined_values(presence, sums[2 * pilots.shape[1] :], worth, self.min_weight)
+            return soft_symbols(values, words, self.independent_pixels)
 
         return decode
+
+
+def learned_worth(
+    presence: PresenceMap,
+    sums: NDArray[np.int16],
+    pilots: NDArray[np.int64],
+    max_events: int,
+    prior_count: float,
+) -> NDArray[np.float64]:
+    """Log-likelihood ratio of a value of +1 against -1, by its chips' polarity sums of -n to n events.
+
+    Args:
+        presence: Of the frame.
+        sums: The frame's polarity sums, pilot first, int16 (chips, height, width).
+        pilots: The codes, int64 (K, values).
+        max_events: n; sums beyond count as this many.
+        prior_count: Observations added to every cell of the two histograms.
+
+    Returns:
+        float64 (2 n + 1, 2 n + 1), by the first chip's sum and the second's.
+    """
+    from evlcp_wh import _kernels
+
+    side = 2 * max_events + 1
+    counts = np.full((2, side, side), prior_count)
+    pilot = sums[: 2 * pilots.shape[1]]
+    _kernels.count_pairs(pilot, pilots, presence.probability, presence.grid_px, max_events, counts)
+    share = counts / counts.sum((1, 2), keepdims=True)
+    worth: NDArray[np.float64] = np.log(share[1] / share[0])
+    return worth
+
+
+def combined_values(
+    presence: PresenceMap, sums: NDArray[np.int16], worth: NDArray[np.float64], min_weight: float
+) -> NDArray[np.float64]:
+    """Presence-weighted sums of what the pixels say of each value of a segment, float64 (K, values).
+
+    Args:
+        presence: Of the frame.
+        sums: Polarity sums of the segment, int16 (2 values, height, width).
+        worth: As from `learned_worth`.
+        min_weight: Presence probability below which a cell is passed over.
+    """
+    from evlcp_wh import _kernels
+
+    values = np.zeros((len(presence.probability), len(sums) // 2))
+    most = len(worth) // 2
+    _kernels.sum_worth(sums, presence.probability, presence.grid_px, min_weight, most, worth, values)
+    return values
+
+
+def soft_symbols(
+    values: NDArray[np.float64], words: NDArray[np.float64], independent_pixels: float
+) -> SoftSymbols:
+    """The likeliest codewords of combined log-likelihood ratios, of which a share is independent.
+
+    Args:
+        values: Log-likelihood ratio of each value, +1 against -1, float64 (K, values).
+        words: The codewords, float64 (2**m, values).
+        independent_pixels: Share of the pixels that err by themselves.
+    """
+    from evlcp_wh import _kernels
+
+    fit = values @ words.T / 2 * independent_pixels
+    bits = len(words).bit_length() - 1
+    zero, one = np.empty((2, len(values), bits))
+    _kernels.max_log(fit, bits, zero, one)
+    symbols = fit.argmax(1)
+    size = np.abs(values)
+    total = float(size.sum())
+    agrees = np.sign(values) * words[symbols] > 0
+    quality = float((size * agrees).sum()) / total if total else 0.0
+    return SoftSymbols(symbols, (zero - one).astype(np.float32), quality)

@@ -5,13 +5,15 @@ import pytest
 import wh_twins as twins
 from evlcp_wh import _kernels
 from evlcp_wh.decoding import WhTransform
-from evlcp_wh.ml_soft import MlSoft
+from evlcp_wh.ml_soft import MlSoft, learned_worth
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
+from evlcp_wh.motion_feedback import MotionFeedback
 from evlcp_wh.pilots import WhPilots
 from evlcp_wh.separation import WhCorrelation
 from numpy.testing import assert_allclose, assert_array_equal
 
 from evlcp_sdk.codebook import Codebook, chips_of_values
+from evlcp_sdk.testing.views import ideal_presence, ideal_sums
 from evlcp_sdk.types import PresenceMap
 
 PROFILES = {"wh4x2": Wh4x2(), "wh8": Wh8(), "raw8": Raw8()}
@@ -107,6 +109,63 @@ def test_max_log(clusters, bits):
     zero, one = np.empty((2, clusters, bits))
     _kernels.max_log(fit, bits, zero, one)
     assert_array_equal([zero, one], twins.max_log(fit, bits))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize(("grid", "most"), [(2, 1), (3, 2)])
+def test_histograms_of_pairs_and_their_worth(seed, grid, most):
+    rng = np.random.default_rng(seed)
+    sums = random_sums(rng, (16, 13, 10))
+    probability = presence_of(rng, CLUSTERS, 13 // grid, 10 // grid, grid).probability
+    counts = np.full((2, 2 * most + 1, 2 * most + 1), 0.5)
+    _kernels.count_pairs(sums, CODES.astype(np.int64), probability, grid, most, counts)
+    assert_allclose(counts, twins.count_pairs(sums, CODES, probability, grid, most, 0.5), rtol=1e-6)
+    worth = rng.normal(size=counts.shape[1:])
+    out = np.zeros((CLUSTERS, 8))
+    _kernels.sum_worth(sums, probability, grid, 0.2, most, worth, out)
+    cells = twins.worth_of(sums, worth)[:, : 13 // grid * grid, : 10 // grid * grid]
+    cells = cells.reshape(8, 13 // grid, grid, 10 // grid, grid).sum((2, 4))
+    weight = np.where(probability >= 0.2, probability, 0)
+    assert_allclose(out, np.einsum("krc,irc->ki", weight, cells), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("reach", [1, 3])
+def test_match_of_shifted_images(seed, reach):
+    rng = np.random.default_rng(seed)
+    sums, worth = random_sums(rng, (12, 11, 7)), rng.normal(size=(5, 5))
+    maps = (rng.random((4, 11, 7)) * (rng.random((4, 11, 7)) < 0.4)).astype(np.float32)
+    codes = rng.choice([-1, 1], (4, 6))
+    padded, side = (11 + 2 * reach, 7 + 2 * reach), 2 * reach + 1
+    images, scores = np.empty((6, *padded)), np.empty((6, side, side))
+    _kernels.expected_images(maps, codes, reach, images)
+    want = np.pad(np.einsum("kvu,ki->ivu", maps, codes), ((0, 0), (reach, reach), (reach, reach)))
+    assert_allclose(images, want, atol=1e-6)
+    _kernels.shift_scores(sums, worth, 2, images, scores)
+    pixels = twins.worth_of(sums, worth) - worth[2, 2]
+    assert_allclose(scores, twins.shift_scores(pixels, want, reach), atol=1e-4)
+    shown, weight = np.empty(padded, np.int64), np.empty(padded, np.float32)
+    _kernels.likeliest(maps, reach, shown, weight)
+    _kernels.blind_scores(sums, worth, 2, shown, weight, 4, scores)
+    assert_allclose(scores, twins.blind_scores(pixels, maps, reach), atol=1e-4)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize(("step_cost", "place_cost"), [(0.0, 0.0), (0.5, 0.1), (3.0, 0.0), (0.1, 2.0)])
+def test_the_smooth_path_is_the_best_of_all(seed, step_cost, place_cost):
+    scores = np.random.default_rng(seed).normal(0, 2, (4, 3, 3))
+    path = np.empty((4, 2), np.int64)
+    _kernels.smooth_path(scores, step_cost, place_cost, path)
+    assert_array_equal(path, twins.best_path(scores, step_cost, place_cost))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_motion_taken_back(seed):
+    rng = np.random.default_rng(seed)
+    sums, path = random_sums(rng, (8, 9, 5)), rng.integers(-6, 7, (4, 2))
+    out = np.empty_like(sums)
+    _kernels.take_back(sums, path, out)
+    assert_array_equal(out, twins.take_back(sums, path))
 
 
 # Separation
@@ -288,3 +347,48 @@ def test_learned_likelihoods_decode_every_symbol(profile, positive_only):
         assert_array_equal(soft.symbols, symbols)
         assert_array_equal(soft.llr < 0, bits_of(symbols, book.bits_per_symbol) == 1)
         assert soft.quality > 0.9
+
+
+def drifting(book, symbols, right_down, missing=0.3, seed=0, **image):
+    """A frame of a bar that stands still while its pilot is on air and drifts away while its info is."""
+    still = ideal_sums(book, symbols, missing=missing, seed=seed, **image)
+    share = np.clip((np.arange(16) - 7.5) / 7.5, 0, 1)
+    path = np.rint(share[:, None] * np.array(right_down)[::-1]).astype(int)
+    return twins.take_back(still, path), path
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("right_down", [(0, 3), (0, -3), (3, 0), (-3, 0), (2, -3)])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_drift_within_the_frame_is_found_and_taken_back(profile, right_down, seed):
+    book = book_of(profile)
+    symbols = np.random.default_rng(seed).integers(len(book.codewords), size=CLUSTERS)
+    shape = {"cluster_px": 4, "width_px": 4}
+    sums, path = drifting(book, symbols, right_down, seed=seed, **shape)
+    presence = ideal_presence(CLUSTERS, **shape)
+    algorithm = MotionFeedback()
+    soft = algorithm.compile(book)(presence, sums)
+    assert_array_equal(soft.symbols, symbols)
+    assert_array_equal(soft.llr < 0, bits_of(symbols, book.bits_per_symbol) == 1)
+    if right_down[1]:
+        assert (MlSoft().compile(book)(presence, sums).symbols != symbols).any()
+    pilots = book.pilots.astype(np.int64)
+    worth = learned_worth(presence, sums, pilots, 3, 1.0)
+    words = book.codewords[symbols].astype(np.int64)
+    known = np.concatenate([pilots, words], axis=1)
+    assert_array_equal(algorithm._path(presence, sums, known, worth), -path)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_bar_that_stands_still_is_decoded_as_before(seed):
+    book = book_of()
+    rng = np.random.default_rng(seed)
+    symbols = rng.integers(64, size=CLUSTERS)
+    sums = ideal_sums(book, symbols, missing=0.3, seed=seed)
+    noise = random_sums(rng, sums.shape, 0.02)
+    presence = ideal_presence(CLUSTERS)
+    want = MlSoft().compile(book)(presence, sums + noise)
+    got = MotionFeedback().compile(book)(presence, sums + noise)
+    assert_array_equal(got.symbols, want.symbols)
+    assert_array_equal(got.llr, want.llr)
+    assert got.quality == want.quality

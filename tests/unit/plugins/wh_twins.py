@@ -1,5 +1,7 @@
 """Separation and decoding once more, from the air interface and Bayes' rule, in NumPy or plain Python."""
 
+import itertools
+
 import numpy as np
 
 
@@ -76,3 +78,74 @@ def llr(values, words):
         zeros = [f"{s:0{bits}b}"[b] == "0" for s in range(len(words))]
         out[k, b] = (cost[k, np.invert(zeros)].min() - cost[k, zeros].min()) / (2 * variance)
     return cost.argmin(1), out, kept / (kept + rest)
+
+
+def count_pairs(sums, codes, probability, grid, most, prior):
+    """Histograms over pixels by plain loops; a pixel counts for its likeliest cluster."""
+    counts = np.full((2, 2 * most + 1, 2 * most + 1), prior)
+    clipped = np.clip(sums.astype(int), -most, most) + most
+    for r, c in np.ndindex(probability.shape[1:]):
+        k = probability[:, r, c].argmax()
+        if probability[k, r, c] < 0.5:
+            continue
+        for v, u in np.ndindex(grid, grid):
+            for i, value in enumerate(codes[k]):
+                first, second = clipped[2 * i : 2 * i + 2, r * grid + v, c * grid + u]
+                counts[int(value > 0), first, second] += probability[k, r, c]
+    return counts
+
+
+def worth_of(sums, worth):
+    """What each pixel's pair of sums is worth, (values, height, width)."""
+    most = len(worth) // 2
+    clipped = np.clip(sums.astype(int), -most, most) + most
+    return worth[clipped[::2], clipped[1::2]]
+
+
+def shift_scores(pixels, images, reach):
+    """Correlation of pixels (values, height, width) with images that have a seam, shift by shift."""
+    _, height, width = pixels.shape
+    side = 2 * reach + 1
+    out = np.zeros((len(pixels), side, side))
+    for a, b in np.ndindex(side, side):
+        out[:, a, b] = (pixels * images[:, a : a + height, b : b + width]).sum((1, 2))
+    return out
+
+
+def blind_scores(pixels, maps, reach):
+    """For each cluster the better of both values: its pixels are those where its map is the largest."""
+    seam = np.pad(maps, ((0, 0), (reach, reach), (reach, reach)))
+    out = np.zeros((len(pixels), 2 * reach + 1, 2 * reach + 1))
+    for k in range(len(maps)):
+        own = np.where(seam.argmax(0) == k, seam.max(0), 0)
+        one = shift_scores(pixels, np.broadcast_to(own, (len(pixels), *own.shape)), reach)
+        out += np.maximum(one, -one)
+    return out
+
+
+def best_path(scores, step_cost, place_cost):
+    """The best of all paths."""
+    values, side, _ = scores.shape
+    places = list(np.ndindex(side, side))
+
+    def total(path):
+        places = np.array(path)
+        return (
+            sum(scores[i, a, b] for i, (a, b) in enumerate(path))
+            - step_cost * (np.diff(places, axis=0) ** 2).sum()
+            - place_cost * ((places - side // 2) ** 2).sum()
+        )
+
+    return np.array(max(itertools.product(places, repeat=values), key=total)) - side // 2
+
+
+def take_back(sums, path):
+    reach = np.abs(path).max()
+    seam = np.pad(sums, ((0, 0), (reach, reach), (reach, reach)))
+    _, height, width = sums.shape
+    return np.array(
+        [
+            seam[c, reach - path[c // 2, 0] :, reach - path[c // 2, 1] :][:height, :width]
+            for c in range(len(sums))
+        ]
+    )

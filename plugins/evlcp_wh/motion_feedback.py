@@ -1,0 +1,152 @@
+"""What the info segment of each cluster says, after the bar's motion within the frame is taken out."""
+
+from dataclasses import dataclass
+from math import log
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from evlcp_sdk.abc import Decode, Decoding
+from evlcp_sdk.codebook import Codebook
+from evlcp_sdk.types import PresenceMap, SoftSymbols
+from evlcp_wh.ml_soft import combined_values, learned_worth, soft_symbols
+
+__all__ = ["MotionFeedback"]
+
+
+@dataclass(frozen=True)
+class MotionFeedback(Decoding):
+    """Decision feedback of motion: find from the chips where the bar was, take it back, decode, again.
+
+    The clusters' pixel maps and the values that they send make the image that each value should give; its
+    match with the events, pixel by pixel in log-likelihood ratios as `ml-soft` learns them, tells how
+    likely the bar was so many pixels off its place then. In the first round the pilot's values are known,
+    and each info value of a cluster is the one that fits better; in the second all are known from the
+    decision. The likeliest smooth path over all values (Viterbi) is taken back from the sums, the clusters
+    are separated again by their pilots, and their info segments decoded. A frame whose path stays at 0 is
+    decoded as by `ml-soft`.
+
+    A path that started from decisions alone would confirm a wrong one: a bar off by the spacing of its
+    clusters says its neighbours' symbols without a fault.
+    """
+
+    reach_px: Annotated[
+        int, Field(ge=1, le=8, description="Farthest that the bar may be off its place in a frame.")
+    ] = 3
+    step_px: Annotated[
+        float,
+        Field(gt=0, description="Likely change of place (sigma) from value to value: 1.5 px/ms for 0.2 ms."),
+    ] = 0.3
+    place_px: Annotated[
+        float, Field(gt=0, description="Likely distance (sigma) of the bar from its place.")
+    ] = 1.0
+    rounds: Annotated[int, Field(ge=1, le=4, description="How often motion and symbols are found anew.")] = 2
+    max_events: Annotated[
+        int, Field(ge=1, le=16, description="Polarity sums beyond this many events count as this many.")
+    ] = 3
+    min_weight: Annotated[
+        float, Field(gt=0, lt=1, description="Presence probability below which a cell is passed over.")
+    ] = 0.05
+    prior_count: Annotated[
+        float, Field(gt=0, description="Observations added to every cell of the histograms.")
+    ] = 1.0
+    independent_pixels: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=1,
+            description="Share of the pixels that err by themselves; neighbours share light and motion.",
+        ),
+    ] = 0.25
+    value_error: Annotated[
+        float, Field(gt=0, lt=0.5, description="Probability that a cell's value is seen wrong.")
+    ] = 0.1
+    min_values: Annotated[
+        int, Field(ge=1, description="Values that must be seen in a cell for it to show a cluster.")
+    ] = 4
+
+    def compile(self, codebook: Codebook) -> Decode:
+        """Precompute for a codebook's pilots and codewords."""
+        words = codebook.codewords.astype(np.float64)
+        pilots = codebook.pilots.astype(np.int64)
+
+        def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
+            worth = learned_worth(presence, sums, pilots, self.max_events, self.prior_count)
+            known, aligned = pilots, sums
+            done = np.zeros((len(sums) // 2, 2), np.int64)
+            for _ in range(self.rounds):
+                path = self._path(presence, sums, known, worth)
+                if (path == done).all():
+                    break
+                aligned, done = _taken_back(sums, path), path
+                presence = self._separated(aligned, presence.grid_px, pilots)
+                worth = learned_worth(presence, aligned, pilots, self.max_events, self.prior_count)
+                soft = self._decided(presence, aligned, pilots, words, worth)
+                known = np.concatenate([pilots, words[soft.symbols].astype(np.int64)], axis=1)
+            return self._decided(presence, aligned, pilots, words, worth)
+
+        return decode
+
+    def _decided(
+        self,
+        presence: PresenceMap,
+        sums: NDArray[np.int16],
+        pilots: NDArray[np.int64],
+        words: NDArray[np.float64],
+        worth: NDArray[np.float64],
+    ) -> SoftSymbols:
+        values = combined_values(presence, sums[2 * pilots.shape[1] :], worth, self.min_weight)
+        return soft_symbols(values, words, self.independent_pixels)
+
+    def _path(
+        self,
+        presence: PresenceMap,
+        sums: NDArray[np.int16],
+        known: NDArray[np.int64],
+        worth: NDArray[np.float64],
+    ) -> NDArray[np.int64]:
+        """Way back to where the maps have the bar from its place in each value, int64 (values, 2), px.
+
+        `known` are the codes of the values that are known, int64 (K, n), n from 0 to all of them.
+        """
+        from evlcp_wh import _kernels
+
+        _, height, width = sums.shape
+        values, seam, most = known.shape[1], self.reach_px, len(worth) // 2
+        padded, side = (height + 2 * seam, width + 2 * seam), 2 * seam + 1
+        gain = worth.astype(np.float32)
+        scores = np.empty((len(sums) // 2, side, side), np.float32)
+        images = np.empty((values, *padded), np.float32)
+        _kernels.expected_images(presence.pixels, known, seam, images)
+        _kernels.shift_scores(sums, gain, most, images, scores[:values])
+        shown, weight = np.empty(padded, np.int64), np.empty(padded, np.float32)
+        _kernels.likeliest(presence.pixels, seam, shown, weight)
+        _kernels.blind_scores(sums[2 * values :], gain, most, shown, weight, len(known), scores[values:])
+        scores *= self.independent_pixels / 2
+        path = np.empty((len(scores), 2), np.int64)
+        _kernels.smooth_path(scores, 0.5 / self.step_px**2, 0.5 / self.place_px**2 / len(scores), path)
+        return path
+
+    def _separated(self, sums: NDArray[np.int16], grid_px: int, pilots: NDArray[np.int64]) -> PresenceMap:
+        """Presence by Bayes' rule, and pixel maps, of sums in which the bar stands still."""
+        from evlcp_wh import _kernels
+
+        _, height, width = sums.shape
+        pilot = sums[: 2 * pilots.shape[1]]
+        agree, disagree = log((1 - self.value_error) / 0.5), log(self.value_error / 0.5)
+        probability = np.zeros((len(pilots), height // grid_px, width // grid_px), np.float32)
+        _kernels.presence(pilot, pilots, grid_px, agree, disagree, self.min_values, probability)
+        selected = probability >= 0.5
+        pixels = np.zeros((len(pilots), height, width), np.float32)
+        _kernels.pixel_maps(pilot, pilots, grid_px, selected, pixels)
+        return PresenceMap(probability, grid_px, selected, pixels)
+
+
+def _taken_back(sums: NDArray[np.int16], path: NDArray[np.int64]) -> NDArray[np.int16]:
+    from evlcp_wh import _kernels
+
+    out = np.empty_like(sums)
+    _kernels.take_back(sums, path, out)
+    return out
