@@ -1,8 +1,8 @@
 """The link: what both ends agree on and how the receiver works, from `link.toml` to checked objects.
 
-One table a role (`[ranging]`: `id = "poc"`, its parameters flat beside it), and `[camera]`, `[bar]`, `[air]`
-and `[regions]`. Every default is written out before anything runs, so that the resolved table alone
-reproduces a result. See `docs/configuration.md`.
+One table a role (`[ranging]`: `id = "poc"`, its parameters flat beside it), and `[camera]`, `[bar]`, `[air]`,
+`[regions]` and `[messages]`. Every default is written out before anything runs, so that the resolved table
+alone reproduces a result. See `docs/configuration.md`.
 """
 
 import difflib
@@ -23,12 +23,14 @@ from evlcp_sdk.errors import ConfigError, UnknownAlgorithmError
 from evlcp_sdk.frames import PacketFormat
 from evlcp_sdk.geometry import BarLayout, CameraModel
 from evlcp_sdk.hookspecs import ROLE_NAMES
+from evlcp_sdk.messages.coding import BlockCoder, packet_bits
 from evlcp_sdk.registry import Registry
 
 __all__ = [
     "DEFAULT_IDS",
     "AirSpec",
     "Link",
+    "MessageSpec",
     "RegionSpec",
     "installed_versions",
     "load_link",
@@ -58,6 +60,32 @@ class AirSpec:
     pilot_every: Annotated[
         int, Field(gt=0, le=64, description="Frames from one pilot to the next; 1: every frame has one.")
     ] = 1
+
+
+@dataclass(frozen=True)
+class MessageSpec:
+    """How messages are read from packets, and whose beacons are believed."""
+
+    decode: Annotated[bool, Field(description="Read messages; without, packets are symbols only.")] = True
+    combine_packets: Annotated[
+        int,
+        Field(ge=0, le=256, description="Undecoded blocks kept to be added to their repetitions; 0: none."),
+    ] = 16
+    max_llr: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=100,
+            description="LLRs are clipped to this; no bit is surer than the sync that it hangs on.",
+        ),
+    ] = 7.0
+    trusted_keys: Annotated[
+        tuple[str, ...],
+        Field(description="Public Ed25519 keys, 64 hex digits each, whose beacons are verified."),
+    ] = ()
+    oldest_sequence: Annotated[
+        int, Field(ge=0, lt=2**32, description="Sequence below which a signed beacon counts as replayed.")
+    ] = 0
 
 
 @dataclass(frozen=True)
@@ -97,6 +125,7 @@ _SPECS: dict[str, type[Any]] = {
     "bar": BarLayout,
     "air": AirSpec,
     "regions": RegionSpec,
+    "messages": MessageSpec,
 }
 
 _UNITS = {
@@ -122,6 +151,7 @@ class Link:
         bar: The transmitter's LEDs and clusters.
         air: Chip rate and packet length.
         regions: Parameters of the region detector.
+        messages: How messages are read.
         algorithms: Role to algorithm, one of each role.
         revisions: Role to the algorithm's revision.
         codebook: The codes that both ends share.
@@ -134,6 +164,7 @@ class Link:
     bar: BarLayout
     air: AirSpec
     regions: RegionSpec
+    messages: MessageSpec
     algorithms: Mapping[str, Any]
     revisions: Mapping[str, int]
     codebook: Codebook
@@ -144,6 +175,15 @@ class Link:
     def algorithm(self, role: str) -> Any:
         """The algorithm of a role, e.g. `link.algorithm("ranging")`."""
         return self.algorithms[role]
+
+    def block_coder(self) -> BlockCoder:
+        """How packets carry blocks of messages.
+
+        Raises:
+            ConfigError: A packet is too short for a block.
+        """
+        code = self.algorithm("error-correction").compile(packet_bits(self.codebook, self.packet))
+        return BlockCoder(self.codebook, self.packet, code)
 
 
 def load_link(
@@ -279,6 +319,7 @@ def resolve(
         bar=bar,
         air=air,
         regions=built["regions"],
+        messages=built["messages"],
         algorithms={role: built[role] for role in ROLE_NAMES},
         revisions=revisions,
         codebook=codebook,

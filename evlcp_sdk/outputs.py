@@ -12,7 +12,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
@@ -21,6 +21,7 @@ from typing import Any, Literal, Self, TextIO
 from evlcp_sdk.config import Link
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.frames import bits_of_symbols
+from evlcp_sdk.messages.received import ReceivedMessage
 from evlcp_sdk.types import Frame, Packet
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "TransmitterTally",
     "filtered_row",
     "frame_row",
+    "message_line",
 ]
 
 FRAME_COLUMNS = (
@@ -202,6 +204,8 @@ class ResultWriter:
             self.transmitters[packet.transmitter] = tally
         tally.add(packet)
         self._packets_file.write(json.dumps(self._packet_line(packet)) + "\n")
+        for message in packet.messages:
+            self._packets_file.write(json.dumps(message_line(message), ensure_ascii=False) + "\n")
         for frame in packet.frames:
             self._rows.writerow(frame_row(frame) + (filtered_row(frame) if self._filtered else []))
             if self._parquet is not None:
@@ -216,6 +220,7 @@ class ResultWriter:
             frame_bits = bits_of_symbols(frame.soft.symbols[None], book.bits_per_symbol)
             bits[frame.frame] = "".join(map(str, frame_bits.tolist()))
         return {
+            "kind": "packet",
             "transmitter": packet.transmitter,
             "packet": packet.packet,
             "t_us": round(packet.t_us, 2),
@@ -263,6 +268,7 @@ class ResultWriter:
             "recording": dict(recording),
             "processing": dict(processing),
             "counts": dict(counts),
+            "messages_off": self._messages_off(),
             "losses": {kind: dict(loss) for kind, loss in losses.items()},
             "digest": self._link.digest,
             "codebook": {"digest": self._link.codebook.digest, "profile": self._link.codebook.profile},
@@ -283,6 +289,16 @@ class ResultWriter:
         except OSError as fault:
             raise EvlcpError(f"{self.folder}: cannot be written: {fault.strerror}") from fault
         return table
+
+    def _messages_off(self) -> str | None:
+        """Why messages were not read; None where they were."""
+        if not self._link.messages.decode:
+            return "messages.decode = false"
+        try:
+            self._link.block_coder()
+        except ConfigError as fault:
+            return str(fault)
+        return None
 
     def headline(self) -> str:
         """What was found, in one sentence."""
@@ -310,6 +326,27 @@ class ResultWriter:
             self._close()
         for name in _FILES:
             self._hidden(name).unlink(missing_ok=True)
+
+
+def message_line(received: ReceivedMessage) -> dict[str, Any]:
+    """A message's line of `packets.jsonl`, as JSON values."""
+    message = received.message
+    line: dict[str, Any] = {
+        "kind": message.kind.name.lower(),
+        "transmitter": received.transmitter,
+        "packet": received.packet,
+        "t_us": round(received.t_us, 2),
+        "transmitter_id": message.transmitter_id,
+        "sequence": message.sequence,
+        "verified": received.trust == "verified",
+        "trust": received.trust,
+        "reason": received.reason,
+    }
+    if received.beacon is not None:
+        return line | asdict(received.beacon) | {"user": received.beacon.user.hex()}
+    if message.text is not None:
+        return line | {"text": message.text}
+    return line | {"data": message.payload.hex()}
 
 
 def frame_row(frame: Frame) -> list[str]:

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import StreamError
+from evlcp_sdk.messages.block import Block
+from evlcp_sdk.messages.received import ReceivedMessage
 
 __all__ = [
     "EVENT_RECORD",
@@ -292,6 +294,9 @@ class Packet:
         chip_us: Length of a chip on the camera's clock, us.
         frames: The decoded frames in order; a frame that was not received is missing here.
         sent: Number of frames that a packet has.
+        block: What its bits carry; None if that cannot be told.
+        block_packets: Packets whose LLRs were added to tell the block; 0 without one.
+        messages: Those that are complete with this packet, or whose trust changed.
     """
 
     transmitter: int
@@ -300,3 +305,6 @@ class Packet:
     chip_us: float
     frames: tuple[Frame, ...]
     sent: int
+    block: Block | None = None
+    block_packets: int = 0
+    messages: tuple[ReceivedMessage, ...] = ()

@@ -21,8 +21,8 @@ from evlcp_sdk.types import Frame
 
 __all__ = ["environment_of", "plan_of", "run_job"]
 
-_SOURCES = ("abc.py", "codebook.py", "config.py", "frames.py", "geometry.py", "types.py")
-_PACKAGES = ("rx", "sim")
+_SOURCES = ("abc.py", "codebook.py", "config.py", "crc.py", "frames.py", "geometry.py", "types.py")
+_PACKAGES = ("messages", "rx", "sim")
 _CAMPAIGN = ("measure.py", "statistics.py", "task.py")
 
 

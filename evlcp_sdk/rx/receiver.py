@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.abc import Synchronizer, Tracker
 from evlcp_sdk.config import Link
-from evlcp_sdk.errors import StreamError
+from evlcp_sdk.errors import ConfigError, StreamError
 from evlcp_sdk.rx.chips import polarity_sums
+from evlcp_sdk.rx.messages import MessageAssembler
 from evlcp_sdk.rx.payload import PacketAssembler
 from evlcp_sdk.rx.presence import clusters_in_place
 from evlcp_sdk.rx.regions import RegionTracker, Track
@@ -115,6 +116,7 @@ class Receiver:
         self._distance = tracker.distance
         self._centres_m = link.bar.cluster_centres_m()
         self._tracker = RegionTracker(link.regions, link.camera, link.packet.chip_us, tracker.position)
+        self._messages = self._assembler(link)
         self._transmitters: dict[int, _Transmitter] = {}
         self._released: list[_Transmitter] = []
         self._pending: list[Events] = []
@@ -143,7 +145,7 @@ class Receiver:
     @property
     def counts(self) -> dict[str, int]:
         """What was taken, found and dropped so far."""
-        return dict(self._counts)
+        return self._counts | (self._messages.counts if self._messages is not None else {})
 
     def feed(self, events: Events) -> list[Packet]:
         """Take the next events of the stream; return the packets that are complete.
@@ -171,7 +173,7 @@ class Receiver:
             packets += self._skip_gap(int(events.t_us[end]))
         if begin < len(events):
             self._pending.append(events[begin:])
-        return packets
+        return self._read(packets)
 
     def close(self) -> list[Packet]:
         """End the stream; return the packets that were still incomplete."""
@@ -182,7 +184,34 @@ class Receiver:
         for transmitter in self._transmitters.values():
             packets += self._end(transmitter)
         self._transmitters = {}
+        packets = self._read(packets)
+        if self._messages is not None:
+            self._messages.close()
         return packets
+
+    @staticmethod
+    def _assembler(link: Link) -> MessageAssembler | None:
+        """What reads messages; None where that is turned off, or packets are too short for them."""
+        if not link.messages.decode:
+            return None
+        try:
+            coder = link.block_coder()
+        except ConfigError:
+            return None
+        return MessageAssembler(coder, link.messages)
+
+    def _read(self, packets: list[Packet]) -> list[Packet]:
+        """Read the messages that packets carry."""
+        if self._messages is None:
+            return packets
+        read = []
+        for packet in packets:
+            clock = time.perf_counter()
+            read.append(self._messages.add(packet))
+            elapsed = time.perf_counter() - clock
+            for message in read[-1].messages:
+                self._tell("message", message, elapsed)
+        return read
 
     def _checked(self, events: Events) -> Events:
         from evlcp_sdk.rx import _kernels

@@ -20,6 +20,7 @@ PAGES = (
     "quickstart",
     "cli",
     "outputs",
+    "messages",
     "configuration",
     "simulator",
     "campaigns",
@@ -108,7 +109,7 @@ def test_every_stage_is_in_the_docs() -> None:
     page = (ROOT / "docs" / "hooks.md").read_text()
     doc = hookspecs.evlcp_stage_finished.__doc__ or ""
     stages = re.findall(r"`(\w+)`", doc.split("stage:")[1].split("value:")[0])
-    assert len(stages) == 6
+    assert len(stages) == 7
     for stage in stages:
         assert f"| `{stage}` |" in page
 

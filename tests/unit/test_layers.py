@@ -10,9 +10,11 @@ SDK = Path(__file__).parents[2] / "evlcp_sdk"
 
 LAYERS = (
     {"errors"},
+    {"messages"},
     {"types"},
     {"geometry", "codebook", "frames", "crc", "sites"},
     {"abc", "hookspecs"},
+    {"messages.coding"},
     {"registry", "config"},
     {"io", "rx", "sim"},
     {"rx.receiver"},

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,13 @@ from evlcp_wh.modulation import Wh8
 from evlcp_wh.pilots import WhPilots
 
 from evlcp_sdk.codebook import Codebook
-from evlcp_sdk.config import AirSpec, Link, RegionSpec, load_link
+from evlcp_sdk.config import AirSpec, Link, MessageSpec, RegionSpec, load_link
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.frames import PacketFormat, symbols_of_bits
 from evlcp_sdk.geometry import BarLayout, CameraModel
+from evlcp_sdk.messages.beacon import Beacon
+from evlcp_sdk.messages.block import Kind, Message
+from evlcp_sdk.messages.received import ReceivedMessage
 from evlcp_sdk.outputs import FIGURE_NAMES, FRAME_COLUMNS, ResultWriter, TransmitterTally
 from evlcp_sdk.types import Frame, Packet, Range, SoftSymbols
 
@@ -27,6 +31,7 @@ LINK = Link(
     bar=BarLayout(),
     air=AirSpec(frames_per_packet=3),
     regions=RegionSpec(),
+    messages=MessageSpec(decode=False),
     algorithms={"tracking": NoTracking()},
     revisions={"ranging": 1},
     codebook=BOOK,
@@ -92,6 +97,7 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
 
     lines = [json.loads(line) for line in (out / "packets.jsonl").read_text().splitlines()]
     first = lines[0]
+    assert {line["kind"] for line in lines} == {"packet"}
     assert (first["transmitter"], first["packet"], first["t_us"]) == (0, 0, 9745.68)
     assert (first["frames_sent"], first["frames_received"]) == (3, 2)
     assert first["symbols"][1] is None
@@ -101,6 +107,7 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
 
     assert table == json.loads((out / "summary.json").read_text())
     assert table["result"] == "2 transmitters, 3 frames"
+    assert table["messages_off"] == "messages.decode = false"
     assert table["digest"] == LINK.digest
     assert table["codebook"] == {"digest": BOOK.digest, "profile": "wh8"}
     assert table["losses"] == {"odd_byte": {"count": 1, "first": 7}}
@@ -119,6 +126,41 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
     assert table["transmitters"][1]["quality"] is None
     assert table["transmitters"][1]["clock_ppm"] is None
     assert table["transmitters"][1]["distance_median_m"] is None
+
+
+def test_a_message_is_a_line_after_its_packet(tmp_path: Path) -> None:
+    beacon = Beacon(35.1, 136.9, 52.0, 90.0, 1.0, 0.96, b"\x01\x02")
+
+    def received(kind: Kind, payload: bytes, **more: Any) -> ReceivedMessage:
+        given = {"beacon": None, "trust": "unverified", "reason": "not signed"} | more
+        return ReceivedMessage(1, 4, 12.3456, Message(kind, 7, 9, payload), **given)
+
+    messages = (
+        received(Kind.TEXT, "Tempo 30 für \n 2 km".encode()),
+        received(Kind.DATA, b"\x00\xff"),
+        received(Kind.BEACON, beacon.pack(), beacon=beacon, trust="verified", reason=""),
+        received(Kind.BEACON, beacon.pack(), beacon=beacon, trust="forged", reason="replayed"),
+    )
+    with ResultWriter(tmp_path, LINK) as writer:
+        writer.write([replace(packet(4, (frame(4, 0),)), messages=messages), packet(5, ())])
+        finish(writer)
+    lines = [json.loads(line) for line in (tmp_path / "packets.jsonl").read_text().splitlines()]
+    assert [line["kind"] for line in lines] == ["packet", "text", "data", "beacon", "beacon", "packet"]
+    shared = {"transmitter": 1, "packet": 4, "t_us": 12.35, "transmitter_id": 7, "sequence": 9}
+    unsigned = shared | {"verified": False, "trust": "unverified", "reason": "not signed"}
+    assert lines[1] == {"kind": "text"} | unsigned | {"text": "Tempo 30 für \n 2 km"}
+    assert lines[2] == {"kind": "data"} | unsigned | {"data": "00ff"}
+    place = {"latitude_deg": 35.1, "longitude_deg": 136.9, "height_m": 52.0, "user": "0102"}
+    place |= {"heading_deg": 90.0, "tilt_deg": 1.0, "length_m": 0.96}
+    assert (
+        lines[3] == {"kind": "beacon", "verified": True, "trust": "verified", "reason": ""} | shared | place
+    )
+    assert (lines[4]["verified"], lines[4]["trust"], lines[4]["reason"]) == (False, "forged", "replayed")
+
+
+def test_packets_too_short_for_messages_are_said(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, load_link(overrides=["air.frames_per_packet=2"])) as writer:
+        assert "expected at least 18" in finish(writer)["messages_off"]
 
 
 def test_no_transmitter_is_said_plainly(tmp_path: Path) -> None:

@@ -1,0 +1,1 @@
+"""Messages: what a transmitter says, as bytes, blocks and packets; the format is in `docs/messages.md`."""

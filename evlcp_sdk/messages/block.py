@@ -1,0 +1,197 @@
+"""Blocks: the bytes that one packet carries, a header and a part of a message."""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+
+from evlcp_sdk.errors import ConfigError, EvlcpError
+
+__all__ = [
+    "DIGEST_BYTES",
+    "FORMAT_VERSION",
+    "HEADER_BYTES",
+    "MOST_MESSAGE_BYTES",
+    "Block",
+    "BlockError",
+    "Kind",
+    "Message",
+    "split",
+]
+
+FORMAT_VERSION = 1
+"""Version of the block format."""
+
+DIGEST_BYTES = 4
+"""Bytes of the codebook's digest in a header: two codebooks agree in them by chance once in 2**32."""
+
+MOST_MESSAGE_BYTES = 0xFFFF
+"""Longest message: what the header's length can tell."""
+
+_HEADER = struct.Struct("<BIIHH4s")
+
+HEADER_BYTES = _HEADER.size
+"""Bytes of a block's header."""
+
+_WHITE_SEED = 2463534242
+"""Begin of the whitening where the header's CRC is 0: xorshift32 would stay there."""
+
+_MOST_NUMBER = 0xFFFFFFFF
+
+
+class Kind(IntEnum):
+    """What a message is."""
+
+    BEACON = 1
+    TEXT = 2
+    DATA = 3
+    SIGNATURE = 4
+
+
+class BlockError(EvlcpError):
+    """Bytes that are no block of this format."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """A message as its transmitter made it.
+
+    Attributes:
+        kind: What the payload is.
+        transmitter_id: Identity of the transmitter, 0 to 2**32 - 1.
+        sequence: Number of the message, rising from each to the next of a transmitter, 0 to 2**32 - 1.
+        payload: Its bytes.
+
+    Raises:
+        ConfigError: A number or the payload's length is out of range.
+    """
+
+    kind: Kind
+    transmitter_id: int
+    sequence: int
+    payload: bytes
+
+    def __post_init__(self) -> None:
+        for name in ("transmitter_id", "sequence"):
+            value = getattr(self, name)
+            if not 0 <= value <= _MOST_NUMBER:
+                raise ConfigError(f"message: {name} = {value}, expected 0 to {_MOST_NUMBER}")
+        if not 1 <= len(self.payload) <= MOST_MESSAGE_BYTES:
+            raise ConfigError(
+                f"message: {len(self.payload)} bytes of {self.kind.name.lower()},"
+                f" expected 1 to {MOST_MESSAGE_BYTES}"
+            )
+
+    @property
+    def text(self) -> str | None:
+        """The payload as text; None if it is not UTF-8, or the message is no text."""
+        if self.kind is not Kind.TEXT:
+            return None
+        try:
+            return self.payload.decode("utf-8")
+        except UnicodeDecodeError:
+            return None
+
+
+@dataclass(frozen=True)
+class Block:
+    """A part of a message, with the header that every part carries.
+
+    Attributes:
+        kind: Kind of the message.
+        transmitter_id: As in `Message`.
+        sequence: As in `Message`.
+        index: Number of the part, from 0.
+        length: Bytes of the whole message; with the size of a block it tells how many parts there are.
+        codebook: First `DIGEST_BYTES` bytes of the codebook's digest.
+        part: The part's bytes; all parts but the last fill their block.
+
+    >>> block = Block(Kind.TEXT, 7, sequence=1, index=0, length=2, codebook=bytes(4), part=b"Hi")
+    >>> Block.unpack(block.pack(24)) == block
+    True
+    """
+
+    kind: Kind
+    transmitter_id: int
+    sequence: int
+    index: int
+    length: int
+    codebook: bytes
+    part: bytes
+
+    def pack(self, size: int) -> bytes:
+        """The block as `size` bytes; what the part leaves free is zero, and all but the header whitened."""
+        head = _HEADER.pack(
+            FORMAT_VERSION << 4 | self.kind,
+            self.transmitter_id,
+            self.sequence,
+            self.index,
+            self.length,
+            self.codebook,
+        )
+        return head + _whitened(head, self.part.ljust(size - HEADER_BYTES, b"\0"))
+
+    @classmethod
+    def unpack(cls, block: bytes) -> "Block":
+        """Read what `pack` wrote.
+
+        Raises:
+            BlockError: Another version, an unknown kind, a part that no message of that length has, or bytes
+                behind the part that are not zero.
+        """
+        first, transmitter_id, sequence, index, length, codebook = _HEADER.unpack_from(block)
+        version, kind = first >> 4, first & 15
+        if version != FORMAT_VERSION:
+            raise BlockError(f"block of format version {version}, expected {FORMAT_VERSION}")
+        if kind not in Kind._value2member_map_:
+            raise BlockError(f"block of kind {kind}, expected 1 to {max(Kind)}")
+        room = len(block) - HEADER_BYTES
+        if not index * room < length:
+            raise BlockError(f"part {index} of a message of {length} bytes, {room} in a part")
+        rest = _whitened(block[:HEADER_BYTES], block[HEADER_BYTES:])
+        end = min(room, length - index * room)
+        if any(rest[end:]):
+            raise BlockError(f"bytes {HEADER_BYTES + end} to {len(block) - 1} of the block: expected zeros")
+        return cls(Kind(kind), transmitter_id, sequence, index, length, codebook, rest[:end])
+
+
+def _whitened(head: bytes, rest: bytes) -> bytes:
+    """The bytes behind a header, added modulo 2 to the numbers of xorshift32 that begins with its CRC-32.
+
+    The numbers are those of Marsaglia 2003 (shifts 13, 17, 5), four bytes each, least significant first.
+    Equal bytes so do not make equal symbols, a light that flickers at a low rate; and two blocks of different
+    headers differ in half their bits on air, so that a receiver can tell which packets carry the same one.
+    """
+    x = zlib.crc32(head) or _WHITE_SEED
+    stream = bytearray()
+    while len(stream) < len(rest):
+        x ^= x << 13 & 0xFFFFFFFF
+        x ^= x >> 17
+        x ^= x << 5 & 0xFFFFFFFF
+        stream += x.to_bytes(4, "little")
+    return bytes(a ^ b for a, b in zip(rest, stream, strict=False))
+
+
+def split(message: Message, codebook: bytes, size: int) -> Iterator[Block]:
+    """The blocks of `size` bytes each that carry a message.
+
+    Args:
+        message: The message.
+        codebook: First `DIGEST_BYTES` bytes of the codebook's digest.
+        size: Bytes of a block.
+
+    >>> [b.part for b in split(Message(Kind.DATA, 1, 0, b"abcde"), bytes(4), HEADER_BYTES + 2)]
+    [b'ab', b'cd', b'e']
+    """
+    room = size - HEADER_BYTES
+    for index, begin in enumerate(range(0, len(message.payload), room)):
+        yield Block(
+            message.kind,
+            message.transmitter_id,
+            message.sequence,
+            index,
+            len(message.payload),
+            codebook,
+            message.payload[begin : begin + room],
+        )

@@ -1,0 +1,63 @@
+"""Worked values of docs/messages.md: prints messages.json."""
+
+import hashlib
+import json
+from typing import Any
+
+from evlcp_sdk.config import load_link
+from evlcp_sdk.messages.beacon import Beacon
+from evlcp_sdk.messages.block import Kind, Message, split
+from evlcp_sdk.messages.coding import interleaver
+from evlcp_sdk.messages.signing import signed_bytes
+
+PROFILES = ("wh4x2", "wh8", "raw8")
+
+
+def messages() -> list[Message]:
+    beacon = Beacon(35.156789012, -136.965432101, 52.345, 123.45, 2.5, 0.96, b"lane 2")
+    return [
+        Message(Kind.BEACON, 7, 1_800_000_000, beacon.pack()),
+        Message(Kind.TEXT, 0xFFFFFFFF, 1, "Tempo 30 für die nächsten zwei Kilometer".encode()),
+        Message(Kind.DATA, 1, 0, bytes(100)),
+        Message(Kind.SIGNATURE, 7, 1_800_000_000, bytes(range(72))),
+    ]
+
+
+def vectors() -> dict[str, Any]:
+    packets = []
+    for profile in PROFILES:
+        for code in ("polar", "none"):
+            coder = load_link(
+                overrides=[f"modulation.id={profile}", f"error-correction.id={code}"]
+            ).block_coder()
+            for message in messages():
+                for block in split(message, coder.digest, coder.block_bytes):
+                    packed = block.pack(coder.block_bytes)
+                    symbols = coder.symbols(packed).astype("uint8").tobytes()
+                    packets.append(
+                        {
+                            "profile": profile,
+                            "error_correction": code,
+                            "codebook": coder.digest.hex(),
+                            "kind": block.kind.name.lower(),
+                            "transmitter_id": block.transmitter_id,
+                            "sequence": block.sequence,
+                            "index": block.index,
+                            "length": block.length,
+                            "part": block.part.hex(),
+                            "block": packed.hex(),
+                            "symbols": symbols.hex()
+                            if code == "none"
+                            else "sha256:" + hashlib.sha256(symbols).hexdigest(),
+                        }
+                    )
+    digest = load_link().block_coder().digest
+    return {
+        "interleaver_960": interleaver(960).tolist(),
+        "signed_bytes": signed_bytes(messages()[0], digest).hex(),
+        "packets": packets,
+    }
+
+
+if __name__ == "__main__":
+    print(json.dumps(vectors(), indent=1))
