@@ -1,7 +1,8 @@
 """The values that flow through the receiver: events, regions, locks, presence, symbols, ranges, frames."""
 
+import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -270,6 +271,10 @@ class Frame:
         filtered: Distance filtered over time; None without tracking.
         x_px: Column of the bar's centre in the middle of the pilot, or of the info segment without one, px.
         y_px: Row of the same, px.
+        points_px: Column and row of each cluster's centre on the sensor at that time, px, float64 (K, 2); NaN
+            where a cluster is not seen; empty for a frame without a pilot.
+        points_sigma_px: Their standard deviations, px, float64 (K,).
+        points_t_us: That time, camera clock, us.
     """
 
     transmitter: int
@@ -281,6 +286,9 @@ class Frame:
     filtered: Range | None
     x_px: float
     y_px: float
+    points_px: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
+    points_sigma_px: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    points_t_us: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)

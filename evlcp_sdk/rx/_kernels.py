@@ -275,3 +275,165 @@ def most_in_place(image: Array, area: Array, layout: Array, spacing: float, leas
                 fits += int(off <= abs(s) * spacing / 2 + 0.5)
         best = max(best, fits)
     return best
+
+
+@njit(cache=True, nogil=True)
+def _placement(image: Array, seen: Array, layout: Array, spacing: float) -> tuple[complex, complex]:
+    """Scale and turn, and shift, that bring a layout to its image: medians over pairs, deaf to outliers."""
+    clusters = layout.shape[0]
+    re = np.empty(clusters * clusters)
+    im = np.empty(clusters * clusters)
+    n = 0
+    for i in range(clusters):
+        for j in range(i + 1, clusters):
+            apart = complex(layout[j, 0] - layout[i, 0], layout[j, 1] - layout[i, 1])
+            if seen[i] and seen[j] and abs(apart) > 1.5 * spacing:
+                s = complex(image[j, 0] - image[i, 0], image[j, 1] - image[i, 1]) / apart
+                re[n] = s.real
+                im[n] = s.imag
+                n += 1
+    if n == 0:
+        return complex(0.0, 0.0), complex(0.0, 0.0)
+    s = complex(np.median(re[:n]), np.median(im[:n]))
+    n = 0
+    for k in range(clusters):
+        if seen[k]:
+            z = complex(image[k, 0], image[k, 1]) - s * complex(layout[k, 0], layout[k, 1])
+            re[n] = z.real
+            im[n] = z.imag
+            n += 1
+    return s, complex(np.median(re[:n]), np.median(im[:n]))
+
+
+@njit(cache=True, nogil=True)
+def _boundary(pixels: Array, k: int, other: int, a: complex, b: complex, reach: float) -> float:
+    """Where clusters `k` and `other`, centred at `a` and `b`, meet: a share of the way between; NaN: unseen.
+
+    Line by line of pixels across the way, the shares of the two clusters say how much of it is the first's.
+    """
+    _, height, width = pixels.shape
+    step = b - a
+    rows = abs(step.imag) >= abs(step.real)
+    start, end = (a.imag, b.imag) if rows else (a.real, b.real)
+    side, slope = (a.real, step.real / step.imag) if rows else (a.imag, step.imag / step.real)
+    sign = 1 if end > start else -1
+    first, last = int(np.rint(start)), int(np.rint(end))
+    total, lines, empty = 0.0, 0, 0
+    for i in range(first, last + sign, sign):
+        middle = side + slope * (i - start)
+        low, high = int(np.ceil(middle - reach)), int(np.floor(middle + reach))
+        mine, its = 0.0, 0.0
+        if 0 <= i < (height if rows else width):
+            for j in range(max(low, 0), min(high, (width if rows else height) - 1) + 1):
+                mine += pixels[k, i, j] if rows else pixels[k, j, i]
+                its += pixels[other, i, j] if rows else pixels[other, j, i]
+        lines += 1
+        if mine + its > 0:
+            total += mine / (mine + its)
+        else:
+            empty += 1
+            total += 0.5
+    if 2 * empty > lines or abs(end - start) < 1.0:
+        return np.nan
+    return (first + sign * (total - 0.5) - start) / (end - start)
+
+
+@njit(cache=True, nogil=True)
+def place_clusters(
+    pixels: Array,
+    cells: Array,
+    area: Array,
+    layout: Array,
+    spacing: float,
+    neighbours: Array,
+    points: Array,
+    ends: Array,
+) -> float:
+    """Centres of the clusters in the image, `points` (K, 2), NaN where unseen; squares left by a similarity.
+
+    `neighbours` (2, K) holds the cluster to the right and the one below, -1 for none; `ends` (K,) becomes 1
+    where a cluster has a boundary on one side only.
+    """
+    clusters, height, width = pixels.shape
+    s, shift = _placement(cells, area > 0, layout, spacing)
+    reach = abs(s) * spacing
+    # Placed so that neighbours fall into one pixel, there is nothing to measure.
+    if reach < 1.0:
+        return 0.0
+    window = 0.5 * reach + 1.5
+    seen = np.zeros(clusters, np.bool_)
+    for k in range(clusters):
+        if area[k] == 0:
+            continue
+        at = s * complex(layout[k, 0], layout[k, 1]) + shift
+        sum_w, sum_x, sum_y = 0.0, 0.0, 0.0
+        for v in range(max(int(np.ceil(at.imag - window)), 0), min(int(at.imag + window), height - 1) + 1):
+            for u in range(max(int(np.ceil(at.real - window)), 0), min(int(at.real + window), width - 1) + 1):
+                w = pixels[k, v, u]
+                sum_w += w
+                sum_x += w * u
+                sum_y += w * v
+        if sum_w > 0:
+            seen[k] = True
+            points[k, 0] = sum_x / sum_w
+            points[k, 1] = sum_y / sum_w
+    if seen.sum() < 3:
+        points[:] = np.nan
+        return 0.0
+    s, shift = _placement(points, seen, layout, spacing)
+    mean = points.copy()
+    gap = abs(s) * spacing
+    for axis in range(2):
+        along = s / abs(s) if axis == 0 else s / abs(s) * 1j
+        before = np.full(clusters, np.nan)
+        after = np.full(clusters, np.nan)
+        for k in range(clusters):
+            other = neighbours[axis, k]
+            if other < 0 or not (seen[k] and seen[other]):
+                continue
+            a, b = complex(mean[k, 0], mean[k, 1]), complex(mean[other, 0], mean[other, 1])
+            share = _boundary(pixels, k, other, a, b, window)
+            if -0.5 < share < 1.5:
+                z = (a + share * (b - a)) * along.conjugate()
+                after[k] = z.real
+                before[other] = z.real
+        for k in range(clusters):
+            if not seen[k]:
+                continue
+            has_before, has_after = not np.isnan(before[k]), not np.isnan(after[k])
+            if has_before and has_after:
+                centre = (before[k] + after[k]) / 2
+            elif has_before:
+                centre = before[k] + gap / 2
+            elif has_after:
+                centre = after[k] - gap / 2
+            else:
+                continue
+            if has_before != has_after:
+                ends[k] = 1
+            move = centre - (complex(mean[k, 0], mean[k, 1]) * along.conjugate()).real
+            points[k, 0] += move * along.real
+            points[k, 1] += move * along.imag
+    # The least-squares similarity, as complex numbers.
+    n = 0
+    image_mean, layout_mean = complex(0.0, 0.0), complex(0.0, 0.0)
+    for k in range(clusters):
+        if seen[k]:
+            n += 1
+            image_mean += complex(points[k, 0], points[k, 1])
+            layout_mean += complex(layout[k, 0], layout[k, 1])
+    image_mean /= n
+    layout_mean /= n
+    cross, power = complex(0.0, 0.0), 0.0
+    for k in range(clusters):
+        if seen[k]:
+            c = complex(layout[k, 0], layout[k, 1]) - layout_mean
+            cross += c.conjugate() * (complex(points[k, 0], points[k, 1]) - image_mean)
+            power += abs(c) ** 2
+    squares = 0.0
+    for k in range(clusters):
+        if seen[k]:
+            c = complex(layout[k, 0], layout[k, 1]) - layout_mean
+            off = abs(complex(points[k, 0], points[k, 1]) - image_mean - cross / power * c)
+            squares += off * off
+    return squares

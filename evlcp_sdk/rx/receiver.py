@@ -16,6 +16,7 @@ from evlcp_sdk.errors import ConfigError, StreamError
 from evlcp_sdk.rx.chips import polarity_sums
 from evlcp_sdk.rx.messages import MessageAssembler
 from evlcp_sdk.rx.payload import PacketAssembler
+from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.presence import clusters_in_place
 from evlcp_sdk.rx.regions import RegionTracker, Track
 from evlcp_sdk.types import Events, Frame, FrameView, Packet, PresenceMap, Range, SyncLock
@@ -30,6 +31,7 @@ _REMEMBER_US = 1e6
 """How long a transmitter lost from sight is remembered: clocks 100 ppm apart drift by a chip in it."""
 
 _NO_RANGE = Range(math.nan, math.nan, 0)
+_NO_POINTS = (np.empty((0, 2)), np.empty(0))
 
 _UNSEEN_STEPS = 5
 """Steps without a position after which a region counts as lost: it blinks in every chip otherwise."""
@@ -115,6 +117,7 @@ class Receiver:
         tracker: Tracker = link.algorithm("tracking").compile()
         self._distance = tracker.distance
         self._centres_m = link.bar.cluster_centres_m()
+        self._find_points = points_finder(self._centres_m)
         self._tracker = RegionTracker(link.regions, link.camera, link.packet.chip_us, tracker.position)
         self._messages = self._assembler(link)
         self._transmitters: dict[int, _Transmitter] = {}
@@ -422,11 +425,13 @@ class Receiver:
             offset_px = np.concatenate([pilot.offset_px, offset_px], axis=1)
         soft = self._decode(presence, sums)
         self._tell("decoding", soft, _lap(clock))
-        distance = _NO_RANGE
+        distance, points = _NO_RANGE, _NO_POINTS
         if has_pilot:
-            # Another distance of the same pilot would say nothing new.
+            # Another distance of the same pilot, or other points, would say nothing new.
             distance = self._measure(FrameView(sums, offset_px, presence, soft))
             self._tell("ranging", distance, _lap(clock))
+            at_px = float(x[middle]), float(y[middle])
+            points = self._find_points(presence, offset_px[:, : packet.pilot_chips], at_px)
         if transmitter.first is None:
             transmitter.first = number
         frame = Frame(
@@ -439,6 +444,9 @@ class Receiver:
             filtered=self._filter(transmitter, start_us, distance),
             x_px=float(x[middle]),
             y_px=float(y[middle]),
+            points_px=points[0],
+            points_sigma_px=points[1],
+            points_t_us=float(middles[middle]),
         )
         self._tell("frame", frame, clock[-1] - clock[0])
         return frame

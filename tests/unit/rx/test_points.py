@@ -1,0 +1,158 @@
+"""Cluster points: on drawn bars, and on a simulated drive with its truth, and on a recording."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from evlcp_sdk.config import load_link, resolve
+from evlcp_sdk.geometry import BarLayout
+from evlcp_sdk.io import open_events
+from evlcp_sdk.rx.points import points_finder
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.sim import Simulation, load_scene
+from evlcp_sdk.sim.motion import project
+from evlcp_sdk.types import Frame, PresenceMap
+
+RECORDING = Path(__file__).parents[3] / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
+BAR = BarLayout()
+CENTRES = BAR.cluster_centres_m()
+FINE = 8
+"""Parts that a pixel's side is cut into to draw with."""
+
+
+def drawn(layout: NDArray[np.float64], turn: complex, shift: complex, half_m: NDArray[np.float64],
+          size: tuple[int, int]) -> PresenceMap:  # fmt: skip
+    """Clusters as boxes of `half_m`, each pixel with its share of each: an ideal image."""
+    width, height = size
+    y, x = (np.mgrid[: height * FINE, : width * FINE] + 0.5) / FINE - 0.5
+    place = (x + 1j * y - shift) / turn
+    pixels = np.empty((len(layout), height, width), np.float32)
+    for k, (a, b) in enumerate(layout):
+        inside = (np.abs(place.real - a) <= half_m[0]) & (np.abs(place.imag - b) <= half_m[1])
+        pixels[k] = inside.reshape(height, FINE, width, FINE).mean((1, 3))
+    cells = pixels.reshape(len(layout), height // 2, 2, width // 2, 2).max((2, 4)) > 0.1
+    return PresenceMap(cells.astype(np.float32), 2, cells, pixels)
+
+
+def truth_of(turn: complex, shift: complex, layout: NDArray[np.float64]) -> NDArray[np.float64]:
+    z = turn * (layout[:, 0] + 1j * layout[:, 1]) + shift
+    return np.stack([z.real, z.imag], -1)
+
+
+@settings(max_examples=25)
+@given(st.floats(75, 220), st.floats(-0.15, 0.15), st.floats(0, 1), st.floats(0, 1))
+def test_points_of_an_ideal_bar(px_per_m: float, roll: float, dx: float, dy: float) -> None:
+    turn, shift = px_per_m * np.exp(1j * roll), complex(24 + dx, 112 + dy)
+    presence = drawn(CENTRES, turn, shift, np.array([1.2 / px_per_m, 0.03]), (48, 224))
+    points, sigma = points_finder(CENTRES)(presence, np.zeros((2, 16)), (23.5, 111.5))
+    want = truth_of(turn, shift, CENTRES)
+    assert np.abs(points - want).max() < 0.2
+    # Drawn in eighths of a pixel.
+    assert np.sqrt(np.mean((points - want) ** 2)) < 0.08
+    assert (sigma[1:-1] < 0.12).all()
+    assert (sigma[[0, -1]] > sigma[1]).all()
+
+
+def test_a_lying_bar_and_one_upside_down() -> None:
+    for turn in (-150.0 + 0j, 150j, -150j):
+        size = (48, 200) if turn.real else (200, 48)
+        shift = complex(size[0] / 2 + 0.3, size[1] / 2 - 0.2)
+        presence = drawn(CENTRES, turn, shift, np.array([0.008, 0.03]), size)
+        at = ((size[0] - 1) / 2, (size[1] - 1) / 2)
+        points, _ = points_finder(CENTRES)(presence, np.zeros((2, 16)), at)
+        assert np.abs(points - truth_of(turn, shift, CENTRES)).max() < 0.2
+
+
+def test_the_motion_and_the_place_on_the_sensor_enter() -> None:
+    presence = drawn(CENTRES, 150, 24 + 100j, np.array([0.008, 0.03]), (48, 200))
+    find = points_finder(CENTRES)
+    still, _ = find(presence, np.zeros((2, 16)), (23.5, 99.5))
+    moved, _ = find(presence, np.tile([[0.25], [-0.125]], 16), (623.5, 299.5))
+    np.testing.assert_allclose(moved - still, np.tile([600 - 0.25, 200 + 0.125], (16, 1)), atol=1e-9)
+
+
+def test_dark_clusters_are_unseen_and_cells_out_of_place_are_left_out() -> None:
+    presence = drawn(CENTRES, 150, 24.3 + 100.4j, np.array([0.008, 0.03]), (48, 200))
+    want = truth_of(150, 24.3 + 100.4j, CENTRES)
+    selected, pixels = presence.selected.copy(), presence.pixels.copy()
+    selected[4], pixels[4] = False, 0
+    selected[9, 5:8, 2], pixels[9, 10:16, 4:6] = True, 0.9
+    points, sigma = points_finder(CENTRES)(
+        PresenceMap(presence.probability, 2, selected, pixels), np.zeros((2, 16)), (23.5, 99.5)
+    )
+    assert np.isnan(points[4]).all()
+    assert np.isnan(sigma[4])
+    others = np.arange(16) != 4
+    assert np.abs(points - want)[others].max() < 0.2
+    assert sigma[3] > sigma[2]
+
+
+def test_a_panel_has_neighbours_on_both_axes() -> None:
+    panel = BarLayout(rows=16, columns=16, cluster_rows=4, cluster_columns=4)
+    layout = panel.cluster_centres_m()
+    turn, shift = 700 * np.exp(0.05j), 64.2 + 63.7j
+    presence = drawn(layout, turn, shift, np.array([0.02, 0.02]), (128, 128))
+    points, _ = points_finder(layout)(presence, np.zeros((2, 16)), (63.5, 63.5))
+    assert np.abs(points - truth_of(turn, shift, layout)).max() < 0.25
+
+
+def test_nothing_seen_gives_no_points() -> None:
+    nothing = PresenceMap(
+        np.zeros((16, 20, 10), np.float32),
+        2,
+        np.zeros((16, 20, 10), bool),
+        np.zeros((16, 40, 20), np.float32),
+    )
+    points, sigma = points_finder(CENTRES)(nothing, np.zeros((2, 16)), (9.5, 19.5))
+    assert np.isnan(points).all()
+    assert np.isnan(sigma).all()
+    assert points.shape == (16, 2)
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    link = load_link()
+    receiver = Receiver(link)
+    packets = []
+    with open_events(str(RECORDING)) as source:
+        for events in source.chunks():
+            packets += receiver.feed(events)
+    return [f for p in packets + receiver.close() for f in p.frames]
+
+
+def test_points_of_a_simulated_drive_lie_where_its_truth_has_them() -> None:
+    scene = load_scene("night", ["duration_s=0.1", "motion.roll_deg=3.0", "camera.centre_x_px=620.0"])
+    simulation = Simulation(scene)
+    receiver = Receiver(resolve({"camera": {"centre_x_px": 620.0}}))
+    packets = [p for events in simulation.stream() for p in receiver.feed(events)] + receiver.close()
+    found = [f for p in packets for f in p.frames]
+    assert len(found) > 20
+    (bar,) = simulation.bars
+    cuts = bar.strip.cuts_m()
+    position, attitude = simulation.path.at([f.points_t_us for f in found])
+    want, _ = project((cuts[1:] + cuts[:-1]) / 2, position, attitude, scene.camera)
+    error = np.array([f.points_px for f in found]) - want
+    assert np.isfinite(error).mean() > 0.98
+    # 0.17 px is an error of 1.2 mm at 50 m.
+    assert np.sqrt(np.nanmean(error**2)) < 0.17
+    assert np.abs(np.nanmean(error, (0, 1))).max() < 0.1
+
+
+def test_sigma_is_the_scatter_about_the_similarity(frames: list[Frame]) -> None:
+    squares, freedom = 0.0, 0
+    for frame in frames:
+        seen = np.isfinite(frame.points_px[:, 0])
+        z = frame.points_px[seen] @ [1, 1j]
+        c = CENTRES[seen] @ [1, 1j]
+        w = 1 / frame.points_sigma_px[seen]
+        a = np.stack([c, np.ones_like(c)], 1) * w[:, None]
+        left = z * w - a @ np.linalg.lstsq(a, z * w)[0]
+        squares += float((np.abs(left) ** 2).sum())
+        freedom += 2 * len(z) - 4
+    # Along and across errors differ, and neighbours share a boundary: the mean counts, not the exact law.
+    assert 0.5 < squares / freedom < 1.5
+    assert freedom > 500
