@@ -135,7 +135,7 @@ class BoundaryInformation(Ranging):
             tilt, left = _line(light)
             spacing, first = theilslopes(at_row[k], k)[:2]
             values, columns = self._row_values(sums, tilt, left, width / 2)
-            codes = _codes(codebook, view.soft.symbols)[:, -len(values) :]
+            codes = _codes(codebook, view.soft.symbols)
             rows, down = _rows(sums.shape[1]), offset[1]
             centre = first + spacing * (len(codes) - 1) / 2 - (sums.shape[1] - 1) / 2
             if spacing < 0:
