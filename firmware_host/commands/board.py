@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from firmware_host.messages import HelloReply, StatusReply
     from firmware_host.payload import Payload
 
-__all__ = ["app"]
+__all__ = ["app", "open_board", "progress_bar", "tell"]
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -62,7 +62,8 @@ class Emulator(StrEnum):
 
 
 @contextlib.contextmanager
-def _board(port: str | None, baud: int, trace: Path | None, replay: Path | None) -> "Iterator[Board]":
+def open_board(port: str | None, baud: int, trace: Path | None, replay: Path | None) -> "Iterator[Board]":
+    """The board at a port, or a recorded one."""
     from evlcp_sdk.errors import ConfigError, InputError
     from firmware_host.board import Board
     from firmware_host.client import Timing
@@ -109,7 +110,8 @@ def _payload(
 
 
 @contextlib.contextmanager
-def _progress(what: str) -> "Iterator[Any]":
+def progress_bar(what: str) -> "Iterator[Any]":
+    """A bar by bytes, on a terminal only: a function of what is done and what there is."""
     from rich.console import Console
     from rich.progress import Progress
 
@@ -243,7 +245,7 @@ def hello(
 
     For example: [bold]evlcp board hello --port native:[/]
     """
-    with _board(port, baud, trace, replay) as board:
+    with open_board(port, baud, trace, replay) as board:
         _show(_about(board.about), as_json)
 
 
@@ -290,12 +292,13 @@ def program(
     action = None if watchdog is None else Watchdog[watchdog.name]
     payload = _payload(symbols, random, masks, seed, frames, profile)
     settings = Settings(chip_rate, level, action, watchdog_ms, start)
-    with _board(port, baud, trace, replay) as board, _progress("programming") as progress:
+    with open_board(port, baud, trace, replay) as board, progress_bar("programming") as progress:
         done = provision(board, payload, settings, verify, progress)
-    _tell(done, as_json)
+    tell(done, as_json)
 
 
-def _tell(done: Any, as_json: bool) -> None:
+def tell(done: Any, as_json: bool) -> None:
+    """Say what programming did."""
     if as_json:
         import dataclasses
         import json
@@ -343,7 +346,7 @@ def send(
     from firmware_host.messages import NO_BANK, Status
 
     payload = _payload(symbols, random, masks, seed, frames, profile)
-    with _board(port, baud, trace, replay) as board, _progress("sending") as progress:
+    with open_board(port, baud, trace, replay) as board, progress_bar("sending") as progress:
         status = board.status()
         if status.active_bank == NO_BANK:
             raise RefusedError(
@@ -352,7 +355,7 @@ def send(
             )
         _check_codebook(board, payload, status)
         done = board.program(payload, status.chip_rate_hz, verify, progress)
-    _tell(done, as_json)
+    tell(done, as_json)
 
 
 def _check_codebook(board: "Board", payload: "Payload", status: "StatusReply") -> None:
@@ -369,14 +372,14 @@ def _check_codebook(board: "Board", payload: "Payload", status: "StatusReply") -
 @app.command()
 def start(port: Port = None, baud: Baud = DEFAULT_BAUD, trace: Trace = None, replay: Replay = None) -> None:
     """Play what is programmed."""
-    with _board(port, baud, trace, replay) as board:
+    with open_board(port, baud, trace, replay) as board:
         board.start()
 
 
 @app.command()
 def stop(port: Port = None, baud: Baud = DEFAULT_BAUD, trace: Trace = None, replay: Replay = None) -> None:
     """Finish the packet, then dark."""
-    with _board(port, baud, trace, replay) as board:
+    with open_board(port, baud, trace, replay) as board:
         board.stop()
         board.wait_dark()
 
@@ -384,7 +387,7 @@ def stop(port: Port = None, baud: Baud = DEFAULT_BAUD, trace: Trace = None, repl
 @app.command()
 def blank(port: Port = None, baud: Baud = DEFAULT_BAUD, trace: Trace = None, replay: Replay = None) -> None:
     """Dark at once."""
-    with _board(port, baud, trace, replay) as board:
+    with open_board(port, baud, trace, replay) as board:
         board.blank()
 
 
@@ -400,7 +403,7 @@ def level(
 
     For example: [bold]evlcp board level 20 --port /dev/ttyUSB0[/]
     """
-    with _board(port, baud, trace, replay) as board:
+    with open_board(port, baud, trace, replay) as board:
         board.level(level_ma)
 
 
@@ -416,7 +419,7 @@ def watchdog(
     """Choose what the board does when the host falls silent: keep playing, idle pattern, or dark."""
     from firmware_host.messages import Watchdog
 
-    with _board(port, baud, trace, replay) as board:
+    with open_board(port, baud, trace, replay) as board:
         board.watchdog(Watchdog[action.name], after_ms)
 
 
@@ -429,7 +432,7 @@ def status(
     as_json: AsJson = False,
 ) -> None:
     """Show what a board does, and what went wrong since its reset."""
-    with _board(port, baud, trace, replay) as board:
+    with open_board(port, baud, trace, replay) as board:
         _show(_status(board.status()), as_json)
 
 
@@ -449,7 +452,7 @@ def monitor(
 
     from firmware_host.messages import State
 
-    with _board(port, baud, trace, replay) as board, contextlib.suppress(KeyboardInterrupt):
+    with open_board(port, baud, trace, replay) as board, contextlib.suppress(KeyboardInterrupt):
         for n in itertools.count(1):
             s = board.status()
             if as_json:
@@ -487,7 +490,7 @@ def verify(
     from firmware_host.messages import NO_BANK
 
     payload = _payload(symbols, random, masks, seed, frames, profile)
-    with _board(port, baud, trace, replay) as board:
+    with open_board(port, baud, trace, replay) as board:
         s = board.status()
         again = "'evlcp board program' brings it there"
         if s.active_bank == NO_BANK:
@@ -525,7 +528,7 @@ def walk_leds(
 
     For example: [bold]evlcp board test-leds --dwell-ms 50 --port /dev/ttyUSB0[/]
     """
-    with _board(port, baud, trace, replay) as board:
+    with open_board(port, baud, trace, replay) as board:
         board.test_leds(first, last, dwell_ms)
         if wait:
             board.wait_dark(10.0 + (last - first + 1) * dwell_ms * 2e-3)
@@ -543,7 +546,7 @@ def save(
 
     For example: [bold]evlcp board save --autostart --port /dev/ttyUSB0[/]
     """
-    with _board(port, baud, trace, replay) as board:
+    with open_board(port, baud, trace, replay) as board:
         reply = board.save(autostart)
     typer.echo(f"saved in slot {reply.slot}, number {reply.save_sequence}")
 
@@ -551,7 +554,7 @@ def save(
 @app.command()
 def recall(port: Port = None, baud: Baud = DEFAULT_BAUD, trace: Trace = None, replay: Replay = None) -> None:
     """Take payload and settings from the board's flash."""
-    with _board(port, baud, trace, replay) as board:
+    with open_board(port, baud, trace, replay) as board:
         reply = board.recall()
     typer.echo(f"recalled slot {reply.slot}, number {reply.save_sequence}")
 

@@ -1,4 +1,4 @@
-"""`evlcp tx`: what a transmitter would send, without one."""
+"""`evlcp tx`: what a transmitter would send."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from firmware_host.commands import _source
+from firmware_host.commands.message import keygen, message
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,8 +18,10 @@ if TYPE_CHECKING:
 __all__ = ["app", "save_array"]
 
 app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode="rich", help="Show and check what goes on air; no board."
+    no_args_is_help=True, rich_markup_mode="rich", help="Make, show and check what goes on air."
 )
+app.command()(message)
+app.command()(keygen)
 
 
 class Form(StrEnum):

@@ -14,7 +14,7 @@ LAYERS = (
     {"types"},
     {"geometry", "codebook", "frames", "crc", "sites"},
     {"abc", "hookspecs"},
-    {"messages.coding"},
+    {"messages.coding", "messages.sending"},
     {"registry", "config"},
     {"io", "rx", "sim"},
     {"rx.receiver"},

@@ -19,6 +19,7 @@ LINKS = [
     ("air.pilot_every=4", "air.frames_per_packet=16"),
     ("bar.rows=48",),
     ("error-correction.id=none",),
+    ("error-correction.id=reed-solomon",),
 ]
 
 

@@ -1,0 +1,232 @@
+"""`evlcp tx message` and `evlcp tx keygen`: messages to packets, chips and boards."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from evlcp_sdk.config import Link
+    from evlcp_sdk.messages.block import Message
+    from evlcp_sdk.messages.coding import BlockCoder
+
+__all__ = ["keygen", "message"]
+
+_MOST_NUMBER = 2**32 - 1
+
+
+def message(
+    text: Annotated[str | None, typer.Option(metavar="TEXT", help="Send a text.")] = None,
+    file: Annotated[Path | None, typer.Option(metavar="FILE", help="Send a file's bytes.")] = None,
+    beacon: Annotated[
+        Path | None, typer.Option(metavar="site.toml", help="Send where the transmitter is.")
+    ] = None,
+    user: Annotated[str, typer.Option(metavar="TEXT", help="The beacon's own bytes, as text.")] = "",
+    key: Annotated[
+        Path | None, typer.Option(metavar="private.pem", help="Sign the beacon; needs the extra sign.")
+    ] = None,
+    transmitter_id: Annotated[
+        int | None,
+        typer.Option("--id", min=0, max=_MOST_NUMBER, help="Transmitter id; the site's, or 0, without it."),
+    ] = None,
+    sequence: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=_MOST_NUMBER, help="Sequence number; seconds since 1970 without it, so that it rises."
+        ),
+    ] = None,
+    repeat: Annotated[int, typer.Option(min=1, max=1000, help="Send each packet so often in a row.")] = 1,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="FILE.json", help="Write the symbols.")
+    ] = None,
+    chips: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.npy", help="Write the chips: uint8, a row a chip, a column a cluster."),
+    ] = None,
+    port: Annotated[
+        str | None,
+        typer.Option(help="Program a board and play: device, pyserial URL, native:, as for 'evlcp board'."),
+    ] = None,
+    baud: Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)] = 1_000_000,
+    link_file: Annotated[
+        str | None,
+        typer.Option("-c", "--config", metavar="link.toml", help="The link; all defaults without it."),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="TABLE.KEY=VALUE", help="Override one value; may be repeated."),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="One JSON object on stdout, with the symbols.")
+    ] = False,
+) -> None:
+    """Put a text, a file or a beacon on packets: symbols, chips, or a board that plays them.
+
+    A text:          [bold]evlcp tx message --text "Tempo 30" --id 7 -o message.json[/]
+
+    A beacon:        [bold]evlcp tx message --beacon site.toml --key private.pem --chips chips.npy[/]
+
+    Onto a board:    [bold]evlcp tx message --text "Tempo 30" --port /dev/ttyUSB0[/]
+    """
+    import json
+
+    from evlcp_sdk.config import load_link
+    from evlcp_sdk.messages.sending import packets_of
+    from evlcp_sdk.registry import Registry
+
+    link = load_link(link_file, overrides or [], Registry.load())
+    coder = link.block_coder()
+    messages = _messages(text, file, beacon, user, key, transmitter_id, sequence, coder)
+    symbols = packets_of(messages, coder, repeat)
+    table = {"profile": link.codebook.profile, "digest": link.codebook.digest, "symbols": symbols.tolist()}
+    if out is not None:
+        _write_text(out, json.dumps(table) + "\n")
+    if chips is not None:
+        from firmware_host.commands.tx import save_array
+
+        save_array(chips, _chips(symbols, link))
+    programmed = None if port is None else _program(symbols, link, port, baud)
+    packet_s = link.packet.packet_chips / link.air.chip_rate_hz
+    summary: dict[str, Any] = {
+        "messages": [
+            {
+                "kind": m.kind.name.lower(),
+                "transmitter_id": m.transmitter_id,
+                "sequence": m.sequence,
+                "bytes": len(m.payload),
+            }
+            for m in messages
+        ],
+        "packets": len(symbols),
+        "duration_s": round(len(symbols) * packet_s, 6),
+    }
+    if as_json:
+        import dataclasses
+
+        board = None if programmed is None else dataclasses.asdict(programmed)
+        typer.echo(json.dumps(summary | {"board": board} | table))
+        return
+    for m in summary["messages"]:
+        typer.echo(
+            f"{m['kind']:9} {m['bytes']:5} bytes, transmitter {m['transmitter_id']}, sequence {m['sequence']}"
+        )
+    typer.echo(f"{summary['packets']} packets, {summary['duration_s']:.4g} s, again and again")
+    if programmed is not None:
+        from firmware_host.commands.board import tell
+
+        tell(programmed, as_json=False)
+
+
+def keygen(
+    private: Annotated[Path, typer.Argument(metavar="private.pem", help="Where the private key goes.")],
+) -> None:
+    """Make an Ed25519 key that signs beacons; print the public key, for messages.trusted_keys.
+
+    For example: [bold]evlcp tx keygen private.pem[/]
+    """
+    from evlcp_sdk.messages.signing import make_key
+
+    typer.echo(make_key(private))
+
+
+def _messages(
+    text: str | None,
+    file: Path | None,
+    site: Path | None,
+    user: str,
+    key: Path | None,
+    transmitter_id: int | None,
+    sequence: int | None,
+    coder: "BlockCoder",
+) -> "list[Message]":
+    import time
+
+    from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.messages.block import Kind, Message
+
+    if text is None and file is None and site is None:
+        raise ConfigError("give what to send: --text TEXT, --file FILE or --beacon site.toml")
+    if site is None and (key is not None or user):
+        raise ConfigError("--key and --user belong to a beacon: give --beacon site.toml, too")
+    number = int(time.time()) if sequence is None else sequence
+    found = []
+    if site is not None:
+        found = _beacon(site, user, key, transmitter_id, number, coder)
+        transmitter_id = found[0].transmitter_id
+    identity = transmitter_id or 0
+    if text is not None:
+        found.append(Message(Kind.TEXT, identity, number, text.encode()))
+    if file is not None:
+        found.append(Message(Kind.DATA, identity, number, _read(file)))
+    return found
+
+
+def _beacon(
+    path: Path, user: str, key: Path | None, transmitter_id: int | None, sequence: int, coder: "BlockCoder"
+) -> "list[Message]":
+    from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.messages.block import Kind, Message
+    from evlcp_sdk.messages.sending import beacon_of_site
+    from evlcp_sdk.sites import load_sites
+
+    sites = load_sites(path)
+    ids = ", ".join(str(s.transmitter_id) for s in sites)
+    if transmitter_id is None and len(sites) > 1:
+        raise ConfigError(f"{path}: {len(sites)} bars: choose one with --id, of {ids}")
+    chosen = [s for s in sites if transmitter_id in (None, s.transmitter_id)]
+    if not chosen:
+        raise ConfigError(f"{path}: no bar has transmitter_id {transmitter_id}, but {ids}")
+    payload = beacon_of_site(chosen[0], user.encode()).pack()
+    beacon = Message(Kind.BEACON, chosen[0].transmitter_id, sequence, payload)
+    if key is None:
+        return [beacon]
+    from evlcp_sdk.messages.signing import read_key, sign
+
+    return [beacon, sign(beacon, coder.digest, read_key(key))]
+
+
+def _read(path: Path) -> bytes:
+    from evlcp_sdk.errors import InputError
+
+    try:
+        return path.read_bytes()
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+
+
+def _write_text(path: Path, text: str) -> None:
+    from evlcp_sdk.errors import InputError
+
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be written: {fault.strerror}") from fault
+
+
+def _chips(symbols: "NDArray[np.int64]", link: "Link") -> "NDArray[np.uint8]":
+    import numpy as np
+
+    from evlcp_sdk.frames import packet_chips
+
+    return np.concatenate([packet_chips(p, link.codebook, link.air.pilot_every) for p in symbols])
+
+
+def _program(symbols: "NDArray[np.int64]", link: "Link", port: str, baud: int) -> Any:
+    from evlcp_sdk.errors import ConfigError
+    from firmware_host.board import Settings, provision
+    from firmware_host.commands.board import open_board, progress_bar
+    from firmware_host.payload import Payload
+
+    if link.air.pilot_every != 1:
+        raise ConfigError(
+            f"air.pilot_every = {link.air.pilot_every}: a board puts a pilot into every frame; expected 1"
+        )
+    if link.air.chip_rate_hz != round(link.air.chip_rate_hz):
+        raise ConfigError(f"air.chip_rate_hz = {link.air.chip_rate_hz}: a board takes whole chips a second")
+    payload = Payload.of_symbols(symbols, link.codebook)
+    settings = Settings(round(link.air.chip_rate_hz))
+    with open_board(port, baud, None, None) as board, progress_bar("programming") as progress:
+        return provision(board, payload, settings, True, progress)
