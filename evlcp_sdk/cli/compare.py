@@ -1,6 +1,6 @@
 """`evlcp compare`."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -13,6 +13,8 @@ from evlcp_sdk.cli._common import Json, LinkFile, Overrides, complain, console, 
 from evlcp_sdk.errors import ConfigError
 
 if TYPE_CHECKING:
+    from rich.table import Table as Grid
+
     from evlcp_sdk.compare.table import Comparison, Table
     from evlcp_sdk.compare.variants import Variant
     from evlcp_sdk.io import EventSource
@@ -21,6 +23,7 @@ __all__ = ["compare", "register"]
 
 _SQLITE = b"SQLite format 3\0"
 _PIPE_WIDTH = 200
+_GAP = 2
 
 
 @dataclass(frozen=True)
@@ -216,7 +219,6 @@ def _write(comparison: "Comparison", paths: Sequence[Path]) -> None:
 
 def _show(comparison: "Comparison", paths: Sequence[Path]) -> None:
     from rich.markup import escape
-    from rich.table import Table as Grid
 
     from evlcp_sdk.compare.table import LEGEND
 
@@ -225,18 +227,33 @@ def _show(comparison: "Comparison", paths: Sequence[Path]) -> None:
         # A pipe has no width that a table should be cut to.
         out.width = _PIPE_WIDTH
     for one in comparison.tables:
-        head, lines = one.cells()
         out.print(f"[bold]{escape(one.name)}[/]")
-        grid = Grid(box=None, pad_edge=False, header_style="dim")
-        for number, title in enumerate(head):
-            grid.add_column(title, justify="left" if number == 0 else "right")
-        for line in lines:
-            texts = [escape(text) + ("" if best else " ") for text, best in line]
-            grid.add_row(*(f"[bold]{t}[/]" if best else t for t, (_, best) in zip(texts, line, strict=True)))
-        out.print(grid)
+        head, lines = one.cells()
+        columns = [[(title, False) for title in head], *lines]
+        if _width(zip(*columns, strict=True)) <= out.width:
+            columns = [list(column) for column in zip(*columns, strict=True)]
+        # A screen too narrow for a line a variant gets a column a variant.
+        out.print(_grid(columns))
         out.print()
     for note in comparison.notes:
         out.print(escape(note), style="yellow")
     out.print(LEGEND, style="dim")
     if paths:
         out.print(f"written: {escape(', '.join(map(str, paths)))}", style="dim")
+
+
+def _width(columns: Iterable[Sequence[tuple[str, bool]]]) -> int:
+    return sum(max(len(text) for text, _ in column) + _GAP for column in columns)
+
+
+def _grid(columns: Sequence[Sequence[tuple[str, bool]]]) -> "Grid":
+    """A table of columns, each with its heading first; the best in bold type."""
+    from rich.markup import escape
+    from rich.table import Table as Grid
+
+    grid = Grid(box=None, pad_edge=False, header_style="dim")
+    for number, column in enumerate(columns):
+        grid.add_column(escape(column[0][0]), justify="right" if number else "left", no_wrap=True)
+    for row in zip(*(column[1:] for column in columns), strict=True):
+        grid.add_row(*(f"[bold]{escape(text)}[/]" if best else escape(text) + " " for text, best in row))
+    return grid

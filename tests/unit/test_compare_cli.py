@@ -1,7 +1,9 @@
 """`evlcp compare` on the shipped recording and on a campaign's results."""
 
 import csv
+import io
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from evlcp_sdk.campaign.collect import collect
 from evlcp_sdk.campaign.executor import Inline
@@ -109,6 +112,25 @@ def test_text_and_files(
         assert {k: v for k, v in one.items() if k not in TIMES} == {
             k: v for k, v in other.items() if k not in TIMES
         }
+
+
+@pytest.mark.parametrize("width", [80, 150])
+def test_no_figure_is_cut_on_a_narrow_screen(
+    evlcp: Evlcp, recording: Path, monkeypatch: pytest.MonkeyPatch, width: int
+) -> None:
+    said = io.StringIO()
+    screen = Console(file=said, width=width, force_terminal=True, no_color=True, soft_wrap=True)
+    monkeypatch.setattr("evlcp_sdk.cli.compare.console", lambda: screen)
+    done = evlcp("compare", recording, *OPTIONS[:4], "-o", recording.with_suffix(".csv"))
+    assert done.code == 0
+    text = re.sub(r"\x1b\[[0-9;]*m", "", said.getvalue())
+    lines = text.split("* best of its column")[0].splitlines()[1:]
+    assert max(map(len, lines)) <= width
+    assert ("…" in text, lines[0].split()[1]) == (False, "paper" if width == 80 else "frames")
+    with recording.with_suffix(".csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            assert f"{float(row['rmse_m']):.4f}" in text
+            assert f"{float(row['bias_m']):+.4f}" in text
 
 
 def test_a_camera_of_positive_events_has_no_bound(evlcp: Evlcp, recording: Path) -> None:
