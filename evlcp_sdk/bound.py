@@ -102,8 +102,8 @@ class BoundaryInformation(Ranging):
     Blur, gain and noise of the bound are those of the frame: its values are fitted by the boundaries' model
     (least squares over spacing, position, drift, gain, blur and an offset between positive and negative
     events), and what is left over is the noise. Neither truth nor any algorithm is needed. The noise is taken
-    as Gaussian and alike in all pixels, and the pixels of a row weigh alike; an error common to several frames
-    is not seen.
+    as Gaussian and alike in all pixels, and the pixels of a row weigh alike; an error that several frames
+    share is not seen.
 
     Attributes:
         full_events: Events of a pixel in a chip that count as a full value; more are clipped, as hot pixels
