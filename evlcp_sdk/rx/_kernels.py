@@ -116,10 +116,8 @@ def measure_box(
     """Where in a box pixels blink at the chip rate and changed polarity since `since_us`.
 
     Returns:
-        (pixels, mean column, first column, last column, upper edge, lower edge). The edges are those of the
-        run of rows that exceeds a quarter of the mean lit row most, with the next row beyond; an edge row of
-        fewer pixels than the mean counts by its share. What lies further out are strays, such as a fast bar
-        leaves behind where noise wakes them; the quarter keeps stretches together where few pixels are awake.
+        (pixels, mean column, first column, last column, upper edge, lower edge); an edge row that holds
+        fewer pixels than a full one counts by its share.
     """
     left, top, right, bottom = box
     total = 0
@@ -140,26 +138,15 @@ def measure_box(
         lit += n > 0
     if total == 0:
         return 0, 0.0, 0, 0, 0.0, 0.0
-    # The run of rows that exceeds a quarter of the mean most (Kadane): 4 n lit > total is n > mean / 4.
-    excess = 0
-    most = 0
-    start = 0
-    first_row, last_row = 0, 0
-    for r in range(rows.size):
-        if excess < 0:
-            excess = 0
-            start = r
-        excess += 4 * rows[r] * lit - total
-        if excess > most:
-            most = excess
-            first_row, last_row = start, r
     full = total / lit
-    upper = top + first_row + 1 - min(rows[first_row] / full, 1.0)
-    if first_row > 0:
-        upper -= min(rows[first_row - 1] / full, 1.0)
-    lower = top + last_row + min(rows[last_row] / full, 1.0)
-    if last_row < rows.size - 1:
-        lower += min(rows[last_row + 1] / full, 1.0)
+    v = top
+    while rows[v - top] == 0:
+        v += 1
+    upper = v + 1 - min(rows[v - top] / full, 1.0)
+    v = bottom - 1
+    while rows[v - top] == 0:
+        v -= 1
+    lower = v + min(rows[v - top] / full, 1.0)
     return total, weighted / total, first_column, last_column, upper, lower
 
 

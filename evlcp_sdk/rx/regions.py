@@ -39,6 +39,14 @@ _RISE_MEASURE_CHIPS = 5
 _MEASURE_CHIPS = 4
 """A blinking pixel changes polarity at least once in two chips; twice that allows for a missed event."""
 
+_AGE_CHIPS = 5
+"""Age of a measured centre. A moving bar's leading end counts once its pixels have had two runs of one chip,
+some six chips late and more where events go missing; its trailing end stays for the four chips of the
+measurement. In recordings and simulated scenes the centre is 4 to 8 chips late."""
+
+_MOST_AHEAD_STEPS = 2
+"""Steps beyond the measured centres for which a region goes straight on, before a shaking camera turns."""
+
 _MIN_PIXELS = 4
 """Blinking pixels below which a region has no position: one cluster at 100 m has a dozen."""
 
@@ -93,8 +101,12 @@ class Track:
         return Region(last.id, t_us, x, y, last.width_px, last.height_px)
 
     def at(self, t_us: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centre (column, row) at times within the track, interpolated, px."""
+        """Centre (column, row) at times, interpolated; straight on for a little before and after, px."""
         t, x, y = np.array([(r.t_us, r.x_px, r.y_px) for r in self.positions]).T
+        if len(t) > 1:
+            # A place more at each end, on the straight line through the outermost two.
+            n = _MOST_AHEAD_STEPS
+            t, x, y = ([v[0] - n * (v[1] - v[0]), *v, v[-1] + n * (v[-1] - v[-2])] for v in (t, x, y))
         return np.interp(t_us, t, x), np.interp(t_us, t, y)
 
     def size_at(self, t_us: float) -> tuple[float, float]:
@@ -134,6 +146,7 @@ class RegionTracker:
         shortest, longest = _RISE_CHIPS
         self._rise_us = (round(shortest * chip_us), round(longest * chip_us))
         self._measure_us = round((_RISE_MEASURE_CHIPS if spec.positive_only else _MEASURE_CHIPS) * chip_us)
+        self._age_us = _AGE_CHIPS * chip_us
         shape = (camera.height, camera.width)
         self._pixels = np.full(shape, _LONG_AGO_US << 8, np.int64)
         self._hits = np.zeros([-(-n >> _CELL_SHIFT) for n in (camera.height + 7, camera.width + 7)], np.int32)
@@ -216,7 +229,7 @@ class RegionTracker:
             return None
         return Region(
             id=id,
-            t_us=end_us - self._measure_us / 2,
+            t_us=end_us - self._age_us,
             x_px=column,
             y_px=(upper + lower - 1) / 2,
             width_px=right - left + 1.0,

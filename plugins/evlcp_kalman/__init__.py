@@ -12,5 +12,5 @@ def evlcp_algorithms() -> Iterator[Algorithm]:
     """The algorithms of this package."""
     yield Algorithm("tracking", "none", "evlcp_kalman.tracking:NoTracking", 1, "each frame by itself")
     yield Algorithm(
-        "tracking", "kalman", "evlcp_kalman.tracking:KalmanTracking", 1, "constant-velocity Kalman filters"
+        "tracking", "kalman", "evlcp_kalman.tracking:KalmanTracking", 2, "constant-velocity Kalman filters"
     )

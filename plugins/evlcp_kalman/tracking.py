@@ -39,7 +39,9 @@ class KalmanTracking(Tracking):
         float,
         Field(gt=0, description="The same in the image: 430 px/s at 15 Hz, for 10 ms, have 3e7, peaks more."),
     ] = 1e8
-    speed_px_s: Annotated[float, Field(gt=0, description="Image speeds that are likely at first.")] = 600.0
+    speed_px_s: Annotated[
+        float, Field(gt=0, description="Image speeds that are likely at first: peaks of vibration.")
+    ] = 1500.0
     gate: Annotated[
         float, Field(gt=1, description="Sigmas from the prediction beyond which a measurement is left out.")
     ] = 5.0

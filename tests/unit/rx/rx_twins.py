@@ -45,12 +45,9 @@ def measure_box(lit, box):
     if not rows.any():
         return (0, 0.0, 0, 0, 0.0, 0.0), rows[top:bottom]
     columns = left + np.nonzero(lit[top:bottom, left:right])[1]
-    full = rows[rows > 0].mean()
-    runs = [(a, b) for b in range(top, bottom) for a in range(top, b + 1)]
-    excess = 4 * rows * (rows > 0).sum() - rows.sum()
-    first, last = max(runs, key=lambda run: excess[run[0] : run[1] + 1].sum())
-    share = np.pad(np.minimum(rows / full, 1), 1)
-    upper, lower = first + 1 - share[first : first + 2].sum(), last + share[last + 1 : last + 3].sum()
+    first, last = np.flatnonzero(rows)[[0, -1]]
+    share = np.minimum(rows / rows[rows > 0].mean(), 1)
+    upper, lower = first + 1 - share[first], last + share[last]
     found = (rows.sum(), columns.mean(), columns.min(), columns.max(), upper, lower)
     return found, rows[top:bottom]
 

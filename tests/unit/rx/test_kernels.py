@@ -123,13 +123,6 @@ def test_an_edge_row_counts_by_its_share():
     assert (upper, lower) == pytest.approx((4, 8 + 2 / 6.8))
 
 
-def test_strays_beyond_the_edges_do_not_move_them():
-    pixels = np.zeros((30, WIDTH), np.int64)
-    pixels[8:20, 2:6] = pixels[1, 3:5] = pixels[4, 2:5] = pixels[27, 2] = 1000 << 8 | 40 << 1
-    *_, upper, lower = _kernels.measure_box(pixels, (0, 0, WIDTH, 30), 1000, 5, np.empty(30, np.int64))
-    assert (upper, lower) == (8, 20)
-
-
 @pytest.mark.parametrize("n", [0, 1, 500])
 @pytest.mark.parametrize("freeze", [1, 2])
 def test_events_in_boxes(n, freeze):

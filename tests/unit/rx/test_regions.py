@@ -1,5 +1,6 @@
 """Finding and following blinking regions."""
 
+from collections import deque
 from collections.abc import Iterable
 from itertools import pairwise
 
@@ -9,7 +10,7 @@ import pytest
 from evlcp_sdk.config import RegionSpec, load_link
 from evlcp_sdk.geometry import CameraModel
 from evlcp_sdk.rx.regions import RegionTracker, Track
-from evlcp_sdk.types import Events
+from evlcp_sdk.types import Events, Region
 from tests.synthetic import Bar, events_of, lamp, merged, noise, random_symbols
 
 LINK = load_link()
@@ -64,6 +65,16 @@ def test_a_shaking_bar_is_followed(shake_px: float, shake_hz: float) -> None:
     (x, y), (true_x, true_y) = track.at(at), bar.centre(at)
     assert np.sqrt(np.mean((x - true_x + 0.5) ** 2)) < 0.6
     assert np.sqrt(np.mean((y - true_y + 0.5) ** 2)) < 0.8
+
+
+def test_a_track_goes_straight_on_for_two_steps() -> None:
+    positions = [Region(0, 1000.0 * n, 50 + n**2, 80 - 2 * n, 4, 100) for n in range(4)]
+    track = Track(0, deque(positions), 0)
+    x, y = track.at(np.array([-9e9, -1000, 0, 500, 3000, 4000, 5000, 9e9]))
+    assert x == pytest.approx([48, 49, 50, 50.5, 59, 64, 69, 69])
+    assert y == pytest.approx([84, 82, 80, 79, 74, 72, 70, 70])
+    alone = Track(0, deque(positions[:1]), 0)
+    assert alone.at(np.array([-5e3, 7e3]))[0] == pytest.approx([50, 50])
 
 
 def test_two_bars_are_two_regions() -> None:
