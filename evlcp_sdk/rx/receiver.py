@@ -67,7 +67,7 @@ class _Transmitter:
         frame: Next frame to decode, counted from that packet's first.
         first: Number of the first packet that had a frame, None before.
         pilot: The newest pilot, None where it showed no bar.
-        distance: State of the distance filter.
+        distance: State of the distance filter, None without one.
     """
 
     track: Track
@@ -263,7 +263,12 @@ class Receiver:
             if track.id not in self._transmitters:
                 self._counts["regions_opened"] += 1
                 assembler = PacketAssembler(self._packet.frames)
-                self._transmitters[track.id] = _Transmitter(track, self._synchronizer.init(), assembler)
+                self._transmitters[track.id] = _Transmitter(
+                    track,
+                    self._synchronizer.init(),
+                    assembler,
+                    distance=self._distance.init() if self._distance else None,
+                )
                 fresh = list(track.blocks)
             else:
                 fresh = [track.blocks[-1]] if track.blocks and track.blocks[-1][0] == start_us else []

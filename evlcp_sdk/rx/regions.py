@@ -71,7 +71,7 @@ class Track:
         positions: Where it was measured, oldest first.
         blocks: Its events, one entry a time step: (start of the step, us; events).
         first_us: Start of the first step of which it has events, us.
-        filter: State of the filter of its centre.
+        filter: State of the filter of its centre, None without one.
         released: True once it has faded or was merged into another; it gets no more events.
     """
 
@@ -280,7 +280,8 @@ class RegionTracker:
         self._next_id += 1
         reach = self._reach(region)
         blocks = deque((start, _select(events, [reach])[0]) for start, events in self._recent)
-        self.tracks.append(Track(region.id, deque([region]), blocks[0][0], blocks))
+        state = self._position.init() if self._position else None
+        self.tracks.append(Track(region.id, deque([region]), blocks[0][0], blocks, filter=state))
 
     def _merge(self) -> None:
         """Keep the older of two regions that have grown together."""

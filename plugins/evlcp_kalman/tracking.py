@@ -102,7 +102,7 @@ class _ConstantVelocity(Filter):
                 1,
                 0,
             )
-            return state, value, sigma
+            return state, value.copy(), sigma
         count = min(state.count + 1, self.pooled)
         variance = state.variance + (sigma**2 - state.variance) / count
         mean, covariance = self._ahead(state, t_us)
@@ -119,7 +119,7 @@ class _ConstantVelocity(Filter):
             mean = mean + gain[:, None] * innovation
             covariance = covariance - np.outer(gain, covariance[0])
         state = _State(t_s, mean, covariance, variance, count, missed)
-        return state, mean[0], float(np.sqrt(covariance[0, 0]))
+        return state, mean[0].copy(), float(np.sqrt(covariance[0, 0]))
 
     def _ahead(self, state: _State, t_us: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         dt = t_us * 1e-6 - state.t_s

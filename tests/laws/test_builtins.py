@@ -7,9 +7,7 @@ from evlcp_sdk.testing import Law, laws_of
 from evlcp_sdk.testing.law import Subject, judge
 
 REGISTRY = Registry.load()
-EXCUSES: dict[tuple[str, str], dict[str, str]] = {
-    ("tracking", "kalman"): {"results-owned": "the first filtered value is the measurement's own array"},
-}
+EXCUSES: dict[tuple[str, str], dict[str, str]] = {}
 """Algorithm to the laws that it is known to break, each with its reason."""
 
 CASES = [

@@ -114,7 +114,6 @@ def test_wrong_names_are_refused(role: str, excuses: dict[str, str], said: str) 
         check(role, CentroidRanging(), excuses)
 
 
-@pytest.mark.xfail(strict=True, reason="the receiver begins with None, not with what Filter.init() gives")
 def test_the_receiver_begins_a_filter_with_its_init() -> None:
     class Latest(Filter):
         def init(self) -> Any:
