@@ -71,13 +71,17 @@ class MessageSpec:
         int,
         Field(ge=0, le=256, description="Undecoded blocks kept to be added to their repetitions; 0: none."),
     ] = 16
-    max_llr: Annotated[
+    llr_power: Annotated[
         float,
         Field(
             gt=0,
-            le=100,
-            description="LLRs are clipped to this; no bit is surer than the sync that it hangs on.",
+            le=1,
+            description="Power that sizes of LLRs are raised to: decoders are surer than they are right.",
         ),
+    ] = 0.5
+    max_llr: Annotated[
+        float,
+        Field(gt=0, le=100, description="Largest LLR after that; no bit is surer than the sync it hangs on."),
     ] = 7.0
     trusted_keys: Annotated[
         tuple[str, ...],

@@ -157,11 +157,12 @@ class MessageAssembler:
         self._inboxes.clear()
 
     def _llr(self, packet: Packet) -> NDArray[np.float32]:
-        """LLRs of a packet's bits in the order on air, 0 where a frame is missing."""
+        """Calibrated LLRs of a packet's bits in the order on air, 0 where a frame is missing."""
         llr = np.zeros((packet.sent, self._coder.bits // packet.sent), np.float32)
         for frame in packet.frames:
             llr[frame.frame] = np.nan_to_num(frame.soft.llr, nan=0.0).ravel()
-        return np.clip(llr.ravel(), -self._spec.max_llr, self._spec.max_llr)
+        size = np.minimum(np.abs(llr.ravel()) ** self._spec.llr_power, self._spec.max_llr)
+        return np.copysign(size, llr.ravel()).astype(np.float32)
 
     def _content(self, inbox: _Inbox, llr: NDArray[np.float32]) -> tuple[bytes | None, int]:
         """The bytes of a packet's block and the packets it took; None if it cannot be told yet."""
