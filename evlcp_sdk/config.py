@@ -1,8 +1,8 @@
 """The link: what both ends agree on and how the receiver works, from `link.toml` to checked objects.
 
 One table a role (`[ranging]`: `id = "poc"`, its parameters flat beside it), and `[camera]`, `[bar]`, `[air]`,
-`[regions]` and `[messages]`. Every default is written out before anything runs, so that the resolved table
-alone reproduces a result. See `docs/configuration.md`.
+`[regions]`, `[messages]` and `[position]`. Every default is written out before anything runs, so that the
+resolved table alone reproduces a result. See `docs/configuration.md`.
 """
 
 import difflib
@@ -124,12 +124,58 @@ class RegionSpec:
     ] = 0.5
 
 
+@dataclass(frozen=True)
+class PositionSpec:
+    """How positions are computed from the image points of bars at known places."""
+
+    min_points: Annotated[
+        int, Field(ge=2, description="Clusters of a bar that must be seen for it to count.")
+    ] = 6
+    huber_sigmas: Annotated[
+        float, Field(gt=0, description="Miss of a point, in its sigmas, beyond which it weighs less.")
+    ] = 3.0
+    shared_sigma_px: Annotated[
+        float,
+        Field(
+            ge=0, description="Error that a bar's points share: motion inside the pilot, up to half a pixel."
+        ),
+    ] = 0.07
+    pixel_sigma_px: Annotated[
+        float,
+        Field(
+            ge=0,
+            description="Error of a point that no averaging over frames removes: where in a pixel it is.",
+        ),
+    ] = 0.04
+    min_view_deg: Annotated[
+        float,
+        Field(ge=0, lt=90, description="Angle between a bar and the line of sight that a lone bar needs."),
+    ] = 10.0
+    max_sigma_m: Annotated[
+        float, Field(gt=0, description="Largest sigma of a position, in any direction, that is given.")
+    ] = 3.0
+    max_misfit: Annotated[
+        float,
+        Field(
+            gt=1, description="Mean square of the misses, in sigmas, above which sites and image disagree."
+        ),
+    ] = 4.0
+    acceleration_m2_s3: Annotated[
+        float,
+        Field(gt=0, description="Power density of the change of speed: 1 m/s2 that lasts for a second."),
+    ] = 1.0
+    gate_sigmas: Annotated[
+        float, Field(gt=1, description="Sigmas from the prediction beyond which a track leaves a fix out.")
+    ] = 5.0
+
+
 _SPECS: dict[str, type[Any]] = {
     "camera": CameraModel,
     "bar": BarLayout,
     "air": AirSpec,
     "regions": RegionSpec,
     "messages": MessageSpec,
+    "position": PositionSpec,
 }
 
 _UNITS = {
@@ -142,6 +188,7 @@ _UNITS = {
     "um": "um",
     "mm": "mm",
     "m": "m",
+    "deg": "deg",
     "chips": "chips",
 }
 
@@ -155,6 +202,7 @@ class Link:
         bar: The transmitter's LEDs and clusters.
         air: Chip rate and packet length.
         regions: Parameters of the region detector.
+        position: Parameters of the positions.
         messages: How messages are read.
         algorithms: Role to algorithm, one of each role.
         revisions: Role to the algorithm's revision.
@@ -169,6 +217,7 @@ class Link:
     air: AirSpec
     regions: RegionSpec
     messages: MessageSpec
+    position: PositionSpec
     algorithms: Mapping[str, Any]
     revisions: Mapping[str, int]
     codebook: Codebook
@@ -323,6 +372,7 @@ def resolve(
         bar=bar,
         air=air,
         regions=built["regions"],
+        position=built["position"],
         messages=built["messages"],
         algorithms={role: built[role] for role in ROLE_NAMES},
         revisions=revisions,

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
 
-__all__ = ["BarLayout", "CameraModel"]
+__all__ = ["Attitude", "BarLayout", "CameraModel"]
 
 _NEWTON_STEPS = 12
 """Each doubles the digits; four suffice for what lenses do."""
@@ -136,6 +136,53 @@ class CameraModel:
             spacing_px: The same in the image, l', px.
         """
         return self.focal_px * spacing_m / spacing_px
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """How the camera is turned, and how surely that is known: a compass and gravity.
+
+    From looking level to the north it is first turned to the right, then up, then rolled.
+
+    Attributes:
+        pitch_deg: How far the optical axis points above the horizon.
+        roll_deg: How far the camera's top leans to its right.
+        heading_deg: Where the optical axis points to, clockwise from north; None when unknown.
+        gravity_sigma_deg: Standard deviation of pitch and roll each; 0: exact.
+        heading_sigma_deg: Of the heading; 0: exact.
+
+    >>> Attitude(heading_deg=90.0).rotation()[:, 2].round(6).tolist()
+    [1.0, 0.0, 0.0]
+    """
+
+    pitch_deg: float = 0.0
+    roll_deg: float = 0.0
+    heading_deg: float | None = None
+    gravity_sigma_deg: float = 0.1
+    heading_sigma_deg: float = 0.5
+
+    def rotation(self) -> NDArray[np.float64]:
+        """Camera axes (x right, y down, z forward) as columns in ENU, float64 (3, 3); north if unknown."""
+        h, p, r = np.radians([self.heading_deg or 0.0, self.pitch_deg, self.roll_deg])
+        forward = np.array([np.cos(p) * np.sin(h), np.cos(p) * np.cos(h), np.sin(p)])
+        level = np.array([np.cos(h), -np.sin(h), 0.0])
+        down = np.cross(forward, level)
+        turned = [level * np.cos(r) + down * np.sin(r), down * np.cos(r) - level * np.sin(r), forward]
+        return np.stack(turned, 1)
+
+    @classmethod
+    def of_rotation(cls, rotation: NDArray[np.float64]) -> "Attitude":
+        """The attitude of camera axes in ENU, float64 (3, 3); heading in 0 to 360, no sigmas.
+
+        >>> a = Attitude.of_rotation(Attitude(pitch_deg=5.0, roll_deg=-3.0, heading_deg=200.0).rotation())
+        >>> round(a.pitch_deg, 6), round(a.roll_deg, 6), round(a.heading_deg or 0, 6)
+        (5.0, -3.0, 200.0)
+        """
+        forward, up = rotation[:, 2], rotation[2]
+        heading = float(np.degrees(np.arctan2(forward[0], forward[1]))) % 360.0
+        pitch = float(np.degrees(np.arcsin(np.clip(forward[2], -1, 1))))
+        roll = float(np.degrees(np.arctan2(-up[0], -up[1])))
+        return cls(pitch, roll, heading, 0.0, 0.0)
 
 
 @dataclass(frozen=True)

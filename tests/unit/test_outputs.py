@@ -15,7 +15,7 @@ from evlcp_wh.modulation import Wh8
 from evlcp_wh.pilots import WhPilots
 
 from evlcp_sdk.codebook import Codebook
-from evlcp_sdk.config import AirSpec, Link, MessageSpec, RegionSpec, load_link
+from evlcp_sdk.config import AirSpec, Link, MessageSpec, PositionSpec, RegionSpec, load_link
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.frames import PacketFormat, symbols_of_bits
 from evlcp_sdk.geometry import BarLayout, CameraModel
@@ -32,6 +32,7 @@ LINK = Link(
     air=AirSpec(frames_per_packet=3),
     regions=RegionSpec(),
     messages=MessageSpec(decode=False),
+    position=PositionSpec(),
     algorithms={"tracking": NoTracking()},
     revisions={"ranging": 1},
     codebook=BOOK,
