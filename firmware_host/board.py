@@ -191,7 +191,8 @@ class Board:
             RefusedError: The board cannot take a value.
         """
         book = payload.codebook
-        self.link.call(ConfigureRequest(chip_rate_hz, profile_number(book), payload.frames), ConfigureReply)
+        configure = ConfigureRequest(chip_rate_hz, profile_number(book), payload.frames, payload.pilot_every)
+        self.link.call(configure, ConfigureReply)
         chips = 2 * len(book.preamble)
         if chips > 32:
             raise IncompatibleError(f"preamble of {chips} chips: the board's has at most 32")
@@ -205,6 +206,7 @@ class Board:
             status.format,
             status.packets,
             status.frames,
+            status.pilot_every,
             status.length,
             status.crc,
             status.chip_rate_hz,
@@ -214,6 +216,7 @@ class Board:
             payload.format,
             payload.packets,
             payload.frames,
+            payload.pilot_every,
             len(payload.content),
             payload.crc,
             chip_rate_hz,

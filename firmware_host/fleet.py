@@ -40,6 +40,7 @@ class Entry(BaseModel):
         unique_id: The part's own number in hex, as `evlcp board hello` shows it; another board is refused.
         profile: Info-segment profile.
         frames: Frames per packet of `random` and of chip masks.
+        pilot_every: Frames from one pilot to the next.
         chip_rate_hz: Chips per second.
         level_ma: LED current, mA.
         watchdog: What the board does when the host is silent.
@@ -59,6 +60,7 @@ class Entry(BaseModel):
     unique_id: Annotated[str, Field(pattern="^[0-9a-f]{24}$")] | None = None
     profile: str = "wh4x2"
     frames: Annotated[int, Field(ge=1, le=65535)] = 10
+    pilot_every: Annotated[int, Field(ge=1, le=64)] = 1
     chip_rate_hz: Annotated[int, Field(ge=1, le=1_000_000)] = 10_000
     level_ma: Annotated[int, Field(ge=0, le=65535)] | None = None
     watchdog: Literal["keep", "idle", "dark"] | None = None
@@ -184,11 +186,12 @@ def _payload(path: Path, index: int, entry: Entry, books: "dict[str, Codebook]")
         book = books.setdefault(entry.profile, codebook_of(entry.profile))
         if entry.random is not None:
             generator = np.random.default_rng(entry.seed)
-            return Payload.of_symbols(random_symbols(entry.random, entry.frames, book, generator), book)
+            symbols = random_symbols(entry.random, entry.frames, book, generator)
+            return Payload.of_symbols(symbols, book, entry.pilot_every)
         file = path.parent / str(entry.payload)
         if file.suffix == ".npy":
-            return read_masks(file, entry.frames, book)
-        return Payload.of_symbols(read_symbols(file, book), book)
+            return read_masks(file, entry.frames, book, entry.pilot_every)
+        return Payload.of_symbols(read_symbols(file, book, entry.pilot_every), book, entry.pilot_every)
     except EvlcpError as fault:
         raise InputError(f"{path}: board[{index}]: {fault}") from fault
 

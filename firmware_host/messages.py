@@ -68,7 +68,7 @@ __all__ = [
 
 PROTOCOL_VERSION = 1
 """Version of the protocol."""
-SCHEMA_HEX = "54fb07bc008612ffa51dbacf400a493acca90dede7115c8654c9f76785310a1c"
+SCHEMA_HEX = "85507b45425b847c4a0f0706672a60bf961ec81b082026425238d00d03dac3dd"
 """SHA-256 of the definition."""
 SCHEMA = bytes.fromhex(SCHEMA_HEX)[:8]
 """What HELLO carries of it."""
@@ -322,6 +322,7 @@ class ConfigureRequest(Payload):
         chip_rate_hz: Chips per second; must divide the tick rate; not changed while playing.
         profile: Info-segment profile.
         frames: Frames per packet.
+        pilot_every: Frames from one pilot to the next; 1: every frame has one.
     """
 
     TYPE: ClassVar[int] = 0x02
@@ -329,11 +330,13 @@ class ConfigureRequest(Payload):
         ("I", 1),
         ("B", 1),
         ("H", 1),
+        ("B", 1),
     )
 
     chip_rate_hz: int
     profile: int
     frames: int
+    pilot_every: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -647,6 +650,7 @@ class StatusReply(Payload):
         format: Format of the active bank.
         profile: Profile of the active bank.
         frames: Frames per packet of the active bank.
+        pilot_every: Frames from one of its pilots to the next.
         packets: Packets in the active bank.
         length: Bytes in the active bank.
         crc: CRC-32 of the active bank.
@@ -679,6 +683,7 @@ class StatusReply(Payload):
         ("B", 1),
         ("B", 1),
         ("H", 1),
+        ("B", 1),
         ("H", 1),
         ("I", 1),
         ("I", 1),
@@ -709,6 +714,7 @@ class StatusReply(Payload):
     format: int
     profile: int
     frames: int
+    pilot_every: int
     packets: int
     length: int
     crc: int

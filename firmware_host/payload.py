@@ -39,6 +39,7 @@ class Payload:
         frames: Frames per packet.
         content: The bank's bytes.
         codebook: The codebook it was made with.
+        pilot_every: Frames from one pilot to the next.
     """
 
     format: Format
@@ -46,9 +47,10 @@ class Payload:
     frames: int
     content: bytes
     codebook: Codebook
+    pilot_every: int = 1
 
     @classmethod
-    def of_symbols(cls, symbols: ArrayLike, codebook: Codebook) -> "Payload":
+    def of_symbols(cls, symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -> "Payload":
         """Info words of symbols (packets, frames, clusters).
 
         Raises:
@@ -62,22 +64,24 @@ class Payload:
         if s.ndim != 3 or not s.size:
             raise ConfigError(f"symbols of shape {s.shape}: expected (packets, frames, clusters)")
         words = np.concatenate([info_words(packet, codebook) for packet in s])
-        return cls(Format.WORDS, len(s), s.shape[1], words.astype("<u2").tobytes(), codebook)
+        return cls(Format.WORDS, len(s), s.shape[1], words.astype("<u2").tobytes(), codebook, pilot_every)
 
     @classmethod
-    def of_masks(cls, chips: ArrayLike, packets: int, frames: int, codebook: Codebook) -> "Payload":
+    def of_masks(
+        cls, chips: ArrayLike, packets: int, frames: int, codebook: Codebook, pilot_every: int = 1
+    ) -> "Payload":
         """Precomposed chips, uint8 (chips, 96 LEDs), that fill `packets` packets.
 
         Raises:
             ConfigError: Another number of chips.
         """
         rows = rows_of_chips(chips)
-        expected = packets * _packet_chips(codebook, frames)
+        expected = packets * _packet_chips(codebook, frames, pilot_every)
         if len(rows) != expected:
             raise ConfigError(
                 f"{len(rows)} chips: expected {expected} for {packets} packets of {frames} frames"
             )
-        return cls(Format.MASKS, packets, frames, rows.tobytes(), codebook)
+        return cls(Format.MASKS, packets, frames, rows.tobytes(), codebook, pilot_every)
 
     @cached_property
     def crc(self) -> int:
@@ -85,8 +89,8 @@ class Payload:
         return zlib.crc32(self.content)
 
 
-def _packet_chips(codebook: Codebook, frames: int) -> int:
-    return PacketFormat.of(codebook, frames).packet_chips
+def _packet_chips(codebook: Codebook, frames: int, pilot_every: int) -> int:
+    return PacketFormat.of(codebook, frames, pilot_every=pilot_every).packet_chips
 
 
 def random_symbols(packets: int, frames: int, codebook: Codebook, generator: np.random.Generator) -> Symbols:
@@ -95,7 +99,7 @@ def random_symbols(packets: int, frames: int, codebook: Codebook, generator: np.
     return generator.integers(0, len(codebook.codewords), shape, dtype=np.int64)
 
 
-def symbol_chips(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.uint8]:
+def symbol_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -> NDArray[np.uint8]:
     """Chips of packets one after another: symbols (P, F, K) to uint8 (chips, K), 1 = on.
 
     Raises:
@@ -104,7 +108,7 @@ def symbol_chips(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.uint8]:
     s = np.asarray(symbols)
     if s.ndim != 3 or not s.size:
         raise ConfigError(f"symbols of shape {s.shape}: expected (packets, frames, clusters)")
-    return np.concatenate([packet_chips(packet, codebook) for packet in s])
+    return np.concatenate([packet_chips(packet, codebook, pilot_every) for packet in s])
 
 
 def word_table(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.uint16]:
@@ -153,10 +157,10 @@ def chips_of_rows(rows: NDArray[np.uint8], clusters: int = 16) -> NDArray[np.uin
     return np.ascontiguousarray(chips[:, :, 0])
 
 
-def read_symbols(path: Path, codebook: Codebook) -> Symbols:
+def read_symbols(path: Path, codebook: Codebook, pilot_every: int = 1) -> Symbols:
     """Symbols of a JSON file: `[packet][frame][cluster]`, or an object with the key `symbols`.
 
-    An object's `profile`, where given, must be the codebook's.
+    An object's `profile`, where given, must be the codebook's, and its `pilot_every` that of the packets.
 
     Raises:
         InputError: The file cannot be read, is no JSON, or an element is missing, out of range or no integer;
@@ -174,6 +178,12 @@ def read_symbols(path: Path, codebook: Codebook) -> Symbols:
         if profile != codebook.profile:
             raise InputError(
                 f"{path}: profile = {profile!r}, expected {codebook.profile!r}; choose it with --profile"
+            )
+        every = table.get("pilot_every", pilot_every)
+        if every != pilot_every:
+            raise InputError(
+                f"{path}: pilot_every = {json.dumps(every)}, expected {pilot_every};"
+                " choose it with --pilot-every"
             )
         if "symbols" not in table:
             raise InputError(f"{path}: key symbols is missing, expected symbols[packet][frame][cluster]")
@@ -202,7 +212,7 @@ def _list(path: Path, place: str, value: Any, of: str, length: int | None = None
     return value
 
 
-def read_masks(path: Path, frames: int, codebook: Codebook) -> Payload:
+def read_masks(path: Path, frames: int, codebook: Codebook, pilot_every: int = 1) -> Payload:
     """Precomposed chips of a `.npy` file: uint8 (chips, 96) or (chips, 16), whole packets of `frames` frames.
 
     Raises:
@@ -216,13 +226,13 @@ def read_masks(path: Path, frames: int, codebook: Codebook) -> Payload:
         raise InputError(f"{path}: not a .npy file of plain numbers: {fault}") from fault
     if not isinstance(chips, np.ndarray):
         raise InputError(f"{path}: not a .npy file, but an archive of several")
-    length = _packet_chips(codebook, frames)
+    length = _packet_chips(codebook, frames, pilot_every)
     if chips.ndim != 2 or not len(chips) or len(chips) % length:
         raise InputError(
             f"{path}: array of shape {chips.shape},"
             f" expected whole packets of {length} chips ({frames} frames)"
         )
     try:
-        return Payload.of_masks(chips, len(chips) // length, frames, codebook)
+        return Payload.of_masks(chips, len(chips) // length, frames, codebook, pilot_every)
     except ConfigError as fault:
         raise InputError(f"{path}: {fault}") from fault

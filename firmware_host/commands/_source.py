@@ -26,7 +26,7 @@ def codebook(profile: str) -> "Codebook":
 
 
 def symbols(
-    path: Path | None, random: int | None, seed: int, frames: int, book: "Codebook"
+    path: Path | None, random: int | None, seed: int, frames: int, pilot_every: int, book: "Codebook"
 ) -> "NDArray[np.int64]":
     """Symbols (packets, frames, clusters) of a file, or `random` packets.
 
@@ -39,7 +39,7 @@ def symbols(
     if (path is None) == (random is None):
         raise ConfigError("give symbols as SYMBOLS.json or with --random N, one of the two")
     if path is not None:
-        return read_symbols(path, book)
+        return read_symbols(path, book, pilot_every)
     import numpy as np
 
     if random is None or random < 1 or frames < 1:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from firmware_host.commands import _source
-from firmware_host.commands.tx import Frames, ProfileName, RandomPackets, Seed, SymbolsFile
+from firmware_host.commands.tx import Frames, PilotEvery, ProfileName, RandomPackets, Seed, SymbolsFile
 
 if TYPE_CHECKING:
     from firmware_host.board import Board
@@ -96,7 +96,13 @@ def open_board(port: str | None, baud: int, trace: Path | None, replay: Path | N
 
 
 def _payload(
-    symbols: Path | None, random: int | None, masks: Path | None, seed: int, frames: int, profile: str
+    symbols: Path | None,
+    random: int | None,
+    masks: Path | None,
+    seed: int,
+    frames: int,
+    pilot_every: int,
+    profile: str,
 ) -> "Payload":
     from evlcp_sdk.errors import ConfigError
     from firmware_host.payload import Payload, read_masks
@@ -105,8 +111,10 @@ def _payload(
     if masks is not None:
         if symbols is not None or random is not None:
             raise ConfigError("--masks, --random and SYMBOLS.json: give one of them")
-        return read_masks(masks, frames, book)
-    return Payload.of_symbols(_source.symbols(symbols, random, seed, frames, book), book)
+        return read_masks(masks, frames, book, pilot_every)
+    return Payload.of_symbols(
+        _source.symbols(symbols, random, seed, frames, pilot_every, book), book, pilot_every
+    )
 
 
 @contextlib.contextmanager
@@ -168,6 +176,7 @@ def _status(status: "StatusReply") -> dict[str, Any]:
             "format": _name(Format, status.format),
             "profile": _name(Profile, status.profile),
             "frames": status.frames,
+            "pilot_every": status.pilot_every,
             "packets": status.packets,
             "length": status.length,
             "crc": f"{status.crc:08x}",
@@ -256,6 +265,7 @@ def program(
     masks: Masks = None,
     seed: Seed = 0,
     frames: Frames = 10,
+    pilot_every: PilotEvery = 1,
     profile: ProfileName = "wh4x2",
     inventory: Annotated[
         Path | None, typer.Option(metavar="FILE.toml", help="Program all boards of an inventory at once.")
@@ -290,7 +300,7 @@ def program(
     from firmware_host.messages import Watchdog
 
     action = None if watchdog is None else Watchdog[watchdog.name]
-    payload = _payload(symbols, random, masks, seed, frames, profile)
+    payload = _payload(symbols, random, masks, seed, frames, pilot_every, profile)
     settings = Settings(chip_rate, level, action, watchdog_ms, start)
     with open_board(port, baud, trace, replay) as board, progress_bar("programming") as progress:
         done = provision(board, payload, settings, verify, progress)
@@ -330,6 +340,7 @@ def send(
     masks: Masks = None,
     seed: Seed = 0,
     frames: Frames = 10,
+    pilot_every: PilotEvery = 1,
     profile: ProfileName = "wh4x2",
     verify: Annotated[bool, typer.Option(help="Compare what the board holds.")] = True,
     port: Port = None,
@@ -345,7 +356,7 @@ def send(
     from firmware_host.errors import RefusedError
     from firmware_host.messages import NO_BANK, Status
 
-    payload = _payload(symbols, random, masks, seed, frames, profile)
+    payload = _payload(symbols, random, masks, seed, frames, pilot_every, profile)
     with open_board(port, baud, trace, replay) as board, progress_bar("sending") as progress:
         status = board.status()
         if status.active_bank == NO_BANK:
@@ -476,6 +487,7 @@ def verify(
     masks: Masks = None,
     seed: Seed = 0,
     frames: Frames = 10,
+    pilot_every: PilotEvery = 1,
     profile: ProfileName = "wh4x2",
     port: Port = None,
     baud: Baud = DEFAULT_BAUD,
@@ -489,19 +501,23 @@ def verify(
     from firmware_host.errors import VerifyError
     from firmware_host.messages import NO_BANK
 
-    payload = _payload(symbols, random, masks, seed, frames, profile)
+    payload = _payload(symbols, random, masks, seed, frames, pilot_every, profile)
     with open_board(port, baud, trace, replay) as board:
         s = board.status()
         again = "'evlcp board program' brings it there"
         if s.active_bank == NO_BANK:
             raise VerifyError(f"{board.link.name}: nothing is programmed; {again}")
         _check_codebook(board, payload, s)
-        shape = (s.format, s.packets, s.frames, s.length)
-        expected = (payload.format, payload.packets, payload.frames, len(payload.content))
+        shape = (s.format, s.packets, s.frames, s.pilot_every, s.length)
+        expected = (
+            *(payload.format, payload.packets, payload.frames),
+            *(payload.pilot_every, len(payload.content)),
+        )
         if shape != expected:
             raise VerifyError(
-                f"{board.link.name}: holds {s.packets} packets of {s.frames} frames, {s.length} bytes;"
-                f" expected {payload.packets} of {payload.frames}, {len(payload.content)} bytes; {again}"
+                f"{board.link.name}: holds {s.packets} packets of {s.frames} frames, pilot in every"
+                f" {s.pilot_every}, {s.length} bytes; expected {payload.packets} of {payload.frames},"
+                f" pilot in every {payload.pilot_every}, {len(payload.content)} bytes; {again}"
             )
         held = board.read(s.active_bank, 0, s.length)
         differ = next((i for i, (a, b) in enumerate(zip(held, payload.content, strict=True)) if a != b), None)

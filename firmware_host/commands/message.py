@@ -81,7 +81,12 @@ def message(
     coder = link.block_coder()
     messages = _messages(text, file, beacon, user, key, transmitter_id, sequence, coder)
     symbols = packets_of(messages, coder, repeat)
-    table = {"profile": link.codebook.profile, "digest": link.codebook.digest, "symbols": symbols.tolist()}
+    table = {
+        "profile": link.codebook.profile,
+        "digest": link.codebook.digest,
+        "pilot_every": link.packet.pilot_every,
+        "symbols": symbols.tolist(),
+    }
     if out is not None:
         _write_text(out, json.dumps(table) + "\n")
     if chips is not None:
@@ -220,13 +225,9 @@ def _program(symbols: "NDArray[np.int64]", link: "Link", port: str, baud: int) -
     from firmware_host.commands.board import open_board, progress_bar
     from firmware_host.payload import Payload
 
-    if link.air.pilot_every != 1:
-        raise ConfigError(
-            f"air.pilot_every = {link.air.pilot_every}: a board puts a pilot into every frame; expected 1"
-        )
     if link.air.chip_rate_hz != round(link.air.chip_rate_hz):
         raise ConfigError(f"air.chip_rate_hz = {link.air.chip_rate_hz}: a board takes whole chips a second")
-    payload = Payload.of_symbols(symbols, link.codebook)
+    payload = Payload.of_symbols(symbols, link.codebook, link.packet.pilot_every)
     settings = Settings(round(link.air.chip_rate_hz))
     with open_board(port, baud, None, None) as board, progress_bar("programming") as progress:
         return provision(board, payload, settings, True, progress)

@@ -41,6 +41,10 @@ RandomPackets = Annotated[
 ]
 Seed = Annotated[int, typer.Option(help="Seed of --random.")]
 Frames = Annotated[int, typer.Option(help="Frames per packet of --random and --masks.")]
+PilotEvery = Annotated[
+    int,
+    typer.Option(min=1, max=64, metavar="N", help="Frames from one pilot to the next, as the receiver's."),
+]
 ProfileName = Annotated[str, typer.Option("--profile", help="Info-segment profile: wh4x2, wh8, raw8.")]
 
 
@@ -50,6 +54,7 @@ def frames(
     random: RandomPackets = None,
     seed: Seed = 0,
     frames: Frames = 10,
+    pilot_every: PilotEvery = 1,
     profile: ProfileName = "wh4x2",
     form: Annotated[Form, typer.Option("--format", help="How the words are printed.")] = Form.TABLE,
     chips: Annotated[
@@ -64,12 +69,12 @@ def frames(
     For example: [bold]evlcp tx frames --random 2 --seed 1 --chips chips.npy[/]
     """
     book = _source.codebook(profile)
-    table = _source.symbols(symbols, random, seed, frames, book)
+    table = _source.symbols(symbols, random, seed, frames, pilot_every, book)
     if chips is not None:
         from firmware_host.payload import symbol_chips
 
-        save_array(chips, symbol_chips(table, book))
-    typer.echo(_FORMS[form](table, book))
+        save_array(chips, symbol_chips(table, book, pilot_every))
+    typer.echo(_FORMS[form](table, book, pilot_every))
 
 
 def save_array(path: Path, array: "NDArray[np.generic]") -> None:
@@ -89,25 +94,30 @@ def save_array(path: Path, array: "NDArray[np.generic]") -> None:
         raise InputError(f"{path}: cannot be written: {fault.strerror}") from fault
 
 
-def _table(symbols: "NDArray[np.int64]", book: "Codebook") -> str:
+def _table(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
     from firmware_host.payload import word_table
 
     lines = ["packet frame cluster symbol pilot info"]
     for p, packet in enumerate(word_table(symbols, book)):
         for f, frame in enumerate(packet):
             for k, (pilot, info) in enumerate(frame):
-                lines.append(f"{p:6} {f:5} {k:7} {symbols[p, f, k]:6}  {pilot:04x} {info:04x}")
+                shown = f"{pilot:04x}" if f % pilot_every == 0 else "   -"
+                lines.append(f"{p:6} {f:5} {k:7} {symbols[p, f, k]:6}  {shown} {info:04x}")
     return "\n".join(lines)
 
 
-def _hex(symbols: "NDArray[np.int64]", book: "Codebook") -> str:
+def _hex(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
     from firmware_host.payload import word_table
 
     words = word_table(symbols, book)
-    return "\n".join(" ".join(f"{p:04x}{i:04x}" for p, i in frame) for packet in words for frame in packet)
+    return "\n".join(
+        " ".join(f"{p:04x}{i:04x}" if f % pilot_every == 0 else f"{i:04x}" for p, i in frame)
+        for packet in words
+        for f, frame in enumerate(packet)
+    )
 
 
-def _c(symbols: "NDArray[np.int64]", book: "Codebook") -> str:
+def _c(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
     from firmware_host.payload import word_table
 
     info = word_table(symbols, book)[..., 1]
@@ -115,7 +125,8 @@ def _c(symbols: "NDArray[np.int64]", book: "Codebook") -> str:
     lines = [
         "/* Info words of evlcp tx frames; pilots and preamble are in codebook.h. */",
         "#include <stdint.h>",
-        f"/* Codebook {book.digest[:16]}, profile {book.profile}. */",
+        f"/* Codebook {book.digest[:16]}, profile {book.profile}, pilot in every frame f with"
+        f" f % {pilot_every} == 0. */",
         f"static const uint16_t evlcp_info[{packets}][{frames}][{clusters}] = {{",
     ]
     for packet in info:
@@ -124,7 +135,7 @@ def _c(symbols: "NDArray[np.int64]", book: "Codebook") -> str:
     return "\n".join([*lines, "};"])
 
 
-def _json(symbols: "NDArray[np.int64]", book: "Codebook") -> str:
+def _json(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
     import json
 
     from firmware_host.payload import word_table
@@ -134,6 +145,7 @@ def _json(symbols: "NDArray[np.int64]", book: "Codebook") -> str:
         {
             "profile": book.profile,
             "digest": book.digest,
+            "pilot_every": pilot_every,
             "symbols": symbols.tolist(),
             "pilot_words": [f"{w:04x}" for w in words[0, 0, :, 0]],
             "info_words": [[[f"{w:04x}" for w in frame] for frame in packet] for packet in words[..., 1]],
@@ -150,6 +162,7 @@ def check(
     random: RandomPackets = None,
     seed: Seed = 0,
     frames: Frames = 10,
+    pilot_every: PilotEvery = 1,
     profile: ProfileName = "wh4x2",
     chip_rate: Annotated[float, typer.Option(help="Chips per second.", min=1.0)] = 10_000.0,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
@@ -164,7 +177,7 @@ def check(
     from firmware_host.payload import symbol_chips
 
     book = _source.codebook(profile)
-    table = symbol_chips(_source.symbols(symbols, random, seed, frames, book), book)
+    table = symbol_chips(_source.symbols(symbols, random, seed, frames, pilot_every, book), book, pilot_every)
     rows = measure(table, chip_rate)
     if as_json:
         import json

@@ -159,7 +159,6 @@ def test_faults_are_one_line(evlcp: Evlcp, site: Path, tmp_path: Path) -> None:
         (("--beacon", two, "--id", "9"), 2, "no bar has transmitter_id 9, but 7, 8"),
         (("--text", "a", "--set", "air.frames_per_packet=2"), 2, "expected at least 18"),
         (("--text", "a", "-o", tmp_path), 3, "cannot be written"),
-        (("--text", "a", "--set", "air.pilot_every=2", "--port", "native:"), 2, "a pilot into every frame"),
     ):
         done = evlcp("tx", "message", *options)
         assert done.code == code, done.err

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.codebook import Codebook
+from evlcp_sdk.frames import packet_chips
 from firmware_host import build
 from firmware_host.board import Board, Settings, provision
 from firmware_host.emulators import start_qemu
@@ -91,6 +92,17 @@ def test_recorded_stream_is_the_air_vectors(cli, tmp_path: Path, book: Codebook)
     frames = tmp_path / "frames.npy"
     cli("tx", "frames", tmp_path / "symbols.json", "--chips", frames)
     assert (np.load(frames) == chips[:90]).all()
+
+
+def test_pilots_in_some_frames_only_in_qemu(tmp_path: Path, book: Codebook) -> None:
+    symbols = random_symbols(3, 20, book, np.random.default_rng(8))
+    leds = tmp_path / "leds.bin"
+    play(leds, Payload.of_symbols(symbols, book, 4), 3000)
+    chips = Recording.read(leds).played().chips()
+    expected = np.concatenate([packet_chips(packet, book, 4) for packet in symbols])
+    assert len(expected) == 3 * 426
+    assert len(chips) >= 3000
+    assert (chips == np.resize(expected, chips.shape)).all()
 
 
 def test_swap_in_qemu_is_hitless(tmp_path: Path, book: Codebook) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from evlcp_sdk.codebook import Codebook
 from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.frames import packet_chips
 from firmware_host import flicker
 from firmware_host.payload import (
     Payload,
@@ -98,6 +99,7 @@ def test_torn_cluster_is_told() -> None:
         ("[[[1]]]", "symbols[0][0]: found 1 elements, expected 16 symbols, one a cluster"),
         ('{"symbol": []}', "key symbols is missing"),
         ('{"profile": "wh8", "symbols": []}', "profile = 'wh8', expected 'wh4x2'"),
+        ('{"pilot_every": 4, "symbols": []}', "pilot_every = 4, expected 1; choose it with --pilot-every"),
         (json.dumps([[[0] * 15 + [64]]]), "symbols[0][0][15] = 64, expected an integer 0 to 63"),
         (json.dumps([[[0] * 15 + [True]]]), "symbols[0][0][15] = true, expected an integer"),
         (json.dumps([[[0] * 15 + [1.5]]]), "symbols[0][0][15] = 1.5, expected an integer"),
@@ -181,3 +183,21 @@ def test_a_flickering_payload_ends_with_one(cli, tmp_path: Path) -> None:
     done = cli("tx", "check", "--random", 10, "--chip-rate", 300)
     assert done.returncode == 1
     assert "FLICKERS" in done.stdout
+
+
+def test_pilots_in_some_frames_only(cli, tmp_path: Path, book: Codebook) -> None:
+    file = tmp_path / "chips.npy"
+    options = ("tx", "frames", "--random", 2, "--seed", 3, "--frames", 6, "--pilot-every", 4)
+    symbols = random_symbols(2, 6, book, np.random.default_rng(3))
+    assert cli(*options, "--chips", file).returncode == 0
+    expected = np.concatenate([packet_chips(packet, book, 4) for packet in symbols])
+    assert np.load(file).tolist() == expected.tolist()
+    masks = read_masks(file, 6, book, 4)
+    assert masks.packets == 2
+    assert masks.pilot_every == 4
+    rows = [line.split() for line in cli(*options, "--format", "table").stdout.splitlines()[1:]]
+    assert {row[1] for row in rows if row[4] == "-"} == {"1", "2", "3", "5"}
+    words = cli(*options, "--format", "hex").stdout.splitlines()
+    assert [len(line.split()[0]) for line in words] == [8, 4, 4, 4, 8, 4] * 2
+    assert json.loads(cli(*options, "--format", "json").stdout)["pilot_every"] == 4
+    assert cli("tx", "check", "--random", 20, "--frames", 20, "--pilot-every", 4).returncode == 0

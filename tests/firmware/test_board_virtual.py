@@ -16,6 +16,7 @@ from board_lines import (
 
 from evlcp_sdk.codebook import Codebook, hadamard
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.frames import packet_chips
 from firmware_host.board import Board, Settings, profile_number, provision
 from firmware_host.client import Timing
 from firmware_host.errors import (
@@ -84,6 +85,41 @@ def test_plays_what_tx_frames_says(profile: str, device: SimulatedBoard, board: 
     assert (played.chips() == table).all()
     assert (np.diff(played.ticks) == device.TICK_HZ // 10_000).all()
     assert (played.numbers == np.arange(len(played))).all()
+
+
+@pytest.mark.parametrize(("frames", "every"), [(10, 4), (20, 4), (7, 2), (3, 64)])
+def test_plays_pilots_in_some_frames_only(
+    frames: int, every: int, device: SimulatedBoard, board: Board, book: Codebook
+) -> None:
+    symbols = random_symbols(3, frames, book, np.random.default_rng(frames))
+    provision(board, Payload.of_symbols(symbols, book, every), Settings())
+    assert board.holds(Payload.of_symbols(symbols, book, every), 10_000, board.status())
+    assert not board.holds(Payload.of_symbols(symbols, book), 10_000, board.status())
+    device.run(400_000)
+    chips = device.records().played().chips()
+    expected = np.concatenate([packet_chips(packet, book, every) for packet in symbols])
+    assert len(chips) > 2 * len(expected)
+    assert (chips == np.resize(expected, chips.shape)).all()
+
+
+def test_from_one_pilot_rate_to_another_without_a_torn_packet(
+    device: SimulatedBoard, board: Board, book: Codebook
+) -> None:
+    symbols = random_symbols(2, 10, book, np.random.default_rng(0))
+    full, sparse = (np.concatenate([packet_chips(p, book, n) for p in symbols]) for n in (1, 4))
+    provision(board, Payload.of_symbols(symbols, book), Settings())
+    device.run(100_000)
+    provision(board, Payload.of_symbols(symbols, book, 4), Settings())
+    device.run(100_000)
+    chips = device.records().played().chips()
+    half = len(full) // 2
+    changes = [
+        n
+        for n in range(half, len(chips), half)
+        if (chips[:n] == np.resize(full, (n, 16))).all()
+        and (chips[n:] == np.resize(sparse, (len(chips) - n, 16))).all()
+    ]
+    assert len(changes) == 1
 
 
 def test_masks_play_as_they_are(device: SimulatedBoard, board: Board, book: Codebook) -> None:
@@ -169,7 +205,7 @@ def test_wrong_crc_or_codebook_never_plays(device: SimulatedBoard, board: Board,
     pilots = tuple(range(16))
     with pytest.raises(IncompatibleError, match="built with another codebook"):
         board.link.call(CodebookRequest(26, 0, pilots, digest), CodebookReply)
-    board.link.call(ConfigureRequest(10_000, Profile.WH8, 10), ConfigureReply)
+    board.link.call(ConfigureRequest(10_000, Profile.WH8, 10, 1), ConfigureReply)
     with pytest.raises(IncompatibleError):
         board.link.call(CommitRequest(1, 0, 2, length, payload.crc, digest), CommitReply)
     device.run(500_000)

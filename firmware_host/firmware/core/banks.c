@@ -21,6 +21,7 @@ void evlcp_setup_init(struct evlcp_setup *setup, uint32_t tick_hz)
     setup->preamble_chips = EVLCP_PREAMBLE_CHIPS;
     setup->preamble = evlcp_preamble;
     setup->frames = 10u;
+    setup->pilot_every = 1u;
     setup->chip_rate_hz = 10000u;
     setup->ticks_per_chip = tick_hz / setup->chip_rate_hz;
     for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
@@ -61,7 +62,8 @@ static bool already(const struct evlcp_plan *plan, const struct evlcp_setup *set
     return plan->valid && plan->format == request->format && plan->packets == request->packets &&
            plan->length == request->length && plan->crc == request->crc &&
            equal(plan->digest, request->digest, 32u) && equal(setup->digest, request->digest, 32u) &&
-           plan->frames == setup->frames && plan->ticks_per_chip == setup->ticks_per_chip;
+           plan->frames == setup->frames && plan->pilot_every == setup->pilot_every &&
+           plan->ticks_per_chip == setup->ticks_per_chip;
 }
 
 enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlcp_setup *setup,
@@ -75,9 +77,10 @@ enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlc
     if (evlcp_banks_held(banks, request->bank))
         return already(plan, setup, request) ? EVLCP_STATUS_OK : EVLCP_STATUS_BUSY;
     plan->valid = false;
-    if (request->format > EVLCP_FORMAT_MASKS || request->packets == 0u || setup->frames == 0u)
+    if (request->format > EVLCP_FORMAT_MASKS || request->packets == 0u || setup->frames == 0u ||
+        setup->pilot_every == 0u)
         return EVLCP_STATUS_OUT_OF_RANGE;
-    uint32_t chips = evlcp_packet_chips(setup->preamble_chips, setup->frames);
+    uint32_t chips = evlcp_packet_chips(setup->preamble_chips, setup->frames, setup->pilot_every);
     uint32_t packet_bytes = request->format == EVLCP_FORMAT_WORDS ? setup->frames * EVLCP_FRAME_BYTES
                                                                   : chips * EVLCP_ROW_BYTES;
     if (packet_bytes > EVLCP_BANK_BYTES || request->packets > EVLCP_BANK_BYTES / packet_bytes) {
@@ -100,6 +103,7 @@ enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlc
     plan->preamble_chips = setup->preamble_chips;
     plan->preamble = setup->preamble;
     plan->frames = setup->frames;
+    plan->pilot_every = setup->pilot_every;
     plan->packets = request->packets;
     plan->length = request->length;
     plan->crc = crc;

@@ -17,6 +17,7 @@
 struct evlcp_setup {
     uint8_t profile;
     uint8_t preamble_chips;
+    uint8_t pilot_every;
     uint16_t frames;
     uint32_t preamble;
     uint32_t chip_rate_hz;

@@ -3,9 +3,10 @@
 _Static_assert(EVLCP_BOARD_CLUSTERS == 16u && EVLCP_LEDS == 96u && EVLCP_ROW_BYTES == 12u,
                "the row tables are made for 16 clusters of 6 LEDs");
 
-uint32_t evlcp_packet_chips(uint8_t preamble_chips, uint16_t frames)
+uint32_t evlcp_packet_chips(uint8_t preamble_chips, uint16_t frames, uint8_t pilot_every)
 {
-    return preamble_chips + (uint32_t)frames * EVLCP_FRAME_CHIPS;
+    uint32_t pilots = ((uint32_t)frames + pilot_every - 1u) / pilot_every;
+    return preamble_chips + (uint32_t)frames * (EVLCP_FRAME_CHIPS - EVLCP_PILOT_CHIPS) + pilots * EVLCP_PILOT_CHIPS;
 }
 
 void evlcp_cursor_seek(struct evlcp_cursor *cursor, const struct evlcp_plan *plan, const uint8_t *content,
@@ -16,6 +17,7 @@ void evlcp_cursor_seek(struct evlcp_cursor *cursor, const struct evlcp_plan *pla
     cursor->packet = packet;
     cursor->chip = 0u;
     cursor->in_frame = 0u;
+    cursor->to_pilot = 0u;
     if (plan->format == EVLCP_FORMAT_WORDS)
         cursor->at = content + packet * plan->frames * EVLCP_FRAME_BYTES;
     else
@@ -39,12 +41,12 @@ void evlcp_row_of_mask(uint16_t mask, uint8_t row[EVLCP_ROW_BYTES])
 static uint16_t frame_mask(const struct evlcp_cursor *c)
 {
     uint32_t mask = 0u;
-    if (c->in_frame < 16u) {
-        uint32_t shift = 15u - c->in_frame;
+    if (c->in_frame < EVLCP_PILOT_CHIPS) {
+        uint32_t shift = EVLCP_PILOT_CHIPS - 1u - c->in_frame;
         for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
             mask = mask << 1 | ((uint32_t)c->plan->pilots[k] >> shift & 1u);
     } else {
-        uint32_t shift = 31u - c->in_frame;
+        uint32_t shift = EVLCP_FRAME_CHIPS - 1u - c->in_frame;
         for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
             mask = mask << 1 | ((uint32_t)evlcp_get16(c->at + 2u * k) >> shift & 1u);
     }
@@ -63,8 +65,9 @@ bool evlcp_cursor_row(struct evlcp_cursor *cursor, uint8_t row[EVLCP_ROW_BYTES])
     } else {
         evlcp_row_of_mask(frame_mask(cursor), row);
         if (++cursor->in_frame == EVLCP_FRAME_CHIPS) {
-            cursor->in_frame = 0u;
             cursor->at += EVLCP_FRAME_BYTES;
+            cursor->to_pilot = (uint8_t)((cursor->to_pilot == 0u ? plan->pilot_every : cursor->to_pilot) - 1u);
+            cursor->in_frame = cursor->to_pilot == 0u ? 0u : EVLCP_PILOT_CHIPS;
         }
     }
     return ++cursor->chip == plan->packet_chips;

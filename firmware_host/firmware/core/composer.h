@@ -8,6 +8,7 @@
 #include "protocol.h"
 
 #define EVLCP_FRAME_CHIPS 32u
+#define EVLCP_PILOT_CHIPS 16u
 #define EVLCP_FRAME_BYTES (2u * EVLCP_BOARD_CLUSTERS)
 
 /* How a bank's content is played; fixed from COMMIT on. */
@@ -16,6 +17,7 @@ struct evlcp_plan {
     uint8_t format;
     uint8_t profile;
     uint8_t preamble_chips;
+    uint8_t pilot_every;
     uint16_t frames;
     uint16_t packets;
     uint32_t preamble;
@@ -35,11 +37,12 @@ struct evlcp_cursor {
     uint32_t packet;
     uint32_t chip;      /* of the packet */
     const uint8_t *at;  /* words of the frame, or row of the chip */
-    uint32_t in_frame;  /* chip of the frame */
+    uint32_t in_frame;  /* chip of the frame; without a pilot it begins at EVLCP_PILOT_CHIPS */
+    uint8_t to_pilot;   /* frames until the next one with a pilot */
 };
 
-/* Chips of a packet. */
-uint32_t evlcp_packet_chips(uint8_t preamble_chips, uint16_t frames);
+/* Chips of a packet whose frames 0, pilot_every, ... have a pilot. */
+uint32_t evlcp_packet_chips(uint8_t preamble_chips, uint16_t frames, uint8_t pilot_every);
 
 /* Go to the first chip of a packet. */
 void evlcp_cursor_seek(struct evlcp_cursor *cursor, const struct evlcp_plan *plan, const uint8_t *content,

@@ -118,6 +118,10 @@ static enum evlcp_status on_configure(struct evlcp *e, struct exchange *x)
         x->detail = most;
         return EVLCP_STATUS_OUT_OF_RANGE;
     }
+    if (request.pilot_every == 0u) {
+        x->detail = 1u;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
     if (request.profile > EVLCP_PROFILE_RAW8 && request.profile != EVLCP_PROFILE_CUSTOM) {
         x->detail = EVLCP_PROFILE_CUSTOM;
         return EVLCP_STATUS_OUT_OF_RANGE;
@@ -126,9 +130,10 @@ static enum evlcp_status on_configure(struct evlcp *e, struct exchange *x)
     e->setup.ticks_per_chip = e->info.tick_hz / request.chip_rate_hz;
     e->setup.profile = request.profile;
     e->setup.frames = request.frames;
+    e->setup.pilot_every = request.pilot_every;
     const struct evlcp_configure_reply reply = {
         .ticks_per_chip = e->setup.ticks_per_chip,
-        .packet_chips = evlcp_packet_chips(e->setup.preamble_chips, request.frames)};
+        .packet_chips = evlcp_packet_chips(e->setup.preamble_chips, request.frames, request.pilot_every)};
     evlcp_configure_reply_put(x->out, &reply);
     x->out_length = EVLCP_CONFIGURE_REPLY_BYTES;
     return EVLCP_STATUS_OK;
@@ -297,11 +302,13 @@ static enum evlcp_status on_status(struct evlcp *e, struct exchange *x)
     reply.chip_rate_hz = e->setup.chip_rate_hz;
     reply.profile = e->setup.profile;
     reply.frames = e->setup.frames;
+    reply.pilot_every = e->setup.pilot_every;
     if (reply.active_bank != EVLCP_NO_BANK) {
         const struct evlcp_plan *plan = &e->banks.plan[reply.active_bank];
         reply.format = plan->format;
         reply.profile = plan->profile;
         reply.frames = plan->frames;
+        reply.pilot_every = plan->pilot_every;
         reply.packets = plan->packets;
         reply.length = plan->length;
         reply.crc = plan->crc;

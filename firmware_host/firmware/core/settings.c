@@ -2,7 +2,7 @@
 #include "crc32.h"
 #include "evlcp.h"
 
-#define MAGIC 0x45564c31u
+#define MAGIC 0x45564c32u
 #define CHUNK 256u
 
 /* A slot's header as it stands in the flash. */
@@ -28,6 +28,7 @@ static void put_header(const struct slot *s, uint8_t b[EVLCP_SLOT_HEADER_BYTES])
     b[16] = s->plan.format;
     b[17] = s->plan.profile;
     b[18] = s->plan.preamble_chips;
+    b[19] = s->plan.pilot_every;
     evlcp_put16(b + 20, s->plan.frames);
     evlcp_put16(b + 22, s->plan.packets);
     evlcp_put32(b + 24, s->plan.preamble);
@@ -56,6 +57,7 @@ static bool get_header(struct evlcp *e, uint8_t index, struct slot *s)
     s->plan.format = b[16];
     s->plan.profile = b[17];
     s->plan.preamble_chips = b[18];
+    s->plan.pilot_every = b[19];
     s->plan.frames = evlcp_get16(b + 20);
     s->plan.packets = evlcp_get16(b + 22);
     s->plan.preamble = evlcp_get32(b + 24);
@@ -134,6 +136,7 @@ static enum evlcp_status load(struct evlcp *e, uint8_t index, const struct slot 
     uint32_t detail = 0u;
     struct evlcp_setup setup = {.profile = s->plan.profile,
                                 .preamble_chips = s->plan.preamble_chips,
+                                .pilot_every = s->plan.pilot_every,
                                 .frames = s->plan.frames,
                                 .preamble = s->plan.preamble,
                                 .chip_rate_hz = s->plan.chip_rate_hz,

@@ -12,7 +12,7 @@
 #define EVLCP_BOARD_CLUSTERS 16u
 #define EVLCP_LEDS 96u
 #define EVLCP_ROW_BYTES 12u
-#define EVLCP_SCHEMA {0x54, 0xfb, 0x07, 0xbc, 0x00, 0x86, 0x12, 0xff}
+#define EVLCP_SCHEMA {0x85, 0x50, 0x7b, 0x45, 0x42, 0x5b, 0x84, 0x7c}
 #define EVLCP_REPLY_BIT 0x80u /* Set in the type of a reply. */
 #define EVLCP_NO_BANK 0xffu /* No bank. */
 #define EVLCP_NO_SESSION 0x0u /* Session of a HELLO request, and of a board that knows no host. */
@@ -230,12 +230,13 @@ static inline void evlcp_hello_reply_get(const uint8_t *p, struct evlcp_hello_re
     evlcp_copy(m->hal, p + 54, 12u);
 }
 
-#define EVLCP_CONFIGURE_REQUEST_BYTES 7u
+#define EVLCP_CONFIGURE_REQUEST_BYTES 8u
 /* Set what the next COMMIT plays with; playing goes on as it was. */
 struct evlcp_configure_request {
     uint32_t chip_rate_hz; /* Chips per second; must divide the tick rate; not changed while playing. */
     uint8_t profile; /* Info-segment profile. */
     uint16_t frames; /* Frames per packet. */
+    uint8_t pilot_every; /* Frames from one pilot to the next; 1: every frame has one. */
 };
 
 static inline void evlcp_configure_request_put(uint8_t *p, const struct evlcp_configure_request *m)
@@ -243,6 +244,7 @@ static inline void evlcp_configure_request_put(uint8_t *p, const struct evlcp_co
     evlcp_put32(p + 0, m->chip_rate_hz);
     evlcp_put8(p + 4, m->profile);
     evlcp_put16(p + 5, m->frames);
+    evlcp_put8(p + 7, m->pilot_every);
 }
 
 static inline void evlcp_configure_request_get(const uint8_t *p, struct evlcp_configure_request *m)
@@ -250,6 +252,7 @@ static inline void evlcp_configure_request_get(const uint8_t *p, struct evlcp_co
     m->chip_rate_hz = evlcp_get32(p + 0);
     m->profile = evlcp_get8(p + 4);
     m->frames = evlcp_get16(p + 5);
+    m->pilot_every = evlcp_get8(p + 7);
 }
 
 #define EVLCP_CONFIGURE_REPLY_BYTES 8u
@@ -499,7 +502,7 @@ static inline void evlcp_level_request_get(const uint8_t *p, struct evlcp_level_
 
 #define EVLCP_STATUS_REQUEST_BYTES 0u
 
-#define EVLCP_STATUS_REPLY_BYTES 119u
+#define EVLCP_STATUS_REPLY_BYTES 120u
 /* Answer to status. */
 struct evlcp_status_reply {
     uint8_t state; /* State. */
@@ -509,6 +512,7 @@ struct evlcp_status_reply {
     uint8_t format; /* Format of the active bank. */
     uint8_t profile; /* Profile of the active bank. */
     uint16_t frames; /* Frames per packet of the active bank. */
+    uint8_t pilot_every; /* Frames from one of its pilots to the next. */
     uint16_t packets; /* Packets in the active bank. */
     uint32_t length; /* Bytes in the active bank. */
     uint32_t crc; /* CRC-32 of the active bank. */
@@ -541,27 +545,28 @@ static inline void evlcp_status_reply_put(uint8_t *p, const struct evlcp_status_
     evlcp_put8(p + 4, m->format);
     evlcp_put8(p + 5, m->profile);
     evlcp_put16(p + 6, m->frames);
-    evlcp_put16(p + 8, m->packets);
-    evlcp_put32(p + 10, m->length);
-    evlcp_put32(p + 14, m->crc);
-    evlcp_put32(p + 18, m->chip_rate_hz);
-    evlcp_put32(p + 22, m->commits);
-    evlcp_put32(p + 26, m->packets_sent);
-    evlcp_put32(p + 30, m->chips_sent);
-    evlcp_put32(p + 34, m->lateness_ticks);
-    evlcp_put32(p + 38, m->lateness_max_ticks);
-    evlcp_put32(p + 42, m->crc_errors);
-    evlcp_put32(p + 46, m->framing_errors);
-    evlcp_put32(p + 50, m->overflow_errors);
-    evlcp_put32(p + 54, m->requests);
-    evlcp_put16(p + 58, m->level_ma);
-    evlcp_put16(p + 60, (uint16_t)m->temperature_dc);
-    evlcp_copy(p + 62, m->open_leds, 12u);
-    evlcp_put8(p + 74, m->watchdog);
-    evlcp_put32(p + 75, m->watchdog_ms);
-    evlcp_put32(p + 79, m->silence_ms);
-    evlcp_put32(p + 83, m->uptime_ms);
-    evlcp_copy(p + 87, m->digest, 32u);
+    evlcp_put8(p + 8, m->pilot_every);
+    evlcp_put16(p + 9, m->packets);
+    evlcp_put32(p + 11, m->length);
+    evlcp_put32(p + 15, m->crc);
+    evlcp_put32(p + 19, m->chip_rate_hz);
+    evlcp_put32(p + 23, m->commits);
+    evlcp_put32(p + 27, m->packets_sent);
+    evlcp_put32(p + 31, m->chips_sent);
+    evlcp_put32(p + 35, m->lateness_ticks);
+    evlcp_put32(p + 39, m->lateness_max_ticks);
+    evlcp_put32(p + 43, m->crc_errors);
+    evlcp_put32(p + 47, m->framing_errors);
+    evlcp_put32(p + 51, m->overflow_errors);
+    evlcp_put32(p + 55, m->requests);
+    evlcp_put16(p + 59, m->level_ma);
+    evlcp_put16(p + 61, (uint16_t)m->temperature_dc);
+    evlcp_copy(p + 63, m->open_leds, 12u);
+    evlcp_put8(p + 75, m->watchdog);
+    evlcp_put32(p + 76, m->watchdog_ms);
+    evlcp_put32(p + 80, m->silence_ms);
+    evlcp_put32(p + 84, m->uptime_ms);
+    evlcp_copy(p + 88, m->digest, 32u);
 }
 
 static inline void evlcp_status_reply_get(const uint8_t *p, struct evlcp_status_reply *m)
@@ -573,27 +578,28 @@ static inline void evlcp_status_reply_get(const uint8_t *p, struct evlcp_status_
     m->format = evlcp_get8(p + 4);
     m->profile = evlcp_get8(p + 5);
     m->frames = evlcp_get16(p + 6);
-    m->packets = evlcp_get16(p + 8);
-    m->length = evlcp_get32(p + 10);
-    m->crc = evlcp_get32(p + 14);
-    m->chip_rate_hz = evlcp_get32(p + 18);
-    m->commits = evlcp_get32(p + 22);
-    m->packets_sent = evlcp_get32(p + 26);
-    m->chips_sent = evlcp_get32(p + 30);
-    m->lateness_ticks = evlcp_get32(p + 34);
-    m->lateness_max_ticks = evlcp_get32(p + 38);
-    m->crc_errors = evlcp_get32(p + 42);
-    m->framing_errors = evlcp_get32(p + 46);
-    m->overflow_errors = evlcp_get32(p + 50);
-    m->requests = evlcp_get32(p + 54);
-    m->level_ma = evlcp_get16(p + 58);
-    m->temperature_dc = (int16_t)evlcp_get16(p + 60);
-    evlcp_copy(m->open_leds, p + 62, 12u);
-    m->watchdog = evlcp_get8(p + 74);
-    m->watchdog_ms = evlcp_get32(p + 75);
-    m->silence_ms = evlcp_get32(p + 79);
-    m->uptime_ms = evlcp_get32(p + 83);
-    evlcp_copy(m->digest, p + 87, 32u);
+    m->pilot_every = evlcp_get8(p + 8);
+    m->packets = evlcp_get16(p + 9);
+    m->length = evlcp_get32(p + 11);
+    m->crc = evlcp_get32(p + 15);
+    m->chip_rate_hz = evlcp_get32(p + 19);
+    m->commits = evlcp_get32(p + 23);
+    m->packets_sent = evlcp_get32(p + 27);
+    m->chips_sent = evlcp_get32(p + 31);
+    m->lateness_ticks = evlcp_get32(p + 35);
+    m->lateness_max_ticks = evlcp_get32(p + 39);
+    m->crc_errors = evlcp_get32(p + 43);
+    m->framing_errors = evlcp_get32(p + 47);
+    m->overflow_errors = evlcp_get32(p + 51);
+    m->requests = evlcp_get32(p + 55);
+    m->level_ma = evlcp_get16(p + 59);
+    m->temperature_dc = (int16_t)evlcp_get16(p + 61);
+    evlcp_copy(m->open_leds, p + 63, 12u);
+    m->watchdog = evlcp_get8(p + 75);
+    m->watchdog_ms = evlcp_get32(p + 76);
+    m->silence_ms = evlcp_get32(p + 80);
+    m->uptime_ms = evlcp_get32(p + 84);
+    evlcp_copy(m->digest, p + 88, 32u);
 }
 
 #define EVLCP_WATCHDOG_REQUEST_BYTES 5u

@@ -415,7 +415,7 @@ static void test_foreign_codebook_never_plays(void)
 
     /* A codebook of one's own, under its own profile, plays its own preamble and pilots. */
     uint8_t configure[EVLCP_CONFIGURE_REQUEST_BYTES];
-    const struct evlcp_configure_request own = {.chip_rate_hz = 10000, .profile = EVLCP_PROFILE_CUSTOM, .frames = 10};
+    const struct evlcp_configure_request own = {.chip_rate_hz = 10000, .profile = EVLCP_PROFILE_CUSTOM, .frames = 10, .pilot_every = 1};
     evlcp_configure_request_put(configure, &own);
     EXPECT(ask(&h, EVLCP_TYPE_CONFIGURE, configure, sizeof configure) == EVLCP_STATUS_OK);
     book.preamble_chips = 2u;
@@ -436,7 +436,7 @@ static void test_configure_limits(void)
     struct host h;
     struct native *board = fresh(&h);
     uint8_t payload[EVLCP_CONFIGURE_REQUEST_BYTES];
-    struct evlcp_configure_request r = {.chip_rate_hz = 3000, .profile = 0, .frames = 10};
+    struct evlcp_configure_request r = {.chip_rate_hz = 3000, .profile = 0, .frames = 10, .pilot_every = 1};
     evlcp_configure_request_put(payload, &r); /* 3 kHz does not divide the ticks */
     EXPECT(ask(&h, EVLCP_TYPE_CONFIGURE, payload, sizeof payload) == EVLCP_STATUS_OUT_OF_RANGE);
     r.chip_rate_hz = 0;
@@ -454,6 +454,11 @@ static void test_configure_limits(void)
     evlcp_configure_request_put(payload, &r);
     EXPECT(ask(&h, EVLCP_TYPE_CONFIGURE, payload, sizeof payload) == EVLCP_STATUS_OUT_OF_RANGE);
     r.profile = EVLCP_PROFILE_WH4X2;
+    r.pilot_every = 0;
+    evlcp_configure_request_put(payload, &r);
+    EXPECT(ask(&h, EVLCP_TYPE_CONFIGURE, payload, sizeof payload) == EVLCP_STATUS_OUT_OF_RANGE);
+    EXPECT(evlcp_get32(h.payload) == 1u);
+    r.pilot_every = 1;
     evlcp_configure_request_put(payload, &r);
     EXPECT(ask(&h, EVLCP_TYPE_CONFIGURE, payload, sizeof payload) == EVLCP_STATUS_OK);
     EXPECT(evlcp_get32(h.payload) == NATIVE_TICK_HZ / 20000u && evlcp_get32(h.payload + 4) == 346u);
@@ -653,6 +658,62 @@ static void test_masks(void)
     EXPECT(same == 700u);
 }
 
+/* The row of a chip of a frame: pilots for its first 16 chips, info words after. */
+static void expected_row(const uint8_t *words, uint32_t chip, uint8_t row[EVLCP_ROW_BYTES])
+{
+    uint32_t mask = 0u;
+    for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++) {
+        uint32_t word = chip < 16u ? evlcp_pilots[k] : evlcp_get16(words + 2u * k);
+        mask = mask << 1 | (word >> (15u - chip % 16u) & 1u);
+    }
+    evlcp_row_of_mask((uint16_t)mask, row);
+}
+
+/* Frames 0, N, ... of every packet have a pilot, the others are their info words alone. */
+static void test_sparse_pilots(void)
+{
+    static const uint8_t every[] = {1u, 2u, 4u, 7u, 255u};
+    const uint32_t frames = 7u;
+    for (uint32_t n = 0; n < sizeof every; n++) {
+        struct host h;
+        struct native *board = fresh(&h);
+        uint8_t payload[EVLCP_CONFIGURE_REQUEST_BYTES];
+        const struct evlcp_configure_request r = {
+            .chip_rate_hz = 10000, .profile = 0, .frames = (uint16_t)frames, .pilot_every = every[n]};
+        evlcp_configure_request_put(payload, &r);
+        EXPECT(ask(&h, EVLCP_TYPE_CONFIGURE, payload, sizeof payload) == EVLCP_STATUS_OK);
+        uint32_t chips = EVLCP_PREAMBLE_CHIPS;
+        for (uint32_t f = 0; f < frames; f++)
+            chips += f % every[n] == 0u ? 32u : 16u;
+        EXPECT(evlcp_get32(h.payload + 4) == chips);
+        uint32_t length = 2u * frames * 32u;
+        uint32_t crc = fill(&h, 0, length, 3);
+        EXPECT(commit(&h, 0, 2, length, crc) == EVLCP_STATUS_OK);
+        EXPECT(ask(&h, EVLCP_TYPE_START, NULL, 0) == EVLCP_STATUS_OK);
+        watch_leds(board);
+        run_chips(board, 2u * chips + 30u);
+        const uint8_t *content = board->core.banks.content[0];
+        uint32_t at = 0u;
+        uint32_t same = 0u;
+        for (uint32_t packet = 0; packet < 2u; packet++) {
+            at += EVLCP_PREAMBLE_CHIPS;
+            for (uint32_t f = 0; f < frames; f++) {
+                for (uint32_t chip = f % every[n] == 0u ? 0u : 16u; chip < 32u; chip++, at++) {
+                    uint8_t row[EVLCP_ROW_BYTES];
+                    expected_row(content + (packet * frames + f) * 32u, chip, row);
+                    same += memcmp(kept[at] + 8, row, EVLCP_ROW_BYTES) == 0;
+                }
+            }
+        }
+        EXPECT(at == 2u * chips && same == 2u * (chips - EVLCP_PREAMBLE_CHIPS));
+        /* Then the first packet begins anew, with its preamble. */
+        uint32_t preamble = 0u;
+        for (uint32_t chip = 0; chip < EVLCP_PREAMBLE_CHIPS; chip++)
+            preamble = preamble << 1 | (kept[at + chip][8] == 0xffu);
+        EXPECT(preamble == evlcp_preamble);
+    }
+}
+
 static uint32_t random_state = 0x2545f491u;
 
 static uint32_t next_random(void)
@@ -711,6 +772,7 @@ int main(int argc, char **argv)
     test_save_and_recall();
     test_led_test();
     test_masks();
+    test_sparse_pilots();
     test_random_strings();
     printf("%u passed, %u failed\n", passed, failed);
     return failed != 0u;
