@@ -77,6 +77,33 @@ def test_a_track_goes_straight_on_for_two_steps() -> None:
     assert alone.at(np.array([-5e3, 7e3]))[0] == pytest.approx([50, 50])
 
 
+@pytest.mark.parametrize("end", ["top", "bottom"])
+def test_an_end_that_is_dark_for_a_while_is_still_there(end: str) -> None:
+    bar = Bar(random_symbols(LINK, 2), start_us=0)
+    events = events_of(LINK, bar)
+    dark = (events.t_us >= 30_000) & (events.t_us < 33_000)
+    dark &= events.y < 309 if end == "top" else events.y >= 411
+    tracks = followed(events[~dark], 60_000)
+    (track,) = tracks[59_000]
+    for region in track.positions:
+        if region.t_us > 10_000:
+            assert region.y_px == pytest.approx(bar.y_px - 0.5, abs=1)
+            assert region.height_px == pytest.approx(128, abs=2)
+
+
+def test_pixels_awake_beyond_an_end_do_not_move_a_region() -> None:
+    bar = Bar(random_symbols(LINK, 2), start_us=0)
+    events = events_of(LINK, bar)
+    copies = events[(events.y == 290) & (events.x == 400) & (events.t_us >= 30_000)]
+    copies = copies[copies.t_us < 34_000]
+    stray = Events.of(copies.t_us, copies.x, copies.y - 8, copies.p)
+    tracks = followed(merged(events, stray), 60_000)
+    (track,) = tracks[59_000]
+    for region in track.positions:
+        if region.t_us > 10_000:
+            assert region.y_px == pytest.approx(bar.y_px - 0.5, abs=1)
+
+
 def test_two_bars_are_two_regions() -> None:
     one, two = Bar(random_symbols(LINK, 1)), Bar(random_symbols(LINK, 1), x_px=450, start_us=5300)
     tracks = followed(merged(events_of(LINK, one), events_of(LINK, two)), 30_000)
