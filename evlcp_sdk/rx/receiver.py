@@ -56,6 +56,25 @@ class _Pilot:
     presence: PresenceMap
 
 
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """A frame with the bar held still.
+
+    Attributes:
+        sums: Polarity sums of pilot and info segment, int16 (chips, height, width).
+        offset_px: The rest of the motion in them, float64 (2, chips), px.
+        presence: Where the clusters are.
+        centre_px: Column and row of the bar's centre at `middle_us`.
+        middle_us: Middle of the pilot, or of the info segment of a frame without one.
+    """
+
+    sums: NDArray[np.int16]
+    offset_px: NDArray[np.float64]
+    presence: PresenceMap
+    centre_px: tuple[float, float]
+    middle_us: float
+
+
 @dataclass
 class _Transmitter:
     """What the receiver knows of one region.
@@ -369,8 +388,7 @@ class Receiver:
         while (lock := transmitter.lock) is not None:
             start_us = self._frame_start_us(transmitter, transmitter.frame)
             last_delay = max(lock.delay_on_us, lock.delay_off_us, 0.0)
-            chips = len(self._chips_of(transmitter.frame))
-            end_us = start_us + chips * lock.chip_us + last_delay
+            end_us = start_us + self._chips_of(transmitter.frame) * lock.chip_us + last_delay
             if end_us > until_us:
                 break
             frame = self._decode_frame(transmitter, start_us, end_us)
@@ -385,25 +403,59 @@ class Receiver:
             packets += done
         return packets
 
-    def _chips_of(self, frame: int) -> range:
-        """The chips of a frame with a pilot that this frame has: all, or those of the info segment."""
+    def _chips_of(self, frame: int) -> int:
+        """Chips of a frame, with its pilot or without."""
         packet = self._packet
-        first = 0 if packet.has_pilot(frame % packet.frames) else packet.pilot_chips
-        return range(first, packet.frame_chips)
+        return packet.frame_chips if packet.has_pilot(frame % packet.frames) else packet.info_chips
 
     def _decode_frame(self, transmitter: _Transmitter, start_us: float, end_us: float) -> Frame | None:
         clock = [time.perf_counter()]
+        assert transmitter.number is not None
+        look = self._look(transmitter, start_us, end_us, clock)
+        if look is None:
+            return None
+        soft = self._decode(look.presence, look.sums)
+        self._tell("decoding", soft, _lap(clock))
+        number, index = divmod(transmitter.frame, self._packet.frames)
+        distance, points = _NO_RANGE, _NO_POINTS
+        if self._packet.has_pilot(index):
+            # Another distance of the same pilot, or other points, would say nothing new.
+            distance = self._measure(FrameView(look.sums, look.offset_px, look.presence, soft))
+            self._tell("ranging", distance, _lap(clock))
+            pilot_px = look.offset_px[:, : self._packet.pilot_chips]
+            points = self._find_points(look.presence, pilot_px, look.centre_px)
+        if transmitter.first is None:
+            transmitter.first = number
+        frame = Frame(
+            transmitter=transmitter.number,
+            packet=number - transmitter.first,
+            frame=index,
+            t_us=start_us,
+            soft=soft,
+            range=distance,
+            filtered=self._filter(transmitter, start_us, distance),
+            x_px=look.centre_px[0],
+            y_px=look.centre_px[1],
+            points_px=points[0],
+            points_sigma_px=points[1],
+            points_t_us=look.middle_us,
+        )
+        self._tell("frame", frame, clock[-1] - clock[0])
+        return frame
+
+    def _look(
+        self, transmitter: _Transmitter, start_us: float, end_us: float, clock: list[float]
+    ) -> _Look | None:
+        """The next frame with the bar held still, and where its clusters are; None if they cannot be told."""
         lock, track, packet = transmitter.lock, transmitter.track, self._packet
         assert lock is not None
-        assert transmitter.number is not None
-        number, index = divmod(transmitter.frame, packet.frames)
-        has_pilot = packet.has_pilot(index)
-        chips = len(self._chips_of(transmitter.frame))
+        index = transmitter.frame % packet.frames
+        chips = self._chips_of(transmitter.frame)
         middles = start_us + (np.arange(chips, dtype=np.float64) + 0.5) * lock.chip_us
         x, y = track.at(middles)
         middle = min(chips, packet.pilot_chips) // 2
         pilot = transmitter.pilot
-        if has_pilot:
+        if packet.has_pilot(index):
             width, height = track.size_at(middles[middle])
             margin = 2 * self._link.regions.margin_px
             size = (_even(width + margin), _even(height + margin))
@@ -413,7 +465,7 @@ class Receiver:
             size = pilot.size_px
         pieces = [e for t, e in track.blocks if t < end_us and t + self._step_us > start_us]
         sums, offset_px = polarity_sums(pieces, lock, start_us, (x, y), size)
-        if has_pilot:
+        if packet.has_pilot(index):
             heard, moved = sums[: packet.pilot_chips], offset_px[:, : packet.pilot_chips]
             presence = self._separate(heard)
             self._tell("separation", presence, _lap(clock))
@@ -428,33 +480,8 @@ class Receiver:
             presence = pilot.presence
             sums = np.concatenate([pilot.sums, sums])
             offset_px = np.concatenate([pilot.offset_px, offset_px], axis=1)
-        soft = self._decode(presence, sums)
-        self._tell("decoding", soft, _lap(clock))
-        distance, points = _NO_RANGE, _NO_POINTS
-        if has_pilot:
-            # Another distance of the same pilot, or other points, would say nothing new.
-            distance = self._measure(FrameView(sums, offset_px, presence, soft))
-            self._tell("ranging", distance, _lap(clock))
-            at_px = float(x[middle]), float(y[middle])
-            points = self._find_points(presence, offset_px[:, : packet.pilot_chips], at_px)
-        if transmitter.first is None:
-            transmitter.first = number
-        frame = Frame(
-            transmitter=transmitter.number,
-            packet=number - transmitter.first,
-            frame=index,
-            t_us=start_us,
-            soft=soft,
-            range=distance,
-            filtered=self._filter(transmitter, start_us, distance),
-            x_px=float(x[middle]),
-            y_px=float(y[middle]),
-            points_px=points[0],
-            points_sigma_px=points[1],
-            points_t_us=float(middles[middle]),
-        )
-        self._tell("frame", frame, clock[-1] - clock[0])
-        return frame
+        centre_px = float(x[middle]), float(y[middle])
+        return _Look(sums, offset_px, presence, centre_px, float(middles[middle]))
 
     def _filter(self, transmitter: _Transmitter, t_us: float, measured: Range) -> Range | None:
         """The distance filtered over time; the prediction where a frame allows none."""
