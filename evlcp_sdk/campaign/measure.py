@@ -8,9 +8,10 @@ import numpy as np
 
 from evlcp_sdk.campaign.statistics import Statistics, Tally, segment_of
 from evlcp_sdk.frames import PacketFormat
-from evlcp_sdk.types import Frame
+from evlcp_sdk.messages.coding import BlockCoder
+from evlcp_sdk.types import Frame, Packet
 
-__all__ = ["statistics_of"]
+__all__ = ["message_tallies", "statistics_of"]
 
 _MOST_LATE_US = 800.0
 _MOST_APART_PX = 60.0
@@ -18,13 +19,19 @@ _TAIL_US = 200.0
 _MIDDLE_OF_PILOT_US = 800.0
 
 
-def statistics_of(frames: Iterable[Frame], known: Mapping[str, Any], events: int) -> Statistics:
+def statistics_of(
+    frames: Iterable[Frame],
+    known: Mapping[str, Any],
+    events: int,
+    messages: Iterable[tuple[int, Tally]] = (),
+) -> Statistics:
     """Hold decoded frames against the truth, each beside the sent one that began nearest on the nearest bar.
 
     Args:
         frames: The decoded frames.
         known: The truth of the scene.
         events: Events that the sensor sent.
+        messages: What `message_tallies` gave, if the bars send messages.
     """
     duration_us = known["scene"]["duration_s"] * 1e6
     bars = [_Sent(known, i) for i, bar in enumerate(known["bars"]) if _sends_frames(bar)]
@@ -47,7 +54,69 @@ def statistics_of(frames: Iterable[Frame], known: Mapping[str, Any], events: int
         error_m = distance_m - true_m if np.isfinite(distance_m) else None
         bits = near.bits_per_symbol(frame) * len(sent)
         tallies.append((segment_of(true_m), Tally.found(bits, errors, error_m)))
+    tallies += messages
     return Statistics.of(1, events, round(duration_us), unmatched, tallies)
+
+
+def message_tallies(
+    packets: Iterable[Packet], known: Mapping[str, Any], coder: BlockCoder
+) -> list[tuple[int, Tally]]:
+    """Hold the blocks of packets against what was sent: one tally a packet, with the begin of its segment.
+
+    Args:
+        packets: The received packets.
+        known: The truth of the scene.
+        coder: How packets carry blocks.
+    """
+    bars = [_SentPackets(known, i) for i, bar in enumerate(known["bars"]) if bar.get("payload")]
+    tallies = [(segment_of(at), Tally(messages_sent=1)) for bar in bars for at in bar.whole_m()]
+    for packet in packets:
+        if packet.block is None or not packet.frames:
+            continue
+        t_us = packet.t_us - known["scene"]["t0_us"]
+        near = min(bars, key=lambda bar: bar.apart_px(t_us, packet.frames[0]), default=None)
+        number = None if near is None else near.number(t_us)
+        if near is None or number is None:
+            tallies.append((0, Tally(messages_wrong=1)))
+            continue
+        said = coder.symbols(packet.block.pack(coder.block_bytes)).tolist()
+        segment = segment_of(float(near.distance_m[number]))
+        if said != near.symbols[number]:
+            tallies.append((segment, Tally(messages_wrong=1)))
+        elif near.whole[number]:
+            tallies.append((segment, Tally(messages_found=1)))
+    return tallies
+
+
+class _SentPackets:
+    """The packets that a bar sent, at least in part, while the recording ran."""
+
+    def __init__(self, known: Mapping[str, Any], number: int) -> None:
+        bar = known["bars"][number]
+        rate_hz = bar.get("chip_rate_hz", 1e4) * (1 + bar["ppm"] * 1e-6)
+        period_us = bar["packet_chips"] / rate_hz * 1e6
+        self.symbols = bar["symbols"]
+        self._t_us = np.array(known["t_s"]) * 1e6
+        self._centre_px = np.array(known["bar_centre_px"][number])
+        self._start_us = np.arange(len(self.symbols)) * period_us - bar["start_chip"] / rate_hz * 1e6
+        end_us = known["scene"]["duration_s"] * 1e6
+        self.whole = (self._start_us >= 0) & (self._start_us + period_us + _TAIL_US < end_us)
+        depth_m = np.array(known["distance_m"][number])
+        self.distance_m = np.interp(self._start_us + period_us / 2, self._t_us, depth_m)
+
+    def whole_m(self) -> list[float]:
+        """Distance of each packet that was sent whole, m."""
+        return [float(at) for at in self.distance_m[self.whole]]
+
+    def apart_px(self, t_us: float, frame: Frame) -> float:
+        """How far the frame's bar lies from this one."""
+        x, y = (float(np.interp(t_us, self._t_us, c)) for c in self._centre_px)
+        return float(np.hypot(frame.x_px - x, frame.y_px - y))
+
+    def number(self, t_us: float) -> int | None:
+        """The packet that began at a time; None if there is none."""
+        nearest = int(np.argmin(np.abs(self._start_us - t_us)))
+        return nearest if abs(self._start_us[nearest] - t_us) <= _MOST_LATE_US else None
 
 
 def _sends_frames(bar: Mapping[str, Any]) -> bool:

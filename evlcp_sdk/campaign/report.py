@@ -191,6 +191,7 @@ def comparison_rows(comparisons: Iterable[Comparison]) -> list[tuple[str, ...]]:
 
 
 def _figures_table(summary: Summary) -> str:
+    messages = any(t.messages_sent for one in summary.series for _, t in one.statistics.segments)
     rows = []
     for one in summary.series:
         for begin, tally in one.statistics.segments:
@@ -204,9 +205,14 @@ def _figures_table(summary: Summary) -> str:
                     _shown(measure(tally, "rmse_m"), "{:.3f}"),
                     "-" if math.isnan(tally.bias_m) else f"{tally.bias_m:+.3f}",
                     _shown(measure(tally, "gross_share"), "{:.2%}"),
+                    *((f"{tally.messages_found} of {tally.messages_sent}",) if messages else ()),
+                    *((f"{tally.messages_wrong}",) if messages else ()),
                 )
             )
-    head = ("series", "distance", "frames", "bit errors", "BER", "RMSE, m", "bias, m", "0.5 m or more")
+    head = (
+        *("series", "distance", "frames", "bit errors", "BER", "RMSE, m", "bias, m", "0.5 m or more"),
+        *(("messages", "read wrong") if messages else ()),
+    )
     return f"<h2>All figures</h2>{table(head, rows)}"
 
 

@@ -49,6 +49,9 @@ class Tally:
         sum_um: Sum of their distance errors, um.
         squares_um2: Sum of the squares of these errors, um^2.
         gross: Errors of half a metre or more.
+        messages_sent: Packets with a message that were sent whole while the recording ran.
+        messages_found: Those of them whose message was read.
+        messages_wrong: Messages that were read and not sent so: undetected errors.
         histogram: (bin, count) in order of the bin; bin b holds errors from `b * BIN_M` up to the next, the
             outermost ones also everything beyond.
     """
@@ -61,6 +64,9 @@ class Tally:
     sum_um: int = 0
     squares_um2: int = 0
     gross: int = 0
+    messages_sent: int = 0
+    messages_found: int = 0
+    messages_wrong: int = 0
     histogram: tuple[tuple[int, int], ...] = ()
 
     @classmethod

@@ -38,7 +38,8 @@ def measure(tally: Tally, kind: str) -> Figure:
 
     Args:
         tally: What was counted.
-        kind: `ber`, `rmse_m`, `gross_share` or `found_share`.
+        kind: `ber`, `rmse_m`, `gross_share`, `found_share`, `lost_share` (messages that were not read) or
+            `wrong_share` (messages that were read wrong, of those that were read).
 
     >>> round(measure(Tally(bits=1000), "ber").high, 4)
     0.0037
@@ -49,6 +50,8 @@ def measure(tally: Tally, kind: str) -> Figure:
         "ber": (tally.bit_errors, tally.bits),
         "gross_share": (tally.gross, tally.ranged),
         "found_share": (tally.frames_found, tally.frames_sent),
+        "lost_share": (tally.messages_sent - tally.messages_found, tally.messages_sent),
+        "wrong_share": (tally.messages_wrong, tally.messages_found + tally.messages_wrong),
     }[kind]
     if not trials:
         return Figure(math.nan, math.nan, math.nan, 0)
@@ -178,11 +181,12 @@ class Summary:
 
 
 def _figures(tally: Tally) -> dict[str, Any]:
-    kinds = ("ber", "rmse_m", "gross_share", "found_share")
-    counts = {
-        name: getattr(tally, name)
-        for name in ("frames_sent", "frames_found", "bits", "bit_errors", "ranged", "gross")
-    }
+    kinds = ("ber", "rmse_m", "gross_share", "found_share", "lost_share", "wrong_share")
+    names = (
+        *("frames_sent", "frames_found", "bits", "bit_errors", "ranged", "gross"),
+        *("messages_sent", "messages_found", "messages_wrong"),
+    )
+    counts = {name: getattr(tally, name) for name in names}
     bias = {"bias_m": tally.bias_m}
     return _plain(counts | bias) | {kind: _plain(asdict(measure(tally, kind))) for kind in kinds}
 

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from evlcp_sdk.campaign.measure import statistics_of
+from evlcp_sdk.campaign.measure import message_tallies, statistics_of
 from evlcp_sdk.campaign.plan import Job, Plan, load_plan
 from evlcp_sdk.campaign.statistics import Statistics
 from evlcp_sdk.config import Link, installed_versions, load_link, resolve
@@ -17,7 +17,7 @@ from evlcp_sdk.hookspecs import ROLE_NAMES
 from evlcp_sdk.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene, load_scene, simulate, truth
-from evlcp_sdk.types import Frame
+from evlcp_sdk.types import Packet
 
 __all__ = ["environment_of", "plan_of", "run_job"]
 
@@ -103,25 +103,32 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
         )
     scene: Scene = job.scene
     known = truth(scene, job.seed)
-    receivers = []
+    links, receivers = [], []
     for task in job.tasks:
         table, digest = task.link
         link = resolve(table, registry)
         if link.digest != digest:
             raise ConfigError(f"link {digest[:12]} resolves to {link.digest[:12]} here")
         _check_shared(known, link)
+        links.append(link)
         receivers.append(Receiver(link))
-    frames: list[list[Frame]] = [[] for _ in receivers]
+    packets: list[list[Packet]] = [[] for _ in receivers]
     number = 0
     for events in simulate(scene, job.seed):
         number += len(events)
-        for receiver, found in zip(receivers, frames, strict=True):
-            found += [frame for packet in receiver.feed(events) for frame in packet.frames]
+        for receiver, found in zip(receivers, packets, strict=True):
+            found += receiver.feed(events)
     results = []
-    for task, receiver, found in zip(job.tasks, receivers, frames, strict=True):
-        found += [frame for packet in receiver.close() for frame in packet.frames]
-        results.append((task.id, statistics_of(found, known, number)))
+    for task, link, receiver, found in zip(job.tasks, links, receivers, packets, strict=True):
+        found += receiver.close()
+        frames = (frame for packet in found for frame in packet.frames)
+        messages = message_tallies(found, known, link.block_coder()) if _sends_messages(known) else []
+        results.append((task.id, statistics_of(frames, known, number, messages)))
     return results
+
+
+def _sends_messages(known: Mapping[str, Any]) -> bool:
+    return any(bar.get("payload") for bar in known["bars"])
 
 
 def _check_shared(known: Mapping[str, Any], link: Link) -> None:
@@ -137,4 +144,12 @@ def _check_shared(known: Mapping[str, Any], link: Link) -> None:
                 raise ConfigError(
                     f"the scene's bar has {key} = {sent!r}, but the link {setting} = {expected!r};"
                     f" set bars.{key} or {setting}"
+                )
+        if bar.get("payload"):
+            table = resolve({"error-correction": {"id": bar["error_correction"]}}).table["error-correction"]
+            if link.table["error-correction"] != table:
+                raise ConfigError(
+                    f"the scene's bar has error_correction = {bar['error_correction']!r} with its default"
+                    f" parameters, but the link [error-correction] {link.table['error-correction']};"
+                    " set bars.error_correction or error-correction.id"
                 )

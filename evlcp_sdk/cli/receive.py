@@ -3,7 +3,7 @@
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -78,7 +78,7 @@ def receive(
 
     Two at a time:       [bold]evlcp receive *.raw -o out --workers 2[/]
 
-    OUT gets frames.csv (a row a frame), packets.jsonl (a line a packet) and summary.json.
+    OUT gets frames.csv (a row a frame), packets.jsonl (a line a packet or message) and summary.json.
     An earlier result there is replaced when the new one is complete.
     """
     import json
@@ -263,6 +263,8 @@ def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
                 + _or_dash(t["distance_last_m"], "{:.2f} m"),
             )
         out.print(table)
+    if text := _messages(summary["counts"]):
+        out.print(text)
     if speed:
         out.print(
             f"{recording['counts']['events'] / 1e6:.2f} Mev of {recording['duration_s']:.3f} s"
@@ -275,6 +277,27 @@ def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
             style="yellow",
         )
     out.print(f"written: {escape(str(folder))}/frames.csv, packets.jsonl, summary.json", style="dim")
+
+
+def _messages(counts: Mapping[str, int]) -> str:
+    """What was read of messages, in one line; empty where there was nothing to read."""
+    if not counts.get("blocks_decoded", 0) + counts.get("blocks_combined", 0):
+        return ""
+    number = counts["messages"]
+    text = f"{number} message{'s' * (number != 1)}"
+    trusts = {t: counts[f"beacons_{t}"] for t in ("verified", "unverified", "forged")}
+    if any(trusts.values()):
+        text += f"; beacons told {', '.join(f'{n} times {t}' for t, n in trusts.items() if n)}"
+    for key, lost in (
+        ("blocks_failed", "packets not readable"),
+        ("blocks_other_codebook", "packets of another codebook"),
+        ("blocks_malformed", "packets with no block of this format"),
+        ("parts_missing", "parts missing"),
+        ("messages_undecodable", "messages without meaning"),
+    ):
+        if counts[key]:
+            text += f"; {counts[key]} {lost}"
+    return text
 
 
 def _or_dash(value: float | None, form: str) -> str:

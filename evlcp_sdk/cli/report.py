@@ -107,6 +107,7 @@ def _series_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
     def shown(value: float, low: float, high: float, form: str) -> str:
         return f"{value:{form}} [{low:{form}}, {high:{form}}]"
 
+    messages = any(t.messages_sent for one in summary.series for _, t in one.statistics.segments)
     rows = []
     for one in summary.series:
         for begin, tally in reversed(one.statistics.segments):
@@ -119,9 +120,12 @@ def _series_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
                     shown(ber.value, ber.low, ber.high, ".1e") if ber.count else "-",
                     shown(rmse.value, rmse.low, rmse.high, ".3f") if rmse.count else "-",
                     f"{gross.value:.2%}" if gross.count else "-",
+                    *([f"{tally.messages_found} of {tally.messages_sent}"] if messages else []),
+                    *([f"{tally.messages_wrong}"] if messages else []),
                 ]
             )
-    return ["series", "distance", "frames", "BER [95 %]", "RMSE, m [95 %]", "0.5 m or more"], rows
+    head = ["series", "distance", "frames", "BER [95 %]", "RMSE, m [95 %]", "0.5 m or more"]
+    return head + (["messages", "wrong"] if messages else []), rows
 
 
 def _paper_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:

@@ -9,14 +9,16 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.codebook import Codebook
-from evlcp_sdk.config import resolve
+from evlcp_sdk.config import Link, resolve
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.frames import PacketFormat, packet_chips
+from evlcp_sdk.frames import packet_chips
+from evlcp_sdk.messages.block import HEADER_BYTES, Kind, Message
+from evlcp_sdk.messages.sending import beacon_of_site, packets_of
 from evlcp_sdk.sim.motion import Strip
 from evlcp_sdk.sim.optics import led_light_w_m2
 from evlcp_sdk.sim.scene import BarSpec, LampSpec, Scene
-from evlcp_sdk.sim.world import bar_axis
+from evlcp_sdk.sim.world import bar_axis, sites_of
+from evlcp_sdk.sites import BarSite
 
 __all__ = ["BarLight", "LampLight", "Source", "sources_of"]
 
@@ -53,9 +55,15 @@ class Source(Protocol):
 
 
 @lru_cache(maxsize=16)
-def _codebook(profile: str, clusters: int) -> Codebook:
-    table = {"modulation": {"id": profile}, "bar": {"rows": clusters, "cluster_rows": 1}}
-    return resolve(table).codebook
+def _link(profile: str, clusters: int, frames: int, pilot_every: int, error_correction: str) -> Link:
+    return resolve(
+        {
+            "modulation": {"id": profile},
+            "bar": {"rows": clusters, "cluster_rows": 1},
+            "air": {"frames_per_packet": frames, "pilot_every": pilot_every},
+            "error-correction": {"id": error_correction},
+        }
+    )
 
 
 class BarLight:
@@ -66,13 +74,23 @@ class BarLight:
         light_w_m2: Irradiance of a pixel that it fills.
         seed: Of its payload and its start, where the bar has none of its own.
         source: What faults name.
+        transmitter_id: What its messages say who it is.
+        site: What its beacon says; None for none.
 
     Raises:
-        ConfigError: Its profile, symbols or chips cannot be sent.
+        ConfigError: Its profile, symbols, messages or chips cannot be sent.
         InputError: The file of chips cannot be read.
     """
 
-    def __init__(self, bar: BarSpec, light_w_m2: float, seed: int, source: str = "bars") -> None:
+    def __init__(
+        self,
+        bar: BarSpec,
+        light_w_m2: float,
+        seed: int,
+        source: str = "bars",
+        transmitter_id: int = 1,
+        site: BarSite | None = None,
+    ) -> None:
         self.bar = bar
         self.light_w_m2 = light_w_m2
         x, y, z = (bar.length_m * part for part in bar_axis(bar))
@@ -89,11 +107,16 @@ class BarLight:
             self.longest_us *= _longest_run(self._chips)
         else:
             try:
-                self._codebook = _codebook(bar.profile, bar.clusters)
+                link = _link(bar.profile, bar.clusters, bar.frames, bar.pilot_every, bar.error_correction)
+                self._codebook = link.codebook
+                self._transmitter_id = transmitter_id
+                if bar.payload != "symbols":
+                    self._coder = link.block_coder()
+                if bar.payload == "messages":
+                    self._cycle = self._messages(site)
             except ConfigError as refused:
                 raise ConfigError(f"{source}: {refused}") from refused
-            form = PacketFormat.of(self._codebook, bar.frames, pilot_every=bar.pilot_every)
-            self.packet_chips = form.packet_chips
+            self.packet_chips = link.packet.packet_chips
             if bar.symbols is not None:
                 self._check(bar, source)
         start = bar.start_chip
@@ -105,6 +128,10 @@ class BarLight:
 
     def _check(self, bar: BarSpec, source: str) -> None:
         assert bar.symbols is not None
+        if bar.payload != "symbols":
+            raise ConfigError(
+                f"{source}.payload = {bar.payload!r}: expected 'symbols' where symbols are given"
+            )
         for q, packet in enumerate(bar.symbols):
             if len(packet) != bar.frames:
                 raise ConfigError(f"{source}.symbols.{q}: {len(packet)} frames, expected {bar.frames}")
@@ -115,11 +142,30 @@ class BarLight:
         if not bar.symbols:
             raise ConfigError(f"{source}.symbols: expected at least one packet")
 
+    def _messages(self, site: BarSite | None) -> NDArray[np.int64]:
+        """Packets of its beacon and its text, one after another: int64 (packets, frames, clusters)."""
+        identity, found = self._transmitter_id, []
+        if site is not None:
+            found.append(Message(Kind.BEACON, identity, 0, beacon_of_site(site).pack()))
+        if self.bar.text is not None:
+            found.append(Message(Kind.TEXT, identity, 0, self.bar.text.encode()))
+        if not found:
+            raise ConfigError('payload = "messages": expected a text, or a [world] to tell a beacon of')
+        return packets_of(found, self._coder)
+
     def symbols(self, packet: int) -> NDArray[np.int64]:
         """Symbols of a packet, counted from the one that `start_chip` is in: int64 (frames, clusters)."""
         if self.bar.symbols is not None:
             return np.array(self.bar.symbols[packet % len(self.bar.symbols)], np.int64)
+        if self.bar.payload == "messages":
+            again: NDArray[np.int64] = self._cycle[packet % len(self._cycle)]
+            return again
         rng = np.random.default_rng([self.payload_seed, 2, packet])
+        if self.bar.payload == "data":
+            part = rng.bytes(self._coder.block_bytes - HEADER_BYTES)
+            message = Message(Kind.DATA, self._transmitter_id, packet, part)
+            one: NDArray[np.int64] = packets_of([message], self._coder)[0]
+            return one
         return rng.integers(0, len(self._codebook.codewords), (self.bar.frames, self.bar.clusters))
 
     def sent_symbols(self, duration_s: float) -> list[list[list[int]]]:
@@ -255,8 +301,16 @@ def sources_of(scene: Scene) -> tuple[list[BarLight], list[LampLight]]:
         ConfigError: A bar cannot send what it should.
         InputError: A file of chips cannot be read.
     """
+    sites = sites_of(scene) if scene.world is not None else (None,) * len(scene.bars)
     bars = [
-        BarLight(bar, led_light_w_m2(bar, scene.lens), scene.seed + i, f"bars.{i}")
-        for i, bar in enumerate(scene.bars)
+        BarLight(
+            bar,
+            led_light_w_m2(bar, scene.lens),
+            scene.seed + i,
+            f"bars.{i}",
+            i + 1 if bar.transmitter_id is None else bar.transmitter_id,
+            site,
+        )
+        for i, (bar, site) in enumerate(zip(scene.bars, sites, strict=True))
     ]
     return bars, [LampLight(lamp) for lamp in (*scene.lamps, *_random_lamps(scene))]

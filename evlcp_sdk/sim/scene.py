@@ -69,6 +69,17 @@ class BarSpec:
         int | None, Field(ge=0, lt=2**32, description="Its number as a site; none: 1 for the first bar.")
     ] = None
     seed: Annotated[int | None, Field(ge=0, description="Seed of its payload; none: the scene's.")] = None
+    payload: Annotated[
+        Literal["symbols", "data", "messages"],
+        Field(
+            description="Random symbols; a message of random data in each packet; or, again and again, its"
+            " beacon if there is a `[world]`, and its text."
+        ),
+    ] = "symbols"
+    text: Annotated[str | None, Field(description="Text among its messages.")] = None
+    error_correction: Annotated[
+        str, Field(description="Error correction of its messages, with its default parameters.")
+    ] = "polar"
     symbols: Annotated[
         tuple[tuple[tuple[int, ...], ...], ...] | None,
         Field(description="Symbols [packet][frame][cluster], sent again and again; none: random."),

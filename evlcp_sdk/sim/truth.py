@@ -30,7 +30,8 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
     """What `REC.truth.json` holds, as JSON values; with the counts when the simulation has run.
 
     `scene` holds its parameters; `bars` what each sent: symbols [packet][frame][cluster], the chip of the
-    first packet that was on air at the scene's begin, and `pilot_every` where not every frame has a pilot;
+    first packet that was on air at the scene's begin, and `pilot_every` where not every frame has a pilot,
+    `payload` and `error_correction` where it sends messages;
     `t_s`, `distance_m` and `bar_centre_px`, every millisecond, the depth along the optical axis and the place
     of each bar's centre; `camera_path`, every millisecond, the camera's place (x, y, z; m) and attitude (yaw,
     pitch, roll; degrees) in the scene and, with a `[world]`, on earth; `sites`, with a `[world]`, where the
@@ -63,6 +64,11 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
                 "symbols": light.sent_symbols(scene.duration_s),
                 "packet_chips": light.packet_chips,
                 **({"pilot_every": bar.pilot_every} if bar.pilot_every > 1 else {}),
+                **(
+                    {"payload": bar.payload, "error_correction": bar.error_correction}
+                    if bar.payload != "symbols"
+                    else {}
+                ),
             }
         )
     found: dict[str, Any] = {

@@ -1,0 +1,149 @@
+"""Bars that send messages: what the receiver reads is what they were told to say."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.campaign.measure import message_tallies
+from evlcp_sdk.campaign.statistics import Tally
+from evlcp_sdk.config import load_link
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.frames import bits_of_symbols
+from evlcp_sdk.messages.beacon import Beacon
+from evlcp_sdk.messages.block import Block, Kind
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.sim import load_scene, resolve_scene, simulate, sites_of, truth
+from evlcp_sdk.sim.light import sources_of
+from evlcp_sdk.types import Events, Packet
+
+WORLD = {"latitude_deg": 35.1, "longitude_deg": 136.9, "height_m": 50.0, "heading_deg": 20.0}
+
+
+def blocks_of(symbols: Any, **settings: Any) -> list[Block]:
+    link = load_link(overrides=[f"{k.replace('__', '.')}={v}" for k, v in settings.items()])
+    coder, found = link.block_coder(), []
+    for packet in symbols:
+        llr = 4 - 8.0 * bits_of_symbols(packet, link.codebook.bits_per_symbol)
+        content = coder.block(llr.astype(np.float32))
+        assert content is not None
+        found.append(Block.unpack(content))
+    return found
+
+
+def test_random_data_is_a_message_a_packet() -> None:
+    scene = resolve_scene({"bars": [{"payload": "data"}, {"payload": "data", "transmitter_id": 9}]})
+    for light, transmitter_id in zip(sources_of(scene)[0], (1, 9), strict=True):
+        blocks = blocks_of([light.symbols(q) for q in range(3)])
+        assert [(b.kind, b.transmitter_id, b.sequence, b.index) for b in blocks] == [
+            (Kind.DATA, transmitter_id, q, 0) for q in range(3)
+        ]
+        assert len({b.part for b in blocks}) == 3
+        assert {(len(b.part), b.length) for b in blocks} == {(40, 40)}
+    other = {"payload": "data", "profile": "raw8", "frames": 20, "pilot_every": 4, "error_correction": "none"}
+    light = sources_of(resolve_scene({"bars": [other]}))[0][0]
+    (block,) = blocks_of(
+        [light.symbols(5)],
+        **{"modulation__id": "raw8", "air__frames_per_packet": 20, "error-correction__id": "none"},
+    )
+    assert block.sequence == 5
+
+
+def test_a_bar_in_the_world_sends_its_beacon() -> None:
+    scene = resolve_scene({"bars": [{"payload": "messages", "text": "Tempo 30"}], "world": WORLD})
+    known = truth(scene)
+    assert (known["bars"][0]["payload"], known["bars"][0]["error_correction"]) == ("messages", "polar")
+    light = sources_of(scene)[0][0]
+    assert (light.symbols(0) == light.symbols(2)).all()
+    beacon, text = blocks_of([light.symbols(0), light.symbols(1)])
+    assert (beacon.kind, beacon.transmitter_id) == (Kind.BEACON, 1)
+    assert (text.kind, text.part) == (Kind.TEXT, b"Tempo 30")
+    said, (site,) = Beacon.unpack(beacon.part), sites_of(scene)
+    assert said.latitude_deg == pytest.approx(site.latitude_deg, abs=6e-10)
+    assert said.height_m == pytest.approx(site.height_m, abs=6e-4)
+    assert (said.heading_deg, said.tilt_deg) == pytest.approx((site.heading_deg, site.tilt_deg), abs=6e-3)
+
+
+@pytest.mark.parametrize(
+    ("bar", "told"),
+    [
+        ({"payload": "messages"}, r'bars.0: payload = "messages": expected a text, or a \[world\]'),
+        ({"payload": "data", "frames": 2}, "bars.0: .* expected at least"),
+        ({"payload": "data", "error_correction": "pole"}, "bars.0: .*did you mean 'polar'"),
+        ({"payload": "data", "symbols": [[[0] * 16] * 10]}, "bars.0.payload = 'data': expected 'symbols'"),
+    ],
+)
+def test_what_cannot_be_sent_is_told(bar: dict[str, Any], told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        sources_of(resolve_scene({"bars": [bar]}))
+
+
+@pytest.fixture(scope="module")
+def received() -> tuple[dict[str, Any], list[Packet]]:
+    scene = load_scene("drive-30kmh", {"duration_s": 0.15, "bars.payload": "data", "bars.start_chip": 300.0})
+    receiver = Receiver(load_link())
+    packets = [p for events in simulate(scene, 3) for p in receiver.feed(events)] + receiver.close()
+    return truth(scene, 3), packets
+
+
+def test_a_campaign_counts_messages(received: tuple[dict[str, Any], list[Packet]]) -> None:
+    known, packets = received
+    coder = load_link().block_coder()
+
+    def total(packets: list[Packet], known: dict[str, Any] = known) -> tuple[int, int, int]:
+        tally = sum((t for _, t in message_tallies(packets, known, coder)), Tally())
+        return tally.messages_sent, tally.messages_found, tally.messages_wrong
+
+    # Packets begin 4.6, 39.2, 73.8, 108.4 and 143 ms after the scene: four are on air as a whole.
+    assert total(packets) == (4, 4, 0)
+    assert total([p for p in packets if p.packet != 2]) == (4, 3, 0)
+    other = [[[s ^ 1 for s in frame] for frame in packet] for packet in known["bars"][0]["symbols"]]
+    wrong = known | {"bars": [known["bars"][0] | {"symbols": other}]}
+    assert total(packets, wrong)[1:] == (0, sum(p.block is not None for p in packets))
+    silent = {k: v for k, v in known["bars"][0].items() if k != "payload"}
+    assert message_tallies([], known | {"bars": [silent]}, coder) == []
+
+
+def test_chunks_do_not_matter(received: tuple[dict[str, Any], list[Packet]]) -> None:
+    _, packets = received
+    scene = load_scene("drive-30kmh", {"duration_s": 0.15, "bars.payload": "data", "bars.start_chip": 300.0})
+    whole, receiver = Events.concat(simulate(scene, 3)), Receiver(load_link())
+    again = receiver.feed(whole) + receiver.close()
+    assert [(p.packet, p.block, p.messages) for p in again] == [
+        (p.packet, p.block, p.messages) for p in packets
+    ]
+    assert receiver.counts["messages"] == sum(len(p.messages) for p in packets) > 0
+
+
+def test_from_a_scene_to_the_lines_of_a_result(evlcp: Any, tmp_path: Path) -> None:
+    key, chips, rec, out = (tmp_path / n for n in ("k.pem", "chips.npy", "rec.raw", "out"))
+    site = tmp_path / "site.toml"
+    site.write_text(
+        "[[bar]]\ntransmitter_id = 7\nlatitude_deg = 35.1\nlongitude_deg = 136.9\nheight_m = 52.4\n"
+    )
+    pytest.importorskip("cryptography", reason="the extra sign is not installed")
+    public = evlcp("tx", "keygen", key).out.strip()
+    said = f"--text Tempo_30 --beacon {site} --key {key} --sequence 5 --chips {chips}"
+    assert evlcp("tx", "message", *said.split()).code == 0
+    scene = (
+        f"--preset drive-30kmh --set duration_s=0.2 --set bars.start_chip=1380 --set bars.chips_file={chips}"
+    )
+    assert evlcp("simulate", *scene.split(), "-o", rec).code == 0
+    told = evlcp("receive", rec, "-o", out, "--set", f'messages.trusted_keys=["{public}"]')
+    assert told.code == 0, told.err
+    lines = [json.loads(line) for line in (out / "packets.jsonl").read_text().splitlines()]
+    messages = [line for line in lines if line["kind"] != "packet"]
+    assert sorted((m["kind"], m["trust"]) for m in messages) == [
+        ("beacon", "unverified"),
+        ("beacon", "verified"),
+        ("text", "unverified"),
+    ]
+    (text,) = (m for m in messages if m["kind"] == "text")
+    assert (text["text"], text["transmitter_id"], text["sequence"]) == ("Tempo_30", 7, 5)
+    (beacon,) = (m for m in messages if m["verified"])
+    assert (beacon["latitude_deg"], beacon["longitude_deg"], beacon["height_m"]) == (35.1, 136.9, 52.4)
+    assert "2 messages; beacons told 1 times verified, 1 times unverified" in told.out
+    counts = json.loads((out / "summary.json").read_text())["counts"]
+    assert counts["blocks_decoded"] == counts["blocks_tried"] - counts["blocks_failed"] >= 4
