@@ -80,12 +80,11 @@ FROZEN, REPEATED, FREE = 0, 1, 2
 
 
 @njit(cache=True, nogil=True)
-def schedule(information: Array, free: bool, nodes: Array) -> int:
+def schedule(information: Array, nodes: Array) -> int:
     """Split the inputs into the largest nodes that are decided at once; their number.
 
     Args:
         information: Which inputs carry information, bool (N,).
-        free: Whether nodes of information only are decided at once; else input by input.
         nodes: Filled with (first input, stage, kind) of each, int64 (N, 3).
     """
     n, at, first = len(information), 0, 0
@@ -101,7 +100,7 @@ def schedule(information: Array, free: bool, nodes: Array) -> int:
                 kind = FROZEN
             elif inside == 1 and information[first + size - 1]:
                 kind = REPEATED
-            elif free and inside == size:
+            elif inside == size:
                 kind = FREE
             else:
                 break
@@ -113,17 +112,108 @@ def schedule(information: Array, free: bool, nodes: Array) -> int:
 
 
 @njit(cache=True, nogil=True)
+def _either(first: Array, second: Array, out: Array) -> None:
+    """LLR of the sum of two bits, min-sum."""
+    for i in range(len(out)):
+        a, b = first[i], second[i]
+        least = min(abs(a), abs(b))
+        out[i] = -least if (a < 0) != (b < 0) else least
+
+
+@njit(cache=True, nogil=True)
+def _both(first: Array, second: Array, known: Array, out: Array) -> None:
+    """LLR of a bit seen twice, once added to a known one."""
+    for i in range(len(out)):
+        a, b = first[i], second[i]
+        out[i] = b - a if known[i] else b + a
+
+
+@njit(cache=True, nogil=True)
+def _find_weakest(values: Array, found: Array) -> None:
+    """Fill `found` with the places of the values next to 0, the nearest first."""
+    count = 0
+    for i in range(len(values)):
+        at = min(count, len(found) - 1)
+        if at < count and not abs(values[i]) < abs(values[found[at]]):
+            continue
+        while at > 0 and abs(values[i]) < abs(values[found[at - 1]]):
+            found[at] = found[at - 1]
+            at -= 1
+        found[at] = i
+        count = min(count + 1, len(found))
+
+
+@njit(cache=True, nogil=True)
+def _fork(
+    metric: Array,
+    zero: Array,
+    one: Array,
+    limit: float,
+    alive: Array,
+    bit: Array,
+    origin: Array,
+    cost: Array,
+    which: Array,
+) -> int:
+    """Continue each path by bit 0 and bit 1, keep the best that have room; their number.
+
+    `zero` and `one` are what the bits add to the metric. Where both continuations of a path stay, that by 1
+    gets a free row; `origin` says of which path each row is the continuation.
+    """
+    size = len(metric)
+    found = 0
+    for path in range(size):
+        if alive[path]:
+            for value in range(2):
+                c = metric[path] + (one[path] if value else zero[path])
+                # Insertion: equal ones keep their order, so that the result is determined.
+                i = found
+                while i > 0 and cost[i - 1] > c:
+                    cost[i] = cost[i - 1]
+                    which[i] = which[i - 1]
+                    i -= 1
+                cost[i] = c
+                which[i] = 2 * path + value
+                found += 1
+    # Bit 1 of `kept` stands for the continuation by 0, bit 2 for that by 1.
+    kept = np.zeros(size, np.uint8)
+    count = 0
+    while count < min(found, size) and cost[count] <= limit:
+        kept[which[count] >> 1] |= 1 << (which[count] & 1)
+        count += 1
+    for path in range(size):
+        alive[path] = kept[path] > 0
+        origin[path] = path
+    free = 0
+    for path in range(size):
+        if kept[path] == 3:
+            while alive[free]:
+                free += 1
+            alive[free] = True
+            origin[free] = path
+            metric[free] = metric[path] + one[path]
+            bit[free] = 1
+        if kept[path] & 1:
+            metric[path] += zero[path]
+            bit[path] = 0
+        elif kept[path]:
+            metric[path] += one[path]
+            bit[path] = 1
+    return count
+
+
+@njit(cache=True, nogil=True)
 def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Array, metric: Array) -> int:
     """Successive-cancellation list decoding; the paths kept, none if all exceed the limit.
 
     Tal and Vardy (2015), by LLRs and min-sum (Balatsoukas-Stimming et al. 2015): the metric of a whole path
     is the total of |llr| where its codeword differs from the sign of the LLR, and only grows along the path.
-    Nodes whose inputs are all 0, or all but the last, are decided at once (Sarkis et al. 2014), with the same
-    result.
+    Nodes whose inputs are all 0, or all but the last, or all free, are decided at once (Hashemi et al. 2016),
+    with the same result.
 
     Args:
         llr: LLRs of the N code bits, float32.
-        nodes: What `schedule` gives, int64 (nodes, 3); FREE nodes only with one path.
+        nodes: What `schedule` gives, int64 (nodes, 3).
         size: Most paths; 1 is successive cancellation.
         limit: A path whose metric exceeds it is dropped.
         codewords: Filled with each path's code bits, uint8 (size, N).
@@ -147,7 +237,8 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
     bit = np.zeros(size, np.uint8)
     cost = np.empty(2 * size, np.float64)
     which = np.empty(2 * size, np.int64)
-    keep = np.empty((size, 2), np.bool_)
+    origin = np.empty(size, np.int64)
+    weakest = np.empty((size, size), np.int64)
     metric[:] = 0.0
     for node in range(len(nodes)):
         first, stage, kind = nodes[node, 0], nodes[node, 1], nodes[node, 2]
@@ -162,27 +253,23 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
                 continue
             for s in range(top, stage - 1, -1):
                 half = 1 << s
-                up = alpha_row[path, s + 1]
+                up = alpha[alpha_row[path, s + 1]]
+                a, b = up[2 * half : 3 * half], up[3 * half : 4 * half]
+                out = alpha[path, half : 2 * half]
                 if s == top and first:
-                    row = beta_row[path, s]
-                    for i in range(half, 2 * half):
-                        a, b = alpha[up, half + i], alpha[up, 2 * half + i]
-                        alpha[path, i] = b - a if beta[row, i] else b + a
+                    _both(a, b, beta[beta_row[path, s], half : 2 * half], out)
                 else:
-                    for i in range(half, 2 * half):
-                        a, b = alpha[up, half + i], alpha[up, 2 * half + i]
-                        least = min(abs(a), abs(b))
-                        alpha[path, i] = -least if (a < 0) != (b < 0) else least
+                    _either(a, b, out)
                 alpha_row[path, s] = path
             row = alpha_row[path, stage]
             zero[path], one[path] = 0.0, 0.0
             if kind != FREE:
                 for i in range(length, 2 * length):
-                    a = alpha[row, i]
-                    if a < 0:
-                        zero[path] -= a
+                    value = alpha[row, i]
+                    if value < 0:
+                        zero[path] -= value
                     else:
-                        one[path] += a
+                        one[path] += value
         if kind == FROZEN:
             count = 0
             for path in range(size):
@@ -192,56 +279,43 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
                     alive[path] = metric[path] <= limit
                     count += alive[path]
         elif kind == REPEATED:
-            found = 0
+            count = _fork(metric, zero, one, limit, alive, bit, origin, cost, which)
+            for path in range(size):
+                if alive[path] and origin[path] != path:
+                    alpha_row[path] = alpha_row[origin[path]]
+                    beta_row[path] = beta_row[origin[path]]
+        else:
+            # Of `size` paths none goes against more than the `size - 1` weakest signs of such a node.
+            splits = min(size - 1, length)
             for path in range(size):
                 if alive[path]:
-                    for value in range(2):
-                        c = metric[path] + (one[path] if value else zero[path])
-                        # Insertion: equal ones keep their order, so that the result is determined.
-                        i = found
-                        while i > 0 and cost[i - 1] > c:
-                            cost[i] = cost[i - 1]
-                            which[i] = which[i - 1]
-                            i -= 1
-                        cost[i] = c
-                        which[i] = 2 * path + value
-                        found += 1
-            keep[:] = False
-            count = 0
-            for i in range(min(found, size)):
-                if cost[i] <= limit:
-                    keep[which[i] >> 1, which[i] & 1] = True
-                    count += 1
-            for path in range(size):
-                alive[path] = keep[path, 0] or keep[path, 1]
-            free = 0
-            for path in range(size):
-                if keep[path, 0] and keep[path, 1]:
-                    while alive[free]:
-                        free += 1
-                    alive[free] = True
-                    alpha_row[free] = alpha_row[path]
-                    beta_row[free] = beta_row[path]
-                    metric[free] = metric[path] + one[path]
-                    bit[free] = 1
-                if keep[path, 0]:
-                    metric[path] += zero[path]
-                    bit[path] = 0
-                elif keep[path, 1]:
-                    metric[path] += one[path]
-                    bit[path] = 1
+                    row = alpha_row[path, stage]
+                    for i in range(length):
+                        codewords[path, i] = alpha[row, length + i] < 0
+                    if splits:
+                        _find_weakest(alpha[row, length : 2 * length], weakest[path, :splits])
+            for split in range(splits):
+                for path in range(size):
+                    if alive[path]:
+                        row = alpha_row[path, stage]
+                        zero[path], one[path] = 0.0, abs(alpha[row, length + weakest[path, split]])
+                count = _fork(metric, zero, one, limit, alive, bit, origin, cost, which)
+                for path in range(size):
+                    if alive[path] and origin[path] != path:
+                        alpha_row[path] = alpha_row[origin[path]]
+                        beta_row[path] = beta_row[origin[path]]
+                        weakest[path] = weakest[origin[path]]
+                        codewords[path, :length] = codewords[origin[path], :length]
+                for path in range(size):
+                    if alive[path] and bit[path]:
+                        codewords[path, weakest[path, split]] ^= 1
         if count == 0:
             return 0
         for path in range(size):
             if not alive[path]:
                 continue
-            if kind == FREE:
-                row = alpha_row[path, stage]
-                for i in range(length):
-                    codewords[path, i] = alpha[row, length + i] < 0
-            else:
-                for i in range(length):
-                    codewords[path, i] = bit[path]
+            if kind != FREE:
+                codewords[path, :length] = bit[path]
             s = stage
             while first >> s & 1:
                 half = 1 << s

@@ -38,7 +38,9 @@ class Polar(ErrorCorrection):
     time, `max_list_size`, until a path passes.
 
     A path passes if its CRC holds and it explains the LLRs so well that a word of random signs would come as
-    near to any codeword with a probability of `undetected` at most, a proven bound.
+    near to any codeword with a probability of `undetected` at most, and of 2**-(reserve * n) at most; both
+    are proven bounds. The reserve is for words that are damaged too much: list decoding, which is not quite
+    maximum likelihood, then ends among codewords next to the one sent, and each passes the CRC by 2**-24.
     """
 
     rate: Annotated[float, Field(gt=0, lt=1, description="Message and CRC bits a coded bit.")] = 0.5
@@ -48,6 +50,12 @@ class Polar(ErrorCorrection):
         float,
         Field(gt=0, lt=1, description="Probability that a codeword of noise alone is taken for a message."),
     ] = 1e-9
+    reserve: Annotated[
+        float,
+        Field(
+            ge=0, lt=1, description="Bits a coded bit that are to be received beyond those of the message."
+        ),
+    ] = 0.08
 
     def __post_init__(self) -> None:
         if self.max_list_size < self.list_size:
@@ -81,10 +89,8 @@ class Polar(ErrorCorrection):
             size *= 2
         sizes.append(self.max_list_size)
         information = information_set(length, message_bits + CRC_BITS)
-        nodes = []
-        for free in (True, False):
-            table = np.empty((len(information), 3), np.int64)
-            nodes.append(table[: _kernels.schedule(information, free, table)].copy())
+        nodes = np.empty((len(information), 3), np.int64)
+        nodes = nodes[: _kernels.schedule(information, nodes)].copy()
         return _PolarCode(
             message_bits=words * message_bits,
             coded_bits=coded_bits,
@@ -93,11 +99,10 @@ class Polar(ErrorCorrection):
             information=information,
             sent=sent_bits(length, message_bits + CRC_BITS),
             punctured=_punctured(length, message_bits + CRC_BITS),
-            nodes=nodes[0],
-            list_nodes=nodes[1],
+            nodes=nodes,
             list_sizes=tuple(dict.fromkeys(sizes)),
             # One of the 2**message_bits codewords is as likely as the other to lie near a random word.
-            log_share=log(self.undetected) - message_bits * log(2),
+            log_share=min(log(self.undetected), -self.reserve * length * log(2)) - message_bits * log(2),
         )
 
 
@@ -140,7 +145,7 @@ def information_set(length: int, information_bits: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class _PolarCode:
-    """A block of codewords; `nodes` for one path, `list_nodes` for lists, `log_share` of random words."""
+    """A block of codewords; `log_share` is the share of random words that may be taken for one codeword."""
 
     message_bits: int
     coded_bits: int
@@ -150,7 +155,6 @@ class _PolarCode:
     sent: NDArray[np.int64]
     punctured: bool
     nodes: NDArray[np.int64]
-    list_nodes: NDArray[np.int64]
     list_sizes: tuple[int, ...]
     log_share: float
 
@@ -200,8 +204,8 @@ class _PolarCode:
         for size in self.list_sizes:
             codewords = np.empty((size, n), np.uint8)
             metric = np.empty(size)
-            nodes, most = (self.nodes, np.inf) if size == 1 else (self.list_nodes, limit)
-            found = _kernels.list_decode(mother, nodes, size, most, codewords, metric)
+            most = np.inf if size == 1 else limit
+            found = _kernels.list_decode(mother, self.nodes, size, most, codewords, metric)
             for path in np.argsort(metric[:found], kind="stable"):
                 inputs = self._inputs(codewords[path])
                 if metric[path] <= limit and _kernels.crc_holds(inputs, CRC24C):

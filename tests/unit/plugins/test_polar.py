@@ -37,9 +37,15 @@ def best_inputs(n: int, k: int) -> NDArray[np.bool_]:
     return found
 
 
-def nodes_of(information: NDArray[np.bool_], free: bool = False) -> NDArray[np.int64]:
+def nodes_of(information: NDArray[np.bool_]) -> NDArray[np.int64]:
     table = np.empty((len(information), 3), np.int64)
-    return table[: _kernels.schedule(information, free, table)]
+    return table[: _kernels.schedule(information, table)]
+
+
+def single_nodes(information: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Every input by itself."""
+    n = len(information)
+    return np.stack([np.arange(n), np.zeros(n, np.int64), information], 1).astype(np.int64)
 
 
 def decoded(llr: NDArray[np.float32], nodes: NDArray[np.int64], size: int, limit: float = np.inf):
@@ -240,7 +246,7 @@ def twin(llr: NDArray[np.float64], information: NDArray[np.bool_], size: int) ->
 
 
 @pytest.mark.parametrize("size", [1, 2, 4, 8])
-@pytest.mark.parametrize(("n", "k"), [(16, 9), (32, 16), (64, 24), (64, 50)])
+@pytest.mark.parametrize(("n", "k"), [(16, 9), (32, 16), (32, 31), (64, 24), (64, 50)])
 def test_list_decoding_against_its_twin(n: int, k: int, size: int) -> None:
     information = best_inputs(n, k)
     rng = np.random.default_rng(n + k + size)
@@ -248,8 +254,8 @@ def test_list_decoding_against_its_twin(n: int, k: int, size: int) -> None:
         for _ in range(4):
             llr = rng.normal(mean, 1.0, n).astype(np.float32)
             wanted = twin(llr.astype(float), information, size)
-            for free in (False, True) if size == 1 else (False,):
-                codewords, metric = decoded(llr, nodes_of(information, free), size)
+            for nodes in (nodes_of(information), single_nodes(information)):
+                codewords, metric = decoded(llr, nodes, size)
                 assert_allclose(metric, [m for m, _ in wanted], rtol=1e-4, atol=1e-5)
                 assert_array_equal(codewords, [c for _, c in wanted])
 
@@ -258,17 +264,29 @@ def test_nodes_cover_all_inputs_once() -> None:
     rng = np.random.default_rng(0)
     sets = [best_inputs(256, 128), information_set(960, 480), rng.random(128) < 0.5, np.ones(32, bool)]
     for information in sets:
-        for free in (False, True):
-            at = 0
-            for first, stage, kind in nodes_of(information, free):
-                inside = information[first : first + (1 << stage)]
-                assert first == at
-                assert first % (1 << stage) == 0
-                expected = {0: 0, 1: 1, 2: len(inside)}[int(kind)]
-                assert inside.sum() == expected
-                assert kind != 1 or inside[-1]
-                at += len(inside)
-            assert at == len(information)
+        at = 0
+        for first, stage, kind in nodes_of(information):
+            inside = information[first : first + (1 << stage)]
+            assert first == at
+            assert first % (1 << stage) == 0
+            expected = {0: 0, 1: 1, 2: len(inside)}[int(kind)]
+            assert inside.sum() == expected
+            assert kind != 1 or inside[-1]
+            at += len(inside)
+        assert at == len(information)
+
+
+@pytest.mark.parametrize("size", [1, 8, 32])
+def test_nodes_decided_at_once_change_nothing(size: int) -> None:
+    rng = np.random.default_rng(size)
+    for length, mean in ((256, 0.0), (256, 0.8), (960, 0.7)):
+        information = information_set(length, length // 2)
+        for _ in range(5):
+            llr = rng.normal(mean, 1.0, len(information)).astype(np.float32)
+            codewords, metric = decoded(llr, nodes_of(information), size)
+            others, same = decoded(llr, single_nodes(information), size)
+            assert_allclose(metric, same, rtol=1e-4)
+            assert_array_equal(codewords, others)
 
 
 def test_a_limit_only_drops_what_exceeds_it() -> None:
@@ -290,7 +308,7 @@ def test_a_limit_only_drops_what_exceeds_it() -> None:
 @pytest.mark.parametrize(("length", "rate"), [(40, 0.9), (80, 0.4), (90, 0.4), (64, 0.5)])
 def test_shortened_and_punctured_codes_against_brute_force(length: int, rate: float) -> None:
     """All 256 messages of a byte: what is decoded is the most likely one."""
-    code = Polar(rate=rate, undetected=0.999, list_size=32).compile(length)
+    code = Polar(rate=rate, undetected=0.999, reserve=0, list_size=32).compile(length)
     assert code.message_bits == 8
     messages = every_word(8)
     codewords = np.array([code.encode(message) for message in messages])
@@ -340,6 +358,21 @@ def test_the_limit_solves_the_bound(n: int, share: float, kind: str) -> None:
 def test_nothing_is_plausible_with_too_few_bits() -> None:
     assert _kernels.discrepancy_limit(np.ones(100), -100 * np.log(2)) == -1
     assert _kernels.discrepancy_limit(np.zeros(100), -1.0) == -1
+
+
+def test_a_reserve_is_kept() -> None:
+    """Bits without errors that are needed: 456 of the message, and 76.8 in reserve or 29.9 of a billionth."""
+    message = np.random.default_rng(0).integers(0, 2, 456).astype(np.uint8)
+    order = np.random.default_rng(1).permutation(960)
+    for reserve, needed in ((0.08, 533), (0.0, 486)):
+        code = Polar(reserve=reserve).compile(960)
+        for received_bits in (needed - 1, needed, 960):
+            llr = 1 - 2 * code.encode(message).astype(np.float32)
+            llr[order[received_bits:]] = 0
+            if received_bits < needed:
+                assert not code.decode(llr).ok
+            elif received_bits == 960 or reserve:
+                assert code.decode(llr).ok
 
 
 @pytest.mark.parametrize(("n", "k"), [(256, 104), (960, 456)])
@@ -423,7 +456,7 @@ def converse(n: int, k: float, sigma: float) -> float:
 
 def test_frame_errors_between_bounds() -> None:
     """(256, 104 + 24) near its end: no better than any code can be, as good as that with 1.5 dB less."""
-    code = Polar(undetected=0.5).compile(256)
+    code = Polar(undetected=0.5, reserve=0).compile(256)
     bit_error_rate = 0.115
     sigma = -1 / stats.norm.ppf(bit_error_rate)
     low, high = proportion_interval(lost(code, 1500, bit_error_rate, hard=False), 1500)
