@@ -11,6 +11,7 @@ nothing on balance. One pass, one number a pixel.
 from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass, field, replace
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -216,7 +217,7 @@ class RegionTracker:
         expected one is taken.
         """
         track.heights.append(measured.height_px)
-        height_px = float(np.median(track.heights))
+        height_px = median(track.heights)
         excess_px = measured.height_px - height_px
         expected_px = self._expected(track, measured.t_us).y_px
         if excess_px > _STRAY_PX:
