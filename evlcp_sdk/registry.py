@@ -49,8 +49,9 @@ class Registry:
         """Find all installed plugins; `plugins` are objects with hooks to add, e.g. a probe.
 
         Raises:
-            PluginError: A plugin fails to import.
+            PluginError: A plugin fails to import, or two distributions have entry points of one name.
         """
+        _expect_distinct_names()
         manager = pluggy.PluginManager(ENTRY_POINT_GROUP)
         manager.add_hookspecs(hookspecs)
         try:
@@ -114,6 +115,19 @@ class Registry:
                 f" is no {ROLES[role].__name__}"
             )
         return found
+
+
+def _expect_distinct_names() -> None:
+    """Refuse two entry points of one name: the plugin manager would pass over the second in silence."""
+    owners: dict[str, str] = {}
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        name = entry.dist.name if entry.dist else "an unknown distribution"
+        first = owners.setdefault(entry.name, name)
+        if first != name:
+            raise PluginError(
+                f"two plugins with an entry point named '{entry.name}': one of {first}, one of {name};"
+                f" rename or uninstall one"
+            )
 
 
 def _failing_plugin() -> str:

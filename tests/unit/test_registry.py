@@ -66,12 +66,27 @@ def test_two_plugins_with_one_name_are_both_told(monkeypatch: pytest.MonkeyPatch
 
     found = [entry("evlcp-sdk", Brings(ranging("poc"))), entry("evlcp-fast-poc", Brings(ranging("poc")))]
     monkeypatch.setattr(importlib.metadata, "distributions", lambda: found)
+    monkeypatch.setattr("evlcp_sdk.registry.entry_points", lambda group: [])
     with pytest.raises(PluginError) as caught:
         Registry.load()
     assert str(caught.value) == (
         "two ranging algorithms named 'poc': one of evlcp-sdk, one of evlcp-fast-poc; uninstall one"
     )
     assert caught.value.exit_code == 2
+
+
+def test_two_entry_points_with_one_name_are_both_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def found(**given: str) -> Any:
+        names = ("evlcp-sdk", "evlcp-fast-poc")
+        return [SimpleNamespace(name="poc", dist=SimpleNamespace(name=name)) for name in names]
+
+    monkeypatch.setattr("evlcp_sdk.registry.entry_points", found)
+    with pytest.raises(PluginError) as caught:
+        Registry.load()
+    assert str(caught.value) == (
+        "two plugins with an entry point named 'poc': one of evlcp-sdk, one of evlcp-fast-poc;"
+        " rename or uninstall one"
+    )
 
 
 def test_a_role_that_does_not_exist() -> None:

@@ -1,0 +1,84 @@
+"""The laws of the SDK, and that bad pixels do not sway what is measured."""
+
+from dataclasses import replace
+
+import numpy as np
+from evlcp_robust.decoding import Majority
+from evlcp_robust.ranging import MedianPairs
+
+from evlcp_sdk.config import load_link
+from evlcp_sdk.testing import conformance, ideal_presence, ideal_sums, ideal_view
+
+LINK = load_link()
+SYMBOLS = np.random.default_rng(7).integers(0, len(LINK.codebook.codewords), LINK.bar.clusters)
+
+
+@conformance("ranging", MedianPairs(), MedianPairs(min_spacing=0.5))
+def test_ranging(check):
+    check()
+
+
+@conformance("decoding", Majority())
+def test_decoding(check):
+    check()
+
+
+def test_three_clusters_out_of_place_do_not_move_the_distance():
+    measure = MedianPairs().compile(LINK.camera, LINK.bar, LINK.codebook)
+    view = ideal_view(LINK.codebook, SYMBOLS)
+    true_m = LINK.camera.distance_m(0.06, 8)
+    pixels = view.presence.pixels.copy()
+    for cluster, rows in ((2, 9), (7, -14), (12, 5)):
+        pixels[cluster] = np.roll(pixels[cluster], rows, 0)
+    found = measure(replace(view, presence=replace(view.presence, pixels=pixels)))
+    assert abs(found.distance_m / true_m - 1) < 0.001
+
+
+def test_sigma_is_that_of_many_trials():
+    measure = MedianPairs().compile(LINK.camera, LINK.bar, LINK.codebook)
+    rng = np.random.default_rng(3)
+    view = ideal_view(LINK.codebook, SYMBOLS)
+    shape = view.presence.pixels.shape
+    rows = np.arange(shape[1])
+    found = []
+    for _ in range(400):
+        centre = 14.0 + 8 * np.arange(shape[0]) + rng.normal(0, 0.2, shape[0])
+        # A weight in two neighbouring rows has its centre of gravity anywhere between them.
+        column = np.maximum(1 - np.abs(rows - centre[:, None]), 0)
+        pixels = np.repeat(column[:, :, None], shape[2], 2).astype(np.float32)
+        found.append(measure(replace(view, presence=replace(view.presence, pixels=pixels))))
+    error = np.std([r.distance_m for r in found])
+    told = np.sqrt(np.mean([r.sigma_m**2 for r in found]))
+    assert 0.85 < told / error < 1.25
+
+
+def test_a_cell_that_never_stops_has_one_vote():
+    decode = Majority().compile(LINK.codebook)
+    sums = ideal_sums(LINK.codebook, SYMBOLS)
+    loud = sums.copy()
+    loud[:, 10::8, 10] = np.random.default_rng(1).choice([-30, 30], loud[:, 10::8, 10].shape)
+    got = decode(ideal_presence(LINK.bar.clusters), loud)
+    assert (got.symbols == SYMBOLS).all()
+    assert 0.5 < got.quality < 1
+
+
+def test_log_likelihood_ratios_are_odds():
+    """Of bits with an LLR of L, one in 1 + exp(L) is wrong; one cell a cluster, strong noise."""
+    book = LINK.codebook
+    decode = Majority().compile(book)
+    presence = ideal_presence(book.clusters, cluster_px=2, width_px=2)
+    rng = np.random.default_rng(5)
+    llr, wrong = [], []
+    for seed in range(300):
+        symbols = rng.integers(0, len(book.codewords), book.clusters)
+        sums = ideal_sums(book, symbols, cluster_px=2, width_px=2, events_per_edge=1, missing=0.4, seed=seed)
+        sums += rng.integers(-2, 3, sums.shape).astype(np.int16)
+        soft = decode(presence, sums)
+        sent = symbols[:, None] >> np.arange(book.bits_per_symbol - 1, -1, -1) & 1
+        llr.append(np.abs(soft.llr).ravel())
+        wrong.append(((soft.llr < 0) != sent).ravel())
+    level, bad = np.concatenate(llr), np.concatenate(wrong)
+    middle = np.median(level)
+    for half in (level <= middle, level > middle):
+        expected = (1 / (1 + np.exp(level[half]))).mean()
+        assert 0.9 < bad[half].mean() / expected < 1.15, (bad[half].mean(), expected)

@@ -1,0 +1,153 @@
+"""A stranger's package and ours, as wheels in a fresh environment: found, checked, used, gone again."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "third_party_plugin"
+RECORDING = ROOT / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
+
+
+class Environment:
+    """A fresh virtual environment that borrows all but the SDK from the one that runs the tests."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.bin = folder / "venv" / "bin"
+        venv.create(folder / "venv", with_pip=False, symlinks=True)
+        borrowed = folder / "borrowed"
+        borrowed.mkdir()
+        for entry in Path(sysconfig.get_path("purelib")).iterdir():
+            # Neither the SDK's metadata nor the file that puts its folders on the path.
+            if "evlcp" not in entry.name and entry.suffix != ".pth":
+                (borrowed / entry.name).symlink_to(entry)
+        version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+        self.site = folder / "venv" / "lib" / version / "site-packages"
+        (self.site / "borrowed.pth").write_text(f"{borrowed}\n")
+
+    def run(self, *command: str | Path, code: int = 0, cwd: Path | None = None) -> str:
+        """What a command of the environment says; it must end with `code`."""
+        clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
+        done = subprocess.run(
+            [self.bin / command[0], *command[1:]],
+            cwd=cwd or self.folder,
+            env=clean | {"NO_COLOR": "1"},
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=300,
+        )
+        assert done.returncode == code, f"{command}\n{done.stdout}\n{done.stderr}"
+        return done.stdout + done.stderr
+
+    def build(self, project: Path) -> Path:
+        """The wheel of a project."""
+        wheels = self.folder / "wheels"
+        before = set(wheels.glob("*.whl"))
+        self.pip("wheel", "--no-build-isolation", "--wheel-dir", wheels, project)
+        (wheel,) = set(wheels.glob("*.whl")) - before
+        return wheel
+
+    def pip(self, verb: str, *rest: str | Path) -> str:
+        """Run pip, which must not ask any index."""
+        only = ("--no-deps", "--no-index") if verb != "uninstall" else ("-y",)
+        return self.run("python", "-m", "pip", "-q", "--disable-pip-version-check", verb, *only, *rest)
+
+    def plugins(self) -> dict[tuple[str, str], tuple[str, str]]:
+        """(role, id) of each algorithm to its distribution and version."""
+        rows = json.loads(self.run("evlcp", "plugins", "--json"))
+        return {(r["role"], r["id"]): (r["distribution"], r["version"]) for r in rows}
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
+    """The environment with both wheels."""
+    made = Environment(tmp_path_factory.mktemp("fresh"))
+    made.pip("install", made.build(ROOT), made.build(EXAMPLE))
+    yield made
+    shutil.rmtree(made.folder)
+
+
+@pytest.fixture
+def copycat(environment: Environment, tmp_path: Path) -> Iterator[str]:
+    """Another distribution that brings the same algorithms, installed for one test."""
+    name = "evlcp-copycat"
+    project = tmp_path / name
+    shutil.copytree(EXAMPLE, project)
+    (project / "src" / "evlcp_robust").rename(project / "src" / "evlcp_copycat")
+    text = (project / "pyproject.toml").read_text()
+    text = text.replace('name = "evlcp-robust"', f'name = "{name}"').replace("robust", "copycat")
+    (project / "pyproject.toml").write_text(text)
+    environment.pip("install", environment.build(project))
+    yield name
+    environment.pip("uninstall", name)
+
+
+def test_what_is_imported_is_the_wheel(environment: Environment) -> None:
+    for module in ("evlcp_sdk", "evlcp_wh", "firmware_host", "evlcp_robust"):
+        path = environment.run("python", "-c", f"import {module}; print({module}.__file__)").strip()
+        assert Path(path).is_relative_to(environment.site)
+    assert environment.plugins()["ranging", "poc"][0] == "evlcp-sdk"
+
+
+def test_it_is_found(environment: Environment) -> None:
+    plugins = environment.plugins()
+    assert plugins["ranging", "median-pairs"] == ("evlcp-robust", "1.2.0")
+    assert plugins["decoding", "majority"] == ("evlcp-robust", "1.2.0")
+    assert "median over all pairs of clusters" in environment.run("evlcp", "plugins")
+
+
+@pytest.mark.parametrize(("role", "id"), [("ranging", "median-pairs"), ("decoding", "majority")])
+def test_it_is_checked(environment: Environment, role: str, id: str) -> None:
+    told = json.loads(environment.run("evlcp", "check", role, id, "--json"))
+    assert (told["distribution"], told["version"]) == ("evlcp-robust", "1.2.0")
+    assert {law["status"] for law in told["laws"]} == {"ok"}
+
+
+def test_its_own_tests_pass(environment: Environment) -> None:
+    said = environment.run("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=EXAMPLE)
+    assert " passed" in said
+    assert "skipped" not in said
+
+
+def test_it_is_used(environment: Environment) -> None:
+    out = environment.folder / "out"
+    sets = ("ranging.id=median-pairs", "ranging.min_spacing=0.4", "decoding.id=majority")
+    environment.run("evlcp", "receive", RECORDING, "-o", out, *(x for s in sets for x in ("--set", s)))
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["versions"]["evlcp-robust"] == "1.2.0"
+    assert summary["configuration"]["ranging"] == {
+        "id": "median-pairs",
+        "min_spacing": 0.4,
+        "min_clusters": 5,
+    }
+    assert summary["configuration"]["decoding"]["id"] == "majority"
+    truth = RECORDING.with_suffix(".truth.json")
+    (bar,) = json.loads(environment.run("evlcp", "score", out, truth, "--json"))["bars"]
+    assert bar["frames_found"] == bar["frames_sent"] > 10
+    assert bar["ber"] < 0.02
+    assert bar["rmse_m"] < 0.5
+
+
+def test_two_of_one_name_are_told_by_their_distributions(environment: Environment, copycat: str) -> None:
+    said = environment.run("evlcp", "plugins", code=2)
+    assert "two ranging algorithms named 'median-pairs'" in said
+    assert copycat in said
+    assert "evlcp-robust" in said
+    assert "Traceback" not in said
+
+
+def test_uninstalled_it_is_gone(environment: Environment) -> None:
+    environment.pip("uninstall", "evlcp-robust")
+    assert ("ranging", "median-pairs") not in environment.plugins()
+    said = environment.run("evlcp", "config", "--set", "ranging.id=median-pairs", code=2)
+    assert "no ranging algorithm named 'median-pairs'" in said
