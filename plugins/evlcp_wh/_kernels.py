@@ -182,86 +182,49 @@ def sum_worth(
 
 
 @njit(cache=True, nogil=True)
-def expected_images(maps: Array, codes: Array, seam: int, out: Array) -> None:
-    """What each value looks like if every cluster says what its code says, in a dark seam.
+def worth_images(sums: Array, worth: Array, most: int, seam: int, out: Array) -> None:
+    """What each pixel's pair of sums says of each value, in a dark seam.
 
-    `out` is (values, height + 2 seam, width + 2 seam).
+    `out` is (height + 2 seam, width + 2 seam, values). A pixel without events counts 0: what it is worth adds
+    the same wherever the bar is.
+    """
+    _, height, width = sums.shape
+    silent = worth[most, most]
+    out[:] = 0.0
+    for i in range(out.shape[2]):
+        for v in range(height):
+            for u in range(width):
+                first, second = sums[2 * i, v, u], sums[2 * i + 1, v, u]
+                if first != 0 or second != 0:
+                    first = min(max(first, -most), most) + most
+                    second = min(max(second, -most), most) + most
+                    out[v + seam, u + seam, i] = worth[first, second] - silent
+
+
+@njit(cache=True, nogil=True)
+def cluster_matches(maps: Array, images: Array, out: Array) -> None:
+    """What the pixels of each cluster say of each value if the bar is off its place, `out` (K, n, n, values).
+
+    Shifts (down, right) go from -(n // 2) to n // 2 px, the seam of the images.
     """
     clusters, height, width = maps.shape
+    _, side, _, values = out.shape
     out[:] = 0.0
     for k in range(clusters):
         for v in range(height):
             for u in range(width):
                 weight = maps[k, v, u]
                 if weight > 0:
-                    for i in range(out.shape[0]):
-                        out[i, v + seam, u + seam] += weight * codes[k, i]
-
-
-@njit(cache=True, nogil=True)
-def shift_scores(sums: Array, worth: Array, most: int, images: Array, scores: Array) -> None:
-    """Match of each value's events with its expected image moved up and left, `scores` (values, n, n).
-
-    Shifts go from -(n // 2) to n // 2 px, the seam of the images. A pixel without events counts 0: what it is
-    worth adds the same to every shift.
-    """
-    _, height, width = sums.shape
-    values, side, _ = scores.shape
-    scores[:] = 0.0
-    for i in range(values):
-        score = scores[i]
-        for v in range(height):
-            for u in range(width):
-                first = min(max(sums[2 * i, v, u], -most), most) + most
-                second = min(max(sums[2 * i + 1, v, u], -most), most) + most
-                pixel = worth[first, second] - worth[most, most]
-                if pixel != 0:
                     for a in range(side):
                         for b in range(side):
-                            score[a, b] += pixel * images[i, v + a, u + b]
-
-
-@njit(cache=True, nogil=True)
-def likeliest(maps: Array, seam: int, shown: Array, weight: Array) -> None:
-    """The cluster that each pixel most likely shows, and how likely, with a seam as in `expected_images`."""
-    clusters, height, width = maps.shape
-    shown[:] = 0
-    weight[:] = 0.0
-    for k in range(clusters):
-        for v in range(height):
-            for u in range(width):
-                if maps[k, v, u] > weight[v + seam, u + seam]:
-                    shown[v + seam, u + seam] = k
-                    weight[v + seam, u + seam] = maps[k, v, u]
-
-
-@njit(cache=True, nogil=True)
-def blind_scores(
-    sums: Array, worth: Array, most: int, shown: Array, weight: Array, clusters: int, scores: Array
-) -> None:
-    """Do as `shift_scores` for values that are not known: each cluster's is the one that fits better."""
-    _, height, width = sums.shape
-    values, side, _ = scores.shape
-    says = np.empty((side, side, clusters), np.float32)
-    for i in range(values):
-        says[:] = 0.0
-        for v in range(height):
-            for u in range(width):
-                first = min(max(sums[2 * i, v, u], -most), most) + most
-                second = min(max(sums[2 * i + 1, v, u], -most), most) + most
-                pixel = worth[first, second] - worth[most, most]
-                if pixel != 0:
-                    for a in range(side):
-                        for b in range(side):
-                            says[a, b, shown[v + a, u + b]] += pixel * weight[v + a, u + b]
-        for a in range(side):
-            for b in range(side):
-                scores[i, a, b] = np.abs(says[a, b]).sum()
+                            # Values innermost: they lie side by side.
+                            for i in range(values):
+                                out[k, a, b, i] += weight * images[v + a, u + b, i]
 
 
 @njit(cache=True, nogil=True)
 def smooth_path(scores: Array, step_cost: float, place_cost: float, path: Array) -> None:
-    """Shifts (up, left) of all values that score best together (Viterbi), `path` (values, 2), px.
+    """Shifts (down, right) of all values that score best together (Viterbi), `path` (values, 2), px.
 
     A shift costs its square times `place_cost`, a change from value to value its square times `step_cost`.
     Squares add, so the best predecessor is sought along one axis, then along the other.
@@ -306,11 +269,11 @@ def smooth_path(scores: Array, step_cost: float, place_cost: float, path: Array)
 
 @njit(cache=True, nogil=True)
 def take_back(sums: Array, path: Array, out: Array) -> None:
-    """Polarity sums moved by each value's shift (down, right); 0 where there was no pixel."""
+    """Polarity sums with each value's shift (down, right) taken back; 0 where there was no pixel."""
     chips, height, width = sums.shape
     out[:] = 0
     for c in range(chips):
         down, right = path[c // 2, 0], path[c // 2, 1]
-        for v in range(max(down, 0), min(height + down, height)):
-            for u in range(max(right, 0), min(width + right, width)):
-                out[c, v, u] = sums[c, v - down, u - right]
+        for v in range(max(-down, 0), min(height - down, height)):
+            for u in range(max(-right, 0), min(width - right, width)):
+                out[c, v, u] = sums[c, v + down, u + right]

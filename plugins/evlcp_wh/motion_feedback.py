@@ -1,6 +1,6 @@
 """What the info segment of each cluster says, after the bar's motion within the frame is taken out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import log
 from typing import Annotated
 
@@ -34,7 +34,7 @@ class MotionFeedback(Decoding):
 
     reach_px: Annotated[
         int, Field(ge=1, le=8, description="Farthest that the bar may be off its place in a frame.")
-    ] = 3
+    ] = 4
     step_px: Annotated[
         float,
         Field(gt=0, description="Likely change of place (sigma) from value to value: 1.5 px/ms for 0.2 ms."),
@@ -74,14 +74,15 @@ class MotionFeedback(Decoding):
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             worth = learned_worth(presence, sums, pilots, self.max_events, self.prior_count)
+            matches = self._matches(presence, sums, worth)
             known, aligned = pilots, sums
             done = np.zeros((len(sums) // 2, 2), np.int64)
             for _ in range(self.rounds):
-                path = self._path(presence, sums, known, worth)
+                path = self._path(matches, known)
                 if (path == done).all():
                     break
                 aligned, done = _taken_back(sums, path), path
-                presence = self._separated(aligned, presence.grid_px, pilots)
+                presence = self._separated(aligned, presence, pilots)
                 worth = learned_worth(presence, aligned, pilots, self.max_events, self.prior_count)
                 soft = self._decided(presence, aligned, pilots, words, worth)
                 known = np.concatenate([pilots, words[soft.symbols].astype(np.int64)], axis=1)
@@ -100,48 +101,48 @@ class MotionFeedback(Decoding):
         values = combined_values(presence, sums[2 * pilots.shape[1] :], worth, self.min_weight)
         return soft_symbols(values, words, self.independent_pixels)
 
-    def _path(
-        self,
-        presence: PresenceMap,
-        sums: NDArray[np.int16],
-        known: NDArray[np.int64],
-        worth: NDArray[np.float64],
-    ) -> NDArray[np.int64]:
-        """Way back to where the maps have the bar from its place in each value, int64 (values, 2), px.
+    def _matches(
+        self, presence: PresenceMap, sums: NDArray[np.int16], worth: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Log-likelihood ratio of each value of each cluster, by the shift of the bar from its place.
 
-        `known` are the codes of the values that are known, int64 (K, n), n from 0 to all of them.
+        float32 (K, n, n, values), from `reach_px` up and left to as much down and right.
         """
         from evlcp_wh import _kernels
 
         _, height, width = sums.shape
-        values, seam, most = known.shape[1], self.reach_px, len(worth) // 2
-        padded, side = (height + 2 * seam, width + 2 * seam), 2 * seam + 1
-        gain = worth.astype(np.float32)
-        scores = np.empty((len(sums) // 2, side, side), np.float32)
-        images = np.empty((values, *padded), np.float32)
-        _kernels.expected_images(presence.pixels, known, seam, images)
-        _kernels.shift_scores(sums, gain, most, images, scores[:values])
-        shown, weight = np.empty(padded, np.int64), np.empty(padded, np.float32)
-        _kernels.likeliest(presence.pixels, seam, shown, weight)
-        _kernels.blind_scores(sums[2 * values :], gain, most, shown, weight, len(known), scores[values:])
-        scores *= self.independent_pixels / 2
+        values, seam, side = len(sums) // 2, self.reach_px, 2 * self.reach_px + 1
+        images = np.empty((height + 2 * seam, width + 2 * seam, values), np.float32)
+        _kernels.worth_images(sums, worth.astype(np.float32), len(worth) // 2, seam, images)
+        out = np.empty((len(presence.pixels), side, side, values), np.float32)
+        _kernels.cluster_matches(presence.pixels, images, out)
+        return self.independent_pixels * out
+
+    def _path(self, matches: NDArray[np.float32], known: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Shift (down, right) of the bar from its place in each value, int64 (values, 2), px.
+
+        `known` are the codes of the first n values, int64 (K, n); of the others, each cluster's is what fits.
+        """
+        from evlcp_wh import _kernels
+
+        n = known.shape[1]
+        fits = np.abs(matches[..., n:]).sum(0), np.einsum("kabi,ki->abi", matches[..., :n], known)
+        scores = np.moveaxis(np.concatenate(fits[::-1], axis=-1), -1, 0) / 2
         path = np.empty((len(scores), 2), np.int64)
         _kernels.smooth_path(scores, 0.5 / self.step_px**2, 0.5 / self.place_px**2 / len(scores), path)
         return path
 
-    def _separated(self, sums: NDArray[np.int16], grid_px: int, pilots: NDArray[np.int64]) -> PresenceMap:
-        """Presence by Bayes' rule, and pixel maps, of sums in which the bar stands still."""
+    def _separated(
+        self, sums: NDArray[np.int16], before: PresenceMap, pilots: NDArray[np.int64]
+    ) -> PresenceMap:
+        """Presence by Bayes' rule of sums in which the bar stands still."""
         from evlcp_wh import _kernels
 
-        _, height, width = sums.shape
-        pilot = sums[: 2 * pilots.shape[1]]
         agree, disagree = log((1 - self.value_error) / 0.5), log(self.value_error / 0.5)
-        probability = np.zeros((len(pilots), height // grid_px, width // grid_px), np.float32)
-        _kernels.presence(pilot, pilots, grid_px, agree, disagree, self.min_values, probability)
-        selected = probability >= 0.5
-        pixels = np.zeros((len(pilots), height, width), np.float32)
-        _kernels.pixel_maps(pilot, pilots, grid_px, selected, pixels)
-        return PresenceMap(probability, grid_px, selected, pixels)
+        probability = np.zeros_like(before.probability)
+        pilot = sums[: 2 * pilots.shape[1]]
+        _kernels.presence(pilot, pilots, before.grid_px, agree, disagree, self.min_values, probability)
+        return replace(before, probability=probability)
 
 
 def _taken_back(sums: NDArray[np.int16], path: NDArray[np.int64]) -> NDArray[np.int16]:

@@ -131,23 +131,18 @@ def test_histograms_of_pairs_and_their_worth(seed, grid, most):
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("reach", [1, 3])
-def test_match_of_shifted_images(seed, reach):
+def test_what_clusters_say_off_their_places(seed, reach):
     rng = np.random.default_rng(seed)
     sums, worth = random_sums(rng, (12, 11, 7)), rng.normal(size=(5, 5))
     maps = (rng.random((4, 11, 7)) * (rng.random((4, 11, 7)) < 0.4)).astype(np.float32)
-    codes = rng.choice([-1, 1], (4, 6))
-    padded, side = (11 + 2 * reach, 7 + 2 * reach), 2 * reach + 1
-    images, scores = np.empty((6, *padded)), np.empty((6, side, side))
-    _kernels.expected_images(maps, codes, reach, images)
-    want = np.pad(np.einsum("kvu,ki->ivu", maps, codes), ((0, 0), (reach, reach), (reach, reach)))
-    assert_allclose(images, want, atol=1e-6)
-    _kernels.shift_scores(sums, worth, 2, images, scores)
+    images = np.empty((11 + 2 * reach, 7 + 2 * reach, 6))
+    _kernels.worth_images(sums, worth, 2, reach, images)
     pixels = twins.worth_of(sums, worth) - worth[2, 2]
-    assert_allclose(scores, twins.shift_scores(pixels, want, reach), atol=1e-4)
-    shown, weight = np.empty(padded, np.int64), np.empty(padded, np.float32)
-    _kernels.likeliest(maps, reach, shown, weight)
-    _kernels.blind_scores(sums, worth, 2, shown, weight, 4, scores)
-    assert_allclose(scores, twins.blind_scores(pixels, maps, reach), atol=1e-4)
+    want = np.pad(pixels, ((0, 0), (reach, reach), (reach, reach)))
+    assert_allclose(images, np.moveaxis(want, 0, -1))
+    out = np.empty((4, 2 * reach + 1, 2 * reach + 1, 6))
+    _kernels.cluster_matches(maps, images, out)
+    assert_allclose(out, twins.cluster_matches(pixels, maps, reach), atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -354,7 +349,7 @@ def drifting(book, symbols, right_down, missing=0.3, seed=0, **image):
     still = ideal_sums(book, symbols, missing=missing, seed=seed, **image)
     share = np.clip((np.arange(16) - 7.5) / 7.5, 0, 1)
     path = np.rint(share[:, None] * np.array(right_down)[::-1]).astype(int)
-    return twins.take_back(still, path), path
+    return twins.take_back(still, -path), path
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -373,10 +368,11 @@ def test_a_drift_within_the_frame_is_found_and_taken_back(profile, right_down, s
     if right_down[1]:
         assert (MlSoft().compile(book)(presence, sums).symbols != symbols).any()
     pilots = book.pilots.astype(np.int64)
-    worth = learned_worth(presence, sums, pilots, 3, 1.0)
-    words = book.codewords[symbols].astype(np.int64)
-    known = np.concatenate([pilots, words], axis=1)
-    assert_array_equal(algorithm._path(presence, sums, known, worth), -path)
+    matches = algorithm._matches(presence, sums, learned_worth(presence, sums, pilots, 3, 1.0))
+    known = np.concatenate([pilots, book.codewords[symbols].astype(np.int64)], axis=1)
+    assert_array_equal(algorithm._path(matches, known), path)
+    # Blind to what the clusters say, it is found as well.
+    assert_array_equal(algorithm._path(matches, pilots), path)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -102,24 +102,14 @@ def worth_of(sums, worth):
     return worth[clipped[::2], clipped[1::2]]
 
 
-def shift_scores(pixels, images, reach):
-    """Correlation of pixels (values, height, width) with images that have a seam, shift by shift."""
+def cluster_matches(pixels, maps, reach):
+    """What each cluster's pixels say where the bar is shifted, shift by shift, (K, n, n, values)."""
     _, height, width = pixels.shape
+    seam = np.pad(pixels, ((0, 0), (reach, reach), (reach, reach)))
     side = 2 * reach + 1
-    out = np.zeros((len(pixels), side, side))
+    out = np.zeros((len(maps), side, side, len(pixels)))
     for a, b in np.ndindex(side, side):
-        out[:, a, b] = (pixels * images[:, a : a + height, b : b + width]).sum((1, 2))
-    return out
-
-
-def blind_scores(pixels, maps, reach):
-    """For each cluster the better of both values: its pixels are those where its map is the largest."""
-    seam = np.pad(maps, ((0, 0), (reach, reach), (reach, reach)))
-    out = np.zeros((len(pixels), 2 * reach + 1, 2 * reach + 1))
-    for k in range(len(maps)):
-        own = np.where(seam.argmax(0) == k, seam.max(0), 0)
-        one = shift_scores(pixels, np.broadcast_to(own, (len(pixels), *own.shape)), reach)
-        out += np.maximum(one, -one)
+        out[:, a, b] = np.einsum("kvu,ivu->ki", maps, seam[:, a : a + height, b : b + width])
     return out
 
 
@@ -145,7 +135,7 @@ def take_back(sums, path):
     _, height, width = sums.shape
     return np.array(
         [
-            seam[c, reach - path[c // 2, 0] :, reach - path[c // 2, 1] :][:height, :width]
+            seam[c, reach + path[c // 2, 0] :, reach + path[c // 2, 1] :][:height, :width]
             for c in range(len(sums))
         ]
     )
