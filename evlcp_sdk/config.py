@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
@@ -139,14 +139,14 @@ class PositionSpec:
         Field(
             ge=0, description="Error that a bar's points share: motion inside the pilot, up to half a pixel."
         ),
-    ] = 0.07
+    ] = 0.1
     pixel_sigma_px: Annotated[
         float,
         Field(
             ge=0,
             description="Error of a point that no averaging over frames removes: where in a pixel it is.",
         ),
-    ] = 0.04
+    ] = 0.08
     min_view_deg: Annotated[
         float,
         Field(ge=0, lt=90, description="Angle between a bar and the line of sight that a lone bar needs."),
@@ -160,6 +160,10 @@ class PositionSpec:
             gt=1, description="Mean square of the misses, in sigmas, above which sites and image disagree."
         ),
     ] = 4.0
+    beacons: Annotated[
+        Literal["none", "verified", "any"],
+        Field(description="Beacons whose own place is believed where no site has their id."),
+    ] = "verified"
     acceleration_m2_s3: Annotated[
         float,
         Field(gt=0, description="Power density of the change of speed: 1 m/s2 that lasts for a second."),

@@ -15,6 +15,7 @@ from evlcp_sdk.messages.received import ReceivedMessage
 __all__ = [
     "EVENT_RECORD",
     "Events",
+    "Fix",
     "Frame",
     "FrameView",
     "Packet",
@@ -316,3 +317,53 @@ class Packet:
     block: Block | None = None
     block_packets: int = 0
     messages: tuple[ReceivedMessage, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Fix:
+    """A position at one time, or why there is none: a row of `fixes.csv`.
+
+    Attributes:
+        t_us: Camera clock, us.
+        latitude_deg: WGS-84; NaN, as all values, where the fix is refused.
+        longitude_deg: The same.
+        height_m: Above the ellipsoid, m.
+        enu_m: The same place in the local frame, m, float64 (3,).
+        covariance_m2: Of `enu_m`, float64 (3, 3).
+        noise_m2: The part of it that is new with every fix; the rest comes from what was said about the
+            attitude, and stays, float64 (3, 3).
+        heading_deg: Where the optical axis points to, clockwise from north.
+        pitch_deg: How far it points above the horizon.
+        roll_deg: How far the camera's top leans to its right.
+        heading_sigma_deg: Standard deviation of the heading.
+        transmitters: Numbers of the bars that count; of those in view where the fix is refused.
+        verified: The places of all of them come from verified beacons, or from the user's file under an id
+            that a verified beacon told.
+        refusal: Kind of refusal, empty for a fix that is given.
+        detail: The refusal in words.
+    """
+
+    t_us: float
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    enu_m: NDArray[np.float64]
+    covariance_m2: NDArray[np.float64]
+    noise_m2: NDArray[np.float64]
+    heading_deg: float
+    pitch_deg: float
+    roll_deg: float
+    heading_sigma_deg: float
+    transmitters: tuple[int, ...]
+    verified: bool
+    refusal: str = ""
+    detail: str = ""
+
+    @classmethod
+    def refused(cls, t_us: float, transmitters: tuple[int, ...], refusal: str, detail: str) -> Self:
+        """A fix that is not given."""
+        place, spread = np.full(3, math.nan), np.full((3, 3), math.nan)
+        geodetic = angles = (math.nan, math.nan, math.nan)
+        return cls(
+            t_us, *geodetic, place, spread, spread, *angles, math.nan, transmitters, False, refusal, detail
+        )

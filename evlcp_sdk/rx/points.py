@@ -12,8 +12,8 @@ __all__ = ["FindPoints", "points_finder"]
 FindPoints = Callable[
     [PresenceMap, NDArray[np.float64], tuple[float, float]], tuple[NDArray[np.float64], NDArray[np.float64]]
 ]
-"""Presence of a pilot, rest of the motion in it (2, chips), and column and row of the bar's centre at the
-instant asked for -> points (K, 2) and their sigmas (K,), px on the sensor; NaN where a cluster is unseen."""
+"""Presence of a pilot, rest of the motion in the chips that it was read from (2, n), and column and row of
+the bar's centre in the middle of these -> points (K, 2) and sigmas (K,), px; NaN where unseen."""
 
 _SIGMA_PX = 0.12
 """Error expected before any is seen: a boundary inside a pixel, found from a few columns of correlations of

@@ -7,7 +7,7 @@ is refused, with the reason. Frames and signs: `docs/position.md`.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -16,8 +16,19 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.config import PositionSpec
 from evlcp_sdk.geometry import Attitude, CameraModel
+from evlcp_sdk.sites import BarSite, LocalFrame, site_of_transmitter
+from evlcp_sdk.types import Fix, Frame, Packet
 
-__all__ = ["REFUSALS", "BarView", "Pose", "Refusal", "project_bars", "solve_pose", "three_point_poses"]
+__all__ = [
+    "REFUSALS",
+    "BarView",
+    "Pose",
+    "Positioner",
+    "Refusal",
+    "project_bars",
+    "solve_pose",
+    "three_point_poses",
+]
 
 Floats = NDArray[np.float64]
 
@@ -48,6 +59,7 @@ _OUTLIER_SHARE = 0.3
 
 
 REFUSALS = {
+    "no-site": "no bar in view stands at a known place",
     "too-few-clusters": "no bar shows as many clusters as a position needs",
     "heading-unknown": "one bar alone, and the camera's heading is not known",
     "gravity-unknown": "fewer than three bars, or bars in line, and gravity is not known",
@@ -560,3 +572,223 @@ def _told(problem: _Problem) -> int:
     if problem.attitude is None or not problem.turns:
         return 0
     return (0 if problem.attitude.gravity_sigma_deg == 0 else 2) + problem.compass
+
+
+def _interpolation(t: Floats) -> Floats:
+    """Weights of values at times `t` in the value at 0 of the polynomial through them (Lagrange)."""
+    away = t[:, None] - t[None]
+    share = -t[None] / np.where(away == 0, 1.0, away)
+    np.fill_diagonal(share, 1.0)
+    return np.asarray(share.prod(1))
+
+
+@dataclass(eq=False)
+class _Seen:
+    """What is known of one transmitter.
+
+    Attributes:
+        frames: Frames with points that a coming fix may need, in order.
+        transmitter_id: What its beacon said, None before.
+        beacon: Its place by its own word.
+        trust: How far that is believed; `forged` shuts it out until a verified one comes.
+    """
+
+    frames: list[Frame]
+    transmitter_id: int | None = None
+    beacon: BarSite | None = None
+    trust: str = "unverified"
+
+
+class Positioner:
+    """Fixes on a fixed time grid, one a packet time, from the packets of a receiver.
+
+    A fix takes the bars that are seen within half a packet time before and after it. The image moves in that
+    time, with the vehicle's vibration, but a bar's shape hardly changes: the shape is a straight line in
+    time through all frames, the place is interpolated between the frames next to the fix. Feeding packet by
+    packet or all at once gives the same fixes.
+
+    Args:
+        camera: The receiving camera.
+        clusters: Clusters of a bar.
+        packet_us: Length of a packet, us.
+        sites: Where the bars stand; may be empty where beacons are believed.
+        attitude_at: What is known of the camera's attitude at a time, us; None for nothing.
+        spec: Bounds and weights; None for the defaults.
+    """
+
+    def __init__(
+        self,
+        camera: CameraModel,
+        clusters: int,
+        packet_us: float,
+        sites: Sequence[BarSite],
+        attitude_at: Callable[[float], Attitude | None],
+        spec: PositionSpec | None = None,
+    ) -> None:
+        self.frame: LocalFrame | None = LocalFrame.of(sites) if sites else None
+        self._camera = camera
+        self._clusters = clusters
+        self._packet_us = packet_us
+        self._sites = tuple(sites)
+        self._attitude_at = attitude_at
+        self._spec = PositionSpec() if spec is None else spec
+        self._seen: dict[int, _Seen] = {}
+        self._next: int | None = None
+        self._counts = dict.fromkeys(("fixes", "refused", "frames_late", "beacons_forged"), 0)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Fixes given and refused, frames that came too late for theirs, forged beacons."""
+        return dict(self._counts)
+
+    @property
+    def stands_at(self) -> dict[int, BarSite]:
+        """Where the transmitters stand of which that is known."""
+        found = {number: self._site(number) for number in sorted(self._seen)}
+        return {number: site for number, site in found.items() if site is not None}
+
+    def feed(self, packets: Iterable[Packet]) -> list[Fix]:
+        """Take the next packets; return the fixes that no later packet can change."""
+        fixes = []
+        for packet in packets:
+            seen = self._seen.setdefault(packet.transmitter, _Seen([]))
+            self._hear(seen, packet)
+            for frame in packet.frames:
+                if len(frame.points_px) == self._clusters and np.isfinite(frame.points_t_us):
+                    number = math.ceil(frame.points_t_us / self._packet_us - 0.5)
+                    if self._next is None:
+                        self._next = number
+                    # What is late for its own grid time may still serve the next as a neighbour.
+                    self._counts["frames_late"] += number < self._next
+                    seen.frames.append(frame)
+            # A packet of another bar that begins half a packet after a fix is complete one packet later.
+            fixes += self._until(packet.t_us / self._packet_us - 1.5)
+        return fixes
+
+    def close(self) -> list[Fix]:
+        """End the stream; return the rest of the fixes."""
+        last = max((f.points_t_us for s in self._seen.values() for f in s.frames), default=-math.inf)
+        return self._until(last / self._packet_us + 0.5) if math.isfinite(last) else []
+
+    def _hear(self, seen: _Seen, packet: Packet) -> None:
+        for heard in packet.messages:
+            if heard.trust == "forged":
+                self._counts["beacons_forged"] += 1
+                seen.trust, seen.beacon = "forged", None
+            if heard.beacon is None or heard.trust == "forged":
+                continue
+            if seen.trust in ("forged", "verified") and heard.trust != "verified":
+                # Once signed, or once forged, only a signature counts.
+                continue
+            b = heard.beacon
+            seen.transmitter_id, seen.trust = heard.message.transmitter_id, heard.trust
+            seen.beacon = BarSite(
+                heard.message.transmitter_id, b.latitude_deg, b.longitude_deg, b.height_m,
+                b.heading_deg % 360, b.tilt_deg, b.length_m,
+            )  # fmt: skip
+
+    def _site(self, number: int) -> BarSite | None:
+        seen = self._seen[number]
+        if seen.trust == "forged":
+            return None
+        alone = len(self._seen) == 1
+        site = site_of_transmitter(self._sites, number, seen.transmitter_id, alone=alone)
+        believed = {"none": (), "verified": ("verified",), "any": ("verified", "unverified")}
+        if site is None and seen.trust in believed[self._spec.beacons]:
+            site = seen.beacon
+        return site
+
+    def _until(self, limit: float) -> list[Fix]:
+        """The fixes of the grid times up to a limit, in packet times."""
+        fixes = []
+        while self._next is not None and self._next <= limit:
+            t_us = self._next * self._packet_us
+            fix = self._fix(t_us)
+            if fix is not None:
+                self._counts["refused" if fix.refusal else "fixes"] += 1
+                fixes.append(fix)
+            self._next += 1
+            for seen in self._seen.values():
+                oldest = (self._next - 1) * self._packet_us
+                seen.frames = [f for f in seen.frames if f.points_t_us > oldest]
+            coming = [f.points_t_us for s in self._seen.values() for f in s.frames]
+            # Where nothing is in view, the grid goes on with the next frame.
+            first = math.ceil(min(coming) / self._packet_us - 0.5) if coming else None
+            self._next = None if first is None else max(self._next, first)
+        return fixes
+
+    def _fix(self, t_us: float) -> Fix | None:
+        views, sited, verified = [], [], True
+        for number, seen in sorted(self._seen.items()):
+            points = self._at(seen.frames, t_us)
+            if points is None:
+                continue
+            views.append(number)
+            site = self._site(number)
+            if site is None:
+                continue
+            if self.frame is None:
+                self.frame = LocalFrame.of([site])
+            enu = site.cluster_positions_m(self._clusters, self.frame)
+            sited.append(BarView(number, enu, *points))
+        if not views:
+            return None
+        if not sited or self.frame is None:
+            which = ", ".join(map(str, views))
+            return Fix.refused(t_us, tuple(views), "no-site", f"no site is known of transmitter {which}")
+        pose = solve_pose(sited, self._camera, self._attitude_at(t_us), self._spec)
+        if isinstance(pose, Refusal):
+            return Fix.refused(t_us, tuple(views), pose.kind, pose.detail)
+        verified = all(self._seen[n].trust == "verified" for n in pose.transmitters)
+        attitude = Attitude.of_rotation(pose.rotation)
+        latitude, longitude, height = (float(v) for v in self.frame.to_geodetic(pose.enu_m))
+        assert attitude.heading_deg is not None
+        return Fix(
+            t_us=t_us,
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            height_m=height,
+            enu_m=pose.enu_m,
+            covariance_m2=pose.covariance[:3, :3],
+            noise_m2=pose.noise[:3, :3],
+            heading_deg=attitude.heading_deg,
+            pitch_deg=attitude.pitch_deg,
+            roll_deg=attitude.roll_deg,
+            heading_sigma_deg=math.degrees(math.sqrt(pose.covariance[5, 5])),
+            transmitters=pose.transmitters,
+            verified=verified,
+        )
+
+    def _at(self, frames: Sequence[Frame], t_us: float) -> tuple[Floats, Floats] | None:
+        """Points and sigmas at a time; None where the bar is not seen before and after it."""
+        least = self._spec.min_points
+        near = [
+            f
+            for f in frames
+            if abs(f.points_t_us - t_us) <= self._packet_us / 2
+            and np.isfinite(f.points_px[:, 0]).sum() >= least
+        ]
+        dt = np.array([f.points_t_us - t_us for f in near])
+        if len(near) < 3 or dt[0] > 0 or dt[-1] < 0:
+            return None
+        points = np.array([f.points_px for f in near])
+        common = np.isfinite(points[:, :, 0]).all(0)
+        if common.sum() < least // 2:
+            return None
+        places = points[:, common].mean(1)
+        after = int(np.searchsorted(dt, 0.0))
+        beside = slice(max(after - 2, 0), after + 2)
+        place = _interpolation(dt[beside]) @ places[beside]
+        shapes = points - places[:, None]
+        sigmas = np.array([f.points_sigma_px for f in near])
+        found, sigma = np.full((self._clusters, 2), np.nan), np.full(self._clusters, np.nan)
+        for k in range(self._clusters):
+            seen = np.isfinite(shapes[:, k, 0])
+            if seen.sum() < 3:
+                continue
+            line = np.stack([np.ones(int(seen.sum())), dt[seen]], 1)
+            inverse = np.linalg.pinv(line)
+            found[k] = place + (inverse @ shapes[seen, k])[0]
+            drawn = math.sqrt(float((inverse[0] ** 2 * sigmas[seen, k] ** 2).sum()))
+            sigma[k] = math.hypot(drawn, self._spec.pixel_sigma_px)
+        return found, sigma

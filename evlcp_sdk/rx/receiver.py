@@ -64,8 +64,9 @@ class _Look:
         sums: Polarity sums of pilot and info segment, int16 (chips, height, width).
         offset_px: The rest of the motion in them, float64 (2, chips), px.
         presence: Where the clusters are.
-        centre_px: Column and row of the bar's centre at `middle_us`.
-        middle_us: Middle of the pilot, or of the info segment of a frame without one.
+        centre_px: Column and row of the bar's centre in the chip that begins at `middle_us`.
+        middle_us: Middle of the pilot, or of the info segment of a frame without one, where a chip begins: a
+            chip's events show the image at its first edge.
     """
 
     sums: NDArray[np.int16]
@@ -422,8 +423,9 @@ class Receiver:
             # Another distance of the same pilot, or other points, would say nothing new.
             distance = self._measure(FrameView(look.sums, look.offset_px, look.presence, soft))
             self._tell("ranging", distance, _lap(clock))
-            pilot_px = look.offset_px[:, : self._packet.pilot_chips]
-            points = self._find_points(look.presence, pilot_px, look.centre_px)
+            # A value is read from its second chip, and a chip's events follow the edge at its start.
+            read_px = look.offset_px[:, 1 : self._packet.pilot_chips : 2]
+            points = self._find_points(look.presence, read_px, look.centre_px)
         if transmitter.first is None:
             transmitter.first = number
         frame = Frame(
@@ -481,7 +483,8 @@ class Receiver:
             sums = np.concatenate([pilot.sums, sums])
             offset_px = np.concatenate([pilot.offset_px, offset_px], axis=1)
         centre_px = float(x[middle]), float(y[middle])
-        return _Look(sums, offset_px, presence, centre_px, float(middles[middle]))
+        middle_us = float(middles[middle]) - lock.chip_us / 2
+        return _Look(sums, offset_px, presence, centre_px, middle_us)
 
     def _filter(self, transmitter: _Transmitter, t_us: float, measured: Range) -> Range | None:
         """The distance filtered over time; the prediction where a frame allows none."""

@@ -214,8 +214,9 @@ def test_every_fault_of_a_file_is_told(registry: Registry, tmp_path: Path) -> No
     window_px = nan
     """
     assert faults_of(registry, text, tmp_path, "bar.led_pitch_m=-1", "lamp.on=1") == [
-        "link.toml: camra: unknown table; did you mean 'camera'? (known: camera, bar, air, regions, messages, position,"
-        " pilots, modulation, synchronization, separation, decoding, ranging, tracking, error-correction)",
+        "link.toml: camra: unknown table; did you mean 'camera'? (known: camera, bar, air, regions, messages,"
+        " position, pilots, modulation, synchronization, separation, decoding, ranging, tracking,"
+        " error-correction)",
         "link.toml: decoding = 4: expected a table",
         "--set: lamp.on: unknown table (known: camera, bar, air, regions, messages, position,"
         " pilots, modulation, synchronization, separation, decoding, ranging, tracking, error-correction)",

@@ -13,6 +13,7 @@ LAYERS = (
     {"messages"},
     {"types"},
     {"geometry", "codebook", "frames", "crc", "sites"},
+    {"attitude"},
     {"abc", "hookspecs"},
     {"messages.coding", "messages.sending"},
     {"registry", "config"},

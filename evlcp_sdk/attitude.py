@@ -1,0 +1,108 @@
+"""The camera's attitude over time, from a file such as an IMU's log."""
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.geometry import Attitude
+
+__all__ = ["AttitudeTrack"]
+
+_NEEDED = ("t_us", "pitch_deg", "roll_deg")
+_OPTIONAL = ("heading_deg", "gravity_sigma_deg", "heading_sigma_deg")
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudeTrack:
+    """Attitudes at rising times, straight between them, nothing before and after.
+
+    Attributes:
+        t_us: Camera clock, us, float64 (n,), rising.
+        pitch_deg: float64 (n,).
+        roll_deg: float64 (n,).
+        heading_deg: float64 (n,); None where the heading is not known.
+        gravity_sigma_deg: float64 (n,).
+        heading_sigma_deg: float64 (n,).
+    """
+
+    t_us: NDArray[np.float64]
+    pitch_deg: NDArray[np.float64]
+    roll_deg: NDArray[np.float64]
+    heading_deg: NDArray[np.float64] | None
+    gravity_sigma_deg: NDArray[np.float64]
+    heading_sigma_deg: NDArray[np.float64]
+
+    @classmethod
+    def read(cls, path: Path | str) -> "AttitudeTrack":
+        """Read a CSV of t_us, pitch_deg, roll_deg and, optionally, heading_deg and both sigmas.
+
+        Raises:
+            InputError: The file cannot be read.
+            ConfigError: A column is missing, a value is no number, or times do not rise.
+        """
+        try:
+            with Path(path).open(newline="", encoding="utf-8") as file:
+                reader = csv.DictReader(file)
+                names = tuple(reader.fieldnames or ())
+                rows = list(reader)
+        except OSError as fault:
+            raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+        except (UnicodeDecodeError, csv.Error) as fault:
+            raise InputError(f"{path}: not a CSV file: {fault}") from fault
+        missing = [name for name in _NEEDED if name not in names]
+        if missing:
+            known = ", ".join(_NEEDED + _OPTIONAL)
+            raise ConfigError(f"{path}: line 1: no column {missing[0]} (columns: {known})")
+        table: dict[str, NDArray[np.float64]] = {}
+        for name in _NEEDED + _OPTIONAL:
+            if name in names:
+                table[name] = np.array([_number(path, i, name, row[name]) for i, row in enumerate(rows)])
+        t_us = table["t_us"]
+        if len(t_us) < 2 or (np.diff(t_us) <= 0).any():
+            raise ConfigError(f"{path}: expected two lines or more with rising t_us")
+        for name in ("gravity_sigma_deg", "heading_sigma_deg"):
+            if name in table and (table[name] < 0).any():
+                line = int(np.flatnonzero(table[name] < 0)[0]) + 2
+                raise ConfigError(
+                    f"{path}: line {line}: {name} = {table[name][line - 2]:g}: expected 0 or more"
+                )
+        usual = Attitude()
+        return cls(
+            t_us,
+            table["pitch_deg"],
+            np.degrees(np.unwrap(np.radians(table["roll_deg"]))),
+            np.degrees(np.unwrap(np.radians(table["heading_deg"]))) if "heading_deg" in table else None,
+            table.get("gravity_sigma_deg", np.full(len(t_us), usual.gravity_sigma_deg)),
+            table.get("heading_sigma_deg", np.full(len(t_us), usual.heading_sigma_deg)),
+        )
+
+    def at(self, t_us: float) -> Attitude | None:
+        """The attitude at a time; None outside of the track."""
+        if not self.t_us[0] <= t_us <= self.t_us[-1]:
+            return None
+
+        def value(column: NDArray[np.float64]) -> float:
+            return float(np.interp(t_us, self.t_us, column))
+
+        return Attitude(
+            value(self.pitch_deg),
+            value(self.roll_deg),
+            None if self.heading_deg is None else value(self.heading_deg) % 360,
+            value(self.gravity_sigma_deg),
+            value(self.heading_sigma_deg),
+        )
+
+
+def _number(path: Path | str, index: int, name: str, text: str | None) -> float:
+    try:
+        value = float(text if text is not None else "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ConfigError(f"{path}: line {index + 2}: {name} = {text!r}: expected a number")
+    return value
