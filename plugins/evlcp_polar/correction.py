@@ -55,7 +55,7 @@ class Polar(ErrorCorrection):
         Field(
             ge=0, lt=1, description="Bits a coded bit that are to be received beyond those of the message."
         ),
-    ] = 0.08
+    ] = 0.06
 
     def __post_init__(self) -> None:
         if self.max_list_size < self.list_size:

@@ -145,6 +145,41 @@ def test_encoding_by_the_matrix(length: int, rate: float) -> None:
         assert not np.delete(codeword, sent).any(), "a bit that is not sent is 0: shortened"
 
 
+def by_the_standard(message: Bits, length: int) -> Bits:
+    """One codeword, from the text of 3GPP TS 38.212, 5.3.1.2 and 5.4.1, and docs/error-correction.md."""
+    k = len(message) + 24
+    n = 32
+    while n < length:
+        n *= 2
+    pieces = [0, 1, 2, 4, 3, 5, 6, 7, 8, 16, 9, 17, 10, 18, 11, 19, 12, 20, 13, 21, 14, 22, 15, 23]
+    pieces += [24, 25, 26, 28, 27, 29, 30, 31]
+    interleaved = [pieces[32 * i // n] * (n // 32) + i % (n // 32) for i in range(n)]
+    frozen: set[int] = set()
+    if 16 * k <= 7 * length:
+        kept = interleaved[n - length :]
+        frozen |= set(interleaved[: n - length])
+        if length < n:
+            early = (3 * n - 2 * length) / 4 if 4 * length >= 3 * n else (9 * n - 4 * length) / 16
+            frozen |= set(range(int(np.ceil(early))))
+    else:
+        kept = interleaved[:length]
+        frozen |= set(interleaved[length:])
+    free = [i for i in RELIABILITY if i < n and i not in frozen][-k:]
+    inputs = dict(zip(sorted(free), [*message, *crc24(message)], strict=True))
+    return np.array([sum(int(bit) for i, bit in inputs.items() if i & j == j) % 2 for j in kept], np.uint8)
+
+
+@pytest.mark.parametrize("rate", [0.15, 0.3, 0.43, 0.45, 0.5, 0.8])
+def test_encoding_by_the_standard(rate: float) -> None:
+    rng = np.random.default_rng(0)
+    for length in (40, 64, 100, 130, 200, 256, 300, 640, 800, 960, 1024):
+        if rate * length < 32:
+            continue
+        code = Polar(rate=rate).compile(length)
+        message = rng.integers(0, 2, code.message_bits).astype(np.uint8)
+        assert_array_equal(code.encode(message), by_the_standard(message, length))
+
+
 def test_a_code_of_half_rate_carries_whole_bytes() -> None:
     sizes = {n: Polar().compile(n).message_bits for n in (64, 256, 640, 960, 1024, 1280, 4000)}
     assert sizes == {64: 8, 256: 104, 640: 296, 960: 456, 1024: 488, 1280: 592, 4000: 4 * 472}
