@@ -1,20 +1,27 @@
 """The docs hold: their code runs, their commands work, their links lead somewhere, nothing is left out."""
 
+import dataclasses
+import importlib
+import inspect
+import json
 import re
 import sys
 import tomllib
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
+from pydantic.fields import FieldInfo
 
 from evlcp_sdk import hookspecs
 from evlcp_sdk.abc import ROLES
 from evlcp_sdk.config import resolve
 from evlcp_sdk.messages.signing import make_key
 from evlcp_sdk.registry import Registry
+from evlcp_sdk.testing import check, laws_of
+from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
 
 ROOT = Path(__file__).parents[2]
 PAGES = (
@@ -30,6 +37,7 @@ PAGES = (
     "paper",
     "rates",
     "roles",
+    "conformance",
     "hooks",
 )
 FILES = [ROOT / "README.md", *(ROOT / "docs" / f"{page}.md" for page in PAGES)]
@@ -38,6 +46,16 @@ HOOKS = [name for name in vars(hookspecs) if name.startswith("evlcp_")]
 
 def blocks(path: Path, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", path.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def section_of(page: str, head: str) -> str:
+    """The text under a heading of the second level."""
+    return (ROOT / "docs" / f"{page}.md").read_text().split(f"\n## {head}\n")[1].split("\n## ")[0]
+
+
+def law_rows(text: str) -> list[tuple[str, str]]:
+    """Name and meaning of each law in a table."""
+    return re.findall(r"^\| `([\w-]+)` \| (.+) \|$", text, re.MULTILINE)
 
 
 @pytest.fixture
@@ -60,6 +78,7 @@ def test_code_and_commands_run(path: Path, workplace: Path, evlcp: Callable[...,
     if "OUT/" in path.read_text():
         assert evlcp("receive", "REC.raw", "-o", "OUT").code == 0
     names: dict[str, Any] = {"__name__": "example"}
+    modules = set(sys.modules)
     for code in blocks(path, "python"):
         if name := re.match(r"# (\w+)\.py\n", code):
             (workplace / f"{name[1]}.py").write_text(code)
@@ -71,8 +90,9 @@ def test_code_and_commands_run(path: Path, workplace: Path, evlcp: Callable[...,
             if line.startswith("$ evlcp "):
                 done = evlcp(*line.removeprefix("$ evlcp ").split())
                 assert done.code == 0, f"{line}\n{done.err}"
-    for name in ("line_plugin",):
-        sys.modules.pop(name, None)
+    for name in set(sys.modules) - modules:
+        if getattr(sys.modules[name], "__file__", None) == str(workplace / f"{name}.py"):
+            sys.modules.pop(name)
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
@@ -88,7 +108,7 @@ def test_links_lead_somewhere(path: Path) -> None:
     for target in re.findall(r"\]\(([^)]+)\)", path.read_text()):
         if not target.startswith("http"):
             name, _, anchor = target.partition("#")
-            page = path.parent / name
+            page = path.parent / name if name else path
             assert page.exists(), f"{path.name} links to {name}"
             if anchor:
                 heads = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
@@ -108,8 +128,11 @@ def test_the_message_that_is_shown_is_the_message(
 
 @pytest.mark.parametrize("hook", HOOKS)
 def test_every_hook_has_a_section_with_a_full_example(hook: str) -> None:
-    page = (ROOT / "docs" / "hooks.md").read_text()
-    section = page.split(f"\n## {hook}\n")[1].split("\n## ")[0]
+    section = section_of("hooks", hook)
+    assert f"`{hook}{inspect.signature(getattr(hookspecs, hook))}`".replace("'", "") in section.replace(
+        "typing.", ""
+    )
+    assert "\nCalled " in section
     assert "@hookimpl" in section
     assert f"def {hook}(" in section
 
@@ -125,13 +148,70 @@ def test_every_stage_is_in_the_docs() -> None:
 
 @pytest.mark.parametrize("role", ROLES)
 def test_every_role_has_a_section_with_its_verbs_and_algorithms(role: str) -> None:
-    page = (ROOT / "docs" / "roles.md").read_text()
-    section = page.split(f"\n## {role}\n")[1].split("\n## ")[0]
+    section = section_of("roles", role)
     for verb in ROLES[role].__abstractmethods__:
         assert f"{ROLES[role].__name__}.{verb}(" in section
     for entry in Registry.load().installed(role):
         if entry.distribution == "evlcp-sdk":
             assert f"`{entry.algorithm.id}`" in section
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_every_parameter_of_every_built_in_is_in_the_docs(role: str) -> None:
+    section = section_of("roles", role)
+    registry = Registry.load()
+    rows = []
+    for entry in registry.installed(role):
+        if entry.distribution != "evlcp-sdk":
+            continue
+        cls = registry.load_class(role, entry.algorithm.id)
+        hints = get_type_hints(cls, include_extras=True)
+        for f in dataclasses.fields(cls):
+            (told,) = [n.description for n in hints[f.name].__metadata__ if isinstance(n, FieldInfo)]
+            rows.append(f"| `{entry.algorithm.id}` | `{f.name}` | {json.dumps(f.default)} | {told} |")
+    shown = [line for line in section.splitlines() if line.startswith("| `")]
+    assert shown == rows, f"docs/roles.md, {role}: expected these rows:\n" + "\n".join(rows)
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_the_example_of_every_role_keeps_its_laws(role: str, workplace: Path) -> None:
+    (code,) = re.findall(r"^```python\n(.*?)^```$", section_of("roles", role), re.MULTILINE | re.DOTALL)
+    first = re.match(r"# (\w+)\.py\n", code)
+    assert first
+    (workplace / f"{first[1]}.py").write_text(code)
+    try:
+        module = importlib.import_module(first[1])
+        (cls,) = [
+            found
+            for found in vars(module).values()
+            if isinstance(found, type) and issubclass(found, ROLES[role]) and found is not ROLES[role]
+            if found.__module__ == first[1]
+        ]
+        for outcome in check(role, cls()):
+            assert outcome.status == "ok", f"{outcome.law.name}: {outcome.detail}"
+    finally:
+        sys.modules.pop(first[1], None)
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_every_law_is_in_the_docs(role: str) -> None:
+    page = (ROOT / "docs" / "conformance.md").read_text()
+    form = law_rows(page.split("\n## Laws of form\n")[1].split("\n## ")[0])
+    own = law_rows(section_of("conformance", role))
+    laws = [(law.name, law.says) for law in laws_of(role)]
+    assert own == [law for law in laws if law not in form]
+    shared = {(law.name, law.says) for law in DESCRIPTION + FUNCTION + RESULT}
+    assert len(form) == len(shared)
+    assert set(form) == shared
+
+
+def test_a_law_of_form_is_of_every_role_but_two() -> None:
+    without = {role for role in ROLES if not {law.name for law in FUNCTION} & {r.name for r in laws_of(role)}}
+    assert without == {"pilots", "modulation"}
+    for role in ROLES:
+        names = [law.name for law in laws_of(role)]
+        assert {law.name for law in DESCRIPTION + RESULT} <= set(names)
+        assert len(names) == len(set(names))
 
 
 def test_the_quickstart_is_the_example(capsys: pytest.CaptureFixture[str], workplace: Path) -> None:
