@@ -30,6 +30,7 @@ PAGES = (
     "cli",
     "outputs",
     "messages",
+    "error-correction",
     "configuration",
     "simulator",
     "campaigns",
