@@ -602,6 +602,33 @@ static void test_save_and_recall(void)
     EXPECT(ask(&h, EVLCP_TYPE_SAVE, &autostart, 1) == EVLCP_STATUS_FLASH_FAULT);
 }
 
+/* A whole slot of the layout before pilot_every is empty to this firmware; this layout keeps pilot_every. */
+static void test_slot_of_older_firmware(void)
+{
+    struct host h;
+    struct native *board = fresh(&h);
+    uint8_t autostart = 0u;
+    uint8_t payload[EVLCP_CONFIGURE_REQUEST_BYTES];
+    const struct evlcp_configure_request r = {.chip_rate_hz = 10000, .profile = 0, .frames = 10, .pilot_every = 4};
+    evlcp_configure_request_put(payload, &r);
+    EXPECT(ask(&h, EVLCP_TYPE_CONFIGURE, payload, sizeof payload) == EVLCP_STATUS_OK);
+    uint32_t crc = fill(&h, 0, 320u, 1);
+    EXPECT(commit(&h, 0, 1, 320u, crc) == EVLCP_STATUS_OK);
+    EXPECT(ask(&h, EVLCP_TYPE_SAVE, &autostart, 1) == EVLCP_STATUS_OK && h.payload[0] == 0u);
+    native_reset(board);
+    say_hello(&h, 1u);
+    EXPECT(ask(&h, EVLCP_TYPE_RECALL, NULL, 0) == EVLCP_STATUS_OK);
+    EXPECT(ask_status(&h).pilot_every == 4u);
+    uint8_t *header = board->flash[0];
+    evlcp_put32(header, 0x45564c31u);
+    header[19] = 0u;
+    evlcp_put32(header + EVLCP_SLOT_HEADER_BYTES - 4u, evlcp_crc32(0u, header, EVLCP_SLOT_HEADER_BYTES - 4u));
+    native_reset(board);
+    say_hello(&h, 2u);
+    EXPECT(ask(&h, EVLCP_TYPE_RECALL, NULL, 0) == EVLCP_STATUS_EMPTY_SLOT);
+    EXPECT(ask_status(&h).active_bank == EVLCP_NO_BANK);
+}
+
 static void test_led_test(void)
 {
     struct host h;
@@ -770,6 +797,7 @@ int main(int argc, char **argv)
     test_watchdog();
     test_faults_darken();
     test_save_and_recall();
+    test_slot_of_older_firmware();
     test_led_test();
     test_masks();
     test_sparse_pilots();
