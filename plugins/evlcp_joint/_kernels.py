@@ -63,10 +63,13 @@ def model(
             if b < 1 or b > clusters - 1 or not (seen[b - 1] and seen[b]):
                 continue
             z = (at - spacing * (b - clusters / 2)) / blur
-            share = _normal(z)
             step = float(codes[b, i] - codes[b - 1, i])
-            level = codes[b - 1, i] + step * share
-            steep = gain * step * exp(-z * z / 2) / sqrt(2 * pi) / blur
+            level = float(codes[b, i] if z > 0 else codes[b - 1, i])
+            steep = 0.0
+            # Six sigmas away, or between equal codes, the boundary is not felt.
+            if step != 0 and abs(z) < 6:
+                level = codes[b - 1, i] + step * _normal(z)
+                steep = gain * step * exp(-z * z / 2) / sqrt(2 * pi) / blur
             value[i, v] = gain * level
             slope[0, i, v] = -steep * (b - clusters / 2)
             slope[1, i, v] = -steep
