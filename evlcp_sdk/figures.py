@@ -7,7 +7,7 @@ figures of a recording of any length take constant memory; `save_figures` draws 
 import colorsys
 import math
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -15,15 +15,26 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Ellipse, Rectangle
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.geometry import CameraModel
 from evlcp_sdk.hookspecs import hookimpl
-from evlcp_sdk.types import Events, Frame, PresenceMap, Region
+from evlcp_sdk.rx.track import TrackPoint
+from evlcp_sdk.types import Events, Fix, Frame, PresenceMap, Region
 
-__all__ = ["FigureProbe", "Thinned", "draw_distance", "draw_presence", "draw_regions", "save_figures"]
+__all__ = [
+    "FigureProbe",
+    "Thinned",
+    "TrackProbe",
+    "draw_distance",
+    "draw_presence",
+    "draw_regions",
+    "draw_track",
+    "save_figures",
+    "save_track",
+]
 
 TRANSMITTER_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Okabe and Ito's colours, told apart by colour-blind readers too."""
@@ -31,6 +42,7 @@ TRANSMITTER_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#
 _INK = "#333333"
 _DPI = 150
 _MOST_ZOOMS = 3
+_MOST_ELLIPSES = 40
 
 T = TypeVar("T")
 
@@ -138,16 +150,108 @@ def save_figures(probe: FigureProbe, title: str, folder: Path) -> list[Path]:
     if probe.frames:
         drawn.append(("distance.png", draw_distance(probe, title)))
     for name, figure in drawn:
-        part = folder / f".{name}.{os.getpid()}.part"
-        try:
-            figure.savefig(part, format="png", dpi=_DPI)
-            part.replace(folder / name)
-        except OSError as fault:
-            raise EvlcpError(f"{folder / name}: cannot be written: {fault.strerror}") from fault
-        finally:
-            part.unlink(missing_ok=True)
+        _save(figure, folder / name)
         written.append(folder / name)
     return written
+
+
+def _save(figure: Figure, path: Path) -> None:
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        figure.savefig(part, format="png", dpi=_DPI)
+        part.replace(path)
+    except OSError as fault:
+        raise EvlcpError(f"{path}: cannot be written: {fault.strerror}") from fault
+    finally:
+        part.unlink(missing_ok=True)
+
+
+class TrackProbe:
+    """Watches a `PositionWriter` for the figure of the track.
+
+    Args:
+        points: How many points to keep.
+    """
+
+    def __init__(self, points: int = 4096) -> None:
+        self.points: Thinned[tuple[Fix, TrackPoint, TrackPoint]] = Thinned(points)
+
+    def add(self, fix: Fix, filtered: TrackPoint, smoothed: TrackPoint) -> None:
+        """Take a fix with its points of the track."""
+        self.points.add((fix, filtered, smoothed))
+
+
+def save_track(
+    probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]], title: str, path: Path
+) -> None:
+    """Draw the track into a file.
+
+    Raises:
+        EvlcpError: The file cannot be written.
+    """
+    _save(draw_track(probe, bars_enu_m, title), path)
+
+
+def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]], title: str) -> Figure:
+    """A map of fixes with their 95 % ellipses, the track and the bars; height and sigma over time.
+
+    Args:
+        probe: Has watched a `PositionWriter` to its end.
+        bars_enu_m: Centre of each bar in the local frame, m, float64 (3,), by transmitter.
+        title: What the figure is of.
+    """
+    figure = Figure(figsize=(11, 7.6), layout="constrained")
+    parts = figure.subplot_mosaic(
+        [["plan", "close"], ["height", "height"], ["spread", "spread"]], height_ratios=[4, 1, 1]
+    )
+    plan, close, height, spread = (parts[name] for name in ("plan", "close", "height", "spread"))
+    points = list(probe.points)
+    for number, enu in sorted(bars_enu_m.items()):
+        plan.plot(enu[0], enu[1], "s", ms=7, color=transmitter_colour(number))
+        plan.annotate(
+            f"bar {number}", (enu[0], enu[1]), xytext=(6, 4), textcoords="offset points", fontsize=9
+        )
+    if points:
+        fixed = np.array([fix.enu_m for fix, _, _ in points])
+        live = np.array([filtered.mean for _, filtered, _ in points])
+        smooth = np.array([smoothed.mean for _, _, smoothed in points])
+        t_s = np.array([fix.t_us for fix, _, _ in points]) * 1e-6
+        for axis in (plan, close):
+            for fix, _, _ in points[:: max(1, len(points) // _MOST_ELLIPSES)]:
+                axis.add_patch(_ellipse(fix.enu_m[:2], fix.covariance_m2[:2, :2]))
+            axis.plot(fixed[:, 0], fixed[:, 1], ".", ms=4, color=_INK, label="fix, with 95 % ellipse")
+        for way, colour, label in ((live, "#56b4e9", "filtered"), (smooth, "#d55e00", "smoothed")):
+            for axis in (plan, close):
+                axis.plot(way[:, 0], way[:, 1], "-", lw=1.4, color=colour, label=label)
+            height.plot(t_s, way[:, 2], "-", lw=1.4, color=colour)
+        height.plot(t_s, fixed[:, 2], ".", ms=3, color=_INK)
+        for i, name in enumerate(("east", "north", "up")):
+            sigma = [math.sqrt(fix.covariance_m2[i, i]) for fix, _, _ in points]
+            spread.plot(t_s, sigma, lw=1.2, color=TRANSMITTER_COLOURS[i], label=name)
+        close.legend(frameon=False, fontsize=9)
+        spread.legend(frameon=False, fontsize=9, ncols=3)
+    for axis in (plan, close):
+        axis.set(xlabel="east, m", ylabel="north, m")
+        axis.set_aspect("equal", adjustable="datalim")
+    _title(plan, "bars and track")
+    _title(close, "the track alone")
+    height.set(ylabel="up, m")
+    spread.set(ylabel="sigma, m", xlabel="camera clock, s", ylim=(0, None))
+    for axis in (plan, close, height, spread):
+        _plain(axis)
+        axis.grid(color="#e6e6e6", lw=0.8)
+        axis.set_axisbelow(True)
+    figure.suptitle(f"{title}: {len(points)} positions shown", fontsize=11, color=_INK)
+    return figure
+
+
+def _ellipse(centre: NDArray[np.float64], covariance: NDArray[np.float64]) -> Ellipse:
+    """The ellipse that holds 95 % of a normal distribution of the plane."""
+    values, axes = np.linalg.eigh(covariance)
+    # The 95 % quantile of chi squared with two degrees of freedom is -2 ln 0.05.
+    wide, long = 2 * np.sqrt(-2 * math.log(0.05) * np.maximum(values, 0))
+    angle = math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
+    return Ellipse((centre[0], centre[1]), long, wide, angle=angle, fill=False, ec="#999999", lw=0.8)
 
 
 def transmitter_colour(number: int) -> str:

@@ -33,6 +33,7 @@ __all__ = [
     "TransmitterTally",
     "filtered_row",
     "frame_row",
+    "hidden_path",
     "message_line",
 ]
 
@@ -59,10 +60,16 @@ FIGURE_NAMES = ("regions.png", "presence.png", "distance.png")
 Status = Literal["complete", "interrupted", "failed"]
 """How a run ended: read to the end, stopped by the user, or stopped by input that cannot be read."""
 
-_FILES = ("frames.csv", "packets.jsonl", "frames.parquet", "summary.json")
+_POSITION_FILES = ("fixes.csv", "track.csv", "fixes.geojson", "fixes.nmea", "fixes.mcap", "track.png")
+_FILES = ("frames.csv", "packets.jsonl", "frames.parquet", *_POSITION_FILES, "summary.json")
 _CELL_M = 0.01
 _FARTHEST_M = 10_000.0
 _MOST_CLOCK_ERROR = 0.01
+
+
+def hidden_path(folder: Path, name: str) -> Path:
+    """Where a file is written until its run ends."""
+    return folder / f".{name}.{os.getpid()}.part"
 
 
 @dataclass
@@ -179,7 +186,7 @@ class ResultWriter:
         self._rows.writerow(FRAME_COLUMNS + (FILTERED_COLUMNS if self._filtered else ()))
 
     def _hidden(self, name: str) -> Path:
-        return self.folder / f".{name}.{os.getpid()}.part"
+        return hidden_path(self.folder, name)
 
     def _open(self, name: str) -> TextIO:
         return self._hidden(name).open("w", encoding="utf-8", newline="")
@@ -240,6 +247,7 @@ class ResultWriter:
         losses: Mapping[str, Mapping[str, Any]],
         versions: Mapping[str, str],
         error: str | None = None,
+        positions: Mapping[str, Any] | None = None,
     ) -> dict[str, Any]:
         """Write the summary, move all files into place, and drop what an earlier run left.
 
@@ -251,6 +259,7 @@ class ResultWriter:
             losses: What the reader skipped, by kind, with byte offsets.
             versions: Installed versions.
             error: The message, when `status` is `failed`.
+            positions: What `PositionWriter.finish` returned, where positions were computed.
 
         Returns:
             The content of `summary.json`.
@@ -275,6 +284,7 @@ class ResultWriter:
             "revisions": dict(self._link.revisions),
             "configuration": {section: dict(keys) for section, keys in self._link.table.items()},
             "versions": dict(versions),
+            **({"positions": dict(positions)} if positions is not None else {}),
         }
         try:
             self._hidden("summary.json").write_text(json.dumps(table, indent=2) + "\n", encoding="utf-8")

@@ -4,7 +4,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,9 @@ from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
 
 if TYPE_CHECKING:
     from evlcp_sdk.config import Link
+    from evlcp_sdk.fixes import PositionPlan
     from evlcp_sdk.io import EventSource
+    from evlcp_sdk.types import Packet
 
 __all__ = ["InterruptedRunError", "bytes_bar", "check_sensor", "decode", "register", "show"]
 
@@ -56,13 +58,36 @@ def receive(
     overrides: Overrides = None,
     as_json: Annotated[bool, typer.Option("--json", help="Each summary as one line of JSON.")] = False,
     figures: Annotated[
-        bool, typer.Option("--figures", help="Draw regions.png, presence.png, distance.png.")
+        bool, typer.Option("--figures", help="Draw regions.png, presence.png, distance.png, track.png.")
     ] = False,
     parquet: Annotated[bool, typer.Option("--parquet", help="Also write frames.parquet.")] = False,
     workers: Annotated[
         int, typer.Option("--workers", min=0, metavar="N", help="Processes for many recordings; 0: this one.")
     ] = 0,
     dask: Dask = None,
+    sites: Annotated[
+        Path | None,
+        typer.Option("--sites", metavar="site.toml", help="Where the bars stand: compute positions."),
+    ] = None,
+    attitude: Annotated[
+        Path | None, typer.Option("--attitude", metavar="FILE.csv", help="The camera's attitude over time.")
+    ] = None,
+    heading_deg: Annotated[
+        float | None, typer.Option("--heading-deg", help="Its heading, clockwise from north, if known.")
+    ] = None,
+    pitch_deg: Annotated[float | None, typer.Option("--pitch-deg", help="Its pitch, up.")] = None,
+    roll_deg: Annotated[float | None, typer.Option("--roll-deg", help="Its roll, top to the right.")] = None,
+    heading_sigma_deg: Annotated[
+        float, typer.Option("--heading-sigma-deg", min=0, help="Standard deviation of the heading.")
+    ] = 0.5,
+    gravity_sigma_deg: Annotated[
+        float, typer.Option("--gravity-sigma-deg", min=0, help="Standard deviation of pitch and roll.")
+    ] = 0.1,
+    clock_zero: Annotated[
+        str | None,
+        typer.Option("--clock-zero", metavar="UTC", help="UTC of the camera clock's 0, for NMEA and MCAP."),
+    ] = None,
+    mcap: Annotated[bool, typer.Option("--mcap", help="Also write fixes.mcap, for Foxglove.")] = False,
 ) -> None:
     """Decode recordings: symbols and distances into OUT.
 
@@ -78,7 +103,13 @@ def receive(
 
     Two at a time:       [bold]evlcp receive *.raw -o out --workers 2[/]
 
+    Positions, with the camera level and looking north: [bold]evlcp receive REC.raw -o out --sites site.toml
+    --heading-deg 0 --pitch-deg 0 --roll-deg 0[/]
+
+    Positions, with an IMU's log: [bold]evlcp receive REC.raw -o out --sites site.toml --attitude imu.csv[/]
+
     OUT gets frames.csv (a row a frame), packets.jsonl (a line a packet or message) and summary.json.
+    With --sites it gets fixes.csv, track.csv, fixes.geojson and fixes.nmea, too.
     An earlier result there is replaced when the new one is complete.
     """
     import json
@@ -88,13 +119,20 @@ def receive(
 
     jobs = _jobs(recordings, out)
     link = load_link(link_file, overrides or [], Registry.load())
+    angles = (heading_deg, pitch_deg, roll_deg)
+    plan = _position_plan(sites, attitude, angles, (gravity_sigma_deg, heading_sigma_deg), clock_zero, mcap)
     here = dask is None and (not workers or len(jobs) == 1)
     executor = make_executor(0 if here else workers or None, dask)
     worst = 0
     interrupted: list[Path] = []
     with _stop_on_request() as stopped, _recordings_bar(0 if here else len(jobs)) as count:
         run = partial(
-            _decode_job, link=link, figures=figures, parquet=parquet, stopped=stopped if here else None
+            _decode_job,
+            link=link,
+            figures=figures,
+            parquet=parquet,
+            plan=plan,
+            stopped=stopped if here else None,
         )
         for outcome in executor.run(run, _until(stopped, jobs)):
             count()
@@ -122,19 +160,71 @@ def receive(
     raise typer.Exit(worst)
 
 
+def _position_plan(
+    sites: Path | None,
+    file: Path | None,
+    angles: tuple[float | None, float | None, float | None],
+    sigmas: tuple[float, float],
+    clock_zero: str | None,
+    mcap: bool,
+) -> "PositionPlan | None":
+    """What the options say of positions; None without sites."""
+    heading, pitch, roll = angles
+    if sites is None:
+        given = {"--attitude": file, "--heading-deg": heading, "--pitch-deg": pitch, "--roll-deg": roll}
+        for name, value in (given | {"--clock-zero": clock_zero, "--mcap": mcap or None}).items():
+            if value is not None:
+                raise typer.BadParameter("needs --sites", param_hint=name)
+        return None
+    from datetime import UTC, datetime
+
+    from evlcp_sdk.attitude import AttitudeTrack
+    from evlcp_sdk.fixes import PositionPlan
+    from evlcp_sdk.geometry import Attitude
+    from evlcp_sdk.sites import load_sites
+
+    if file is not None and angles != (None, None, None):
+        raise typer.BadParameter("give a file or angles, not both", param_hint="--attitude")
+    if (pitch is None) != (roll is None) or (heading is not None and pitch is None):
+        raise typer.BadParameter(
+            "gravity needs --pitch-deg and --roll-deg; a heading needs gravity", param_hint="--pitch-deg"
+        )
+    attitude: AttitudeTrack | Attitude | None = None
+    if file is not None:
+        attitude = AttitudeTrack.read(file)
+    elif pitch is not None and roll is not None:
+        attitude = Attitude(pitch, roll, heading, *sigmas)
+    zero = None
+    if clock_zero is not None:
+        try:
+            zero = datetime.fromisoformat(clock_zero)
+        except ValueError as fault:
+            text = f"{clock_zero!r}: expected a time such as 2026-03-01T10:15:00Z"
+            raise typer.BadParameter(text, param_hint="--clock-zero") from fault
+        zero = zero if zero.tzinfo is not None else zero.replace(tzinfo=UTC)
+    return PositionPlan(load_sites(sites), attitude, zero, mcap)
+
+
 def _decode_job(
-    job: Job, *, link: "Link", figures: bool, parquet: bool, stopped: Callable[[], bool] | None
+    job: Job,
+    *,
+    link: "Link",
+    figures: bool,
+    parquet: bool,
+    plan: "PositionPlan | None",
+    stopped: Callable[[], bool] | None,
 ) -> dict[str, Any]:
     """Decode a recording here, with a bar; or, without `stopped`, quietly in a worker."""
+    extras: dict[str, Any] = {"figures": figures, "parquet": parquet, "plan": plan}
     if stopped is not None:
         with bytes_bar(Path(job.url).name) as advance:
-            return decode(job.url, job.folder, link, advance, stopped, figures=figures, parquet=parquet)
+            return decode(job.url, job.folder, link, advance, stopped, **extras)
     # A terminal sends Ctrl-C to workers, too; only a main thread can listen to it.
     main = threading.current_thread() is threading.main_thread()
     listening: AbstractContextManager[Callable[[], bool]]
     listening = _stop_on_request() if main else nullcontext(lambda: False)
     with listening as asked:
-        return decode(job.url, job.folder, link, lambda _a, _b: None, asked, figures=figures, parquet=parquet)
+        return decode(job.url, job.folder, link, lambda _a, _b: None, asked, **extras)
 
 
 def _until(stopped: Callable[[], bool], jobs: Sequence[Job]) -> Iterator[Job]:
@@ -153,6 +243,7 @@ def decode(
     *,
     figures: bool = False,
     parquet: bool = False,
+    plan: "PositionPlan | None" = None,
 ) -> dict[str, Any]:
     """Decode one recording into a folder, in constant memory.
 
@@ -164,6 +255,7 @@ def decode(
         stopped: Asked after every piece whether to end early.
         figures: Draw the figures.
         parquet: Write Parquet, too.
+        plan: What positions are computed from; None for none.
 
     Returns:
         The summary; its `status` is `failed` when the recording cannot be read on.
@@ -185,11 +277,27 @@ def decode(
         from evlcp_sdk.figures import FigureProbe
 
         probes.append(FigureProbe(link.camera))
+    tracks = []
+    if figures and plan is not None:
+        from evlcp_sdk.figures import TrackProbe
+
+        tracks.append(TrackProbe())
     registry = Registry.load(*probes)
     with open_source(url, registry) as source:
         check_sensor(source, url, link)
-        with ResultWriter(folder, link, parquet=parquet) as writer:
+        with ResultWriter(folder, link, parquet=parquet) as writer, ExitStack() as closing:
             receiver = Receiver(link, registry.hook)
+            positions = None
+            if plan is not None:
+                from evlcp_sdk.fixes import PositionWriter
+
+                positions = closing.enter_context(PositionWriter(folder, link, plan, tracks))
+
+            def write(packets: list["Packet"]) -> None:
+                writer.write(packets)
+                if positions is not None:
+                    positions.write(packets)
+
             status: Status = "complete"
             error = None
             first_us = last_us = None
@@ -201,14 +309,14 @@ def decode(
                         last_us = int(events.t_us[-1])
                         for probe in probes:
                             probe.watch(events)
-                        writer.write(receiver.feed(events))
+                        write(receiver.feed(events))
                         advance(source.position_bytes, source.size_bytes)
                         if stopped():
                             status = "interrupted"
                             break
                 except InputError as fault:
                     status, error = "failed", str(fault)
-                writer.write(receiver.close())
+                write(receiver.close())
             # Kernels are compiled once on a machine, which says nothing of the receiver's speed.
             elapsed_s = time.perf_counter() - began - sum(compiled_s)
             read = source.counts["events"]
@@ -237,12 +345,18 @@ def decode(
                 losses={kind: asdict(loss) for kind, loss in source.losses.items()},
                 versions=installed_versions(registry),
                 error=error,
+                positions=positions.finish() if positions is not None else None,
             )
     if figures:
         from evlcp_sdk.figures import save_figures
 
         for probe in probes:
             save_figures(probe, Path(url).name, folder)
+    for track in tracks:
+        from evlcp_sdk.figures import save_track
+
+        assert positions is not None
+        save_track(track, positions.bars_enu_m(), Path(url).name, folder / "track.png")
     return summary
 
 
@@ -271,6 +385,8 @@ def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
         out.print(table)
     if text := _messages(summary["counts"]):
         out.print(text)
+    if "positions" in summary:
+        out.print(_positions(summary["positions"]))
     if speed:
         out.print(
             f"{recording['counts']['events'] / 1e6:.2f} Mev of {recording['duration_s']:.3f} s"
@@ -285,6 +401,16 @@ def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
             style="yellow",
         )
     out.print(f"written: {escape(str(folder))}/frames.csv, packets.jsonl, summary.json", style="dim")
+
+
+def _positions(told: Mapping[str, Any]) -> str:
+    """How many positions there are, and why not more, in one line."""
+    text = f"{told['fixes']} position{'s' * (told['fixes'] != 1)}"
+    if told["fixes_verified"]:
+        text += f", {told['fixes_verified']} verified"
+    for kind, number in told["refused"].items():
+        text += f"; {number} refused: {kind}"
+    return text
 
 
 def _messages(counts: Mapping[str, int]) -> str:

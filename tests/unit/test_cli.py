@@ -360,3 +360,71 @@ def test_a_closed_pipe_is_silent() -> None:
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=True)
     assert done.stderr == ""
     assert done.stdout.startswith("# EVLCP link")
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated drive towards two bars that send their beacons, with its truth and sites."""
+    folder = tmp_path_factory.mktemp("street")
+    bar = 'payload = "messages"\ny_m = -3.5\n'
+    (folder / "scene.toml").write_text(
+        "duration_s = 0.16\nseed = 3\n[world]\nlatitude_deg = 35.1\nlongitude_deg = 137.0\nheight_m = 50.0\n"
+        "[motion]\npitch_deg = 4.0\nvib_rate_rad_s = 0.0\n"
+        f"[[bars]]\nx_m = -3.0\n{bar}[[bars]]\nx_m = 3.0\nz_m = -5.0\n{bar}"
+    )
+    code = (
+        "from pathlib import Path; import json, sys\n"
+        "from evlcp_sdk.cli.main import main\n"
+        "sys.argv = ['evlcp', 'simulate', 'scene.toml', '-o', 'rec.raw']\nmain()\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=folder, stdout=subprocess.DEVNULL)
+    sites = json.loads((folder / "rec.truth.json").read_text())["sites"]
+    lines = ["[[bar]]\n" + "".join(f"{k} = {v}\n" for k, v in s.items() if v is not None) for s in sites]
+    (folder / "site.toml").write_text("\n".join(lines))
+    return folder
+
+
+def test_receive_writes_positions(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
+    angles = ("--pitch-deg", "4", "--roll-deg", "0", "--gravity-sigma-deg", "0.01")
+    done = evlcp(
+        "receive", street / "rec.raw", "-o", tmp_path, "--sites", street / "site.toml", *angles, "--figures"
+    )
+    assert done.code == 0
+    assert done.err == ""
+    files = {"fixes.csv", "track.csv", "fixes.geojson", "fixes.nmea", "track.png"}
+    assert names_in(tmp_path) == FILES | files | set(FIGURE_NAMES)
+    told = summary_of(tmp_path)["positions"]
+    assert told["fixes"] >= 3
+    assert sorted(told["bars"].values()) == [1, 2]
+    assert f"{told['fixes']} positions" in done.out
+    with (tmp_path / "fixes.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if not row["refusal"]]
+    truth = json.loads((street / "rec.truth.json").read_text())
+    path = truth["camera_path"]
+    for row in rows:
+        at = float(row["t_us"]) * 1e-6
+        for key, metres in (("latitude_deg", 111_000), ("longitude_deg", 91_000), ("height_m", 1)):
+            off = float(row[key]) - np.interp(at, truth["t_s"], path[key])
+            assert abs(off) * metres < 0.15
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--heading-deg", "3"], "needs --sites"),
+        (["--sites", "S", "--heading-deg", "3"], "a heading needs gravity"),
+        (["--sites", "S", "--pitch-deg", "3"], "gravity needs --pitch-deg and --roll-deg"),
+        (["--sites", "S", "--attitude", "a.csv", "--pitch-deg", "3", "--roll-deg", "0"], "not both"),
+        (["--sites", "S", "--clock-zero", "noon"], "expected a time such as"),
+        (["--sites", "none.toml"], "none.toml: cannot be read"),
+        (["--sites", "S", "--attitude", "none.csv"], "none.csv: cannot be read"),
+    ],
+)
+def test_faults_of_position_options(
+    evlcp: Evlcp, street: Path, tmp_path: Path, options: list[str], says: str
+) -> None:
+    given = [str(street / "site.toml") if o == "S" else o for o in options]
+    done = evlcp("receive", street / "rec.raw", "-o", tmp_path / "out", *given)
+    assert done.code in (2, 3)
+    assert says in " ".join(done.err.replace("│", " ").split())
+    assert not (tmp_path / "out").exists()

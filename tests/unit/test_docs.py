@@ -31,6 +31,7 @@ PAGES = (
     "outputs",
     "messages",
     "error-correction",
+    "position",
     "configuration",
     "simulator",
     "campaigns",
@@ -67,6 +68,7 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, demo_raw: Path) -
     (tmp_path / "payload.bin").write_bytes(bytes(100))
     (site,) = [text for text in blocks(ROOT / "docs" / "messages.md", "text") if "[[bar]]" in text]
     (tmp_path / "site.toml").write_text(site)
+    (tmp_path / "imu.csv").write_text("t_us,pitch_deg,roll_deg,heading_deg\n0,0,0,0\n1000000,0,0,0\n")
     if find_spec("cryptography") is not None:
         make_key(tmp_path / "private.pem")
     monkeypatch.chdir(tmp_path)

@@ -1,0 +1,89 @@
+"""NMEA-0183 sentences of a fix: GGA and RMC.
+
+Talker `IN`, integrated navigation; quality 6 and mode E, estimated, as nothing here is a satellite's. The
+altitude is that above the WGS-84 ellipsoid; the geoid's height is not known and left empty. The number of
+satellites is that of bars, the dilution of precision the horizontal sigma in metres.
+"""
+
+import math
+from datetime import UTC, datetime, timedelta
+from functools import reduce
+
+__all__ = ["checksum", "gga", "rmc"]
+
+_KNOTS_PER_M_S = 3600 / 1852
+
+
+def checksum(body: str) -> str:
+    """Exclusive or of a sentence's characters between `$` and `*`, two hex digits.
+
+    >>> checksum("GPGLL,4916.45,N,12311.12,W,225444,A,")
+    '1D'
+    """
+    return f"{reduce(lambda a, b: a ^ b, body.encode('ascii'), 0):02X}"
+
+
+def gga(
+    t_us: float,
+    zero: datetime | None,
+    place: tuple[float, float, float] | None,
+    bars: int,
+    sigma_m: float,
+) -> str:
+    """A GGA sentence, with its line end.
+
+    Args:
+        t_us: Camera clock, us.
+        zero: UTC of the camera clock's 0; None: the clock itself is written as time of day.
+        place: Latitude and longitude, degrees, and height, m; None where there is no fix.
+        bars: Bars that count.
+        sigma_m: Horizontal standard deviation, m.
+    """
+    clock, _ = _time(t_us, zero)
+    if place is None:
+        return _sentence(f"INGGA,{clock},,,,,0,{bars:02d},,,M,,M,,")
+    latitude, longitude, height = place
+    where = f"{_angle(latitude, 2, 'NS')},{_angle(longitude, 3, 'EW')}"
+    return _sentence(f"INGGA,{clock},{where},6,{bars:02d},{sigma_m:.3f},{height:.3f},M,,M,,")
+
+
+def rmc(
+    t_us: float,
+    zero: datetime | None,
+    place: tuple[float, float, float] | None,
+    way: tuple[float, float] | None,
+) -> str:
+    """An RMC sentence, with its line end; the date is empty where `zero` is None.
+
+    Args:
+        t_us: Camera clock, us.
+        zero: UTC of the camera clock's 0; None: the clock itself is written as time of day.
+        place: Latitude and longitude, degrees, and height, m; None where there is no fix.
+        way: Speed over ground, m/s, and course, degrees clockwise from north; None where not known.
+    """
+    clock, date = _time(t_us, zero)
+    if place is None:
+        return _sentence(f"INRMC,{clock},V,,,,,,,{date},,,N")
+    latitude, longitude, _ = place
+    where = f"{_angle(latitude, 2, 'NS')},{_angle(longitude, 3, 'EW')}"
+    knots, course = ("", "") if way is None else (f"{way[0] * _KNOTS_PER_M_S:.3f}", f"{way[1] % 360:.2f}")
+    return _sentence(f"INRMC,{clock},A,{where},{knots},{course},{date},,,E")
+
+
+def _sentence(body: str) -> str:
+    return f"${body}*{checksum(body)}\r\n"
+
+
+def _angle(degrees: float, digits: int, signs: str) -> str:
+    """Degrees and minutes to 1e-7 minutes, 0.2 mm."""
+    ticks = round(abs(degrees) * 60 * 1e7)
+    whole, minutes = divmod(ticks, 60 * 10**7)
+    return f"{whole:0{digits}d}{minutes // 10**7:02d}.{minutes % 10**7:07d},{signs[degrees < 0]}"
+
+
+def _time(t_us: float, zero: datetime | None) -> tuple[str, str]:
+    """Time of day to a millisecond, and the date."""
+    begin = zero if zero is not None else datetime(1970, 1, 1, tzinfo=UTC)
+    at = begin.astimezone(UTC) + timedelta(milliseconds=math.floor(t_us / 1000 + 0.5))
+    date = at.strftime("%d%m%y") if zero is not None else ""
+    return f"{at:%H%M%S}.{at.microsecond // 1000:03d}", date
