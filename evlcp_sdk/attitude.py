@@ -81,6 +81,20 @@ class AttitudeTrack:
             table.get("heading_sigma_deg", np.full(len(t_us), usual.heading_sigma_deg)),
         )
 
+    def to_csv(self) -> str:
+        """The text of a file that `read` takes."""
+        columns = {
+            "t_us": [f"{v:.0f}" for v in self.t_us],
+            "pitch_deg": [f"{v:.5f}" for v in self.pitch_deg],
+            "roll_deg": [f"{v:.5f}" for v in self.roll_deg],
+            "gravity_sigma_deg": [f"{v:g}" for v in self.gravity_sigma_deg],
+        }
+        if self.heading_deg is not None:
+            columns["heading_deg"] = [f"{v % 360:.5f}" for v in self.heading_deg]
+            columns["heading_sigma_deg"] = [f"{v:g}" for v in self.heading_sigma_deg]
+        lines = [",".join(columns), *(",".join(row) for row in zip(*columns.values(), strict=True))]
+        return "\n".join(lines) + "\n"
+
     def at(self, t_us: float) -> Attitude | None:
         """The attitude at a time; None outside of the track."""
         if not self.t_us[0] <= t_us <= self.t_us[-1]:

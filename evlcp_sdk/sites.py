@@ -19,7 +19,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from evlcp_sdk.errors import ConfigError
 
-__all__ = ["BarSite", "LocalFrame", "load_sites", "resolve_sites", "site_of_transmitter"]
+__all__ = ["BarSite", "LocalFrame", "load_sites", "resolve_sites", "site_of_transmitter", "to_toml"]
 
 
 @dataclass(frozen=True)
@@ -194,6 +194,15 @@ def resolve_sites(table: Mapping[str, Any], *, source: str = "") -> tuple[BarSit
     if faults:
         raise ConfigError("\n".join(faults))
     return tuple(sites)
+
+
+def to_toml(sites: Sequence[BarSite]) -> str:
+    """The text of a `site.toml`; `load_sites` takes it back."""
+    lines = []
+    for site in sites:
+        values = ((f.name, getattr(site, f.name)) for f in fields(site))
+        lines += ["[[bar]]", *(f"{name} = {value!r}" for name, value in values if value is not None), ""]
+    return "\n".join(lines)
 
 
 def site_of_transmitter(

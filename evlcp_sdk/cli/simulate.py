@@ -4,12 +4,15 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from evlcp_sdk.cli._common import Json, console
 from evlcp_sdk.errors import EvlcpError
+
+if TYPE_CHECKING:
+    from evlcp_sdk.sim import Simulation
 
 __all__ = ["register", "simulate"]
 
@@ -46,6 +49,9 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Render a scene: REC.raw (EVT3) and its truth, REC.truth.json.
+
+    A scene that says where on earth it is also gives REC.site.toml, where its bars stand, and REC.attitude.csv, what an IMU
+    tells, for [bold]evlcp receive --sites[/].
 
     A scene of yours:      [bold]evlcp simulate scene.toml -o REC.raw[/]
 
@@ -98,6 +104,7 @@ def simulate(
                 advance(simulation.done_s)
     truth = truth_of(simulation) | {"bytes": out.stat().st_size}
     _write_text(truth_path, json.dumps(truth))
+    written = [out, truth_path, *_on_earth(simulation, out)]
     elapsed_s = time.perf_counter() - began
     counts = simulation.counts
     summary = {
@@ -122,7 +129,24 @@ def simulate(
     )
     if counts["dropped_by_rate_cap"]:
         screen.print(f"lost to the event-rate limit: {counts['dropped_by_rate_cap']} events", style="yellow")
-    screen.print(f"written: {out}, {truth_path}", style="dim")
+    screen.print(f"written: {', '.join(map(str, written))}", style="dim")
+
+
+def _on_earth(simulation: "Simulation", out: Path) -> list[Path]:
+    """Write where the bars stand and how the camera does, if the scene says so; return the files."""
+    from evlcp_sdk.sim.world import attitude_log, sites_of
+    from evlcp_sdk.sites import to_toml
+
+    scene = simulation.scene
+    if scene.world is None:
+        return []
+    written = [out.with_suffix(".site.toml")]
+    _write_text(written[0], to_toml(sites_of(scene)))
+    log = attitude_log(scene, scene.seed, simulation.path)
+    if log is not None:
+        written.append(out.with_suffix(".attitude.csv"))
+        _write_text(written[1], log.to_csv())
+    return written
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -166,7 +166,7 @@ class MotionSpec:
 
 @dataclass(frozen=True)
 class WorldSpec:
-    """Where the scene's origin, x_m = y_m = z_m = 0, is on earth, and where its z axis points."""
+    """Where the scene's origin, x_m = y_m = z_m = 0, is on earth, and z points; what an IMU tells."""
 
     __pydantic_config__ = _STRICT
 
@@ -174,6 +174,14 @@ class WorldSpec:
     longitude_deg: Annotated[float, Field(ge=-180, le=180, description="The same.")] = 0.0
     height_m: Annotated[float, Field(ge=-12_000, le=20_000, description="Above the WGS-84 ellipsoid.")] = 0.0
     heading_deg: Annotated[float, Field(ge=0, lt=360, description="Of z, clockwise from north.")] = 0.0
+    attitude: Annotated[
+        Literal["none", "gravity", "heading"],
+        Field(description="What is known of the camera's attitude: nothing, pitch and roll, or all."),
+    ] = "heading"
+    gravity_sigma_deg: Annotated[
+        float, Field(ge=0, le=10, description="Error of pitch and of roll, the same all through a recording.")
+    ] = 0.1
+    heading_sigma_deg: Annotated[float, Field(ge=0, le=30, description="The same of the heading.")] = 0.1
 
 
 @dataclass(frozen=True)

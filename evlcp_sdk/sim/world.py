@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.attitude import AttitudeTrack
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.sim.motion import CameraPath
 from evlcp_sdk.sim.scene import BarSpec, Scene, WorldSpec
 from evlcp_sdk.sites import BarSite, LocalFrame
 
-__all__ = ["bar_axis", "camera_on_earth", "scene_to_enu", "sites_of"]
+__all__ = ["attitude_log", "bar_axis", "camera_on_earth", "scene_to_enu", "sites_of"]
 
 Floats = NDArray[np.float64]
 
@@ -94,6 +96,37 @@ def camera_on_earth(scene: Scene, position_m: Floats, attitude_rad: Floats) -> d
         "pitch_deg": [round(float(v), 5) for v in pitch],
         "roll_deg": [round(float(v), 5) for v in roll],
     }
+
+
+def attitude_log(scene: Scene, seed: int, path: CameraPath) -> AttitudeTrack | None:
+    """What an IMU tells of the camera's attitude, every millisecond: the truth and one error a recording.
+
+    Args:
+        scene: With its `[world]`.
+        seed: Of the errors.
+        path: The camera's path.
+
+    Returns:
+        The log; None where `world.attitude` is "none".
+
+    Raises:
+        ConfigError: The scene has no `[world]`.
+    """
+    world, _ = _world(scene)
+    if world.attitude == "none":
+        return None
+    t_us = np.append(np.arange(0.0, scene.duration_s * 1e6, 1000.0), scene.duration_s * 1e6)
+    yaw, pitch, roll = np.degrees(path.at(t_us)[1]).T
+    error = np.random.default_rng([seed, 0xA77]).normal(size=3)
+    heading = world.heading_deg + yaw + error[2] * world.heading_sigma_deg
+    return AttitudeTrack(
+        t_us + scene.t0_us,
+        pitch + error[0] * world.gravity_sigma_deg,
+        roll + error[1] * world.gravity_sigma_deg,
+        heading if world.attitude == "heading" else None,
+        np.full(len(t_us), world.gravity_sigma_deg),
+        np.full(len(t_us), world.heading_sigma_deg),
+    )
 
 
 def _world(scene: Scene) -> tuple[WorldSpec, LocalFrame]:
