@@ -50,8 +50,8 @@ def simulate(
 ) -> None:
     """Render a scene: REC.raw (EVT3) and its truth, REC.truth.json.
 
-    A scene that says where on earth it is also gives REC.site.toml, where its bars stand, and REC.attitude.csv, what an IMU
-    tells, for [bold]evlcp receive --sites[/].
+    A scene that says where on earth it is also gives REC.site.toml, where its bars stand, and
+    REC.attitude.csv, what an IMU tells, for [bold]evlcp receive --sites[/].
 
     A scene of yours:      [bold]evlcp simulate scene.toml -o REC.raw[/]
 
