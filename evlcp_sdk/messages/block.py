@@ -160,8 +160,9 @@ def _whitened(head: bytes, rest: bytes) -> bytes:
     """The bytes behind a header, added modulo 2 to the numbers of xorshift32 that begins with its CRC-32.
 
     The numbers are those of Marsaglia 2003 (shifts 13, 17, 5), four bytes each, least significant first.
-    Equal bytes so do not make equal symbols, a light that flickers at a low rate; and two blocks of different
-    headers differ in half their bits on air, so that a receiver can tell which packets carry the same one.
+    Equal bytes so do not make equal symbols, a light that repeats itself frame by frame; and two blocks of
+    different headers differ in half their bits on air, so that a receiver can tell which packets carry the
+    same one.
     """
     x = zlib.crc32(head) or _WHITE_SEED
     stream = bytearray()

@@ -147,3 +147,32 @@ def test_from_a_scene_to_the_lines_of_a_result(evlcp: Any, tmp_path: Path) -> No
     assert "2 messages; beacons told 1 times verified, 1 times unverified" in told.out
     counts = json.loads((out / "summary.json").read_text())["counts"]
     assert counts["blocks_decoded"] == counts["blocks_tried"] - counts["blocks_failed"] >= 4
+
+
+@pytest.mark.parametrize("after_us", [4_000, 10_000, 17_000, 24_600])
+def test_ten_milliseconds_lost_in_every_packet(after_us: int) -> None:
+    scene = load_scene("drive-30kmh", {"duration_s": 0.15, "bars.payload": "data", "bars.start_chip": 300.0})
+    events = Events.concat(simulate(scene, 3))
+    # Packets of 34.6 ms begin 4.6 ms after the scene; their preambles stay, or nothing tells where they are.
+    left = events[(events.t_us - 4_600 - after_us) % 34_600 >= 10_000]
+    assert len(left) < 0.75 * len(events)
+    receiver, coder = Receiver(load_link()), load_link().block_coder()
+    packets = receiver.feed(left) + receiver.close()
+    assert min(len(p.frames) for p in packets[1:4]) <= 7
+    tally = sum((t for _, t in message_tallies(packets, truth(scene, 3), coder)), Tally())
+    assert (tally.messages_sent, tally.messages_found, tally.messages_wrong) == (4, 4, 0)
+
+
+@pytest.mark.parametrize("cluster", [0, 7, 15])
+def test_one_cluster_dark(cluster: int, tmp_path: Path) -> None:
+    settings = {"duration_s": 0.12, "bars.payload": "data", "bars.start_chip": 300.0}
+    light = sources_of(load_scene("drive-30kmh", settings))[0][0]
+    chips = light.chips(0, 5 * light.packet_chips).copy()
+    chips[:, cluster] = 0
+    np.save(tmp_path / "chips.npy", chips)
+    dark = {"bars.chips_file": str(tmp_path / "chips.npy"), "bars.payload": "symbols"}
+    scene = load_scene("drive-30kmh", settings | dark)
+    receiver = Receiver(load_link())
+    packets = [p for events in simulate(scene, 3) for p in receiver.feed(events)] + receiver.close()
+    found = [p.block.sequence for p in packets if p.block is not None]
+    assert found == [1, 2, 3]
