@@ -20,6 +20,7 @@ Exit codes: [bold]0[/] done (also when no transmitter was there), [bold]1[/] fai
 def make_app() -> typer.Typer:
     """The command line with its own commands; plugins add theirs by `evlcp_register_commands`."""
     from evlcp_sdk.cli import (
+        calibrate,
         check,
         compare,
         config,
@@ -37,7 +38,8 @@ def make_app() -> typer.Typer:
         name="evlcp", no_args_is_help=True, rich_markup_mode="rich", pretty_exceptions_enable=False, help=HELP
     )
     app.callback()(_root)
-    for module in (receive, info, compare, simulate, score, sweep, report, demo, config, plugins, check):
+    first = (receive, info, compare, simulate, score, sweep, report, demo)
+    for module in (*first, calibrate, config, plugins, check):
         module.register(app)
     return app
 

@@ -25,6 +25,7 @@ __all__ = [
     "Pose",
     "Positioner",
     "Refusal",
+    "points_at",
     "project_bars",
     "solve_pose",
     "three_point_poses",
@@ -582,6 +583,56 @@ def _interpolation(t: Floats) -> Floats:
     return np.asarray(share.prod(1))
 
 
+def points_at(
+    frames: Sequence[Frame], t_us: float, period_us: float, clusters: int, spec: PositionSpec
+) -> tuple[Floats, Floats] | None:
+    """A bar's image points at a time between its frames.
+
+    The shape is a straight line in time through all frames within half a period, the place is interpolated
+    between the frames next to the time.
+
+    Args:
+        frames: With points, in order of time.
+        t_us: Camera clock, us.
+        period_us: Frames within half of it, before and after, count, us.
+        clusters: Clusters of a bar.
+        spec: Least number of points, and the error that no averaging removes.
+
+    Returns:
+        Points, px, float64 (K, 2), and sigmas (K,); None where the bar is not seen before and after.
+    """
+    near = [
+        f
+        for f in frames
+        if abs(f.points_t_us - t_us) <= period_us / 2
+        and np.isfinite(f.points_px[:, 0]).sum() >= spec.min_points
+    ]
+    dt = np.array([f.points_t_us - t_us for f in near])
+    if len(near) < 3 or dt[0] > 0 or dt[-1] < 0:
+        return None
+    points = np.array([f.points_px for f in near])
+    common = np.isfinite(points[:, :, 0]).all(0)
+    if common.sum() < spec.min_points // 2:
+        return None
+    places = points[:, common].mean(1)
+    after = int(np.searchsorted(dt, 0.0))
+    beside = slice(max(after - 2, 0), after + 2)
+    place = _interpolation(dt[beside]) @ places[beside]
+    shapes = points - places[:, None]
+    sigmas = np.array([f.points_sigma_px for f in near])
+    found, sigma = np.full((clusters, 2), np.nan), np.full(clusters, np.nan)
+    for k in range(clusters):
+        seen = np.isfinite(shapes[:, k, 0])
+        if seen.sum() < 3:
+            continue
+        line = np.stack([np.ones(int(seen.sum())), dt[seen]], 1)
+        inverse = np.linalg.pinv(line)
+        found[k] = place + (inverse @ shapes[seen, k])[0]
+        drawn = math.sqrt(float((inverse[0] ** 2 * sigmas[seen, k] ** 2).sum()))
+        sigma[k] = math.hypot(drawn, spec.pixel_sigma_px)
+    return found, sigma
+
+
 @dataclass(eq=False)
 class _Seen:
     """What is known of one transmitter.
@@ -651,8 +702,7 @@ class Positioner:
         """Take the next packets; return the fixes that no later packet can change."""
         fixes = []
         for packet in packets:
-            seen = self._seen.setdefault(packet.transmitter, _Seen([]))
-            self._hear(seen, packet)
+            seen = self.hear(packet)
             for frame in packet.frames:
                 if len(frame.points_px) == self._clusters and np.isfinite(frame.points_t_us):
                     number = math.ceil(frame.points_t_us / self._packet_us - 0.5)
@@ -670,7 +720,9 @@ class Positioner:
         last = max((f.points_t_us for s in self._seen.values() for f in s.frames), default=-math.inf)
         return self._until(last / self._packet_us + 0.5) if math.isfinite(last) else []
 
-    def _hear(self, seen: _Seen, packet: Packet) -> None:
+    def hear(self, packet: Packet) -> _Seen:
+        """Take what a packet's beacons say of its transmitter, and nothing else."""
+        seen = self._seen.setdefault(packet.transmitter, _Seen([]))
         for heard in packet.messages:
             if heard.trust == "forged":
                 self._counts["beacons_forged"] += 1
@@ -686,6 +738,7 @@ class Positioner:
                 heard.message.transmitter_id, b.latitude_deg, b.longitude_deg, b.height_m,
                 b.heading_deg % 360, b.tilt_deg, b.length_m,
             )  # fmt: skip
+        return seen
 
     def _site(self, number: int) -> BarSite | None:
         seen = self._seen[number]
@@ -720,7 +773,7 @@ class Positioner:
     def _fix(self, t_us: float) -> Fix | None:
         views, sited, verified = [], [], True
         for number, seen in sorted(self._seen.items()):
-            points = self._at(seen.frames, t_us)
+            points = points_at(seen.frames, t_us, self._packet_us, self._clusters, self._spec)
             if points is None:
                 continue
             views.append(number)
@@ -758,37 +811,3 @@ class Positioner:
             transmitters=pose.transmitters,
             verified=verified,
         )
-
-    def _at(self, frames: Sequence[Frame], t_us: float) -> tuple[Floats, Floats] | None:
-        """Points and sigmas at a time; None where the bar is not seen before and after it."""
-        least = self._spec.min_points
-        near = [
-            f
-            for f in frames
-            if abs(f.points_t_us - t_us) <= self._packet_us / 2
-            and np.isfinite(f.points_px[:, 0]).sum() >= least
-        ]
-        dt = np.array([f.points_t_us - t_us for f in near])
-        if len(near) < 3 or dt[0] > 0 or dt[-1] < 0:
-            return None
-        points = np.array([f.points_px for f in near])
-        common = np.isfinite(points[:, :, 0]).all(0)
-        if common.sum() < least // 2:
-            return None
-        places = points[:, common].mean(1)
-        after = int(np.searchsorted(dt, 0.0))
-        beside = slice(max(after - 2, 0), after + 2)
-        place = _interpolation(dt[beside]) @ places[beside]
-        shapes = points - places[:, None]
-        sigmas = np.array([f.points_sigma_px for f in near])
-        found, sigma = np.full((self._clusters, 2), np.nan), np.full(self._clusters, np.nan)
-        for k in range(self._clusters):
-            seen = np.isfinite(shapes[:, k, 0])
-            if seen.sum() < 3:
-                continue
-            line = np.stack([np.ones(int(seen.sum())), dt[seen]], 1)
-            inverse = np.linalg.pinv(line)
-            found[k] = place + (inverse @ shapes[seen, k])[0]
-            drawn = math.sqrt(float((inverse[0] ** 2 * sigmas[seen, k] ** 2).sum()))
-            sigma[k] = math.hypot(drawn, self._spec.pixel_sigma_px)
-        return found, sigma

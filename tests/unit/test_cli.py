@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,7 @@ def names_in(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-COMMANDS = ["receive", "info", "sweep", "report", "demo", "config", "plugins"]
+COMMANDS = ["receive", "info", "sweep", "report", "demo", "calibrate", "config", "plugins"]
 
 
 def test_help_lists_commands_and_exit_codes(evlcp: Evlcp) -> None:
@@ -428,3 +429,29 @@ def test_faults_of_position_options(
     assert done.code in (2, 3)
     assert says in " ".join(done.err.replace("│", " ").split())
     assert not (tmp_path / "out").exists()
+
+
+def test_calibrate_finds_the_focal_length(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
+    truth = json.loads((street / "rec.truth.json").read_text())
+    path = truth["camera_path"]
+    names = ("latitude_deg", "longitude_deg", "height_m", "heading_deg", "pitch_deg", "roll_deg")
+    lines = ["t_us," + ",".join(names) + ",attitude_sigma_deg"]
+    for ms in (50, 80, 110):
+        lines.append(f"{ms * 1000}," + ",".join(str(path[name][ms]) for name in names) + ",0.01")
+    poses = tmp_path / "poses.csv"
+    poses.write_text("\n".join(lines) + "\n")
+    given = ("calibrate", street / "rec.raw", "--sites", street / "site.toml", "--poses", poses)
+    done = evlcp(*given, "--set", "camera.focal_mm=34.7")
+    assert done.code == 0, done.err
+    table = tomllib.loads(done.out)["camera"]
+    told = json.loads(evlcp(*given, "--json").out)
+    assert abs(table["focal_mm"] - 35) < 5 * told["sigma"]["focal_mm"]
+    assert told["sigma"]["focal_mm"] < 0.05
+    assert told["camera"]["focal_mm"] == pytest.approx(table["focal_mm"], abs=1e-4)
+    assert told["views"] == 3
+    # A table for link.toml.
+    link = tmp_path / "link.toml"
+    link.write_text(done.out)
+    assert evlcp("config", "--digest", "-c", link).code == 0
+    poses.write_text("recording," + "\nother.raw,".join(lines))
+    assert "line 2" in evlcp(*given).err

@@ -19,7 +19,7 @@ LAYERS = (
     {"registry", "config"},
     {"io", "rx", "sim"},
     {"rx.receiver"},
-    {"bound", "outputs", "fixes", "figures", "score", "campaign", "compare", "testing"},
+    {"bound", "calibration", "outputs", "fixes", "figures", "score", "campaign", "compare", "testing"},
     {"cli"},
 )
 """From the ground up: a module imports from its own layer and those below."""
