@@ -105,7 +105,7 @@ class Chart:
 
 
 def charts_of(summary: Summary) -> list[Chart]:
-    """The charts of a campaign: BER, RMSE, gross errors, frames found, and the histogram of errors."""
+    """The charts of a campaign: BER, RMSE, gross errors, frames found, histogram, and positions if any."""
     distance = "distance, m"
 
     def over_distance(kind: str, id: str, title: str, label: str, note: str, *, log: bool) -> Chart:
@@ -123,6 +123,14 @@ def charts_of(summary: Summary) -> list[Chart]:
         " are not quite, so true intervals are wider."
     )
     histogram = _lines(summary.series, lambda series, _: _bins(series))
+    positions = over_distance(
+        "position_rmse_m",
+        "position",
+        "Position error",
+        "position RMSE in space, m",
+        f"{independent} Chi-square. The distance is that of the nearest bar.",
+        log=True,
+    )
     return [
         over_distance(
             "ber",
@@ -162,6 +170,7 @@ def charts_of(summary: Summary) -> list[Chart]:
             (),
             "All distances together; the outermost bins hold everything beyond.",
         ),
+        *((positions,) if any(line.dots for line in positions.lines) else ()),
     ]
 
 
@@ -211,6 +220,8 @@ def _dots(series: Series, kind: str, shift: float, *, log: bool) -> tuple[Dot, .
             "rmse_m": f"{tally.ranged} distances, bias {tally.bias_m:+.3f} m",
             "gross_share": f"{tally.gross} of {tally.ranged} distances",
             "found_share": f"{tally.frames_found} of {tally.frames_sent} frames",
+            "position_rmse_m": f"{tally.fixes} positions, half within {tally.position_quantile_m(0.5):.3f} m,"
+            f" 95 % within {tally.position_quantile_m(0.95):.3f} m; {tally.fixes_refused} refused",
         }[kind]
         shown = f"below {figure.high:.2g}" if none else f"{figure.value:.4g}"
         text = (

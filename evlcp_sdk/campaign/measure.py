@@ -6,12 +6,16 @@ from typing import Any
 
 import numpy as np
 
+from evlcp_sdk.attitude import AttitudeTrack
 from evlcp_sdk.campaign.statistics import Statistics, Tally, segment_of
+from evlcp_sdk.config import Link
 from evlcp_sdk.frames import PacketFormat
 from evlcp_sdk.messages.coding import BlockCoder
+from evlcp_sdk.rx.position import Positioner
+from evlcp_sdk.sites import BarSite
 from evlcp_sdk.types import Frame, Packet
 
-__all__ = ["message_tallies", "statistics_of"]
+__all__ = ["message_tallies", "position_tallies", "statistics_of"]
 
 _MOST_LATE_US = 800.0
 _MOST_APART_PX = 60.0
@@ -23,7 +27,7 @@ def statistics_of(
     frames: Iterable[Frame],
     known: Mapping[str, Any],
     events: int,
-    messages: Iterable[tuple[int, Tally]] = (),
+    others: Iterable[tuple[int, Tally]] = (),
 ) -> Statistics:
     """Hold decoded frames against the truth, each beside the sent one that began nearest on the nearest bar.
 
@@ -31,7 +35,7 @@ def statistics_of(
         frames: The decoded frames.
         known: The truth of the scene.
         events: Events that the sensor sent.
-        messages: What `message_tallies` gave, if the bars send messages.
+        others: What `message_tallies` and `position_tallies` gave.
     """
     duration_us = known["scene"]["duration_s"] * 1e6
     bars = [_Sent(known, i) for i, bar in enumerate(known["bars"]) if _sends_frames(bar)]
@@ -54,7 +58,7 @@ def statistics_of(
         error_m = distance_m - true_m if np.isfinite(distance_m) else None
         bits = near.bits_per_symbol(frame) * len(sent)
         tallies.append((segment_of(true_m), Tally.found(bits, errors, error_m)))
-    tallies += messages
+    tallies += others
     return Statistics.of(1, events, round(duration_us), unmatched, tallies)
 
 
@@ -85,6 +89,56 @@ def message_tallies(
             tallies.append((segment, Tally(messages_wrong=1)))
         elif near.whole[number]:
             tallies.append((segment, Tally(messages_found=1)))
+    return tallies
+
+
+def position_tallies(
+    packets: Sequence[Packet], known: Mapping[str, Any], link: Link, attitude: AttitudeTrack | None
+) -> list[tuple[int, Tally]]:
+    """Hold the positions that follow from packets against the truth: one tally a time, by the nearest bar.
+
+    Which transmitter stands where is what the image shows, so that no beacon is needed.
+
+    Args:
+        packets: The received packets.
+        known: The truth of the scene, with its `sites`.
+        link: The link they were received with.
+        attitude: What is known of the camera's attitude; None for nothing.
+    """
+    bars = [_SentPackets(known, i) for i in range(len(known["bars"]))]
+    sites = [BarSite(**site) for site in known["sites"]]
+    t0_us, path = known["scene"]["t0_us"], known["camera_path"]
+    first: dict[int, Frame] = {}
+    for packet in packets:
+        for frame in packet.frames:
+            first.setdefault(packet.transmitter, frame)
+    for number, frame in first.items():
+        away = [bar.apart_px(frame.t_us - t0_us, frame) for bar in bars]
+        i = int(np.argmin(away))
+        if away[i] <= _MOST_APART_PX and sites[i].transmitter is None:
+            sites[i] = replace(sites[i], transmitter=number)
+    positioner = Positioner(
+        link.camera,
+        link.bar.clusters,
+        link.packet.packet_chips * link.packet.chip_us,
+        sites,
+        (lambda _: None) if attitude is None else attitude.at,
+        link.position,
+    )
+    frame_of = positioner.frame
+    assert frame_of is not None
+    t_us = np.array(known["t_s"]) * 1e6
+    tallies = []
+    for fix in [*positioner.feed(packets), *positioner.close()]:
+        at = fix.t_us - t0_us
+        segment = segment_of(min(float(np.interp(at, t_us, depth)) for depth in known["distance_m"]))
+        if fix.refusal:
+            tallies.append((segment, Tally(fixes_refused=1)))
+            continue
+        place = (np.interp(at, t_us, path[key]) for key in ("latitude_deg", "longitude_deg", "height_m"))
+        error = fix.enu_m - frame_of.to_enu(*place)
+        nees = float(error @ np.linalg.solve(fix.covariance_m2, error))
+        tallies.append((segment, Tally.fix(float(np.linalg.norm(error)), nees)))
     return tallies
 
 

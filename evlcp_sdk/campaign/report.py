@@ -15,7 +15,7 @@ from evlcp_sdk.campaign.charts import Chart, charts_of, decades
 from evlcp_sdk.campaign.markup import details, document, save_text, table
 from evlcp_sdk.campaign.paper import PAPER_NAME
 from evlcp_sdk.campaign.plan import digest_of
-from evlcp_sdk.campaign.statistics import SEGMENT_M
+from evlcp_sdk.campaign.statistics import SEGMENT_M, Tally
 from evlcp_sdk.campaign.summary import Comparison, Figure, Summary, compare, measure
 from evlcp_sdk.errors import ConfigError
 
@@ -192,6 +192,7 @@ def comparison_rows(comparisons: Iterable[Comparison]) -> list[tuple[str, ...]]:
 
 def _figures_table(summary: Summary) -> str:
     messages = any(t.messages_sent for one in summary.series for _, t in one.statistics.segments)
+    positions = any(t.fixes or t.fixes_refused for one in summary.series for _, t in one.statistics.segments)
     rows = []
     for one in summary.series:
         for begin, tally in one.statistics.segments:
@@ -207,13 +208,31 @@ def _figures_table(summary: Summary) -> str:
                     _shown(measure(tally, "gross_share"), "{:.2%}"),
                     *((f"{tally.messages_found} of {tally.messages_sent}",) if messages else ()),
                     *((f"{tally.messages_wrong}",) if messages else ()),
+                    *(_positions(tally) if positions else ()),
                 )
             )
     head = (
         *("series", "distance", "frames", "bit errors", "BER", "RMSE, m", "bias, m", "0.5 m or more"),
         *(("messages", "read wrong") if messages else ()),
+        *(_POSITION_HEAD if positions else ()),
     )
     return f"<h2>All figures</h2>{table(head, rows)}"
+
+
+_POSITION_HEAD = ("positions", "RMSE in space, m", "half within, m", "95 % within, m", "NEES, ideally 3")
+
+
+def _positions(tally: Tally) -> tuple[str, ...]:
+    """Positions given of those due, and their errors, as text."""
+    if not tally.fixes:
+        return (f"0 of {tally.fixes_refused}", *4 * ("-",))
+    return (
+        f"{tally.fixes} of {tally.fixes + tally.fixes_refused}",
+        _shown(measure(tally, "position_rmse_m"), "{:.3f}"),
+        f"{tally.position_quantile_m(0.5):.3f}",
+        f"{tally.position_quantile_m(0.95):.3f}",
+        f"{tally.position_nees:.2f}",
+    )
 
 
 def _shown(figure: Figure, form: str) -> str:

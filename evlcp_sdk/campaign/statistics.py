@@ -9,6 +9,7 @@ from typing import Any, Self
 __all__ = [
     "BIN_M",
     "HALF_METRE_M",
+    "POSITION_BIN_M",
     "SEGMENT_M",
     "Statistics",
     "Tally",
@@ -21,10 +22,15 @@ SEGMENT_M = 10
 BIN_M = 0.02
 """Width of a bin of the histogram of distance errors, m."""
 
+POSITION_BIN_M = 0.005
+"""Width of a bin of the histogram of position errors, m."""
+
 HALF_METRE_M = 0.5
 """Distance error from which on an error counts as gross, m."""
 
 _FARTHEST_BIN = 150
+_FARTHEST_POSITION_BIN = 1000
+_HISTOGRAMS = ("histogram", "position_histogram")
 
 
 def segment_of(distance_m: float) -> int:
@@ -52,8 +58,13 @@ class Tally:
         messages_sent: Packets with a message that were sent whole while the recording ran.
         messages_found: Those of them whose message was read.
         messages_wrong: Messages that were read and not sent so: undetected errors.
+        fixes: Positions that were given.
+        fixes_refused: Times at which a bar was in view, and no position was given.
+        position_squares_um2: Sum of the squares of the positions' errors in space, um^2.
+        position_nees_milli: Sum of these errors squared in their own sigmas, thousandths; 3000 each is ideal.
         histogram: (bin, count) in order of the bin; bin b holds errors from `b * BIN_M` up to the next, the
             outermost ones also everything beyond.
+        position_histogram: The same of the positions' errors, in bins of `POSITION_BIN_M` from 0.
     """
 
     frames_sent: int = 0
@@ -67,7 +78,12 @@ class Tally:
     messages_sent: int = 0
     messages_found: int = 0
     messages_wrong: int = 0
+    fixes: int = 0
+    fixes_refused: int = 0
+    position_squares_um2: int = 0
+    position_nees_milli: int = 0
     histogram: tuple[tuple[int, int], ...] = ()
+    position_histogram: tuple[tuple[int, int], ...] = ()
 
     @classmethod
     def sent(cls) -> Self:
@@ -96,15 +112,34 @@ class Tally:
             histogram=((bin, 1),),
         )
 
+    @classmethod
+    def fix(cls, error_m: float, nees: float) -> Self:
+        """One position that was given, its error in space and that squared in its own sigmas.
+
+        >>> Tally.fix(0.012, 2.5).position_histogram
+        ((2, 1),)
+        """
+        error_um = round(error_m * 1e6)
+        bin = min(_FARTHEST_POSITION_BIN, error_um // round(POSITION_BIN_M * 1e6))
+        return cls(
+            fixes=1,
+            position_squares_um2=error_um**2,
+            # A thousand sigmas are wrong beyond all measure.
+            position_nees_milli=round(min(nees, 1e6) * 1000),
+            position_histogram=((bin, 1),),
+        )
+
     def __add__(self, other: "Tally") -> "Tally":
-        bins = Counter(dict(self.histogram))
-        bins.update(dict(other.histogram))
-        numbers = {
+        numbers: dict[str, Any] = {
             f.name: getattr(self, f.name) + getattr(other, f.name)
             for f in fields(self)
-            if f.name != "histogram"
+            if f.name not in _HISTOGRAMS
         }
-        return Tally(**numbers, histogram=tuple(sorted(bins.items())))
+        for name in _HISTOGRAMS:
+            bins = Counter(dict(getattr(self, name)))
+            bins.update(dict(getattr(other, name)))
+            numbers[name] = tuple(sorted(bins.items()))
+        return Tally(**numbers)
 
     @property
     def ber(self) -> float:
@@ -120,6 +155,29 @@ class Tally:
     def bias_m(self) -> float:
         """Mean of the distance errors, m; NaN without any."""
         return self.sum_um / self.ranged * 1e-6 if self.ranged else math.nan
+
+    @property
+    def position_rmse_m(self) -> float:
+        """Root mean square of the positions' errors in space, m; NaN without any."""
+        return math.sqrt(self.position_squares_um2 / self.fixes) * 1e-6 if self.fixes else math.nan
+
+    @property
+    def position_nees(self) -> float:
+        """Mean of the positions' errors squared in their own sigmas, ideally 3; NaN without any."""
+        return self.position_nees_milli / self.fixes / 1000 if self.fixes else math.nan
+
+    def position_quantile_m(self, share: float) -> float:
+        """Error in space that a share of the positions stays below, to a bin, m; NaN without any.
+
+        >>> (Tally.fix(0.02, 1) + Tally.fix(0.9, 1)).position_quantile_m(0.5)
+        0.025
+        """
+        seen = 0
+        for bin, count in self.position_histogram:
+            seen += count
+            if seen >= share * self.fixes:
+                return (bin + 1) * POSITION_BIN_M
+        return math.nan
 
     @property
     def gross_share(self) -> float:
@@ -182,8 +240,10 @@ class Statistics:
             "duration_us": self.duration_us,
             "unmatched": self.unmatched,
             "segments": {
-                str(begin): {f.name: getattr(tally, f.name) for f in fields(tally) if f.name != "histogram"}
-                | {"histogram": {str(b): n for b, n in tally.histogram}}
+                str(begin): {
+                    f.name: getattr(tally, f.name) for f in fields(tally) if f.name not in _HISTOGRAMS
+                }
+                | {name: {str(b): n for b, n in getattr(tally, name)} for name in _HISTOGRAMS}
                 for begin, tally in self.segments
             },
         }
@@ -193,8 +253,11 @@ class Statistics:
         """What `to_dict` gave."""
         tallies = []
         for begin, values in table["segments"].items():
-            bins = tuple(sorted((int(b), n) for b, n in values["histogram"].items()))
-            tallies.append((int(begin), Tally(**{**values, "histogram": bins})))
+            bins = {
+                name: tuple(sorted((int(b), n) for b, n in values.get(name, {}).items()))
+                for name in _HISTOGRAMS
+            }
+            tallies.append((int(begin), Tally(**{**values, **bins})))
         return cls.of(table["tasks"], table["events"], table["duration_us"], table["unmatched"], tallies)
 
 

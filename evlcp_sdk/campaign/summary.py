@@ -38,14 +38,18 @@ def measure(tally: Tally, kind: str) -> Figure:
 
     Args:
         tally: What was counted.
-        kind: `ber`, `rmse_m`, `gross_share`, `found_share`, `lost_share` (messages that were not read) or
-            `wrong_share` (messages that were read wrong, of those that were read).
+        kind: `ber`, `rmse_m`, `gross_share`, `found_share`, `lost_share` (messages that were not read),
+            `wrong_share` (messages that were read wrong, of those that were read) or `position_rmse_m`.
 
     >>> round(measure(Tally(bits=1000), "ber").high, 4)
     0.0037
     """
     if kind == "rmse_m":
         return Figure(tally.rmse_m, *rms_interval(tally.rmse_m, tally.ranged), tally.ranged)
+    if kind == "position_rmse_m":
+        # An error in space has three parts.
+        interval = rms_interval(tally.position_rmse_m, 3 * tally.fixes)
+        return Figure(tally.position_rmse_m, *interval, tally.fixes)
     hits, trials = {
         "ber": (tally.bit_errors, tally.bits),
         "gross_share": (tally.gross, tally.ranged),
@@ -181,14 +185,19 @@ class Summary:
 
 
 def _figures(tally: Tally) -> dict[str, Any]:
-    kinds = ("ber", "rmse_m", "gross_share", "found_share", "lost_share", "wrong_share")
+    kinds = ("ber", "rmse_m", "gross_share", "found_share", "lost_share", "wrong_share", "position_rmse_m")
     names = (
         *("frames_sent", "frames_found", "bits", "bit_errors", "ranged", "gross"),
-        *("messages_sent", "messages_found", "messages_wrong"),
+        *("messages_sent", "messages_found", "messages_wrong", "fixes", "fixes_refused"),
     )
     counts = {name: getattr(tally, name) for name in names}
-    bias = {"bias_m": tally.bias_m}
-    return _plain(counts | bias) | {kind: _plain(asdict(measure(tally, kind))) for kind in kinds}
+    others = {
+        "bias_m": tally.bias_m,
+        "position_median_m": tally.position_quantile_m(0.5),
+        "position_95_m": tally.position_quantile_m(0.95),
+        "position_nees": tally.position_nees,
+    }
+    return _plain(counts | others) | {kind: _plain(asdict(measure(tally, kind))) for kind in kinds}
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from evlcp_sdk.campaign.measure import message_tallies, statistics_of
+from evlcp_sdk.campaign.measure import message_tallies, position_tallies, statistics_of
 from evlcp_sdk.campaign.plan import Job, Plan, load_plan
 from evlcp_sdk.campaign.statistics import Statistics
 from evlcp_sdk.config import Link, installed_versions, load_link, resolve
@@ -16,12 +16,16 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.hookspecs import ROLE_NAMES
 from evlcp_sdk.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.sim import Scene, load_scene, simulate, truth
+from evlcp_sdk.sim import Scene, Simulation, load_scene, truth_of
+from evlcp_sdk.sim.world import attitude_log
 from evlcp_sdk.types import Packet
 
 __all__ = ["environment_of", "plan_of", "run_job"]
 
-_SOURCES = ("abc.py", "codebook.py", "config.py", "crc.py", "frames.py", "geometry.py", "types.py")
+_SOURCES = (
+    *("abc.py", "attitude.py", "codebook.py", "config.py", "crc.py", "frames.py", "geometry.py"),
+    *("sites.py", "types.py"),
+)
 _PACKAGES = ("messages", "rx", "sim")
 _CAMPAIGN = ("measure.py", "statistics.py", "task.py")
 
@@ -102,7 +106,9 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
             " (run it again), or other than on the machine that asks (install the same)"
         )
     scene: Scene = job.scene
-    known = truth(scene, job.seed)
+    simulation = Simulation(scene, job.seed)
+    known = truth_of(simulation)
+    attitude = attitude_log(scene, job.seed, simulation.path) if scene.world is not None else None
     links, receivers = [], []
     for task in job.tasks:
         table, digest = task.link
@@ -114,7 +120,7 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
         receivers.append(Receiver(link))
     packets: list[list[Packet]] = [[] for _ in receivers]
     number = 0
-    for events in simulate(scene, job.seed):
+    for events in simulation.stream():
         number += len(events)
         for receiver, found in zip(receivers, packets, strict=True):
             found += receiver.feed(events)
@@ -122,8 +128,10 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
     for task, link, receiver, found in zip(job.tasks, links, receivers, packets, strict=True):
         found += receiver.close()
         frames = (frame for packet in found for frame in packet.frames)
-        messages = message_tallies(found, known, link.block_coder()) if _sends_messages(known) else []
-        results.append((task.id, statistics_of(frames, known, number, messages)))
+        others = message_tallies(found, known, link.block_coder()) if _sends_messages(known) else []
+        if scene.world is not None:
+            others += position_tallies(found, known, link, attitude)
+        results.append((task.id, statistics_of(frames, known, number, others)))
     return results
 
 

@@ -8,6 +8,7 @@ import typer
 from evlcp_sdk.cli._common import Json, console
 
 if TYPE_CHECKING:
+    from evlcp_sdk.campaign.statistics import Tally
     from evlcp_sdk.campaign.summary import Summary
 
 __all__ = ["register", "report", "show_paper", "show_series"]
@@ -107,7 +108,9 @@ def _series_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
     def shown(value: float, low: float, high: float, form: str) -> str:
         return f"{value:{form}} [{low:{form}}, {high:{form}}]"
 
-    messages = any(t.messages_sent for one in summary.series for _, t in one.statistics.segments)
+    tallies = [t for one in summary.series for _, t in one.statistics.segments]
+    messages = any(t.messages_sent for t in tallies)
+    positions = any(t.fixes or t.fixes_refused for t in tallies)
     rows = []
     for one in summary.series:
         for begin, tally in reversed(one.statistics.segments):
@@ -122,10 +125,19 @@ def _series_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
                     f"{gross.value:.2%}" if gross.count else "-",
                     *([f"{tally.messages_found} of {tally.messages_sent}"] if messages else []),
                     *([f"{tally.messages_wrong}"] if messages else []),
+                    *([f"{tally.fixes} of {tally.fixes + tally.fixes_refused}"] if positions else []),
+                    *([_within(tally)] if positions else []),
+                    *([f"{tally.position_nees:.1f}" if tally.fixes else "-"] if positions else []),
                 ]
             )
     head = ["series", "distance", "frames", "BER [95 %]", "RMSE, m [95 %]", "0.5 m or more"]
-    return head + (["messages", "wrong"] if messages else []), rows
+    head += ["messages", "wrong"] if messages else []
+    return head + (["positions", "half, 95 % within, m", "NEES of 3"] if positions else []), rows
+
+
+def _within(tally: "Tally") -> str:
+    half, most = (tally.position_quantile_m(share) for share in (0.5, 0.95))
+    return f"{half:.3f}, {most:.3f}" if tally.fixes else "-"
 
 
 def _paper_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:

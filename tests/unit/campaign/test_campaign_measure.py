@@ -8,10 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evlcp_sdk.campaign.measure import statistics_of
-from evlcp_sdk.campaign.statistics import Statistics
+from evlcp_sdk.campaign.measure import position_tallies, statistics_of
+from evlcp_sdk.campaign.statistics import Statistics, Tally
 from evlcp_sdk.config import load_link
-from evlcp_sdk.types import Frame, Range, SoftSymbols
+from evlcp_sdk.geometry import Attitude
+from evlcp_sdk.sim import Simulation, resolve_scene, sites_of, truth_of
+from evlcp_sdk.sim.world import attitude_log
+from evlcp_sdk.sites import LocalFrame
+from evlcp_sdk.types import Frame, Packet, Range, SoftSymbols
 from tests.conftest import ROOT, Run
 
 SHARED = ROOT.parent / "shared"
@@ -117,3 +121,77 @@ def received(recording: Path) -> list[Frame]:
     with open_events(str(recording)) as source:
         packets = [p for events in source.chunks() for p in receiver.feed(events)] + receiver.close()
     return [frame for packet in packets for frame in packet.frames]
+
+
+GATE = {
+    "duration_s": 0.12,
+    "world": {"latitude_deg": 35.0, "longitude_deg": 137.0, "heading_deg": 70.0, "gravity_sigma_deg": 0.0},
+    "motion": {"distance_m": 45.0, "vib_rate_rad_s": 0.0},
+    "bars": [{"x_m": -2.0}, {"x_m": 2.0, "y_m": -0.5, "z_m": 4.0}],
+}
+
+
+def seen(known: dict[str, Any]) -> list[Packet]:
+    """Packets whose frames show the clusters of a scene exactly, of the last bar first."""
+    scene = resolve_scene(GATE)
+    path = known["camera_path"]
+    t_us = np.array(known["t_s"]) * 1e6
+    packets = []
+    for number, i in ((0, 1), (1, 0)):
+        frames = []
+        for f, at in enumerate(np.arange(2000.0, 110_000.0, 3200.0)):
+            keys = ("latitude_deg", "longitude_deg", "height_m", "pitch_deg", "roll_deg", "heading_deg")
+            here = [float(np.interp(at, t_us, path[key])) for key in keys]
+            turned = Attitude(*here[3:]).rotation()
+            clusters = sites_of(scene)[i].cluster_positions_m(16, LocalFrame(*here[:3]))
+            points = scene.camera.project(clusters @ turned)
+            symbols = SoftSymbols(np.zeros(16, int), np.zeros((16, 6), np.float32), 1.0)
+            middle = points.mean(0)
+            frames.append(
+                Frame(
+                    transmitter=number,
+                    packet=f // 10,
+                    frame=f % 10,
+                    t_us=at - 800,
+                    soft=symbols,
+                    range=Range(float("nan"), float("nan"), 0),
+                    filtered=None,
+                    x_px=float(middle[0]),
+                    y_px=float(middle[1]),
+                    points_px=points,
+                    points_sigma_px=np.full(16, 0.1),
+                    points_t_us=at,
+                )
+            )
+        packets += [
+            Packet(number, p, frames[10 * p].t_us - 2600, 100.0, tuple(frames[10 * p : 10 * p + 10]), 10)
+            for p in range(3)
+        ]
+    return sorted(packets, key=lambda packet: packet.t_us)
+
+
+@pytest.mark.parametrize("attitude", ["none", "gravity", "heading"])
+def test_positions_are_held_beside_the_cameras_path(attitude: str) -> None:
+    scene = resolve_scene(GATE | {"world": GATE["world"] | {"attitude": attitude}})  # type: ignore[operator]
+    simulation = Simulation(scene)
+    known = json.loads(json.dumps(truth_of(simulation)))
+    true_path = dict(known["camera_path"])
+    log = attitude_log(scene, 0, simulation.path)
+    tallies = position_tallies(seen(known), known, load_link(), log)
+    total = sum((tally for _, tally in tallies), Tally())
+    assert {begin for begin, _ in tallies} == {40}
+    if attitude == "none":
+        assert (total.fixes, total.fixes_refused) == (0, len(tallies))
+        return
+    assert total.fixes >= 2
+    assert total.fixes_refused == 0
+    # Exact points: what is left is a path straight between its milliseconds.
+    assert total.position_rmse_m < 2e-3
+    assert total.position_nees < 1
+    # A truth 1e-6 degrees further north is 0.111 m off.
+    path = known["camera_path"]
+    path["latitude_deg"] = [latitude + 1e-6 for latitude in path["latitude_deg"]]
+    tallies = position_tallies(seen(known | {"camera_path": true_path}), known, load_link(), log)
+    total = sum((tally for _, tally in tallies), Tally())
+    assert total.position_rmse_m == pytest.approx(0.111, abs=0.003)
+    assert total.position_nees > 20

@@ -77,3 +77,17 @@ def test_rms_intervals_cover() -> None:
     inside = [low <= 0.07 <= high for low, high in (rms_interval(float(r), 40) for r in rms)]
     assert 0.93 <= np.mean(inside) <= 0.97
     assert all(math.isnan(v) for v in rms_interval(0.1, 0))
+
+
+def test_positions_have_quantiles() -> None:
+    errors_m = np.random.default_rng(0).exponential(0.1, 999)
+    total = sum((Tally.fix(float(e), 3.0) for e in errors_m), Tally(fixes_refused=2))
+    assert (total.fixes, total.fixes_refused) == (999, 2)
+    assert total.position_rmse_m == pytest.approx(np.sqrt((errors_m**2).mean()), rel=1e-4)
+    assert total.position_nees == pytest.approx(3.0)
+    for share in (0.5, 0.95):
+        # The upper end of the bin that holds it.
+        true = np.quantile(errors_m, share, method="higher")
+        assert 0 <= total.position_quantile_m(share) - true <= 0.005 + 1e-9
+    assert math.isnan(Tally().position_quantile_m(0.5))
+    assert Statistics.from_dict(Statistics.of(1, 0, 0, 0, [(40, total)]).to_dict()).total() == total
