@@ -280,37 +280,42 @@ def _starts(problem: _Problem) -> list[tuple[Floats, Floats]]:
         return _three_point_starts(problem)
     known = problem.attitude.rotation()
     if problem.compass:
-        found = _nearest_to_sights(enu, sights @ known.T)
-        return [] if found is None else [(found[0], known)]
-    tried = []
-    for turn in np.arange(_HEADINGS) * (2 * math.pi / _HEADINGS):
-        rotation = _turn(np.array([0.0, 0.0, turn])) @ known
-        found = _nearest_to_sights(enu, sights @ rotation.T)
-        tried.append((np.inf, np.zeros(3), rotation) if found is None else (found[1], found[0], rotation))
-    costs = np.array([cost for cost, *_ in tried])
+        position, cost = _nearest_to_sights(enu, sights @ known.T)
+        return [(position, known)] if np.isfinite(cost) else []
+    angle = np.arange(_HEADINGS) * (2 * math.pi / _HEADINGS)
+    turned = np.zeros((_HEADINGS, 3, 3))
+    turned[:, 0, 0] = turned[:, 1, 1] = np.cos(angle)
+    turned[:, 1, 0], turned[:, 0, 1] = np.sin(angle), -np.sin(angle)
+    turned[:, 2, 2] = 1
+    rotations = turned @ known
+    positions, costs = _nearest_to_sights(enu, sights @ rotations.transpose(0, 2, 1))
     # A start from each valley, so that a second solution is found where there is one.
     low = (costs <= np.roll(costs, 1)) & (costs <= np.roll(costs, -1)) & np.isfinite(costs)
-    order = [i for i in np.argsort(costs) if low[i]][:4]
-    return [tried[i][1:] for i in order]
+    order = [int(i) for i in np.argsort(costs) if low[i]][:4]
+    return [(positions[i], rotations[i]) for i in order]
 
 
-def _nearest_to_sights(enu_m: Floats, sights: Floats) -> tuple[Floats, float] | None:
+def _nearest_to_sights(enu_m: Floats, sights: Floats) -> tuple[Floats, Floats]:
     """The point nearest to all lines through `enu_m` along `sights`, and how far it is from them.
 
-    The distances are seen as angles, from that point; None where it is not determined, or behind.
+    Args:
+        enu_m: Points, m, float64 (n, 3).
+        sights: Unit vectors, float64 (..., n, 3).
+
+    Returns:
+        Points, m, float64 (..., 3), and the sum of 1 - cosine of the angles by which the lines miss them,
+        float64 (...,): large where lines lead there from behind, infinite where it is not determined.
     """
-    across = np.eye(3) - sights[:, :, None] * sights[:, None, :]
-    normal = across.sum(0)
-    if np.linalg.cond(normal) > 1e12:
-        return None
-    position = np.linalg.solve(normal, (across @ enu_m[:, :, None]).sum(0)[:, 0])
-    offset = enu_m - position
-    along = (offset * sights).sum(1)
-    distance = np.linalg.norm(offset, axis=1)
-    if not (distance > 0).all():
-        return None
-    # Behind counts as far off, but keeps its place among the valleys.
-    return position, float((1 - along / distance).sum())
+    normal = len(enu_m) * np.eye(3) - np.swapaxes(sights, -1, -2) @ sights
+    # What the lines leave open, as when all are parallel, is a direction of no curvature.
+    determined = np.linalg.eigvalsh(normal)[..., 0] > 1e-12 * len(enu_m)
+    normal = np.where(determined[..., None, None], normal, np.eye(3))
+    along = (sights * enu_m).sum(-1, keepdims=True)
+    position = np.linalg.solve(normal, (enu_m - sights * along).sum(-2)[..., None])[..., 0]
+    offset = enu_m - position[..., None, :]
+    distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-9)
+    cost = (1 - (offset * sights).sum(-1) / distance).sum(-1)
+    return position, np.where(determined, cost, np.inf)
 
 
 def _three_point_starts(problem: _Problem) -> list[tuple[Floats, Floats]]:
