@@ -109,6 +109,28 @@ class LocalFrame:
         """Latitude, longitude and height of the origin."""
         return self.latitude_deg, self.longitude_deg, self.height_m
 
+    def turn_from(self, other: "LocalFrame") -> NDArray[np.float64]:
+        """What turns vectors of another frame into this one, float64 (3, 3): 0.009 degrees a kilometre.
+
+        >>> far = LocalFrame(35.1, 137.0, 50.0)
+        >>> up = LocalFrame(35.0, 137.0, 50.0).turn_from(far)[:, 2]
+        >>> round(float(np.degrees(np.arctan2(up[1], up[2]))), 3)
+        0.1
+        """
+        return np.asarray(self._axes() @ other._axes().T)
+
+    def _axes(self) -> NDArray[np.float64]:
+        """East, north and up in the earth's frame (ECEF), as rows."""
+        sin_lat, sin_lon = np.sin(np.radians([self.latitude_deg, self.longitude_deg]))
+        cos_lat, cos_lon = np.cos(np.radians([self.latitude_deg, self.longitude_deg]))
+        return np.array(
+            [
+                [-sin_lon, cos_lon, 0.0],
+                [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+                [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
+            ]
+        )
+
     def to_enu(
         self, latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike
     ) -> NDArray[np.float64]:

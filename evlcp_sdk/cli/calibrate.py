@@ -99,6 +99,7 @@ def _views(
     from evlcp_sdk.registry import Registry
     from evlcp_sdk.rx.position import BarView, Positioner, points_at
     from evlcp_sdk.rx.receiver import Receiver
+    from evlcp_sdk.sites import LocalFrame
     from evlcp_sdk.types import Frame, Packet
 
     registry = Registry.load()
@@ -133,12 +134,16 @@ def _views(
             if points is not None and number in stands_at:
                 enu = stands_at[number].cluster_positions_m(clusters, frame)
                 bars.append(BarView(number, enu, *points))
+        place = (pose.latitude_deg, pose.longitude_deg, pose.height_m)
+        rotation = None
+        if pose.attitude is not None:
+            rotation = frame.turn_from(LocalFrame(*place)) @ pose.attitude.rotation()
         views.append(
             CalibrationView(
                 tuple(bars),
-                frame.to_enu(pose.latitude_deg, pose.longitude_deg, pose.height_m),
+                frame.to_enu(*place),
                 pose.position_sigma_m,
-                None if pose.attitude is None else pose.attitude.rotation(),
+                rotation,
                 pose.attitude_sigma_deg,
             )
         )

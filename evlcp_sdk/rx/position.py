@@ -776,7 +776,8 @@ class Positioner:
         return fixes
 
     def _fix(self, t_us: float) -> Fix | None:
-        views, sited, verified = [], [], True
+        views, sited = [], []
+        here: LocalFrame | None = None
         for number, seen in sorted(self._seen.items()):
             points = points_at(seen.frames, t_us, self._packet_us, self._clusters, self._spec)
             if points is None:
@@ -787,11 +788,13 @@ class Positioner:
                 continue
             if self.frame is None:
                 self.frame = LocalFrame.of([site])
-            enu = site.cluster_positions_m(self._clusters, self.frame)
+            # Gravity and north are those of here, which may be far from the origin of the track.
+            here = LocalFrame.of([site]) if here is None else here
+            enu = site.cluster_positions_m(self._clusters, here)
             sited.append(BarView(number, enu, *points))
         if not views:
             return None
-        if not sited or self.frame is None:
+        if here is None or self.frame is None:
             which = ", ".join(map(str, views))
             return Fix.refused(t_us, tuple(views), "no-site", f"no site is known of transmitter {which}")
         pose = solve_pose(sited, self._camera, self._attitude_at(t_us), self._spec)
@@ -799,16 +802,17 @@ class Positioner:
             return Fix.refused(t_us, tuple(views), pose.kind, pose.detail)
         verified = all(self._seen[n].trust == "verified" for n in pose.transmitters)
         attitude = Attitude.of_rotation(pose.rotation)
-        latitude, longitude, height = (float(v) for v in self.frame.to_geodetic(pose.enu_m))
+        latitude, longitude, height = (float(v) for v in here.to_geodetic(pose.enu_m))
+        turn = self.frame.turn_from(here)
         assert attitude.heading_deg is not None
         return Fix(
             t_us=t_us,
             latitude_deg=latitude,
             longitude_deg=longitude,
             height_m=height,
-            enu_m=pose.enu_m,
-            covariance_m2=pose.covariance[:3, :3],
-            noise_m2=pose.noise[:3, :3],
+            enu_m=self.frame.to_enu(latitude, longitude, height),
+            covariance_m2=turn @ pose.covariance[:3, :3] @ turn.T,
+            noise_m2=turn @ pose.noise[:3, :3] @ turn.T,
             heading_deg=attitude.heading_deg,
             pitch_deg=attitude.pitch_deg,
             roll_deg=attitude.roll_deg,

@@ -67,6 +67,15 @@ def test_the_local_frame_and_back(lat: float, lon: float, place: tuple[float, fl
     np.testing.assert_allclose(ecef(*(float(v[0]) for v in found)), world, atol=1e-6)
 
 
+@given(st.floats(-85, 85), st.floats(-179, 179), st.floats(-1, 1), st.floats(-1, 1))
+def test_vectors_turn_between_frames(lat: float, lon: float, dlat: float, dlon: float) -> None:
+    one, two = LocalFrame(lat, lon, 10.0), LocalFrame(lat + dlat, lon + dlon, 40.0)
+    want = enu_axes(one.latitude_deg, one.longitude_deg) @ enu_axes(two.latitude_deg, two.longitude_deg).T
+    np.testing.assert_allclose(one.turn_from(two), want, atol=1e-12)
+    step = one.to_enu(*two.to_geodetic([3.0, -4.0, 5.0])) - one.to_enu(*two.to_geodetic([0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(one.turn_from(two) @ [3.0, -4.0, 5.0], step, atol=1e-6)
+
+
 def test_a_site_file(tmp_path: Path) -> None:
     path = tmp_path / "site.toml"
     path.write_text(

@@ -108,6 +108,23 @@ def test_two_bars_of_other_phases_give_the_heading() -> None:
     assert all(math.isnan(f.latitude_deg) for f in alone)
 
 
+def test_gravity_and_north_are_those_of_the_place_not_of_the_first_site() -> None:
+    # 30 km away, the vertical leans by 0.27 degrees and north by 0.2.
+    far = site(99, (-30_000.0, 10_000.0, 0.0))
+    p = positioner([far, LEFT])
+    fixes = p.feed(packets_of(LEFT, 0, 6)) + p.close()
+    assert_right(fixes)
+    assert p.frame == LocalFrame.of([far])
+    heading = fixes[0].heading_deg
+    assert min(heading, 360 - heading) < 1e-3
+    # The covariance turns along: its size stays, its axes are those of the track's frame.
+    near = positioner([LEFT])
+    plain = near.feed(packets_of(LEFT, 0, 6)) + near.close()
+    here = LocalFrame.of([LEFT])
+    turn = LocalFrame.of([far]).turn_from(here)
+    np.testing.assert_allclose(fixes[1].covariance_m2, turn @ plain[1].covariance_m2 @ turn.T, atol=1e-9)
+
+
 def test_feeding_by_packets_or_all_at_once_is_the_same() -> None:
     stream = merged(packets_of(LEFT, 0, 8), packets_of(RIGHT, 1, 8, 21_000.0))
     one, many = positioner([LEFT, RIGHT]), positioner([LEFT, RIGHT])
