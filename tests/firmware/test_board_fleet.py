@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from evlcp_sdk.errors import InputError
 from firmware_host.emulators import native_command
+from firmware_host.fleet import read_inventory
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -40,6 +42,14 @@ def inventory(path: Path, ports: list[str], extra: dict[int, str]) -> Path:
         tables.append(line + extra.get(n, ""))
     path.write_text("\n".join(tables))
     return path
+
+
+def test_a_boards_pilots(tmp_path: Path) -> None:
+    file = inventory(tmp_path / "two.toml", ["unix:/a", "unix:/b"], {1: "pilot_every = 4\n"})
+    assert [payload.pilot_every for _, payload in read_inventory(file).boards] == [1, 4]
+    inventory(file, ["unix:/a"], {0: "pilot_every = 0\n"})
+    with pytest.raises(InputError, match=r"board\[0\]\.pilot_every = 0"):
+        read_inventory(file)
 
 
 def test_thirty_of_thirty_two(cli, boards: list[str], tmp_path: Path) -> None:

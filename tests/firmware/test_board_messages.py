@@ -116,6 +116,8 @@ def test_a_text_a_file_and_a_beacon(evlcp: Evlcp, site: Path, tmp_path: Path) ->
 def test_any_link(evlcp: Evlcp, tmp_path: Path, settings: tuple[str, ...]) -> None:
     chips = tmp_path / "c.npy"
     options = [part for setting in settings for part in ("--set", setting)]
+    played = evlcp("tx", "message", "--text", "Hello", "--port", "native:", *options)
+    assert played.code == 0, played.err
     done = evlcp(
         "tx", "message", "--text", "Hello " * 40, "--chips", chips, "--repeat", 2, "--json", *options
     )

@@ -200,4 +200,6 @@ def test_pilots_in_some_frames_only(cli, tmp_path: Path, book: Codebook) -> None
     words = cli(*options, "--format", "hex").stdout.splitlines()
     assert [len(line.split()[0]) for line in words] == [8, 4, 4, 4, 8, 4] * 2
     assert json.loads(cli(*options, "--format", "json").stdout)["pilot_every"] == 4
-    assert cli("tx", "check", "--random", 20, "--frames", 20, "--pilot-every", 4).returncode == 0
+    for profile in ("wh4x2", "wh8", "raw8"):
+        options = ("--random", 20, "--frames", 20, "--pilot-every", 4, "--profile", profile)
+        assert cli("tx", "check", *options).returncode == 0
