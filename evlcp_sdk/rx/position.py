@@ -220,14 +220,17 @@ class _Problem:
     def of(
         cls, views: Sequence[BarView], camera: CameraModel, attitude: Attitude | None, spec: PositionSpec
     ) -> "_Problem | Refusal":
-        kept = []
+        kept, most = [], 0
         for view in views:
             seen = np.isfinite(view.points_px).all(1) & np.isfinite(view.sigma_px) & (view.sigma_px > 0)
+            seen &= _whole(view.points_px, camera)
+            most = max(most, int(seen.sum()))
             if seen.sum() >= spec.min_points:
                 kept.append((view, seen))
         if not kept:
-            most = max((int(np.isfinite(v.points_px[:, 0]).sum()) for v in views), default=0)
-            return Refusal("too-few-clusters", f"{most} clusters of a bar seen, {spec.min_points} needed")
+            return Refusal(
+                "too-few-clusters", f"{most} whole clusters of a bar seen, {spec.min_points} needed"
+            )
         compass = attitude is not None and attitude.heading_deg is not None
         centres = np.array([v.enu_m[s].mean(0) for v, s in kept])
         if not compass and len(kept) == 1:
@@ -259,6 +262,19 @@ class _Problem:
         flat = self.camera.undistort(self.points_px)
         ray = np.concatenate([flat, np.ones((len(flat), 1))], 1)
         return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+
+
+def _whole(points_px: Floats, camera: CameraModel) -> NDArray[np.bool_]:
+    """Which clusters do not touch the image's edge: of one that is cut off, only a part is seen.
+
+    A cluster is as long as the spacing of neighbours; three quarters of it and a pixel of blur must be free.
+    """
+    gaps = np.linalg.norm(np.diff(points_px, axis=0), axis=1)
+    gap = float(np.median(gaps[np.isfinite(gaps)])) if np.isfinite(gaps).any() else 0.0
+    margin = 0.75 * gap + 1
+    low = points_px - margin >= -0.5
+    high = points_px + margin <= np.array([camera.width, camera.height]) - 0.5
+    return np.asarray((low & high).all(1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -157,7 +157,7 @@ def monte_carlo(
     ("places", "known", "median_m", "most_m"),
     [
         (POLES, LEVEL, 0.06, 0.15),
-        ([(-4.0, 50.0, 4.5), (4.0, 45.0, 4.5)], LEVEL, 0.06, 0.15),
+        ([(-4.0, 50.0, 4.5), (3.5, 45.0, 4.5)], LEVEL, 0.06, 0.15),
         (THREE, LEVEL, 0.02, 0.03),
         (THREE, None, 0.02, 0.03),
         (POLES[:1], Attitude(heading_deg=0.0, gravity_sigma_deg=0.0, heading_sigma_deg=0.1), 0.2, 0.35),
@@ -208,6 +208,19 @@ def test_a_point_out_of_place_does_not_matter() -> None:
     seen[1].points_px[3] += 40
     pose = solved(solve_pose(seen, CAMERA, Attitude(5.0, 0.0, None, 0.0)))
     assert np.linalg.norm(pose.enu_m - clean.enu_m) < 0.02
+
+
+def test_a_cluster_that_the_edge_cuts_off_is_left_out() -> None:
+    # The bar's centre is on the image's upper edge: half of it is seen, and a part of the cluster beside.
+    rotation, known = Attitude().rotation(), Attitude(0.0, 0.0, 0.0, 0.0, 0.0)
+    (seen,) = views([bar((-2.0, 50.0, 2.5))], np.zeros(3), rotation, noise_px=0.1)
+    off = seen.points_px[:, 1] < -4.3
+    seen.points_px[off] = np.nan
+    cut = np.flatnonzero(~off)[0]
+    assert 4 < seen.points_px[cut, 1] < 5
+    seen.points_px[cut, 1] += 2
+    pose = solved(solve_pose([seen], CAMERA, known))
+    assert np.linalg.norm(pose.enu_m) < 1e-3
 
 
 def refused(found: Pose | Refusal) -> str:
