@@ -45,10 +45,10 @@ def statistics_of(
     unmatched = 0
     for frame in frames:
         t_us = frame.t_us - known["scene"]["t0_us"]
-        near = min(bars, key=lambda bar: bar.apart_px(t_us, frame), default=None)
+        near = min(bars, key=lambda bar: bar.sight.apart_px(t_us, frame), default=None)
         place = None if near is None else near.take(t_us, frame)
         if near is None or place is None:
-            cut = near is not None and near.apart_px(t_us, frame) <= _MOST_APART_PX
+            cut = near is not None and near.sight.apart_px(t_us, frame) <= _MOST_APART_PX
             unmatched += not (cut and (t_us < _TAIL_US or t_us + 3400 > duration_us))
             continue
         heard = frame.soft.symbols.tolist()
@@ -78,7 +78,7 @@ def message_tallies(
         if packet.block is None or not packet.frames:
             continue
         t_us = packet.t_us - known["scene"]["t0_us"]
-        near = min(bars, key=lambda bar: bar.apart_px(t_us, packet.frames[0]), default=None)
+        near = min(bars, key=lambda bar: bar.sight.apart_px(t_us, packet.frames[0]), default=None)
         number = None if near is None else near.number(t_us)
         if near is None or number is None:
             tallies.append((0, Tally(messages_wrong=1)))
@@ -105,7 +105,7 @@ def position_tallies(
         link: The link they were received with.
         attitude: What is known of the camera's attitude; None for nothing.
     """
-    bars = [_SentPackets(known, i) for i in range(len(known["bars"]))]
+    sights = [_Sight(known, i) for i in range(len(known["bars"]))]
     sites = [BarSite(**site) for site in known["sites"]]
     t0_us, path = known["scene"]["t0_us"], known["camera_path"]
     first: dict[int, Frame] = {}
@@ -113,7 +113,7 @@ def position_tallies(
         for frame in packet.frames:
             first.setdefault(packet.transmitter, frame)
     for number, frame in first.items():
-        away = [bar.apart_px(frame.t_us - t0_us, frame) for bar in bars]
+        away = [sight.apart_px(frame.t_us - t0_us, frame) for sight in sights]
         i = int(np.argmin(away))
         if away[i] <= _MOST_APART_PX and sites[i].transmitter is None:
             sites[i] = replace(sites[i], transmitter=number)
@@ -142,6 +142,19 @@ def position_tallies(
     return tallies
 
 
+class _Sight:
+    """Where a bar is in the image."""
+
+    def __init__(self, known: Mapping[str, Any], number: int) -> None:
+        self._t_us = np.array(known["t_s"]) * 1e6
+        self._centre_px = np.array(known["bar_centre_px"][number])
+
+    def apart_px(self, t_us: float, frame: Frame) -> float:
+        """How far a frame's bar lies from it."""
+        x, y = (float(np.interp(t_us, self._t_us, c)) for c in self._centre_px)
+        return float(np.hypot(frame.x_px - x, frame.y_px - y))
+
+
 class _SentPackets:
     """The packets that a bar sent, at least in part, while the recording ran."""
 
@@ -150,22 +163,17 @@ class _SentPackets:
         rate_hz = bar.get("chip_rate_hz", 1e4) * (1 + bar["ppm"] * 1e-6)
         period_us = bar["packet_chips"] / rate_hz * 1e6
         self.symbols = bar["symbols"]
-        self._t_us = np.array(known["t_s"]) * 1e6
-        self._centre_px = np.array(known["bar_centre_px"][number])
+        self.sight = _Sight(known, number)
         self._start_us = np.arange(len(self.symbols)) * period_us - bar["start_chip"] / rate_hz * 1e6
         end_us = known["scene"]["duration_s"] * 1e6
         self.whole = (self._start_us >= 0) & (self._start_us + period_us + _TAIL_US < end_us)
         depth_m = np.array(known["distance_m"][number])
-        self.distance_m = np.interp(self._start_us + period_us / 2, self._t_us, depth_m)
+        t_us = np.array(known["t_s"]) * 1e6
+        self.distance_m = np.interp(self._start_us + period_us / 2, t_us, depth_m)
 
     def whole_m(self) -> list[float]:
         """Distance of each packet that was sent whole, m."""
         return [float(at) for at in self.distance_m[self.whole]]
-
-    def apart_px(self, t_us: float, frame: Frame) -> float:
-        """How far the frame's bar lies from this one."""
-        x, y = (float(np.interp(t_us, self._t_us, c)) for c in self._centre_px)
-        return float(np.hypot(frame.x_px - x, frame.y_px - y))
 
     def number(self, t_us: float) -> int | None:
         """The packet that began at a time; None if there is none."""
@@ -184,8 +192,7 @@ class _Sent:
 
     def __init__(self, known: Mapping[str, Any], number: int) -> None:
         bar = known["bars"][number]
-        self._t_us = np.array(known["t_s"]) * 1e6
-        self._centre_px = np.array(known["bar_centre_px"][number])
+        self.sight = _Sight(known, number)
         rate_hz = bar.get("chip_rate_hz", 1e4) * (1 + bar["ppm"] * 1e-6)
         end_us = known["scene"]["duration_s"] * 1e6
         starts, self.symbols = [], []
@@ -195,17 +202,13 @@ class _Sent:
                 self.symbols.append(symbols)
         self._start_us = np.array(starts)
         depth_m = np.array(known["distance_m"][number])
-        self.distance_m = np.interp(self._start_us + _MIDDLE_OF_PILOT_US, self._t_us, depth_m)
+        t_us = np.array(known["t_s"]) * 1e6
+        self.distance_m = np.interp(self._start_us + _MIDDLE_OF_PILOT_US, t_us, depth_m)
         self._taken: set[int] = set()
-
-    def apart_px(self, t_us: float, frame: Frame) -> float:
-        """How far the frame's bar lies from this one."""
-        x, y = (float(np.interp(t_us, self._t_us, c)) for c in self._centre_px)
-        return float(np.hypot(frame.x_px - x, frame.y_px - y))
 
     def take(self, t_us: float, frame: Frame) -> int | None:
         """Number of the sent frame that this is; None if it is none, or was found before."""
-        if not len(self._start_us) or self.apart_px(t_us, frame) > _MOST_APART_PX:
+        if not len(self._start_us) or self.sight.apart_px(t_us, frame) > _MOST_APART_PX:
             return None
         nearest = int(np.argmin(np.abs(self._start_us - t_us)))
         if abs(self._start_us[nearest] - t_us) > _MOST_LATE_US or nearest in self._taken:
