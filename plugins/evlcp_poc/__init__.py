@@ -11,5 +11,5 @@ __all__ = ["evlcp_algorithms"]
 def evlcp_algorithms() -> Iterator[Algorithm]:
     """The algorithms of this package."""
     yield Algorithm(
-        "ranging", "poc", "evlcp_poc.ranging:PocRanging", 2, "phase-only correlation of cluster pairs"
+        "ranging", "poc", "evlcp_poc.ranging:PocRanging", 3, "phase-only correlation of cluster pairs"
     )

@@ -97,6 +97,14 @@ class PocRanging(Ranging):
     peak_samples: Annotated[
         int, Field(ge=1, le=8, description="Samples on each side of the peak that the kernel is fitted to.")
     ] = 2
+    min_pairs: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="Pairs that a distance needs, or all of a smaller layout: of seven, five are left"
+            " without the extremes, and outvote two wrong ones.",
+        ),
+    ] = 7
     min_pixels: Annotated[
         int, Field(ge=1, description="Lit pixels that a cluster's map needs to be used.")
     ] = 4
@@ -140,7 +148,7 @@ class PocRanging(Ranging):
             apart_px = (middle[second] - middle[first]).astype(np.float64)
             off_px = np.hypot(apart_px[:, 0], apart_px[:, 1]) - px_per_m * spacing
             pairs = known[first] & known[second] & (np.abs(off_px) <= neighbour_px)
-            if not pairs.any():
+            if pairs.sum() < min(self.min_pairs, len(first)):
                 return _NONE
             a, b, apart_m, apart_px = first[pairs], second[pairs], spacing[pairs], apart_px[pairs]
             # A cut of two spacings and a seam holds a cluster's blob with its blur, wherever it sits in it.

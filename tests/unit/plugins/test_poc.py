@@ -371,10 +371,18 @@ def test_all_clusters_in_one_place_have_no_distance():
 def test_dark_clusters_cost_only_their_pairs(dark):
     maps = image_of(BAR, 50)
     maps[dark] = 0
-    found = measured(maps, drop_extremes=0, outlier_iqr=1e6)
+    found = measured(maps, drop_extremes=0, outlier_iqr=1e6, min_pairs=1)
     lit = [k for k in range(1, 15) if k not in dark]
     assert found.pairs == sum(j - i >= 6.5 for i in lit for j in lit)
     assert found.distance_m == pytest.approx(50, rel=1e-3)
+
+
+@pytest.mark.parametrize(("dark", "pairs"), [((1, 2, 3), 10), ((1, 2, 3, 4), 6), (range(4, 12), 9)])
+def test_a_distance_needs_its_pairs(dark, pairs):
+    maps = image_of(BAR, 50)
+    maps[list(dark)] = 0
+    assert measured(maps, min_pairs=1, drop_extremes=0, outlier_iqr=1e6).pairs == pairs
+    assert np.isnan(measured(maps).distance_m) == (pairs < 7)
 
 
 @pytest.mark.parametrize("cluster", [2, 5, 12])
