@@ -225,7 +225,7 @@ class ResultWriter:
         for frame in packet.frames:
             symbols[frame.frame] = frame.soft.symbols.tolist()
             frame_bits = bits_of_symbols(frame.soft.symbols[None], book.bits_per_symbol)
-            bits[frame.frame] = "".join(map(str, frame_bits.tolist()))
+            bits[frame.frame] = (frame_bits + ord("0")).tobytes().decode("ascii")
         return {
             "kind": "packet",
             "transmitter": packet.transmitter,

@@ -65,18 +65,25 @@ def score_pixels(
     of the air interface.
     """
     shortest, single, double = run_us
+    # Whether an event changes a pixel's polarity is as good as random: a branch would stall at every third.
+    changes = np.empty(t_us.size + 1, np.int32)
+    n = 0
     for i in range(t_us.size):
-        u, v, polarity = np.int64(x[i]), np.int64(y[i]), np.int64(p[i])
+        u, v = np.uint64(x[i]), np.uint64(y[i])
+        change = (pixels[v, u] ^ p[i]) & 1
+        pixels[v, u] ^= change
+        changes[n] = i
+        n += change
+    shift = np.uint64(cell_shift)
+    for i in changes[:n]:
+        u, v = np.uint64(x[i]), np.uint64(y[i])
         state = pixels[v, u]
-        if (state & 1) == polarity:
-            continue
         run = t_us[i] - (state >> 8)
         score = (state >> 1) & 127
         score += 2 * (np.int64(run >= shortest) & np.int64(run < single)) - 2 * np.int64(run >= double)
         score = min(max(score, 0), 40)
-        pixels[v, u] = (t_us[i] << 8) | (score << 1) | polarity
-        if score >= min_score:
-            hits[v >> cell_shift, u >> cell_shift] += 1
+        pixels[v, u] = (t_us[i] << 8) | (score << 1) | (state & 1)
+        hits[v >> shift, u >> shift] += np.int32(score >= min_score)
 
 
 @njit(cache=True, nogil=True)
@@ -164,18 +171,25 @@ def select_boxes(
     taken: Array,
 ) -> None:
     """Copy the events inside each box (left, top, right, bottom) to that box's row; count them in `taken`."""
+    inside = np.empty(t_us.size, np.uint8)
+    which = np.empty(t_us.size + 1, np.int32)
     for b in range(boxes.shape[0]):
-        left, top, right, bottom = boxes[b, 0], boxes[b, 1], boxes[b, 2], boxes[b, 3]
+        left, top = np.uint16(boxes[b, 0]), np.uint16(boxes[b, 1])
+        width, height = np.uint16(boxes[b, 2] - boxes[b, 0]), np.uint16(boxes[b, 3] - boxes[b, 1])
+        # Without a branch, so that it runs on many events at once; unsigned, one comparison for both edges.
+        for i in range(t_us.size):
+            inside[i] = np.uint8(np.uint16(x[i] - left) < width) & np.uint8(np.uint16(y[i] - top) < height)
         n = 0
         for i in range(t_us.size):
-            u = np.int64(x[i])
-            v = np.int64(y[i])
             # Written always, kept if inside: between two bars, a branch would be a coin toss.
-            out_t[b, n] = t_us[i]
-            out_x[b, n] = x[i]
-            out_y[b, n] = y[i]
-            out_p[b, n] = p[i]
-            n += int(u >= left) & int(u < right) & int(v >= top) & int(v < bottom)
+            which[n] = i
+            n += inside[i]
+        for j in range(n):
+            i = which[j]
+            out_t[b, j] = t_us[i]
+            out_x[b, j] = x[i]
+            out_y[b, j] = y[i]
+            out_p[b, j] = p[i]
         taken[b] = n
 
 
@@ -213,10 +227,11 @@ def add_polarity(
             if min(chip_on, chip_off) >= chips:
                 break
             continue
-        u = np.int64(x[i]) - shift_x[c]
-        v = np.int64(y[i]) - shift_y[c]
-        if 0 <= u < width and 0 <= v < height:
-            sums[c, v, u] += np.int16(2 * on - 1)
+        # Unsigned, a pixel to the left of the image is far to its right: one comparison for both edges.
+        u = np.uint64(np.int64(x[i]) - shift_x[c])
+        v = np.uint64(np.int64(y[i]) - shift_y[c])
+        if u < np.uint64(width) and v < np.uint64(height):
+            sums[np.uint64(c), v, u] += np.int16(2 * on - 1)
 
 
 @njit(cache=True, nogil=True)
@@ -237,13 +252,17 @@ def cell_centres(selected: Array, centres: Array, area: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def most_in_place(image: Array, area: Array, layout: Array, spacing: float, least_spacing: float) -> int:
+def most_in_place(image: Array, area: Array, layout: Array, least_spacing: float) -> int:
     """Most clusters that one similarity of the layout brings to within half a spacing of the image's.
 
     Each pair of seen clusters half the layout apart proposes a similarity (as complex numbers: a turn and
     scale `s`, then a shift); those that bring neighbours nearer than `least_spacing` do not count.
     """
     clusters = area.size
+    spacing = np.inf
+    for k in range(1, clusters):
+        across, down = layout[k, 0] - layout[k - 1, 0], layout[k, 1] - layout[k - 1, 1]
+        spacing = min(spacing, max(abs(across), abs(down)))
     best = 0
     for i in range(clusters - clusters // 2):
         j = i + clusters // 2
@@ -339,9 +358,11 @@ def place_clusters(
     """Centres of the clusters in the image, `points` (K, 2), NaN where unseen; squares left by a similarity.
 
     `neighbours` (2, K) holds the cluster to the right and the one below, -1 for none; `ends` (K,) becomes 1
-    where a cluster has a boundary on one side only.
+    where a cluster has a boundary on one side only, else 0, NaN where unseen.
     """
     clusters, height, width = pixels.shape
+    points[:] = np.nan
+    ends[:] = np.nan
     s, shift = _placement(cells, area > 0, layout, spacing)
     reach = abs(s) * spacing
     # Placed so that neighbours fall into one pixel, there is nothing to measure.
@@ -367,6 +388,9 @@ def place_clusters(
     if seen.sum() < 3:
         points[:] = np.nan
         return 0.0
+    for k in range(clusters):
+        if seen[k]:
+            ends[k] = 0
     s, shift = _placement(points, seen, layout, spacing)
     mean = points.copy()
     gap = abs(s) * spacing

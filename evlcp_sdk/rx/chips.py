@@ -32,11 +32,13 @@ def polarity_sums(
     """
     from evlcp_sdk.rx import _kernels
 
-    x, y = centre_px
     width, height = size_px
-    shift_x = np.rint(x - (width - 1) / 2).astype(np.int64)
-    shift_y = np.rint(y - (height - 1) / 2).astype(np.int64)
-    sums = np.zeros((len(x), height, width), np.int16)
+    corner_px = np.array(centre_px)
+    corner_px[0] -= (width - 1) / 2
+    corner_px[1] -= (height - 1) / 2
+    whole_px = np.rint(corner_px)
+    shift_x, shift_y = whole_px.astype(np.int64)
+    sums = np.zeros((len(shift_x), height, width), np.int16)
     for e in events:
         _kernels.add_polarity(
             e.t_us,
@@ -50,4 +52,4 @@ def polarity_sums(
             shift_y,
             sums,
         )
-    return sums, np.stack([x - (width - 1) / 2 - shift_x, y - (height - 1) / 2 - shift_y])
+    return sums, corner_px - whole_px

@@ -160,9 +160,10 @@ class MessageAssembler:
         """Calibrated LLRs of a packet's bits in the order on air, 0 where a frame is missing."""
         llr = np.zeros((packet.sent, self._coder.bits // packet.sent), np.float32)
         for frame in packet.frames:
-            llr[frame.frame] = np.nan_to_num(frame.soft.llr, nan=0.0).ravel()
-        size = np.minimum(np.abs(llr.ravel()) ** self._spec.llr_power, self._spec.max_llr)
-        return np.copysign(size, llr.ravel()).astype(np.float32)
+            llr[frame.frame] = frame.soft.llr.ravel()
+        known = np.nan_to_num(llr.ravel(), nan=0.0)
+        size = np.minimum(np.abs(known) ** self._spec.llr_power, self._spec.max_llr)
+        return np.copysign(size, known).astype(np.float32)
 
     def _content(self, inbox: _Inbox, llr: NDArray[np.float32]) -> tuple[bytes | None, int]:
         """The bytes of a packet's block and the packets it took; None if it cannot be told yet."""
@@ -296,7 +297,7 @@ class MessageAssembler:
 def _agreement(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
     """How much two packets' soft bits agree, in standard deviations of what independent bits would."""
     product = a.astype(np.float64) * b
-    spread = float(np.sqrt((product**2).sum()))
+    spread = float(np.vdot(product, product)) ** 0.5
     return float(product.sum()) / spread if spread else 0.0
 
 

@@ -60,23 +60,22 @@ def points_finder(centres_m: NDArray[np.float64]) -> FindPoints:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         from evlcp_sdk.rx import _kernels
 
-        points = np.full((clusters, 2), np.nan)
-        ends = np.zeros(clusters, np.int64)
         cells, area = np.empty((clusters, 2)), np.empty(clusters, np.int64)
         _kernels.cell_centres(presence.selected, cells, area)
+        if np.count_nonzero(area) < 3 or not spacing_m:
+            return np.full((clusters, 2), np.nan), np.full(clusters, np.nan)
         cells = cells * presence.grid_px + (presence.grid_px - 1) / 2
-        if (area > 0).sum() < 3 or not spacing_m:
-            return points, np.full(clusters, np.nan)
+        points, ends = np.empty((clusters, 2)), np.empty(clusters)
         squares = _kernels.place_clusters(
             presence.pixels, cells, area, layout, spacing_m, neighbours, points, ends
         )
-        seen = int(np.isfinite(points[:, 0]).sum())
+        seen = clusters - int(np.count_nonzero(np.isnan(ends)))
         freedom = max(2 * seen - 4, 0)
         variance = (_EXPECTED_WORTH * _SIGMA_PX**2 + squares) / (_EXPECTED_WORTH + freedom)
-        sigma = np.sqrt(variance) * np.where(ends > 0, _OUTER, 1.0)
         height, width = presence.pixels.shape[1:]
         # The image shows the pilot's mean; the bar's centre at the instant is known from its track.
-        still = np.array([(width - 1) / 2, (height - 1) / 2]) + offset_px.mean(1)
-        return points - still + np.asarray(centre_px), np.where(np.isfinite(points[:, 0]), sigma, np.nan)
+        points -= ((width - 1) / 2, (height - 1) / 2) + offset_px.sum(1) / offset_px.shape[1]
+        points += centre_px
+        return points, variance**0.5 * (1 + (_OUTER - 1) * ends)
 
     return find

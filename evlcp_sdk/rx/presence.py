@@ -24,6 +24,5 @@ def clusters_in_place(presence: PresenceMap, centres_m: NDArray[np.float64]) -> 
     image = np.empty((len(centres_m), 2))
     area = np.empty(len(centres_m), np.int64)
     _kernels.cell_centres(presence.selected, image, area)
-    spacing_m = float(np.abs(np.diff(centres_m, axis=0)).max(1).min())
     # A placement that puts neighbours into one pixel would fit anything.
-    return int(_kernels.most_in_place(image, area, centres_m, spacing_m, 1 / presence.grid_px))
+    return int(_kernels.most_in_place(image, area, centres_m, 1 / presence.grid_px))

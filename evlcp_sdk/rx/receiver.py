@@ -265,7 +265,7 @@ class Receiver:
             before = np.concatenate([[self._step_start_us // self._step_us], step[:-1]])
             return [int(i) for i in np.flatnonzero(step > before)]
         starts = np.arange(self._step_start_us + self._step_us, int(events.t_us[-1]) + 1, self._step_us)
-        return [int(i) for i in np.unique(np.searchsorted(events.t_us, starts))]
+        return sorted(set(np.searchsorted(events.t_us, starts).tolist()))
 
     def _run_step(self, until_us: int | None = None) -> list[Packet]:
         """Process the time step whose events are pending; `until_us` where the stream ends inside it."""

@@ -111,7 +111,9 @@ class Track:
 
     def at(self, t_us: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Centre (column, row) at times, interpolated; straight on for a little before and after, px."""
-        t, x, y = np.array([(r.t_us, r.x_px, r.y_px) for r in self.positions]).T
+        t = [r.t_us for r in self.positions]
+        x = [r.x_px for r in self.positions]
+        y = [r.y_px for r in self.positions]
         if len(t) > 1:
             # A place more at each end, on the straight line through the outermost two.
             n = _MOST_AHEAD_STEPS
@@ -278,7 +280,7 @@ class RegionTracker:
                 top >> _CELL_SHIFT : (bottom >> _CELL_SHIFT) + 1,
                 left >> _CELL_SHIFT : (right >> _CELL_SHIFT) + 1,
             ] = 0
-        if not hits.any():
+        if hits.max() == 0:
             self._fresh = []
             return
         near = np.ones((3, 3), bool)

@@ -16,17 +16,17 @@ def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, known: Arra
     for row in range(2):
         for b in range(bins):
             counts[row, b] = known[row, b] if b < known.shape[1] else 0.0
-    b = -1
-    upper = first_bin * bin_us
-    for i in range(t_us.size):
-        # Time never runs backward, so the bin only moves on.
-        while t_us[i] >= upper and b < bins:
-            b += 1
-            upper = (first_bin + b + 1) * bin_us
-        if b >= bins:
-            break
-        if b >= 0:
-            counts[p[i], b] += 1
+    i = np.searchsorted(t_us, first_bin * bin_us)
+    # Time never runs backward, so each bin goes on where the last one ended.
+    for b in range(bins):
+        upper = (first_bin + b + 1) * bin_us
+        begin = i
+        on = 0
+        while i < t_us.size and t_us[i] < upper:
+            on += p[i]
+            i += 1
+        counts[0, b] += i - begin - on
+        counts[1, b] += on
 
 
 @njit(cache=True, nogil=True)

@@ -1,6 +1,7 @@
 """Packet timing by sliding correlation with the preamble."""
 
 from dataclasses import dataclass, field, replace
+from statistics import fmean
 from typing import Annotated
 
 import numpy as np
@@ -148,10 +149,11 @@ class BarkerSynchronizer:
         start = max(lag - n, 0)
         stop = min(lag + n + 1, counts.shape[1] - n * len(self._chips) + 1)
 
+        bounds = np.arange(start, stop)[:, None] + n * np.arange(len(self._chips) + 1)
+
         def centre(count: NDArray[np.float64], sign: float) -> float:
             running = np.concatenate([[0.0], np.cumsum(count)])
-            windows = np.lib.stride_tricks.sliding_window_view(running, n * len(self._chips) + 1)
-            part = sign * (windows[start:stop, ::n] @ self._weights)
+            part = sign * (running[bounds] @ self._weights)
             # The top is flat where a window holds all events of an edge: its middle is the best window.
             weight = np.maximum(part - 0.9 * part.max(), 0) if part.max() > 0 else np.zeros(len(part))
             if weight.sum() == 0:
@@ -206,12 +208,14 @@ class BarkerSynchronizer:
     def _fit(self, heard: tuple[_Heard, ...]) -> tuple[float, float]:
         """(time of the last preamble, chip length), us: least squares with the nominal rate as prior."""
         nominal = self._packet.chip_us
-        chips = np.array([(h.packet - heard[-1].packet) * self._packet.packet_chips for h in heard], float)
-        late = np.array([h.on_us - heard[-1].on_us for h in heard]) - chips * nominal
+        chips = [(h.packet - heard[-1].packet) * self._packet.packet_chips for h in heard]
+        late = [h.on_us - heard[-1].on_us - c * nominal for h, c in zip(heard, chips, strict=True)]
         prior = _TIMING_SIGMA_US / (self._spec.clock_tolerance_ppm * 1e-6 * nominal)
-        rows = np.concatenate([np.stack([np.ones(len(chips)), chips], 1), [[0.0, prior]]])
-        fit, *_ = np.linalg.lstsq(rows, np.append(late, 0.0), rcond=None)
-        return heard[-1].on_us + float(fit[0]), nominal + float(fit[1])
+        mean_chips, mean_late = fmean(chips), fmean(late)
+        # The prior stands at chip 0 without lateness, whatever the grid: it bears on the slope alone.
+        power = sum((c - mean_chips) ** 2 for c in chips) + prior**2
+        slope = sum((c - mean_chips) * t for c, t in zip(chips, late, strict=True)) / power
+        return heard[-1].on_us + mean_late - slope * mean_chips, nominal + slope
 
     def _lock(self, heard: tuple[_Heard, ...]) -> SyncLock:
         grid_us, chip_us = self._fit(heard)

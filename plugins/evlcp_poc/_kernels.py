@@ -231,15 +231,40 @@ def _quantile(ordered: Array, share: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def middle_shifts(middle: Array, first: Array, second: Array, apart_m: Array, shifts: Array) -> float:
-    """Whole-pixel shifts between the middles of pairs, `shifts` (pairs, 2); their median in px a metre."""
+def median_scale(middle: Array, first: Array, second: Array, apart_m: Array) -> float:
+    """Median over pairs of what lies between their middles, px a metre; 0 without a pair that has both."""
     scale = np.empty(first.size)
+    n = 0
     for q in range(first.size):
-        for axis in range(2):
-            shifts[q, axis] = middle[second[q], axis] - middle[first[q], axis]
-        scale[q] = np.hypot(shifts[q, 0], shifts[q, 1]) / apart_m[q]
-    scale.sort()
-    return _quantile(scale, 0.5)
+        a, b = middle[first[q]], middle[second[q]]
+        if a[0] >= 0 and b[0] >= 0:
+            scale[n] = np.hypot(b[0] - a[0], b[1] - a[1]) / apart_m[q]
+            n += 1
+    return _quantile(np.sort(scale[:n]), 0.5) if n else 0.0
+
+
+@njit(cache=True, nogil=True)
+def pairs_in_place(
+    middle: Array,
+    first: Array,
+    second: Array,
+    apart_m: Array,
+    px_per_m: float,
+    most_off_px: float,
+    which: Array,
+    shifts: Array,
+) -> int:
+    """Which pairs have middles as far apart as the scale says, and their whole-pixel shifts; how many."""
+    n = 0
+    for q in range(first.size):
+        a, b = middle[first[q]], middle[second[q]]
+        down, right = b[0] - a[0], b[1] - a[1]
+        off_px = np.hypot(down, right) - px_per_m * apart_m[q]
+        if a[0] >= 0 and b[0] >= 0 and abs(off_px) <= most_off_px:
+            which[n] = q
+            shifts[n, 0], shifts[n, 1] = down, right
+            n += 1
+    return n
 
 
 @njit(cache=True, nogil=True)

@@ -136,21 +136,18 @@ class PocRanging(Ranging):
             maps = view.presence.pixels
             middle = np.empty((len(every), 2), np.int64)
             _kernels.middles(maps, every, self.min_pixels, middle)
-            known = middle[:, 0] >= 0
-            pairs = known[wide_a] & known[wide_b]
-            if not pairs.any():
-                return _NONE
-            a, b, apart_m = wide_a[pairs], wide_b[pairs], wide_m[pairs]
-            px_per_m = _kernels.middle_shifts(middle, a, b, apart_m, np.empty((len(a), 2)))
+            px_per_m = _kernels.median_scale(middle, wide_a, wide_b, wide_m)
             if px_per_m <= 0:
                 return _NONE
             neighbour_px = px_per_m * neighbour
-            apart_px = (middle[second] - middle[first]).astype(np.float64)
-            off_px = np.hypot(apart_px[:, 0], apart_px[:, 1]) - px_per_m * spacing
-            pairs = known[first] & known[second] & (np.abs(off_px) <= neighbour_px)
-            if pairs.sum() < min(self.min_pairs, len(first)):
+            pairs, apart_px = np.empty(len(first), np.int64), np.empty((len(first), 2))
+            n = _kernels.pairs_in_place(
+                middle, first, second, spacing, px_per_m, neighbour_px, pairs, apart_px
+            )
+            if n < min(self.min_pairs, len(first)):
                 return _NONE
-            a, b, apart_m, apart_px = first[pairs], second[pairs], spacing[pairs], apart_px[pairs]
+            pairs, apart_px = pairs[:n], apart_px[:n]
+            a, b, apart_m = first[pairs], second[pairs], spacing[pairs]
             # A cut of two spacings and a seam holds a cluster's blob with its blur, wherever it sits in it.
             height = _cut_size(2 * neighbour_px + 8)
             width = min(height, _cut_size(maps.shape[2]))

@@ -18,7 +18,7 @@ def evlcp_algorithms() -> Iterator[Algorithm]:
     ):
         yield Algorithm("modulation", name, f"evlcp_wh.modulation:{cls}", 1, what)
     yield Algorithm(
-        "separation", "wh-correlation", "evlcp_wh.separation:WhCorrelation", 1, "pilot correlation in grids"
+        "separation", "wh-correlation", "evlcp_wh.separation:WhCorrelation", 2, "pilot correlation in grids"
     )
     yield Algorithm(
         "decoding", "wh-transform", "evlcp_wh.decoding:WhTransform", 1, "presence-weighted WH transform"
@@ -30,6 +30,6 @@ def evlcp_algorithms() -> Iterator[Algorithm]:
         "decoding",
         "motion-feedback",
         "evlcp_wh.motion_feedback:MotionFeedback",
-        1,
+        2,
         "ml-soft again after the motion is known",
     )

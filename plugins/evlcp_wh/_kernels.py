@@ -30,6 +30,9 @@ def presence(
     clusters, length = codes.shape
     _, rows, columns = out.shape
     values = np.empty(length, np.int64)
+    fits = np.empty(clusters, np.int64)
+    # A likelihood beside that of the best fit, which it is less by twice as many values as it has fewer.
+    beside = np.exp(np.arange(2 * length + 1) * (disagree - agree) / 2)
     for r in range(rows):
         for c in range(columns):
             seen = 0
@@ -44,22 +47,17 @@ def presence(
                 seen += values[i] != 0
             if seen < min_seen:
                 continue
-            top = 0.0
+            most = -length
             for k in range(clusters):
-                fit = 0
+                fits[k] = 0
                 for i in range(length):
-                    fit += codes[k, i] * values[i]
-                likelihood = agree * (seen + fit) / 2 + disagree * (seen - fit) / 2
-                out[k, r, c] = likelihood
-                top = max(top, likelihood)
-            norm = clusters * np.exp(-top)
+                    fits[k] += codes[k, i] * values[i]
+                most = max(most, fits[k])
+            norm = clusters * np.exp(-(agree * (seen + most) + disagree * (seen - most)) / 2)
             for k in range(clusters):
-                # Ratios below 1e-9 are nothing beside the largest.
-                ratio = out[k, r, c] - top
-                out[k, r, c] = np.exp(ratio) if ratio > -20.0 else 0.0
-                norm += out[k, r, c]
+                norm += beside[most - fits[k]]
             for k in range(clusters):
-                out[k, r, c] /= norm
+                out[k, r, c] = beside[most - fits[k]] / norm
 
 
 @njit(cache=True, nogil=True)

@@ -28,9 +28,9 @@ class WhTransform(Decoding):
 
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's codewords."""
-        words = codebook.codewords.astype(np.float64)
+        words = np.ascontiguousarray(codebook.codewords.T, np.float64)
         pilot_chips = 2 * codebook.pilots.shape[1]
-        length, m = words.shape[1], codebook.bits_per_symbol
+        length, m = len(words), codebook.bits_per_symbol
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             from evlcp_wh import _kernels
@@ -38,11 +38,11 @@ class WhTransform(Decoding):
             values = np.zeros((len(presence.probability), length))
             info = sums[pilot_chips:]
             _kernels.weighted_values(info, presence.probability, presence.grid_px, self.min_weight, values)
-            fit = values @ words.T
+            fit = values @ words
             symbols = fit.argmax(1)
-            energy = float((values**2).sum())
+            energy = float(np.vdot(values, values))
             amplitude = fit.max(1) / length
-            explained = float((amplitude**2).sum()) * length
+            explained = float(np.vdot(amplitude, amplitude)) * length
             # One noise for all clusters of a frame: eight values are too few for one each. A dim cluster,
             # whose amplitude is small beside it, is unsure.
             rest = max(energy - explained, 1e-3 * energy, 1e-9)

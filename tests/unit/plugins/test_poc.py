@@ -164,15 +164,24 @@ def test_medians_and_cuts_of_maps(seed):
             assert_array_equal(out[n], twins.cut(maps[k], middle[n], rows, columns))
 
 
-def test_whole_pixel_shifts_and_their_scale():
+@pytest.mark.parametrize("unseen", [[], [2], [0, 5], [0, 1, 2, 3, 4]])
+def test_pairs_in_place_and_their_scale(unseen):
     rng = np.random.default_rng(0)
     middle = rng.integers(0, 90, (6, 2))
+    middle[unseen] = -1
     first, second = np.triu_indices(6, 1)
     apart = rng.uniform(0.1, 1, 15)
-    shifts = np.empty((15, 2))
-    scale = _kernels.middle_shifts(middle, first, second, apart, shifts)
-    assert_array_equal(shifts, middle[second] - middle[first])
-    assert scale == pytest.approx(np.median(np.linalg.norm(shifts, axis=1) / apart))
+    shifts = middle[second] - middle[first]
+    length = np.linalg.norm(shifts, axis=1)
+    seen = ~np.isin(first, unseen) & ~np.isin(second, unseen)
+    scale = _kernels.median_scale(middle, first, second, apart)
+    assert scale == (pytest.approx(np.median((length / apart)[seen])) if seen.any() else 0)
+    which, got = np.empty(15, np.int64), np.empty((15, 2))
+    n = _kernels.pairs_in_place(middle, first, second, apart, scale, 30.0, which, got)
+    want = np.flatnonzero(seen & (np.abs(length - scale * apart) <= 30))
+    assert_array_equal(which[:n], want)
+    assert_array_equal(got[:n], shifts[want])
+    assert 0 < n < seen.sum() or not seen.any()
 
 
 @pytest.mark.parametrize("clusters", [2, 3, 4, 14])

@@ -181,8 +181,8 @@ def test_most_clusters_in_place(seed, clusters):
     area = (rng.random(clusters) < 0.9).astype(np.int64)
     lit = int(area.sum())
     pairs = (area[: clusters - clusters // 2] * area[clusters // 2 :]).any() and clusters > 1
-    exact = _kernels.most_in_place(image, area, layout, 0.06, least)
+    exact = _kernels.most_in_place(image, area, layout, least)
     assert exact == (lit if pairs and scale * 0.06 >= least else 0)
     image[rng.random(clusters) < 0.4] += rng.normal(0, 5, 2)
-    got = _kernels.most_in_place(image, area, layout, 0.06, least)
+    got = _kernels.most_in_place(image, area, layout, least)
     assert got == twins.most_in_place(image, area, layout, 0.06, least)
