@@ -65,7 +65,7 @@ def score_pixels(
     of the air interface.
     """
     shortest, single, double = run_us
-    # Whether an event changes a pixel's polarity is as good as random: a branch would stall at every third.
+    # Whether an event changes its pixel's polarity is as good as random, so it is found without a branch.
     changes = np.empty(t_us.size + 1, np.int32)
     n = 0
     for i in range(t_us.size):

@@ -241,14 +241,15 @@ class RegionTracker:
         return replace(measured, x_px=float(centre[0]), y_px=float(centre[1]))
 
     def _reach(self, region: Region) -> Box:
-        """The box in which a region's events lie within the next step."""
+        """The box in which a region's events lie within the next step; an empty one off the sensor."""
         m = self._spec.margin_px
         half_w, half_h = region.width_px / 2 + m, region.height_px / 2 + m
+        width, height = self._camera.width, self._camera.height
         return (
-            max(int(region.x_px - half_w), 0),
-            max(int(region.y_px - half_h), 0),
-            min(int(region.x_px + half_w) + 1, self._camera.width),
-            min(int(region.y_px + half_h) + 1, self._camera.height),
+            min(max(int(region.x_px - half_w), 0), width),
+            min(max(int(region.y_px - half_h), 0), height),
+            min(max(int(region.x_px + half_w) + 1, 0), width),
+            min(max(int(region.y_px + half_h) + 1, 0), height),
         )
 
     def _measure(self, id: int, box: Box, end_us: int, rows: NDArray[np.int64]) -> Region | None:

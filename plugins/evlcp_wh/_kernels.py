@@ -31,7 +31,7 @@ def presence(
     _, rows, columns = out.shape
     values = np.empty(length, np.int64)
     fits = np.empty(clusters, np.int64)
-    # A likelihood beside that of the best fit, which it is less by twice as many values as it has fewer.
+    # A cluster whose fit is d below the best is `beside[d]` times as likely.
     beside = np.exp(np.arange(2 * length + 1) * (disagree - agree) / 2)
     for r in range(rows):
         for c in range(columns):

@@ -67,6 +67,27 @@ def test_a_shaking_bar_is_followed(shake_px: float, shake_hz: float) -> None:
     assert np.sqrt(np.mean((y - true_y + 0.5) ** 2)) < 0.8
 
 
+@pytest.mark.parametrize("way", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_a_bar_that_leaves_the_image_fast_is_let_go(way: tuple[int, int]) -> None:
+    """The filter's prediction runs on off the sensor until the region is released."""
+    link = load_link(overrides=["tracking.id=kalman"])
+    regions = RegionTracker(
+        SPEC, CameraModel(), LINK.packet.chip_us, link.algorithm("tracking").compile().position
+    )
+    events = events_of(LINK, Bar(random_symbols(LINK, 3), start_us=0))
+    gone_us = 15_000
+    moved_px = np.rint(9e-3 * np.maximum(events.t_us - gone_us, 0)).astype(np.int64)
+    x = events.x.astype(np.int64) + way[0] * moved_px + {1: 800, 0: 0, -1: -350}[way[0]]
+    y = events.y.astype(np.int64) + way[1] * moved_px
+    seen = (x >= 0) & (x < 1280) & (y >= 0) & (y < 720)
+    kept = Events.of(events.t_us[seen], x[seen], y[seen], events.p[seen])
+    assert kept.t_us[-1] < 90_000
+    tracks = [track for start, part in steps(kept, 160_000) for track in regions.step(start, part)]
+    assert {track.id for track in tracks} >= {0}
+    assert not regions.tracks
+    assert all(track.released for track in tracks)
+
+
 def test_a_track_goes_straight_on_for_two_steps() -> None:
     positions = [Region(0, 1000.0 * n, 50 + n**2, 80 - 2 * n, 4, 100) for n in range(4)]
     track = Track(0, deque(positions), 0)
