@@ -11,7 +11,33 @@ from evlcp_sdk.abc import Decode, Decoding
 from evlcp_sdk.codebook import Codebook
 from evlcp_sdk.types import PresenceMap, SoftSymbols
 
-__all__ = ["MlSoft", "combined_values", "learned_worth", "soft_symbols"]
+__all__ = [
+    "IndependentPixels",
+    "MaxEvents",
+    "MinWeight",
+    "MlSoft",
+    "PriorCount",
+    "combined_values",
+    "learned_worth",
+    "soft_symbols",
+]
+
+
+MaxEvents = Annotated[
+    int, Field(ge=1, le=16, description="Polarity sums beyond this many events count as this many.")
+]
+MinWeight = Annotated[
+    float, Field(gt=0, lt=1, description="Presence probability below which a cell is passed over.")
+]
+PriorCount = Annotated[float, Field(gt=0, description="Observations added to every cell of the histograms.")]
+IndependentPixels = Annotated[
+    float,
+    Field(
+        gt=0,
+        le=1,
+        description="Share of the pixels that err by themselves; neighbours share light and motion.",
+    ),
+]
 
 
 @dataclass(frozen=True)
@@ -24,23 +50,10 @@ class MlSoft(Decoding):
     no negative events, silence in both chips counts for what it is worth, too.
     """
 
-    max_events: Annotated[
-        int, Field(ge=1, le=16, description="Polarity sums beyond this many events count as this many.")
-    ] = 3
-    min_weight: Annotated[
-        float, Field(gt=0, lt=1, description="Presence probability below which a cell is passed over.")
-    ] = 0.05
-    prior_count: Annotated[
-        float, Field(gt=0, description="Observations added to every cell of the histograms.")
-    ] = 1.0
-    independent_pixels: Annotated[
-        float,
-        Field(
-            gt=0,
-            le=1,
-            description="Share of the pixels that err by themselves; neighbours share light and motion.",
-        ),
-    ] = 0.25
+    max_events: MaxEvents = 3
+    min_weight: MinWeight = 0.05
+    prior_count: PriorCount = 1.0
+    independent_pixels: IndependentPixels = 0.25
 
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's pilots and codewords."""

@@ -11,7 +11,16 @@ from pydantic import Field
 from evlcp_sdk.abc import Decode, Decoding
 from evlcp_sdk.codebook import Codebook
 from evlcp_sdk.types import PresenceMap, SoftSymbols
-from evlcp_wh.ml_soft import combined_values, learned_worth, soft_symbols
+from evlcp_wh.ml_soft import (
+    IndependentPixels,
+    MaxEvents,
+    MinWeight,
+    PriorCount,
+    combined_values,
+    learned_worth,
+    soft_symbols,
+)
+from evlcp_wh.separation import ErrorShare, MinValues
 
 __all__ = ["MotionFeedback"]
 
@@ -43,29 +52,12 @@ class MotionFeedback(Decoding):
         float, Field(gt=0, description="Likely distance (sigma) of the bar from its place.")
     ] = 1.0
     rounds: Annotated[int, Field(ge=1, le=4, description="How often motion and symbols are found anew.")] = 2
-    max_events: Annotated[
-        int, Field(ge=1, le=16, description="Polarity sums beyond this many events count as this many.")
-    ] = 3
-    min_weight: Annotated[
-        float, Field(gt=0, lt=1, description="Presence probability below which a cell is passed over.")
-    ] = 0.05
-    prior_count: Annotated[
-        float, Field(gt=0, description="Observations added to every cell of the histograms.")
-    ] = 1.0
-    independent_pixels: Annotated[
-        float,
-        Field(
-            gt=0,
-            le=1,
-            description="Share of the pixels that err by themselves; neighbours share light and motion.",
-        ),
-    ] = 0.25
-    value_error: Annotated[
-        float, Field(gt=0, lt=0.5, description="Probability that a cell's value is seen wrong.")
-    ] = 0.1
-    min_values: Annotated[
-        int, Field(ge=1, description="Values that must be seen in a cell for it to show a cluster.")
-    ] = 4
+    max_events: MaxEvents = 3
+    min_weight: MinWeight = 0.05
+    prior_count: PriorCount = 1.0
+    independent_pixels: IndependentPixels = 0.25
+    value_error: ErrorShare = 0.1
+    min_values: MinValues = 4
 
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's pilots and codewords."""

@@ -12,7 +12,14 @@ from evlcp_sdk.abc import Separate, Separation
 from evlcp_sdk.codebook import Codebook
 from evlcp_sdk.types import PresenceMap
 
-__all__ = ["WhCorrelation"]
+__all__ = ["ErrorShare", "MinValues", "WhCorrelation"]
+
+ErrorShare = Annotated[
+    float, Field(gt=0, lt=0.5, description="Probability that a cell's value is seen wrong.")
+]
+MinValues = Annotated[
+    int, Field(ge=1, description="Values that must be seen in a cell for it to show a cluster.")
+]
 
 
 @dataclass(frozen=True)
@@ -24,12 +31,8 @@ class WhCorrelation(Separation):
     """
 
     grid_px: Annotated[int, Field(ge=2, le=16, description="Side of a grid cell.")] = 2
-    value_error: Annotated[
-        float, Field(gt=0, lt=0.5, description="Probability that a cell's value is seen wrong.")
-    ] = 0.1
-    min_values: Annotated[
-        int, Field(ge=1, description="Values that must be seen in a cell for it to show a cluster.")
-    ] = 4
+    value_error: ErrorShare = 0.1
+    min_values: MinValues = 4
     min_probability: Annotated[
         float, Field(gt=0, lt=1, description="Presence probability that selects a cell.")
     ] = 0.5
