@@ -9,7 +9,6 @@ import difflib
 import hashlib
 import json
 import platform
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields
 from importlib.metadata import version
@@ -20,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from evlcp_sdk.codebook import Codebook
 from evlcp_sdk.errors import ConfigError, UnknownAlgorithmError
+from evlcp_sdk.files import parse_value, read_toml
 from evlcp_sdk.frames import PacketFormat
 from evlcp_sdk.geometry import BarLayout, CameraModel
 from evlcp_sdk.hookspecs import ROLE_NAMES
@@ -263,14 +263,7 @@ def load_link(
     source = ""
     if path is not None:
         source = str(path)
-        try:
-            table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except OSError as fault:
-            raise ConfigError(f"{path}: cannot be read: {fault.strerror}") from fault
-        except UnicodeDecodeError as fault:
-            raise ConfigError(f"{path}: at byte {fault.start}: not UTF-8 text") from fault
-        except tomllib.TOMLDecodeError as fault:
-            raise ConfigError(f"{path}: not TOML: {fault}") from fault
+        table = read_toml(path)
     set_here = set()
     for override in overrides:
         section, key, value = _parse_override(override)
@@ -464,10 +457,7 @@ def _parse_override(text: str) -> tuple[str, str, Any]:
     section, dot, key = (part.strip() for part in name.partition("."))
     if not (equals and dot and section and key):
         raise ConfigError(f"--set {text}: expected table.key=value, e.g. modulation.id=wh8")
-    try:
-        return section, key, tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        return section, key, value.strip()
+    return section, key, parse_value(value)
 
 
 def _spec_model(cls: type[Any]) -> type[BaseModel]:

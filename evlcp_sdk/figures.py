@@ -6,7 +6,6 @@ figures of a recording of any length take constant memory; `save_figures` draws 
 
 import colorsys
 import math
-import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Ellipse, Rectangle
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import EvlcpError
+from evlcp_sdk.files import whole_file
 from evlcp_sdk.geometry import CameraModel
 from evlcp_sdk.hookspecs import hookimpl
 from evlcp_sdk.rx.track import TrackPoint
@@ -156,14 +155,8 @@ def save_figures(probe: FigureProbe, title: str, folder: Path) -> list[Path]:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with whole_file(path) as part:
         figure.savefig(part, format="png", dpi=_DPI)
-        part.replace(path)
-    except OSError as fault:
-        raise EvlcpError(f"{path}: cannot be written: {fault.strerror}") from fault
-    finally:
-        part.unlink(missing_ok=True)
 
 
 class TrackProbe:

@@ -8,7 +8,6 @@ that is interrupted or meets unreadable input is finished too, and its summary s
 import csv
 import json
 import math
-import os
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -20,6 +19,7 @@ from typing import Any, Literal, Self, TextIO
 
 from evlcp_sdk.config import Link
 from evlcp_sdk.errors import ConfigError, EvlcpError
+from evlcp_sdk.files import hidden_path
 from evlcp_sdk.frames import bits_of_symbols
 from evlcp_sdk.messages.received import ReceivedMessage
 from evlcp_sdk.types import Frame, Packet
@@ -33,7 +33,6 @@ __all__ = [
     "TransmitterTally",
     "filtered_row",
     "frame_row",
-    "hidden_path",
     "message_line",
 ]
 
@@ -65,11 +64,6 @@ _FILES = ("frames.csv", "packets.jsonl", "frames.parquet", *_POSITION_FILES, "su
 _CELL_M = 0.01
 _FARTHEST_M = 10_000.0
 _MOST_CLOCK_ERROR = 0.01
-
-
-def hidden_path(folder: Path, name: str) -> Path:
-    """Where a file is written until its run ends."""
-    return folder / f".{name}.{os.getpid()}.part"
 
 
 @dataclass

@@ -7,7 +7,6 @@ an origin near the bars. See `docs/position.md`.
 import difflib
 import json
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -18,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import read_toml
 
 __all__ = ["BarSite", "LocalFrame", "load_sites", "resolve_sites", "site_of_transmitter", "to_toml"]
 
@@ -158,15 +158,7 @@ def load_sites(path: Path | str) -> tuple[BarSite, ...]:
     Raises:
         ConfigError: The file cannot be read, is no TOML, or does not describe bars; one line a fault.
     """
-    try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as fault:
-        raise ConfigError(f"{path}: cannot be read: {fault.strerror}") from fault
-    except UnicodeDecodeError as fault:
-        raise ConfigError(f"{path}: at byte {fault.start}: not UTF-8 text") from fault
-    except tomllib.TOMLDecodeError as fault:
-        raise ConfigError(f"{path}: not TOML: {fault}") from fault
-    return resolve_sites(table, source=str(path))
+    return resolve_sites(read_toml(path), source=str(path))
 
 
 def resolve_sites(table: Mapping[str, Any], *, source: str = "") -> tuple[BarSite, ...]:

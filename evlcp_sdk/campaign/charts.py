@@ -1,7 +1,6 @@
 """The charts of a campaign as plain data, and how Matplotlib draws them; `report` draws them in a page."""
 
 import math
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +11,8 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from evlcp_sdk.campaign.paper import PAPER_NAME, Measure
 from evlcp_sdk.campaign.statistics import BIN_M, SEGMENT_M
 from evlcp_sdk.campaign.summary import Series, Summary, measure, reference_marks
-from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.figures import TRANSMITTER_COLOURS
+from evlcp_sdk.files import whole_file
 
 __all__ = ["Chart", "Dot", "Line", "Mark", "charts_of", "decades", "draw", "save_charts"]
 
@@ -338,14 +337,8 @@ def save_charts(charts: Sequence[Chart], title: str, folder: Path) -> list[Path]
         figure = draw(chart, title)
         for kind in ("png", "svg"):
             path = folder / f"{chart.id}.{kind}"
-            part = folder / f".{path.name}.{os.getpid()}.part"
-            try:
+            with whole_file(path) as part:
                 folder.mkdir(parents=True, exist_ok=True)
                 figure.savefig(part, format=kind, dpi=150)
-                part.replace(path)
-            except OSError as fault:
-                raise EvlcpError(f"{path}: cannot be written: {fault.strerror}") from fault
-            finally:
-                part.unlink(missing_ok=True)
             written.append(path)
     return written

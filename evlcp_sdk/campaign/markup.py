@@ -2,14 +2,10 @@
 
 import html
 import json
-import os
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
-from evlcp_sdk.errors import EvlcpError
-
-__all__ = ["details", "document", "save_text", "table"]
+__all__ = ["details", "document", "table"]
 
 _CSS = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #333; max-width: 70rem; margin: 2rem auto;
@@ -60,19 +56,3 @@ def details(title: str, values: Any) -> str:
     """JSON values that show when their title is clicked."""
     text = html.escape(json.dumps(values, indent=1, sort_keys=True))
     return f'<details><summary class="digest">{html.escape(title)}</summary><pre>{text}</pre></details>'
-
-
-def save_text(text: str, path: Path) -> None:
-    """Write a file; an earlier one stays until the new one is complete.
-
-    Raises:
-        EvlcpError: The file cannot be written.
-    """
-    part = path.parent / f".{path.name}.{os.getpid()}.part"
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as fault:
-        raise EvlcpError(f"{path}: cannot be written: {fault.strerror}") from fault
-    finally:
-        part.unlink(missing_ok=True)

@@ -8,7 +8,6 @@ once: a scene, rendered once, and all links that receive it.
 import hashlib
 import itertools
 import json
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from evlcp_sdk.campaign.statistics import Statistics
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import parse_value, read_toml
 
 __all__ = ["Case", "Job", "Plan", "Point", "StopRule", "Task", "digest_of", "load_plan", "make_plan"]
 
@@ -268,7 +268,7 @@ def load_plan(
     Raises:
         ConfigError: All faults of the file, one line each.
     """
-    table = _read(path)
+    table = read_toml(path)
     for override in overrides:
         _override(table, override)
     try:
@@ -302,26 +302,12 @@ def load_plan(
     )
 
 
-def _read(path: Path | str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as fault:
-        raise ConfigError(f"{path}: cannot be read: {fault.strerror}") from fault
-    except UnicodeDecodeError as fault:
-        raise ConfigError(f"{path}: at byte {fault.start}: not UTF-8 text") from fault
-    except tomllib.TOMLDecodeError as fault:
-        raise ConfigError(f"{path}: not TOML: {fault}") from fault
-
-
 def _override(table: dict[str, Any], text: str) -> None:
     name, equals, value = text.partition("=")
     section, dot, key = (part.strip() for part in name.partition("."))
     if not (equals and dot and key) or section not in ("campaign", "scene", "link"):
         raise ConfigError(f"--set {text}: expected campaign.KEY=, scene.KEY= or link.KEY=VALUE")
-    try:
-        parsed = tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        parsed = value.strip()
+    parsed = parse_value(value)
     keys = table.setdefault(section, {})
     if section != "campaign" and isinstance(keys, dict):
         for name in ("grid", "set"):

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.campaign.charts import Chart, charts_of, decades
-from evlcp_sdk.campaign.markup import details, document, save_text, table
+from evlcp_sdk.campaign.markup import details, document, table
 from evlcp_sdk.campaign.paper import PAPER_NAME
 from evlcp_sdk.campaign.plan import digest_of
 from evlcp_sdk.campaign.statistics import SEGMENT_M, Tally
 from evlcp_sdk.campaign.summary import Comparison, Figure, Summary, compare, measure
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import write_text
 
 __all__ = ["comparison_rows", "page", "save_page"]
 
@@ -71,7 +72,7 @@ def save_page(summary: Summary, path: Path) -> None:
         ConfigError: The extra is not installed.
         EvlcpError: The file cannot be written.
     """
-    save_text(page(summary), path)
+    write_text(page(summary), path)
 
 
 def _plotly(chart: Chart) -> dict[str, Any]:

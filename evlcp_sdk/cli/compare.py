@@ -210,11 +210,11 @@ def _bar(job: Job) -> Iterator[Callable[[int, int | None], None]]:
 
 
 def _write(comparison: "Comparison", paths: Sequence[Path]) -> None:
-    from evlcp_sdk.campaign.markup import save_text
+    from evlcp_sdk.files import write_text
 
     for path in paths:
         texts = {".csv": comparison.to_csv, ".html": comparison.to_html, ".json": comparison.to_json}
-        save_text(texts[path.suffix](), path)
+        write_text(texts[path.suffix](), path)
 
 
 def _show(comparison: "Comparison", paths: Sequence[Path]) -> None:

@@ -1,6 +1,5 @@
 """`evlcp simulate`."""
 
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._common import Json, console
-from evlcp_sdk.errors import EvlcpError
+from evlcp_sdk.files import write_text
 
 if TYPE_CHECKING:
     from evlcp_sdk.sim import Simulation
@@ -103,7 +102,7 @@ def simulate(
                 writer.write(events)
                 advance(simulation.done_s)
     truth = truth_of(simulation) | {"bytes": out.stat().st_size}
-    _write_text(truth_path, json.dumps(truth))
+    write_text(json.dumps(truth), truth_path)
     written = [out, truth_path, *_on_earth(simulation, out)]
     elapsed_s = time.perf_counter() - began
     counts = simulation.counts
@@ -141,24 +140,12 @@ def _on_earth(simulation: "Simulation", out: Path) -> list[Path]:
     if scene.world is None:
         return []
     written = [out.with_suffix(".site.toml")]
-    _write_text(written[0], to_toml(sites_of(scene)))
+    write_text(to_toml(sites_of(scene)), written[0])
     log = attitude_log(scene, scene.seed, simulation.path)
     if log is not None:
         written.append(out.with_suffix(".attitude.csv"))
-        _write_text(written[1], log.to_csv())
+        write_text(log.to_csv(), written[1])
     return written
-
-
-def _write_text(path: Path, text: str) -> None:
-    """Write a file that is never there by half."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as fault:
-        raise EvlcpError(f"{path}: cannot be written: {fault.strerror}") from fault
-    finally:
-        part.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from evlcp_sdk.attitude import AttitudeTrack
 from evlcp_sdk.config import Link
 from evlcp_sdk.errors import ConfigError, EvlcpError
+from evlcp_sdk.files import hidden_path
 from evlcp_sdk.fixes.mcap import McapFixes, check_mcap
 from evlcp_sdk.fixes.nmea import gga, rmc
 from evlcp_sdk.geometry import Attitude
-from evlcp_sdk.outputs import hidden_path
 from evlcp_sdk.rx.position import REFUSALS, Positioner
 from evlcp_sdk.rx.track import TrackPoint, smooth_track, track_step
 from evlcp_sdk.sites import BarSite

@@ -7,7 +7,6 @@ number is an engineering guess, its description says so.
 
 import difflib
 import json
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -18,6 +17,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import parse_toml, parse_value, read_toml
 from evlcp_sdk.geometry import CameraModel
 
 __all__ = [
@@ -330,7 +330,7 @@ def load_scene(source: Path | str, overrides: Sequence[str] | Mapping[str, Any] 
     name = str(source)
     folder: Path | None = None
     if isinstance(source, str) and source in preset_names():
-        text, where = preset_text(source), f"preset {name}"
+        table, where = parse_toml(preset_text(source), name), f"preset {name}"
     else:
         path = Path(source)
         folder = path.parent
@@ -339,16 +339,7 @@ def load_scene(source: Path | str, overrides: Sequence[str] | Mapping[str, Any] 
             raise ConfigError(
                 f"{name}: no such file, and no preset of that name{_nearest(name, preset_names())}"
             )
-        try:
-            text = path.read_text(encoding="utf-8")
-        except OSError as fault:
-            raise ConfigError(f"{name}: cannot be read: {fault.strerror}") from fault
-        except UnicodeDecodeError as fault:
-            raise ConfigError(f"{name}: at byte {fault.start}: not UTF-8 text") from fault
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as fault:
-        raise ConfigError(f"{name}: not TOML: {fault}") from fault
+        table = read_toml(path)
     pairs = overrides.items() if isinstance(overrides, Mapping) else map(_parse_override, overrides)
     for key, value in pairs:
         _set(table, key, value)
@@ -423,10 +414,7 @@ def _parse_override(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise ConfigError(f"--set {text}: expected table.key=value, e.g. motion.distance_m=60")
-    try:
-        return key.strip(), tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        return key.strip(), value.strip()
+    return key.strip(), parse_value(value)
 
 
 def _set(table: dict[str, Any], key: str, value: Any) -> None:

@@ -10,6 +10,7 @@ SDK = Path(__file__).parents[2] / "evlcp_sdk"
 
 LAYERS = (
     {"errors"},
+    {"files"},
     {"messages"},
     {"types"},
     {"geometry", "codebook", "frames", "crc", "sites"},

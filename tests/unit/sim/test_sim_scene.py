@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
+from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.frames import packet_chips
 from evlcp_sdk.geometry import CameraModel
 from evlcp_sdk.sim import (
     BarSpec,
     LampSpec,
-    MotionSpec,
     Scene,
     Simulation,
     load_scene,
@@ -291,19 +290,6 @@ def test_simulate_tells_what_is_wrong(
     assert done.code == code
     assert says in done.err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_full_disk_leaves_no_half_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from evlcp_sdk.cli.simulate import _write_text
-
-    def full(*_args: object, **_kwargs: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(EvlcpError, match="No space left"):
-        _write_text(tmp_path / "a.truth.json", "x")
-    assert list(tmp_path.iterdir()) == []
-    assert MotionSpec().distance_m == 50
 
 
 def test_the_simulator_sees_through_the_camera_model() -> None:

@@ -1,0 +1,78 @@
+"""Files read and written whole."""
+
+from pathlib import Path
+
+import pytest
+
+from evlcp_sdk.errors import ConfigError, EvlcpError
+from evlcp_sdk.files import parse_value, read_toml, whole_file, write_text
+
+
+def test_a_table_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "a.toml"
+    file.write_text("[bar]\nleds = 96\nname = 'ü'\n", encoding="utf-8")
+    assert read_toml(file) == read_toml(str(file)) == {"bar": {"leds": 96, "name": "ü"}}
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"a = \n", r"a\.toml: not TOML: Invalid value \(at line 1"),
+        (b"a = '\xff'\n", r"a\.toml: at byte 5: not UTF-8 text"),
+        (b"a = " + 2000 * b"[", r"a\.toml: not TOML: "),
+    ],
+)
+def test_what_is_no_toml_is_told(content: bytes, says: str, tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_bytes(content)
+    with pytest.raises(ConfigError, match=says):
+        read_toml(tmp_path / "a.toml")
+
+
+def test_what_cannot_be_read_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"b\.toml: cannot be read: No such file"):
+        read_toml(tmp_path / "b.toml")
+    with pytest.raises(ConfigError, match=r"cannot be read: Is a directory"):
+        read_toml(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("3", 3), (" 0.5 ", 0.5), ("true", True), ("[1, 'a']", [1, "a"]), ("wh8", "wh8"), (" a b ", "a b")],
+)
+def test_values(text: str, value: object) -> None:
+    assert parse_value(text) == value
+
+
+def break_off(path: Path) -> None:
+    with whole_file(path) as part:
+        part.write_text("half")
+        raise KeyError
+
+
+def test_an_earlier_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    write_text("old", path)
+    with pytest.raises(KeyError):
+        break_off(path)
+    assert path.read_text() == "old"
+    with whole_file(path) as part:
+        part.write_text("new")
+        assert path.read_text() == "old"
+    assert path.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(self: Path, *_args: object, **_kwargs: object) -> None:
+        self.touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(EvlcpError, match=r"a\.txt: cannot be written: No space left"):
+        write_text("x", tmp_path / "a.txt")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(EvlcpError, match=r"a\.txt: cannot be written: No such file"):
+        write_text("x", tmp_path / "none" / "a.txt")
