@@ -162,7 +162,10 @@ class PositionSpec:
     ] = 4.0
     beacons: Annotated[
         Literal["none", "verified", "any"],
-        Field(description="Beacons whose own place is believed where no site has their id."),
+        Field(
+            description="Beacons whose own place is believed where no site has their id;"
+            " with none, they do not contradict sites, either."
+        ),
     ] = "verified"
     acceleration_m2_s3: Annotated[
         float,

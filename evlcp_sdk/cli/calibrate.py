@@ -96,6 +96,7 @@ def _views(
     """What a recording shows at the times of known poses."""
     from evlcp_sdk.calibration import CalibrationView
     from evlcp_sdk.cli.receive import check_sensor
+    from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.registry import Registry
     from evlcp_sdk.rx.position import BarView, Positioner, points_at
     from evlcp_sdk.rx.receiver import Receiver
@@ -125,6 +126,8 @@ def _views(
         for events in source.chunks():
             take(receiver.feed(events))
         take(receiver.close())
+    for how in who.contradicted.values():
+        raise ConfigError(f"{url}: {how}")
     stands_at = who.stands_at
     views = []
     for pose in poses:

@@ -410,6 +410,8 @@ def _positions(told: Mapping[str, Any]) -> str:
         text += f", {told['fixes_verified']} verified"
     for kind, number in told["refused"].items():
         text += f"; {number} refused: {kind}"
+    for how in told["sites_contradicted"].values():
+        text += f"; left out: {how}"
     return text
 
 

@@ -188,6 +188,7 @@ class PositionWriter:
             "left_out_of_track": self._left_out,
             "frames_late": self.positioner.counts["frames_late"],
             "beacons_forged": self.positioner.counts["beacons_forged"],
+            "sites_contradicted": {str(n): how for n, how in self.positioner.contradicted.items()},
             "origin": asdict(frame) if frame is not None else None,
             "bars": {str(n): s.transmitter_id for n, s in self.positioner.stands_at.items()},
         }

@@ -58,9 +58,13 @@ _MOST_BEND = 3.0
 _OUTLIER_SHARE = 0.3
 """Share of points that may lie beyond the Huber bound before nothing is believed."""
 
+_LENGTH_SHARE = 0.01
+"""Share by which a beacon's length may differ from its site's: a lone bar's distance is wrong by as much."""
+
 
 REFUSALS = {
     "no-site": "no bar in view stands at a known place",
+    "site-contradicted": "the bars' own beacons tell other places or lengths than their sites",
     "too-few-clusters": "no bar shows as many clusters as a position needs",
     "heading-unknown": "one bar alone, and the camera's heading is not known",
     "gravity-unknown": "fewer than three bars, or bars in line, and gravity is not known",
@@ -719,6 +723,12 @@ class Positioner:
         found = {number: self._site(number) for number in sorted(self._seen)}
         return {number: site for number, site in found.items() if site is not None}
 
+    @property
+    def contradicted(self) -> dict[int, str]:
+        """Transmitters that are left out as their beacons contradict their sites, and how."""
+        found = {number: self._contradiction(number) for number in sorted(self._seen)}
+        return {number: how for number, how in found.items() if how}
+
     def feed(self, packets: Iterable[Packet]) -> list[Fix]:
         """Take the next packets; return the fixes that no later packet can change."""
         fixes = []
@@ -761,12 +771,34 @@ class Positioner:
             )  # fmt: skip
         return seen
 
+    def _listed(self, number: int) -> BarSite | None:
+        """The site of the list that a transmitter stands at."""
+        alone = len(self._seen) == 1
+        return site_of_transmitter(self._sites, number, self._seen[number].transmitter_id, alone=alone)
+
+    def _contradiction(self, number: int) -> str:
+        """How a transmitter's own beacon contradicts its site; empty where it does not.
+
+        A lamp that is not where its site is would move the camera by as much, and so would two bars that are
+        mixed up. Nearer than a bar's length, two places are taken for one.
+        """
+        site, beacon = self._listed(number), self._seen[number].beacon
+        if site is None or beacon is None or self._spec.beacons == "none":
+            return ""
+        place = (beacon.latitude_deg, beacon.longitude_deg, beacon.height_m)
+        apart = float(np.linalg.norm(LocalFrame.of([site]).to_enu(*place)))
+        if apart > site.length_m:
+            return f"transmitter {number} says that it is {apart:.1f} m from the site of its id"
+        if abs(beacon.length_m - site.length_m) > _LENGTH_SHARE * site.length_m:
+            long = f"{beacon.length_m:g} m long, its site {site.length_m:g} m"
+            return f"transmitter {number} says that it is {long}"
+        return ""
+
     def _site(self, number: int) -> BarSite | None:
         seen = self._seen[number]
-        if seen.trust == "forged":
+        if seen.trust == "forged" or self._contradiction(number):
             return None
-        alone = len(self._seen) == 1
-        site = site_of_transmitter(self._sites, number, seen.transmitter_id, alone=alone)
+        site = self._listed(number)
         believed = {"none": (), "verified": ("verified",), "any": ("verified", "unverified")}
         if site is None and seen.trust in believed[self._spec.beacons]:
             site = seen.beacon
@@ -811,6 +843,9 @@ class Positioner:
         if not views:
             return None
         if here is None or self.frame is None:
+            how = [text for number in views if (text := self._contradiction(number))]
+            if how:
+                return Fix.refused(t_us, tuple(views), "site-contradicted", "; ".join(how))
             which = ", ".join(map(str, views))
             return Fix.refused(t_us, tuple(views), "no-site", f"no site is known of transmitter {which}")
         pose = solve_pose(sited, self._camera, self._attitude_at(t_us), self._spec)

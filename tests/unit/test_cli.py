@@ -455,3 +455,7 @@ def test_calibrate_finds_the_focal_length(evlcp: Evlcp, street: Path, tmp_path: 
     assert evlcp("config", "--digest", "-c", link).code == 0
     poses.write_text("recording," + "\nother.raw,".join(lines))
     assert "line 2" in evlcp(*given).err
+    poses.write_text("\n".join(lines) + "\n")
+    other = tmp_path / "site.toml"
+    other.write_text((street / "site.toml").read_text().replace("length_m = 0.96", "length_m = 1.5"))
+    assert "0.96 m long, its site 1.5 m" in evlcp("calibrate", *given[1:3], other, *given[4:]).err

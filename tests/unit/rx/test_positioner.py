@@ -197,6 +197,46 @@ def test_a_forged_beacon_cannot_move_the_camera() -> None:
     assert 1 <= len(given) <= 4
 
 
+def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
+    """From behind two bars the image of swapped ones is the same; what they say of themselves tells."""
+    gravity = Attitude(4.0, 1.0, None, 0.0, 0.0)
+    swapped = [dataclasses.replace(LEFT, transmitter_id=9), dataclasses.replace(RIGHT, transmitter_id=7)]
+    stream = merged(
+        packets_of(LEFT, 0, 6, messages={0: (heard(LEFT, "unverified", 0),)}),
+        packets_of(RIGHT, 1, 6, messages={0: (heard(RIGHT, "unverified", 0),)}),
+    )
+    right = positioner([LEFT, RIGHT], gravity)
+    assert_right(right.feed(stream) + right.close())
+    assert right.contradicted == {}
+    wrong = positioner(swapped, gravity)
+    fixes = wrong.feed(stream) + wrong.close()
+    assert {f.refusal for f in fixes} == {"site-contradicted"}
+    assert "transmitter 0 says that it is 7.2 m from the site of its id" in fixes[0].detail
+    assert wrong.stands_at == {}
+    assert set(wrong.contradicted) == {0, 1}
+    # Whoever knows better than the beacons says so; nothing in the image could.
+    alone = positioner(swapped, gravity, beacons="none")
+    assert not any(f.refusal for f in alone.feed(stream) + alone.close())
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"length_m": 1.92}, "0.96 m long, its site 1.92 m"),
+        ({"length_m": 0.965}, None),
+        ({"height_m": LEFT.height_m + 1.5}, "1.5 m from the site"),
+        ({"height_m": LEFT.height_m + 0.005}, None),
+    ],
+)
+def test_a_bar_that_is_not_its_site(change: dict[str, float], told: str | None) -> None:
+    """A lone bar of the wrong length or place fits the image as well as the right one."""
+    p = positioner([dataclasses.replace(LEFT, **change)])  # type: ignore[arg-type]
+    fixes = p.feed(packets_of(LEFT, 0, 6, messages={0: (heard(LEFT, "unverified", 0),)})) + p.close()
+    assert {f.refusal for f in fixes} == ({"site-contradicted"} if told else {""})
+    if told:
+        assert told in fixes[0].detail
+
+
 def test_an_attitude_file(tmp_path: Path) -> None:
     path = tmp_path / "attitude.csv"
     path.write_text(
