@@ -38,18 +38,28 @@ class AttitudeTrack:
     heading_sigma_deg: NDArray[np.float64]
 
     @classmethod
-    def read(cls, path: Path | str) -> "AttitudeTrack":
+    def read(cls, path: Path | str, usual: Attitude | None = None) -> "AttitudeTrack":
         """Read a CSV of t_us, pitch_deg, roll_deg and, optionally, heading_deg and both sigmas.
+
+        Args:
+            path: The file.
+            usual: Its sigmas count where the file has none; None for the defaults.
 
         Raises:
             InputError: The file cannot be read.
             ConfigError: A column is missing, a value is no number, or times do not rise.
         """
+        usual = Attitude() if usual is None else usual
         try:
-            with Path(path).open(newline="", encoding="utf-8") as file:
+            # Spreadsheets begin a file with a byte order mark.
+            with Path(path).open(newline="", encoding="utf-8-sig") as file:
                 reader = csv.DictReader(file)
                 names = tuple(reader.fieldnames or ())
-                rows = list(reader)
+                # Empty lines give no row.
+                lines, rows = [], []
+                for row in reader:
+                    lines.append(reader.line_num)
+                    rows.append(row)
         except OSError as fault:
             raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
         except (UnicodeDecodeError, csv.Error) as fault:
@@ -61,17 +71,22 @@ class AttitudeTrack:
         table: dict[str, NDArray[np.float64]] = {}
         for name in _NEEDED + _OPTIONAL:
             if name in names:
-                table[name] = np.array([_number(path, i, name, row[name]) for i, row in enumerate(rows)])
+                table[name] = np.array(
+                    [_number(path, line, name, row[name]) for line, row in zip(lines, rows, strict=True)]
+                )
         t_us = table["t_us"]
-        if len(t_us) < 2 or (np.diff(t_us) <= 0).any():
+        if len(t_us) < 2:
             raise ConfigError(f"{path}: expected two lines or more with rising t_us")
+        if (np.diff(t_us) <= 0).any():
+            i = int(np.argmax(np.diff(t_us) <= 0)) + 1
+            raise ConfigError(
+                f"{path}: line {lines[i]}: t_us = {t_us[i]:.16g}: expected more than the line before,"
+                f" {t_us[i - 1]:.16g}: rising t_us"
+            )
         for name in ("gravity_sigma_deg", "heading_sigma_deg"):
             if name in table and (table[name] < 0).any():
-                line = int(np.flatnonzero(table[name] < 0)[0]) + 2
-                raise ConfigError(
-                    f"{path}: line {line}: {name} = {table[name][line - 2]:g}: expected 0 or more"
-                )
-        usual = Attitude()
+                i = int(np.flatnonzero(table[name] < 0)[0])
+                raise ConfigError(f"{path}: line {lines[i]}: {name} = {table[name][i]:g}: expected 0 or more")
         return cls(
             t_us,
             table["pitch_deg"],
@@ -112,11 +127,11 @@ class AttitudeTrack:
         )
 
 
-def _number(path: Path | str, index: int, name: str, text: str | None) -> float:
+def _number(path: Path | str, line: int, name: str, text: str | None) -> float:
     try:
         value = float(text if text is not None else "")
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ConfigError(f"{path}: line {index + 2}: {name} = {text!r}: expected a number")
+        raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected a number")
     return value

@@ -41,6 +41,14 @@ of the columns: what lenses and their mounts have. What is not determined widens
 _LEARNT = 0.5
 """Share of that sigma below which the views, not it, determine a parameter."""
 
+_RANGES = {
+    "latitude_deg": (-90.0, 90.0),
+    "longitude_deg": (-180.0, 180.0),
+    "position_sigma_m": (1e-6, math.inf),
+    "attitude_sigma_deg": (1e-6, math.inf),
+}
+"""What a pose's values may be, least and most; exact ones would outweigh all in double precision."""
+
 _STEPS = 60
 _FREE_SIGMA_RAD = 0.5
 """Sigma of an attitude that is not known, about its closed-form start."""
@@ -123,11 +131,13 @@ def read_poses(path: Path | str) -> list[KnownPose]:
 
     Raises:
         InputError: The file cannot be read.
-        ConfigError: A column is missing, or a value is no number.
+        ConfigError: A column is missing, or a value is no number or out of range.
     """
     try:
-        with Path(path).open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+        # Spreadsheets begin a file with a byte order mark; empty lines give no row.
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            rows = [(reader.line_num, row) for row in reader]
     except OSError as fault:
         raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
     except (UnicodeDecodeError, csv.Error) as fault:
@@ -135,7 +145,7 @@ def read_poses(path: Path | str) -> list[KnownPose]:
     if not rows:
         raise ConfigError(f"{path}: expected one line of values or more")
     poses = []
-    for line, row in enumerate(rows, 2):
+    for line, row in rows:
 
         def value(name: str, usual: float | None = None, line: int = line, row: Any = row) -> float:
             text = row.get(name)
@@ -145,8 +155,12 @@ def read_poses(path: Path | str) -> list[KnownPose]:
                 number = float(text)
             except (TypeError, ValueError):
                 number = math.nan
-            if not math.isfinite(number) or (name.endswith("sigma_m") and number <= 0):
+            if not math.isfinite(number):
                 raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected a number")
+            low, high = _RANGES.get(name, (number, number))
+            if not low <= number <= high:
+                expected = f"{low:g} to {high:g}" if math.isfinite(high) else f"{low:g} or more"
+                raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected {expected}")
             return number
 
         angles = [name for name in ("heading_deg", "pitch_deg", "roll_deg") if row.get(name)]

@@ -176,6 +176,7 @@ def _position_plan(
             if value is not None:
                 raise typer.BadParameter("needs --sites", param_hint=name)
         return None
+    import math
     from datetime import UTC, datetime
 
     from evlcp_sdk.attitude import AttitudeTrack
@@ -189,9 +190,13 @@ def _position_plan(
         raise typer.BadParameter(
             "gravity needs --pitch-deg and --roll-deg; a heading needs gravity", param_hint="--pitch-deg"
         )
+    names = ("--heading-deg", "--pitch-deg", "--roll-deg", "--gravity-sigma-deg", "--heading-sigma-deg")
+    for name, given_deg in zip(names, (*angles, *sigmas), strict=True):
+        if given_deg is not None and not math.isfinite(given_deg):
+            raise typer.BadParameter(f"{given_deg}: expected a finite number", param_hint=name)
     attitude: AttitudeTrack | Attitude | None = None
     if file is not None:
-        attitude = AttitudeTrack.read(file)
+        attitude = AttitudeTrack.read(file, Attitude(0.0, 0.0, None, *sigmas))
     elif pitch is not None and roll is not None:
         attitude = Attitude(pitch, roll, heading, *sigmas)
     zero = None
@@ -202,6 +207,9 @@ def _position_plan(
             text = f"{clock_zero!r}: expected a time such as 2026-03-01T10:15:00Z"
             raise typer.BadParameter(text, param_hint="--clock-zero") from fault
         zero = zero if zero.tzinfo is not None else zero.replace(tzinfo=UTC)
+        # MCAP counts from 1970 on, and NMEA has two digits of the year.
+        if not datetime(1970, 1, 1, tzinfo=UTC) <= zero < datetime(2200, 1, 1, tzinfo=UTC):
+            raise typer.BadParameter(f"{clock_zero!r}: expected 1970 to 2199", param_hint="--clock-zero")
     return PositionPlan(load_sites(sites), attitude, zero, mcap)
 
 

@@ -132,11 +132,20 @@ def test_poses_are_read_and_their_faults_told(tmp_path: Path) -> None:
     one, two = read_poses(path)
     assert (one.recording, one.t_us, one.attitude, one.position_sigma_m) == ("a.raw", 5000, None, 0.01)
     assert two.attitude == Attitude(1, 2, 350)
+    # As spreadsheets write it.
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    assert read_poses(path) == [one, two]
     for text, says in (
         (head, "one line of values or more"),
         (head + "a.raw,,35,137,5,,,\n", r"line 2: t_us = '': expected a number"),
         (head + "a.raw,1,35,137,5,3,,\n", r"line 2: pitch_deg = '': expected a number"),
         ("t_us,latitude_deg\n1,2\n", r"line 2: longitude_deg = None: expected a number"),
+        (head + "\na.raw,1,95,137,5,,,\n", r"line 3: latitude_deg = '95': expected -90 to 90"),
+        (f"attitude_sigma_deg,{head}0,a.raw,1,35,137,5,1,1,1\n", r"line 2: attitude_sigma_deg = '0'"),
+        (
+            f"position_sigma_m,{head}-1,a.raw,1,35,137,5,1,1,1\n",
+            r"position_sigma_m = '-1': expected 1e-06 or more",
+        ),
     ):
         path.write_text(text)
         with pytest.raises(ConfigError, match=says):

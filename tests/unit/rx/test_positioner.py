@@ -254,6 +254,11 @@ def test_an_attitude_file(tmp_path: Path) -> None:
     level = AttitudeTrack.read(path).at(3)
     assert level is not None
     assert level.heading_deg is None
+    # Sigmas that the file has not are those that are said; and it may come from a spreadsheet.
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    level = AttitudeTrack.read(path, Attitude(gravity_sigma_deg=0.7, heading_sigma_deg=3.0)).at(3)
+    assert level is not None
+    assert (level.gravity_sigma_deg, level.heading_sigma_deg) == (0.7, 3.0)
 
 
 @pytest.mark.parametrize(
@@ -261,7 +266,10 @@ def test_an_attitude_file(tmp_path: Path) -> None:
     [
         ("t_us,roll_deg\n0,1\n", r"line 1: no column pitch_deg"),
         ("t_us,pitch_deg,roll_deg\n0,1,2\n1,x,2\n", r"line 3: pitch_deg = 'x': expected a number"),
-        ("t_us,pitch_deg,roll_deg\n0,1,2\n0,1,2\n", r"rising t_us"),
+        ("t_us,pitch_deg,roll_deg\n0,1,2\n", r"two lines or more with rising t_us"),
+        ("t_us,pitch_deg,roll_deg\n0,1,2\n0,1,2\n", r"line 3: t_us = 0: expected more than .* rising t_us"),
+        ("t_us,pitch_deg,roll_deg\n0,1,2\n\n5,1,2\n3,1,2\n", r"line 5: t_us = 3: expected more than .* 5"),
+        ("t_us,pitch_deg,roll_deg\n\n0,1,2\n1,x,2\n", r"line 4: pitch_deg = 'x': expected a number"),
         ("t_us,pitch_deg,roll_deg,gravity_sigma_deg\n0,1,2,1\n1,1,2,-1\n", r"line 3: gravity_sigma_deg = -1"),
         ("t_us,pitch_deg,roll_deg\n0,1\n1,1,2\n", r"line 2: roll_deg = None: expected a number"),
     ],
