@@ -1,7 +1,7 @@
 """CRC-aided polar code."""
 
 from dataclasses import dataclass
-from math import ceil, log
+from math import ceil, floor, log
 from typing import Annotated
 
 import numpy as np
@@ -68,7 +68,8 @@ class Polar(ErrorCorrection):
         """Choose the code's inputs and the bits that are sent.
 
         Raises:
-            ConfigError: A codeword has no room for a byte beside the CRC.
+            ConfigError: A codeword has no room for a byte beside the CRC, or for what a plausible one has
+                beyond its message.
         """
         from evlcp_polar import _kernels
 
@@ -81,6 +82,14 @@ class Polar(ErrorCorrection):
             raise ConfigError(
                 f"error-correction 'polar': a block of {coded_bits} bits, expected at least {need}"
                 f" at rate {self.rate:g}"
+            )
+        # One of the 2**message_bits codewords is as likely as the other to lie near a random word.
+        log_share = min(log(self.undetected), -self.reserve * length * log(2)) - message_bits * log(2)
+        if -log_share >= length * log(2):
+            raise ConfigError(
+                f"error-correction.rate = {self.rate:g}: {message_bits} bits of a message in a codeword of"
+                f" {length}, expected at most {floor(length + log_share / log(2) + message_bits)}: the rest"
+                " is for error-correction.undetected and reserve"
             )
         sizes = [1]
         size = self.list_size
@@ -101,8 +110,7 @@ class Polar(ErrorCorrection):
             punctured=_punctured(length, message_bits + CRC_BITS),
             nodes=nodes,
             list_sizes=tuple(dict.fromkeys(sizes)),
-            # One of the 2**message_bits codewords is as likely as the other to lie near a random word.
-            log_share=min(log(self.undetected), -self.reserve * length * log(2)) - message_bits * log(2),
+            log_share=log_share,
         )
 
 

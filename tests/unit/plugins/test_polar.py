@@ -225,6 +225,21 @@ def test_what_does_not_fit_is_refused() -> None:
         Polar(max_list_size=4)
 
 
+@pytest.mark.parametrize(("length", "rate"), [(960, 0.97), (960, 0.99), (45, 0.9), (512, 0.999), (64, 0.85)])
+def test_a_code_decodes_at_least_what_has_no_errors_or_is_refused(length: int, rate: float) -> None:
+    """Of 960 bits, 57.6 are in reserve: 904 bits of a message leave less, and nothing would ever pass."""
+    size = (int(rate * length) - 24) // 8 * 8
+    if size + max(0.06 * length, np.log2(1e9)) >= length:
+        with pytest.raises(ConfigError, match=rf"rate = {rate:g}: {size} bits of a message in a codeword"):
+            Polar(rate=rate).compile(length)
+        return
+    code = Polar(rate=rate).compile(length)
+    message = np.random.default_rng(length).integers(0, 2, code.message_bits).astype(np.uint8)
+    found = code.decode(1 - 2 * code.encode(message).astype(np.float32))
+    assert found.ok
+    assert_array_equal(found.bits, message)
+
+
 def test_crc_of_the_kernel() -> None:
     rng = np.random.default_rng(0)
     for length in (1, 8, 104, 456):
