@@ -163,7 +163,7 @@ def _messages(
         transmitter_id = found[0].transmitter_id
     identity = transmitter_id or 0
     if text is not None:
-        found.append(Message(Kind.TEXT, identity, number, text.encode()))
+        found.append(Message(Kind.TEXT, identity, number, _utf8("--text", text)))
     if file is not None:
         found.append(Message(Kind.DATA, identity, number, _read(file)))
     return found
@@ -184,13 +184,25 @@ def _beacon(
     chosen = [s for s in sites if transmitter_id in (None, s.transmitter_id)]
     if not chosen:
         raise ConfigError(f"{path}: no bar has transmitter_id {transmitter_id}, but {ids}")
-    payload = beacon_of_site(chosen[0], user.encode()).pack()
+    payload = beacon_of_site(chosen[0], _utf8("--user", user)).pack()
     beacon = Message(Kind.BEACON, chosen[0].transmitter_id, sequence, payload)
     if key is None:
         return [beacon]
     from evlcp_sdk.messages.signing import read_key, sign
 
     return [beacon, sign(beacon, coder.digest, read_key(key))]
+
+
+def _utf8(option: str, text: str) -> bytes:
+    """The bytes of a text; the shell's bytes that are no UTF-8 arrive as lone surrogates."""
+    from evlcp_sdk.errors import ConfigError
+
+    try:
+        return text.encode()
+    except UnicodeEncodeError as fault:
+        raise ConfigError(
+            f"{option}: character {fault.start + 1} is no UTF-8; send bytes by --file"
+        ) from fault
 
 
 def _read(path: Path) -> bytes:

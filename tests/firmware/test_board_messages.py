@@ -154,6 +154,8 @@ def test_faults_are_one_line(evlcp: Evlcp, site: Path, tmp_path: Path) -> None:
     for options, code, told in (
         ((), 2, "give what to send: --text TEXT, --file FILE or --beacon site.toml"),
         (("--text", ""), 2, "message: 0 bytes of text, expected 1 to 65535"),
+        (("--text", "a\udcff"), 2, "--text: character 2 is no UTF-8"),
+        (("--beacon", two, "--id", "7", "--user", "\udcff"), 2, "--user: character 1 is no UTF-8"),
         (("--text", "a", "--user", "b"), 2, "--key and --user belong to a beacon"),
         (("--file", tmp_path / "no"), 3, "no: cannot be read"),
         (("--beacon", tmp_path / "no"), 2, "no: cannot be read"),
