@@ -66,7 +66,9 @@ def rmc(
         return _sentence(f"INRMC,{clock},V,,,,,,,{date},,,N")
     latitude, longitude, _ = place
     where = f"{_angle(latitude, 2, 'NS')},{_angle(longitude, 3, 'EW')}"
-    knots, course = ("", "") if way is None else (f"{way[0] * _KNOTS_PER_M_S:.3f}", f"{way[1] % 360:.2f}")
+    knots, course = (
+        ("", "") if way is None else (f"{way[0] * _KNOTS_PER_M_S:.3f}", f"{round(way[1], 2) % 360:.2f}")
+    )
     return _sentence(f"INRMC,{clock},A,{where},{knots},{course},{date},,,E")
 
 

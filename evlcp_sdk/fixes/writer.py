@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -270,9 +271,10 @@ class PositionWriter:
         self._window = self._window[count:]
 
     def _line(self, line: list[list[float]]) -> None:
-        # A line of GeoJSON has two points or more.
-        if len(line) > 1:
-            self._feature("LineString", line, {"track": "smoothed"})
+        for piece in _cut(line):
+            # A line of GeoJSON has two points or more.
+            if len(piece) > 1:
+                self._feature("LineString", piece, {"track": "smoothed"})
 
     def _feature(self, kind: str, coordinates: list[Any], properties: dict[str, Any]) -> None:
         shape = {"type": kind, "coordinates": coordinates}
@@ -301,6 +303,21 @@ class PositionWriter:
         """End the files; the `ResultWriter` drops what it has not moved into place."""
         with suppress(OSError):
             self._close()
+
+
+def _cut(line: list[list[float]]) -> list[list[list[float]]]:
+    """A line in pieces that do not cross the 180th meridian (RFC 7946, 3.1.9)."""
+    pieces = [line[:1]]
+    for here, there in pairwise(line):
+        turn = there[0] - here[0]
+        if abs(turn) > 180:
+            edge = math.copysign(180.0, here[0])
+            share = (edge - here[0]) / (turn - math.copysign(360.0, turn))
+            at = [round(a + share * (b - a), 9) for a, b in zip(here[1:], there[1:], strict=True)]
+            pieces[-1].append([edge, *at])
+            pieces.append([[-edge, *at]])
+        pieces[-1].append(there)
+    return pieces
 
 
 def _fix_row(fix: Fix) -> list[str]:

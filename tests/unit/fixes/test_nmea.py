@@ -58,4 +58,5 @@ def test_the_standards_own_sum() -> None:
 
 
 def test_sixty_minutes_carry() -> None:
+    assert ",0.00,010326," in rmc(0, ZERO, (0.0, 0.0, 0.0), (0.0, 359.999))
     assert ",3600.0000000,N," in gga(0, None, (35.9999999999, 0.0, 0.0), 1, 0.1)

@@ -107,6 +107,25 @@ def test_files_of_a_drive(tmp_path: Path) -> None:
     assert sorted((ellipse.width, ellipse.height)) == pytest.approx(want, rel=1e-4)
 
 
+def test_a_track_across_the_180th_meridian_is_cut(tmp_path: Path) -> None:
+    metre = 1 / (111_319.5 * math.cos(math.radians(35)))
+    site = dataclasses.replace(SITE, longitude_deg=180 - metre)
+    write(tmp_path, packets(4), PositionPlan((site,), ATTITUDE, ZERO))
+    shapes = json.loads((tmp_path / "fixes.geojson").read_text())["features"]
+    (line,) = (s["geometry"]["coordinates"] for s in shapes if s["geometry"]["type"] == "LineString")
+    assert all(-180 <= point[0] < -179.9999 for point in line)
+    assert writer._cut([]) == [[]]
+    for sign in (1.0, -1.0):
+        way = [
+            [sign * (180 - 1e-5), 35.0, 1.0],
+            [sign * (-180 + 2e-5), 35.3, 4.0],
+            [sign * (-180 + 3e-5), 35.4, 5.0],
+        ]
+        one, two = writer._cut(way)
+        assert one == [way[0], pytest.approx([sign * 180, 35.1, 2.0])]
+        assert two == [pytest.approx([sign * -180, 35.1, 2.0]), way[1], way[2]]
+
+
 def test_refused_fixes_are_listed_and_counted(tmp_path: Path) -> None:
     told = write(tmp_path, packets(7), PositionPlan((SITE,), Attitude(5.0, 0.0)))
     assert told["fixes"] == 0
