@@ -571,7 +571,9 @@ def _judged(problem: _Problem, fit: _Fit) -> Pose | Refusal:
 def _bend(problem: _Problem, fit: _Fit, covariance: Floats) -> float:
     """How far the cost is from its parabola two sigmas away along the position's least certain axis.
 
-    The larger of the ratios, or of their inverses, of the true and the expected growth to both sides.
+    The larger of the ratios, or of their inverses, of the true and the expected growth to both sides. Of a
+    lone bar, angles and shared shift follow the position: the arc that an uncertain heading leaves is bent by
+    less than these allow. Of several bars they stay, as they would hide the circle through the bars.
     """
     values, axes = np.linalg.eigh(covariance[:3, :3])
     move = np.asarray(2 * covariance[:, :3] @ axes[:, -1] / math.sqrt(values[-1]), np.float64)
@@ -579,6 +581,9 @@ def _bend(problem: _Problem, fit: _Fit, covariance: Floats) -> float:
     for side in (-1.0, 1.0):
         there = _moved(problem, fit, np.asarray(side * move, np.float64))
         found = _linear(problem, there)
+        if found is not None and len(problem.transmitters) == 1:
+            follow = np.linalg.solve(found[0][3:, 3:], found[1][3:])
+            found = _linear(problem, _moved(problem, there, np.concatenate([np.zeros(3), follow])))
         growth = 1e-9 if found is None else max((found[2] - fit.cost) / 4, 1e-9)
         worst = max(worst, growth, 1 / growth)
     return worst
