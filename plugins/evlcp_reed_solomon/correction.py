@@ -82,6 +82,8 @@ class _ReedSolomonCode:
         if llr.shape != (self.coded_bits,):
             raise ConfigError(f"LLRs of shape {llr.shape}: expected ({self.coded_bits},)")
         size = self.data + self.words * self.parity
+        # What is not a number says nothing.
+        llr = np.where(np.isnan(llr), np.float32(0), llr)
         signs = llr[: 8 * size] < 0
         received = np.packbits(signs)
         weakest = np.abs(llr[: 8 * size]).reshape(size, 8).min(1)

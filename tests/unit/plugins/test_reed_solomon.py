@@ -101,6 +101,21 @@ def test_bytes_that_were_not_received_or_are_unsure() -> None:
     assert_array_equal(found.bits, message)
 
 
+def test_what_is_no_number_says_nothing() -> None:
+    """As with `polar`: 40 bytes that are NaN are erased; as received ones they are too many to correct."""
+    code = ReedSolomon().compile(960)
+    message = message_of(code.message_bits)
+    sent = np.packbits(code.encode(message))
+    places = np.random.default_rng(2).permutation(120)
+    sent[places[40:48]] ^= 0xFF
+    llr = llr_of(np.unpackbits(sent))
+    llr.reshape(120, 8)[places[:40]] = np.nan
+    found = code.decode(llr)
+    assert found.ok
+    assert_array_equal(found.bits, message)
+    assert found.flipped == 64
+
+
 def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(ConfigError, match="expected 4 bytes of message and CRC"):
         ReedSolomon().compile(48)
