@@ -78,10 +78,13 @@ def receive(
     pitch_deg: Annotated[float | None, typer.Option("--pitch-deg", help="Its pitch, up.")] = None,
     roll_deg: Annotated[float | None, typer.Option("--roll-deg", help="Its roll, top to the right.")] = None,
     heading_sigma_deg: Annotated[
-        float, typer.Option("--heading-sigma-deg", min=0, help="Standard deviation of the heading.")
+        float,
+        typer.Option(
+            "--heading-sigma-deg", min=0, help="Standard deviation of the heading, unless a file tells it."
+        ),
     ] = 0.5,
     gravity_sigma_deg: Annotated[
-        float, typer.Option("--gravity-sigma-deg", min=0, help="Standard deviation of pitch and roll.")
+        float, typer.Option("--gravity-sigma-deg", min=0, help="The same of pitch and roll.")
     ] = 0.1,
     clock_zero: Annotated[
         str | None,
