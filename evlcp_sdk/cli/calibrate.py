@@ -68,9 +68,9 @@ def calibrate(
         views += _views(url, mine, link, known, frame)
     found = fit(views, link.camera, link.position, limit_px=limit_px)
     if as_json:
-        typer.echo(json.dumps(_table(found)))
+        typer.echo(json.dumps(_table(found) | {"poses": len(told)}))
     else:
-        console().print(_toml(found), markup=False)
+        console().print(_toml(found, len(told)), markup=False)
 
 
 def _check_names(recordings: list[str], poses: "Sequence[KnownPose]", path: Path) -> None:
@@ -164,10 +164,11 @@ def _table(found: "Calibrated") -> dict[str, Any]:
     }
 
 
-def _toml(found: "Calibrated") -> str:
+def _toml(found: "Calibrated", poses: int) -> str:
     """The `[camera]` table, each value with its sigma; what was not determined as a comment."""
     lines = [
         f"# {found.views} views, {found.points} points, misses of {found.misfit**0.5:.2f} sigmas (rms)",
+        *([f"# {poses - found.views} of {poses} poses show no bar"] if poses > found.views else []),
         "[camera]",
     ]
     for name, sigma in found.sigma.items():

@@ -458,6 +458,9 @@ def test_calibrate_finds_the_focal_length(evlcp: Evlcp, street: Path, tmp_path: 
     link = tmp_path / "link.toml"
     link.write_text(done.out)
     assert evlcp("config", "--digest", "-c", link).code == 0
+    assert told["poses"] == 3
+    poses.write_text("\n".join([*lines, lines[-1].replace("110000", "9110000", 1)]) + "\n")
+    assert "# 1 of 4 poses show no bar\n" in evlcp(*given).out
     poses.write_text("recording," + "\nother.raw,".join(lines))
     assert "line 2" in evlcp(*given).err
     poses.write_text("\n".join(lines) + "\n")
