@@ -340,8 +340,7 @@ class Board:
     def _settled(self) -> StatusReply:
         """Status once no bank waits for its packet boundary."""
         status = self.status()
-        # A packet of 16 kB of chips at the lowest useful rate takes seconds; then something is wrong.
-        end = self.link.transport.now() + 10.0
+        end = self.link.transport.now() + 10.0 + _packet_s(status)
         while status.pending_bank != NO_BANK:
             if self.link.transport.now() > end:
                 raise VerifyError(
@@ -356,15 +355,17 @@ class Board:
         """Status once the LEDs are dark after a stop.
 
         Raises:
-            LinkError: They are not within `timeout_s`.
+            LinkError: They are not within `timeout_s` and the packet that a stop finishes.
         """
-        end = self.link.transport.now() + timeout_s
-        while (status := self.status()).state not in (State.DARK, State.FAULT):
+        status = self.status()
+        end = self.link.transport.now() + timeout_s + _packet_s(status)
+        while status.state not in (State.DARK, State.FAULT):
             if self.link.transport.now() > end:
                 raise LinkError(
                     f"{self.link.name}: still {State(status.state).name}; try 'evlcp board blank'"
                 )
             self.link.transport.read(0.005)
+            status = self.status()
         return status
 
 
@@ -390,6 +391,11 @@ def provision(
     if settings.start and status.state != State.PLAYING:
         board.start()
     return done
+
+
+def _packet_s(status: StatusReply) -> float:
+    """Time a packet of the active bank takes at most, s: a preamble of 32 chips, a pilot in every frame."""
+    return 32.0 * (1 + status.frames) / status.chip_rate_hz
 
 
 def _silent(done: int, total: int) -> None:

@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 __all__ = ["Entry", "Inventory", "Result", "program_fleet", "raise_failures", "read_inventory"]
 
 
+_MOST_FRAMES = 1_000_000
+"""Random frames of a board at most; far beyond any bank, and within memory."""
+
+
 class Entry(BaseModel):
     """One board of an inventory.
 
@@ -72,6 +76,8 @@ class Entry(BaseModel):
     def _one_payload(self) -> "Entry":
         if (self.payload is None) == (self.random is None):
             raise ValueError("give payload or random, one of the two")
+        if self.random is not None and self.random * self.frames > _MOST_FRAMES:
+            raise ValueError(f"random x frames = {self.random * self.frames}, at most {_MOST_FRAMES}")
         return self
 
     @property

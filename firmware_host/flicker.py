@@ -5,6 +5,7 @@ Mod% = f / 30 for 90 Hz to 3 kHz and 0.01 f below 90 Hz; low risk (practice 1) u
 1250 Hz and 0.025 f below 90 Hz. Above 3 kHz there is no bound, and from 1250 Hz none at low risk.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +30,8 @@ class ClusterFlicker:
         longest_run: Longest run of equal chips, the table played round and round.
         line_hz: Frequency of the worst line below 3 kHz.
         line_percent: Its modulation, percent of the mean light (sine of amplitude A on mean M: 100 A / M).
-        limit_percent: What is free of observable effect at that frequency.
+        limit_percent: What is free of observable effect at that frequency; infinite if there is no line
+            below 3 kHz.
         low_risk: Whether every line is within the low-risk bound.
         no_effect: Whether every line is within the no-effect bound.
     """
@@ -44,14 +46,14 @@ class ClusterFlicker:
     no_effect: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain values."""
+        """As plain values; what is infinite is None, as JSON has no number for it."""
         return {
             "cluster": self.cluster,
             "on_share": self.on_share,
             "longest_run": self.longest_run,
             "line_hz": self.line_hz,
             "line_percent": self.line_percent,
-            "limit_percent": self.limit_percent,
+            "limit_percent": self.limit_percent if math.isfinite(self.limit_percent) else None,
             "low_risk": self.low_risk,
             "no_effect": self.no_effect,
         }

@@ -1,6 +1,7 @@
 """What a driver board is sent: symbols or chip masks, as bank content, words and chip tables."""
 
 import json
+import zipfile
 import zlib
 from dataclasses import dataclass
 from functools import cached_property
@@ -219,10 +220,11 @@ def read_masks(path: Path, frames: int, codebook: Codebook, pilot_every: int = 1
         InputError: The file cannot be read, or holds something else.
     """
     try:
-        chips = np.load(path, allow_pickle=False)
+        with path.open("rb") as file:
+            chips = np.load(file, allow_pickle=False)
     except OSError as fault:
         raise InputError(f"{path}: cannot be read: {fault}") from fault
-    except (ValueError, EOFError) as fault:
+    except (ValueError, EOFError, MemoryError, zipfile.BadZipFile) as fault:
         raise InputError(f"{path}: not a .npy file of plain numbers: {fault}") from fault
     if not isinstance(chips, np.ndarray):
         raise InputError(f"{path}: not a .npy file, but an archive of several")

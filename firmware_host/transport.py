@@ -240,7 +240,7 @@ class ReplayTransport:
                 if event["dir"] not in ("tx", "rx"):
                     raise ValueError(f"dir = {event['dir']!r}, expected 'tx' or 'rx'")
                 self._events.append((float(event["t"]), event["dir"], bytes.fromhex(event["hex"])))
-        except (ValueError, KeyError, TypeError, IndexError) as fault:
+        except (ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError) as fault:
             raise InputError(
                 f"{path}: line {self._number + 1}: not a trace of the wire: {fault!r}"
             ) from fault

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
 __all__ = ["codebook", "symbols"]
 
+MOST = 1_000_000
+"""Random frames at most: minutes of light at 10 000 chips/s, far beyond any bank, and within memory."""
+
 
 def codebook(profile: str) -> "Codebook":
     """The codebook of a profile.
@@ -42,6 +45,8 @@ def symbols(
         return read_symbols(path, book, pilot_every)
     import numpy as np
 
-    if random is None or random < 1 or frames < 1:
-        raise ConfigError(f"--random {random} --frames {frames}: expected at least 1 of each")
+    if random is None or not (1 <= random <= MOST and 1 <= frames <= MOST and random * frames <= MOST):
+        raise ConfigError(
+            f"--random {random} --frames {frames}: expected at least 1 of each, at most {MOST} frames in all"
+        )
     return random_symbols(random, frames, book, np.random.default_rng(seed))

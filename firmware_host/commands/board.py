@@ -260,6 +260,7 @@ def hello(
 
 @app.command()
 def program(
+    context: typer.Context,
     symbols: SymbolsFile = None,
     random: RandomPackets = None,
     masks: Masks = None,
@@ -292,8 +293,17 @@ def program(
     if inventory is not None:
         from evlcp_sdk.errors import ConfigError
 
-        if any(v is not None for v in (symbols, random, masks, trace, replay)):
-            raise ConfigError("--inventory names ports and payloads itself: give no other, and no --trace")
+        given = [
+            "/".join([*parameter.opts, *parameter.secondary_opts])
+            for parameter in context.command.params
+            if parameter.name not in ("inventory", "verify", "as_json")
+            and getattr(context.get_parameter_source(parameter.name or ""), "name", "") == "COMMANDLINE"
+        ]
+        if given:
+            raise ConfigError(
+                f"--inventory names ports, payloads and settings itself: write {given[0]} there,"
+                " not on the command line"
+            )
         _program_fleet(inventory, verify, as_json)
         return
     from firmware_host.board import Settings, provision

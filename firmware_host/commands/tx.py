@@ -39,7 +39,7 @@ SymbolsFile = Annotated[
 RandomPackets = Annotated[
     int | None, typer.Option("--random", metavar="N", help="N packets of random symbols.")
 ]
-Seed = Annotated[int, typer.Option(help="Seed of --random.")]
+Seed = Annotated[int, typer.Option(help="Seed of --random.", min=0)]
 Frames = Annotated[int, typer.Option(help="Frames per packet of --random and --masks.")]
 PilotEvery = Annotated[
     int,
@@ -164,7 +164,7 @@ def check(
     frames: Frames = 10,
     pilot_every: PilotEvery = 1,
     profile: ProfileName = "wh4x2",
-    chip_rate: Annotated[float, typer.Option(help="Chips per second.", min=1.0)] = 10_000.0,
+    chip_rate: Annotated[float, typer.Option(help="Chips per second.", min=1.0, max=1e6)] = 10_000.0,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
     """Check balance and flicker: on-share, longest run, lines below 3 kHz against IEEE Std 1789-2015.

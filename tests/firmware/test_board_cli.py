@@ -296,3 +296,45 @@ def test_programming_is_near_the_wire_time() -> None:
     assert done.returncode == 0, done.stderr
     ratio = float(done.stdout.rsplit("ratio", 1)[1].split()[0])
     assert ratio <= 1.5
+
+
+@pytest.mark.parametrize(
+    "option", [("--no-start",), ("--level", 30), ("--seed", 1), ("--port", "native:"), ("--frames", 10)]
+)
+def test_an_inventory_takes_no_settings_from_the_command_line(cli, option: tuple[object, ...]) -> None:
+    done = cli("board", "program", "--inventory", "x.toml", *option)
+    assert done.returncode == 2
+    assert str(option[0]) in done.stderr
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("tx", "frames", "--random", 1, "--seed", -1),
+        ("tx", "frames", "--random", 10**12),
+        ("tx", "frames", "--random", 1, "--frames", 10**12),
+        ("tx", "check", "--random", 1, "--chip-rate", "inf"),
+    ],
+)
+def test_numbers_beyond_reason_are_usage(cli, command: tuple[object, ...]) -> None:
+    done = cli(*command)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("head", ['{"first": 1e999, "nonce": 1, "baud": 1}', "[" * 100_000])
+def test_a_trace_of_nonsense_is_one_line(cli, tmp_path: Path, head: str) -> None:
+    path = tmp_path / "wire.jsonl"
+    path.write_text(head)
+    done = cli("board", "hello", "--replay", path)
+    assert done.returncode == 3
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("option", ["--listen", "--link"])
+def test_an_emulator_leaves_a_users_file_alone(cli, tmp_path: Path, option: str) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("mine")
+    place = f"unix:{path}" if option == "--listen" else path
+    assert cli("board", "emulate", "native", option, place).returncode == 1
+    assert path.read_text() == "mine"

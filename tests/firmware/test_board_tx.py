@@ -203,3 +203,25 @@ def test_pilots_in_some_frames_only(cli, tmp_path: Path, book: Codebook) -> None
     for profile in ("wh4x2", "wh8", "raw8"):
         options = ("--random", 20, "--frames", 20, "--pilot-every", 4, "--profile", profile)
         assert cli("tx", "check", *options).returncode == 0
+
+
+def test_masks_that_are_no_array_are_one_line(book: Codebook, tmp_path: Path) -> None:
+    path = tmp_path / "chips.npy"
+    path.write_bytes(b"PK\x03\x04junk")
+    with pytest.raises(InputError, match=r"not a \.npy file"):
+        read_masks(path, 10, book)
+    with path.open("wb") as file:
+        header = {"descr": "|u1", "fortran_order": False, "shape": (10**13, 16)}
+        np.lib.format.write_array_header_1_0(file, header)
+    with pytest.raises(InputError, match=r"not a \.npy file"):
+        read_masks(path, 10, book)
+
+
+def test_check_without_a_line_below_3_khz_is_json(cli) -> None:
+    done = cli("tx", "check", "--random", 1, "--frames", 1, "--chip-rate", 1_000_000, "--json")
+
+    def no_number(name: str) -> None:
+        raise AssertionError(f"{name} is no JSON")
+
+    rows = json.loads(done.stdout, parse_constant=no_number)["clusters"]
+    assert {row["limit_percent"] for row in rows} == {None}

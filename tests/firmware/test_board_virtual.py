@@ -432,3 +432,29 @@ def test_led_test_walks_all(device: SimulatedBoard, board: Board) -> None:
     rows = device.records().rows
     lit = np.unpackbits(rows[rows.any(1)], axis=1)
     assert (lit == np.eye(96, dtype=np.uint8)).all()
+
+
+def test_a_fault_that_comes_back_ends_the_led_test(device: SimulatedBoard, board: Board) -> None:
+    device.set_health(120.0, Fault.OVER_TEMPERATURE)
+    device.run(300_000)
+    device.set_health()
+    device.run(300_000)
+    board.test_leds(0, 95, 1000)
+    assert device.shown().any()
+    device.set_health(120.0, Fault.OVER_TEMPERATURE)
+    device.run(300_000)
+    assert not device.shown().any()
+
+
+def test_a_packet_may_take_longer_than_ten_seconds(
+    device: SimulatedBoard, board: Board, book: Codebook
+) -> None:
+    # 400 frames at 1000 chips/s: 12.8 s
+    old, new = (
+        Payload.of_symbols(random_symbols(1, 400, book, np.random.default_rng(seed)), book) for seed in (0, 1)
+    )
+    provision(board, old, Settings(chip_rate_hz=1000))
+    device.run(10_000)
+    assert provision(board, new, Settings(chip_rate_hz=1000)).swapped
+    board.stop()
+    assert board.wait_dark().state == State.DARK

@@ -598,8 +598,11 @@ static void check_health(struct evlcp *e, uint32_t now)
         return;
     e->health_ms = now;
     hal_health(&e->health);
-    if ((e->health.faults & HOLDS_DARK) != 0u && (e->latched & e->health.faults & HOLDS_DARK) == 0u) {
-        e->latched |= e->health.faults & HOLDS_DARK;
+    if ((e->health.faults & HOLDS_DARK) == 0u)
+        return;
+    e->latched |= e->health.faults & HOLDS_DARK;
+    /* Whatever lights the LEDs, even if an earlier fault is still latched. */
+    if (running(e) || atomic_load(&e->player.want_play) || e->test.on) {
         atomic_store(&e->player.want_play, false);
         e->test.on = false;
         evlcp_player_blank(&e->player);

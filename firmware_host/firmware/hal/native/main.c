@@ -15,6 +15,7 @@
 #include <string.h>
 #include <sys/prctl.h>
 #include <sys/socket.h>
+#include <sys/stat.h>
 #include <sys/un.h>
 #include <termios.h>
 #include <time.h>
@@ -66,6 +67,19 @@ static void nonblocking(int fd)
         die("fcntl");
 }
 
+/* Makes room for a name of ours; a file that is something else stays. */
+static void remove_old(const char *path, mode_t type)
+{
+    struct stat found;
+    if (lstat(path, &found) != 0)
+        return;
+    if ((found.st_mode & S_IFMT) != type) {
+        errno = EEXIST;
+        die(path);
+    }
+    unlink(path);
+}
+
 static int listen_unix(const char *path)
 {
     struct sockaddr_un address = {.sun_family = AF_UNIX};
@@ -75,7 +89,7 @@ static int listen_unix(const char *path)
     }
     memcpy(address.sun_path, path, strlen(path) + 1u);
     int fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
-    unlink(path);
+    remove_old(path, S_IFSOCK);
     if (fd < 0 || bind(fd, (struct sockaddr *)&address, sizeof address) < 0 || listen(fd, 1) < 0)
         die(path);
     return fd;
@@ -119,7 +133,7 @@ static int open_pty(const char *link_path)
         die("tcsetattr");
     /* The slave stays open here, so that a host that leaves does not hang up the line. */
     if (link_path != NULL) {
-        unlink(link_path);
+        remove_old(link_path, S_IFLNK);
         if (symlink(name, link_path) < 0)
             die(link_path);
     }
