@@ -41,6 +41,8 @@ class DaskCluster:
         self._address = address
         self._dask: Any = distributed
         try:
+            # A client of an address that cannot be one takes 20 s to close, with a traceback.
+            self._dask.comm.get_address_host_port(address)
             self._client = self._dask.Client(address, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, TimeoutError, ValueError, ImportError) as fault:
             raise ConfigError(f"--dask {address}: no Dask scheduler answers there") from fault

@@ -126,6 +126,14 @@ def test_no_scheduler() -> None:
         DaskCluster("nonsense://x")
 
 
+def test_an_address_that_cannot_be_one_starts_no_client(monkeypatch: pytest.MonkeyPatch) -> None:
+    distributed = pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    monkeypatch.setattr(distributed, "Client", lambda *_, **__: pytest.fail("a client was started"))
+    for address in ("nonsense", "tcp://127.0.0.1", "nonsense://x:1"):
+        with pytest.raises(ConfigError, match="no Dask scheduler answers there"):
+            DaskCluster(address)
+
+
 def test_without_dask(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ConfigError, match="pip install 'evlcp-sdk\\[cluster\\]'"):
