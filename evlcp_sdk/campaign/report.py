@@ -52,8 +52,8 @@ def page(summary: Summary) -> str:
         body.append(f'<p class="note">{html.escape(chart.note)}</p>')
     body += [_paper_table(compare(summary.series)), _figures_table(summary), _configuration(summary)]
     drawn = {chart.id: _plotly(chart) for chart in charts}
-    # "</" would end the script element.
-    data = json.dumps(drawn, allow_nan=False).replace("</", "<\\/")
+    # "</script>" in a name would end the script element, "<!--<script>" keep it from ending.
+    data = json.dumps(drawn, allow_nan=False).replace("<", "\\u003c")
     script = (
         f"const charts = {data};\n"
         # The library would offer to upload a chart.
