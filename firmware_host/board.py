@@ -1,6 +1,7 @@
 """What a host does with a board: program it, start and stop it, ask how it is."""
 
 import zlib
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from evlcp_sdk.codebook import Codebook, word_of_values
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.frames import pilot_words
 from firmware_host.client import Outcome
-from firmware_host.errors import IncompatibleError, LinkError, VerifyError
+from firmware_host.errors import IncompatibleError, LinkError, RefusedError, VerifyError
 from firmware_host.link import Link
 from firmware_host.messages import (
     NO_BANK,
@@ -38,6 +39,7 @@ from firmware_host.messages import (
     StartReply,
     StartRequest,
     State,
+    Status,
     StatusReply,
     StatusRequest,
     StopReply,
@@ -192,7 +194,19 @@ class Board:
         """
         book = payload.codebook
         configure = ConfigureRequest(chip_rate_hz, profile_number(book), payload.frames, payload.pilot_every)
-        self.link.call(configure, ConfigureReply)
+        try:
+            self.link.call(configure, ConfigureReply)
+        except RefusedError as fault:
+            # the chip rate is what the board looks at first
+            wrong = chip_rate_hz > self.about.chip_rate_max_hz or self.about.tick_hz % chip_rate_hz
+            if fault.status != Status.OUT_OF_RANGE or not wrong:
+                raise
+            raise RefusedError(
+                f"{self.link.name}: no chip rate of {chip_rate_hz} Hz: must divide {self.about.tick_hz} Hz,"
+                f" at most {self.about.chip_rate_max_hz}; the nearest the board can take is {fault.detail}",
+                fault.status,
+                fault.detail,
+            ) from fault
         chips = 2 * len(book.preamble)
         if chips > 32:
             raise IncompatibleError(f"preamble of {chips} chips: the board's has at most 32")
@@ -276,10 +290,17 @@ class Board:
                 f" {self.link.name} has {self.about.clusters}"
             )
         each = len(payload.content) // payload.packets
-        if len(payload.content) > self.about.bank_bytes:
+        room = self.about.bank_bytes
+        if each > room:
+            fits = bisect_right(range(1, payload.frames + 1), room, key=payload.packet_bytes)
+            raise ConfigError(
+                f"a packet of {payload.frames} frames takes {each} bytes, a bank of {self.link.name} has"
+                f" {room}: not one fits; a packet may have at most {fits} frames"
+            )
+        if len(payload.content) > room:
             raise ConfigError(
                 f"{payload.packets} packets of {each} bytes, a bank of {self.link.name} has"
-                f" {self.about.bank_bytes} bytes: send at most {self.about.bank_bytes // each} packets"
+                f" {room} bytes: send at most {room // each} packets"
             )
 
     def fill(self, bank: int, content: bytes, progress: Progress | None = None) -> int:

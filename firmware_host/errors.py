@@ -8,7 +8,7 @@ EvlcpError
     ├── LinkError                  6   no answer after all tries, or the line went away
     │   └── BoardResetError        6   the board forgot this session: it was reset, or another host took over
     ├── VerifyError                7   what the board holds is not what was sent
-    ├── IncompatibleError          8   the board's protocol or codebook is another one
+    ├── IncompatibleError          8   protocol or codebook is another one than the host's
     ├── FleetError                 *   boards of an inventory failed; the exit code of the first that did
     └── ToolchainError             1   a compiler or emulator is missing or failed
 DatagramError                          bytes that are no datagram of this protocol (never leaves the link)
@@ -79,7 +79,7 @@ class VerifyError(BoardError):
 
 
 class IncompatibleError(BoardError):
-    """The board's protocol or codebook is another one than this host's."""
+    """A board's protocol, or the codebook of a board or a file, is another one than this host's."""
 
     exit_code = 8
 

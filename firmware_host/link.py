@@ -25,8 +25,8 @@ Reply = TypeVar("Reply", bound=Payload)
 _ADVICE = {
     Status.UNKNOWN_TYPE: "the firmware does not know it; update the firmware",
     Status.BAD_LENGTH: "it expects {detail} bytes; host and firmware are of different versions",
-    Status.OUT_OF_RANGE: "the board's limit is {detail}; choose a value within it",
-    Status.BUSY: "not while it plays or swaps; 'evlcp board stop' first, or try again",
+    Status.OUT_OF_RANGE: "the nearest value the board can take is {detail}; choose that",
+    Status.BUSY: "not while it plays, swaps or tests its LEDs; 'evlcp board stop' first, or try again",
     Status.BAD_CRC: "the bank holds other bytes than were sent (CRC {detail:08x}); program it again",
     Status.FOREIGN_CODEBOOK: "the firmware was built with another codebook; update firmware or host",
     Status.NO_SESSION: "the board was reset, or another program took it over; run the command again,"

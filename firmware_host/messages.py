@@ -125,7 +125,7 @@ class Status(IntEnum):
     OUT_OF_RANGE = 3
     """A value the board cannot take; detail: the nearest value it can."""
     BUSY = 4
-    """Not while playing, or the bank is playing or about to."""
+    """Not while playing or, for flash, in a LED test; or the bank is playing or about to."""
     BAD_CRC = 5
     """The bank's content has another CRC; detail: the CRC found."""
     FOREIGN_CODEBOOK = 6
@@ -767,7 +767,7 @@ class WatchdogReply(Payload):
 
 @dataclass(frozen=True, slots=True)
 class SaveRequest(Payload):
-    """Save active bank and settings to the older of two flash slots; not while playing.
+    """Save active bank and settings to the older of two flash slots; only while the LEDs are dark.
 
     Attributes:
         autostart: 1: recall and play after a reset.
@@ -800,7 +800,7 @@ class SaveReply(Payload):
 
 @dataclass(frozen=True, slots=True)
 class RecallRequest(Payload):
-    """Commit what the newest valid flash slot holds."""
+    """Commit what the newest valid flash slot holds; only while the LEDs are dark."""
 
     TYPE: ClassVar[int] = 0x0F
     LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()

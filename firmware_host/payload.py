@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from evlcp_sdk.codebook import Codebook
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.frames import PacketFormat, info_words, packet_chips, pilot_words
-from firmware_host.messages import LEDS, Format
+from firmware_host.errors import IncompatibleError
+from firmware_host.messages import LEDS, ROW_BYTES, Format
 
 __all__ = [
     "Payload",
@@ -83,6 +84,12 @@ class Payload:
                 f"{len(rows)} chips: expected {expected} for {packets} packets of {frames} frames"
             )
         return cls(Format.MASKS, packets, frames, rows.tobytes(), codebook, pilot_every)
+
+    def packet_bytes(self, frames: int) -> int:
+        """Bytes a packet of this format with another number of frames takes in a bank."""
+        if self.format == Format.MASKS:
+            return ROW_BYTES * _packet_chips(self.codebook, frames, self.pilot_every)
+        return 2 * self.codebook.clusters * frames
 
     @cached_property
     def crc(self) -> int:
@@ -161,9 +168,11 @@ def chips_of_rows(rows: NDArray[np.uint8], clusters: int = 16) -> NDArray[np.uin
 def read_symbols(path: Path, codebook: Codebook, pilot_every: int = 1) -> Symbols:
     """Symbols of a JSON file: `[packet][frame][cluster]`, or an object with the key `symbols`.
 
-    An object's `profile`, where given, must be the codebook's, and its `pilot_every` that of the packets.
+    An object's `profile` and `digest`, where given, must be the codebook's, and its `pilot_every` that of the
+    packets.
 
     Raises:
+        IncompatibleError: The file's digest is another one.
         InputError: The file cannot be read, is no JSON, or an element is missing, out of range or no integer;
             the message names the place.
     """
@@ -179,6 +188,12 @@ def read_symbols(path: Path, codebook: Codebook, pilot_every: int = 1) -> Symbol
         if profile != codebook.profile:
             raise InputError(
                 f"{path}: profile = {profile!r}, expected {codebook.profile!r}; choose it with --profile"
+            )
+        digest = table.get("digest", codebook.digest)
+        if digest != codebook.digest:
+            raise IncompatibleError(
+                f"{path}: digest = {json.dumps(digest)[:18]}, expected {codebook.digest[:16]}"
+                f" ({codebook.profile}): made with another codebook; make the file again"
             )
         every = table.get("pilot_every", pilot_every)
         if every != pilot_every:

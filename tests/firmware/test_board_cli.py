@@ -97,7 +97,7 @@ def test_a_users_first_hour(cli, native: str, tmp_path: Path) -> None:
     assert "playing" in lines[0]
     refused = board("level", 61)
     assert refused.returncode == 5
-    assert "the board's limit is 60" in refused.stderr
+    assert "the nearest value the board can take is 60" in refused.stderr
     assert board("watchdog", "dark", "--after-ms", 60_000).returncode == 0
     assert board("save").returncode == 5
     assert board("stop").returncode == 0

@@ -70,7 +70,7 @@ def test_thirty_of_thirty_two(cli, boards: list[str], tmp_path: Path) -> None:
     assert "FAILED (4)" in bad[0]
     assert bad[1].startswith("T20")
     assert "FAILED (5)" in bad[1]
-    assert "limit is 60" in bad[1]
+    assert "nearest value the board can take is 60" in bad[1]
     assert done.returncode == 4
     assert done.stderr.startswith(f"evlcp: {file}: 2 of 32 boards failed (T07, T20)")
     for n in (0, 31):

@@ -130,10 +130,14 @@ def test_led_test_and_save_in_qemu(tmp_path: Path, book: Codebook) -> None:
     leds = tmp_path / "leds.bin"
     with Link(start_qemu(leds)) as link:
         board = Board(link)
-        board.test_leds(0, 95, 1)
-        board.wait_dark()
         payload = Payload.of_symbols(random_symbols(2, 10, book, np.random.default_rng(0)), book)
+        with pytest.raises(RefusedError, match="nearest the board can take is 8000"):
+            board.program(payload, 7777)
         provision(board, payload, Settings(start=False))
+        board.test_leds(0, 95, 1)
+        with pytest.raises(RefusedError, match="BUSY"):
+            board.save()
+        board.wait_dark()
         assert board.save().save_sequence == 1
         other = Payload.of_symbols(random_symbols(2, 10, book, np.random.default_rng(1)), book)
         provision(board, other, Settings(start=False))
@@ -226,7 +230,7 @@ def test_stm32f405_register_writes(tmp_path: Path, book: Codebook) -> None:
 
         board.level(30)
         assert at("DAC", 0x08, netduino.writes())[-1] == 30 * 4095 // 60
-        with pytest.raises(RefusedError, match="limit is 60"):
+        with pytest.raises(RefusedError, match="nearest value the board can take is 60"):
             board.level(61)
 
         payload = Payload.of_symbols(random_symbols(2, 10, book, np.random.default_rng(0)), book)

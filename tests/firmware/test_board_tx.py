@@ -116,6 +116,21 @@ def test_wrong_symbols_are_one_line(cli, tmp_path: Path, text: str, expected: st
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize("digest", ['"00"', "5", "null"])
+def test_symbols_of_another_codebook_are_refused(cli, tmp_path: Path, digest: str) -> None:
+    said = cli("tx", "frames", "--random", 1, "--format", "json").stdout
+    path = tmp_path / "s.json"
+    path.write_text(said)
+    assert cli("tx", "frames", path, "--format", "json").stdout == said
+    own = json.loads(said)["digest"]
+    path.write_text(said.replace(f'"{own}"', digest))
+    done = cli("tx", "frames", path)
+    assert done.returncode == 8
+    assert f"{path}: digest = {digest}" in done.stderr
+    assert f"expected {own[:16]}" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
 def test_missing_files_and_usage(cli, tmp_path: Path) -> None:
     missing = cli("tx", "frames", tmp_path / "no.json")
     assert missing.returncode == 3

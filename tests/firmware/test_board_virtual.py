@@ -361,10 +361,40 @@ def test_too_much_is_told_before_anything_is_sent(board: Board, book: Codebook) 
     with pytest.raises(ConfigError, match="send at most 128 packets"):
         board.program(payload)
     assert board.status().requests <= 3
+    # 2 bytes for each of 16 clusters a frame: 1280 frames fill the 40960 bytes
+    one = Payload.of_symbols(random_symbols(1, 1281, book, np.random.default_rng(0)), book)
+    with pytest.raises(ConfigError, match=r"1281 frames takes 40992 bytes.*at most 1280 frames"):
+        board.program(one)
+    # 12 bytes a chip: 3413 chips, 26 of the preamble and 32 a frame
+    masks = Payload.of_masks(np.zeros((26 + 32 * 106, 96), np.uint8), 1, 106, book)
+    with pytest.raises(ConfigError, match="at most 105 frames"):
+        board.program(masks)
+
+
+def test_a_chip_rate_that_cannot_be_is_told_with_the_nearest(board: Board, book: Codebook) -> None:
+    payload = Payload.of_symbols(symbols_of(1, 0, book), book)
+    for rate in (7777, 20_001, 1_000_000):
+        nearest = min((r for r in range(1, 20_001) if 10_000_000 % r == 0), key=lambda r: abs(r - rate))
+        with pytest.raises(
+            RefusedError, match=f"no chip rate of {rate} Hz.* nearest .* is {nearest}$"
+        ) as told:
+            board.program(payload, rate)
+        assert told.value.detail == nearest
+        assert board.program(payload, nearest).swapped or rate > 20_001
+
+
+def test_flash_waits_for_the_end_of_a_led_test(board: Board, book: Codebook) -> None:
+    provision(board, Payload.of_symbols(symbols_of(1, 0, book), book), Settings(start=False))
+    board.test_leds(0, 95, 1000)
+    for ask in (board.save, board.recall):
+        with pytest.raises(RefusedError, match="'evlcp board stop' first"):
+            ask()
+    board.stop()
+    assert board.save().slot == 0
 
 
 def test_level_above_the_maximum_is_refused(board: Board, book: Codebook) -> None:
-    with pytest.raises(RefusedError, match="limit is 60") as refused:
+    with pytest.raises(RefusedError, match="nearest value the board can take is 60") as refused:
         provision(board, Payload.of_symbols(symbols_of(1, 0, book), book), Settings(level_ma=61))
     assert refused.value.detail == 60
     assert refused.value.exit_code == 5

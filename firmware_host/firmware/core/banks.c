@@ -59,11 +59,14 @@ bool evlcp_banks_held(const struct evlcp_banks *banks, uint8_t bank)
 static bool already(const struct evlcp_plan *plan, const struct evlcp_setup *setup,
                     const struct evlcp_commit_request *request)
 {
-    return plan->valid && plan->format == request->format && plan->packets == request->packets &&
+    bool same = plan->preamble == setup->preamble && plan->preamble_chips == setup->preamble_chips;
+    for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
+        same = same && plan->pilots[k] == setup->pilots[k];
+    return same && plan->valid && plan->format == request->format && plan->packets == request->packets &&
            plan->length == request->length && plan->crc == request->crc &&
            equal(plan->digest, request->digest, 32u) && equal(setup->digest, request->digest, 32u) &&
-           plan->frames == setup->frames && plan->pilot_every == setup->pilot_every &&
-           plan->ticks_per_chip == setup->ticks_per_chip;
+           plan->profile == setup->profile && plan->frames == setup->frames &&
+           plan->pilot_every == setup->pilot_every && plan->ticks_per_chip == setup->ticks_per_chip;
 }
 
 enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlcp_setup *setup,

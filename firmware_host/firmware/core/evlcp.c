@@ -103,19 +103,36 @@ static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x, uint16_t 
     return EVLCP_STATUS_OK;
 }
 
+static bool chip_rate_ok(const struct evlcp_hal_info *info, uint32_t rate_hz)
+{
+    return rate_hz != 0u && rate_hz <= info->chip_rate_max_hz && info->tick_hz % rate_hz == 0u &&
+           info->tick_hz / rate_hz <= info->ticks_per_chip_max;
+}
+
+/* The chip rate nearest to `rate_hz` that the board can play, the lower of two. */
+static uint32_t nearest_chip_rate(const struct evlcp_hal_info *info, uint32_t rate_hz)
+{
+    uint32_t from = rate_hz < info->chip_rate_max_hz ? rate_hz : info->chip_rate_max_hz;
+    for (uint32_t step = 0; step <= info->chip_rate_max_hz; step++) {
+        if (step <= from && chip_rate_ok(info, from - step))
+            return from - step;
+        if (chip_rate_ok(info, from + step))
+            return from + step;
+    }
+    return 0u;
+}
+
 static enum evlcp_status on_configure(struct evlcp *e, struct exchange *x)
 {
     struct evlcp_configure_request request;
     evlcp_configure_request_get(x->in, &request);
-    if (request.chip_rate_hz == 0u || request.chip_rate_hz > e->info.chip_rate_max_hz ||
-        e->info.tick_hz % request.chip_rate_hz != 0u ||
-        e->info.tick_hz / request.chip_rate_hz > e->info.ticks_per_chip_max) {
-        x->detail = e->info.chip_rate_max_hz;
+    if (!chip_rate_ok(&e->info, request.chip_rate_hz)) {
+        x->detail = nearest_chip_rate(&e->info, request.chip_rate_hz);
         return EVLCP_STATUS_OUT_OF_RANGE;
     }
     uint32_t most = EVLCP_BANK_BYTES / EVLCP_FRAME_BYTES;
     if (request.frames == 0u || request.frames > most) {
-        x->detail = most;
+        x->detail = request.frames == 0u ? 1u : most;
         return EVLCP_STATUS_OUT_OF_RANGE;
     }
     if (request.pilot_every == 0u) {

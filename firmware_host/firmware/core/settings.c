@@ -84,8 +84,8 @@ enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct ev
     uint8_t header[EVLCP_SLOT_HEADER_BYTES];
     if ((e->info.capabilities & EVLCP_CAPABILITY_FLASH) == 0u)
         return EVLCP_STATUS_NOT_SUPPORTED;
-    /* Erasing stops the processor on single-bank parts; chips would come late. */
-    if (atomic_load(&e->player.running) || atomic_load(&e->player.want_play))
+    /* Erasing stops the processor on single-bank parts: chips would come late, a LED test would stand still. */
+    if (atomic_load(&e->player.running) || atomic_load(&e->player.want_play) || e->test.on)
         return EVLCP_STATUS_BUSY;
     if (active == EVLCP_NO_BANK)
         return EVLCP_STATUS_NOTHING_COMMITTED;
@@ -171,7 +171,7 @@ enum evlcp_status evlcp_settings_recall(struct evlcp *e, bool only_autostart, st
     bool valid[EVLCP_SLOTS];
     if ((e->info.capabilities & EVLCP_CAPABILITY_FLASH) == 0u)
         return EVLCP_STATUS_NOT_SUPPORTED;
-    if (atomic_load(&e->player.running) || atomic_load(&e->banks.pending) != EVLCP_NO_BANK)
+    if (atomic_load(&e->player.running) || atomic_load(&e->banks.pending) != EVLCP_NO_BANK || e->test.on)
         return EVLCP_STATUS_BUSY;
     for (uint8_t i = 0; i < EVLCP_SLOTS; i++)
         valid[i] = get_header(e, i, &found[i]);

@@ -44,7 +44,7 @@ enum evlcp_status {
     EVLCP_STATUS_UNKNOWN_TYPE = 1, /* The board does not know this request. */
     EVLCP_STATUS_BAD_LENGTH = 2, /* The payload has another length than the request's; detail: expected length. */
     EVLCP_STATUS_OUT_OF_RANGE = 3, /* A value the board cannot take; detail: the nearest value it can. */
-    EVLCP_STATUS_BUSY = 4, /* Not while playing, or the bank is playing or about to. */
+    EVLCP_STATUS_BUSY = 4, /* Not while playing or, for flash, in a LED test; or the bank is playing or about to. */
     EVLCP_STATUS_BAD_CRC = 5, /* The bank's content has another CRC; detail: the CRC found. */
     EVLCP_STATUS_FOREIGN_CODEBOOK = 6, /* The codebook's digest is not the one that belongs here. */
     EVLCP_STATUS_NO_SESSION = 7, /* The board was reset, or another host has said HELLO. */
@@ -624,7 +624,7 @@ static inline void evlcp_watchdog_request_get(const uint8_t *p, struct evlcp_wat
 #define EVLCP_WATCHDOG_REPLY_BYTES 0u
 
 #define EVLCP_SAVE_REQUEST_BYTES 1u
-/* Save active bank and settings to the older of two flash slots; not while playing. */
+/* Save active bank and settings to the older of two flash slots; only while the LEDs are dark. */
 struct evlcp_save_request {
     uint8_t autostart; /* 1: recall and play after a reset. */
 };

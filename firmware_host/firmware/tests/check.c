@@ -425,6 +425,20 @@ static void test_foreign_codebook_never_plays(void)
     memcpy(request.digest, book.digest, 32u);
     evlcp_commit_request_put(payload, &request);
     EXPECT(ask(&h, EVLCP_TYPE_COMMIT, payload, sizeof payload) == EVLCP_STATUS_OK);
+    /* A digest of one's own vouches for nothing: other pilots or another preamble are not there already. */
+    book.pilots[3] ^= 2u;
+    evlcp_codebook_request_put(code, &book);
+    EXPECT(ask(&h, EVLCP_TYPE_CODEBOOK, code, sizeof code) == EVLCP_STATUS_OK);
+    EXPECT(ask(&h, EVLCP_TYPE_COMMIT, payload, sizeof payload) == EVLCP_STATUS_BUSY);
+    book.pilots[3] ^= 2u;
+    book.preamble = 1u;
+    evlcp_codebook_request_put(code, &book);
+    EXPECT(ask(&h, EVLCP_TYPE_CODEBOOK, code, sizeof code) == EVLCP_STATUS_OK);
+    EXPECT(ask(&h, EVLCP_TYPE_COMMIT, payload, sizeof payload) == EVLCP_STATUS_BUSY);
+    book.preamble = 2u;
+    evlcp_codebook_request_put(code, &book);
+    EXPECT(ask(&h, EVLCP_TYPE_CODEBOOK, code, sizeof code) == EVLCP_STATUS_OK);
+    EXPECT(ask(&h, EVLCP_TYPE_COMMIT, payload, sizeof payload) == EVLCP_STATUS_OK);
     EXPECT(ask(&h, EVLCP_TYPE_START, NULL, 0) == EVLCP_STATUS_OK);
     watch_leds(board);
     run_chips(board, 3u);
@@ -439,16 +453,25 @@ static void test_configure_limits(void)
     struct evlcp_configure_request r = {.chip_rate_hz = 3000, .profile = 0, .frames = 10, .pilot_every = 1};
     evlcp_configure_request_put(payload, &r); /* 3 kHz does not divide the ticks */
     EXPECT(ask(&h, EVLCP_TYPE_CONFIGURE, payload, sizeof payload) == EVLCP_STATUS_OUT_OF_RANGE);
-    r.chip_rate_hz = 0;
-    evlcp_configure_request_put(payload, &r);
-    EXPECT(ask(&h, EVLCP_TYPE_CONFIGURE, payload, sizeof payload) == EVLCP_STATUS_OUT_OF_RANGE);
+    /* The nearest of the products of powers of 2 and 5 up to 20000: 10 MHz is 2^7 5^7. */
+    static const uint32_t nearest[][2] = {{3000u, 3125u},   {7777u, 8000u},        {7125u, 6250u},
+                                          {0u, 1u},         {3u, 2u},              {18001u, 20000u},
+                                          {20001u, 20000u}, {4294967295u, 20000u}, {18000u, 16000u}};
+    for (uint32_t i = 0; i < sizeof nearest / sizeof nearest[0]; i++) {
+        r.chip_rate_hz = nearest[i][0];
+        evlcp_configure_request_put(payload, &r);
+        EXPECT(ask(&h, EVLCP_TYPE_CONFIGURE, payload, sizeof payload) == EVLCP_STATUS_OUT_OF_RANGE);
+        EXPECT(evlcp_get32(h.payload) == nearest[i][1]);
+    }
     r.chip_rate_hz = 20000;
     r.frames = 0;
     evlcp_configure_request_put(payload, &r);
     EXPECT(ask(&h, EVLCP_TYPE_CONFIGURE, payload, sizeof payload) == EVLCP_STATUS_OUT_OF_RANGE);
+    EXPECT(evlcp_get32(h.payload) == 1u);
     r.frames = 65535;
     evlcp_configure_request_put(payload, &r);
     EXPECT(ask(&h, EVLCP_TYPE_CONFIGURE, payload, sizeof payload) == EVLCP_STATUS_OUT_OF_RANGE);
+    EXPECT(evlcp_get32(h.payload) == EVLCP_BANK_BYTES / EVLCP_FRAME_BYTES);
     r.frames = 10;
     r.profile = 9;
     evlcp_configure_request_put(payload, &r);
@@ -653,6 +676,18 @@ static void test_led_test(void)
     r.last = 96;
     evlcp_led_test_request_put(payload, &r);
     EXPECT(ask(&h, EVLCP_TYPE_LED_TEST, payload, sizeof payload) == EVLCP_STATUS_OUT_OF_RANGE);
+    /* Flash waits until the LEDs are dark. */
+    uint8_t autostart = 0u;
+    uint32_t crc = fill(&h, 0, 320u, 1);
+    EXPECT(commit(&h, 0, 1, 320u, crc) == EVLCP_STATUS_OK);
+    EXPECT(ask(&h, EVLCP_TYPE_SAVE, &autostart, 1) == EVLCP_STATUS_OK);
+    r.last = 95;
+    evlcp_led_test_request_put(payload, &r);
+    EXPECT(ask(&h, EVLCP_TYPE_LED_TEST, payload, sizeof payload) == EVLCP_STATUS_OK);
+    EXPECT(ask(&h, EVLCP_TYPE_SAVE, &autostart, 1) == EVLCP_STATUS_BUSY);
+    EXPECT(ask(&h, EVLCP_TYPE_RECALL, NULL, 0) == EVLCP_STATUS_BUSY);
+    EXPECT(ask(&h, EVLCP_TYPE_STOP, NULL, 0) == EVLCP_STATUS_OK);
+    EXPECT(ask(&h, EVLCP_TYPE_SAVE, &autostart, 1) == EVLCP_STATUS_OK);
 }
 
 static void test_masks(void)
