@@ -5,7 +5,7 @@ EvlcpError                     1   anything the SDK raises on purpose
 ├── ConfigError                2   a configuration value; names its path, the value, what was expected
 │   ├── UnknownAlgorithmError  2   no algorithm of that role and id; suggests the nearest
 │   └── CodebookMismatchError  2   two ends that do not share one codebook
-├── PluginError                2   a plugin that cannot be loaded, or two that claim one (role, id)
+├── PluginError                2   a plugin that cannot be loaded or fails, or two that claim one (role, id)
 ├── InputError                 3   a file or stream that cannot be read
 │   └── RawFormatError         3   a RAW file's header or words; names byte offset, found, expected
 └── StreamError                1   events fed in an order or shape the receiver cannot take
@@ -48,7 +48,7 @@ class CodebookMismatchError(ConfigError):
 
 
 class PluginError(EvlcpError):
-    """A plugin that cannot be loaded, or two plugins that claim one (role, id)."""
+    """A plugin that cannot be loaded, one whose code fails, or two plugins that claim one (role, id)."""
 
     exit_code = 2
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.abc import Synchronizer, Tracker
 from evlcp_sdk.config import Link
 from evlcp_sdk.errors import ConfigError, StreamError
+from evlcp_sdk.rx.blame import Blame
 from evlcp_sdk.rx.chips import polarity_sums
 from evlcp_sdk.rx.messages import MessageAssembler
 from evlcp_sdk.rx.payload import PacketAssembler
@@ -22,6 +23,8 @@ from evlcp_sdk.rx.regions import RegionTracker, Track
 from evlcp_sdk.types import Events, Frame, FrameView, Packet, PresenceMap, Range, SyncLock
 
 __all__ = ["Receiver"]
+
+_ROLES = ("synchronization", "separation", "decoding", "ranging", "tracking")
 
 _LOOKBACK_PACKETS = 2
 """Packets of events kept while there is no lock: one to hear a preamble in, one to look back on."""
@@ -128,13 +131,19 @@ class Receiver:
         self._announce: Callable[..., Any] | None = None
         if hook is not None and hook.evlcp_stage_finished.get_hookimpls():
             self._announce = hook.evlcp_stage_finished
-        self._synchronizer: Synchronizer = link.algorithm("synchronization").compile(
-            link.codebook, link.packet
-        )
-        self._separate = link.algorithm("separation").compile(link.codebook)
-        self._decode = link.algorithm("decoding").compile(link.codebook)
-        self._measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
-        tracker: Tracker = link.algorithm("tracking").compile()
+        self._blame = {role: Blame(link, role) for role in _ROLES}
+        with self._blame["synchronization"]:
+            self._synchronizer: Synchronizer = link.algorithm("synchronization").compile(
+                link.codebook, link.packet
+            )
+        with self._blame["separation"]:
+            self._separate = link.algorithm("separation").compile(link.codebook)
+        with self._blame["decoding"]:
+            self._decode = link.algorithm("decoding").compile(link.codebook)
+        with self._blame["ranging"]:
+            self._measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+        with self._blame["tracking"]:
+            tracker: Tracker = link.algorithm("tracking").compile()
         self._distance = tracker.distance
         self._centres_m = link.bar.cluster_centres_m()
         self._find_points = points_finder(self._centres_m)
@@ -318,7 +327,10 @@ class Receiver:
 
     def _synchronize(self, transmitter: _Transmitter, events: Events, until_us: int) -> None:
         clock = time.perf_counter()
-        transmitter.sync, locks = self._synchronizer.step(transmitter.sync, events.t_us, events.p, until_us)
+        with self._blame["synchronization"]:
+            transmitter.sync, locks = self._synchronizer.step(
+                transmitter.sync, events.t_us, events.p, until_us
+            )
         elapsed = time.perf_counter() - clock
         for lock in locks:
             self._counts["preambles"] += 1
@@ -415,13 +427,17 @@ class Receiver:
         look = self._look(transmitter, start_us, end_us, clock)
         if look is None:
             return None
-        soft = self._decode(look.presence, look.sums)
+        with self._blame["decoding"]:
+            soft = self._decode(look.presence, look.sums)
+        self._blame["decoding"].expect_symbols(soft, self._link.codebook)
         self._tell("decoding", soft, _lap(clock))
         number, index = divmod(transmitter.frame, self._packet.frames)
         distance, points = _NO_RANGE, _NO_POINTS
         if self._packet.has_pilot(index):
             # Another distance of the same pilot, or other points, would say nothing new.
-            distance = self._measure(FrameView(look.sums, look.offset_px, look.presence, soft))
+            with self._blame["ranging"]:
+                distance = self._measure(FrameView(look.sums, look.offset_px, look.presence, soft))
+            self._blame["ranging"].expect(distance, Range)
             self._tell("ranging", distance, _lap(clock))
             # A value is read from its second chip, and a chip's events follow the edge at its start.
             read_px = look.offset_px[:, 1 : self._packet.pilot_chips : 2]
@@ -469,7 +485,9 @@ class Receiver:
         sums, offset_px = polarity_sums(pieces, lock, start_us, (x, y), size)
         if packet.has_pilot(index):
             heard, moved = sums[: packet.pilot_chips], offset_px[:, : packet.pilot_chips]
-            presence = self._separate(heard)
+            with self._blame["separation"]:
+                presence = self._separate(heard)
+            self._blame["separation"].expect(presence, PresenceMap)
             self._tell("separation", presence, _lap(clock))
             in_place = clusters_in_place(presence, self._centres_m)
             if in_place < self._link.regions.min_clusters_share * len(self._centres_m):
@@ -491,12 +509,14 @@ class Receiver:
         if self._distance is None:
             return None
         if np.isnan(measured.distance_m) or np.isnan(measured.sigma_m):
-            expected = self._distance.predict(transmitter.distance, t_us)
+            with self._blame["tracking"]:
+                expected = self._distance.predict(transmitter.distance, t_us)
             return None if expected is None else Range(float(expected[0][0]), expected[1], 0)
         value = np.array([measured.distance_m])
-        transmitter.distance, value, sigma = self._distance.step(
-            transmitter.distance, t_us, value, measured.sigma_m
-        )
+        with self._blame["tracking"]:
+            transmitter.distance, value, sigma = self._distance.step(
+                transmitter.distance, t_us, value, measured.sigma_m
+            )
         return Range(float(value[0]), sigma, measured.pairs)
 
     def _forget(self, transmitter: _Transmitter, now_us: float) -> None:
