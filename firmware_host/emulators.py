@@ -8,6 +8,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from evlcp_sdk.errors import InputError
 from firmware_host import build
 from firmware_host.errors import LinkError, NoBoardError, ToolchainError
 from firmware_host.transport import SocketTransport
@@ -64,16 +65,32 @@ def native_command(
         flash: File that keeps the flash slots.
         link: Name to give the pseudo-terminal.
         baud: Line rate to keep to, bit/s; 0 for as fast as it goes.
-        unique_id: The board's number.
+        unique_id: The board's number, 64 bits.
 
     Raises:
+        InputError: The flash file cannot be read, or not be replaced.
         ToolchainError: It cannot be built.
     """
+    if flash is not None:
+        _check_flash(flash)
     command = [str(build.native_program()), "--listen", listen]
     for name, value in (("--leds", leds), ("--flash", flash), ("--link", link)):
         if value is not None:
             command += [name, str(value)]
     return [*command, "--baud", str(baud), "--id", str(unique_id)]
+
+
+def _check_flash(path: Path) -> None:
+    try:
+        if not path.is_file() and path.exists():
+            raise InputError(f"{path}: not a file; expected the name of a flash file, there or new")
+        if path.is_file():
+            path.open("rb").close()
+        folder = path.resolve().parent
+        # SAVE puts a new file in the place of the old one
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as fault:
+        raise InputError(f"{path}: the flash file cannot be used: {fault.strerror}") from fault
 
 
 def qemu_command(listen: str, leds: Path | None = None, wait: bool = False) -> list[str]:
@@ -119,6 +136,7 @@ def start_native(
     """Start the native board and connect to it.
 
     Raises:
+        InputError: The flash file cannot be used.
         ToolchainError: It cannot be built.
     """
     ours, theirs = socket.socketpair()

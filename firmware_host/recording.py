@@ -50,13 +50,18 @@ class Recording:
         """Read a file that an emulator wrote.
 
         Raises:
-            InputError: It cannot be read, or its chips do not follow one another.
+            InputError: It cannot be read, has no whole record, or its chips do not follow one another.
         """
         try:
             data = path.read_bytes()
         except OSError as fault:
             raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
         whole, cut = divmod(len(data), RECORD.itemsize)
+        if not whole:
+            raise InputError(
+                f"{path}: {len(data)} bytes, expected LED records of {RECORD.itemsize} bytes;"
+                " the emulator writes them when the LEDs are lit"
+            )
         records = np.frombuffer(data, RECORD, whole)
         chip = records["chip"].astype(np.int64)
         is_chip = chip < CHIP_TEST

@@ -595,23 +595,28 @@ def emulate(
     flash: Annotated[Path | None, typer.Option(metavar="FILE", help="(native) keep SAVE slots here.")] = None,
     link: Annotated[Path | None, typer.Option(metavar="PATH", help="(native) name for the pty.")] = None,
     baud: Annotated[int, typer.Option(help="(native) keep to a line rate; 0 as fast as it goes.", min=0)] = 0,
-    unique_id: Annotated[int, typer.Option(help="(native) the board's number.", min=0)] = 0,
+    unique_id: Annotated[int, typer.Option(help="(native) the board's number.", min=0, max=2**64 - 1)] = 0,
 ) -> None:
     """Run an emulated board in the foreground; end with Ctrl-C.
 
     For example: [bold]evlcp board emulate qemu --listen unix:/tmp/board --leds leds.bin[/]
     """
+    import re
     import signal
     import subprocess
 
-    from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.errors import ConfigError, InputError
     from firmware_host.emulators import native_command, qemu_command, wait_for
     from firmware_host.errors import ToolchainError
 
-    scheme = listen.partition(":")[0]
+    scheme, _, place = listen.partition(":")
     known = ("unix", "tcp") if emulator is Emulator.QEMU else ("unix", "tcp", "pty")
     if scheme not in known:
         raise ConfigError(f"--listen {listen}: expected {' or '.join(known)} for {emulator}")
+    if scheme == "tcp":
+        host, _, number = place.rpartition(":")
+        if not host or not re.fullmatch("[0-9]{1,5}", number) or not 1 <= int(number) <= 65535:
+            raise ConfigError(f"--listen {listen}: expected tcp:HOST:PORT with a port from 1 to 65535")
     if emulator is Emulator.QEMU:
         command = qemu_command(listen, leds)
     else:
@@ -628,6 +633,8 @@ def emulate(
         process.terminate()
         process.wait()
         return
+    if code == InputError.exit_code:
+        raise typer.Exit(code)  # a file of the board's, which has told of it
     if code not in (0, -signal.SIGTERM, -signal.SIGINT):
         raise ToolchainError(f"the {emulator} board ended with {code}; see its message above")
 
@@ -642,7 +649,8 @@ def leds(
 ) -> None:
     """Turn an LED record into a chip table; the ticks go into OUT.ticks.npy.
 
-    Rows that are no chip (dark, single-LED test) are left out.
+    Rows that are no chip (dark, single-LED test) are left out. So is a last record that is cut off, and then
+    the command ends with 3.
 
     For example: [bold]evlcp board leds leds.bin --chips chips.npy[/]
     """
@@ -657,6 +665,9 @@ def leds(
         raise InputError(f"{record}: {fault}") from fault
     save_array(chips, table)
     save_array(chips.with_suffix(".ticks.npy"), played.ticks)
-    if played.cut_bytes:
-        typer.echo(f"{record}: the last record is cut off ({played.cut_bytes} bytes) and left out", err=True)
     typer.echo(f"{len(played)} chips")
+    if played.cut_bytes:
+        raise InputError(
+            f"{record}: the last record is cut off ({played.cut_bytes} bytes) and left out;"
+            f" the {len(played)} chips before it are in {chips}"
+        )

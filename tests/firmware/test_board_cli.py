@@ -1,9 +1,11 @@
 """`evlcp board` against running boards: commands, exit codes, traces, hosts that are killed."""
 
+import contextlib
 import json
 import os
 import pty
 import random
+import resource
 import signal
 import socket
 import subprocess
@@ -18,7 +20,11 @@ import pytest
 from board_lines import check_order, packet_sequence
 
 from evlcp_sdk.codebook import Codebook
-from firmware_host.payload import random_symbols
+from firmware_host.board import Board
+from firmware_host.emulators import native_command, wait_for
+from firmware_host.errors import LinkError
+from firmware_host.link import Link
+from firmware_host.payload import Payload, random_symbols
 from firmware_host.recording import RECORD, Recording
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -135,8 +141,16 @@ def test_wrong_records_are_told(cli, tmp_path: Path) -> None:
     assert "at byte 40: chip 3 after chip 1: not an LED record" in done.stderr
     torn.write_bytes(records.tobytes()[:45])
     cut = cli("board", "leds", torn, "--chips", tmp_path / "c.npy")
-    assert (cut.returncode, cut.stdout) == (0, "2 chips\n")
+    assert (cut.returncode, cut.stdout) == (3, "2 chips\n")
     assert "the last record is cut off (5 bytes)" in cut.stderr
+    assert cut.stderr.count("\n") == 1
+    assert len(np.load(tmp_path / "c.npy")) == 2
+    for count in (0, 19):
+        torn.write_bytes(records.tobytes()[:count])
+        none = cli("board", "leds", torn, "--chips", tmp_path / "none.npy")
+        assert (none.returncode, none.stdout) == (3, "")
+        assert f"{torn}: {count} bytes, expected LED records of 20 bytes" in none.stderr
+        assert not (tmp_path / "none.npy").exists()
     assert cli("board", "leds", tmp_path / "no", "--chips", tmp_path / "c.npy").returncode == 3
 
 
@@ -197,6 +211,9 @@ def test_usage_is_two(cli) -> None:
         ("program", "--inventory", "x.toml", "--random", 1),
         ("emulate", "qemu", "--listen", "pty"),
         ("emulate", "native", "--listen", "smoke:signals"),
+        ("emulate", "native", "--listen", "tcp:127.0.0.1:999999"),
+        ("emulate", "native", "--listen", "tcp:127.0.0.1"),
+        ("emulate", "native", "--unique-id", 2**64),
         ("level", "much"),
     ):
         done = cli("board", *arguments)
@@ -338,3 +355,73 @@ def test_an_emulator_leaves_a_users_file_alone(cli, tmp_path: Path, option: str)
     place = f"unix:{path}" if option == "--listen" else path
     assert cli("board", "emulate", "native", option, place).returncode == 1
     assert path.read_text() == "mine"
+
+
+def test_a_flash_file_is_replaced_whole(tmp_path: Path, book: Codebook) -> None:
+    flash, place = tmp_path / "flash.bin", f"unix:{tmp_path / 'board'}"
+    command = native_command(place, flash=flash)
+    payload = Payload.of_symbols(random_symbols(1, 10, book, np.random.default_rng(0)), book)
+
+    @contextlib.contextmanager
+    def started() -> "Iterator[tuple[subprocess.Popen[bytes], Board]]":
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+        try:
+            line = wait_for(place, process)
+            assert line is not None
+            with Link(line) as link:
+                yield process, Board(link)
+        finally:
+            process.terminate()
+            process.wait(10)
+
+    with started() as (process, board):
+        board.program(payload)
+        for number in range(1, 6):
+            with flash.open("rb") as old:
+                before = flash.read_bytes()
+                assert board.save().save_sequence == number
+                # who opened the old file still reads it whole: the new one is another
+                assert old.read() == before
+            assert flash.read_bytes() != before
+        saved = flash.read_bytes()
+        # The system ends the board in the middle of the next write.
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (40_000, 40_000))
+        with pytest.raises(LinkError):
+            board.save()
+        assert process.wait(10) == -signal.SIGXFSZ
+    assert flash.read_bytes() == saved
+    with started() as (_, board):
+        assert board.recall().save_sequence == 5
+        assert board.holds(payload, 10_000, board.status())
+
+
+@pytest.mark.parametrize("through", ["--flash", "native:"])
+def test_a_flash_file_that_cannot_be_used_is_told_at_once(cli, tmp_path: Path, through: str) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "notes.txt").write_text("mine")
+    for name, says in (
+        ("no/flash.bin", "No such file or directory"),
+        ("folder", "not a file"),
+        ("notes.txt/flash.bin", "Not a directory"),
+    ):
+        path = tmp_path / name
+        listen = ("--listen", f"unix:{tmp_path / 'b'}")
+        done = (
+            cli("board", "emulate", "native", *listen, "--flash", path)
+            if through == "--flash"
+            else cli("board", "hello", "--port", f"native:{path}")
+        )
+        assert done.returncode == 3, (name, done.stderr)
+        assert says in done.stderr
+        assert done.stderr.count("\n") == 1
+
+
+def test_a_file_that_is_no_flash_is_left_alone(cli, tmp_path: Path) -> None:
+    path = tmp_path / "notes.bin"
+    for size in (4, 100_000):
+        path.write_bytes(bytes(size))
+        done = cli("board", "emulate", "native", "--listen", f"unix:{tmp_path / 'b'}", "--flash", path)
+        assert done.returncode == 3
+        assert f"{path}: not a flash file of" in done.stderr
+        assert done.stderr.count("\n") == 1
+        assert path.read_bytes() == bytes(size)

@@ -6,6 +6,7 @@
 #include <arpa/inet.h>
 #include <errno.h>
 #include <fcntl.h>
+#include <limits.h>
 #include <netdb.h>
 #include <poll.h>
 #include <pty.h>
@@ -51,6 +52,26 @@ static void die(const char *what)
 {
     fprintf(stderr, "evlcp-board: %s: %s\n", what, strerror(errno));
     exit(1);
+}
+
+static void die_of_file(const char *path)
+{
+    fprintf(stderr, "evlcp-board: %s: the flash file cannot be used: %s\n", path, strerror(errno));
+    exit(3);
+}
+
+/* A whole number from 0 to `most`. */
+static uint64_t number(const char *option, const char *text, int base, uint64_t most)
+{
+    char *end;
+    errno = 0;
+    unsigned long long value = strtoull(text, &end, base);
+    if (errno != 0 || *text < '0' || *text > '9' || *end != '\0' || value > most) {
+        fprintf(stderr, "evlcp-board: %s: %s, expected a whole number from 0 to %llu\n", option, text,
+                (unsigned long long)most);
+        exit(2);
+    }
+    return value;
 }
 
 static uint64_t now_ns(void)
@@ -103,6 +124,7 @@ static int listen_tcp(const char *host_port)
         errno = EINVAL;
         die(host_port);
     }
+    (void)number("--listen tcp:HOST:PORT", colon + 1, 10, 65535u);
     memcpy(host, host_port, (size_t)(colon - host_port));
     host[colon - host_port] = '\0';
     struct addrinfo hints = {.ai_family = AF_INET, .ai_socktype = SOCK_STREAM, .ai_flags = AI_PASSIVE};
@@ -184,22 +206,61 @@ static void record_to_file(void *context, const uint8_t record[NATIVE_RECORD_BYT
 static void load_flash(struct native *board, const char *path)
 {
     FILE *file = fopen(path, "rb");
-    if (file == NULL)
+    if (file == NULL && errno == ENOENT)
         return; /* a new board */
-    size_t count = fread(board->flash, 1, sizeof board->flash, file);
-    fclose(file);
-    if (count != sizeof board->flash) {
-        fprintf(stderr, "evlcp-board: %s: %zu bytes, expected %zu\n", path, count, sizeof board->flash);
-        exit(1);
+    struct stat found;
+    if (file == NULL || fstat(fileno(file), &found) < 0)
+        die_of_file(path);
+    if (!S_ISREG(found.st_mode) || found.st_size != (off_t)sizeof board->flash) {
+        fprintf(stderr, "evlcp-board: %s: not a flash file of %zu bytes\n", path, sizeof board->flash);
+        exit(3);
     }
+    if (fread(board->flash, sizeof board->flash, 1, file) != 1)
+        die_of_file(path);
+    fclose(file);
     native_reset(board);
 }
 
+/* A new file takes the place of the old one when it is whole: a kill or a power failure leaves one of the two. */
 static void store_flash(const struct native *board, const char *path)
 {
-    FILE *file = fopen(path, "wb");
-    if (file == NULL || fwrite(board->flash, sizeof board->flash, 1, file) != 1 || fclose(file) != 0)
-        die(path);
+    char name[4096];
+    struct stat old;
+    int length = snprintf(name, sizeof name, "%s.new", path);
+    if (length < 0 || (size_t)length >= sizeof name) {
+        errno = ENAMETOOLONG;
+        die_of_file(path);
+    }
+    int fd = open(name, O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0666);
+    if (fd < 0 || (stat(path, &old) == 0 && fchmod(fd, old.st_mode & 07777u) < 0))
+        die_of_file(name);
+    const uint8_t *bytes = board->flash[0];
+    for (size_t at = 0; at < sizeof board->flash;) {
+        ssize_t count = write(fd, bytes + at, sizeof board->flash - at);
+        if (count < 0 && errno != EINTR)
+            die_of_file(name);
+        at += count > 0 ? (size_t)count : 0u;
+    }
+    if (fsync(fd) < 0 || close(fd) < 0 || rename(name, path) < 0)
+        die_of_file(name);
+    char *slash = strrchr(name, '/');
+    if (slash != NULL)
+        slash[1] = '\0';
+    int folder = open(slash != NULL ? name : ".", O_RDONLY | O_DIRECTORY | O_CLOEXEC);
+    if (folder >= 0) {
+        (void)fsync(folder); /* not every file system can */
+        close(folder);
+    }
+}
+
+/* Tells the slots' content apart: each SAVE has another header. Without the headers' own CRC: a CRC over bytes
+   and their CRC is the same for all bytes. */
+static uint32_t headers(const struct native *board)
+{
+    uint32_t crc = 0u;
+    for (uint32_t i = 0; i < EVLCP_SLOTS; i++)
+        crc = evlcp_crc32(crc, board->flash[i], EVLCP_SLOT_HEADER_BYTES - 4u);
+    return crc;
 }
 
 static struct options parse(int argc, char **argv)
@@ -221,9 +282,9 @@ static struct options parse(int argc, char **argv)
         else if (strcmp(name, "--flash") == 0)
             o.flash = argv[i];
         else if (strcmp(name, "--baud") == 0)
-            o.baud = strtoull(argv[i], NULL, 10);
+            o.baud = number(name, argv[i], 10, UINT64_MAX);
         else if (strcmp(name, "--id") == 0)
-            o.id = strtoull(argv[i], NULL, 0);
+            o.id = number(name, argv[i], 0, UINT64_MAX);
         else {
             fprintf(stderr, "evlcp-board: unknown option %s\n", name);
             exit(2);
@@ -301,8 +362,14 @@ int main(int argc, char **argv)
     native_init(&board);
     for (int i = 0; i < 8; i++)
         board.unique_id[11 - i] = (uint8_t)(o.id >> 8 * i);
-    if (o.flash != NULL)
+    static char target[PATH_MAX];
+    const char *flash_file = o.flash;
+    if (o.flash != NULL) {
         load_flash(&board, o.flash);
+        if (realpath(o.flash, target) != NULL)
+            flash_file = target; /* a link stays one */
+        store_flash(&board, flash_file); /* a place that takes no SAVE is told now */
+    }
     FILE *leds = NULL;
     if (o.leds != NULL) {
         leds = fopen(o.leds, "wb");
@@ -316,9 +383,7 @@ int main(int argc, char **argv)
     struct throttle in = {.baud = o.baud, .last_ns = now_ns()};
     struct throttle out = in;
     uint64_t began = now_ns();
-    uint32_t saved = 0u;
-    for (uint32_t i = 0; i < EVLCP_SLOTS; i++)
-        saved = evlcp_crc32(saved, board.flash[i], EVLCP_SLOT_HEADER_BYTES);
+    uint32_t saved = headers(&board);
 
     while (!ended) {
         bool throttled = in.baud != 0u && line.fd >= 0;
@@ -342,11 +407,9 @@ int main(int argc, char **argv)
         }
         native_run(&board, (ns - began) / (1000000000u / NATIVE_TICK_HZ));
         /* Before the answer to a SAVE goes out, the slots are in the file. */
-        uint32_t flash = 0u;
-        for (uint32_t i = 0; i < EVLCP_SLOTS; i++)
-            flash = evlcp_crc32(flash, board.flash[i], EVLCP_SLOT_HEADER_BYTES);
-        if (flash != saved && o.flash != NULL)
-            store_flash(&board, o.flash);
+        uint32_t flash = headers(&board);
+        if (flash != saved && flash_file != NULL)
+            store_flash(&board, flash_file);
         saved = flash;
         if (line.fd >= 0)
             write_line(&board, &line, &out, ns);
