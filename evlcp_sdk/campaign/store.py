@@ -65,8 +65,8 @@ class Store:
                     self._base.execute(f"PRAGMA user_version = {SCHEMA}")
         except sqlite3.DatabaseError as fault:
             self._close()
-            if create and not isinstance(fault, sqlite3.OperationalError):
-                raise InputError(f"{path}: {fault}") from fault
+            if not isinstance(fault, sqlite3.OperationalError):
+                raise _no_store(path, fault) from fault
             raise (ConfigError if create else InputError)(f"{path}: {fault}") from fault
         except EvlcpError:
             self._close()
@@ -91,14 +91,23 @@ class Store:
         except sqlite3.DatabaseError as fault:
             raise EvlcpError(f"{self.path}: cannot be written: {fault}; what was finished is kept") from fault
 
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.DatabaseError, ValueError, TypeError, KeyError, AttributeError) as fault:
+            raise _no_store(self.path, fault) from fault
+
     def adopt(self, plan: Plan) -> None:
         """Take a campaign's plan; a later plan of the same campaign replaces it.
 
         Raises:
             ConfigError: The file holds another campaign.
+            InputError: The file is damaged.
             EvlcpError: The file cannot be written.
         """
-        row = self._base.execute("SELECT name FROM plan").fetchone()
+        with self._reading():
+            row = self._base.execute("SELECT name FROM plan").fetchone()
         if row is not None and row[0] != plan.name:
             raise ConfigError(
                 f"{self.path}: holds the campaign '{row[0]}', not '{plan.name}'; give another file"
@@ -111,12 +120,13 @@ class Store:
         """The plan as `Plan.to_dict` gave it.
 
         Raises:
-            InputError: There is none.
+            InputError: There is none, or the file is damaged.
         """
-        row = self._base.execute("SELECT body FROM plan").fetchone()
-        if row is None:
+        with self._reading():
+            row = self._base.execute("SELECT body FROM plan").fetchone()
+            table: dict[str, Any] | None = None if row is None else json.loads(row[0])
+        if table is None:
             raise InputError(f"{self.path}: no campaign has begun in it")
-        table: dict[str, Any] = json.loads(row[0])
         return table
 
     def put(self, results: list[tuple[str, Statistics]]) -> None:
@@ -137,6 +147,15 @@ class Store:
                 raise
 
     def results(self) -> dict[str, Statistics]:
-        """Task id to statistics, of all that is kept."""
-        rows = self._base.execute("SELECT task, statistics FROM result")
-        return {task: Statistics.from_dict(json.loads(text)) for task, text in rows}
+        """Task id to statistics, of all that is kept.
+
+        Raises:
+            InputError: The file is damaged.
+        """
+        with self._reading():
+            rows = self._base.execute("SELECT task, statistics FROM result")
+            return {task: Statistics.from_dict(json.loads(text)) for task, text in rows}
+
+
+def _no_store(path: Path, fault: Exception) -> InputError:
+    return InputError(f"{path}: damaged, or no results file of evlcp sweep ({type(fault).__name__}: {fault})")

@@ -63,7 +63,7 @@ def simulate(
     import json
     import time
 
-    from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.errors import ConfigError, EvlcpError
     from evlcp_sdk.io import open_writer
     from evlcp_sdk.sim import Simulation, load_scene, preset_names, preset_text, truth_of
 
@@ -102,7 +102,12 @@ def simulate(
                 writer.write(events)
                 advance(simulation.done_s)
     truth = truth_of(simulation) | {"bytes": out.stat().st_size}
-    write_text(json.dumps(truth), truth_path)
+    try:
+        write_text(json.dumps(truth), truth_path)
+    except EvlcpError as fault:
+        # An older truth may lie there; the scores of another recording would look like this one's.
+        out.unlink(missing_ok=True)
+        raise type(fault)(f"{fault}; {out} is taken away, as it would be without its truth") from fault
     written = [out, truth_path, *_on_earth(simulation, out)]
     elapsed_s = time.perf_counter() - began
     counts = simulation.counts

@@ -211,6 +211,26 @@ def test_someone_elses_database_is_left_alone(tmp_path: Path) -> None:
         Store(path, create=True)
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "DROP TABLE plan; DROP TABLE result",
+        "UPDATE plan SET body = '{'; UPDATE result SET statistics = '{'",
+        "UPDATE plan SET body = x'ff'; UPDATE result SET statistics = '[1]'",
+    ],
+)
+def test_a_damaged_store_is_named(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "r.sqlite"
+    collected(fake_plan(), path)
+    base = sqlite3.connect(path)
+    base.executescript(damage)
+    base.close()
+    with Store(path) as store:
+        for read in (store.plan, store.results):
+            with pytest.raises(InputError, match=r"r\.sqlite: damaged, or no results file of evlcp sweep"):
+                read()
+
+
 def test_stores_that_cannot_be_opened(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no results file there"):
         Store(tmp_path / "none.sqlite")

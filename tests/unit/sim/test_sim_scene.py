@@ -268,6 +268,16 @@ def test_simulate_writes_a_recording_and_its_truth(
     assert "drive-30kmh" in evlcp("simulate", "--presets").out
 
 
+def test_a_recording_without_its_truth_does_not_stay(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+    recording = tmp_path / "a.raw"
+    (tmp_path / "a.truth.json").mkdir()
+    done = evlcp("simulate", "--preset", "night", "-o", recording, "--set", "duration_s=0.02")
+    assert done.code == 1
+    assert "a.truth.json: cannot be written" in done.err
+    assert "a.raw is taken away" in done.err
+    assert not recording.exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
