@@ -271,4 +271,9 @@ def read_truth(path: Path | str) -> dict[str, Any]:
     if missing:
         raise InputError(f"{path}: not a scene's truth: {', '.join(sorted(missing))} missing")
     assert isinstance(truth, dict)
+    for key in sorted(wanted):
+        kind, what = (dict, "a table") if key == "scene" else (list, "a list")
+        if not isinstance(truth[key], kind):
+            text = f"{truth[key]!r:.40}"
+            raise InputError(f"{path}: not a scene's truth: {key} = {text}: expected {what}")
     return truth

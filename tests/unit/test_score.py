@@ -132,6 +132,11 @@ def test_a_perfect_result_scores_perfectly() -> None:
         ("t_us,symbols\n", "{}", "frames.csv: without the columns distance_m, x_px, y_px"),
         (",".join(COLUMNS) + "\n", "{}", "not a scene's truth: bar_centre_px, bars, distance_m, scene, t_s"),
         (",".join(COLUMNS) + "\n", "[]", "not a scene's truth"),
+        (
+            ",".join(COLUMNS) + "\n",
+            '{"scene": {}, "bars": 3, "t_s": [], "distance_m": [], "bar_centre_px": []}',
+            "t.json: not a scene's truth: bars = 3: expected a list",
+        ),
         (",".join(COLUMNS) + "\n", "{", "not JSON"),
         (",".join(COLUMNS) + "\n", None, "cannot be read"),
     ],
