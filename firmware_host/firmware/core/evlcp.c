@@ -684,6 +684,17 @@ void evlcp_chip(struct evlcp *e)
     evlcp_player_chip(&e->player, &e->banks);
 }
 
+void evlcp_failed(struct evlcp *e)
+{
+    atomic_store(&e->player.want_play, false);
+    evlcp_player_blank(&e->player);
+    e->test.on = false;
+    hal_health(&e->health);
+    e->latched |= e->health.faults & HOLDS_DARK;
+    if ((e->health.faults & HOLDS_DARK) == 0u)
+        atomic_store(&e->player.chip_lost, true);
+}
+
 void evlcp_poll(struct evlcp *e)
 {
     struct evlcp_datagram datagram;

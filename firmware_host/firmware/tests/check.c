@@ -586,6 +586,53 @@ static void test_faults_darken(void)
     EXPECT(ask_status(&h).state == EVLCP_STATE_PLAYING);
 }
 
+static bool is_dark(const struct native *board)
+{
+    static const uint8_t none[EVLCP_ROW_BYTES];
+    return memcmp(board->shown, none, sizeof none) == 0;
+}
+
+static void test_hardware_that_fails_darkens(void)
+{
+    struct host h;
+    struct native *board = fresh(&h);
+    uint32_t crc = fill(&h, 0, 320u, 1);
+    EXPECT(commit(&h, 0, 1, 320u, crc) == EVLCP_STATUS_OK);
+    for (uint32_t stopping = 0; stopping < 2u; stopping++) {
+        EXPECT(ask(&h, EVLCP_TYPE_START, NULL, 0) == EVLCP_STATUS_OK);
+        run_chips(board, 10u);
+        if (stopping != 0u) {
+            EXPECT(ask(&h, EVLCP_TYPE_STOP, NULL, 0) == EVLCP_STATUS_OK);
+            EXPECT(ask_status(&h).state == EVLCP_STATE_STOPPING);
+        }
+        evlcp_failed(&board->core);
+        EXPECT(is_dark(board) && board->period == 0u);
+        struct evlcp_status_reply s = ask_status(&h);
+        EXPECT(s.state == EVLCP_STATE_FAULT && s.faults == EVLCP_FAULT_CHIP_LOST);
+        EXPECT(ask(&h, EVLCP_TYPE_STOP, NULL, 0) == EVLCP_STATUS_OK);
+        run_chips(board, 10u);
+        EXPECT(is_dark(board) && ask_status(&h).state == EVLCP_STATE_FAULT);
+    }
+    /* What the health tells is the fault's name. */
+    EXPECT(ask(&h, EVLCP_TYPE_START, NULL, 0) == EVLCP_STATUS_OK);
+    run_chips(board, 10u);
+    board->health.faults = EVLCP_FAULT_CLOCK;
+    evlcp_failed(&board->core);
+    struct evlcp_status_reply s = ask_status(&h);
+    EXPECT(is_dark(board) && s.state == EVLCP_STATE_FAULT && s.faults == EVLCP_FAULT_CLOCK);
+    EXPECT(ask(&h, EVLCP_TYPE_START, NULL, 0) == EVLCP_STATUS_HARDWARE_FAULT);
+    board->health.faults = 0u;
+    EXPECT(ask(&h, EVLCP_TYPE_START, NULL, 0) == EVLCP_STATUS_OK);
+    run_chips(board, 10u);
+    EXPECT(ask_status(&h).state == EVLCP_STATE_PLAYING);
+    /* It ends a LED test as well. */
+    EXPECT(ask(&h, EVLCP_TYPE_BLANK, NULL, 0) == EVLCP_STATUS_OK);
+    const uint8_t walk[] = {5u, 5u, 100u, 0u};
+    EXPECT(ask(&h, EVLCP_TYPE_LED_TEST, walk, sizeof walk) == EVLCP_STATUS_OK && !is_dark(board));
+    evlcp_failed(&board->core);
+    EXPECT(is_dark(board) && ask_status(&h).state == EVLCP_STATE_FAULT);
+}
+
 static void test_save_and_recall(void)
 {
     struct host h;
@@ -831,6 +878,7 @@ int main(int argc, char **argv)
     test_configure_limits();
     test_watchdog();
     test_faults_darken();
+    test_hardware_that_fails_darkens();
     test_save_and_recall();
     test_slot_of_older_firmware();
     test_led_test();

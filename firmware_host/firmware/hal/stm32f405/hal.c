@@ -16,7 +16,24 @@
 
    The stream goes round and round over two rows and interrupts after each: the core fills the row that has just
    gone. The other one is on its way already, for in direct mode the stream fetches a word ahead. So a row has a
-   whole chip of time to be handed in, and is on show two chips later. */
+   whole chip of time to be handed in, and is on show two chips later.
+
+   Dark is output enable, a pin that needs neither the stream nor a timer. What sets it by itself:
+
+   | what fails                             | what notices, and when                                          |
+   |----------------------------------------|-----------------------------------------------------------------|
+   | no chip comes: TIM1, DMA, interrupts   | SysTick, which every chip restarts, after 1.5 chips;            |
+   |                                        | the main loop by TIM2, after 1.5 chips                          |
+   | stream: transfer, direct mode, FIFO    | its interrupt, at once; off by itself: the next chip            |
+   | SPI1 takes no word; the latch timer    | the main loop, after 2 chips                                    |
+   | stops                                  |                                                                 |
+   | crystal                                | clock security, NMI, at once; goes on at 16 MHz, without chips  |
+   | supply below 2.8 V                     | PVD interrupt, at once; below the brown-out level, reset        |
+   | core exception                         | hal_panic, at once; then the independent watchdog's reset       |
+   | main loop hangs, core clock stands     | independent watchdog (LSI): reset in 70 to 190 ms               |
+
+   Reset leaves PB0 an input: the pull-up on the board is what keeps the LEDs dark then. A board that comes from the
+   watchdog's reset stays dark, with CHIP_LOST, until START, even if a slot says autostart. */
 #include "evlcp.h"
 #include "startup.h"
 
@@ -32,13 +49,46 @@
 #define RCC_CR REGISTER(RCC + 0x00u)
 #define RCC_PLLCFGR REGISTER(RCC + 0x04u)
 #define RCC_CFGR REGISTER(RCC + 0x08u)
+#define RCC_CIR REGISTER(RCC + 0x0cu)
 #define RCC_AHB1ENR REGISTER(RCC + 0x30u)
 #define RCC_APB1ENR REGISTER(RCC + 0x40u)
 #define RCC_APB2ENR REGISTER(RCC + 0x44u)
+#define RCC_CSR REGISTER(RCC + 0x74u)
 #define HSE_ON 0x00010000u
 #define HSE_READY 0x00020000u
 #define PLL_ON 0x01000000u
 #define PLL_READY 0x02000000u
+#define CLOCK_SECURITY_ON 0x00080000u
+#define CLOCK_SECURITY_CLEAR 0x00800000u
+#define RESET_FLAGS_CLEAR 0x01000000u
+#define RESET_BY_IWDG 0x20000000u
+
+#define IWDG 0x40003000u
+#define IWDG_KR REGISTER(IWDG + 0x0u)
+#define IWDG_PR REGISTER(IWDG + 0x4u)
+#define IWDG_RLR REGISTER(IWDG + 0x8u)
+#define IWDG_SR REGISTER(IWDG + 0xcu)
+#define IWDG_START 0xccccu
+#define IWDG_UNLOCK 0x5555u
+#define IWDG_FEED 0xaaaau
+#define IWDG_BY_32 3u      /* counts of a millisecond, by an LSI of 17 to 47 kHz of 0.7 to 1.9 ms */
+#define IWDG_SHORT 100u
+#define IWDG_LONG 4095u    /* while a sector is erased, or at 16 MHz: the LEDs are dark then */
+
+#define PWR_CR REGISTER(0x40007000u)
+#define PVD_2V8 0x000000d0u /* level 6, on */
+#define EXTI 0x40013c00u
+#define EXTI_IMR REGISTER(EXTI + 0x00u)
+#define EXTI_RTSR REGISTER(EXTI + 0x08u)
+#define EXTI_PR REGISTER(EXTI + 0x14u)
+#define EXTI_PVD 0x00010000u
+
+#define SYSTICK_CSR REGISTER(0xe000e010u)
+#define SYSTICK_RVR REGISTER(0xe000e014u)
+#define SYSTICK_CVR REGISTER(0xe000e018u)
+#define SYSTICK_ON 0x7u /* core clock, exception */
+#define SCB_ICSR REGISTER(0xe000ed04u)
+#define SYSTICK_FORGET 0x02000000u
 
 #define FLASH 0x40023c00u
 #define FLASH_ACR REGISTER(FLASH + 0x00u)
@@ -85,6 +135,7 @@
 #define SPI_DR REGISTER(SPI1 + 0x0cu)
 #define SPI_EMPTY 0x02u
 #define SPI_BUSY 0x80u
+#define SPI_ON 0x40u
 
 #define TIM1 0x40010000u
 #define TIM2 0x40000000u
@@ -113,7 +164,10 @@
 #define DMA_ENABLE 0x1u
 #define DMA_S5_HALF 0x00000400u
 #define DMA_S5_ALL 0x00000800u
+#define DMA_S5_ERRORS 0x00000340u /* transfer, direct mode, FIFO */
 #define DMA_S5_FLAGS 0x00000f40u
+#define DMA_ERROR_INTERRUPTS 0x6u /* transfer, direct mode */
+#define DMA_FIFO_INTERRUPT 0x80u
 
 #define DAC_CR REGISTER(0x40007400u)
 #define DAC_DHR12R1 REGISTER(0x40007408u)
@@ -122,23 +176,29 @@
 #define SLOT_ADDRESS(slot) (0x080c0000u + 0x20000u * (slot))
 #define SLOT_SECTOR(slot) (10u + (slot))
 
+#define IRQ_PVD 1u
 #define IRQ_USART1 37u
 #define IRQ_DMA2_STREAM5 68u
 
 #define LEVEL_MAX_MA 60u
 #define DAC_FULL 4095u
 #define WAIT_LOOPS 1000000u
+#define DMA_WAIT_LOOPS 1000u /* a stream ends with the word under way */
+#define LOOKS_MIN 16u        /* longer than a word is on its way to the chain */
 
 extern uint32_t link_stack[];
 
 static struct evlcp board;
 static volatile uint16_t words[2][SLOTS_PER_CHIP]; /* two rows on their way to the chain */
 static uint32_t gone;                              /* the row that may be filled */
-static bool clock_failed;
+static volatile bool clock_failed;
 static volatile bool in_chip;      /* the chip interrupt runs the core */
 static volatile uint32_t draining; /* chips until the chain is at rest after the core has stopped */
 static volatile uint32_t served;   /* chip interrupts since the start, up to 2 */
 static bool overrun;               /* the chip interrupt missed a row */
+static volatile bool streaming;    /* TIM1 and the stream are to run */
+static volatile bool failed;       /* went dark by itself; the core is yet to be told */
+static volatile uint32_t chip_at;  /* TIM2 at the latest chip interrupt */
 static uint32_t slot_cycles;
 static uint32_t last_count;
 static uint32_t count_rest;
@@ -168,6 +228,8 @@ static void outputs_off(void)
 static void outputs_on(void)
 {
     GPIO_BSRR(GPIOB) = PIN_CLEAR(0);
+    if (failed) /* just now, by an interrupt */
+        outputs_off();
 }
 
 /* LED 0 leaves first and ends at the far end of the chain: it is output 15 of the last register. */
@@ -206,16 +268,69 @@ void hal_leds(const uint8_t *row, uint32_t chip)
     }
 }
 
+/* Dark first: nothing of what follows is sure to work. */
 static void chips_stop(void)
 {
+    outputs_off();
+    streaming = false;
+    SYSTICK_CSR = 0u;
     TIM_CR1(TIM1) = 0u;
+    TIM_DIER(TIM1) = 0u; /* or an update would ask for a word that the next stream hands out */
     TIM_CR1(TIM3) = 0u;
     DMA_S5CR = 0u;
-    for (uint32_t n = 0; n < WAIT_LOOPS && (DMA_S5CR & DMA_ENABLE) != 0u; n++) {
+    for (uint32_t n = 0; n < DMA_WAIT_LOOPS && (DMA_S5CR & DMA_ENABLE) != 0u; n++) {
     }
     DMA_HIFCR = DMA_S5_FLAGS;
+    SCB_ICSR = SYSTICK_FORGET;
     irq_forget(IRQ_DMA2_STREAM5);
     draining = 0u;
+}
+
+static void fail(void)
+{
+    failed = true;
+    chips_stop();
+}
+
+/* Something that should go on all the time, as the main loop sees it. */
+struct look {
+    uint32_t good_at;
+    uint32_t bad;
+};
+
+static bool stands(struct look *look, bool good, uint32_t now, uint32_t most)
+{
+    if (good || look->bad == 0u) {
+        look->good_at = now;
+        look->bad = good ? 0u : 1u;
+        return false;
+    }
+    look->bad++;
+    return look->bad > LOOKS_MIN && now - look->good_at > most;
+}
+
+static struct look spi_look;
+static struct look latch_look;
+static uint32_t latch_count;
+static bool latch_seen; /* it has counted since the start */
+
+/* Called without pause while chips may run. */
+static void watch_chips(void)
+{
+    uint32_t at = chip_at; /* before the count: a chip in between makes it no older */
+    uint32_t now = TIM_CNT(TIM2);
+    uint32_t chip = SLOTS_PER_CHIP * slot_cycles / 2u;
+    if (!streaming)
+        return;
+    bool bad = now - at > chip + chip / 2u;
+    bad |= stands(&spi_look, (SPI_SR & (SPI_EMPTY | SPI_BUSY)) == SPI_EMPTY && (SPI_CR1 & SPI_ON) != 0u, now,
+                  2u * chip);
+    uint32_t count = TIM_CNT(TIM3);
+    latch_seen |= count != latch_count;
+    bad |= stands(&latch_look, count != latch_count || !latch_seen, now, 2u * chip);
+    latch_count = count;
+    if (bad && streaming) /* it may have ended meanwhile */
+        fail();
 }
 
 static void chips_start(uint32_t ticks)
@@ -233,7 +348,8 @@ static void chips_start(uint32_t ticks)
     TIM_CR2(TIM1) = 0x10u; /* TRGO is the enable bit */
     TIM_PSC(TIM1) = 0u;
     TIM_ARR(TIM1) = slot_cycles - 1u;
-    TIM_EGR(TIM1) = 1u;
+    TIM_DIER(TIM1) = 0u;
+    TIM_EGR(TIM1) = 1u; /* an update too, which must not ask for a word */
     TIM_SR(TIM1) = 0u;
     TIM_DIER(TIM1) = 0x100u; /* update -> DMA */
 
@@ -254,11 +370,21 @@ static void chips_start(uint32_t ticks)
     DMA_S5PAR = SPI1 + 0x0cu;
     DMA_S5M0AR = (uint32_t)(uintptr_t)words;
     DMA_S5NDTR = 2u * SLOTS_PER_CHIP;
-    DMA_S5FCR = 0u;
     /* Channel 6 (TIM1_UP), very high priority, 16 bits both sides, memory counts up, circular, memory to
        peripheral, interrupts when half and when all have gone. */
     DMA_S5CR = 6u << 25 | 3u << 16 | 1u << 13 | 1u << 11 | 1u << 10 | 1u << 8 | 1u << 6 | 1u << 4 | 1u << 3;
-    DMA_S5CR |= DMA_ENABLE;
+    DMA_S5FCR = DMA_FIFO_INTERRUPT;
+    DMA_S5CR |= DMA_ERROR_INTERRUPTS | DMA_ENABLE;
+
+    SYSTICK_RVR = SLOTS_PER_CHIP * slot_cycles * 3u / 2u - 1u;
+    SYSTICK_CVR = 0u;
+    spi_look.bad = 0u;
+    latch_look.bad = 0u;
+    latch_seen = false;
+    latch_count = TIM_CNT(TIM3);
+    chip_at = TIM_CNT(TIM2);
+    streaming = true;
+    SYSTICK_CSR = SYSTICK_ON;
     TIM_CR1(TIM1) = 1u;
 }
 
@@ -273,9 +399,10 @@ void hal_chips(uint32_t ticks)
         chips_stop();
         return;
     }
-    while (draining != 0u) { /* at most three chips */
-    }
-    chips_start(ticks);
+    while (draining != 0u) /* at most three chips */
+        watch_chips();
+    if (!failed)
+        chips_start(ticks);
 }
 
 uint32_t hal_lateness(void)
@@ -344,13 +471,25 @@ static void flash_unlock(void)
     FLASH_SR = FLASH_ERRORS;
 }
 
+static void iwdg_reload(uint32_t counts)
+{
+    IWDG_KR = IWDG_UNLOCK;
+    IWDG_PR = IWDG_BY_32;
+    IWDG_RLR = counts;
+    for (uint32_t n = 0; n < WAIT_LOOPS && IWDG_SR != 0u; n++) { /* some periods of the LSI */
+    }
+    IWDG_KR = IWDG_FEED;
+}
+
 bool hal_flash_erase(uint8_t slot)
 {
+    iwdg_reload(IWDG_LONG); /* the core stands while a sector is erased */
     flash_unlock();
     FLASH_CR = FLASH_WORDS | FLASH_SECTOR_ERASE | SLOT_SECTOR(slot) << 3;
     FLASH_CR |= FLASH_START;
     bool done = flash_done();
     FLASH_CR = FLASH_LOCK;
+    iwdg_reload(clock_failed ? IWDG_LONG : IWDG_SHORT);
     return done;
 }
 
@@ -364,6 +503,7 @@ bool hal_flash_write(uint8_t slot, uint32_t offset, const uint8_t *bytes, uint32
         evlcp_copy(last, bytes + i, count - i < 4u ? count - i : 4u);
         REGISTER(SLOT_ADDRESS(slot) + offset + i) = evlcp_get32(last);
         good = flash_done();
+        IWDG_KR = IWDG_FEED; /* 48 KiB take longer than it waits */
     }
     FLASH_CR = FLASH_LOCK;
     return good;
@@ -377,15 +517,47 @@ bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t coun
 
 void hal_panic(void)
 {
-    outputs_off();
     chips_stop();
+}
+
+static void silence_handler(void)
+{
+    if (streaming)
+        fail();
+}
+
+/* Clock security: the crystal has stopped, and the core runs on the 16 MHz RC oscillator. */
+static void clock_handler(void)
+{
+    outputs_off();
+    RCC_CIR |= CLOCK_SECURITY_CLEAR;
+    clock_failed = true;
+    fail();
+    RCC_CFGR = 0u; /* buses undivided: the host's line rate can be kept */
+    USART_BRR = HSI_HZ / EVLCP_BAUD;
+    IWDG_KR = IWDG_UNLOCK;
+    IWDG_RLR = IWDG_LONG;
+}
+
+static void supply_handler(void)
+{
+    EXTI_PR = EXTI_PVD;
+    fail();
 }
 
 static void chip_handler(void)
 {
     static const uint8_t dark[EVLCP_ROW_BYTES];
-    uint32_t flags = DMA_HISR & (DMA_S5_HALF | DMA_S5_ALL);
+    SYSTICK_CVR = 0u;
+    chip_at = TIM_CNT(TIM2);
+    uint32_t flags = DMA_HISR & DMA_S5_FLAGS;
     DMA_HIFCR = DMA_S5_FLAGS;
+    if (!streaming) /* chips_stop was under way */
+        return;
+    if ((flags & DMA_S5_ERRORS) != 0u || (DMA_S5CR & DMA_ENABLE) == 0u) {
+        fail();
+        return;
+    }
     gone = flags == DMA_S5_HALF ? 0u : 1u;
     overrun = flags == (DMA_S5_HALF | DMA_S5_ALL);
     /* The first row shifted was dark; once it is latched the outputs may be let on. */
@@ -449,13 +621,16 @@ static bool clock_start(void)
         return false;
     RCC_CFGR = 5u << 10 | 4u << 13; /* APB1 by 4, APB2 by 2 */
     RCC_CFGR |= 2u;
-    return ready(&RCC_CFGR, 0xcu, 8u);
+    if (!ready(&RCC_CFGR, 0xcu, 8u))
+        return false;
+    RCC_CR |= CLOCK_SECURITY_ON;
+    return true;
 }
 
 static void pins_start(void)
 {
     RCC_AHB1ENR |= 1u << 22 | 1u << 1 | 1u << 0;             /* DMA2, GPIOB, GPIOA */
-    RCC_APB1ENR |= 1u << 29 | 1u << 1 | 1u << 0;             /* DAC, TIM3, TIM2 */
+    RCC_APB1ENR |= 1u << 29 | 1u << 28 | 1u << 1 | 1u << 0;  /* DAC, PWR, TIM3, TIM2 */
     RCC_APB2ENR |= 1u << 12 | 1u << 4 | 1u << 0;             /* SPI1, USART1, TIM1 */
     GPIO_BSRR(GPIOB) = PIN(0);                               /* dark before the pin drives */
     GPIO_MODER(GPIOB) |= MODE(0, MODE_OUTPUT);
@@ -470,8 +645,13 @@ static void pins_start(void)
 
 int main(void)
 {
-    clock_failed = !clock_start();
+    bool by_watchdog = (RCC_CSR & RESET_BY_IWDG) != 0u;
+    RCC_CSR |= RESET_FLAGS_CLEAR;
+    if (!clock_start())
+        clock_failed = true;
     pins_start();
+    IWDG_KR = IWDG_START;
+    iwdg_reload(clock_failed ? IWDG_LONG : IWDG_SHORT);
     DAC_CR = 1u;
     /* 16 bits, master, most significant first, data taken on the rising edge, 84 MHz / 8. */
     SPI_CR2 = 0u;
@@ -481,13 +661,28 @@ int main(void)
     TIM_EGR(TIM2) = 1u;
     TIM_CR1(TIM2) = 1u;
     last_count = TIM_CNT(TIM2);
+    PWR_CR = PVD_2V8;
+    EXTI_RTSR = EXTI_PVD; /* rising: the supply falls */
     evlcp_init(&board);
-    irq_enable(IRQ_DMA2_STREAM5, 0x00u); /* the highest: nothing delays a row */
+    if (by_watchdog)
+        evlcp_failed(&board);
+    EXTI_PR = EXTI_PVD;
+    EXTI_IMR = EXTI_PVD;
+    /* SysTick and PVD are the highest, to get through a chip interrupt that hangs; nothing else delays a row. */
+    irq_enable(IRQ_PVD, 0x00u);
+    irq_enable(IRQ_DMA2_STREAM5, 0x10u);
     irq_enable(IRQ_USART1, 0x80u);
     USART_BRR = (clock_failed ? HSI_HZ : CORE_HZ / 2u) / EVLCP_BAUD;
     USART_CR1 = 1u << 13 | 1u << 5 | 1u << 3 | 1u << 2; /* on, receive interrupt, transmitter, receiver */
-    for (;;)
+    for (;;) {
         evlcp_poll(&board);
+        watch_chips();
+        if (failed) {
+            failed = false;
+            evlcp_failed(&board);
+        }
+        IWDG_KR = IWDG_FEED;
+    }
 }
 
 union vector {
@@ -496,12 +691,13 @@ union vector {
 };
 
 __attribute__((section(".vectors"), used)) static const union vector vectors[16 + 82] = {
-    {.stack = link_stack},      {.handler = reset_handler}, {.handler = fault_handler},
+    {.stack = link_stack},      {.handler = reset_handler}, {.handler = clock_handler},
     {.handler = fault_handler}, {.handler = fault_handler}, {.handler = fault_handler},
     {.handler = fault_handler}, {.handler = fault_handler}, {.handler = fault_handler},
     {.handler = fault_handler}, {.handler = fault_handler}, {.handler = fault_handler},
     {.handler = fault_handler}, {.handler = fault_handler}, {.handler = fault_handler},
-    {.handler = fault_handler},
+    {.handler = silence_handler},
+    [16 + IRQ_PVD] = {.handler = supply_handler},
     [16 + IRQ_USART1] = {.handler = receive_handler},
     [16 + IRQ_DMA2_STREAM5] = {.handler = chip_handler},
 };
