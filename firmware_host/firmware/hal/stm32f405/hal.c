@@ -20,17 +20,16 @@
 
    Dark is output enable, a pin that needs neither the stream nor a timer. What sets it by itself:
 
-   | what fails                             | what notices, and when                                          |
-   |----------------------------------------|-----------------------------------------------------------------|
-   | no chip comes: TIM1, DMA, interrupts   | SysTick, which every chip restarts, after 1.5 chips;            |
-   |                                        | the main loop by TIM2, after 1.5 chips                          |
-   | stream: transfer, direct mode, FIFO    | its interrupt, at once; off by itself: the next chip            |
-   | SPI1 takes no word; the latch timer    | the main loop, after 2 chips                                    |
-   | stops                                  |                                                                 |
-   | crystal                                | clock security, NMI, at once; goes on at 16 MHz, without chips  |
-   | supply below 2.8 V                     | PVD interrupt, at once; below the brown-out level, reset        |
-   | core exception                         | hal_panic, at once; then the independent watchdog's reset       |
-   | main loop hangs, core clock stands     | independent watchdog (LSI): reset in 70 to 190 ms               |
+   | what fails                              | what notices, and when                                  |
+   |-----------------------------------------|---------------------------------------------------------|
+   | no chip comes: TIM1, DMA, its interrupt | SysTick, which every chip restarts, after 1.5 chips;    |
+   |                                         | the main loop by TIM2, after 1.5 chips                  |
+   | the stream: transfer, direct mode, FIFO | its interrupt, at once                                  |
+   | SPI1 takes no word, TIM3 stands         | the main loop, after 1.5 chips                          |
+   | the crystal                             | clock security (NMI), at once; then 16 MHz, no chips    |
+   | the supply is below 2.8 V               | PVD interrupt, at once; brown-out reset (option bytes)  |
+   | the core: an exception                  | hal_panic, at once; then the watchdog's reset           |
+   | the main loop hangs, the core stands    | independent watchdog on the LSI: reset in 70 to 190 ms  |
 
    Reset leaves PB0 an input: the pull-up on the board is what keeps the LEDs dark then. A board that comes from the
    watchdog's reset stays dark, with CHIP_LOST, until START, even if a slot says autostart. */
@@ -319,15 +318,14 @@ static void watch_chips(void)
 {
     uint32_t at = chip_at; /* before the count: a chip in between makes it no older */
     uint32_t now = TIM_CNT(TIM2);
-    uint32_t chip = SLOTS_PER_CHIP * slot_cycles / 2u;
+    uint32_t most = SLOTS_PER_CHIP * slot_cycles / 2u * 3u / 2u; /* 1.5 chips of TIM2, at half the core clock */
     if (!streaming)
         return;
-    bool bad = now - at > chip + chip / 2u;
-    bad |= stands(&spi_look, (SPI_SR & (SPI_EMPTY | SPI_BUSY)) == SPI_EMPTY && (SPI_CR1 & SPI_ON) != 0u, now,
-                  2u * chip);
+    bool bad = now - at > most;
+    bad |= stands(&spi_look, (SPI_SR & (SPI_EMPTY | SPI_BUSY)) == SPI_EMPTY && (SPI_CR1 & SPI_ON) != 0u, now, most);
     uint32_t count = TIM_CNT(TIM3);
     latch_seen |= count != latch_count;
-    bad |= stands(&latch_look, count != latch_count || !latch_seen, now, 2u * chip);
+    bad |= stands(&latch_look, count != latch_count || !latch_seen, now, most);
     latch_count = count;
     if (bad && streaming) /* it may have ended meanwhile */
         fail();

@@ -1,0 +1,805 @@
+"""An STM32F405 with a bar of LEDs on it, for the real image: the core by Unicorn, the rest from RM0090.
+
+It knows nothing of the firmware but the wiring of the board (the table in hal.c). Peripherals are event
+models: what they do between two instructions is worked out from how they were set up. Time is in units of
+1/336 MHz. Timers, DMA, SPI and the latch are exact to the clock against each other; an instruction counts as
+one clock of the core, so its speed is an estimate. The timers, the stream, SPI, USART and SysTick raise at a
+setting that they do not know; ports, PWR, DAC and EXTI keep what is written.
+"""
+
+import heapq
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+import unicorn
+from unicorn import arm_const
+
+UNIT_HZ = 336_000_000
+HSI_HZ, HSE_HZ, LSI_HZ = 16_000_000, 8_000_000, 32_000
+US = UNIT_HZ // 1_000_000
+LEDS = 96
+
+RETURN = 0x1FFE0000
+"""Where BX LR goes at the end of an exception: a place the part does not have."""
+
+RESET_BY_PIN, RESET_BY_IWDG = 1 << 26, 1 << 29
+SLICE = 160
+"""Instructions from one look at the events to the next, at most: 1 us at 168 MHz."""
+
+
+class Timer:
+    """TIM1 to TIM3, as far as the board needs: up-counting, update, PWM mode 1 on channel 1, trigger mode."""
+
+    CR1, CR2, SMCR, DIER, SR, EGR, CCMR1, CCER, CNT, PSC, ARR, CCR1 = (
+        *(0x00, 0x04, 0x08, 0x0C, 0x10, 0x14, 0x18, 0x20, 0x24, 0x28, 0x2C, 0x34),
+    )
+
+    def __init__(self, chip: "Stm32", name: str) -> None:
+        self.chip, self.name = chip, name
+        self.r = dict.fromkeys((0x00, 0x04, 0x08, 0x0C, 0x10, 0x18, 0x20, 0x24, 0x28, 0x34), 0)
+        self.r[self.ARR] = 0xFFFFFFFF if name == "TIM2" else 0xFFFF
+        self.since = 0  # when the counter stood at `held`
+        self.held = 0
+        self.stands = False  # broken: the counter does not move
+        self.request = False  # of the update, for DMA
+        self.generation = 0
+        self.on_edge: Callable[[bool], None] = lambda high: None
+        self.slave: Timer | None = None
+
+    @property
+    def unit(self) -> int:
+        """Time of a count. Timers get twice the bus clock if that is divided (RM0090 7.2)."""
+        return self.chip.timer_unit(self.name)
+
+    @property
+    def running(self) -> bool:
+        return bool(self.r[self.CR1] & 1) and not self.stands
+
+    def counter(self) -> int:
+        period = self.r[self.ARR] + 1
+        moved = (self.chip.now - self.since) // self.unit if self.running else 0
+        return (self.held + moved) % period
+
+    def hold(self, value: int) -> None:
+        self.held, self.since = value, self.chip.now
+
+    def read(self, offset: int) -> int:
+        return self.counter() if offset == self.CNT else self.r[offset]
+
+    def write(self, offset: int, value: int) -> None:
+        self.hold(self.counter())
+        if offset == self.EGR:
+            assert value == 1, value
+            self.hold(0)
+            self.update()
+        elif offset == self.SR:
+            self.r[self.SR] &= value
+        elif offset == self.CNT:
+            self.hold(value)
+        else:
+            allowed = {self.CR1: 1, self.CR2: 0x70, self.SMCR: 0x77, self.DIER: 0x100, self.PSC: 0}
+            assert not value & ~allowed.get(offset, 0xFFFFFFFF), (self.name, hex(offset), hex(value))
+            started = offset == self.CR1 and value & 1 and not self.r[self.CR1] & 1
+            self.r[offset] = value
+            if offset == self.DIER and not value & 0x100:
+                self.request = False
+            if started and self.slave and self.r[self.CR2] & 0x70 == 0x10 and not self.stands:
+                self.slave.trigger()
+        self.plan()
+
+    def trigger(self) -> None:
+        """A rising edge of ITR0: TIM3's is TIM1's TRGO (RM0090, table 99)."""
+        if self.r[self.SMCR] & 0x77 == 0x06:
+            self.hold(self.counter())
+            self.r[self.CR1] |= 1
+            self.plan()
+
+    def update(self) -> None:
+        """An update event: a flag, and with UDE a DMA request that stays until it is served."""
+        self.r[self.SR] |= 1
+        if self.r[self.DIER] & 0x100:
+            self.request = True
+            self.chip.at(self.chip.now, self.chip.dma.serve)
+
+    def output(self) -> bool:
+        """Channel 1 in PWM mode 1."""
+        on = self.r[self.CCMR1] & 0x70 == 0x60 and self.r[self.CCER] & 1
+        return bool(on) and self.counter() < self.r[self.CCR1]
+
+    def plan(self) -> None:
+        """Look ahead to the next wrap and the next edge of the output."""
+        self.generation += 1
+        self.on_edge(self.output())
+        if not self.running or self.name == "TIM2":
+            return
+        here, unit = self.counter(), self.unit
+        base = self.since + (here - self.held) % (self.r[self.ARR] + 1) * unit
+        generation = self.generation
+
+        def event(wraps: bool) -> None:
+            if generation != self.generation or not self.running:
+                return
+            if wraps:
+                self.hold(0)
+                self.update()
+            self.plan()
+
+        to_wrap = self.r[self.ARR] + 1 - here
+        self.chip.at(base + to_wrap * unit, lambda: event(True))
+        if here < self.r[self.CCR1] < self.r[self.ARR] + 1:
+            self.chip.at(base + (self.r[self.CCR1] - here) * unit, lambda: event(False))
+
+    def stop_for_good(self) -> None:
+        """Broken: the counter stands, whatever is written."""
+        self.hold(self.counter())
+        self.stands = True
+        self.generation += 1
+
+
+class Dma:
+    """Stream 5 of DMA2: direct mode, memory to peripheral, 16 bits, circular (RM0090 10)."""
+
+    IRQ = 68
+    HALF, ALL, TRANSFER_ERROR, DIRECT_ERROR, FIFO_ERROR = 1 << 10, 1 << 11, 1 << 9, 1 << 8, 1 << 6
+
+    def __init__(self, chip: "Stm32") -> None:
+        self.chip = chip
+        self.cr = self.left = self.count = self.par = self.memory = self.flags = 0
+        self.fcr = 0x21
+        self.ahead = 0  # the word fetched ahead
+        self.dead = False
+
+    def read(self, offset: int) -> int:
+        return {
+            0x04: self.flags,
+            0x0C: 0,
+            0x88: self.cr,
+            0x8C: self.left,
+            0x90: self.par,
+            0x94: self.memory,
+            0x9C: self.fcr,
+        }[offset]
+
+    def write(self, offset: int, value: int) -> None:
+        on = self.cr & 1
+        if offset == 0x0C:
+            self.flags &= ~value
+        elif offset == 0x88:
+            if not value & 1:
+                self.cr = value | (on if self.dead else 0)  # broken: EN never falls
+                if on and not self.dead:
+                    self.flags |= self.ALL  # ended by software
+            else:
+                self.cr = value
+                if not on:
+                    self.start()
+        elif not on:  # these are protected while the stream runs
+            if offset == 0x8C:
+                self.left = value
+            elif offset == 0x90:
+                self.par = value
+            elif offset == 0x94:
+                self.memory = value
+            elif offset == 0x9C:
+                self.fcr = value
+            else:
+                raise AssertionError(hex(offset))
+        self.line()
+
+    def start(self) -> None:
+        # channel 6, 16 bits both sides, memory counts up, circular, to the peripheral: all the model knows
+        assert self.cr & ~0x1E == 6 << 25 | 3 << 16 | 1 << 13 | 1 << 11 | 1 << 10 | 1 << 8 | 1 << 6 | 1
+        assert not self.fcr & 4  # direct mode
+        assert not self.flags & 0xF40, "a stream starts only with its flags cleared (RM0090 10.3.17)"
+        self.count = self.left
+        self.fetch()
+        self.serve()
+
+    def fetch(self) -> None:
+        at = self.memory + 2 * (self.count - self.left)
+        self.ahead = struct.unpack("<H", self.chip.uc.mem_read(at, 2))[0]
+
+    def serve(self) -> None:
+        """A request of TIM1's update, if the stream runs, moves a word at once."""
+        if not self.chip.tim1.request or not self.cr & 1 or self.dead:
+            return
+        self.chip.tim1.request = False
+        assert self.par == 0x4001300C
+        self.chip.spi.send(self.ahead)
+        self.left -= 1
+        if self.left == self.count // 2:
+            self.flags |= self.HALF
+        if self.left == 0:
+            self.flags |= self.ALL
+            self.left = self.count
+        self.fetch()
+        self.line()
+
+    def error(self, flag: int) -> None:
+        """An error of the stream; a transfer error ends it."""
+        self.flags |= flag
+        if flag == self.TRANSFER_ERROR:
+            self.cr &= ~1
+        self.line()
+
+    def line(self) -> None:
+        cr = self.cr
+        enabled = (cr >> 4 & 1) * self.ALL | (cr >> 3 & 1) * self.HALF | (cr >> 2 & 1) * self.TRANSFER_ERROR
+        enabled |= (cr >> 1 & 1) * self.DIRECT_ERROR | (self.fcr >> 7 & 1) * self.FIFO_ERROR
+        self.chip.set_line(16 + self.IRQ, bool(self.flags & enabled))
+
+
+class Spi:
+    """SPI1, master, 16 bits, and the chain of shift registers on it."""
+
+    def __init__(self, chip: "Stm32") -> None:
+        self.chip = chip
+        self.cr1 = self.cr2 = 0
+        self.buffer: int | None = None
+        self.word: int | None = None
+        self.began = 0
+        self.chain = 0  # 96 bits; the one that left first is the highest
+        self.dead = False
+
+    def bits_done(self) -> int:
+        if self.word is None or self.dead:
+            return 0
+        return min(16, (self.chip.now - self.began) // self.bit)
+
+    @property
+    def bit(self) -> int:
+        return UNIT_HZ // self.chip.pclk2 * (2 << (self.cr1 >> 3 & 7))
+
+    def outputs(self) -> int:
+        """The chain as it stands, a word on its way included."""
+        done = self.bits_done()
+        return (self.chain << done | (self.word or 0) >> (16 - done)) & (1 << LEDS) - 1
+
+    def read(self, offset: int) -> int:
+        if offset == 0x08:
+            return (self.buffer is None) << 1 | (self.word is not None) << 7
+        return {0x00: self.cr1, 0x04: self.cr2, 0x0C: 0}[offset]
+
+    def write(self, offset: int, value: int) -> None:
+        if offset == 0x0C:
+            self.send(value)
+        elif offset == 0x00:
+            assert value & ~0x78 == 1 << 11 | 1 << 9 | 1 << 8 | 1 << 2, hex(value)
+            self.cr1 = value
+        else:
+            assert offset == 0x04, hex(offset)
+            self.cr2 = value
+
+    def send(self, word: int) -> None:
+        if not self.cr1 & 0x40:
+            return
+        if self.word is None and not self.dead:
+            self.shift(word)
+        else:
+            self.buffer = word
+
+    def shift(self, word: int) -> None:
+        self.word, self.began = word, self.chip.now
+        self.chip.at(self.chip.now + 16 * self.bit, self.done)
+
+    def done(self) -> None:
+        if self.dead or self.word is None:
+            return
+        self.chain = (self.chain << 16 | self.word) & (1 << LEDS) - 1
+        self.word = None
+        self.chip.drivers.look()
+        if self.buffer is not None:
+            word, self.buffer = self.buffer, None
+            self.shift(word)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What 96 LEDs show from `time` on; LED 0 is the highest bit of `row`."""
+
+    time: int
+    row: int
+    latched: bool
+    """Whether the latch has just closed, whatever the row."""
+    dark: bool
+    """Whether output enable keeps all LEDs off."""
+
+
+class Drivers:
+    """The latches and output enable of the LED drivers; the latch is transparent while it is high."""
+
+    def __init__(self, chip: "Stm32") -> None:
+        self.chip = chip
+        self.latch = False
+        self.held = 0
+        self.log: list[Shown] = []
+
+    @property
+    def dark(self) -> bool:
+        """Output enable is high: driven so, or an input, which the board pulls up."""
+        return self.chip.pin(0x40020400, 0) is not False
+
+    @property
+    def row(self) -> int:
+        return 0 if self.dark else self.held
+
+    def look(self) -> None:
+        """Something may have changed: the chain, the latch, output enable."""
+        level = self.chip.pin(0x40020000, 6)
+        closes = self.latch and not level
+        if self.latch or level:
+            self.held = self.chip.spi.outputs()
+        self.latch = bool(level)
+        last = self.log[-1] if self.log else None
+        if closes or last is None or (last.row, last.dark) != (self.row, self.dark):
+            self.log.append(Shown(self.chip.now, self.row, closes, self.dark))
+
+
+class Usart:
+    """USART1 and the host at its other end, which keeps to 1 Mbit/s."""
+
+    IRQ = 37
+    BYTE = 10 * US
+
+    def __init__(self, chip: "Stm32") -> None:
+        self.chip = chip
+        self.sr, self.dr, self.brr, self.cr1 = 0xC0, 0, 0, 0
+        self.free_at = 0  # when the transmitter has room
+        self.line_free = 0
+        self.to_host = bytearray()
+
+    def right_rate(self) -> bool:
+        """Within 3 % of the host's."""
+        return self.brr >= 16 and abs(self.chip.pclk2 / self.brr / 1e6 - 1) < 0.03
+
+    def arrive(self, data: bytes) -> None:
+        """Bytes from the host, one after the other."""
+        self.line_free = max(self.line_free, self.chip.now)
+        for byte in data:
+            self.line_free += self.BYTE
+            self.chip.at(self.line_free, lambda byte=byte: self.received(byte))
+
+    def received(self, byte: int) -> None:
+        if self.cr1 & 0x2004 != 0x2004 or not self.right_rate():
+            return
+        if self.sr & 0x20:
+            self.sr |= 0x08
+        else:
+            self.dr, self.sr = byte, self.sr | 0x20
+        self.line()
+
+    def read(self, offset: int) -> int:
+        if offset == 0x00:
+            return self.sr & ~0x80 | (self.chip.now >= self.free_at) << 7
+        if offset == 0x04:
+            self.sr &= ~0x28
+            self.line()
+            return self.dr
+        return {0x08: self.brr, 0x0C: self.cr1}[offset]
+
+    def write(self, offset: int, value: int) -> None:
+        if offset == 0x04:
+            if self.cr1 & 0x2008 == 0x2008:
+                leaves = max(self.chip.now, self.free_at) + self.BYTE
+                self.free_at = leaves
+                if self.right_rate():
+                    self.chip.at(leaves, lambda: self.to_host.append(value & 0xFF))
+        elif offset == 0x08:
+            self.brr = value
+        else:
+            assert offset == 0x0C, hex(offset)
+            assert not value & ~0x202C, hex(value)
+            self.cr1 = value
+        self.line()
+
+    def line(self) -> None:
+        self.chip.set_line(16 + self.IRQ, bool(self.cr1 & 0x20 and self.sr & 0x28))
+
+
+class SysTick:
+    """The core's own timer, on the core's clock."""
+
+    def __init__(self, chip: "Stm32") -> None:
+        self.chip = chip
+        self.csr = self.rvr = 0
+        self.generation = 0
+
+    def read(self, offset: int) -> int:
+        return {0x10: self.csr, 0x14: self.rvr, 0x18: 0}[offset]
+
+    def write(self, offset: int, value: int) -> None:
+        if offset == 0x10:
+            assert not value & ~7
+            assert value in (0, 5, 7), "on the core's clock"
+            self.csr = value
+        elif offset == 0x14:
+            self.rvr = value & 0xFFFFFF
+        self.plan()  # a write to the counter clears it: it begins again with the reload value
+
+    def plan(self) -> None:
+        self.generation += 1
+        generation = self.generation
+
+        def ends() -> None:
+            if generation == self.generation:
+                if self.csr & 2:
+                    self.chip.pending.add(15)
+                self.plan()
+
+        if self.csr & 1 and self.rvr:
+            self.chip.at(self.chip.now + (self.rvr + 1) * self.chip.cycle, ends)
+
+
+class Iwdg:
+    """The independent watchdog, on the LSI (RM0090 21)."""
+
+    def __init__(self, chip: "Stm32") -> None:
+        self.chip = chip
+        self.pr, self.rlr = 0, 0xFFF
+        self.open = self.on = False
+        self.busy_until = 0
+        self.generation = 0
+
+    @property
+    def timeout(self) -> int:
+        return (self.rlr + 1) * (4 << self.pr) * UNIT_HZ // LSI_HZ
+
+    def read(self, offset: int) -> int:
+        busy = 3 if self.chip.now < self.busy_until else 0
+        return {0x0: 0, 0x4: self.pr, 0x8: self.rlr, 0xC: busy}[offset]
+
+    def write(self, offset: int, value: int) -> None:
+        if offset == 0x0:
+            self.open = value == 0x5555
+            self.on |= value == 0xCCCC
+            if value in (0xAAAA, 0xCCCC) and self.on:
+                self.feed()
+        elif self.open:
+            self.busy_until = self.chip.now + 5 * UNIT_HZ // LSI_HZ
+            if offset == 0x4:
+                self.pr = value
+            elif offset == 0x8:
+                self.rlr = value
+
+    def feed(self) -> None:
+        self.generation += 1
+        generation = self.generation
+
+        def bites() -> None:
+            if generation == self.generation:
+                self.chip.reset(RESET_BY_IWDG)
+
+        self.chip.at(self.chip.now + self.timeout, bites)
+
+
+class Flash:
+    """The flash's registers; a word is programmed and a sector erased at once."""
+
+    def __init__(self, chip: "Stm32") -> None:
+        self.chip = chip
+        self.acr, self.cr, self.keys = 0, 0x80000000, []
+
+    def read(self, offset: int) -> int:
+        return {0x00: self.acr, 0x0C: 0, 0x10: self.cr}[offset]
+
+    def write(self, offset: int, value: int) -> None:
+        if offset == 0x00:
+            self.acr = value
+        elif offset == 0x04:
+            self.keys = [*self.keys, value][-2:]
+            if self.keys == [0x45670123, 0xCDEF89AB]:
+                self.cr &= 0x7FFFFFFF
+        elif offset == 0x10 and not self.cr & 0x80000000:
+            self.cr = value
+            if value & 0x10002 == 0x10002:
+                sector = value >> 3 & 15
+                assert 8 <= sector < 12, "the last four, of 128 KiB each"
+                self.chip.uc.mem_write(0x08080000 + 0x20000 * (sector - 8), b"\xff" * 0x20000)
+                self.cr &= ~0x10000
+
+
+class Stm32:
+    """The part, from power-up on.
+
+    Args:
+        elf: The image.
+    """
+
+    def __init__(self, elf: Path) -> None:
+        self.uc = uc = unicorn.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB | unicorn.UC_MODE_MCLASS)
+        uc.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
+        uc.mem_map(0x08000000, 1 << 20)
+        uc.mem_write(0x08000000, b"\xff" * (1 << 20))
+        uc.mem_map(0x20000000, 1 << 17)
+        uc.mem_map(0x1FFF7000, 0x1000, unicorn.UC_PROT_READ)
+        uc.mem_map(RETURN, 0x1000)
+        for base, size in ((0x40000000, 0x80000), (0xE0000000, 0x100000)):
+            uc.mmio_map(base, size, self._read, base, self._write, base)
+        data = elf.read_bytes()
+        start, number = struct.unpack_from("<I", data, 28)[0], struct.unpack_from("<H", data, 44)[0]
+        for n in range(number):
+            kind, offset, _, at, size = struct.unpack_from("<5I", data, start + 32 * n)
+            if kind == 1 and size:
+                uc.mem_write(at, data[offset : offset + size])
+        self.now = 0
+        self.events: list[tuple[int, int, Callable[[], None]]] = []
+        self.order = count()
+        self.resets: list[int] = []
+        self.hse_works = True
+        self.reset(RESET_BY_PIN)
+
+    # -- clocks and reset
+
+    def reset(self, cause: int) -> None:
+        """All but RAM, flash and the log of the LEDs begins anew."""
+        if hasattr(self, "iwdg"):
+            self.iwdg.generation += 1
+        log = self.drivers.log if hasattr(self, "drivers") else []
+        chain = self.spi.chain if hasattr(self, "spi") else 0
+        held = self.drivers.held if hasattr(self, "drivers") else 0
+        self.resets.append(cause)
+        self.events.clear()
+        self.plain: dict[int, int] = {0x40023800: 0x83, 0x40023874: cause, 0x40023804: 0x24003010}
+        self.cycle = UNIT_HZ // HSI_HZ
+        self.enabled: set[int] = set()
+        self.pending: set[int] = set()
+        self.lines: set[int] = set()
+        self.priorities: dict[int, int] = {}
+        self.active: list[int] = []
+        self.tim1, self.tim2, self.tim3 = Timer(self, "TIM1"), Timer(self, "TIM2"), Timer(self, "TIM3")
+        self.tim1.slave = self.tim3
+        self.tim3.on_edge = lambda high: self.drivers.look()
+        self.dma, self.spi, self.usart = Dma(self), Spi(self), Usart(self)
+        self.systick, self.iwdg, self.flash = SysTick(self), Iwdg(self), Flash(self)
+        self.drivers = Drivers(self)
+        self.drivers.log, self.drivers.held, self.spi.chain = log, held, chain
+        self.places = {
+            0x40000000: self.tim2,
+            0x40000400: self.tim3,
+            0x40003000: self.iwdg,
+            0x40010000: self.tim1,
+            0x40011000: self.usart,
+            0x40013000: self.spi,
+            0x40023C00: self.flash,
+            0x40026400: self.dma,
+        }
+        stack, entry = struct.unpack("<2I", self.uc.mem_read(0x08000000, 8))
+        self.uc.reg_write(arm_const.UC_ARM_REG_SP, stack)
+        self.pc = entry & ~1
+        self.drivers.look()
+
+    @property
+    def pclk2(self) -> int:
+        divider = self.plain.get(0x40023808, 0) >> 13 & 7
+        return UNIT_HZ // self.cycle >> (divider - 3 if divider & 4 else 0)
+
+    def timer_unit(self, name: str) -> int:
+        """Time of a count at the timer's input."""
+        divider = self.plain.get(0x40023808, 0) >> (13 if name == "TIM1" else 10) & 7
+        shift = divider - 3 if divider & 4 else 0
+        return self.cycle << max(0, shift - 1)
+
+    def _rcc_write(self, offset: int, value: int) -> None:
+        at = 0x40023800 + offset
+        if offset == 0x00:
+            hse = bool(value & 1 << 16 and self.hse_works)
+            pll = bool(value & 1 << 24 and hse)
+            value = value & ~(1 << 17 | 1 << 25) | hse << 17 | pll << 25
+        elif offset == 0x08:
+            assert value & 3 in (0, 2), value
+            if value & 3 == 2:
+                assert self.plain[0x40023804] == 7 << 24 | 1 << 22 | 336 << 6 | 8  # 8 MHz to 168 MHz
+                assert self.flash.acr & 7 == 5
+            self._core_cycle(UNIT_HZ // (168_000_000 if value & 3 == 2 else HSI_HZ), value)
+            value |= (value & 3) << 2
+        elif offset == 0x0C:
+            value = self.plain.get(at, 0) & ~0x80 if value & 1 << 23 else self.plain.get(at, 0)
+        elif offset == 0x74:
+            value = self.plain[at] & (0 if value & 1 << 24 else 0xFFFFFFFF)
+        self.plain[at] = value
+
+    def _core_cycle(self, cycle: int, cfgr: int) -> None:
+        timers = (self.tim1, self.tim2, self.tim3)
+        for timer in timers:
+            timer.hold(timer.counter())
+        self.cycle = cycle
+        self.plain[0x40023808] = cfgr
+        for timer in timers:
+            timer.plan()
+        self.systick.plan()
+
+    def stop_crystal(self) -> None:
+        """The crystal stands: with clock security the core goes on at 16 MHz, with an NMI, else it stops."""
+        self.hse_works = False
+        cr = self.plain[0x40023800]
+        if not self.plain.get(0x40023808, 0) & 2:
+            return
+        self.plain[0x40023800] = cr & ~(1 << 16 | 1 << 17 | 1 << 24 | 1 << 25)
+        if cr & 1 << 19:
+            self._core_cycle(UNIT_HZ // HSI_HZ, self.plain[0x40023808] & ~0xF)
+            self.plain[0x4002380C] = self.plain.get(0x4002380C, 0) | 0x80
+            self.pending.add(2)
+        else:
+            for timer in (self.tim1, self.tim2, self.tim3):
+                timer.stop_for_good()
+            self.spi.dead = self.dma.dead = True
+            self.systick.generation += 1
+            self.core_stands = True
+
+    core_stands = False
+
+    # -- pins
+
+    def pin(self, port: int, number: int) -> bool | None:
+        """What a pin drives; None if it does not."""
+        mode = self.plain.get(port, 0xA8000000 if port == 0x40020000 else 0) >> 2 * number & 3
+        if mode == 1:
+            return bool(self.plain.get(port + 0x14, 0) >> number & 1)
+        if mode == 2 and (port, number) == (0x40020000, 6):
+            assert self.plain[port + 0x20] >> 24 & 15 == 2  # TIM3
+            return self.tim3.output()
+        return None
+
+    # -- registers
+
+    def _read(self, uc: object, offset: int, size: int, base: int) -> int:
+        at = base + offset
+        if size != 4:
+            raise AssertionError(hex(at))
+        place = self.places.get(at & ~0x3FF)
+        if place is not None:
+            return place.read(at & 0x3FF)
+        if 0xE000E010 <= at < 0xE000E020:
+            return self.systick.read(at & 0xFF)
+        if at == 0x40020410:  # thermal flag: cool
+            return 0
+        if at == 0x40020000:
+            return self.plain.get(at, 0xA8000000)
+        return self.plain.get(at, 0)
+
+    def _write(self, uc: object, offset: int, size: int, value: int, base: int) -> None:
+        at = base + offset
+        place = self.places.get(at & ~0x3FF)
+        if place is not None:
+            place.write(at & 0x3FF, value)
+        elif at & ~0x3FF == 0x40023800:
+            self._rcc_write(at & 0x3FF, value)
+        elif at in (0x40020018, 0x40020418):
+            port = at & ~0x3FF
+            old = self.plain.get(port + 0x14, 0)
+            self.plain[port + 0x14] = old & ~(value >> 16) | value & 0xFFFF
+            self.drivers.look()
+        elif at in (0x40020000, 0x40020400):
+            self.plain[at] = value
+            self.drivers.look()
+        elif 0xE000E010 <= at < 0xE000E020:
+            self.systick.write(at & 0xFF, value)
+        elif 0xE000E100 <= at < 0xE000E120:
+            self.enabled |= {16 + 8 * (at - 0xE000E100) + n for n in range(32) if value >> n & 1}
+        elif 0xE000E280 <= at < 0xE000E2A0:
+            gone = {16 + 8 * (at - 0xE000E280) + n for n in range(32) if value >> n & 1}
+            self.pending -= gone - self.lines
+        elif 0xE000E400 <= at < 0xE000E500:
+            self.priorities[16 + at - 0xE000E400] = value & 0xF0
+        elif at == 0xE000ED04:
+            assert value == 1 << 25
+            self.pending.discard(15)
+        else:
+            self.plain[at] = value
+
+    # -- exceptions
+
+    def set_line(self, number: int, high: bool) -> None:
+        if high:
+            self.lines.add(number)
+            self.pending.add(number)
+        else:
+            self.lines.discard(number)
+
+    def _priority(self, number: int) -> int:
+        return {2: -2, 3: -1}.get(number, self.priorities.get(number, 0))
+
+    def _take(self) -> None:
+        ready = [n for n in self.pending if n < 16 or n in self.enabled]
+        if not ready:
+            return
+        number = min(ready, key=lambda n: (self._priority(n), n))
+        if self.active and self._priority(number) >= min(map(self._priority, self.active)):
+            return
+        self.pending.discard(number)
+        self.exception(number)
+
+    def exception(self, number: int) -> None:
+        """Enter an exception: eight words go onto the stack."""
+        c, uc = arm_const, self.uc
+        kept = (c.UC_ARM_REG_R0, c.UC_ARM_REG_R1, c.UC_ARM_REG_R2, c.UC_ARM_REG_R3, c.UC_ARM_REG_R12)
+        frame = [*(uc.reg_read(r) for r in kept), uc.reg_read(c.UC_ARM_REG_LR), self.pc]
+        frame.append(uc.reg_read(c.UC_ARM_REG_XPSR) | 1 << 24)
+        stack = uc.reg_read(c.UC_ARM_REG_SP)
+        odd = stack >> 2 & 1
+        frame[7] |= odd << 9
+        stack -= 32 + 4 * odd
+        uc.mem_write(stack, struct.pack("<8I", *frame))
+        uc.reg_write(c.UC_ARM_REG_SP, stack)
+        uc.reg_write(c.UC_ARM_REG_LR, RETURN | 1)
+        handler = struct.unpack("<I", uc.mem_read(0x08000000 + 4 * number, 4))[0]
+        assert handler & 1, f"exception {number} has no handler"
+        self.pc = handler & ~1
+        self.active.append(number)
+        self.now += 12 * self.cycle
+
+    def _leave(self) -> None:
+        c, uc = arm_const, self.uc
+        stack = uc.reg_read(c.UC_ARM_REG_SP)
+        *kept, link, self.pc, status = struct.unpack("<8I", uc.mem_read(stack, 32))
+        names = (c.UC_ARM_REG_R0, c.UC_ARM_REG_R1, c.UC_ARM_REG_R2, c.UC_ARM_REG_R3, c.UC_ARM_REG_R12)
+        for name, value in zip(names, kept, strict=True):
+            uc.reg_write(name, value)
+        uc.reg_write(c.UC_ARM_REG_LR, link)
+        uc.reg_write(c.UC_ARM_REG_XPSR, status & ~(1 << 9) & 0xFF000000)
+        uc.reg_write(c.UC_ARM_REG_SP, stack + 32 + 4 * (status >> 9 & 1))
+        ended = self.active.pop()
+        if ended in self.lines:
+            self.pending.add(ended)
+        self.now += 12 * self.cycle
+
+    # -- time
+
+    def at(self, time: int, event: Callable[[], None]) -> None:
+        """Do this then."""
+        heapq.heappush(self.events, (time, next(self.order), event))
+
+    def _events(self) -> None:
+        while self.events and self.events[0][0] <= self.now:
+            time, _, event = heapq.heappop(self.events)
+            now, self.now = self.now, time
+            event()
+            self.now = max(now, self.now)
+
+    def run(self, us: float) -> None:
+        """Let `us` microseconds pass."""
+        end = self.now + round(us * US)
+        while self.now < end:
+            self._events()
+            until = min(end, self.events[0][0]) if self.events else end
+            if self.core_stands:
+                self.now = max(self.now, until)
+                continue
+            self._take()
+            instructions = max(1, min(SLICE, (until - self.now) // self.cycle))
+            resets = len(self.resets)
+            self.uc.emu_start(self.pc | 1, RETURN, count=instructions)
+            if len(self.resets) != resets:
+                continue
+            self.now += instructions * self.cycle
+            self.pc = self.uc.reg_read(arm_const.UC_ARM_REG_PC)
+            if self.pc == RETURN:
+                self._leave()
+
+
+class ModelLine:
+    """The host's line to the model, as a `Transport`; its clock is the model's."""
+
+    def __init__(self, chip: Stm32) -> None:
+        self.name = "model:"
+        self.chip = chip
+
+    def now(self) -> float:
+        return self.chip.now / UNIT_HZ
+
+    def read(self, timeout_s: float) -> bytes:
+        end = self.chip.now + int(timeout_s * UNIT_HZ)
+        while not self.chip.usart.to_host and self.chip.now < end:
+            self.chip.run(50)
+        data = bytes(self.chip.usart.to_host)
+        self.chip.usart.to_host.clear()
+        return data
+
+    def write(self, data: bytes) -> None:
+        self.chip.usart.arrive(data)
+
+    def close(self) -> None:
+        pass

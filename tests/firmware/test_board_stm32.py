@@ -1,0 +1,224 @@
+"""The STM32F405 image as it is flashed, on a model of the part: every LED, chip by chip, and what fails."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from evlcp_sdk.codebook import Codebook
+from firmware_host import build
+from firmware_host.board import Board, Settings, provision
+from firmware_host.client import Timing
+from firmware_host.errors import RefusedError
+from firmware_host.link import Link
+from firmware_host.messages import Fault, State
+from firmware_host.payload import Payload, random_symbols, symbol_chips
+
+unicorn = pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
+from stm32_model import RESET_BY_IWDG, RESET_BY_PIN, US, Dma, ModelLine, Shown, Stm32  # noqa: E402
+
+CHIP = 100 * US
+BOOT_US = 15_000
+
+
+class Bar:
+    """A programmed board on the model, dark."""
+
+    def __init__(self, book: Codebook, seed: int = 1) -> None:
+        self.chip = Stm32(build.arm_image("stm32f405"))
+        self.chip.run(BOOT_US)
+        self.board = self.connect()
+        symbols = random_symbols(1, 4, book, np.random.default_rng(seed))
+        provision(self.board, Payload.of_symbols(symbols, book), Settings(start=False))
+        self.chips = symbol_chips(symbols, book)
+
+    def connect(self) -> Board:
+        return Board(Link(ModelLine(self.chip), Timing(latency_s=0.02)))
+
+    def expected(self, count: int) -> NDArray[np.uint8]:
+        """Rows from the first lit chip on, (count, 96)."""
+        first = int(self.chips.any(1).argmax())
+        return np.repeat(np.resize(np.roll(self.chips, -first, axis=0), (count, 16)), 6, axis=1)
+
+    @property
+    def log(self) -> list[Shown]:
+        return self.chip.drivers.log
+
+    @property
+    def dark(self) -> bool:
+        return self.chip.drivers.dark
+
+
+@pytest.fixture
+def bar(book: Codebook, needs: Callable[..., None]) -> Bar:
+    needs("cc", "make", "arm-none-eabi-gcc")
+    return Bar(book)
+
+
+def played(log: list[Shown]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Rows that the latch showed, from the first lit one on, (n, 96), and when."""
+    shown = [s for s in log if s.latched and not s.dark]
+    while shown and not shown[0].row:
+        del shown[0]
+    rows = [[int(bit) for bit in f"{s.row:096b}"] for s in shown]
+    return np.array(rows, np.uint8).reshape(-1, 96), np.array([s.time for s in shown])
+
+
+def test_every_start_shows_every_chip_on_every_led(bar: Bar) -> None:
+    expected = bar.expected(200)
+    for _ in range(4):
+        begin = len(bar.log)
+        bar.board.start()
+        bar.chip.run(21_500)
+        assert bar.board.status().state == State.PLAYING
+        rows, times = played(bar.log[begin:])
+        right = (rows[:200] == expected).all(1)
+        assert (int(right.sum()), len(right)) == (200, 200)
+        assert (np.diff(times[:200]) == CHIP).all()
+        bar.board.stop()
+        bar.board.wait_dark()
+        bar.chip.run(500)  # the last rows leave the chain
+        assert bar.dark
+        assert bar.board.status().faults == 0
+        # whole packets, chip for chip to the last lit one
+        rows, _ = played(bar.log[begin:])
+        lit = np.flatnonzero(rows.any(1))[-1] + 1
+        packets = round(lit / len(bar.chips))
+        whole = np.flatnonzero(bar.chips.any(1))
+        assert lit == packets * len(bar.chips) - whole[0] - (len(bar.chips) - 1 - whole[-1])
+        assert (rows[:lit] == bar.expected(lit)).all()
+        assert not rows[lit:].any()
+
+
+def stop_stream(chip: Stm32) -> None:
+    chip.dma.dead = True
+
+
+def end_stream(chip: Stm32) -> None:
+    chip.dma.cr &= ~1
+
+
+def stop_spi(chip: Stm32) -> None:
+    chip.spi.dead = True
+
+
+def stop_interrupt(chip: Stm32) -> None:
+    chip.enabled.discard(16 + Dma.IRQ)
+
+
+BREAKS: dict[str, tuple[Callable[[Stm32], None], Fault, float]] = {
+    "tim1": (lambda chip: chip.tim1.stop_for_good(), Fault.CHIP_LOST, 1.6),
+    "stream-stands": (stop_stream, Fault.CHIP_LOST, 1.6),
+    "stream-ends": (end_stream, Fault.CHIP_LOST, 1.6),
+    "transfer-error": (lambda chip: chip.dma.error(Dma.TRANSFER_ERROR), Fault.CHIP_LOST, 0.1),
+    "direct-mode-error": (lambda chip: chip.dma.error(Dma.DIRECT_ERROR), Fault.CHIP_LOST, 0.1),
+    "fifo-error": (lambda chip: chip.dma.error(Dma.FIFO_ERROR), Fault.CHIP_LOST, 0.1),
+    "interrupt": (stop_interrupt, Fault.CHIP_LOST, 1.6),
+    "crystal": (lambda chip: chip.stop_crystal(), Fault.CLOCK, 0.1),
+    "supply": (lambda chip: chip.pending.add(16 + 1), Fault.CHIP_LOST, 0.1),
+    "spi": (stop_spi, Fault.CHIP_LOST, 1.7),
+    "latch-timer": (lambda chip: chip.tim3.stop_for_good(), Fault.CHIP_LOST, 1.7),
+}
+
+
+@pytest.mark.parametrize("what", BREAKS)
+def test_what_fails_while_playing_ends_in_the_dark(bar: Bar, what: str) -> None:
+    breaks, fault, most_chips = BREAKS[what]
+    rng = np.random.default_rng(list(BREAKS).index(what))
+    bar.board.start()
+    bar.chip.run(5_000 + float(rng.uniform(0, 10_000)))
+    assert not bar.dark
+    assert bar.board.status().state == State.PLAYING
+    bar.chip.run(float(rng.uniform(0, 200)))
+    at = bar.chip.now
+    breaks(bar.chip)
+    bar.chip.run(1_000)
+    assert bar.dark
+    went = max(s.time for s in bar.log if s.dark)
+    assert not any(not s.dark for s in bar.log if s.time > went)
+    assert went - at <= most_chips * CHIP
+    # named at once, and STOP and BLANK find nothing that could hang
+    status = bar.board.status()
+    assert (status.state, status.faults) == (State.FAULT, fault)
+    bar.board.stop()
+    assert bar.board.status().state == State.FAULT
+    bar.board.blank()
+    assert bar.dark
+    assert bar.board.status().faults == fault
+    bar.chip.run(10_000)
+    assert bar.dark
+    assert bar.chip.resets == [RESET_BY_PIN]
+
+
+def test_stop_ends_in_the_dark_on_a_stream_that_dies_meanwhile(bar: Bar) -> None:
+    for moment in (0, 70, 250):
+        bar.board.start()
+        bar.chip.run(5_000 + moment)
+        bar.board.stop()
+        assert bar.board.status().state == State.STOPPING
+        bar.chip.dma.dead = True
+        bar.chip.run(300)
+        assert bar.dark
+        assert bar.board.status().state == State.FAULT
+        bar.chip.dma.dead = False
+        bar.chip.dma.cr &= ~1
+    # what works again plays again
+    begin = len(bar.log)
+    bar.board.start()
+    bar.chip.run(15_000)
+    rows, _ = played(bar.log[begin:])
+    assert (rows[:100] == bar.expected(100)).all()
+    assert bar.board.status().state == State.PLAYING
+
+
+def test_dead_from_the_start_stays_dark(bar: Bar) -> None:
+    bar.chip.tim1.stop_for_good()
+    begin = len(bar.log)
+    bar.board.start()
+    bar.chip.run(2_000)
+    assert all(s.dark for s in bar.log[begin:])
+    assert bar.board.status().state == State.FAULT
+
+
+def test_no_crystal_then_no_chip(bar: Bar) -> None:
+    bar.chip.stop_crystal()
+    bar.chip.run(1_000)
+    status = bar.board.status()  # at 16 MHz the line rate is kept
+    assert (status.state, status.faults) == (State.FAULT, Fault.CLOCK)
+    with pytest.raises(RefusedError, match="HARDWARE_FAULT"):
+        bar.board.start()
+    before = bar.board.status().uptime_ms
+    bar.chip.run(50_000)
+    assert 49 <= bar.board.status().uptime_ms - before <= 54
+
+
+@pytest.mark.parametrize("what", ["hangs", "stands", "faults"])
+def test_a_core_that_stops_is_reset_and_stays_dark(bar: Bar, what: str) -> None:
+    bar.board.start()
+    bar.chip.run(8_000)
+    assert not bar.dark
+    at = bar.chip.now
+    if what == "faults":
+        bar.chip.exception(3)
+    elif what == "hangs":
+        # main loop and SysTick: an instruction that jumps to itself, with TIM1 dead
+        bar.chip.uc.mem_write(0x20018000, b"\xfe\xe7")
+        bar.chip.pc = 0x20018000
+        bar.chip.enabled.clear()
+        bar.chip.systick.generation += 1
+    else:
+        bar.chip.plain[0x40023800] &= ~(1 << 19)  # as if clock security had failed as well
+        bar.chip.stop_crystal()
+    bar.chip.run(200)
+    assert bar.dark == (what == "faults")
+    bar.chip.run(110_000)
+    assert bar.chip.resets == [RESET_BY_PIN, RESET_BY_IWDG]
+    assert bar.dark
+    assert max(s.time for s in bar.log if not s.dark) - at <= 101_000 * US
+    # named, and dark until START
+    bar.chip.hse_works, bar.chip.core_stands = True, False
+    bar.chip.run(BOOT_US)
+    status = bar.connect().status()
+    assert (status.state, status.faults) == (State.FAULT, Fault.CHIP_LOST)
+    assert bar.dark
