@@ -472,7 +472,7 @@ class Iwdg:
 
 
 class Flash:
-    """The flash's registers; a word is programmed and a sector erased at once."""
+    """The flash's registers; words take no time, and a sector a second, in which the core stands."""
 
     def __init__(self, chip: "Stm32") -> None:
         self.chip = chip
@@ -494,6 +494,7 @@ class Flash:
                 sector = value >> 3 & 15
                 assert 8 <= sector < 12, "the last four, of 128 KiB each"
                 self.chip.uc.mem_write(0x08080000 + 0x20000 * (sector - 8), b"\xff" * 0x20000)
+                self.chip.now += UNIT_HZ
                 self.cr &= ~0x10000
 
 

@@ -15,8 +15,8 @@ from firmware_host.link import Link
 from firmware_host.messages import Fault, State
 from firmware_host.payload import Payload, random_symbols, symbol_chips
 
-unicorn = pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
-from stm32_model import RESET_BY_IWDG, RESET_BY_PIN, US, Dma, ModelLine, Shown, Stm32  # noqa: E402
+pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
+from stm32_model import RESET_BY_IWDG, RESET_BY_PIN, US, Dma, ModelLine, Shown, Stm32
 
 CHIP = 100 * US
 BOOT_US = 15_000
@@ -191,6 +191,38 @@ def test_no_crystal_then_no_chip(bar: Bar) -> None:
     before = bar.board.status().uptime_ms
     bar.chip.run(50_000)
     assert 49 <= bar.board.status().uptime_ms - before <= 54
+
+
+def test_led_test_shows_one_led_and_nothing_on_a_dead_spi(bar: Bar) -> None:
+    begin = len(bar.log)
+    bar.board.test_leds(0, 95, 1)
+    bar.board.wait_dark()
+    lit = [s.row for s in bar.log[begin:] if s.row]
+    assert [row for n, row in enumerate(lit) if lit[n - 1] != row] == [1 << 95 - led for led in range(96)]
+    bar.chip.spi.dead = True
+    begin = len(bar.log)
+    bar.board.test_leds(3, 3, 100)
+    assert all(s.dark for s in bar.log[begin:])
+    assert bar.board.status().state == State.FAULT
+
+
+def test_save_outlives_the_watchdog_and_autostart_waits_for_start_after_its_reset(bar: Bar) -> None:
+    bar.board.save(autostart=True)
+    bar.chip.run(20_000)
+    assert bar.chip.resets == [RESET_BY_PIN]
+    bar.chip.reset(RESET_BY_PIN)
+    bar.chip.run(BOOT_US + 5_000)
+    assert not bar.dark
+    bar.chip.exception(3)
+    bar.chip.run(110_000 + BOOT_US)
+    assert bar.chip.resets == [RESET_BY_PIN, RESET_BY_PIN, RESET_BY_IWDG]
+    assert bar.dark
+    board = bar.connect()
+    assert board.status().faults == Fault.CHIP_LOST
+    board.start()
+    bar.chip.run(5_000)
+    assert not bar.dark
+    assert board.status().faults == 0
 
 
 @pytest.mark.parametrize("what", ["hangs", "stands", "faults"])

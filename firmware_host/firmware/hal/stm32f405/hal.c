@@ -25,7 +25,7 @@
    | no chip comes: TIM1, DMA, its interrupt | SysTick, which every chip restarts, after 1.5 chips;    |
    |                                         | the main loop by TIM2, after 1.5 chips                  |
    | the stream: transfer, direct mode, FIFO | its interrupt, at once                                  |
-   | SPI1 takes no word, TIM3 stands         | the main loop, after 1.5 chips                          |
+   | SPI1 takes no word, TIM3 stands         | the main loop, after 1.5 chips, 5 ms more during a CRC  |
    | the crystal                             | clock security (NMI), at once; then 16 MHz, no chips    |
    | the supply is below 2.8 V               | PVD interrupt, at once; brown-out reset (option bytes)  |
    | the core: an exception                  | hal_panic, at once; then the watchdog's reset           |
@@ -182,7 +182,7 @@
 #define LEVEL_MAX_MA 60u
 #define DAC_FULL 4095u
 #define WAIT_LOOPS 1000000u
-#define DMA_WAIT_LOOPS 1000u /* a stream ends with the word under way */
+#define WORD_WAIT_LOOPS 1000u /* a word is on its way for 1.5 us; a stream ends with the one under way */
 #define LOOKS_MIN 16u        /* longer than a word is on its way to the chain */
 
 extern uint32_t link_stack[];
@@ -238,35 +238,6 @@ static void load(const uint8_t *row)
         words[gone][i] = (uint16_t)(row[2u * i] << 8 | row[2u * i + 1u]);
 }
 
-/* Shift a row out by hand while no chips run: the single-LED test. */
-static void shift_now(void)
-{
-    for (uint32_t i = 0; i < SLOTS_PER_CHIP; i++) {
-        for (uint32_t n = 0; n < WAIT_LOOPS && (SPI_SR & SPI_EMPTY) == 0u; n++) {
-        }
-        SPI_DR = words[gone][i];
-    }
-    for (uint32_t n = 0; n < WAIT_LOOPS && (SPI_SR & SPI_BUSY) != 0u; n++) {
-    }
-    GPIO_MODER(GPIOA) = (GPIO_MODER(GPIOA) & ~MODE(6, 3)) | MODE(6, MODE_OUTPUT);
-    GPIO_BSRR(GPIOA) = PIN(6);
-    GPIO_BSRR(GPIOA) = PIN(6); /* a second write: the latch pulse is longer than the drivers' 20 ns */
-    GPIO_BSRR(GPIOA) = PIN_CLEAR(6);
-}
-
-void hal_leds(const uint8_t *row, uint32_t chip)
-{
-    if (chip == EVLCP_CHIP_DARK && !in_chip) {
-        outputs_off();
-        return;
-    }
-    load(row);
-    if (chip == EVLCP_CHIP_TEST) {
-        shift_now();
-        outputs_on();
-    }
-}
-
 /* Dark first: nothing of what follows is sure to work. */
 static void chips_stop(void)
 {
@@ -277,7 +248,7 @@ static void chips_stop(void)
     TIM_DIER(TIM1) = 0u; /* or an update would ask for a word that the next stream hands out */
     TIM_CR1(TIM3) = 0u;
     DMA_S5CR = 0u;
-    for (uint32_t n = 0; n < DMA_WAIT_LOOPS && (DMA_S5CR & DMA_ENABLE) != 0u; n++) {
+    for (uint32_t n = 0; n < WORD_WAIT_LOOPS && (DMA_S5CR & DMA_ENABLE) != 0u; n++) {
     }
     DMA_HIFCR = DMA_S5_FLAGS;
     SCB_ICSR = SYSTICK_FORGET;
@@ -289,6 +260,40 @@ static void fail(void)
 {
     failed = true;
     chips_stop();
+}
+
+/* Shift a row out by hand while no chips run: the single-LED test. False if SPI1 does not follow. */
+static bool shift_now(void)
+{
+    for (uint32_t i = 0; i < SLOTS_PER_CHIP; i++) {
+        for (uint32_t n = 0; n < WORD_WAIT_LOOPS && (SPI_SR & SPI_EMPTY) == 0u; n++) {
+        }
+        SPI_DR = words[gone][i];
+    }
+    for (uint32_t n = 0; n < WORD_WAIT_LOOPS && (SPI_SR & SPI_BUSY) != 0u; n++) {
+    }
+    if ((SPI_SR & (SPI_EMPTY | SPI_BUSY)) != SPI_EMPTY)
+        return false;
+    GPIO_MODER(GPIOA) = (GPIO_MODER(GPIOA) & ~MODE(6, 3)) | MODE(6, MODE_OUTPUT);
+    GPIO_BSRR(GPIOA) = PIN(6);
+    GPIO_BSRR(GPIOA) = PIN(6); /* a second write: the latch pulse is longer than the drivers' 20 ns */
+    GPIO_BSRR(GPIOA) = PIN_CLEAR(6);
+    return true;
+}
+
+void hal_leds(const uint8_t *row, uint32_t chip)
+{
+    if (chip == EVLCP_CHIP_DARK && !in_chip) {
+        outputs_off();
+        return;
+    }
+    load(row);
+    if (chip == EVLCP_CHIP_TEST) {
+        if (shift_now())
+            outputs_on();
+        else
+            fail();
+    }
 }
 
 /* Something that should go on all the time, as the main loop sees it. */
