@@ -225,7 +225,7 @@ def test_save_outlives_the_watchdog_and_autostart_waits_for_start_after_its_rese
     assert board.status().faults == 0
 
 
-@pytest.mark.parametrize("what", ["hangs", "stands", "faults"])
+@pytest.mark.parametrize("what", ["hangs", "hangs-in-chip", "stands", "faults"])
 def test_a_core_that_stops_is_reset_and_stays_dark(bar: Bar, what: str) -> None:
     bar.board.start()
     bar.chip.run(8_000)
@@ -233,17 +233,20 @@ def test_a_core_that_stops_is_reset_and_stays_dark(bar: Bar, what: str) -> None:
     at = bar.chip.now
     if what == "faults":
         bar.chip.exception(3)
-    elif what == "hangs":
-        # main loop and SysTick: an instruction that jumps to itself, with TIM1 dead
+    elif what.startswith("hangs"):
+        # an instruction that jumps to itself: in the chip interrupt, or where nothing interrupts it
+        if what == "hangs-in-chip":
+            bar.chip.exception(16 + Dma.IRQ)
+        else:
+            bar.chip.enabled.clear()
+            bar.chip.systick.generation += 1
         bar.chip.uc.mem_write(0x20018000, b"\xfe\xe7")
         bar.chip.pc = 0x20018000
-        bar.chip.enabled.clear()
-        bar.chip.systick.generation += 1
     else:
         bar.chip.plain[0x40023800] &= ~(1 << 19)  # as if clock security had failed as well
         bar.chip.stop_crystal()
     bar.chip.run(200)
-    assert bar.dark == (what == "faults")
+    assert bar.dark == (what in ("faults", "hangs-in-chip"))
     bar.chip.run(110_000)
     assert bar.chip.resets == [RESET_BY_PIN, RESET_BY_IWDG]
     assert bar.dark
