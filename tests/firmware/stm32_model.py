@@ -14,8 +14,10 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
-import unicorn
-from unicorn import arm_const
+import pytest
+
+unicorn = pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
+arm_const = pytest.importorskip("unicorn.arm_const")
 
 UNIT_HZ = 336_000_000
 HSI_HZ, HSE_HZ, LSI_HZ = 16_000_000, 8_000_000, 32_000

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from stm32_model import RESET_BY_IWDG, RESET_BY_PIN, US, Dma, ModelLine, Shown, Stm32
 
 from evlcp_sdk.codebook import Codebook
 from firmware_host import build
@@ -14,9 +15,6 @@ from firmware_host.errors import RefusedError
 from firmware_host.link import Link
 from firmware_host.messages import Fault, State
 from firmware_host.payload import Payload, random_symbols, symbol_chips
-
-pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
-from stm32_model import RESET_BY_IWDG, RESET_BY_PIN, US, Dma, ModelLine, Shown, Stm32
 
 CHIP = 100 * US
 BOOT_US = 15_000
