@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_host.board import Board, Settings, provision
-from firmware_host.client import Outcome
-from firmware_host.emulators import start_qemu
-from firmware_host.generate import codebook_of
-from firmware_host.link import Link
-from firmware_host.messages import StatusReply, StatusRequest
-from firmware_host.payload import Payload, random_symbols, symbol_chips
-from firmware_host.recording import Recording
-from firmware_host.wire import Payload as Message
+from firmware_host.board.bank import Payload, random_symbols, symbol_chips
+from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.session import Link
+from firmware_host.emulators.processes import start_qemu
+from firmware_host.emulators.recording import Recording
+from firmware_host.protocol.client import Outcome
+from firmware_host.protocol.generate import codebook_of
+from firmware_host.protocol.requests import StatusReply, StatusRequest
+from firmware_host.protocol.wire import Payload as Message
 
 CHIPS = 20_000
 TICKS_PER_US = 25.0

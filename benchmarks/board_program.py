@@ -7,12 +7,12 @@ import time
 
 import numpy as np
 
-from firmware_host.board import Board, Settings, provision
-from firmware_host.client import Timing
-from firmware_host.emulators import start_native
-from firmware_host.generate import codebook_of
-from firmware_host.link import Link
-from firmware_host.payload import Payload, random_symbols
+from firmware_host.board.bank import Payload, random_symbols
+from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.session import Link
+from firmware_host.emulators.processes import start_native
+from firmware_host.protocol.client import Timing
+from firmware_host.protocol.generate import codebook_of
 
 BAUD = 1_000_000
 RUNS = 5

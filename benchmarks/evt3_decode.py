@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from evlcp_sdk.io import DEFAULT_MAX_EVENTS, open_events, open_writer, read_events
-from evlcp_sdk.types import Events
+from evlcp_sdk.values import Events
 
 COLUMNS = ("t_us", "x", "y", "p")
 SHARED = Path(__file__).parents[2] / "shared" / "recordings" / "night-50m-30kmh.raw"

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from evlcp_sdk.config import load_link
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import load_scene, simulate, truth
-from evlcp_sdk.types import Frame
+from evlcp_sdk.values import Frame
 
 SCENES = (
     ("drive-30kmh", 45.0),

@@ -21,13 +21,13 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import norm
 
-from evlcp_sdk.campaign.measure import message_tallies
-from evlcp_sdk.campaign.statistics import Tally
-from evlcp_sdk.config import load_link
-from evlcp_sdk.messages.block import HEADER_BYTES, Block, BlockError, Kind
-from evlcp_sdk.messages.coding import BlockCoder
+from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind
+from evlcp_sdk.link.blocks import BlockCoder
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import scene_of_truth, simulate, truth
+from evlcp_sdk.study.measure import message_tallies
+from evlcp_sdk.study.tally import Tally
 
 DARK_W_M2 = 1e-6
 BERS = (0.01, 0.03, 0.05, 0.07, 0.09, 0.11, 0.13, 0.16, 0.2, 0.25, 0.3, 0.4)

@@ -18,8 +18,8 @@ from pathlib import Path
 from evt3_decode import tile
 
 from evlcp_sdk.cli.receive import decode
-from evlcp_sdk.config import Link, load_link
 from evlcp_sdk.io import open_events, read_events
+from evlcp_sdk.link.resolve import Link, load_link
 
 SHARED = Path(__file__).parents[2] / "shared" / "recordings"
 FIRST = "night-50m-30kmh.raw"

@@ -19,10 +19,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import binomtest, chi2, norm
 
-from evlcp_sdk.config import load_link
 from evlcp_sdk.io import read_events
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.score import BarScore, score_frames
 from evlcp_sdk.sim import BackgroundSpec, Scene, SensorSpec, scene_of_truth, simulate, truth
 from evlcp_sdk.sim.validation import (
     MEASURED_AREA,
@@ -33,7 +32,8 @@ from evlcp_sdk.sim.validation import (
     pixel_events,
     step_response,
 )
-from evlcp_sdk.types import Events
+from evlcp_sdk.study.score import BarScore, score_frames
+from evlcp_sdk.values import Events
 
 SHARED = Path(__file__).parents[2] / "shared" / "recordings"
 SENSOR = SensorSpec()

@@ -2,8 +2,8 @@
 
 import sys
 
-from evlcp_sdk.config import load_link
 from evlcp_sdk.io import open_events
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
 
 

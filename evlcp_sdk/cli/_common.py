@@ -8,9 +8,9 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from evlcp_sdk.campaign.executor import Executor
     from evlcp_sdk.io import EventSource
-    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.jobs.executor import Executor
+    from evlcp_sdk.plugin.registry import Registry
 
 __all__ = [
     "Dask",
@@ -84,12 +84,12 @@ def make_executor(workers: int | None, dask: str | None) -> "Executor":
     Raises:
         ConfigError: The cluster is not there.
     """
-    from evlcp_sdk.campaign.executor import Inline, Processes
+    from evlcp_sdk.jobs.executor import Inline, Processes
 
     if dask is not None:
         if workers is not None:
             raise typer.BadParameter("give one of --workers and --dask", param_hint="--dask")
-        from evlcp_sdk.campaign.cluster import DaskCluster
+        from evlcp_sdk.jobs.dask import DaskCluster
 
         return DaskCluster(dask)
     if workers == 0:

@@ -30,7 +30,7 @@ def info(
     import json
 
     from evlcp_sdk.cli._common import open_source
-    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.plugin.registry import Registry
 
     with open_source(recording, Registry.load()) as source:
         table = describe(source, recording)

@@ -138,8 +138,8 @@ def simulate(
 
 def _on_earth(simulation: "Simulation", out: Path) -> list[Path]:
     """Write where the bars stand and how the camera does, if the scene says so; return the files."""
+    from evlcp_sdk.scene.sites import to_toml
     from evlcp_sdk.sim.world import attitude_log, sites_of
-    from evlcp_sdk.sites import to_toml
 
     scene = simulation.scene
     if scene.world is None:

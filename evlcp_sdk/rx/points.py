@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.types import PresenceMap
+from evlcp_sdk.values import PresenceMap
 
 __all__ = ["FindPoints", "points_finder"]
 

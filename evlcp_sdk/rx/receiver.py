@@ -10,17 +10,17 @@ import numpy as np
 import pluggy
 from numpy.typing import NDArray
 
-from evlcp_sdk.abc import Synchronizer, Tracker
-from evlcp_sdk.config import Link
 from evlcp_sdk.errors import ConfigError, StreamError
-from evlcp_sdk.rx.blame import Blame
-from evlcp_sdk.rx.chips import polarity_sums
-from evlcp_sdk.rx.messages import MessageAssembler
-from evlcp_sdk.rx.payload import PacketAssembler
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.roles import Synchronizer, Tracker
+from evlcp_sdk.rx.detection import RegionTracker, Track
+from evlcp_sdk.rx.guard import Blame
+from evlcp_sdk.rx.inbox import MessageAssembler
+from evlcp_sdk.rx.look import polarity_sums
+from evlcp_sdk.rx.packets import PacketAssembler
+from evlcp_sdk.rx.plausibility import clusters_in_place
 from evlcp_sdk.rx.points import points_finder
-from evlcp_sdk.rx.presence import clusters_in_place
-from evlcp_sdk.rx.regions import RegionTracker, Track
-from evlcp_sdk.types import Events, Frame, FrameView, Packet, PresenceMap, Range, SyncLock
+from evlcp_sdk.values import Events, Frame, FrameView, Packet, PresenceMap, Range, SyncLock
 
 __all__ = ["Receiver"]
 
@@ -114,7 +114,7 @@ class Receiver:
         link: The resolved configuration.
         hook: Where finished stages are announced (`Registry.hook`); None for nowhere.
 
-    >>> from evlcp_sdk.config import load_link
+    >>> from evlcp_sdk.link.resolve import load_link
     >>> receiver = Receiver(load_link())
     >>> receiver.feed(Events.of(t_us=[10, 20], x=[5, 5], y=[7, 7], p=[1, 0]))
     []

@@ -9,16 +9,16 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.config import Link, resolve
+from evlcp_sdk.air.blocks import HEADER_BYTES, Kind, Message
+from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.frames import packet_chips
-from evlcp_sdk.messages.block import HEADER_BYTES, Kind, Message
-from evlcp_sdk.messages.sending import beacon_of_site, packets_of
+from evlcp_sdk.link.compose import beacon_of_site, packets_of
+from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.sim.motion import Strip
 from evlcp_sdk.sim.optics import led_light_w_m2
 from evlcp_sdk.sim.scene import BarSpec, LampSpec, Scene
 from evlcp_sdk.sim.world import bar_axis, sites_of
-from evlcp_sdk.sites import BarSite
 
 __all__ = ["BarLight", "LampLight", "Source", "sources_of"]
 

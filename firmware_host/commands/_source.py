@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from evlcp_sdk.codebook import Codebook
+    from evlcp_sdk.air.codebook import Codebook
 
 __all__ = ["codebook", "symbols"]
 
@@ -23,7 +23,7 @@ def codebook(profile: str) -> "Codebook":
     Raises:
         UnknownAlgorithmError: No modulation has that name.
     """
-    from firmware_host.generate import codebook_of
+    from firmware_host.protocol.generate import codebook_of
 
     return codebook_of(profile)
 
@@ -37,7 +37,7 @@ def symbols(
         ConfigError: Neither is given, or both.
         InputError: The file is wrong.
     """
-    from firmware_host.payload import random_symbols, read_symbols
+    from firmware_host.board.bank import random_symbols, read_symbols
 
     if (path is None) == (random is None):
         raise ConfigError("give symbols as SYMBOLS.json or with --random N, one of the two")

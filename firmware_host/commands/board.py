@@ -12,9 +12,9 @@ from firmware_host.commands import _source
 from firmware_host.commands.tx import Frames, PilotEvery, ProfileName, RandomPackets, Seed, SymbolsFile
 
 if TYPE_CHECKING:
-    from firmware_host.board import Board
-    from firmware_host.messages import HelloReply, StatusReply
-    from firmware_host.payload import Payload
+    from firmware_host.board.bank import Payload
+    from firmware_host.board.board import Board
+    from firmware_host.protocol.requests import HelloReply, StatusReply
 
 __all__ = ["app", "open_board", "progress_bar", "tell"]
 
@@ -65,11 +65,11 @@ class Emulator(StrEnum):
 def open_board(port: str | None, baud: int, trace: Path | None, replay: Path | None) -> "Iterator[Board]":
     """The board at a port, or a recorded one."""
     from evlcp_sdk.errors import ConfigError, InputError
-    from firmware_host.board import Board
-    from firmware_host.client import Timing
-    from firmware_host.link import Link
-    from firmware_host.ports import find
-    from firmware_host.transport import ReplayTransport, TraceTransport, Transport, open_transport
+    from firmware_host.board.board import Board
+    from firmware_host.board.session import Link
+    from firmware_host.ports.survey import find
+    from firmware_host.ports.transport import ReplayTransport, TraceTransport, Transport, open_transport
+    from firmware_host.protocol.client import Timing
 
     transport: Transport
     first = nonce = None
@@ -105,7 +105,7 @@ def _payload(
     profile: str,
 ) -> "Payload":
     from evlcp_sdk.errors import ConfigError
-    from firmware_host.payload import Payload, read_masks
+    from firmware_host.board.bank import Payload, read_masks
 
     book = _source.codebook(profile)
     if masks is not None:
@@ -130,7 +130,7 @@ def progress_bar(what: str) -> "Iterator[Any]":
 
 
 def _about(about: "HelloReply") -> dict[str, Any]:
-    from firmware_host.messages import Capability
+    from firmware_host.protocol.requests import Capability
 
     return {
         "hal": about.hal.rstrip(b"\0").decode("ascii", "replace"),
@@ -159,7 +159,7 @@ def _name(enum: Any, value: int) -> str:
 
 
 def _status(status: "StatusReply") -> dict[str, Any]:
-    from firmware_host.messages import NO_BANK, Fault, Format, Profile, State, Watchdog
+    from firmware_host.protocol.requests import NO_BANK, Fault, Format, Profile, State, Watchdog
 
     def bank(number: int) -> int | None:
         return None if number == NO_BANK else number
@@ -220,7 +220,7 @@ def ports(baud: Baud = DEFAULT_BAUD, as_json: AsJson = False) -> None:
 
     For example: [bold]evlcp board ports[/]
     """
-    from firmware_host.ports import survey
+    from firmware_host.ports.survey import survey
 
     found = survey(baud)
     if as_json:
@@ -306,8 +306,8 @@ def program(
             )
         _program_fleet(inventory, verify, as_json)
         return
-    from firmware_host.board import Settings, provision
-    from firmware_host.messages import Watchdog
+    from firmware_host.board.board import Settings, provision
+    from firmware_host.protocol.requests import Watchdog
 
     action = None if watchdog is None else Watchdog[watchdog.name]
     payload = _payload(symbols, random, masks, seed, frames, pilot_every, profile)
@@ -333,7 +333,7 @@ def tell(done: Any, as_json: bool) -> None:
 def _program_fleet(path: Path, verify: bool, as_json: bool) -> None:
     import json
 
-    from firmware_host.fleet import Result, program_fleet, raise_failures, read_inventory
+    from firmware_host.board.fleet import Result, program_fleet, raise_failures, read_inventory
 
     inventory = read_inventory(path)
 
@@ -364,7 +364,7 @@ def send(
     For example: [bold]evlcp board send --random 4 --seed 7 --port unix:/tmp/board[/]
     """
     from firmware_host.errors import RefusedError
-    from firmware_host.messages import NO_BANK, Status
+    from firmware_host.protocol.requests import NO_BANK, Status
 
     payload = _payload(symbols, random, masks, seed, frames, pilot_every, profile)
     with open_board(port, baud, trace, replay) as board, progress_bar("sending") as progress:
@@ -438,7 +438,7 @@ def watchdog(
     replay: Replay = None,
 ) -> None:
     """Choose what the board does when the host falls silent: keep playing, idle pattern, or dark."""
-    from firmware_host.messages import Watchdog
+    from firmware_host.protocol.requests import Watchdog
 
     with open_board(port, baud, trace, replay) as board:
         board.watchdog(Watchdog[action.name], after_ms)
@@ -471,7 +471,7 @@ def monitor(
     import itertools
     import json
 
-    from firmware_host.messages import State
+    from firmware_host.protocol.requests import State
 
     with open_board(port, baud, trace, replay) as board, contextlib.suppress(KeyboardInterrupt):
         for n in itertools.count(1):
@@ -509,7 +509,7 @@ def verify(
     For example: [bold]evlcp board verify SYMBOLS.json --port /dev/ttyUSB0[/]
     """
     from firmware_host.errors import VerifyError
-    from firmware_host.messages import NO_BANK
+    from firmware_host.protocol.requests import NO_BANK
 
     payload = _payload(symbols, random, masks, seed, frames, pilot_every, profile)
     with open_board(port, baud, trace, replay) as board:
@@ -606,7 +606,7 @@ def emulate(
     import subprocess
 
     from evlcp_sdk.errors import ConfigError, InputError
-    from firmware_host.emulators import native_command, qemu_command, wait_for
+    from firmware_host.emulators.processes import native_command, qemu_command, wait_for
     from firmware_host.errors import ToolchainError
 
     scheme, _, place = listen.partition(":")
@@ -656,7 +656,7 @@ def leds(
     """
     from evlcp_sdk.errors import ConfigError, InputError
     from firmware_host.commands.tx import save_array
-    from firmware_host.recording import Recording
+    from firmware_host.emulators.recording import Recording
 
     played = Recording.read(record).played()
     try:

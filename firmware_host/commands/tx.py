@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from evlcp_sdk.codebook import Codebook
+    from evlcp_sdk.air.codebook import Codebook
 
 __all__ = ["app", "save_array"]
 
@@ -71,7 +71,7 @@ def frames(
     book = _source.codebook(profile)
     table = _source.symbols(symbols, random, seed, frames, pilot_every, book)
     if chips is not None:
-        from firmware_host.payload import symbol_chips
+        from firmware_host.board.bank import symbol_chips
 
         save_array(chips, symbol_chips(table, book, pilot_every))
     typer.echo(_FORMS[form](table, book, pilot_every))
@@ -95,7 +95,7 @@ def save_array(path: Path, array: "NDArray[np.generic]") -> None:
 
 
 def _table(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
-    from firmware_host.payload import word_table
+    from firmware_host.board.bank import word_table
 
     lines = ["packet frame cluster symbol pilot info"]
     for p, packet in enumerate(word_table(symbols, book)):
@@ -107,7 +107,7 @@ def _table(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> 
 
 
 def _hex(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
-    from firmware_host.payload import word_table
+    from firmware_host.board.bank import word_table
 
     words = word_table(symbols, book)
     return "\n".join(
@@ -118,7 +118,7 @@ def _hex(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> st
 
 
 def _c(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
-    from firmware_host.payload import word_table
+    from firmware_host.board.bank import word_table
 
     info = word_table(symbols, book)[..., 1]
     packets, frames, clusters = info.shape
@@ -138,7 +138,7 @@ def _c(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
 def _json(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
     import json
 
-    from firmware_host.payload import word_table
+    from firmware_host.board.bank import word_table
 
     words = word_table(symbols, book)
     return json.dumps(
@@ -173,8 +173,8 @@ def check(
 
     For example: [bold]evlcp tx check --random 100[/]
     """
+    from firmware_host.board.bank import symbol_chips
     from firmware_host.flicker import check as measure
-    from firmware_host.payload import symbol_chips
 
     book = _source.codebook(profile)
     table = symbol_chips(_source.symbols(symbols, random, seed, frames, pilot_every, book), book, pilot_every)

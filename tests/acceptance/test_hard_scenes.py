@@ -5,12 +5,12 @@ from functools import cache
 
 import pytest
 
-from evlcp_sdk.campaign.measure import statistics_of
-from evlcp_sdk.campaign.statistics import Tally
-from evlcp_sdk.config import load_link
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import load_scene, simulate, truth
-from evlcp_sdk.types import Events
+from evlcp_sdk.study.measure import statistics_of
+from evlcp_sdk.study.tally import Tally
+from evlcp_sdk.values import Events
 from tests.conftest import ROOT
 
 SCENES = ROOT / "examples" / "scenes"

@@ -6,12 +6,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_host.board import Board
-from firmware_host.client import Timing
-from firmware_host.link import Link
-from firmware_host.payload import symbol_chips
-from firmware_host.recording import Recording
-from firmware_host.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.board.bank import symbol_chips
+from firmware_host.board.board import Board
+from firmware_host.board.session import Link
+from firmware_host.emulators.recording import Recording
+from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.protocol.client import Timing
 
 PACKET = 346
 

@@ -19,13 +19,13 @@ import numpy as np
 import pytest
 from board_lines import check_order, packet_sequence
 
-from evlcp_sdk.codebook import Codebook
-from firmware_host.board import Board
-from firmware_host.emulators import native_command, wait_for
+from evlcp_sdk.air.codebook import Codebook
+from firmware_host.board.bank import Payload, random_symbols
+from firmware_host.board.board import Board
+from firmware_host.board.session import Link
+from firmware_host.emulators.processes import native_command, wait_for
+from firmware_host.emulators.recording import RECORD, Recording
 from firmware_host.errors import LinkError
-from firmware_host.link import Link
-from firmware_host.payload import Payload, random_symbols
-from firmware_host.recording import RECORD, Recording
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -255,7 +255,7 @@ def test_pty_and_tcp(cli, tmp_path: Path) -> None:
 
 def test_ports_are_asked(native: str, tmp_path: Path) -> None:
     from firmware_host.errors import NoBoardError
-    from firmware_host.ports import find, survey
+    from firmware_host.ports.survey import find, survey
 
     silent, other = pty.openpty()
     tty.setraw(other)

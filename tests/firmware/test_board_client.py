@@ -4,9 +4,9 @@ from itertools import pairwise
 
 import pytest
 
-from firmware_host.client import TRIES, Client, Timing
-from firmware_host.datagram import Datagram, Decoder
-from firmware_host.messages import (
+from firmware_host.protocol.client import TRIES, Client, Timing
+from firmware_host.protocol.datagram import Datagram, Decoder
+from firmware_host.protocol.requests import (
     MAX_PAYLOAD,
     CrcReply,
     CrcRequest,

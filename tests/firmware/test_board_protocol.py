@@ -11,11 +11,12 @@ from cobs import cobs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_host import generate, messages
-from firmware_host.datagram import MAX_WIRE_BYTES, Datagram, Decoder
 from firmware_host.errors import DatagramError
-from firmware_host.vectors import read_vectors
-from firmware_host.wire import Payload
+from firmware_host.protocol import generate
+from firmware_host.protocol import requests as messages
+from firmware_host.protocol.datagram import MAX_WIRE_BYTES, Datagram, Decoder
+from firmware_host.protocol.vectors import read_vectors
+from firmware_host.protocol.wire import Payload
 
 VECTORS = list(read_vectors())
 PAYLOADS = [
@@ -26,12 +27,12 @@ PAYLOADS = [
 
 
 def definition() -> dict:
-    return tomllib.loads((generate.HERE / "protocol.toml").read_text())
+    return tomllib.loads((generate.HERE / "protocol" / "protocol.toml").read_text())
 
 
 def test_generated_files_are_fresh() -> None:
     stale = [p.name for p, text in generate.generated_files().items() if p.read_text() != text]
-    assert not stale, "run python -m firmware_host.generate"
+    assert not stale, "run python -m firmware_host.protocol.generate"
 
 
 def test_generator_names_a_stale_file(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:

@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evlcp_sdk.codebook import Codebook
-from evlcp_sdk.frames import packet_chips
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import packet_chips
 from firmware_host import build
-from firmware_host.board import Board, Settings, provision
-from firmware_host.emulators import start_qemu
+from firmware_host.board.bank import Payload, random_symbols
+from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.session import Link
+from firmware_host.emulators.processes import start_qemu
+from firmware_host.emulators.recording import Recording
 from firmware_host.errors import RefusedError
-from firmware_host.link import Link
-from firmware_host.messages import State, StatusReply, StatusRequest
-from firmware_host.payload import Payload, random_symbols
-from firmware_host.recording import Recording
-from firmware_host.transport import SocketTransport
+from firmware_host.ports.transport import SocketTransport
+from firmware_host.protocol.requests import State, StatusReply, StatusRequest
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evlcp_sdk.codebook import Codebook
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.frames import packet_chips
 from firmware_host import flicker
-from firmware_host.payload import (
+from firmware_host.board.bank import (
     Payload,
     chips_of_rows,
     random_symbols,

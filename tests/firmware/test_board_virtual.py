@@ -14,11 +14,13 @@ from board_lines import (
     packet_sequence,
 )
 
-from evlcp_sdk.codebook import Codebook, hadamard
+from evlcp_sdk.air.codebook import Codebook, hadamard
+from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.frames import packet_chips
-from firmware_host.board import Board, Settings, profile_number, provision
-from firmware_host.client import Timing
+from firmware_host.board.bank import Payload, random_symbols, symbol_chips
+from firmware_host.board.board import Board, Settings, profile_number, provision
+from firmware_host.board.session import Link
+from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import (
     BoardResetError,
     IncompatibleError,
@@ -27,9 +29,9 @@ from firmware_host.errors import (
     RefusedError,
     VerifyError,
 )
-from firmware_host.generate import codebook_of
-from firmware_host.link import Link
-from firmware_host.messages import (
+from firmware_host.protocol.client import Timing
+from firmware_host.protocol.generate import codebook_of
+from firmware_host.protocol.requests import (
     NO_BANK,
     CodebookReply,
     CodebookRequest,
@@ -52,8 +54,6 @@ from firmware_host.messages import (
     WriteReply,
     WriteRequest,
 )
-from firmware_host.payload import Payload, random_symbols, symbol_chips
-from firmware_host.simulated import SimulatedBoard, SimulatedLine
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -351,7 +351,7 @@ def test_silence_is_told(device: SimulatedBoard, board: Board) -> None:
 
 
 def test_another_schema_is_incompatible(device: SimulatedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("firmware_host.link.SCHEMA", b"12345678")
+    monkeypatch.setattr("firmware_host.board.session.SCHEMA", b"12345678")
     with pytest.raises(IncompatibleError, match="update firmware or host"):
         Board(Link(SimulatedLine(device), Timing()))
 

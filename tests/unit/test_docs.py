@@ -15,11 +15,11 @@ from typing import Any, get_type_hints
 import pytest
 from pydantic.fields import FieldInfo
 
-from evlcp_sdk import hookspecs
-from evlcp_sdk.abc import ROLES
-from evlcp_sdk.config import resolve
-from evlcp_sdk.messages.signing import make_key
-from evlcp_sdk.registry import Registry
+from evlcp_sdk.air.signing import make_key
+from evlcp_sdk.link.resolve import resolve
+from evlcp_sdk.plugin import hooks as hookspecs
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.testing import check, laws_of
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
 

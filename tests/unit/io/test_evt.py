@@ -12,7 +12,7 @@ from evlcp_sdk.errors import StreamError
 from evlcp_sdk.io import RawSource, RawWriter, open_events, read_events, write_events
 from evlcp_sdk.io._codec import Columns, Decoder
 from evlcp_sdk.io.raw import CODECS
-from evlcp_sdk.types import Events, Triggers
+from evlcp_sdk.values import Events, Triggers
 
 WIDTH, HEIGHT = 640, 480
 

@@ -9,7 +9,7 @@ import pytest
 from evlcp_sdk.errors import EvlcpError, InputError, RawFormatError, StreamError
 from evlcp_sdk.io import RawWriter, open_events, write_events
 from evlcp_sdk.io.raw import CODECS, format_header, parse_header
-from evlcp_sdk.types import Events
+from evlcp_sdk.values import Events
 
 HEADER = format_header(CODECS["EVT3"], 640, 480)
 GOOD = [0x8001, 0x6002, 0x0003, 0x2804]

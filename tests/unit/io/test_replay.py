@@ -5,7 +5,7 @@ import pytest
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.io import ReplaySource, open_events, write_events
-from evlcp_sdk.types import Events, Triggers
+from evlcp_sdk.values import Events, Triggers
 
 
 class Clock:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from evlcp_sdk.errors import InputError, StreamError
 from evlcp_sdk.io import CsvSource, NpzSource, open_events, open_writer, read_events, write_events
-from evlcp_sdk.types import Events, Triggers
+from evlcp_sdk.values import Events, Triggers
 
 tables = st.lists(
     st.tuples(

@@ -6,8 +6,8 @@ from evlcp_kalman.tracking import KalmanTracking, NoTracking
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from evlcp_sdk.abc import Filter
-from evlcp_sdk.config import load_link
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.plugin.roles import Filter
 from evlcp_sdk.rx.receiver import Receiver
 from tests.synthetic import Bar, events_of, random_symbols
 

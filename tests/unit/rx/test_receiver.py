@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from evlcp_sdk.config import Link, load_link
 from evlcp_sdk.errors import StreamError
-from evlcp_sdk.hookspecs import hookimpl
-from evlcp_sdk.registry import Registry
+from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.types import Events, Packet
+from evlcp_sdk.values import Events, Packet
 from tests.synthetic import Bar, events_of, lamp, merged, noise, random_symbols
 
 LINK = load_link()

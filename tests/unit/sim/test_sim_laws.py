@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evlcp_sdk.config import load_link
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.geometry import CameraModel
 from evlcp_sdk.io import read_events
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.score import score_frames
+from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
     BackgroundSpec,
     BarSpec,
@@ -27,7 +26,8 @@ from evlcp_sdk.sim import (
     truth,
     truth_of,
 )
-from evlcp_sdk.types import Events
+from evlcp_sdk.study.score import score_frames
+from evlcp_sdk.values import Events
 
 SHARED = Path(__file__).parents[4] / "shared" / "recordings"
 SHORT = replace(load_scene("two-bars"), duration_s=0.03, lamps=(LampSpec(x_m=-1.4, y_m=-0.6, z_m=3.0),))

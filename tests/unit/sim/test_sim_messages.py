@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evlcp_sdk.campaign.measure import message_tallies
-from evlcp_sdk.campaign.statistics import Tally
-from evlcp_sdk.config import load_link
+from evlcp_sdk.air.beacons import Beacon
+from evlcp_sdk.air.blocks import Block, Kind
+from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.frames import bits_of_symbols
-from evlcp_sdk.messages.beacon import Beacon
-from evlcp_sdk.messages.block import Block, Kind
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import load_scene, resolve_scene, simulate, sites_of, truth
 from evlcp_sdk.sim.light import sources_of
-from evlcp_sdk.types import Events, Packet
+from evlcp_sdk.study.measure import message_tallies
+from evlcp_sdk.study.tally import Tally
+from evlcp_sdk.values import Events, Packet
 
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 136.9, "height_m": 50.0, "heading_deg": 20.0}
 

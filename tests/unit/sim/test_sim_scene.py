@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.frames import packet_chips
-from evlcp_sdk.geometry import CameraModel
+from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
     BarSpec,
     LampSpec,

@@ -6,12 +6,12 @@ import numpy as np
 import pymap3d
 import pytest
 
-from evlcp_sdk.attitude import AttitudeTrack
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.scene.attitude import AttitudeLog
+from evlcp_sdk.scene.sites import LocalFrame, load_sites, to_toml
 from evlcp_sdk.sim import Simulation, load_scene, resolve_scene, sites_of, truth_of
 from evlcp_sdk.sim.motion import project
 from evlcp_sdk.sim.world import attitude_log
-from evlcp_sdk.sites import LocalFrame, load_sites, to_toml
 
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 137.2, "height_m": 40.0, "heading_deg": 30.0}
 SCENE = resolve_scene(
@@ -102,7 +102,7 @@ def test_an_imu_tells_the_attitude_and_one_error(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.std(errors, 0), 0.1, rtol=0.2)
     file = tmp_path / "attitude.csv"
     file.write_text(log.to_csv())
-    again = AttitudeTrack.read(file).at(20_300.0)
+    again = AttitudeLog.read(file).at(20_300.0)
     assert again is not None
     assert again.heading_deg == pytest.approx(found.heading_deg, abs=1e-4)
     assert again.pitch_deg == pytest.approx(found.pitch_deg, abs=1e-4)
