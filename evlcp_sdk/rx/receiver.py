@@ -435,8 +435,10 @@ class Receiver:
         distance, points = _NO_RANGE, _NO_POINTS
         if self._packet.has_pilot(index):
             # Another distance of the same pilot, or other points, would say nothing new.
+            view = FrameView(look.sums, look.offset_px, look.presence, soft)
+            self._tell("view", view, 0.0)
             with self._blame["ranging"]:
-                distance = self._measure(FrameView(look.sums, look.offset_px, look.presence, soft))
+                distance = self._measure(view)
             self._blame["ranging"].expect(distance, Range)
             self._tell("ranging", distance, _lap(clock))
             # A value is read from its second chip, and a chip's events follow the edge at its start.

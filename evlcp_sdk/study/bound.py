@@ -2,10 +2,10 @@
 
 It belongs to the geometry of the problem and to no algorithm, so it stands here and not beside one: how
 sharply a boundary of the bar shows in the image, how noisy its pixels are, and how far boundaries lie apart
-bound whatever ranging there is. `BoundaryInformation` reads these quantities from the frames of a recording.
+bound whatever ranging there is. `frame_bound` reads these quantities from the frames of a recording.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,12 +15,11 @@ from scipy.stats import theilslopes
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.plugin.roles import Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, PresenceMap, Range
 
-__all__ = ["BoundaryInformation", "cramer_rao_sigma_m"]
+__all__ = ["cramer_rao_sigma_m", "frame_bound"]
 
 _NONE = Range(float("nan"), float("nan"), 0)
 
@@ -96,9 +95,10 @@ def cramer_rao_sigma_m(
     return float(distance_m * np.sqrt(np.linalg.inv(information)[0, 0]) / spacing)
 
 
-@dataclass(frozen=True)
-class BoundaryInformation(Ranging):
-    """Takes the place of a ranging algorithm and gives, as sigma, the bound of each frame.
+def frame_bound(
+    camera: CameraModel, bar: BarLayout, codebook: Codebook, *, full_events: float = 3.0
+) -> Callable[[FrameView], Range]:
+    """A function that gives, as sigma, the bound of a frame.
 
     Blur, gain and noise of the bound are those of the frame: its values are fitted by the boundaries' model
     (least squares over spacing, position, drift, gain, blur and an offset between positive and negative
@@ -106,76 +106,77 @@ class BoundaryInformation(Ranging):
     as Gaussian and alike in all pixels, and the pixels of a row weigh alike; an error that several frames
     share is not seen.
 
-    Attributes:
+    Args:
+        camera: For the spacing in the image.
+        bar: One column of clusters.
+        codebook: Pilots and codewords.
         full_events: Events of a pixel in a chip that count as a full value; more are clipped, as hot pixels
             send them.
+
+    Returns:
+        From what the receiver's stage `view` shows to the fit's distance and the bound, both NaN where the
+        frame shows no boundaries.
+
+    Raises:
+        ConfigError: The layout has more than one column of clusters, or fewer than three.
     """
+    if np.ptp(bar.cluster_centres_m()[:, 0]) > 1e-9 or bar.clusters < 3:
+        raise ConfigError("the Cramer-Rao bound needs a bar of one column of three clusters or more")
+    spacing_m = _spacing_m(bar)
 
-    full_events: float = 3.0
+    def bound(view: FrameView) -> Range:
+        place = _place(view.presence)
+        if place is None:
+            return _NONE
+        upright, at_row, seen, width = place
+        sums, offset = view.sums, view.offset_px.reshape(2, -1, 2).mean(2)
+        light = view.presence.pixels.sum(0)
+        if not upright:
+            # A bar that lies across the image: exchange rows and columns.
+            sums, light, offset = sums.transpose(0, 2, 1), light.T, offset[::-1]
+        k = np.flatnonzero(seen)
+        tilt, left = _line(light)
+        spacing, first = theilslopes(at_row[k], k)[:2]
+        values, columns = _row_values(sums, tilt, left, width / 2, full_events)
+        codes = _codes(codebook, view.soft.symbols)
+        rows, down = _rows(sums.shape[1]), offset[1]
+        centre = first + spacing * (len(codes) - 1) / 2 - (sums.shape[1] - 1) / 2
+        if spacing < 0:
+            # A bar upside down: mirror it.
+            values, down, spacing, centre = values[:, ::-1], -down, -spacing, -centre
+        start = np.array([spacing, centre, 0.0, 0.5, 0.5, 0.0])
+        found = _fit(start, codes, values, seen, rows, down, _when(len(values)))
+        if found is None:
+            return _NONE
+        fit, noise = found
+        distance_m = camera.distance_m(spacing_m, float(fit[0]) * float(np.hypot(1.0, tilt)))
+        sigma_m = cramer_rao_sigma_m(
+            camera,
+            bar,
+            codebook,
+            distance_m,
+            view.soft.symbols,
+            blur_px=float(fit[4]),
+            noise=noise * float(np.sqrt(columns)),
+            columns=columns,
+            gain=float(fit[3]),
+            shift_px=float(fit[1]),
+        )
+        return Range(distance_m, sigma_m, int((seen[1:] & seen[:-1]).sum()))
 
-    def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
-        """Precompute for a bar of one column.
+    return bound
 
-        Raises:
-            ConfigError: The layout has more than one column of clusters, or fewer than three.
-        """
-        if np.ptp(bar.cluster_centres_m()[:, 0]) > 1e-9 or bar.clusters < 3:
-            raise ConfigError("the Cramer-Rao bound needs a bar of one column of three clusters or more")
-        spacing_m = _spacing_m(bar)
 
-        def measure(view: FrameView) -> Range:
-            place = _place(view.presence)
-            if place is None:
-                return _NONE
-            upright, at_row, seen, width = place
-            sums, offset = view.sums, view.offset_px.reshape(2, -1, 2).mean(2)
-            light = view.presence.pixels.sum(0)
-            if not upright:
-                # A bar that lies across the image: exchange rows and columns.
-                sums, light, offset = sums.transpose(0, 2, 1), light.T, offset[::-1]
-            k = np.flatnonzero(seen)
-            tilt, left = _line(light)
-            spacing, first = theilslopes(at_row[k], k)[:2]
-            values, columns = self._row_values(sums, tilt, left, width / 2)
-            codes = _codes(codebook, view.soft.symbols)
-            rows, down = _rows(sums.shape[1]), offset[1]
-            centre = first + spacing * (len(codes) - 1) / 2 - (sums.shape[1] - 1) / 2
-            if spacing < 0:
-                # A bar upside down: mirror it.
-                values, down, spacing, centre = values[:, ::-1], -down, -spacing, -centre
-            start = np.array([spacing, centre, 0.0, 0.5, 0.5, 0.0])
-            when = _when(len(values))
-            found = _fit(start, codes, values, seen, rows, down, when)
-            if found is None:
-                return _NONE
-            fit, noise = found
-            distance_m = camera.distance_m(spacing_m, float(fit[0]) * float(np.hypot(1.0, tilt)))
-            sigma_m = cramer_rao_sigma_m(
-                camera,
-                bar,
-                codebook,
-                distance_m,
-                view.soft.symbols,
-                blur_px=float(fit[4]),
-                noise=noise * float(np.sqrt(columns)),
-                columns=columns,
-                gain=float(fit[3]),
-                shift_px=float(fit[1]),
-            )
-            return Range(distance_m, sigma_m, int((seen[1:] & seen[:-1]).sum()))
-
-        return measure
-
-    def _row_values(
-        self, sums: NDArray[np.int16], tilt: float, left: float, half_width: float
-    ) -> tuple[Array, float]:
-        """Mean of each row's clipped sums in every value's second chip (values, rows); columns of a row."""
-        row, column = np.ogrid[: sums.shape[1], : sums.shape[2]]
-        inside = np.abs(column - (left + tilt * row)) < half_width
-        clipped: Array = np.clip(sums[1::2].astype(np.float64) / self.full_events, -1.0, 1.0)
-        number = inside.sum(1)
-        values: Array = np.where(inside, clipped, 0.0).sum(2) / np.maximum(number, 1)
-        return values, float(number.mean())
+def _row_values(
+    sums: NDArray[np.int16], tilt: float, left: float, half_width: float, full_events: float
+) -> tuple[Array, float]:
+    """Mean of each row's clipped sums in every value's second chip (values, rows); columns of a row."""
+    row, column = np.ogrid[: sums.shape[1], : sums.shape[2]]
+    inside = np.abs(column - (left + tilt * row)) < half_width
+    clipped: Array = np.clip(sums[1::2].astype(np.float64) / full_events, -1.0, 1.0)
+    number = inside.sum(1)
+    values: Array = np.where(inside, clipped, 0.0).sum(2) / np.maximum(number, 1)
+    return values, float(number.mean())
 
 
 def _spacing_m(bar: BarLayout) -> float:
@@ -276,7 +277,7 @@ def _place(presence: PresenceMap) -> tuple[bool, Array, NDArray[np.bool_], int] 
         return None
     middle = np.zeros((2, len(selected)))
     for k in np.flatnonzero(seen):
-        # Medians are deaf to stray cells.
+        # Medians are robust against stray cells.
         middle[:, k] = np.median(np.nonzero(selected[k]), axis=1) * grid + (grid - 1) / 2
     upright = bool(np.ptp(middle[0][seen]) >= np.ptp(middle[1][seen]))
     across = selected.any(0).sum(0 if upright else 1)

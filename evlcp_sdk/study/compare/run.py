@@ -20,12 +20,12 @@ from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.outputs import FILTERED_COLUMNS, FRAME_COLUMNS, filtered_row, frame_row
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.study.bound import BoundaryInformation
+from evlcp_sdk.study.bound import frame_bound
 from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments
 from evlcp_sdk.study.compare.table import Row, Table
 from evlcp_sdk.study.compare.variants import Variant
 from evlcp_sdk.study.score import score_frames
-from evlcp_sdk.values import Events, Packet
+from evlcp_sdk.values import Events, FrameView, Packet, Range
 
 __all__ = ["measure_recording", "truth_path"]
 
@@ -69,12 +69,37 @@ class _Watch:
         self._told_s = time.thread_time()
 
 
+class _Bound:
+    """Gives the bound of every frame that a receiver decodes.
+
+    Args:
+        measure: From a frame's view to its bound.
+    """
+
+    def __init__(self, measure: Callable[[FrameView], Range]) -> None:
+        self.sigma_m: list[float] = []
+        self._measure = measure
+        self._views: list[FrameView] = []
+
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str, value: object) -> None:
+        if stage == "view":
+            assert isinstance(value, FrameView)
+            self._views.append(value)
+
+    def settle(self) -> None:
+        """Compute what is due, while no receiver's time runs."""
+        self.sigma_m += [self._measure(view).sigma_m for view in self._views]
+        self._views = []
+
+
 class _Lane:
     """One variant's receiver, its rows of `frames.csv` and its time."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: Link, bound: _Bound | None = None) -> None:
         self.watch = _Watch()
-        self.receiver = Receiver(link, Registry.load(self.watch).hook)
+        others = [] if bound is None else [bound]
+        self.receiver = Receiver(link, Registry.load(self.watch, *others).hook)
         self.rows: list[dict[str, str]] = []
         self.packets = 0
         self.cpu_s = 0.0
@@ -123,9 +148,8 @@ def measure_recording(
             _check_shared(name, known, variant)
     with open_source() as source:
         _warm(source, variants)
-    lanes = [_Lane(variant.link) for variant in variants]
-    reference = _reference(variants[0].link)
-    every = lanes + ([reference] if reference is not None else [])
+    bound = _bound_of(variants[0].link)
+    lanes = [_Lane(variant.link, None if n else bound) for n, variant in enumerate(variants)]
     first_us = last_us = None
     reading_s = 0.0
     with open_source() as source:
@@ -135,19 +159,24 @@ def measure_recording(
             first_us = int(events.t_us[0]) if first_us is None else first_us
             last_us = int(events.t_us[-1])
             # Who comes first brings the events into the cache: each in turn.
-            turn = number % len(every)
-            for lane in every[turn:] + every[:turn]:
+            turn = number % len(lanes)
+            for lane in lanes[turn:] + lanes[:turn]:
                 lane.feed(events)
+            if bound is not None:
+                bound.settle()
             advance(source)
             began = time.process_time()
-    for lane in every:
+    for lane in lanes:
         lane.feed(None)
+    if bound is not None:
+        bound.settle()
     recorded_s = 0.0 if first_us is None or last_us is None else (last_us - first_us) * 1e-6
     rows = tuple(
         Row(variant.name, _measured(lane, known, recorded_s, reading_s))
         for variant, lane in zip(variants, lanes, strict=True)
     )
-    return Table(name, rows, Moments() if reference is None else Moments.of(_sigmas(reference.rows)))
+    sigma_m = [] if bound is None else bound.sigma_m
+    return Table(name, rows, Moments.of(np.array(sigma_m, np.float64)))
 
 
 def _warm(source: EventSource, variants: Sequence[Variant]) -> None:
@@ -166,16 +195,14 @@ def _warm(source: EventSource, variants: Sequence[Variant]) -> None:
         lane.feed(None)
 
 
-def _reference(link: Link) -> _Lane | None:
-    """The receiver whose sigma is the bound of each frame; None where the bound's model does not hold."""
-    information = BoundaryInformation()
-    try:
-        information.compile(link.camera, link.bar, link.codebook)
-    except ConfigError:
-        return None
+def _bound_of(link: Link) -> _Bound | None:
+    """What gives the bound of each frame; None where the bound's model does not hold."""
     if link.regions.positive_only:
         return None
-    return _Lane(replace(link, algorithms={**link.algorithms, "ranging": information}))
+    try:
+        return _Bound(frame_bound(link.camera, link.bar, link.codebook))
+    except ConfigError:
+        return None
 
 
 def _sigmas(rows: Iterable[Mapping[str, str]]) -> NDArray[np.float64]:

@@ -290,7 +290,7 @@ def test_probes_see_every_stage() -> None:
     receiver = Receiver(LINK, Registry.load(probe).hook)
     receiver.feed(events_of(LINK, Bar(random_symbols(LINK, 2))))
     receiver.close()
-    assert probe.seen["frame"] == probe.seen["ranging"] == probe.seen["decoding"] == 20
+    assert probe.seen["frame"] == probe.seen["ranging"] == probe.seen["decoding"] == probe.seen["view"] == 20
     assert probe.seen["synchronization"] == 2
     assert probe.seen["separation"] >= 20
     assert probe.seen["regions"] >= 40

@@ -8,7 +8,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.study.bound import BoundaryInformation, cramer_rao_sigma_m
+from evlcp_sdk.study.bound import cramer_rao_sigma_m, frame_bound
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
 LINK = load_link()
@@ -91,7 +91,7 @@ def view_of(
 @pytest.mark.parametrize("blur_px", [0.45, 0.6])
 def test_statistics_come_from_the_frames(distance_m: float, blur_px: float) -> None:
     noise, rng = 0.1, np.random.default_rng(0)
-    measure = BoundaryInformation(FULL).compile(LINK.camera, LINK.bar, LINK.codebook)
+    measure = frame_bound(LINK.camera, LINK.bar, LINK.codebook, full_events=FULL)
     errors, sigmas, wanted = [], [], []
     for _ in range(60):
         view = view_of(distance_m, noise, rng, blur_px=blur_px)
@@ -108,7 +108,7 @@ def test_statistics_come_from_the_frames(distance_m: float, blur_px: float) -> N
 
 @pytest.mark.parametrize("how", [{"upside_down": True}, {"across": True}, {"dark": (5,)}], ids=str)
 def test_any_way_that_a_bar_lies(how: dict[str, bool]) -> None:
-    measure = BoundaryInformation(FULL).compile(LINK.camera, LINK.bar, LINK.codebook)
+    measure = frame_bound(LINK.camera, LINK.bar, LINK.codebook, full_events=FULL)
     plain = measure(view_of(50.0, 0.1, np.random.default_rng(1)))
     found = measure(view_of(50.0, 0.1, np.random.default_rng(1), **how))
     assert found.distance_m == pytest.approx(50, abs=4 * plain.sigma_m)
@@ -117,7 +117,7 @@ def test_any_way_that_a_bar_lies(how: dict[str, bool]) -> None:
 
 
 def test_frames_that_show_no_boundary_have_no_bound() -> None:
-    measure = BoundaryInformation().compile(LINK.camera, LINK.bar, LINK.codebook)
+    measure = frame_bound(LINK.camera, LINK.bar, LINK.codebook)
     rng = np.random.default_rng(2)
     assert np.isnan(measure(view_of(50.0, 0.1, rng, dark=tuple(range(0, 16, 2)))).sigma_m)
     view = view_of(50.0, 0.1, rng)
@@ -128,4 +128,4 @@ def test_frames_that_show_no_boundary_have_no_bound() -> None:
 def test_panels_have_none() -> None:
     panel = BarLayout(rows=16, columns=16, cluster_rows=4, cluster_columns=4)
     with pytest.raises(ConfigError, match="one column"):
-        BoundaryInformation().compile(CameraModel(), panel, LINK.codebook)
+        frame_bound(CameraModel(), panel, LINK.codebook)
