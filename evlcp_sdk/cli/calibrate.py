@@ -94,8 +94,8 @@ def _views(
     frame: "LocalFrame",
 ) -> "list[CalibrationView]":
     """What a recording shows at the times of known poses."""
-    from evlcp_sdk.cli.receive import check_sensor
     from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.io.sensor import check_sensor
     from evlcp_sdk.place.calibration import CalibrationView
     from evlcp_sdk.place.points import points_at
     from evlcp_sdk.place.pose import BarView
@@ -124,7 +124,7 @@ def _views(
                     kept.append(frame)
 
     with open_source(url, registry) as source:
-        check_sensor(source, url, link)
+        check_sensor(source, url, link.camera)
         for events in source.chunks():
             take(receiver.feed(events))
         take(receiver.close())

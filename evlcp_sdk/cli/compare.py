@@ -133,7 +133,7 @@ def _of_results(path: Path) -> "Comparison":
 def _of_recordings(
     urls: Sequence[str], texts: Sequence[str], link_file: str | None, overrides: Sequence[str], workers: int
 ) -> tuple[int, "Comparison"]:
-    from evlcp_sdk.cli.receive import InterruptedRunError
+    from evlcp_sdk.errors import InterruptedRunError
     from evlcp_sdk.plugin.registry import Registry, installed_versions
     from evlcp_sdk.study.compare.run import truth_path
     from evlcp_sdk.study.compare.table import Comparison, total_of
@@ -173,7 +173,7 @@ def _of_recordings(
 
 def _run(job: Job, *, variants: "tuple[Variant, ...]") -> "Table":
     """Receive a recording with every variant, in this process or in a worker."""
-    from evlcp_sdk.cli.receive import check_sensor
+    from evlcp_sdk.io.sensor import check_sensor
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.study.compare.run import measure_recording, truth_path
     from evlcp_sdk.study.score import read_truth
@@ -182,7 +182,7 @@ def _run(job: Job, *, variants: "tuple[Variant, ...]") -> "Table":
         source = open_source(job.url, registry)
         try:
             for variant in variants:
-                check_sensor(source, job.url, variant.link)
+                check_sensor(source, job.url, variant.link.camera)
         except ConfigError:
             source.close()
             raise

@@ -9,29 +9,22 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from evlcp_sdk.cli._common import Dask, LinkFile, Overrides, complain, console, make_executor, open_source
-from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
+from evlcp_sdk.errors import InputError, InterruptedRunError
 
 if TYPE_CHECKING:
-    from evlcp_sdk.io import EventSource
     from evlcp_sdk.link.resolve import Link
     from evlcp_sdk.results.positions import PositionPlan
     from evlcp_sdk.values import Packet
 
-__all__ = ["InterruptedRunError", "bytes_bar", "check_sensor", "decode", "register", "show"]
+__all__ = ["bytes_bar", "decode", "register", "show"]
 
 Advance = Callable[[int, int | None], None]
 """Told, after each piece, how many bytes are done, and of how many if that is known."""
-
-
-class InterruptedRunError(EvlcpError):
-    """The user stopped the run; what was decoded until then is written."""
-
-    exit_code: ClassVar[int] = 130
 
 
 @dataclass(frozen=True)
@@ -276,6 +269,7 @@ def decode(
     """
     from numba.core.event import install_timer
 
+    from evlcp_sdk.io.sensor import check_sensor
     from evlcp_sdk.plugin.registry import Registry, installed_versions
     from evlcp_sdk.results.outputs import ResultWriter, Status
     from evlcp_sdk.rx.receiver import Receiver
@@ -293,7 +287,7 @@ def decode(
         tracks.append(TrackProbe())
     registry = Registry.load(*probes)
     with open_source(url, registry) as source:
-        check_sensor(source, url, link)
+        check_sensor(source, url, link.camera)
         with ResultWriter(folder, link, parquet=parquet) as writer, ExitStack() as closing:
             receiver = Receiver(link, registry.hook)
             positions = None
@@ -467,21 +461,6 @@ def _stem(url: str) -> str:
     """The recording's name without its kind: `night.csv.gz` gives `night`."""
     name = Path(url).name
     return name.removesuffix(".gz").rsplit(".", 1)[0] or name
-
-
-def check_sensor(source: "EventSource", url: str, link: "Link") -> None:
-    """Refuse a recording of another sensor than the link's camera has.
-
-    Raises:
-        ConfigError: The sizes differ.
-    """
-    camera = link.camera
-    size = (source.width, source.height)
-    if None not in size and size != (camera.width, camera.height):
-        raise ConfigError(
-            f"{url}: recorded with {size[0]} x {size[1]} pixels, but the link's camera has"
-            f" {camera.width} x {camera.height}; set camera.width, camera.height and camera.pitch_um"
-        )
 
 
 @contextmanager

@@ -63,7 +63,7 @@ def sweep(
     import json
     from dataclasses import asdict
 
-    from evlcp_sdk.cli.receive import InterruptedRunError
+    from evlcp_sdk.errors import InterruptedRunError
     from evlcp_sdk.study.campaign.collect import collect, progress_of
     from evlcp_sdk.study.campaign.store import Store
     from evlcp_sdk.study.campaign.task import plan_of, run_job

@@ -15,7 +15,9 @@ LAYERS = (
     {"plugin"},
     {"link"},
     {"io", "rx", "place", "sim"},
-    {"results", "jobs", "study", "testing"},
+    {"results", "jobs", "study"},
+    {"run"},
+    {"testing"},
     {"cli"},
 )
 """From the ground up: a module imports from its own layer and those below."""
