@@ -53,7 +53,7 @@ class MessageSpec:
 class RegionSpec:
     """How blinking regions are found and followed in the image."""
 
-    block_us: Annotated[
+    step_us: Annotated[
         int, Field(ge=200, le=10_000, description="Time step of the detector; results come once a step.")
     ] = 1500
     min_score: Annotated[
@@ -129,5 +129,6 @@ class PositionSpec:
         Field(gt=0, description="Power density of the change of speed: 1 m/s2 that lasts for a second."),
     ] = 1.0
     gate_sigmas: Annotated[
-        float, Field(gt=1, description="Sigmas from the prediction beyond which a track leaves a fix out.")
+        float,
+        Field(gt=1, description="Sigmas from the prediction beyond which a trajectory leaves a fix out."),
     ] = 5.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.values import Fix
 
-__all__ = ["TrackPoint", "smooth_track", "track_fixes", "track_step"]
+__all__ = ["TrajectoryPoint", "filter_fixes", "smooth_trajectory", "trajectory_step"]
 
 Floats = NDArray[np.float64]
 
@@ -18,11 +18,11 @@ _SPEED_M_S = 30.0
 """Speeds that are likely at first (sigma): a car's."""
 
 _MOST_MISSES = 10
-"""Fixes in a row that are left out before the track begins anew: so many are no outliers."""
+"""Fixes in a row that are left out before the trajectory starts anew: so many are no outliers."""
 
 
 @dataclass(frozen=True, eq=False)
-class TrackPoint:
+class TrajectoryPoint:
     """Position and velocity at one time, filtered or smoothed; the filter's state, too.
 
     Attributes:
@@ -31,7 +31,7 @@ class TrackPoint:
         noise: Covariance of `mean` from what is new with every fix, float64 (6, 6).
         standing_m2: Covariance of the position from what stays, as an attitude that was said wrong, (3, 3).
         misses: Fixes in a row that were left out, this one included; 0 where it counts.
-        begins: A track begins here.
+        starts: A trajectory starts here.
     """
 
     t_us: float
@@ -39,7 +39,7 @@ class TrackPoint:
     noise: Floats
     standing_m2: Floats
     misses: int = 0
-    begins: bool = False
+    starts: bool = False
 
     @property
     def covariance_m2(self) -> Floats:
@@ -47,23 +47,23 @@ class TrackPoint:
         return np.asarray(self.noise[:3, :3] + self.standing_m2)
 
 
-def track_step(state: TrackPoint | None, fix: Fix, spec: PositionSpec) -> TrackPoint:
+def trajectory_step(state: TrajectoryPoint | None, fix: Fix, spec: PositionSpec) -> TrajectoryPoint:
     """Take a fix: constant velocity, driven by white acceleration (Bar-Shalom, chapter 6).
 
     Only what is new with every fix is filtered; what stays, as a heading that was said wrong, shifts the
-    whole track and is added to its covariance. A fix beyond `spec.gate_sigmas` is left out, and after many of
-    those in a row the track begins anew.
+    whole trajectory and is added to its covariance. A fix beyond `spec.gate_sigmas` is left out, and after
+    many of those in a row the trajectory starts anew.
 
     Args:
-        state: The last point, None at the begin; not changed.
+        state: The last point, None at the start; not changed.
         fix: One that is given, not before the last.
         spec: Power of the acceleration, and the gate.
     """
     standing = fix.covariance_m2 - fix.noise_m2
-    begin = np.zeros((6, 6))
-    begin[:3, :3] = fix.noise_m2
-    begin[3:, 3:] = _SPEED_M_S**2 * np.eye(3)
-    first = TrackPoint(fix.t_us, np.concatenate([fix.enu_m, np.zeros(3)]), begin, standing, begins=True)
+    start = np.zeros((6, 6))
+    start[:3, :3] = fix.noise_m2
+    start[3:, 3:] = _SPEED_M_S**2 * np.eye(3)
+    first = TrajectoryPoint(fix.t_us, np.concatenate([fix.enu_m, np.zeros(3)]), start, standing, starts=True)
     if state is None:
         return first
     mean, noise = _ahead(state, fix.t_us, spec)
@@ -72,40 +72,40 @@ def track_step(state: TrackPoint | None, fix: Fix, spec: PositionSpec) -> TrackP
     if innovation @ np.linalg.solve(spread, innovation) > spec.gate_sigmas**2:
         if state.misses + 1 > _MOST_MISSES:
             return first
-        return TrackPoint(fix.t_us, mean, noise, standing, state.misses + 1)
+        return TrajectoryPoint(fix.t_us, mean, noise, standing, state.misses + 1)
     gain = np.linalg.solve(spread, noise[:3]).T
     keep = np.eye(6)
     keep[:, :3] -= gain
     # Joseph's form keeps the covariance symmetric and positive.
     after = keep @ noise @ keep.T + gain @ fix.noise_m2 @ gain.T
-    return TrackPoint(fix.t_us, mean + gain @ innovation, after, standing)
+    return TrajectoryPoint(fix.t_us, mean + gain @ innovation, after, standing)
 
 
-def track_fixes(fixes: Iterable[Fix], spec: PositionSpec) -> list[TrackPoint]:
+def filter_fixes(fixes: Iterable[Fix], spec: PositionSpec) -> list[TrajectoryPoint]:
     """Filter the fixes that are given, one point each; refused ones have none."""
-    points: list[TrackPoint] = []
+    points: list[TrajectoryPoint] = []
     for fix in fixes:
         if not fix.refusal:
-            points.append(track_step(points[-1] if points else None, fix, spec))
+            points.append(trajectory_step(points[-1] if points else None, fix, spec))
     return points
 
 
-def smooth_track(points: Sequence[TrackPoint], spec: PositionSpec) -> list[TrackPoint]:
-    """Smooth filtered points with those after them (Rauch, Tung and Striebel 1965), track by track."""
+def smooth_trajectory(points: Sequence[TrajectoryPoint], spec: PositionSpec) -> list[TrajectoryPoint]:
+    """Smooth filtered points with those after them (Rauch, Tung, Striebel 1965), each trajectory alone."""
     smoothed = list(points)
     for i in range(len(points) - 2, -1, -1):
-        if points[i + 1].begins:
+        if points[i + 1].starts:
             continue
         here, after = points[i], smoothed[i + 1]
         mean, noise = _ahead(here, after.t_us, spec)
         gain = np.linalg.solve(noise, _move(after.t_us - here.t_us) @ here.noise).T
-        smoothed[i] = TrackPoint(
+        smoothed[i] = TrajectoryPoint(
             here.t_us,
             here.mean + gain @ (after.mean - mean),
             here.noise + gain @ (after.noise - noise) @ gain.T,
             here.standing_m2,
             here.misses,
-            here.begins,
+            here.starts,
         )
     return smoothed
 
@@ -116,7 +116,7 @@ def _move(dt_us: float) -> Floats:
     return move
 
 
-def _ahead(state: TrackPoint, t_us: float, spec: PositionSpec) -> tuple[Floats, Floats]:
+def _ahead(state: TrajectoryPoint, t_us: float, spec: PositionSpec) -> tuple[Floats, Floats]:
     dt = (t_us - state.t_us) * 1e-6
     move = _move(t_us - state.t_us)
     power = spec.acceleration_m2_s3 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, math.fabs(dt)]])

@@ -18,7 +18,7 @@ from matplotlib.patches import Ellipse, Rectangle
 from numpy.typing import NDArray
 
 from evlcp_sdk.files import whole_file
-from evlcp_sdk.place.trajectory import TrackPoint
+from evlcp_sdk.place.trajectory import TrajectoryPoint
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Fix, Frame, PresenceMap, Region
@@ -167,9 +167,9 @@ class TrackProbe:
     """
 
     def __init__(self, points: int = 4096) -> None:
-        self.points: Thinned[tuple[Fix, TrackPoint, TrackPoint]] = Thinned(points)
+        self.points: Thinned[tuple[Fix, TrajectoryPoint, TrajectoryPoint]] = Thinned(points)
 
-    def add(self, fix: Fix, filtered: TrackPoint, smoothed: TrackPoint) -> None:
+    def add(self, fix: Fix, filtered: TrajectoryPoint, smoothed: TrajectoryPoint) -> None:
         """Take a fix with its points of the track."""
         self.points.add((fix, filtered, smoothed))
 

@@ -21,7 +21,7 @@ from evlcp_sdk.files import hidden_path
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.pose import REFUSALS
 from evlcp_sdk.place.positioner import Positioner
-from evlcp_sdk.place.trajectory import TrackPoint, smooth_track, track_step
+from evlcp_sdk.place.trajectory import TrajectoryPoint, smooth_trajectory, trajectory_step
 from evlcp_sdk.results.mcap import McapFixes, check_mcap
 from evlcp_sdk.results.nmea import gga, rmc
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
@@ -69,7 +69,7 @@ acceleration of 1 m/s2 lasts against fixes of centimetres."""
 class Watcher(Protocol):
     """Told of every point of the track, e.g. to draw it."""
 
-    def add(self, fix: Fix, filtered: TrackPoint, smoothed: TrackPoint) -> None:
+    def add(self, fix: Fix, filtered: TrajectoryPoint, smoothed: TrajectoryPoint) -> None:
         """Take a fix with its points of the track, in order of time."""
 
 
@@ -127,8 +127,8 @@ class PositionWriter:
             attitude_source(plan.attitude),
             link.position,
         )
-        self._state: TrackPoint | None = None
-        self._window: list[tuple[Fix, TrackPoint]] = []
+        self._state: TrajectoryPoint | None = None
+        self._window: list[tuple[Fix, TrajectoryPoint]] = []
         self._line_end: list[list[float]] = []
         self._refused: Counter[str] = Counter()
         self._given = self._verified = self._left_out = self._features = 0
@@ -220,10 +220,10 @@ class PositionWriter:
             return
         self._given += 1
         self._verified += fix.verified
-        point = self._state = track_step(self._state, fix, self._spec)
+        point = self._state = trajectory_step(self._state, fix, self._spec)
         self._left_out += point.misses > 0
         place, sigma = self._place(point), np.sqrt(np.diag(point.covariance_m2))
-        way = None if point.begins else _way(point)
+        way = None if point.starts else _way(point)
         bars, across = len(fix.transmitters), math.hypot(sigma[0], sigma[1])
         self._nmea.write(gga(fix.t_us, zero, place, bars, across) + rmc(fix.t_us, zero, place, way))
         if self._mcap is not None:
@@ -245,7 +245,7 @@ class PositionWriter:
 
     def _emit(self, count: int) -> None:
         """Smooth the window, write its first points and drop them."""
-        smooth = smooth_track([point for _, point in self._window], self._spec)
+        smooth = smooth_trajectory([point for _, point in self._window], self._spec)
         line = self._line_end
         for (fix, filtered), smoothed in list(zip(self._window, smooth, strict=True))[:count]:
             place, way = self._place(smoothed), _way(smoothed)
@@ -259,7 +259,7 @@ class PositionWriter:
                     int(filtered.misses > 0),
                 ]
             )
-            if filtered.begins and line:
+            if filtered.starts and line:
                 self._line(line)
                 line = []
             line.append([round(place[1], 9), round(place[0], 9), round(place[2], 4)])
@@ -282,7 +282,7 @@ class PositionWriter:
         self._geojson.write(("," if self._features else "") + "\n" + json.dumps(feature))
         self._features += 1
 
-    def _place(self, point: TrackPoint) -> tuple[float, float, float]:
+    def _place(self, point: TrajectoryPoint) -> tuple[float, float, float]:
         frame = self.positioner.frame
         assert frame is not None
         latitude, longitude, height = frame.to_geodetic(point.mean[:3])
@@ -344,7 +344,7 @@ def _place_row(place: tuple[float, float, float], covariance_m2: NDArray[np.floa
     return [f"{place[0]:.10f}", f"{place[1]:.10f}", f"{place[2]:.4f}", *(f"{value:.4f}" for value in sigma)]
 
 
-def _way(point: TrackPoint) -> tuple[float, float]:
+def _way(point: TrajectoryPoint) -> tuple[float, float]:
     """Speed over ground, m/s, and course, degrees clockwise from north."""
     east, north = float(point.mean[3]), float(point.mean[4])
     return math.hypot(east, north), math.degrees(math.atan2(east, north)) % 360

@@ -23,7 +23,7 @@ from evlcp_sdk.plugin.roles import Filter
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
 
-__all__ = ["RegionTracker", "Track"]
+__all__ = ["Followed", "RegionFollower"]
 
 _CELL_SHIFT = 3
 """Cells of 8 x 8 px: smaller than any bar in range (34 px at 100 m), and few enough to label each step."""
@@ -66,17 +66,17 @@ _BACKFILL_STEPS = 12
 _LONG_AGO_US = -(10**12)
 
 Box = tuple[int, int, int, int]
-Block = tuple[int, Events]
+Piece = tuple[int, Events]
 
 
 @dataclass
-class Track:
+class Followed:
     """A region followed over time, and its events since the first.
 
     Attributes:
         id: Number of the region, from 0.
         positions: Where it was measured, oldest first.
-        blocks: Its events, one entry a time step: (start of the step, us; events).
+        pieces: Its events, one entry a time step: (start of the step, us; events).
         first_us: Start of the first step of which it has events, us.
         filter: State of the filter of its centre, None without one.
         heights: As measured lately, px.
@@ -86,7 +86,7 @@ class Track:
     id: int
     positions: deque[Region]
     first_us: int
-    blocks: deque[Block] = field(default_factory=deque)
+    pieces: deque[Piece] = field(default_factory=deque)
     released: bool = False
     filter: Any = None
     heights: deque[float] = field(default_factory=lambda: deque(maxlen=_HEIGHTS))
@@ -130,14 +130,14 @@ class Track:
 
     def forget_before(self, t_us: float, step_us: int) -> None:
         """Drop events and positions older than a time."""
-        while self.blocks and self.blocks[0][0] + step_us <= t_us:
-            self.blocks.popleft()
+        while self.pieces and self.pieces[0][0] + step_us <= t_us:
+            self.pieces.popleft()
         while len(self.positions) > 2 and self.positions[1].t_us < t_us:
             self.positions.popleft()
 
 
-class RegionTracker:
-    """Streams time steps of events into tracks.
+class RegionFollower:
+    """Streams time steps of events into the regions that blink.
 
     Args:
         spec: Parameters.
@@ -162,12 +162,12 @@ class RegionTracker:
         self._pixels = np.full(shape, _LONG_AGO_US << 8, np.int64)
         self._hits = np.zeros([-(-n >> _CELL_SHIFT) for n in (camera.height + 7, camera.width + 7)], np.int32)
         self._fresh: list[Box] = []
-        self._recent: deque[Block] = deque(maxlen=_BACKFILL_STEPS)
+        self._recent: deque[Piece] = deque(maxlen=_BACKFILL_STEPS)
         self._next_id = 0
-        self.tracks: list[Track] = []
+        self.alive: list[Followed] = []
 
-    def step(self, start_us: int, events: Events) -> list[Track]:
-        """Take the events of one time step; return the tracks that are alive or ended in it."""
+    def step(self, start_us: int, events: Events) -> list[Followed]:
+        """Take the events of one time step; return the regions that are alive or ended in it."""
         from evlcp_sdk.rx import _kernels
 
         spec = self._spec
@@ -182,46 +182,48 @@ class RegionTracker:
             )
         else:
             _kernels.score_pixels(t_us, x, y, p, *score, self._run_us, spec.min_score, _CELL_SHIFT)
-        end_us = start_us + spec.block_us
-        boxes = [self._reach(self._expected(track, start_us + spec.block_us / 2)) for track in self.tracks]
-        for track, box, inside in zip(self.tracks, boxes, _select(events, boxes), strict=True):
-            track.blocks.append((start_us, inside))
+        end_us = start_us + spec.step_us
+        boxes = [
+            self._reach(self._expected(followed, start_us + spec.step_us / 2)) for followed in self.alive
+        ]
+        for followed, box, inside in zip(self.alive, boxes, _select(events, boxes), strict=True):
+            followed.pieces.append((start_us, inside))
             rows = np.empty(box[3] - box[1], np.int64)
-            measured = self._measure(track.id, box, end_us, rows)
+            measured = self._measure(followed.id, box, end_us, rows)
             if measured is not None:
-                measured = self._whole(track, measured, box[1], rows)
-                track.positions.append(self._filtered(track, measured))
+                measured = self._whole(followed, measured, box[1], rows)
+                followed.positions.append(self._filtered(followed, measured))
         self._merge()
         self._open(end_us)
-        seen = list(self.tracks)
-        for track in self.tracks:
-            track.released |= end_us - track.latest.t_us > spec.fade_us
-        self.tracks = [track for track in self.tracks if not track.released]
+        seen = list(self.alive)
+        for followed in self.alive:
+            followed.released |= end_us - followed.latest.t_us > spec.fade_us
+        self.alive = [followed for followed in self.alive if not followed.released]
         return seen
 
     def skip(self) -> None:
-        """Pass over a gap in time, with no track alive."""
+        """Pass over a gap in time, with no region alive."""
         self._fresh = []
         self._recent.clear()
 
-    def _expected(self, track: Track, t_us: float) -> Region:
+    def _expected(self, followed: Followed, t_us: float) -> Region:
         """Where a region should be soon: by its filter, or else straight on."""
-        expected = self._position.predict(track.filter, t_us) if self._position else None
+        expected = self._position.predict(followed.filter, t_us) if self._position else None
         if expected is None:
-            return track.expected(t_us)
-        return replace(track.latest, x_px=float(expected[0][0]), y_px=float(expected[0][1]))
+            return followed.expected(t_us)
+        return replace(followed.latest, x_px=float(expected[0][0]), y_px=float(expected[0][1]))
 
-    def _whole(self, track: Track, measured: Region, top: int, rows: NDArray[np.int64]) -> Region:
+    def _whole(self, followed: Followed, measured: Region, top: int, rows: NDArray[np.int64]) -> Region:
         """A region of the height that it lately had; `rows`: its pixels in each row from `top` on.
 
         Where few pixels are awake, an end is dark; where noise wakes pixels that a fast bar has left, there
         is one too many. Of the places that the edges allow, or that hold the most pixels, the nearest to the
         expected one is taken.
         """
-        track.heights.append(measured.height_px)
-        height_px = median(track.heights)
+        followed.heights.append(measured.height_px)
+        height_px = median(followed.heights)
         excess_px = measured.height_px - height_px
-        expected_px = self._expected(track, measured.t_us).y_px
+        expected_px = self._expected(followed, measured.t_us).y_px
         if excess_px > _STRAY_PX:
             n = round(height_px)
             total = np.concatenate([[0], np.cumsum(rows)])
@@ -233,11 +235,13 @@ class RegionTracker:
             y_px = measured.y_px + min(max(expected_px - measured.y_px, -slack_px), slack_px)
         return replace(measured, y_px=y_px, height_px=height_px + min(max(excess_px, 0.0), _STRAY_PX))
 
-    def _filtered(self, track: Track, measured: Region) -> Region:
+    def _filtered(self, followed: Followed, measured: Region) -> Region:
         if self._position is None:
             return measured
         centre = np.array([measured.x_px, measured.y_px])
-        track.filter, centre, _ = self._position.step(track.filter, measured.t_us, centre, _CENTRE_SIGMA_PX)
+        followed.filter, centre, _ = self._position.step(
+            followed.filter, measured.t_us, centre, _CENTRE_SIGMA_PX
+        )
         return replace(measured, x_px=float(centre[0]), y_px=float(centre[1]))
 
     def _reach(self, region: Region) -> Box:
@@ -275,8 +279,8 @@ class RegionTracker:
         """Open a region where something blinks in two steps on end outside those known."""
         hits = self._hits
         merge = self._spec.merge_px
-        for track in self.tracks:
-            left, top, right, bottom = _grown(self._reach(track.latest), merge)
+        for followed in self.alive:
+            left, top, right, bottom = _grown(self._reach(followed.latest), merge)
             hits[
                 top >> _CELL_SHIFT : (bottom >> _CELL_SHIFT) + 1,
                 left >> _CELL_SHIFT : (right >> _CELL_SHIFT) + 1,
@@ -314,14 +318,14 @@ class RegionTracker:
             return
         self._next_id += 1
         reach = self._reach(region)
-        blocks = deque((start, _select(events, [reach])[0]) for start, events in self._recent)
+        pieces = deque((start, _select(events, [reach])[0]) for start, events in self._recent)
         state = self._position.init() if self._position else None
-        self.tracks.append(Track(region.id, deque([region]), blocks[0][0], blocks, filter=state))
+        self.alive.append(Followed(region.id, deque([region]), pieces[0][0], pieces, filter=state))
 
     def _merge(self) -> None:
         """Keep the older of two regions that have grown together."""
-        for i, older in enumerate(self.tracks):
-            for younger in self.tracks[i + 1 :]:
+        for i, older in enumerate(self.alive):
+            for younger in self.alive[i + 1 :]:
                 if not younger.released and _overlap(_tight(older.latest), _tight(younger.latest)):
                     younger.released = True
         # The survivor reaches over both within a few steps, as its seam finds the other's pixels.

@@ -11,10 +11,10 @@ from evlcp_sdk.errors import EvlcpError, PluginError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.values import SoftSymbols
 
-__all__ = ["Blame"]
+__all__ = ["Guard"]
 
 
-class Blame:
+class Guard:
     """A context in which code of one algorithm runs: what it raises becomes a `PluginError` that names it.
 
     What the SDK itself raises on purpose passes. The original exception is the cause.
@@ -24,7 +24,7 @@ class Blame:
         role: Its role.
 
     >>> from evlcp_sdk.link.resolve import load_link
-    >>> with Blame(load_link(), "ranging"):
+    >>> with Guard(load_link(), "ranging"):
     ...     {}["boom"]
     Traceback (most recent call last):
     evlcp_sdk.errors.PluginError: ranging algorithm 'poc': KeyError: 'boom' (...
@@ -61,7 +61,7 @@ class Blame:
         """Check what a decoding gave.
 
         Raises:
-            PluginError: It is no `SoftSymbols`, or of other shapes than the codebook's.
+            PluginError: It is not a `SoftSymbols`, or of other shapes than the codebook's.
         """
         self.expect(soft, SoftSymbols)
         for name, found, expected in (

@@ -207,7 +207,7 @@ def test_every_fault_of_a_file_is_told(registry: Registry, tmp_path: Path) -> No
     [modulation]
     id = 8
     [regions]
-    block_us = "slow"
+    step_us = "slow"
     [ranging]
     min_spaceing = 9
     min_spacing = 16
@@ -226,7 +226,7 @@ def test_every_fault_of_a_file_is_told(registry: Registry, tmp_path: Path) -> No
         'link.toml: camera.focal_mm = "35": expected a valid number',
         "--set: bar.led_pitch_m = -1: expected greater than 0",
         "link.toml: air.frames_per_packet = 2.5: expected a valid integer",
-        'link.toml: regions.block_us = "slow": expected a valid integer',
+        'link.toml: regions.step_us = "slow": expected a valid integer',
         "link.toml: modulation.id = 8: expected a string",
         "link.toml: ranging.min_spacing = 16: expected less than or equal to 15",
         "link.toml: ranging.window_px = nan: expected a finite number",

@@ -1,4 +1,4 @@
-"""The track against a batch solution of the same model, and its consistency."""
+"""The trajectory against a batch solution of the same model, and its consistency."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from evlcp_sdk.link.sections import PositionSpec
-from evlcp_sdk.place.trajectory import smooth_track, track_fixes, track_step
+from evlcp_sdk.place.trajectory import filter_fixes, smooth_trajectory, trajectory_step
 from evlcp_sdk.values import Fix
 
 SPEC = PositionSpec(acceleration_m2_s3=2.0)
@@ -25,7 +25,7 @@ def fix(t_us: float, enu_m: NDArray[np.float64], standing_m: float = 0.0) -> Fix
 
 
 def drive(rng: np.random.Generator, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times, us, at uneven steps, and states (n, 6) of white acceleration from a likely begin."""
+    """Times, us, at uneven steps, and states (n, 6) of white acceleration from a likely start."""
     t_s = np.cumsum(rng.uniform(0.01, 0.2, n))
     states = np.empty((n, 6))
     states[0] = np.concatenate([rng.normal(0, 100, 3), rng.normal(0, 30, 3)])
@@ -72,8 +72,8 @@ def test_filter_and_smoother_are_the_batch_solution() -> None:
     t_us, states = drive(rng, 12)
     seen = states[:, :3] + rng.normal(size=(12, 3)) * SIGMA_M
     spec = dataclasses.replace(SPEC, gate_sigmas=50.0)
-    points = track_fixes([fix(t, p) for t, p in zip(t_us, seen, strict=True)], spec)
-    smooth = smooth_track(points, spec)
+    points = filter_fixes([fix(t, p) for t, p in zip(t_us, seen, strict=True)], spec)
+    smooth = smooth_trajectory(points, spec)
     for axis in range(3):
         mean, variance = batch(t_us, seen, axis)
         np.testing.assert_allclose([p.mean[axis::3] for p in smooth], mean, atol=1e-6)
@@ -90,9 +90,9 @@ def test_both_are_consistent() -> None:
         seen = states[:, :3] + rng.normal(size=(20, 3)) * SIGMA_M
         standing = rng.normal(0, 0.5, 3)
         fixes = [fix(t, p + standing, 0.5) for t, p in zip(t_us, seen, strict=True)]
-        points = track_fixes(fixes, SPEC)
-        for found, kept in ((points, forward), (smooth_track(points, SPEC), backward)):
-            # One time a track: errors at its other times are not independent.
+        points = filter_fixes(fixes, SPEC)
+        for found, kept in ((points, forward), (smooth_trajectory(points, SPEC), backward)):
+            # One time a trajectory: errors at its other times are not independent.
             error = found[10].mean[:3] - states[10, :3]
             kept.append(error @ np.linalg.solve(found[10].covariance_m2, error))
     low, high = stats.chi2.interval(0.95, 3 * count)
@@ -100,24 +100,24 @@ def test_both_are_consistent() -> None:
     assert low / count < np.mean(backward) < high / count
 
 
-def test_an_outlier_is_left_out_and_a_new_place_begins_a_track() -> None:
+def test_an_outlier_is_left_out_and_a_new_place_starts_a_trajectory() -> None:
     fixes = [fix(i * 1e5, np.array([float(i), 0, 0])) for i in range(10)]
     fixes[5] = fix(5e5, np.array([50.0, 0, 0]))
-    points = track_fixes(fixes, SPEC)
+    points = filter_fixes(fixes, SPEC)
     assert [p.misses for p in points] == [0, 0, 0, 0, 0, 1, 0, 0, 0, 0]
     assert abs(points[5].mean[0] - 5) < 0.5
     jumped = fixes[:5] + [fix((5 + i) * 1e5, np.array([1000.0 + i, 0, 0])) for i in range(15)]
-    points = track_fixes(jumped, SPEC)
-    assert [i for i, p in enumerate(points) if p.begins] == [0, 15]
-    smooth = smooth_track(points, SPEC)
+    points = filter_fixes(jumped, SPEC)
+    assert [i for i, p in enumerate(points) if p.starts] == [0, 15]
+    smooth = smooth_trajectory(points, SPEC)
     assert max(p.mean[0] for p in smooth[:5]) < 10
 
 
 def test_refused_fixes_have_no_point_and_the_state_is_not_changed() -> None:
     refused = Fix.refused(1e5, (0,), "misfit", "far off")
-    points = track_fixes([fix(0, np.zeros(3)), refused, fix(2e5, np.ones(3) * 0.1)], SPEC)
+    points = filter_fixes([fix(0, np.zeros(3)), refused, fix(2e5, np.ones(3) * 0.1)], SPEC)
     assert [p.t_us for p in points] == [0, 2e5]
     before = points[0].mean.copy(), points[0].noise.copy()
-    track_step(points[0], fix(3e5, np.ones(3)), SPEC)
+    trajectory_step(points[0], fix(3e5, np.ones(3)), SPEC)
     np.testing.assert_array_equal(before[0], points[0].mean)
     np.testing.assert_array_equal(before[1], points[0].noise)

@@ -13,11 +13,11 @@ from evlcp_sdk.errors import ConfigError, PluginError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.roles import Filter, Tracker
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.values import SoftSymbols
-from tests.synthetic import Bar, events_of, random_symbols
 
 LINK = load_link(overrides=["tracking.id=kalman"])
-EVENTS = events_of(LINK, Bar(random_symbols(LINK, 2)))
+EVENTS = ideal_events(LINK, IdealBar(random_symbols(LINK, 2)))
 ROLES = {
     "synchronization": "barker",
     "separation": "wh-correlation",
