@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 from skimage.registration import phase_cross_correlation
 
-from evlcp_sdk.io import open_events
+from evlcp_sdk.io import open_source
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
@@ -73,7 +73,7 @@ def caught(path: Path, link: Link) -> list[tuple[PresenceMap, float]]:
     """Presence and true distance of each frame of a recording of one bar."""
     catch = Catch()
     receiver = Receiver(link, Registry.load(catch).hook)
-    with open_events(path) as source:
+    with open_source(path) as source:
         for events in source.chunks():
             receiver.feed(events)
     receiver.close()

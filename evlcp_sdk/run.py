@@ -6,7 +6,7 @@ from types import TracebackType
 from typing import Self
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io import EventSource, Loss, open_events
+from evlcp_sdk.io import EventSource, Loss, open_source
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.registry import Registry
@@ -34,7 +34,7 @@ def receive(
     """
     registry = Registry.load() if registry is None else registry
     link = load_link(registry=registry) if link is None else link
-    opened = source if isinstance(source, EventSource) else _open(str(source), registry)
+    opened = source if isinstance(source, EventSource) else open_source(source, registry)
     try:
         check_sensor(opened, opened.path if isinstance(source, EventSource) else source, link.camera)
         return Reception(opened, Receiver(link, registry.hook), link)
@@ -106,9 +106,3 @@ class Reception(Iterator[Packet]):
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _open(url: str, registry: Registry) -> EventSource:
-    """Open a recording or a camera: plugins are asked first, then the built-in readers."""
-    source = registry.hook.evlcp_open_events(url=url)
-    return source if isinstance(source, EventSource) else open_events(url)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, open_source
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -95,6 +95,7 @@ def _views(
 ) -> "list[CalibrationView]":
     """What a recording shows at the times of known poses."""
     from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.io.open import open_source
     from evlcp_sdk.io.sensor import check_sensor
     from evlcp_sdk.place.calibration import CalibrationView
     from evlcp_sdk.place.points import points_at

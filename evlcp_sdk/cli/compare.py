@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, complain, console, make_executor, open_source
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, complain, console, make_executor
 from evlcp_sdk.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -173,6 +173,7 @@ def _of_recordings(
 
 def _run(job: Job, *, variants: "tuple[Variant, ...]") -> "Table":
     """Receive a recording with every variant, in this process or in a worker."""
+    from evlcp_sdk.io.open import open_source
     from evlcp_sdk.io.sensor import check_sensor
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.study.compare.run import measure_recording, truth_path

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Dask, LinkFile, Overrides, complain, console, make_executor, open_source
+from evlcp_sdk.cli._common import Dask, LinkFile, Overrides, complain, console, make_executor
 from evlcp_sdk.errors import InputError, InterruptedRunError
 
 if TYPE_CHECKING:
@@ -269,6 +269,7 @@ def decode(
     """
     from numba.core.event import install_timer
 
+    from evlcp_sdk.io.open import open_source
     from evlcp_sdk.io.sensor import check_sensor
     from evlcp_sdk.plugin.registry import Registry, installed_versions
     from evlcp_sdk.results.outputs import ResultWriter, Status

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evlcp_sdk.cli import _common
 from evlcp_sdk.cli.demo import score
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource, write_events
+from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource, open_source, write_events
 from evlcp_sdk.results.outputs import FIGURE_NAMES
 from evlcp_sdk.values import Events, Triggers
 
@@ -209,7 +208,7 @@ class FailingSource(RawSource):
 def test_input_that_fails_half_way(
     evlcp: Evlcp, demo_raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("evlcp_sdk.io.open_events", FailingSource)
+    monkeypatch.setattr("evlcp_sdk.io.open.RawSource", FailingSource)
     done = evlcp("receive", demo_raw, "-o", tmp_path / "out")
     assert done.code == 3
     assert done.err == f"evlcp: {demo_raw}: at byte 1000: the disk is gone\n"
@@ -232,7 +231,7 @@ class InterruptedSource(RawSource):
 def test_interrupt_keeps_what_was_decoded(
     evlcp: Evlcp, demo_raw: Path, noise_raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("evlcp_sdk.io.open_events", InterruptedSource)
+    monkeypatch.setattr("evlcp_sdk.io.open.RawSource", InterruptedSource)
     before = signal.getsignal(signal.SIGINT)
     done = evlcp("receive", demo_raw, noise_raw, "-o", tmp_path / "out")
     assert signal.getsignal(signal.SIGINT) is before
@@ -259,7 +258,7 @@ def test_a_plugin_opens_what_the_readers_do_not_know(
     monkeypatch.setattr(Registry, "load", lambda *plugins: load(Camera(), *plugins))
     assert evlcp("receive", "camera:0", "-o", tmp_path / "out").code == 0
     assert summary_of(tmp_path / "out")["recording"]["path"] == "camera:0"
-    with _common.open_source(str(demo_raw), Registry.load()) as source:
+    with open_source(demo_raw) as source:
         assert isinstance(source, RawSource)
 
 

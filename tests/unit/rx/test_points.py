@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from evlcp_sdk.io import open_events
+from evlcp_sdk.io import open_source
 from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.receiver import Receiver
@@ -118,7 +118,7 @@ def frames() -> list[Frame]:
     link = load_link()
     receiver = Receiver(link)
     packets = []
-    with open_events(str(RECORDING)) as source:
+    with open_source(str(RECORDING)) as source:
         for events in source.chunks():
             packets += receiver.feed(events)
     return [f for p in packets + receiver.close() for f in p.frames]

@@ -114,11 +114,11 @@ def test_figures_are_the_scorers(name: str, tmp_path: Path, evlcp: Any) -> None:
 
 
 def received(recording: Path) -> list[Frame]:
-    from evlcp_sdk.io import open_events
+    from evlcp_sdk.io import open_source
     from evlcp_sdk.rx.receiver import Receiver
 
     receiver = Receiver(load_link())
-    with open_events(str(recording)) as source:
+    with open_source(str(recording)) as source:
         packets = [p for events in source.chunks() for p in receiver.feed(events)] + receiver.close()
     return [frame for packet in packets for frame in packet.frames]
 
