@@ -15,15 +15,14 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat, info_words, packet_chips, pilot_words
 from evlcp_sdk.errors import ConfigError, InputError
 from firmware_host.errors import IncompatibleError
-from firmware_host.protocol.requests import LEDS, ROW_BYTES, Format
+from firmware_host.protocol.requests import ROW_BYTES, Format
+from firmware_host.protocol.rows import rows_of_chips
 
 __all__ = [
-    "Payload",
-    "chips_of_rows",
+    "Bank",
     "random_symbols",
     "read_masks",
     "read_symbols",
-    "rows_of_chips",
     "symbol_chips",
     "word_table",
 ]
@@ -32,7 +31,7 @@ Symbols = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Payload:
+class Bank:
     """Content of one bank.
 
     Attributes:
@@ -52,14 +51,14 @@ class Payload:
     pilot_every: int = 1
 
     @classmethod
-    def of_symbols(cls, symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -> "Payload":
+    def of_symbols(cls, symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -> "Bank":
         """Info words of symbols (packets, frames, clusters).
 
         Raises:
             ConfigError: Symbols of another shape or outside the codebook.
 
         >>> from firmware_host.protocol.generate import codebook_of
-        >>> Payload.of_symbols([[[0] * 16]], codebook_of("wh4x2")).content[:2].hex()
+        >>> Bank.of_symbols([[[0] * 16]], codebook_of("wh4x2")).content[:2].hex()
         '5555'
         """
         s = np.asarray(symbols)
@@ -71,7 +70,7 @@ class Payload:
     @classmethod
     def of_masks(
         cls, chips: ArrayLike, packets: int, frames: int, codebook: Codebook, pilot_every: int = 1
-    ) -> "Payload":
+    ) -> "Bank":
         """Precomposed chips, uint8 (chips, 96 LEDs), that fill `packets` packets.
 
         Raises:
@@ -125,44 +124,6 @@ def word_table(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.uint16]:
     info = np.stack([info_words(packet, codebook) for packet in s])
     pilots = np.broadcast_to(pilot_words(codebook), info.shape)
     return np.stack([pilots, info], axis=-1)
-
-
-def rows_of_chips(chips: ArrayLike) -> NDArray[np.uint8]:
-    """LED rows of chips, uint8 (chips, 12): from one column an LED, or one a cluster of equal size.
-
-    LED 0 is the most significant bit of the first byte.
-
-    Raises:
-        ConfigError: The chips are not 0 and 1, or the columns do not divide the 96 LEDs.
-
-    >>> rows_of_chips([[1] + [0] * 15]).tolist()
-    [[252, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]]
-    """
-    c = np.asarray(chips)
-    if c.ndim != 2 or not c.size or LEDS % c.shape[1]:
-        raise ConfigError(
-            f"chips of shape {c.shape}: expected one column for each of {LEDS} LEDs or 16 clusters"
-        )
-    if c.dtype.kind not in "uib" or not np.isin(c, (0, 1)).all():
-        raise ConfigError("chips: expected integers 0 and 1")
-    return np.packbits(np.repeat(c.astype(np.uint8), LEDS // c.shape[1], axis=1), axis=1)
-
-
-def chips_of_rows(rows: NDArray[np.uint8], clusters: int = 16) -> NDArray[np.uint8]:
-    """Chips of LED rows, uint8 (chips, clusters); `clusters` 96 gives every LED.
-
-    Raises:
-        ConfigError: LEDs of one cluster differ.
-    """
-    leds = np.unpackbits(rows, axis=1)
-    chips = leds.reshape(len(rows), clusters, LEDS // clusters)
-    torn = np.argwhere((chips != chips[:, :, :1]).any(2))
-    if len(torn):
-        chip, cluster = torn[0]
-        raise ConfigError(
-            f"chip {chip}: the LEDs of cluster {cluster} differ; take every LED for itself with --per-led"
-        )
-    return np.ascontiguousarray(chips[:, :, 0])
 
 
 def read_symbols(path: Path, codebook: Codebook, pilot_every: int = 1) -> Symbols:
@@ -228,7 +189,7 @@ def _list(path: Path, place: str, value: Any, of: str, length: int | None = None
     return value
 
 
-def read_masks(path: Path, frames: int, codebook: Codebook, pilot_every: int = 1) -> Payload:
+def read_masks(path: Path, frames: int, codebook: Codebook, pilot_every: int = 1) -> Bank:
     """Precomposed chips of a `.npy` file: uint8 (chips, 96) or (chips, 16), whole packets of `frames` frames.
 
     Raises:
@@ -250,6 +211,6 @@ def read_masks(path: Path, frames: int, codebook: Codebook, pilot_every: int = 1
             f" expected whole packets of {length} chips ({frames} frames)"
         )
     try:
-        return Payload.of_masks(chips, len(chips) // length, frames, codebook, pilot_every)
+        return Bank.of_masks(chips, len(chips) // length, frames, codebook, pilot_every)
     except ConfigError as fault:
         raise InputError(f"{path}: {fault}") from fault

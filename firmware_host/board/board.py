@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from evlcp_sdk.air.codebook import Codebook, word_of_values
 from evlcp_sdk.air.frames import pilot_words
 from evlcp_sdk.errors import ConfigError
-from firmware_host.board.bank import Payload
-from firmware_host.board.session import Link
-from firmware_host.errors import IncompatibleError, LinkError, RefusedError, VerifyError
-from firmware_host.protocol.client import Outcome
+from firmware_host.board.bank import Bank
+from firmware_host.board.session import Session
+from firmware_host.errors import IncompatibleError, LineError, RefusedError, VerifyError
+from firmware_host.protocol.client import RequestOutcome
 from firmware_host.protocol.requests import (
     NO_BANK,
     BlankReply,
@@ -50,7 +50,7 @@ from firmware_host.protocol.requests import (
     WatchdogRequest,
     WriteRequest,
 )
-from firmware_host.protocol.wire import Payload as Message
+from firmware_host.protocol.wire import WireMessage
 
 __all__ = ["Board", "Programmed", "Settings", "profile_number", "provision"]
 
@@ -105,10 +105,10 @@ class Settings:
 
 
 class Board:
-    """The board at the other end of a link; says HELLO at once.
+    """The board at the other end of a line; says HELLO at once.
 
     Attributes:
-        link: The session.
+        session: The session.
         about: What HELLO told.
 
     Raises:
@@ -116,27 +116,27 @@ class Board:
         IncompatibleError: The board speaks another protocol.
     """
 
-    def __init__(self, link: Link) -> None:
-        self.link = link
-        self.about: HelloReply = link.hello()
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.about: HelloReply = session.hello()
 
     # -- single requests
 
     def status(self) -> StatusReply:
         """What the board does."""
-        return self.link.call(StatusRequest(), StatusReply)
+        return self.session.call(StatusRequest(), StatusReply)
 
     def start(self) -> None:
         """Play the active bank."""
-        self.link.call(StartRequest(), StartReply)
+        self.session.call(StartRequest(), StartReply)
 
     def stop(self) -> None:
         """Finish the packet, then dark."""
-        self.link.call(StopRequest(), StopReply)
+        self.session.call(StopRequest(), StopReply)
 
     def blank(self) -> None:
         """Dark at once."""
-        self.link.call(BlankRequest(), BlankReply)
+        self.session.call(BlankRequest(), BlankReply)
 
     def level(self, level_ma: int) -> None:
         """Set the LED current, mA.
@@ -144,48 +144,48 @@ class Board:
         Raises:
             RefusedError: It is above the board's maximum.
         """
-        self.link.call(LevelRequest(level_ma), LevelReply)
+        self.session.call(LevelRequest(level_ma), LevelReply)
 
     def watchdog(self, action: Watchdog, timeout_ms: int) -> None:
         """What to do when the host is silent for `timeout_ms`."""
-        self.link.call(WatchdogRequest(action, timeout_ms), WatchdogReply)
+        self.session.call(WatchdogRequest(action, timeout_ms), WatchdogReply)
 
     def save(self, autostart: bool = False) -> SaveReply:
         """Save active bank and settings to flash."""
-        return self.link.call(SaveRequest(int(autostart)), SaveReply)
+        return self.session.call(SaveRequest(int(autostart)), SaveReply)
 
     def recall(self) -> RecallReply:
         """Commit what was saved."""
-        return self.link.call(RecallRequest(), RecallReply)
+        return self.session.call(RecallRequest(), RecallReply)
 
     def test_leds(self, first: int, last: int, dwell_ms: int) -> None:
         """Walk over LEDs one by one."""
-        self.link.call(LedTestRequest(first, last, dwell_ms), LedTestReply)
+        self.session.call(LedTestRequest(first, last, dwell_ms), LedTestReply)
 
     def crc(self, bank: int, offset: int, length: int) -> int:
         """CRC-32 of a bank's bytes."""
-        return self.link.call(CrcRequest(bank, offset, length), CrcReply).crc
+        return self.session.call(CrcRequest(bank, offset, length), CrcReply).crc
 
     def read(self, bank: int, offset: int, length: int) -> bytes:
         """A bank's bytes."""
         most = self.about.max_payload - ReadReply.fixed_bytes()
         found: dict[int, bytes] = {}
 
-        def handle(request: Message, outcome: Outcome) -> None:
-            reply = self.link.checked(request, outcome)
+        def handle(request: WireMessage, outcome: RequestOutcome) -> None:
+            reply = self.session.checked(request, outcome)
             if isinstance(reply, ReadReply):
                 found[reply.offset] = reply.data
 
         pieces = [(at, min(most, offset + length - at)) for at in range(offset, offset + length, most)]
-        self.link.run((ReadRequest(bank, at, n) for at, n in pieces), handle)
+        self.session.run((ReadRequest(bank, at, n) for at, n in pieces), handle)
         data = b"".join(found.get(at, b"") for at, _ in pieces)
         if len(data) != length:
-            raise LinkError(f"{self.link.name}: READ gave {len(data)} bytes, expected {length}; try again")
+            raise LineError(f"{self.session.name}: READ gave {len(data)} bytes, expected {length}; try again")
         return data
 
     # -- programming
 
-    def prepare(self, payload: Payload, chip_rate_hz: int) -> None:
+    def prepare(self, payload: Bank, chip_rate_hz: int) -> None:
         """Set chip rate, profile and codebook for the next commit.
 
         Raises:
@@ -195,15 +195,16 @@ class Board:
         book = payload.codebook
         configure = ConfigureRequest(chip_rate_hz, profile_number(book), payload.frames, payload.pilot_every)
         try:
-            self.link.call(configure, ConfigureReply)
+            self.session.call(configure, ConfigureReply)
         except RefusedError as fault:
             # the chip rate is what the board looks at first
             wrong = chip_rate_hz > self.about.chip_rate_max_hz or self.about.tick_hz % chip_rate_hz
             if fault.status != Status.OUT_OF_RANGE or not wrong:
                 raise
             raise RefusedError(
-                f"{self.link.name}: no chip rate of {chip_rate_hz} Hz: must divide {self.about.tick_hz} Hz,"
-                f" at most {self.about.chip_rate_max_hz}; the nearest the board can take is {fault.detail}",
+                f"{self.session.name}: no chip rate of {chip_rate_hz} Hz: must divide"
+                f" {self.about.tick_hz} Hz, at most {self.about.chip_rate_max_hz};"
+                f" the nearest the board can take is {fault.detail}",
                 fault.status,
                 fault.detail,
             ) from fault
@@ -212,9 +213,9 @@ class Board:
             raise IncompatibleError(f"preamble of {chips} chips: the board's has at most 32")
         pilots = tuple(int(w) for w in pilot_words(book))
         request = CodebookRequest(chips, word_of_values(book.preamble), pilots, bytes.fromhex(book.digest))
-        self.link.call(request, CodebookReply)
+        self.session.call(request, CodebookReply)
 
-    def holds(self, payload: Payload, chip_rate_hz: int, status: StatusReply) -> bool:
+    def holds(self, payload: Bank, chip_rate_hz: int, status: StatusReply) -> bool:
         """Whether the active bank is this payload."""
         return status.active_bank != NO_BANK and (
             status.format,
@@ -240,7 +241,7 @@ class Board:
 
     def program(
         self,
-        payload: Payload,
+        payload: Bank,
         chip_rate_hz: int = 10_000,
         verify: bool = True,
         progress: Progress | None = None,
@@ -254,52 +255,52 @@ class Board:
             ConfigError: The payload is larger than a bank, or of other clusters than the board.
             RefusedError: The board refuses a value.
             VerifyError: The bank does not hold what was sent.
-            LinkError: The line fails; what was active stays so.
+            LineError: The line fails; what was active stays so.
         """
         self.check_fits(payload)
-        before = self.link.client.retries
+        before = self.session.client.retries
         total = len(payload.content)
         status = self._settled()
         if self.holds(payload, chip_rate_hz, status):
             if progress:
                 progress(total, total)
-            return Programmed(0, total, False, status.active_bank, self.link.client.retries - before)
+            return Programmed(0, total, False, status.active_bank, self.session.client.retries - before)
         self.prepare(payload, chip_rate_hz)
         bank = 1 if status.active_bank == 0 else 0
         written = self.fill(bank, payload.content, progress)
         if verify and written and self.crc(bank, 0, total) != payload.crc:
             raise VerifyError(
-                f"{self.link.name}: bank {bank} does not hold what was sent; the old one goes on;"
+                f"{self.session.name}: bank {bank} does not hold what was sent; the old one goes on;"
                 " program it again, or with --baud of a lower rate"
             )
         digest = bytes.fromhex(payload.codebook.digest)
         commit = CommitRequest(bank, payload.format, payload.packets, total, payload.crc, digest)
-        self.link.call(commit, CommitReply)
+        self.session.call(commit, CommitReply)
         status = self._settled()
         if verify and not self.holds(payload, chip_rate_hz, status):
             raise VerifyError(
-                f"{self.link.name}: bank {status.active_bank} is active, expected {bank}; program it again"
+                f"{self.session.name}: bank {status.active_bank} is active, expected {bank}; program it again"
             )
-        return Programmed(written, total, True, bank, self.link.client.retries - before)
+        return Programmed(written, total, True, bank, self.session.client.retries - before)
 
-    def check_fits(self, payload: Payload) -> None:
+    def check_fits(self, payload: Bank) -> None:
         """Raise ConfigError unless the payload fits the board's clusters and bank."""
         if payload.codebook.clusters != self.about.clusters:
             raise ConfigError(
                 f"payload for {payload.codebook.clusters} clusters,"
-                f" {self.link.name} has {self.about.clusters}"
+                f" {self.session.name} has {self.about.clusters}"
             )
         each = len(payload.content) // payload.packets
         room = self.about.bank_bytes
         if each > room:
             fits = bisect_right(range(1, payload.frames + 1), room, key=payload.packet_bytes)
             raise ConfigError(
-                f"a packet of {payload.frames} frames takes {each} bytes, a bank of {self.link.name} has"
+                f"a packet of {payload.frames} frames takes {each} bytes, a bank of {self.session.name} has"
                 f" {room}: not one fits; a packet may have at most {fits} frames"
             )
         if len(payload.content) > room:
             raise ConfigError(
-                f"{payload.packets} packets of {each} bytes, a bank of {self.link.name} has"
+                f"{payload.packets} packets of {each} bytes, a bank of {self.session.name} has"
                 f" {room} bytes: send at most {room // each} packets"
             )
 
@@ -309,7 +310,7 @@ class Board:
         On a noisy line a piece that does not get through is cut in two.
 
         Raises:
-            LinkError: Not even the smallest piece gets through.
+            LineError: Not even the smallest piece gets through.
         """
         missing = self._missing(bank, content)
         total = sum(n for _, n in missing)
@@ -327,7 +328,7 @@ class Board:
                     end = at + state["piece"]
                 yield WriteRequest(bank, at, content[at:end])
 
-        def handle(request: Message, outcome: Outcome) -> None:
+        def handle(request: WireMessage, outcome: RequestOutcome) -> None:
             if not isinstance(request, WriteRequest):
                 return
             n = len(request.data)
@@ -335,40 +336,40 @@ class Board:
                 state["piece"] = max(_LEAST, min(state["piece"], n // 2))
                 left.append((request.offset, request.offset + n))
                 return
-            self.link.checked(request, outcome)
+            self.session.checked(request, outcome)
             state["done"] += n
             advance(len(content) - total + state["done"], len(content))
 
         while left:
-            self.link.run(requests(), handle)
+            self.session.run(requests(), handle)
         return total
 
     def _missing(self, bank: int, content: bytes) -> list[tuple[int, int]]:
         """Blocks (offset, bytes) of a bank that are not `content`."""
         missing: list[tuple[int, int]] = []
 
-        def handle(request: Message, outcome: Outcome) -> None:
-            reply = self.link.checked(request, outcome)
+        def handle(request: WireMessage, outcome: RequestOutcome) -> None:
+            reply = self.session.checked(request, outcome)
             if isinstance(request, CrcRequest) and isinstance(reply, CrcReply):
                 end = request.offset + request.length
                 if zlib.crc32(content[request.offset : end]) != reply.crc:
                     missing.append((request.offset, request.length))
 
         blocks = [(at, min(_BLOCK, len(content) - at)) for at in range(0, len(content), _BLOCK)]
-        self.link.run((CrcRequest(bank, at, n) for at, n in blocks), handle)
+        self.session.run((CrcRequest(bank, at, n) for at, n in blocks), handle)
         return sorted(missing)
 
     def _settled(self) -> StatusReply:
         """Status once no bank waits for its packet boundary."""
         status = self.status()
-        end = self.link.transport.now() + 10.0 + _packet_s(status)
+        end = self.session.transport.now() + 10.0 + _packet_s(status)
         while status.pending_bank != NO_BANK:
-            if self.link.transport.now() > end:
+            if self.session.transport.now() > end:
                 raise VerifyError(
-                    f"{self.link.name}: bank {status.pending_bank} does not become active;"
+                    f"{self.session.name}: bank {status.pending_bank} does not become active;"
                     " the old one plays on; 'evlcp board stop', then program it again"
                 )
-            self.link.transport.read(0.002)
+            self.session.transport.read(0.002)
             status = self.status()
         return status
 
@@ -376,22 +377,22 @@ class Board:
         """Status once the LEDs are dark after a stop.
 
         Raises:
-            LinkError: They are not within `timeout_s` and the packet that a stop finishes.
+            LineError: They are not within `timeout_s` and the packet that a stop finishes.
         """
         status = self.status()
-        end = self.link.transport.now() + timeout_s + _packet_s(status)
+        end = self.session.transport.now() + timeout_s + _packet_s(status)
         while status.state not in (State.DARK, State.FAULT):
-            if self.link.transport.now() > end:
-                raise LinkError(
-                    f"{self.link.name}: still {State(status.state).name}; try 'evlcp board blank'"
+            if self.session.transport.now() > end:
+                raise LineError(
+                    f"{self.session.name}: still {State(status.state).name}; try 'evlcp board blank'"
                 )
-            self.link.transport.read(0.005)
+            self.session.transport.read(0.005)
             status = self.status()
         return status
 
 
 def provision(
-    board: Board, payload: Payload, settings: Settings, verify: bool = True, progress: Progress | None = None
+    board: Board, payload: Bank, settings: Settings, verify: bool = True, progress: Progress | None = None
 ) -> Programmed:
     """Bring a board to payload and settings; what is so already is left alone.
 

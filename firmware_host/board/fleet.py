@@ -12,11 +12,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from evlcp_sdk.errors import EvlcpError, InputError
-from firmware_host.board.bank import Payload, random_symbols, read_masks, read_symbols
+from firmware_host.board.bank import Bank, random_symbols, read_masks, read_symbols
 from firmware_host.board.board import Board, Programmed, Settings, provision
-from firmware_host.board.session import Link
+from firmware_host.board.session import Session
+from firmware_host.emulators.opening import open_port
 from firmware_host.errors import FleetError, IncompatibleError
-from firmware_host.ports.transport import open_transport
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.generate import codebook_of
 from firmware_host.protocol.requests import DEFAULT_BAUD, Watchdog
@@ -97,7 +97,7 @@ class Inventory:
     """
 
     path: Path
-    boards: tuple[tuple[Entry, Payload], ...]
+    boards: tuple[tuple[Entry, Bank], ...]
 
 
 @dataclass(frozen=True)
@@ -187,26 +187,26 @@ def _entry(path: Path, index: int, row: dict[str, Any]) -> Entry:
         raise InputError(f"{path}: {place}{value}: {first['msg']}") from fault
 
 
-def _payload(path: Path, index: int, entry: Entry, books: "dict[str, Codebook]") -> Payload:
+def _payload(path: Path, index: int, entry: Entry, books: "dict[str, Codebook]") -> Bank:
     try:
         book = books.setdefault(entry.profile, codebook_of(entry.profile))
         if entry.random is not None:
             generator = np.random.default_rng(entry.seed)
             symbols = random_symbols(entry.random, entry.frames, book, generator)
-            return Payload.of_symbols(symbols, book, entry.pilot_every)
+            return Bank.of_symbols(symbols, book, entry.pilot_every)
         file = path.parent / str(entry.payload)
         if file.suffix == ".npy":
             return read_masks(file, entry.frames, book, entry.pilot_every)
-        return Payload.of_symbols(read_symbols(file, book, entry.pilot_every), book, entry.pilot_every)
+        return Bank.of_symbols(read_symbols(file, book, entry.pilot_every), book, entry.pilot_every)
     except EvlcpError as fault:
         raise InputError(f"{path}: board[{index}]: {fault}") from fault
 
 
-def _program(entry: Entry, payload: Payload, verify: bool) -> Result:
+def _program(entry: Entry, payload: Bank, verify: bool) -> Result:
     start = time.monotonic()
     try:
-        with Link(open_transport(entry.port, entry.baud), Timing(entry.baud)) as link:
-            board = Board(link)
+        with Session(open_port(entry.port, entry.baud), Timing(entry.baud)) as session:
+            board = Board(session)
             found = board.about.unique_id.hex()
             if entry.unique_id not in (None, found):
                 raise IncompatibleError(

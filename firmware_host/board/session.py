@@ -8,19 +8,19 @@ from firmware_host.errors import (
     BoardError,
     BoardResetError,
     IncompatibleError,
-    LinkError,
+    LineError,
     NoBoardError,
     RefusedError,
     VerifyError,
 )
 from firmware_host.ports.transport import Transport
-from firmware_host.protocol.client import TRIES, Client, Outcome, Timing
+from firmware_host.protocol.client import TRIES, Client, RequestOutcome, Timing
 from firmware_host.protocol.requests import NO_SESSION, SCHEMA, HelloReply, HelloRequest, Status, Type
-from firmware_host.protocol.wire import Payload
+from firmware_host.protocol.wire import WireMessage
 
-__all__ = ["Link", "refusal"]
+__all__ = ["Session", "refusal"]
 
-Reply = TypeVar("Reply", bound=Payload)
+Reply = TypeVar("Reply", bound=WireMessage)
 
 _ADVICE = {
     Status.UNKNOWN_TYPE: "the firmware does not know it; update the firmware",
@@ -58,11 +58,11 @@ def refusal(name: str, type_: int, status: Status | int, detail: int) -> BoardEr
     return kind(message) if kind else RefusedError(message, int(status), detail)
 
 
-class Link:
+class Session:
     """A session with the board on a line.
 
     Args:
-        transport: The line; closed with the link.
+        transport: The line; closed with the session.
         timing: How long an answer may take.
         first: First sequence number, by default drawn at random.
         nonce: Number of the session, by default drawn at random.
@@ -91,7 +91,7 @@ class Link:
         """What to call the board in messages."""
         return self.transport.name
 
-    def __enter__(self) -> "Link":
+    def __enter__(self) -> "Session":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -112,7 +112,7 @@ class Link:
         self.client.window = 1
         # Ends what a host before this one may have left half sent.
         self.transport.write(b"\0")
-        found: list[Outcome] = []
+        found: list[RequestOutcome] = []
         self.run([HelloRequest(SCHEMA, self._nonce)], lambda _, outcome: found.append(outcome))
         outcome = found[0]
         if outcome.status is None:
@@ -126,28 +126,28 @@ class Link:
         self.client.window = max(1, outcome.reply.window)
         return outcome.reply
 
-    def call(self, request: Payload, reply: type[Reply]) -> Reply:
+    def call(self, request: WireMessage, reply: type[Reply]) -> Reply:
         """One request and its answer.
 
         Raises:
             RefusedError: The board refuses; or the error that its status stands for.
-            LinkError: No answer came.
+            LineError: No answer came.
         """
-        found: list[Outcome] = []
+        found: list[RequestOutcome] = []
         self.run([request], lambda _, outcome: found.append(outcome))
         answer = self.checked(request, found[0])
         if not isinstance(answer, reply):
-            raise LinkError(f"{self.name}: {type(answer).__name__} came, expected {reply.__name__}")
+            raise LineError(f"{self.name}: {type(answer).__name__} came, expected {reply.__name__}")
         return answer
 
-    def checked(self, request: Payload, outcome: Outcome) -> Payload:
+    def checked(self, request: WireMessage, outcome: RequestOutcome) -> WireMessage:
         """The answer of an outcome.
 
         Raises:
             BoardError: There is none; see `call`.
         """
         if outcome.status is None:
-            raise LinkError(
+            raise LineError(
                 f"{self.name}: no answer to {Type(request.TYPE).name} after {outcome.tries} tries;"
                 " check the line and run the command again, it goes on where it was"
             )
@@ -155,16 +155,18 @@ class Link:
             raise refusal(self.name, request.TYPE, outcome.status, outcome.detail)
         return outcome.reply
 
-    def run(self, requests: Iterable[Payload], handle: Callable[[Payload, Outcome], None]) -> None:
+    def run(
+        self, requests: Iterable[WireMessage], handle: Callable[[WireMessage, RequestOutcome], None]
+    ) -> None:
         """Send requests, as many at once as the board takes; `handle` gets each with its outcome.
 
         `requests` may be a generator that goes on while outcomes come in. What `handle` raises ends the run.
 
         Raises:
-            LinkError: The line went away.
+            LineError: The line went away.
         """
         source = iter(requests)
-        sent: dict[int, Payload] = {}
+        sent: dict[int, WireMessage] = {}
         more = True
         try:
             while True:

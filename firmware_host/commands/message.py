@@ -90,7 +90,7 @@ def message(
     if out is not None:
         _write_text(out, json.dumps(table) + "\n")
     if chips is not None:
-        from firmware_host.commands.tx import save_array
+        from firmware_host.commands._output import save_array
 
         save_array(chips, _chips(symbols, link))
     programmed = None if port is None else _program(symbols, link, port, baud)
@@ -120,7 +120,7 @@ def message(
         )
     typer.echo(f"{summary['packets']} packets, {summary['duration_s']:.4g} s, again and again")
     if programmed is not None:
-        from firmware_host.commands.board import tell
+        from firmware_host.commands._line import tell
 
         tell(programmed, as_json=False)
 
@@ -233,13 +233,13 @@ def _chips(symbols: "NDArray[np.int64]", link: "Link") -> "NDArray[np.uint8]":
 
 def _program(symbols: "NDArray[np.int64]", link: "Link", port: str, baud: int) -> Any:
     from evlcp_sdk.errors import ConfigError
-    from firmware_host.board.bank import Payload
+    from firmware_host.board.bank import Bank
     from firmware_host.board.board import Settings, provision
-    from firmware_host.commands.board import open_board, progress_bar
+    from firmware_host.commands._line import open_board, progress_bar
 
     if link.air.chip_rate_hz != round(link.air.chip_rate_hz):
         raise ConfigError(f"air.chip_rate_hz = {link.air.chip_rate_hz}: a board takes whole chips a second")
-    payload = Payload.of_symbols(symbols, link.codebook, link.packet.pilot_every)
+    payload = Bank.of_symbols(symbols, link.codebook, link.packet.pilot_every)
     settings = Settings(round(link.air.chip_rate_hz))
     with open_board(port, baud, None, None) as board, progress_bar("programming") as progress:
         return provision(board, payload, settings, True, progress)

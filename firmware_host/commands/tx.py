@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from firmware_host.commands import _source
+from firmware_host.commands._output import save_array
+from firmware_host.commands._source import Frames, PilotEvery, ProfileName, RandomPackets, Seed, SymbolsFile
 from firmware_host.commands.message import keygen, message
 
 if TYPE_CHECKING:
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.air.codebook import Codebook
 
-__all__ = ["app", "save_array"]
+__all__ = ["app"]
 
 app = typer.Typer(
     no_args_is_help=True, rich_markup_mode="rich", help="Make, show and check what goes on air."
@@ -31,21 +33,6 @@ class Form(StrEnum):
     HEX = "hex"
     C = "c"
     JSON = "json"
-
-
-SymbolsFile = Annotated[
-    Path | None, typer.Argument(metavar="SYMBOLS.json", help="Symbols \\[packet]\\[frame]\\[cluster].")
-]
-RandomPackets = Annotated[
-    int | None, typer.Option("--random", metavar="N", help="N packets of random symbols.")
-]
-Seed = Annotated[int, typer.Option(help="Seed of --random.", min=0)]
-Frames = Annotated[int, typer.Option(help="Frames per packet of --random and --masks.")]
-PilotEvery = Annotated[
-    int,
-    typer.Option(min=1, max=64, metavar="N", help="Frames from one pilot to the next, as the receiver's."),
-]
-ProfileName = Annotated[str, typer.Option("--profile", help="Info-segment profile: wh4x2, wh8, raw8.")]
 
 
 @app.command()
@@ -75,23 +62,6 @@ def frames(
 
         save_array(chips, symbol_chips(table, book, pilot_every))
     typer.echo(_FORMS[form](table, book, pilot_every))
-
-
-def save_array(path: Path, array: "NDArray[np.generic]") -> None:
-    """Write an array as `.npy` under exactly this name.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
-    import numpy as np
-
-    from evlcp_sdk.errors import InputError
-
-    try:
-        with path.open("wb") as file:
-            np.save(file, array)
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be written: {fault.strerror}") from fault
 
 
 def _table(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:

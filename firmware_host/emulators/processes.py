@@ -10,7 +10,7 @@ from pathlib import Path
 
 from evlcp_sdk.errors import InputError
 from firmware_host import build
-from firmware_host.errors import LinkError, NoBoardError, ToolchainError
+from firmware_host.errors import LineError, NoBoardError, ToolchainError
 from firmware_host.ports.transport import SocketTransport
 
 __all__ = ["ProcessTransport", "native_command", "qemu_command", "start_native", "start_qemu", "wait_for"]
@@ -151,7 +151,7 @@ def start_qemu(leds: Path | None = None) -> ProcessTransport:
 
     Raises:
         ToolchainError: QEMU or the cross compiler is missing.
-        LinkError: QEMU does not come up.
+        LineError: QEMU does not come up.
     """
     folder = Path(tempfile.mkdtemp(prefix="evlcp-qemu-"))
     listen = f"unix:{folder / 'uart0'}"
@@ -163,4 +163,4 @@ def start_qemu(leds: Path | None = None) -> ProcessTransport:
     said = process.stderr.read().decode(errors="replace").strip() if process.stderr else ""
     _end(process)
     shutil.rmtree(folder, ignore_errors=True)
-    raise LinkError(f"qemu: does not come up: {said or 'no socket'}; try 'evlcp board emulate qemu'")
+    raise LineError(f"qemu: does not come up: {said or 'no socket'}; try 'evlcp board emulate qemu'")

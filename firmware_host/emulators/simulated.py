@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_host import build
-from firmware_host.emulators.recording import RECORD, Recording
+from firmware_host.emulators.led_record import RECORD, LedRecord
 from firmware_host.protocol.requests import LEDS, ROW_BYTES
 
 __all__ = ["SimulatedBoard", "SimulatedLine"]
@@ -78,11 +78,11 @@ class SimulatedBoard:
         count = self._c.board_output(self._board, self._room, len(self._room))
         return self._room.raw[:count]
 
-    def records(self) -> Recording:
+    def records(self) -> LedRecord:
         """LED outputs since the last call."""
         table = np.zeros(self._c.board_record_count(self._board), RECORD)
         self._c.board_take_records(self._board, table.ctypes.data)
-        return Recording.of_records(table)
+        return LedRecord.of_records(table)
 
     def shown(self) -> NDArray[np.uint8]:
         """The LEDs now, uint8 (96,)."""

@@ -1,7 +1,6 @@
-"""Byte lines to a board: serial ports, sockets, emulators started for the purpose, traces.
+"""Byte lines to a board: serial ports, sockets, traces.
 
-A port is named by a device or any pyserial URL, by `unix:PATH` or `tcp:HOST:PORT`, or by `native:` or
-`qemu:`, which start an emulator that lives as long as the line.
+A port is named by a device or any pyserial URL, or by `unix:PATH` or `tcp:HOST:PORT`.
 """
 
 import contextlib
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol, TextIO
 
 from evlcp_sdk.errors import InputError
-from firmware_host.errors import LinkError, NoBoardError
+from firmware_host.errors import LineError, NoBoardError
 from firmware_host.protocol.requests import DEFAULT_BAUD
 
 __all__ = ["ReplayTransport", "SocketTransport", "TraceTransport", "Transport", "open_transport"]
@@ -35,14 +34,14 @@ class Transport(Protocol):
         """Bytes that came, after at most `timeout_s`; empty if none did.
 
         Raises:
-            LinkError: The line went away.
+            LineError: The line went away.
         """
 
     def write(self, data: bytes) -> None:
         """Send bytes.
 
         Raises:
-            LinkError: The line went away.
+            LineError: The line went away.
         """
 
     def close(self) -> None:
@@ -100,9 +99,9 @@ class SocketTransport:
                 return b""
             data = self._socket.recv(65536)
         except (OSError, ValueError) as fault:
-            raise LinkError(f"{self.name}: the line broke: {fault}; run the command again") from fault
+            raise LineError(f"{self.name}: the line broke: {fault}; run the command again") from fault
         if not data:
-            raise LinkError(f"{self.name}: the board hung up; start it again and run the command again")
+            raise LineError(f"{self.name}: the board hung up; start it again and run the command again")
         return data
 
     def write(self, data: bytes) -> None:
@@ -113,7 +112,7 @@ class SocketTransport:
                 with contextlib.suppress(BlockingIOError):
                     data = data[self._socket.send(data) :]
         except (OSError, ValueError) as fault:
-            raise LinkError(f"{self.name}: the line broke: {fault}; run the command again") from fault
+            raise LineError(f"{self.name}: the line broke: {fault}; run the command again") from fault
 
     def close(self) -> None:
         """Close the socket."""
@@ -153,7 +152,7 @@ class SerialTransport:
                     return data
         except (OSError, TypeError) as fault:
             # pyserial raises TypeError when another thread closes the port under a read
-            raise LinkError(
+            raise LineError(
                 f"{self.name}: the line broke: {fault}; plug it in and run the command again"
             ) from fault
 
@@ -162,7 +161,7 @@ class SerialTransport:
         try:
             self._port.write(data)
         except OSError as fault:
-            raise LinkError(
+            raise LineError(
                 f"{self.name}: the line broke: {fault}; plug it in and run the command again"
             ) from fault
 
@@ -174,7 +173,7 @@ class SerialTransport:
 class TraceTransport:
     """Passes everything through and records it as JSON lines.
 
-    The first line tells port, line rate and what the client drew at random; each further one is
+    The first line has port, line rate and what the client drew at random; each further one is
     `{"t": seconds, "dir": "tx" | "rx", "hex": bytes}`.
     """
 
@@ -258,7 +257,7 @@ class ReplayTransport:
             self._now = max(self._now, at)
             return data
         if not self._events:
-            raise LinkError(f"{self.name}: the trace ends here; record it again with --trace")
+            raise LineError(f"{self.name}: the trace ends here; record it again with --trace")
         self._now += timeout_s
         return b""
 
@@ -266,17 +265,17 @@ class ReplayTransport:
         """Compare with what was sent in the trace.
 
         Raises:
-            LinkError: It is something else.
+            LineError: It is something else.
         """
         while data:
             if not self._events:
-                raise LinkError(f"{self.name}: the trace ends here; record it again with --trace")
+                raise LineError(f"{self.name}: the trace ends here; record it again with --trace")
             if self._events[0][1] != "tx":
-                raise LinkError(f"{self.name}: sends more than was recorded; {self._advice}")
+                raise LineError(f"{self.name}: sends more than was recorded; {self._advice}")
             at, _, expected = self._events[0]
             n = min(len(data), len(expected))
             if data[:n] != expected[:n]:
-                raise LinkError(f"{self.name}: byte {self._sent} sent is another one; {self._advice}")
+                raise LineError(f"{self.name}: byte {self._sent} sent is another one; {self._advice}")
             self._now = max(self._now, at)
             data = data[n:]
             self._sent += n
@@ -292,21 +291,11 @@ class ReplayTransport:
 
 
 def open_transport(spec: str, baud: int = DEFAULT_BAUD) -> Transport:
-    """Open a port by its name; see the module.
+    """Open a port by its name; see the module. `firmware_host.emulators.opening` opens emulators, too.
 
     Raises:
         NoBoardError: It cannot be opened.
-        ToolchainError: An emulator cannot be built or started.
     """
-    scheme, _, rest = spec.partition(":")
-    if scheme == "native":
-        from firmware_host.emulators.processes import start_native
-
-        return start_native(flash=Path(rest) if rest else None)
-    if scheme == "qemu":
-        from firmware_host.emulators.processes import start_qemu
-
-        return start_qemu()
-    if scheme in ("unix", "tcp"):
+    if spec.partition(":")[0] in ("unix", "tcp"):
         return SocketTransport.connect(spec)
     return SerialTransport(spec, baud)

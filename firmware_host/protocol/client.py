@@ -9,7 +9,7 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from firmware_host.errors import DatagramError
-from firmware_host.protocol.datagram import Datagram, Decoder
+from firmware_host.protocol.datagram import Datagram, DatagramDecoder
 from firmware_host.protocol.requests import (
     CRC_BYTES,
     HEADER_BYTES,
@@ -19,9 +19,9 @@ from firmware_host.protocol.requests import (
     REPLY_BIT,
     Status,
 )
-from firmware_host.protocol.wire import Payload
+from firmware_host.protocol.wire import WireMessage
 
-__all__ = ["TRIES", "Client", "Outcome", "Timing"]
+__all__ = ["TRIES", "Client", "RequestOutcome", "Timing"]
 
 TRIES = 5
 """How often a request is sent before it is given up, unless the caller says otherwise."""
@@ -60,7 +60,7 @@ class Timing:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class RequestOutcome:
     """How a request ended.
 
     Attributes:
@@ -73,7 +73,7 @@ class Outcome:
 
     token: int
     status: Status | int | None
-    reply: Payload | None
+    reply: WireMessage | None
     detail: int
     tries: int
 
@@ -114,13 +114,13 @@ class Client:
     first: int = field(default_factory=lambda: random.SystemRandom().randrange(1 << 16))
     tries: int = TRIES
     retries: int = 0
-    decoder: Decoder = field(default_factory=Decoder)
+    decoder: DatagramDecoder = field(default_factory=DatagramDecoder)
     _tokens: int = 0
     _queue: deque[_Waiting] = field(default_factory=deque)
     _flight: dict[int, _Waiting] = field(default_factory=dict)
-    _outcomes: list[Outcome] = field(default_factory=list)
+    _outcomes: list[RequestOutcome] = field(default_factory=list)
 
-    def submit(self, request: Payload, session: int | None = None) -> int:
+    def submit(self, request: WireMessage, session: int | None = None) -> int:
         """Queue a request; returns the token its outcome will carry."""
         sequence = (self.first + self._tokens) & 0xFFFF
         chosen = self.session if session is None else session
@@ -147,7 +147,7 @@ class Client:
         self._queue.clear()
         self._flight.clear()
 
-    def receive(self, data: bytes) -> list[Outcome]:
+    def receive(self, data: bytes) -> list[RequestOutcome]:
         """Take what was read from the line; give what it settles."""
         for datagram in self.decoder.feed(data):
             waiting = self._flight.get(datagram.sequence)
@@ -175,7 +175,7 @@ class Client:
                 continue
             if waiting.tries >= self.tries:
                 del self._flight[sequence]
-                self._outcomes.append(Outcome(waiting.token, None, None, 0, waiting.tries))
+                self._outcomes.append(RequestOutcome(waiting.token, None, None, 0, waiting.tries))
             else:
                 self.retries += 1
                 out.append(self._send(waiting, now))
@@ -191,17 +191,17 @@ class Client:
         return waiting.wire
 
 
-def _outcome(waiting: _Waiting, datagram: Datagram) -> Outcome | None:
+def _outcome(waiting: _Waiting, datagram: Datagram) -> RequestOutcome | None:
     """The outcome, or None if the payload is not the reply's (then a further try decides)."""
     if datagram.status == Status.OK:
         try:
             reply = REPLIES[waiting.type].unpack(datagram.payload)
         except DatagramError:
             return None
-        return Outcome(waiting.token, Status.OK, reply, 0, waiting.tries)
+        return RequestOutcome(waiting.token, Status.OK, reply, 0, waiting.tries)
     detail = int.from_bytes(datagram.payload[:4], "little")
     try:
         status: Status | int = Status(datagram.status)
     except ValueError:
         status = datagram.status
-    return Outcome(waiting.token, status, None, detail, waiting.tries)
+    return RequestOutcome(waiting.token, status, None, detail, waiting.tries)

@@ -14,7 +14,7 @@ from cobs import cobs
 from firmware_host.errors import DatagramError
 from firmware_host.protocol.requests import CRC_BYTES, HEADER_BYTES, MAX_PAYLOAD
 
-__all__ = ["MAX_WIRE_BYTES", "Counts", "Datagram", "Decoder"]
+__all__ = ["MAX_WIRE_BYTES", "Counts", "Datagram", "DatagramDecoder"]
 
 _HEADER = struct.Struct("<BBHH")
 
@@ -83,11 +83,11 @@ class Counts:
 
 
 @dataclass(slots=True)
-class Decoder:
+class DatagramDecoder:
     """Bytes in any portions -> datagrams; what is no datagram is counted and dropped.
 
     >>> wire = Datagram(0x0C, 0, 7, 1, b"").encode()
-    >>> decoder = Decoder()
+    >>> decoder = DatagramDecoder()
     >>> decoder.feed(b"noise" + wire[:3]), decoder.counts.bad
     ([], 0)
     >>> decoder.feed(wire[3:] + wire), decoder.counts.bad  # doctest: +ELLIPSIS

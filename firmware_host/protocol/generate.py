@@ -60,7 +60,7 @@ class Field:
 
     @property
     def layout(self) -> tuple[str, int]:
-        """Entry of `Payload.LAYOUT`."""
+        """Entry of `WireMessage.LAYOUT`."""
         if self.base == "bytes":
             return (f"{self.count}s", 1) if self.count else ("*", 1)
         return (_CODES[self.base] * self.count, self.count)
@@ -108,8 +108,12 @@ def _messages(definition: dict[str, Any]) -> Iterator[tuple[dict[str, Any], list
         )
 
 
+_CLASSES = {"fault": "BoardFault"}
+"""Classes whose name is not that of their definition, which the SDK has for something else."""
+
+
 def _camel(name: str) -> str:
-    return "".join(part.capitalize() for part in name.split("_"))
+    return _CLASSES.get(name) or "".join(part.capitalize() for part in name.split("_"))
 
 
 def python_module(definition: dict[str, Any]) -> str:
@@ -126,7 +130,7 @@ def python_module(definition: dict[str, Any]) -> str:
         "from enum import IntEnum, IntFlag",
         "from typing import ClassVar",
         "",
-        "from firmware_host.protocol.wire import Payload",
+        "from firmware_host.protocol.wire import WireMessage",
         "",
         "@ALL@",
         "",
@@ -166,7 +170,7 @@ def python_module(definition: dict[str, Any]) -> str:
                 if kind == "Request"
                 else f"What the board answers to {message['name'].upper()}."
             )
-            out += ["", "", "@dataclass(frozen=True, slots=True)", f"class {cls}(Payload):"]
+            out += ["", "", "@dataclass(frozen=True, slots=True)", f"class {cls}(WireMessage):"]
             if fields:
                 out += [f'    """{verb}', "", "    Attributes:"]
                 out += [f"        {f.name}: {f.doc}" for f in fields]
@@ -184,7 +188,7 @@ def python_module(definition: dict[str, Any]) -> str:
             if fields:
                 out.append("")
             out += [f"    {f.name}: {f.python_type}" for f in fields]
-    out += ["", "", "REPLIES: dict[int, type[Payload]] = {"]
+    out += ["", "", "REPLIES: dict[int, type[WireMessage]] = {"]
     out += [f"    0x{m['type']:02X}: {_camel(m['name'])}Reply," for m, _, _ in _messages(definition)]
     out += ["}", '"""The reply of each request type."""', ""]
     constants = sorted(n for n in names if n.isupper())

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 from typing import ClassVar
 
-from firmware_host.protocol.wire import Payload
+from firmware_host.protocol.wire import WireMessage
 
 __all__ = [
     "CHIP_DARK",
@@ -26,6 +26,7 @@ __all__ = [
     "WINDOW",
     "BlankReply",
     "BlankRequest",
+    "BoardFault",
     "Capability",
     "CodebookReply",
     "CodebookRequest",
@@ -35,7 +36,6 @@ __all__ = [
     "ConfigureRequest",
     "CrcReply",
     "CrcRequest",
-    "Fault",
     "Format",
     "HelloReply",
     "HelloRequest",
@@ -213,7 +213,7 @@ class Capability(IntFlag):
     """LED outputs are recorded (emulators)."""
 
 
-class Fault(IntFlag):
+class BoardFault(IntFlag):
     """Bits of STATUS.faults."""
 
     OVER_TEMPERATURE = 1
@@ -229,7 +229,7 @@ class Fault(IntFlag):
 
 
 @dataclass(frozen=True, slots=True)
-class HelloRequest(Payload):
+class HelloRequest(WireMessage):
     """Open a session and learn the board. Its first two fields never change between versions.
 
     Attributes:
@@ -248,7 +248,7 @@ class HelloRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class HelloReply(Payload):
+class HelloReply(WireMessage):
     """What the board answers to HELLO.
 
     Attributes:
@@ -315,7 +315,7 @@ class HelloReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class ConfigureRequest(Payload):
+class ConfigureRequest(WireMessage):
     """Set what the next COMMIT plays with; playing goes on as it was.
 
     Attributes:
@@ -340,7 +340,7 @@ class ConfigureRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class ConfigureReply(Payload):
+class ConfigureReply(WireMessage):
     """What the board answers to CONFIGURE.
 
     Attributes:
@@ -359,7 +359,7 @@ class ConfigureReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class CodebookRequest(Payload):
+class CodebookRequest(WireMessage):
     """Set preamble and pilots for the next COMMIT; those of a built-in profile must be the firmware's own.
 
     Attributes:
@@ -384,7 +384,7 @@ class CodebookRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class CodebookReply(Payload):
+class CodebookReply(WireMessage):
     """What the board answers to CODEBOOK."""
 
     TYPE: ClassVar[int] = 0x03
@@ -392,7 +392,7 @@ class CodebookReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class WriteRequest(Payload):
+class WriteRequest(WireMessage):
     """Write into a spare bank; voids what was committed in it.
 
     Attributes:
@@ -414,7 +414,7 @@ class WriteRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class WriteReply(Payload):
+class WriteReply(WireMessage):
     """What the board answers to WRITE.
 
     Attributes:
@@ -436,7 +436,7 @@ class WriteReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class ReadRequest(Payload):
+class ReadRequest(WireMessage):
     """Read from a bank.
 
     Attributes:
@@ -458,7 +458,7 @@ class ReadRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class ReadReply(Payload):
+class ReadReply(WireMessage):
     """What the board answers to READ.
 
     Attributes:
@@ -480,7 +480,7 @@ class ReadReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class CrcRequest(Payload):
+class CrcRequest(WireMessage):
     """CRC-32/ISO-HDLC of a bank's bytes.
 
     Attributes:
@@ -502,7 +502,7 @@ class CrcRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class CrcReply(Payload):
+class CrcReply(WireMessage):
     """What the board answers to CRC.
 
     Attributes:
@@ -516,7 +516,7 @@ class CrcReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class CommitRequest(Payload):
+class CommitRequest(WireMessage):
     """Check a bank; play it from the next packet boundary, or, if the check fails, go on with the old one.
 
     Attributes:
@@ -547,7 +547,7 @@ class CommitRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class CommitReply(Payload):
+class CommitReply(WireMessage):
     """What the board answers to COMMIT.
 
     Attributes:
@@ -561,7 +561,7 @@ class CommitReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class StartRequest(Payload):
+class StartRequest(WireMessage):
     """Play the active bank from its first packet; nothing happens if it plays."""
 
     TYPE: ClassVar[int] = 0x08
@@ -569,7 +569,7 @@ class StartRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class StartReply(Payload):
+class StartReply(WireMessage):
     """What the board answers to START."""
 
     TYPE: ClassVar[int] = 0x08
@@ -577,7 +577,7 @@ class StartReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class StopRequest(Payload):
+class StopRequest(WireMessage):
     """Finish the packet, then dark."""
 
     TYPE: ClassVar[int] = 0x09
@@ -585,7 +585,7 @@ class StopRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class StopReply(Payload):
+class StopReply(WireMessage):
     """What the board answers to STOP."""
 
     TYPE: ClassVar[int] = 0x09
@@ -593,7 +593,7 @@ class StopReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class BlankRequest(Payload):
+class BlankRequest(WireMessage):
     """Dark at once, within the packet."""
 
     TYPE: ClassVar[int] = 0x0A
@@ -601,7 +601,7 @@ class BlankRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class BlankReply(Payload):
+class BlankReply(WireMessage):
     """What the board answers to BLANK."""
 
     TYPE: ClassVar[int] = 0x0A
@@ -609,7 +609,7 @@ class BlankReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class LevelRequest(Payload):
+class LevelRequest(WireMessage):
     """Set the LED current; above the board's maximum it is refused.
 
     Attributes:
@@ -623,7 +623,7 @@ class LevelRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class LevelReply(Payload):
+class LevelReply(WireMessage):
     """What the board answers to LEVEL."""
 
     TYPE: ClassVar[int] = 0x0B
@@ -631,7 +631,7 @@ class LevelReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class StatusRequest(Payload):
+class StatusRequest(WireMessage):
     """What the board does, and what went wrong since reset."""
 
     TYPE: ClassVar[int] = 0x0C
@@ -639,7 +639,7 @@ class StatusRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class StatusReply(Payload):
+class StatusReply(WireMessage):
     """What the board answers to STATUS.
 
     Attributes:
@@ -739,7 +739,7 @@ class StatusReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class WatchdogRequest(Payload):
+class WatchdogRequest(WireMessage):
     """What to do when the host falls silent.
 
     Attributes:
@@ -758,7 +758,7 @@ class WatchdogRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class WatchdogReply(Payload):
+class WatchdogReply(WireMessage):
     """What the board answers to WATCHDOG."""
 
     TYPE: ClassVar[int] = 0x0D
@@ -766,7 +766,7 @@ class WatchdogReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class SaveRequest(Payload):
+class SaveRequest(WireMessage):
     """Save active bank and settings to the older of two flash slots; only while the LEDs are dark.
 
     Attributes:
@@ -780,7 +780,7 @@ class SaveRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class SaveReply(Payload):
+class SaveReply(WireMessage):
     """What the board answers to SAVE.
 
     Attributes:
@@ -799,7 +799,7 @@ class SaveReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class RecallRequest(Payload):
+class RecallRequest(WireMessage):
     """Commit what the newest valid flash slot holds; only while the LEDs are dark."""
 
     TYPE: ClassVar[int] = 0x0F
@@ -807,7 +807,7 @@ class RecallRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class RecallReply(Payload):
+class RecallReply(WireMessage):
     """What the board answers to RECALL.
 
     Attributes:
@@ -826,7 +826,7 @@ class RecallReply(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class LedTestRequest(Payload):
+class LedTestRequest(WireMessage):
     """Walk over LEDs one by one; not while playing. STOP or BLANK ends it early.
 
     Attributes:
@@ -848,14 +848,14 @@ class LedTestRequest(Payload):
 
 
 @dataclass(frozen=True, slots=True)
-class LedTestReply(Payload):
+class LedTestReply(WireMessage):
     """What the board answers to LED_TEST."""
 
     TYPE: ClassVar[int] = 0x10
     LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
 
 
-REPLIES: dict[int, type[Payload]] = {
+REPLIES: dict[int, type[WireMessage]] = {
     0x01: HelloReply,
     0x02: ConfigureReply,
     0x03: CodebookReply,

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self
 
 from firmware_host.errors import DatagramError
 
-__all__ = ["Payload"]
+__all__ = ["WireMessage"]
 
 
 @cache
@@ -15,7 +15,7 @@ def _packer(codes: str) -> struct.Struct:
     return struct.Struct("<" + codes)
 
 
-class Payload:
+class WireMessage:
     """Base of a message's payload; subclasses are frozen dataclasses made from `protocol.toml`.
 
     Attributes:

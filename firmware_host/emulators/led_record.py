@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError
-from firmware_host.board.bank import chips_of_rows
 from firmware_host.protocol.requests import CHIP_DARK, CHIP_TEST, ROW_BYTES
+from firmware_host.protocol.rows import chips_of_rows
 
-__all__ = ["RECORD", "Recording"]
+__all__ = ["RECORD", "LedRecord"]
 
 RECORD = np.dtype([("tick", "<u4"), ("chip", "<u4"), ("row", "u1", (ROW_BYTES,))])
 """One record."""
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class LedRecord:
     """LED outputs in the order they happened.
 
     Attributes:
@@ -37,7 +37,7 @@ class Recording:
     cut_bytes: int = 0
 
     @classmethod
-    def of_records(cls, records: NDArray[np.void]) -> "Recording":
+    def of_records(cls, records: NDArray[np.void]) -> "LedRecord":
         """From an array of `RECORD`; the tick counter wraps at 2**32 and is unwrapped here."""
         tick = records["tick"].astype(np.uint32)
         steps = np.diff(tick)  # modulo 2**32
@@ -46,7 +46,7 @@ class Recording:
         return cls(ticks, records["chip"].astype(np.uint32), np.ascontiguousarray(records["row"]))
 
     @classmethod
-    def read(cls, path: Path) -> "Recording":
+    def read(cls, path: Path) -> "LedRecord":
         """Read a file that an emulator wrote.
 
         Raises:
@@ -79,10 +79,10 @@ class Recording:
             )
         return replace(cls.of_records(records), cut_bytes=cut)
 
-    def played(self) -> "Recording":
+    def played(self) -> "LedRecord":
         """Without the records that are no chip: dark, and the single-LED test."""
         keep = (self.numbers != CHIP_DARK) & (self.numbers != CHIP_TEST)
-        return Recording(self.ticks[keep], self.numbers[keep], self.rows[keep], self.cut_bytes)
+        return LedRecord(self.ticks[keep], self.numbers[keep], self.rows[keep], self.cut_bytes)
 
     def chips(self, clusters: int = 16) -> NDArray[np.uint8]:
         """The chip table, uint8 (n, clusters); 96 clusters give every LED.

@@ -3,7 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-from firmware_host.board.session import Link
+from firmware_host.board.session import Session
 from firmware_host.errors import BoardError, NoBoardError
 from firmware_host.ports.transport import open_transport
 from firmware_host.protocol.client import Timing
@@ -41,8 +41,8 @@ def serial_ports() -> list[tuple[str, str]]:
 def ask(port: str, baud: int, description: str = "") -> Found:
     """Say HELLO on a port, briefly."""
     try:
-        with Link(open_transport(port, baud), Timing(baud, latency_s=0.15), tries=_PROBE_TRIES) as link:
-            return Found(port, description, link.hello(), "")
+        with Session(open_transport(port, baud), Timing(baud, latency_s=0.15), tries=_PROBE_TRIES) as session:
+            return Found(port, description, session.hello(), "")
     except BoardError as fault:
         return Found(port, description, None, str(fault))
 
