@@ -25,7 +25,7 @@ from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind
 from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.sim import scene_of_truth, simulate, truth
+from evlcp_sdk.sim import scene_of_truth, simulate, truth_of
 from evlcp_sdk.study.measure import message_tallies
 from evlcp_sdk.study.tally import Tally
 
@@ -102,7 +102,7 @@ def recordings(folder: Path, packets: int) -> None:
         link = load_link(overrides=[f"modulation.id={bars[0].profile}"])
         coder, total, seed, began = link.block_coder(), Tally(), 0, time.perf_counter()
         while total.messages_sent < packets:
-            known, receiver = truth(scene, seed), Receiver(link)
+            known, receiver = truth_of(scene, seed).to_table(), Receiver(link)
             found = [p for events in simulate(scene, seed) for p in receiver.feed(events)] + receiver.close()
             total += sum((t for _, t in message_tallies(found, known, coder)), Tally())
             seed += 1

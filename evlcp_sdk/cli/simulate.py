@@ -101,7 +101,7 @@ def simulate(
             for events in simulation.stream():
                 writer.write(events)
                 advance(simulation.done_s)
-    truth = truth_of(simulation) | {"bytes": out.stat().st_size}
+    truth = truth_of(simulation).to_table() | {"bytes": out.stat().st_size}
     try:
         write_text(json.dumps(truth), truth_path)
     except EvlcpError as fault:

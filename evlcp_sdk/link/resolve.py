@@ -67,6 +67,8 @@ class Link:
         packet: Lengths of a packet's parts.
         table: The resolved configuration, every default written out; plain values as in TOML.
         digest: SHA-256 of table, codebook digest and revisions, 64 hex digits.
+
+    Two links are equal when their digests are.
     """
 
     camera: CameraModel
@@ -81,6 +83,12 @@ class Link:
     packet: PacketFormat
     table: Mapping[str, Mapping[str, Any]]
     digest: str
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Link) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
 
     def algorithm(self, role: str) -> Any:
         """The algorithm of a role, e.g. `link.algorithm("ranging")`."""

@@ -103,7 +103,7 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
         )
     scene: Scene = job.scene
     simulation = Simulation(scene, job.seed)
-    known = truth_of(simulation)
+    known = truth_of(simulation).to_table()
     attitude = attitude_log(scene, job.seed, simulation.path) if scene.world is not None else None
     links, receivers = [], []
     for task in job.tasks:

@@ -41,7 +41,7 @@ def turned(heading_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarray:
 
 def test_sites_and_camera_say_what_the_image_shows() -> None:
     simulation = Simulation(SCENE)
-    truth = truth_of(simulation)
+    truth = truth_of(simulation).to_table()
     sites, path = sites_of(SCENE), truth["camera_path"]
     assert [s.transmitter_id for s in sites] == [1, 77, 3]
     camera = SCENE.camera
@@ -74,7 +74,7 @@ def test_the_origin_is_the_worlds() -> None:
 
 def test_without_a_world_there_are_no_sites() -> None:
     scene = load_scene("drive-30kmh", ["duration_s=0.01"])
-    assert "sites" not in truth_of(Simulation(scene))
+    assert "sites" not in truth_of(Simulation(scene)).to_table()
     with pytest.raises(ConfigError, match=r"no \[world\]"):
         sites_of(scene)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.sim import Scene, load_scene, truth
+from evlcp_sdk.sim import Scene, load_scene, truth_of
 from evlcp_sdk.study.score import read_frames, read_truth, score_frames
 
 SHARED = Path(__file__).parents[4] / "shared"
@@ -61,10 +61,12 @@ def write(folder: Path, rows: list[dict[str, str]], found: dict[str, Any]) -> tu
 
 
 def scene_truths() -> dict[str, dict[str, Any]]:
-    two = truth(load_scene("two-bars", ["duration_s=0.2", "motion.distance_m=61.0", "t0_us=16777000"]))
-    dark = truth(Scene())
+    two = truth_of(
+        load_scene("two-bars", ["duration_s=0.2", "motion.distance_m=61.0", "t0_us=16777000"])
+    ).to_table()
+    dark = truth_of(Scene()).to_table()
     dark["bars"][0]["led_w_m2"] = 1e-9
-    return {"two": two, "dark": dark, "one": truth(load_scene("tunnel", ["bars.profile=wh8"]))}
+    return {"two": two, "dark": dark, "one": truth_of(load_scene("tunnel", ["bars.profile=wh8"])).to_table()}
 
 
 def independent(folder: Path, path: Path) -> dict[str, Any]:
@@ -100,7 +102,7 @@ def test_the_numbers_agree_on_the_recordings(path: Path, tmp_path: Path) -> None
 
 
 def test_a_perfect_result_scores_perfectly() -> None:
-    found = truth(load_scene("night"))
+    found = truth_of(load_scene("night")).to_table()
     (bar,) = found["bars"]
     t_us = np.array(found["t_s"]) * 1e6
     rows = []
@@ -154,7 +156,7 @@ def test_what_cannot_be_scored_is_told(
 
 
 def test_a_row_without_a_number_is_told() -> None:
-    found = truth(Scene(duration_s=0.05))
+    found = truth_of(Scene(duration_s=0.05)).to_table()
     row = {"t_us": "soon", "symbols": "", "distance_m": "", "x_px": "0", "y_px": "0"}
     with pytest.raises(InputError, match="soon"):
         score_frames([row], found)

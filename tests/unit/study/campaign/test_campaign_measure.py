@@ -174,7 +174,7 @@ def seen(known: dict[str, Any]) -> list[Packet]:
 def test_positions_are_held_beside_the_cameras_path(attitude: str) -> None:
     scene = resolve_scene(GATE | {"world": GATE["world"] | {"attitude": attitude}})  # type: ignore[operator]
     simulation = Simulation(scene)
-    known = json.loads(json.dumps(truth_of(simulation)))
+    known = json.loads(json.dumps(truth_of(simulation).to_table()))
     true_path = dict(known["camera_path"])
     log = attitude_log(scene, 0, simulation.path)
     tallies = position_tallies(seen(known), known, load_link(), log)
