@@ -11,23 +11,23 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_host.board import Board, Settings, provision
-from firmware_host.client import Outcome
-from firmware_host.emulators import start_qemu
-from firmware_host.generate import codebook_of
-from firmware_host.link import Link
-from firmware_host.messages import StatusReply, StatusRequest
-from firmware_host.payload import Payload, random_symbols, symbol_chips
-from firmware_host.recording import Recording
-from firmware_host.wire import Payload as Message
+from firmware_host.board.bank import Bank, random_symbols, symbol_chips
+from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.session import Session
+from firmware_host.emulators.led_record import LedRecord
+from firmware_host.emulators.processes import start_qemu
+from firmware_host.protocol.client import RequestOutcome
+from firmware_host.protocol.generate import codebook_of
+from firmware_host.protocol.requests import StatusReply, StatusRequest
+from firmware_host.protocol.wire import WireMessage
 
 CHIPS = 20_000
 TICKS_PER_US = 25.0
 
 
-def play(leds: Path, payload: Payload) -> tuple[int, StatusReply]:
-    with Link(start_qemu(leds)) as link:
-        board = Board(link)
+def play(leds: Path, payload: Bank) -> tuple[int, StatusReply]:
+    with Session(start_qemu(leds)) as session:
+        board = Board(session)
         provision(board, payload, Settings())
         asked, last = 0, board.status()
 
@@ -35,13 +35,13 @@ def play(leds: Path, payload: Payload) -> tuple[int, StatusReply]:
             while last.chips_sent < CHIPS:
                 yield StatusRequest()
 
-        def handle(request: Message, outcome: Outcome) -> None:
+        def handle(request: WireMessage, outcome: RequestOutcome) -> None:
             nonlocal asked, last
-            reply = link.checked(request, outcome)
+            reply = session.checked(request, outcome)
             if isinstance(reply, StatusReply):
                 asked, last = asked + 1, reply
 
-        link.run(requests(), handle)
+        session.run(requests(), handle)
         return asked, last
 
 
@@ -50,8 +50,8 @@ def main() -> None:
     symbols = random_symbols(8, 10, book, np.random.default_rng(5))
     with tempfile.TemporaryDirectory() as folder:
         leds = Path(folder) / "leds.bin"
-        asked, status = play(leds, Payload.of_symbols(symbols, book))
-        played = Recording.read(leds).played()
+        asked, status = play(leds, Bank.of_symbols(symbols, book))
+        played = LedRecord.read(leds).played()
     ticks, rows = played.ticks[:CHIPS], played.rows[:CHIPS]
     expected = np.resize(symbol_chips(symbols, book), (CHIPS, 16))
     wrong = int((played.chips()[:CHIPS] != expected).any(1).sum())

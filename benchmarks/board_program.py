@@ -7,21 +7,21 @@ import time
 
 import numpy as np
 
-from firmware_host.board import Board, Settings, provision
-from firmware_host.client import Timing
-from firmware_host.emulators import start_native
-from firmware_host.generate import codebook_of
-from firmware_host.link import Link
-from firmware_host.payload import Payload, random_symbols
+from firmware_host.board.bank import Bank, random_symbols
+from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.session import Session
+from firmware_host.emulators.processes import start_native
+from firmware_host.protocol.client import Timing
+from firmware_host.protocol.generate import codebook_of
 
 BAUD = 1_000_000
 RUNS = 5
 
 
-def once(payload: Payload, settings: Settings) -> float:
-    with Link(start_native(baud=BAUD), Timing(BAUD)) as link:
+def once(payload: Bank, settings: Settings) -> float:
+    with Session(start_native(baud=BAUD), Timing(BAUD)) as session:
         start = time.perf_counter()
-        done = provision(Board(link), payload, settings)
+        done = provision(Board(session), payload, settings)
         elapsed = time.perf_counter() - start
     assert done.written == len(payload.content)
     return elapsed
@@ -29,7 +29,7 @@ def once(payload: Payload, settings: Settings) -> float:
 
 def main() -> None:
     book = codebook_of("wh4x2")
-    payload = Payload.of_symbols(random_symbols(64, 10, book, np.random.default_rng(0)), book)
+    payload = Bank.of_symbols(random_symbols(64, 10, book, np.random.default_rng(0)), book)
     times = sorted(once(payload, Settings()) for _ in range(RUNS))
     wire = 10 * len(payload.content) / BAUD
     best, median = times[0], times[RUNS // 2]

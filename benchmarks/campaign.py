@@ -12,11 +12,11 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from evlcp_sdk.campaign.collect import collect
-from evlcp_sdk.campaign.executor import Executor, Inline, Processes
-from evlcp_sdk.campaign.plan import Case, Job, make_plan
-from evlcp_sdk.campaign.statistics import Statistics, Tally
-from evlcp_sdk.campaign.store import Store
+from evlcp_sdk.jobs.executor import Executor, Inline, Processes
+from evlcp_sdk.study.campaign.collect import collect
+from evlcp_sdk.study.campaign.plan import Case, Job, make_plan
+from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.tally import Statistics, Tally
 
 NOTHING = Statistics.of(1, 0, 0, 0, [(10 * n, Tally.found(96, 1, 0.01 * n)) for n in range(3, 10)])
 

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from evlcp_sdk.io import DEFAULT_MAX_EVENTS, open_events, open_writer, read_events
-from evlcp_sdk.types import Events
+from evlcp_sdk.io import DEFAULT_MAX_EVENTS, open_source, open_writer, read_events
+from evlcp_sdk.values import Events
 
 COLUMNS = ("t_us", "x", "y", "p")
 SHARED = Path(__file__).parents[2] / "shared" / "recordings" / "night-50m-30kmh.raw"
@@ -75,7 +75,7 @@ def compare(path: Path, rounds: int) -> None:
     del theirs
 
     def stream() -> None:
-        with open_events(path) as source:
+        with open_source(path) as source:
             for _ in source.stream():
                 pass
 
@@ -121,9 +121,9 @@ def compare(path: Path, rounds: int) -> None:
 STREAM = """
 import re, sys, time
 from pathlib import Path
-from evlcp_sdk.io import open_events
+from evlcp_sdk.io import open_source
 start = time.perf_counter()
-with open_events(sys.argv[1]) as source:
+with open_source(sys.argv[1]) as source:
     events = sum(map(len, source.chunks()))
 seconds = time.perf_counter() - start
 # Not ru_maxrss: that one a process inherits from its parent.

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from evlcp_sdk.config import load_link
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.sim import load_scene, simulate, truth
-from evlcp_sdk.types import Frame
+from evlcp_sdk.sim import load_scene, simulate, truth_of
+from evlcp_sdk.values import Frame
 
 SCENES = (
     ("drive-30kmh", 45.0),
@@ -69,7 +69,7 @@ def main() -> None:
     for preset, distance_m in SCENES:
         for seed in range(seeds):
             scene = load_scene(preset, HARD | {"motion.distance_m": distance_m})
-            known = truth(scene, seed)
+            known = truth_of(scene, seed).to_table()
             receivers = [Receiver(link) for link in links]
             frames: list[list[Frame]] = [[] for _ in links]
             for events in simulate(scene, seed):

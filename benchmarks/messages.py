@@ -21,13 +21,13 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import norm
 
-from evlcp_sdk.campaign.measure import message_tallies
-from evlcp_sdk.campaign.statistics import Tally
-from evlcp_sdk.config import load_link
-from evlcp_sdk.messages.block import HEADER_BYTES, Block, BlockError, Kind
-from evlcp_sdk.messages.coding import BlockCoder
+from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind
+from evlcp_sdk.link.blocks import BlockCoder
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.sim import scene_of_truth, simulate, truth
+from evlcp_sdk.sim import scene_of_truth, simulate, truth_of
+from evlcp_sdk.study.measure import message_tallies
+from evlcp_sdk.study.tally import Tally
 
 DARK_W_M2 = 1e-6
 BERS = (0.01, 0.03, 0.05, 0.07, 0.09, 0.11, 0.13, 0.16, 0.2, 0.25, 0.3, 0.4)
@@ -102,7 +102,7 @@ def recordings(folder: Path, packets: int) -> None:
         link = load_link(overrides=[f"modulation.id={bars[0].profile}"])
         coder, total, seed, began = link.block_coder(), Tally(), 0, time.perf_counter()
         while total.messages_sent < packets:
-            known, receiver = truth(scene, seed), Receiver(link)
+            known, receiver = truth_of(scene, seed).to_table(), Receiver(link)
             found = [p for events in simulate(scene, seed) for p in receiver.feed(events)] + receiver.close()
             total += sum((t for _, t in message_tallies(found, known, coder)), Tally())
             seed += 1

@@ -28,14 +28,14 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 from skimage.registration import phase_cross_correlation
 
-from evlcp_sdk.compare.run import truth_path
-from evlcp_sdk.config import Link, load_link
-from evlcp_sdk.hookspecs import hookimpl
-from evlcp_sdk.io import open_events
-from evlcp_sdk.registry import Registry
+from evlcp_sdk.io import open_source
+from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.score import read_truth
-from evlcp_sdk.types import FrameView, PresenceMap, SoftSymbols
+from evlcp_sdk.study.compare.run import truth_path
+from evlcp_sdk.study.score import read_truth
+from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
 SHIPPED = Path(__file__).parents[1] / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
 SAMPLES, IDEAL_NOISE = 2, 0.15
@@ -73,7 +73,7 @@ def caught(path: Path, link: Link) -> list[tuple[PresenceMap, float]]:
     """Presence and true distance of each frame of a recording of one bar."""
     catch = Catch()
     receiver = Receiver(link, Registry.load(catch).hook)
-    with open_events(path) as source:
+    with open_source(path) as source:
         for events in source.chunks():
             receiver.feed(events)
     receiver.close()

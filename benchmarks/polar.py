@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import ndtri
 
-from evlcp_sdk.campaign.intervals import proportion_interval
+from evlcp_sdk.study.intervals import proportion_interval
 
 AIR_S = 346 * 100e-6
 """A packet of the default profile on air."""

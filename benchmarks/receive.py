@@ -18,8 +18,8 @@ from pathlib import Path
 from evt3_decode import tile
 
 from evlcp_sdk.cli.receive import decode
-from evlcp_sdk.config import Link, load_link
-from evlcp_sdk.io import open_events, read_events
+from evlcp_sdk.io import open_source, read_events
+from evlcp_sdk.link.resolve import Link, load_link
 
 SHARED = Path(__file__).parents[2] / "shared" / "recordings"
 FIRST = "night-50m-30kmh.raw"
@@ -40,7 +40,7 @@ def receive(path: Path, folder: Path) -> dict[str, float]:
 def plain_decoding(path: Path) -> float:
     """Seconds to read a file's events and drop them: the part of the receiver's time that is the file's."""
     began = time.perf_counter()
-    with open_events(path) as source:
+    with open_source(path) as source:
         for _ in source.chunks():
             pass
     return time.perf_counter() - began

@@ -19,11 +19,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import binomtest, chi2, norm
 
-from evlcp_sdk.config import load_link
 from evlcp_sdk.io import read_events
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.score import BarScore, score_frames
-from evlcp_sdk.sim import BackgroundSpec, Scene, SensorSpec, scene_of_truth, simulate, truth
+from evlcp_sdk.sim import BackgroundSpec, Scene, SensorSpec, scene_of_truth, simulate, truth_of
 from evlcp_sdk.sim.validation import (
     MEASURED_AREA,
     MEASURED_LATENCY,
@@ -33,7 +32,8 @@ from evlcp_sdk.sim.validation import (
     pixel_events,
     step_response,
 )
-from evlcp_sdk.types import Events
+from evlcp_sdk.study.score import BarScore, score_frames
+from evlcp_sdk.values import Events
 
 SHARED = Path(__file__).parents[2] / "shared" / "recordings"
 SENSOR = SensorSpec()
@@ -180,7 +180,7 @@ def compare() -> None:
     for events, truth_ in (
         (read_events(SHARED / "night-50m-30kmh.raw"), told),
         *(
-            (Events.concat(list(simulate(made))), truth(made))
+            (Events.concat(list(simulate(made))), truth_of(made).to_table())
             for made in (scene, replace(scene, sensor=SENSOR))
         ),
     ):
@@ -194,7 +194,7 @@ def compare() -> None:
         made = scene_of_truth(told)
         for name, events, truth_ in (
             (path.stem, read_events(path), told),
-            ("simulated", Events.concat(list(simulate(made))), truth(made)),
+            ("simulated", Events.concat(list(simulate(made))), truth_of(made).to_table()),
         ):
             score = receive([events], truth_)
             low, high = rmse_bounds(score)

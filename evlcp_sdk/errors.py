@@ -8,6 +8,7 @@ EvlcpError                     1   anything the SDK raises on purpose
 ├── PluginError                2   a plugin that cannot be loaded or fails, or two that claim one (role, id)
 ├── InputError                 3   a file or stream that cannot be read
 │   └── RawFormatError         3   a RAW file's header or words; names byte offset, found, expected
+├── InterruptedRunError      130   the user stopped the run; what was done until then is kept
 └── StreamError                1   events fed in an order or shape the receiver cannot take
 ```
 """
@@ -20,6 +21,7 @@ __all__ = [
     "ConfigError",
     "EvlcpError",
     "InputError",
+    "InterruptedRunError",
     "PluginError",
     "RawFormatError",
     "StreamError",
@@ -79,3 +81,9 @@ class RawFormatError(InputError):
 
 class StreamError(EvlcpError):
     """Events in an order or shape the receiver cannot take."""
+
+
+class InterruptedRunError(EvlcpError):
+    """The user stopped the run; what was done until then is kept, or the message says that nothing is."""
+
+    exit_code = 130

@@ -1,56 +1,13 @@
-"""Files read and written whole: TOML with one clear line for what is wrong, and no half-written results."""
+"""Files written whole: no reader ever sees half a result."""
 
 import os
-import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
-from evlcp_sdk.errors import ConfigError, EvlcpError
+from evlcp_sdk.errors import EvlcpError
 
-__all__ = ["hidden_path", "parse_toml", "parse_value", "read_toml", "whole_file", "write_text"]
-
-
-def read_toml(path: Path | str) -> dict[str, Any]:
-    """The table of a TOML file.
-
-    Raises:
-        ConfigError: The file cannot be read, or is no TOML.
-    """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except OSError as fault:
-        raise ConfigError(f"{path}: cannot be read: {fault.strerror}") from fault
-    except UnicodeDecodeError as fault:
-        raise ConfigError(f"{path}: at byte {fault.start}: not UTF-8 text") from fault
-    return parse_toml(text, str(path))
-
-
-def parse_toml(text: str, source: str) -> dict[str, Any]:
-    """The table of a TOML text; `source` says in the message where it comes from.
-
-    Raises:
-        ConfigError: It is no TOML.
-    """
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as fault:
-        raise ConfigError(f"{source}: not TOML: {fault}") from fault
-    except RecursionError as fault:
-        raise ConfigError(f"{source}: not TOML: nested too deep") from fault
-
-
-def parse_value(text: str) -> Any:
-    """A TOML value; what is none is a string, so that a shell needs no second quotes.
-
-    >>> parse_value("[1, 2.5]"), parse_value("joint-scale")
-    ([1, 2.5], 'joint-scale')
-    """
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (tomllib.TOMLDecodeError, RecursionError):
-        return text.strip()
+__all__ = ["hidden_path", "whole_file", "write_text"]
 
 
 def hidden_path(folder: Path, name: str) -> Path:

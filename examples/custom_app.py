@@ -11,13 +11,13 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from evlcp_sdk.config import load_link
 from evlcp_sdk.errors import EvlcpError
-from evlcp_sdk.hookspecs import hookimpl
-from evlcp_sdk.io import open_events
-from evlcp_sdk.registry import Registry
+from evlcp_sdk.io import open_source
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.types import Frame
+from evlcp_sdk.values import Frame
 
 
 class SpeedDisplay:
@@ -53,7 +53,7 @@ class SpeedDisplay:
             registry = Registry.load(self)
             link = load_link(None, ["ranging.id=joint-scale"], registry)
             receiver = Receiver(link, registry.hook)
-            with registry.hook.evlcp_open_events(url=recording) or open_events(recording) as source:
+            with open_source(recording, registry) as source:
                 for events in source.chunks():
                     receiver.feed(events)
             receiver.close()

@@ -2,8 +2,8 @@
 
 import sys
 
-from evlcp_sdk.config import load_link
-from evlcp_sdk.io import open_events
+from evlcp_sdk.io import open_source
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
 
 
@@ -11,7 +11,7 @@ def main(path: str) -> None:
     """Feed the recording to a receiver, piece by piece."""
     receiver = Receiver(load_link())
     packets = []
-    with open_events(path) as source:
+    with open_source(path) as source:
         for events in source.chunks():
             packets += receiver.feed(events)
     packets += receiver.close()

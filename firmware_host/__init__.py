@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from evlcp_sdk.hookspecs import hookimpl
+from evlcp_sdk.plugin.hooks import hookimpl
 
 if TYPE_CHECKING:
     import typer

@@ -5,13 +5,13 @@ EvlcpError
 └── BoardError                     6
     ├── NoBoardError               4   no board answers, or more than one could be meant
     ├── RefusedError               5   the board refuses a request; carries its status
-    ├── LinkError                  6   no answer after all tries, or the line went away
+    ├── LineError                  6   no answer after all tries, or the line went away
     │   └── BoardResetError        6   the board forgot this session: it was reset, or another host took over
     ├── VerifyError                7   what the board holds is not what was sent
     ├── IncompatibleError          8   protocol or codebook is another one than the host's
     ├── FleetError                 *   boards of an inventory failed; the exit code of the first that did
     └── ToolchainError             1   a compiler or emulator is missing or failed
-DatagramError                          bytes that are no datagram of this protocol (never leaves the link)
+DatagramError                          bytes that are no datagram of this protocol (never leaves the client)
 ```
 """
 
@@ -23,7 +23,7 @@ __all__ = [
     "DatagramError",
     "FleetError",
     "IncompatibleError",
-    "LinkError",
+    "LineError",
     "NoBoardError",
     "RefusedError",
     "ToolchainError",
@@ -64,11 +64,11 @@ class RefusedError(BoardError):
         super().__init__(message)
 
 
-class LinkError(BoardError):
+class LineError(BoardError):
     """No answer after all tries, or the line went away."""
 
 
-class BoardResetError(LinkError):
+class BoardResetError(LineError):
     """The board forgot this session: it was reset, or another host took over."""
 
 

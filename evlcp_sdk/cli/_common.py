@@ -1,4 +1,4 @@
-"""What the commands share: their options, how a source is opened, what goes to stderr."""
+"""What the commands share: their options, where jobs run, what goes to stderr."""
 
 import os
 from typing import TYPE_CHECKING, Annotated
@@ -8,9 +8,7 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from evlcp_sdk.campaign.executor import Executor
-    from evlcp_sdk.io import EventSource
-    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.jobs.executor import Executor
 
 __all__ = [
     "Dask",
@@ -21,7 +19,6 @@ __all__ = [
     "complain",
     "console",
     "make_executor",
-    "open_source",
 ]
 
 LinkFile = Annotated[
@@ -66,30 +63,18 @@ def console() -> "Console":
     return Console(highlight=False, soft_wrap=True)
 
 
-def open_source(url: str, registry: "Registry") -> "EventSource":
-    """Open a recording or a camera: plugins are asked first, then the built-in readers.
-
-    Raises:
-        InputError: It cannot be opened.
-    """
-    from evlcp_sdk.io import EventSource, open_events
-
-    source = registry.hook.evlcp_open_events(url=url)
-    return source if isinstance(source, EventSource) else open_events(url)
-
-
 def make_executor(workers: int | None, dask: str | None) -> "Executor":
     """Where jobs run: on a cluster, in processes (None: one a core), or in this one for 0.
 
     Raises:
         ConfigError: The cluster is not there.
     """
-    from evlcp_sdk.campaign.executor import Inline, Processes
+    from evlcp_sdk.jobs.executor import Inline, Processes
 
     if dask is not None:
         if workers is not None:
             raise typer.BadParameter("give one of --workers and --dask", param_hint="--dask")
-        from evlcp_sdk.campaign.cluster import DaskCluster
+        from evlcp_sdk.jobs.dask import DaskCluster
 
         return DaskCluster(dask)
     if workers == 0:

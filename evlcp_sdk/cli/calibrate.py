@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, open_source
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from evlcp_sdk.calibration import Calibrated, CalibrationView, KnownPose
-    from evlcp_sdk.config import Link
-    from evlcp_sdk.sites import BarSite, LocalFrame
+    from evlcp_sdk.link.resolve import Link
+    from evlcp_sdk.place.calibration import Calibrated, CalibrationView, KnownPose
+    from evlcp_sdk.scene.sites import BarSite, LocalFrame
 
 __all__ = ["register"]
 
@@ -50,11 +50,11 @@ def calibrate(
     """
     import json
 
-    from evlcp_sdk.calibration import calibrate as fit
-    from evlcp_sdk.calibration import read_poses
-    from evlcp_sdk.config import load_link
-    from evlcp_sdk.registry import Registry
-    from evlcp_sdk.sites import LocalFrame, load_sites
+    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.place.calibration import calibrate as fit
+    from evlcp_sdk.place.calibration import read_poses
+    from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.scene.sites import LocalFrame, load_sites
 
     link = load_link(link_file, overrides or [], Registry.load())
     known = load_sites(sites)
@@ -94,14 +94,17 @@ def _views(
     frame: "LocalFrame",
 ) -> "list[CalibrationView]":
     """What a recording shows at the times of known poses."""
-    from evlcp_sdk.calibration import CalibrationView
-    from evlcp_sdk.cli.receive import check_sensor
     from evlcp_sdk.errors import ConfigError
-    from evlcp_sdk.registry import Registry
-    from evlcp_sdk.rx.position import BarView, Positioner, points_at
+    from evlcp_sdk.io.open import open_source
+    from evlcp_sdk.io.sensor import check_sensor
+    from evlcp_sdk.place.calibration import CalibrationView
+    from evlcp_sdk.place.points import points_at
+    from evlcp_sdk.place.pose import BarView
+    from evlcp_sdk.place.positioner import Positioner
+    from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.rx.receiver import Receiver
-    from evlcp_sdk.sites import LocalFrame
-    from evlcp_sdk.types import Frame, Packet
+    from evlcp_sdk.scene.sites import LocalFrame
+    from evlcp_sdk.values import Frame, Packet
 
     registry = Registry.load()
     receiver = Receiver(link, registry.hook)
@@ -122,7 +125,7 @@ def _views(
                     kept.append(frame)
 
     with open_source(url, registry) as source:
-        check_sensor(source, url, link)
+        check_sensor(source, url, link.camera)
         for events in source.chunks():
             take(receiver.feed(events))
         take(receiver.close())

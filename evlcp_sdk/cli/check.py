@@ -49,9 +49,9 @@ def check(
     """
     import json
 
-    from evlcp_sdk.config import load_link
     from evlcp_sdk.errors import ConfigError
-    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.testing import check as hold
     from evlcp_sdk.testing import laws_of
 

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, complain, console, make_executor, open_source
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, complain, console, make_executor
 from evlcp_sdk.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.table import Table as Grid
 
-    from evlcp_sdk.compare.table import Comparison, Table
-    from evlcp_sdk.compare.variants import Variant
     from evlcp_sdk.io import EventSource
+    from evlcp_sdk.study.compare.table import Comparison, Table
+    from evlcp_sdk.study.compare.variants import Variant
 
 __all__ = ["compare", "register"]
 
@@ -122,9 +122,9 @@ def _is_campaign(url: str) -> bool:
 
 
 def _of_results(path: Path) -> "Comparison":
-    from evlcp_sdk.campaign.store import Store
-    from evlcp_sdk.campaign.summary import summarize
-    from evlcp_sdk.compare.campaigns import of_campaign
+    from evlcp_sdk.study.campaign.store import Store
+    from evlcp_sdk.study.campaign.summary import summarize
+    from evlcp_sdk.study.compare.campaigns import of_campaign
 
     with Store(path) as store:
         return of_campaign(summarize(store))
@@ -133,12 +133,11 @@ def _of_results(path: Path) -> "Comparison":
 def _of_recordings(
     urls: Sequence[str], texts: Sequence[str], link_file: str | None, overrides: Sequence[str], workers: int
 ) -> tuple[int, "Comparison"]:
-    from evlcp_sdk.cli.receive import InterruptedRunError
-    from evlcp_sdk.compare.run import truth_path
-    from evlcp_sdk.compare.table import Comparison, total_of
-    from evlcp_sdk.compare.variants import load_variants
-    from evlcp_sdk.config import installed_versions
-    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.errors import InterruptedRunError
+    from evlcp_sdk.plugin.registry import Registry, installed_versions
+    from evlcp_sdk.study.compare.run import truth_path
+    from evlcp_sdk.study.compare.table import Comparison, total_of
+    from evlcp_sdk.study.compare.variants import load_variants
 
     if not texts:
         raise typer.BadParameter("name at least one, e.g. --variant paper:", param_hint="--variant")
@@ -174,16 +173,17 @@ def _of_recordings(
 
 def _run(job: Job, *, variants: "tuple[Variant, ...]") -> "Table":
     """Receive a recording with every variant, in this process or in a worker."""
-    from evlcp_sdk.cli.receive import check_sensor
-    from evlcp_sdk.compare.run import measure_recording, truth_path
-    from evlcp_sdk.registry import Registry
-    from evlcp_sdk.score import read_truth
+    from evlcp_sdk.io.open import open_source
+    from evlcp_sdk.io.sensor import check_sensor
+    from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.study.compare.run import measure_recording, truth_path
+    from evlcp_sdk.study.score import read_truth
 
     def opened() -> "EventSource":
         source = open_source(job.url, registry)
         try:
             for variant in variants:
-                check_sensor(source, job.url, variant.link)
+                check_sensor(source, job.url, variant.link.camera)
         except ConfigError:
             source.close()
             raise
@@ -220,7 +220,7 @@ def _write(comparison: "Comparison", paths: Sequence[Path]) -> None:
 def _show(comparison: "Comparison", paths: Sequence[Path]) -> None:
     from rich.markup import escape
 
-    from evlcp_sdk.compare.table import LEGEND
+    from evlcp_sdk.study.compare.table import LEGEND
 
     out = console()
     if not out.is_terminal:

@@ -42,8 +42,9 @@ def config(
     """
     import json
 
-    from evlcp_sdk.config import load_link, to_toml
-    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.link.text import to_toml
+    from evlcp_sdk.plugin.registry import Registry
 
     if digest + as_json + (codebook is not None) > 1:
         raise typer.BadParameter("give one of --digest, --json and --codebook", param_hint="--json")

@@ -12,7 +12,7 @@ from evlcp_sdk.cli._common import Json, Workers, console
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from evlcp_sdk.campaign.summary import Summary
+    from evlcp_sdk.study.campaign.summary import Summary
 
 __all__ = ["Score", "demo", "demo_campaign", "demo_files", "register", "score"]
 
@@ -115,15 +115,15 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     import json
     from contextlib import suppress
 
-    from evlcp_sdk.campaign.charts import charts_of, save_charts
-    from evlcp_sdk.campaign.collect import collect
-    from evlcp_sdk.campaign.report import save_page
-    from evlcp_sdk.campaign.store import Store
-    from evlcp_sdk.campaign.summary import summarize
-    from evlcp_sdk.campaign.task import plan_of, run_job
     from evlcp_sdk.cli._common import make_executor
     from evlcp_sdk.cli.sweep import progress_bar, tell_faults
     from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.study.campaign.charts import charts_of, save_charts
+    from evlcp_sdk.study.campaign.collect import collect
+    from evlcp_sdk.study.campaign.report import save_page
+    from evlcp_sdk.study.campaign.store import Store
+    from evlcp_sdk.study.campaign.summary import summarize
+    from evlcp_sdk.study.campaign.task import plan_of, run_job
 
     plan = plan_of(demo_campaign())
     if not as_json:
@@ -164,8 +164,8 @@ def show_drive(summary: "Summary") -> None:
     """Print BER and RMSE of each segment of distance beside the paper's."""
     from rich.table import Table
 
-    from evlcp_sdk.campaign.statistics import SEGMENT_M
-    from evlcp_sdk.campaign.summary import compare, measure
+    from evlcp_sdk.study.campaign.summary import compare, measure
+    from evlcp_sdk.study.tally import SEGMENT_M
 
     (series,) = summary.series
     paper = {
@@ -196,8 +196,8 @@ def _decode_recording(out: Path, as_json: bool) -> None:
     from dataclasses import asdict
 
     from evlcp_sdk.cli.receive import decode, show
-    from evlcp_sdk.config import load_link
-    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.plugin.registry import Registry
 
     recording, truth_file = demo_files()
     link = load_link(None, (), Registry.load())

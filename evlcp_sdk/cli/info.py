@@ -29,10 +29,9 @@ def info(
     """
     import json
 
-    from evlcp_sdk.cli._common import open_source
-    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.io.open import open_source
 
-    with open_source(recording, Registry.load()) as source:
+    with open_source(recording) as source:
         table = describe(source, recording)
     typer.echo(json.dumps(table, indent=2) if as_json else _text(table))
 

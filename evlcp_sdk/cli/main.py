@@ -64,7 +64,7 @@ def main() -> None:
     """Run the command line; an SDK error becomes one line a fault on stderr and its exit code."""
     from evlcp_sdk.cli._common import complain
     from evlcp_sdk.errors import EvlcpError
-    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.plugin.registry import Registry
 
     try:
         app = make_app()

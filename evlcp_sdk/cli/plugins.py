@@ -19,7 +19,7 @@ def plugins(as_json: Json = False) -> None:
     """
     import json
 
-    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.plugin.registry import Registry
 
     rows = [
         {

@@ -9,29 +9,22 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Dask, LinkFile, Overrides, complain, console, make_executor, open_source
-from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
+from evlcp_sdk.cli._common import Dask, LinkFile, Overrides, complain, console, make_executor
+from evlcp_sdk.errors import InputError, InterruptedRunError
 
 if TYPE_CHECKING:
-    from evlcp_sdk.config import Link
-    from evlcp_sdk.fixes import PositionPlan
-    from evlcp_sdk.io import EventSource
-    from evlcp_sdk.types import Packet
+    from evlcp_sdk.link.resolve import Link
+    from evlcp_sdk.results.positions import PositionPlan
+    from evlcp_sdk.values import Packet
 
-__all__ = ["InterruptedRunError", "bytes_bar", "check_sensor", "decode", "register", "show"]
+__all__ = ["bytes_bar", "decode", "register", "show"]
 
 Advance = Callable[[int, int | None], None]
 """Told, after each piece, how many bytes are done, and of how many if that is known."""
-
-
-class InterruptedRunError(EvlcpError):
-    """The user stopped the run; what was decoded until then is written."""
-
-    exit_code: ClassVar[int] = 130
 
 
 @dataclass(frozen=True)
@@ -117,8 +110,8 @@ def receive(
     """
     import json
 
-    from evlcp_sdk.config import load_link
-    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.plugin.registry import Registry
 
     jobs = _jobs(recordings, out)
     link = load_link(link_file, overrides or [], Registry.load())
@@ -182,10 +175,9 @@ def _position_plan(
     import math
     from datetime import UTC, datetime
 
-    from evlcp_sdk.attitude import AttitudeTrack
-    from evlcp_sdk.fixes import PositionPlan
-    from evlcp_sdk.geometry import Attitude
-    from evlcp_sdk.sites import load_sites
+    from evlcp_sdk.results.positions import PositionPlan
+    from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
+    from evlcp_sdk.scene.sites import load_sites
 
     if file is not None and angles != (None, None, None):
         raise typer.BadParameter("give a file or angles, not both", param_hint="--attitude")
@@ -197,9 +189,9 @@ def _position_plan(
     for name, given_deg in zip(names, (*angles, *sigmas), strict=True):
         if given_deg is not None and not math.isfinite(given_deg):
             raise typer.BadParameter(f"{given_deg}: expected a finite number", param_hint=name)
-    attitude: AttitudeTrack | Attitude | None = None
+    attitude: AttitudeLog | Attitude | None = None
     if file is not None:
-        attitude = AttitudeTrack.read(file, Attitude(0.0, 0.0, None, *sigmas))
+        attitude = AttitudeLog.read(file, Attitude(0.0, 0.0, None, *sigmas))
     elif pitch is not None and roll is not None:
         attitude = Attitude(pitch, roll, heading, *sigmas)
     zero = None
@@ -277,30 +269,31 @@ def decode(
     """
     from numba.core.event import install_timer
 
-    from evlcp_sdk.config import installed_versions
-    from evlcp_sdk.outputs import ResultWriter, Status
-    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.io.open import open_source
+    from evlcp_sdk.io.sensor import check_sensor
+    from evlcp_sdk.plugin.registry import Registry, installed_versions
+    from evlcp_sdk.results.outputs import ResultWriter, Status
     from evlcp_sdk.rx.receiver import Receiver
 
     compiled_s: list[float] = []
     probes: list[Any] = []
     if figures:
-        from evlcp_sdk.figures import FigureProbe
+        from evlcp_sdk.results.figures import FigureProbe
 
         probes.append(FigureProbe(link.camera))
     tracks = []
     if figures and plan is not None:
-        from evlcp_sdk.figures import TrackProbe
+        from evlcp_sdk.results.figures import TrackProbe
 
         tracks.append(TrackProbe())
     registry = Registry.load(*probes)
     with open_source(url, registry) as source:
-        check_sensor(source, url, link)
+        check_sensor(source, url, link.camera)
         with ResultWriter(folder, link, parquet=parquet) as writer, ExitStack() as closing:
             receiver = Receiver(link, registry.hook)
             positions = None
             if plan is not None:
-                from evlcp_sdk.fixes import PositionWriter
+                from evlcp_sdk.results.positions import PositionWriter
 
                 positions = closing.enter_context(PositionWriter(folder, link, plan, tracks))
 
@@ -359,12 +352,12 @@ def decode(
                 positions=positions.finish() if positions is not None else None,
             )
     if figures:
-        from evlcp_sdk.figures import save_figures
+        from evlcp_sdk.results.figures import save_figures
 
         for probe in probes:
             save_figures(probe, Path(url).name, folder)
     for track in tracks:
-        from evlcp_sdk.figures import save_track
+        from evlcp_sdk.results.figures import save_track
 
         assert positions is not None
         save_track(track, positions.bars_enu_m(), Path(url).name, folder / "track.png")
@@ -469,21 +462,6 @@ def _stem(url: str) -> str:
     """The recording's name without its kind: `night.csv.gz` gives `night`."""
     name = Path(url).name
     return name.removesuffix(".gz").rsplit(".", 1)[0] or name
-
-
-def check_sensor(source: "EventSource", url: str, link: "Link") -> None:
-    """Refuse a recording of another sensor than the link's camera has.
-
-    Raises:
-        ConfigError: The sizes differ.
-    """
-    camera = link.camera
-    size = (source.width, source.height)
-    if None not in size and size != (camera.width, camera.height):
-        raise ConfigError(
-            f"{url}: recorded with {size[0]} x {size[1]} pixels, but the link's camera has"
-            f" {camera.width} x {camera.height}; set camera.width, camera.height and camera.pitch_um"
-        )
 
 
 @contextmanager

@@ -8,8 +8,8 @@ import typer
 from evlcp_sdk.cli._common import Json, console
 
 if TYPE_CHECKING:
-    from evlcp_sdk.campaign.statistics import Tally
-    from evlcp_sdk.campaign.summary import Summary
+    from evlcp_sdk.study.campaign.summary import Summary
+    from evlcp_sdk.study.tally import Tally
 
 __all__ = ["register", "report", "show_paper", "show_series"]
 
@@ -51,10 +51,10 @@ def report(
     """
     import json
 
-    from evlcp_sdk.campaign.charts import charts_of, save_charts
-    from evlcp_sdk.campaign.report import save_page
-    from evlcp_sdk.campaign.store import Store
-    from evlcp_sdk.campaign.summary import summarize
+    from evlcp_sdk.study.campaign.charts import charts_of, save_charts
+    from evlcp_sdk.study.campaign.report import save_page
+    from evlcp_sdk.study.campaign.store import Store
+    from evlcp_sdk.study.campaign.summary import summarize
 
     if markdown and as_json:
         raise typer.BadParameter("give one of --markdown and --json", param_hint="--json")
@@ -102,8 +102,8 @@ def as_markdown(summary: "Summary") -> str:
 
 
 def _series_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
-    from evlcp_sdk.campaign.statistics import SEGMENT_M
-    from evlcp_sdk.campaign.summary import measure
+    from evlcp_sdk.study.campaign.summary import measure
+    from evlcp_sdk.study.tally import SEGMENT_M
 
     def shown(value: float, low: float, high: float, form: str) -> str:
         return f"{value:{form}} [{low:{form}}, {high:{form}}]"
@@ -141,8 +141,8 @@ def _within(tally: "Tally") -> str:
 
 
 def _paper_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
-    from evlcp_sdk.campaign.report import comparison_rows
-    from evlcp_sdk.campaign.summary import compare
+    from evlcp_sdk.study.campaign.report import comparison_rows
+    from evlcp_sdk.study.campaign.summary import compare
 
     rows = [list(row) for row in comparison_rows(compare(summary.series))]
     return ["figure", "distance", "series", "paper", "here", "95 %", "agrees"], rows

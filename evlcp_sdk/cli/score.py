@@ -29,7 +29,7 @@ def score(
     """
     import json
 
-    from evlcp_sdk.score import read_frames, read_truth, score_frames
+    from evlcp_sdk.study.score import read_frames, read_truth, score_frames
 
     found = score_frames(read_frames(folder), read_truth(truth_file)).to_dict()
     if as_json:

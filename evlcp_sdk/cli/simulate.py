@@ -101,7 +101,7 @@ def simulate(
             for events in simulation.stream():
                 writer.write(events)
                 advance(simulation.done_s)
-    truth = truth_of(simulation) | {"bytes": out.stat().st_size}
+    truth = truth_of(simulation).to_table() | {"bytes": out.stat().st_size}
     try:
         write_text(json.dumps(truth), truth_path)
     except EvlcpError as fault:
@@ -138,8 +138,8 @@ def simulate(
 
 def _on_earth(simulation: "Simulation", out: Path) -> list[Path]:
     """Write where the bars stand and how the camera does, if the scene says so; return the files."""
+    from evlcp_sdk.scene.sites import to_toml
     from evlcp_sdk.sim.world import attitude_log, sites_of
-    from evlcp_sdk.sites import to_toml
 
     scene = simulation.scene
     if scene.world is None:

@@ -10,7 +10,7 @@ import typer
 from evlcp_sdk.cli._common import Dask, Json, Workers, complain, console, make_executor
 
 if TYPE_CHECKING:
-    from evlcp_sdk.campaign.collect import Progress
+    from evlcp_sdk.study.campaign.collect import Progress
 
 __all__ = ["progress_bar", "register", "sweep", "tell_faults"]
 
@@ -63,10 +63,10 @@ def sweep(
     import json
     from dataclasses import asdict
 
-    from evlcp_sdk.campaign.collect import collect, progress_of
-    from evlcp_sdk.campaign.store import Store
-    from evlcp_sdk.campaign.task import plan_of, run_job
-    from evlcp_sdk.cli.receive import InterruptedRunError
+    from evlcp_sdk.errors import InterruptedRunError
+    from evlcp_sdk.study.campaign.collect import collect, progress_of
+    from evlcp_sdk.study.campaign.store import Store
+    from evlcp_sdk.study.campaign.task import plan_of, run_job
 
     plan = plan_of(campaign, overrides or [])
     path = out or Path(f"{plan.name}.sqlite")

@@ -1,7 +1,7 @@
 """Recordings and cameras in and out: EVT2 and EVT3 RAW files, tables, and other formats through `faery`."""
 
 from evlcp_sdk.io.faery import FaerySource
-from evlcp_sdk.io.files import open_events, open_writer, read_events, write_events
+from evlcp_sdk.io.open import open_source, open_writer, read_events, write_events
 from evlcp_sdk.io.raw import RawHeader, RawSource, RawWriter
 from evlcp_sdk.io.sources import DEFAULT_MAX_EVENTS, EventSource, Loss, ReplaySource
 from evlcp_sdk.io.tables import CsvSource, CsvWriter, NpzSource, NpzWriter
@@ -21,7 +21,7 @@ __all__ = [
     "RawSource",
     "RawWriter",
     "ReplaySource",
-    "open_events",
+    "open_source",
     "open_writer",
     "read_events",
     "write_events",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.io import _words
 from evlcp_sdk.io.sources import Loss
-from evlcp_sdk.types import Events, Triggers
+from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["Codec", "Columns", "Decoder"]
 

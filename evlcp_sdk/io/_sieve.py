@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.io.sources import Loss
-from evlcp_sdk.types import Events
+from evlcp_sdk.values import Events
 
 __all__ = ["Sieve"]
 

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from evlcp_sdk.errors import StreamError
-from evlcp_sdk.types import Events, Triggers
+from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["DEFAULT_MAX_EVENTS", "EventSource", "Loss", "ReplaySource"]
 

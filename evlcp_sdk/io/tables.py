@@ -17,7 +17,7 @@ from evlcp_sdk.errors import InputError, StreamError
 from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.io.sources import EventSource, Loss
 from evlcp_sdk.io.writers import LAST_TIME_US, EventWriter
-from evlcp_sdk.types import Events, Triggers
+from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["CsvSource", "CsvWriter", "NpzSource", "NpzWriter"]
 

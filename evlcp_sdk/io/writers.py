@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import EvlcpError, StreamError
-from evlcp_sdk.types import Events, Triggers
+from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["LAST_TIME_US", "EventWriter"]
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.types import PresenceMap
+from evlcp_sdk.values import PresenceMap
 
 __all__ = ["FindPoints", "points_finder"]
 
@@ -73,7 +73,7 @@ def points_finder(centres_m: NDArray[np.float64]) -> FindPoints:
         freedom = max(2 * seen - 4, 0)
         variance = (_EXPECTED_WORTH * _SIGMA_PX**2 + squares) / (_EXPECTED_WORTH + freedom)
         height, width = presence.pixels.shape[1:]
-        # The image shows the pilot's mean; the bar's centre at the instant is known from its track.
+        # The image shows the pilot's mean; the bar's centre at the instant is that of its region.
         points -= ((width - 1) / 2, (height - 1) / 2) + offset_px.sum(1) / offset_px.shape[1]
         points += centre_px
         return points, variance**0.5 * (1 + (_OUTER - 1) * ends)

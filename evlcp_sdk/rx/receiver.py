@@ -10,17 +10,17 @@ import numpy as np
 import pluggy
 from numpy.typing import NDArray
 
-from evlcp_sdk.abc import Synchronizer, Tracker
-from evlcp_sdk.config import Link
 from evlcp_sdk.errors import ConfigError, StreamError
-from evlcp_sdk.rx.blame import Blame
-from evlcp_sdk.rx.chips import polarity_sums
-from evlcp_sdk.rx.messages import MessageAssembler
-from evlcp_sdk.rx.payload import PacketAssembler
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.roles import Synchronizer, Tracker
+from evlcp_sdk.rx.detection import Followed, RegionFollower
+from evlcp_sdk.rx.guard import Guard
+from evlcp_sdk.rx.inbox import MessageAssembler
+from evlcp_sdk.rx.look import polarity_sums
+from evlcp_sdk.rx.packets import PacketAssembler
+from evlcp_sdk.rx.plausibility import clusters_in_place
 from evlcp_sdk.rx.points import points_finder
-from evlcp_sdk.rx.presence import clusters_in_place
-from evlcp_sdk.rx.regions import RegionTracker, Track
-from evlcp_sdk.types import Events, Frame, FrameView, Packet, PresenceMap, Range, SyncLock
+from evlcp_sdk.values import Events, Frame, FrameView, Packet, PresenceMap, Range, SyncLock
 
 __all__ = ["Receiver"]
 
@@ -93,7 +93,7 @@ class _Transmitter:
         distance: State of the distance filter, None without one.
     """
 
-    track: Track
+    region: Followed
     sync: Any
     assembler: PacketAssembler
     number: int | None = None
@@ -114,7 +114,7 @@ class Receiver:
         link: The resolved configuration.
         hook: Where finished stages are announced (`Registry.hook`); None for nowhere.
 
-    >>> from evlcp_sdk.config import load_link
+    >>> from evlcp_sdk.link.resolve import load_link
     >>> receiver = Receiver(load_link())
     >>> receiver.feed(Events.of(t_us=[10, 20], x=[5, 5], y=[7, 7], p=[1, 0]))
     []
@@ -127,27 +127,27 @@ class Receiver:
     def __init__(self, link: Link, hook: pluggy.HookRelay | None = None) -> None:
         self._link = link
         self._packet = link.packet
-        self._step_us = link.regions.block_us
-        self._announce: Callable[..., Any] | None = None
+        self._step_us = link.regions.step_us
+        self._hook: Callable[..., Any] | None = None
         if hook is not None and hook.evlcp_stage_finished.get_hookimpls():
-            self._announce = hook.evlcp_stage_finished
-        self._blame = {role: Blame(link, role) for role in _ROLES}
-        with self._blame["synchronization"]:
+            self._hook = hook.evlcp_stage_finished
+        self._guards = {role: Guard(link, role) for role in _ROLES}
+        with self._guards["synchronization"]:
             self._synchronizer: Synchronizer = link.algorithm("synchronization").compile(
                 link.codebook, link.packet
             )
-        with self._blame["separation"]:
+        with self._guards["separation"]:
             self._separate = link.algorithm("separation").compile(link.codebook)
-        with self._blame["decoding"]:
+        with self._guards["decoding"]:
             self._decode = link.algorithm("decoding").compile(link.codebook)
-        with self._blame["ranging"]:
+        with self._guards["ranging"]:
             self._measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
-        with self._blame["tracking"]:
+        with self._guards["tracking"]:
             tracker: Tracker = link.algorithm("tracking").compile()
         self._distance = tracker.distance
         self._centres_m = link.bar.cluster_centres_m()
         self._find_points = points_finder(self._centres_m)
-        self._tracker = RegionTracker(link.regions, link.camera, link.packet.chip_us, tracker.position)
+        self._regions = RegionFollower(link.regions, link.camera, link.packet.chip_us, tracker.position)
         self._messages = self._assembler(link)
         self._transmitters: dict[int, _Transmitter] = {}
         self._released: list[_Transmitter] = []
@@ -242,7 +242,7 @@ class Receiver:
             read.append(self._messages.add(packet))
             elapsed = time.perf_counter() - clock
             for message in read[-1].messages:
-                self._tell("message", message, elapsed)
+                self._announce("message", message, elapsed)
         return read
 
     def _checked(self, events: Events) -> Events:
@@ -285,31 +285,31 @@ class Receiver:
         self._step_start_us += self._step_us
         end_us = self._step_start_us if until_us is None else until_us
         clock = time.perf_counter()
-        tracks = self._tracker.step(start_us, events)
+        regions = self._regions.step(start_us, events)
         elapsed = time.perf_counter() - clock
         packets: list[Packet] = []
-        for track in tracks:
-            if track.id not in self._transmitters:
+        for region in regions:
+            if region.id not in self._transmitters:
                 self._counts["regions_opened"] += 1
                 assembler = PacketAssembler(self._packet.frames)
-                self._transmitters[track.id] = _Transmitter(
-                    track,
+                self._transmitters[region.id] = _Transmitter(
+                    region,
                     self._synchronizer.init(),
                     assembler,
                     distance=self._distance.init() if self._distance else None,
                 )
-                fresh = list(track.blocks)
+                fresh = list(region.pieces)
             else:
-                fresh = [track.blocks[-1]] if track.blocks and track.blocks[-1][0] == start_us else []
+                fresh = [region.pieces[-1]] if region.pieces and region.pieces[-1][0] == start_us else []
             self._counts["events_in_regions"] += sum(len(e) for _, e in fresh)
-            self._tell("regions", track.latest, elapsed)
-            transmitter = self._transmitters[track.id]
-            for block_us, block in fresh:
-                self._synchronize(transmitter, block, min(block_us + self._step_us, end_us))
+            self._announce("regions", region.latest, elapsed)
+            transmitter = self._transmitters[region.id]
+            for piece_us, piece in fresh:
+                self._synchronize(transmitter, piece, min(piece_us + self._step_us, end_us))
             packets += self._decode_due(transmitter, end_us)
             self._forget(transmitter, end_us)
-            if track.released:
-                packets += self._release(track)
+            if region.released:
+                packets += self._release(region)
         return packets
 
     def _skip_gap(self, next_us: int) -> list[Packet]:
@@ -317,17 +317,17 @@ class Receiver:
         assert self._step_start_us is not None
         target = next_us // self._step_us * self._step_us
         packets: list[Packet] = []
-        while self._step_start_us < target and self._tracker.tracks:
+        while self._step_start_us < target and self._regions.alive:
             self._pending = [Events.empty()]
             packets += self._run_step()
         if self._step_start_us < target:
-            self._tracker.skip()
+            self._regions.skip()
             self._step_start_us = target
         return packets
 
     def _synchronize(self, transmitter: _Transmitter, events: Events, until_us: int) -> None:
         clock = time.perf_counter()
-        with self._blame["synchronization"]:
+        with self._guards["synchronization"]:
             transmitter.sync, locks = self._synchronizer.step(
                 transmitter.sync, events.t_us, events.p, until_us
             )
@@ -335,7 +335,7 @@ class Receiver:
         for lock in locks:
             self._counts["preambles"] += 1
             self._adopt(transmitter, lock)
-            self._tell("synchronization", lock, elapsed)
+            self._announce("synchronization", lock, elapsed)
 
     def _adopt(self, transmitter: _Transmitter, lock: SyncLock) -> None:
         """Take a new lock; frames go on where they were, or begin with the first whole one of the region."""
@@ -350,7 +350,7 @@ class Receiver:
         self._counts["locks"] += 1
         transmitter.pilot = None
         # Half a chip before the first event is still within the first edge's delay.
-        earliest = max(transmitter.track.first_us, self._first_us - lock.chip_us / 2)
+        earliest = max(transmitter.region.first_us, self._first_us - lock.chip_us / 2)
         if old is None and self._inherit(transmitter, lock):
             while self._frame_start_us(transmitter, transmitter.frame) < earliest:
                 transmitter.frame += 1
@@ -373,7 +373,7 @@ class Receiver:
         packet = self._packet
         period = packet.packet_chips * lock.chip_us
         for lost in [*self._transmitters.values(), *self._released]:
-            unseen_us = lock.packet_t_us - lost.track.latest.t_us
+            unseen_us = lock.packet_t_us - lost.region.latest.t_us
             if lost is transmitter or lost.lock is None or not 0 < unseen_us < _REMEMBER_US:
                 continue
             if unseen_us < _UNSEEN_STEPS * self._step_us:
@@ -427,18 +427,20 @@ class Receiver:
         look = self._look(transmitter, start_us, end_us, clock)
         if look is None:
             return None
-        with self._blame["decoding"]:
+        with self._guards["decoding"]:
             soft = self._decode(look.presence, look.sums)
-        self._blame["decoding"].expect_symbols(soft, self._link.codebook)
-        self._tell("decoding", soft, _lap(clock))
+        self._guards["decoding"].expect_symbols(soft, self._link.codebook)
+        self._announce("decoding", soft, _lap(clock))
         number, index = divmod(transmitter.frame, self._packet.frames)
         distance, points = _NO_RANGE, _NO_POINTS
         if self._packet.has_pilot(index):
             # Another distance of the same pilot, or other points, would say nothing new.
-            with self._blame["ranging"]:
-                distance = self._measure(FrameView(look.sums, look.offset_px, look.presence, soft))
-            self._blame["ranging"].expect(distance, Range)
-            self._tell("ranging", distance, _lap(clock))
+            view = FrameView(look.sums, look.offset_px, look.presence, soft)
+            self._announce("view", view, 0.0)
+            with self._guards["ranging"]:
+                distance = self._measure(view)
+            self._guards["ranging"].expect(distance, Range)
+            self._announce("ranging", distance, _lap(clock))
             # A value is read from its second chip, and a chip's events follow the edge at its start.
             read_px = look.offset_px[:, 1 : self._packet.pilot_chips : 2]
             points = self._find_points(look.presence, read_px, look.centre_px)
@@ -458,37 +460,37 @@ class Receiver:
             points_sigma_px=points[1],
             points_t_us=look.middle_us,
         )
-        self._tell("frame", frame, clock[-1] - clock[0])
+        self._announce("frame", frame, clock[-1] - clock[0])
         return frame
 
     def _look(
         self, transmitter: _Transmitter, start_us: float, end_us: float, clock: list[float]
     ) -> _Look | None:
         """The next frame with the bar held still, and where its clusters are; None if they cannot be told."""
-        lock, track, packet = transmitter.lock, transmitter.track, self._packet
+        lock, region, packet = transmitter.lock, transmitter.region, self._packet
         assert lock is not None
         index = transmitter.frame % packet.frames
         chips = self._chips_of(transmitter.frame)
         middles = start_us + (np.arange(chips, dtype=np.float64) + 0.5) * lock.chip_us
-        x, y = track.at(middles)
+        x, y = region.at(middles)
         middle = min(chips, packet.pilot_chips) // 2
         pilot = transmitter.pilot
         if packet.has_pilot(index):
-            width, height = track.size_at(middles[middle])
+            width, height = region.size_at(middles[middle])
             margin = 2 * self._link.regions.margin_px
             size = (_even(width + margin), _even(height + margin))
         elif pilot is None or pilot.frame != transmitter.frame - index % packet.pilot_every:
             return None
         else:
             size = pilot.size_px
-        pieces = [e for t, e in track.blocks if t < end_us and t + self._step_us > start_us]
+        pieces = [e for t, e in region.pieces if t < end_us and t + self._step_us > start_us]
         sums, offset_px = polarity_sums(pieces, lock, start_us, (x, y), size)
         if packet.has_pilot(index):
             heard, moved = sums[: packet.pilot_chips], offset_px[:, : packet.pilot_chips]
-            with self._blame["separation"]:
+            with self._guards["separation"]:
                 presence = self._separate(heard)
-            self._blame["separation"].expect(presence, PresenceMap)
-            self._tell("separation", presence, _lap(clock))
+            self._guards["separation"].expect(presence, PresenceMap)
+            self._announce("separation", presence, _lap(clock))
             in_place = clusters_in_place(presence, self._centres_m)
             if in_place < self._link.regions.min_clusters_share * len(self._centres_m):
                 transmitter.pilot = None
@@ -509,11 +511,11 @@ class Receiver:
         if self._distance is None:
             return None
         if np.isnan(measured.distance_m) or np.isnan(measured.sigma_m):
-            with self._blame["tracking"]:
+            with self._guards["tracking"]:
                 expected = self._distance.predict(transmitter.distance, t_us)
             return None if expected is None else Range(float(expected[0][0]), expected[1], 0)
         value = np.array([measured.distance_m])
-        with self._blame["tracking"]:
+        with self._guards["tracking"]:
             transmitter.distance, value, sigma = self._distance.step(
                 transmitter.distance, t_us, value, measured.sigma_m
             )
@@ -524,32 +526,32 @@ class Receiver:
         if transmitter.lock is None:
             packet_us = self._packet.packet_chips * self._packet.chip_us
             keep_us = now_us - _LOOKBACK_PACKETS * packet_us
-            transmitter.track.first_us = max(transmitter.track.first_us, int(keep_us))
+            transmitter.region.first_us = max(transmitter.region.first_us, int(keep_us))
         else:
             # A later lock may move the next frame's start by a chip.
             keep_us = self._frame_start_us(transmitter, transmitter.frame) - transmitter.lock.chip_us
-        transmitter.track.forget_before(keep_us, self._step_us)
+        transmitter.region.forget_before(keep_us, self._step_us)
 
-    def _release(self, track: Track) -> list[Packet]:
+    def _release(self, region: Followed) -> list[Packet]:
         self._counts["regions_released"] += 1
-        lost = self._transmitters.pop(track.id)
+        lost = self._transmitters.pop(region.id)
         packets = self._end(lost)
-        lost.track.blocks.clear()
-        oldest_us = track.latest.t_us - _REMEMBER_US
-        self._released = [r for r in self._released if r.track.latest.t_us > oldest_us] + [lost]
+        lost.region.pieces.clear()
+        oldest_us = region.latest.t_us - _REMEMBER_US
+        self._released = [r for r in self._released if r.region.latest.t_us > oldest_us] + [lost]
         return packets
 
     def _end(self, transmitter: _Transmitter) -> list[Packet]:
         packets = self._decode_due(
-            transmitter, min(self._last_us, transmitter.track.latest.t_us + self._step_us)
+            transmitter, min(self._last_us, transmitter.region.latest.t_us + self._step_us)
         )
         rest = transmitter.assembler.flush()
         self._counts["packets"] += len(rest)
         return packets + rest
 
-    def _tell(self, stage: str, value: object, elapsed_s: float) -> None:
-        if self._announce is not None:
-            self._announce(stage=stage, value=value, elapsed_s=elapsed_s)
+    def _announce(self, stage: str, value: object, elapsed_s: float) -> None:
+        if self._hook is not None:
+            self._hook(stage=stage, value=value, elapsed_s=elapsed_s)
 
 
 def _even(size: float) -> int:

@@ -9,16 +9,16 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.config import Link, resolve
+from evlcp_sdk.air.blocks import HEADER_BYTES, Kind, Message
+from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.frames import packet_chips
-from evlcp_sdk.messages.block import HEADER_BYTES, Kind, Message
-from evlcp_sdk.messages.sending import beacon_of_site, packets_of
+from evlcp_sdk.link.compose import beacon_of_site, packets_of
+from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.sim.motion import Strip
 from evlcp_sdk.sim.optics import led_light_w_m2
 from evlcp_sdk.sim.scene import BarSpec, LampSpec, Scene
 from evlcp_sdk.sim.world import bar_axis, sites_of
-from evlcp_sdk.sites import BarSite
 
 __all__ = ["BarLight", "LampLight", "Source", "sources_of"]
 
@@ -55,12 +55,14 @@ class Source(Protocol):
 
 
 @lru_cache(maxsize=16)
-def _link(profile: str, clusters: int, frames: int, pilot_every: int, error_correction: str) -> Link:
+def _link(
+    profile: str, clusters: int, frames: int, pilot_every: int, error_correction: str, rate_hz: float
+) -> Link:
     return resolve(
         {
             "modulation": {"id": profile},
-            "bar": {"rows": clusters, "cluster_rows": 1},
-            "air": {"frames_per_packet": frames, "pilot_every": pilot_every},
+            "bar": {"rows": 6 * clusters, "cluster_rows": 6},
+            "air": {"frames_per_packet": frames, "pilot_every": pilot_every, "chip_rate_hz": rate_hz},
             "error-correction": {"id": error_correction},
         }
     )
@@ -101,13 +103,23 @@ class BarLight:
         self.payload_seed = seed if bar.seed is None else bar.seed
         self._chips: NDArray[np.uint8] | None = None
         self._packets: dict[int, NDArray[np.uint8]] = {}
+        try:
+            self.link = link = _link(
+                bar.profile,
+                bar.clusters,
+                bar.frames,
+                bar.pilot_every,
+                bar.error_correction,
+                bar.chip_rate_hz,
+            )
+        except ConfigError as refused:
+            raise ConfigError(f"{source}: {refused}") from refused
         if bar.chips_file is not None:
             self._chips = _read_chips(Path(bar.chips_file), bar.clusters)
             self.packet_chips = len(self._chips)
             self.longest_us *= _longest_run(self._chips)
         else:
             try:
-                link = _link(bar.profile, bar.clusters, bar.frames, bar.pilot_every, bar.error_correction)
                 self._codebook = link.codebook
                 self._transmitter_id = transmitter_id
                 if bar.payload != "symbols":

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.geometry import CameraModel
+from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim.scene import NEAREST_M, MotionSpec
 
 __all__ = ["CameraPath", "Strip", "Vibration", "project"]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from evlcp_sdk.geometry import CameraModel
+from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim.scene import BarSpec, LensSpec
 
 __all__ = ["blur_sigma_px", "led_light_w_m2", "lit_share", "step_table"]

@@ -17,8 +17,8 @@ import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import parse_toml, parse_value, read_toml
-from evlcp_sdk.geometry import CameraModel
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.specs import parse_toml, parse_value, read_toml
 
 __all__ = [
     "BackgroundSpec",

@@ -17,7 +17,7 @@ from evlcp_sdk.sim.light import Source, sources_of
 from evlcp_sdk.sim.motion import CameraPath, project
 from evlcp_sdk.sim.optics import blur_sigma_px, step_table
 from evlcp_sdk.sim.scene import NEAREST_M, Scene, SensorSpec
-from evlcp_sdk.types import Events
+from evlcp_sdk.values import Events
 
 __all__ = ["ACTIVITY_FLOOR", "MOTION_STEP_PX", "Simulation", "quantile_table", "sensor_vector", "simulate"]
 

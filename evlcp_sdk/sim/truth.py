@@ -1,198 +1,467 @@
-"""The truth beside a recording: what was sent, and where the bars were."""
+"""The truth beside a recording: what each bar sent, with which link, and where it was in the image."""
 
-from collections.abc import Mapping
-from dataclasses import asdict
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.sim.motion import project
-from evlcp_sdk.sim.optics import blur_sigma_px
-from evlcp_sdk.sim.scene import Scene, resolve_scene
-from evlcp_sdk.sim.simulation import Simulation, scene_table
-from evlcp_sdk.sim.world import camera_on_earth, sites_of
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.errors import EvlcpError, InputError
+from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.scene.sites import BarSite
 
-__all__ = ["scene_of_truth", "truth", "truth_of"]
+__all__ = ["SentBar", "Truth", "read_truth", "truth_from_table"]
+
+Floats = NDArray[np.float64]
+
+_DARK_W_M2 = 1e-6
+"""Light up to which a bar counts as dark."""
+
+_PAYLOADS = ("symbols", "data", "messages")
 
 
-def truth(scene: Scene, seed: int | None = None) -> dict[str, Any]:
-    """The truth of a scene without rendering it: all but the counts of events.
+@dataclass(frozen=True, eq=False)
+class SentBar:
+    """What one bar sent, and where it was.
 
-    Raises:
-        ConfigError: The scene cannot be rendered.
-        InputError: One of its files cannot be read.
+    Attributes:
+        link: The link that it was sent with.
+        symbols: int64 (packets, frames, clusters); packet 0 is on air as the scene starts. None of them,
+            (0, frames, clusters), where the bar sends chips of a file.
+        start_chip: Chip of packet 0 that is on air as the scene starts.
+        ppm: How much faster than nominal its clock runs.
+        payload: "symbols", "data" or "messages".
+        sends_frames: It is lit, and sends packets.
+        lit: It is lit.
+        centre_px: Column and row of its centre at `Truth.t_us`, float64 (n, 2).
+        distance_m: Depth of its centre along the optical axis, m, float64 (n,).
+        covered: Clusters that are hidden all the time.
+        cover_s: Times and clusters that are hidden then: (from s, to s, first cluster, last cluster).
+        pole_s: Times when all of it is hidden: (from s, to s).
     """
-    return truth_of(Simulation(scene, seed))
+
+    link: Link
+    symbols: NDArray[np.int64]
+    start_chip: float
+    ppm: float
+    payload: str
+    sends_frames: bool
+    lit: bool
+    centre_px: Floats
+    distance_m: Floats
+    covered: tuple[int, ...] = ()
+    cover_s: tuple[tuple[float, float, int, int], ...] = ()
+    pole_s: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def rate_hz(self) -> float:
+        """Chips a second by the clock of the recording."""
+        return self.link.air.chip_rate_hz * (1 + self.ppm * 1e-6)
+
+    @property
+    def packet(self) -> PacketFormat:
+        """Lengths of a packet's parts."""
+        return self.link.packet
+
+    @property
+    def clusters(self) -> int:
+        """Number of clusters K."""
+        return self.link.codebook.clusters
+
+    @property
+    def bits_per_symbol(self) -> int:
+        """Bits that one symbol carries."""
+        return self.link.codebook.bits_per_symbol
 
 
-def truth_of(simulation: Simulation) -> dict[str, Any]:
-    """What `REC.truth.json` holds, as JSON values; with the counts when the simulation has run.
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a recording shows.
 
-    `scene` holds its parameters; `bars` what each sent: symbols [packet][frame][cluster], the chip of the
-    first packet that was on air at the scene's begin, and `pilot_every` where not every frame has a pilot,
-    `payload` and `error_correction` where it sends messages;
-    `t_s`, `distance_m` and `bar_centre_px`, every millisecond, the depth along the optical axis and the place
-    of each bar's centre; `camera_path`, every millisecond, the camera's place (x, y, z; m) and attitude (yaw,
-    pitch, roll; degrees) in the scene and, with a `[world]`, on earth; `sites`, with a `[world]`, where the
-    bars stand (`BarSite`); `simulator` the resolved scene, which renders the recording again.
+    Attributes:
+        t0_us: Camera clock as the scene starts, us.
+        duration_us: Length of the scene, us.
+        t_us: Times of the samples, from the scene's start, us, float64 (n,).
+        bars: What each bar sent, and where it was.
+        sites: Where the bars stand on earth; none without a `[world]`.
+        camera_path: Arrays of the camera at `t_us`: latitude_deg, longitude_deg, height_m, heading_deg,
+            pitch_deg, roll_deg, float64 (n,), in a scene on earth; position_m and attitude_deg, float64
+            (3, n), in the scene's own axes. Empty where the file says none.
+        table: The rest of the JSON: scene, camera, simulator, counts, and under `bars` the rest of each bar.
+        warnings: What does not fit this installation, in words.
     """
-    scene = simulation.scene
-    camera, sensor, motion = scene.camera, scene.sensor, scene.motion
-    t_s = np.arange(max(1, round(scene.duration_s * 1000))) / 1000
-    position, attitude = simulation.path.at(t_s * 1e6)
-    centres = np.array([b.strip.centre_m for b in simulation.bars]).reshape(-1, 3)
-    place, depth = project(centres, position, attitude, camera)
-    bars = []
-    for light in simulation.bars:
-        bar = light.bar
-        bars.append(
-            {
-                "x_m": bar.x_m,
-                "y_m": bar.y_m,
-                "z_m": bar.z_m,
-                "length_m": bar.length_m,
-                "width_m": bar.width_m,
-                "clusters": bar.clusters,
-                "profile": bar.profile,
-                "frames": bar.frames,
-                "seed": light.payload_seed,
-                "ppm": bar.ppm,
-                "start_chip": light.start_chip,
-                "led_w_m2": bar.led_w_m2,
-                "chips_file": bar.chips_file,
-                "symbols": light.sent_symbols(scene.duration_s),
-                "packet_chips": light.packet_chips,
-                **({"pilot_every": bar.pilot_every} if bar.pilot_every > 1 else {}),
-                **(
-                    {"payload": bar.payload, "error_correction": bar.error_correction}
-                    if bar.payload != "symbols"
-                    else {}
-                ),
+
+    t0_us: int
+    duration_us: float
+    t_us: Floats
+    bars: tuple[SentBar, ...]
+    sites: tuple[BarSite, ...]
+    camera_path: Mapping[str, Floats]
+    table: Mapping[str, Any]
+    warnings: tuple[str, ...] = ()
+
+    def to_table(self) -> dict[str, Any]:
+        """What `REC.truth.json` holds, as JSON values; `truth_from_table` takes it back.
+
+        A bar's `profile`, `clusters`, `frames`, `pilot_every` and `packet_chips` are there for other readers;
+        what counts is its `link`, the digest of one of the `links`.
+        """
+        links = {bar.link.digest: bar.link for bar in self.bars}
+        found = dict(self.table)
+        found["scene"] = {**found.get("scene", {}), "t0_us": self.t0_us}
+        found["scene"].setdefault("duration_s", self.duration_us / 1e6)
+        rest = found.get("bars", ({},) * len(self.bars))
+        found["bars"] = [{**_table_of(bar), **more} for bar, more in zip(self.bars, rest, strict=True)]
+        found["links"] = {
+            digest: {
+                "table": {section: dict(keys) for section, keys in link.table.items()},
+                "codebook": link.codebook.digest,
+                "revisions": dict(link.revisions),
             }
-        )
-    found: dict[str, Any] = {
-        "scene": {
-            "name": scene.name,
-            "duration_s": scene.duration_s,
-            "distance_m": motion.distance_m,
-            "speed_mps": motion.speed_mps,
-            "vib_rate_rad_s": motion.vib_rate_rad_s,
-            "background_w_m2": scene.background.light_w_m2,
-            "background_texture": scene.background.texture,
-            "noise_hz": sensor.noise_hz,
-            "hot_pixels": simulation.hot_pixels,
-            "focus_m": scene.lens.focus_m,
-            "f_number": scene.lens.f_number,
-            "refr_us": sensor.refr_us,
-            "th_on": sensor.th_on,
-            "th_off": sensor.th_off,
-            "noise_ln": sensor.noise_ln,
-            "p_on_miss": sensor.p_on_miss,
-            "p_off_miss": sensor.p_off_miss,
-            "dly_on_us": sensor.dly_on_us,
-            "dly_off_us": sensor.dly_off_us,
-            "jitter_us": sensor.jitter_us,
-            "tau_sf_us": sensor.tau_sf_us,
-            "hpf_us": 0.0,
-            "t_row_us": sensor.t_row_us,
-            "cap_mev_s": sensor.cap_mev_s,
-            "halo": scene.lens.halo,
-            "seed": scene.seed,
-            "flicker_lamps": scene.flicker_lamps,
-            "t0_us": scene.t0_us,
-        },
-        "bars": bars,
-        "camera": {
-            "focal_mm": camera.focal_mm,
-            "pitch_um": camera.pitch_um,
-            "width": camera.width,
-            "height": camera.height,
-            "cx": camera.centre_px[0],
-            "cy": camera.centre_px[1],
-        },
-        "t_s": [round(float(t), 3) for t in t_s],
-        "distance_m": [[round(float(v), 5) for v in column] for column in depth.T],
-        "bar_centre_px": [
-            [[round(float(v), 3) for v in place[:, i, axis]] for axis in (0, 1)] for i in range(len(bars))
-        ],
-        "camera_path": {
-            "position_m": [[round(float(v), 5) for v in axis] for axis in position.T],
-            "attitude_deg": [[round(float(v), 5) for v in axis] for axis in np.degrees(attitude).T],
-        },
-        "psf_sigma_px": [blur_sigma_px(float(d), scene.lens, camera) for d in depth[0]],
-        "e_led": [light.light_w_m2 for light in simulation.bars],
-        "simulator": scene_table(scene),
-    }
-    if scene.world is not None:
-        found["sites"] = [asdict(site) for site in sites_of(scene)]
-        found["camera_path"] |= camera_on_earth(scene, position, attitude)
-    if simulation.done_s:
-        found |= simulation.counts
-    return found
+            for digest, link in links.items()
+        }
+        found["t_s"] = [round(t / 1e6, 9) for t in self.t_us.tolist()]
+        found["distance_m"] = [bar.distance_m.tolist() for bar in self.bars]
+        found["bar_centre_px"] = [bar.centre_px.T.tolist() for bar in self.bars]
+        if self.sites:
+            found["sites"] = [asdict(site) for site in self.sites]
+        if self.camera_path:
+            found["camera_path"] = {key: values.tolist() for key, values in self.camera_path.items()}
+        return found
 
 
-def scene_of_truth(truth: Mapping[str, Any]) -> Scene:
-    """The scene of a recording, from its truth: the same bars, symbols, light and sensor; another vibration.
+def read_truth(path: Path | str, registry: Registry | None = None) -> Truth:
+    """The truth of a recording, from its `REC.truth.json`.
 
-    A truth written here gives exactly its scene. Of another generator's, with the same keys, everything is
-    taken over that both know; lamps are as many, but at other places.
+    Args:
+        path: The file.
+        registry: Where the algorithms of its links are found; None for all that are installed.
 
     Raises:
-        ConfigError: Keys are missing, or ask for what is not modelled (`hpf_us`).
+        InputError: It cannot be read, is no scene's truth, or names codes that are not those of this
+            installation; one line.
     """
-    if "simulator" in truth:
-        return resolve_scene(truth["simulator"], source="truth")
     try:
-        told, camera = truth["scene"], truth["camera"]
-        if told["hpf_us"] != 0:
-            raise ConfigError(f"truth: scene.hpf_us = {told['hpf_us']}: a high-pass filter is not modelled")
-        same = (
-            *(
-                "th_on",
-                "th_off",
-                "noise_ln",
-                "noise_hz",
-                "p_on_miss",
-                "p_off_miss",
-                "dly_on_us",
-                "dly_off_us",
-            ),
-            *("jitter_us", "tau_sf_us", "refr_us", "t_row_us", "cap_mev_s"),
-        )
-        shape = (
-            "x_m",
-            "y_m",
-            "z_m",
-            "length_m",
-            "width_m",
-            "clusters",
-            "profile",
-            "frames",
-            "ppm",
-            "led_w_m2",
-        )
-        pixels = camera["width"] * camera["height"]
-        table = {
-            "name": told["name"],
-            "duration_s": told["duration_s"],
-            "t0_us": told["t0_us"],
-            "seed": told["seed"],
-            "flicker_lamps": told["flicker_lamps"],
-            "camera": {key: camera[key] for key in ("width", "height", "focal_mm", "pitch_um")},
-            "lens": {key: told[key] for key in ("f_number", "focus_m", "halo")},
-            "motion": {key: told[key] for key in ("distance_m", "speed_mps", "vib_rate_rad_s")},
-            "background": {
-                "light_w_m2": told["background_w_m2"],
-                "texture": told["background_texture"],
-            },
-            "sensor": {key: told[key] for key in same} | {"hot_share": told["hot_pixels"] / pixels},
-            "bars": [
-                {key: bar[key] for key in (*shape, "start_chip", "chips_file")}
-                | ({"symbols": bar["symbols"]} if bar["symbols"] else {})
-                for bar in truth["bars"]
-            ],
+        table = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+    except (ValueError, RecursionError) as fault:
+        raise InputError(f"{path}: not JSON: {fault}") from fault
+    return truth_from_table(table, registry, source=str(path))
+
+
+def truth_from_table(
+    table: Mapping[str, Any],
+    registry: Registry | None = None,
+    *,
+    source: str = "truth",
+    links: Mapping[str, Link] | None = None,
+) -> Truth:
+    """The truth of what `REC.truth.json` holds.
+
+    A file of another generator that names no link is read as sent with the default link, but for the
+    `profile`, `clusters`, `frames` and `pilot_every` of its bars.
+
+    Args:
+        table: The JSON values.
+        registry: Where the algorithms of its links are found; None for all that are installed.
+        source: What faults name as their place.
+        links: Links by digest, instead of those of the table.
+
+    Raises:
+        InputError: It is no scene's truth, or names codes that are not those of this installation.
+    """
+    return _Reader(source, registry).truth(table, links)
+
+
+_OWN = ("link", "symbols", "start_chip", "ppm", "payload", "covered", "cover_s", "pole_s")
+"""Keys of a bar's table that `SentBar` holds, and those that follow from its link."""
+
+_OF_LINK = ("profile", "clusters", "frames", "pilot_every", "packet_chips", "error_correction")
+
+
+def _table_of(bar: SentBar) -> dict[str, Any]:
+    form = bar.link.packet
+    return {
+        "link": bar.link.digest,
+        "profile": bar.link.codebook.profile,
+        "clusters": bar.clusters,
+        "frames": form.frames,
+        "pilot_every": form.pilot_every,
+        "packet_chips": form.packet_chips,
+        "ppm": bar.ppm,
+        "start_chip": bar.start_chip,
+        **(
+            {"payload": bar.payload, "error_correction": bar.link.table["error-correction"]["id"]}
+            if bar.payload != "symbols"
+            else {}
+        ),
+        "symbols": bar.symbols.tolist(),
+        "led_w_m2": None if bar.lit else 0.0,
+        "chips_file": None,
+        **({"covered": list(bar.covered)} if bar.covered else {}),
+        **({"cover_s": [list(span) for span in bar.cover_s]} if bar.cover_s else {}),
+        **({"pole_s": [list(span) for span in bar.pole_s]} if bar.pole_s else {}),
+    }
+
+
+class _Reader:
+    """Checks the values of a truth; every fault names its place."""
+
+    def __init__(self, source: str, registry: Registry | None) -> None:
+        self._source = source
+        self._registry = registry
+        self._warnings: list[str] = []
+
+    def truth(self, table: Any, links: Mapping[str, Link] | None = None) -> Truth:
+        wanted = ("bar_centre_px", "bars", "distance_m", "scene", "t_s")
+        missing = [key for key in wanted if not isinstance(table, Mapping) or key not in table]
+        if missing:
+            raise InputError(f"{self._source}: not a scene's truth: {', '.join(missing)} missing")
+        scene = self._table(table, "scene")
+        rows = self._list(table, "bars")
+        t_us = self._numbers(table["t_s"], "t_s", 1) * 1e6
+        if (np.diff(t_us) <= 0).any():
+            raise self._fault("t_s", table["t_s"], "rising times")
+        n = len(t_us)
+        if not n:
+            raise self._fault("t_s", table["t_s"], "at least one time")
+        depths, centres = self._list(table, "distance_m"), self._list(table, "bar_centre_px")
+        for key, columns in (("distance_m", depths), ("bar_centre_px", centres)):
+            if len(columns) < len(rows):
+                raise self._fault(key, columns, f"one list a bar, {len(rows)}")
+        links = self._links(table.get("links")) if links is None else links
+        bars = []
+        for i, row in enumerate(rows):
+            if not isinstance(row, Mapping):
+                raise self._fault(f"bars.{i}", row, "a table")
+            depth = self._numbers(depths[i], f"distance_m.{i}", 1, n)
+            centre = self._numbers(centres[i], f"bar_centre_px.{i}", 2, 2, n).T
+            bars.append(self._bar(row, f"bars.{i}", links, centre, depth))
+        path = table.get("camera_path", {})
+        if not isinstance(path, Mapping):
+            raise self._fault("camera_path", path, "a table")
+        rest = {
+            key: value
+            for key, value in table.items()
+            if key not in (*wanted, "links", "sites", "camera_path") or key == "scene"
         }
-    except (KeyError, TypeError) as fault:
-        raise ConfigError(f"truth: not a scene's truth: {fault}") from fault
-    return resolve_scene(table, source="truth")
+        rest["bars"] = tuple(
+            {
+                key: value
+                for key, value in row.items()
+                if key not in _OWN and (key not in _OF_LINK or row.get("chips_file") is not None)
+            }
+            for row in rows
+        )
+        return Truth(
+            t0_us=int(self._number(scene, "t0_us", "scene.")),
+            duration_us=self._number(scene, "duration_s", "scene.", least=0.0) * 1e6,
+            t_us=t_us,
+            bars=tuple(bars),
+            sites=self._sites(table.get("sites", [])),
+            camera_path={
+                key: self._numbers(values, f"camera_path.{key}", None) for key, values in path.items()
+            },
+            table=rest,
+            warnings=tuple(self._warnings),
+        )
+
+    def _bar(
+        self, row: Mapping[str, Any], where: str, links: Mapping[str, Link], centre: Floats, depth: Floats
+    ) -> SentBar:
+        link = self._link(row, where, links)
+        ppm = self._number(row, "ppm", f"{where}.")
+        light = row.get("led_w_m2")
+        lit = light is None or self._number(row, "led_w_m2", f"{where}.") > _DARK_W_M2
+        payload = row.get("payload") or "symbols"
+        if payload not in _PAYLOADS:
+            raise self._fault(f"{where}.payload", payload, f"one of {', '.join(_PAYLOADS)}")
+        return SentBar(
+            link=link,
+            symbols=self._symbols(row, where, link),
+            start_chip=self._number(row, "start_chip", f"{where}.", least=0.0),
+            ppm=ppm,
+            payload=payload,
+            sends_frames=lit and row.get("chips_file") is None,
+            lit=lit,
+            centre_px=centre,
+            distance_m=depth,
+            covered=tuple(self._spans(row, "covered", where, 1)[:, 0].astype(int).tolist()),
+            cover_s=tuple(
+                (a, b, int(first), int(last))
+                for a, b, first, last in self._spans(row, "cover_s", where, 4).tolist()
+            ),
+            pole_s=tuple((a, b) for a, b in self._spans(row, "pole_s", where, 2).tolist()),
+        )
+
+    def _links(self, told: Any) -> dict[str, Link]:
+        if told is None:
+            return {}
+        if not isinstance(told, Mapping):
+            raise self._fault("links", told, "a table")
+        found = {}
+        for digest, entry in told.items():
+            where = f"links.{digest[:12]}"
+            if not isinstance(entry, Mapping):
+                raise self._fault(where, entry, "a table")
+            table = self._table(entry, "table", f"{where}.")
+            link = self._resolved(table, where)
+            if link.codebook.digest != entry.get("codebook"):
+                raise InputError(
+                    f"{self._source}: {where}.codebook = {str(entry.get('codebook'))[:12]}: its settings give"
+                    f" {link.codebook.digest[:12]} here{self._revisions(entry, link)};"
+                    " install the versions it was sent with"
+                )
+            if link.digest != digest:
+                self._warnings.append(
+                    f"{self._source}: {where}: resolves to {link.digest[:12]} here"
+                    f"{self._revisions(entry, link)}; the codes are the same"
+                )
+            found[digest] = link
+        return found
+
+    def _resolved(self, table: Mapping[str, Any], where: str) -> Link:
+        if self._registry is None:
+            self._registry = Registry.load()
+        try:
+            return resolve(table, self._registry)
+        except EvlcpError as refused:
+            first = str(refused).splitlines()[0]
+            raise InputError(f"{self._source}: {where}: not a link here: {first}") from refused
+
+    def _revisions(self, entry: Mapping[str, Any], link: Link) -> str:
+        """Which algorithms have another revision here than in the file."""
+        told = entry.get("revisions")
+        told = told if isinstance(told, Mapping) else {}
+        other = [
+            f"{role} {link.table[role]['id']} {told.get(role)} there, {here} here"
+            for role, here in link.revisions.items()
+            if told.get(role) != here
+        ]
+        return f" (revisions: {'; '.join(other)})" if other else ""
+
+    def _link(self, row: Mapping[str, Any], where: str, links: Mapping[str, Link]) -> Link:
+        digest = row.get("link")
+        if digest is not None:
+            if not isinstance(digest, str) or digest not in links:
+                raise self._fault(f"{where}.link", digest, "the digest of one of the links")
+            return links[digest]
+        return self._resolved(link_table_of(row, self._source, where), where)
+
+    def _symbols(self, row: Mapping[str, Any], where: str, link: Link) -> NDArray[np.int64]:
+        frames, clusters = link.packet.frames, link.codebook.clusters
+        if "symbols" not in row:
+            raise InputError(f"{self._source}: {where}.symbols: missing")
+        told, top = row["symbols"], len(link.codebook.codewords)
+        wanted = f"packets of {frames} frames of {clusters} symbols, 0 to {top - 1}"
+        if isinstance(told, list) and not told:
+            return np.empty((0, frames, clusters), np.int64)
+        try:
+            symbols = np.array(told)
+        except ValueError as fault:
+            raise self._fault(f"{where}.symbols", told, wanted) from fault
+        if symbols.shape[1:] != (frames, clusters) or symbols.dtype.kind != "i":
+            raise self._fault(f"{where}.symbols", told, wanted)
+        if symbols.min() < 0 or symbols.max() >= top:
+            q, f, k = np.argwhere((symbols < 0) | (symbols >= top))[0].tolist()
+            raise self._fault(f"{where}.symbols.{q}.{f}.{k}", symbols[q, f, k], f"0 to {top - 1}")
+        return symbols.astype(np.int64)
+
+    def _sites(self, told: Any) -> tuple[BarSite, ...]:
+        if not isinstance(told, list):
+            raise self._fault("sites", told, "a list")
+        try:
+            return tuple(BarSite(**site) for site in told)
+        except TypeError as fault:
+            raise self._fault("sites", told, "tables with the keys of a site") from fault
+
+    def _spans(self, row: Mapping[str, Any], key: str, where: str, columns: int) -> Floats:
+        told = row.get(key) or []
+        rows = [[v] for v in told] if columns == 1 and isinstance(told, list) else told
+        found = self._numbers(rows, f"{where}.{key}", None)
+        if not found.size:
+            return np.empty((0, columns))
+        if found.ndim != 2 or found.shape[1] != columns:
+            raise self._fault(f"{where}.{key}", told, f"a list of lists of {columns} numbers")
+        return found
+
+    def _table(self, table: Mapping[str, Any], key: str, before: str = "") -> Mapping[str, Any]:
+        if key not in table:
+            raise InputError(f"{self._source}: {before}{key}: missing; expected a table")
+        if not isinstance(table[key], Mapping):
+            raise self._fault(before + key, table[key], "a table")
+        found: Mapping[str, Any] = table[key]
+        return found
+
+    def _list(self, table: Mapping[str, Any], key: str) -> Sequence[Any]:
+        if not isinstance(table[key], list | tuple):
+            raise self._fault(key, table[key], "a list")
+        found: Sequence[Any] = table[key]
+        return found
+
+    def _number(
+        self, table: Mapping[str, Any], key: str, before: str = "", least: float = -math.inf
+    ) -> float:
+        value = table.get(key)
+        wanted = "a number" if least == -math.inf else f"a number, at least {least:g}"
+        if key not in table:
+            raise InputError(f"{self._source}: {before}{key}: missing; expected {wanted}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise self._fault(before + key, value, wanted)
+        if value < least:
+            raise self._fault(before + key, value, wanted)
+        return value
+
+    def _numbers(self, told: Any, where: str, ndim: int | None, *shape: int) -> Floats:
+        wanted = f"finite numbers, {' x '.join(map(str, shape))}" if shape else "a list of finite numbers"
+        try:
+            found = np.array(told, np.float64)
+        except (TypeError, ValueError, OverflowError) as fault:
+            raise self._fault(where, told, wanted) from fault
+        right = ndim is None or (found.ndim == ndim and (not shape or found.shape == shape))
+        if not right or not np.isfinite(found).all():
+            raise self._fault(where, told, wanted)
+        return found
+
+    def _fault(self, where: str, value: Any, wanted: str) -> InputError:
+        return InputError(f"{self._source}: not a scene's truth: {where} = {value!r:.40}: expected {wanted}")
+
+
+_LEDS_PER_CLUSTER = 6
+
+
+def link_table_of(row: Mapping[str, Any], source: str, where: str) -> dict[str, Any]:
+    """The link's table of a bar that says its profile, clusters and frames instead of a link.
+
+    Args:
+        row: The bar's table.
+        source: What faults name as their file.
+        where: What faults name as the bar.
+
+    Raises:
+        InputError: A value is missing or not what it should be.
+    """
+    reader = _Reader(source, None)
+    clusters, frames, every = (
+        reader._number({"pilot_every": 1, "clusters": 16, **row}, key, f"{where}.", least=1)
+        for key in ("clusters", "frames", "pilot_every")
+    )
+    profile = row.get("profile")
+    if not isinstance(profile, str):
+        raise InputError(f"{source}: {where}.profile = {profile!r}: expected a modulation's id, or a link")
+    leds = _LEDS_PER_CLUSTER * int(clusters)
+    bar: dict[str, Any] = {"rows": leds, "cluster_rows": _LEDS_PER_CLUSTER}
+    if "length_m" in row:
+        bar["led_pitch_m"] = round(reader._number(row, "length_m", f"{where}.") / leds, 9)
+    return {
+        "modulation": {"id": profile},
+        "bar": bar,
+        "air": {"frames_per_packet": frames, "pilot_every": every},
+    }

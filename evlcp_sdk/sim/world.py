@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.attitude import AttitudeTrack
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.scene.attitude import AttitudeLog
+from evlcp_sdk.scene.sites import BarSite, LocalFrame
 from evlcp_sdk.sim.motion import CameraPath
 from evlcp_sdk.sim.scene import BarSpec, Scene, WorldSpec
-from evlcp_sdk.sites import BarSite, LocalFrame
 
 __all__ = ["attitude_log", "bar_axis", "camera_on_earth", "scene_to_enu", "sites_of"]
 
@@ -98,7 +98,7 @@ def camera_on_earth(scene: Scene, position_m: Floats, attitude_rad: Floats) -> d
     }
 
 
-def attitude_log(scene: Scene, seed: int, path: CameraPath) -> AttitudeTrack | None:
+def attitude_log(scene: Scene, seed: int, path: CameraPath) -> AttitudeLog | None:
     """What an IMU tells of the camera's attitude, every millisecond: the truth and one error a recording.
 
     Args:
@@ -119,7 +119,7 @@ def attitude_log(scene: Scene, seed: int, path: CameraPath) -> AttitudeTrack | N
     yaw, pitch, roll = np.degrees(path.at(t_us)[1]).T
     error = np.random.default_rng([seed, 0xA77]).normal(size=3)
     heading = world.heading_deg + yaw + error[2] * world.heading_sigma_deg
-    return AttitudeTrack(
+    return AttitudeLog(
         t_us + scene.t0_us,
         pitch + error[0] * world.gravity_sigma_deg,
         roll + error[1] * world.gravity_sigma_deg,

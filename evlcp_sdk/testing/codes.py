@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.config import load_link
+from evlcp_sdk.air.frames import bits_of_symbols, symbols_of_bits
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.frames import bits_of_symbols, symbols_of_bits
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.testing.exercises import link_of
 from evlcp_sdk.testing.law import InapplicableLawError, Law, Subject, expect
 from evlcp_sdk.testing.views import ideal_presence, ideal_sums

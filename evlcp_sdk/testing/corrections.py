@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.abc import Corrected
+from evlcp_sdk.air.frames import symbols_of_bits
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.frames import symbols_of_bits
+from evlcp_sdk.plugin.roles import Corrected
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.exercises import coded_bits_of, link_of
 from evlcp_sdk.testing.law import InapplicableLawError, Law, Subject, compiled, expect

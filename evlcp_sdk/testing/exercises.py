@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from evlcp_sdk.codebook import Codebook
-from evlcp_sdk.config import Link, load_link
-from evlcp_sdk.frames import PacketFormat
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, compiled
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.testing.views import ideal_presence, ideal_sums, ideal_view

@@ -8,9 +8,9 @@ from typing import Any, get_type_hints
 import numpy as np
 from pydantic.fields import FieldInfo
 
-from evlcp_sdk.abc import ROLES
-from evlcp_sdk.config import _spec_model
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.plugin.roles import ROLES
+from evlcp_sdk.specs import spec_model
 from evlcp_sdk.testing.exercises import coded_bits_of, exercise_of, link_of
 from evlcp_sdk.testing.law import Law, LawError, Subject, expect
 from evlcp_sdk.testing.trees import arrays_of, copied, difference, mapped, read_only, strided
@@ -62,7 +62,7 @@ def round_trip(subject: Subject) -> None:
     """Hold the law."""
     _parameters(subject)
     cls = type(subject.algorithm)
-    model = _spec_model(cls)
+    model = spec_model(cls)
     text = json.dumps(dataclasses.asdict(subject.algorithm), allow_nan=False)
     values = model.model_validate_json(text)
     again = cls(**{name: getattr(values, name) for name in model.model_fields})

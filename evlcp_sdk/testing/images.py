@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.abc import Decode
-from evlcp_sdk.codebook import Codebook
-from evlcp_sdk.config import Link, load_link
+from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.registry import Registry
+from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.roles import Decode
 from evlcp_sdk.testing.exercises import link_of, symbols_of
 from evlcp_sdk.testing.law import InapplicableLawError, Law, Subject, compiled, expect
 from evlcp_sdk.testing.views import GRID_PX, ideal_presence, ideal_sums, ideal_view
-from evlcp_sdk.types import PresenceMap, Range, SoftSymbols
+from evlcp_sdk.values import PresenceMap, Range, SoftSymbols
 
 __all__ = ["DECODING", "RANGING", "SEPARATION"]
 

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from evlcp_sdk.config import Link
+from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.exercises import link_of
 from evlcp_sdk.testing.law import Law, Subject, compiled, expect
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
-from evlcp_sdk.types import Frame
+from evlcp_sdk.values import Frame
 
 __all__ = ["LINK"]
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.config import Link
-from evlcp_sdk.frames import packet_chips
-from evlcp_sdk.types import Events
+from evlcp_sdk.air.frames import packet_chips
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.values import Events
 
 __all__ = ["IdealBar", "ideal_events", "lamp_events", "merged", "noise_events", "random_symbols"]
 

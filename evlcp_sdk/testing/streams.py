@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from evlcp_sdk.config import Link
+from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.testing.exercises import filters_of, link_of
 from evlcp_sdk.testing.law import Law, Subject, compiled, expect
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.testing.trees import difference
-from evlcp_sdk.types import Events, SyncLock
+from evlcp_sdk.values import Events, SyncLock
 
 __all__ = ["SYNCHRONIZATION", "TRACKING"]
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.hookspecs import ROLE_NAMES
+from evlcp_sdk.plugin.hooks import ROLE_NAMES
 from evlcp_sdk.testing.codes import MODULATION, PILOTS
 from evlcp_sdk.testing.corrections import ERROR_CORRECTION
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
@@ -70,7 +70,7 @@ def check(role: str, algorithm: Any, excuses: Mapping[str, str] | None = None) -
     Raises:
         ConfigError: There is no such role or law, or an excuse has no reason.
 
-    >>> from evlcp_sdk.config import load_link
+    >>> from evlcp_sdk.link.resolve import load_link
     >>> {outcome.status for outcome in check("modulation", load_link().algorithm("modulation"))}
     {'ok'}
     """

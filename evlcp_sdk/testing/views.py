@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evlcp_sdk.codebook import Codebook, chips_of_values
-from evlcp_sdk.types import FrameView, PresenceMap, SoftSymbols
+from evlcp_sdk.air.codebook import Codebook, chips_of_values
+from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
 __all__ = ["GRID_PX", "ideal_presence", "ideal_soft", "ideal_sums", "ideal_view"]
 

@@ -1,7 +1,6 @@
 """`evlcp board`: program and watch driver boards."""
 
 import contextlib
-from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,14 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from firmware_host.commands import _source
-from firmware_host.commands.tx import Frames, PilotEvery, ProfileName, RandomPackets, Seed, SymbolsFile
+from firmware_host.commands._line import open_board, progress_bar, tell
+from firmware_host.commands._source import Frames, PilotEvery, ProfileName, RandomPackets, Seed, SymbolsFile
 
 if TYPE_CHECKING:
-    from firmware_host.board import Board
-    from firmware_host.messages import HelloReply, StatusReply
-    from firmware_host.payload import Payload
+    from firmware_host.board.bank import Bank
+    from firmware_host.board.board import Board
+    from firmware_host.protocol.requests import HelloReply, StatusReply
 
-__all__ = ["app", "open_board", "progress_bar", "tell"]
+__all__ = ["app"]
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -24,7 +24,7 @@ app = typer.Typer(
     help="""Program and watch driver boards.
 
     Exit codes: [bold]2[/] usage, [bold]3[/] input file, [bold]4[/] no board, [bold]5[/] refused,
-    [bold]6[/] link, [bold]7[/] verify, [bold]8[/] incompatible.
+    [bold]6[/] line, [bold]7[/] verify, [bold]8[/] incompatible.
     """,
 )
 
@@ -61,40 +61,6 @@ class Emulator(StrEnum):
     QEMU = "qemu"
 
 
-@contextlib.contextmanager
-def open_board(port: str | None, baud: int, trace: Path | None, replay: Path | None) -> "Iterator[Board]":
-    """The board at a port, or a recorded one."""
-    from evlcp_sdk.errors import ConfigError, InputError
-    from firmware_host.board import Board
-    from firmware_host.client import Timing
-    from firmware_host.link import Link
-    from firmware_host.ports import find
-    from firmware_host.transport import ReplayTransport, TraceTransport, Transport, open_transport
-
-    transport: Transport
-    first = nonce = None
-    if replay is not None:
-        if trace is not None:
-            raise ConfigError("--trace and --replay: give one of the two")
-        transport = played = ReplayTransport(replay)
-        first, nonce, baud = played.first, played.nonce, played.baud
-    else:
-        transport = open_transport(port or find(baud), baud)
-        if trace is not None:
-            import random
-
-            draw = random.SystemRandom()
-            first, nonce = draw.randrange(1 << 16), draw.randrange(1 << 32)
-            try:
-                file = trace.open("w", encoding="utf-8")
-            except OSError as fault:
-                transport.close()
-                raise InputError(f"{trace}: cannot be written: {fault.strerror}") from fault
-            transport = TraceTransport(transport, file, baud, first, nonce)
-    with Link(transport, Timing(baud), first, nonce) as link:
-        yield Board(link)
-
-
 def _payload(
     symbols: Path | None,
     random: int | None,
@@ -103,34 +69,22 @@ def _payload(
     frames: int,
     pilot_every: int,
     profile: str,
-) -> "Payload":
+) -> "Bank":
     from evlcp_sdk.errors import ConfigError
-    from firmware_host.payload import Payload, read_masks
+    from firmware_host.board.bank import Bank, read_masks
 
     book = _source.codebook(profile)
     if masks is not None:
         if symbols is not None or random is not None:
             raise ConfigError("--masks, --random and SYMBOLS.json: give one of them")
         return read_masks(masks, frames, book, pilot_every)
-    return Payload.of_symbols(
+    return Bank.of_symbols(
         _source.symbols(symbols, random, seed, frames, pilot_every, book), book, pilot_every
     )
 
 
-@contextlib.contextmanager
-def progress_bar(what: str) -> "Iterator[Any]":
-    """A bar by bytes, on a terminal only: a function of what is done and what there is."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
 def _about(about: "HelloReply") -> dict[str, Any]:
-    from firmware_host.messages import Capability
+    from firmware_host.protocol.requests import Capability
 
     return {
         "hal": about.hal.rstrip(b"\0").decode("ascii", "replace"),
@@ -159,7 +113,7 @@ def _name(enum: Any, value: int) -> str:
 
 
 def _status(status: "StatusReply") -> dict[str, Any]:
-    from firmware_host.messages import NO_BANK, Fault, Format, Profile, State, Watchdog
+    from firmware_host.protocol.requests import NO_BANK, BoardFault, Format, Profile, State, Watchdog
 
     def bank(number: int) -> int | None:
         return None if number == NO_BANK else number
@@ -167,7 +121,7 @@ def _status(status: "StatusReply") -> dict[str, Any]:
     open_leds = int.from_bytes(status.open_leds, "big")
     table: dict[str, Any] = {
         "state": _name(State, status.state),
-        "faults": [f.name.lower() for f in Fault if f & status.faults and f.name],
+        "faults": [f.name.lower() for f in BoardFault if f & status.faults and f.name],
         "active_bank": bank(status.active_bank),
         "pending_bank": bank(status.pending_bank),
     }
@@ -220,7 +174,7 @@ def ports(baud: Baud = DEFAULT_BAUD, as_json: AsJson = False) -> None:
 
     For example: [bold]evlcp board ports[/]
     """
-    from firmware_host.ports import survey
+    from firmware_host.board.survey import survey
 
     found = survey(baud)
     if as_json:
@@ -306,8 +260,8 @@ def program(
             )
         _program_fleet(inventory, verify, as_json)
         return
-    from firmware_host.board import Settings, provision
-    from firmware_host.messages import Watchdog
+    from firmware_host.board.board import Settings, provision
+    from firmware_host.protocol.requests import Watchdog
 
     action = None if watchdog is None else Watchdog[watchdog.name]
     payload = _payload(symbols, random, masks, seed, frames, pilot_every, profile)
@@ -317,23 +271,10 @@ def program(
     tell(done, as_json)
 
 
-def tell(done: Any, as_json: bool) -> None:
-    """Say what programming did."""
-    if as_json:
-        import dataclasses
-        import json
-
-        typer.echo(json.dumps(dataclasses.asdict(done)))
-    elif not done.swapped:
-        typer.echo(f"was there already: {done.length} bytes in bank {done.bank}")
-    else:
-        typer.echo(f"sent {done.written} of {done.length} bytes; bank {done.bank} is active")
-
-
 def _program_fleet(path: Path, verify: bool, as_json: bool) -> None:
     import json
 
-    from firmware_host.fleet import Result, program_fleet, raise_failures, read_inventory
+    from firmware_host.board.fleet import Result, program_fleet, raise_failures, read_inventory
 
     inventory = read_inventory(path)
 
@@ -364,14 +305,14 @@ def send(
     For example: [bold]evlcp board send --random 4 --seed 7 --port unix:/tmp/board[/]
     """
     from firmware_host.errors import RefusedError
-    from firmware_host.messages import NO_BANK, Status
+    from firmware_host.protocol.requests import NO_BANK, Status
 
     payload = _payload(symbols, random, masks, seed, frames, pilot_every, profile)
     with open_board(port, baud, trace, replay) as board, progress_bar("sending") as progress:
         status = board.status()
         if status.active_bank == NO_BANK:
             raise RefusedError(
-                f"{board.link.name}: nothing is programmed; 'evlcp board program' first",
+                f"{board.session.name}: nothing is programmed; 'evlcp board program' first",
                 Status.NOTHING_COMMITTED,
             )
         _check_codebook(board, payload, status)
@@ -379,12 +320,12 @@ def send(
     tell(done, as_json)
 
 
-def _check_codebook(board: "Board", payload: "Payload", status: "StatusReply") -> None:
+def _check_codebook(board: "Board", payload: "Bank", status: "StatusReply") -> None:
     from firmware_host.errors import IncompatibleError
 
     if status.digest.hex() != payload.codebook.digest:
         raise IncompatibleError(
-            f"{board.link.name}: plays codebook {status.digest.hex()[:16]}, this payload is of"
+            f"{board.session.name}: plays codebook {status.digest.hex()[:16]}, this payload is of"
             f" {payload.codebook.digest[:16]} ({payload.codebook.profile}); choose its --profile, or"
             " 'evlcp board program' to change it"
         )
@@ -438,7 +379,7 @@ def watchdog(
     replay: Replay = None,
 ) -> None:
     """Choose what the board does when the host falls silent: keep playing, idle pattern, or dark."""
-    from firmware_host.messages import Watchdog
+    from firmware_host.protocol.requests import Watchdog
 
     with open_board(port, baud, trace, replay) as board:
         board.watchdog(Watchdog[action.name], after_ms)
@@ -471,7 +412,7 @@ def monitor(
     import itertools
     import json
 
-    from firmware_host.messages import State
+    from firmware_host.protocol.requests import State
 
     with open_board(port, baud, trace, replay) as board, contextlib.suppress(KeyboardInterrupt):
         for n in itertools.count(1):
@@ -487,7 +428,7 @@ def monitor(
                 )
             if n == count:
                 return
-            board.link.transport.read(interval)
+            board.session.transport.read(interval)
 
 
 @app.command()
@@ -509,14 +450,14 @@ def verify(
     For example: [bold]evlcp board verify SYMBOLS.json --port /dev/ttyUSB0[/]
     """
     from firmware_host.errors import VerifyError
-    from firmware_host.messages import NO_BANK
+    from firmware_host.protocol.requests import NO_BANK
 
     payload = _payload(symbols, random, masks, seed, frames, pilot_every, profile)
     with open_board(port, baud, trace, replay) as board:
         s = board.status()
         again = "'evlcp board program' brings it there"
         if s.active_bank == NO_BANK:
-            raise VerifyError(f"{board.link.name}: nothing is programmed; {again}")
+            raise VerifyError(f"{board.session.name}: nothing is programmed; {again}")
         _check_codebook(board, payload, s)
         shape = (s.format, s.packets, s.frames, s.pilot_every, s.length)
         expected = (
@@ -525,7 +466,7 @@ def verify(
         )
         if shape != expected:
             raise VerifyError(
-                f"{board.link.name}: holds {s.packets} packets of {s.frames} frames, pilot in every"
+                f"{board.session.name}: holds {s.packets} packets of {s.frames} frames, pilot in every"
                 f" {s.pilot_every}, {s.length} bytes; expected {payload.packets} of {payload.frames},"
                 f" pilot in every {payload.pilot_every}, {len(payload.content)} bytes; {again}"
             )
@@ -533,7 +474,7 @@ def verify(
         differ = next((i for i, (a, b) in enumerate(zip(held, payload.content, strict=True)) if a != b), None)
         if differ is not None:
             raise VerifyError(
-                f"{board.link.name}: byte {differ} of bank {s.active_bank} is {held[differ]:#04x},"
+                f"{board.session.name}: byte {differ} of bank {s.active_bank} is {held[differ]:#04x},"
                 f" expected {payload.content[differ]:#04x}; {again}"
             )
     typer.echo(f"same: {len(held)} bytes in bank {s.active_bank}, CRC {payload.crc:08x}")
@@ -606,7 +547,7 @@ def emulate(
     import subprocess
 
     from evlcp_sdk.errors import ConfigError, InputError
-    from firmware_host.emulators import native_command, qemu_command, wait_for
+    from firmware_host.emulators.processes import native_command, qemu_command, wait_for
     from firmware_host.errors import ToolchainError
 
     scheme, _, place = listen.partition(":")
@@ -655,10 +596,10 @@ def leds(
     For example: [bold]evlcp board leds leds.bin --chips chips.npy[/]
     """
     from evlcp_sdk.errors import ConfigError, InputError
-    from firmware_host.commands.tx import save_array
-    from firmware_host.recording import Recording
+    from firmware_host.commands._output import save_array
+    from firmware_host.emulators.led_record import LedRecord
 
-    played = Recording.read(record).played()
+    played = LedRecord.read(record).played()
     try:
         table = played.chips(96 if per_led else 16)
     except ConfigError as fault:

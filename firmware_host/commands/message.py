@@ -9,9 +9,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from evlcp_sdk.config import Link
-    from evlcp_sdk.messages.block import Message
-    from evlcp_sdk.messages.coding import BlockCoder
+    from evlcp_sdk.air.blocks import Message
+    from evlcp_sdk.link.blocks import BlockCoder
+    from evlcp_sdk.link.resolve import Link
 
 __all__ = ["keygen", "message"]
 
@@ -73,9 +73,9 @@ def message(
     """
     import json
 
-    from evlcp_sdk.config import load_link
-    from evlcp_sdk.messages.sending import packets_of
-    from evlcp_sdk.registry import Registry
+    from evlcp_sdk.link.compose import packets_of
+    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.plugin.registry import Registry
 
     link = load_link(link_file, overrides or [], Registry.load())
     coder = link.block_coder()
@@ -90,7 +90,7 @@ def message(
     if out is not None:
         _write_text(out, json.dumps(table) + "\n")
     if chips is not None:
-        from firmware_host.commands.tx import save_array
+        from firmware_host.commands._output import save_array
 
         save_array(chips, _chips(symbols, link))
     programmed = None if port is None else _program(symbols, link, port, baud)
@@ -120,7 +120,7 @@ def message(
         )
     typer.echo(f"{summary['packets']} packets, {summary['duration_s']:.4g} s, again and again")
     if programmed is not None:
-        from firmware_host.commands.board import tell
+        from firmware_host.commands._line import tell
 
         tell(programmed, as_json=False)
 
@@ -132,7 +132,7 @@ def keygen(
 
     For example: [bold]evlcp tx keygen private.pem[/]
     """
-    from evlcp_sdk.messages.signing import make_key
+    from evlcp_sdk.air.signing import make_key
 
     typer.echo(make_key(private))
 
@@ -149,8 +149,8 @@ def _messages(
 ) -> "list[Message]":
     import time
 
+    from evlcp_sdk.air.blocks import Kind, Message
     from evlcp_sdk.errors import ConfigError
-    from evlcp_sdk.messages.block import Kind, Message
 
     if text is None and file is None and site is None:
         raise ConfigError("give what to send: --text TEXT, --file FILE or --beacon site.toml")
@@ -172,10 +172,10 @@ def _messages(
 def _beacon(
     path: Path, user: str, key: Path | None, transmitter_id: int | None, sequence: int, coder: "BlockCoder"
 ) -> "list[Message]":
+    from evlcp_sdk.air.blocks import Kind, Message
     from evlcp_sdk.errors import ConfigError
-    from evlcp_sdk.messages.block import Kind, Message
-    from evlcp_sdk.messages.sending import beacon_of_site
-    from evlcp_sdk.sites import load_sites
+    from evlcp_sdk.link.compose import beacon_of_site
+    from evlcp_sdk.scene.sites import load_sites
 
     sites = load_sites(path)
     ids = ", ".join(str(s.transmitter_id) for s in sites)
@@ -188,7 +188,7 @@ def _beacon(
     beacon = Message(Kind.BEACON, chosen[0].transmitter_id, sequence, payload)
     if key is None:
         return [beacon]
-    from evlcp_sdk.messages.signing import read_key, sign
+    from evlcp_sdk.air.signing import read_key, sign
 
     return [beacon, sign(beacon, coder.digest, read_key(key))]
 
@@ -226,20 +226,20 @@ def _write_text(path: Path, text: str) -> None:
 def _chips(symbols: "NDArray[np.int64]", link: "Link") -> "NDArray[np.uint8]":
     import numpy as np
 
-    from evlcp_sdk.frames import packet_chips
+    from evlcp_sdk.air.frames import packet_chips
 
     return np.concatenate([packet_chips(p, link.codebook, link.air.pilot_every) for p in symbols])
 
 
 def _program(symbols: "NDArray[np.int64]", link: "Link", port: str, baud: int) -> Any:
     from evlcp_sdk.errors import ConfigError
-    from firmware_host.board import Settings, provision
-    from firmware_host.commands.board import open_board, progress_bar
-    from firmware_host.payload import Payload
+    from firmware_host.board.bank import Bank
+    from firmware_host.board.board import Settings, provision
+    from firmware_host.commands._line import open_board, progress_bar
 
     if link.air.chip_rate_hz != round(link.air.chip_rate_hz):
         raise ConfigError(f"air.chip_rate_hz = {link.air.chip_rate_hz}: a board takes whole chips a second")
-    payload = Payload.of_symbols(symbols, link.codebook, link.packet.pilot_every)
+    payload = Bank.of_symbols(symbols, link.codebook, link.packet.pilot_every)
     settings = Settings(round(link.air.chip_rate_hz))
     with open_board(port, baud, None, None) as board, progress_bar("programming") as progress:
         return provision(board, payload, settings, True, progress)

@@ -7,15 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from firmware_host.commands import _source
+from firmware_host.commands._output import save_array
+from firmware_host.commands._source import Frames, PilotEvery, ProfileName, RandomPackets, Seed, SymbolsFile
 from firmware_host.commands.message import keygen, message
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from evlcp_sdk.codebook import Codebook
+    from evlcp_sdk.air.codebook import Codebook
 
-__all__ = ["app", "save_array"]
+__all__ = ["app"]
 
 app = typer.Typer(
     no_args_is_help=True, rich_markup_mode="rich", help="Make, show and check what goes on air."
@@ -31,21 +33,6 @@ class Form(StrEnum):
     HEX = "hex"
     C = "c"
     JSON = "json"
-
-
-SymbolsFile = Annotated[
-    Path | None, typer.Argument(metavar="SYMBOLS.json", help="Symbols \\[packet]\\[frame]\\[cluster].")
-]
-RandomPackets = Annotated[
-    int | None, typer.Option("--random", metavar="N", help="N packets of random symbols.")
-]
-Seed = Annotated[int, typer.Option(help="Seed of --random.", min=0)]
-Frames = Annotated[int, typer.Option(help="Frames per packet of --random and --masks.")]
-PilotEvery = Annotated[
-    int,
-    typer.Option(min=1, max=64, metavar="N", help="Frames from one pilot to the next, as the receiver's."),
-]
-ProfileName = Annotated[str, typer.Option("--profile", help="Info-segment profile: wh4x2, wh8, raw8.")]
 
 
 @app.command()
@@ -71,31 +58,14 @@ def frames(
     book = _source.codebook(profile)
     table = _source.symbols(symbols, random, seed, frames, pilot_every, book)
     if chips is not None:
-        from firmware_host.payload import symbol_chips
+        from firmware_host.board.bank import symbol_chips
 
         save_array(chips, symbol_chips(table, book, pilot_every))
     typer.echo(_FORMS[form](table, book, pilot_every))
 
 
-def save_array(path: Path, array: "NDArray[np.generic]") -> None:
-    """Write an array as `.npy` under exactly this name.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
-    import numpy as np
-
-    from evlcp_sdk.errors import InputError
-
-    try:
-        with path.open("wb") as file:
-            np.save(file, array)
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be written: {fault.strerror}") from fault
-
-
 def _table(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
-    from firmware_host.payload import word_table
+    from firmware_host.board.bank import word_table
 
     lines = ["packet frame cluster symbol pilot info"]
     for p, packet in enumerate(word_table(symbols, book)):
@@ -107,7 +77,7 @@ def _table(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> 
 
 
 def _hex(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
-    from firmware_host.payload import word_table
+    from firmware_host.board.bank import word_table
 
     words = word_table(symbols, book)
     return "\n".join(
@@ -118,7 +88,7 @@ def _hex(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> st
 
 
 def _c(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
-    from firmware_host.payload import word_table
+    from firmware_host.board.bank import word_table
 
     info = word_table(symbols, book)[..., 1]
     packets, frames, clusters = info.shape
@@ -138,7 +108,7 @@ def _c(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
 def _json(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
     import json
 
-    from firmware_host.payload import word_table
+    from firmware_host.board.bank import word_table
 
     words = word_table(symbols, book)
     return json.dumps(
@@ -173,8 +143,8 @@ def check(
 
     For example: [bold]evlcp tx check --random 100[/]
     """
+    from firmware_host.board.bank import symbol_chips
     from firmware_host.flicker import check as measure
-    from firmware_host.payload import symbol_chips
 
     book = _source.codebook(profile)
     table = symbol_chips(_source.symbols(symbols, random, seed, frames, pilot_every, book), book, pilot_every)

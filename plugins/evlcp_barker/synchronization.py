@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from evlcp_sdk.abc import Synchronization
-from evlcp_sdk.codebook import Codebook, chips_of_values
-from evlcp_sdk.frames import PacketFormat
-from evlcp_sdk.types import SyncLock
+from evlcp_sdk.air.codebook import Codebook, chips_of_values
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.plugin.roles import Synchronization
+from evlcp_sdk.values import SyncLock
 
 __all__ = ["BarkerSync"]
 

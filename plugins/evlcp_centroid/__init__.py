@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from evlcp_sdk.hookspecs import Algorithm, hookimpl
+from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 
 __all__ = ["evlcp_algorithms"]
 

@@ -6,10 +6,11 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from evlcp_sdk.abc import Measure, Ranging
-from evlcp_sdk.codebook import Codebook
-from evlcp_sdk.geometry import BarLayout, CameraModel
-from evlcp_sdk.types import FrameView, Range
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.plugin.roles import Measure, Ranging
+from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.values import FrameView, Range
 
 __all__ = ["CentroidRanging"]
 

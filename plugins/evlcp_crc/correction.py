@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.abc import Code, Corrected, ErrorCorrection
-from evlcp_sdk.crc import CRC_BITS, crc24
+from evlcp_sdk.air.crc import CRC_BITS, crc24
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.plugin.roles import Code, Corrected, ErrorCorrection
 
 __all__ = ["NoCorrection"]
 

@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from evlcp_sdk.abc import Measure, Ranging
-from evlcp_sdk.codebook import Codebook
+from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.geometry import BarLayout, CameraModel
-from evlcp_sdk.types import FrameView, PresenceMap, Range
+from evlcp_sdk.plugin.roles import Measure, Ranging
+from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.values import FrameView, PresenceMap, Range
 
 __all__ = ["JointScaleRanging"]
 

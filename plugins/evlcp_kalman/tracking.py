@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from evlcp_sdk.abc import Filter, Tracker, Tracking
+from evlcp_sdk.plugin.roles import Filter, Tracker, Tracking
 
 __all__ = ["KalmanTracking", "NoTracking"]
 

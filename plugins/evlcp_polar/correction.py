@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_polar.sequence import RELIABILITY
-from evlcp_sdk.abc import Code, Corrected, ErrorCorrection
-from evlcp_sdk.crc import CRC24C, CRC_BITS, crc24
+from evlcp_sdk.air.crc import CRC24C, CRC_BITS, crc24
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.plugin.roles import Code, Corrected, ErrorCorrection
 
 __all__ = ["Polar", "information_set", "sent_bits"]
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.abc import Modulation
-from evlcp_sdk.codebook import hadamard
+from evlcp_sdk.air.codebook import hadamard
+from evlcp_sdk.plugin.roles import Modulation
 
 __all__ = ["Raw8", "Wh4x2", "Wh8"]
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from evlcp_sdk.abc import Decode, Decoding
-from evlcp_sdk.codebook import Codebook
-from evlcp_sdk.types import PresenceMap, SoftSymbols
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.plugin.roles import Decode, Decoding
+from evlcp_sdk.values import PresenceMap, SoftSymbols
 from evlcp_wh.ml_soft import (
     IndependentPixels,
     MaxEvents,

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.abc import Pilots
-from evlcp_sdk.codebook import BARKER13, hadamard
+from evlcp_sdk.air.codebook import BARKER13, hadamard
+from evlcp_sdk.plugin.roles import Pilots
 
 __all__ = ["WhPilots"]
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from evlcp_sdk.abc import Separate, Separation
-from evlcp_sdk.codebook import Codebook
-from evlcp_sdk.types import PresenceMap
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.plugin.roles import Separate, Separation
+from evlcp_sdk.values import PresenceMap
 
 __all__ = ["ErrorShare", "MinValues", "WhCorrelation"]
 

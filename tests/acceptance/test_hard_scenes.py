@@ -5,12 +5,12 @@ from functools import cache
 
 import pytest
 
-from evlcp_sdk.campaign.measure import statistics_of
-from evlcp_sdk.campaign.statistics import Tally
-from evlcp_sdk.config import load_link
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.sim import load_scene, simulate, truth
-from evlcp_sdk.types import Events
+from evlcp_sdk.sim import load_scene, simulate, truth_of
+from evlcp_sdk.study.measure import statistics_of
+from evlcp_sdk.study.tally import Tally
+from evlcp_sdk.values import Events
 from tests.conftest import ROOT
 
 SCENES = ROOT / "examples" / "scenes"
@@ -21,7 +21,7 @@ BEST = ("decoding.id=motion-feedback", "ranging.id=joint-scale", "tracking.id=ka
 @cache
 def rendered(scene: str, seed: int, settings: tuple[str, ...]) -> tuple[Events, dict[str, object]]:
     cut = load_scene(scene if scene.startswith("drive") else SCENES / f"{scene}.toml", settings)
-    return Events.concat(simulate(cut, seed=seed)), truth(cut, seed=seed)
+    return Events.concat(simulate(cut, seed=seed)), truth_of(cut, seed=seed).to_table()
 
 
 def received(scene: str, seeds: Iterable[int], settings: tuple[str, ...], link: tuple[str, ...]) -> Tally:

@@ -6,12 +6,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_host.board import Board
-from firmware_host.client import Timing
-from firmware_host.link import Link
-from firmware_host.payload import symbol_chips
-from firmware_host.recording import Recording
-from firmware_host.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.board.bank import symbol_chips
+from firmware_host.board.board import Board
+from firmware_host.board.session import Session
+from firmware_host.emulators.led_record import LedRecord
+from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.protocol.client import Timing
 
 PACKET = 346
 
@@ -88,11 +88,11 @@ class NoisyLine(SimulatedLine):
 
 def board_on(line: SimulatedLine, nonce: int | None = None) -> Board:
     """A session; with a nonce of one's own its bytes are the same each time."""
-    return Board(Link(line, Timing(latency_s=0.02), first=nonce, nonce=nonce))
+    return Board(Session(line, Timing(latency_s=0.02), first=nonce, nonce=nonce))
 
 
 def packet_sequence(
-    played: Recording, payloads: dict[str, NDArray[np.int64]], book: object
+    played: LedRecord, payloads: dict[str, NDArray[np.int64]], book: object
 ) -> list[tuple[str, int]]:
     """Name and packet number of every whole packet that was played; fails on one that is none of them."""
     known = {}

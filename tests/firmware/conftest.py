@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 import pytest
 
-from evlcp_sdk.codebook import Codebook
-from firmware_host.generate import codebook_of
+from evlcp_sdk.air.codebook import Codebook
+from firmware_host.protocol.generate import codebook_of
 
 INSTALL = "sh firmware_host/firmware/install-toolchain.sh installs it (as root)"
 

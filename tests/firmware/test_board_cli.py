@@ -19,13 +19,13 @@ import numpy as np
 import pytest
 from board_lines import check_order, packet_sequence
 
-from evlcp_sdk.codebook import Codebook
-from firmware_host.board import Board
-from firmware_host.emulators import native_command, wait_for
-from firmware_host.errors import LinkError
-from firmware_host.link import Link
-from firmware_host.payload import Payload, random_symbols
-from firmware_host.recording import RECORD, Recording
+from evlcp_sdk.air.codebook import Codebook
+from firmware_host.board.bank import Bank, random_symbols
+from firmware_host.board.board import Board
+from firmware_host.board.session import Session
+from firmware_host.emulators.led_record import RECORD, LedRecord
+from firmware_host.emulators.processes import native_command, wait_for
+from firmware_host.errors import LineError
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -157,8 +157,8 @@ def test_wrong_records_are_told(cli, tmp_path: Path) -> None:
 def test_ticks_unwrap() -> None:
     records = np.zeros(4, RECORD)
     records["tick"] = (2**32 - 2500, 0, 2500, 5000)
-    assert Recording.of_records(records).ticks.tolist() == [2**32 + n for n in (-2500, 0, 2500, 5000)]
-    assert len(Recording.of_records(records[:0])) == 0
+    assert LedRecord.of_records(records).ticks.tolist() == [2**32 + n for n in (-2500, 0, 2500, 5000)]
+    assert len(LedRecord.of_records(records[:0])) == 0
 
 
 def test_trace_and_replay(cli, tmp_path: Path) -> None:
@@ -254,8 +254,8 @@ def test_pty_and_tcp(cli, tmp_path: Path) -> None:
 
 
 def test_ports_are_asked(native: str, tmp_path: Path) -> None:
+    from firmware_host.board.survey import find, survey
     from firmware_host.errors import NoBoardError
-    from firmware_host.ports import find, survey
 
     silent, other = pty.openpty()
     tty.setraw(other)
@@ -289,7 +289,7 @@ def test_host_processes_killed(native: str, tmp_path: Path, book: Codebook, cli)
     last = cli("board", "program", "--random", 2, "--seed", 0, "--port", native)
     assert last.returncode == 0, last.stderr
     cli("board", "stop", "--port", native)
-    played = Recording.read(tmp_path / "leds.bin").played()
+    played = LedRecord.read(tmp_path / "leds.bin").played()
     assert (np.diff(played.ticks) == 1000).all()
     sequence = packet_sequence(played, payloads, book)
     assert check_order(sequence, {n: len(s) for n, s in payloads.items()})[0] == "0"
@@ -360,7 +360,7 @@ def test_an_emulator_leaves_a_users_file_alone(cli, tmp_path: Path, option: str)
 def test_a_flash_file_is_replaced_whole(tmp_path: Path, book: Codebook) -> None:
     flash, place = tmp_path / "flash.bin", f"unix:{tmp_path / 'board'}"
     command = native_command(place, flash=flash)
-    payload = Payload.of_symbols(random_symbols(1, 10, book, np.random.default_rng(0)), book)
+    payload = Bank.of_symbols(random_symbols(1, 10, book, np.random.default_rng(0)), book)
 
     @contextlib.contextmanager
     def started() -> "Iterator[tuple[subprocess.Popen[bytes], Board]]":
@@ -368,8 +368,8 @@ def test_a_flash_file_is_replaced_whole(tmp_path: Path, book: Codebook) -> None:
         try:
             line = wait_for(place, process)
             assert line is not None
-            with Link(line) as link:
-                yield process, Board(link)
+            with Session(line) as session:
+                yield process, Board(session)
         finally:
             process.terminate()
             process.wait(10)
@@ -386,7 +386,7 @@ def test_a_flash_file_is_replaced_whole(tmp_path: Path, book: Codebook) -> None:
         saved = flash.read_bytes()
         # The system ends the board in the middle of the next write.
         resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (40_000, 40_000))
-        with pytest.raises(LinkError):
+        with pytest.raises(LineError):
             board.save()
         assert process.wait(10) == -signal.SIGXFSZ
     assert flash.read_bytes() == saved

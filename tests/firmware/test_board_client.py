@@ -4,9 +4,9 @@ from itertools import pairwise
 
 import pytest
 
-from firmware_host.client import TRIES, Client, Timing
-from firmware_host.datagram import Datagram, Decoder
-from firmware_host.messages import (
+from firmware_host.protocol.client import TRIES, Client, Timing
+from firmware_host.protocol.datagram import Datagram, DatagramDecoder
+from firmware_host.protocol.requests import (
     MAX_PAYLOAD,
     CrcReply,
     CrcRequest,
@@ -23,7 +23,7 @@ def reply(request: Datagram, payload: bytes = b"", status: int = 0) -> bytes:
 
 
 def sent(wire: bytes) -> list[Datagram]:
-    return Decoder().feed(wire)
+    return DatagramDecoder().feed(wire)
 
 
 def test_window_bounds_what_is_under_way() -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_host.fleet import read_inventory
+from firmware_host.board.fleet import read_inventory
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -40,7 +40,7 @@ def test_every_command_is_told() -> None:
 
 
 def test_every_key_of_an_inventory_is_told() -> None:
-    from firmware_host.fleet import Entry
+    from firmware_host.board.fleet import Entry
 
     section = PAGE.split("## Many boards")[1].split("## Emulated")[0]
     assert [k for k in Entry.model_fields if k not in section] == []

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from evlcp_sdk.errors import InputError
-from firmware_host.emulators import native_command
-from firmware_host.fleet import read_inventory
+from firmware_host.board.fleet import read_inventory
+from firmware_host.emulators.processes import native_command
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

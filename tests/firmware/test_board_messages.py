@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from test_board_cli import Emulated
 
-from evlcp_sdk.codebook import chips_of_values
-from evlcp_sdk.config import Link, load_link
-from evlcp_sdk.frames import bits_of_symbols
-from evlcp_sdk.messages.beacon import Beacon
-from evlcp_sdk.messages.block import Block, Kind, Message
-from evlcp_sdk.messages.signing import TrustedKeys
+from evlcp_sdk.air.beacons import Beacon
+from evlcp_sdk.air.blocks import Block, Kind, Message
+from evlcp_sdk.air.codebook import chips_of_values
+from evlcp_sdk.air.frames import bits_of_symbols
+from evlcp_sdk.air.signing import TrustedKeys
+from evlcp_sdk.link.resolve import Link, load_link
 
 SITE = """
 [[bar]]

@@ -11,27 +11,28 @@ from cobs import cobs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_host import generate, messages
-from firmware_host.datagram import MAX_WIRE_BYTES, Datagram, Decoder
 from firmware_host.errors import DatagramError
-from firmware_host.vectors import read_vectors
-from firmware_host.wire import Payload
+from firmware_host.protocol import generate
+from firmware_host.protocol import requests as messages
+from firmware_host.protocol.datagram import MAX_WIRE_BYTES, Datagram, DatagramDecoder
+from firmware_host.protocol.vectors import read_vectors
+from firmware_host.protocol.wire import WireMessage
 
 VECTORS = list(read_vectors())
 PAYLOADS = [
     value
     for name, value in vars(messages).items()
-    if isinstance(value, type) and issubclass(value, Payload) and value is not Payload
+    if isinstance(value, type) and issubclass(value, WireMessage) and value is not WireMessage
 ]
 
 
 def definition() -> dict:
-    return tomllib.loads((generate.HERE / "protocol.toml").read_text())
+    return tomllib.loads((generate.HERE / "protocol" / "protocol.toml").read_text())
 
 
 def test_generated_files_are_fresh() -> None:
     stale = [p.name for p, text in generate.generated_files().items() if p.read_text() != text]
-    assert not stale, "run python -m firmware_host.generate"
+    assert not stale, "run python -m firmware_host.protocol.generate"
 
 
 def test_generator_names_a_stale_file(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
@@ -68,7 +69,7 @@ def test_golden_vector(vector) -> None:
     body = head + d.payload
     assert vector.wire == cobs.encode(body + zlib.crc32(body).to_bytes(4, "little")) + b"\0"
     assert d.encode() == vector.wire
-    assert Decoder().feed(vector.wire) == [d]
+    assert DatagramDecoder().feed(vector.wire) == [d]
 
 
 def test_golden_vectors_carry_real_messages() -> None:
@@ -93,7 +94,7 @@ def test_c_header_has_the_same_sizes() -> None:
 
 
 @st.composite
-def payloads(draw: st.DrawFn) -> Payload:
+def payloads(draw: st.DrawFn) -> WireMessage:
     cls = draw(st.sampled_from(PAYLOADS))
     values = []
     for code, count in cls.LAYOUT:
@@ -110,12 +111,12 @@ def payloads(draw: st.DrawFn) -> Payload:
 
 
 @given(payloads())
-def test_message_round_trip(message: Payload) -> None:
+def test_message_round_trip(message: WireMessage) -> None:
     assert type(message).unpack(message.pack()) == message
 
 
 @given(payloads(), st.integers(1, 3))
-def test_message_of_another_length_is_refused(message: Payload, cut: int) -> None:
+def test_message_of_another_length_is_refused(message: WireMessage, cut: int) -> None:
     data = message.pack()
     cls = type(message)
     if len(data) >= cut and data[:-cut] and len(data) - cut < cls.fixed_bytes():
@@ -145,10 +146,10 @@ def test_values_that_do_not_fit_are_refused() -> None:
 def test_decoder_does_not_care_about_portions(bodies: list[bytes], cuts: list[int], noise: bytes) -> None:
     sent = [Datagram(12, 0, i, 7, body[:512]) for i, body in enumerate(bodies)]
     wire = noise + b"\0" + b"".join(d.encode() for d in sent)
-    whole = Decoder()
+    whole = DatagramDecoder()
     expected = whole.feed(wire)
     assert [d for d in expected if d.session == 7][-len(sent) :] == sent
-    parts = Decoder()
+    parts = DatagramDecoder()
     found = []
     edges = sorted({0, len(wire), *(c for c in cuts if c < len(wire))})
     for a, b in pairwise(edges):
@@ -162,11 +163,11 @@ def test_a_flipped_byte_is_never_accepted_as_the_same(body: bytes, data: st.Data
     wire = bytearray(Datagram(4, 0, 1, 2, body).encode())
     at = data.draw(st.integers(0, len(wire) - 2))
     wire[at] ^= data.draw(st.integers(1, 255))
-    assert not Decoder().feed(bytes(wire))
+    assert not DatagramDecoder().feed(bytes(wire))
 
 
 def test_endless_line_does_not_fill_memory() -> None:
-    decoder = Decoder()
+    decoder = DatagramDecoder()
     for _ in range(100):
         assert decoder.feed(b"\x55" * 1000) == []
     assert decoder.counts.too_long == 1

@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evlcp_sdk.codebook import Codebook
-from evlcp_sdk.frames import packet_chips
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import packet_chips
 from firmware_host import build
-from firmware_host.board import Board, Settings, provision
-from firmware_host.emulators import start_qemu
+from firmware_host.board.bank import Bank, random_symbols
+from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.session import Session
+from firmware_host.emulators.led_record import LedRecord
+from firmware_host.emulators.processes import start_qemu
 from firmware_host.errors import RefusedError
-from firmware_host.link import Link
-from firmware_host.messages import Fault, State, StatusReply, StatusRequest
-from firmware_host.payload import Payload, random_symbols
-from firmware_host.recording import Recording
-from firmware_host.transport import SocketTransport
+from firmware_host.ports.transport import SocketTransport
+from firmware_host.protocol.requests import BoardFault, State, StatusReply, StatusRequest
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -34,10 +34,10 @@ def _tools(needs) -> None:
     needs("qemu-system-arm", "arm-none-eabi-gcc")
 
 
-def play(leds: Path, payload: Payload, chips: int) -> tuple[int, StatusReply]:
+def play(leds: Path, payload: Bank, chips: int) -> tuple[int, StatusReply]:
     """Play in QEMU while the host asks without pause; returns how often it asked, and the last status."""
-    with Link(start_qemu(leds)) as link:
-        board = Board(link)
+    with Session(start_qemu(leds)) as session:
+        board = Board(session)
         provision(board, payload, Settings())
         asked = 0
         last = board.status()
@@ -49,9 +49,9 @@ def play(leds: Path, payload: Payload, chips: int) -> tuple[int, StatusReply]:
         def handle(request: object, outcome: object) -> None:
             nonlocal asked, last
             asked += 1
-            last = link.checked(request, outcome)  # type: ignore[arg-type,assignment]
+            last = session.checked(request, outcome)  # type: ignore[arg-type,assignment]
 
-        link.run(requests(), handle)
+        session.run(requests(), handle)
         # ended while it plays, QEMU would cut the record off anywhere
         board.stop()
         board.wait_dark()
@@ -66,10 +66,10 @@ def test_chips_are_exact_while_the_host_asks_without_pause(cli, tmp_path: Path, 
     hashes = set()
     for n in range(5):
         leds = tmp_path / f"leds{n}.bin"
-        asked, status = play(leds, Payload.of_symbols(symbols, book), CHIPS)
-        recording = Recording.read(leds)
-        assert recording.cut_bytes == 0
-        played = recording.played()
+        asked, status = play(leds, Bank.of_symbols(symbols, book), CHIPS)
+        record = LedRecord.read(leds)
+        assert record.cut_bytes == 0
+        played = record.played()
         assert len(played) >= CHIPS
         chips, ticks = played.chips()[:CHIPS], played.ticks[:CHIPS]
         assert (played.numbers[:CHIPS] == np.arange(CHIPS)).all()
@@ -86,7 +86,7 @@ def test_chips_are_exact_while_the_host_asks_without_pause(cli, tmp_path: Path, 
 def test_recorded_stream_is_the_air_vectors(cli, tmp_path: Path, book: Codebook) -> None:
     example = json.loads(VECTORS.read_text())["example_packet"]
     leds = tmp_path / "leds.bin"
-    play(leds, Payload.of_symbols([example["symbols"]], book), 200)
+    play(leds, Bank.of_symbols([example["symbols"]], book), 200)
     out = tmp_path / "chips.npy"
     assert cli("board", "leds", leds, "--chips", out).returncode == 0
     chips, ticks = np.load(out), np.load(tmp_path / "chips.ticks.npy")
@@ -102,8 +102,8 @@ def test_recorded_stream_is_the_air_vectors(cli, tmp_path: Path, book: Codebook)
 def test_pilots_in_some_frames_only_in_qemu(tmp_path: Path, book: Codebook) -> None:
     symbols = random_symbols(3, 20, book, np.random.default_rng(8))
     leds = tmp_path / "leds.bin"
-    play(leds, Payload.of_symbols(symbols, book, 4), 3000)
-    chips = Recording.read(leds).played().chips()
+    play(leds, Bank.of_symbols(symbols, book, 4), 3000)
+    chips = LedRecord.read(leds).played().chips()
     expected = np.concatenate([packet_chips(packet, book, 4) for packet in symbols])
     assert len(expected) == 3 * 426
     assert len(chips) >= 3000
@@ -115,17 +115,17 @@ def test_swap_in_qemu_is_hitless(tmp_path: Path, book: Codebook) -> None:
 
     payloads = {f"p{n}": random_symbols(2, 10, book, np.random.default_rng(n)) for n in range(20)}
     leds = tmp_path / "leds.bin"
-    with Link(start_qemu(leds)) as link:
-        board = Board(link)
+    with Session(start_qemu(leds)) as session:
+        board = Board(session)
         for symbols in payloads.values():
-            provision(board, Payload.of_symbols(symbols, book), Settings())
+            provision(board, Bank.of_symbols(symbols, book), Settings())
             until = board.status().packets_sent + 2
             while board.status().packets_sent < until:
                 pass
         board.stop()
         board.wait_dark()
         assert board.status().state == State.DARK
-    played = Recording.read(leds).played()
+    played = LedRecord.read(leds).played()
     assert (np.diff(played.ticks) == 2500).all()
     sequence = packet_sequence(played, payloads, book)
     assert check_order(sequence, dict.fromkeys(payloads, 2)) == list(payloads)
@@ -133,9 +133,9 @@ def test_swap_in_qemu_is_hitless(tmp_path: Path, book: Codebook) -> None:
 
 def test_led_test_and_save_in_qemu(tmp_path: Path, book: Codebook) -> None:
     leds = tmp_path / "leds.bin"
-    with Link(start_qemu(leds)) as link:
-        board = Board(link)
-        payload = Payload.of_symbols(random_symbols(2, 10, book, np.random.default_rng(0)), book)
+    with Session(start_qemu(leds)) as session:
+        board = Board(session)
+        payload = Bank.of_symbols(random_symbols(2, 10, book, np.random.default_rng(0)), book)
         with pytest.raises(RefusedError, match="nearest the board can take is 8000"):
             board.program(payload, 7777)
         provision(board, payload, Settings(start=False))
@@ -144,11 +144,11 @@ def test_led_test_and_save_in_qemu(tmp_path: Path, book: Codebook) -> None:
             board.save()
         board.wait_dark()
         assert board.save().save_sequence == 1
-        other = Payload.of_symbols(random_symbols(2, 10, book, np.random.default_rng(1)), book)
+        other = Bank.of_symbols(random_symbols(2, 10, book, np.random.default_rng(1)), book)
         provision(board, other, Settings(start=False))
         assert board.recall().slot == 0
         assert board.holds(payload, 10_000, board.status())
-    rows = Recording.read(leds).rows
+    rows = LedRecord.read(leds).rows
     assert (np.unpackbits(rows[rows.any(1)], axis=1) == np.eye(96, dtype=np.uint8)).all()
 
 
@@ -207,7 +207,7 @@ class Netduino:
 def test_stm32f405_register_writes(tmp_path: Path, book: Codebook) -> None:
     netduino = Netduino(tmp_path)
     try:
-        board = Board(Link(netduino.line))
+        board = Board(Session(netduino.line))
         assert board.about.hal.rstrip(b"\0") == b"stm32f405"
         assert board.about.tick_hz == 14_000_000
         boot = netduino.writes()
@@ -238,14 +238,14 @@ def test_stm32f405_register_writes(tmp_path: Path, book: Codebook) -> None:
         with pytest.raises(RefusedError, match="nearest value the board can take is 60"):
             board.level(61)
 
-        payload = Payload.of_symbols(random_symbols(2, 10, book, np.random.default_rng(0)), book)
+        payload = Bank.of_symbols(random_symbols(2, 10, book, np.random.default_rng(0)), book)
         before = len(netduino.writes())
         provision(board, payload, Settings())
         # QEMU has no TIM1: no chip comes, and the board notices
         end = time.monotonic() + 10.0
         while (status := board.status()).state == State.PLAYING:
             assert time.monotonic() < end
-        assert (status.state, status.faults) == (State.FAULT, Fault.CHIP_LOST)
+        assert (status.state, status.faults) == (State.FAULT, BoardFault.CHIP_LOST)
         run = netduino.writes()[before:]
         ends = next(i for i, w in enumerate(run) if w[1:] == (0x18, 1) and w[0] == "GPIOB")
         run, fault = run[:ends], run[ends:]

@@ -7,14 +7,14 @@ import pytest
 from numpy.typing import NDArray
 from stm32_model import RESET_BY_IWDG, RESET_BY_PIN, US, Dma, ModelLine, Shown, Stm32
 
-from evlcp_sdk.codebook import Codebook
+from evlcp_sdk.air.codebook import Codebook
 from firmware_host import build
-from firmware_host.board import Board, Settings, provision
-from firmware_host.client import Timing
+from firmware_host.board.bank import Bank, random_symbols, symbol_chips
+from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.session import Session
 from firmware_host.errors import RefusedError
-from firmware_host.link import Link
-from firmware_host.messages import Fault, State
-from firmware_host.payload import Payload, random_symbols, symbol_chips
+from firmware_host.protocol.client import Timing
+from firmware_host.protocol.requests import BoardFault, State
 
 CHIP = 100 * US
 BOOT_US = 15_000
@@ -28,11 +28,11 @@ class Bar:
         self.chip.run(BOOT_US)
         self.board = self.connect()
         symbols = random_symbols(1, 4, book, np.random.default_rng(seed))
-        provision(self.board, Payload.of_symbols(symbols, book), Settings(start=False))
+        provision(self.board, Bank.of_symbols(symbols, book), Settings(start=False))
         self.chips = symbol_chips(symbols, book)
 
     def connect(self) -> Board:
-        return Board(Link(ModelLine(self.chip), Timing(latency_s=0.02)))
+        return Board(Session(ModelLine(self.chip), Timing(latency_s=0.02)))
 
     def expected(self, count: int) -> NDArray[np.uint8]:
         """Rows from the first lit chip on, (count, 96)."""
@@ -105,18 +105,18 @@ def stop_interrupt(chip: Stm32) -> None:
     chip.enabled.discard(16 + Dma.IRQ)
 
 
-BREAKS: dict[str, tuple[Callable[[Stm32], None], Fault, float]] = {
-    "tim1": (lambda chip: chip.tim1.stop_for_good(), Fault.CHIP_LOST, 1.6),
-    "stream-stands": (stop_stream, Fault.CHIP_LOST, 1.6),
-    "stream-ends": (end_stream, Fault.CHIP_LOST, 1.6),
-    "transfer-error": (lambda chip: chip.dma.error(Dma.TRANSFER_ERROR), Fault.CHIP_LOST, 0.1),
-    "direct-mode-error": (lambda chip: chip.dma.error(Dma.DIRECT_ERROR), Fault.CHIP_LOST, 0.1),
-    "fifo-error": (lambda chip: chip.dma.error(Dma.FIFO_ERROR), Fault.CHIP_LOST, 0.1),
-    "interrupt": (stop_interrupt, Fault.CHIP_LOST, 1.6),
-    "crystal": (lambda chip: chip.stop_crystal(), Fault.CLOCK, 0.1),
-    "supply": (lambda chip: chip.pending.add(16 + 1), Fault.CHIP_LOST, 0.1),
-    "spi": (stop_spi, Fault.CHIP_LOST, 1.7),
-    "latch-timer": (lambda chip: chip.tim3.stop_for_good(), Fault.CHIP_LOST, 1.7),
+BREAKS: dict[str, tuple[Callable[[Stm32], None], BoardFault, float]] = {
+    "tim1": (lambda chip: chip.tim1.stop_for_good(), BoardFault.CHIP_LOST, 1.6),
+    "stream-stands": (stop_stream, BoardFault.CHIP_LOST, 1.6),
+    "stream-ends": (end_stream, BoardFault.CHIP_LOST, 1.6),
+    "transfer-error": (lambda chip: chip.dma.error(Dma.TRANSFER_ERROR), BoardFault.CHIP_LOST, 0.1),
+    "direct-mode-error": (lambda chip: chip.dma.error(Dma.DIRECT_ERROR), BoardFault.CHIP_LOST, 0.1),
+    "fifo-error": (lambda chip: chip.dma.error(Dma.FIFO_ERROR), BoardFault.CHIP_LOST, 0.1),
+    "interrupt": (stop_interrupt, BoardFault.CHIP_LOST, 1.6),
+    "crystal": (lambda chip: chip.stop_crystal(), BoardFault.CLOCK, 0.1),
+    "supply": (lambda chip: chip.pending.add(16 + 1), BoardFault.CHIP_LOST, 0.1),
+    "spi": (stop_spi, BoardFault.CHIP_LOST, 1.7),
+    "latch-timer": (lambda chip: chip.tim3.stop_for_good(), BoardFault.CHIP_LOST, 1.7),
 }
 
 
@@ -183,7 +183,7 @@ def test_no_crystal_then_no_chip(bar: Bar) -> None:
     bar.chip.stop_crystal()
     bar.chip.run(1_000)
     status = bar.board.status()  # at 16 MHz the line rate is kept
-    assert (status.state, status.faults) == (State.FAULT, Fault.CLOCK)
+    assert (status.state, status.faults) == (State.FAULT, BoardFault.CLOCK)
     with pytest.raises(RefusedError, match="HARDWARE_FAULT"):
         bar.board.start()
     before = bar.board.status().uptime_ms
@@ -216,7 +216,7 @@ def test_save_outlives_the_watchdog_and_autostart_waits_for_start_after_its_rese
     assert bar.chip.resets == [RESET_BY_PIN, RESET_BY_PIN, RESET_BY_IWDG]
     assert bar.dark
     board = bar.connect()
-    assert board.status().faults == Fault.CHIP_LOST
+    assert board.status().faults == BoardFault.CHIP_LOST
     board.start()
     bar.chip.run(5_000)
     assert not bar.dark
@@ -253,5 +253,5 @@ def test_a_core_that_stops_is_reset_and_stays_dark(bar: Bar, what: str) -> None:
     bar.chip.hse_works, bar.chip.core_stands = True, False
     bar.chip.run(BOOT_US)
     status = bar.connect().status()
-    assert (status.state, status.faults) == (State.FAULT, Fault.CHIP_LOST)
+    assert (status.state, status.faults) == (State.FAULT, BoardFault.CHIP_LOST)
     assert bar.dark

@@ -6,18 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evlcp_sdk.codebook import Codebook
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.frames import packet_chips
 from firmware_host import flicker
-from firmware_host.payload import (
-    Payload,
-    chips_of_rows,
+from firmware_host.board.bank import (
+    Bank,
     random_symbols,
     read_masks,
-    rows_of_chips,
     symbol_chips,
 )
+from firmware_host.protocol.rows import chips_of_rows, rows_of_chips
 
 AIR = json.loads((Path(__file__).parents[1] / "vectors" / "air-vectors.json").read_text())
 EXAMPLE = AIR["example_packet"]
@@ -70,8 +69,8 @@ def test_random_is_a_seed(cli, profile: str, tmp_path: Path) -> None:
 
 def test_payload_is_what_the_chips_say(book: Codebook) -> None:
     symbols = random_symbols(3, 2, book, np.random.default_rng(0))
-    words = Payload.of_symbols(symbols, book)
-    masks = Payload.of_masks(symbol_chips(symbols, book), 3, 2, book)
+    words = Bank.of_symbols(symbols, book)
+    masks = Bank.of_masks(symbol_chips(symbols, book), 3, 2, book)
     assert len(words.content) == 3 * 2 * 16 * 2
     assert len(masks.content) == 3 * 90 * 12
     rows = np.frombuffer(masks.content, np.uint8).reshape(-1, 12)

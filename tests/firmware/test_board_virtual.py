@@ -14,23 +14,26 @@ from board_lines import (
     packet_sequence,
 )
 
-from evlcp_sdk.codebook import Codebook, hadamard
+from evlcp_sdk.air.codebook import Codebook, hadamard
+from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.frames import packet_chips
-from firmware_host.board import Board, Settings, profile_number, provision
-from firmware_host.client import Timing
+from firmware_host.board.bank import Bank, random_symbols, symbol_chips
+from firmware_host.board.board import Board, Settings, profile_number, provision
+from firmware_host.board.session import Session
+from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import (
     BoardResetError,
     IncompatibleError,
-    LinkError,
+    LineError,
     NoBoardError,
     RefusedError,
     VerifyError,
 )
-from firmware_host.generate import codebook_of
-from firmware_host.link import Link
-from firmware_host.messages import (
+from firmware_host.protocol.client import Timing
+from firmware_host.protocol.generate import codebook_of
+from firmware_host.protocol.requests import (
     NO_BANK,
+    BoardFault,
     CodebookReply,
     CodebookRequest,
     CommitReply,
@@ -39,7 +42,6 @@ from firmware_host.messages import (
     ConfigureRequest,
     CrcReply,
     CrcRequest,
-    Fault,
     LevelReply,
     LevelRequest,
     Profile,
@@ -52,8 +54,6 @@ from firmware_host.messages import (
     WriteReply,
     WriteRequest,
 )
-from firmware_host.payload import Payload, random_symbols, symbol_chips
-from firmware_host.simulated import SimulatedBoard, SimulatedLine
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -76,7 +76,7 @@ def board(device: SimulatedBoard) -> Board:
 def test_plays_what_tx_frames_says(profile: str, device: SimulatedBoard, board: Board) -> None:
     book = codebook_of(profile)
     symbols = symbols_of(4, 0, book)
-    provision(board, Payload.of_symbols(symbols, book), Settings())
+    provision(board, Bank.of_symbols(symbols, book), Settings())
     device.run(200_000)
     played = device.records().played()
     expected = symbol_chips(symbols, book)
@@ -92,9 +92,9 @@ def test_plays_pilots_in_some_frames_only(
     frames: int, every: int, device: SimulatedBoard, board: Board, book: Codebook
 ) -> None:
     symbols = random_symbols(3, frames, book, np.random.default_rng(frames))
-    provision(board, Payload.of_symbols(symbols, book, every), Settings())
-    assert board.holds(Payload.of_symbols(symbols, book, every), 10_000, board.status())
-    assert not board.holds(Payload.of_symbols(symbols, book), 10_000, board.status())
+    provision(board, Bank.of_symbols(symbols, book, every), Settings())
+    assert board.holds(Bank.of_symbols(symbols, book, every), 10_000, board.status())
+    assert not board.holds(Bank.of_symbols(symbols, book), 10_000, board.status())
     device.run(400_000)
     chips = device.records().played().chips()
     expected = np.concatenate([packet_chips(packet, book, every) for packet in symbols])
@@ -107,9 +107,9 @@ def test_from_one_pilot_rate_to_another_without_a_torn_packet(
 ) -> None:
     symbols = random_symbols(2, 10, book, np.random.default_rng(0))
     full, sparse = (np.concatenate([packet_chips(p, book, n) for p in symbols]) for n in (1, 4))
-    provision(board, Payload.of_symbols(symbols, book), Settings())
+    provision(board, Bank.of_symbols(symbols, book), Settings())
     device.run(100_000)
-    provision(board, Payload.of_symbols(symbols, book, 4), Settings())
+    provision(board, Bank.of_symbols(symbols, book, 4), Settings())
     device.run(100_000)
     chips = device.records().played().chips()
     half = len(full) // 2
@@ -125,7 +125,7 @@ def test_from_one_pilot_rate_to_another_without_a_torn_packet(
 def test_masks_play_as_they_are(device: SimulatedBoard, board: Board, book: Codebook) -> None:
     random = np.random.default_rng(0)
     leds = random.integers(0, 2, (2 * PACKET, 96), dtype=np.uint8)
-    provision(board, Payload.of_masks(leds, 2, 10, book), Settings(chip_rate_hz=20_000))
+    provision(board, Bank.of_masks(leds, 2, 10, book), Settings(chip_rate_hz=20_000))
     device.run(100_000)
     played = device.records().played()
     assert (played.chips(96)[: len(leds)] == leds).all()
@@ -137,7 +137,7 @@ def test_a_codebook_of_ones_own(device: SimulatedBoard, board: Board) -> None:
     book = Codebook("barker5", np.array([1, 1, 1, -1, 1], np.int8), np.concatenate([-rows, rows]), rows)
     assert profile_number(book) == Profile.CUSTOM
     symbols = random_symbols(2, 3, book, np.random.default_rng(0))
-    provision(board, Payload.of_symbols(symbols, book), Settings())
+    provision(board, Bank.of_symbols(symbols, book), Settings())
     device.run(100_000)
     expected = symbol_chips(symbols, book)
     assert (device.records().played().chips()[: len(expected)] == expected).all()
@@ -145,7 +145,7 @@ def test_a_codebook_of_ones_own(device: SimulatedBoard, board: Board) -> None:
 
 def test_what_is_there_is_not_sent_again(device: SimulatedBoard, board: Board, book: Codebook) -> None:
     symbols = symbols_of(64, 0, book)
-    payload = Payload.of_symbols(symbols, book)
+    payload = Bank.of_symbols(symbols, book)
     seen: list[tuple[int, int]] = []
     done = board.program(payload, progress=lambda a, b: seen.append((a, b)))
     assert (done.written, done.length, done.swapped, done.bank) == (20480, 20480, True, 0)
@@ -154,14 +154,14 @@ def test_what_is_there_is_not_sent_again(device: SimulatedBoard, board: Board, b
     assert [a for a, _ in seen] == sorted(a for a, _ in seen)
     again = board.program(payload)
     assert (again.written, again.swapped) == (0, False)
-    assert board.program(Payload.of_symbols(symbols[:32], book)).bank == 1
+    assert board.program(Bank.of_symbols(symbols[:32], book)).bank == 1
     # bank 0 still holds the first payload: only the commit is needed
     back = board.program(payload)
     assert (back.written, back.swapped, back.bank) == (0, True, 0)
     changed = symbols.copy()
     changed[40, 3, 5] ^= 1
-    board.program(Payload.of_symbols(symbols[:32], book))
-    assert board.program(Payload.of_symbols(changed, book)).written == 2048
+    board.program(Bank.of_symbols(symbols[:32], book))
+    assert board.program(Bank.of_symbols(changed, book)).written == 2048
 
 
 def test_hitless_swap_800_packets(device: SimulatedBoard, board: Board, book: Codebook) -> None:
@@ -169,7 +169,7 @@ def test_hitless_swap_800_packets(device: SimulatedBoard, board: Board, book: Co
     for n in range(60):
         name = f"p{n}"
         payloads[name] = symbols_of(1 + n % 4, 100 + n, book)
-        provision(board, Payload.of_symbols(payloads[name], book), Settings())
+        provision(board, Bank.of_symbols(payloads[name], book), Settings())
         device.run(int(np.random.default_rng(n).integers(200_000, 500_000)))
     device.run(28_000_000 - device.now_us if device.now_us < 28_000_000 else 0)
     played = device.records().played()
@@ -183,8 +183,8 @@ def test_hitless_swap_800_packets(device: SimulatedBoard, board: Board, book: Co
 
 def test_wrong_crc_or_codebook_never_plays(device: SimulatedBoard, board: Board, book: Codebook) -> None:
     old = symbols_of(2, 1, book)
-    provision(board, Payload.of_symbols(old, book), Settings())
-    payload = Payload.of_symbols(symbols_of(2, 2, book), book)
+    provision(board, Bank.of_symbols(old, book), Settings())
+    payload = Bank.of_symbols(symbols_of(2, 2, book), book)
     board.prepare(payload, 10_000)
     board.fill(1, payload.content)
     length, digest = len(payload.content), bytes.fromhex(book.digest)
@@ -198,16 +198,16 @@ def test_wrong_crc_or_codebook_never_plays(device: SimulatedBoard, board: Board,
         (CommitRequest(2, 0, 2, length, payload.crc, digest), RefusedError),
     ):
         with pytest.raises(error):
-            board.link.call(commit, CommitReply)
+            board.session.call(commit, CommitReply)
         device.run(100_000)
         status = board.status()
         assert (status.active_bank, status.pending_bank, status.commits) == (0, NO_BANK, 1)
     pilots = tuple(range(16))
     with pytest.raises(IncompatibleError, match="built with another codebook"):
-        board.link.call(CodebookRequest(26, 0, pilots, digest), CodebookReply)
-    board.link.call(ConfigureRequest(10_000, Profile.WH8, 10, 1), ConfigureReply)
+        board.session.call(CodebookRequest(26, 0, pilots, digest), CodebookReply)
+    board.session.call(ConfigureRequest(10_000, Profile.WH8, 10, 1), ConfigureReply)
     with pytest.raises(IncompatibleError):
-        board.link.call(CommitRequest(1, 0, 2, length, payload.crc, digest), CommitReply)
+        board.session.call(CommitRequest(1, 0, 2, length, payload.crc, digest), CommitReply)
     device.run(500_000)
     sequence = packet_sequence(device.records().played(), {"old": old}, book)
     assert len(sequence) > 20
@@ -218,26 +218,26 @@ def test_ten_thousand_requests_over_a_noisy_line(device: SimulatedBoard) -> None
     board = board_on(line)
     random = np.random.default_rng(4)
     bank = bytearray(board.read(1, 0, 4096))
-    level, link, retried = board.status().level_ma, board.link, 0
+    level, session, retried = board.status().level_ma, board.session, 0
     for _ in range(10_000):
         what = random.integers(5)
         at = int(random.integers(4000))
         n = int(random.integers(1, 64))
         if what == 0:
             data = random.bytes(n)
-            assert link.call(WriteRequest(1, at, data), WriteReply) == WriteReply(1, at, n)
+            assert session.call(WriteRequest(1, at, data), WriteReply) == WriteReply(1, at, n)
             bank[at : at + n] = data
         elif what == 1:
-            assert link.call(ReadRequest(1, at, n), ReadReply).data == bank[at : at + n]
+            assert session.call(ReadRequest(1, at, n), ReadReply).data == bank[at : at + n]
         elif what == 2:
             expected = zlib.crc32(bytes(bank[at : at + n]))
-            assert link.call(CrcRequest(1, at, n), CrcReply).crc == expected
+            assert session.call(CrcRequest(1, at, n), CrcReply).crc == expected
         elif what == 3:
             level = int(random.integers(61))
-            link.call(LevelRequest(level), LevelReply)
+            session.call(LevelRequest(level), LevelReply)
         else:
-            assert link.call(StatusRequest(), StatusReply).level_ma == level
-    retried = link.client.retries
+            assert session.call(StatusRequest(), StatusReply).level_ma == level
+    retried = session.client.retries
     status = board.status()
     assert board.read(1, 0, 4096) == bytes(bank)
     assert retried > 300
@@ -249,7 +249,7 @@ def test_ten_thousand_requests_over_a_noisy_line(device: SimulatedBoard) -> None
 def test_programming_over_a_very_noisy_line(device: SimulatedBoard, book: Codebook) -> None:
     board = board_on(NoisyLine(device, flips=2e-3, drops=0.01, doubles=0.01, seed=5))
     symbols = symbols_of(64, 6, book)
-    payload = Payload.of_symbols(symbols, book)
+    payload = Bank.of_symbols(symbols, book)
     done = provision(board, payload, Settings())
     assert done.retries > 20
     device.run(3_000_000)
@@ -261,10 +261,10 @@ def test_programming_over_a_very_noisy_line(device: SimulatedBoard, book: Codebo
 
 def _bytes_of_programming(old: np.ndarray, new: np.ndarray, book: Codebook) -> int:
     device = SimulatedBoard()
-    provision(board_on(SimulatedLine(device)), Payload.of_symbols(old, book), Settings())
+    provision(board_on(SimulatedLine(device)), Bank.of_symbols(old, book), Settings())
     device.run(50_000)
     line = FatalLine(device, 1 << 30, lambda: None)
-    provision(board_on(line, nonce=7), Payload.of_symbols(new, book), Settings())
+    provision(board_on(line, nonce=7), Bank.of_symbols(new, book), Settings())
     return line.written
 
 
@@ -281,12 +281,12 @@ def test_host_killed_at_100_moments(book: Codebook) -> None:
 
     for moment in moments:
         device = SimulatedBoard()
-        provision(board_on(SimulatedLine(device)), Payload.of_symbols(old, book), Settings())
+        provision(board_on(SimulatedLine(device)), Bank.of_symbols(old, book), Settings())
         device.run(50_000)
         with pytest.raises(HostDiedError):
             provision(
                 board_on(FatalLine(device, int(moment), die), nonce=7),
-                Payload.of_symbols(new, book),
+                Bank.of_symbols(new, book),
                 Settings(),
             )
         device.run(400_000)
@@ -296,13 +296,13 @@ def test_host_killed_at_100_moments(book: Codebook) -> None:
         ends[order[-1]] += 1
         # the next host finishes the work
         board = board_on(SimulatedLine(device))
-        done = provision(board, Payload.of_symbols(new, book), Settings())
-        assert board.holds(Payload.of_symbols(new, book), 10_000, board.status())
+        done = provision(board, Bank.of_symbols(new, book), Settings())
+        assert board.holds(Bank.of_symbols(new, book), 10_000, board.status())
         assert done.swapped == (order[-1] == "old")
     assert min(ends.values()) > 5
 
 
-def _fault_of(line: SimulatedLine, payload: Payload) -> str | None:
+def _fault_of(line: SimulatedLine, payload: Bank) -> str | None:
     try:
         provision(board_on(line, nonce=7), payload, Settings())
     except BoardResetError as fault:
@@ -311,13 +311,13 @@ def _fault_of(line: SimulatedLine, payload: Payload) -> str | None:
 
 
 def test_board_reset_at_100_moments(book: Codebook) -> None:
-    payload = Payload.of_symbols(symbols_of(12, 2, book), book)
+    payload = Bank.of_symbols(symbols_of(12, 2, book), book)
     total = _bytes_of_programming(symbols_of(2, 1, book), symbols_of(12, 2, book), book)
     random = np.random.default_rng(8)
     told = 0
     for moment in random.integers(1, total, 100):
         device = SimulatedBoard()
-        first = Payload.of_symbols(symbols_of(2, 1, book), book)
+        first = Bank.of_symbols(symbols_of(2, 1, book), book)
         provision(board_on(SimulatedLine(device)), first, Settings())
         device.run(50_000)
         fault = _fault_of(FatalLine(device, int(moment), device.reset), payload)
@@ -343,36 +343,36 @@ def test_silence_is_told(device: SimulatedBoard, board: Board) -> None:
 
     with pytest.raises(NoBoardError, match="no board answers; check power, cable and --baud"):
         board_on(Deaf(device))
-    board.link.transport = Deaf(device)
-    with pytest.raises(LinkError, match="no answer to STATUS after 5 tries"):
+    board.session.transport = Deaf(device)
+    with pytest.raises(LineError, match="no answer to STATUS after 5 tries"):
         board.status()
     assert NoBoardError.exit_code == 4
-    assert LinkError.exit_code == 6
+    assert LineError.exit_code == 6
 
 
 def test_another_schema_is_incompatible(device: SimulatedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("firmware_host.link.SCHEMA", b"12345678")
+    monkeypatch.setattr("firmware_host.board.session.SCHEMA", b"12345678")
     with pytest.raises(IncompatibleError, match="update firmware or host"):
-        Board(Link(SimulatedLine(device), Timing()))
+        Board(Session(SimulatedLine(device), Timing()))
 
 
 def test_too_much_is_told_before_anything_is_sent(board: Board, book: Codebook) -> None:
-    payload = Payload.of_symbols(symbols_of(129, 0, book), book)
+    payload = Bank.of_symbols(symbols_of(129, 0, book), book)
     with pytest.raises(ConfigError, match="send at most 128 packets"):
         board.program(payload)
     assert board.status().requests <= 3
     # 2 bytes for each of 16 clusters a frame: 1280 frames fill the 40960 bytes
-    one = Payload.of_symbols(random_symbols(1, 1281, book, np.random.default_rng(0)), book)
+    one = Bank.of_symbols(random_symbols(1, 1281, book, np.random.default_rng(0)), book)
     with pytest.raises(ConfigError, match=r"1281 frames takes 40992 bytes.*at most 1280 frames"):
         board.program(one)
     # 12 bytes a chip: 3413 chips, 26 of the preamble and 32 a frame
-    masks = Payload.of_masks(np.zeros((26 + 32 * 106, 96), np.uint8), 1, 106, book)
+    masks = Bank.of_masks(np.zeros((26 + 32 * 106, 96), np.uint8), 1, 106, book)
     with pytest.raises(ConfigError, match="at most 105 frames"):
         board.program(masks)
 
 
 def test_a_chip_rate_that_cannot_be_is_told_with_the_nearest(board: Board, book: Codebook) -> None:
-    payload = Payload.of_symbols(symbols_of(1, 0, book), book)
+    payload = Bank.of_symbols(symbols_of(1, 0, book), book)
     for rate in (7777, 20_001, 1_000_000):
         nearest = min((r for r in range(1, 20_001) if 10_000_000 % r == 0), key=lambda r: abs(r - rate))
         with pytest.raises(
@@ -384,7 +384,7 @@ def test_a_chip_rate_that_cannot_be_is_told_with_the_nearest(board: Board, book:
 
 
 def test_flash_waits_for_the_end_of_a_led_test(board: Board, book: Codebook) -> None:
-    provision(board, Payload.of_symbols(symbols_of(1, 0, book), book), Settings(start=False))
+    provision(board, Bank.of_symbols(symbols_of(1, 0, book), book), Settings(start=False))
     board.test_leds(0, 95, 1000)
     for ask in (board.save, board.recall):
         with pytest.raises(RefusedError, match="'evlcp board stop' first"):
@@ -395,7 +395,7 @@ def test_flash_waits_for_the_end_of_a_led_test(board: Board, book: Codebook) -> 
 
 def test_level_above_the_maximum_is_refused(board: Board, book: Codebook) -> None:
     with pytest.raises(RefusedError, match="nearest value the board can take is 60") as refused:
-        provision(board, Payload.of_symbols(symbols_of(1, 0, book), book), Settings(level_ma=61))
+        provision(board, Bank.of_symbols(symbols_of(1, 0, book), book), Settings(level_ma=61))
     assert refused.value.detail == 60
     assert refused.value.exit_code == 5
     status = board.status()
@@ -407,19 +407,19 @@ def test_save_survives_reset_and_damage(device: SimulatedBoard, book: Codebook) 
     board = board_on(SimulatedLine(device))
     settings = Settings(level_ma=33, watchdog=Watchdog.IDLE, watchdog_ms=700, start=False)
     for symbols in (first, second):
-        provision(board, Payload.of_symbols(symbols, book), settings)
+        provision(board, Bank.of_symbols(symbols, book), settings)
         board.save()
     device.reset()
     board = board_on(SimulatedLine(device))
     assert board.recall().slot == 1
     status = board.status()
-    assert board.holds(Payload.of_symbols(second, book), 10_000, status)
+    assert board.holds(Bank.of_symbols(second, book), 10_000, status)
     assert (status.level_ma, status.watchdog, status.watchdog_ms) == (33, Watchdog.IDLE, 700)
     device.flip_flash(1, 200)
     device.reset()
     board = board_on(SimulatedLine(device))
     assert board.recall().slot == 0
-    assert board.holds(Payload.of_symbols(first, book), 10_000, board.status())
+    assert board.holds(Bank.of_symbols(first, book), 10_000, board.status())
     board.save(autostart=True)
     device.reset()
     device.records()
@@ -433,12 +433,12 @@ def test_save_survives_reset_and_damage(device: SimulatedBoard, book: Codebook) 
 
 
 def test_faults_show_and_darken(device: SimulatedBoard, board: Board, book: Codebook) -> None:
-    provision(board, Payload.of_symbols(symbols_of(1, 0, book), book), Settings())
-    device.set_health(30.0, Fault.OPEN_LED, open_led=95)
+    provision(board, Bank.of_symbols(symbols_of(1, 0, book), book), Settings())
+    device.set_health(30.0, BoardFault.OPEN_LED, open_led=95)
     device.run(300_000)
     status = board.status()
-    assert (status.temperature_dc, status.faults, status.open_leds[-1]) == (300, Fault.OPEN_LED, 1)
-    device.set_health(120.0, Fault.OVER_TEMPERATURE)
+    assert (status.temperature_dc, status.faults, status.open_leds[-1]) == (300, BoardFault.OPEN_LED, 1)
+    device.set_health(120.0, BoardFault.OVER_TEMPERATURE)
     device.run(300_000)
     assert board.status().state == State.FAULT
     assert not device.shown().any()
@@ -452,7 +452,7 @@ def test_faults_show_and_darken(device: SimulatedBoard, board: Board, book: Code
     device.run(1000)
     status = board.status()
     assert status.state == State.FAULT
-    assert status.faults & Fault.CHIP_LOST
+    assert status.faults & BoardFault.CHIP_LOST
     assert not device.shown().any()
 
 
@@ -465,13 +465,13 @@ def test_led_test_walks_all(device: SimulatedBoard, board: Board) -> None:
 
 
 def test_a_fault_that_comes_back_ends_the_led_test(device: SimulatedBoard, board: Board) -> None:
-    device.set_health(120.0, Fault.OVER_TEMPERATURE)
+    device.set_health(120.0, BoardFault.OVER_TEMPERATURE)
     device.run(300_000)
     device.set_health()
     device.run(300_000)
     board.test_leds(0, 95, 1000)
     assert device.shown().any()
-    device.set_health(120.0, Fault.OVER_TEMPERATURE)
+    device.set_health(120.0, BoardFault.OVER_TEMPERATURE)
     device.run(300_000)
     assert not device.shown().any()
 
@@ -481,7 +481,7 @@ def test_a_packet_may_take_longer_than_ten_seconds(
 ) -> None:
     # 400 frames at 1000 chips/s: 12.8 s
     old, new = (
-        Payload.of_symbols(random_symbols(1, 400, book, np.random.default_rng(seed)), book) for seed in (0, 1)
+        Bank.of_symbols(random_symbols(1, 400, book, np.random.default_rng(seed)), book) for seed in (0, 1)
     )
     provision(board, old, Settings(chip_rate_hz=1000))
     device.run(10_000)

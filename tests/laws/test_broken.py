@@ -16,7 +16,10 @@ from evlcp_wh.pilots import WhPilots
 from evlcp_wh.separation import WhCorrelation
 from pydantic import Field
 
-from evlcp_sdk.abc import (
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.plugin.hooks import ROLE_NAMES
+from evlcp_sdk.plugin.roles import (
     Decoding,
     ErrorCorrection,
     Modulation,
@@ -27,15 +30,12 @@ from evlcp_sdk.abc import (
     Tracker,
     Tracking,
 )
-from evlcp_sdk.config import load_link
-from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.geometry import CameraModel
-from evlcp_sdk.hookspecs import ROLE_NAMES
+from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing import LawError, laws_of
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
 from evlcp_sdk.testing.law import Subject
 from evlcp_sdk.testing.links import LINK
-from evlcp_sdk.types import PresenceMap, Range, SyncLock
+from evlcp_sdk.values import PresenceMap, Range, SyncLock
 
 Change = Callable[..., Any]
 

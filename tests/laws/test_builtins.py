@@ -2,7 +2,7 @@
 
 import pytest
 
-from evlcp_sdk.registry import Registry
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.testing import Law, laws_of
 from evlcp_sdk.testing.law import Subject, judge
 

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from evlcp_centroid.ranging import CentroidRanging
 
-from evlcp_sdk.abc import Filter, Ranging, Tracker, Tracking
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.plugin.roles import Filter, Ranging, Tracker, Tracking
 from evlcp_sdk.testing import check, laws_of
 from evlcp_sdk.testing.law import Subject
 from evlcp_sdk.testing.trees import difference
@@ -136,7 +136,7 @@ def test_the_receiver_begins_a_filter_with_its_init() -> None:
 
 
 def test_difference_says_where() -> None:
-    from evlcp_sdk.types import Range
+    from evlcp_sdk.values import Range
 
     a = Range(1.0, float("nan"), 2)
     assert difference([a], [a]) is None

@@ -12,7 +12,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from evlcp_sdk.types import Frame, Range, SoftSymbols
+from evlcp_sdk.values import Frame, Range, SoftSymbols
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "examples" / "custom_app.py"

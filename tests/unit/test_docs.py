@@ -15,11 +15,11 @@ from typing import Any, get_type_hints
 import pytest
 from pydantic.fields import FieldInfo
 
-from evlcp_sdk import hookspecs
-from evlcp_sdk.abc import ROLES
-from evlcp_sdk.config import resolve
-from evlcp_sdk.messages.signing import make_key
-from evlcp_sdk.registry import Registry
+from evlcp_sdk.air.signing import make_key
+from evlcp_sdk.link.resolve import resolve
+from evlcp_sdk.plugin import hooks as hookspecs
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.testing import check, laws_of
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
 
@@ -144,7 +144,7 @@ def test_every_stage_is_in_the_docs() -> None:
     page = (ROOT / "docs" / "hooks.md").read_text()
     doc = hookspecs.evlcp_stage_finished.__doc__ or ""
     stages = re.findall(r"`(\w+)`", doc.split("stage:")[1].split("value:")[0])
-    assert len(stages) == 7
+    assert len(stages) == 8
     for stage in stages:
         assert f"| `{stage}` |" in page
 

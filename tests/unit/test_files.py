@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from evlcp_sdk.errors import ConfigError, EvlcpError
-from evlcp_sdk.files import parse_value, read_toml, whole_file, write_text
+from evlcp_sdk.files import whole_file, write_text
+from evlcp_sdk.specs import parse_value, read_toml
 
 
 def test_a_table_is_read(tmp_path: Path) -> None:

@@ -4,11 +4,11 @@ import hashlib
 import json
 from typing import Any
 
-from evlcp_sdk.config import load_link
-from evlcp_sdk.messages.beacon import Beacon
-from evlcp_sdk.messages.block import Kind, Message, split
-from evlcp_sdk.messages.coding import interleaver
-from evlcp_sdk.messages.signing import signed_bytes
+from evlcp_sdk.air.beacons import Beacon
+from evlcp_sdk.air.blocks import Kind, Message, split
+from evlcp_sdk.air.signing import signed_bytes
+from evlcp_sdk.link.blocks import interleaver
+from evlcp_sdk.link.resolve import load_link
 
 PROFILES = ("wh4x2", "wh8", "raw8")
 

@@ -6,7 +6,7 @@ import numpy as np
 from evlcp_robust.decoding import Majority
 from evlcp_robust.ranging import MedianPairs
 
-from evlcp_sdk.config import load_link
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.testing import conformance, ideal_presence, ideal_sums, ideal_view
 
 LINK = load_link()

@@ -1,4 +1,4 @@
-/* Codebook digests of the built-in profiles; generated from evlcp_sdk.codebook, do not edit. */
+/* Codebook digests of the built-in profiles; generated, do not edit. */
 #ifndef EVLCP_PROFILES_H
 #define EVLCP_PROFILES_H
 #include <stdint.h>

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evlcp_sdk.errors import StreamError
-from evlcp_sdk.io import RawSource, RawWriter, open_events, read_events, write_events
+from evlcp_sdk.io import RawSource, RawWriter, open_source, read_events, write_events
 from evlcp_sdk.io._codec import Columns, Decoder
 from evlcp_sdk.io.raw import CODECS
-from evlcp_sdk.types import Events, Triggers
+from evlcp_sdk.values import Events, Triggers
 
 WIDTH, HEIGHT = 640, 480
 
@@ -148,7 +148,7 @@ def test_round_trip_is_the_identity(name, width, height, tmp_path_factory):
         with RawWriter(path, width, height, codec) as writer:
             for piece in pieces(events, triggers, cuts):
                 writer.write(*piece)
-        with open_events(path) as source:
+        with open_source(path) as source:
             got = list(source.stream(max_events))
             assert all(len(e) <= max_events and len(g) <= max_events for e, g in got)
             assert (source.format, source.width, source.height) == (name, width, height)
@@ -268,7 +268,7 @@ def test_any_buffer_and_any_piece_give_the_same_events(tmp_path):
 def test_a_second_stream_goes_on_where_the_first_stopped(tmp_path):
     events = Events.of(range(10), range(10), [0] * 10, [1] * 10)
     write_events(tmp_path / "a.raw", events, 640, 480)
-    with open_events(tmp_path / "a.raw") as source:
+    with open_source(tmp_path / "a.raw") as source:
         first = next(source.chunks(3))
         second = next(source.chunks(2))
         rest, _ = source.read()
@@ -279,7 +279,7 @@ def test_a_second_stream_goes_on_where_the_first_stopped(tmp_path):
 def test_pieces_stay_valid(tmp_path):
     events = Events.of(range(100), range(100), [0] * 100, [1] * 100)
     write_events(tmp_path / "a.raw", events, 640, 480)
-    with open_events(tmp_path / "a.raw") as source:
+    with open_source(tmp_path / "a.raw") as source:
         got = list(source.chunks(20))
     assert len(got) >= 5
     assert Events.concat(got).t_us.tolist() == list(range(100))

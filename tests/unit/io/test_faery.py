@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io import open_events
+from evlcp_sdk.io import open_source
 
 NAMES = {"a.aedat4": "AEDAT4", "a.dat": "DAT", "a.es": "ES"}
 
@@ -25,7 +25,7 @@ def test_events_are_those_written(name, kind, faery, tmp_path):
     records["y"] = rng.integers(0, 480, len(records))
     records["on"] = rng.integers(0, 2, len(records))
     faery.events_stream_from_array(records, (640, 480)).to_file(tmp_path / name, zero_t0=False)
-    with open_events(tmp_path / name) as source:
+    with open_source(tmp_path / name) as source:
         assert (source.format, source.width, source.height) == (kind, 640, 480)
         pieces = list(source.stream(1000))
     assert all(len(events) <= 1000 for events, _ in pieces)
@@ -40,7 +40,7 @@ def test_events_are_those_written(name, kind, faery, tmp_path):
 def test_bad_file_is_an_error(name, kind, data, faery, tmp_path):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(InputError, match=f"{name}: found no {kind} file, expected one"):
-        open_events(tmp_path / name)
+        open_source(tmp_path / name)
 
 
 def test_cut_file_is_an_error(faery, tmp_path):
@@ -48,7 +48,7 @@ def test_cut_file_is_an_error(faery, tmp_path):
     faery.events_stream_from_array(records, (640, 480)).to_file(tmp_path / "a.aedat4")
     data = (tmp_path / "a.aedat4").read_bytes()
     (tmp_path / "a.aedat4").write_bytes(data[: len(data) // 2])
-    with open_events(tmp_path / "a.aedat4") as source, pytest.raises(InputError, match="at event"):
+    with open_source(tmp_path / "a.aedat4") as source, pytest.raises(InputError, match="at event"):
         source.read()
 
 
@@ -56,4 +56,4 @@ def test_missing_package_is_named_with_the_way_to_install_it(monkeypatch, tmp_pa
     (tmp_path / "a.es").write_bytes(b"Event Stream")
     monkeypatch.setitem(sys.modules, "faery", None)
     with pytest.raises(InputError, match=r"pip install 'evlcp-sdk\[faery\]'"):
-        open_events(tmp_path / "a.es")
+        open_source(tmp_path / "a.es")

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.errors import EvlcpError, InputError, RawFormatError, StreamError
-from evlcp_sdk.io import RawWriter, open_events, write_events
+from evlcp_sdk.io import RawWriter, open_source, write_events
 from evlcp_sdk.io.raw import CODECS, format_header, parse_header
-from evlcp_sdk.types import Events
+from evlcp_sdk.values import Events
 
 HEADER = format_header(CODECS["EVT3"], 640, 480)
 GOOD = [0x8001, 0x6002, 0x0003, 0x2804]
@@ -80,7 +80,7 @@ def test_bad_header_is_an_error_with_offset_found_expected(data, offset, found, 
     path = tmp_path / "bad.raw"
     path.write_bytes(data)
     with pytest.raises(RawFormatError) as caught:
-        open_events(path)
+        open_source(path)
     assert caught.value.path == path
     assert caught.value.offset == offset
     assert found in caught.value.found
@@ -90,7 +90,7 @@ def test_bad_header_is_an_error_with_offset_found_expected(data, offset, found, 
 
 def test_header_without_end_is_counted(tmp_path):
     header = HEADER.removesuffix(b"% end\n")
-    with open_events(raw(tmp_path / "a.raw", GOOD, header)) as source:
+    with open_source(raw(tmp_path / "a.raw", GOOD, header)) as source:
         events, _ = source.read()
     assert events.x.tolist() == [4]
     assert source.losses.keys() == {"header_without_end"}
@@ -111,7 +111,7 @@ def test_header_lines_of_a_real_camera():
 
 
 def test_size_of_the_sensor_may_be_missing(tmp_path):
-    with open_events(raw(tmp_path / "a.raw", [0x8001, 0x07FF, 0x27FF], b"% evt 3.0\n% end\n")) as source:
+    with open_source(raw(tmp_path / "a.raw", [0x8001, 0x07FF, 0x27FF], b"% evt 3.0\n% end\n")) as source:
         events, _ = source.read()
     assert (source.width, source.height) == (None, None)
     assert (events.x.tolist(), events.y.tolist()) == ([2047], [2047])
@@ -125,7 +125,7 @@ def test_another_encoding_than_declared(written, declared, n, tmp_path):
     data = path.read_bytes()
     header = format_header(CODECS[declared], 640, 480)
     path.write_bytes(header + data[data.index(b"% end\n") + 6 :])
-    with pytest.raises(RawFormatError) as caught, open_events(path):
+    with pytest.raises(RawFormatError) as caught, open_source(path):
         pass
     assert "a word of a reserved type" in caught.value.found
     assert f"{declared}, as the header says" in caught.value.expected
@@ -135,13 +135,13 @@ def test_another_encoding_than_declared(written, declared, n, tmp_path):
 def test_noise_behind_a_header(tmp_path):
     noise = np.random.default_rng(3).integers(0, 1 << 16, 5000)
     with pytest.raises(RawFormatError, match="reserved type"):
-        open_events(raw(tmp_path / "a.raw", noise))
+        open_source(raw(tmp_path / "a.raw", noise))
 
 
 @pytest.mark.parametrize("size", [3, 9_000_000])
 def test_words_without_any_time(size, tmp_path):
     path = raw(tmp_path / "a.raw", np.full(size, 0x2001))
-    with open_events(path) as source, pytest.raises(RawFormatError) as caught:
+    with open_source(path) as source, pytest.raises(RawFormatError) as caught:
         source.read()
     assert "no TIME_HIGH in" in caught.value.found
     assert caught.value.offset == len(HEADER)
@@ -183,7 +183,7 @@ LOSSES = {
     ("words", "tail", "kind", "count", "first", "events"), LOSSES.values(), ids=LOSSES.keys()
 )
 def test_loss_is_counted_with_its_first_offset(words, tail, kind, count, first, events, tmp_path):
-    with open_events(raw(tmp_path / "a.raw", words, tail=tail)) as source:
+    with open_source(raw(tmp_path / "a.raw", words, tail=tail)) as source:
         got, _ = source.read()
     assert len(got) == events
     assert source.losses.keys() == {kind}
@@ -209,7 +209,7 @@ LOSSES_EVT2 = {
 )
 def test_loss_in_evt2(words, tail, kind, count, first, events, tmp_path):
     header = format_header(CODECS["EVT2"], 640, 480)
-    with open_events(raw(tmp_path / "a.raw", words, header, tail, "<u4")) as source:
+    with open_source(raw(tmp_path / "a.raw", words, header, tail, "<u4")) as source:
         got, _ = source.read()
     assert len(got) == events
     assert source.losses.keys() == {kind}
@@ -220,7 +220,7 @@ def test_first_offset_is_found_across_buffers(tmp_path):
     words = np.full(2_000_000, 0x2001)
     words[:2] = 0x8001, 0x0003
     words[1_500_000] = 0x2000 | 700
-    with open_events(raw(tmp_path / "a.raw", words)) as source:
+    with open_source(raw(tmp_path / "a.raw", words)) as source:
         events, _ = source.read()
     assert len(events) == 2_000_000 - 3
     assert source.losses["outside_sensor"].first == len(HEADER) + 3_000_000
@@ -229,18 +229,18 @@ def test_first_offset_is_found_across_buffers(tmp_path):
 @pytest.mark.parametrize("name", ["missing.raw", "missing.npz", "missing.csv", "missing.dat", "no-suffix"])
 def test_missing_file(name, tmp_path):
     with pytest.raises(InputError, match=f"{name}: No such file"):
-        open_events(tmp_path / name)
+        open_source(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["dir.raw", "dir.npz", "dir.es"])
 def test_directory(name, tmp_path):
     (tmp_path / name).mkdir()
     with pytest.raises(InputError, match=f"{name}: "):
-        open_events(tmp_path / name)
+        open_source(tmp_path / name)
 
 
 def test_closed_source_is_an_error(tmp_path):
-    with open_events(raw(tmp_path / "a.raw", np.full(2_000_000, 0x8001))) as source:
+    with open_source(raw(tmp_path / "a.raw", np.full(2_000_000, 0x8001))) as source:
         pass
     with pytest.raises(InputError, match="closed"):
         source.read()
@@ -248,7 +248,7 @@ def test_closed_source_is_an_error(tmp_path):
 
 def test_pieces_of_no_events_are_refused(tmp_path):
     with (
-        open_events(raw(tmp_path / "a.raw", GOOD)) as source,
+        open_source(raw(tmp_path / "a.raw", GOOD)) as source,
         pytest.raises(StreamError, match="max_events is 0"),
     ):
         next(source.stream(0))
@@ -260,7 +260,7 @@ def test_pipe_is_read_without_its_size(tmp_path):
     data = HEADER + np.array(GOOD * 100_000, "<u2").tobytes()
     writer = threading.Thread(target=path.write_bytes, args=(data,))
     writer.start()
-    with open_events(path) as source:
+    with open_source(path) as source:
         assert source.size_bytes is None
         assert len(source.read()[0]) == 100_000
     writer.join()

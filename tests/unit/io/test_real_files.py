@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from evt_twins import decode_evt3
 
-from evlcp_sdk.io import open_events, write_events
+from evlcp_sdk.io import open_source, write_events
 
 REAL = Path(__file__).parents[3].parent / "shared" / "recordings" / "real"
 NAMES = ["ros_evt3_trigger.raw", "ros_py_test_events_1.raw"]
@@ -22,7 +22,7 @@ needs_recordings = pytest.mark.skipif(not REAL.exists(), reason=f"needs the reco
 @pytest.mark.parametrize("name", NAMES)
 def test_columns_have_the_expected_digests(name):
     expected = json.loads((REAL / "expected.json").read_text())[name]
-    with open_events(REAL / name) as source:
+    with open_source(REAL / name) as source:
         events, triggers = source.read()
     digests = {
         key: hashlib.sha256(column.astype(code).tobytes()).hexdigest()
@@ -45,7 +45,7 @@ def test_columns_have_the_expected_digests(name):
 @needs_recordings
 @pytest.mark.parametrize("name", NAMES)
 def test_twin_agrees_and_every_format_keeps_them(name, tmp_path):
-    with open_events(REAL / name) as source:
+    with open_source(REAL / name) as source:
         events, triggers = source.read()
     data = (REAL / name).read_bytes()
     twin = decode_evt3(data[data.index(b"% end\n") + 6 :], source.width, source.height)
@@ -56,7 +56,7 @@ def test_twin_agrees_and_every_format_keeps_them(name, tmp_path):
     assert np.array_equal(np.array(twin.events), np.stack([events.t_us, events.x, events.y, events.p], 1))
     for copy, kind in (("a.raw", "EVT3"), ("b.raw", "EVT2"), ("c.npz", "NPZ")):
         write_events(tmp_path / copy, events, source.width, source.height, triggers, kind)
-        with open_events(tmp_path / copy) as again:
+        with open_source(tmp_path / copy) as again:
             got, edges = again.read()
         assert all(np.array_equal(getattr(got, c), getattr(events, c)) for c in ("t_us", "x", "y", "p"))
         assert all(

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.errors import StreamError
-from evlcp_sdk.io import ReplaySource, open_events, write_events
-from evlcp_sdk.types import Events, Triggers
+from evlcp_sdk.io import ReplaySource, open_source, write_events
+from evlcp_sdk.values import Events, Triggers
 
 
 class Clock:
@@ -31,7 +31,7 @@ def recording(tmp_path):
 def test_each_slice_comes_when_its_time_is_over(recording):
     clock = Clock()
     got = []
-    with ReplaySource(open_events(recording), speed=2.0, clock=clock, sleep=clock.sleep) as source:
+    with ReplaySource(open_source(recording), speed=2.0, clock=clock, sleep=clock.sleep) as source:
         for events, triggers in source.stream():
             got.append((round((clock.now - 100) * 2e6), events.t_us.tolist(), triggers.t_us.tolist()))
         assert (source.format, source.width, source.height) == ("NPZ", 640, 480)
@@ -53,7 +53,7 @@ def test_any_slices_give_the_same_events(recording):
     for slice_us in (1, 300, 100_000):
         for max_events in (1, 4):
             with ReplaySource(
-                open_events(recording), slice_us=slice_us, clock=clock, sleep=clock.sleep
+                open_source(recording), slice_us=slice_us, clock=clock, sleep=clock.sleep
             ) as source:
                 pieces = list(source.stream(max_events))
             events = Events.concat(e for e, _ in pieces)
@@ -63,7 +63,7 @@ def test_any_slices_give_the_same_events(recording):
 
 def test_lag_tells_that_the_receiver_is_too_slow(recording):
     clock = Clock()
-    with ReplaySource(open_events(recording), clock=clock, sleep=clock.sleep) as source:
+    with ReplaySource(open_source(recording), clock=clock, sleep=clock.sleep) as source:
         stream = source.stream()
         next(stream)
         clock.now += 0.5
@@ -73,5 +73,5 @@ def test_lag_tells_that_the_receiver_is_too_slow(recording):
 
 @pytest.mark.parametrize(("speed", "slice_us"), [(0, 1000), (-1, 1000), (float("nan"), 1000), (1, 0)])
 def test_pace_must_be_positive(speed, slice_us, recording):
-    with open_events(recording) as source, pytest.raises(StreamError, match="expected both positive"):
+    with open_source(recording) as source, pytest.raises(StreamError, match="expected both positive"):
         ReplaySource(source, speed, slice_us)

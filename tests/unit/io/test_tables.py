@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evlcp_sdk.errors import InputError, StreamError
-from evlcp_sdk.io import CsvSource, NpzSource, open_events, open_writer, read_events, write_events
-from evlcp_sdk.types import Events, Triggers
+from evlcp_sdk.io import CsvSource, NpzSource, open_source, open_writer, read_events, write_events
+from evlcp_sdk.values import Events, Triggers
 
 tables = st.lists(
     st.tuples(
@@ -41,7 +41,7 @@ def test_round_trip_is_the_identity(name, tmp_path_factory):
         with open_writer(path) as writer:
             writer.write(events[:cut])
             writer.write(events[cut:])
-        with open_events(path) as source:
+        with open_source(path) as source:
             got = list(source.chunks(max_events))
             assert all(len(piece) <= max_events for piece in got)
             assert source.losses == {}
@@ -63,7 +63,7 @@ def test_large_table_in_pieces(name, tmp_path):
         rng.integers(0, 2, n),
     )
     write_events(tmp_path / name, events)
-    with open_events(tmp_path / name) as source:
+    with open_source(tmp_path / name) as source:
         half = next(source.chunks(20_000))
         assert 0 < source.position_bytes <= source.size_bytes
         rest, _ = source.read()
@@ -78,7 +78,7 @@ def test_npz_keeps_size_and_triggers(tmp_path):
     with np.load(tmp_path / "a.npz") as arrays:
         assert int(arrays["width"]) == 640
         assert arrays["t_us"].dtype == np.int64
-    with open_events(tmp_path / "a.npz") as source:
+    with open_source(tmp_path / "a.npz") as source:
         assert (source.width, source.height) == (640, 480)
         pieces = list(source.stream(2))
     assert [g.t_us.tolist() for _, g in pieces] == [[0, 5], [7], [11]]
@@ -237,7 +237,7 @@ def test_content_tells_the_format_whatever_the_name(tmp_path):
     events = Events.of([1], [2], [3], [1])
     for name in ("NPZ", "CSV", "EVT3", "EVT2"):
         write_events(tmp_path / "a.bin", events, 640, 480, format=name.lower())
-        with open_events(tmp_path / "a.bin") as source:
+        with open_source(tmp_path / "a.bin") as source:
             assert source.format == name
             assert rows(source.read()[0]) == [(1, 2, 3, 1)]
 
@@ -245,7 +245,7 @@ def test_content_tells_the_format_whatever_the_name(tmp_path):
 def test_closed_tables_are_errors(tmp_path):
     for name in ("a.npz", "a.csv"):
         write_events(tmp_path / name, Events.of(range(500_000), [1] * 500_000, [1] * 500_000, [1] * 500_000))
-        with open_events(tmp_path / name) as source:
+        with open_source(tmp_path / name) as source:
             next(source.chunks(10))
         source.close()
         with pytest.raises(InputError, match=name):

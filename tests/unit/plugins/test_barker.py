@@ -15,9 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from evlcp_sdk.codebook import BARKER13, Codebook, chips_of_values
+from evlcp_sdk.air.codebook import BARKER13, Codebook, chips_of_values
+from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.frames import PacketFormat, packet_chips
 
 PROFILES = {"wh4x2": Wh4x2(), "wh8": Wh8(), "raw8": Raw8()}
 CLUSTERS, FRAMES, START_US = 16, 10, 5000.0

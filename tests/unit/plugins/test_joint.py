@@ -7,11 +7,12 @@ from evlcp_joint.ranging import JointScaleRanging
 from numpy.testing import assert_allclose
 from scipy.stats import norm
 
-from evlcp_sdk.bound import cramer_rao_sigma_m
-from evlcp_sdk.config import load_link
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.geometry import BarLayout, CameraModel
-from evlcp_sdk.types import FrameView, PresenceMap, Range, SoftSymbols
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.study.bound import cramer_rao_sigma_m
+from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols
 
 LINK = load_link()
 PILOTS = LINK.codebook.pilots.astype(float)

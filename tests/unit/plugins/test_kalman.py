@@ -6,10 +6,10 @@ from evlcp_kalman.tracking import KalmanTracking, NoTracking
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from evlcp_sdk.abc import Filter
-from evlcp_sdk.config import load_link
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.plugin.roles import Filter
 from evlcp_sdk.rx.receiver import Receiver
-from tests.synthetic import Bar, events_of, random_symbols
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 
 FRAME_US = 3460.0
 
@@ -104,9 +104,9 @@ def test_the_receiver_filters_only_when_asked() -> None:
     assert NoTracking().compile().distance is None
     for override, filtered in (("tracking.id=none", False), ("tracking.id=kalman", True)):
         link = load_link(overrides=[override])
-        bar = Bar(random_symbols(link, 2), shake_px=10, shake_hz=12)
+        bar = IdealBar(random_symbols(link, 2), shake_px=10, shake_hz=12)
         receiver = Receiver(link)
-        frames = [f for p in receiver.feed(events_of(link, bar)) + receiver.close() for f in p.frames]
+        frames = [f for p in receiver.feed(ideal_events(link, bar)) + receiver.close() for f in p.frames]
         assert len(frames) == 20
         assert all((f.filtered is not None) == filtered for f in frames)
         got = [f.soft.symbols.tolist() for f in frames]

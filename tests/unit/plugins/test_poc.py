@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from evlcp_sdk.config import load_link
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.geometry import BarLayout, CameraModel
-from evlcp_sdk.types import FrameView, PresenceMap, SoftSymbols
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
 SEEDS = range(10)
 CAMERA, BAR = CameraModel(), BarLayout()

@@ -11,10 +11,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scipy import integrate, optimize, stats
 
-from evlcp_sdk.abc import Code
-from evlcp_sdk.campaign.intervals import proportion_interval
-from evlcp_sdk.crc import CRC24C, crc24
+from evlcp_sdk.air.crc import CRC24C, crc24
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.plugin.roles import Code
+from evlcp_sdk.study.intervals import proportion_interval
 
 Bits = NDArray[np.uint8]
 

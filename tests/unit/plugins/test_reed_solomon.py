@@ -6,7 +6,7 @@ from evlcp_reed_solomon.correction import ReedSolomon
 from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
-from evlcp_sdk.crc import crc24
+from evlcp_sdk.air.crc import crc24
 from evlcp_sdk.errors import ConfigError
 
 

@@ -12,9 +12,9 @@ from evlcp_wh.pilots import WhPilots
 from evlcp_wh.separation import WhCorrelation
 from numpy.testing import assert_allclose, assert_array_equal
 
-from evlcp_sdk.codebook import Codebook, chips_of_values
+from evlcp_sdk.air.codebook import Codebook, chips_of_values
 from evlcp_sdk.testing.views import ideal_presence, ideal_sums
-from evlcp_sdk.types import PresenceMap
+from evlcp_sdk.values import PresenceMap
 
 PROFILES = {"wh4x2": Wh4x2(), "wh8": Wh8(), "raw8": Raw8()}
 SEEDS = range(6)

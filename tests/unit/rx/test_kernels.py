@@ -6,7 +6,7 @@ import rx_twins as twins
 from numpy.testing import assert_allclose, assert_array_equal
 
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.types import Events
+from evlcp_sdk.values import Events
 
 WIDTH, HEIGHT = 24, 16
 SEEDS = range(8)

@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from evlcp_sdk.config import load_link, resolve
-from evlcp_sdk.geometry import BarLayout
-from evlcp_sdk.io import open_events
+from evlcp_sdk.io import open_source
+from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.sim import Simulation, load_scene
 from evlcp_sdk.sim.motion import project
-from evlcp_sdk.types import Frame, PresenceMap
+from evlcp_sdk.values import Frame, PresenceMap
 
 RECORDING = Path(__file__).parents[3] / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
 BAR = BarLayout()
@@ -118,7 +118,7 @@ def frames() -> list[Frame]:
     link = load_link()
     receiver = Receiver(link)
     packets = []
-    with open_events(str(RECORDING)) as source:
+    with open_source(str(RECORDING)) as source:
         for events in source.chunks():
             packets += receiver.feed(events)
     return [f for p in packets + receiver.close() for f in p.frames]

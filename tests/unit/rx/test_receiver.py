@@ -10,13 +10,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from evlcp_sdk.config import Link, load_link
 from evlcp_sdk.errors import StreamError
-from evlcp_sdk.hookspecs import hookimpl
-from evlcp_sdk.registry import Registry
+from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.types import Events, Packet
-from tests.synthetic import Bar, events_of, lamp, merged, noise, random_symbols
+from evlcp_sdk.testing.recordings import (
+    IdealBar,
+    ideal_events,
+    lamp_events,
+    merged,
+    noise_events,
+    random_symbols,
+)
+from evlcp_sdk.values import Events, Packet
 
 LINK = load_link()
 
@@ -41,7 +48,7 @@ def rows(packets: list[Packet]) -> list[tuple[Any, ...]]:
     ]
 
 
-def check_symbols(packets: list[Packet], bar: Bar, link: Link, *, t0_us: int = 0) -> int:
+def check_symbols(packets: list[Packet], bar: IdealBar, link: Link, *, t0_us: int = 0) -> int:
     """Compare every frame with the sent one that began at its time; return how many."""
     chip_us = link.packet.chip_us / (1 + bar.ppm * 1e-6)
     frames = [f for p in packets for f in p.frames]
@@ -61,8 +68,8 @@ def check_symbols(packets: list[Packet], bar: Bar, link: Link, *, t0_us: int = 0
 @pytest.mark.parametrize("ppm", [-100, 0, 100])
 def test_every_profile_with_both_clocks_off(profile: str, ppm: float) -> None:
     link = load_link(overrides=[f"modulation.id={profile}"])
-    bar = Bar(random_symbols(link, 5), ppm=ppm)
-    packets = received(link, events_of(link, bar))
+    bar = IdealBar(random_symbols(link, 5), ppm=ppm)
+    packets = received(link, ideal_events(link, bar))
     assert check_symbols(packets, bar, link) == 50
     assert [p.packet for p in packets] == [0, 1, 2, 3, 4]
     # Two packets of 2 us jitter tell the rate to 40 ppm, five to 20.
@@ -75,8 +82,8 @@ def test_pilots_in_some_frames_only(profile: str, frames: int, every: int) -> No
     air = [f"air.frames_per_packet={frames}", f"air.pilot_every={every}"]
     link = load_link(overrides=[f"modulation.id={profile}", *air])
     # It moves by a spacing while a pilot of eight frames holds.
-    bar = Bar(random_symbols(link, 3), shake_px=16, shake_hz=10)
-    packets = received(link, events_of(link, bar))
+    bar = IdealBar(random_symbols(link, 3), shake_px=16, shake_hz=10)
+    packets = received(link, ideal_events(link, bar))
     assert check_symbols(packets, bar, link) == 3 * frames
     for f in (f for p in packets for f in p.frames):
         assert np.isnan(f.range.distance_m) == (f.frame % every != 0)
@@ -84,17 +91,17 @@ def test_pilots_in_some_frames_only(profile: str, frames: int, every: int) -> No
 
 def test_frames_without_their_pilot_are_rejected() -> None:
     link = load_link(overrides=["air.pilot_every=4"])
-    bar = Bar(random_symbols(link, 3), start_us=-8_300.0)
+    bar = IdealBar(random_symbols(link, 3), start_us=-8_300.0)
     # Frame 2 began before the recording, and so did the pilot of frame 3.
-    packets = received(link, events_of(link, bar))
+    packets = received(link, ideal_events(link, bar))
     assert [f.frame for f in packets[0].frames] == [4, 5, 6, 7, 8, 9]
     assert check_symbols(packets, bar, link) == 26
 
 
 def test_a_pilot_in_the_dark_takes_its_frames_with_it() -> None:
     link = load_link(overrides=["air.pilot_every=4"])
-    bar = Bar(random_symbols(link, 3))
-    events = events_of(link, bar)
+    bar = IdealBar(random_symbols(link, 3))
+    events = ideal_events(link, bar)
     begin_us = bar.start_us + 100 * (link.packet.packet_chips + link.packet.frame_start_chip(4))
     dark = (events.t_us >= begin_us) & (events.t_us < begin_us + 1600)
     receiver = Receiver(link)
@@ -105,8 +112,8 @@ def test_a_pilot_in_the_dark_takes_its_frames_with_it() -> None:
 
 
 def test_distance_is_that_of_the_spacing() -> None:
-    bar = Bar(random_symbols(LINK, 3), cluster_px=9.0)
-    ranges = [f.range for p in received(LINK, events_of(LINK, bar)) for f in p.frames]
+    bar = IdealBar(random_symbols(LINK, 3), cluster_px=9.0)
+    ranges = [f.range for p in received(LINK, ideal_events(LINK, bar)) for f in p.frames]
     want = LINK.camera.focal_px * 0.06 / 9.0
     # Whole pixels, still bar: every cluster's map is the same, so the shift is exact.
     assert_allclose([r.distance_m for r in ranges], want, rtol=2e-3)
@@ -114,8 +121,8 @@ def test_distance_is_that_of_the_spacing() -> None:
 
 
 def test_frames_before_the_first_preamble_are_decoded() -> None:
-    bar = Bar(random_symbols(LINK, 3), start_us=-15_000.0)
-    packets = received(LINK, events_of(LINK, bar))
+    bar = IdealBar(random_symbols(LINK, 3), start_us=-15_000.0)
+    packets = received(LINK, ideal_events(LINK, bar))
     # Of the packet that began before the recording, the frames from chip 154 = 26 + 4 * 32 on.
     assert [f.frame for f in packets[0].frames] == [4, 5, 6, 7, 8, 9]
     assert check_symbols(packets, bar, LINK) == 26
@@ -123,8 +130,8 @@ def test_frames_before_the_first_preamble_are_decoded() -> None:
 
 def test_the_centre_is_followed() -> None:
     # 16 px at 15 Hz: up to 1.5 px/ms.
-    bar = Bar(random_symbols(LINK, 4), shake_px=16, shake_hz=15)
-    packets = received(LINK, events_of(LINK, bar))
+    bar = IdealBar(random_symbols(LINK, 4), shake_px=16, shake_hz=15)
+    packets = received(LINK, ideal_events(LINK, bar))
     assert check_symbols(packets, bar, LINK) == 40
     for f in (f for p in packets for f in p.frames):
         x, y = bar.centre(np.array([f.t_us + 850]))
@@ -133,12 +140,13 @@ def test_the_centre_is_followed() -> None:
 
 
 def test_two_bars_and_lamps() -> None:
-    one = Bar(random_symbols(LINK, 4, 1), ppm=40)
-    two = Bar(random_symbols(LINK, 4, 2), x_px=900, y_px=250, cluster_px=5, ppm=-25, start_us=11_234)
+    one = IdealBar(random_symbols(LINK, 4, 1), ppm=40)
+    two = IdealBar(random_symbols(LINK, 4, 2), x_px=900, y_px=250, cluster_px=5, ppm=-25, start_us=11_234)
     lamps = [
-        lamp(600, 300, 12, hz, 150_000, duty=duty) for hz, duty in ((100, 0.5), (1000, 0.2), (2000, 0.5))
+        lamp_events(600, 300, 12, hz, 150_000, duty=duty)
+        for hz, duty in ((100, 0.5), (1000, 0.2), (2000, 0.5))
     ]
-    events = merged(events_of(LINK, one), events_of(LINK, two), *lamps, noise(50_000, 150_000))
+    events = merged(ideal_events(LINK, one), ideal_events(LINK, two), *lamps, noise_events(50_000, 150_000))
     packets = received(LINK, events)
     by_number = [[p for p in packets if p.frames[0].transmitter == n] for n in (0, 1)]
     assert check_symbols(by_number[0], one, LINK) == 40
@@ -150,7 +158,12 @@ def test_two_bars_and_lamps() -> None:
 @pytest.mark.parametrize("duty", [0.1, 0.5])
 def test_a_lamp_is_no_transmitter(hz: float, duty: float) -> None:
     receiver = Receiver(LINK)
-    assert receiver.feed(merged(lamp(500, 300, 15, hz, 120_000, duty=duty), noise(200_000, 120_000))) == []
+    assert (
+        receiver.feed(
+            merged(lamp_events(500, 300, 15, hz, 120_000, duty=duty), noise_events(200_000, 120_000))
+        )
+        == []
+    )
     assert receiver.close() == []
     assert receiver.counts["regions_opened"] == 0
 
@@ -167,8 +180,8 @@ def test_random_blinking_at_the_chip_rate_is_no_transmitter() -> None:
 
 
 def test_a_dark_cluster_costs_only_itself() -> None:
-    bar = Bar(random_symbols(LINK, 2))
-    events = events_of(LINK, bar)
+    bar = IdealBar(random_symbols(LINK, 2))
+    events = ideal_events(LINK, bar)
     top = 350.7 - 64 + 5 * 8
     lit = (events.y < np.floor(top)) | (events.y > np.ceil(top + 8))
     frames = [f for p in received(LINK, events[lit]) for f in p.frames]
@@ -179,8 +192,8 @@ def test_a_dark_cluster_costs_only_itself() -> None:
 
 
 def test_a_bar_lost_from_sight_goes_on_as_the_same() -> None:
-    bar = Bar(random_symbols(LINK, 6), ppm=30)
-    events = events_of(LINK, bar)
+    bar = IdealBar(random_symbols(LINK, 6), ppm=30)
+    events = ideal_events(LINK, bar)
     hidden = (events.t_us >= 80_000) & (events.t_us < 150_000)
     moved = Events.of(events.t_us, events.x + np.where(events.t_us < 150_000, 0, 70), events.y, events.p)
     packets = received(LINK, moved[~hidden])
@@ -194,8 +207,11 @@ def test_a_bar_lost_from_sight_goes_on_as_the_same() -> None:
 
 
 def test_a_transmitter_that_starts_anew_is_followed() -> None:
-    before, after = Bar(random_symbols(LINK, 3, 1)), Bar(random_symbols(LINK, 5, 2), start_us=127_777)
-    events = merged(events_of(LINK, before), events_of(LINK, after))
+    before, after = (
+        IdealBar(random_symbols(LINK, 3, 1)),
+        IdealBar(random_symbols(LINK, 5, 2), start_us=127_777),
+    )
+    events = merged(ideal_events(LINK, before), ideal_events(LINK, after))
     packets = received(LINK, events)
     # One preamble off the old grid may be chance; the second one is believed.
     late = [p for p in packets if p.t_us > after.start_us + 30_000]
@@ -205,9 +221,9 @@ def test_a_transmitter_that_starts_anew_is_followed() -> None:
 
 
 STREAM = merged(
-    events_of(LINK, Bar(random_symbols(LINK, 3, 3), shake_px=5, ppm=35), seed=3),
-    events_of(LINK, Bar(random_symbols(LINK, 3, 4), x_px=800, start_us=9000, cluster_px=5), seed=4),
-    noise(30_000, 130_000),
+    ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 3), shake_px=5, ppm=35), seed=3),
+    ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 4), x_px=800, start_us=9000, cluster_px=5), seed=4),
+    noise_events(30_000, 130_000),
 )
 WHOLE = rows(received(LINK, STREAM))
 
@@ -221,7 +237,7 @@ def test_any_split_gives_the_same(cuts: list[int]) -> None:
 
 def test_any_split_gives_the_same_with_few_pilots() -> None:
     link = load_link(overrides=["air.pilot_every=4"])
-    events = events_of(link, Bar(random_symbols(link, 3), shake_px=5))
+    events = ideal_events(link, IdealBar(random_symbols(link, 3), shake_px=5))
     whole = rows(received(link, events))
     assert len(whole) == 30
     cuts = np.random.default_rng(0).integers(0, len(events), 60)
@@ -256,23 +272,23 @@ def test_what_is_dropped_is_counted() -> None:
 
 
 def test_a_long_gap_costs_nothing() -> None:
-    bar = Bar(random_symbols(LINK, 2))
-    first = events_of(LINK, bar)
+    bar = IdealBar(random_symbols(LINK, 2))
+    first = ideal_events(LINK, bar)
     hour = 3_600_000_000
-    packets = received(LINK, Events.concat([first, events_of(LINK, bar, t0_us=hour)]))
+    packets = received(LINK, Events.concat([first, ideal_events(LINK, bar, t0_us=hour)]))
     assert [f.transmitter for p in packets for f in p.frames] == [0] * 20 + [1] * 20
     assert check_symbols(packets[2:], bar, LINK, t0_us=hour) == 20
 
 
 def test_memory_does_not_grow() -> None:
     receiver = Receiver(LINK)
-    bar = Bar(random_symbols(LINK, 2), cluster_px=4, width_px=2)
+    bar = IdealBar(random_symbols(LINK, 2), cluster_px=4, width_px=2)
     period = 2 * LINK.packet.packet_chips * 100
     for n in range(12):
-        receiver.feed(events_of(LINK, bar, t0_us=n * period))
-    (track,) = receiver._tracker.tracks
-    assert len(track.blocks) < 10
-    assert len(track.positions) < 10
+        receiver.feed(ideal_events(LINK, bar, t0_us=n * period))
+    (region,) = receiver._regions.alive
+    assert len(region.pieces) < 10
+    assert len(region.positions) < 10
 
 
 def test_probes_see_every_stage() -> None:
@@ -288,9 +304,9 @@ def test_probes_see_every_stage() -> None:
 
     probe = Probe()
     receiver = Receiver(LINK, Registry.load(probe).hook)
-    receiver.feed(events_of(LINK, Bar(random_symbols(LINK, 2))))
+    receiver.feed(ideal_events(LINK, IdealBar(random_symbols(LINK, 2))))
     receiver.close()
-    assert probe.seen["frame"] == probe.seen["ranging"] == probe.seen["decoding"] == 20
+    assert probe.seen["frame"] == probe.seen["ranging"] == probe.seen["decoding"] == probe.seen["view"] == 20
     assert probe.seen["synchronization"] == 2
     assert probe.seen["separation"] >= 20
     assert probe.seen["regions"] >= 40
@@ -299,13 +315,13 @@ def test_probes_see_every_stage() -> None:
 def test_other_codes_work() -> None:
     link = load_link(overrides=["pilots.id=barker13", "bar.rows=78", "air.frames_per_packet=4"])
     assert link.packet.frame_chips == 26 + 16
-    bar = Bar(random_symbols(link, 4))
-    packets = received(link, events_of(link, bar))
+    bar = IdealBar(random_symbols(link, 4))
+    packets = received(link, ideal_events(link, bar))
     got = [f.soft.symbols.tolist() for p in packets for f in p.frames]
     assert got == bar.symbols.reshape(-1, 13).tolist()
 
 
 def test_another_chip_rate_works() -> None:
     link = load_link(overrides=["air.chip_rate_hz=5000"])
-    bar = Bar(random_symbols(link, 3))
-    assert check_symbols(received(link, events_of(link, bar)), bar, link) == 30
+    bar = IdealBar(random_symbols(link, 3))
+    assert check_symbols(received(link, ideal_events(link, bar)), bar, link) == 30

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evlcp_sdk.config import load_link
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.geometry import CameraModel
 from evlcp_sdk.io import read_events
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.score import score_frames
+from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
     BackgroundSpec,
     BarSpec,
@@ -24,10 +23,10 @@ from evlcp_sdk.sim import (
     load_scene,
     scene_of_truth,
     simulate,
-    truth,
     truth_of,
 )
-from evlcp_sdk.types import Events
+from evlcp_sdk.study.score import score_frames
+from evlcp_sdk.values import Events
 
 SHARED = Path(__file__).parents[4] / "shared" / "recordings"
 SHORT = replace(load_scene("two-bars"), duration_s=0.03, lamps=(LampSpec(x_m=-1.4, y_m=-0.6, z_m=3.0),))
@@ -122,7 +121,7 @@ def test_dark_and_passed_bars_give_nothing() -> None:
 def test_only_the_lit_part_of_the_sensor_is_active() -> None:
     scene = Scene(duration_s=0.02, sensor=QUIET)
     events = every(scene)
-    place = np.array(truth(scene)["bar_centre_px"])[0]
+    place = np.array(truth_of(scene).to_table()["bar_centre_px"])[0]
     assert np.abs(events.x - place[0].mean()).max() < 30
     assert np.abs(events.y - place[1].mean()).max() < 69 + 30
 
@@ -160,7 +159,7 @@ def received(scene: Scene, profile: str = "wh4x2") -> tuple[list[dict[str, str]]
 def test_the_receiver_hears_the_simulated_bar() -> None:
     scene = load_scene("drive-30kmh", ["motion.distance_m=50.0", "duration_s=0.1"])
     rows, simulation = received(scene)
-    result = score_frames(rows, truth_of(simulation))
+    result = score_frames(rows, truth_of(simulation).to_table())
     (bar,) = result.bars
     assert result.unmatched == 0
     assert bar.frames_found == bar.frames_sent > 20
@@ -171,9 +170,9 @@ def test_the_receiver_hears_the_simulated_bar() -> None:
 
 def test_the_truth_counts_what_was_rendered() -> None:
     simulation = Simulation(SHORT)
-    assert "events" not in truth_of(simulation)
+    assert "events" not in truth_of(simulation).to_table()
     events = sum(map(len, simulation.stream()))
-    found = truth_of(simulation)
+    found = truth_of(simulation).to_table()
     assert found["events"] == events
     assert found["signal_events"] + 30_000 > events
     assert len(found["t_s"]) == len(found["distance_m"][1]) == len(found["bar_centre_px"][1][0]) == 30
@@ -181,7 +180,7 @@ def test_the_truth_counts_what_was_rendered() -> None:
 
 
 def test_the_truth_says_where_the_camera_was() -> None:
-    found = truth_of(Simulation(SHORT))
+    found = truth_of(Simulation(SHORT)).to_table()
     x, y, z = np.array(found["camera_path"]["position_m"])
     motion = SHORT.motion
     np.testing.assert_allclose(z, motion.speed_mps * np.array(found["t_s"]) - motion.distance_m, atol=1e-5)
@@ -205,10 +204,10 @@ def test_the_truth_has_the_schema_of_the_recordings() -> None:
     simulation = Simulation(SHORT)
     for _ in simulation.stream():
         pass
-    ours = truth_of(simulation) | {"bytes": 0}
+    ours = truth_of(simulation).to_table() | {"bytes": 0}
     assert set(theirs) <= set(ours)
     assert set(theirs["scene"]) == set(ours["scene"])
-    assert set(theirs["bars"][0]) == set(ours["bars"][0])
+    assert set(theirs["bars"][0]) | {"link", "pilot_every"} == set(ours["bars"][0])
     assert theirs["camera"] == ours["camera"]
 
 
@@ -224,14 +223,14 @@ def test_statistics_are_near_those_of_the_independent_recording(name: str) -> No
 
 
 def test_a_truth_gives_its_scene_again() -> None:
-    found = json.loads(json.dumps(truth(SHORT)))
+    found = json.loads(json.dumps(truth_of(SHORT).to_table()))
     assert scene_of_truth(found) == SHORT
     # Without its own record, all that the shared keys tell.
     del found["simulator"]
     again = scene_of_truth(found)
     assert [b.x_m for b in again.bars] == [b.x_m for b in SHORT.bars]
-    assert truth(again)["bars"][0]["symbols"] == found["bars"][0]["symbols"]
-    assert truth(again)["bars"][1]["start_chip"] == found["bars"][1]["start_chip"]
+    assert truth_of(again).to_table()["bars"][0]["symbols"] == found["bars"][0]["symbols"]
+    assert truth_of(again).to_table()["bars"][1]["start_chip"] == found["bars"][1]["start_chip"]
     assert again.sensor == replace(SHORT.sensor, hot_share=found["scene"]["hot_pixels"] / (1280 * 720))
     found["scene"]["hpf_us"] = 3.0
     with pytest.raises(ConfigError, match="high-pass"):

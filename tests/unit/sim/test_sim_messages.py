@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evlcp_sdk.campaign.measure import message_tallies
-from evlcp_sdk.campaign.statistics import Tally
-from evlcp_sdk.config import load_link
+from evlcp_sdk.air.beacons import Beacon
+from evlcp_sdk.air.blocks import Block, Kind
+from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.frames import bits_of_symbols
-from evlcp_sdk.messages.beacon import Beacon
-from evlcp_sdk.messages.block import Block, Kind
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.sim import load_scene, resolve_scene, simulate, sites_of, truth
+from evlcp_sdk.sim import load_scene, resolve_scene, simulate, sites_of, truth_of
 from evlcp_sdk.sim.light import sources_of
-from evlcp_sdk.types import Events, Packet
+from evlcp_sdk.study.measure import message_tallies
+from evlcp_sdk.study.tally import Tally
+from evlcp_sdk.values import Events, Packet
 
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 136.9, "height_m": 50.0, "heading_deg": 20.0}
 
@@ -53,7 +53,7 @@ def test_random_data_is_a_message_a_packet() -> None:
 
 def test_a_bar_in_the_world_sends_its_beacon() -> None:
     scene = resolve_scene({"bars": [{"payload": "messages", "text": "Tempo 30"}], "world": WORLD})
-    known = truth(scene)
+    known = truth_of(scene).to_table()
     assert (known["bars"][0]["payload"], known["bars"][0]["error_correction"]) == ("messages", "polar")
     light = sources_of(scene)[0][0]
     assert (light.symbols(0) == light.symbols(2)).all()
@@ -85,7 +85,7 @@ def received() -> tuple[dict[str, Any], list[Packet]]:
     scene = load_scene("drive-30kmh", {"duration_s": 0.15, "bars.payload": "data", "bars.start_chip": 300.0})
     receiver = Receiver(load_link())
     packets = [p for events in simulate(scene, 3) for p in receiver.feed(events)] + receiver.close()
-    return truth(scene, 3), packets
+    return truth_of(scene, 3).to_table(), packets
 
 
 def test_a_campaign_counts_messages(received: tuple[dict[str, Any], list[Packet]]) -> None:
@@ -159,7 +159,7 @@ def test_ten_milliseconds_lost_in_every_packet(after_us: int) -> None:
     receiver, coder = Receiver(load_link()), load_link().block_coder()
     packets = receiver.feed(left) + receiver.close()
     assert min(len(p.frames) for p in packets[1:4]) <= 7
-    tally = sum((t for _, t in message_tallies(packets, truth(scene, 3), coder)), Tally())
+    tally = sum((t for _, t in message_tallies(packets, truth_of(scene, 3).to_table(), coder)), Tally())
     assert (tally.messages_sent, tally.messages_found, tally.messages_wrong) == (4, 4, 0)
 
 

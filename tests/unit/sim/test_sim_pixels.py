@@ -21,7 +21,7 @@ from evlcp_sdk.sim.validation import (
     pixel_events,
     step_response,
 )
-from evlcp_sdk.types import Events
+from evlcp_sdk.values import Events
 
 SENSOR = SensorSpec()
 IDEAL = replace(SENSOR, noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.frames import packet_chips
-from evlcp_sdk.geometry import CameraModel
+from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
     BarSpec,
     LampSpec,
@@ -21,7 +21,7 @@ from evlcp_sdk.sim import (
     preset_names,
     resolve_scene,
     scene_table,
-    truth,
+    truth_of,
 )
 from evlcp_sdk.sim.light import BarLight, LampLight
 from evlcp_sdk.sim.motion import CameraPath, Vibration, project
@@ -203,7 +203,7 @@ def test_a_path_of_a_file_is_followed(tmp_path: Path) -> None:
     position, attitude = CameraPath(scene.motion, 0.2, 0).at([1e5])
     assert position[0] == pytest.approx([0.3, 0.1, -39])
     assert np.degrees(attitude[0]) == pytest.approx([0.5, -0.2, 2])
-    assert truth(scene)["distance_m"][0][100] == pytest.approx(39, abs=0.05)
+    assert truth_of(scene).to_table()["distance_m"][0][100] == pytest.approx(39, abs=0.05)
     with pytest.raises(ConfigError, match=r"lasts from 0\.0 to 0\.2 s"):
         Simulation(load_scene(tmp_path / "scene.toml", ["duration_s=0.3"]))
     (tmp_path / "path.csv").write_text("\n".join([line.replace("-", "") for line in lines]))

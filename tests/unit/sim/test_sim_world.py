@@ -6,12 +6,12 @@ import numpy as np
 import pymap3d
 import pytest
 
-from evlcp_sdk.attitude import AttitudeTrack
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.scene.attitude import AttitudeLog
+from evlcp_sdk.scene.sites import LocalFrame, load_sites, to_toml
 from evlcp_sdk.sim import Simulation, load_scene, resolve_scene, sites_of, truth_of
 from evlcp_sdk.sim.motion import project
 from evlcp_sdk.sim.world import attitude_log
-from evlcp_sdk.sites import LocalFrame, load_sites, to_toml
 
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 137.2, "height_m": 40.0, "heading_deg": 30.0}
 SCENE = resolve_scene(
@@ -41,7 +41,7 @@ def turned(heading_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarray:
 
 def test_sites_and_camera_say_what_the_image_shows() -> None:
     simulation = Simulation(SCENE)
-    truth = truth_of(simulation)
+    truth = truth_of(simulation).to_table()
     sites, path = sites_of(SCENE), truth["camera_path"]
     assert [s.transmitter_id for s in sites] == [1, 77, 3]
     camera = SCENE.camera
@@ -74,7 +74,7 @@ def test_the_origin_is_the_worlds() -> None:
 
 def test_without_a_world_there_are_no_sites() -> None:
     scene = load_scene("drive-30kmh", ["duration_s=0.01"])
-    assert "sites" not in truth_of(Simulation(scene))
+    assert "sites" not in truth_of(Simulation(scene)).to_table()
     with pytest.raises(ConfigError, match=r"no \[world\]"):
         sites_of(scene)
 
@@ -102,7 +102,7 @@ def test_an_imu_tells_the_attitude_and_one_error(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.std(errors, 0), 0.1, rtol=0.2)
     file = tmp_path / "attitude.csv"
     file.write_text(log.to_csv())
-    again = AttitudeTrack.read(file).at(20_300.0)
+    again = AttitudeLog.read(file).at(20_300.0)
     assert again is not None
     assert again.heading_deg == pytest.approx(found.heading_deg, abs=1e-4)
     assert again.pitch_deg == pytest.approx(found.pitch_deg, abs=1e-4)

@@ -1,0 +1,170 @@
+"""Frames and packets: symbols and bits to chips on air, and back.
+
+A packet is the preamble followed by F frames; a frame is a pilot and an info segment; packets follow one
+another without a gap (air interface 1). At a higher rate only every N-th frame of a packet, from its first
+on, has a pilot; the others are the info segment alone.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evlcp_sdk.air.codebook import Codebook, chips_of_values
+from evlcp_sdk.errors import ConfigError
+
+__all__ = ["PacketFormat", "bits_of_symbols", "info_words", "packet_chips", "pilot_words", "symbols_of_bits"]
+
+
+@dataclass(frozen=True)
+class PacketFormat:
+    """Lengths of a packet's parts in chips, and the chip rate.
+
+    >>> from evlcp_sdk.air.codebook import Codebook, hadamard
+    >>> book = Codebook("demo", hadamard(2)[1], hadamard(8), hadamard(8))
+    >>> PacketFormat.of(book, frames=10).frame_chips
+    32
+    >>> PacketFormat.of(book, frames=10, pilot_every=4).packet_chips
+    212
+    """
+
+    preamble_chips: int = 26
+    pilot_chips: int = 16
+    info_chips: int = 16
+    frames: int = 10
+    chip_rate_hz: float = 10_000.0
+    pilot_every: int = 1
+
+    @classmethod
+    def of(
+        cls, codebook: Codebook, frames: int, chip_rate_hz: float = 10_000.0, pilot_every: int = 1
+    ) -> "PacketFormat":
+        """The format that a codebook's code lengths imply."""
+        return cls(
+            preamble_chips=2 * len(codebook.preamble),
+            pilot_chips=2 * codebook.pilots.shape[1],
+            info_chips=2 * codebook.codewords.shape[1],
+            frames=frames,
+            chip_rate_hz=chip_rate_hz,
+            pilot_every=pilot_every,
+        )
+
+    @property
+    def frame_chips(self) -> int:
+        """Chips of a frame with a pilot: pilot and info segment."""
+        return self.pilot_chips + self.info_chips
+
+    @property
+    def packet_chips(self) -> int:
+        """Chips of one packet: preamble and frames."""
+        return self.frame_start_chip(self.frames)
+
+    @property
+    def chip_us(self) -> float:
+        """Nominal length of a chip, us."""
+        return 1e6 / self.chip_rate_hz
+
+    def has_pilot(self, frame: int) -> bool:
+        """Whether a frame of the packet begins with a pilot."""
+        return frame % self.pilot_every == 0
+
+    def frame_start_chip(self, frame: int) -> int:
+        """Chip of the packet at which a frame begins: with its pilot, or with its info segment."""
+        pilots = -(-frame // self.pilot_every)
+        return self.preamble_chips + frame * self.info_chips + pilots * self.pilot_chips
+
+    def gross_bit_s(self, bits_per_symbol: int, clusters: int) -> float:
+        """Bits on air a second, the share of preamble and pilots taken off.
+
+        >>> round(PacketFormat().gross_bit_s(6, 16))
+        27746
+        """
+        return self.frames * clusters * bits_per_symbol * self.chip_rate_hz / self.packet_chips
+
+
+def _checked(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.int64]:
+    s = np.asarray(symbols)
+    if s.ndim != 2 or s.shape[1] != codebook.clusters:
+        raise ConfigError(f"symbols of shape {s.shape}: expected (frames, {codebook.clusters} clusters)")
+    if s.dtype.kind not in "ui":
+        raise ConfigError(f"symbols of type {s.dtype}: expected integers")
+    top = len(codebook.codewords)
+    if s.size and (s.min() < 0 or s.max() >= top):
+        f, k = np.argwhere((s < 0) | (s >= top))[0]
+        raise ConfigError(
+            f"symbol {s[f, k]} at frame {f}, cluster {k}: expected 0 to {top - 1} ({codebook.profile})"
+        )
+    return s.astype(np.int64)
+
+
+def packet_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -> NDArray[np.uint8]:
+    """Chips of one packet: symbols (F, K) to uint8 (chips, K), 1 = on.
+
+    Args:
+        symbols: The packet's symbols.
+        codebook: What they mean.
+        pilot_every: Frames from one pilot to the next.
+
+    Raises:
+        ConfigError: Symbols of another shape or outside the codebook.
+    """
+    s = _checked(symbols, codebook)
+    preamble = np.repeat(chips_of_values(codebook.preamble)[:, None], codebook.clusters, axis=1)
+    pilot = chips_of_values(codebook.pilots).T
+    info = chips_of_values(codebook.codewords)
+    parts = [preamble]
+    for frame, row in enumerate(s):
+        parts += [pilot, info[row].T] if frame % pilot_every == 0 else [info[row].T]
+    return np.concatenate(parts)
+
+
+def _words(chips: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    if chips.shape[-1] != 16:
+        raise ConfigError(f"a driver-board word has 16 chips, these codes have {chips.shape[-1]}")
+    shifted = chips.astype(np.uint16) << np.arange(15, -1, -1, dtype=np.uint16)
+    words: NDArray[np.uint16] = shifted.sum(-1, dtype=np.uint16)
+    return words
+
+
+def pilot_words(codebook: Codebook) -> NDArray[np.uint16]:
+    """The pilots as driver-board words, uint16 (K,); most significant bit first on air."""
+    return _words(chips_of_values(codebook.pilots))
+
+
+def info_words(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.uint16]:
+    """Info segments as driver-board words: symbols (F, K) to uint16 (F, K).
+
+    Raises:
+        ConfigError: Symbols of another shape or outside the codebook, or codes of another length.
+    """
+    words = _words(chips_of_values(codebook.codewords))
+    found: NDArray[np.uint16] = words[_checked(symbols, codebook)]
+    return found
+
+
+def bits_of_symbols(symbols: ArrayLike, bits_per_symbol: int) -> NDArray[np.uint8]:
+    """Bits of symbols (F, K), frame by frame, cluster 0 first, most significant bit first.
+
+    >>> bits_of_symbols([[5, 2]], 3).tolist()
+    [1, 0, 1, 0, 1, 0]
+    """
+    s = np.asarray(symbols, np.int64)
+    shifts = np.arange(bits_per_symbol - 1, -1, -1)
+    return ((s[..., None] >> shifts) & 1).astype(np.uint8).ravel()
+
+
+def symbols_of_bits(bits: ArrayLike, bits_per_symbol: int, clusters: int) -> NDArray[np.int64]:
+    """Symbols (F, K) of a packet's bits; the inverse of `bits_of_symbols`.
+
+    Raises:
+        ConfigError: The bits do not fill whole frames.
+
+    >>> symbols_of_bits([1, 0, 1, 0, 1, 0], 3, 2).tolist()
+    [[5, 2]]
+    """
+    b = np.asarray(bits, np.int64).ravel()
+    if b.size % (bits_per_symbol * clusters):
+        raise ConfigError(f"{b.size} bits: expected a multiple of {bits_per_symbol * clusters} (one frame)")
+    weights = 1 << np.arange(bits_per_symbol - 1, -1, -1)
+    symbols: NDArray[np.int64] = (b.reshape(-1, clusters, bits_per_symbol) * weights).sum(-1)
+    return symbols

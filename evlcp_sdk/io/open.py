@@ -1,0 +1,152 @@
+"""Open and save recordings of any format, and whatever plugins bring."""
+
+import re
+from pathlib import Path
+from typing import Final
+from urllib.parse import unquote
+
+from evlcp_sdk.errors import EvlcpError, InputError, PluginError, StreamError
+from evlcp_sdk.io.faery import FORMATS, FaerySource
+from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
+from evlcp_sdk.io.sources import EventSource
+from evlcp_sdk.io.tables import CSV_HEADER, CsvSource, CsvWriter, NpzSource, NpzWriter
+from evlcp_sdk.io.writers import EventWriter
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.values import Events, Triggers
+
+__all__ = ["open_source", "open_writer", "read_events", "write_events"]
+
+WRITABLE: Final = {".raw": "EVT3", ".npz": "NPZ", ".csv": "CSV", ".csv.gz": "CSV"}
+
+_SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
+
+
+def open_source(url: Path | str, registry: Registry | None = None) -> EventSource:
+    """Open a recording, a camera or whatever else a plugin knows, as an event source: a context manager.
+
+    Plugins are asked first, by the hook `evlcp_open_events`. Of a file the content says the format, or else
+    the suffix of its name; `file:` before its name does no harm.
+
+    Args:
+        url: A file, or what a plugin opens, e.g. `cam:0`.
+        registry: The plugins that are asked; None for all that are installed.
+
+    Raises:
+        InputError: It cannot be opened or is not of a known format, or nobody knows its scheme.
+        PluginError: The plugin that opens it fails.
+    """
+    registry = Registry.load() if registry is None else registry
+    source = _ask_plugins(str(url), registry)
+    if source is not None:
+        return source
+    scheme = _SCHEME.match(str(url))
+    if scheme is None or Path(url).exists():
+        return _open_file(url)
+    if scheme[1].lower() == "file":
+        return _open_file(unquote(str(url)[len(scheme[0]) :].removeprefix("//")))
+    asked = sorted({impl.plugin_name for impl in registry.hook.evlcp_open_events.get_hookimpls()})
+    raise InputError(
+        f"{url}: scheme '{scheme[1]}', expected file: or one that a plugin opens"
+        f" (asked: {', '.join(asked) or 'no plugin that opens sources is installed'})"
+    )
+
+
+def _ask_plugins(url: str, registry: Registry) -> EventSource | None:
+    """The source that the first plugin gives; None where no plugin knows the url."""
+    try:
+        source: object = registry.hook.evlcp_open_events(url=url)
+    except EvlcpError:
+        raise
+    except Exception as fault:
+        what = f"{type(fault).__name__}: {fault}".splitlines()[0]
+        raise PluginError(f"{url}: the plugin that opens it fails: {what}") from fault
+    if source is None or isinstance(source, EventSource):
+        return source
+    raise PluginError(f"{url}: a plugin opens it as {type(source).__name__}, expected an EventSource")
+
+
+def _open_file(path: Path | str) -> EventSource:
+    target = Path(path)
+    if target.suffix.lower() in FORMATS:
+        return FaerySource(path)
+    try:
+        special = target.exists() and not target.is_file() and not target.is_dir()
+        start = b"% " if special else _first_bytes(target)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from error
+    suffix = _suffix(target)
+    if start.startswith(b"% "):
+        return RawSource(path)
+    if start.startswith(b"PK\x03\x04") or suffix == ".npz":
+        return NpzSource(path)
+    if start.startswith((b"\x1f\x8b", CSV_HEADER)) or suffix in (".csv", ".csv.gz"):
+        return CsvSource(path)
+    return RawSource(path)  # which says what is wrong
+
+
+def _first_bytes(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(16)
+
+
+def _suffix(path: Path) -> str:
+    return "".join(path.suffixes[-2:]).lower() if path.suffix == ".gz" else path.suffix.lower()
+
+
+def read_events(url: Path | str) -> Events:
+    """Return all events of a recording; `open_source(url).read()` returns the triggers too.
+
+    Raises:
+        InputError: The recording cannot be read.
+    """
+    with open_source(url) as source:
+        return source.read()[0]
+
+
+def open_writer(
+    path: Path | str,
+    width: int | None = None,
+    height: int | None = None,
+    format: str | None = None,
+) -> EventWriter:
+    """Create a recording to write piece by piece, a context manager.
+
+    Args:
+        path: The file; `.raw`, `.npz`, `.csv` or `.csv.gz` tells the format.
+        width: Columns of the sensor; RAW needs it, the tables do not.
+        height: Rows of the sensor, likewise.
+        format: `EVT3` (the default for `.raw`), `EVT2`, `NPZ` or `CSV`, whatever the file's name.
+
+    Raises:
+        EvlcpError: The file cannot be written.
+        StreamError: The format is unknown, or width and height are missing for RAW.
+    """
+    name = (format or WRITABLE.get(_suffix(Path(path)), "")).upper()
+    if name == "NPZ":
+        return NpzWriter(path, width, height)
+    if name == "CSV":
+        return CsvWriter(path, width, height)
+    if name not in CODECS:
+        found = f"format {format!r}" if format else f"suffix {_suffix(Path(path))!r}"
+        raise StreamError(f"{path}: {found}, expected {', '.join(WRITABLE)} or format EVT2, EVT3, NPZ, CSV")
+    if width is None or height is None:
+        raise StreamError(f"{path}: sensor of {width}x{height}, expected a width and a height for {name}")
+    return RawWriter(path, width, height, CODECS[name])
+
+
+def write_events(
+    path: Path | str,
+    events: Events,
+    width: int | None = None,
+    height: int | None = None,
+    triggers: Triggers | None = None,
+    format: str | None = None,
+) -> None:
+    """Save events and triggers, sorted by time, as a recording; arguments as for `open_writer`.
+
+    Raises:
+        EvlcpError: The file cannot be written.
+        StreamError: The format is unknown or has no place for a value or for triggers, or times run backward.
+    """
+    with open_writer(path, width, height, format) as writer:
+        writer.write(events, triggers)

@@ -1,0 +1,101 @@
+"""Blocks to packets: protection and interleaving, and back from soft bits."""
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.air.blocks import DIGEST_BYTES, HEADER_BYTES
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import PacketFormat, symbols_of_bits
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.plugin.roles import Code
+
+__all__ = ["BlockCoder", "interleaver", "packet_bits"]
+
+_SEED = 2463534242
+"""Begin of the interleaver's sequence, Marsaglia's own."""
+
+
+def packet_bits(codebook: Codebook, packet: PacketFormat) -> int:
+    """Bits of a packet on air."""
+    return packet.frames * codebook.clusters * codebook.bits_per_symbol
+
+
+def interleaver(bits: int) -> NDArray[np.int64]:
+    """Where on air each coded bit goes, int64 (bits,): the places 0, 1, ... in the order of random numbers.
+
+    The numbers are those of the generator xorshift32 (Marsaglia 2003, shifts 13, 17, 5), one a place. A lost
+    cluster or frame so takes bits from all over the code. An order without chance, like multiples of the
+    golden ratio, spreads them more evenly but is a poor one for a polar code, whose own order is as regular.
+
+    >>> interleaver(10).tolist()
+    [5, 7, 0, 8, 6, 3, 2, 1, 9, 4]
+    """
+    numbers = []
+    x = _SEED
+    for _ in range(bits):
+        x ^= x << 13 & 0xFFFFFFFF
+        x ^= x >> 17
+        x ^= x << 5 & 0xFFFFFFFF
+        numbers.append(x)
+    return np.argsort(np.array(numbers, np.int64), kind="stable")
+
+
+class BlockCoder:
+    """Puts one block on each packet, and reads it from a packet's soft bits.
+
+    Args:
+        codebook: The codes that both ends share.
+        packet: Lengths of a packet's parts.
+        code: The error-correcting code of a packet's bits.
+
+    Raises:
+        ConfigError: A packet is too short for a block.
+    """
+
+    def __init__(self, codebook: Codebook, packet: PacketFormat, code: Code) -> None:
+        self.codebook = codebook
+        self._frames = packet.frames
+        self._code = code
+        self.bits = packet_bits(codebook, packet)
+        self.block_bytes = code.message_bits // 8
+        if self.block_bytes <= HEADER_BYTES:
+            raise ConfigError(
+                f"messages: a packet of {packet.frames} frames has {self.bits} bits on air and carries"
+                f" {self.block_bytes} bytes, expected at least {HEADER_BYTES + 1};"
+                " raise air.frames_per_packet or the rate of the error correction"
+            )
+        self._order = interleaver(self.bits)
+
+    @cached_property
+    def digest(self) -> bytes:
+        """The codebook's digest as blocks tell it."""
+        return bytes.fromhex(self.codebook.digest)[:DIGEST_BYTES]
+
+    def symbols(self, block: bytes) -> NDArray[np.int64]:
+        """Symbols of the packet that carries a block, int64 (frames, clusters)."""
+        return symbols_of_bits(self.air_bits(block), self.codebook.bits_per_symbol, self.codebook.clusters)
+
+    def air_bits(self, block: bytes) -> NDArray[np.uint8]:
+        """Bits of the packet that carries a block of `block_bytes` bytes, uint8 (bits,)."""
+        message = np.zeros(self._code.message_bits, np.uint8)
+        message[: 8 * self.block_bytes] = np.unpackbits(np.frombuffer(block, np.uint8))
+        air = np.empty(self.bits, np.uint8)
+        air[self._order] = self._code.encode(message)
+        return air
+
+    def block(self, llr: NDArray[np.float32]) -> bytes | None:
+        """The block that a packet carries; None if the code's check fails.
+
+        Args:
+            llr: LLRs ln P(bit 0) / P(bit 1) of the packet's bits in the order on air, float32 (bits,); 0 for
+                a bit that was not received.
+        """
+        # Fewer bits than the message has say nothing of the rest of it.
+        if np.count_nonzero(llr) < self._code.message_bits:
+            return None
+        found = self._code.decode(np.ascontiguousarray(llr[self._order], np.float32))
+        if not found.ok or found.bits[8 * self.block_bytes :].any():
+            return None
+        return np.packbits(found.bits[: 8 * self.block_bytes]).tobytes()

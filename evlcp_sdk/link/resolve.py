@@ -1,0 +1,255 @@
+"""The link: what both ends agree on and how the receiver works, from `link.toml` to checked objects.
+
+One table a role (`[ranging]`: `id = "poc"`, its parameters flat beside it), and `[camera]`, `[bar]`, `[air]`,
+`[regions]`, `[messages]` and `[position]`. Every default is written out before anything runs, so that the
+resolved table alone reproduces a result. See `docs/configuration.md`.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.errors import ConfigError, UnknownAlgorithmError
+from evlcp_sdk.link.blocks import BlockCoder, packet_bits
+from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
+from evlcp_sdk.plugin.hooks import ROLE_NAMES
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.specs import expected, nearest, parse_value, read_toml, shown, spec_model
+
+__all__ = ["DEFAULT_IDS", "Link", "load_link", "resolve"]
+
+DEFAULT_IDS = {
+    "pilots": "wh",
+    "modulation": "wh4x2",
+    "synchronization": "barker",
+    "separation": "wh-correlation",
+    "decoding": "wh-transform",
+    "ranging": "poc",
+    "tracking": "none",
+    "error-correction": "polar",
+}
+"""The algorithm of each role when the configuration names none."""
+
+
+_SPECS: dict[str, type[Any]] = {
+    "camera": CameraModel,
+    "bar": BarLayout,
+    "air": AirSpec,
+    "regions": RegionSpec,
+    "messages": MessageSpec,
+    "position": PositionSpec,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A resolved configuration and the objects it describes.
+
+    Attributes:
+        camera: The receiving camera.
+        bar: The transmitter's LEDs and clusters.
+        air: Chip rate and packet length.
+        regions: Parameters of the region detector.
+        position: Parameters of the positions.
+        messages: How messages are read.
+        algorithms: Role to algorithm, one of each role.
+        revisions: Role to the algorithm's revision.
+        codebook: The codes that both ends share.
+        packet: Lengths of a packet's parts.
+        table: The resolved configuration, every default written out; plain values as in TOML.
+        digest: SHA-256 of table, codebook digest and revisions, 64 hex digits.
+
+    Two links are equal when their digests are.
+    """
+
+    camera: CameraModel
+    bar: BarLayout
+    air: AirSpec
+    regions: RegionSpec
+    messages: MessageSpec
+    position: PositionSpec
+    algorithms: Mapping[str, Any]
+    revisions: Mapping[str, int]
+    codebook: Codebook
+    packet: PacketFormat
+    table: Mapping[str, Mapping[str, Any]]
+    digest: str
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Link) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    def algorithm(self, role: str) -> Any:
+        """The algorithm of a role, e.g. `link.algorithm("ranging")`."""
+        return self.algorithms[role]
+
+    def block_coder(self) -> BlockCoder:
+        """How packets carry blocks of messages.
+
+        Raises:
+            ConfigError: A packet is too short for a block.
+        """
+        code = self.algorithm("error-correction").compile(packet_bits(self.codebook, self.packet))
+        return BlockCoder(self.codebook, self.packet, code)
+
+
+def load_link(
+    path: Path | str | None = None, overrides: Sequence[str] = (), registry: Registry | None = None
+) -> Link:
+    """Read a `link.toml`, apply `role.key=value` overrides, resolve.
+
+    Args:
+        path: The file; None for all defaults.
+        overrides: What `--set` takes, e.g. `"ranging.id=poc"`; the value is TOML, or else plain text.
+        registry: Where algorithms are found; None for all that are installed.
+
+    Raises:
+        ConfigError: The file cannot be read, is no TOML, or does not describe a link.
+
+    >>> load_link(overrides=["modulation.id=wh8"]).codebook.bits_per_symbol
+    4
+    """
+    table: dict[str, Any] = {}
+    source = ""
+    if path is not None:
+        source = str(path)
+        table = read_toml(path)
+    set_here = set()
+    for override in overrides:
+        section, key, value = _parse_override(override)
+        keys = table.setdefault(section, {})
+        if not isinstance(keys, dict):
+            keys = table[section] = {}
+        keys[key] = value
+        set_here.add((section, key))
+    return resolve(table, registry, source=source, overridden=frozenset(set_here))
+
+
+def resolve(
+    table: Mapping[str, Any],
+    registry: Registry | None = None,
+    *,
+    source: str = "",
+    overridden: frozenset[tuple[str, str]] = frozenset(),
+) -> Link:
+    """Check a configuration table, write out every default, build what it describes.
+
+    Args:
+        table: Section to keys, as read from TOML; may be empty.
+        registry: Where algorithms are found; None for all that are installed.
+        source: What faults name as their place, e.g. the file.
+        overridden: (section, key) that came from `--set` instead.
+
+    Raises:
+        ConfigError: All faults of the table, one line each.
+        UnknownAlgorithmError: The only fault is an id that is not installed.
+
+    >>> resolve({"bar": {"rows": 48}}).codebook.clusters
+    8
+    """
+    registry = Registry.load() if registry is None else registry
+    faults: list[str | UnknownAlgorithmError] = []
+
+    def fault(section: str, key: str | None, text: str) -> None:
+        where = "--set" if (section, key) in overridden else source
+        name = section if key is None else f"{section}.{key}"
+        faults.append(f"{where}: {name}{text}" if where else f"{name}{text}")
+
+    known = [*_SPECS, *ROLE_NAMES]
+    for section, keys in table.items():
+        if section not in known:
+            from_set = (
+                next((k for k in keys if (section, k) in overridden), None)
+                if isinstance(keys, dict)
+                else None
+            )
+            fault(section, from_set, f": unknown table{nearest(section, known)}")
+        elif not isinstance(keys, Mapping):
+            fault(section, None, f" = {keys!r}: expected a table")
+
+    built: dict[str, Any] = {}
+    resolved: dict[str, dict[str, Any]] = {}
+    revisions: dict[str, int] = {}
+    for section in known:
+        keys = table.get(section, {})
+        if not isinstance(keys, Mapping):
+            continue
+        keys = dict(keys)
+        head: dict[str, Any] = {}
+        if section in _SPECS:
+            cls = _SPECS[section]
+        else:
+            head["id"] = name = keys.pop("id", DEFAULT_IDS[section])
+            if not isinstance(name, str):
+                fault(section, "id", f" = {name!r}: expected a string")
+                continue
+            try:
+                revisions[section] = registry.find(section, name).algorithm.revision
+            except UnknownAlgorithmError as unknown:
+                faults.append(unknown)
+                continue
+            cls = registry.load_class(section, name)
+        try:
+            values = spec_model(cls).model_validate_json(json.dumps(keys, default=str))
+            built[section] = cls(**{k: getattr(values, k) for k in type(values).model_fields})
+            resolved[section] = head | json.loads(json.dumps(asdict(built[section])))
+        except ValidationError as refused:
+            names = [f.name for f in fields(cls) if f.init]
+            for error in refused.errors():
+                key = str(error["loc"][0])
+                given = f" = {shown(keys[key])}" if key in keys else ""
+                if error["type"] == "extra_forbidden":
+                    fault(section, key, f"{given}: unknown key{nearest(key, names)}")
+                else:
+                    fault(section, key, f"{given}: {expected(error['msg'])}")
+        except ConfigError as refused:
+            faults.append(f"{source}: {refused}" if source else str(refused))
+    if len(faults) == 1 and isinstance(faults[0], UnknownAlgorithmError):
+        raise faults[0]
+    if faults:
+        raise ConfigError("\n".join(str(f) for f in faults))
+
+    bar, air = built["bar"], built["air"]
+    pilots, modulation = built["pilots"], built["modulation"]
+    codebook = Codebook(
+        resolved["modulation"]["id"], pilots.preamble(), pilots.codes(bar.clusters), modulation.codewords()
+    )
+    return Link(
+        camera=built["camera"],
+        bar=bar,
+        air=air,
+        regions=built["regions"],
+        position=built["position"],
+        messages=built["messages"],
+        algorithms={role: built[role] for role in ROLE_NAMES},
+        revisions=revisions,
+        codebook=codebook,
+        packet=PacketFormat.of(codebook, air.frames_per_packet, air.chip_rate_hz, air.pilot_every),
+        table=resolved,
+        digest=_digest(resolved, codebook, revisions),
+    )
+
+
+def _parse_override(text: str) -> tuple[str, str, Any]:
+    name, equals, value = text.partition("=")
+    section, dot, key = (part.strip() for part in name.partition("."))
+    if not (equals and dot and section and key):
+        raise ConfigError(f"--set {text}: expected table.key=value, e.g. modulation.id=wh8")
+    return section, key, parse_value(value)
+
+
+def _digest(table: Mapping[str, Any], codebook: Codebook, revisions: Mapping[str, int]) -> str:
+    content = {"table": table, "codebook": codebook.digest, "revisions": dict(revisions)}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()

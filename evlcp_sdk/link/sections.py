@@ -1,0 +1,134 @@
+"""The sections of a link that are no algorithm: the air, regions, messages, positions."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+__all__ = ["AirSpec", "MessageSpec", "PositionSpec", "RegionSpec"]
+
+
+@dataclass(frozen=True)
+class AirSpec:
+    """What is on air: the rate of the chips and the length of a packet."""
+
+    chip_rate_hz: Annotated[float, Field(gt=0, description="Chips sent a second.")] = 10_000.0
+    frames_per_packet: Annotated[int, Field(gt=0, description="Frames between two preambles.")] = 10
+    pilot_every: Annotated[
+        int, Field(gt=0, le=64, description="Frames from one pilot to the next; 1: every frame has one.")
+    ] = 1
+
+
+@dataclass(frozen=True)
+class MessageSpec:
+    """How messages are read from packets, and whose beacons are believed."""
+
+    decode: Annotated[bool, Field(description="Read messages; without, packets are symbols only.")] = True
+    combine_packets: Annotated[
+        int,
+        Field(ge=0, le=256, description="Undecoded blocks kept to be added to their repetitions; 0: none."),
+    ] = 16
+    llr_power: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=1,
+            description="Power that sizes of LLRs are raised to: decoders are surer than they are right.",
+        ),
+    ] = 0.5
+    max_llr: Annotated[
+        float,
+        Field(gt=0, le=100, description="Largest LLR after that; no bit is surer than the sync it hangs on."),
+    ] = 7.0
+    trusted_keys: Annotated[
+        tuple[str, ...],
+        Field(description="Public Ed25519 keys, 64 hex digits each, whose beacons are verified."),
+    ] = ()
+    oldest_sequence: Annotated[
+        int, Field(ge=0, lt=2**32, description="Sequence below which a signed beacon counts as replayed.")
+    ] = 0
+
+
+@dataclass(frozen=True)
+class RegionSpec:
+    """How blinking regions are found and followed in the image."""
+
+    step_us: Annotated[
+        int, Field(ge=200, le=10_000, description="Time step of the detector; results come once a step.")
+    ] = 1500
+    min_score: Annotated[
+        int,
+        Field(ge=2, le=40, description="Score at which a pixel is a candidate: 2 for each run of one chip."),
+    ] = 8
+    min_runs: Annotated[
+        int, Field(ge=1, description="Runs of candidate pixels in a step that a new region needs.")
+    ] = 20
+    margin_px: Annotated[
+        int, Field(ge=2, le=64, description="Seam around a region: how far it may move in a step, and blur.")
+    ] = 5
+    merge_px: Annotated[
+        int, Field(ge=8, le=256, description="Gap below which two blinking areas are one region.")
+    ] = 16
+    fade_us: Annotated[
+        int, Field(ge=1000, description="Time without blinking after which a region is released.")
+    ] = 50_000
+    positive_only: Annotated[
+        bool, Field(description="The camera sends positive events only: tell blinking from their times.")
+    ] = False
+    min_clusters_share: Annotated[
+        float,
+        Field(ge=0, le=1, description="Share of the clusters that must be in their place in a frame."),
+    ] = 0.5
+
+
+@dataclass(frozen=True)
+class PositionSpec:
+    """How positions are computed from the image points of bars at known places."""
+
+    min_points: Annotated[
+        int, Field(ge=2, description="Clusters of a bar that must be seen for it to count.")
+    ] = 6
+    huber_sigmas: Annotated[
+        float, Field(gt=0, description="Miss of a point, in its sigmas, beyond which it weighs less.")
+    ] = 3.0
+    shared_sigma_px: Annotated[
+        float,
+        Field(
+            ge=0, description="Error that a bar's points share: motion inside the pilot, up to half a pixel."
+        ),
+    ] = 0.1
+    pixel_sigma_px: Annotated[
+        float,
+        Field(
+            ge=0,
+            description="Error of a point that no averaging over frames removes: where in a pixel it is.",
+        ),
+    ] = 0.08
+    min_view_deg: Annotated[
+        float,
+        Field(ge=0, lt=90, description="Angle between a bar and the line of sight that a lone bar needs."),
+    ] = 10.0
+    max_sigma_m: Annotated[
+        float, Field(gt=0, description="Largest sigma of a position, in any direction, that is given.")
+    ] = 3.0
+    max_misfit: Annotated[
+        float,
+        Field(
+            gt=1, description="Mean square of the misses, in sigmas, above which sites and image disagree."
+        ),
+    ] = 4.0
+    beacons: Annotated[
+        Literal["none", "verified", "any"],
+        Field(
+            description="Beacons whose own place is believed where no site has their id;"
+            " with none, they do not contradict sites, either."
+        ),
+    ] = "verified"
+    acceleration_m2_s3: Annotated[
+        float,
+        Field(gt=0, description="Power density of the change of speed: 1 m/s2 that lasts for a second."),
+    ] = 1.0
+    gate_sigmas: Annotated[
+        float,
+        Field(gt=1, description="Sigmas from the prediction beyond which a trajectory leaves a fix out."),
+    ] = 5.0

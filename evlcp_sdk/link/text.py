@@ -1,0 +1,79 @@
+"""A link as TOML text that explains itself."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.hooks import ROLE_NAMES
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.specs import spec_model, toml_value
+
+__all__ = ["to_toml"]
+
+_UNITS = {
+    "us": "us",
+    "ms": "ms",
+    "s": "s",
+    "hz": "Hz",
+    "ppm": "ppm",
+    "px": "px",
+    "um": "um",
+    "mm": "mm",
+    "m": "m",
+    "deg": "deg",
+    "chips": "chips",
+}
+
+
+def to_toml(link: Link, registry: Registry) -> str:
+    """The resolved configuration as TOML, each key with its meaning, unit, bounds and default.
+
+    Loading the text again gives a link with the same digest.
+    """
+    return "\n".join(_toml_lines(link, registry)).rstrip("\n") + "\n"
+
+
+def _toml_lines(link: Link, registry: Registry) -> Iterator[str]:
+    yield "# EVLCP link: what transmitter and receiver agree on, and how the receiver works."
+    yield f"# digest {link.digest}"
+    yield f"# codebook {link.codebook.digest}"
+    yield ""
+    for section, values in link.table.items():
+        thing = link.algorithms.get(section) or getattr(link, section)
+        schema = spec_model(type(thing)).model_json_schema()["properties"]
+        yield f"# {_first_line(type(thing))}"
+        yield f"[{section}]"
+        if section in ROLE_NAMES:
+            others = [e.algorithm.id for e in registry.installed(section) if e.algorithm.id != values["id"]]
+            yield f'id = "{values["id"]}"' + (f"  # or {', '.join(others)}" if others else "")
+        for key, value in values.items():
+            if key in schema:
+                yield f"# {_comment(key, schema[key])}"
+                yield f"# {key} =" if value is None else f"{key} = {toml_value(value)}"
+        yield ""
+
+
+def _comment(key: str, schema: Mapping[str, Any]) -> str:
+    unit = _UNITS.get(key.rpartition("_")[2], "") if "_" in key else ""
+    bounds = [
+        f"{sign} {schema[name]}"
+        for name, sign in (
+            ("exclusiveMinimum", ">"),
+            ("minimum", ">="),
+            ("exclusiveMaximum", "<"),
+            ("maximum", "<="),
+        )
+        if name in schema
+    ]
+    choices = [" | ".join(toml_value(c) for c in schema["enum"])] if "enum" in schema else []
+    value = schema.get("default")
+    if value is not None and schema.get("type") == "number":
+        value = float(value)
+    default = "none" if value is None else toml_value(value)
+    facts = ", ".join([*([unit] if unit else []), *bounds, *choices, f"default {default}"])
+    text = str(schema.get("description", "")).strip()
+    return f"{text} [{facts}]" if text else f"[{facts}]"
+
+
+def _first_line(cls: type[Any]) -> str:
+    return (cls.__doc__ or cls.__name__).strip().splitlines()[0]

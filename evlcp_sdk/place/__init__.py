@@ -1,0 +1,1 @@
+"""From image points to positions: poses, the positioner, the trajectory, calibration."""

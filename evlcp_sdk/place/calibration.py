@@ -1,0 +1,382 @@
+"""Focal length, principal point and distortion from bars at known places, seen from known places.
+
+One least-squares problem over all views: the camera's parameters and each view's position and attitude, as
+far as these are not known. A parameter that the views do not determine keeps its configured value.
+"""
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.pose import BarView, project_bars
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.camera import CameraModel
+
+__all__ = ["PARAMETERS", "Calibrated", "CalibrationView", "KnownPose", "calibrate", "read_poses"]
+
+Floats = NDArray[np.float64]
+
+PARAMETERS = ("focal_mm", "centre_x_px", "centre_y_px", "k1", "k2", "p1", "p2")
+"""What can be estimated, in the order of the fit's columns."""
+
+_USUAL = {
+    "focal_mm": 0.2,
+    "centre_x_px": 0.02,
+    "centre_y_px": 0.02,
+    "k1": 0.5,
+    "k2": 1.0,
+    "p1": 1e-3,
+    "p2": 1e-3,
+}
+"""Sigmas before anything is seen, of the focal length as a share of itself, of the principal point as a share
+of the columns: what lenses and their mounts have. What is not determined widens the sigmas of the rest."""
+
+_LEARNT = 0.5
+"""Share of that sigma below which the views, not it, determine a parameter."""
+
+_RANGES = {
+    "latitude_deg": (-90.0, 90.0),
+    "longitude_deg": (-180.0, 180.0),
+    "position_sigma_m": (1e-6, math.inf),
+    "attitude_sigma_deg": (1e-6, math.inf),
+}
+"""What a pose's values may be, least and most; exact ones would outweigh all in double precision."""
+
+_STEPS = 60
+_FREE_SIGMA_RAD = 0.5
+"""Sigma of an attitude that is not known, about its closed-form start."""
+
+_MOST_MISFIT = 4.0
+"""Mean square of the misses, in sigmas, above which nothing is believed."""
+
+
+@dataclass(frozen=True)
+class KnownPose:
+    """Where a camera was, and how it was turned if that is known: a row of `poses.csv`.
+
+    Attributes:
+        recording: Name of the recording's file; empty where there is only one.
+        t_us: When, camera clock, us.
+        latitude_deg: WGS-84.
+        longitude_deg: The same.
+        height_m: Above the ellipsoid, m.
+        position_sigma_m: Standard deviation of each of these, m.
+        attitude: With heading; None where it is not known.
+        attitude_sigma_deg: Standard deviation of a turn about each axis, degrees.
+    """
+
+    recording: str
+    t_us: float
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    position_sigma_m: float
+    attitude: Attitude | None
+    attitude_sigma_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationView:
+    """The bars that a camera saw from a known place.
+
+    Attributes:
+        bars: What was seen.
+        enu_m: The camera's place in the local frame, m, float64 (3,).
+        position_sigma_m: Its standard deviation, m.
+        rotation: Camera axes as columns in ENU, float64 (3, 3); None where they are not known.
+        attitude_sigma_deg: Standard deviation of a turn about each axis, degrees.
+    """
+
+    bars: tuple[BarView, ...]
+    enu_m: Floats
+    position_sigma_m: float
+    rotation: Floats | None
+    attitude_sigma_deg: float
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A camera as the views show it.
+
+    Attributes:
+        camera: With what was determined; the rest as it was.
+        sigma: Standard deviation of each parameter that was determined, in its unit.
+        refused: Parameters that the views do not determine: how far the corners of the image would be
+            uncertain by each, px.
+        views: Number of views.
+        points: Number of image points.
+        misfit: Mean square of the misses in sigmas, over the degrees of freedom.
+    """
+
+    camera: CameraModel
+    sigma: Mapping[str, float]
+    refused: Mapping[str, float]
+    views: int
+    points: int
+    misfit: float
+
+
+def read_poses(path: Path | str) -> list[KnownPose]:
+    """Read a CSV of known poses.
+
+    Columns t_us, latitude_deg, longitude_deg, height_m; optional recording, position_sigma_m (0.01),
+    heading_deg, pitch_deg and roll_deg together, and attitude_sigma_deg (0.1).
+
+    Raises:
+        InputError: The file cannot be read.
+        ConfigError: A column is missing, or a value is no number or out of range.
+    """
+    try:
+        # Spreadsheets begin a file with a byte order mark; empty lines give no row.
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            rows = [(reader.line_num, row) for row in reader]
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+    except (UnicodeDecodeError, csv.Error) as fault:
+        raise InputError(f"{path}: not a CSV file: {fault}") from fault
+    if not rows:
+        raise ConfigError(f"{path}: expected one line of values or more")
+    poses = []
+    for line, row in rows:
+
+        def value(name: str, usual: float | None = None, line: int = line, row: Any = row) -> float:
+            text = row.get(name)
+            if usual is not None and text in (None, ""):
+                return usual
+            try:
+                number = float(text)
+            except (TypeError, ValueError):
+                number = math.nan
+            if not math.isfinite(number):
+                raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected a number")
+            low, high = _RANGES.get(name, (number, number))
+            if not low <= number <= high:
+                expected = f"{low:g} to {high:g}" if math.isfinite(high) else f"{low:g} or more"
+                raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected {expected}")
+            return number
+
+        angles = [name for name in ("heading_deg", "pitch_deg", "roll_deg") if row.get(name)]
+        attitude = None
+        if angles:
+            attitude = Attitude(value("pitch_deg"), value("roll_deg"), value("heading_deg"))
+        poses.append(
+            KnownPose(
+                row.get("recording") or "",
+                value("t_us"),
+                value("latitude_deg"),
+                value("longitude_deg"),
+                value("height_m"),
+                value("position_sigma_m", 0.01),
+                attitude,
+                value("attitude_sigma_deg", 0.1),
+            )
+        )
+    return poses
+
+
+def calibrate(
+    views: Sequence[CalibrationView],
+    camera: CameraModel,
+    spec: PositionSpec | None = None,
+    *,
+    limit_px: float = 2.0,
+) -> Calibrated:
+    """Fit the camera to all views.
+
+    All parameters are fitted together, within what lenses usually have. One is determined where the views say
+    more than that, and leave the image's corners uncertain by no more than a limit; the sigmas of these
+    contain what is not known of the others. An error that a bar's points share is `spec.shared_sigma_px`.
+
+    Args:
+        views: Bars seen from known places.
+        camera: Where the fit starts, and what is kept of what is not determined.
+        spec: Weights; None for the defaults.
+        limit_px: Uncertainty of the corners, by one parameter, above which it is not determined, px.
+
+    Raises:
+        ConfigError: Not even the focal length is determined, or the views do not fit their places.
+    """
+    spec = PositionSpec() if spec is None else spec
+    seen = [_Seen.of(view, camera, spec) for view in views]
+    seen = [view for view in seen if len(view.points_px)]
+    if not seen:
+        raise ConfigError("no view shows a bar at a known site: nothing to calibrate from")
+    start = replace(camera, centre_x_px=camera.centre_px[0], centre_y_px=camera.centre_px[1])
+    found, sigma, misfit = _fit(seen, start)
+    corner = {name: _at_corner(start, name) * sigma[name] for name in PARAMETERS}
+    usual = _usual_sigma(start)
+    sure = [n for n in PARAMETERS if corner[n] <= limit_px and sigma[n] <= _LEARNT * usual[n]]
+    if "focal_mm" not in sure:
+        raise ConfigError(
+            "the views do not determine the focal length: the image's corners stay uncertain by"
+            f" {corner['focal_mm']:.1f} px, {limit_px:g} px allowed"
+        )
+    if misfit > _MOST_MISFIT:
+        raise ConfigError(
+            f"the views miss their places by {math.sqrt(misfit):.1f} sigmas (rms):"
+            " a site or pose is not as was said"
+        )
+    return Calibrated(
+        replace(camera, **{name: getattr(found, name) for name in sure}),
+        {name: sigma[name] for name in sure},
+        {name: corner[name] for name in PARAMETERS if name not in sure},
+        len(seen),
+        sum(len(v.points_px) for v in seen),
+        misfit,
+    )
+
+
+def _usual_sigma(camera: CameraModel) -> dict[str, float]:
+    scale = {"focal_mm": camera.focal_mm, "centre_x_px": camera.width, "centre_y_px": camera.width}
+    return {name: sigma * scale.get(name, 1.0) for name, sigma in _USUAL.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A view's points in one array, with what makes their errors white and of one sigma."""
+
+    enu_m: Floats
+    points_px: Floats
+    whiten: Floats
+    place_m: Floats
+    place_sigma_m: float
+    rotation: Floats
+    turn_sigma_rad: float
+
+    @classmethod
+    def of(cls, view: CalibrationView, camera: CameraModel, spec: PositionSpec) -> "_Seen":
+        enu, points, whiten = [], [], []
+        for bar in view.bars:
+            good = np.isfinite(bar.points_px).all(1) & (bar.sigma_px > 0)
+            if good.sum() < spec.min_points:
+                continue
+            enu.append(bar.enu_m[good])
+            points.append(bar.points_px[good])
+            covariance = np.diag(bar.sigma_px[good] ** 2) + spec.shared_sigma_px**2
+            whiten.append(np.linalg.inv(np.linalg.cholesky(covariance)))
+        size = sum(map(len, points))
+        joined, at = np.zeros((size, size)), 0
+        for part in whiten:
+            joined[at : at + len(part), at : at + len(part)] = part
+            at += len(part)
+        flat = np.concatenate([np.empty((0, 3)), *enu])
+        seen = np.concatenate([np.empty((0, 2)), *points])
+        rotation = view.rotation
+        sigma = math.radians(view.attitude_sigma_deg)
+        if rotation is None:
+            rotation, sigma = _turned(flat - view.enu_m, seen, camera), _FREE_SIGMA_RAD
+        return cls(flat, seen, joined, view.enu_m, view.position_sigma_m, rotation, sigma)
+
+
+def _turned(offset_m: Floats, points_px: Floats, camera: CameraModel) -> Floats:
+    """The attitude that brings sights best onto directions (Kabsch)."""
+    if not len(points_px):
+        return np.eye(3)
+    flat = camera.undistort(points_px)
+    sights = np.concatenate([flat, np.ones((len(flat), 1))], 1)
+    sights /= np.linalg.norm(sights, axis=1, keepdims=True)
+    world = offset_m / np.linalg.norm(offset_m, axis=1, keepdims=True)
+    left, _, right = np.linalg.svd(world.T @ sights)
+    return np.asarray(left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right)
+
+
+def _slopes(camera: CameraModel, direction: Floats, points_px: Floats, names: Sequence[str]) -> Floats:
+    """Derivatives of image points by the camera's parameters, float64 (n, 2, len(names))."""
+    u, v = direction.T
+    r2, f, zero, one = u * u + v * v, camera.focal_px, np.zeros(len(u)), np.ones(len(u))
+    away = (points_px - camera.centre_px) / camera.focal_mm
+    by: dict[str, tuple[Floats, Floats]] = {
+        "focal_mm": (away[:, 0], away[:, 1]),
+        "centre_x_px": (one, zero),
+        "centre_y_px": (zero, one),
+        "k1": (f * u * r2, f * v * r2),
+        "k2": (f * u * r2**2, f * v * r2**2),
+        "p1": (f * 2 * u * v, f * (r2 + 2 * v * v)),
+        "p2": (f * (r2 + 2 * u * u), f * 2 * u * v),
+    }
+    return np.stack([np.stack(by[name], -1) for name in names], -1)
+
+
+def _at_corner(camera: CameraModel, name: str) -> float:
+    """How far the image's farthest corner moves by a parameter's unit, px."""
+    corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
+    direction = (corners - camera.centre_px) / camera.focal_px
+    moved = _slopes(camera, direction, corners, [name])[:, :, 0]
+    return float(np.linalg.norm(moved, axis=1).max())
+
+
+def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, dict[str, float], float]:
+    """Least squares over everything; the camera, its parameters' sigmas, and the misfit."""
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
+    names, shared = PARAMETERS, len(PARAMETERS)
+    begin = np.array([float(getattr(camera, name)) for name in names] + [0.0] * (6 * len(views)))
+    usual = _usual_sigma(camera)
+    loose = np.array([1 / usual[name] for name in names])
+
+    def camera_of(x: Floats) -> CameraModel:
+        values = dict(zip(names, x[:shared].tolist(), strict=True))
+        values["focal_mm"] = max(values["focal_mm"], 1e-3)
+        return replace(camera, **values)
+
+    def parts(x: Floats) -> tuple[Floats, Floats]:
+        now = camera_of(x)
+        misses, rows = [(x[:shared] - begin[:shared]) * loose], [np.diag(loose) @ np.eye(shared, len(x))]
+        for i, view in enumerate(views):
+            at = shared + 6 * i
+            turn = x[at + 3 : at + 6]
+            rotation = Rotation.from_rotvec(turn).as_matrix() @ view.rotation
+            position = view.place_m + x[at : at + 3]
+            place, slope = project_bars(view.enu_m, position, rotation, now)
+            seen = (view.enu_m - position) @ rotation
+            block = np.zeros((len(place), 2, len(x)))
+            block[:, :, :shared] = _slopes(now, seen[:, :2] / seen[:, 2:], place, names)
+            block[:, :, at : at + 3] = slope[:, :, :3]
+            block[:, :, at + 3 : at + 6] = slope[:, :, 3:] @ _turn_slope(turn)
+            for axis in (0, 1):
+                # A step that turns a point behind the camera is not to be taken.
+                off = np.nan_to_num(place[:, axis] - view.points_px[:, axis], nan=1e6)
+                misses.append(view.whiten @ off)
+                rows.append(view.whiten @ np.nan_to_num(block[:, axis]))
+            scale = np.repeat([1 / view.place_sigma_m, 1 / view.turn_sigma_rad], 3)
+            misses.append(x[at : at + 6] * scale)
+            prior = np.zeros((6, len(x)))
+            prior[:, at : at + 6] = np.diag(scale)
+            rows.append(prior)
+        return np.concatenate(misses), np.concatenate(rows)
+
+    def miss(x: Floats) -> Floats:
+        return parts(x)[0]
+
+    def slope_of(x: Floats) -> Floats:
+        return parts(x)[1]
+
+    fit = least_squares(miss, begin, slope_of, x_scale="jac", max_nfev=_STEPS)
+    misses, rows = parts(fit.x)
+    scale = 1 / np.sqrt((rows**2).sum(0))
+    half = np.linalg.inv(np.linalg.qr(rows * scale, mode="r"))
+    covariance = (half @ half.T) * scale * scale[:, None]
+    points = 2 * sum(len(v.points_px) for v in views)
+    freedom = max(points - shared - 3 * len(views), 1)
+    sigma = dict(zip(names, np.sqrt(np.diag(covariance)[:shared]).tolist(), strict=True))
+    return camera_of(fit.x), sigma, float(misses @ misses) / freedom
+
+
+def _turn_slope(turn: Floats) -> Floats:
+    """Small turn of the whole by the parts of a rotation vector (the left Jacobian of the rotations)."""
+    angle = float(np.linalg.norm(turn))
+    cross = np.cross(np.eye(3), turn)
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) + cross / 2)
+    k = cross / angle
+    return np.asarray(np.eye(3) + (1 - math.cos(angle)) / angle * k + (1 - math.sin(angle) / angle) * (k @ k))

@@ -1,0 +1,1 @@
+"""How packages join: roles, hooks, and the registry of what is installed."""

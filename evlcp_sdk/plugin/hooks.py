@@ -1,0 +1,85 @@
+"""The hooks by which packages join the SDK, and the record that names an algorithm.
+
+A package joins by an entry point in the group `evlcp` that names a module with functions marked `@hookimpl`.
+See `docs/hooks.md` for a complete example of each hook.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import pluggy
+
+if TYPE_CHECKING:
+    import typer
+
+    from evlcp_sdk.io import EventSource
+
+__all__ = ["ENTRY_POINT_GROUP", "ROLE_NAMES", "Algorithm", "hookimpl", "hookspec"]
+
+ENTRY_POINT_GROUP = "evlcp"
+"""Entry-point group, and pluggy project name."""
+
+ROLE_NAMES = (
+    "pilots",
+    "modulation",
+    "synchronization",
+    "separation",
+    "decoding",
+    "ranging",
+    "tracking",
+    "error-correction",
+)
+"""The roles that algorithms fill, in the order of the signal's flow."""
+
+hookspec = pluggy.HookspecMarker(ENTRY_POINT_GROUP)
+hookimpl = pluggy.HookimplMarker(ENTRY_POINT_GROUP)
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """Where one algorithm is found, without importing it.
+
+    Attributes:
+        role: The role it fills, one of `ROLE_NAMES`; its abstract class is `plugin.roles.ROLES[role]`.
+        id: The name by which a configuration selects it.
+        target: `module:Class` of its description.
+        revision: Raised whenever its results may change; part of every result's digest.
+        summary: One line for `evlcp plugins`.
+    """
+
+    role: str
+    id: str
+    target: str
+    revision: int
+    summary: str
+
+
+@hookspec
+def evlcp_algorithms() -> Iterable[Algorithm]:  # type: ignore[empty-body]
+    """Yield a record for each algorithm the package brings; import no kernel here."""
+
+
+@hookspec(firstresult=True)
+def evlcp_open_events(url: str) -> "EventSource | None":
+    """Open `url` as an event source, or return None to leave it to others.
+
+    Asked before the built-in readers, so that a package can bring a camera or a file format.
+    """
+
+
+@hookspec
+def evlcp_stage_finished(stage: str, value: Any, elapsed_s: float) -> None:
+    """Watch the receiver: called once after each stage, never once an event.
+
+    Args:
+        stage: `regions`, `synchronization`, `separation`, `decoding`, `view`, `ranging`, `frame` or
+            `message`.
+        value: What the stage produced.
+        elapsed_s: How long it took, s.
+    """
+
+
+@hookspec
+def evlcp_register_commands(app: "typer.Typer") -> None:
+    """Add commands to the `evlcp` command line; import only what the command needs, inside it."""

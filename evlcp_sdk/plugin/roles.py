@@ -1,0 +1,237 @@
+"""The roles: one abstract class each, filled by plugins.
+
+An algorithm is a frozen dataclass whose fields are its parameters, each with a default, a unit in its name
+and a description. Pydantic checks the fields when a configuration is loaded; the dataclass itself stays
+plain, picklable and JSON-round-trippable. `compile` precomputes and returns a pure function over arrays; only
+synchronization keeps state, and that state is explicit.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols, SyncLock
+
+__all__ = [
+    "ROLES",
+    "Code",
+    "Corrected",
+    "Decode",
+    "Decoding",
+    "ErrorCorrection",
+    "Filter",
+    "Measure",
+    "Modulation",
+    "Pilots",
+    "Ranging",
+    "Separate",
+    "Separation",
+    "Synchronization",
+    "Synchronizer",
+    "Tracker",
+    "Tracking",
+]
+
+Separate = Callable[[NDArray[np.int16]], PresenceMap]
+"""Chip-aligned polarity sums of a pilot, int16 (chips, height, width) -> presence."""
+
+Decode = Callable[[PresenceMap, NDArray[np.int16]], SoftSymbols]
+"""Presence and a frame's polarity sums, pilot then info, int16 (chips, height, width) -> soft symbols."""
+
+Measure = Callable[[FrameView], Range]
+"""A decoded frame's image -> distance."""
+
+
+class Pilots(ABC):
+    """Codes that find time and tell clusters apart."""
+
+    @abstractmethod
+    def preamble(self) -> NDArray[np.int8]:
+        """The code that finds time, int8 (P,)."""
+
+    @abstractmethod
+    def codes(self, clusters: int) -> NDArray[np.int8]:
+        """One code a cluster, int8 (clusters, N).
+
+        Raises:
+            ConfigError: The family has fewer codes.
+        """
+
+
+class Modulation(ABC):
+    """Bits to codewords."""
+
+    @abstractmethod
+    def codewords(self) -> NDArray[np.int8]:
+        """One bipolar codeword a symbol, int8 (2**m, M); row s carries the m bits of s, msb first."""
+
+
+class Synchronizer(Protocol):
+    """What `Synchronization.compile` returns: a step function over explicit state."""
+
+    def init(self) -> Any:
+        """State before the first event."""
+
+    def step(
+        self, state: Any, t_us: NDArray[np.int64], p: NDArray[np.uint8], until_us: int
+    ) -> tuple[Any, list[SyncLock]]:
+        """Take a region's events up to `until_us`; give one lock for each packet whose preamble was heard.
+
+        Args:
+            state: What `init` or the last `step` gave; not changed.
+            t_us: Event times, ascending, int64 (n,).
+            p: Polarities, uint8 (n,).
+            until_us: All events before this time have been given.
+        """
+
+
+class Synchronization(ABC):
+    """Region events to packet timing and clock rate, step by step."""
+
+    @abstractmethod
+    def compile(self, codebook: Codebook, packet: PacketFormat) -> Synchronizer:
+        """Precompute for a codebook's preamble and a packet format."""
+
+
+class Separation(ABC):
+    """Chip-aligned polarity sums to presence probability of each cluster."""
+
+    @abstractmethod
+    def compile(self, codebook: Codebook) -> Separate:
+        """Precompute for a codebook's pilots."""
+
+
+class Decoding(ABC):
+    """Presence and a frame's chips to soft symbols."""
+
+    @abstractmethod
+    def compile(self, codebook: Codebook) -> Decode:
+        """Precompute for a codebook's codewords."""
+
+
+class Ranging(ABC):
+    """A decoded frame's image to distance."""
+
+    @abstractmethod
+    def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
+        """Precompute for a camera, a bar and its codes.
+
+        Raises:
+            ConfigError: The parameters do not fit the bar.
+        """
+
+
+class Filter(ABC):
+    """Follows values that change smoothly, step by step, over explicit state."""
+
+    @abstractmethod
+    def init(self) -> Any:
+        """State before the first measurement."""
+
+    @abstractmethod
+    def predict(self, state: Any, t_us: float) -> tuple[NDArray[np.float64], float] | None:
+        """Values float64 (n,) and sigma expected at a time; None before the first measurement."""
+
+    @abstractmethod
+    def step(
+        self, state: Any, t_us: float, value: NDArray[np.float64], sigma: float
+    ) -> tuple[Any, NDArray[np.float64], float]:
+        """Take a measurement, float64 (n,); give the new state, the filtered values and their sigma.
+
+        The state that is given is not changed.
+        """
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """The filters that `Tracking.compile` returns; None leaves a quantity as measured.
+
+    Attributes:
+        position: Of a region's centre (column, row), px, at every time step.
+        distance: Of a transmitter's distance, m, at every frame.
+    """
+
+    position: Filter | None
+    distance: Filter | None
+
+
+class Tracking(ABC):
+    """Distance and image position over time."""
+
+    @abstractmethod
+    def compile(self) -> Tracker:
+        """Make the filters."""
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """A block as the code understands it.
+
+    Attributes:
+        bits: Message bits, uint8 (message_bits,); the best guess where the check fails.
+        ok: The check against undetected errors holds.
+        flipped: Received bits (the signs of the LLRs) that differ from the coded bits decided for.
+    """
+
+    bits: NDArray[np.uint8]
+    ok: bool
+    flipped: int
+
+
+class Code(Protocol):
+    """What `ErrorCorrection.compile` returns: message bits to coded bits and back."""
+
+    @property
+    def message_bits(self) -> int:
+        """Bits of a message that a block carries."""
+
+    @property
+    def coded_bits(self) -> int:
+        """Bits of the block on air."""
+
+    def encode(self, bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Message bits uint8 (message_bits,), 0 or 1 -> coded bits uint8 (coded_bits,).
+
+        Raises:
+            ConfigError: Bits of another number.
+        """
+
+    def decode(self, llr: NDArray[np.float32]) -> Corrected:
+        """LLRs ln P(bit 0) / P(bit 1) of the coded bits, float32 (coded_bits,), 0 for a bit not received.
+
+        Raises:
+            ConfigError: LLRs of another number.
+        """
+
+
+class ErrorCorrection(ABC):
+    """Message bits to coded bits and back, with a check against undetected errors."""
+
+    @abstractmethod
+    def compile(self, coded_bits: int) -> Code:
+        """Precompute for blocks of so many bits on air.
+
+        Raises:
+            ConfigError: The block is too short to carry anything.
+        """
+
+
+ROLES: dict[str, type[ABC]] = {
+    "pilots": Pilots,
+    "modulation": Modulation,
+    "synchronization": Synchronization,
+    "separation": Separation,
+    "decoding": Decoding,
+    "ranging": Ranging,
+    "tracking": Tracking,
+    "error-correction": ErrorCorrection,
+}
+"""The abstract class of each role name."""

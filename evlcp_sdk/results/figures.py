@@ -1,0 +1,435 @@
+"""Figures of one recording: where the regions were, which pixels show which cluster, distance over time.
+
+A `FigureProbe` listens to the receiver's stages and keeps a bounded share of what it hears, so that the
+figures of a recording of any length take constant memory; `save_figures` draws them.
+"""
+
+import colorsys
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.patches import Ellipse, Rectangle
+from numpy.typing import NDArray
+
+from evlcp_sdk.files import whole_file
+from evlcp_sdk.place.trajectory import TrajectoryPoint
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.values import Events, Fix, Frame, PresenceMap, Region
+
+__all__ = [
+    "FigureProbe",
+    "Thinned",
+    "TrackProbe",
+    "draw_distance",
+    "draw_presence",
+    "draw_regions",
+    "draw_track",
+    "save_figures",
+    "save_track",
+]
+
+TRANSMITTER_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+"""Okabe and Ito's colours, told apart by colour-blind readers too."""
+
+_INK = "#333333"
+_DPI = 150
+_MOST_ZOOMS = 3
+_MOST_ELLIPSES = 40
+
+T = TypeVar("T")
+
+
+class Thinned(Generic[T]):
+    """Keeps at most `limit` values of a stream, evenly spread: every value, then every second, fourth, ...
+
+    >>> kept = Thinned(4)
+    >>> for i in range(10):
+    ...     kept.add(i)
+    >>> list(kept)
+    [0, 4, 8]
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._every = 1
+        self._seen = 0
+        self._values: list[T] = []
+
+    def add(self, value: T) -> None:
+        """Take the next value of the stream."""
+        if self._seen % self._every == 0:
+            if len(self._values) == self._limit:
+                self._values = self._values[::2]
+                self._every *= 2
+            if self._seen % self._every == 0:
+                self._values.append(value)
+        self._seen += 1
+
+    def __iter__(self) -> Iterator[T]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """The clearest presence map of a transmitter and the frame it belongs to."""
+
+    frame: Frame
+    presence: PresenceMap
+
+
+class FigureProbe:
+    """Watches a receiver for the figures; register it with `Registry.load(probe)`.
+
+    Args:
+        camera: Tells the size of the image.
+        points: How many frames of a transmitter, and places of a region, to keep.
+    """
+
+    def __init__(self, camera: CameraModel, points: int = 4096) -> None:
+        self.image: NDArray[np.int64] = np.zeros((camera.height, camera.width), np.int64)
+        self.first_us: int | None = None
+        self.regions: dict[int, Thinned[Region]] = {}
+        self.frames: dict[int, Thinned[Frame]] = {}
+        self.clearest: dict[int, _Shown] = {}
+        self._points = points
+        self._presence: PresenceMap | None = None
+
+    def watch(self, events: Events) -> None:
+        """Add events to the accumulated image."""
+        if len(events):
+            if self.first_us is None:
+                self.first_us = int(events.t_us[0])
+            height, width = self.image.shape
+            inside = (events.x < width) & (events.y < height)
+            flat = events.y[inside].astype(np.int64) * width + events.x[inside]
+            self.image += np.bincount(flat, minlength=self.image.size).reshape(self.image.shape)
+
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str, value: Any) -> None:
+        """Keep regions, presence maps and frames."""
+        if stage == "regions":
+            self.regions.setdefault(value.id, Thinned(self._points)).add(value)
+        elif stage == "separation":
+            self._presence = value
+        elif stage == "frame":
+            self.frames.setdefault(value.transmitter, Thinned(self._points)).add(value)
+            best = self.clearest.get(value.transmitter)
+            if self._presence is not None and (best is None or value.soft.quality > best.frame.soft.quality):
+                self.clearest[value.transmitter] = _Shown(value, self._presence)
+
+
+def save_figures(probe: FigureProbe, title: str, folder: Path) -> list[Path]:
+    """Draw what the probe has seen into `regions.png`, `presence.png` and `distance.png`.
+
+    Args:
+        probe: Has watched a receiver to its end.
+        title: What the figures are of, e.g. the recording's name.
+        folder: Where they go; a figure without anything to show is left out.
+
+    Returns:
+        The files written.
+
+    Raises:
+        EvlcpError: A file cannot be written.
+    """
+    written = []
+    drawn: list[tuple[str, Figure]] = [("regions.png", draw_regions(probe, title))]
+    if probe.clearest:
+        drawn.append(("presence.png", draw_presence(probe, title)))
+    if probe.frames:
+        drawn.append(("distance.png", draw_distance(probe, title)))
+    for name, figure in drawn:
+        _save(figure, folder / name)
+        written.append(folder / name)
+    return written
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with whole_file(path) as part:
+        figure.savefig(part, format="png", dpi=_DPI)
+
+
+class TrackProbe:
+    """Watches a `PositionWriter` for the figure of the track.
+
+    Args:
+        points: How many points to keep.
+    """
+
+    def __init__(self, points: int = 4096) -> None:
+        self.points: Thinned[tuple[Fix, TrajectoryPoint, TrajectoryPoint]] = Thinned(points)
+
+    def add(self, fix: Fix, filtered: TrajectoryPoint, smoothed: TrajectoryPoint) -> None:
+        """Take a fix with its points of the track."""
+        self.points.add((fix, filtered, smoothed))
+
+
+def save_track(
+    probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]], title: str, path: Path
+) -> None:
+    """Draw the track into a file.
+
+    Raises:
+        EvlcpError: The file cannot be written.
+    """
+    _save(draw_track(probe, bars_enu_m, title), path)
+
+
+def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]], title: str) -> Figure:
+    """A map of fixes with their 95 % ellipses, the track and the bars; height and sigma over time.
+
+    Args:
+        probe: Has watched a `PositionWriter` to its end.
+        bars_enu_m: Centre of each bar in the local frame, m, float64 (3,), by transmitter.
+        title: What the figure is of.
+    """
+    figure = Figure(figsize=(11, 7.6), layout="constrained")
+    parts = figure.subplot_mosaic(
+        [["plan", "close"], ["height", "height"], ["spread", "spread"]], height_ratios=[4, 1, 1]
+    )
+    plan, close, height, spread = (parts[name] for name in ("plan", "close", "height", "spread"))
+    points = list(probe.points)
+    for number, enu in sorted(bars_enu_m.items()):
+        plan.plot(enu[0], enu[1], "s", ms=7, color=transmitter_colour(number))
+        plan.annotate(
+            f"bar {number}", (enu[0], enu[1]), xytext=(6, 4), textcoords="offset points", fontsize=9
+        )
+    if points:
+        fixed = np.array([fix.enu_m for fix, _, _ in points])
+        live = np.array([filtered.mean for _, filtered, _ in points])
+        smooth = np.array([smoothed.mean for _, _, smoothed in points])
+        t_s = np.array([fix.t_us for fix, _, _ in points]) * 1e-6
+        for axis in (plan, close):
+            for fix, _, _ in points[:: max(1, len(points) // _MOST_ELLIPSES)]:
+                axis.add_patch(_ellipse(fix.enu_m[:2], fix.covariance_m2[:2, :2]))
+            axis.plot(fixed[:, 0], fixed[:, 1], ".", ms=4, color=_INK, label="fix, with 95 % ellipse")
+        for way, colour, label in ((live, "#56b4e9", "filtered"), (smooth, "#d55e00", "smoothed")):
+            for axis in (plan, close):
+                axis.plot(way[:, 0], way[:, 1], "-", lw=1.4, color=colour, label=label)
+            height.plot(t_s, way[:, 2], "-", lw=1.4, color=colour)
+        height.plot(t_s, fixed[:, 2], ".", ms=3, color=_INK)
+        for i, name in enumerate(("east", "north", "up")):
+            sigma = [math.sqrt(fix.covariance_m2[i, i]) for fix, _, _ in points]
+            spread.plot(t_s, sigma, lw=1.2, color=TRANSMITTER_COLOURS[i], label=name)
+        close.legend(frameon=False, fontsize=9)
+        spread.legend(frameon=False, fontsize=9, ncols=3)
+    for axis in (plan, close):
+        axis.set(xlabel="east, m", ylabel="north, m")
+        axis.set_aspect("equal", adjustable="datalim")
+    _title(plan, "bars and track")
+    _title(close, "the track alone")
+    height.set(ylabel="up, m")
+    spread.set(ylabel="sigma, m", xlabel="camera clock, s", ylim=(0, None))
+    for axis in (plan, close, height, spread):
+        _plain(axis)
+        axis.grid(color="#e6e6e6", lw=0.8)
+        axis.set_axisbelow(True)
+    figure.suptitle(f"{title}: {len(points)} positions shown", fontsize=11, color=_INK)
+    return figure
+
+
+def _ellipse(centre: NDArray[np.float64], covariance: NDArray[np.float64]) -> Ellipse:
+    """The ellipse that holds 95 % of a normal distribution of the plane."""
+    values, axes = np.linalg.eigh(covariance)
+    # The 95 % quantile of chi squared with two degrees of freedom is -2 ln 0.05.
+    wide, long = 2 * np.sqrt(-2 * math.log(0.05) * np.maximum(values, 0))
+    angle = math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
+    return Ellipse((centre[0], centre[1]), long, wide, angle=angle, fill=False, ec="#999999", lw=0.8)
+
+
+def transmitter_colour(number: int) -> str:
+    """Colour of a transmitter, the same in every figure."""
+    return TRANSMITTER_COLOURS[number % len(TRANSMITTER_COLOURS)]
+
+
+def cluster_colours(clusters: int) -> NDArray[np.float64]:
+    """Colours of the clusters, float64 (clusters, 3): hue along the bar, neighbours bright and dark."""
+    hues = np.arange(clusters) / max(clusters, 1) * 0.85
+    return np.array([colorsys.hsv_to_rgb(h, 0.95, (0.95, 0.65)[k % 2]) for k, h in enumerate(hues)])
+
+
+def draw_regions(probe: FigureProbe, title: str) -> Figure:
+    """Accumulated events of the whole sensor with the followed regions, and a close view of some of them."""
+    shown = sorted(probe.regions.items(), key=lambda item: -len(item[1]))
+    zooms = sorted(dict(shown[:_MOST_ZOOMS]))
+    figure = Figure(figsize=(8 + 1.8 * len(zooms), 4.8), layout="constrained")
+    axes = figure.subplots(1, 1 + len(zooms), width_ratios=[8] + [1.6] * len(zooms), squeeze=False)[0]
+    height, width = probe.image.shape
+    top = max(float(np.quantile(probe.image[probe.image > 0], 0.99)) if probe.image.any() else 1.0, 1.0)
+    for axis in axes:
+        axis.imshow(
+            np.log1p(probe.image), cmap="Greys", vmin=0, vmax=math.log1p(top), interpolation="nearest"
+        )
+        axis.set_xlabel("column, px")
+    whole = axes[0]
+    whole.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), ylabel="row, px")
+    many = f"{len(probe.regions)} region{'s' * (len(probe.regions) != 1)}"
+    if zooms:
+        many += " (beside: dotted at first, solid at last)"
+    _title(whole, f"{title}: {probe.image.sum():,} events, {many}")
+    for n, (number, places) in enumerate(sorted(probe.regions.items())):
+        colour = transmitter_colour(n)
+        path = list(places)
+        left, upper, right, lower = _bounds(path)
+        whole.add_patch(
+            Rectangle(
+                (left - 6, upper - 6), right - left + 12, lower - upper + 12, fill=False, ec=colour, lw=1.4
+            )
+        )
+        whole.annotate(
+            str(number),
+            (right + 6, upper - 6),
+            xytext=(3, 0),
+            textcoords="offset points",
+            color=colour,
+            va="top",
+        )
+        if number in zooms:
+            axis = axes[1 + zooms.index(number)]
+            pad = 0.15 * max(lower - upper, 20)
+            middle, half = (left + right) / 2, max(right - left, 0.36 * (lower - upper + 2 * pad)) / 2 + 4
+            axis.set(xlim=(middle - half, middle + half), ylim=(lower + pad, upper - pad))
+            first = path[0]
+            for place, style in ((first, ":"), (path[-1], "-")):
+                axis.add_patch(
+                    Rectangle(
+                        _corner(place),
+                        place.width_px,
+                        place.height_px,
+                        fill=False,
+                        ec=colour,
+                        ls=style,
+                        lw=1.4,
+                    )
+                )
+            _title(axis, f"region {number}")
+    return figure
+
+
+def draw_presence(probe: FigureProbe, title: str) -> Figure:
+    """Which pixels show which cluster, in one frame of each transmitter, and the profile of each cluster."""
+    shown = [probe.clearest[n] for n in sorted(probe.clearest)[:_MOST_ZOOMS]]
+    figure = Figure(figsize=(6 * len(shown), 6.4), layout="constrained")
+    parts = figure.subfigures(1, len(shown), squeeze=False)[0]
+    for part, best in zip(parts, shown, strict=True):
+        _draw_one_presence(part, best)
+    figure.suptitle(f"{title}: presence of the clusters", fontsize=11, color=_INK)
+    return figure
+
+
+def _draw_one_presence(part: SubFigure, best: _Shown) -> None:
+    cells, pixels, profile = part.subplots(1, 3, width_ratios=[1, 1, 1.8], sharey=True)
+    presence, frame = best.presence, best.frame
+    colours = cluster_colours(len(presence.probability))
+    height, width = presence.pixels.shape[1:]
+    size = presence.grid_px
+    selected = presence.selected.any(0)
+    rows, columns = selected.shape
+    where = np.argwhere(selected) * size
+    upper, left = (where.min(0) if len(where) else np.zeros(2)) - 3
+    lower, right = (where.max(0) + size if len(where) else np.array([height, width])) + 2
+
+    strength = np.where(selected, presence.probability.max(0), 0)
+    cells.imshow(
+        _coloured(presence.probability, strength, colours),
+        extent=(-0.5, columns * size - 0.5, rows * size - 0.5, -0.5),
+        interpolation="nearest",
+    )
+    _title(cells, f"cells, {size} x {size} px")
+    signal = np.clip(presence.pixels, 0, None)
+    strongest = signal.max(0)
+    scale = float(np.quantile(strongest[strongest > 0], 0.9)) if strongest.any() else 1.0
+    pixels.imshow(_coloured(signal, np.clip(strongest / scale, 0, 1), colours), interpolation="nearest")
+    _title(pixels, "pixels")
+    for axis in (cells, pixels):
+        axis.set(xlim=(left, right), ylim=(lower, upper), xlabel="column, px", aspect="auto")
+    cells.set_ylabel("row of the region, px")
+    for k, curve in enumerate(signal.sum(2)):
+        profile.plot(curve, np.arange(height), color=colours[k], lw=1.3)
+        if curve.any():
+            peak = float(np.average(np.arange(height), weights=curve**4))
+            profile.annotate(
+                str(k),
+                (1.0, peak),
+                xycoords=("axes fraction", "data"),
+                color=colours[k],
+                va="center",
+                fontsize=8,
+                annotation_clip=False,
+            )
+    profile.set(xlabel="pilot correlation of the row", xlim=(0, None))
+    _plain(profile)
+    _title(profile, f"transmitter {frame.transmitter}, packet {frame.packet}, frame {frame.frame}")
+
+
+def draw_distance(probe: FigureProbe, title: str) -> Figure:
+    """Distance of each transmitter with its one-sigma band, and the quality of each frame, over time."""
+    numbers = sorted(probe.frames)[:_MOST_ZOOMS]
+    figure = Figure(figsize=(8, 2.6 + 2.4 * len(numbers)), layout="constrained")
+    axes = figure.subplots(len(numbers) + 1, 1, sharex=True, height_ratios=[2.4] * len(numbers) + [1])
+    begin_us = probe.first_us or 0
+    last = axes[-1]
+    for axis, number in zip(axes, numbers, strict=False):
+        frames = sorted(probe.frames[number], key=lambda f: f.t_us)
+        colour = transmitter_colour(number)
+        t_s = np.array([f.t_us - begin_us for f in frames]) * 1e-6
+        distance = np.array([f.range.distance_m for f in frames])
+        sigma = np.array([f.range.sigma_m for f in frames])
+        known = np.isfinite(distance)
+        axis.plot(t_s[known], distance[known], "o", ms=3, color=colour, label="a frame")
+        near, far = (distance - sigma)[known], (distance + sigma)[known]
+        axis.fill_between(t_s[known], near, far, color=colour, alpha=0.25, lw=0, label="one sigma")
+        axis.set_ylabel("distance, m")
+        _title(axis, f"transmitter {number}, {known.sum()} distances")
+        axis.legend(frameon=False, fontsize=9)
+        last.plot(t_s, [f.soft.quality for f in frames], "o", ms=2.5, color=colour)
+    last.set(ylabel="quality", xlabel="time since the first event, s", ylim=(0, 1.05))
+    for axis in axes:
+        _plain(axis)
+        axis.grid(color="#e6e6e6", lw=0.8)
+        axis.set_axisbelow(True)
+    figure.suptitle(f"{title}: distance along the optical axis", fontsize=11, color=_INK)
+    return figure
+
+
+def _coloured(
+    clusters: NDArray[np.floating[Any]], strength: NDArray[Any], colours: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Each pixel in its strongest cluster's colour, paler where it is weak: float64 (rows, columns, 3)."""
+    alpha = np.asarray(strength, np.float64)[..., None]
+    mixed: NDArray[np.float64] = colours[np.argmax(clusters, axis=0)] * alpha + (1 - alpha)
+    return mixed
+
+
+def _corner(region: Region) -> tuple[float, float]:
+    return region.x_px - region.width_px / 2, region.y_px - region.height_px / 2
+
+
+def _bounds(path: Iterable[Region]) -> tuple[float, float, float, float]:
+    left, upper, right, lower = [], [], [], []
+    for region in path:
+        x, y = _corner(region)
+        left.append(x)
+        upper.append(y)
+        right.append(x + region.width_px)
+        lower.append(y + region.height_px)
+    return min(left), min(upper), max(right), max(lower)
+
+
+def _title(axis: Axes, text: str) -> None:
+    axis.set_title(text, loc="left", fontsize=10, color=_INK)
+
+
+def _plain(axis: Axes) -> None:
+    for side in ("top", "right"):
+        axis.spines[side].set_visible(False)

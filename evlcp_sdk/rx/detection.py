@@ -1,0 +1,362 @@
+"""Finds regions that blink at the chip rate and follows them while the camera moves.
+
+The frequency filter works per pixel on runs: the time between two changes of polarity. A code of the air
+interface has runs of one or two chips only, as many of the one as of the other on average. A lamp on AC mains
+or a PWM lamp of up to 2 kHz changes polarity every 250 us or slower, that is after 2.5 chips; a moving edge
+and a hot pixel, slower still. So a run of one chip raises a pixel's score by two, a run longer than two chips
+lowers it by two, and a run of two chips, which both kinds may have, leaves it: a lamp of short pulses gains
+nothing on balance. One pass, one number a pixel.
+"""
+
+from bisect import bisect_left
+from collections import deque
+from dataclasses import dataclass, field, replace
+from statistics import median
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from evlcp_sdk.link.sections import RegionSpec
+from evlcp_sdk.plugin.roles import Filter
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.values import Events, Region
+
+__all__ = ["Followed", "RegionFollower"]
+
+_CELL_SHIFT = 3
+"""Cells of 8 x 8 px: smaller than any bar in range (34 px at 100 m), and few enough to label each step."""
+
+_RUN_CHIPS = (0.4, 1.5, 2.7)
+"""Bounds between runs of noise, one chip, two chips, and slower; ON and OFF delays differ by up to 0.3."""
+
+_RISE_CHIPS = (1.5, 4.5)
+"""Bounds of the time from rise to rise: two to four chips in any code, five for a lamp of 2 kHz."""
+
+_RISE_MEASURE_CHIPS = 5
+"""A blinking pixel rises at least once in four chips."""
+
+_MEASURE_CHIPS = 4
+"""A blinking pixel changes polarity at least once in two chips; twice that allows for a missed event."""
+
+_AGE_CHIPS = 5
+"""Age of a measured centre. A moving bar's leading end counts once its pixels have had two runs of one chip,
+some six chips late and more where events go missing; its trailing end stays for the four chips of the
+measurement. In recordings and simulated scenes the centre is 4 to 8 chips late."""
+
+_MOST_AHEAD_STEPS = 2
+"""Steps beyond the measured centres for which a region goes straight on, before a shaking camera turns."""
+
+_HEIGHTS = 9
+"""Measured heights whose median is a region's: a bar ahead grows by a percent in so many steps at 80 km/h."""
+
+_STRAY_PX = 2.0
+"""How much too long a region may be before what is too much must be strays: an edge is good to a pixel."""
+
+_MIN_PIXELS = 4
+"""Blinking pixels below which a region has no position: one cluster at 100 m has a dozen."""
+
+_CENTRE_SIGMA_PX = 0.25
+"""Error of a measured centre: the edge of a row of pixels, a third of one, at the top and at the bottom."""
+
+_BACKFILL_STEPS = 12
+"""Steps kept from before a region was found: a pixel needs about 1 ms to score, a region two steps."""
+
+_LONG_AGO_US = -(10**12)
+
+Box = tuple[int, int, int, int]
+Piece = tuple[int, Events]
+
+
+@dataclass
+class Followed:
+    """A region followed over time, and its events since the first.
+
+    Attributes:
+        id: Number of the region, from 0.
+        positions: Where it was measured, oldest first.
+        pieces: Its events, one entry a time step: (start of the step, us; events).
+        first_us: Start of the first step of which it has events, us.
+        filter: State of the filter of its centre, None without one.
+        heights: As measured lately, px.
+        released: True once it has faded or was merged into another; it gets no more events.
+    """
+
+    id: int
+    positions: deque[Region]
+    first_us: int
+    pieces: deque[Piece] = field(default_factory=deque)
+    released: bool = False
+    filter: Any = None
+    heights: deque[float] = field(default_factory=lambda: deque(maxlen=_HEIGHTS))
+
+    @property
+    def latest(self) -> Region:
+        """The newest position."""
+        return self.positions[-1]
+
+    def expected(self, t_us: float) -> Region:
+        """Where the region should be at a time soon, if it goes on as between the two newest positions."""
+        last = self.positions[-1]
+        if len(self.positions) < 2:
+            return last
+        before = self.positions[-2]
+        ahead = (t_us - last.t_us) / (last.t_us - before.t_us)
+        # Further ahead than that, a shaking camera has turned back.
+        ahead = min(ahead, 1.0)
+        x = last.x_px + ahead * (last.x_px - before.x_px)
+        y = last.y_px + ahead * (last.y_px - before.y_px)
+        return Region(last.id, t_us, x, y, last.width_px, last.height_px)
+
+    def at(self, t_us: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Centre (column, row) at times, interpolated; straight on for a little before and after, px."""
+        t = [r.t_us for r in self.positions]
+        x = [r.x_px for r in self.positions]
+        y = [r.y_px for r in self.positions]
+        if len(t) > 1:
+            # A place more at each end, on the straight line through the outermost two.
+            n = _MOST_AHEAD_STEPS
+            t, x, y = ([v[0] - n * (v[1] - v[0]), *v, v[-1] + n * (v[-1] - v[-2])] for v in (t, x, y))
+        return np.interp(t_us, t, x), np.interp(t_us, t, y)
+
+    def size_at(self, t_us: float) -> tuple[float, float]:
+        """(width, height) measured nearest to a time, px."""
+        times = [r.t_us for r in self.positions]
+        i = min(bisect_left(times, t_us), len(times) - 1)
+        if i and t_us - times[i - 1] < times[i] - t_us:
+            i -= 1
+        return self.positions[i].width_px, self.positions[i].height_px
+
+    def forget_before(self, t_us: float, step_us: int) -> None:
+        """Drop events and positions older than a time."""
+        while self.pieces and self.pieces[0][0] + step_us <= t_us:
+            self.pieces.popleft()
+        while len(self.positions) > 2 and self.positions[1].t_us < t_us:
+            self.positions.popleft()
+
+
+class RegionFollower:
+    """Streams time steps of events into the regions that blink.
+
+    Args:
+        spec: Parameters.
+        camera: For the size of the sensor.
+        chip_us: Nominal length of a chip, us.
+        position: Filter of the centres; None for centres as measured.
+    """
+
+    def __init__(
+        self, spec: RegionSpec, camera: CameraModel, chip_us: float, position: Filter | None = None
+    ) -> None:
+        self._spec = spec
+        self._position = position
+        self._camera = camera
+        shortest, single, double = _RUN_CHIPS
+        self._run_us = (round(shortest * chip_us), round(single * chip_us), round(double * chip_us))
+        shortest, longest = _RISE_CHIPS
+        self._rise_us = (round(shortest * chip_us), round(longest * chip_us))
+        self._measure_us = round((_RISE_MEASURE_CHIPS if spec.positive_only else _MEASURE_CHIPS) * chip_us)
+        self._age_us = _AGE_CHIPS * chip_us
+        shape = (camera.height, camera.width)
+        self._pixels = np.full(shape, _LONG_AGO_US << 8, np.int64)
+        self._hits = np.zeros([-(-n >> _CELL_SHIFT) for n in (camera.height + 7, camera.width + 7)], np.int32)
+        self._fresh: list[Box] = []
+        self._recent: deque[Piece] = deque(maxlen=_BACKFILL_STEPS)
+        self._next_id = 0
+        self.alive: list[Followed] = []
+
+    def step(self, start_us: int, events: Events) -> list[Followed]:
+        """Take the events of one time step; return the regions that are alive or ended in it."""
+        from evlcp_sdk.rx import _kernels
+
+        spec = self._spec
+        self._recent.append((start_us, events))
+        self._hits[:] = 0
+        t_us, x, y, p = events.t_us, events.x, events.y, events.p
+        score = self._pixels, self._hits
+        if spec.positive_only:
+            lit = p == 1
+            _kernels.score_rises(
+                t_us[lit], x[lit], y[lit], *score, self._rise_us, spec.min_score, _CELL_SHIFT
+            )
+        else:
+            _kernels.score_pixels(t_us, x, y, p, *score, self._run_us, spec.min_score, _CELL_SHIFT)
+        end_us = start_us + spec.step_us
+        boxes = [
+            self._reach(self._expected(followed, start_us + spec.step_us / 2)) for followed in self.alive
+        ]
+        for followed, box, inside in zip(self.alive, boxes, _select(events, boxes), strict=True):
+            followed.pieces.append((start_us, inside))
+            rows = np.empty(box[3] - box[1], np.int64)
+            measured = self._measure(followed.id, box, end_us, rows)
+            if measured is not None:
+                measured = self._whole(followed, measured, box[1], rows)
+                followed.positions.append(self._filtered(followed, measured))
+        self._merge()
+        self._open(end_us)
+        seen = list(self.alive)
+        for followed in self.alive:
+            followed.released |= end_us - followed.latest.t_us > spec.fade_us
+        self.alive = [followed for followed in self.alive if not followed.released]
+        return seen
+
+    def skip(self) -> None:
+        """Pass over a gap in time, with no region alive."""
+        self._fresh = []
+        self._recent.clear()
+
+    def _expected(self, followed: Followed, t_us: float) -> Region:
+        """Where a region should be soon: by its filter, or else straight on."""
+        expected = self._position.predict(followed.filter, t_us) if self._position else None
+        if expected is None:
+            return followed.expected(t_us)
+        return replace(followed.latest, x_px=float(expected[0][0]), y_px=float(expected[0][1]))
+
+    def _whole(self, followed: Followed, measured: Region, top: int, rows: NDArray[np.int64]) -> Region:
+        """A region of the height that it lately had; `rows`: its pixels in each row from `top` on.
+
+        Where few pixels are awake, an end is dark; where noise wakes pixels that a fast bar has left, there
+        is one too many. Of the places that the edges allow, or that hold the most pixels, the nearest to the
+        expected one is taken.
+        """
+        followed.heights.append(measured.height_px)
+        height_px = median(followed.heights)
+        excess_px = measured.height_px - height_px
+        expected_px = self._expected(followed, measured.t_us).y_px
+        if excess_px > _STRAY_PX:
+            n = round(height_px)
+            total = np.concatenate([[0], np.cumsum(rows)])
+            inside = total[n:] - total[:-n]
+            places_px = top + np.flatnonzero(inside == inside.max()) + (n - 1) / 2
+            y_px = float(places_px[np.abs(places_px - expected_px).argmin()])
+        else:
+            slack_px = abs(excess_px) / 2
+            y_px = measured.y_px + min(max(expected_px - measured.y_px, -slack_px), slack_px)
+        return replace(measured, y_px=y_px, height_px=height_px + min(max(excess_px, 0.0), _STRAY_PX))
+
+    def _filtered(self, followed: Followed, measured: Region) -> Region:
+        if self._position is None:
+            return measured
+        centre = np.array([measured.x_px, measured.y_px])
+        followed.filter, centre, _ = self._position.step(
+            followed.filter, measured.t_us, centre, _CENTRE_SIGMA_PX
+        )
+        return replace(measured, x_px=float(centre[0]), y_px=float(centre[1]))
+
+    def _reach(self, region: Region) -> Box:
+        """The box in which a region's events lie within the next step; an empty one off the sensor."""
+        m = self._spec.margin_px
+        half_w, half_h = region.width_px / 2 + m, region.height_px / 2 + m
+        width, height = self._camera.width, self._camera.height
+        return (
+            min(max(int(region.x_px - half_w), 0), width),
+            min(max(int(region.y_px - half_h), 0), height),
+            min(max(int(region.x_px + half_w) + 1, 0), width),
+            min(max(int(region.y_px + half_h) + 1, 0), height),
+        )
+
+    def _measure(self, id: int, box: Box, end_us: int, rows: NDArray[np.int64]) -> Region | None:
+        """Centre and size of what blinks in a box at the end of a step; `rows`: its pixels in each row."""
+        from evlcp_sdk.rx import _kernels
+
+        # Half the score suffices inside a region: its seam is new to the light as the bar moves.
+        total, column, left, right, upper, lower = _kernels.measure_box(
+            self._pixels, box, end_us - self._measure_us, self._spec.min_score // 2, rows
+        )
+        if total < _MIN_PIXELS:
+            return None
+        return Region(
+            id=id,
+            t_us=end_us - self._age_us,
+            x_px=column,
+            y_px=(upper + lower - 1) / 2,
+            width_px=right - left + 1.0,
+            height_px=lower - upper,
+        )
+
+    def _open(self, end_us: int) -> None:
+        """Open a region where something blinks in two steps on end outside those known."""
+        hits = self._hits
+        merge = self._spec.merge_px
+        for followed in self.alive:
+            left, top, right, bottom = _grown(self._reach(followed.latest), merge)
+            hits[
+                top >> _CELL_SHIFT : (bottom >> _CELL_SHIFT) + 1,
+                left >> _CELL_SHIFT : (right >> _CELL_SHIFT) + 1,
+            ] = 0
+        if hits.max() == 0:
+            self._fresh = []
+            return
+        near = np.ones((3, 3), bool)
+        areas, _ = ndimage.label(ndimage.binary_dilation(hits > 0, near, merge >> (_CELL_SHIFT + 1)), near)
+        boxes = []
+        for number, where in enumerate(ndimage.find_objects(areas), 1):
+            inside = np.where(areas[where] == number, hits[where], 0)
+            if inside.sum() < self._spec.min_runs:
+                continue
+            v, u = np.nonzero(inside)
+            v, u = v + where[0].start, u + where[1].start
+            boxes.append(
+                (
+                    int(u.min()) << _CELL_SHIFT,
+                    int(v.min()) << _CELL_SHIFT,
+                    min(int(u.max() + 1) << _CELL_SHIFT, self._camera.width),
+                    min(int(v.max() + 1) << _CELL_SHIFT, self._camera.height),
+                )
+            )
+        fresh, self._fresh = self._fresh, []
+        for box in boxes:
+            if any(_overlap(_grown(box, merge), other) for other in fresh):
+                self._start(box, end_us)
+            else:
+                self._fresh.append(box)
+
+    def _start(self, box: Box, end_us: int) -> None:
+        region = self._measure(self._next_id, box, end_us, np.empty(box[3] - box[1], np.int64))
+        if region is None:
+            return
+        self._next_id += 1
+        reach = self._reach(region)
+        pieces = deque((start, _select(events, [reach])[0]) for start, events in self._recent)
+        state = self._position.init() if self._position else None
+        self.alive.append(Followed(region.id, deque([region]), pieces[0][0], pieces, filter=state))
+
+    def _merge(self) -> None:
+        """Keep the older of two regions that have grown together."""
+        for i, older in enumerate(self.alive):
+            for younger in self.alive[i + 1 :]:
+                if not younger.released and _overlap(_tight(older.latest), _tight(younger.latest)):
+                    younger.released = True
+        # The survivor reaches over both within a few steps, as its seam finds the other's pixels.
+
+
+def _select(events: Events, boxes: list[Box]) -> list[Events]:
+    """The events inside each box."""
+    from evlcp_sdk.rx import _kernels
+
+    if not boxes:
+        return []
+    shape = (len(boxes), len(events) + 1)
+    t, x, y = np.empty(shape, np.int64), np.empty(shape, np.uint16), np.empty(shape, np.uint16)
+    p, taken = np.empty(shape, np.uint8), np.empty(len(boxes), np.int64)
+    _kernels.select_boxes(events.t_us, events.x, events.y, events.p, np.array(boxes), t, x, y, p, taken)
+    return [Events(t[i, :n], x[i, :n], y[i, :n], p[i, :n]) for i, n in enumerate(taken)]
+
+
+def _tight(region: Region) -> Box:
+    return (
+        int(region.x_px - region.width_px / 2),
+        int(region.y_px - region.height_px / 2),
+        int(region.x_px + region.width_px / 2) + 1,
+        int(region.y_px + region.height_px / 2) + 1,
+    )
+
+
+def _grown(box: Box, by: int) -> Box:
+    left, top, right, bottom = box
+    return max(left - by, 0), max(top - by, 0), right + by, bottom + by
+
+
+def _overlap(a: Box, b: Box) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

@@ -1,0 +1,308 @@
+"""Packets to messages: soft bits to blocks, blocks to messages, signatures to trust."""
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.air.beacons import Beacon
+from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message
+from evlcp_sdk.air.signing import TrustedKeys
+from evlcp_sdk.link.blocks import BlockCoder
+from evlcp_sdk.link.sections import MessageSpec
+from evlcp_sdk.values import Packet, ReceivedMessage, Trust
+
+__all__ = ["MessageAssembler"]
+
+_SAME_BLOCK_SIGMA = 6.0
+"""Agreement of two packets' soft bits from which on they carry one block: by chance once in 1e9 pairs."""
+
+_MOST_TRANSMITTERS = 16
+"""Transmitters whose messages are collected; the one not heard for longest makes way."""
+
+_MOST_MESSAGES = 8
+"""Messages of a transmitter that are collected at a time, and that are remembered when complete."""
+
+_MOST_VERIFIED = 4096
+"""Transmitter ids whose last verified beacon is remembered; the one not heard for longest makes way."""
+
+_Key = tuple[int, Kind, int]
+_K = TypeVar("_K")
+_V = TypeVar("_V")
+
+
+@dataclass
+class _Sum:
+    """Packets of one block that is not decoded yet: the sum of their LLRs, float32 (bits,), and how many."""
+
+    llr: NDArray[np.float32]
+    packets: int
+
+
+@dataclass
+class _Parts:
+    """A message as far as it is known.
+
+    Attributes:
+        length: Its bytes.
+        parts: Known parts by number.
+        told: The trust and reason last handed on; None before.
+    """
+
+    length: int
+    parts: dict[int, bytes] = field(default_factory=dict)
+    told: tuple[Trust, str] | None = None
+
+    def complete(self) -> bool:
+        return sum(map(len, self.parts.values())) == self.length
+
+    def payload(self) -> bytes:
+        return b"".join(self.parts[i] for i in sorted(self.parts))
+
+
+@dataclass
+class _Inbox:
+    """What is known of one transmitter's messages, in bounded memory."""
+
+    sums: list[_Sum] = field(default_factory=list)
+    open: OrderedDict[_Key, _Parts] = field(default_factory=OrderedDict)
+    done: OrderedDict[_Key, _Parts] = field(default_factory=OrderedDict)
+
+
+@dataclass(frozen=True)
+class _Verified:
+    sequence: int
+    payload: bytes
+
+
+class MessageAssembler:
+    """Reads the blocks of packets and puts messages together, transmitter by transmitter.
+
+    A packet is decoded by itself first. If that fails, its LLRs are added to those of earlier packets that
+    carry the same block, if there are any, and the sum is decoded. Two packets carry the same block if the
+    products of their soft bits add up to more than six standard deviations of what chance gives, whatever the
+    order in which the transmitter repeats its blocks. So a packet is decoded twice at most, and the
+    probability that noise is taken for a block is at most twice that of a single decoding.
+
+    Args:
+        coder: How packets carry blocks.
+        spec: The configuration.
+
+    Raises:
+        ConfigError: A trusted key is none, or there are keys and the extra `sign` is not installed.
+    """
+
+    def __init__(self, coder: BlockCoder, spec: MessageSpec) -> None:
+        self._coder = coder
+        self._spec = spec
+        self._room = coder.block_bytes - HEADER_BYTES
+        self._keys = TrustedKeys(spec.trusted_keys)
+        self._inboxes: OrderedDict[int, _Inbox] = OrderedDict()
+        self._verified: OrderedDict[int, _Verified] = OrderedDict()
+        self._counts = dict.fromkeys(
+            (
+                "blocks_tried",
+                "blocks_decoded",
+                "blocks_combined",
+                "blocks_failed",
+                "blocks_malformed",
+                "blocks_other_codebook",
+                "parts_repeated",
+                "parts_conflicting",
+                "parts_missing",
+                "messages",
+                "messages_undecodable",
+                "beacons_verified",
+                "beacons_unverified",
+                "beacons_forged",
+            ),
+            0,
+        )
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What was tried, found and given up so far."""
+        return dict(self._counts)
+
+    def add(self, packet: Packet) -> Packet:
+        """Read a packet; return it with its block and the messages that it completes."""
+        inbox = _kept(self._inboxes, packet.transmitter, _Inbox)
+        while len(self._inboxes) > _MOST_TRANSMITTERS:
+            self._give_up(self._inboxes.popitem(last=False)[1])
+        self._counts["blocks_tried"] += 1
+        content, packets = self._content(inbox, self._llr(packet))
+        if content is None:
+            self._counts["blocks_failed"] += 1
+            return packet
+        self._counts["blocks_decoded" if packets == 1 else "blocks_combined"] += 1
+        try:
+            block = Block.unpack(content)
+        except BlockError:
+            self._counts["blocks_malformed"] += 1
+            return packet
+        if block.codebook != self._coder.digest:
+            self._counts["blocks_other_codebook"] += 1
+            return packet
+        messages = tuple(self._take(inbox, block, packet))
+        return replace(packet, block=block, block_packets=packets, messages=messages)
+
+    def close(self) -> None:
+        """End the stream: what is still incomplete counts as missing."""
+        for inbox in self._inboxes.values():
+            self._give_up(inbox)
+        self._inboxes.clear()
+
+    def _llr(self, packet: Packet) -> NDArray[np.float32]:
+        """Calibrated LLRs of a packet's bits in the order on air, 0 where a frame is missing."""
+        llr = np.zeros((packet.sent, self._coder.bits // packet.sent), np.float32)
+        for frame in packet.frames:
+            llr[frame.frame] = frame.soft.llr.ravel()
+        known = np.nan_to_num(llr.ravel(), nan=0.0)
+        size = np.minimum(np.abs(known) ** self._spec.llr_power, self._spec.max_llr)
+        return np.copysign(size, known).astype(np.float32)
+
+    def _content(self, inbox: _Inbox, llr: NDArray[np.float32]) -> tuple[bytes | None, int]:
+        """The bytes of a packet's block and the packets it took; None if it cannot be told yet."""
+        found = self._coder.block(llr)
+        if found is not None or not self._spec.combine_packets:
+            return found, 1
+        alike = [_agreement(llr, earlier.llr) for earlier in inbox.sums]
+        best = int(np.argmax(alike)) if alike else -1
+        if best < 0 or alike[best] < _SAME_BLOCK_SIGMA:
+            inbox.sums = [*inbox.sums, _Sum(llr, 1)][-self._spec.combine_packets :]
+            return None, 0
+        one = inbox.sums.pop(best)
+        total = _Sum(one.llr + llr, one.packets + 1)
+        found = self._coder.block(total.llr)
+        if found is None:
+            inbox.sums.append(total)
+        return found, total.packets
+
+    def _take(self, inbox: _Inbox, block: Block, packet: Packet) -> list[ReceivedMessage]:
+        """Put a block into its message; give what can be handed on now."""
+        key = (block.transmitter_id, block.kind, block.sequence)
+        known = inbox.done.get(key) or inbox.open.get(key)
+        if known and known.length == block.length and known.parts.get(block.index) == block.part:
+            self._counts["parts_repeated"] += 1
+            return self._hand_on(inbox, key, packet)
+        if known and (known.length != block.length or block.index in known.parts):
+            # Two messages under one number: the later one is collected anew.
+            self._counts["parts_conflicting"] += 1
+            inbox.done.pop(key, None)
+            self._missing(inbox.open.pop(key, None))
+        parts = _kept(inbox.open, key, lambda: _Parts(block.length))
+        parts.parts[block.index] = block.part
+        while len(inbox.open) > _MOST_MESSAGES:
+            self._missing(inbox.open.popitem(last=False)[1])
+        if not parts.complete():
+            return []
+        inbox.done[key] = inbox.open.pop(key)
+        while len(inbox.done) > _MOST_MESSAGES:
+            inbox.done.popitem(last=False)
+        return self._hand_on(inbox, key, packet)
+
+    def _hand_on(self, inbox: _Inbox, key: _Key, packet: Packet) -> list[ReceivedMessage]:
+        """A complete message, if it is new or its trust has changed; a signature's is its beacon."""
+        transmitter_id, kind, sequence = key
+        if kind is Kind.SIGNATURE:
+            key = (transmitter_id, Kind.BEACON, sequence)
+        parts = inbox.done.get(key)
+        if parts is None:
+            return []
+        inbox.done.move_to_end(key)
+        message = Message(key[1], transmitter_id, sequence, parts.payload())
+        beacon = None
+        verdict: tuple[Trust, str] = ("unverified", "not signed")
+        if message.kind is Kind.BEACON:
+            try:
+                beacon = Beacon.unpack(message.payload)
+            except BlockError:
+                return self._undecodable(parts)
+            verdict = self._judge(inbox, message, beacon)
+        elif message.kind is Kind.TEXT and message.text is None:
+            return self._undecodable(parts)
+        if verdict == parts.told:
+            return []
+        self._counts["messages"] += parts.told is None
+        if beacon is not None and (parts.told is None or parts.told[0] != verdict[0]):
+            self._counts[f"beacons_{verdict[0]}"] += 1
+        parts.told = verdict
+        return [ReceivedMessage(packet.transmitter, packet.packet, packet.t_us, message, beacon, *verdict)]
+
+    def _undecodable(self, parts: _Parts) -> list[ReceivedMessage]:
+        """Count a message whose bytes mean nothing, once."""
+        if parts.told is None:
+            parts.told = ("unverified", "undecodable")
+            self._counts["messages_undecodable"] += 1
+        return []
+
+    def _judge(self, inbox: _Inbox, message: Message, beacon: Beacon) -> tuple[Trust, str]:
+        """How far a beacon may be believed; remembers it if it is verified."""
+        last = self._verified.get(message.transmitter_id)
+        if last is not None and last.sequence == message.sequence and last.payload == message.payload:
+            self._verified.move_to_end(message.transmitter_id)
+            return "verified", ""
+        if last is not None and message.sequence < last.sequence:
+            return "forged", f"replayed: sequence {message.sequence} is older than verified {last.sequence}"
+        if last is not None and message.sequence == last.sequence:
+            return "forged", f"differs from the verified beacon of sequence {last.sequence}"
+        signed = inbox.done.get((message.transmitter_id, Kind.SIGNATURE, message.sequence))
+        digest = self._coder.digest
+        good = (
+            None
+            if signed is None
+            else self._keys.check(
+                message,
+                digest,
+                Message(Kind.SIGNATURE, message.transmitter_id, message.sequence, signed.payload()),
+            )
+        )
+        if good is False:
+            return "forged", "the signature is not that of this beacon"
+        if good is None:
+            if last is not None and Beacon.unpack(last.payload).place != beacon.place:
+                return (
+                    "forged",
+                    f"another place than the verified beacon of sequence {last.sequence}, unsigned",
+                )
+            return (
+                "unverified",
+                "no signature yet" if signed is None else "signed by a key that is not trusted",
+            )
+        if message.sequence < self._spec.oldest_sequence:
+            oldest = self._spec.oldest_sequence
+            return (
+                "forged",
+                f"replayed: sequence {message.sequence} is older than messages.oldest_sequence {oldest}",
+            )
+        self._verified[message.transmitter_id] = _Verified(message.sequence, message.payload)
+        self._verified.move_to_end(message.transmitter_id)
+        while len(self._verified) > _MOST_VERIFIED:
+            self._verified.popitem(last=False)
+        return "verified", ""
+
+    def _missing(self, parts: _Parts | None) -> None:
+        if parts is not None:
+            self._counts["parts_missing"] += -(-parts.length // self._room) - len(parts.parts)
+
+    def _give_up(self, inbox: _Inbox) -> None:
+        for parts in inbox.open.values():
+            self._missing(parts)
+
+
+def _agreement(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    """How much two packets' soft bits agree, in standard deviations of what independent bits would."""
+    product = a.astype(np.float64) * b
+    spread = float(np.vdot(product, product)) ** 0.5
+    return float(product.sum()) / spread if spread else 0.0
+
+
+def _kept(table: OrderedDict[_K, _V], key: _K, make: Callable[[], _V]) -> _V:
+    """The entry of a table, made if need be; it is now the newest."""
+    if key not in table:
+        table[key] = make()
+    table.move_to_end(key)
+    return table[key]

@@ -1,0 +1,1 @@
+"""The world: camera, bar, sites, attitude."""

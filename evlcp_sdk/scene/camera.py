@@ -1,0 +1,136 @@
+"""The camera: a pinhole with distortion, its sensor and its lens."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+__all__ = ["CameraModel"]
+
+_NEWTON_STEPS = 12
+"""Each doubles the digits; four suffice for what lenses do."""
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """A pinhole camera with Brown distortion: sensor size, pixel pitch, focal length, principal point.
+
+    Its axes are x right, y down, z forward; the middle of pixel (i, j) is at (i, j). A direction
+    (u, v) = (x / z, y / z) with r2 = u^2 + v^2 is seen in pixel
+
+        column = centre_x_px + focal_px (u (1 + k1 r2 + k2 r2^2 + k3 r2^3) + 2 p1 u v + p2 (r2 + 2 u^2)),
+        row    = centre_y_px + focal_px (v (1 + k1 r2 + k2 r2^2 + k3 r2^3) + p1 (r2 + 2 v^2) + 2 p2 u v)
+
+    (Brown 1971, with the signs and names of OpenCV).
+
+    >>> round(CameraModel().focal_px, 1)
+    7201.6
+    >>> CameraModel(k1=-0.1).project(np.array([0.5, 0.0, 10.0])).round(2).tolist()
+    [999.99, 360.0]
+    """
+
+    width: Annotated[int, Field(gt=0, description="Columns of the sensor.")] = 1280
+    height: Annotated[int, Field(gt=0, description="Rows of the sensor.")] = 720
+    focal_mm: Annotated[float, Field(gt=0, description="Focal length of the lens.")] = 35.0
+    pitch_um: Annotated[float, Field(gt=0, description="Spacing of the sensor's pixels.")] = 4.86
+    centre_x_px: Annotated[
+        float | None, Field(description="Column of the principal point; none: half the columns.")
+    ] = None
+    centre_y_px: Annotated[
+        float | None, Field(description="Row of the principal point; none: half the rows.")
+    ] = None
+    k1: Annotated[
+        float, Field(ge=-10, le=10, description="Radial distortion by the square of the angle.")
+    ] = 0.0
+    k2: Annotated[float, Field(ge=-100, le=100, description="The same by its fourth power.")] = 0.0
+    p1: Annotated[float, Field(ge=-1, le=1, description="Distortion of a lens tilted up or down.")] = 0.0
+    p2: Annotated[float, Field(ge=-1, le=1, description="Distortion of a lens tilted to a side.")] = 0.0
+    k3: Annotated[float, Field(ge=-1000, le=1000, description="Radial distortion by the sixth power.")] = 0.0
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length in pixels."""
+        return self.focal_mm * 1e3 / self.pitch_um
+
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        """Column and row where the optical axis meets the image."""
+        x, y = self.centre_x_px, self.centre_y_px
+        return self.width / 2 if x is None else x, self.height / 2 if y is None else y
+
+    def project(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where points of the camera's frame are seen, px; NaN for points that are not in front of it.
+
+        Args:
+            points_m: x right, y down, z forward, m, float64 (..., 3).
+        """
+        z = points_m[..., 2:]
+        return self.distort(points_m[..., :2] / np.where(z > 0, z, np.nan))
+
+    def distort(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where directions (x / z, y / z), float64 (..., 2), are seen: (column, row), px, the same shape."""
+        u, v = direction[..., 0], direction[..., 1]
+        r2 = u * u + v * v
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        bent_u = u * radial + 2 * self.p1 * u * v + self.p2 * (r2 + 2 * u * u)
+        bent_v = v * radial + self.p1 * (r2 + 2 * v * v) + 2 * self.p2 * u * v
+        return np.stack([bent_u, bent_v], -1) * self.focal_px + self.centre_px
+
+    def distort_slope(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives of `distort`, px, float64 (..., 2, 2): of column and row by the direction's parts."""
+        u, v = direction[..., 0], direction[..., 1]
+        r2 = u * u + v * v
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        growth = 2 * (self.k1 + r2 * (2 * self.k2 + 3 * r2 * self.k3))
+        cross = u * v * growth + 2 * self.p1 * u + 2 * self.p2 * v
+        uu = radial + u * u * growth + 2 * self.p1 * v + 6 * self.p2 * u
+        vv = radial + v * v * growth + 6 * self.p1 * v + 2 * self.p2 * u
+        slope: NDArray[np.float64] = np.stack([np.stack([uu, cross], -1), np.stack([cross, vv], -1)], -2)
+        return slope * self.focal_px
+
+    def project_slope(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives of `project` by the point, px / m, float64 (..., 2, 3), for points in front."""
+        z = points_m[..., 2]
+        direction = points_m[..., :2] / z[..., None]
+        turned = np.zeros((*z.shape, 2, 3))
+        turned[..., 0, 0] = turned[..., 1, 1] = 1 / z
+        turned[..., 2] = -direction / z[..., None]
+        return self.distort_slope(direction) @ turned
+
+    def undistort(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Directions (x / z, y / z) that are seen at (column, row), px: the inverse of `distort`.
+
+        Newton steps from the undistorted direction; NaN where they do not arrive, as for a pixel beyond the
+        largest angle that a strong distortion can show.
+
+        Args:
+            points_px: float64 (..., 2).
+        """
+        straight = (points_px - self.centre_px) / self.focal_px
+        if self.k1 == self.k2 == self.p1 == self.p2 == self.k3 == 0:
+            return straight
+        found = straight.copy()
+        for _ in range(_NEWTON_STEPS):
+            slope = self.distort_slope(found) / self.focal_px
+            miss = straight - (self.distort(found) - self.centre_px) / self.focal_px
+            a, b, d = slope[..., 0, 0], slope[..., 0, 1], slope[..., 1, 1]
+            # The slope turns singular, and then negative, at the largest angle that is shown.
+            size = np.where((a > 0) & (a * d > b * b), a * d - b * b, np.nan)
+            step_u = (d * miss[..., 0] - b * miss[..., 1]) / size
+            step_v = (a * miss[..., 1] - b * miss[..., 0]) / size
+            found = found + np.stack([step_u, step_v], -1)
+        away = np.abs(self.distort(found) - points_px).max(-1, keepdims=True)
+        return np.where(away < 1e-6, found, np.nan)
+
+    def distance_m(self, spacing_m: float, spacing_px: float) -> float:
+        """Depth along the optical axis of two points parallel to the sensor: L = f S / (l' a).
+
+        arXiv 2510.17203, equation for L.
+
+        Args:
+            spacing_m: Their distance S from each other, m.
+            spacing_px: The same in the image, l', px.
+        """
+        return self.focal_px * spacing_m / spacing_px

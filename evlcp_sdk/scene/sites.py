@@ -1,0 +1,246 @@
+"""Where transmitters stand on earth: `site.toml`, and the local frame that positions are computed in.
+
+Heights are above the WGS-84 ellipsoid. A local frame has its axes to the east, to the north and up (ENU) at
+an origin near the bars. See `docs/position.md`.
+"""
+
+import difflib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.specs import read_toml
+
+__all__ = ["BarSite", "LocalFrame", "load_sites", "resolve_sites", "site_of_transmitter", "to_toml"]
+
+
+@dataclass(frozen=True)
+class BarSite:
+    """Where one bar stands, and how: a `[[bar]]` of `site.toml`, and what its beacon says.
+
+    Its axis points from its bottom to its top, where its first cluster is: up, and tilted from there towards
+    `heading_deg`.
+
+    >>> BarSite(7, 35.0, 137.0, 50.0, tilt_deg=90.0, heading_deg=90.0).axis_enu().round(6).tolist()
+    [1.0, 0.0, 0.0]
+    """
+
+    __pydantic_config__ = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+    transmitter_id: Annotated[
+        int, Field(ge=0, lt=2**32, description="Number of the transmitter, as its beacon sends it.")
+    ]
+    latitude_deg: Annotated[float, Field(ge=-90, le=90, description="Of the bar's centre, WGS-84.")]
+    longitude_deg: Annotated[float, Field(ge=-180, le=180, description="The same.")]
+    height_m: Annotated[
+        float, Field(ge=-12_000, le=20_000, description="The same, above the WGS-84 ellipsoid.")
+    ]
+    heading_deg: Annotated[
+        float, Field(ge=0, lt=360, description="Where its top leans to, clockwise from north.")
+    ] = 0.0
+    tilt_deg: Annotated[
+        float, Field(ge=0, le=180, description="Of its axis from the vertical; 90: lying, 180: upside down.")
+    ] = 0.0
+    length_m: Annotated[
+        float, Field(gt=0, le=100, description="From its first to its last LED's outer edge.")
+    ] = 0.96
+    transmitter: Annotated[
+        int | None,
+        Field(ge=0, description="Number that the receiver gives it, where no beacon tells its id."),
+    ] = None
+
+    def axis_enu(self) -> NDArray[np.float64]:
+        """Unit vector from its bottom to its top, in the ENU frame of its own centre, float64 (3,)."""
+        heading, tilt = math.radians(self.heading_deg), math.radians(self.tilt_deg)
+        lean = math.sin(tilt)
+        return np.array([lean * math.sin(heading), lean * math.cos(heading), math.cos(tilt)])
+
+    def cluster_positions_m(self, clusters: int, frame: "LocalFrame") -> NDArray[np.float64]:
+        """Centres of its clusters in a local frame, from its top, m, float64 (clusters, 3).
+
+        Args:
+            clusters: How many equal parts the bar is cut into.
+            frame: The local frame.
+        """
+        import pymap3d
+
+        along = (0.5 - (np.arange(clusters) + 0.5) / clusters) * self.length_m
+        offset = along[:, None] * self.axis_enu()
+        here = (self.latitude_deg, self.longitude_deg, self.height_m)
+        ecef = pymap3d.enu2ecef(*offset.T, *here)
+        return np.stack(pymap3d.ecef2enu(*ecef, *frame.origin), -1)
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """East, north and up at an origin on earth.
+
+    >>> frame = LocalFrame(35.0, 137.0, 50.0)
+    >>> frame.to_enu(*frame.to_geodetic([10.0, 20.0, 3.0])).round(6).tolist()
+    [10.0, 20.0, 3.0]
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+
+    @classmethod
+    def of(cls, sites: Sequence[BarSite]) -> "LocalFrame":
+        """The frame at the centre of the first of these bars.
+
+        Raises:
+            ConfigError: There is none.
+        """
+        if not sites:
+            raise ConfigError("a local frame needs one bar or more")
+        first = sites[0]
+        return cls(first.latitude_deg, first.longitude_deg, first.height_m)
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """Latitude, longitude and height of the origin."""
+        return self.latitude_deg, self.longitude_deg, self.height_m
+
+    def turn_from(self, other: "LocalFrame") -> NDArray[np.float64]:
+        """What turns vectors of another frame into this one, float64 (3, 3): 0.009 degrees a kilometre.
+
+        >>> far = LocalFrame(35.1, 137.0, 50.0)
+        >>> up = LocalFrame(35.0, 137.0, 50.0).turn_from(far)[:, 2]
+        >>> round(float(np.degrees(np.arctan2(up[1], up[2]))), 3)
+        0.1
+        """
+        return np.asarray(self._axes() @ other._axes().T)
+
+    def _axes(self) -> NDArray[np.float64]:
+        """East, north and up in the earth's frame (ECEF), as rows."""
+        sin_lat, sin_lon = np.sin(np.radians([self.latitude_deg, self.longitude_deg]))
+        cos_lat, cos_lon = np.cos(np.radians([self.latitude_deg, self.longitude_deg]))
+        return np.array(
+            [
+                [-sin_lon, cos_lon, 0.0],
+                [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+                [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
+            ]
+        )
+
+    def to_enu(
+        self, latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike
+    ) -> NDArray[np.float64]:
+        """Geodetic coordinates (n,) to east, north, up, m, float64 (n, 3); scalars give (3,)."""
+        import pymap3d
+
+        place = [np.asarray(v, np.float64) for v in (latitude_deg, longitude_deg, height_m)]
+        return np.stack(pymap3d.geodetic2enu(*place, *self.origin), -1)
+
+    def to_geodetic(self, enu_m: ArrayLike) -> tuple[Any, Any, Any]:
+        """East, north, up (n, 3) or (3,) to latitude and longitude, degrees, and height, m, (n,) each."""
+        import pymap3d
+
+        east, north, up = np.moveaxis(np.asarray(enu_m, np.float64), -1, 0)
+        latitude, longitude, height = pymap3d.enu2geodetic(east, north, up, *self.origin)
+        return latitude, longitude, height
+
+
+_ADAPTER: TypeAdapter[BarSite] = TypeAdapter(BarSite)
+
+
+def load_sites(path: Path | str) -> tuple[BarSite, ...]:
+    """Read a `site.toml`: one `[[bar]]` or more.
+
+    Raises:
+        ConfigError: The file cannot be read, is no TOML, or does not describe bars; one line a fault.
+    """
+    return resolve_sites(read_toml(path), source=str(path))
+
+
+def resolve_sites(table: Mapping[str, Any], *, source: str = "") -> tuple[BarSite, ...]:
+    """Check a table of bars, with every default.
+
+    Args:
+        table: As read from TOML: `bar`, a list of tables.
+        source: What faults name as their place.
+
+    Raises:
+        ConfigError: One line a fault, each with its path, e.g. `bar.0.latitude_deg`.
+
+    >>> bar = {"transmitter_id": 1, "latitude_deg": 35.0, "longitude_deg": 137.0, "height_m": 5.0}
+    >>> resolve_sites({"bar": [bar]})[0].length_m
+    0.96
+    """
+    before = f"{source}: " if source else ""
+    faults = [f"{before}{key}: unknown table{_nearest(key, ['bar'])}" for key in table if key != "bar"]
+    rows = table.get("bar")
+    if not isinstance(rows, list) or not rows:
+        faults.append(f"{before}bar: expected one [[bar]] or more")
+        rows = []
+    sites: list[BarSite] = []
+    names = [f.name for f in fields(BarSite)]
+    for i, row in enumerate(rows):
+        try:
+            sites.append(_ADAPTER.validate_json(json.dumps(row, default=str)))
+        except ValidationError as refused:
+            for error in refused.errors():
+                where = ".".join(["bar", str(i), *map(str, error["loc"])])
+                if error["type"] == "missing":
+                    faults.append(f"{before}{where}: missing")
+                elif error["type"] == "unexpected_keyword_argument":
+                    near = _nearest(str(error["loc"][-1]), names)
+                    faults.append(f"{before}{where} = {error['input']!r}: unknown key{near}")
+                else:
+                    expected = error["msg"].replace("Input should be", "expected", 1)
+                    faults.append(f"{before}{where} = {error['input']!r}: {expected}")
+    if not faults:
+        for name in ("transmitter_id", "transmitter"):
+            first: dict[int, int] = {}
+            for i, site in enumerate(sites):
+                number = getattr(site, name)
+                if number is not None and first.setdefault(number, i) != i:
+                    same = f"bar.{first[number]} has it, too; expected one each"
+                    faults.append(f"{before}bar.{i}.{name} = {number}: {same}")
+    if faults:
+        raise ConfigError("\n".join(faults))
+    return tuple(sites)
+
+
+def to_toml(sites: Sequence[BarSite]) -> str:
+    """The text of a `site.toml`; `load_sites` takes it back."""
+    lines = []
+    for site in sites:
+        values = ((f.name, getattr(site, f.name)) for f in fields(site))
+        lines += ["[[bar]]", *(f"{name} = {value!r}" for name, value in values if value is not None), ""]
+    return "\n".join(lines)
+
+
+def site_of_transmitter(
+    sites: Sequence[BarSite], transmitter: int, transmitter_id: int | None = None, *, alone: bool = False
+) -> BarSite | None:
+    """Which site a received transmitter stands at; None when nothing tells.
+
+    Its beacon's id decides; without one the `transmitter` of a site does; and a transmitter that is the only
+    one received stands at the only site.
+
+    Args:
+        sites: The known bars.
+        transmitter: Number that the receiver gave it.
+        transmitter_id: What its beacon said, None before the first.
+        alone: It is the only transmitter received.
+    """
+    if transmitter_id is not None:
+        return next((s for s in sites if s.transmitter_id == transmitter_id), None)
+    named = next((s for s in sites if s.transmitter == transmitter), None)
+    if named is None and alone and len(sites) == 1 and sites[0].transmitter is None:
+        return sites[0]
+    return named
+
+
+def _nearest(word: str, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(word, known, n=1)
+    return (f"; did you mean '{near[0]}'?" if near else "") + f" (known: {', '.join(known)})"

@@ -1,0 +1,1 @@
+"""What was received beside what was sent: truth, score, comparison, campaigns."""

@@ -1,0 +1,344 @@
+"""The charts of a campaign as plain data, and how Matplotlib draws them; `report` draws them in a page."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure as Drawing
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+from evlcp_sdk.files import whole_file
+from evlcp_sdk.results.figures import TRANSMITTER_COLOURS
+from evlcp_sdk.study.campaign.paper import PAPER_NAME, Measure
+from evlcp_sdk.study.campaign.summary import Series, Summary, measure, reference_marks
+from evlcp_sdk.study.tally import BIN_M, SEGMENT_M
+
+__all__ = ["Chart", "Dot", "Line", "Mark", "charts_of", "decades", "draw", "save_charts"]
+
+DASHES = ("solid", "dash", "dot", "dashdot")
+SYMBOLS = ("circle", "diamond", "square", "cross")
+
+_MATPLOTLIB = {
+    "solid": "-",
+    "dash": "--",
+    "dot": ":",
+    "dashdot": "-.",
+    "circle": "o",
+    "diamond": "D",
+    "square": "s",
+    "cross": "X",
+}
+_INK = "#333333"
+
+
+@dataclass(frozen=True)
+class Dot:
+    """A measured figure.
+
+    Attributes:
+        x: Where.
+        y: The figure; where there was not one error on a logarithmic axis, the upper end of its interval.
+        low: Lower end of the interval.
+        high: Upper end.
+        text: What a reader who points at it is told.
+        limit: Only an upper limit is known.
+    """
+
+    x: float
+    y: float
+    low: float
+    high: float
+    text: str
+    limit: bool = False
+
+
+@dataclass(frozen=True)
+class Line:
+    """The dots of one series."""
+
+    name: str
+    dots: tuple[Dot, ...]
+    colour: str
+    dash: str
+    symbol: str
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A reference: a level between two places; `bound` where it is a limit from above."""
+
+    name: str
+    x0: float
+    x1: float
+    y: float
+    bound: bool
+    clusters: int | None
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart, however it is drawn.
+
+    Attributes:
+        id: Its name in files and pages.
+        title: Heading.
+        x_label: Horizontal axis, with unit.
+        y_label: Vertical axis, with unit.
+        log_y: The vertical axis is logarithmic.
+        steps: Lines are the outlines of histograms, without intervals.
+        lines: A line a series.
+        marks: References.
+        note: What a reader must know of it.
+    """
+
+    id: str
+    title: str
+    x_label: str
+    y_label: str
+    log_y: bool
+    steps: bool
+    lines: tuple[Line, ...]
+    marks: tuple[Mark, ...]
+    note: str
+
+
+def charts_of(summary: Summary) -> list[Chart]:
+    """The charts of a campaign: BER, RMSE, gross errors, frames found, histogram, and positions if any."""
+    distance = "distance, m"
+
+    def over_distance(kind: str, id: str, title: str, label: str, note: str, *, log: bool) -> Chart:
+        lines = _lines(summary.series, lambda series, shift: _dots(series, kind, shift, log=log))
+        marks: list[Mark] = []
+        if kind in ("ber", "rmse_m", "gross_share"):
+            marks = [
+                Mark(_mark_name(r.clusters, r.speed_kmh), r.from_m, r.to_m, r.value, r.bound, r.clusters)
+                for r in reference_marks(_as_measure(kind))
+            ]
+        return Chart(id, title, distance, label, log, False, lines, tuple(marks), note)
+
+    independent = (
+        f"Segments of {SEGMENT_M} m. 95 % intervals take errors as independent; those of one frame or drive"
+        " are not quite, so true intervals are wider."
+    )
+    histogram = _lines(summary.series, lambda series, _: _bins(series))
+    positions = over_distance(
+        "position_rmse_m",
+        "position",
+        "Position error",
+        "position RMSE in space, m",
+        f"{independent} Chi-square. The distance is that of the nearest bar.",
+        log=True,
+    )
+    return [
+        over_distance(
+            "ber",
+            "ber",
+            "Bit error rate",
+            "bit error rate",
+            f"{independent} A triangle is an upper limit: not one error was seen. Clopper-Pearson.",
+            log=True,
+        ),
+        over_distance(
+            "rmse_m", "rmse", "Distance error", "distance RMSE, m", f"{independent} Chi-square.", log=True
+        ),
+        over_distance(
+            "gross_share",
+            "gross",
+            "Distance errors of 0.5 m or more",
+            "share of distances",
+            f"{independent} Clopper-Pearson.",
+            log=False,
+        ),
+        over_distance(
+            "found_share",
+            "found",
+            "Frames found",
+            "share of frames sent",
+            independent + " Clopper-Pearson.",
+            log=False,
+        ),
+        Chart(
+            "histogram",
+            "Histogram of distance errors",
+            "measured less true distance, m",
+            f"share of distances in {BIN_M:g} m",
+            False,
+            True,
+            histogram,
+            (),
+            "All distances together; the outermost bins hold everything beyond.",
+        ),
+        *((positions,) if any(line.dots for line in positions.lines) else ()),
+    ]
+
+
+def _as_measure(kind: str) -> Measure:
+    return "ber" if kind == "ber" else "rmse_m" if kind == "rmse_m" else "gross_share"
+
+
+def _mark_name(clusters: int | None, speed_kmh: float | None) -> str:
+    parts = [f"{clusters} clusters"] if clusters and speed_kmh else []
+    parts += [f"{speed_kmh:g} km/h"] if speed_kmh else ["20 to 40 km/h"]
+    return f"{PAPER_NAME}: {', '.join(parts)}"
+
+
+def _lines(series: Sequence[Series], dots: Callable[[Series, float], tuple[Dot, ...]]) -> tuple[Line, ...]:
+    """Colour tells the scene, dash and symbol the link; neighbours stand a little apart."""
+    scenes = list(dict.fromkeys(_part(one, "scene.") for one in series))
+    links = list(dict.fromkeys(_part(one, "link.") for one in series))
+    lines = []
+    for number, one in enumerate(series):
+        scene, link = scenes.index(_part(one, "scene.")), links.index(_part(one, "link."))
+        shift = (number - (len(series) - 1) / 2) * min(0.7, 5 / max(len(series), 1))
+        lines.append(
+            Line(
+                one.name,
+                dots(one, shift),
+                TRANSMITTER_COLOURS[(scene if len(scenes) > 1 else link) % len(TRANSMITTER_COLOURS)],
+                DASHES[link % len(DASHES)],
+                SYMBOLS[link % len(SYMBOLS)],
+            )
+        )
+    return tuple(lines)
+
+
+def _part(series: Series, prefix: str) -> str:
+    return repr([(k, v) for k, v in series.labels.items() if k.startswith(prefix)])
+
+
+def _dots(series: Series, kind: str, shift: float, *, log: bool) -> tuple[Dot, ...]:
+    dots = []
+    for begin, tally in series.statistics.segments:
+        figure = measure(tally, kind)
+        if not figure.count:
+            continue
+        none = log and figure.value == 0
+        what = {
+            "ber": f"{tally.bit_errors} of {tally.bits} bits wrong",
+            "rmse_m": f"{tally.ranged} distances, bias {tally.bias_m:+.3f} m",
+            "gross_share": f"{tally.gross} of {tally.ranged} distances",
+            "found_share": f"{tally.frames_found} of {tally.frames_sent} frames",
+            "position_rmse_m": f"{tally.fixes} positions, half within {tally.position_quantile_m(0.5):.3f} m,"
+            f" 95 % within {tally.position_quantile_m(0.95):.3f} m; {tally.fixes_refused} refused",
+        }[kind]
+        shown = f"below {figure.high:.2g}" if none else f"{figure.value:.4g}"
+        text = (
+            f"{series.name}<br>{begin} to {begin + SEGMENT_M} m: {shown}"
+            f"<br>95 %: {figure.low:.3g} to {figure.high:.3g}<br>{what}"
+        )
+        y = figure.high if none else figure.value
+        dots.append(Dot(begin + SEGMENT_M / 2 + shift, y, figure.low, figure.high, text, none))
+    return tuple(dots)
+
+
+def _bins(series: Series) -> tuple[Dot, ...]:
+    tally = series.statistics.total()
+    if not tally.ranged:
+        return ()
+    counts = dict(tally.histogram)
+    dots = []
+    for bin in range(min(counts) - 1, max(counts) + 2):
+        low, share = bin * BIN_M, counts.get(bin, 0) / tally.ranged
+        text = f"{series.name}<br>{low:+.2f} to {low + BIN_M:+.2f} m: {counts.get(bin, 0)} of {tally.ranged}"
+        dots.append(Dot(low + BIN_M / 2, share, share, share, text))
+    return tuple(dots)
+
+
+def draw(chart: Chart, title: str) -> Drawing:
+    """Draw a chart with Matplotlib."""
+    figure = Drawing(figsize=(8, 5), layout="constrained")
+    axis = figure.subplots()
+    for line in chart.lines:
+        xs, ys = [d.x for d in line.dots], [d.y for d in line.dots]
+        style = _MATPLOTLIB[line.dash]
+        if chart.steps:
+            axis.step(xs, ys, where="mid", color=line.colour, ls=style, lw=1.2, label=line.name)
+            continue
+        axis.plot(xs, ys, style, color=line.colour, lw=1.2, label=line.name)
+        for limit in (False, True):
+            dots = [d for d in line.dots if d.limit is limit]
+            if dots:
+                axis.errorbar(
+                    [d.x for d in dots],
+                    [d.y for d in dots],
+                    None if limit else [[d.y - d.low for d in dots], [d.high - d.y for d in dots]],
+                    fmt="v" if limit else _MATPLOTLIB[line.symbol],
+                    mfc="none" if limit else line.colour,
+                    color=line.colour,
+                    ms=5,
+                    capsize=2,
+                    lw=1,
+                )
+    for mark in chart.marks:
+        axis.plot([mark.x0, mark.x1], [mark.y, mark.y], "-", color=_INK, lw=2.5 if not mark.bound else 1.2)
+        text = (
+            ("at most " if mark.bound else "")
+            + f"{mark.y:g}"
+            + (f" ({mark.clusters})" if mark.clusters else "")
+        )
+        axis.annotate(
+            text, ((mark.x0 + mark.x1) / 2, mark.y), xytext=(0, 3), textcoords="offset points", ha="center",
+            fontsize=8, color=_INK,
+        )  # fmt: skip
+    if chart.marks:
+        axis.plot([], [], "-", color=_INK, lw=2.5, label=f"{PAPER_NAME} (clusters)")
+    if chart.log_y:
+        axis.set_yscale("log")
+        if decades(chart) < 2:
+            axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axis.yaxis.set_minor_formatter(NullFormatter())
+    axis.set(xlabel=chart.x_label, ylabel=chart.y_label)
+    if chart.steps:
+        axis.set_xlim(*_core(chart))
+    axis.set_title(f"{title}: {chart.title}", loc="left", fontsize=11, color=_INK)
+    axis.grid(color="#e6e6e6", lw=0.8)
+    axis.set_axisbelow(True)
+    for side in ("top", "right"):
+        axis.spines[side].set_visible(False)
+    if axis.get_legend_handles_labels()[1]:
+        axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def decades(chart: Chart) -> float:
+    """How many powers of ten the vertical axis spans."""
+    levels = [d.y for line in chart.lines for d in line.dots if d.y > 0] + [m.y for m in chart.marks]
+    return math.log10(max(levels) / min(levels)) if levels else 0.0
+
+
+def _core(chart: Chart) -> tuple[float, float]:
+    """Where nearly all of a histogram lies."""
+    reach = max(
+        (_quantile(line.dots, 0.99) for line in chart.lines if line.dots),
+        default=1.0,
+    )
+    return -reach, reach
+
+
+def _quantile(dots: Iterable[Dot], share: float) -> float:
+    total = 0.0
+    for dot in sorted(dots, key=lambda d: abs(d.x)):
+        total += dot.y
+        if total >= share:
+            return abs(dot.x) + BIN_M
+    return math.inf
+
+
+def save_charts(charts: Sequence[Chart], title: str, folder: Path) -> list[Path]:
+    """Draw charts as PNG and SVG, named by their id.
+
+    Raises:
+        EvlcpError: A file cannot be written.
+    """
+    written = []
+    for chart in charts:
+        figure = draw(chart, title)
+        for kind in ("png", "svg"):
+            path = folder / f"{chart.id}.{kind}"
+            with whole_file(path) as part:
+                folder.mkdir(parents=True, exist_ok=True)
+                figure.savefig(part, format=kind, dpi=150)
+            written.append(path)
+    return written

@@ -1,0 +1,384 @@
+"""The plan of a campaign: from `campaign.toml` to points, tasks and jobs.
+
+A point is one scene with one link; its tasks are its seeds. A task's id is the SHA-256 of everything that
+determines its result, so a result is found again whatever file asks for it. A job is what one worker does at
+once: a scene, rendered once, and all links that receive it.
+"""
+
+import hashlib
+import itertools
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.specs import parse_value, read_toml
+from evlcp_sdk.study.tally import Statistics
+
+__all__ = ["Case", "Job", "Plan", "Point", "StopRule", "Task", "digest_of", "load_plan", "make_plan"]
+
+Labels = tuple[tuple[str, Any], ...]
+"""What sets a case apart: (key, value) of everything that the campaign varies."""
+
+
+@dataclass(frozen=True)
+class StopRule:
+    """When a point has enough; None for never.
+
+    Attributes:
+        max_bits: Bits received.
+        max_errors: Wrong bits received.
+    """
+
+    max_bits: int | None = None
+    max_errors: int | None = None
+
+    def reached(self, statistics: Statistics) -> bool:
+        """Whether these statistics are enough.
+
+        >>> StopRule(max_errors=0).reached(Statistics())
+        True
+        """
+        tally = statistics.total()
+        enough_bits = self.max_bits is not None and tally.bits >= self.max_bits
+        return enough_bits or (self.max_errors is not None and tally.bit_errors >= self.max_errors)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene or a link of the grid.
+
+    Attributes:
+        labels: What sets it apart from the others.
+        value: What a worker needs of it; can be pickled.
+        identity: Everything about it that determines a result, as JSON values.
+    """
+
+    labels: Labels
+    value: Any
+    identity: Any
+
+
+@dataclass(frozen=True)
+class Task:
+    """One seed of one point.
+
+    Attributes:
+        id: SHA-256 of everything that determines its result, 64 hex digits.
+        point: Number of its point.
+        link: The link's value, as `Case.value` has it.
+    """
+
+    id: str
+    point: int
+    link: Any
+
+
+@dataclass(frozen=True)
+class Job:
+    """A scene with a seed, and the tasks that receive it.
+
+    Attributes:
+        scene: The scene's value, as `Case.value` has it.
+        seed: The seed of everything random in it.
+        tasks: One a link.
+        environment: What the tasks' ids say of the code and its versions.
+    """
+
+    scene: Any
+    seed: int
+    tasks: tuple[Task, ...]
+    environment: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Point:
+    """One scene with one link.
+
+    Attributes:
+        labels: What sets it apart: keys begin with `scene.` or `link.`.
+        scene: Number of its scene.
+        link: Number of its link.
+        tasks: Ids of its tasks, by seed.
+    """
+
+    labels: Labels
+    scene: int
+    link: int
+    tasks: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A whole campaign.
+
+    Attributes:
+        name: Its name.
+        rule: When a point has enough.
+        merge: Labels over which a report adds points up.
+        seeds: The seeds of every point, in order.
+        scenes: The scenes.
+        links: The links.
+        points: Every scene with every link.
+        jobs: What there is to do: the first seed of every scene, then the second, and so on.
+        environment: Code and versions that the results come from.
+    """
+
+    name: str
+    rule: StopRule
+    merge: tuple[str, ...]
+    seeds: tuple[int, ...]
+    scenes: tuple[Case, ...]
+    links: tuple[Case, ...]
+    points: tuple[Point, ...]
+    jobs: tuple[Job, ...]
+    environment: Mapping[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, as for JSON: everything but the jobs."""
+        return {
+            "name": self.name,
+            "rule": asdict(self.rule),
+            "merge": list(self.merge),
+            "seeds": list(self.seeds),
+            "scenes": [{"labels": dict(s.labels), "identity": s.identity} for s in self.scenes],
+            "links": [{"labels": dict(k.labels), "identity": k.identity} for k in self.links],
+            "points": [
+                {"labels": dict(p.labels), "scene": p.scene, "link": p.link, "tasks": list(p.tasks)}
+                for p in self.points
+            ],
+            "environment": dict(self.environment),
+            "digest": digest_of([p.tasks for p in self.points]),
+        }
+
+
+def digest_of(value: Any) -> str:
+    """SHA-256 of JSON values, whatever the order of keys, 64 hex digits.
+
+    >>> digest_of({"a": 1, "b": 2}) == digest_of({"b": 2, "a": 1})
+    True
+    """
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def make_plan(
+    name: str,
+    scenes: Sequence[Case],
+    links: Sequence[Case],
+    seeds: Sequence[int],
+    *,
+    rule: StopRule = StopRule(),
+    merge: Sequence[str] = (),
+    environment: Mapping[str, Any] | None = None,
+) -> Plan:
+    """Every scene with every link and every seed.
+
+    Args:
+        name: Name of the campaign.
+        scenes: The scenes.
+        links: The links.
+        seeds: The seeds, in the order in which they count.
+        rule: When a point has enough.
+        merge: Labels over which a report adds points up.
+        environment: Code and versions, part of every task's id.
+    """
+    environment = dict(environment or {})
+
+    def id_of(scene: Case, link: Case, seed: int) -> str:
+        whole = {"scene": scene.identity, "link": link.identity, "seed": seed, "environment": environment}
+        return digest_of(whole)
+
+    points = []
+    for (s, scene), (k, link) in itertools.product(enumerate(scenes), enumerate(links)):
+        tasks = tuple(id_of(scene, link, seed) for seed in seeds)
+        labels = (*(("scene." + a, b) for a, b in scene.labels), *(("link." + a, b) for a, b in link.labels))
+        points.append(Point(labels, s, k, tasks))
+    jobs = []
+    for (n, seed), (s, scene) in itertools.product(enumerate(seeds), enumerate(scenes)):
+        numbers = range(s * len(links), (s + 1) * len(links))
+        # Links that differ in name only are one task.
+        tasks_of = {
+            points[p].tasks[n]: Task(points[p].tasks[n], p, links[points[p].link].value) for p in numbers
+        }
+        jobs.append(Job(scene.value, seed, tuple(tasks_of.values()), environment))
+    return Plan(
+        name,
+        rule,
+        tuple(merge),
+        tuple(seeds),
+        tuple(scenes),
+        tuple(links),
+        tuple(points),
+        tuple(jobs),
+        environment,
+    )
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class _Campaign(_Strict):
+    name: Annotated[str, Field(pattern=r"^[\w.-]+$")]
+    seeds: Annotated[int, Field(ge=1, le=1_000_000)] = 1
+    first_seed: Annotated[int, Field(ge=0)] = 0
+    max_bits: Annotated[int | None, Field(ge=1)] = None
+    max_errors: Annotated[int | None, Field(ge=1)] = None
+    merge: list[str] | None = None
+
+
+class _Grid(_Strict):
+    base: str | None = None
+    set: dict[str, Any] = {}
+    grid: dict[str, Any] = {}
+    variants: dict[str, dict[str, Any]] = {}
+
+
+class _File(_Strict):
+    campaign: _Campaign
+    scene: _Grid = _Grid()
+    link: _Grid = _Grid()
+
+
+SceneCases = Callable[[str | None, Sequence[str]], tuple[Any, Any]]
+"""From base and overrides to (value, identity)."""
+
+
+def load_plan(
+    path: Path | str,
+    scene_of: SceneCases,
+    link_of: SceneCases,
+    environment: Mapping[str, Any],
+    overrides: Sequence[str] = (),
+) -> Plan:
+    """Read a campaign file and lay out its points.
+
+    Args:
+        path: The file.
+        scene_of: Makes a scene of a base (a preset, a file or None) and overrides.
+        link_of: Makes a link likewise.
+        environment: Code and versions, part of every task's id.
+        overrides: What `--set` takes, e.g. `"campaign.seeds=2"`; the value is TOML, or else plain text.
+
+    Raises:
+        ConfigError: All faults of the file, one line each.
+    """
+    table = read_toml(path)
+    for override in overrides:
+        _override(table, override)
+    try:
+        file = TypeAdapter(_File).validate_python(table)
+    except ValidationError as refused:
+        raise ConfigError("\n".join(_fault_line(path, e) for e in refused.errors())) from refused
+    folder = Path(path).parent
+    faults: list[str] = []
+    scenes = _cases("scene", file.scene, folder, scene_of, faults, path)
+    links = _cases("link", file.link, folder, link_of, faults, path)
+    varied = {"scene." + key for s in scenes for key, _ in s.labels}
+    varied |= {"link." + key for k in links for key, _ in k.labels}
+    merge = file.campaign.merge
+    if merge is None:
+        merge = sorted(key for key in varied if key.endswith("distance_m"))
+    for key in merge:
+        if key not in varied:
+            known = ", ".join(sorted(varied)) or "nothing"
+            faults.append(f"{path}: campaign.merge: '{key}' is not varied (varied: {known})")
+    if faults:
+        raise ConfigError("\n".join(dict.fromkeys(faults)))
+    head = file.campaign
+    return make_plan(
+        head.name,
+        scenes,
+        links,
+        range(head.first_seed, head.first_seed + head.seeds),
+        rule=StopRule(head.max_bits, head.max_errors),
+        merge=merge,
+        environment=environment,
+    )
+
+
+def _override(table: dict[str, Any], text: str) -> None:
+    name, equals, value = text.partition("=")
+    section, dot, key = (part.strip() for part in name.partition("."))
+    if not (equals and dot and key) or section not in ("campaign", "scene", "link"):
+        raise ConfigError(f"--set {text}: expected campaign.KEY=, scene.KEY= or link.KEY=VALUE")
+    parsed = parse_value(value)
+    keys = table.setdefault(section, {})
+    if section != "campaign" and isinstance(keys, dict):
+        for name in ("grid", "set"):
+            if isinstance(inner := keys.get(name, {}), dict):
+                keys[name] = {k: v for k, v in _flat(inner).items() if k != key}
+        keys = keys["set"]
+    if isinstance(keys, dict):
+        keys[key] = parsed
+
+
+def _fault_line(path: Path | str, error: Any) -> str:
+    where = ".".join(str(part) for part in error["loc"])
+    if error["type"] == "extra_forbidden":
+        return f"{path}: {where}: unknown key"
+    if error["type"] == "missing":
+        return f"{path}: {where}: missing"
+    return f"{path}: {where} = {error['input']!r}: {error['msg'].replace('Input should be', 'expected', 1)}"
+
+
+def _cases(
+    kind: str, grid: _Grid, folder: Path, make: SceneCases, faults: list[str], path: Path | str
+) -> list[Case]:
+    fixed = _flat(grid.set)
+    axes = _flat(grid.grid)
+    for key, values in axes.items():
+        if not isinstance(values, list) or not values:
+            faults.append(f"{path}: {kind}.grid.{key} = {values!r}: expected a list of values")
+        elif len({repr(v) for v in values}) < len(values):
+            faults.append(f"{path}: {kind}.grid.{key}: a value stands there twice")
+    if faults:
+        return []
+    base = grid.base
+    cases = []
+    for name, variant in (grid.variants or {"": {}}).items():
+        variant = _flat(variant)
+        its_base = variant.pop("base", base)
+        for values in itertools.product(*axes.values()):
+            chosen = dict(zip(axes, values, strict=True))
+            overrides = [f"{key}={_toml(value)}" for key, value in (fixed | chosen | variant).items()]
+            try:
+                value, identity = make(_located(its_base, folder), overrides)
+            except ConfigError as fault:
+                faults.extend(f"{path}: {kind}: {line}" for line in str(fault).splitlines())
+                continue
+            labels = (*([("variant", name)] if grid.variants else []), *chosen.items())
+            cases.append(Case(tuple(labels), value, identity))
+    return cases
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """`{"a": {"b": 1}}` and `{"a.b": 1}` are both `{"a.b": 1}`."""
+    found: dict[str, Any] = {}
+    for key, value in table.items():
+        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
+    return found
+
+
+def _located(base: Any, folder: Path) -> Any:
+    """A file is named from the campaign's folder; a preset has no suffix."""
+    return str(folder / base) if isinstance(base, str) and base.endswith(".toml") else base
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, bool | str) else repr(value)
+
+
+def labels_of(points: Sequence[Point]) -> Iterator[str]:
+    """The keys that set points apart, in order of appearance."""
+    seen: dict[str, None] = {}
+    for point in points:
+        seen |= dict.fromkeys(key for key, _ in point.labels)
+    yield from seen

@@ -1,0 +1,63 @@
+"""The links of a campaign as variants."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from evlcp_sdk.study.campaign.summary import Series, Summary
+from evlcp_sdk.study.compare.measured import Measured, Moments
+from evlcp_sdk.study.compare.table import Comparison, Row, Table, total_of
+from evlcp_sdk.study.tally import Tally
+
+__all__ = ["of_campaign"]
+
+
+def of_campaign(summary: Summary) -> Comparison:
+    """The links of a campaign as variants, with a table a scene.
+
+    What a campaign does not keep, such as packets, time and stated sigmas, has no column; nor is there a
+    bound, which needs the events.
+    """
+    links: dict[str, Mapping[str, Any]] = {}
+    scenes: dict[str, list[Row]] = {}
+    for series in summary.series:
+        scene, link = _part(series, "scene.", "the scene"), _part(series, "link.", "the link")
+        settings = [
+            f"{k.removeprefix('link.')}={v}" for k, v in series.labels.items() if k.startswith("link.")
+        ]
+        identity = series.link if isinstance(series.link, Mapping) else {}
+        links[link] = {
+            "settings": settings,
+            "digest": identity.get("digest", ""),
+            "configuration": identity.get("table", {}),
+        }
+        tally = series.statistics.total()
+        scenes.setdefault(scene, []).append(Row(link, _of_tally(tally, series.statistics.unmatched)))
+    tables = [Table(name, tuple(rows)) for name, rows in scenes.items()]
+    if len(tables) > 1:
+        tables.append(total_of(tables, "all scenes"))
+    notes = [f"campaign {summary.name}, {summary.digest}"]
+    if summary.done < summary.tasks:
+        notes.append(f"{summary.done} of {summary.tasks} tasks are done")
+    return Comparison(links, tuple(tables), tuple(notes), summary.plan["environment"])
+
+
+def _part(series: Series, prefix: str, otherwise: str) -> str:
+    """The name that a series has by the labels of its scene or of its link."""
+    labels = {key: value for key, value in series.labels.items() if key.startswith(prefix)}
+    return replace(series, labels=labels).name if labels else otherwise
+
+
+def _of_tally(tally: Tally, unmatched: int) -> Measured:
+    errors = Moments(tally.ranged, tally.sum_um * 1e-6, tally.squares_um2 * 1e-12)
+    return Measured(
+        frames=tally.frames_found + unmatched,
+        packets=None,
+        frames_sent=tally.frames_sent,
+        frames_found=tally.frames_found,
+        unmatched=unmatched,
+        bits=tally.bits,
+        bit_errors=tally.bit_errors,
+        error_m=errors,
+        gross=tally.gross,
+    )

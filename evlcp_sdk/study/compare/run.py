@@ -1,0 +1,258 @@
+"""A recording received with every variant at once, and scored.
+
+It is read once; each piece of its events goes through one `Receiver.feed` after the other, so that all see
+the same and time is told in one run. What comes out is scored as `evlcp score` scores `frames.csv`.
+"""
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import ConfigError, UnknownAlgorithmError
+from evlcp_sdk.io import EventSource
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.results.outputs import FILTERED_COLUMNS, FRAME_COLUMNS, filtered_row, frame_row
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.study.bound import frame_bound
+from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments
+from evlcp_sdk.study.compare.table import Row, Table
+from evlcp_sdk.study.compare.variants import Variant
+from evlcp_sdk.study.score import score_frames
+from evlcp_sdk.values import Events, FrameView, Packet, Range
+
+__all__ = ["measure_recording", "truth_path"]
+
+_DARK_W_M2 = 1e-6
+"""Irradiance below which a bar of a truth is dark: it sends nothing that could be received."""
+
+_WARM_PACKETS = 2
+"""Packets that a variant decodes beforehand: one may be cut, so that a whole one loads every kernel."""
+
+
+def truth_path(url: str) -> Path:
+    """Where the truth of a recording lies: `night.raw` and `night.csv.gz` have `night.truth.json`."""
+    path = Path(url)
+    stem = path.name.removesuffix(".gz").rsplit(".", 1)[0] or path.name
+    return path.with_name(f"{stem}.truth.json")
+
+
+class _Watch:
+    """Notes the processor time of the stages of each frame, us.
+
+    A stage's time is what passed since the stage before was told, on the clock of the thread's processor, or
+    on that of the wall where that is less: between two frames, work of other stages lies before the first.
+    """
+
+    def __init__(self) -> None:
+        self.stage_us: dict[str, list[float]] = {stage: [] for stage in STAGES}
+        self.frame_us: list[float] = []
+        self._frame: dict[str, float] = {}
+        self._told_s = time.thread_time()
+
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str, elapsed_s: float) -> None:
+        spent_s = min(elapsed_s, time.thread_time() - self._told_s)
+        if stage in STAGES:
+            self._frame[stage] = spent_s * 1e6
+        elif stage == "frame":
+            for name, us in self._frame.items():
+                self.stage_us[name].append(us)
+            self.frame_us.append(sum(self._frame.values()))
+            self._frame = {}
+        self._told_s = time.thread_time()
+
+
+class _Bound:
+    """Gives the bound of every frame that a receiver decodes.
+
+    Args:
+        measure: From a frame's view to its bound.
+    """
+
+    def __init__(self, measure: Callable[[FrameView], Range]) -> None:
+        self.sigma_m: list[float] = []
+        self._measure = measure
+        self._views: list[FrameView] = []
+
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str, value: object) -> None:
+        if stage == "view":
+            assert isinstance(value, FrameView)
+            self._views.append(value)
+
+    def settle(self) -> None:
+        """Compute what is due, while no receiver's time runs."""
+        self.sigma_m += [self._measure(view).sigma_m for view in self._views]
+        self._views = []
+
+
+class _Lane:
+    """One variant's receiver, its rows of `frames.csv` and its time."""
+
+    def __init__(self, link: Link, bound: _Bound | None = None) -> None:
+        self.watch = _Watch()
+        others = [] if bound is None else [bound]
+        self.receiver = Receiver(link, Registry.load(self.watch, *others).hook)
+        self.rows: list[dict[str, str]] = []
+        self.packets = 0
+        self.cpu_s = 0.0
+
+    def feed(self, events: Events | None) -> None:
+        """Take events; None ends the stream."""
+        began = time.process_time()
+        packets = self.receiver.close() if events is None else self.receiver.feed(events)
+        self.cpu_s += time.process_time() - began
+        self.packets += len(packets)
+        self.rows += [dict(row) for packet in packets for row in _rows(packet)]
+
+
+def _rows(packet: Packet) -> Iterator[Iterable[tuple[str, str]]]:
+    columns = (*FRAME_COLUMNS, *FILTERED_COLUMNS)
+    for frame in packet.frames:
+        yield zip(columns, (*frame_row(frame), *filtered_row(frame)), strict=True)
+
+
+def measure_recording(
+    name: str,
+    open_source: Callable[[], EventSource],
+    variants: Sequence[Variant],
+    known: Mapping[str, Any] | None = None,
+    advance: Callable[[EventSource], None] = lambda _: None,
+) -> Table:
+    """Receive a recording with every variant, and hold what came out against the truth.
+
+    Its first packets are read and received once before, so that no kernel is loaded or compiled while time
+    runs. The bound is that of the frames as the first variant decodes them; a bar of several columns, or a
+    camera that sends positive events only, has none.
+
+    Args:
+        name: Of the table.
+        open_source: Opens the recording at its beginning; called twice.
+        variants: At least one.
+        known: What its `REC.truth.json` holds; None without one.
+        advance: Told after every piece.
+
+    Raises:
+        ConfigError: The truth was sent with another modulation than a variant receives.
+        InputError: The recording cannot be read, or its truth cannot be used.
+    """
+    if known is not None:
+        for variant in variants:
+            _check_shared(name, known, variant)
+    with open_source() as source:
+        _warm(source, variants)
+    bound = _bound_of(variants[0].link)
+    lanes = [_Lane(variant.link, None if n else bound) for n, variant in enumerate(variants)]
+    first_us = last_us = None
+    reading_s = 0.0
+    with open_source() as source:
+        began = time.process_time()
+        for number, events in enumerate(source.chunks()):
+            reading_s += time.process_time() - began
+            first_us = int(events.t_us[0]) if first_us is None else first_us
+            last_us = int(events.t_us[-1])
+            # Who comes first brings the events into the cache: each in turn.
+            turn = number % len(lanes)
+            for lane in lanes[turn:] + lanes[:turn]:
+                lane.feed(events)
+            if bound is not None:
+                bound.settle()
+            advance(source)
+            began = time.process_time()
+    for lane in lanes:
+        lane.feed(None)
+    if bound is not None:
+        bound.settle()
+    recorded_s = 0.0 if first_us is None or last_us is None else (last_us - first_us) * 1e-6
+    rows = tuple(
+        Row(variant.name, _measured(lane, known, recorded_s, reading_s))
+        for variant, lane in zip(variants, lanes, strict=True)
+    )
+    sigma_m = [] if bound is None else bound.sigma_m
+    return Table(name, rows, Moments.of(np.array(sigma_m, np.float64)))
+
+
+def _warm(source: EventSource, variants: Sequence[Variant]) -> None:
+    """Receive the first packets with every variant."""
+    lanes = [_Lane(variant.link) for variant in variants]
+    packets = [variant.link.packet for variant in variants]
+    enough_us = _WARM_PACKETS * max(packet.packet_chips * packet.chip_us for packet in packets)
+    first_us = None
+    for events in source.chunks():
+        first_us = int(events.t_us[0]) if first_us is None else first_us
+        for lane in lanes:
+            lane.feed(events)
+        if events.t_us[-1] - first_us >= enough_us:
+            break
+    for lane in lanes:
+        lane.feed(None)
+
+
+def _bound_of(link: Link) -> _Bound | None:
+    """What gives the bound of each frame; None where the bound's model does not hold."""
+    if link.regions.positive_only:
+        return None
+    try:
+        return _Bound(frame_bound(link.camera, link.bar, link.codebook))
+    except ConfigError:
+        return None
+
+
+def _sigmas(rows: Iterable[Mapping[str, str]]) -> NDArray[np.float64]:
+    return np.array([float(row["distance_sigma_m"] or "nan") for row in rows], np.float64)
+
+
+def _measured(lane: _Lane, known: Mapping[str, Any] | None, recorded_s: float, reading_s: float) -> Measured:
+    plain = Measured(
+        frames=len(lane.rows),
+        packets=lane.packets,
+        stated_sigma_m=Moments.of(_sigmas(lane.rows)),
+        frame_us=tuple(lane.watch.frame_us),
+        stage_us={stage: tuple(lane.watch.stage_us[stage]) for stage in STAGES},
+        recorded_s=recorded_s,
+        cpu_s=reading_s + lane.cpu_s,
+    )
+    if known is None:
+        return plain
+    score = score_frames(lane.rows, known)
+    return replace(
+        plain,
+        frames_sent=sum(bar.frames_sent for bar in score.bars),
+        frames_found=sum(bar.frames_found for bar in score.bars),
+        unmatched=score.unmatched,
+        bits=sum(bar.bits for bar in score.bars),
+        bit_errors=sum(bar.bit_errors for bar in score.bars),
+        error_m=sum((Moments.of(bar.error_m) for bar in score.bars), Moments()),
+        gross=sum(bar.gross for bar in score.bars),
+        filtered_error_m=sum((Moments.of(bar.filtered_error_m) for bar in score.bars), Moments()),
+    )
+
+
+def _check_shared(name: str, known: Mapping[str, Any], variant: Variant) -> None:
+    """Refuse a truth of other codewords than the variant's: a mismatch is an error, never a wrong answer."""
+    mine = variant.link.table["modulation"]["id"]
+    for bar in known["bars"]:
+        sent, light = bar.get("profile"), bar.get("led_w_m2")
+        dark = light is not None and light <= _DARK_W_M2
+        if sent == mine or dark or bar.get("chips_file") is not None:
+            continue
+        if not np.array_equal(_codewords(sent), variant.link.codebook.codewords):
+            raise ConfigError(
+                f"{name}: sent with '{sent}', but the variant '{variant.name}' receives '{mine}';"
+                f" set modulation.id={sent}"
+            )
+
+
+def _codewords(modulation: str) -> NDArray[np.int8]:
+    try:
+        words: NDArray[np.int8] = Registry.load().load_class("modulation", modulation)().codewords()
+    except UnknownAlgorithmError:
+        return np.empty((0, 0), np.int8)
+    return words

@@ -1,0 +1,261 @@
+"""The table of a comparison: columns, who is best in them, and how it is written down."""
+
+import csv
+import html
+import io
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments, median
+from evlcp_sdk.study.markup import details, document, table
+
+__all__ = ["BOUND_NAME", "COLUMNS", "LEGEND", "MARK", "Column", "Comparison", "Row", "Table", "total_of"]
+
+BOUND_NAME = "Cramer-Rao bound"
+"""Name of the reference row."""
+
+MARK = "*"
+"""Follows the best figure of a column, where bold type may be lost."""
+
+LEGEND = (
+    f"{MARK} best of its column. BER with its 95 % interval; filtered is the RMSE after tracking; sigma is"
+    " what the ranging itself states, root mean square; us/frame is the median processor time of separation,"
+    " decoding and ranging; x real time is recorded time over the processor time of reading and receiving."
+)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the table.
+
+    Attributes:
+        key: Name of the figure, as in JSON and CSV.
+        title: Heading.
+        cell: The figure as text; `-` where it was not measured.
+        rank: The smallest is the best; None where there is no best.
+    """
+
+    key: str
+    title: str
+    cell: Callable[[Measured], str]
+    rank: Callable[[Measured], float] | None
+
+
+def _text(value: float, form: str) -> str:
+    return "-" if math.isnan(value) else format(value, form)
+
+
+def _frames(m: Measured) -> str:
+    return f"{m.frames_found}/{m.frames_sent}" if m.frames_sent else str(m.frames)
+
+
+def _ber(m: Measured) -> str:
+    return _text(m.ber, ".1e") if m.bit_errors else "-" if not m.bits else "0"
+
+
+def _gross(m: Measured) -> str:
+    return f"{m.gross_share:.1%} ({m.gross})" if m.error_m.count else "-"
+
+
+COLUMNS = (
+    Column("found_share", "frames", _frames, lambda m: -m.found_share),
+    Column("packets", "packets", lambda m: "-" if m.packets is None else str(m.packets), None),
+    Column("ber", "BER", _ber, lambda m: m.ber),
+    Column(
+        "ber_interval",
+        "95 %",
+        lambda m: (
+            "-"
+            if not m.bits
+            else "{:.1e} to {:.1e}".format(*m.ber_interval)
+            if m.bit_errors
+            else f"< {m.ber_interval[1]:.1e}"
+        ),
+        None,
+    ),
+    Column("rmse_m", "RMSE, m", lambda m: _text(m.rmse_m, ".4f"), lambda m: m.rmse_m),
+    Column("bias_m", "bias, m", lambda m: _text(m.bias_m, "+.4f"), lambda m: abs(m.bias_m)),
+    Column("gross_share", ">= 0.5 m", _gross, lambda m: m.gross_share),
+    Column(
+        "filtered_rmse_m",
+        "filtered, m",
+        lambda m: _text(m.filtered_rmse_m, ".4f"),
+        lambda m: m.filtered_rmse_m,
+    ),
+    Column("sigma_m", "sigma, m", lambda m: _text(m.sigma_m, ".4f"), None),
+    Column("us_per_frame", "us/frame", lambda m: _text(m.us_per_frame, ".0f"), lambda m: m.us_per_frame),
+    Column(
+        "times_real_time",
+        "x real time",
+        lambda m: _text(m.times_real_time, ".2f"),
+        lambda m: -m.times_real_time,
+    ),
+)
+"""The columns, in order; BER's interval decides nothing."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A variant's line."""
+
+    variant: str
+    measured: Measured
+
+
+@dataclass(frozen=True)
+class Table:
+    """All variants on one recording, or on all.
+
+    Attributes:
+        name: Of the recording.
+        rows: One a variant.
+        bound_m: The frames' Cramer-Rao bounds, m.
+    """
+
+    name: str
+    rows: tuple[Row, ...]
+    bound_m: Moments = field(default_factory=Moments)
+
+    def best(self) -> tuple[frozenset[str], ...]:
+        """Of each row, the keys of the columns in which it is the best, or as good as the best.
+
+        Where fewer than two rows have a figure, none is.
+        """
+        found: list[set[str]] = [set() for _ in self.rows]
+        for column in COLUMNS:
+            if column.rank is None:
+                continue
+            ranks = [column.rank(row.measured) for row in self.rows]
+            known = [rank for rank in ranks if not math.isnan(rank)]
+            if len(known) > 1:
+                for keys, rank in zip(found, ranks, strict=True):
+                    if rank == min(known):
+                        keys.add(column.key)
+        return tuple(map(frozenset, found))
+
+    def cells(self) -> tuple[list[str], list[list[tuple[str, bool]]]]:
+        """Headings, and of each row the cells as (text, is best); columns without any figure are left out.
+
+        The best have a mark behind; the last row is the bound, if there is one.
+        """
+        best = self.best()
+        columns = [c for c in COLUMNS if any(c.cell(row.measured) != "-" for row in self.rows)]
+        lines = []
+        for row, keys in zip(self.rows, best, strict=True):
+            line = [(row.variant, False)]
+            for column in columns:
+                is_best = column.key in keys
+                line.append((column.cell(row.measured) + (MARK if is_best else ""), is_best))
+            lines.append(line)
+        if self.bound_m.count:
+            bound = [_text(self.bound_m.rms, ".4f") if c.key == "rmse_m" else "" for c in columns]
+            lines.append([(text, False) for text in (BOUND_NAME, *bound)])
+        return ["variant", *(c.title for c in columns)], lines
+
+    def records(self) -> list[dict[str, Any]]:
+        """Every figure of each row as plain values; None where it was not measured."""
+        found = []
+        for row, keys in zip(self.rows, self.best(), strict=True):
+            m = row.measured
+            low, high = m.ber_interval
+            values: dict[str, Any] = {
+                "recording": self.name,
+                "variant": row.variant,
+                "frames": m.frames,
+                "frames_sent": m.frames_sent if m.frames_sent else None,
+                "frames_found": m.frames_found if m.frames_sent else None,
+                "found_share": m.found_share,
+                "unmatched": m.unmatched if m.frames_sent else None,
+                "packets": m.packets,
+                "bits": m.bits,
+                "bit_errors": m.bit_errors if m.bits else None,
+                "ber": m.ber,
+                "ber_low": low,
+                "ber_high": high,
+                "ranged": m.error_m.count,
+                "rmse_m": m.rmse_m,
+                "bias_m": m.bias_m,
+                "gross": m.gross if m.error_m.count else None,
+                "gross_share": m.gross_share,
+                "filtered_rmse_m": m.filtered_rmse_m,
+                "sigma_m": m.sigma_m,
+                "us_per_frame": m.us_per_frame,
+                **{f"{stage}_us": median(m.stage_us[stage]) for stage in STAGES},
+                "recorded_s": m.recorded_s,
+                "cpu_s": m.cpu_s if m.cpu_s else None,
+                "times_real_time": m.times_real_time,
+                "cramer_rao_bound_m": self.bound_m.rms,
+                "best": sorted(keys),
+            }
+            found.append(
+                {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()}
+            )
+        return found
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All tables.
+
+    Attributes:
+        variants: Name to what sets it apart, with digest and resolved table.
+        tables: One a recording; over all, the last, where there are several.
+        notes: What a reader must know.
+        versions: What was installed.
+    """
+
+    variants: Mapping[str, Mapping[str, Any]]
+    tables: tuple[Table, ...]
+    notes: tuple[str, ...]
+    versions: Mapping[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as JSON values; what was not measured is null."""
+        return {
+            "variants": {name: dict(values) for name, values in self.variants.items()},
+            "rows": [record for one in self.tables for record in one.records()],
+            "notes": list(self.notes),
+            "versions": dict(self.versions),
+        }
+
+    def to_json(self) -> str:
+        """`to_dict` as text."""
+        return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
+
+    def to_csv(self) -> str:
+        """A line a variant and recording; `best` names its best figures, parted by spaces."""
+        records = [record for one in self.tables for record in one.records()]
+        out = io.StringIO()
+        writer = csv.DictWriter(out, list(records[0]) if records else [], lineterminator="\n")
+        writer.writeheader()
+        for record in records:
+            writer.writerow(record | {"best": " ".join(record["best"])})
+        return out.getvalue()
+
+    def to_html(self) -> str:
+        """One self-contained page."""
+        body = ["<h1>Variants compared</h1>"]
+        for one in self.tables:
+            head, lines = one.cells()
+            rows = [
+                [f"<b>{html.escape(t)}</b>" if best else html.escape(t) for t, best in row] for row in lines
+            ]
+            body += [f"<h2>{html.escape(one.name)}</h2>", table([html.escape(h) for h in head], rows)]
+        body += [f'<p class="note">{html.escape(text)}</p>' for text in (LEGEND, *self.notes)]
+        body.append("<h2>Configuration and digests</h2>")
+        for name, values in self.variants.items():
+            about = ", ".join(values["settings"]) or "the link as it is"
+            body.append(details(f"{name}: {about}; SHA-256 {values['digest']}", values))
+        body.append(details("versions", dict(self.versions)))
+        return document("Variants compared", body)
+
+
+def total_of(tables: Sequence[Table], name: str = "all") -> Table:
+    """The table of all recordings together; they have the same variants."""
+    rows = []
+    for same in zip(*(one.rows for one in tables), strict=True):
+        rows.append(Row(same[0].variant, sum((row.measured for row in same), Measured())))
+    return Table(name, tuple(rows), sum((one.bound_m for one in tables), Moments()))

@@ -1,0 +1,398 @@
+"""The values that flow through the receiver: events, regions, locks, presence, symbols, ranges, frames."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.air.beacons import Beacon
+from evlcp_sdk.air.blocks import Block, Message
+from evlcp_sdk.errors import StreamError
+
+__all__ = [
+    "EVENT_RECORD",
+    "Events",
+    "Fix",
+    "Frame",
+    "FrameView",
+    "Packet",
+    "PresenceMap",
+    "Range",
+    "ReceivedMessage",
+    "Region",
+    "SoftSymbols",
+    "SyncLock",
+    "Triggers",
+    "Trust",
+]
+
+EVENT_RECORD = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
+"""The structured record of Prophesee's Metavision SDK (`EventCD`)."""
+
+
+_COLUMNS = (
+    ("t_us", np.dtype(np.int64)),
+    ("x", np.dtype(np.uint16)),
+    ("y", np.dtype(np.uint16)),
+    ("p", np.dtype(np.uint8)),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Events:
+    """Contrast-detection events in columns of equal length.
+
+    Attributes:
+        t_us: Camera clock, us, int64 (n,).
+        x: Column, uint16 (n,).
+        y: Row, uint16 (n,).
+        p: Polarity, uint8 (n,); 1 = brighter (ON), 0 = darker (OFF).
+
+    Raises:
+        StreamError: A column has another type or length.
+
+    >>> e = Events.of([5, 7], x=[1, 2], y=[3, 4], p=[1, 0])
+    >>> len(e), e[1:].t_us.tolist()
+    (2, [7])
+    """
+
+    t_us: NDArray[np.int64]
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    p: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        shape = self.t_us.shape
+        for name, dtype in _COLUMNS:
+            column = getattr(self, name)
+            if column.dtype != dtype or column.shape != shape or len(shape) != 1:
+                raise StreamError(
+                    f"events column {name}: {column.dtype} {column.shape},"
+                    f" expected {dtype} ({len(self.t_us)},)"
+                )
+
+    @classmethod
+    def of(cls, t_us: Any, x: Any, y: Any, p: Any) -> Self:
+        """Events from array-likes, converted to the column types."""
+        return cls(
+            np.ascontiguousarray(t_us, np.int64),
+            np.ascontiguousarray(x, np.uint16),
+            np.ascontiguousarray(y, np.uint16),
+            np.ascontiguousarray(p, np.uint8),
+        )
+
+    @classmethod
+    def empty(cls) -> Self:
+        """No events."""
+        return cls.of([], [], [], [])
+
+    @classmethod
+    def concat(cls, parts: Iterable["Events"]) -> Self:
+        """All events of `parts`, in order."""
+        ps = list(parts)
+        if not ps:
+            return cls.empty()
+        return cls(*(np.concatenate([getattr(q, c) for q in ps]) for c in ("t_us", "x", "y", "p")))
+
+    @classmethod
+    def from_records(cls, records: NDArray[np.void]) -> Self:
+        """Events from Metavision records (fields x, y, p, t)."""
+        return cls.of(records["t"], records["x"], records["y"], records["p"])
+
+    def to_records(self) -> NDArray[np.void]:
+        """Metavision records (`EVENT_RECORD`)."""
+        out = np.empty(len(self), EVENT_RECORD)
+        out["x"], out["y"], out["p"], out["t"] = self.x, self.y, self.p, self.t_us
+        return out
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+    def __getitem__(self, rows: Any) -> "Events":
+        """The events of a slice or a mask (a view for a slice)."""
+        return Events(self.t_us[rows], self.x[rows], self.y[rows], self.p[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Triggers:
+    """Edges of the camera's external trigger inputs.
+
+    Attributes:
+        t_us: Camera clock, us, int64 (n,).
+        channel: Trigger input, uint8 (n,).
+        value: 1 = rising, 0 = falling, uint8 (n,).
+    """
+
+    t_us: NDArray[np.int64]
+    channel: NDArray[np.uint8]
+    value: NDArray[np.uint8]
+
+    @classmethod
+    def of(cls, t_us: Any, channel: Any, value: Any) -> Self:
+        """Triggers from array-likes, converted to the column types."""
+        return cls(np.asarray(t_us, np.int64), np.asarray(channel, np.uint8), np.asarray(value, np.uint8))
+
+    @classmethod
+    def empty(cls) -> Self:
+        """No triggers."""
+        return cls.of([], [], [])
+
+    @classmethod
+    def concat(cls, parts: Iterable["Triggers"]) -> Self:
+        """All triggers of `parts`, in order."""
+        ps = list(parts)
+        if not ps:
+            return cls.empty()
+        return cls(*(np.concatenate([getattr(q, c) for q in ps]) for c in ("t_us", "channel", "value")))
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+
+@dataclass(frozen=True)
+class Region:
+    """A blinking region of the image at one time.
+
+    Attributes:
+        id: Number of the region in order of appearance, from 0.
+        t_us: When it was measured, camera clock, us.
+        x_px: Column of its centre, px.
+        y_px: Row of its centre, px.
+        width_px: Its width, px.
+        height_px: Its height, px.
+    """
+
+    id: int
+    t_us: float
+    x_px: float
+    y_px: float
+    width_px: float
+    height_px: float
+
+
+@dataclass(frozen=True)
+class SyncLock:
+    """Where a transmitter's packets stand on the camera's clock.
+
+    Attributes:
+        packet_t_us: Start of a packet's first preamble chip, us, as the earliest events of rising edges show
+            it; other packets lie whole periods away.
+        chip_us: Length of a chip on the camera's clock, us.
+        delay_on_us: What to add to a chip's start so that the window of one chip holds the positive events
+            of an edge at that start best, us; negative where these events last nearly a chip.
+        delay_off_us: The same for negative events.
+        quality: Normalised preamble correlation, 0 to 1.
+    """
+
+    packet_t_us: float
+    chip_us: float
+    delay_on_us: float
+    delay_off_us: float
+    quality: float
+
+
+@dataclass(frozen=True, eq=False)
+class PresenceMap:
+    """Probability that a grid cell shows a cluster.
+
+    Attributes:
+        probability: float32 (K, rows, columns), 0 to 1.
+        grid_px: Side of a grid cell, px.
+        selected: Cells that show a cluster, bool (K, rows, columns).
+        pixels: Pilot correlation of the pixels in and around each cluster's selected cells, float32
+            (K, height, width), 0 elsewhere; the maps that ranging needs.
+    """
+
+    probability: NDArray[np.float32]
+    grid_px: int
+    selected: NDArray[np.bool_]
+    pixels: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class SoftSymbols:
+    """What one frame says, with how sure.
+
+    Attributes:
+        symbols: Most likely symbol of each cluster, int64 (K,).
+        llr: Log-likelihood ratio ln P(bit 0) / P(bit 1) of each bit, most significant first, float32 (K, m).
+        quality: Share of the received energy that the decided codewords explain, 0 to 1.
+    """
+
+    symbols: NDArray[np.int64]
+    llr: NDArray[np.float32]
+    quality: float
+
+
+@dataclass(frozen=True, eq=False)
+class FrameView:
+    """What a decoded frame shows: all that ranging may use.
+
+    Attributes:
+        sums: Polarity sums of pilot and info segment with the bar held still, int16 (chips, height, width).
+        offset_px: What is left of the bar's motion in each chip: (right, down) of its centre from the middle
+            of the image, float64 (2, chips), px, within half a pixel.
+        presence: Where each cluster is.
+        soft: What each cluster says.
+    """
+
+    sums: NDArray[np.int16]
+    offset_px: NDArray[np.float64]
+    presence: PresenceMap
+    soft: SoftSymbols
+
+
+@dataclass(frozen=True)
+class Range:
+    """A distance along the optical axis.
+
+    Attributes:
+        distance_m: Depth, m; NaN when the maps do not allow one.
+        sigma_m: Its standard deviation, m.
+        pairs: Number of cluster pairs that entered.
+    """
+
+    distance_m: float
+    sigma_m: float
+    pairs: int
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One decoded frame: a row of `frames.csv`.
+
+    Attributes:
+        transmitter: Number of the transmitter in order of first lock, from 0.
+        packet: Number of the packet since the transmitter's first, from 0.
+        frame: Number of the frame in its packet, from 0.
+        t_us: Start of the frame's first chip on the camera's clock, us: of its pilot, if it has one.
+        soft: Symbols and log-likelihood ratios.
+        range: Distance; its values are NaN when the maps do not allow one, or the frame has no pilot.
+        filtered: Distance filtered over time; None without tracking.
+        x_px: Column of the bar's centre in the middle of the pilot, or of the info segment without one, px.
+        y_px: Row of the same, px.
+        points_px: Column and row of each cluster's centre on the sensor at that time, px, float64 (K, 2); NaN
+            where a cluster is not seen; empty for a frame without a pilot.
+        points_sigma_px: Their standard deviations, px, float64 (K,).
+        points_t_us: That time, camera clock, us.
+    """
+
+    transmitter: int
+    packet: int
+    frame: int
+    t_us: float
+    soft: SoftSymbols
+    range: Range
+    filtered: Range | None
+    x_px: float
+    y_px: float
+    points_px: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
+    points_sigma_px: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    points_t_us: float = math.nan
+
+
+Trust = Literal["verified", "unverified", "forged"]
+"""Signed by a trusted key and not replayed; not known to be; or known not to be."""
+
+
+@dataclass(frozen=True)
+class ReceivedMessage:
+    """A message that is complete, and how far it may be believed.
+
+    Attributes:
+        transmitter: Number of the transmitter, as in `Packet`.
+        packet: Number of the packet that completed it, or that changed how far it may be believed.
+        t_us: Start of that packet's first preamble chip on the camera's clock, us.
+        message: What was received.
+        beacon: What a beacon says; None for other kinds.
+        trust: How far it may be believed. Texts and data are not signed, so they are `unverified`.
+        reason: Why it is not `verified`; empty where it is.
+    """
+
+    transmitter: int
+    packet: int
+    t_us: float
+    message: Message
+    beacon: Beacon | None
+    trust: Trust
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Packet:
+    """The frames of one packet: a line of `packets.jsonl`.
+
+    Attributes:
+        transmitter: Number of the transmitter, as in `Frame`.
+        packet: Number of the packet, as in `Frame`.
+        t_us: Start of its first preamble chip on the camera's clock, us.
+        chip_us: Length of a chip on the camera's clock, us.
+        frames: The decoded frames in order; a frame that was not received is missing here.
+        sent: Number of frames that a packet has.
+        block: What its bits carry; None if that cannot be told.
+        block_packets: Packets whose LLRs were added to tell the block; 0 without one.
+        messages: Those that are complete with this packet, or whose trust changed.
+    """
+
+    transmitter: int
+    packet: int
+    t_us: float
+    chip_us: float
+    frames: tuple[Frame, ...]
+    sent: int
+    block: Block | None = None
+    block_packets: int = 0
+    messages: tuple[ReceivedMessage, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Fix:
+    """A position at one time, or why there is none: a row of `fixes.csv`.
+
+    Attributes:
+        t_us: Camera clock, us.
+        latitude_deg: WGS-84; NaN, as all values, where the fix is refused.
+        longitude_deg: The same.
+        height_m: Above the ellipsoid, m.
+        enu_m: The same place in the local frame, m, float64 (3,).
+        covariance_m2: Of `enu_m`, float64 (3, 3).
+        noise_m2: The part of it that is new with every fix; the rest comes from what was said about the
+            attitude, and stays, float64 (3, 3).
+        heading_deg: Where the optical axis points to, clockwise from north.
+        pitch_deg: How far it points above the horizon.
+        roll_deg: How far the camera's top leans to its right.
+        heading_sigma_deg: Standard deviation of the heading.
+        transmitters: Numbers of the bars that count; of those in view where the fix is refused.
+        verified: The places of all of them come from verified beacons, or from the user's file under an id
+            that a verified beacon told.
+        refusal: Kind of refusal, empty for a fix that is given.
+        detail: The refusal in words.
+    """
+
+    t_us: float
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    enu_m: NDArray[np.float64]
+    covariance_m2: NDArray[np.float64]
+    noise_m2: NDArray[np.float64]
+    heading_deg: float
+    pitch_deg: float
+    roll_deg: float
+    heading_sigma_deg: float
+    transmitters: tuple[int, ...]
+    verified: bool
+    refusal: str = ""
+    detail: str = ""
+
+    @classmethod
+    def refused(cls, t_us: float, transmitters: tuple[int, ...], refusal: str, detail: str) -> Self:
+        """A fix that is not given."""
+        place, spread = np.full(3, math.nan), np.full((3, 3), math.nan)
+        geodetic = angles = (math.nan, math.nan, math.nan)
+        return cls(
+            t_us, *geodetic, place, spread, spread, *angles, math.nan, transmitters, False, refusal, detail
+        )

@@ -1,0 +1,432 @@
+"""What a host does with a board: program it, start and stop it, ask how it is."""
+
+import zlib
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from evlcp_sdk.air.codebook import Codebook, word_of_values
+from evlcp_sdk.air.frames import pilot_words
+from evlcp_sdk.errors import ConfigError
+from firmware_host.board.bank import Bank
+from firmware_host.board.session import Session
+from firmware_host.errors import IncompatibleError, LineError, RefusedError, VerifyError
+from firmware_host.protocol.client import RequestOutcome
+from firmware_host.protocol.requests import (
+    NO_BANK,
+    BlankReply,
+    BlankRequest,
+    CodebookReply,
+    CodebookRequest,
+    CommitReply,
+    CommitRequest,
+    ConfigureReply,
+    ConfigureRequest,
+    CrcReply,
+    CrcRequest,
+    HelloReply,
+    LedTestReply,
+    LedTestRequest,
+    LevelReply,
+    LevelRequest,
+    Profile,
+    ReadReply,
+    ReadRequest,
+    RecallReply,
+    RecallRequest,
+    SaveReply,
+    SaveRequest,
+    StartReply,
+    StartRequest,
+    State,
+    Status,
+    StatusReply,
+    StatusRequest,
+    StopReply,
+    StopRequest,
+    Watchdog,
+    WatchdogReply,
+    WatchdogRequest,
+    WriteRequest,
+)
+from firmware_host.protocol.wire import WireMessage
+
+__all__ = ["Board", "Programmed", "Settings", "profile_number", "provision"]
+
+_BLOCK = 2048
+"""Bytes of a bank whose CRC decides together whether they are there."""
+
+_LEAST = 32
+"""Smallest piece that a noisy line is tried with, bytes."""
+
+_WRITE_OVERHEAD = WriteRequest.fixed_bytes()
+
+Progress = Callable[[int, int], None]
+"""Called with bytes done and bytes in all."""
+
+
+@dataclass(frozen=True)
+class Programmed:
+    """What programming did.
+
+    Attributes:
+        written: Bytes sent into the bank; 0 if all was there.
+        length: Bytes of the payload.
+        swapped: Whether another bank became active.
+        bank: The active bank.
+        retries: Requests that had to be sent again.
+    """
+
+    written: int
+    length: int
+    swapped: bool
+    bank: int
+    retries: int
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a board is set to besides its payload.
+
+    Attributes:
+        chip_rate_hz: Chips per second.
+        level_ma: LED current, mA; None leaves it.
+        watchdog: What to do when the host falls silent; None leaves it.
+        watchdog_ms: After which silence, ms.
+        start: Whether to play when all is done.
+    """
+
+    chip_rate_hz: int = 10_000
+    level_ma: int | None = None
+    watchdog: Watchdog | None = None
+    watchdog_ms: int = 5_000
+    start: bool = True
+
+
+class Board:
+    """The board at the other end of a line; says HELLO at once.
+
+    Attributes:
+        session: The session.
+        about: What HELLO told.
+
+    Raises:
+        NoBoardError: Nobody answers.
+        IncompatibleError: The board speaks another protocol.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.about: HelloReply = session.hello()
+
+    # -- single requests
+
+    def status(self) -> StatusReply:
+        """What the board does."""
+        return self.session.call(StatusRequest(), StatusReply)
+
+    def start(self) -> None:
+        """Play the active bank."""
+        self.session.call(StartRequest(), StartReply)
+
+    def stop(self) -> None:
+        """Finish the packet, then dark."""
+        self.session.call(StopRequest(), StopReply)
+
+    def blank(self) -> None:
+        """Dark at once."""
+        self.session.call(BlankRequest(), BlankReply)
+
+    def level(self, level_ma: int) -> None:
+        """Set the LED current, mA.
+
+        Raises:
+            RefusedError: It is above the board's maximum.
+        """
+        self.session.call(LevelRequest(level_ma), LevelReply)
+
+    def watchdog(self, action: Watchdog, timeout_ms: int) -> None:
+        """What to do when the host is silent for `timeout_ms`."""
+        self.session.call(WatchdogRequest(action, timeout_ms), WatchdogReply)
+
+    def save(self, autostart: bool = False) -> SaveReply:
+        """Save active bank and settings to flash."""
+        return self.session.call(SaveRequest(int(autostart)), SaveReply)
+
+    def recall(self) -> RecallReply:
+        """Commit what was saved."""
+        return self.session.call(RecallRequest(), RecallReply)
+
+    def test_leds(self, first: int, last: int, dwell_ms: int) -> None:
+        """Walk over LEDs one by one."""
+        self.session.call(LedTestRequest(first, last, dwell_ms), LedTestReply)
+
+    def crc(self, bank: int, offset: int, length: int) -> int:
+        """CRC-32 of a bank's bytes."""
+        return self.session.call(CrcRequest(bank, offset, length), CrcReply).crc
+
+    def read(self, bank: int, offset: int, length: int) -> bytes:
+        """A bank's bytes."""
+        most = self.about.max_payload - ReadReply.fixed_bytes()
+        found: dict[int, bytes] = {}
+
+        def handle(request: WireMessage, outcome: RequestOutcome) -> None:
+            reply = self.session.checked(request, outcome)
+            if isinstance(reply, ReadReply):
+                found[reply.offset] = reply.data
+
+        pieces = [(at, min(most, offset + length - at)) for at in range(offset, offset + length, most)]
+        self.session.run((ReadRequest(bank, at, n) for at, n in pieces), handle)
+        data = b"".join(found.get(at, b"") for at, _ in pieces)
+        if len(data) != length:
+            raise LineError(f"{self.session.name}: READ gave {len(data)} bytes, expected {length}; try again")
+        return data
+
+    # -- programming
+
+    def prepare(self, payload: Bank, chip_rate_hz: int) -> None:
+        """Set chip rate, profile and codebook for the next commit.
+
+        Raises:
+            IncompatibleError: The firmware was built with another codebook.
+            RefusedError: The board cannot take a value.
+        """
+        book = payload.codebook
+        configure = ConfigureRequest(chip_rate_hz, profile_number(book), payload.frames, payload.pilot_every)
+        try:
+            self.session.call(configure, ConfigureReply)
+        except RefusedError as fault:
+            # the chip rate is what the board looks at first
+            wrong = chip_rate_hz > self.about.chip_rate_max_hz or self.about.tick_hz % chip_rate_hz
+            if fault.status != Status.OUT_OF_RANGE or not wrong:
+                raise
+            raise RefusedError(
+                f"{self.session.name}: no chip rate of {chip_rate_hz} Hz: must divide"
+                f" {self.about.tick_hz} Hz, at most {self.about.chip_rate_max_hz};"
+                f" the nearest the board can take is {fault.detail}",
+                fault.status,
+                fault.detail,
+            ) from fault
+        chips = 2 * len(book.preamble)
+        if chips > 32:
+            raise IncompatibleError(f"preamble of {chips} chips: the board's has at most 32")
+        pilots = tuple(int(w) for w in pilot_words(book))
+        request = CodebookRequest(chips, word_of_values(book.preamble), pilots, bytes.fromhex(book.digest))
+        self.session.call(request, CodebookReply)
+
+    def holds(self, payload: Bank, chip_rate_hz: int, status: StatusReply) -> bool:
+        """Whether the active bank is this payload."""
+        return status.active_bank != NO_BANK and (
+            status.format,
+            status.packets,
+            status.frames,
+            status.pilot_every,
+            status.length,
+            status.crc,
+            status.chip_rate_hz,
+            status.profile,
+            status.digest.hex(),
+        ) == (
+            payload.format,
+            payload.packets,
+            payload.frames,
+            payload.pilot_every,
+            len(payload.content),
+            payload.crc,
+            chip_rate_hz,
+            profile_number(payload.codebook),
+            payload.codebook.digest,
+        )
+
+    def program(
+        self,
+        payload: Bank,
+        chip_rate_hz: int = 10_000,
+        verify: bool = True,
+        progress: Progress | None = None,
+    ) -> Programmed:
+        """Bring a payload onto the board and make it active; what is there already is not sent again.
+
+        A board that plays goes on with the old bank until the new one is complete and checked, and changes
+        between two packets.
+
+        Raises:
+            ConfigError: The payload is larger than a bank, or of other clusters than the board.
+            RefusedError: The board refuses a value.
+            VerifyError: The bank does not hold what was sent.
+            LineError: The line fails; what was active stays so.
+        """
+        self.check_fits(payload)
+        before = self.session.client.retries
+        total = len(payload.content)
+        status = self._settled()
+        if self.holds(payload, chip_rate_hz, status):
+            if progress:
+                progress(total, total)
+            return Programmed(0, total, False, status.active_bank, self.session.client.retries - before)
+        self.prepare(payload, chip_rate_hz)
+        bank = 1 if status.active_bank == 0 else 0
+        written = self.fill(bank, payload.content, progress)
+        if verify and written and self.crc(bank, 0, total) != payload.crc:
+            raise VerifyError(
+                f"{self.session.name}: bank {bank} does not hold what was sent; the old one goes on;"
+                " program it again, or with --baud of a lower rate"
+            )
+        digest = bytes.fromhex(payload.codebook.digest)
+        commit = CommitRequest(bank, payload.format, payload.packets, total, payload.crc, digest)
+        self.session.call(commit, CommitReply)
+        status = self._settled()
+        if verify and not self.holds(payload, chip_rate_hz, status):
+            raise VerifyError(
+                f"{self.session.name}: bank {status.active_bank} is active, expected {bank}; program it again"
+            )
+        return Programmed(written, total, True, bank, self.session.client.retries - before)
+
+    def check_fits(self, payload: Bank) -> None:
+        """Raise ConfigError unless the payload fits the board's clusters and bank."""
+        if payload.codebook.clusters != self.about.clusters:
+            raise ConfigError(
+                f"payload for {payload.codebook.clusters} clusters,"
+                f" {self.session.name} has {self.about.clusters}"
+            )
+        each = len(payload.content) // payload.packets
+        room = self.about.bank_bytes
+        if each > room:
+            fits = bisect_right(range(1, payload.frames + 1), room, key=payload.packet_bytes)
+            raise ConfigError(
+                f"a packet of {payload.frames} frames takes {each} bytes, a bank of {self.session.name} has"
+                f" {room}: not one fits; a packet may have at most {fits} frames"
+            )
+        if len(payload.content) > room:
+            raise ConfigError(
+                f"{payload.packets} packets of {each} bytes, a bank of {self.session.name} has"
+                f" {room} bytes: send at most {room // each} packets"
+            )
+
+    def fill(self, bank: int, content: bytes, progress: Progress | None = None) -> int:
+        """Write what a spare bank does not hold yet; returns the bytes written.
+
+        On a noisy line a piece that does not get through is cut in two.
+
+        Raises:
+            LineError: Not even the smallest piece gets through.
+        """
+        missing = self._missing(bank, content)
+        total = sum(n for _, n in missing)
+        advance = progress or _silent
+        advance(len(content) - total, len(content))
+        piece = self.about.max_payload - _WRITE_OVERHEAD
+        left = deque((at, at + n) for at, n in missing)
+        state = {"piece": piece, "done": 0}
+
+        def requests() -> Iterator[WriteRequest]:
+            while left:
+                at, end = left.popleft()
+                if end - at > state["piece"]:
+                    left.appendleft((at + state["piece"], end))
+                    end = at + state["piece"]
+                yield WriteRequest(bank, at, content[at:end])
+
+        def handle(request: WireMessage, outcome: RequestOutcome) -> None:
+            if not isinstance(request, WriteRequest):
+                return
+            n = len(request.data)
+            if outcome.status is None and n > _LEAST:
+                state["piece"] = max(_LEAST, min(state["piece"], n // 2))
+                left.append((request.offset, request.offset + n))
+                return
+            self.session.checked(request, outcome)
+            state["done"] += n
+            advance(len(content) - total + state["done"], len(content))
+
+        while left:
+            self.session.run(requests(), handle)
+        return total
+
+    def _missing(self, bank: int, content: bytes) -> list[tuple[int, int]]:
+        """Blocks (offset, bytes) of a bank that are not `content`."""
+        missing: list[tuple[int, int]] = []
+
+        def handle(request: WireMessage, outcome: RequestOutcome) -> None:
+            reply = self.session.checked(request, outcome)
+            if isinstance(request, CrcRequest) and isinstance(reply, CrcReply):
+                end = request.offset + request.length
+                if zlib.crc32(content[request.offset : end]) != reply.crc:
+                    missing.append((request.offset, request.length))
+
+        blocks = [(at, min(_BLOCK, len(content) - at)) for at in range(0, len(content), _BLOCK)]
+        self.session.run((CrcRequest(bank, at, n) for at, n in blocks), handle)
+        return sorted(missing)
+
+    def _settled(self) -> StatusReply:
+        """Status once no bank waits for its packet boundary."""
+        status = self.status()
+        end = self.session.transport.now() + 10.0 + _packet_s(status)
+        while status.pending_bank != NO_BANK:
+            if self.session.transport.now() > end:
+                raise VerifyError(
+                    f"{self.session.name}: bank {status.pending_bank} does not become active;"
+                    " the old one plays on; 'evlcp board stop', then program it again"
+                )
+            self.session.transport.read(0.002)
+            status = self.status()
+        return status
+
+    def wait_dark(self, timeout_s: float = 10.0) -> StatusReply:
+        """Status once the LEDs are dark after a stop.
+
+        Raises:
+            LineError: They are not within `timeout_s` and the packet that a stop finishes.
+        """
+        status = self.status()
+        end = self.session.transport.now() + timeout_s + _packet_s(status)
+        while status.state not in (State.DARK, State.FAULT):
+            if self.session.transport.now() > end:
+                raise LineError(
+                    f"{self.session.name}: still {State(status.state).name}; try 'evlcp board blank'"
+                )
+            self.session.transport.read(0.005)
+            status = self.status()
+        return status
+
+
+def provision(
+    board: Board, payload: Bank, settings: Settings, verify: bool = True, progress: Progress | None = None
+) -> Programmed:
+    """Bring a board to payload and settings; what is so already is left alone.
+
+    The level comes first: a board that cannot take it keeps its old payload.
+
+    Raises:
+        BoardError: See `Board.program` and `Board.level`.
+        ConfigError: The payload does not fit the board.
+    """
+    board.check_fits(payload)
+    status = board.status()
+    if settings.level_ma is not None and status.level_ma != settings.level_ma:
+        board.level(settings.level_ma)
+    wanted = (settings.watchdog, settings.watchdog_ms)
+    if settings.watchdog is not None and (status.watchdog, status.watchdog_ms) != wanted:
+        board.watchdog(settings.watchdog, settings.watchdog_ms)
+    done = board.program(payload, settings.chip_rate_hz, verify, progress)
+    if settings.start and status.state != State.PLAYING:
+        board.start()
+    return done
+
+
+def _packet_s(status: StatusReply) -> float:
+    """Time a packet of the active bank takes at most, s: a preamble of 32 chips, a pilot in every frame."""
+    return 32.0 * (1 + status.frames) / status.chip_rate_hz
+
+
+def _silent(done: int, total: int) -> None:
+    del done, total
+
+
+def profile_number(book: Codebook) -> int:
+    """The protocol's number of a codebook's profile; `custom` for one that the firmware cannot know."""
+    try:
+        return Profile[book.profile.upper()]
+    except KeyError:
+        return Profile.CUSTOM

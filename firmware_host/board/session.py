@@ -1,0 +1,190 @@
+"""A client on a line: requests are sent, answers awaited, refusals become errors that say what to do."""
+
+import random
+from collections.abc import Callable, Iterable
+from typing import TypeVar
+
+from firmware_host.errors import (
+    BoardError,
+    BoardResetError,
+    IncompatibleError,
+    LineError,
+    NoBoardError,
+    RefusedError,
+    VerifyError,
+)
+from firmware_host.ports.transport import Transport
+from firmware_host.protocol.client import TRIES, Client, RequestOutcome, Timing
+from firmware_host.protocol.requests import NO_SESSION, SCHEMA, HelloReply, HelloRequest, Status, Type
+from firmware_host.protocol.wire import WireMessage
+
+__all__ = ["Session", "refusal"]
+
+Reply = TypeVar("Reply", bound=WireMessage)
+
+_ADVICE = {
+    Status.UNKNOWN_TYPE: "the firmware does not know it; update the firmware",
+    Status.BAD_LENGTH: "it expects {detail} bytes; host and firmware are of different versions",
+    Status.OUT_OF_RANGE: "the nearest value the board can take is {detail}; choose that",
+    Status.BUSY: "not while it plays, swaps or tests its LEDs; 'evlcp board stop' first, or try again",
+    Status.BAD_CRC: "the bank holds other bytes than were sent (CRC {detail:08x}); program it again",
+    Status.FOREIGN_CODEBOOK: "the firmware was built with another codebook; update firmware or host",
+    Status.NO_SESSION: "the board was reset, or another program took it over; run the command again,"
+    " it goes on where it was",
+    Status.STALE: "the board has done a later request already; run the command again",
+    Status.NOTHING_COMMITTED: "nothing is programmed; 'evlcp board program' first",
+    Status.INCOMPATIBLE: "its protocol is another one than this host's; update firmware or host",
+    Status.FLASH_FAULT: "its flash does not hold the data; try again, then replace the board",
+    Status.NOT_SUPPORTED: "this board cannot do that; 'evlcp board hello' shows what it can",
+    Status.EMPTY_SLOT: "no settings are saved; 'evlcp board save' first",
+    Status.HARDWARE_FAULT: "a fault holds the LEDs dark (bits {detail:#x}); see 'evlcp board status'",
+}
+
+_KINDS: dict[int, type[BoardError]] = {
+    Status.BAD_CRC: VerifyError,
+    Status.FOREIGN_CODEBOOK: IncompatibleError,
+    Status.INCOMPATIBLE: IncompatibleError,
+    Status.NO_SESSION: BoardResetError,
+}
+
+
+def refusal(name: str, type_: int, status: Status | int, detail: int) -> BoardError:
+    """The error for a request that a board refused; its message says why and what to do."""
+    request = Type(type_).name
+    word = status.name if isinstance(status, Status) else f"status {status}"
+    advice = _ADVICE.get(status, "update the host") if isinstance(status, Status) else "update the host"
+    message = f"{name}: {request} refused ({word}): {advice.format(detail=detail)}"
+    kind = _KINDS.get(status)
+    return kind(message) if kind else RefusedError(message, int(status), detail)
+
+
+class Session:
+    """A session with the board on a line.
+
+    Args:
+        transport: The line; closed with the session.
+        timing: How long an answer may take.
+        first: First sequence number, by default drawn at random.
+        nonce: Number of the session, by default drawn at random.
+        tries: How often a request is sent before it is given up.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        timing: Timing | None = None,
+        first: int | None = None,
+        nonce: int | None = None,
+        tries: int = TRIES,
+    ) -> None:
+        draw = random.SystemRandom()
+        self.transport = transport
+        self._nonce = draw.randrange(1 << 32) if nonce is None else nonce
+        self.client = Client(
+            timing or Timing(),
+            first=draw.randrange(1 << 16) if first is None else first,
+            tries=tries,
+        )
+
+    @property
+    def name(self) -> str:
+        """What to call the board in messages."""
+        return self.transport.name
+
+    def __enter__(self) -> "Session":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the line."""
+        self.transport.close()
+
+    def hello(self) -> HelloReply:
+        """Open the session, or keep it.
+
+        Raises:
+            NoBoardError: Nobody answers.
+            IncompatibleError: The board speaks another protocol.
+        """
+        self.client.session = NO_SESSION
+        self.client.window = 1
+        # Ends what a host before this one may have left half sent.
+        self.transport.write(b"\0")
+        found: list[RequestOutcome] = []
+        self.run([HelloRequest(SCHEMA, self._nonce)], lambda _, outcome: found.append(outcome))
+        outcome = found[0]
+        if outcome.status is None:
+            raise NoBoardError(
+                f"{self.name}: no board answers; check power, cable and --baud, or find it with"
+                " 'evlcp board ports'"
+            )
+        if not isinstance(outcome.reply, HelloReply):
+            raise refusal(self.name, Type.HELLO, outcome.status, outcome.detail)
+        self.client.session = outcome.reply.session
+        self.client.window = max(1, outcome.reply.window)
+        return outcome.reply
+
+    def call(self, request: WireMessage, reply: type[Reply]) -> Reply:
+        """One request and its answer.
+
+        Raises:
+            RefusedError: The board refuses; or the error that its status stands for.
+            LineError: No answer came.
+        """
+        found: list[RequestOutcome] = []
+        self.run([request], lambda _, outcome: found.append(outcome))
+        answer = self.checked(request, found[0])
+        if not isinstance(answer, reply):
+            raise LineError(f"{self.name}: {type(answer).__name__} came, expected {reply.__name__}")
+        return answer
+
+    def checked(self, request: WireMessage, outcome: RequestOutcome) -> WireMessage:
+        """The answer of an outcome.
+
+        Raises:
+            BoardError: There is none; see `call`.
+        """
+        if outcome.status is None:
+            raise LineError(
+                f"{self.name}: no answer to {Type(request.TYPE).name} after {outcome.tries} tries;"
+                " check the line and run the command again, it goes on where it was"
+            )
+        if outcome.reply is None:
+            raise refusal(self.name, request.TYPE, outcome.status, outcome.detail)
+        return outcome.reply
+
+    def run(
+        self, requests: Iterable[WireMessage], handle: Callable[[WireMessage, RequestOutcome], None]
+    ) -> None:
+        """Send requests, as many at once as the board takes; `handle` gets each with its outcome.
+
+        `requests` may be a generator that goes on while outcomes come in. What `handle` raises ends the run.
+
+        Raises:
+            LineError: The line went away.
+        """
+        source = iter(requests)
+        sent: dict[int, WireMessage] = {}
+        more = True
+        try:
+            while True:
+                while more and self.client.room:
+                    request = next(source, None)
+                    if request is None:
+                        more = False
+                        break
+                    sent[self.client.submit(request)] = request
+                data, deadline = self.client.poll(self.transport.now())
+                if data:
+                    self.transport.write(data)
+                wait = 0.0 if deadline is None else max(0.0, deadline - self.transport.now())
+                received = self.transport.read(wait) if sent else b""
+                for outcome in self.client.receive(received):
+                    handle(sent.pop(outcome.token), outcome)
+                    more = True
+                if not sent and not more:
+                    return
+        finally:
+            self.client.forget()

@@ -1,0 +1,96 @@
+"""LED records of the emulators: what each LED did, chip by chip, and when.
+
+A record is 20 bytes, little-endian: u32 tick, u32 chip, 12 bytes of 96 LEDs (LED 0 the most significant bit
+of the first byte). Chip numbers count from START; two of them mean no chip: dark, and the single-LED test.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import InputError
+from firmware_host.protocol.requests import CHIP_DARK, CHIP_TEST, ROW_BYTES
+from firmware_host.protocol.rows import chips_of_rows
+
+__all__ = ["RECORD", "LedRecord"]
+
+RECORD = np.dtype([("tick", "<u4"), ("chip", "<u4"), ("row", "u1", (ROW_BYTES,))])
+"""One record."""
+
+
+@dataclass(frozen=True, eq=False)
+class LedRecord:
+    """LED outputs in the order they happened.
+
+    Attributes:
+        ticks: Tick of each output, unwrapped, int64 (n,).
+        numbers: Chip number of each, uint32 (n,).
+        rows: LEDs, uint8 (n, 12).
+        cut_bytes: Bytes of a last record that an emulator, ended while it played, did not finish; left out.
+    """
+
+    ticks: NDArray[np.int64]
+    numbers: NDArray[np.uint32]
+    rows: NDArray[np.uint8]
+    cut_bytes: int = 0
+
+    @classmethod
+    def of_records(cls, records: NDArray[np.void]) -> "LedRecord":
+        """From an array of `RECORD`; the tick counter wraps at 2**32 and is unwrapped here."""
+        tick = records["tick"].astype(np.uint32)
+        steps = np.diff(tick)  # modulo 2**32
+        start = tick[:1].astype(np.int64)
+        ticks = np.concatenate([start, start + np.cumsum(steps, dtype=np.int64)]) if len(tick) else start
+        return cls(ticks, records["chip"].astype(np.uint32), np.ascontiguousarray(records["row"]))
+
+    @classmethod
+    def read(cls, path: Path) -> "LedRecord":
+        """Read a file that an emulator wrote.
+
+        Raises:
+            InputError: It cannot be read, has no whole record, or its chips do not follow one another.
+        """
+        try:
+            data = path.read_bytes()
+        except OSError as fault:
+            raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+        whole, cut = divmod(len(data), RECORD.itemsize)
+        if not whole:
+            raise InputError(
+                f"{path}: {len(data)} bytes, expected LED records of {RECORD.itemsize} bytes;"
+                " the emulator writes them when the LEDs are lit"
+            )
+        records = np.frombuffer(data, RECORD, whole)
+        chip = records["chip"].astype(np.int64)
+        is_chip = chip < CHIP_TEST
+        places, chip = np.flatnonzero(is_chip), chip[is_chip]
+        # within one START each chip follows the one before
+        wrong = np.flatnonzero((chip[1:] != chip[:-1] + 1) & (chip[1:] != 0)) + 1
+        if len(chip) and chip[0] != 0:
+            wrong = np.array([0])
+        if len(wrong):
+            at = int(wrong[0])
+            before = f"after chip {chip[at - 1]}" if at else "at the start"
+            raise InputError(
+                f"{path}: at byte {places[at] * RECORD.itemsize}: chip {chip[at]} {before}:"
+                " not an LED record, or a part of it is missing"
+            )
+        return replace(cls.of_records(records), cut_bytes=cut)
+
+    def played(self) -> "LedRecord":
+        """Without the records that are no chip: dark, and the single-LED test."""
+        keep = (self.numbers != CHIP_DARK) & (self.numbers != CHIP_TEST)
+        return LedRecord(self.ticks[keep], self.numbers[keep], self.rows[keep], self.cut_bytes)
+
+    def chips(self, clusters: int = 16) -> NDArray[np.uint8]:
+        """The chip table, uint8 (n, clusters); 96 clusters give every LED.
+
+        Raises:
+            ConfigError: LEDs of one cluster differ.
+        """
+        return chips_of_rows(self.rows, clusters)
+
+    def __len__(self) -> int:
+        return len(self.ticks)

@@ -1,0 +1,29 @@
+"""Ports by name, emulators among them.
+
+`native:` (`native:FILE` keeps its flash) and `qemu:` start an emulator that lives as long as the line; all
+else is a port of `firmware_host.ports.transport`.
+"""
+
+from pathlib import Path
+
+from firmware_host.emulators.processes import start_native, start_qemu
+from firmware_host.ports.transport import Transport, open_transport
+from firmware_host.protocol.requests import DEFAULT_BAUD
+
+__all__ = ["open_port"]
+
+
+def open_port(spec: str, baud: int = DEFAULT_BAUD) -> Transport:
+    """Open a port, or start an emulator, by its name; see the module.
+
+    Raises:
+        InputError: The emulator's flash file cannot be used.
+        NoBoardError: The port cannot be opened.
+        ToolchainError: An emulator cannot be built or started.
+    """
+    scheme, _, rest = spec.partition(":")
+    if scheme == "native":
+        return start_native(flash=Path(rest) if rest else None)
+    if scheme == "qemu":
+        return start_qemu()
+    return open_transport(spec, baud)

@@ -1,0 +1,166 @@
+"""The board without a board: the native program, and the ARM image in QEMU."""
+
+import contextlib
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+from evlcp_sdk.errors import InputError
+from firmware_host import build
+from firmware_host.errors import LineError, NoBoardError, ToolchainError
+from firmware_host.ports.transport import SocketTransport
+
+__all__ = ["ProcessTransport", "native_command", "qemu_command", "start_native", "start_qemu", "wait_for"]
+
+
+class ProcessTransport(SocketTransport):
+    """The socket of an emulator that ends with the line."""
+
+    def __init__(
+        self,
+        name: str,
+        connected: socket.socket,
+        process: "subprocess.Popen[bytes]",
+        folder: Path | None = None,
+    ) -> None:
+        super().__init__(name, connected)
+        self.process = process
+        self._folder = folder
+
+    def close(self) -> None:
+        """Close the socket and end the emulator."""
+        super().close()
+        _end(self.process)
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    process.terminate()
+    try:
+        process.wait(5.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    if process.stderr is not None:
+        process.stderr.close()
+
+
+def native_command(
+    listen: str,
+    leds: Path | None = None,
+    flash: Path | None = None,
+    link: Path | None = None,
+    baud: int = 0,
+    unique_id: int = 0,
+) -> list[str]:
+    """Command line of the native board.
+
+    Args:
+        listen: `pty`, `unix:PATH`, `tcp:HOST:PORT` or `fd:N`.
+        leds: File for the LED records.
+        flash: File that keeps the flash slots.
+        link: Name to give the pseudo-terminal.
+        baud: Line rate to keep to, bit/s; 0 for as fast as it goes.
+        unique_id: The board's number, 64 bits.
+
+    Raises:
+        InputError: The flash file cannot be read, or not be replaced.
+        ToolchainError: It cannot be built.
+    """
+    if flash is not None:
+        _check_flash(flash)
+    command = [str(build.native_program()), "--listen", listen]
+    for name, value in (("--leds", leds), ("--flash", flash), ("--link", link)):
+        if value is not None:
+            command += [name, str(value)]
+    return [*command, "--baud", str(baud), "--id", str(unique_id)]
+
+
+def _check_flash(path: Path) -> None:
+    try:
+        if not path.is_file() and path.exists():
+            raise InputError(f"{path}: not a file; expected the name of a flash file, there or new")
+        if path.is_file():
+            path.open("rb").close()
+        folder = path.resolve().parent
+        # SAVE puts a new file in the place of the old one
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as fault:
+        raise InputError(f"{path}: the flash file cannot be used: {fault.strerror}") from fault
+
+
+def qemu_command(listen: str, leds: Path | None = None, wait: bool = False) -> list[str]:
+    """Command line of QEMU with the board's ARM image.
+
+    Args:
+        listen: `unix:PATH` or `tcp:HOST:PORT`; QEMU drops bytes on a pseudo-terminal.
+        leds: File for the LED records.
+        wait: Start the board only when a host has connected.
+
+    Raises:
+        ToolchainError: QEMU is missing, or the image cannot be built.
+    """
+    if shutil.which("qemu-system-arm") is None:
+        raise ToolchainError(
+            "qemu-system-arm is missing: apt-get install --no-install-recommends qemu-system-arm"
+        )
+    # A comma in a name stands doubled in QEMU's options.
+    serial = f"{listen.replace(',', ',,')},server=on,wait={'on' if wait else 'off'}"
+    record = "null" if leds is None else f"file:{str(leds).replace(',', ',,')}"
+    return [
+        *("qemu-system-arm", "-M", "mps2-an385", "-kernel", str(build.arm_image("mps2-an385"))),
+        *("-icount", "shift=3,sleep=off", "-display", "none", "-monitor", "none", "-nodefaults"),
+        *("-serial", serial, "-serial", record),
+    ]
+
+
+def wait_for(
+    listen: str, process: "subprocess.Popen[bytes]", timeout_s: float = 10.0
+) -> SocketTransport | None:
+    """Connect to an emulator that is coming up; None if it ends or takes longer than `timeout_s`."""
+    end = time.monotonic() + timeout_s
+    while time.monotonic() < end and process.poll() is None:
+        with contextlib.suppress(NoBoardError):
+            return SocketTransport.connect(listen)
+        time.sleep(0.02)
+    return None
+
+
+def start_native(
+    leds: Path | None = None, flash: Path | None = None, baud: int = 0, unique_id: int = 0
+) -> ProcessTransport:
+    """Start the native board and connect to it.
+
+    Raises:
+        InputError: The flash file cannot be used.
+        ToolchainError: It cannot be built.
+    """
+    ours, theirs = socket.socketpair()
+    with theirs:
+        command = native_command(f"fd:{theirs.fileno()}", leds, flash, None, baud, unique_id)
+        process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL)
+    return ProcessTransport("native:", ours, process)
+
+
+def start_qemu(leds: Path | None = None) -> ProcessTransport:
+    """Start the board in QEMU and connect to it.
+
+    Raises:
+        ToolchainError: QEMU or the cross compiler is missing.
+        LineError: QEMU does not come up.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="evlcp-qemu-"))
+    listen = f"unix:{folder / 'uart0'}"
+    process = subprocess.Popen(qemu_command(listen, leds), stdin=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    connected = wait_for(listen, process)
+    if connected is not None:
+        return ProcessTransport("qemu:", connected.detach(), process, folder)
+    process.kill()
+    said = process.stderr.read().decode(errors="replace").strip() if process.stderr else ""
+    _end(process)
+    shutil.rmtree(folder, ignore_errors=True)
+    raise LineError(f"qemu: does not come up: {said or 'no socket'}; try 'evlcp board emulate qemu'")

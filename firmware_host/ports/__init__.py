@@ -1,0 +1,1 @@
+"""Lines to boards, and which of them answer."""

@@ -1,0 +1,301 @@
+"""Byte lines to a board: serial ports, sockets, traces.
+
+A port is named by a device or any pyserial URL, or by `unix:PATH` or `tcp:HOST:PORT`.
+"""
+
+import contextlib
+import json
+import select
+import socket
+import time
+from pathlib import Path
+from typing import Any, Protocol, TextIO
+
+from evlcp_sdk.errors import InputError
+from firmware_host.errors import LineError, NoBoardError
+from firmware_host.protocol.requests import DEFAULT_BAUD
+
+__all__ = ["ReplayTransport", "SocketTransport", "TraceTransport", "Transport", "open_transport"]
+
+
+class Transport(Protocol):
+    """A byte line and the clock that its time-outs follow.
+
+    Attributes:
+        name: What to call it in messages.
+    """
+
+    name: str
+
+    def now(self) -> float:
+        """The time, s."""
+
+    def read(self, timeout_s: float) -> bytes:
+        """Bytes that came, after at most `timeout_s`; empty if none did.
+
+        Raises:
+            LineError: The line went away.
+        """
+
+    def write(self, data: bytes) -> None:
+        """Send bytes.
+
+        Raises:
+            LineError: The line went away.
+        """
+
+    def close(self) -> None:
+        """Let go of the line."""
+
+
+class SocketTransport:
+    """A connected stream socket."""
+
+    def __init__(self, name: str, connected: socket.socket) -> None:
+        self.name = name
+        self._socket = connected
+        self._socket.setblocking(False)
+
+    @classmethod
+    def connect(cls, spec: str) -> "SocketTransport":
+        """Connect to `unix:PATH` or `tcp:HOST:PORT`.
+
+        Raises:
+            NoBoardError: Nobody listens there.
+        """
+        scheme, _, place = spec.partition(":")
+        try:
+            if scheme == "unix":
+                connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+                connected.settimeout(5.0)
+                try:
+                    connected.connect(place)
+                except OSError:
+                    connected.close()
+                    raise
+            else:
+                host, _, port = place.rpartition(":")
+                connected = socket.create_connection((host, int(port)), timeout=5.0)
+                connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except (OSError, ValueError, OverflowError) as fault:
+            raise NoBoardError(
+                f"{spec}: no board listens there ({fault}); start one with"
+                f" 'evlcp board emulate native --listen {spec}' or name another --port"
+            ) from fault
+        return cls(spec, connected)
+
+    def detach(self) -> socket.socket:
+        """Give the socket away; this transport is of no further use."""
+        return self._socket
+
+    def now(self) -> float:
+        """Monotonic time, s."""
+        return time.monotonic()
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Transport.read`."""
+        try:
+            if not select.select([self._socket], [], [], max(0.0, timeout_s))[0]:
+                return b""
+            data = self._socket.recv(65536)
+        except (OSError, ValueError) as fault:
+            raise LineError(f"{self.name}: the line broke: {fault}; run the command again") from fault
+        if not data:
+            raise LineError(f"{self.name}: the board hung up; start it again and run the command again")
+        return data
+
+    def write(self, data: bytes) -> None:
+        """See `Transport.write`."""
+        try:
+            while data:
+                select.select([], [self._socket], [], 1.0)
+                with contextlib.suppress(BlockingIOError):
+                    data = data[self._socket.send(data) :]
+        except (OSError, ValueError) as fault:
+            raise LineError(f"{self.name}: the line broke: {fault}; run the command again") from fault
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class SerialTransport:
+    """Anything that pyserial opens: a device, `socket://`, `rfc2217://`, `loop://` and so on."""
+
+    _SLICE_S = 0.005
+
+    def __init__(self, url: str, baud: int) -> None:
+        import serial
+
+        self.name = url
+        try:
+            options: dict[str, Any] = {} if "://" in url else {"exclusive": True}
+            self._port = serial.serial_for_url(
+                url, baudrate=baud, timeout=self._SLICE_S, write_timeout=5.0, **options
+            )
+        except (OSError, ValueError) as fault:
+            raise NoBoardError(
+                f"{url}: cannot be opened: {fault}; 'evlcp board ports' lists the ports"
+            ) from fault
+
+    def now(self) -> float:
+        """Monotonic time, s."""
+        return time.monotonic()
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Transport.read`."""
+        end = time.monotonic() + timeout_s
+        try:
+            while True:
+                data = bytes(self._port.read(max(1, self._port.in_waiting)))
+                if data or time.monotonic() >= end:
+                    return data
+        except (OSError, TypeError) as fault:
+            # pyserial raises TypeError when another thread closes the port under a read
+            raise LineError(
+                f"{self.name}: the line broke: {fault}; plug it in and run the command again"
+            ) from fault
+
+    def write(self, data: bytes) -> None:
+        """See `Transport.write`."""
+        try:
+            self._port.write(data)
+        except OSError as fault:
+            raise LineError(
+                f"{self.name}: the line broke: {fault}; plug it in and run the command again"
+            ) from fault
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+
+class TraceTransport:
+    """Passes everything through and records it as JSON lines.
+
+    The first line has port, line rate and what the client drew at random; each further one is
+    `{"t": seconds, "dir": "tx" | "rx", "hex": bytes}`.
+    """
+
+    def __init__(self, inner: Transport, file: TextIO, baud: int, first: int, nonce: int) -> None:
+        self.name = inner.name
+        self._inner = inner
+        self._file = file
+        self._start = inner.now()
+        head = {"evlcp_trace": 1, "port": inner.name, "baud": baud, "first": first, "nonce": nonce}
+        file.write(json.dumps(head) + "\n")
+
+    def _note(self, direction: str, data: bytes) -> None:
+        if data:
+            line = {"t": round(self._inner.now() - self._start, 6), "dir": direction, "hex": data.hex()}
+            self._file.write(json.dumps(line) + "\n")
+
+    def now(self) -> float:
+        """The inner line's time, s."""
+        return self._inner.now()
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Transport.read`."""
+        data = self._inner.read(timeout_s)
+        self._note("rx", data)
+        return data
+
+    def write(self, data: bytes) -> None:
+        """See `Transport.write`."""
+        self._note("tx", data)
+        self._inner.write(data)
+
+    def close(self) -> None:
+        """Close line and file."""
+        self._inner.close()
+        self._file.close()
+
+
+class ReplayTransport:
+    """Plays a trace back: gives what was received, once what was sent before it has been sent again.
+
+    Args:
+        path: A file that `TraceTransport` wrote.
+
+    Raises:
+        InputError: The file cannot be read, or a line of it is wrong.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.name = f"replay of {path}"
+        self._events: list[tuple[float, str, bytes]] = []
+        try:
+            lines = path.read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError) as fault:
+            raise InputError(f"{path}: cannot be read: {fault}") from fault
+        self._number = 0
+        try:
+            head = json.loads(lines[0])
+            self.first, self.nonce, self.baud = int(head["first"]), int(head["nonce"]), int(head["baud"])
+            if not (0 <= self.nonce < 1 << 32 and self.baud > 0):
+                raise ValueError(f"nonce {self.nonce}, baud {self.baud}")
+            for self._number, line in enumerate(lines[1:], 1):
+                event = json.loads(line)
+                if event["dir"] not in ("tx", "rx"):
+                    raise ValueError(f"dir = {event['dir']!r}, expected 'tx' or 'rx'")
+                self._events.append((float(event["t"]), event["dir"], bytes.fromhex(event["hex"])))
+        except (ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError) as fault:
+            raise InputError(
+                f"{path}: line {self._number + 1}: not a trace of the wire: {fault!r}"
+            ) from fault
+        self._now = 0.0
+        self._sent = 0
+
+    def now(self) -> float:
+        """Time of the trace, s."""
+        return self._now
+
+    def read(self, timeout_s: float) -> bytes:
+        """What was received here in the trace; else time passes."""
+        if self._events and self._events[0][1] == "rx":
+            at, _, data = self._events.pop(0)
+            self._now = max(self._now, at)
+            return data
+        if not self._events:
+            raise LineError(f"{self.name}: the trace ends here; record it again with --trace")
+        self._now += timeout_s
+        return b""
+
+    def write(self, data: bytes) -> None:
+        """Compare with what was sent in the trace.
+
+        Raises:
+            LineError: It is something else.
+        """
+        while data:
+            if not self._events:
+                raise LineError(f"{self.name}: the trace ends here; record it again with --trace")
+            if self._events[0][1] != "tx":
+                raise LineError(f"{self.name}: sends more than was recorded; {self._advice}")
+            at, _, expected = self._events[0]
+            n = min(len(data), len(expected))
+            if data[:n] != expected[:n]:
+                raise LineError(f"{self.name}: byte {self._sent} sent is another one; {self._advice}")
+            self._now = max(self._now, at)
+            data = data[n:]
+            self._sent += n
+            if n == len(expected):
+                self._events.pop(0)
+            else:
+                self._events[0] = (at, "tx", expected[n:])
+
+    _advice = "replay the command, the options and the files that were recorded"
+
+    def close(self) -> None:
+        """Nothing to let go."""
+
+
+def open_transport(spec: str, baud: int = DEFAULT_BAUD) -> Transport:
+    """Open a port by its name; see the module. `firmware_host.emulators.opening` opens emulators, too.
+
+    Raises:
+        NoBoardError: It cannot be opened.
+    """
+    if spec.partition(":")[0] in ("unix", "tcp"):
+        return SocketTransport.connect(spec)
+    return SerialTransport(spec, baud)

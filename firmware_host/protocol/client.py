@@ -1,0 +1,207 @@
+"""The host's end of the protocol as a state machine without I/O: window, time-outs, tries, sessions.
+
+The caller moves bytes and time: `submit` requests, hand what was read to `receive`, write what `poll` gives,
+and come back before its deadline.
+"""
+
+import random
+from collections import deque
+from dataclasses import dataclass, field
+
+from firmware_host.errors import DatagramError
+from firmware_host.protocol.datagram import Datagram, DatagramDecoder
+from firmware_host.protocol.requests import (
+    CRC_BYTES,
+    HEADER_BYTES,
+    MAX_PAYLOAD,
+    NO_SESSION,
+    REPLIES,
+    REPLY_BIT,
+    Status,
+)
+from firmware_host.protocol.wire import WireMessage
+
+__all__ = ["TRIES", "Client", "RequestOutcome", "Timing"]
+
+TRIES = 5
+"""How often a request is sent before it is given up, unless the caller says otherwise."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How long an answer may take.
+
+    Attributes:
+        baud: Line rate, bit/s; a byte takes ten bits.
+        latency_s: What board and host operating system add, s.
+        backoff: Factor by which each further try waits longer.
+
+    >>> round(Timing(1_000_000, 0.05).timeout_s(100, 100, 0), 3)
+    0.054
+    """
+
+    baud: int = 1_000_000
+    latency_s: float = 0.1
+    backoff: float = 2.0
+
+    def wire_s(self, count: int) -> float:
+        """Time that `count` bytes take on the line, s."""
+        return 10.0 * count / self.baud
+
+    def timeout_s(self, queued: int, reply: int, tries: int) -> float:
+        """Time after which the answer is overdue, s.
+
+        Args:
+            queued: Bytes on the line before and with the request.
+            reply: Bytes of the longest answer to it and to those before.
+            tries: How often it was sent before.
+        """
+        return (2 * self.wire_s(queued + reply) + self.latency_s) * self.backoff**tries
+
+
+@dataclass(frozen=True, slots=True)
+class RequestOutcome:
+    """How a request ended.
+
+    Attributes:
+        token: What `submit` returned for it.
+        status: The board's status, or None if no answer came.
+        reply: The answer, if the status is OK.
+        detail: Number that goes with another status.
+        tries: How often it was sent.
+    """
+
+    token: int
+    status: Status | int | None
+    reply: WireMessage | None
+    detail: int
+    tries: int
+
+
+@dataclass(slots=True)
+class _Waiting:
+    token: int
+    type: int
+    wire: bytes
+    reply_bytes: int
+    tries: int = 0
+    due: float = 0.0
+
+
+@dataclass
+class Client:
+    """Requests in, outcomes out; between them bytes and time.
+
+    Args:
+        timing: How long an answer may take.
+        window: Requests under way at once; HELLO tells how many the board takes.
+        session: Session that HELLO gave.
+        first: First sequence number, by default drawn at random.
+        tries: How often a request is sent before it is given up.
+        retries: Counts the requests sent again.
+
+    >>> from firmware_host.protocol.requests import StatusRequest
+    >>> client = Client(Timing())
+    >>> token = client.submit(StatusRequest())
+    >>> wire, deadline = client.poll(0.0)
+    >>> wire[-1], deadline > 0
+    (0, True)
+    """
+
+    timing: Timing
+    window: int = 1
+    session: int = NO_SESSION
+    first: int = field(default_factory=lambda: random.SystemRandom().randrange(1 << 16))
+    tries: int = TRIES
+    retries: int = 0
+    decoder: DatagramDecoder = field(default_factory=DatagramDecoder)
+    _tokens: int = 0
+    _queue: deque[_Waiting] = field(default_factory=deque)
+    _flight: dict[int, _Waiting] = field(default_factory=dict)
+    _outcomes: list[RequestOutcome] = field(default_factory=list)
+
+    def submit(self, request: WireMessage, session: int | None = None) -> int:
+        """Queue a request; returns the token its outcome will carry."""
+        sequence = (self.first + self._tokens) & 0xFFFF
+        chosen = self.session if session is None else session
+        wire = Datagram(request.TYPE, 0, sequence, chosen, request.pack()).encode()
+        reply = REPLIES[request.TYPE]
+        longest = MAX_PAYLOAD if reply.LAYOUT[-1:] == (("*", 1),) else max(4, reply.fixed_bytes())
+        token = self._tokens
+        self._tokens += 1
+        self._queue.append(_Waiting(token, request.TYPE, wire, longest + HEADER_BYTES + CRC_BYTES + 4))
+        return token
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is queued or under way."""
+        return not self._queue and not self._flight
+
+    @property
+    def room(self) -> bool:
+        """Whether one more request would go out at once."""
+        return len(self._queue) + len(self._flight) < self.window
+
+    def forget(self) -> None:
+        """Drop everything queued and under way; late answers will be ignored."""
+        self._queue.clear()
+        self._flight.clear()
+
+    def receive(self, data: bytes) -> list[RequestOutcome]:
+        """Take what was read from the line; give what it settles."""
+        for datagram in self.decoder.feed(data):
+            waiting = self._flight.get(datagram.sequence)
+            if waiting is None or datagram.type != waiting.type | REPLY_BIT:
+                continue
+            outcome = _outcome(waiting, datagram)
+            if outcome is not None:
+                del self._flight[datagram.sequence]
+                self._outcomes.append(outcome)
+        done, self._outcomes = self._outcomes, []
+        return done
+
+    def poll(self, now: float) -> tuple[bytes, float | None]:
+        """Bytes to write now, and the time by which to come back (None if nothing is under way).
+
+        Requests that have had all their tries are settled without a status; `receive` gives them.
+        """
+        out = []
+        while self._queue and len(self._flight) < self.window:
+            waiting = self._queue.popleft()
+            self._flight[(self.first + waiting.token) & 0xFFFF] = waiting
+            out.append(self._send(waiting, now))
+        for sequence, waiting in list(self._flight.items()):
+            if waiting.due > now:
+                continue
+            if waiting.tries >= self.tries:
+                del self._flight[sequence]
+                self._outcomes.append(RequestOutcome(waiting.token, None, None, 0, waiting.tries))
+            else:
+                self.retries += 1
+                out.append(self._send(waiting, now))
+        if self._outcomes:
+            return b"".join(out), now
+        return b"".join(out), min((w.due for w in self._flight.values()), default=None)
+
+    def _send(self, waiting: _Waiting, now: float) -> bytes:
+        queued = sum(len(w.wire) for w in self._flight.values())
+        replies = sum(w.reply_bytes for w in self._flight.values())
+        waiting.due = now + self.timing.timeout_s(queued, replies, waiting.tries)
+        waiting.tries += 1
+        return waiting.wire
+
+
+def _outcome(waiting: _Waiting, datagram: Datagram) -> RequestOutcome | None:
+    """The outcome, or None if the payload is not the reply's (then a further try decides)."""
+    if datagram.status == Status.OK:
+        try:
+            reply = REPLIES[waiting.type].unpack(datagram.payload)
+        except DatagramError:
+            return None
+        return RequestOutcome(waiting.token, Status.OK, reply, 0, waiting.tries)
+    detail = int.from_bytes(datagram.payload[:4], "little")
+    try:
+        status: Status | int = Status(datagram.status)
+    except ValueError:
+        status = datagram.status
+    return RequestOutcome(waiting.token, status, None, detail, waiting.tries)

@@ -1,0 +1,119 @@
+"""Datagrams on the wire: header, payload and CRC-32 in COBS, ended by a zero byte. No I/O.
+
+```
+COBS( type u8 | status u8 | sequence u16 | session u16 | payload | CRC-32/ISO-HDLC u32 ) 0x00
+```
+"""
+
+import struct
+import zlib
+from dataclasses import dataclass, field
+
+from cobs import cobs
+
+from firmware_host.errors import DatagramError
+from firmware_host.protocol.requests import CRC_BYTES, HEADER_BYTES, MAX_PAYLOAD
+
+__all__ = ["MAX_WIRE_BYTES", "Counts", "Datagram", "DatagramDecoder"]
+
+_HEADER = struct.Struct("<BBHH")
+
+MAX_WIRE_BYTES = HEADER_BYTES + MAX_PAYLOAD + CRC_BYTES + 3 + 1
+"""Longest datagram on the wire, COBS overhead and delimiter included."""
+
+
+@dataclass(frozen=True, slots=True)
+class Datagram:
+    """One request or reply.
+
+    Attributes:
+        type: Request type; bit 7 is set in a reply.
+        status: 0 in a request; how it ended in a reply.
+        sequence: Number of the request, 0 to 65535.
+        session: Session that HELLO gave.
+        payload: Bytes of the message.
+
+    >>> Datagram.decode(Datagram(0x0C, 0, 7, 1, b"").encode()[:-1]).sequence
+    7
+    """
+
+    type: int
+    status: int
+    sequence: int
+    session: int
+    payload: bytes
+
+    def encode(self) -> bytes:
+        """Bytes on the wire, delimiter included.
+
+        Raises:
+            DatagramError: The payload is longer than the protocol allows.
+        """
+        if len(self.payload) > MAX_PAYLOAD:
+            raise DatagramError(f"payload of {len(self.payload)} bytes, at most {MAX_PAYLOAD}")
+        body = _HEADER.pack(self.type, self.status, self.sequence, self.session) + self.payload
+        return bytes(cobs.encode(body + zlib.crc32(body).to_bytes(4, "little"))) + b"\0"
+
+    @classmethod
+    def decode(cls, wire: bytes) -> "Datagram":
+        """Read the bytes between two delimiters.
+
+        Raises:
+            DatagramError: They are no datagram: COBS, length or CRC is wrong.
+        """
+        try:
+            body = cobs.decode(wire)
+        except cobs.DecodeError as fault:
+            raise DatagramError(f"no COBS: {fault}") from fault
+        if not HEADER_BYTES + CRC_BYTES <= len(body) <= HEADER_BYTES + CRC_BYTES + MAX_PAYLOAD:
+            raise DatagramError(f"{len(body)} bytes are no datagram")
+        head, crc = body[:-CRC_BYTES], int.from_bytes(body[-CRC_BYTES:], "little")
+        if zlib.crc32(head) != crc:
+            raise DatagramError(f"CRC {crc:08x}, expected {zlib.crc32(head):08x}")
+        type_, status, sequence, session = _HEADER.unpack(head[:HEADER_BYTES])
+        return cls(type_, status, sequence, session, head[HEADER_BYTES:])
+
+
+@dataclass(slots=True)
+class Counts:
+    """What a decoder threw away: datagrams with a wrong CRC or COBS, and datagrams too long."""
+
+    bad: int = 0
+    too_long: int = 0
+
+
+@dataclass(slots=True)
+class DatagramDecoder:
+    """Bytes in any portions -> datagrams; what is no datagram is counted and dropped.
+
+    >>> wire = Datagram(0x0C, 0, 7, 1, b"").encode()
+    >>> decoder = DatagramDecoder()
+    >>> decoder.feed(b"noise" + wire[:3]), decoder.counts.bad
+    ([], 0)
+    >>> decoder.feed(wire[3:] + wire), decoder.counts.bad  # doctest: +ELLIPSIS
+    ([Datagram(type=12, ...)], 1)
+    """
+
+    counts: Counts = field(default_factory=Counts)
+    _open: bytearray = field(default_factory=bytearray)
+    _skip: bool = False
+
+    def feed(self, data: bytes) -> list[Datagram]:
+        """Take bytes from the wire; give the datagrams that they complete."""
+        found = []
+        *ended, rest = data.split(b"\0")
+        for part in ended:
+            self._open += part
+            if self._open and not self._skip:
+                try:
+                    found.append(Datagram.decode(bytes(self._open)))
+                except DatagramError:
+                    self.counts.bad += 1
+            self._open.clear()
+            self._skip = False
+        self._open += rest
+        if len(self._open) > MAX_WIRE_BYTES:
+            self.counts.too_long += not self._skip
+            self._skip = True
+            self._open.clear()
+        return found

@@ -1,0 +1,876 @@
+"""Messages of the driver board; `python -m firmware_host.protocol.generate` writes this file."""
+
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+from typing import ClassVar
+
+from firmware_host.protocol.wire import WireMessage
+
+__all__ = [
+    "CHIP_DARK",
+    "CHIP_TEST",
+    "CLUSTERS",
+    "CRC_BYTES",
+    "DEFAULT_BAUD",
+    "HEADER_BYTES",
+    "LEDS",
+    "MAX_PAYLOAD",
+    "NO_BANK",
+    "NO_SESSION",
+    "PROTOCOL_VERSION",
+    "REPLIES",
+    "REPLY_BIT",
+    "ROW_BYTES",
+    "SCHEMA",
+    "SCHEMA_HEX",
+    "WINDOW",
+    "BlankReply",
+    "BlankRequest",
+    "BoardFault",
+    "Capability",
+    "CodebookReply",
+    "CodebookRequest",
+    "CommitReply",
+    "CommitRequest",
+    "ConfigureReply",
+    "ConfigureRequest",
+    "CrcReply",
+    "CrcRequest",
+    "Format",
+    "HelloReply",
+    "HelloRequest",
+    "LedTestReply",
+    "LedTestRequest",
+    "LevelReply",
+    "LevelRequest",
+    "Profile",
+    "ReadReply",
+    "ReadRequest",
+    "RecallReply",
+    "RecallRequest",
+    "SaveReply",
+    "SaveRequest",
+    "StartReply",
+    "StartRequest",
+    "State",
+    "Status",
+    "StatusReply",
+    "StatusRequest",
+    "StopReply",
+    "StopRequest",
+    "Type",
+    "Watchdog",
+    "WatchdogReply",
+    "WatchdogRequest",
+    "WriteReply",
+    "WriteRequest",
+]
+
+PROTOCOL_VERSION = 1
+"""Version of the protocol."""
+SCHEMA_HEX = "85507b45425b847c4a0f0706672a60bf961ec81b082026425238d00d03dac3dd"
+"""SHA-256 of the definition."""
+SCHEMA = bytes.fromhex(SCHEMA_HEX)[:8]
+"""What HELLO carries of it."""
+HEADER_BYTES = 6
+CRC_BYTES = 4
+MAX_PAYLOAD = 512
+WINDOW = 6
+DEFAULT_BAUD = 1000000
+CLUSTERS = 16
+LEDS = 96
+ROW_BYTES = 12
+REPLY_BIT = 0x80
+"""Set in the type of a reply."""
+NO_BANK = 0xFF
+"""No bank."""
+NO_SESSION = 0x0
+"""Session of a HELLO request, and of a board that knows no host."""
+CHIP_DARK = 0xFFFFFFFF
+"""Chip number in an LED record: output is dark, no chip."""
+CHIP_TEST = 0xFFFFFFFE
+"""Chip number in an LED record: single-LED test, no chip."""
+
+
+class Type(IntEnum):
+    """Requests."""
+
+    HELLO = 0x01
+    CONFIGURE = 0x02
+    CODEBOOK = 0x03
+    WRITE = 0x04
+    READ = 0x05
+    CRC = 0x06
+    COMMIT = 0x07
+    START = 0x08
+    STOP = 0x09
+    BLANK = 0x0A
+    LEVEL = 0x0B
+    STATUS = 0x0C
+    WATCHDOG = 0x0D
+    SAVE = 0x0E
+    RECALL = 0x0F
+    LED_TEST = 0x10
+
+
+class Status(IntEnum):
+    """How a request ended."""
+
+    OK = 0
+    """Done."""
+    UNKNOWN_TYPE = 1
+    """The board does not know this request."""
+    BAD_LENGTH = 2
+    """The payload has another length than the request's; detail: expected length."""
+    OUT_OF_RANGE = 3
+    """A value the board cannot take; detail: the nearest value it can."""
+    BUSY = 4
+    """Not while playing or, for flash, in a LED test; or the bank is playing or about to."""
+    BAD_CRC = 5
+    """The bank's content has another CRC; detail: the CRC found."""
+    FOREIGN_CODEBOOK = 6
+    """The codebook's digest is not the one that belongs here."""
+    NO_SESSION = 7
+    """The board was reset, or another host has said HELLO."""
+    STALE = 8
+    """Older than a request already done; not done."""
+    NOTHING_COMMITTED = 9
+    """No bank has been committed."""
+    INCOMPATIBLE = 10
+    """The host's schema is another one."""
+    FLASH_FAULT = 11
+    """The flash did not take or give the data."""
+    NOT_SUPPORTED = 12
+    """This board cannot do that."""
+    EMPTY_SLOT = 13
+    """No flash slot holds a valid setting."""
+    HARDWARE_FAULT = 14
+    """A fault holds the LEDs dark; detail: fault bits."""
+
+
+class Format(IntEnum):
+    """What a bank holds."""
+
+    WORDS = 0
+    """Info words u16 [packet][frame][cluster]; the board adds preamble and pilots."""
+    MASKS = 1
+    """Chip masks, row_bytes a chip, LED 0 the most significant bit of the first byte."""
+
+
+class Profile(IntEnum):
+    """Info-segment profiles of air interface 1."""
+
+    WH4X2 = 0
+    """Two words of H_4, 6 bits a symbol."""
+    WH8 = 1
+    """One word of H_8, 4 bits a symbol."""
+    RAW8 = 2
+    """Eight plain values, 8 bits a symbol."""
+    CUSTOM = 255
+    """A codebook the firmware was not built with."""
+
+
+class State(IntEnum):
+    """What the LEDs do."""
+
+    DARK = 0
+    """Dark; the chip timer stands."""
+    PLAYING = 1
+    """Packets of the active bank."""
+    STOPPING = 2
+    """The last packet before dark."""
+    IDLE_PATTERN = 3
+    """The watchdog's idle pattern: every LED alternates chip by chip."""
+    TESTING = 4
+    """Single-LED test."""
+    FAULT = 5
+    """Dark because of a fault."""
+
+
+class Watchdog(IntEnum):
+    """What happens when the host falls silent."""
+
+    KEEP = 0
+    """Go on playing."""
+    IDLE = 1
+    """Idle pattern from the next packet boundary until the host is heard again."""
+    DARK = 2
+    """Dark after the packet; START plays again."""
+
+
+class Capability(IntFlag):
+    """Bits of HELLO.capabilities."""
+
+    FLASH = 1
+    """SAVE and RECALL."""
+    LEVEL = 2
+    """LEVEL sets the LED current."""
+    TEMPERATURE = 4
+    """STATUS.temperature_dc is measured."""
+    OPEN_LED = 8
+    """STATUS.open_leds is measured."""
+    RECORDS = 16
+    """LED outputs are recorded (emulators)."""
+
+
+class BoardFault(IntFlag):
+    """Bits of STATUS.faults."""
+
+    OVER_TEMPERATURE = 1
+    """The drivers are too hot: LEDs dark until they cool and START."""
+    OPEN_LED = 2
+    """A LED or its wire is open; playing goes on."""
+    CLOCK = 4
+    """The crystal did not start: LEDs dark, timing would be wrong."""
+    CHIP_LOST = 8
+    """A chip interrupt came a whole chip late: LEDs dark."""
+    WATCHDOG = 16
+    """The host fell silent and the watchdog acted; cleared by the next request."""
+
+
+@dataclass(frozen=True, slots=True)
+class HelloRequest(WireMessage):
+    """Open a session and learn the board. Its first two fields never change between versions.
+
+    Attributes:
+        schema: First bytes of the SHA-256 of the host's protocol definition.
+        nonce: Random; the same nonce keeps the session.
+    """
+
+    TYPE: ClassVar[int] = 0x01
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("8s", 1),
+        ("I", 1),
+    )
+
+    schema: bytes
+    nonce: int
+
+
+@dataclass(frozen=True, slots=True)
+class HelloReply(WireMessage):
+    """What the board answers to HELLO.
+
+    Attributes:
+        schema: The board's schema.
+        session: Goes into the header of every further request.
+        version_major: Firmware version.
+        version_minor: Firmware version.
+        version_patch: Firmware version.
+        window: Requests the host may have under way.
+        max_payload: Largest payload, bytes.
+        banks: Number of banks.
+        bank_bytes: Size of a bank, bytes.
+        clusters: Clusters.
+        leds: LEDs.
+        tick_hz: Rate of the tick counter that times the chips.
+        chip_rate_max_hz: Fastest chip rate.
+        level_max_ma: Largest LED current, mA.
+        capabilities: Capability bits.
+        unique_id: The part's own number.
+        uptime_ms: Time since reset; smaller than before means a reset.
+        hal: Name of the hardware layer, ASCII, zero-padded.
+    """
+
+    TYPE: ClassVar[int] = 0x01
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("8s", 1),
+        ("H", 1),
+        ("B", 1),
+        ("B", 1),
+        ("B", 1),
+        ("B", 1),
+        ("H", 1),
+        ("B", 1),
+        ("I", 1),
+        ("B", 1),
+        ("H", 1),
+        ("I", 1),
+        ("I", 1),
+        ("H", 1),
+        ("I", 1),
+        ("12s", 1),
+        ("I", 1),
+        ("12s", 1),
+    )
+
+    schema: bytes
+    session: int
+    version_major: int
+    version_minor: int
+    version_patch: int
+    window: int
+    max_payload: int
+    banks: int
+    bank_bytes: int
+    clusters: int
+    leds: int
+    tick_hz: int
+    chip_rate_max_hz: int
+    level_max_ma: int
+    capabilities: int
+    unique_id: bytes
+    uptime_ms: int
+    hal: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class ConfigureRequest(WireMessage):
+    """Set what the next COMMIT plays with; playing goes on as it was.
+
+    Attributes:
+        chip_rate_hz: Chips per second; must divide the tick rate; not changed while playing.
+        profile: Info-segment profile.
+        frames: Frames per packet.
+        pilot_every: Frames from one pilot to the next; 1: every frame has one.
+    """
+
+    TYPE: ClassVar[int] = 0x02
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("I", 1),
+        ("B", 1),
+        ("H", 1),
+        ("B", 1),
+    )
+
+    chip_rate_hz: int
+    profile: int
+    frames: int
+    pilot_every: int
+
+
+@dataclass(frozen=True, slots=True)
+class ConfigureReply(WireMessage):
+    """What the board answers to CONFIGURE.
+
+    Attributes:
+        ticks_per_chip: Length of a chip in ticks.
+        packet_chips: Length of a packet in chips.
+    """
+
+    TYPE: ClassVar[int] = 0x02
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("I", 1),
+        ("I", 1),
+    )
+
+    ticks_per_chip: int
+    packet_chips: int
+
+
+@dataclass(frozen=True, slots=True)
+class CodebookRequest(WireMessage):
+    """Set preamble and pilots for the next COMMIT; those of a built-in profile must be the firmware's own.
+
+    Attributes:
+        preamble_chips: Chips of the preamble, at most 32.
+        preamble: Preamble, first chip on air the most significant of preamble_chips bits.
+        pilots: Pilot words, first chip on air the most significant bit.
+        digest: SHA-256 of the codebook.
+    """
+
+    TYPE: ClassVar[int] = 0x03
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("I", 1),
+        ("HHHHHHHHHHHHHHHH", 16),
+        ("32s", 1),
+    )
+
+    preamble_chips: int
+    preamble: int
+    pilots: tuple[int, ...]
+    digest: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class CodebookReply(WireMessage):
+    """What the board answers to CODEBOOK."""
+
+    TYPE: ClassVar[int] = 0x03
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class WriteRequest(WireMessage):
+    """Write into a spare bank; voids what was committed in it.
+
+    Attributes:
+        bank: Bank.
+        offset: First byte.
+        data: Content.
+    """
+
+    TYPE: ClassVar[int] = 0x04
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("I", 1),
+        ("*", 1),
+    )
+
+    bank: int
+    offset: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class WriteReply(WireMessage):
+    """What the board answers to WRITE.
+
+    Attributes:
+        bank: Bank.
+        offset: First byte.
+        count: Bytes written.
+    """
+
+    TYPE: ClassVar[int] = 0x04
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("I", 1),
+        ("H", 1),
+    )
+
+    bank: int
+    offset: int
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReadRequest(WireMessage):
+    """Read from a bank.
+
+    Attributes:
+        bank: Bank.
+        offset: First byte.
+        count: Bytes wanted.
+    """
+
+    TYPE: ClassVar[int] = 0x05
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("I", 1),
+        ("H", 1),
+    )
+
+    bank: int
+    offset: int
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReadReply(WireMessage):
+    """What the board answers to READ.
+
+    Attributes:
+        bank: Bank.
+        offset: First byte.
+        data: Content.
+    """
+
+    TYPE: ClassVar[int] = 0x05
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("I", 1),
+        ("*", 1),
+    )
+
+    bank: int
+    offset: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class CrcRequest(WireMessage):
+    """CRC-32/ISO-HDLC of a bank's bytes.
+
+    Attributes:
+        bank: Bank.
+        offset: First byte.
+        length: Bytes.
+    """
+
+    TYPE: ClassVar[int] = 0x06
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("I", 1),
+        ("I", 1),
+    )
+
+    bank: int
+    offset: int
+    length: int
+
+
+@dataclass(frozen=True, slots=True)
+class CrcReply(WireMessage):
+    """What the board answers to CRC.
+
+    Attributes:
+        crc: CRC of the bytes.
+    """
+
+    TYPE: ClassVar[int] = 0x06
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (("I", 1),)
+
+    crc: int
+
+
+@dataclass(frozen=True, slots=True)
+class CommitRequest(WireMessage):
+    """Check a bank; play it from the next packet boundary, or, if the check fails, go on with the old one.
+
+    Attributes:
+        bank: Bank.
+        format: What the bank holds.
+        packets: Packets in the bank.
+        length: Bytes in the bank.
+        crc: CRC-32 of those bytes.
+        digest: Digest of the codebook the content was made with.
+    """
+
+    TYPE: ClassVar[int] = 0x07
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("B", 1),
+        ("H", 1),
+        ("I", 1),
+        ("I", 1),
+        ("32s", 1),
+    )
+
+    bank: int
+    format: int
+    packets: int
+    length: int
+    crc: int
+    digest: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class CommitReply(WireMessage):
+    """What the board answers to COMMIT.
+
+    Attributes:
+        commits: Commits accepted since reset.
+    """
+
+    TYPE: ClassVar[int] = 0x07
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (("I", 1),)
+
+    commits: int
+
+
+@dataclass(frozen=True, slots=True)
+class StartRequest(WireMessage):
+    """Play the active bank from its first packet; nothing happens if it plays."""
+
+    TYPE: ClassVar[int] = 0x08
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class StartReply(WireMessage):
+    """What the board answers to START."""
+
+    TYPE: ClassVar[int] = 0x08
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class StopRequest(WireMessage):
+    """Finish the packet, then dark."""
+
+    TYPE: ClassVar[int] = 0x09
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class StopReply(WireMessage):
+    """What the board answers to STOP."""
+
+    TYPE: ClassVar[int] = 0x09
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class BlankRequest(WireMessage):
+    """Dark at once, within the packet."""
+
+    TYPE: ClassVar[int] = 0x0A
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class BlankReply(WireMessage):
+    """What the board answers to BLANK."""
+
+    TYPE: ClassVar[int] = 0x0A
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class LevelRequest(WireMessage):
+    """Set the LED current; above the board's maximum it is refused.
+
+    Attributes:
+        level_ma: LED current, mA.
+    """
+
+    TYPE: ClassVar[int] = 0x0B
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (("H", 1),)
+
+    level_ma: int
+
+
+@dataclass(frozen=True, slots=True)
+class LevelReply(WireMessage):
+    """What the board answers to LEVEL."""
+
+    TYPE: ClassVar[int] = 0x0B
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class StatusRequest(WireMessage):
+    """What the board does, and what went wrong since reset."""
+
+    TYPE: ClassVar[int] = 0x0C
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class StatusReply(WireMessage):
+    """What the board answers to STATUS.
+
+    Attributes:
+        state: State.
+        faults: Fault bits.
+        active_bank: Bank that plays or would play, or no_bank.
+        pending_bank: Bank waiting for the packet boundary, or no_bank.
+        format: Format of the active bank.
+        profile: Profile of the active bank.
+        frames: Frames per packet of the active bank.
+        pilot_every: Frames from one of its pilots to the next.
+        packets: Packets in the active bank.
+        length: Bytes in the active bank.
+        crc: CRC-32 of the active bank.
+        chip_rate_hz: Chips per second, as configured.
+        commits: Commits accepted since reset.
+        packets_sent: Packets played to their end since reset.
+        chips_sent: Chips since reset.
+        lateness_ticks: Delay of the latest chip.
+        lateness_max_ticks: Largest delay since START.
+        crc_errors: Datagrams with a wrong CRC.
+        framing_errors: Datagrams too short, too long or no COBS.
+        overflow_errors: Bytes lost because the receive buffer was full.
+        requests: Good datagrams received.
+        level_ma: LED current, mA.
+        temperature_dc: Driver temperature, 0.1 degree C.
+        open_leds: A bit a LED: open.
+        watchdog: Watchdog action.
+        watchdog_ms: Watchdog time-out.
+        silence_ms: Time since the request before this one.
+        uptime_ms: Time since reset.
+        digest: Digest of the active bank's codebook, or of the one set.
+    """
+
+    TYPE: ClassVar[int] = 0x0C
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("B", 1),
+        ("B", 1),
+        ("B", 1),
+        ("B", 1),
+        ("B", 1),
+        ("H", 1),
+        ("B", 1),
+        ("H", 1),
+        ("I", 1),
+        ("I", 1),
+        ("I", 1),
+        ("I", 1),
+        ("I", 1),
+        ("I", 1),
+        ("I", 1),
+        ("I", 1),
+        ("I", 1),
+        ("I", 1),
+        ("I", 1),
+        ("I", 1),
+        ("H", 1),
+        ("h", 1),
+        ("12s", 1),
+        ("B", 1),
+        ("I", 1),
+        ("I", 1),
+        ("I", 1),
+        ("32s", 1),
+    )
+
+    state: int
+    faults: int
+    active_bank: int
+    pending_bank: int
+    format: int
+    profile: int
+    frames: int
+    pilot_every: int
+    packets: int
+    length: int
+    crc: int
+    chip_rate_hz: int
+    commits: int
+    packets_sent: int
+    chips_sent: int
+    lateness_ticks: int
+    lateness_max_ticks: int
+    crc_errors: int
+    framing_errors: int
+    overflow_errors: int
+    requests: int
+    level_ma: int
+    temperature_dc: int
+    open_leds: bytes
+    watchdog: int
+    watchdog_ms: int
+    silence_ms: int
+    uptime_ms: int
+    digest: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class WatchdogRequest(WireMessage):
+    """What to do when the host falls silent.
+
+    Attributes:
+        action: Watchdog action.
+        timeout_ms: Silence before it acts, at least 100 ms.
+    """
+
+    TYPE: ClassVar[int] = 0x0D
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("I", 1),
+    )
+
+    action: int
+    timeout_ms: int
+
+
+@dataclass(frozen=True, slots=True)
+class WatchdogReply(WireMessage):
+    """What the board answers to WATCHDOG."""
+
+    TYPE: ClassVar[int] = 0x0D
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SaveRequest(WireMessage):
+    """Save active bank and settings to the older of two flash slots; only while the LEDs are dark.
+
+    Attributes:
+        autostart: 1: recall and play after a reset.
+    """
+
+    TYPE: ClassVar[int] = 0x0E
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (("B", 1),)
+
+    autostart: int
+
+
+@dataclass(frozen=True, slots=True)
+class SaveReply(WireMessage):
+    """What the board answers to SAVE.
+
+    Attributes:
+        slot: Slot written.
+        save_sequence: Its sequence number.
+    """
+
+    TYPE: ClassVar[int] = 0x0E
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("I", 1),
+    )
+
+    slot: int
+    save_sequence: int
+
+
+@dataclass(frozen=True, slots=True)
+class RecallRequest(WireMessage):
+    """Commit what the newest valid flash slot holds; only while the LEDs are dark."""
+
+    TYPE: ClassVar[int] = 0x0F
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class RecallReply(WireMessage):
+    """What the board answers to RECALL.
+
+    Attributes:
+        slot: Slot read.
+        save_sequence: Its sequence number.
+    """
+
+    TYPE: ClassVar[int] = 0x0F
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("I", 1),
+    )
+
+    slot: int
+    save_sequence: int
+
+
+@dataclass(frozen=True, slots=True)
+class LedTestRequest(WireMessage):
+    """Walk over LEDs one by one; not while playing. STOP or BLANK ends it early.
+
+    Attributes:
+        first: First LED.
+        last: Last LED.
+        dwell_ms: Time a LED is on, at least 1 ms.
+    """
+
+    TYPE: ClassVar[int] = 0x10
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("B", 1),
+        ("H", 1),
+    )
+
+    first: int
+    last: int
+    dwell_ms: int
+
+
+@dataclass(frozen=True, slots=True)
+class LedTestReply(WireMessage):
+    """What the board answers to LED_TEST."""
+
+    TYPE: ClassVar[int] = 0x10
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+REPLIES: dict[int, type[WireMessage]] = {
+    0x01: HelloReply,
+    0x02: ConfigureReply,
+    0x03: CodebookReply,
+    0x04: WriteReply,
+    0x05: ReadReply,
+    0x06: CrcReply,
+    0x07: CommitReply,
+    0x08: StartReply,
+    0x09: StopReply,
+    0x0A: BlankReply,
+    0x0B: LevelReply,
+    0x0C: StatusReply,
+    0x0D: WatchdogReply,
+    0x0E: SaveReply,
+    0x0F: RecallReply,
+    0x10: LedTestReply,
+}
+"""The reply of each request type."""

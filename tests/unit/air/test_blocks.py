@@ -1,0 +1,154 @@
+"""Blocks and beacons, held against struct and against hand-made bytes."""
+
+import binascii
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evlcp_sdk.air.beacons import BEACON_BYTES, Beacon
+from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message, split
+from evlcp_sdk.errors import ConfigError
+
+DIGEST = bytes.fromhex("00112233")
+
+
+def plain(block: bytes) -> bytes:
+    """The block with the whitening taken off, as docs/messages.md tells it, one 32-bit number at a time."""
+    x = np.uint32(binascii.crc32(block[:17]))
+    numbers = []
+    for _ in range(len(block)):
+        x = np.uint32(x ^ (x << np.uint32(13)))
+        x = np.uint32(x ^ (x >> np.uint32(17)))
+        x = np.uint32(x ^ (x << np.uint32(5)))
+        numbers.append(x)
+    stream = np.array(numbers, "<u4").view(np.uint8)[: len(block) - 17]
+    return block[:17] + (np.frombuffer(block[17:], np.uint8) ^ stream).tobytes()
+
+
+U32 = st.integers(0, 2**32 - 1)
+
+
+@given(
+    U32, U32, st.binary(min_size=1, max_size=300), st.integers(HEADER_BYTES + 1, 90), st.sampled_from(Kind)
+)
+def test_a_message_is_the_sum_of_its_blocks(
+    transmitter_id: int, sequence: int, payload: bytes, size: int, kind: Kind
+) -> None:
+    message = Message(kind, transmitter_id, sequence, payload)
+    blocks = list(split(message, DIGEST, size))
+    assert len(blocks) == -(-len(payload) // (size - HEADER_BYTES))
+    packed = [b.pack(size) for b in blocks]
+    assert {len(p) for p in packed} == {size}
+    assert [Block.unpack(p) for p in packed] == blocks
+    assert b"".join(b.part for b in blocks) == payload
+    for i, p in enumerate(packed):
+        # Independent of the module: the table of docs/messages.md.
+        head = struct.pack("<BIIHH", 0x10 + kind, transmitter_id, sequence, i, len(payload)) + DIGEST
+        assert p[:17] == head
+        part = payload[i * (size - 17) : (i + 1) * (size - 17)]
+        assert plain(p)[17:] == part + bytes(size - 17 - len(part))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({0: 0x22}, "format version 2, expected 1"),
+        ({0: 0x00}, "format version 0"),
+        ({0: 0x1F}, "kind 15, expected 1 to 4"),
+        ({0: 0x10}, "kind 0"),
+        ({9: 1}, "part 1 of a message of 2 bytes, 7 in a part"),
+        ({11: 0}, "part 0 of a message of 0 bytes"),
+        ({23: 1}, "bytes 19 to 23 of the block: expected zeros"),
+    ],
+)
+def test_what_is_no_block_is_told(change: dict[int, int], told: str) -> None:
+    block = bytearray(Block(Kind.TEXT, 7, 1, 0, 2, DIGEST, b"Hi").pack(24))
+    assert Block.unpack(bytes(block)).part == b"Hi"
+    for at, value in change.items():
+        block[at] = value if at < 17 else block[at] ^ value
+    with pytest.raises(BlockError, match=told):
+        Block.unpack(bytes(block))
+
+
+@pytest.mark.parametrize(
+    ("kind", "transmitter_id", "sequence", "payload", "told"),
+    [
+        (Kind.TEXT, -1, 0, b"a", "transmitter_id = -1, expected 0 to 4294967295"),
+        (Kind.TEXT, 0, 2**32, b"a", "sequence = 4294967296, expected"),
+        (Kind.DATA, 0, 0, b"", "0 bytes of data, expected 1 to 65535"),
+        (Kind.DATA, 0, 0, bytes(65536), "65536 bytes of data"),
+    ],
+)
+def test_what_is_no_message_is_told(
+    kind: Kind, transmitter_id: int, sequence: int, payload: bytes, told: str
+) -> None:
+    with pytest.raises(ConfigError, match=told):
+        Message(kind, transmitter_id, sequence, payload)
+
+
+def test_text_is_utf8() -> None:
+    assert Message(Kind.TEXT, 0, 0, "Tempo 30 für 2 km".encode()).text == "Tempo 30 für 2 km"
+    assert Message(Kind.TEXT, 0, 0, b"\xff").text is None
+    assert Message(Kind.DATA, 0, 0, b"Hi").text is None
+
+
+@given(
+    st.integers(-90 * 10**9, 90 * 10**9),
+    st.integers(-180 * 10**9, 180 * 10**9),
+    st.integers(-12 * 10**6, 20 * 10**6),
+    st.integers(0, 35999),
+    st.integers(0, 18000),
+    st.integers(1, 100_000),
+    st.binary(max_size=40),
+)
+def test_beacons_keep_every_digit(
+    latitude: int, longitude: int, height: int, heading: int, tilt: int, length: int, user: bytes
+) -> None:
+    payload = struct.pack("<qqiHHI", latitude, longitude, height, heading, tilt, length) + user
+    beacon = Beacon.unpack(payload)
+    assert beacon.pack() == payload
+    assert beacon.place[:2] == pytest.approx((latitude * 1e-9, longitude * 1e-9), abs=1e-12)
+    assert (beacon.height_m, beacon.length_m) == pytest.approx((height * 1e-3, length * 1e-3))
+    assert (beacon.heading_deg, beacon.tilt_deg) == pytest.approx((heading / 100, tilt / 100))
+    assert beacon.user == user
+
+
+def test_a_beacon_is_as_fine_as_a_millimetre() -> None:
+    # A degree of latitude is 111.7 km at most (WGS-84, at the poles).
+    one = Beacon(48.1, 11.5, 500.0, 0.0, 0.0, 1.0)
+    for moved in (
+        replace(one, latitude_deg=48.1 + 0.001 / 111.7e3),
+        replace(one, longitude_deg=11.5 + 0.001 / 111.7e3),
+        replace(one, height_m=500.001),
+        replace(one, length_m=1.001),
+    ):
+        assert moved.pack() != one.pack()
+    assert replace(one, heading_deg=359.999).pack() == one.pack()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("latitude_deg", 90.1),
+        ("longitude_deg", -181.0),
+        ("height_m", float("nan")),
+        ("heading_deg", -1.0),
+        ("tilt_deg", 181.0),
+        ("length_m", 0.0),
+    ],
+)
+def test_beacons_that_cannot_be(name: str, value: float) -> None:
+    names = ("latitude_deg", "longitude_deg", "height_m", "heading_deg", "tilt_deg", "length_m")
+    with pytest.raises(ConfigError, match=f"beacon: {name} = {value}, expected"):
+        Beacon(**(dict.fromkeys(names, 1.0) | {name: value}))
+
+
+def test_bytes_that_are_no_beacon() -> None:
+    with pytest.raises(BlockError, match=f"beacon of 27 bytes, expected at least {BEACON_BYTES}"):
+        Beacon.unpack(bytes(27))
+    with pytest.raises(BlockError, match="latitude_deg"):
+        Beacon.unpack(struct.pack("<qqiHHI", 91 * 10**9, 0, 0, 0, 0, 1))

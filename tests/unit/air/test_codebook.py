@@ -1,0 +1,155 @@
+"""The codebook against the worked values of the air interface, and its JSON and C forms."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evlcp_barker.pilots import Barker13Pilots
+from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
+from evlcp_wh.pilots import WhPilots
+
+from evlcp_sdk.air.codebook import Codebook, chips_of_values, hadamard
+from evlcp_sdk.air.frames import (
+    PacketFormat,
+    bits_of_symbols,
+    info_words,
+    packet_chips,
+    pilot_words,
+    symbols_of_bits,
+)
+from evlcp_sdk.errors import CodebookMismatchError, ConfigError
+from evlcp_sdk.plugin.roles import Modulation
+
+VECTORS = json.loads((Path(__file__).parents[2] / "vectors" / "air-vectors.json").read_text())
+PROFILES: dict[str, Modulation] = {"wh4x2": Wh4x2(), "wh8": Wh8(), "raw8": Raw8()}
+
+
+def book_of(profile: str) -> Codebook:
+    pilots = WhPilots()
+    return Codebook(profile, pilots.preamble(), pilots.codes(16), PROFILES[profile].codewords())
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_words_are_the_vectors(profile: str) -> None:
+    book = book_of(profile)
+    assert [f"{w:04x}" for w in pilot_words(book)] == VECTORS["pilot_words"]
+    n = len(book.codewords)
+    words = info_words(np.arange(n).repeat(16).reshape(n, 16), book)[:, 0]
+    assert [f"{w:04x}" for w in words] == VECTORS["info_words"][profile]
+    assert "".join(map(str, chips_of_values(book.preamble))) == VECTORS["preamble_chips"]
+    assert book.preamble.tolist() == VECTORS["barker13"]
+
+
+def test_packet_is_the_vector() -> None:
+    want = VECTORS["example_packet"]
+    book = book_of(want["profile"])
+    chips = packet_chips(want["symbols"], book)
+    assert len(chips) == PacketFormat.of(book, want["frames"]).packet_chips
+    assert ["".join(map(str, row)) for row in chips] == [f"{int(m, 16):016b}" for m in want["cluster_masks"]]
+    bits = bits_of_symbols(want["symbols"], book.bits_per_symbol)
+    assert "".join(map(str, bits)) == want["bits"]
+    assert symbols_of_bits(bits, book.bits_per_symbol, 16).tolist() == want["symbols"]
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize(("frames", "every"), [(10, 1), (10, 4), (8, 4), (9, 4), (3, 5)])
+def test_a_sparse_packet_is_the_full_one_without_some_pilots(profile: str, frames: int, every: int) -> None:
+    book = book_of(profile)
+    symbols = np.random.default_rng(frames).integers(0, len(book.codewords), (frames, 16))
+    full = packet_chips(symbols, book)
+    form = PacketFormat.of(book, frames, pilot_every=every)
+    bare = [f for f in range(frames) if f % every]
+    dropped = [26 + 32 * f + chip for f in bare for chip in range(16)]
+    kept = np.delete(full, dropped, axis=0)
+    assert packet_chips(symbols, book, every).tolist() == kept.tolist()
+    assert form.packet_chips == len(kept)
+    for f in range(frames):
+        assert form.has_pilot(f) == (f not in bare)
+        begin = form.frame_start_chip(f)
+        at = 26 + 32 * f + (0 if form.has_pilot(f) else 16)
+        assert kept[begin : begin + 16].tolist() == full[at : at + 16].tolist()
+
+
+@pytest.mark.parametrize(
+    ("profile", "frames", "every", "bit_s"),
+    # Air interface 1 for every frame with its pilot; beyond, bits over chips by hand.
+    [
+        ("wh4x2", 10, 1, 27_746),
+        ("wh8", 10, 1, 18_497),
+        ("raw8", 10, 1, 36_994),
+        ("raw8", 10, 4, 1280 / 234 * 1e4),
+        ("raw8", 20, 4, 2560 / 426 * 1e4),
+    ],
+)
+def test_gross_rate(profile: str, frames: int, every: int, bit_s: float) -> None:
+    book = book_of(profile)
+    form = PacketFormat.of(book, frames, pilot_every=every)
+    assert form.gross_bit_s(book.bits_per_symbol, 16) == pytest.approx(bit_s, abs=0.5)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_json_round_trip_keeps_the_digest(profile: str) -> None:
+    book = book_of(profile)
+    again = Codebook.from_json(book.to_json())
+    assert again == book
+    assert hash(again) == hash(book)
+    assert len({book_of(p).digest for p in PROFILES}) == 3
+
+
+def test_a_changed_code_is_refused() -> None:
+    table = json.loads(book_of("wh8").to_json())
+    table["pilots"][3], table["pilots"][4] = table["pilots"][4], table["pilots"][3]
+    with pytest.raises(CodebookMismatchError, match="digest"):
+        Codebook.from_json(json.dumps(table))
+    with pytest.raises(CodebookMismatchError, match="air_interface 9, expected 1"):
+        Codebook.from_json(json.dumps(table | {"air_interface": 9}))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("{", "not a codebook"), ('{"air_interface": 1}', "'profile' is missing"), ("[]", "not a codebook")],
+)
+def test_bad_json_names_the_source(text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^book\.json.*{message}"):
+        Codebook.from_json(text, "book.json")
+
+
+def test_codes_are_checked() -> None:
+    with pytest.raises(ConfigError, match="two rows are equal"):
+        Codebook("x", hadamard(2)[0], np.ones((2, 8), np.int8), hadamard(8))
+    with pytest.raises(ConfigError, match="preamble"):
+        Codebook("x", np.zeros(13, np.int8), hadamard(8), hadamard(8))
+    with pytest.raises(ConfigError, match="power of two"):
+        Codebook("x", hadamard(2)[0], hadamard(8), hadamard(8)[:3])
+
+
+def test_c_table_holds_the_words() -> None:
+    book = book_of("wh4x2")
+    text = book.to_c()
+    words = re.findall(r"0x([0-9a-f]{4})u", text)
+    assert words == VECTORS["pilot_words"] + VECTORS["info_words"]["wh4x2"]
+    assert f"{int(VECTORS['preamble_chips'], 2):08x}" in text
+
+
+def test_more_clusters_need_longer_pilots() -> None:
+    codes = WhPilots().codes(20)
+    assert codes.shape == (20, 16)
+    assert len(np.unique(codes, axis=0)) == 20
+    assert Barker13Pilots().codes(26).shape == (26, 13)
+    with pytest.raises(ConfigError, match="at most 26"):
+        Barker13Pilots().codes(27)
+
+
+@pytest.mark.parametrize(
+    ("symbols", "message"),
+    [
+        ([[0] * 15], "expected \\(frames, 16 clusters\\)"),
+        ([[0] * 15 + [64]], "symbol 64 at frame 0, cluster 15: expected 0 to 63"),
+        ([[0.5] * 16], "expected integers"),
+    ],
+)
+def test_bad_symbols_are_named(symbols: list[list[float]], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        packet_chips(symbols, book_of("wh4x2"))

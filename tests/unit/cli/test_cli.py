@@ -1,0 +1,468 @@
+"""The command line: what it prints, what it writes, how it ends."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.cli.demo import score
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource, open_source, write_events
+from evlcp_sdk.results.outputs import FIGURE_NAMES
+from evlcp_sdk.values import Events, Triggers
+
+Evlcp = Callable[..., Any]
+FILES = {"frames.csv", "packets.jsonl", "summary.json"}
+
+
+@pytest.fixture
+def noise_raw(tmp_path: Path) -> Path:
+    """A recording of nothing but noise."""
+    rng = np.random.default_rng(3)
+    n = 20_000
+    columns = (np.sort(rng.integers(0, 100_000, n)), rng.integers(0, 1280, n), rng.integers(0, 720, n))
+    path = tmp_path / "noise.raw"
+    write_events(path, Events.of(*columns, rng.integers(0, 2, n)), width=1280, height=720)
+    return path
+
+
+def summary_of(folder: Path) -> dict[str, Any]:
+    table: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return table
+
+
+def names_in(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+COMMANDS = ["receive", "info", "sweep", "report", "demo", "calibrate", "config", "plugins"]
+
+
+def test_help_lists_commands_and_exit_codes(evlcp: Evlcp) -> None:
+    done = evlcp("--help")
+    assert done.code == 0
+    for text in [*COMMANDS, "board", "tx", "evlcp demo", "3 input that cannot be read"]:
+        assert text in " ".join(done.out.split())
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_teaches_by_example(evlcp: Evlcp, command: str) -> None:
+    done = evlcp(command, "--help")
+    assert done.code == 0
+    assert done.out.count(f"evlcp {command}") >= 2 or command == "plugins"
+    assert done.out.count("evlcp ") >= 2
+    assert "\x1b" not in done.out
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys\n"
+        "from evlcp_sdk.cli.main import main\n"
+        "sys.argv = ['evlcp', '--help']\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        "heavy = {'numpy', 'numba', 'scipy', 'matplotlib'} & set(sys.modules)\n"
+        "sys.exit(f'imported {heavy}' if heavy else 0)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_version(evlcp: Evlcp) -> None:
+    assert evlcp("--version").out.startswith("evlcp-sdk ")
+
+
+def test_receive_writes_and_tells(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:
+    done = evlcp("receive", demo_raw, "-o", tmp_path / "out")
+    assert done.code == 0
+    assert done.err == ""
+    assert "1 transmitter, " in done.out
+    assert "x real time" in done.out
+    assert "\x1b" not in done.out
+    assert names_in(tmp_path / "out") == FILES
+    table = summary_of(tmp_path / "out")
+    assert table["status"] == "complete"
+    assert table["counts"]["events"] == table["recording"]["counts"]["events"] == 764_142
+    assert len(table["digest"]) == 64
+    assert {"evlcp-sdk", "numpy", "python"} <= set(table["versions"])
+    assert table["configuration"]["ranging"]["id"] == "poc"
+
+
+def test_receive_draws_figures_and_parquet(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
+    assert evlcp("receive", demo_raw, "-o", tmp_path, "--figures", "--parquet").code == 0
+    assert names_in(tmp_path) == FILES | {"frames.parquet", *FIGURE_NAMES}
+    for name in FIGURE_NAMES:
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+    with (tmp_path / "frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    table = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
+    assert [" ".join(map(str, row["symbols"])) for row in table] == [row["symbols"] for row in rows]
+
+
+def test_probes_do_not_change_the_result(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:
+    evlcp("receive", demo_raw, "-o", tmp_path / "plain")
+    evlcp("receive", demo_raw, "-o", tmp_path / "drawn", "--figures")
+    plain, drawn = ((tmp_path / name / "frames.csv").read_bytes() for name in ("plain", "drawn"))
+    assert plain == drawn
+
+
+def test_no_transmitter_is_no_failure(evlcp: Evlcp, noise_raw: Path, tmp_path: Path) -> None:
+    done = evlcp("receive", noise_raw, "-o", tmp_path / "out", "--figures")
+    assert done.code == 0
+    assert "noise.raw: no transmitter was found" in done.out
+    assert summary_of(tmp_path / "out")["result"] == "no transmitter was found"
+    assert names_in(tmp_path / "out") == FILES | {"regions.png"}
+
+
+def test_receive_json_is_one_line_a_recording(
+    evlcp: Evlcp, noise_raw: Path, demo_raw: Path, tmp_path: Path
+) -> None:
+    done = evlcp("receive", noise_raw, demo_raw, tmp_path / "none.raw", "-o", tmp_path / "out", "--json")
+    assert done.code == 3
+    tables = [json.loads(line) for line in done.out.splitlines()]
+    assert [t["status"] for t in tables] == ["complete", "complete", "failed"]
+    assert tables[1] == summary_of(tmp_path / "out" / demo_raw.stem)
+    assert done.err == f"evlcp: {tmp_path}/none.raw: No such file or directory\n"
+
+
+def test_of_several_recordings_the_others_are_decoded(
+    evlcp: Evlcp, noise_raw: Path, demo_raw: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "photo.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(64))
+    done = evlcp("receive", tmp_path / "photo.png", noise_raw, demo_raw, "-o", tmp_path / "out")
+    assert done.code == 3
+    assert done.err.startswith(f"evlcp: {tmp_path}/photo.png: ")
+    assert len(done.err.splitlines()) == 1
+    assert names_in(tmp_path / "out") == {"noise", demo_raw.stem}
+    assert summary_of(tmp_path / "out" / "noise")["status"] == "complete"
+
+
+@pytest.mark.parametrize(
+    ("args", "told"),
+    [
+        (["--set", "ranging.id=pco"], "evlcp: no ranging algorithm named 'pco'; did you mean 'poc'?"),
+        (["--set", "camera.focal_mm=-1"], "evlcp: --set: camera.focal_mm = -1: expected greater than 0"),
+        (["--set", "nonsense"], "evlcp: --set nonsense: expected table.key=value, e.g. modulation.id=wh8"),
+        (["-c", "missing.toml"], "evlcp: missing.toml: cannot be read: No such file or directory"),
+        (
+            ["--set", "camera.width=640"],
+            "recorded with 1280 x 720 pixels, but the link's camera has 640 x 720",
+        ),
+        (["--figuers"], "No such option"),
+    ],
+)
+def test_usage_and_configuration_end_with_2(
+    evlcp: Evlcp, demo_raw: Path, tmp_path: Path, args: list[str], told: str
+) -> None:
+    done = evlcp("receive", demo_raw, "-o", tmp_path / "out", *args)
+    assert done.code == 2
+    assert told in done.err
+    assert not (tmp_path / "out").exists()
+    assert "Traceback" not in done.err
+
+
+def test_every_fault_of_a_link_is_one_line(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:
+    (tmp_path / "link.toml").write_text("[camera]\nwidht = 3\n[air]\nchip_rate_hz = 0\n")
+    done = evlcp("receive", demo_raw, "-o", tmp_path / "out", "-c", tmp_path / "link.toml")
+    assert done.code == 2
+    assert [line.split(": ")[2] for line in done.err.splitlines()] == [
+        "camera.widht = 3",
+        "air.chip_rate_hz = 0",
+    ]
+
+
+def test_two_recordings_of_one_name(evlcp: Evlcp, tmp_path: Path) -> None:
+    done = evlcp("receive", "a/night.raw", "b/night.npz", "-o", tmp_path / "out")
+    assert done.code == 2
+    assert "two recordings would both be written" in done.err
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n" + bytes(40), b"no header at all"])
+def test_what_cannot_be_read_ends_with_3(evlcp: Evlcp, tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "bad.raw"
+    path.write_bytes(content)
+    for command in (["receive", path, "-o", tmp_path / "out"], ["info", path]):
+        done = evlcp(*command)
+        assert done.code == 3
+        assert done.err.startswith(f"evlcp: {path}: ")
+        assert len(done.err.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+class FailingSource(RawSource):
+    """A recording whose bytes cannot be read after the first piece."""
+
+    def stream(self, max_events: int = DEFAULT_MAX_EVENTS) -> Iterator[tuple[Events, Triggers]]:
+        yield from [next(super().stream(400_000))]
+        raise InputError(f"{self.path}: at byte 1000: the disk is gone")
+
+
+def test_input_that_fails_half_way(
+    evlcp: Evlcp, demo_raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("evlcp_sdk.io.open.RawSource", FailingSource)
+    done = evlcp("receive", demo_raw, "-o", tmp_path / "out")
+    assert done.code == 3
+    assert done.err == f"evlcp: {demo_raw}: at byte 1000: the disk is gone\n"
+    table = summary_of(tmp_path / "out")
+    assert table["status"] == "failed"
+    assert table["error"].endswith("the disk is gone")
+    assert table["transmitters"][0]["frames_found"] > 0
+
+
+class InterruptedSource(RawSource):
+    """A recording during which the user types Ctrl-C."""
+
+    def stream(self, max_events: int = DEFAULT_MAX_EVENTS) -> Iterator[tuple[Events, Triggers]]:
+        for i, piece in enumerate(super().stream(400_000)):
+            assert i == 0, "reading went on"
+            signal.raise_signal(signal.SIGINT)
+            yield piece
+
+
+def test_interrupt_keeps_what_was_decoded(
+    evlcp: Evlcp, demo_raw: Path, noise_raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("evlcp_sdk.io.open.RawSource", InterruptedSource)
+    before = signal.getsignal(signal.SIGINT)
+    done = evlcp("receive", demo_raw, noise_raw, "-o", tmp_path / "out")
+    assert signal.getsignal(signal.SIGINT) is before
+    assert done.code == 130
+    folder = tmp_path / "out" / demo_raw.stem
+    assert done.err == f"evlcp: interrupted; what was decoded until then is in {folder}\n"
+    assert summary_of(folder)["status"] == "interrupted"
+    assert summary_of(folder)["transmitters"][0]["frames_found"] > 0
+    assert not (tmp_path / "out" / "noise").exists()
+
+
+def test_a_plugin_opens_what_the_readers_do_not_know(
+    evlcp: Evlcp, demo_raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from evlcp_sdk.plugin.hooks import hookimpl
+    from evlcp_sdk.plugin.registry import Registry
+
+    class Camera:
+        @hookimpl
+        def evlcp_open_events(self, url: str) -> RawSource | None:
+            return RawSource(demo_raw) if url == "camera:0" else None
+
+    load = Registry.load
+    monkeypatch.setattr(Registry, "load", lambda *plugins: load(Camera(), *plugins))
+    assert evlcp("receive", "camera:0", "-o", tmp_path / "out").code == 0
+    assert summary_of(tmp_path / "out")["recording"]["path"] == "camera:0"
+    with open_source(demo_raw) as source:
+        assert isinstance(source, RawSource)
+
+
+def test_info(evlcp: Evlcp, demo_raw: Path) -> None:
+    done = evlcp("info", demo_raw)
+    assert done.code == 0
+    lines = done.out.splitlines()
+    assert "sensor     1280 x 720" in lines
+    assert "events     764,142, 43% positive" in lines
+    assert "anomalies  none" in lines
+    table = json.loads(evlcp("info", demo_raw, "--json").out)
+    assert table["counts"]["events"] == 764_142
+    assert table["duration_s"] == pytest.approx(0.08, abs=1e-4)
+    assert table["peak_events_per_s"] >= table["events_per_s"]
+
+
+def test_info_tells_triggers_and_anomalies(evlcp: Evlcp, tmp_path: Path) -> None:
+    path = tmp_path / "t.raw"
+    events = Events.of(np.arange(100) * 10, np.zeros(100), np.zeros(100), np.ones(100))
+    write_events(path, events, 1280, 720, triggers=Triggers.of([5, 505], [2, 2], [1, 0]))
+    path.write_bytes(path.read_bytes() + b"\x01")
+    done = evlcp("info", path)
+    assert done.code == 0
+    assert "triggers   channel 2 falling: 1\n           channel 2 rising: 1\n" in done.out
+    assert "at byte" in done.out.split("anomalies")[1]
+    table = json.loads(evlcp("info", path, "--json").out)
+    assert len(table["losses"]) == 1
+
+
+def test_what_a_reader_lost_is_told(evlcp: Evlcp, noise_raw: Path, tmp_path: Path) -> None:
+    noise_raw.write_bytes(noise_raw.read_bytes() + b"\x01")
+    done = evlcp("receive", noise_raw, "-o", tmp_path / "out")
+    assert done.code == 0
+    assert "lost: 1 " in done.out
+    (loss,) = summary_of(tmp_path / "out")["losses"].values()
+    assert (loss["count"], loss["unit"]) == (1, "byte")
+    assert loss["first"] == noise_raw.stat().st_size - 1
+
+
+def test_config_prints_what_it_loads(evlcp: Evlcp, tmp_path: Path) -> None:
+    text = evlcp("config", "--set", "modulation.id=wh8").out
+    (tmp_path / "link.toml").write_text(text)
+    assert evlcp("config", "-c", tmp_path / "link.toml").out == text
+    digest = evlcp("config", "-c", tmp_path / "link.toml", "--digest").out.strip()
+    assert digest in text
+    table = json.loads(evlcp("config", "--set", "modulation.id=wh8", "--json").out)
+    assert table["digest"] == digest
+    book = json.loads(evlcp("config", "--set", "modulation.id=wh8", "--codebook", "json").out)
+    assert book["digest"] == table["codebook"]["digest"]
+    assert "evlcp_pilots[16]" in evlcp("config", "--codebook", "c").out
+    assert evlcp("config", "--json", "--digest").code == 2
+
+
+def test_examples_are_links(evlcp: Evlcp) -> None:
+    examples = Path(__file__).parents[3] / "examples"
+    default = evlcp("config", "--digest").out
+    assert evlcp("config", "-c", examples / "link.toml", "--digest").out == default
+    table = json.loads(evlcp("config", "-c", examples / "two-clusters.toml", "--json").out)
+    assert table["configuration"]["ranging"]["clusters"] == [1, 14]
+
+
+def test_demo_against_the_truth(evlcp: Evlcp, tmp_path: Path) -> None:
+    done = evlcp("demo", "--recording", "-o", tmp_path, "--json")
+    assert done.code == 0
+    result = json.loads(done.out)["score"]
+    assert result["found"] >= 0.9 * result["sent"]
+    assert result["unmatched"] == 0
+    assert result["bit_errors"] <= 1e-3 * result["bits"]
+    assert result["rmse_m"] <= 0.12
+    assert names_in(tmp_path) == FILES | set(FIGURE_NAMES)
+    shown = evlcp("demo", "--recording", "-o", tmp_path).out
+    assert "against the truth: " in shown
+    assert all(len(line) <= 80 for line in shown.splitlines() if "±" in line)
+
+
+def test_score_counts_errors() -> None:
+    truth = {
+        "bits_per_symbol": 6,
+        "tolerance_us": 800,
+        "frames": [
+            {"t_us": 1000.0, "symbols": [1, 2], "distance_m": 50.0},
+            {"t_us": 4200.0, "symbols": [3, 4], "distance_m": 49.0},
+        ],
+    }
+    rows = [
+        {"t_us": "1100", "symbols": "1 0", "distance_m": "50.3"},
+        {"t_us": "1200", "symbols": "1 2", "distance_m": "50.0"},
+        {"t_us": "9000", "symbols": "3 4", "distance_m": ""},
+    ]
+    result = score(rows, truth)
+    assert (result.found, result.sent, result.unmatched) == (1, 2, 2)
+    assert (result.bit_errors, result.bits) == (1, 12)
+    assert result.rmse_m == pytest.approx(0.3)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a POSIX shell")
+def test_a_closed_pipe_is_silent() -> None:
+    command = f"{sys.executable} -c 'from evlcp_sdk.cli.main import main; main()' config | head -1"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    assert done.stdout.startswith("# EVLCP link")
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated drive towards two bars that send their beacons, with its truth and sites."""
+    folder = tmp_path_factory.mktemp("street")
+    bar = 'payload = "messages"\ny_m = -3.5\n'
+    (folder / "scene.toml").write_text(
+        "duration_s = 0.16\nseed = 3\n[world]\nlatitude_deg = 35.1\nlongitude_deg = 137.0\nheight_m = 50.0\n"
+        "[motion]\npitch_deg = 4.0\nvib_rate_rad_s = 0.0\n"
+        f"[[bars]]\nx_m = -3.0\n{bar}[[bars]]\nx_m = 3.0\nz_m = -5.0\n{bar}"
+    )
+    code = (
+        "from pathlib import Path; import json, sys\n"
+        "from evlcp_sdk.cli.main import main\n"
+        "sys.argv = ['evlcp', 'simulate', 'scene.toml', '-o', 'rec.raw']\nmain()\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=folder, stdout=subprocess.DEVNULL)
+    sites = json.loads((folder / "rec.truth.json").read_text())["sites"]
+    lines = ["[[bar]]\n" + "".join(f"{k} = {v}\n" for k, v in s.items() if v is not None) for s in sites]
+    (folder / "site.toml").write_text("\n".join(lines))
+    return folder
+
+
+def test_receive_writes_positions(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
+    angles = ("--pitch-deg", "4", "--roll-deg", "0", "--gravity-sigma-deg", "0.01")
+    done = evlcp(
+        "receive", street / "rec.raw", "-o", tmp_path, "--sites", street / "site.toml", *angles, "--figures"
+    )
+    assert done.code == 0
+    assert done.err == ""
+    files = {"fixes.csv", "track.csv", "fixes.geojson", "fixes.nmea", "track.png"}
+    assert names_in(tmp_path) == FILES | files | set(FIGURE_NAMES)
+    told = summary_of(tmp_path)["positions"]
+    assert told["fixes"] >= 3
+    assert sorted(told["bars"].values()) == [1, 2]
+    assert f"{told['fixes']} positions" in done.out
+    with (tmp_path / "fixes.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if not row["refusal"]]
+    truth = json.loads((street / "rec.truth.json").read_text())
+    path = truth["camera_path"]
+    for row in rows:
+        at = float(row["t_us"]) * 1e-6
+        for key, metres in (("latitude_deg", 111_000), ("longitude_deg", 91_000), ("height_m", 1)):
+            off = float(row[key]) - np.interp(at, truth["t_s"], path[key])
+            assert abs(off) * metres < 0.15
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--heading-deg", "3"], "needs --sites"),
+        (["--sites", "S", "--heading-deg", "3"], "a heading needs gravity"),
+        (["--sites", "S", "--pitch-deg", "3"], "gravity needs --pitch-deg and --roll-deg"),
+        (["--sites", "S", "--attitude", "a.csv", "--pitch-deg", "3", "--roll-deg", "0"], "not both"),
+        (["--sites", "S", "--clock-zero", "noon"], "expected a time such as"),
+        (["--sites", "S", "--clock-zero", "0001-01-01T00:00:00+10:00"], "expected 1970 to 2199"),
+        (["--sites", "S", "--clock-zero", "1960-01-01", "--mcap"], "expected 1970 to 2199"),
+        (["--sites", "S", "--clock-zero", "9999-12-31T23:59:59.9"], "expected 1970 to 2199"),
+        (["--sites", "S", "--heading-deg", "nan", "--pitch-deg", "3", "--roll-deg", "0"], "--heading-deg"),
+        (["--sites", "S", "--pitch-deg", "inf", "--roll-deg", "0"], "inf: expected a finite number"),
+        (["--sites", "none.toml"], "none.toml: cannot be read"),
+        (["--sites", "S", "--attitude", "none.csv"], "none.csv: cannot be read"),
+    ],
+)
+def test_faults_of_position_options(
+    evlcp: Evlcp, street: Path, tmp_path: Path, options: list[str], says: str
+) -> None:
+    given = [str(street / "site.toml") if o == "S" else o for o in options]
+    done = evlcp("receive", street / "rec.raw", "-o", tmp_path / "out", *given)
+    assert done.code in (2, 3)
+    assert says in " ".join(done.err.replace("│", " ").split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_calibrate_finds_the_focal_length(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
+    truth = json.loads((street / "rec.truth.json").read_text())
+    path = truth["camera_path"]
+    names = ("latitude_deg", "longitude_deg", "height_m", "heading_deg", "pitch_deg", "roll_deg")
+    lines = ["t_us," + ",".join(names) + ",attitude_sigma_deg"]
+    for ms in (50, 80, 110):
+        lines.append(f"{ms * 1000}," + ",".join(str(path[name][ms]) for name in names) + ",0.01")
+    poses = tmp_path / "poses.csv"
+    poses.write_text("\n".join(lines) + "\n")
+    given = ("calibrate", street / "rec.raw", "--sites", street / "site.toml", "--poses", poses)
+    done = evlcp(*given, "--set", "camera.focal_mm=34.7")
+    assert done.code == 0, done.err
+    table = tomllib.loads(done.out)["camera"]
+    told = json.loads(evlcp(*given, "--json").out)
+    assert abs(table["focal_mm"] - 35) < 5 * told["sigma"]["focal_mm"]
+    assert told["sigma"]["focal_mm"] < 0.05
+    assert told["camera"]["focal_mm"] == pytest.approx(table["focal_mm"], abs=1e-4)
+    assert told["views"] == 3
+    # A table for link.toml.
+    link = tmp_path / "link.toml"
+    link.write_text(done.out)
+    assert evlcp("config", "--digest", "-c", link).code == 0
+    assert told["poses"] == 3
+    poses.write_text("\n".join([*lines, lines[-1].replace("110000", "9110000", 1)]) + "\n")
+    assert "# 1 of 4 poses show no bar\n" in evlcp(*given).out
+    poses.write_text("recording," + "\nother.raw,".join(lines))
+    assert "line 2" in evlcp(*given).err
+    poses.write_text("\n".join(lines) + "\n")
+    other = tmp_path / "site.toml"
+    other.write_text((street / "site.toml").read_text().replace("length_m = 0.96", "length_m = 1.5"))
+    assert "0.96 m long, its site 1.5 m" in evlcp("calibrate", *given[1:3], other, *given[4:]).err

@@ -1,0 +1,200 @@
+"""`evlcp compare` on the shipped recording and on a campaign's results."""
+
+import csv
+import io
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from evlcp_sdk.jobs.executor import Inline
+from evlcp_sdk.study.campaign.collect import collect
+from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.score import read_frames, read_truth
+from tests.unit.study.campaign.fake import fake_plan, run_fake
+
+Evlcp = Callable[..., Any]
+VARIANTS = {
+    "paper": (),
+    "filtered": ("ranging.id=joint-scale", "tracking.id=kalman"),
+    "coarse": ("ranging.id=centroid", "ranging.skip_outer=2"),
+}
+OPTIONS = [part for name, s in VARIANTS.items() for part in ("--variant", f"{name}:{','.join(s)}")]
+TIMES = ("us_per_frame", "separation_us", "decoding_us", "ranging_us", "cpu_s", "times_real_time", "best")
+
+
+@pytest.fixture
+def recording(tmp_path: Path, demo_raw: Path) -> Path:
+    """The shipped recording with its truth, in a folder of its own."""
+    for path in (demo_raw, demo_raw.with_suffix(".truth.json")):
+        shutil.copy(path, tmp_path / path.name.replace(demo_raw.stem, "REC"))
+    return tmp_path / "REC.raw"
+
+
+def test_the_numbers_are_those_of_receive_and_score(evlcp: Evlcp, recording: Path, tmp_path: Path) -> None:
+    done = evlcp("compare", recording, *OPTIONS, "--json")
+    assert (done.code, done.err) == (0, "")
+    rows = {row["variant"]: row for row in json.loads(done.out)["rows"]}
+    truth = read_truth(tmp_path / "REC.truth.json")
+    for name, settings in VARIANTS.items():
+        options = [part for setting in settings for part in ("--set", setting)]
+        assert evlcp("receive", recording, "-o", tmp_path / name, *options).code == 0
+        told = json.loads(evlcp("score", tmp_path / name, tmp_path / "REC.truth.json", "--json").out)
+        (bar,), row = told["bars"], rows[name]
+        for mine, theirs in (
+            (row["frames"], told["rows"]),
+            (row["unmatched"], told["unmatched"]),
+            (row["frames_found"], bar["frames_found"]),
+            (row["frames_sent"], bar["frames_sent"]),
+            (row["bits"], bar["bits"]),
+            (row["bit_errors"], bar["bit_errors"]),
+            (row["ranged"], bar["ranged"]),
+            (round(row["ber"], 6), bar["ber"]),
+            (round(row["rmse_m"], 4), bar["rmse_m"]),
+            (round(row["gross_share"], 4), bar["over_half_metre"]),
+        ):
+            assert mine == theirs
+        frames = read_frames(tmp_path / name)
+        assert row["packets"] == len((tmp_path / name / "packets.jsonl").read_text().splitlines())
+        stated = np.array([float(f["distance_sigma_m"]) for f in frames])
+        assert row["sigma_m"] == pytest.approx(np.sqrt(np.mean(stated**2)))
+        if name == "filtered":
+            t_us = np.array([float(f["t_us"]) for f in frames]) - truth["scene"]["t0_us"]
+            true_m = np.interp(t_us + 800, np.array(truth["t_s"]) * 1e6, truth["distance_m"][0])
+            off = np.array([float(f["distance_filtered_m"]) for f in frames]) - true_m
+            assert row["filtered_rmse_m"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=0.01)
+        else:
+            assert row["filtered_rmse_m"] is None
+        assert row["us_per_frame"] > 0
+        assert row["times_real_time"] == pytest.approx(row["recorded_s"] / row["cpu_s"])
+    # The bound: less than what any one reaches, and no other order of size than the best.
+    bounds = {row["cramer_rao_bound_m"] for row in rows.values()}
+    assert len(bounds) == 1
+    best = min(row["rmse_m"] for row in rows.values())
+    assert best / 3 < bounds.pop() < 1.2 * best
+
+
+def test_text_and_files(
+    evlcp: Evlcp, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NO_COLOR", "1")
+    second = tmp_path / "other.raw"
+    shutil.copy(recording, second)
+    files = [tmp_path / f"t{suffix}" for suffix in (".csv", ".html", ".json")]
+    options = [part for path in files for part in ("-o", path)]
+    done = evlcp("compare", recording, second, *OPTIONS[:4], *options, "-j", "2")
+    assert done.code == 0
+    assert "\x1b" not in done.out
+    assert done.out.count("Cramer-Rao bound") == 3
+    assert "\nall\n" in done.out
+    assert f"{second}: no other.truth.json beside it, so no BER and no distance error" in done.out
+    with files[0].open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    table = json.loads(files[2].read_text())
+    assert [row["recording"] for row in rows] == [str(recording)] * 2 + [str(second)] * 2 + ["all"] * 2
+    assert [row["variant"] for row in table["rows"]] == ["paper", "filtered"] * 3
+    paper, filtered, blind, *_ = rows
+    assert "rmse_m" in filtered["best"].split()
+    assert f"{float(filtered['rmse_m']):.4f}*" in done.out
+    assert blind["ber"] == blind["rmse_m"] == blind["frames_sent"] == ""
+    assert blind["frames"] == paper["frames"]
+    assert blind["sigma_m"] == paper["sigma_m"]
+    assert files[1].read_text().startswith("<!DOCTYPE html>")
+    # In this process or another: the same, but for the time.
+    here = json.loads(evlcp("compare", recording, *OPTIONS[:4], "--json").out)["rows"]
+    for one, other in zip(here, table["rows"], strict=False):
+        assert {k: v for k, v in one.items() if k not in TIMES} == {
+            k: v for k, v in other.items() if k not in TIMES
+        }
+
+
+@pytest.mark.parametrize("width", [80, 150])
+def test_no_figure_is_cut_on_a_narrow_screen(
+    evlcp: Evlcp, recording: Path, monkeypatch: pytest.MonkeyPatch, width: int
+) -> None:
+    said = io.StringIO()
+    screen = Console(file=said, width=width, force_terminal=True, no_color=True, soft_wrap=True)
+    monkeypatch.setattr("evlcp_sdk.cli.compare.console", lambda: screen)
+    done = evlcp("compare", recording, *OPTIONS[:4], "-o", recording.with_suffix(".csv"))
+    assert done.code == 0
+    text = re.sub(r"\x1b\[[0-9;]*m", "", said.getvalue())
+    lines = text.split("* best of its column")[0].splitlines()[1:]
+    assert max(map(len, lines)) <= width
+    assert ("…" in text, lines[0].split()[1]) == (False, "paper" if width == 80 else "frames")
+    with recording.with_suffix(".csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            assert f"{float(row['rmse_m']):.4f}" in text
+            assert f"{float(row['bias_m']):+.4f}" in text
+
+
+def test_a_camera_of_positive_events_has_no_bound(evlcp: Evlcp, recording: Path) -> None:
+    done = evlcp("compare", recording, "--variant", "a:", "--set", "regions.positive_only=true")
+    assert done.code == 0
+    assert "Cramer-Rao" not in done.out.split("* best")[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "told"),
+    [
+        ((), 2, "name at least one"),
+        (("--variant", "a"), 2, "evlcp: --variant a: expected NAME:TABLE.KEY=VALUE"),
+        (("--variant", "a:", "--variant", "a:"), 2, "the name 'a' is taken"),
+        (("--variant", "a:ranging.id=pco"), 2, "--variant a: no ranging algorithm named 'pco'"),
+        (("--variant", "a:", "-o", "t.pdf"), 2, ".csv, .html"),
+        (("--variant", "a:", "-o", "none/t.csv"), 2, "none/t.csv: cannot be written: no folder none"),
+        (("REC.raw", "--variant", "a:"), 2, "REC.raw is named twice"),
+        (("paper.toml",), 2, "evlcp sweep paper.toml -o R.sqlite, then evlcp compare R.sqlite"),
+        (("none.sqlite",), 2, "stand alone"),
+        (("--variant", "a:modulation.id=wh8"), 2, "REC.raw: sent with 'wh4x2', but the variant 'a' receives"),
+        (("--variant", "a:camera.width=640"), 2, "recorded with 1280 x 720 pixels"),
+    ],
+)
+def test_faults(
+    evlcp: Evlcp,
+    recording: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: tuple[str, ...],
+    code: int,
+    told: str,
+) -> None:
+    monkeypatch.chdir(recording.parent)
+    done = evlcp("compare", "REC.raw", *arguments)
+    assert done.code == code
+    assert told in " ".join(done.err.replace("│", " ").split())
+    assert "Traceback" not in done.err
+    assert done.out == ""
+
+
+def test_of_several_recordings_the_others_are_compared(evlcp: Evlcp, recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "torn.truth.json").write_text("{")
+    shutil.copy(recording, tmp_path / "torn.raw")
+    done = evlcp(
+        "compare", tmp_path / "none.raw", tmp_path / "torn.raw", recording, "--variant", "a:", "--json"
+    )
+    assert done.code == 3
+    missing, torn = done.err.splitlines()
+    assert missing == f"evlcp: {tmp_path}/none.raw: No such file or directory"
+    assert torn.startswith(f"evlcp: {tmp_path}/torn.truth.json: not JSON")
+    assert [row["recording"] for row in json.loads(done.out)["rows"]] == [str(recording)]
+
+
+def test_results_of_a_campaign(evlcp: Evlcp, tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    assert evlcp("compare", tmp_path / "r.sqlite").code == 3
+    with Store(results, create=True) as store:
+        collect(fake_plan(scenes=2), store, Inline(), run_fake)
+    done = evlcp("compare", results)
+    assert (done.code, done.err) == (0, "")
+    for text in ("distance 30 m", "distance 40 m", "all scenes", "link 0", "link 1", "campaign fake"):
+        assert text in done.out
+    refused = evlcp("compare", results, "--variant", "a:")
+    assert (refused.code, refused.out) == (2, "")
+    rows = json.loads(evlcp("compare", results, "--json").out)["rows"]
+    assert len(rows) == 6
+    assert {row["packets"] for row in rows} == {None}

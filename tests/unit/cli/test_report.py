@@ -1,0 +1,196 @@
+"""The report: what the page holds, that it needs no network, and that a browser draws it."""
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.jobs.executor import Inline
+from evlcp_sdk.study.campaign.charts import charts_of, save_charts
+from evlcp_sdk.study.campaign.collect import collect
+from evlcp_sdk.study.campaign.paper import PAPER
+from evlcp_sdk.study.campaign.plan import Case, Plan, make_plan
+from evlcp_sdk.study.campaign.report import page, save_page
+from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.campaign.summary import Series, Summary, compare, measure, summarize
+from evlcp_sdk.study.tally import Statistics, Tally
+from tests.unit.study.campaign.browser import CHROMIUM, Browser
+from tests.unit.study.campaign.fake import run_fake
+
+TWO = "two clusters <!--<script>"
+"""In a script element, such a name would keep its end tag from ending it."""
+
+CHARTS = ("ber", "rmse", "gross", "found", "histogram")
+
+
+def plan_of_two_methods() -> Plan:
+    """Drives at two speeds through five segments, received with 16 clusters and with two."""
+    bar = {"rows": 96, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
+    methods = {"16 clusters": {}, TWO: {"clusters": [1, 14]}}
+    return make_plan(
+        "two methods </script>",
+        [
+            Case((("speed_kmh", v), ("distance_m", 30.0 + 10 * n)), {"n": n}, {"n": n, "speed_kmh": v})
+            for v in (20, 30)
+            for n in range(5)
+        ],
+        [
+            Case((("variant", name),), i, {"table": {"bar": bar, "ranging": ranging}, "digest": "d" * 64})
+            for i, (name, ranging) in enumerate(methods.items())
+        ],
+        range(2),
+        merge=["scene.distance_m"],
+        environment={"evlcp-sdk": "0"},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def summary(tmp_path_factory: pytest.TempPathFactory) -> Summary:
+    with Store(tmp_path_factory.mktemp("report") / "a.sqlite", create=True) as store:
+        collect(plan_of_two_methods(), store, Inline(), run_fake)
+        return summarize(store)
+
+
+def test_points_that_differ_in_distance_only_are_one_series(summary: Summary) -> None:
+    assert [s.name for s in summary.series] == [
+        "20 km/h, 16 clusters",
+        f"20 km/h, {TWO}",
+        "30 km/h, 16 clusters",
+        f"30 km/h, {TWO}",
+    ]
+    for series in summary.series:
+        assert [at for at, _ in series.statistics.segments] == [30, 40, 50, 60, 70]
+        assert series.statistics.tasks == 10
+    assert [s.clusters for s in summary.series] == [16, 2, 16, 2]
+    assert [s.speed_kmh for s in summary.series] == [20, 20, 30, 30]
+
+
+def test_the_paper_is_held_beside_the_series_it_speaks_of(summary: Summary) -> None:
+    found = compare(summary.series)
+    by_name = {(c.reference.measure, c.reference.from_m, c.reference.clusters): c.series for c in found}
+    assert by_name["rmse_m", 30, 16].startswith("30 km/h, 16")
+    assert by_name["rmse_m", 30, 2].startswith("30 km/h, two")
+    assert sum(c.reference.measure == "ber" for c in found) == 2
+    ours = Series({}, {"speed_kmh": 30}, summary.series[0].link, Statistics())
+    assert compare([ours]) == []
+
+
+def test_agreement_is_a_kept_bound_or_a_figure_within_30_percent(summary: Summary) -> None:
+    link = summary.series[0].link
+    for reference in PAPER:
+        if reference.measure != "rmse_m" or reference.clusters != 16:
+            continue
+        for factor, agrees in (
+            (1.4, False),
+            (0.99, True),
+            (0.5, reference.bound),
+            (1.25, not reference.bound),
+        ):
+            tally = Tally.found(96, 0, reference.value * factor)
+            at = Statistics.of(1, 0, 0, 0, [(reference.from_m, tally)])
+            (one,) = compare([Series({}, {"speed_kmh": 30}, link, at)], [reference])
+            assert one.agrees is agrees, (reference, factor)
+
+
+def test_no_errors_and_no_data_have_figures() -> None:
+    none = measure(Tally(bits=10_000), "ber")
+    assert (none.value, none.low) == (0, 0)
+    assert 3e-4 < none.high < 4e-4
+    assert measure(Tally(), "rmse_m").count == 0
+    assert measure(Tally(), "gross_share").count == 0
+
+
+def test_json_has_every_figure(summary: Summary) -> None:
+    table = json.loads(json.dumps(summary.to_dict(), allow_nan=False))
+    assert len(table["series"]) == 4
+    first = table["series"][0]["segments"][0]
+    assert first["ber"]["value"] == first["bit_errors"] / first["bits"]
+    assert {"ours", "agrees", "value"} <= set(table["paper"][0])
+
+
+def test_charts_are_saved_as_png_and_svg(summary: Summary, tmp_path: Path) -> None:
+    written = save_charts(charts_of(summary), summary.name, tmp_path / "figures")
+    assert [p.name for p in written] == [f"{c}.{kind}" for c in CHARTS for kind in ("png", "svg")]
+    for path in written:
+        assert path.read_bytes().startswith((b"\x89PNG", b"<?xml"))
+
+
+def test_an_empty_campaign_has_a_page(tmp_path: Path) -> None:
+    pytest.importorskip("plotly", reason="the extra report is not installed")
+    with Store(tmp_path / "a.sqlite", create=True) as store:
+        store.adopt(plan_of_two_methods())
+        nothing = summarize(store)
+    assert "0 of 40 tasks" in page(nothing)
+    assert len(save_charts(charts_of(nothing), "nothing", tmp_path)) == 10
+
+
+def test_without_plotly(summary: Summary, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "plotly.offline", None)
+    with pytest.raises(ConfigError, match="pip install 'evlcp-sdk\\[report\\]'"):
+        page(summary)
+
+
+def test_the_page_tells_everything(summary: Summary) -> None:
+    pytest.importorskip("plotly", reason="the extra report is not installed")
+    text = page(summary)
+    assert summary.digest in text
+    assert "arXiv 2510.17203" in text
+    assert "d" * 64 in text
+    for tag in re.findall(
+        r"<(?:script|link|img|iframe)[^>]*>", re.sub(r"<script>.*?</script>", "", text, flags=re.S)
+    ):
+        assert "src=" not in tag
+        assert 'href="data:,"' in tag or "href=" not in tag
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) -> None:
+    pytest.importorskip("plotly", reason="the extra report is not installed")
+    save_page(summary, tmp_path / "report.html")
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(tmp_path / "report.html")
+        drawn = browser.value(
+            "Object.fromEntries([...document.querySelectorAll('.chart')].map(e =>"
+            " [e.id, e.querySelectorAll('.scatterlayer .trace').length]))"
+        )
+        assert set(drawn) == set(CHARTS)
+        assert drawn["histogram"] == 4
+        assert drawn["rmse"] > 4, "the paper's figures are missing"
+        assert browser.value("document.querySelectorAll('table tr').length") > 20
+        offers = browser.value("[...document.querySelectorAll('.modebar-btn')].map(b => b.dataset.title)")
+        assert offers
+        assert not [title for title in offers if "loud" in title], "the page offers an upload"
+        for chart in CHARTS:
+            told = hovered(browser, chart)
+            assert "km/h" in told, f"{chart}: nothing is told where the pointer is"
+        asked = [
+            m["params"]["request"]["url"]
+            for m in browser.heard
+            if m.get("method") == "Network.requestWillBeSent"
+        ]
+        assert {url.split(":")[0] for url in asked} <= {"file", "data", "blob"}
+        wrong = [m for m in browser.heard if m.get("method") == "Runtime.exceptionThrown"]
+        assert wrong == []
+
+
+def hovered(browser: Browser, chart: str) -> str:
+    """What a chart tells when the pointer is on the first dot of its first line."""
+    place: dict[str, Any] = browser.value(
+        f"(() => {{ const e = document.getElementById('{chart}'); e.scrollIntoView({{block: 'center'}});"
+        " const l = e._fullLayout, r = e.getBoundingClientRect();"
+        " const t = e.data[0], i = Math.floor(t.x.length / 2);"
+        " return {x: r.left + l.xaxis._offset + l.xaxis.c2p(t.x[i]),"
+        " y: r.top + l.yaxis._offset + l.yaxis.c2p(t.y[i])} })()"
+    )
+    browser.point_at(place["x"], place["y"])
+    return str(
+        browser.value(
+            "new Promise(done => { const until = Date.now() + 3000; const look = () => {"
+            f" const h = document.querySelector('#{chart} .hoverlayer .hovertext');"
+            " h || Date.now() > until ? done(h ? h.textContent : '') : setTimeout(look, 30) }; look() })"
+        )
+    )

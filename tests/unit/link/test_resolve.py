@@ -1,0 +1,330 @@
+"""link.toml: what is refused and how it is said, overrides, the digest, and the commented text."""
+
+import json
+import pickle
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pluggy
+import pytest
+from numpy.typing import NDArray
+from pydantic import Field
+
+from evlcp_sdk.air.codebook import BARKER13, Codebook, hadamard
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.errors import ConfigError, UnknownAlgorithmError
+from evlcp_sdk.link.resolve import DEFAULT_IDS, Link, load_link, resolve
+from evlcp_sdk.link.text import to_toml
+from evlcp_sdk.plugin import hooks as hookspecs
+from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
+from evlcp_sdk.plugin.registry import Registry, installed_versions
+from evlcp_sdk.plugin.roles import (
+    Code,
+    Decode,
+    Decoding,
+    ErrorCorrection,
+    Measure,
+    Modulation,
+    Pilots,
+    Ranging,
+    Separate,
+    Separation,
+    Synchronization,
+    Synchronizer,
+    Tracker,
+    Tracking,
+)
+from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.camera import CameraModel
+
+
+@dataclass(frozen=True)
+class FakePilots(Pilots):
+    def preamble(self) -> NDArray[np.int8]:
+        return np.array(BARKER13, np.int8)
+
+    def codes(self, clusters: int) -> NDArray[np.int8]:
+        if clusters > 16:
+            raise ConfigError(f"pilots 'wh': {clusters} clusters, expected at most 16")
+        return np.concatenate([hadamard(8), -hadamard(8)])[:clusters]
+
+
+@dataclass(frozen=True)
+class FakeModulation(Modulation):
+    def codewords(self) -> NDArray[np.int8]:
+        return np.concatenate([hadamard(8), -hadamard(8)])
+
+
+@dataclass(frozen=True)
+class FakeSynchronization(Synchronization):
+    def compile(self, codebook: Codebook, packet: PacketFormat) -> Synchronizer:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class FakeSeparation(Separation):
+    def compile(self, codebook: Codebook) -> Separate:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class FakeDecoding(Decoding):
+    def compile(self, codebook: Codebook) -> Decode:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class FakeRanging(Ranging):
+    """Distance out of thin air."""
+
+    min_spacing: Annotated[int, Field(ge=1, le=15, description="Clusters between the two of a pair.")] = 8
+    window_px: Annotated[float, Field(gt=0, description="Half width of the fit.")] = 2
+    kernel: Annotated[Literal["sinc", "gauss"], Field(description="What is fitted.")] = "sinc"
+    drop: Annotated[tuple[int, ...], Field(description="Clusters left out.")] = (0, 15)
+    trim: bool = True
+    limit_m: Annotated[float | None, Field(description="Farthest distance told.")] = None
+
+    def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class FakeTracking(Tracking):
+    def compile(self) -> Tracker:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class FakeErrorCorrection(ErrorCorrection):
+    def compile(self, coded_bits: int) -> Code:
+        raise NotImplementedError
+
+
+class Fakes:
+    def __init__(self, revision: int = 1) -> None:
+        self.revision = revision
+
+    @hookimpl
+    def evlcp_algorithms(self) -> Iterator[Algorithm]:
+        for role, name in DEFAULT_IDS.items():
+            target = f"{__name__}:Fake{role.title().replace('-', '')}"
+            yield Algorithm(role, name, target, self.revision if role == "ranging" else 1, "a fake")
+        yield Algorithm("ranging", "centroid", f"{__name__}:FakeRanging", 3, "another fake")
+
+
+def registry_of(*plugins: object) -> Registry:
+    manager = pluggy.PluginManager(hookspecs.ENTRY_POINT_GROUP)
+    manager.add_hookspecs(hookspecs)
+    for plugin in plugins:
+        manager.register(plugin)
+    return Registry(manager)
+
+
+@pytest.fixture
+def registry() -> Registry:
+    return registry_of(Fakes())
+
+
+def faults_of(registry: Registry, text: str, tmp_path: Path, *overrides: str) -> list[str]:
+    path = tmp_path / "link.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load_link(path, overrides, registry)
+    assert caught.value.exit_code == 2
+    return str(caught.value).replace(f"{tmp_path}/", "").splitlines()
+
+
+def test_defaults_are_all_written_out(registry: Registry) -> None:
+    link = load_link(None, (), registry)
+    assert list(link.table) == [
+        *("camera", "bar", "air", "regions", "messages", "position"),
+        *("pilots", "modulation", "synchronization", "separation", "decoding", "ranging", "tracking"),
+        "error-correction",
+    ]
+    assert link.table["air"] == {"chip_rate_hz": 10_000.0, "frames_per_packet": 10, "pilot_every": 1}
+    assert link.table["ranging"] == {
+        "id": "poc",
+        "min_spacing": 8,
+        "window_px": 2.0,
+        "kernel": "sinc",
+        "drop": [0, 15],
+        "trim": True,
+        "limit_m": None,
+    }
+    assert link.algorithm("ranging") == FakeRanging()
+    assert link.packet.packet_chips == 346
+    assert json.loads(json.dumps(link.table)) == link.table
+
+
+def test_values_reach_the_objects(registry: Registry) -> None:
+    table = {"bar": {"rows": 48}, "ranging": {"id": "centroid", "drop": [1], "window_px": 3}}
+    link = resolve(table, registry)
+    assert link.codebook.clusters == 8
+    assert link.algorithm("ranging") == FakeRanging(drop=(1,), window_px=3.0)
+    assert link.revisions["ranging"] == 3
+
+
+@pytest.mark.parametrize(
+    ("override", "section", "key", "value"),
+    [
+        ("ranging.id=centroid", "ranging", "id", "centroid"),
+        ("ranging.window_px=2.5", "ranging", "window_px", 2.5),
+        ("ranging.trim = false", "ranging", "trim", False),
+        ("ranging.drop=[0, 1]", "ranging", "drop", [0, 1]),
+        ('ranging.kernel="gauss"', "ranging", "kernel", "gauss"),
+        ("air.frames_per_packet=4", "air", "frames_per_packet", 4),
+    ],
+)
+def test_overrides(registry: Registry, override: str, section: str, key: str, value: Any) -> None:
+    assert load_link(None, [override], registry).table[section][key] == value
+
+
+def test_an_override_beats_the_file_and_the_last_beats_the_first(registry: Registry, tmp_path: Path) -> None:
+    path = tmp_path / "link.toml"
+    path.write_text("[ranging]\nmin_spacing = 4\ntrim = false\n")
+    link = load_link(path, ["ranging.min_spacing=5", "ranging.min_spacing=6"], registry)
+    assert (link.algorithm("ranging").min_spacing, link.algorithm("ranging").trim) == (6, False)
+
+
+@pytest.mark.parametrize("override", ["ranging", "ranging.id", "=3", "ranging=3", ".id=3", "ranging.=3"])
+def test_an_override_of_another_form(registry: Registry, override: str) -> None:
+    with pytest.raises(ConfigError, match=r"^--set .*: expected table\.key=value, e\.g\."):
+        load_link(None, [override], registry)
+
+
+def test_every_fault_of_a_file_is_told(registry: Registry, tmp_path: Path) -> None:
+    text = """
+    camra.width = 3
+    decoding = 4
+    [camera]
+    width = 0
+    focal_mm = "35"
+    [air]
+    frames_per_packet = 2.5
+    [modulation]
+    id = 8
+    [regions]
+    step_us = "slow"
+    [ranging]
+    min_spaceing = 9
+    min_spacing = 16
+    trim = 1
+    kernel = "sink"
+    window_px = nan
+    """
+    assert faults_of(registry, text, tmp_path, "bar.led_pitch_m=-1", "lamp.on=1") == [
+        "link.toml: camra: unknown table; did you mean 'camera'? (known: camera, bar, air, regions, messages,"
+        " position, pilots, modulation, synchronization, separation, decoding, ranging, tracking,"
+        " error-correction)",
+        "link.toml: decoding = 4: expected a table",
+        "--set: lamp.on: unknown table (known: camera, bar, air, regions, messages, position,"
+        " pilots, modulation, synchronization, separation, decoding, ranging, tracking, error-correction)",
+        "link.toml: camera.width = 0: expected greater than 0",
+        'link.toml: camera.focal_mm = "35": expected a valid number',
+        "--set: bar.led_pitch_m = -1: expected greater than 0",
+        "link.toml: air.frames_per_packet = 2.5: expected a valid integer",
+        'link.toml: regions.step_us = "slow": expected a valid integer',
+        "link.toml: modulation.id = 8: expected a string",
+        "link.toml: ranging.min_spacing = 16: expected less than or equal to 15",
+        "link.toml: ranging.window_px = nan: expected a finite number",
+        "link.toml: ranging.kernel = \"sink\": expected 'sinc' or 'gauss'",
+        "link.toml: ranging.trim = 1: expected a valid boolean",
+        "link.toml: ranging.min_spaceing = 9: unknown key; did you mean 'min_spacing'?"
+        " (known: min_spacing, window_px, kernel, drop, trim, limit_m)",
+    ]
+
+
+def test_a_wrong_id_says_exactly_this(registry: Registry) -> None:
+    with pytest.raises(UnknownAlgorithmError) as caught:
+        load_link(None, ["ranging.id=pco"], registry)
+    expected = "no ranging algorithm named 'pco'; did you mean 'poc'? (installed: centroid, poc)"
+    assert str(caught.value) == expected
+    with pytest.raises(ConfigError) as both:
+        load_link(None, ["ranging.id=pco", "air.frames_per_packet=0"], registry)
+    assert expected in str(both.value).splitlines()
+    assert len(str(both.value).splitlines()) == 2
+
+
+def test_what_is_no_toml(registry: Registry, tmp_path: Path) -> None:
+    assert faults_of(registry, "[air]\nchip_rate_hz = = 3\n", tmp_path) == [
+        "link.toml: not TOML: Invalid value (at line 2, column 16)"
+    ]
+    (tmp_path / "link.toml").write_bytes(b"\x89PNG\r\n")
+    with pytest.raises(ConfigError, match="at byte 0: not UTF-8 text"):
+        load_link(tmp_path / "link.toml", (), registry)
+    with pytest.raises(ConfigError, match="cannot be read: No such file"):
+        load_link(tmp_path / "none.toml", (), registry)
+    with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
+        load_link(tmp_path, (), registry)
+
+
+def test_values_that_do_not_fit_each_other(registry: Registry, tmp_path: Path) -> None:
+    text = "[bar]\ncluster_rows = 7\n[camera]\nwidth = 0\n"
+    assert faults_of(registry, text, tmp_path) == [
+        "link.toml: camera.width = 0: expected greater than 0",
+        "link.toml: bar.cluster_rows = 7: expected a divisor of bar.rows = 96",
+    ]
+
+
+def test_too_many_clusters_for_the_pilots(registry: Registry) -> None:
+    with pytest.raises(ConfigError, match="32 clusters, expected at most 16"):
+        load_link(None, ["bar.cluster_rows=3"], registry)
+
+
+def test_the_digest_holds_table_codebook_and_revisions(registry: Registry) -> None:
+    link = load_link(None, (), registry)
+    assert len(link.digest) == 64
+    assert load_link(None, ["ranging.min_spacing=8"], registry).digest == link.digest
+    assert load_link(None, ["camera.focal_mm=35"], registry).digest == link.digest
+    assert load_link(None, ["ranging.min_spacing=9"], registry).digest != link.digest
+    assert load_link(None, ["ranging.id=centroid"], registry).digest != link.digest
+    assert load_link(None, (), registry_of(Fakes(revision=2))).digest != link.digest
+
+
+OVERRIDES: list[list[str]] = [
+    [],
+    ["ranging.limit_m=120", "ranging.drop=[]", 'ranging.kernel="gauss"', "ranging.window_px=1e-7"],
+    ["ranging.id=centroid", "camera.focal_mm=1e17", "air.chip_rate_hz=12500"],
+]
+
+
+@pytest.mark.parametrize("overrides", OVERRIDES)
+def test_the_commented_text_gives_the_same_link(
+    registry: Registry, tmp_path: Path, overrides: list[str]
+) -> None:
+    link = load_link(None, overrides, registry)
+    path = tmp_path / "link.toml"
+    path.write_text(to_toml(link, registry))
+    again = load_link(path, (), registry)
+    assert (again.digest, again.table) == (link.digest, link.table)
+    assert to_toml(again, registry) == path.read_text()
+
+
+def test_the_text_tells_meaning_unit_bounds_and_default(registry: Registry) -> None:
+    lines = to_toml(load_link(None, ["ranging.window_px=3"], registry), registry).splitlines()
+    i = lines.index("[ranging]")
+    assert lines[i - 1 : i + 6] == [
+        "# Distance out of thin air.",
+        "[ranging]",
+        'id = "poc"  # or centroid',
+        "# Clusters between the two of a pair. [>= 1, <= 15, default 8]",
+        "min_spacing = 8",
+        "# Half width of the fit. [px, > 0, default 2.0]",
+        "window_px = 3.0",
+    ]
+    assert '# What is fitted. ["sinc" | "gauss", default "sinc"]' in lines
+    assert "# Farthest distance told. [m, default none]" in lines
+
+
+def test_a_link_travels_to_another_process(registry: Registry) -> None:
+    link = load_link(None, ["ranging.drop=[3]"], registry)
+    again: Link = pickle.loads(pickle.dumps(link))
+    assert (again.digest, again.algorithm("ranging")) == (link.digest, link.algorithm("ranging"))
+
+
+def test_versions_name_every_distribution(registry: Registry) -> None:
+    found = installed_versions(registry)
+    assert {"python", "evlcp-sdk", "numpy", "scipy", "numba"} <= set(found)

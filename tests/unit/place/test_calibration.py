@@ -1,0 +1,155 @@
+"""Calibration: the camera comes back within its sigmas, or is refused."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.optimize import approx_fprime
+from scipy.spatial.transform import Rotation
+
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.calibration import (
+    PARAMETERS,
+    CalibrationView,
+    _slopes,
+    _turn_slope,
+    calibrate,
+    read_poses,
+)
+from evlcp_sdk.place.pose import BarView, project_bars
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.camera import CameraModel
+
+TRUE = CameraModel(focal_mm=8.2, centre_x_px=652.0, centre_y_px=351.0, k1=-0.12, k2=0.05, p1=8e-4, p2=-5e-4)
+NOMINAL = CameraModel(focal_mm=8.0)
+SPEC = PositionSpec(shared_sigma_px=0)
+ALONG = (0.5 - (np.arange(16) + 0.5) / 16) * 0.96
+
+
+def views(
+    rng: np.random.Generator, count: int, known: bool, noise_px: float = 0.1, bars: int = 6
+) -> list[CalibrationView]:
+    """A camera among poles 8 to 20 m away, that looks about and is rolled."""
+    poles = [
+        np.array([rng.uniform(-9, 9), rng.uniform(8, 20), rng.uniform(-4, 4)]) + ALONG[:, None] * [0, 0, 1]
+        for _ in range(bars)
+    ]
+    found = []
+    while len(found) < count:
+        attitude = Attitude(rng.uniform(-10, 10), rng.choice([0, 90, -90, 180]) + rng.uniform(-5, 5), 0.0)
+        attitude = dataclasses.replace(attitude, heading_deg=rng.uniform(-15, 15))
+        place, rotation = rng.uniform(-1, 1, 3), attitude.rotation()
+        said = place + rng.normal(0, 0.005, 3)
+        turned = Rotation.from_rotvec(np.radians(rng.normal(0, 0.05, 3))).as_matrix() @ rotation
+        seen = []
+        for i, pole in enumerate(poles):
+            points, _ = project_bars(pole, place, rotation, TRUE)
+            inside = (points > 0).all() and (points < [TRUE.width, TRUE.height]).all()
+            if inside:
+                points = points + rng.normal(0, noise_px, points.shape)
+                seen.append(BarView(i, pole, points, np.full(16, noise_px)))
+        if len(seen) >= 2:
+            found.append(CalibrationView(tuple(seen), said, 0.005, turned if known else None, 0.05))
+    return found
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_camera_comes_back_within_its_sigmas(known: bool) -> None:
+    rng = np.random.default_rng(6)
+    squares = []
+    for _ in range(4):
+        found = calibrate(views(rng, 12, known), NOMINAL, SPEC)
+        assert set(found.sigma) >= {"focal_mm", "k1"}
+        assert set(found.sigma) | set(found.refused) == set(PARAMETERS)
+        if known:
+            assert set(found.sigma) >= {"centre_x_px", "centre_y_px", "p1", "p2"}
+        assert 0.7 < found.misfit < 1.3
+        squares += [(getattr(found.camera, n) - getattr(TRUE, n)) ** 2 / s**2 for n, s in found.sigma.items()]
+    assert len(squares) >= 12
+    # Parameters are correlated: the mean square is 1, the bounds are those of a few.
+    assert 0.2 < np.mean(squares) < stats.chi2.isf(1e-4, 8) / 8
+    assert max(squares) < 5**2
+
+
+def test_what_one_bar_does_not_determine_is_refused() -> None:
+    rng = np.random.default_rng(2)
+    pole = np.array([0.5, 12.0, 0.2]) + ALONG[:, None] * [0, 0, 1]
+    rotation, seen = Attitude(0.0, 0.0, 0.0).rotation(), []
+    for n in range(3):
+        place = np.array([0.0, 2.0 * n, 0.0])
+        points, _ = project_bars(pole, place, rotation, NOMINAL)
+        bar = BarView(0, pole, points + rng.normal(0, 0.02, points.shape), np.full(16, 0.02))
+        seen.append(CalibrationView((bar,), place, 0.002, None, 0.1))
+    found = calibrate(seen, dataclasses.replace(NOMINAL, focal_mm=8.3), SPEC)
+    assert "focal_mm" in found.sigma
+    assert not {"centre_x_px", "centre_y_px", "p1", "p2"} & set(found.sigma)
+    assert abs(found.camera.focal_mm - 8.0) < 5 * found.sigma["focal_mm"]
+    assert found.camera.centre_x_px is None
+    assert found.camera.p1 == 0
+    assert set(found.refused) == set(PARAMETERS) - set(found.sigma)
+    blurred = [dataclasses.replace(v, position_sigma_m=5.0) for v in seen]
+    with pytest.raises(ConfigError, match="do not determine the focal length"):
+        calibrate(blurred, NOMINAL, SPEC)
+    with pytest.raises(ConfigError, match="nothing to calibrate from"):
+        calibrate([dataclasses.replace(seen[0], bars=())], NOMINAL, SPEC)
+
+
+def test_a_site_that_is_not_right_is_told() -> None:
+    rng = np.random.default_rng(3)
+    seen = views(rng, 8, True)
+    wrong = dataclasses.replace(seen[2], enu_m=seen[2].enu_m + np.array([0.5, 0, 0]))
+    with pytest.raises(ConfigError, match="not as was said"):
+        calibrate([*seen[:2], wrong, *seen[3:]], NOMINAL, SPEC)
+
+
+def test_slopes_are_the_numerical_ones() -> None:
+    rng = np.random.default_rng(1)
+    direction = rng.uniform(-0.5, 0.5, (5, 2))
+    values = np.array([getattr(TRUE, name) for name in PARAMETERS])
+
+    def image(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        camera = dataclasses.replace(TRUE, **dict(zip(PARAMETERS, x.tolist(), strict=True)))
+        return camera.distort(direction).ravel()
+
+    found = _slopes(TRUE, direction, TRUE.distort(direction), PARAMETERS).reshape(10, -1)
+    np.testing.assert_allclose(found, approx_fprime(values, image, 1e-6), rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("turn", [np.array([0.2, -0.3, 0.1]), np.full(3, 1e-9)])
+def test_the_slope_of_a_turn_is_the_numerical_one(turn: NDArray[np.float64]) -> None:
+    begin = Rotation.from_rotvec(turn).inv()
+    want = approx_fprime(np.zeros(3), lambda d: (Rotation.from_rotvec(turn + d) * begin).as_rotvec(), 1e-7)
+    np.testing.assert_allclose(_turn_slope(turn), want, atol=1e-6)
+
+
+def test_poses_are_read_and_their_faults_told(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    head = "recording,t_us,latitude_deg,longitude_deg,height_m,heading_deg,pitch_deg,roll_deg\n"
+    path.write_text(head + "a.raw,5000,35,137,5,,,\nb.raw,6000,35,137,5,350,1,2\n")
+    one, two = read_poses(path)
+    assert (one.recording, one.t_us, one.attitude, one.position_sigma_m) == ("a.raw", 5000, None, 0.01)
+    assert two.attitude == Attitude(1, 2, 350)
+    # As spreadsheets write it.
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    assert read_poses(path) == [one, two]
+    for text, says in (
+        (head, "one line of values or more"),
+        (head + "a.raw,,35,137,5,,,\n", r"line 2: t_us = '': expected a number"),
+        (head + "a.raw,1,35,137,5,3,,\n", r"line 2: pitch_deg = '': expected a number"),
+        ("t_us,latitude_deg\n1,2\n", r"line 2: longitude_deg = None: expected a number"),
+        (head + "\na.raw,1,95,137,5,,,\n", r"line 3: latitude_deg = '95': expected -90 to 90"),
+        (f"attitude_sigma_deg,{head}0,a.raw,1,35,137,5,1,1,1\n", r"line 2: attitude_sigma_deg = '0'"),
+        (
+            f"position_sigma_m,{head}-1,a.raw,1,35,137,5,1,1,1\n",
+            r"position_sigma_m = '-1': expected 1e-06 or more",
+        ),
+    ):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=says):
+            read_poses(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_poses(tmp_path / "none.csv")

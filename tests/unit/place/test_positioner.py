@@ -1,0 +1,324 @@
+"""Fixes from packets: in time, with sites, beacons and attitudes; and from a simulated drive."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from evlcp_sdk.air.beacons import Beacon
+from evlcp_sdk.air.blocks import Kind, Message
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.pose import project_bars
+from evlcp_sdk.place.positioner import Positioner
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.scene.sites import BarSite, LocalFrame
+from evlcp_sdk.sim import Simulation
+from evlcp_sdk.sim.scene import resolve_scene
+from evlcp_sdk.sim.world import scene_to_enu, sites_of
+from evlcp_sdk.values import Fix, Frame, Packet, Range, ReceivedMessage, SoftSymbols, Trust
+
+CAMERA = CameraModel()
+PACKET_US, FRAME_US = 34_600.0, 3200.0
+ORIGIN = LocalFrame(35.0, 137.0, 40.0)
+EXACT = Attitude(4.0, 1.0, 0.0, 0.0, 0.0)
+SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
+
+
+def site(number: int, enu_m: tuple[float, float, float], transmitter: int | None = None) -> BarSite:
+    latitude, longitude, height = (float(v) for v in ORIGIN.to_geodetic(enu_m))
+    return BarSite(number, latitude, longitude, height, transmitter=transmitter)
+
+
+def camera_at(t_us: float) -> NDArray[np.float64]:
+    return np.array([0.0, -50.0 + 8.0 * t_us * 1e-6, -4.0])
+
+
+def packets_of(bar: BarSite, transmitter: int, count: int, start_us: float = 5000.0,
+               messages: dict[int, tuple[ReceivedMessage, ...]] | None = None,
+               attitude: Attitude = EXACT, dark: tuple[int, ...] = ()) -> list[Packet]:  # fmt: skip
+    """What a receiver of a bar gives while the camera drives, without noise."""
+    enu, found = bar.cluster_positions_m(16, ORIGIN), []
+    for n in range(count):
+        begin = start_us + n * PACKET_US
+        frames = []
+        for k in range(10):
+            t_us = begin + 2600 + k * FRAME_US
+            points, _ = project_bars(enu, camera_at(t_us + 800), attitude.rotation(), CAMERA)
+            points[list(dark)] = np.nan
+            frames.append(
+                Frame(transmitter, n, k, t_us, SOFT, Range(math.nan, math.nan, 0), None, 0.0, 0.0,
+                      points, np.full(16, 0.1), t_us + 800)
+            )  # fmt: skip
+        heard = (messages or {}).get(n, ())
+        found.append(Packet(transmitter, n, begin, 100.0, tuple(frames), 10, messages=heard))
+    return found
+
+
+def merged(*streams: list[Packet]) -> list[Packet]:
+    return sorted((p for s in streams for p in s), key=lambda p: p.t_us)
+
+
+def positioner(sites: list[BarSite], attitude: Attitude | None = EXACT, **spec: object) -> Positioner:
+    return Positioner(CAMERA, 16, PACKET_US, sites, lambda _t: attitude, PositionSpec(**spec))  # type: ignore[arg-type]
+
+
+def assert_right(fixes: list[Fix], most_m: float = 2e-3) -> None:
+    assert fixes
+    for fix in fixes:
+        assert not fix.refusal, fix.detail
+        want = ORIGIN.to_geodetic(camera_at(fix.t_us))
+        off = ORIGIN.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height_m) - ORIGIN.to_enu(*want)
+        assert np.abs(off).max() < most_m
+
+
+LEFT, RIGHT = site(7, (-2.0, 0.0, 0.0), 0), site(9, (2.0, -6.0, 0.0), 1)
+
+
+def test_one_bar_gives_a_fix_a_packet_time() -> None:
+    p = positioner([LEFT])
+    fixes = p.feed(packets_of(LEFT, 0, 8)) + p.close()
+    assert_right(fixes)
+    assert [f.t_us for f in fixes] == [PACKET_US * n for n in range(1, 9)]
+    assert p.counts == {"fixes": 8, "refused": 0, "frames_late": 0, "beacons_forged": 0}
+    assert fixes[0].heading_deg == pytest.approx(0, abs=1e-6) or fixes[0].heading_deg > 359
+    assert fixes[0].pitch_deg == pytest.approx(4)
+    assert fixes[0].roll_deg == pytest.approx(1)
+    assert not fixes[0].verified
+
+
+def test_two_bars_of_other_phases_give_the_heading() -> None:
+    turned = Attitude(4.0, 1.0, 359.0, 0.0, 0.0)
+    p = positioner([LEFT, RIGHT], Attitude(4.0, 1.0, None, 0.0))
+    fixes = p.feed(
+        merged(packets_of(LEFT, 0, 8, attitude=turned), packets_of(RIGHT, 1, 8, 21_000.0, attitude=turned))
+    )
+    fixes += p.close()
+    both = [f for f in fixes if f.transmitters == (0, 1) and not f.refusal]
+    assert len(both) >= 6
+    assert_right(both, 5e-3)
+    assert both[0].heading_deg == pytest.approx(359, abs=2e-3)
+    alone = [f for f in fixes if f.refusal]
+    assert {f.refusal for f in alone} <= {"heading-unknown"}
+    assert all(math.isnan(f.latitude_deg) for f in alone)
+
+
+def test_gravity_and_north_are_those_of_the_place_not_of_the_first_site() -> None:
+    # 30 km away, the vertical leans by 0.27 degrees and north by 0.2.
+    far = site(99, (-30_000.0, 10_000.0, 0.0))
+    p = positioner([far, LEFT])
+    fixes = p.feed(packets_of(LEFT, 0, 6)) + p.close()
+    assert_right(fixes)
+    assert p.frame == LocalFrame.of([far])
+    heading = fixes[0].heading_deg
+    assert min(heading, 360 - heading) < 1e-3
+    # The covariance turns along: its size stays, its axes are those of the track's frame.
+    near = positioner([LEFT])
+    plain = near.feed(packets_of(LEFT, 0, 6)) + near.close()
+    here = LocalFrame.of([LEFT])
+    turn = LocalFrame.of([far]).turn_from(here)
+    np.testing.assert_allclose(fixes[1].covariance_m2, turn @ plain[1].covariance_m2 @ turn.T, atol=1e-9)
+
+
+def test_feeding_by_packets_or_all_at_once_is_the_same() -> None:
+    stream = merged(packets_of(LEFT, 0, 8), packets_of(RIGHT, 1, 8, 21_000.0))
+    one, many = positioner([LEFT, RIGHT]), positioner([LEFT, RIGHT])
+    whole = one.feed(stream) + one.close()
+    parts = [f for packet in stream for f in many.feed([packet])] + many.close()
+    assert [f.t_us for f in whole] == [f.t_us for f in parts]
+    np.testing.assert_array_equal([f.enu_m for f in whole], [f.enu_m for f in parts])
+
+
+def test_dark_clusters_and_a_gap_in_time() -> None:
+    p = positioner([LEFT])
+    fixes = p.feed(packets_of(LEFT, 0, 4, dark=(2, 9)))
+    fixes += p.feed(packets_of(LEFT, 0, 4, 1e6)) + p.close()
+    assert len(fixes) == 8
+    assert_right(fixes)
+
+
+def test_an_unknown_site_is_refused() -> None:
+    p = positioner([LEFT])
+    fixes = p.feed(packets_of(RIGHT, 3, 4)) + p.close()
+    assert {f.refusal for f in fixes} == {"no-site"}
+    assert fixes[0].transmitters == (3,)
+    assert p.counts["refused"] == len(fixes)
+
+
+def heard(bar: BarSite, trust: Trust, packet: int) -> ReceivedMessage:
+    beacon = Beacon(
+        bar.latitude_deg, bar.longitude_deg, bar.height_m, bar.heading_deg, bar.tilt_deg, bar.length_m
+    )
+    message = Message(Kind.BEACON, bar.transmitter_id, packet, beacon.pack())
+    return ReceivedMessage(0, packet, 0.0, message, beacon, trust, "" if trust == "verified" else "why")
+
+
+def test_beacons_tell_who_and_where() -> None:
+    told = {0: (heard(RIGHT, "unverified", 0),)}
+    # The id decides, not the receiver's number, which is the other bar's here.
+    p = positioner([LEFT, RIGHT])
+    fixes = p.feed(packets_of(RIGHT, 0, 6, messages=told)) + p.close()
+    assert_right(fixes)
+    assert not any(f.verified for f in fixes)
+    # Without a file, a verified beacon's own place is believed; an unverified one's only if so configured.
+    for trust, believed, given in (
+        ("verified", "verified", True), ("unverified", "verified", False),
+        ("unverified", "any", True), ("verified", "none", False),
+    ):  # fmt: skip
+        p = positioner([], beacons=believed)
+        fixes = p.feed(packets_of(RIGHT, 0, 6, messages={0: (heard(RIGHT, trust, 0),)})) + p.close()  # type: ignore[arg-type]
+        if given:
+            assert_right(fixes)
+            assert all(f.verified == (trust == "verified") for f in fixes)
+        else:
+            assert {f.refusal for f in fixes} == {"no-site"}
+
+
+def test_a_forged_beacon_cannot_move_the_camera() -> None:
+    liar = dataclasses.replace(RIGHT, transmitter_id=7)
+    told = {
+        0: (heard(LEFT, "verified", 0),),
+        2: (heard(liar, "unverified", 2),),
+        4: (heard(liar, "forged", 4),),
+    }
+    p = positioner([])
+    fixes = p.feed(packets_of(LEFT, 0, 9, messages=told)) + p.close()
+    given = [f for f in fixes if not f.refusal]
+    assert_right(given)
+    assert all(f.verified for f in given)
+    assert {f.refusal for f in fixes[len(given) :]} == {"no-site"}
+    assert p.counts["beacons_forged"] == 1
+    # What was said in packet 4 counts for fixes that were not out yet.
+    assert 1 <= len(given) <= 4
+
+
+def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
+    """From behind two bars the image of swapped ones is the same; what they say of themselves tells."""
+    gravity = Attitude(4.0, 1.0, None, 0.0, 0.0)
+    swapped = [dataclasses.replace(LEFT, transmitter_id=9), dataclasses.replace(RIGHT, transmitter_id=7)]
+    stream = merged(
+        packets_of(LEFT, 0, 6, messages={0: (heard(LEFT, "unverified", 0),)}),
+        packets_of(RIGHT, 1, 6, messages={0: (heard(RIGHT, "unverified", 0),)}),
+    )
+    right = positioner([LEFT, RIGHT], gravity)
+    assert_right(right.feed(stream) + right.close())
+    assert right.contradicted == {}
+    wrong = positioner(swapped, gravity)
+    fixes = wrong.feed(stream) + wrong.close()
+    assert {f.refusal for f in fixes} == {"site-contradicted"}
+    assert "transmitter 0 says that it is 7.2 m from the site of its id" in fixes[0].detail
+    assert wrong.stands_at == {}
+    assert set(wrong.contradicted) == {0, 1}
+    # Whoever knows better than the beacons says so; nothing in the image could.
+    alone = positioner(swapped, gravity, beacons="none")
+    assert not any(f.refusal for f in alone.feed(stream) + alone.close())
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"length_m": 1.92}, "0.96 m long, its site 1.92 m"),
+        ({"length_m": 0.965}, None),
+        ({"height_m": LEFT.height_m + 1.5}, "1.5 m from the site"),
+        ({"height_m": LEFT.height_m + 0.005}, None),
+    ],
+)
+def test_a_bar_that_is_not_its_site(change: dict[str, float], told: str | None) -> None:
+    """A lone bar of the wrong length or place fits the image as well as the right one."""
+    p = positioner([dataclasses.replace(LEFT, **change)])  # type: ignore[arg-type]
+    fixes = p.feed(packets_of(LEFT, 0, 6, messages={0: (heard(LEFT, "unverified", 0),)})) + p.close()
+    assert {f.refusal for f in fixes} == ({"site-contradicted"} if told else {""})
+    if told:
+        assert told in fixes[0].detail
+
+
+def test_an_attitude_file(tmp_path: Path) -> None:
+    path = tmp_path / "attitude.csv"
+    path.write_text(
+        "t_us,heading_deg,pitch_deg,roll_deg,heading_sigma_deg\n0,359,1,-1,0.2\n1000,1,3,-1,0.4\n"
+    )
+    track = AttitudeLog.read(path)
+    found = track.at(500)
+    assert found is not None
+    assert found.heading_deg == pytest.approx(0)
+    assert (found.pitch_deg, found.roll_deg) == (2, -1)
+    assert found.heading_sigma_deg == pytest.approx(0.3)
+    assert found.gravity_sigma_deg == Attitude().gravity_sigma_deg
+    assert track.at(1001) is None
+    path.write_text("t_us,pitch_deg,roll_deg\n0,1,2\n10,1,2\n")
+    level = AttitudeLog.read(path).at(3)
+    assert level is not None
+    assert level.heading_deg is None
+    # Sigmas that the file has not are those that are said; and it may come from a spreadsheet.
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    level = AttitudeLog.read(path, Attitude(gravity_sigma_deg=0.7, heading_sigma_deg=3.0)).at(3)
+    assert level is not None
+    assert (level.gravity_sigma_deg, level.heading_sigma_deg) == (0.7, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t_us,roll_deg\n0,1\n", r"line 1: no column pitch_deg"),
+        ("t_us,pitch_deg,roll_deg\n0,1,2\n1,x,2\n", r"line 3: pitch_deg = 'x': expected a number"),
+        ("t_us,pitch_deg,roll_deg\n0,1,2\n", r"two lines or more with rising t_us"),
+        ("t_us,pitch_deg,roll_deg\n0,1,2\n0,1,2\n", r"line 3: t_us = 0: expected more than .* rising t_us"),
+        ("t_us,pitch_deg,roll_deg\n0,1,2\n\n5,1,2\n3,1,2\n", r"line 5: t_us = 3: expected more than .* 5"),
+        ("t_us,pitch_deg,roll_deg\n\n0,1,2\n1,x,2\n", r"line 4: pitch_deg = 'x': expected a number"),
+        ("t_us,pitch_deg,roll_deg,gravity_sigma_deg\n0,1,2,1\n1,1,2,-1\n", r"line 3: gravity_sigma_deg = -1"),
+        ("t_us,pitch_deg,roll_deg\n0,1\n1,1,2\n", r"line 2: roll_deg = None: expected a number"),
+    ],
+)
+def test_faults_of_an_attitude_file(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "attitude.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        AttitudeLog.read(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        AttitudeLog.read(tmp_path / "none.csv")
+
+
+def test_a_simulated_drive_past_two_bars() -> None:
+    """From events to fixes: two bars 45 and 50 m ahead, gravity known, as vehicles vibrate."""
+    bars = [{"x_m": -3.0, "y_m": -3.5}, {"x_m": 3.0, "y_m": -4.0, "z_m": -5.0, "ppm": 20.0}]
+    scene = resolve_scene(
+        {
+            "duration_s": 0.2,
+            "seed": 2,
+            "world": {"latitude_deg": 35.1, "longitude_deg": 137.0, "height_m": 50.0, "heading_deg": 30.0},
+            "motion": {"distance_m": 50.0, "pitch_deg": 4.0},
+            "bars": bars,
+        }
+    )
+    simulation, link = Simulation(scene), load_link()
+    receiver = Receiver(link)
+    packets = [p for events in simulation.stream() for p in receiver.feed(events)] + receiver.close()
+    first = {p.transmitter: p.frames[0].x_px for p in reversed(packets)}
+    numbers = sorted(first, key=lambda n: first[n])
+    sites = [dataclasses.replace(s, transmitter=n) for s, n in zip(sites_of(scene), numbers, strict=True)]
+
+    def attitude_at(t_us: float) -> Attitude:
+        _, ((_yaw, pitch, roll),) = simulation.path.at([t_us])
+        return Attitude(math.degrees(pitch), math.degrees(roll), None, 0.0)
+
+    p = Positioner(link.camera, 16, link.packet.packet_chips * link.packet.chip_us, sites, attitude_at)
+    fixes = p.feed(packets) + p.close()
+    given = [f for f in fixes if not f.refusal]
+    assert len(given) >= 4
+    world = LocalFrame(35.1, 137.0, 50.0)
+    error = []
+    for fix in given:
+        place, ((yaw, _pitch, _roll),) = simulation.path.at([fix.t_us])
+        true = scene_to_enu(place, 30.0)[0]
+        found = world.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height_m)
+        error.append(np.linalg.norm(found - true))
+        assert abs(fix.heading_deg - 30 - math.degrees(yaw)) < 5 * fix.heading_sigma_deg
+        assert error[-1] < 5 * math.sqrt(np.trace(fix.covariance_m2))
+    assert np.median(error) < 0.06
+    assert max(error) < 0.15

@@ -1,0 +1,93 @@
+"""Figures: drawn from whatever a recording gives, in bounded memory."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from evlcp_sdk.results.figures import (
+    FigureProbe,
+    Thinned,
+    cluster_colours,
+    draw_distance,
+    draw_presence,
+    draw_regions,
+    save_figures,
+)
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.values import Events, Frame, PresenceMap, Range, Region, SoftSymbols
+
+
+def presence(fill: float) -> PresenceMap:
+    probability = np.zeros((16, 40, 4), np.float32)
+    pixels = np.zeros((16, 80, 8), np.float32)
+    for k in range(16):
+        probability[k, 2 * k : 2 * k + 2, 1:3] = fill
+        pixels[k, 4 * k : 4 * k + 4, 2:6] = fill
+    return PresenceMap(probability, 2, probability > 0.5, pixels)
+
+
+def frame(transmitter: int, number: int, distance_m: float, quality: float = 0.9) -> Frame:
+    soft = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), quality)
+    return Frame(transmitter, 0, number, 3200.0 * number, soft, Range(distance_m, 0.1, 9), None, 100.0, 200.0)
+
+
+def told(probe: FigureProbe, transmitters: int, frames: int, fill: float = 1.0) -> FigureProbe:
+    for n in range(transmitters):
+        for i in range(frames):
+            probe.evlcp_stage_finished("regions", Region(n, 1000.0 * i, 100.0 + 50 * n, 200.0, 6.0, 80.0))
+            probe.evlcp_stage_finished("separation", presence(fill))
+            probe.evlcp_stage_finished("frame", frame(n, i, 50.0 - i, quality=0.5 + 0.4 * (i == 3)))
+    return probe
+
+
+def test_what_is_kept_is_bounded_and_even() -> None:
+    kept = Thinned[int](8)
+    for i in range(1000):
+        kept.add(i)
+    values = list(kept)
+    assert 4 <= len(values) <= 8
+    assert len(set(np.diff(values))) == 1
+    probe = told(FigureProbe(CameraModel(), points=8), 1, 100)
+    assert len(probe.frames[0]) <= 8
+    assert len(probe.regions[0]) <= 8
+
+
+def test_the_image_counts_events_on_the_sensor() -> None:
+    probe = FigureProbe(CameraModel())
+    probe.watch(Events.empty())
+    probe.watch(Events.of([70, 80, 90], [5, 5, 2000], [6, 6, 6], [1, 0, 1]))
+    assert probe.first_us == 70
+    assert probe.image[6, 5] == probe.image.sum() == 2
+
+
+def test_the_clearest_frame_is_shown() -> None:
+    probe = told(FigureProbe(CameraModel()), 1, 6)
+    assert probe.clearest[0].frame.frame == 3
+
+
+@pytest.mark.parametrize("transmitters", [0, 1, 2, 7])
+def test_any_number_of_transmitters(transmitters: int, tmp_path: Path) -> None:
+    probe = told(FigureProbe(CameraModel()), transmitters, 5)
+    written = save_figures(probe, "a.raw", tmp_path)
+    names = ["regions.png", "presence.png", "distance.png"][: 3 if transmitters else 1]
+    assert [path.name for path in written] == names
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
+
+
+def test_nothing_to_show() -> None:
+    probe = FigureProbe(CameraModel())
+    assert isinstance(draw_regions(probe, "empty"), Figure)
+    dark = told(FigureProbe(CameraModel()), 1, 1, fill=0.0)
+    draw_presence(dark, "dark").draw_without_rendering()
+    dark.evlcp_stage_finished("frame", frame(1, 0, math.nan))
+    draw_distance(dark, "no distance").draw_without_rendering()
+
+
+def test_neighbouring_clusters_differ_in_colour() -> None:
+    colours = cluster_colours(16)
+    apart = np.abs(colours[1:] - colours[:-1]).max(1)
+    assert apart.min() > 0.2
+    assert len(np.unique(colours, axis=0)) == 16

@@ -1,0 +1,62 @@
+"""NMEA sentences, read back by an independent parser."""
+
+from datetime import UTC, datetime, timedelta
+
+import pynmea2
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evlcp_sdk.results.nmea import checksum, gga, rmc
+
+ZERO = datetime(2026, 3, 1, 23, 59, 58, tzinfo=UTC)
+
+
+@given(
+    st.floats(-90, 90), st.floats(-180, 180), st.floats(-100, 5000), st.floats(0, 1e9),
+    st.integers(1, 20), st.floats(0, 99), st.floats(0, 100), st.floats(0, 360),
+)  # fmt: skip
+def test_sentences_read_back(
+    lat: float, lon: float, height: float, t_us: float, bars: int, sigma: float, speed: float, course: float
+) -> None:
+    place = (lat, lon, height)
+    seen = pynmea2.parse(gga(t_us, ZERO, place, bars, sigma).strip(), check=True)
+    assert seen.talker == "IN"
+    # 1e-7 minutes, rounded.
+    assert seen.latitude == pytest.approx(lat, abs=1e-9)
+    assert seen.longitude == pytest.approx(lon, abs=1e-9)
+    assert seen.altitude == pytest.approx(height, abs=5e-4 + 1e-9)
+    assert seen.altitude_units == "M"
+    assert (seen.gps_qual, int(seen.num_sats)) == (6, bars)
+    assert float(seen.horizontal_dil) == pytest.approx(sigma, abs=6e-4)
+    moved = pynmea2.parse(rmc(t_us, ZERO, place, (speed, course)).strip(), check=True)
+    assert moved.is_valid
+    assert moved.latitude == pytest.approx(lat, abs=1e-9)
+    assert moved.spd_over_grnd == pytest.approx(speed * 3600 / 1852, abs=6e-4)
+    assert abs((moved.true_course - course + 180) % 360 - 180) < 6e-3
+    at = ZERO + timedelta(microseconds=t_us)
+    told = datetime.combine(moved.datestamp, moved.timestamp)
+    assert abs((told - at).total_seconds()) <= 6e-4
+
+
+def test_no_fix_says_so() -> None:
+    seen = pynmea2.parse(gga(1e6, None, None, 0, 0.0).strip(), check=True)
+    assert seen.gps_qual == 0
+    assert seen.lat == ""
+    assert str(seen.timestamp)[:8] == "00:00:01"
+    lost = pynmea2.parse(rmc(1e6, None, None, None).strip(), check=True)
+    assert not lost.is_valid
+    assert lost.datestamp is None
+    begun = pynmea2.parse(rmc(1e6, None, (0.0, 0.0, 0.0), None).strip(), check=True)
+    assert begun.is_valid
+    assert begun.spd_over_grnd is None
+
+
+def test_the_standards_own_sum() -> None:
+    # The example that the standard's readers quote.
+    assert checksum("GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,") == "47"
+
+
+def test_sixty_minutes_carry() -> None:
+    assert ",0.00,010326," in rmc(0, ZERO, (0.0, 0.0, 0.0), (0.0, 359.999))
+    assert ",3600.0000000,N," in gga(0, None, (35.9999999999, 0.0, 0.0), 1, 0.1)

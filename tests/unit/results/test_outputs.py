@@ -1,0 +1,287 @@
+"""The three files of a result: columns, values, streaming, and what is left after a stop or a crash."""
+
+import csv
+import json
+import math
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evlcp_kalman.tracking import NoTracking
+from evlcp_wh.modulation import Wh8
+from evlcp_wh.pilots import WhPilots
+
+from evlcp_sdk.air.beacons import Beacon
+from evlcp_sdk.air.blocks import Kind, Message
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import PacketFormat, symbols_of_bits
+from evlcp_sdk.errors import ConfigError, EvlcpError
+from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
+from evlcp_sdk.results.outputs import FIGURE_NAMES, FRAME_COLUMNS, ResultWriter, TransmitterTally
+from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.values import Frame, Packet, Range, ReceivedMessage, SoftSymbols
+
+BOOK = Codebook("wh8", WhPilots().preamble(), WhPilots().codes(16), Wh8().codewords())
+LINK = Link(
+    camera=CameraModel(),
+    bar=BarLayout(),
+    air=AirSpec(frames_per_packet=3),
+    regions=RegionSpec(),
+    messages=MessageSpec(decode=False),
+    position=PositionSpec(),
+    algorithms={"tracking": NoTracking()},
+    revisions={"ranging": 1},
+    codebook=BOOK,
+    packet=PacketFormat.of(BOOK, 3),
+    table={"air": {"chip_rate_hz": 10_000.0, "frames_per_packet": 3}},
+    digest="0" * 64,
+)
+
+
+def frame(packet: int, number: int, distance_m: float = 50.0, transmitter: int = 0) -> Frame:
+    symbols = (np.arange(16) + number) % 16
+    soft = SoftSymbols(symbols, np.zeros((16, 4), np.float32), 0.875)
+    sigma = 0.05 if math.isfinite(distance_m) else math.nan
+    return Frame(
+        transmitter,
+        packet,
+        number,
+        12_345.678 + 3200 * number,
+        soft,
+        Range(distance_m, sigma, 20),
+        Range(distance_m + 1, sigma / 2, 20) if math.isfinite(distance_m) else None,
+        640.1234,
+        360.5,
+    )
+
+
+def packet(number: int, frames: tuple[Frame, ...], transmitter: int = 0, chip_us: float = 99.999) -> Packet:
+    return Packet(transmitter, number, 9_745.678 + 12_200 * number * chip_us / 100, chip_us, frames, sent=3)
+
+
+def finish(writer: ResultWriter, **kw: Any) -> dict[str, Any]:
+    given: dict[str, Any] = {
+        "status": "complete",
+        "recording": {"path": "a.raw"},
+        "processing": {"elapsed_s": 1.0},
+        "counts": {"events": 3},
+        "losses": {"odd_byte": {"count": 1, "first": 7}},
+        "versions": {"evlcp-sdk": "0"},
+    }
+    return writer.finish(**(given | kw))
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / "frames.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_files_of_a_result(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path / "out", LINK) as writer:
+        writer.write([packet(0, (frame(0, 0), frame(0, 2, math.nan)))])
+        writer.write([packet(2, (frame(2, 1, 51.0),)), packet(0, (), transmitter=1)])
+        table = finish(writer)
+    out = tmp_path / "out"
+    assert sorted(p.name for p in out.iterdir()) == ["frames.csv", "packets.jsonl", "summary.json"]
+
+    rows = rows_of(out)
+    assert tuple(rows[0]) == FRAME_COLUMNS
+    assert list(rows[0].values()) == [
+        *("0", "0", "0", "12345.68", "0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15", "0.8750"),
+        *("50.0000", "0.0500", "640.123", "360.500"),
+    ]
+    assert (rows[1]["distance_m"], rows[1]["distance_sigma_m"]) == ("", "")
+
+    lines = [json.loads(line) for line in (out / "packets.jsonl").read_text().splitlines()]
+    first = lines[0]
+    assert {line["kind"] for line in lines} == {"packet"}
+    assert (first["transmitter"], first["packet"], first["t_us"]) == (0, 0, 9745.68)
+    assert (first["frames_sent"], first["frames_received"]) == (3, 2)
+    assert first["symbols"][1] is None
+    assert first["bits"][64:128] == "?" * 64
+    heard = [int(b) for b in first["bits"][:64]]
+    assert symbols_of_bits(heard, 4, 16).tolist() == [first["symbols"][0]]
+
+    assert table == json.loads((out / "summary.json").read_text())
+    assert table["result"] == "2 transmitters, 3 frames"
+    assert table["messages_off"] == "messages.decode = false"
+    assert table["digest"] == LINK.digest
+    assert table["codebook"] == {"digest": BOOK.digest, "profile": "wh8"}
+    assert table["losses"] == {"odd_byte": {"count": 1, "first": 7}}
+    assert table["transmitters"][0] == {
+        "transmitter": 0,
+        "packets": 2,
+        "frames_found": 3,
+        "frames_expected": 8,
+        "quality": 0.875,
+        "clock_ppm": 10.0,
+        "frames_ranged": 2,
+        "distance_first_m": 50.0,
+        "distance_last_m": 51.0,
+        "distance_median_m": 50.0,
+    }
+    assert table["transmitters"][1]["quality"] is None
+    assert table["transmitters"][1]["clock_ppm"] is None
+    assert table["transmitters"][1]["distance_median_m"] is None
+
+
+def test_a_message_is_a_line_after_its_packet(tmp_path: Path) -> None:
+    beacon = Beacon(35.1, 136.9, 52.0, 90.0, 1.0, 0.96, b"\x01\x02")
+
+    def received(kind: Kind, payload: bytes, **more: Any) -> ReceivedMessage:
+        given = {"beacon": None, "trust": "unverified", "reason": "not signed"} | more
+        return ReceivedMessage(1, 4, 12.3456, Message(kind, 7, 9, payload), **given)
+
+    messages = (
+        received(Kind.TEXT, "Tempo 30 für \n 2 km".encode()),
+        received(Kind.DATA, b"\x00\xff"),
+        received(Kind.BEACON, beacon.pack(), beacon=beacon, trust="verified", reason=""),
+        received(Kind.BEACON, beacon.pack(), beacon=beacon, trust="forged", reason="replayed"),
+    )
+    with ResultWriter(tmp_path, LINK) as writer:
+        writer.write([replace(packet(4, (frame(4, 0),)), messages=messages), packet(5, ())])
+        finish(writer)
+    lines = [json.loads(line) for line in (tmp_path / "packets.jsonl").read_text().splitlines()]
+    assert [line["kind"] for line in lines] == ["packet", "text", "data", "beacon", "beacon", "packet"]
+    shared = {"transmitter": 1, "packet": 4, "t_us": 12.35, "transmitter_id": 7, "sequence": 9}
+    unsigned = shared | {"verified": False, "trust": "unverified", "reason": "not signed"}
+    assert lines[1] == {"kind": "text"} | unsigned | {"text": "Tempo 30 für \n 2 km"}
+    assert lines[2] == {"kind": "data"} | unsigned | {"data": "00ff"}
+    place = {"latitude_deg": 35.1, "longitude_deg": 136.9, "height_m": 52.0, "user": "0102"}
+    place |= {"heading_deg": 90.0, "tilt_deg": 1.0, "length_m": 0.96}
+    assert (
+        lines[3] == {"kind": "beacon", "verified": True, "trust": "verified", "reason": ""} | shared | place
+    )
+    assert (lines[4]["verified"], lines[4]["trust"], lines[4]["reason"]) == (False, "forged", "replayed")
+
+
+def test_packets_too_short_for_messages_are_said(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, load_link(overrides=["air.frames_per_packet=2"])) as writer:
+        assert "expected at least 18" in finish(writer)["messages_off"]
+
+
+def test_no_transmitter_is_said_plainly(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, LINK) as writer:
+        table = finish(writer)
+    assert table["result"] == "no transmitter was found"
+    assert table["transmitters"] == []
+    assert (tmp_path / "frames.csv").read_text() == ",".join(FRAME_COLUMNS) + "\n"
+    assert (tmp_path / "packets.jsonl").read_text() == ""
+
+
+def test_a_new_result_replaces_all_of_the_old_one_and_only_at_the_end(tmp_path: Path) -> None:
+    for name in (*FIGURE_NAMES, "frames.parquet", "frames.csv", "notes.txt"):
+        (tmp_path / name).write_text("old")
+    with ResultWriter(tmp_path, LINK) as writer:
+        writer.write([packet(0, (frame(0, 0),))])
+        assert (tmp_path / "frames.csv").read_text() == "old"
+        finish(writer)
+    names = sorted(p.name for p in tmp_path.iterdir())
+    assert names == ["frames.csv", "notes.txt", "packets.jsonl", "summary.json"]
+    assert len(rows_of(tmp_path)) == 1
+
+
+def test_a_crash_leaves_the_old_result(tmp_path: Path) -> None:
+    (tmp_path / "frames.csv").write_text("old")
+
+    def crash() -> None:
+        with ResultWriter(tmp_path, LINK) as writer:
+            writer.write([packet(0, (frame(0, 0),))])
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        crash()
+    assert [p.name for p in tmp_path.iterdir()] == ["frames.csv"]
+    assert (tmp_path / "frames.csv").read_text() == "old"
+
+
+def test_a_failed_run_says_so_and_keeps_what_was_decoded(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, LINK) as writer:
+        writer.write([packet(0, (frame(0, 0),))])
+        finish(writer, status="failed", error="a.raw: at byte 9: found x, expected y")
+    table = json.loads((tmp_path / "summary.json").read_text())
+    assert (table["status"], table["error"]) == ("failed", "a.raw: at byte 9: found x, expected y")
+    assert len(rows_of(tmp_path)) == 1
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="file: cannot be written"):
+        ResultWriter(tmp_path / "file", LINK)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("packets", [1, 100])
+def test_a_full_disk_is_told_and_leaves_the_old_result(tmp_path: Path, packets: int) -> None:
+    (tmp_path / "frames.csv").write_text("old")
+    (tmp_path / f".packets.jsonl.{os.getpid()}.part").symlink_to("/dev/full")
+
+    def fill() -> None:
+        with ResultWriter(tmp_path, LINK) as writer:
+            writer.write([packet(i, (frame(i, 0), frame(i, 1))) for i in range(packets)])
+            finish(writer)
+
+    with pytest.raises(EvlcpError, match="cannot be written: No space left on device") as caught:
+        fill()
+    assert caught.value.exit_code == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["frames.csv"]
+
+
+def test_parquet_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("evlcp_sdk.results.outputs.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match="needs the extra: pip install"):
+        ResultWriter(tmp_path / "out", LINK, parquet=True)
+    assert not (tmp_path / "out").exists()
+
+
+def test_parquet_holds_the_same_frames(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
+    with ResultWriter(tmp_path, LINK, parquet=True) as writer:
+        writer.write([packet(0, (frame(0, 0), frame(0, 1, math.nan)))])
+        finish(writer)
+    table = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
+    assert tuple(table[0]) == FRAME_COLUMNS
+    assert table[0]["symbols"] == list(range(16))
+    assert [row["distance_m"] for row in table] == [50.0, None]
+    assert len(table) == len(rows_of(tmp_path))
+
+
+def test_the_median_needs_no_memory_of_every_frame() -> None:
+    tally = TransmitterTally(3, 100.0)
+    distances = np.random.default_rng(1).normal(60.0, 2.0, 999)
+    for i in range(0, 999, 3):
+        tally.add(packet(i // 3, tuple(frame(i // 3, k, float(distances[i + k])) for k in range(3))))
+    assert tally.median_m() == pytest.approx(np.median(distances), abs=0.006)
+    tally.add(packet(333, (frame(333, 0, 1e300),)))
+    assert max(tally.cells) == 1_000_000
+
+
+def test_a_jump_in_time_is_no_clock_error() -> None:
+    tally = TransmitterTally(3, 12_200.0)
+    for number, t_us in enumerate([0.0, 12_200.1, 24_400.2, 30_000.0, 42_200.1]):
+        tally.add(Packet(0, number, t_us, 100.0, (), sent=3))
+    assert tally.clock_ppm() == pytest.approx(-0.1 / 12_200 * 1e6, rel=1e-3)
+
+
+@pytest.mark.parametrize("parquet", [False, True])
+def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path, parquet: bool) -> None:
+    if parquet:
+        pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
+    link = load_link(overrides=["tracking.id=kalman"])
+    with ResultWriter(tmp_path, link, parquet=parquet) as writer:
+        writer.write([packet(0, (frame(0, 0), frame(0, 1, math.nan)))])
+        finish(writer)
+    with (tmp_path / "frames.csv").open() as file:
+        first, second = csv.DictReader(file)
+    assert (first["distance_filtered_m"], first["distance_filtered_sigma_m"]) == ("51.0000", "0.0250")
+    assert (second["distance_filtered_m"], second["distance_filtered_sigma_m"]) == ("", "")
+    if parquet:
+        import pyarrow.parquet
+
+        table = pyarrow.parquet.read_table(tmp_path / "frames.parquet").to_pylist()
+        assert [row["distance_filtered_m"] for row in table] == [51.0, None]

@@ -1,0 +1,220 @@
+"""Position files: what is in them, what is not left behind."""
+
+import csv
+import dataclasses
+import json
+import math
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pynmea2
+import pytest
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.place.pose import project_bars
+from evlcp_sdk.results import positions
+from evlcp_sdk.results.figures import TrackProbe, draw_track, save_track
+from evlcp_sdk.results.outputs import ResultWriter, hidden_path
+from evlcp_sdk.results.positions import PositionPlan, PositionWriter
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.sites import BarSite, LocalFrame
+from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
+
+LINK = load_link()
+ZERO = datetime(2026, 3, 1, 10, 15, tzinfo=UTC)
+SITE = BarSite(7, 35.0, 137.0, 54.0, length_m=0.96)
+ATTITUDE = Attitude(5.0, 0.0, 0.0, 0.05, 0.1)
+PACKET_US = LINK.packet.packet_chips * LINK.packet.chip_us
+SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
+
+
+def packets(count: int, seed: int = 1, transmitter: int = 0) -> list[Packet]:
+    """A camera that drives north at 10 m/s towards a bar."""
+    rng, enu = np.random.default_rng(seed), SITE.cluster_positions_m(16, LocalFrame.of([SITE]))
+    found = []
+    for n in range(count):
+        frames = []
+        for k in range(10):
+            t_us = n * PACKET_US + 2600 + k * 3200
+            place = np.array([2.0, -60 + 10e-6 * t_us, -4.0])
+            points, _ = project_bars(enu, place, ATTITUDE.rotation(), LINK.camera)
+            points += rng.normal(0, 0.1, points.shape)
+            frames.append(
+                Frame(transmitter, n, k, t_us, SOFT, Range(math.nan, math.nan, 0), None, 0.0, 0.0,
+                      points, np.full(16, 0.1), t_us)
+            )  # fmt: skip
+        found.append(Packet(transmitter, n, n * PACKET_US, 100.0, tuple(frames), 10))
+    return found
+
+
+def write(
+    folder: Path, stream: Iterable[Packet], plan: PositionPlan, probes: tuple[TrackProbe, ...] = ()
+) -> dict[str, object]:
+    with ResultWriter(folder, LINK) as results, PositionWriter(folder, LINK, plan, probes) as positions:
+        positions.write(stream)
+        told = positions.finish()
+        results.finish("complete", {}, {}, {}, {}, {}, positions=told)
+    return told
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_files_of_a_drive(tmp_path: Path) -> None:
+    probe = TrackProbe()
+    told = write(tmp_path, packets(13), PositionPlan((SITE,), ATTITUDE, ZERO), probes=(probe,))
+    fixes = rows(tmp_path / "fixes.csv")
+    assert told["fixes"] == len(fixes) == 12
+    assert told["bars"] == {"0": 7}
+    frame = LocalFrame.of([SITE])
+    for row in fixes + rows(tmp_path / "track.csv"):
+        t_us = float(row["t_us"])
+        place = frame.to_enu(*(float(row[k]) for k in ("latitude_deg", "longitude_deg", "height_m")))
+        sigma = [float(row[f"sigma_{axis}_m"]) for axis in ("east", "north", "up")]
+        assert (np.abs(place - [2.0, -60 + 10e-6 * t_us, -4.0]) < 5 * np.array(sigma)).all()
+        assert row.get("refusal", "") == ""
+    track = rows(tmp_path / "track.csv")
+    assert float(track[6]["speed_m_s"]) == pytest.approx(10, abs=0.5)
+    assert min(abs(float(track[6]["course_deg"]) - c) for c in (0, 360)) < 3
+    shapes = json.loads((tmp_path / "fixes.geojson").read_text())["features"]
+    kinds = [s["geometry"]["type"] for s in shapes]
+    assert kinds == ["Point"] * 12 + ["LineString", "Point"]
+    assert shapes[-1]["geometry"]["coordinates"] == [137.0, 35.0, 54.0]
+    assert len(shapes[12]["geometry"]["coordinates"]) == 12
+    _, latitude, _ = shapes[3]["geometry"]["coordinates"]
+    assert latitude == pytest.approx(float(fixes[3]["latitude_deg"]), abs=2e-9)
+    sentences = (tmp_path / "fixes.nmea").read_text().split("\n")[:-1]
+    assert len(sentences) == 24
+    last = pynmea2.parse(sentences[-1].strip(), check=True)
+    assert last.spd_over_grnd * 1852 / 3600 == pytest.approx(10, abs=0.5)
+    assert last.datestamp.isoformat() == "2026-03-01"
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["positions"] == json.loads(json.dumps(told))
+    assert not list(tmp_path.glob(".*"))
+    bars = {0: np.zeros(3)}
+    save_track(probe, bars, "a drive", tmp_path / "track.png")
+    assert (tmp_path / "track.png").read_bytes().startswith(b"\x89PNG")
+    (ellipse, *_) = draw_track(probe, bars, "").axes[0].patches
+    # 95 % of a normal distribution of the plane lies within 2.4477 sigma.
+    fix = next(iter(probe.points))[0]
+    values = np.linalg.eigvalsh(fix.covariance_m2[:2, :2])
+    want = (2 * 2.44775 * np.sqrt(values)).tolist()
+    assert sorted((ellipse.width, ellipse.height)) == pytest.approx(want, rel=1e-4)
+
+
+def test_a_track_across_the_180th_meridian_is_cut(tmp_path: Path) -> None:
+    metre = 1 / (111_319.5 * math.cos(math.radians(35)))
+    site = dataclasses.replace(SITE, longitude_deg=180 - metre)
+    write(tmp_path, packets(4), PositionPlan((site,), ATTITUDE, ZERO))
+    shapes = json.loads((tmp_path / "fixes.geojson").read_text())["features"]
+    (line,) = (s["geometry"]["coordinates"] for s in shapes if s["geometry"]["type"] == "LineString")
+    assert all(-180 <= point[0] < -179.9999 for point in line)
+    assert positions._cut([]) == [[]]
+    for sign in (1.0, -1.0):
+        way = [
+            [sign * (180 - 1e-5), 35.0, 1.0],
+            [sign * (-180 + 2e-5), 35.3, 4.0],
+            [sign * (-180 + 3e-5), 35.4, 5.0],
+        ]
+        one, two = positions._cut(way)
+        assert one == [way[0], pytest.approx([sign * 180, 35.1, 2.0])]
+        assert two == [pytest.approx([sign * -180, 35.1, 2.0]), way[1], way[2]]
+
+
+def test_refused_fixes_are_listed_and_counted(tmp_path: Path) -> None:
+    told = write(tmp_path, packets(7), PositionPlan((SITE,), Attitude(5.0, 0.0)))
+    assert told["fixes"] == 0
+    assert told["refused"] == {"heading-unknown": 6}
+    found = rows(tmp_path / "fixes.csv")
+    assert {r["refusal"] for r in found} == {"heading-unknown"}
+    assert found[0]["latitude_deg"] == ""
+    assert found[0]["detail"]
+    assert rows(tmp_path / "track.csv") == []
+    first = (tmp_path / "fixes.nmea").read_text().splitlines()[0]
+    assert pynmea2.parse(first, check=True).gps_qual == 0
+    assert draw_track(TrackProbe(), {}, "nothing").axes
+
+
+def test_a_long_track_is_smoothed_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan, stream = PositionPlan((SITE,), ATTITUDE), packets(60)
+    write(tmp_path / "whole", stream, plan)
+    monkeypatch.setattr(positions, "_BLOCK", 16)
+    write(tmp_path / "blocks", stream, plan)
+    whole, blocks = (rows(tmp_path / name / "track.csv") for name in ("whole", "blocks"))
+    assert [r["t_us"] for r in whole] == [r["t_us"] for r in blocks]
+    apart = [abs(float(a["height_m"]) - float(b["height_m"])) for a, b in zip(whole, blocks, strict=True)]
+    assert max(apart) < 0.2 * float(whole[0]["sigma_up_m"])
+    shapes = json.loads((tmp_path / "blocks" / "fixes.geojson").read_text())["features"]
+    lines = [s["geometry"]["coordinates"] for s in shapes if s["geometry"]["type"] == "LineString"]
+    assert len(lines) == 3
+    for before, after in pairwise(lines):
+        assert before[-1] == after[0]
+
+
+def test_a_run_without_sites_drops_an_earlier_ones_positions(tmp_path: Path) -> None:
+    write(tmp_path, packets(3), PositionPlan((SITE,), ATTITUDE))
+    assert (tmp_path / "fixes.csv").exists()
+    with ResultWriter(tmp_path, LINK) as results:
+        results.finish("complete", {}, {}, {}, {}, {})
+    assert {p.name for p in tmp_path.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
+
+
+def test_a_run_that_breaks_off_leaves_nothing(tmp_path: Path) -> None:
+    plan = PositionPlan((SITE,), ATTITUDE)
+    with ResultWriter(tmp_path, LINK), PositionWriter(tmp_path, LINK, plan) as positions:
+        positions.write(packets(5))
+        assert list(tmp_path.glob(".fixes.csv.*"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_mcap_is_read_back(tmp_path: Path) -> None:
+    reader = pytest.importorskip("mcap.reader", reason="the extra mcap is not installed")
+    from mcap_protobuf.decoder import DecoderFactory
+    from scipy.spatial.transform import Rotation
+
+    write(tmp_path, packets(6), PositionPlan((SITE,), ATTITUDE, ZERO, mcap=True))
+    fixes = rows(tmp_path / "fixes.csv")
+    found: dict[str, list[tuple[str, int, object]]] = {}
+    with (tmp_path / "fixes.mcap").open("rb") as file:
+        source = reader.make_reader(file, decoder_factories=[DecoderFactory()])
+        for schema, channel, message, decoded in source.iter_decoded_messages():
+            found.setdefault(channel.topic, []).append((schema.name, message.log_time, decoded))
+    assert {t: {name for name, _, _ in m} for t, m in found.items()} == {
+        "/fix": {"foxglove.LocationFix"},
+        "/track": {"foxglove.LocationFix"},
+        "/pose": {"foxglove.PoseInFrame"},
+    }
+    for row, (_, at_ns, fix), (_, _, pose) in zip(fixes, found["/fix"], found["/pose"], strict=True):
+        assert at_ns == int(ZERO.timestamp()) * 10**9 + round(float(row["t_us"]) * 1000)
+        assert fix.timestamp.ToNanoseconds() == at_ns  # type: ignore[attr-defined]
+        assert fix.latitude == pytest.approx(float(row["latitude_deg"]), abs=1e-10)  # type: ignore[attr-defined]
+        assert math.sqrt(fix.position_covariance[0]) == pytest.approx(float(row["sigma_east_m"]), abs=6e-5)  # type: ignore[attr-defined]
+        q = pose.pose.orientation  # type: ignore[attr-defined]
+        forward = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()[:, 2]
+        heading = math.degrees(math.atan2(forward[0], forward[1])) % 360
+        assert abs((heading - float(row["heading_deg"]) + 180) % 360 - 180) < 1e-3
+        assert pose.pose.position.z == pytest.approx(float(row["height_m"]) - 54, abs=2e-3)  # type: ignore[attr-defined]
+
+
+def test_mcap_without_the_extra_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("evlcp_sdk.results.mcap.find_spec", lambda _name: None)
+    with pytest.raises(ConfigError, match=r"evlcp-sdk\[mcap\]"):
+        PositionWriter(tmp_path, LINK, PositionPlan((SITE,), ATTITUDE, mcap=True))
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be written"):
+        PositionWriter(tmp_path / "none", LINK, PositionPlan((SITE,), ATTITUDE))
+
+
+def test_beacons_that_are_not_believed_give_no_positions(tmp_path: Path) -> None:
+    stranger = dataclasses.replace(SITE, transmitter=3)
+    told = write(tmp_path, packets(5), PositionPlan((stranger,), ATTITUDE))
+    assert told["refused"] == {"no-site": 4}
+    assert not hidden_path(tmp_path, "fixes.csv").exists()

@@ -1,0 +1,186 @@
+"""Finding and following blinking regions."""
+
+from collections import deque
+from collections.abc import Iterable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.link.sections import RegionSpec
+from evlcp_sdk.rx.detection import Followed, RegionFollower
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.testing.recordings import (
+    IdealBar,
+    ideal_events,
+    lamp_events,
+    merged,
+    noise_events,
+    random_symbols,
+)
+from evlcp_sdk.values import Events, Region
+
+LINK = load_link()
+SPEC = RegionSpec(step_us=1000)
+STEP_US = SPEC.step_us
+
+
+def follower() -> RegionFollower:
+    return RegionFollower(SPEC, CameraModel(), LINK.packet.chip_us)
+
+
+def steps(events: Events, until_us: int) -> Iterable[tuple[int, Events]]:
+    bounds = np.searchsorted(events.t_us, np.arange(0, until_us + 1, STEP_US))
+    return ((n * STEP_US, events[a:b]) for n, (a, b) in enumerate(pairwise(bounds)))
+
+
+def followed(events: Events, until_us: int) -> dict[int, list[Followed]]:
+    """The regions of each step, by its start."""
+    regions = follower()
+    return {start: regions.step(start, part) for start, part in steps(events, until_us)}
+
+
+def test_a_bar_is_found_within_three_steps_and_measured() -> None:
+    bar = IdealBar(random_symbols(LINK, 1), start_us=3000)
+    by_step = followed(ideal_events(LINK, bar), 30_000)
+    first = next(start for start, found in by_step.items() if found)
+    assert first <= 3000 + 3 * STEP_US
+    (region,) = by_step[29_000]
+    assert region.latest.x_px == pytest.approx(bar.x_px - 0.5, abs=0.6)
+    assert region.latest.y_px == pytest.approx(bar.y_px - 0.5, abs=0.6)
+    assert region.latest.height_px == pytest.approx(128, abs=1.5)
+    assert region.latest.width_px == bar.width_px
+
+
+def test_events_from_before_it_was_found_are_kept() -> None:
+    bar = IdealBar(random_symbols(LINK, 1), start_us=3000)
+    events = ideal_events(LINK, bar)
+    by_step = followed(events, 20_000)
+    (region,) = by_step[19_000]
+    kept = sum(len(e) for _, e in region.pieces)
+    assert kept == np.searchsorted(events.t_us, 20_000)
+
+
+@pytest.mark.parametrize(("shake_px", "shake_hz"), [(16, 15), (4, 60)])
+def test_a_shaking_bar_is_followed(shake_px: float, shake_hz: float) -> None:
+    """1.5 px/ms is the most that the paper has seen."""
+    bar = IdealBar(random_symbols(LINK, 3), shake_px=shake_px, shake_hz=shake_hz, start_us=0)
+    by_step = followed(ideal_events(LINK, bar), 100_000)
+    assert {t.id for found in by_step.values() for t in found} == {0}
+    (region,) = by_step[99_000]
+    at = np.arange(5000.0, 99_000.0, 500.0)
+    (x, y), (true_x, true_y) = region.at(at), bar.centre(at)
+    assert np.sqrt(np.mean((x - true_x + 0.5) ** 2)) < 0.6
+    assert np.sqrt(np.mean((y - true_y + 0.5) ** 2)) < 0.8
+
+
+@pytest.mark.parametrize("way", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_a_bar_that_leaves_the_image_fast_is_let_go(way: tuple[int, int]) -> None:
+    """The filter's prediction runs on off the sensor until the region is released."""
+    link = load_link(overrides=["tracking.id=kalman"])
+    regions = RegionFollower(
+        SPEC, CameraModel(), LINK.packet.chip_us, link.algorithm("tracking").compile().position
+    )
+    events = ideal_events(LINK, IdealBar(random_symbols(LINK, 3), start_us=0))
+    gone_us = 15_000
+    moved_px = np.rint(9e-3 * np.maximum(events.t_us - gone_us, 0)).astype(np.int64)
+    x = events.x.astype(np.int64) + way[0] * moved_px + {1: 800, 0: 0, -1: -350}[way[0]]
+    y = events.y.astype(np.int64) + way[1] * moved_px
+    seen = (x >= 0) & (x < 1280) & (y >= 0) & (y < 720)
+    kept = Events.of(events.t_us[seen], x[seen], y[seen], events.p[seen])
+    assert kept.t_us[-1] < 90_000
+    seen = [region for start, part in steps(kept, 160_000) for region in regions.step(start, part)]
+    assert {region.id for region in seen} >= {0}
+    assert not regions.alive
+    assert all(region.released for region in seen)
+
+
+def test_a_region_goes_straight_on_for_two_steps() -> None:
+    positions = [Region(0, 1000.0 * n, 50 + n**2, 80 - 2 * n, 4, 100) for n in range(4)]
+    region = Followed(0, deque(positions), 0)
+    x, y = region.at(np.array([-9e9, -1000, 0, 500, 3000, 4000, 5000, 9e9]))
+    assert x == pytest.approx([48, 49, 50, 50.5, 59, 64, 69, 69])
+    assert y == pytest.approx([84, 82, 80, 79, 74, 72, 70, 70])
+    alone = Followed(0, deque(positions[:1]), 0)
+    assert alone.at(np.array([-5e3, 7e3]))[0] == pytest.approx([50, 50])
+
+
+@pytest.mark.parametrize("end", ["top", "bottom"])
+def test_an_end_that_is_dark_for_a_while_is_still_there(end: str) -> None:
+    bar = IdealBar(random_symbols(LINK, 2), start_us=0)
+    events = ideal_events(LINK, bar)
+    dark = (events.t_us >= 30_000) & (events.t_us < 33_000)
+    dark &= events.y < 309 if end == "top" else events.y >= 411
+    by_step = followed(events[~dark], 60_000)
+    (region,) = by_step[59_000]
+    for at in region.positions:
+        if at.t_us > 10_000:
+            assert at.y_px == pytest.approx(bar.y_px - 0.5, abs=1)
+            assert at.height_px == pytest.approx(128, abs=2)
+
+
+def test_pixels_awake_beyond_an_end_do_not_move_a_region() -> None:
+    bar = IdealBar(random_symbols(LINK, 2), start_us=0)
+    events = ideal_events(LINK, bar)
+    copies = events[(events.y == 290) & (events.x == 400) & (events.t_us >= 30_000)]
+    copies = copies[copies.t_us < 34_000]
+    stray = Events.of(copies.t_us, copies.x, copies.y - 8, copies.p)
+    by_step = followed(merged(events, stray), 60_000)
+    (region,) = by_step[59_000]
+    for at in region.positions:
+        if at.t_us > 10_000:
+            assert at.y_px == pytest.approx(bar.y_px - 0.5, abs=1)
+
+
+def test_two_bars_are_two_regions() -> None:
+    one, two = IdealBar(random_symbols(LINK, 1)), IdealBar(random_symbols(LINK, 1), x_px=450, start_us=5300)
+    by_step = followed(merged(ideal_events(LINK, one), ideal_events(LINK, two)), 30_000)
+    assert sorted(round(t.latest.x_px) for t in by_step[29_000]) == [400, 450]
+
+
+def test_a_bar_in_two_pieces_is_one_region() -> None:
+    bar = IdealBar(random_symbols(LINK, 1))
+    events = ideal_events(LINK, bar)
+    middle = (events.y >= 345) & (events.y < 355)
+    by_step = followed(events[~middle], 30_000)
+    (region,) = by_step[29_000]
+    assert region.latest.height_px == pytest.approx(128, abs=1.5)
+
+
+def test_what_fades_is_released() -> None:
+    bar = IdealBar(random_symbols(LINK, 1), start_us=0)
+    ends = 34_600
+    regions = follower()
+    events = ideal_events(LINK, bar)
+    alive = {
+        start: [not t.released for t in regions.step(start, part)]
+        for start, part in steps(events, ends + SPEC.fade_us + 5000)
+    }
+    (gone,) = [start for start, found in alive.items() if found == [False]]
+    assert gone == pytest.approx(ends + SPEC.fade_us, abs=2 * STEP_US)
+    assert alive[gone + STEP_US] == []
+
+
+@pytest.mark.parametrize("hz", [100, 300, 1000, 2000])
+@pytest.mark.parametrize("duty", [0.05, 0.2, 0.5])
+def test_lamps_and_noise_are_no_regions(hz: float, duty: float) -> None:
+    by_step = followed(
+        merged(lamp_events(300, 300, 20, hz, 60_000, duty=duty), noise_events(500_000, 60_000)), 60_000
+    )
+    assert not any(by_step.values())
+
+
+def test_a_moving_edge_is_no_region() -> None:
+    """A bright post that crosses the image at 3 px/ms: each pixel sees it come and go once."""
+    column, row = np.meshgrid(np.arange(100, 400), np.arange(100, 500))
+    comes, goes = (column - 100) * 333, (column - 100) * 333 + 3000
+    t = np.concatenate([comes.ravel() + d for d in (0, 20, 40)] + [goes.ravel() + d for d in (0, 20, 40)])
+    order = np.argsort(t, kind="stable")
+    events = Events.of(
+        t[order],
+        np.tile(column.ravel(), 6)[order],
+        np.tile(row.ravel(), 6)[order],
+        np.repeat([1, 0], 3 * column.size)[order],
+    )
+    assert not any(followed(events, 100_000).values())

@@ -1,0 +1,85 @@
+"""The camera model against closed forms and numerical inverses."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import approx_fprime, root
+
+from evlcp_sdk.link.resolve import resolve
+from evlcp_sdk.scene.camera import CameraModel
+
+BENT = CameraModel(
+    focal_mm=4.0, centre_x_px=650.5, centre_y_px=340.25, k1=-0.21, k2=0.06, p1=1.1e-3, p2=-7e-4, k3=-0.004
+)
+
+
+def test_without_distortion_it_is_a_pinhole_with_its_axis_in_the_middle() -> None:
+    camera = CameraModel()
+    points = np.array([[0.0, 0.0, 50.0], [1.5, -0.5, 30.0]])
+    f = 35e3 / 4.86
+    want = [[640, 360], [640 + f * 1.5 / 30, 360 - f * 0.5 / 30]]
+    np.testing.assert_allclose(camera.project(points), want, rtol=1e-14)
+    np.testing.assert_allclose(camera.undistort(camera.project(points)), points[:, :2] / points[:, 2:])
+    assert np.isnan(camera.project(np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))).all()
+
+
+def test_the_terms_are_those_of_opencv() -> None:
+    # The formulae as OpenCV's documentation of calibrateCamera writes them.
+    x, y = 0.3, -0.2
+    r2 = x * x + y * y
+    k1, k2, p1, p2, k3 = BENT.k1, BENT.k2, BENT.p1, BENT.p2, BENT.k3
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    xx = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+    yy = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+    want = [BENT.focal_px * xx + 650.5, BENT.focal_px * yy + 340.25]
+    np.testing.assert_allclose(BENT.project(np.array([3.0, -2.0, 10.0])), want, rtol=1e-14)
+
+
+@given(st.floats(0, 1279), st.floats(0, 719))
+def test_undistort_is_the_numerical_inverse(x: float, y: float) -> None:
+    pixel = np.array([x, y])
+    found = BENT.undistort(pixel)
+    solved = root(lambda d: BENT.distort(d) - pixel, (pixel - BENT.centre_px) / BENT.focal_px, tol=1e-13)
+    assert solved.success
+    np.testing.assert_allclose(found, solved.x, atol=1e-9)
+    np.testing.assert_allclose(BENT.distort(found), pixel, atol=1e-6)
+
+
+@given(st.floats(-0.25, -0.01), st.floats(0, 0.55))
+def test_undistort_of_one_radial_term_is_the_root_of_a_cubic(k1: float, u: float) -> None:
+    camera = CameraModel(focal_mm=4.0, k1=k1)
+    seen = u + k1 * u**3
+    roots = np.roots([k1, 0, 1, -seen])
+    real = roots[np.abs(roots.imag) < 1e-9].real
+    nearest = real[np.argmin(np.abs(real - seen))]
+    pixel = np.array([640 + camera.focal_px * seen, 360.0])
+    np.testing.assert_allclose(camera.undistort(pixel), [nearest, 0], atol=1e-8)
+
+
+def test_a_pixel_that_no_direction_reaches_is_not_inverted() -> None:
+    # u + k1 u^3 is largest at u = 1 / sqrt(3 |k1|).
+    camera = CameraModel(focal_mm=2.0, k1=-1.0)
+    largest = 2 / 3 / np.sqrt(3)
+    pixels = 640 + camera.focal_px * largest * np.array([0.99, 1.01])
+    found = camera.undistort(np.stack([pixels, [360, 360]], -1))
+    assert np.isfinite(found[0]).all()
+    assert np.isnan(found[1]).all()
+
+
+@given(st.floats(-3, 3), st.floats(-2, 2), st.floats(5, 20))
+def test_slopes_are_the_numerical_ones(x: float, y: float, z: float) -> None:
+    point = np.array([x, y, z])
+    want = approx_fprime(point, BENT.project, 1e-6)
+    np.testing.assert_allclose(BENT.project_slope(point), want, atol=2e-3)
+    direction = point[:2] / z
+    np.testing.assert_allclose(
+        BENT.distort_slope(direction), approx_fprime(direction, BENT.distort, 1e-7), atol=2e-3
+    )
+
+
+def test_the_configuration_has_the_keys() -> None:
+    camera = resolve({"camera": {"k1": -0.1, "centre_x_px": 641.5}}).camera
+    assert camera == CameraModel(k1=-0.1, centre_x_px=641.5)
+    assert camera.centre_px == (641.5, 360.0)
+    assert camera.distance_m(0.06, 6.0) == pytest.approx(72.016, abs=1e-3)

@@ -1,0 +1,72 @@
+"""A campaign without light: tasks that cost little, fail and die as told."""
+
+import os
+import random
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from evlcp_sdk.errors import EvlcpError
+from evlcp_sdk.jobs.executor import Processes
+from evlcp_sdk.study.campaign.plan import Case, Job, Plan, StopRule, make_plan
+from evlcp_sdk.study.tally import Statistics, Tally
+
+
+def fake_plan(
+    scenes: int = 5, links: int = 2, seeds: int = 4, rule: StopRule | None = None, **scene: Any
+) -> Plan:
+    """Scenes of growing difficulty; `scene` says what else their tasks do."""
+    return make_plan(
+        "fake",
+        [Case((("distance_m", 30.0 + 10 * n),), {"n": n, **scene}, {"n": n}) for n in range(scenes)],
+        [Case((("variant", f"link {n}"),), n, n) for n in range(links)],
+        range(seeds),
+        rule=rule or StopRule(),
+        environment={"code": "fake"},
+    )
+
+
+def run_fake(job: Job) -> list[tuple[str, Statistics]]:
+    """Statistics that follow from scene, link and seed alone, after a while."""
+    scene = job.scene
+    time.sleep(scene.get("seconds", 0.0))
+    mark = scene.get("dies_once")
+    if mark is not None and not Path(f"{mark}-{scene['n']}-{job.seed}").exists():
+        Path(f"{mark}-{scene['n']}-{job.seed}").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if scene.get("dies") == scene["n"]:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if scene.get("fails") == scene["n"]:
+        raise EvlcpError("this scene cannot be rendered")
+    if scene.get("breaks") == scene["n"]:
+        raise ValueError("a fault in a plugin")
+    return [(task.id, fake_statistics(scene["n"], task.link, job.seed)) for task in job.tasks]
+
+
+def fake_statistics(scene: int, link: int, seed: int) -> Statistics:
+    rng = random.Random(f"{scene} {link} {seed}")
+    tallies = []
+    for _ in range(20):
+        begin = 30 + 10 * scene
+        tallies.append((begin, Tally.sent()))
+        if rng.random() < 0.95:
+            errors = sum(rng.random() < 0.01 * (scene + 1) for _ in range(96))
+            error_m = rng.gauss(0, 0.05 * (scene + 1) * (link + 1))
+            tallies.append((begin, Tally.found(96, errors, error_m)))
+    return Statistics.of(1, rng.randrange(10_000), 100_000, 0, tallies)
+
+
+def main(store: str, workers: str, scenes: str, links: str, seeds: str, seconds: str) -> None:
+    """The process that the kill tests kill."""
+    from evlcp_sdk.study.campaign.collect import collect
+    from evlcp_sdk.study.campaign.store import Store
+
+    plan = fake_plan(int(scenes), int(links), int(seeds), seconds=float(seconds))
+    with Store(Path(store), create=True) as file:
+        collect(plan, file, Processes(int(workers)), run_fake)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,140 @@
+"""A Dask cluster gives what local processes give, also while its workers die."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from evlcp_sdk.errors import ConfigError, EvlcpError
+from evlcp_sdk.jobs.dask import DaskCluster
+from evlcp_sdk.jobs.executor import Inline
+from evlcp_sdk.study.campaign.collect import Counted, Progress, collect
+from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.tally import Statistics
+from tests.conftest import ROOT
+from tests.unit.study.campaign.fake import fake_plan, run_fake
+
+QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+
+
+class Cluster:
+    """A scheduler and its workers, each a process."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.file = folder / "scheduler.json"
+        self.processes: list[subprocess.Popen[bytes]] = []
+        options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-show"]
+        self._start("distributed.cli.dask_scheduler", *options, "--scheduler-file", self.file)
+        until = time.monotonic() + 30
+        while not self.file.exists() and time.monotonic() < until:
+            time.sleep(0.05)
+        self.address: str = json.loads(self.file.read_text())["address"]
+
+    def _start(self, module: str, *options: str | Path) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", module, *map(str, options)]
+        process = subprocess.Popen(
+            command,
+            cwd=ROOT,
+            env=os.environ | {"HOME": str(self.folder), "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "3s"},
+            **QUIET,
+        )  # type: ignore[call-overload]
+        self.processes.append(process)
+        return process  # type: ignore[no-any-return]
+
+    def add_worker(self) -> subprocess.Popen[bytes]:
+        options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1"]
+        space = ["--local-directory", self.folder]
+        return self._start("distributed.cli.dask_worker", self.address, *options, *space)
+
+    def end(self) -> None:
+        for process in reversed(self.processes):
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    made = Cluster(tmp_path)
+    yield made
+    made.end()
+
+
+def test_workers_may_die_and_come(cluster: Cluster, tmp_path: Path) -> None:
+    """200 tasks; two of three workers are killed in the middle and one comes."""
+    plan = fake_plan(25, 2, 4, seconds=0.02)
+    workers = [cluster.add_worker() for _ in range(3)]
+    deaths = {30: 0, 90: 1}
+
+    def watch(progress: Progress) -> None:
+        for done in [d for d in deaths if progress.done >= d]:
+            workers[deaths.pop(done)].send_signal(signal.SIGKILL)
+            cluster.add_worker()
+
+    with Store(tmp_path / "dask.sqlite", create=True) as store:
+        progress = collect(plan, store, DaskCluster(cluster.address), run_fake, watch)
+        found = store.results()
+    assert not deaths
+    assert progress.faults == ()
+    assert progress.done == 200
+    with Store(tmp_path / "inline.sqlite", create=True) as store:
+        collect(fake_plan(25, 2, 4), store, Inline(), run_fake)
+        assert store.results() == found
+
+
+def test_faults_are_told(cluster: Cluster, tmp_path: Path) -> None:
+    cluster.add_worker()
+    plan = fake_plan(4, 1, 1, fails=1, breaks=2)
+    with Store(tmp_path / "a.sqlite", create=True) as store:
+        progress = collect(plan, store, DaskCluster(cluster.address), run_fake)
+    messages = {job.scene["n"]: fault.message for job, fault in progress.faults}
+    assert messages == {1: "this scene cannot be rendered", 2: "ValueError: a fault in a plugin"}
+    assert progress.done == 2
+
+
+def test_a_scheduler_that_dies_keeps_what_was_finished(cluster: Cluster, tmp_path: Path) -> None:
+    cluster.add_worker()
+    plan = fake_plan(25, 2, 4, seconds=0.02)
+
+    def watch(progress: Progress) -> None:
+        if progress.done == 40:
+            cluster.processes[0].kill()
+
+    with Store(tmp_path / "a.sqlite", create=True) as store:
+        with pytest.raises(EvlcpError, match="scheduler is gone; what was finished is kept") as told:
+            collect(plan, store, DaskCluster(cluster.address), run_fake, watch)
+        assert len(str(told.value).splitlines()) == 1
+        assert len(store.results()) >= 40
+        collect(fake_plan(25, 2, 4), store, Inline(), run_fake)
+        results = store.results()
+    totals = [Counted(point.tasks, plan.rule, results).total for point in plan.points]
+    assert sum(totals, Statistics()).tasks == 200
+
+
+def test_no_scheduler() -> None:
+    pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    with pytest.raises(ConfigError, match=r"^--dask tcp://127\.0\.0\.1:9: no Dask scheduler answers there$"):
+        DaskCluster("tcp://127.0.0.1:9")
+    with pytest.raises(ConfigError, match="no Dask scheduler answers there"):
+        DaskCluster("nonsense://x")
+
+
+def test_an_address_that_cannot_be_one_starts_no_client(monkeypatch: pytest.MonkeyPatch) -> None:
+    distributed = pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    monkeypatch.setattr(distributed, "Client", lambda *_, **__: pytest.fail("a client was started"))
+    for address in ("nonsense", "tcp://127.0.0.1", "nonsense://x:1"):
+        with pytest.raises(ConfigError, match="no Dask scheduler answers there"):
+            DaskCluster(address)
+
+
+def test_without_dask(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ConfigError, match="pip install 'evlcp-sdk\\[cluster\\]'"):
+        DaskCluster("tcp://127.0.0.1:9")

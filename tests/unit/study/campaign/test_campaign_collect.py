@@ -1,0 +1,260 @@
+"""Collection: what is run, what is kept, and that the answer is the same whoever runs it and who dies."""
+
+import os
+import random
+import resource
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
+from evlcp_sdk.jobs.executor import Executor, Inline, Processes
+from evlcp_sdk.study.campaign.collect import Counted, Progress, collect
+from evlcp_sdk.study.campaign.plan import Plan, StopRule
+from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.tally import Statistics
+from tests.conftest import ROOT
+from tests.unit.study.campaign.fake import fake_plan, run_fake
+
+
+def collected(plan: Plan, path: Path, executor: Executor | None = None) -> tuple[Progress, list[Statistics]]:
+    """How a collection ended, and what counts of each point in its store."""
+    with Store(path, create=True) as store:
+        progress = collect(plan, store, executor or Inline(), run_fake)
+        results = store.results()
+    return progress, [Counted(point.tasks, plan.rule, results).total for point in plan.points]
+
+
+def test_all_points_get_all_their_seeds(tmp_path: Path) -> None:
+    plan = fake_plan()
+    progress, totals = collected(plan, tmp_path / "a.sqlite")
+    assert (progress.tasks, progress.done, progress.points, progress.points_done) == (40, 40, 10, 10)
+    assert all(total.tasks == 4 for total in totals)
+    assert progress.bits == sum(t.total().bits for t in totals)
+    assert progress.bit_errors == sum(t.total().bit_errors for t in totals)
+
+
+@pytest.mark.parametrize(
+    "rule", [StopRule(), StopRule(max_errors=60), StopRule(max_bits=9000, max_errors=400)]
+)
+def test_the_number_of_workers_changes_nothing(tmp_path: Path, rule: StopRule) -> None:
+    plan = fake_plan(seeds=8, rule=rule)
+    one, expected = collected(plan, tmp_path / "one.sqlite")
+    many, totals = collected(plan, tmp_path / "many.sqlite", Processes(3))
+    assert totals == expected
+    assert one == many
+    assert one.done == one.tasks
+    if rule.max_errors == 60:
+        assert one.tasks < 80
+        assert max(t.tasks for t in totals) > min(t.tasks for t in totals)
+
+
+def test_a_finished_campaign_runs_nothing_and_a_grown_one_the_rest(tmp_path: Path) -> None:
+    ran: list[str] = []
+
+    def run(job: object) -> list[tuple[str, Statistics]]:
+        results = run_fake(job)  # type: ignore[arg-type]
+        ran.extend(task for task, _ in results)
+        return results
+
+    with Store(tmp_path / "a.sqlite", create=True) as store:
+        collect(fake_plan(), store, Inline(), run)
+        assert len(ran) == 40
+        collect(fake_plan(), store, Inline(), run)
+        assert len(ran) == 40
+        collect(fake_plan(scenes=6, seeds=5), store, Inline(), run)
+    assert len(ran) == len(set(ran)) == 60
+
+
+def test_a_rule_that_is_tightened_counts_less_of_what_is_there(tmp_path: Path) -> None:
+    collected(fake_plan(seeds=8), tmp_path / "a.sqlite")
+    rule = StopRule(max_bits=5000)
+    _, totals = collected(fake_plan(seeds=8, rule=rule), tmp_path / "a.sqlite")
+    _, expected = collected(fake_plan(seeds=8, rule=rule), tmp_path / "b.sqlite")
+    assert totals == expected
+
+
+@pytest.mark.parametrize("executor", [Inline(), Processes(2)], ids=["inline", "processes"])
+def test_a_job_that_fails_does_not_stop_the_others(tmp_path: Path, executor: Executor) -> None:
+    progress, totals = collected(fake_plan(fails=1, breaks=3), tmp_path / "a.sqlite", executor)
+    messages = {job.scene["n"]: fault.message for job, fault in progress.faults}
+    assert messages == {1: "this scene cannot be rendered", 3: "ValueError: a fault in a plugin"}
+    assert progress.done == 24
+    assert [t.tasks for t in totals] == [4, 4, 0, 0, 4, 4, 0, 0, 4, 4]
+
+
+def test_a_worker_that_dies_is_replaced(tmp_path: Path) -> None:
+    plan = fake_plan(seeds=1, dies_once=str(tmp_path / "mark"))
+    progress, totals = collected(plan, tmp_path / "a.sqlite", Processes(2))
+    assert not progress.faults
+    assert totals == collected(fake_plan(seeds=1), tmp_path / "b.sqlite")[1]
+
+
+def test_a_job_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
+    progress, _ = collected(fake_plan(scenes=3, seeds=1, dies=1), tmp_path / "a.sqlite", Processes(2))
+    ((job, fault),) = progress.faults
+    assert job.scene["n"] == 1
+    assert fault.message == "its process died 3 times (exit code -9)"
+    assert progress.done == 4
+
+
+def start(store: Path, *, seconds: float = 0.02) -> subprocess.Popen[bytes]:
+    command = [
+        sys.executable,
+        "-m",
+        "tests.unit.study.campaign.fake",
+        store,
+        "2",
+        "25",
+        "2",
+        "4",
+        str(seconds),
+    ]
+    return subprocess.Popen([str(c) for c in command], cwd=ROOT, start_new_session=True)
+
+
+def kept(store: Path) -> int:
+    if not store.exists():
+        return 0
+    try:
+        with Store(store) as file:
+            return len(file.results())
+    except InputError:
+        return 0
+
+
+def wait_for(count: Callable[[], int], more_than: int, seconds: float = 30) -> int:
+    until = time.monotonic() + seconds
+    while (n := count()) <= more_than and time.monotonic() < until:
+        time.sleep(0.02)
+    return n
+
+
+def children(pid: int) -> list[int]:
+    listed = Path(f"/proc/{pid}/task/{pid}/children")
+    return [int(p) for p in listed.read_text().split()] if listed.exists() else []
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc to find the workers")
+def test_killed_five_times_it_ends_as_if_never(tmp_path: Path) -> None:
+    """200 tasks: scheduler and workers are killed at random moments, and nothing finished is lost."""
+    rng = random.Random(4)
+    store = tmp_path / "killed.sqlite"
+    seen = 0
+    for death in range(5):
+        process = start(store)
+        try:
+            seen_now = wait_for(lambda: kept(store), seen + rng.randrange(4, 14))
+            assert seen_now > seen
+            workers = children(process.pid)
+            if death % 2:
+                for worker in workers:
+                    os.kill(worker, signal.SIGKILL)
+                wait_for(lambda: kept(store), seen_now)
+            process.kill()
+        finally:
+            process.wait()
+        for worker in workers:
+            wait_for(lambda w=worker: int(not Path(f"/proc/{w}").exists()), 0)  # type: ignore[misc]
+            assert not Path(f"/proc/{worker}/exe").exists(), "a worker outlives its scheduler"
+        assert kept(store) >= seen_now
+        seen = kept(store)
+    assert 0 < seen < 200
+    process = start(store)
+    assert process.wait(60) == 0
+    plan = fake_plan(25, 2, 4)
+    progress, totals = collected(plan, store)
+    _, expected = collected(plan, tmp_path / "whole.sqlite")
+    assert totals == expected
+    assert progress.done == 200
+    with Store(store) as left, Store(tmp_path / "whole.sqlite") as right:
+        assert left.results() == right.results()
+
+
+def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "a.sqlite"
+    plan = fake_plan(seeds=40)
+    collected(fake_plan(seeds=2), path)
+    before = kept(path)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    with Store(path, create=True) as store:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 150_000, hard))
+        try:
+            with pytest.raises(
+                EvlcpError, match=r"a\.sqlite: cannot be written: .*; what was finished is kept"
+            ) as told:
+                collect(plan, store, Inline(), run_fake)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+            signal.signal(signal.SIGXFSZ, ignored)
+    assert len(str(told.value).splitlines()) == 1
+    assert before < kept(path) < 400
+    assert collected(plan, path)[1] == collected(plan, tmp_path / "b.sqlite")[1]
+
+
+@pytest.mark.parametrize(
+    "content", [b"not a database at all, but long enough to be looked at" * 20, b"\x89PNG"]
+)
+def test_a_store_that_is_none(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a.sqlite"
+    path.write_bytes(content)
+    for create in (True, False):
+        with pytest.raises(InputError, match=r"a\.sqlite: "):
+            Store(path, create=create)
+    assert path.read_bytes() == content
+
+
+def test_someone_elses_database_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.sqlite"
+    other = sqlite3.connect(path)
+    other.execute("CREATE TABLE theirs (x)")
+    other.commit()
+    other.close()
+    with pytest.raises(InputError, match="not a results file"):
+        Store(path, create=True)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "DROP TABLE plan; DROP TABLE result",
+        "UPDATE plan SET body = '{'; UPDATE result SET statistics = '{'",
+        "UPDATE plan SET body = x'ff'; UPDATE result SET statistics = '[1]'",
+    ],
+)
+def test_a_damaged_store_is_named(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "r.sqlite"
+    collected(fake_plan(), path)
+    base = sqlite3.connect(path)
+    base.executescript(damage)
+    base.close()
+    with Store(path) as store:
+        for read in (store.plan, store.results):
+            with pytest.raises(InputError, match=r"r\.sqlite: damaged, or no results file of evlcp sweep"):
+                read()
+
+
+def test_stores_that_cannot_be_opened(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no results file there"):
+        Store(tmp_path / "none.sqlite")
+    with pytest.raises(ConfigError, match="unable to open"):
+        Store(tmp_path / "no" / "such" / "a.sqlite", create=True)
+    with Store(tmp_path / "a.sqlite", create=True) as store:
+        with pytest.raises(InputError, match="no campaign has begun"):
+            store.plan()
+        store.adopt(fake_plan())
+
+
+def test_a_store_holds_one_campaign(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    collected(fake_plan(), tmp_path / "a.sqlite")
+    with pytest.raises(ConfigError, match="holds the campaign 'fake', not 'other'"):
+        collected(replace(fake_plan(), name="other"), tmp_path / "a.sqlite")

@@ -1,0 +1,197 @@
+"""Statistics of decoded frames, beside the independent scorer's figures on its recordings."""
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.sites import LocalFrame
+from evlcp_sdk.sim import Simulation, resolve_scene, sites_of, truth_of
+from evlcp_sdk.sim.world import attitude_log
+from evlcp_sdk.study.measure import position_tallies, statistics_of
+from evlcp_sdk.study.tally import Statistics, Tally
+from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
+from tests.conftest import ROOT, Run
+
+SHARED = ROOT.parent / "shared"
+
+CHIPS = 26 + 32 * 2
+TRUTH: dict[str, Any] = {
+    "scene": {"duration_s": 0.02, "t0_us": 1000},
+    "t_s": [0.0, 0.02],
+    "distance_m": [[40.002, 39.998]],
+    "bar_centre_px": [[[600.0, 600.0], [300.0, 300.0]]],
+    "bars": [
+        {
+            "profile": "wh4x2",
+            "frames": 2,
+            "packet_chips": CHIPS,
+            "ppm": 0.0,
+            "start_chip": 26.0,
+            "symbols": [[[1, 2], [3, 4]], [[5, 6], [7, 8]]],
+        }
+    ],
+}
+
+
+def frame(t_us: float, symbols: list[int], distance_m: float, x_px: float = 601.0) -> Frame:
+    soft = SoftSymbols(np.array(symbols), np.zeros((len(symbols), 6), np.float32), 1.0)
+    return Frame(
+        transmitter=0,
+        packet=0,
+        frame=0,
+        t_us=t_us + 1000,
+        soft=soft,
+        range=Range(distance_m, 0.1, 3),
+        filtered=None,
+        x_px=x_px,
+        y_px=301.0,
+    )
+
+
+def test_each_frame_is_held_beside_the_sent_one() -> None:
+    frames = [
+        frame(20, [1, 2], 40.5),
+        frame(3200, [3, 5], float("nan")),
+        frame(3300, [3, 4], 40.0),
+        frame(9050, [5, 6], 39.9, x_px=700.0),
+        frame(9050, [5, 7], 39.9),
+    ]
+    found = statistics_of(frames, TRUTH, 123)
+    assert (found.tasks, found.events, found.duration_us, found.unmatched) == (1, 123, 20_000, 2)
+    (near, at_30), (far, at_40) = found.segments
+    assert (near, far) == (30, 40)
+    # Frames begin at 0, 3.2, 9 and 12.2 ms; the bar is 40 m away at 10 ms.
+    assert (at_40.frames_sent, at_40.frames_found, at_40.bits, at_40.bit_errors) == (3, 3, 36, 2)
+    assert (at_40.ranged, at_40.gross) == (2, 0)
+    assert (at_30.frames_sent, at_30.frames_found) == (1, 0)
+    assert at_40.bias_m == pytest.approx(((40.5 - 40.00184) + (39.9 - 40.00004)) / 2, abs=1e-4)
+
+
+def test_a_scene_without_bars_has_only_ghosts() -> None:
+    found = statistics_of([frame(20, [1, 2], 40.5)], TRUTH | {"bars": []}, 0)
+    assert found == Statistics(1, 0, 20_000, 1)
+
+
+# The scorer, not this project's, leaves its files to the collector.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs the recordings with truth in ../shared")
+@pytest.mark.parametrize("name", ["night-50m-30kmh", "two-bars-60m-75m", "no-bar"])
+def test_figures_are_the_scorers(name: str, tmp_path: Path, evlcp: Any) -> None:
+    spec = importlib.util.spec_from_file_location("score", SHARED / "tools" / "score.py")
+    assert spec is not None
+    assert spec.loader is not None
+    scorer = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(scorer)
+    recording = SHARED / "recordings" / f"{name}.raw"
+    done: Run = evlcp("receive", recording, "-o", tmp_path)
+    assert done.code == 0
+    truth_file = recording.with_suffix(".truth.json")
+    expected = scorer.score(tmp_path, truth_file)
+    ours = statistics_of(received(recording), json.loads(truth_file.read_text()), 0)
+    assert ours.unmatched == expected["unmatched"]
+    total = ours.total()
+    bars = expected["bars"]
+    for mine, theirs in (
+        (total.frames_sent, "frames_sent"),
+        (total.frames_found, "frames_found"),
+        (total.bits, "bits"),
+        (total.bit_errors, "bit_errors"),
+        (total.ranged, "ranged"),
+    ):
+        assert mine == sum(bar[theirs] for bar in bars)
+    for begin, tally in ours.segments:
+        key = f"{begin}-{begin + 10}m"
+        segments = [bar["segments"][key] for bar in bars if key in bar["segments"]]
+        if len(segments) == 1:
+            assert tally.rmse_m == pytest.approx(segments[0]["rmse_m"], abs=2e-3)
+            assert abs(tally.ranged - segments[0]["n"]) <= 1
+
+
+def received(recording: Path) -> list[Frame]:
+    from evlcp_sdk.io import open_source
+    from evlcp_sdk.rx.receiver import Receiver
+
+    receiver = Receiver(load_link())
+    with open_source(str(recording)) as source:
+        packets = [p for events in source.chunks() for p in receiver.feed(events)] + receiver.close()
+    return [frame for packet in packets for frame in packet.frames]
+
+
+GATE = {
+    "duration_s": 0.12,
+    "world": {"latitude_deg": 35.0, "longitude_deg": 137.0, "heading_deg": 70.0, "gravity_sigma_deg": 0.0},
+    "motion": {"distance_m": 45.0, "vib_rate_rad_s": 0.0},
+    "bars": [{"x_m": -2.0}, {"x_m": 2.0, "y_m": -0.5, "z_m": 4.0}],
+}
+
+
+def seen(known: dict[str, Any]) -> list[Packet]:
+    """Packets whose frames show the clusters of a scene exactly, of the last bar first."""
+    scene = resolve_scene(GATE)
+    path = known["camera_path"]
+    t_us = np.array(known["t_s"]) * 1e6
+    packets = []
+    for number, i in ((0, 1), (1, 0)):
+        frames = []
+        for f, at in enumerate(np.arange(2000.0, 110_000.0, 3200.0)):
+            keys = ("latitude_deg", "longitude_deg", "height_m", "pitch_deg", "roll_deg", "heading_deg")
+            here = [float(np.interp(at, t_us, path[key])) for key in keys]
+            turned = Attitude(*here[3:]).rotation()
+            clusters = sites_of(scene)[i].cluster_positions_m(16, LocalFrame(*here[:3]))
+            points = scene.camera.project(clusters @ turned)
+            symbols = SoftSymbols(np.zeros(16, int), np.zeros((16, 6), np.float32), 1.0)
+            middle = points.mean(0)
+            frames.append(
+                Frame(
+                    transmitter=number,
+                    packet=f // 10,
+                    frame=f % 10,
+                    t_us=at - 800,
+                    soft=symbols,
+                    range=Range(float("nan"), float("nan"), 0),
+                    filtered=None,
+                    x_px=float(middle[0]),
+                    y_px=float(middle[1]),
+                    points_px=points,
+                    points_sigma_px=np.full(16, 0.1),
+                    points_t_us=at,
+                )
+            )
+        packets += [
+            Packet(number, p, frames[10 * p].t_us - 2600, 100.0, tuple(frames[10 * p : 10 * p + 10]), 10)
+            for p in range(3)
+        ]
+    return sorted(packets, key=lambda packet: packet.t_us)
+
+
+@pytest.mark.parametrize("attitude", ["none", "gravity", "heading"])
+def test_positions_are_held_beside_the_cameras_path(attitude: str) -> None:
+    scene = resolve_scene(GATE | {"world": GATE["world"] | {"attitude": attitude}})  # type: ignore[operator]
+    simulation = Simulation(scene)
+    known = json.loads(json.dumps(truth_of(simulation).to_table()))
+    true_path = dict(known["camera_path"])
+    log = attitude_log(scene, 0, simulation.path)
+    tallies = position_tallies(seen(known), known, load_link(), log)
+    total = sum((tally for _, tally in tallies), Tally())
+    assert {begin for begin, _ in tallies} == {40}
+    if attitude == "none":
+        assert (total.fixes, total.fixes_refused) == (0, len(tallies))
+        return
+    assert total.fixes >= 2
+    assert total.fixes_refused == 0
+    # Exact points: what is left is a path straight between its milliseconds.
+    assert total.position_rmse_m < 2e-3
+    assert total.position_nees < 1
+    # A truth 1e-6 degrees further north is 0.111 m off.
+    path = known["camera_path"]
+    path["latitude_deg"] = [latitude + 1e-6 for latitude in path["latitude_deg"]]
+    tallies = position_tallies(seen(known | {"camera_path": true_path}), known, load_link(), log)
+    total = sum((tally for _, tally in tallies), Tally())
+    assert total.position_rmse_m == pytest.approx(0.111, abs=0.003)
+    assert total.position_nees > 20

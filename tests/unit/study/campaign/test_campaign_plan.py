@@ -1,0 +1,140 @@
+"""From campaign.toml to points, tasks and jobs."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.study.campaign.plan import Case, Plan, StopRule, digest_of, load_plan, make_plan
+
+TEXT = """
+[campaign]
+name = "try"
+seeds = 3
+first_seed = 10
+max_errors = 100
+
+[scene]
+base = "night.toml"
+set = { sensor.noise_ln = 0.02 }
+
+[scene.grid]
+speed_kmh = [20, 30]
+distance_m = [90.0, 60.0, 30.0]
+
+[link.variants]
+"16 clusters" = {}
+"two clusters" = { "ranging.clusters" = [1, 14], ranging.drop_extremes = 0 }
+"""
+
+
+def made(base: str | None, overrides: Sequence[str]) -> tuple[Any, Any]:
+    if any(o.startswith("wrong=") for o in overrides):
+        raise ConfigError("wrong: unknown key\nand more")
+    return (base, tuple(overrides)), {"base": base and Path(base).name, "set": list(overrides)}
+
+
+def plan_of(tmp_path: Path, text: str = TEXT, overrides: Sequence[str] = (), environment: Any = None) -> Plan:
+    path = tmp_path / "c.toml"
+    path.write_text(text)
+    return load_plan(path, made, made, environment or {}, overrides)
+
+
+def test_a_grid_with_variants(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path)
+    assert plan.name == "try"
+    assert plan.rule == StopRule(None, 100)
+    assert plan.seeds == (10, 11, 12)
+    assert plan.merge == ("scene.distance_m",)
+    assert len(plan.scenes) == 6
+    assert len(plan.points) == 12
+    assert len(plan.jobs) == 18
+    assert plan.points[3].labels == (
+        ("scene.speed_kmh", 20),
+        ("scene.distance_m", 60.0),
+        ("link.variant", "two clusters"),
+    )
+    base, overrides = plan.scenes[1].value
+    assert base == str(tmp_path / "night.toml")
+    assert overrides == ("sensor.noise_ln=0.02", "speed_kmh=20", "distance_m=60.0")
+    assert plan.links[1].value == (None, ("ranging.clusters=[1, 14]", "ranging.drop_extremes=0"))
+
+
+def test_jobs_go_seed_by_seed_and_share_a_scene_among_links(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path)
+    assert [job.seed for job in plan.jobs] == [10] * 6 + [11] * 6 + [12] * 6
+    assert all(len(job.tasks) == 2 for job in plan.jobs)
+    ids = [task.id for job in plan.jobs for task in job.tasks]
+    assert len(set(ids)) == 36
+    assert sorted(ids) == sorted(task for point in plan.points for task in point.tasks)
+
+
+def test_an_id_follows_everything_that_determines_the_result_and_nothing_else(tmp_path: Path) -> None:
+    ids = {task for point in plan_of(tmp_path).points for task in point.tasks}
+
+    def shared(text: str = TEXT, overrides: Sequence[str] = (), environment: Any = None) -> int:
+        other = plan_of(tmp_path, text, overrides, environment)
+        return len(ids & {task for point in other.points for task in point.tasks})
+
+    assert shared() == 36
+    assert shared(overrides=["campaign.name=other", "campaign.max_bits=5"]) == 36
+    assert shared(TEXT.replace("16 clusters", "all")) == 36
+    assert shared(overrides=["campaign.seeds=5"]) == 36
+    assert shared(overrides=["campaign.first_seed=11"]) == 24
+    assert shared(overrides=["scene.sensor.noise_ln=0.03"]) == 0
+    assert shared(overrides=["scene.speed_kmh=20"]) == 18
+    assert shared(TEXT.replace("[20, 30]", "[30]")) == 18
+    assert shared(TEXT.replace("[1, 14]", "[2, 13]")) == 18
+    assert shared(environment={"evlcp-sdk": "2"}) == 0
+
+
+@given(st.dictionaries(st.text(max_size=4), st.one_of(st.integers(), st.text(max_size=4), st.booleans())))
+def test_a_digest_knows_no_order(table: dict[str, Any]) -> None:
+    assert digest_of(table) == digest_of(dict(reversed(table.items())))
+
+
+def test_links_that_differ_in_name_only_are_one_task() -> None:
+    links = [Case((("variant", name),), 0, 0) for name in "ab"]
+    plan = make_plan("x", [Case((), 0, 0)], links, [0])
+    assert [len(job.tasks) for job in plan.jobs] == [1]
+    assert plan.points[0].tasks == plan.points[1].tasks
+
+
+def test_an_override_takes_the_place_of_an_axis(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, overrides=["scene.distance_m=45", "campaign.seeds=1"])
+    assert len(plan.points) == 4
+    assert plan.scenes[0].value[1][-1] == "speed_kmh=20"
+    assert "distance_m=45" in plan.scenes[0].value[1]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("seeds = 3", "seeds = 0", "c.toml: campaign.seeds = 0: expected greater than or equal to 1"),
+        ("seeds = 3", "sedes = 3", "c.toml: campaign.sedes: unknown key"),
+        ('name = "try"', "", "c.toml: campaign.name: missing"),
+        ('name = "try"', 'name = "a b"', "campaign.name = 'a b'"),
+        ("[20, 30]", "20", "c.toml: scene.grid.speed_kmh = 20: expected a list of values"),
+        ("[20, 30]", "[20, 20]", "c.toml: scene.grid.speed_kmh: a value stands there twice"),
+        ("[20, 30]", "[]", "expected a list of values"),
+        ("speed_kmh", "wrong", "c.toml: scene: wrong: unknown key"),
+        ("seeds = 3", 'seeds = 3\nmerge = ["scene.speed"]', "campaign.merge: 'scene.speed' is not varied"),
+        ("[campaign]", "[campaign", "c.toml: not TOML: "),
+        ("[scene.grid]", "[sceen.grid]", "c.toml: sceen: unknown key"),
+    ],
+)
+def test_faults_are_told_with_their_path(tmp_path: Path, old: str, new: str, told: str) -> None:
+    with pytest.raises(ConfigError) as fault:
+        plan_of(tmp_path, TEXT.replace(old, new))
+    assert told in str(fault.value)
+
+
+def test_overrides_that_name_nothing(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"--set seeds=3: expected campaign\.KEY="):
+        plan_of(tmp_path, overrides=["seeds=3"])
+    with pytest.raises(ConfigError, match=r"none\.toml: cannot be read"):
+        load_plan(tmp_path / "none.toml", made, made, {})

@@ -1,0 +1,168 @@
+"""`evlcp sweep` and `evlcp report` from a campaign file to figures, with real light."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evlcp_sdk.cli.demo import demo_campaign
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.jobs.executor import Inline
+from evlcp_sdk.study.campaign.plan import Job
+from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.campaign.summary import summarize
+from evlcp_sdk.study.campaign.task import plan_of, run_job
+from tests.conftest import ROOT
+
+Evlcp = Callable[..., Any]
+
+CAMPAIGN = """
+[campaign]
+name = "short"
+seeds = 2
+
+[scene]
+base = "drive-30kmh"
+set = { duration_s = 0.05 }
+
+[scene.grid]
+motion.distance_m = [95.0, 85.0]
+
+[link.variants]
+"16 clusters" = {}
+"two clusters" = { ranging.clusters = [1, 14], ranging.drop_extremes = 0 }
+"""
+
+
+@pytest.fixture
+def campaign(tmp_path: Path) -> Path:
+    path = tmp_path / "short.toml"
+    path.write_text(CAMPAIGN)
+    return path
+
+
+def test_from_a_file_to_figures(evlcp: Evlcp, campaign: Path, tmp_path: Path) -> None:
+    results = tmp_path / "r.sqlite"
+    dry = evlcp("sweep", campaign, "-o", results, "--dry-run")
+    assert dry.code == 0
+    assert "short: 0 of 8 tasks" in dry.out
+    assert not results.exists()
+    done = evlcp("sweep", campaign, "-o", results, "--workers", "2")
+    assert (done.code, done.err) == (0, "")
+    assert "short: 8 of 8 tasks, 4 of 4 points" in done.out
+    with Store(results) as store:
+        found = store.results()
+    plan = plan_of(campaign)
+    for outcome in Inline().run(run_job, plan.jobs[:2]):
+        assert outcome.value is not None
+        for task, statistics in outcome.value:
+            assert found[task] == statistics, "another process found something else"
+    for statistics in found.values():
+        tally = statistics.total()
+        assert tally.frames_found >= 0.85 * tally.frames_sent > 0
+        assert tally.ber < 0.01
+        assert statistics.unmatched == 0
+    again = evlcp("sweep", campaign, "-o", results, "--json")
+    table = json.loads(again.out)
+    assert (table["done"], table["tasks"], table["failed"]) == (8, 8, 0)
+
+    shown = evlcp("report", results)
+    assert shown.code == 0
+    for text in ("16 clusters", "two clusters", "90 to 100 m", "80 to 90 m"):
+        assert text in shown.out
+    table = json.loads(evlcp("report", results, "--json").out)
+    assert [s["name"] for s in table["series"]] == ["16 clusters", "two clusters"]
+    assert "| 16 clusters |" in evlcp("report", results, "--markdown").out
+    pytest.importorskip("plotly", reason="the extra report is not installed")
+    drawn = evlcp("report", results, "-o", tmp_path / "page.html")
+    assert drawn.code == 0
+    assert "Plotly.newPlot" in (tmp_path / "page.html").read_text()
+    assert len(list((tmp_path / "page-figures").iterdir())) == 10
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        (["scene.motion.distence_m=3"], "motion.distence_m = 3: unknown key; did you mean 'distance_m'?"),
+        (["scene.motion.distance_m=-5"], "motion.distance_m = -5: expected greater than 0"),
+        (["scene.bars.z_m=-100"], "the bar is behind the camera"),
+        (["link.ranging.id=pco"], "no ranging algorithm named 'pco'; did you mean 'poc'?"),
+        (["campaign.seeds=0"], "campaign.seeds = 0: expected greater than or equal to 1"),
+        (["seeds=0"], "--set seeds=0: expected campaign.KEY="),
+    ],
+)
+def test_bad_campaigns_are_one_line(
+    evlcp: Evlcp, campaign: Path, tmp_path: Path, overrides: list[str], told: str
+) -> None:
+    options = [part for text in overrides for part in ("--set", text)]
+    done = evlcp("sweep", campaign, "-o", tmp_path / "r.sqlite", *options)
+    assert done.code == 2
+    assert told in done.err
+    assert len(done.err.splitlines()) <= 2
+    assert not (tmp_path / "r.sqlite").exists()
+
+
+def test_a_bar_that_the_link_does_not_speak_to(evlcp: Evlcp, campaign: Path, tmp_path: Path) -> None:
+    done = evlcp(
+        "sweep", campaign, "-o", tmp_path / "r.sqlite", "--set", "link.modulation.id=wh8", "--workers", "0"
+    )
+    assert done.code == 2
+    assert "the scene's bar has profile = 'wh4x2', but the link modulation.id = 'wh8'" in done.err
+    assert len(done.err.splitlines()) == 1
+
+
+def test_results_that_cannot_be_written(evlcp: Evlcp, campaign: Path, tmp_path: Path) -> None:
+    done = evlcp("sweep", campaign, "-o", tmp_path / "no" / "r.sqlite")
+    assert done.code == 2
+    assert done.err == f"evlcp: {tmp_path}/no/r.sqlite: unable to open database file\n"
+    assert evlcp("report", tmp_path / "none.sqlite").code == 3
+
+
+def test_other_code_is_refused(campaign: Path) -> None:
+    plan = plan_of(campaign)
+    job = plan.jobs[0]
+    with pytest.raises(ConfigError, match="not those of the campaign's plan"):
+        run_job(Job(job.scene, job.seed, job.tasks, {"source": "0" * 64}))
+
+
+def test_files_of_a_scene_count_by_what_they_hold(campaign: Path, tmp_path: Path) -> None:
+    def ids() -> tuple[str, ...]:
+        return plan_of(campaign, ["scene.motion.path_file=path.csv"]).points[0].tasks
+
+    (tmp_path / "scene.toml").write_text("duration_s = 0.05\n")
+    campaign.write_text(CAMPAIGN.replace('"drive-30kmh"', '"scene.toml"'))
+    with pytest.raises(ConfigError, match=r"path\.csv: cannot be read"):
+        ids()
+    (tmp_path / "path.csv").write_text("t_s,x_m\n0,0\n")
+    before = ids()
+    assert ids() == before
+    (tmp_path / "path.csv").write_text("t_s,x_m\n0,1\n")
+    assert ids() != before
+
+
+def test_the_shipped_campaigns_are_read() -> None:
+    demo, paper = plan_of(demo_campaign()), plan_of(ROOT / "examples" / "paper.toml")
+    assert len(demo.jobs) == 4
+    assert {round(s.identity["motion"]["speed_mps"] * 3.6, 1) for s in paper.scenes} == {20.0, 30.0, 40.0}
+    assert [dict(k.labels)["variant"] for k in paper.links] == ["16 clusters", "two clusters"]
+    # The guesses are set in one way wherever the paper's drive is simulated.
+    guesses = {json.dumps([s.identity["sensor"], s.identity["lens"]]) for s in [*demo.scenes, *paper.scenes]}
+    assert len(guesses) == 1
+
+
+def test_the_demo(evlcp: Evlcp, tmp_path: Path) -> None:
+    pytest.importorskip("plotly", reason="the extra report is not installed")
+    done = evlcp("demo", "-o", tmp_path / "out")
+    assert done.code == 0
+    for begin in (80, 50, 40, 30):
+        assert f"{begin} to {begin + 10} m" in done.out
+    assert "0.0702" in done.out
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"report.html", "demo.sqlite", "ber.png", "rmse.png", "rmse.svg"} <= names
+    with Store(tmp_path / "out" / "demo.sqlite") as store:
+        (series,) = summarize(store).series
+    for _, tally in series.statistics.segments:
+        assert tally.frames_found >= 0.9 * tally.frames_sent
+        assert tally.ber <= 0.05

@@ -1,0 +1,274 @@
+"""The table of a comparison: sums, who is best, what is written; variants as users name them."""
+
+import csv
+import io
+import json
+import math
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.jobs.executor import Inline
+from evlcp_sdk.study.campaign.collect import collect
+from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.campaign.summary import summarize
+from evlcp_sdk.study.compare.campaigns import of_campaign
+from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments
+from evlcp_sdk.study.compare.run import _Watch, truth_path
+from evlcp_sdk.study.compare.table import BOUND_NAME, COLUMNS, Comparison, Row, Table, total_of
+from evlcp_sdk.study.compare.variants import load_variants
+from tests.unit.study.campaign.fake import fake_plan, run_fake
+
+
+def measured(**changes: Any) -> Measured:
+    """A variant with truth and a tracking filter."""
+    values = {
+        "frames": 90,
+        "packets": 9,
+        "frames_sent": 100,
+        "frames_found": 88,
+        "unmatched": 2,
+        "bits": 8448,
+        "bit_errors": 3,
+        "error_m": Moments.of(np.array([0.1, -0.2, 0.6])),
+        "gross": 1,
+        "filtered_error_m": Moments.of(np.array([0.05, 0.02])),
+        "stated_sigma_m": Moments.of(np.array([0.1, 0.3])),
+        "frame_us": (500.0, 700.0, 9000.0),
+        "stage_us": dict.fromkeys(STAGES, (100.0, 200.0, 300.0)),
+        "recorded_s": 0.4,
+        "cpu_s": 0.2,
+    }
+    return Measured(**(values | changes))
+
+
+BLIND = Measured(frames=5, packets=1, stated_sigma_m=Moments.of(np.array([0.2])), recorded_s=0.1, cpu_s=0.1)
+"""A variant on a recording without truth."""
+
+
+def table(*rows: Measured, bound: float | None = 0.05) -> Table:
+    names = [f"v{n}" for n in range(len(rows))]
+    bound_m = Moments() if bound is None else Moments.of(np.array([bound]))
+    return Table("REC.raw", tuple(map(Row, names, rows)), bound_m)
+
+
+def comparison(*tables: Table) -> Comparison:
+    about = {row.variant: {"settings": [], "digest": "0" * 64} for row in tables[0].rows}
+    return Comparison(about, tables, ("a note, with <brackets>",), {"python": "3"})
+
+
+class Cells(HTMLParser):
+    """The tables of a page: (text, is bold) a cell."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tables: list[list[list[tuple[str, bool]]]] = []
+        self.asks: list[str] = []
+        self._inside = self._bold = False
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.asks += [str(v) for k, v in attrs if k in ("src", "href") and not str(v).startswith("data:")]
+        if tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in ("td", "th"):
+            self._inside, self._bold = True, False
+            self.tables[-1][-1].append(("", False))
+        elif tag == "b":
+            self._bold = True
+
+    def handle_endtag(self, tag: str) -> None:
+        self._inside = self._inside and tag not in ("td", "th")
+
+    def handle_data(self, data: str) -> None:
+        if self._inside:
+            self.tables[-1][-1][-1] = (data, self._bold)
+
+
+@given(st.lists(st.lists(st.floats(-1e3, 1e3), max_size=9), max_size=5))
+def test_moments_add(parts: list[list[float]]) -> None:
+    together = np.array([v for part in parts for v in part])
+    found = sum((Moments.of(np.array(part, np.float64)) for part in parts), Moments())
+    assert found.count == len(together)
+    if len(together):
+        assert found.rms == pytest.approx(math.sqrt(np.mean(together**2)))
+        assert found.mean == pytest.approx(together.mean(), abs=1e-9)
+    else:
+        assert math.isnan(found.rms)
+        assert math.isnan(found.mean)
+
+
+def test_figures_by_hand() -> None:
+    m = measured()
+    assert m.ber == 3 / 8448
+    low, high = m.ber_interval
+    assert low < m.ber < high
+    assert m.rmse_m == pytest.approx(math.sqrt((0.01 + 0.04 + 0.36) / 3))
+    assert m.bias_m == pytest.approx(0.5 / 3)
+    assert m.gross_share == pytest.approx(1 / 3)
+    assert m.sigma_m == pytest.approx(math.sqrt(0.05))
+    assert (m.us_per_frame, m.times_real_time, m.found_share) == (700, 2, 0.88)
+    both = m + measured(bit_errors=5, packets=None)
+    assert (both.bits, both.bit_errors, both.packets, both.frames) == (16896, 8, None, 180)
+    assert both.frame_us == m.frame_us * 2
+    assert both.stage_us["ranging"] == m.stage_us["ranging"] * 2
+    nothing = Measured()
+    for column in COLUMNS:
+        assert column.cell(nothing) in ("-", "0")
+        if column.rank is not None:
+            assert math.isnan(column.rank(nothing))
+
+
+def test_the_best_are_marked() -> None:
+    other = {"bit_errors": 2, "frames_found": 88, "frame_us": (800.0,), "cpu_s": 0.1}
+    other["error_m"] = Moments.of(np.array([-0.2, 0.15, 0.0]))
+    best = table(measured(), measured(**other)).best()
+    # As many frames and gross errors: both. BER by its value: the intervals of 2 and 3 errors overlap.
+    shared = {"found_share", "gross_share", "filtered_rmse_m"}
+    assert best[0] == shared | {"us_per_frame"}
+    assert best[1] == shared | {"ber", "rmse_m", "bias_m", "times_real_time"}
+
+
+def test_where_nothing_was_measured_nothing_is_best() -> None:
+    nan = measured(error_m=Moments(), gross=0, filtered_error_m=Moments())
+    alone, other = table(measured(), nan).best()
+    # Two have a BER, only one has distances.
+    assert "ber" in alone & other
+    assert not (alone | other) & {"rmse_m", "bias_m", "gross_share", "filtered_rmse_m"}
+    assert table(measured()).best() == (frozenset(),)
+    assert table(BLIND, BLIND).best() == (frozenset({"times_real_time"}),) * 2
+
+
+def test_cells() -> None:
+    head, lines = table(measured(), measured(bit_errors=0)).cells()
+    rows = [dict(zip(head, (text for text, _ in line), strict=True)) for line in lines]
+    assert rows[0]["frames"] == "88/100*"
+    assert rows[0]["95 %"] == "7.3e-05 to 1.0e-03"
+    assert rows[1]["BER"] == "0*"
+    assert rows[1]["95 %"] == "< 4.4e-04"
+    assert rows[0][">= 0.5 m"] == "33.3% (1)*"
+    assert rows[0]["bias, m"] == "+0.1667*"
+    assert rows[2] == dict.fromkeys(head, "") | {"variant": BOUND_NAME, "RMSE, m": "0.0500"}
+    for line in lines:
+        assert all(best == text.endswith("*") for text, best in line)
+    head, lines = table(BLIND, bound=None).cells()
+    assert head == ["variant", "frames", "packets", "sigma, m", "x real time"]
+    assert [text for text, _ in lines[0]] == ["v0", "5", "1", "0.2000", "1.00"]
+
+
+def test_total_adds_recordings() -> None:
+    one = table(measured(), measured(bit_errors=1))
+    total = total_of([one, one])
+    assert total.rows[1].measured.bit_errors == 2
+    assert total.rows[0].measured.rmse_m == pytest.approx(measured().rmse_m)
+    assert total.bound_m.rms == pytest.approx(0.05)
+    # A recording without truth adds frames and time, and takes nothing from the rest.
+    mixed = total_of([one, table(BLIND, BLIND)])
+    assert mixed.rows[0].measured.ber == measured().ber
+    assert mixed.rows[0].measured.frames == 95
+
+
+def test_json_csv_and_html_parse_back() -> None:
+    whole = comparison(table(measured(), measured(bit_errors=0)), table(BLIND, BLIND, bound=None))
+    parsed = json.loads(whole.to_json())
+    assert parsed == json.loads(json.dumps(whole.to_dict(), allow_nan=False))
+    first, second, third, _ = parsed["rows"]
+    assert first["rmse_m"] == measured().rmse_m
+    assert (first["cramer_rao_bound_m"], third["cramer_rao_bound_m"]) == (pytest.approx(0.05), None)
+    assert "ber" in second["best"]
+    assert (third["ber"], third["frames_sent"], third["bit_errors"]) == (None, None, None)
+    rows = list(csv.DictReader(io.StringIO(whole.to_csv())))
+    assert len(rows) == 4
+    for line, record in zip(rows, parsed["rows"], strict=True):
+        assert line["best"].split() == record["best"]
+        for key, value in record.items():
+            if isinstance(value, int | float):
+                assert float(line[key]) == value, key
+            elif value is None:
+                assert line[key] == "", key
+    page = Cells()
+    page.feed(whole.to_html())
+    assert page.asks == []
+    for found, one in zip(page.tables, whole.tables, strict=True):
+        head, lines = one.cells()
+        assert [text for text, _ in found[0]] == head
+        assert found[1:] == lines
+    assert "&lt;brackets&gt;" in whole.to_html()
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("joint", "--variant joint: expected NAME:TABLE.KEY=VALUE"),
+        (":ranging.id=poc", "expected NAME:"),
+        ("a:ranging", "('ranging'): expected NAME:"),
+        ("a:ranging.id=pco", "--variant a: no ranging algorithm named 'pco'; did you mean 'poc'?"),
+        ("a:ranging.foo=1", "--variant a: ranging.foo = 1: unknown key"),
+        ("base:ranging.id=centroid", "the name 'base' is taken"),
+    ],
+)
+def test_variants_that_cannot_be(text: str, told: str) -> None:
+    with pytest.raises(ConfigError) as fault:
+        load_variants(["base:", text])
+    assert told in str(fault.value)
+    assert len(str(fault.value).splitlines()) == 1
+
+
+def test_variants_share_what_is_set_for_all() -> None:
+    base, other = load_variants(
+        ["base:", "other: decoding.min_weight=0.3,ranging.clusters=[1, 3, 14] , ranging.skip_outer=0"],
+        overrides=["decoding.min_weight=0.2", "ranging.min_pixels=7"],
+    )
+    assert base.link.table["decoding"]["min_weight"] == 0.2
+    assert other.link.table["decoding"]["min_weight"] == 0.3
+    assert other.link.table["ranging"]["clusters"] == [1, 3, 14]
+    assert other.link.table["ranging"]["min_pixels"] == 7
+    assert base.to_dict()["digest"] != other.to_dict()["digest"]
+    with pytest.raises(ConfigError) as fault:
+        load_variants(["a:", "b:ranging.id=poc"], overrides=["bar.rows=x"])
+    assert str(fault.value).startswith('--set: bar.rows = "x": expected')
+
+
+@pytest.mark.parametrize("name", ["night.raw", "night.csv.gz", "night.npz", "night"])
+def test_truth_lies_beside(name: str) -> None:
+    assert truth_path(f"folder/{name}").as_posix() == "folder/night.truth.json"
+
+
+def test_time_counts_of_frames_only() -> None:
+    watch = _Watch()
+    for stage in ("separation", "separation", "decoding", "ranging", "frame", "regions"):
+        watch.evlcp_stage_finished(stage, 1e-9)
+    assert {stage: len(us) for stage, us in watch.stage_us.items()} == dict.fromkeys(STAGES, 1)
+    # The wall's clock is the upper limit: a nanosecond each.
+    assert watch.frame_us == [pytest.approx(3e-3)]
+
+
+def test_a_campaign_is_a_table_a_scene(tmp_path: Path) -> None:
+    with Store(tmp_path / "r.sqlite", create=True) as store:
+        collect(fake_plan(scenes=2), store, Inline(), run_fake)
+        summary = summarize(store)
+    whole = of_campaign(summary)
+    assert [one.name for one in whole.tables] == ["distance 30 m", "distance 40 m", "all scenes"]
+    assert list(whole.variants) == ["link 0", "link 1"]
+    tallies = [series.statistics.total() for series in summary.series]
+    rows = [row.measured for one in whole.tables for row in one.rows]
+    for tally, m in zip(tallies, rows[:4], strict=True):
+        assert (m.frames_found, m.frames_sent, m.bits) == (tally.frames_found, tally.frames_sent, tally.bits)
+        assert (m.ber, m.gross_share) == (tally.ber, tally.gross_share)
+        assert m.rmse_m == pytest.approx(tally.rmse_m)
+        assert m.bias_m == pytest.approx(tally.bias_m)
+    both = tallies[1] + tallies[3]
+    assert rows[5].rmse_m == pytest.approx(both.rmse_m)
+    assert "link 1" in whole.to_html()
+    # Twice the error in every frame.
+    assert "rmse_m" in whole.tables[2].best()[0]
+    head, lines = whole.tables[0].cells()
+    assert "us/frame" not in head
+    assert len(lines) == 2

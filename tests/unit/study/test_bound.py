@@ -1,0 +1,131 @@
+"""The Cramer-Rao bound: its laws, and its statistics from frames that follow the model."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.study.bound import cramer_rao_sigma_m, frame_bound
+from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
+
+LINK = load_link()
+K, COLUMNS, FULL = 16, 4, 300.0
+
+
+def bound(**how: float) -> float:
+    given = {"distance_m": 50.0, "blur_px": 0.45, "noise": 0.3} | how
+    return cramer_rao_sigma_m(LINK.camera, LINK.bar, LINK.codebook, symbols=np.arange(K), **given)
+
+
+def test_the_bound_follows_noise_and_distance() -> None:
+    assert bound(noise=0.6) == pytest.approx(2 * bound())
+    assert bound(columns=20.0) == pytest.approx(bound() / 2)
+    # A boundary is as sure at any distance: the error grows with its square.
+    assert bound(distance_m=100.0) == pytest.approx(4 * bound(), rel=0.2)
+    with pytest.raises(ConfigError, match="noise = 0"):
+        bound(noise=0)
+
+
+@pytest.mark.parametrize("blur_px", [0.6, 0.9])
+def test_the_bound_is_that_of_boundaries_by_themselves(blur_px: float) -> None:
+    # Where blur smooths the pixel grid, a boundary with a step of 2 has the information
+    # sum of (2 gain pdf)^2 = 2 gain^2 / (sqrt(pi) blur) a column and value, wherever it lies.
+    codes = np.concatenate([LINK.codebook.pilots, LINK.codebook.codewords[np.arange(K)]], axis=1)
+    steps = np.diff(codes.astype(float), axis=0)
+    values = codes.shape[1]
+    each = 0.8**2 * steps**2 / (2 * np.sqrt(np.pi) * blur_px) * 5 / 0.3**2
+    apart = np.arange(1, K) - K / 2
+    when = np.arange(values) / values - 0.5
+    slopes = np.stack([np.repeat(apart[:, None], values, 1), np.ones_like(each), np.tile(when, (K - 1, 1))])
+    information = np.einsum("aki,bki,ki->ab", slopes, slopes, each)
+    spacing_px = LINK.camera.focal_px * 0.06 / 50
+    want = 50 / spacing_px * np.sqrt(np.linalg.inv(information)[0, 0])
+    assert bound(blur_px=blur_px) == pytest.approx(want, rel=0.02)
+
+
+def view_of(
+    distance_m: float,
+    noise: float,
+    rng: np.random.Generator,
+    *,
+    blur_px: float = 0.45,
+    upside_down: bool = False,
+    across: bool = False,
+    dark: tuple[int, ...] = (),
+) -> FrameView:
+    """A frame of a bar of `COLUMNS` pixels: the model's values and Gaussian noise, `FULL` events a value."""
+    spacing = LINK.camera.focal_px * 0.06 / distance_m
+    height, width = 2 * int(spacing * K / 2 + 8), 20
+    symbols = rng.integers(0, 64, K)
+    codes = np.concatenate([LINK.codebook.pilots, LINK.codebook.codewords[symbols]], axis=1).astype(float)
+    codes[list(dark)] = 0
+    shift = rng.uniform(-0.5, 0.5)
+    rows = np.arange(height) - (height - 1) / 2 - shift
+    cdf = norm.cdf((rows[:, None] - spacing * (np.arange(K + 1) - K / 2)) / blur_px)
+    level = 0.5 * (cdf[:, :-1] - cdf[:, 1:]) @ codes
+    sums = np.zeros((32, height, width))
+    bar = slice(width // 2 - COLUMNS // 2, width // 2 + COLUMNS // 2)
+    sums[1::2, :, bar] = level.T[:, :, None]
+    sums[1::2, :, bar] += rng.normal(0, noise, sums[1::2, :, bar].shape)
+    selected = np.zeros((K, height // 2, width // 2), bool)
+    pixels = np.zeros((K, height, width), np.float32)
+    for k in set(range(K)) - set(dark):
+        middle = (height - 1) / 2 + shift + spacing * (k - (K - 1) / 2)
+        inside = np.abs(np.arange(height) - middle) < spacing / 2
+        pixels[k, inside, bar] = 1
+        cells = np.abs(np.arange(height // 2) * 2 + 0.5 - middle) < spacing / 2
+        selected[k, cells, bar.start // 2 : bar.stop // 2] = True
+    if upside_down:
+        sums, selected, pixels = sums[:, ::-1], selected[:, ::-1], pixels[:, ::-1]
+    if across:
+        sums, selected, pixels = (a.transpose(0, 2, 1) for a in (sums, selected, pixels))
+    presence = PresenceMap(selected.astype(np.float32), 2, selected, pixels)
+    soft = SoftSymbols(symbols, np.zeros((K, 6), np.float32), 1.0)
+    return FrameView(np.rint(FULL * sums).astype(np.int16), np.zeros((2, 32)), presence, soft)
+
+
+@pytest.mark.parametrize("distance_m", [40.0, 80.0])
+@pytest.mark.parametrize("blur_px", [0.45, 0.6])
+def test_statistics_come_from_the_frames(distance_m: float, blur_px: float) -> None:
+    noise, rng = 0.1, np.random.default_rng(0)
+    measure = frame_bound(LINK.camera, LINK.bar, LINK.codebook, full_events=FULL)
+    errors, sigmas, wanted = [], [], []
+    for _ in range(60):
+        view = view_of(distance_m, noise, rng, blur_px=blur_px)
+        found = measure(view)
+        errors.append(found.distance_m - distance_m)
+        sigmas.append(found.sigma_m)
+        given = {"blur_px": blur_px, "noise": noise, "columns": COLUMNS, "gain": 0.5}
+        where = (LINK.camera, LINK.bar, LINK.codebook, distance_m, view.soft.symbols)
+        wanted.append(cramer_rao_sigma_m(*where, **given))
+    assert np.mean(sigmas) == pytest.approx(np.mean(wanted), rel=0.03)
+    # 60 errors tell a spread to 9 %: three of these.
+    assert np.std(errors) == pytest.approx(np.mean(wanted), rel=0.27)
+
+
+@pytest.mark.parametrize("how", [{"upside_down": True}, {"across": True}, {"dark": (5,)}], ids=str)
+def test_any_way_that_a_bar_lies(how: dict[str, bool]) -> None:
+    measure = frame_bound(LINK.camera, LINK.bar, LINK.codebook, full_events=FULL)
+    plain = measure(view_of(50.0, 0.1, np.random.default_rng(1)))
+    found = measure(view_of(50.0, 0.1, np.random.default_rng(1), **how))
+    assert found.distance_m == pytest.approx(50, abs=4 * plain.sigma_m)
+    assert found.pairs == (13 if "dark" in how else 15)
+    assert found.sigma_m == pytest.approx(plain.sigma_m, rel=0.2)
+
+
+def test_frames_that_show_no_boundary_have_no_bound() -> None:
+    measure = frame_bound(LINK.camera, LINK.bar, LINK.codebook)
+    rng = np.random.default_rng(2)
+    assert np.isnan(measure(view_of(50.0, 0.1, rng, dark=tuple(range(0, 16, 2)))).sigma_m)
+    view = view_of(50.0, 0.1, rng)
+    blank = FrameView(np.zeros_like(view.sums), view.offset_px, view.presence, view.soft)
+    assert np.isnan(measure(blank).sigma_m)
+
+
+def test_panels_have_none() -> None:
+    panel = BarLayout(rows=16, columns=16, cluster_rows=4, cluster_columns=4)
+    with pytest.raises(ConfigError, match="one column"):
+        frame_bound(CameraModel(), panel, LINK.codebook)

@@ -1,0 +1,93 @@
+"""The use cases as library functions."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.run import receive
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.values import Events, Triggers
+
+
+def by_hand(path: Path) -> list[tuple[int, int, list[int]]]:
+    """(transmitter, packet, frames' numbers) by the plain loop, closed at its end."""
+    receiver = Receiver(load_link())
+    with RawSource(path) as source:
+        packets = [p for events in source.chunks() for p in receiver.feed(events)] + receiver.close()
+    return [(p.transmitter, p.packet, [f.frame for f in p.frames]) for p in packets]
+
+
+def test_the_last_packet_comes_too_and_the_source_is_closed(demo_raw: Path) -> None:
+    closed = []
+
+    class Watched(RawSource):
+        def close(self) -> None:
+            closed.append(True)
+            super().close()
+
+    reception = receive(Watched(demo_raw))
+    found = [(p.transmitter, p.packet, [f.frame for f in p.frames]) for p in reception]
+    assert found == by_hand(demo_raw)
+    assert list(reception) == []
+    assert reception.counts["packets"] == len(found)
+    assert reception.losses == {}
+    assert closed
+
+
+def test_frames_are_those_of_the_packets(demo_raw: Path) -> None:
+    frames = [(f.packet, f.frame) for f in receive(str(demo_raw)).frames()]
+    assert frames == [(packet, n) for _, packet, numbers in by_hand(demo_raw) for n in numbers]
+
+
+def test_leaving_early_closes_the_source(demo_raw: Path) -> None:
+    with receive(RawSource(demo_raw), load_link()) as reception:
+        next(reception)
+    assert list(reception) == []
+    with pytest.raises(InputError, match="closed file"):
+        list(reception.source.chunks())
+
+
+def test_a_plugins_camera_is_opened(demo_raw: Path) -> None:
+    class Camera:
+        @hookimpl
+        def evlcp_open_events(self, url: str) -> RawSource | None:
+            return RawSource(demo_raw) if url == "camera:0" else None
+
+    frames = list(receive("camera:0", registry=Registry.load(Camera())).frames())
+    assert len(frames) == sum(len(numbers) for _, _, numbers in by_hand(demo_raw))
+
+
+def test_input_that_fails_gives_what_was_decoded_first(demo_raw: Path) -> None:
+    class Failing(RawSource):
+        def stream(self, max_events: int = DEFAULT_MAX_EVENTS) -> Iterator[tuple[Events, Triggers]]:
+            yield from [next(super().stream(400_000))]
+            raise InputError(f"{self.path}: the disk is gone")
+
+    reception, packets = receive(Failing(demo_raw)), []
+
+    def read() -> None:
+        for packet in reception:
+            packets.append(packet)
+
+    with pytest.raises(InputError, match="the disk is gone"):
+        read()
+    assert sum(len(packet.frames) for packet in packets) == reception.counts["frames"] > 0
+
+
+def test_another_sensor_is_refused_and_the_source_closed(demo_raw: Path) -> None:
+    source = RawSource(demo_raw)
+    with pytest.raises(ConfigError, match="recorded with 1280 x 720 pixels"):
+        receive(source, load_link(overrides=["camera.width=640", "camera.height=480"]))
+    with pytest.raises(InputError, match="closed file"):
+        list(source.chunks())
+
+
+def test_what_is_not_there_is_refused_at_once(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no\.raw"):
+        receive(tmp_path / "no.raw")
