@@ -1,1 +1,189 @@
-"""Visible-light communication and positioning with event cameras."""
+"""Visible-light communication and positioning with event cameras: the public face of the SDK.
+
+`import evlcp_sdk as evlcp` is all that a program needs; what it does not use is not imported.
+
+```
+for packet in evlcp.receive("REC.raw"):
+    for frame in packet.frames:
+        print(frame.t_us, frame.soft.symbols, frame.range.distance_m)
+```
+"""
+
+TYPE_CHECKING = False  # typing itself would take longer to import than all that follows
+
+if TYPE_CHECKING:
+    from evlcp_sdk.air.beacons import Beacon
+    from evlcp_sdk.air.blocks import Message
+    from evlcp_sdk.errors import (
+        CodebookMismatchError,
+        ConfigError,
+        EvlcpError,
+        InputError,
+        InterruptedRunError,
+        PluginError,
+        RawFormatError,
+        StreamError,
+        UnknownAlgorithmError,
+    )
+    from evlcp_sdk.io.open import open_source as open
+    from evlcp_sdk.io.open import read_events, write_events
+    from evlcp_sdk.io.sources import EventSource, Loss, ReplaySource
+    from evlcp_sdk.link.compose import compose
+    from evlcp_sdk.link.resolve import Link, load_link
+    from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
+    from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.plugin.roles import (
+        Decoding,
+        ErrorCorrection,
+        Modulation,
+        Pilots,
+        Ranging,
+        Separation,
+        Synchronization,
+        Tracking,
+    )
+    from evlcp_sdk.results.tables import frames_table
+    from evlcp_sdk.run import Reception, receive
+    from evlcp_sdk.rx.receiver import Receiver
+    from evlcp_sdk.scene.sites import BarSite, load_sites
+    from evlcp_sdk.simulated import SimulatedSource, simulate
+    from evlcp_sdk.values import (
+        Events,
+        Fix,
+        Frame,
+        FrameView,
+        Packet,
+        PresenceMap,
+        Range,
+        ReceivedMessage,
+        Region,
+        SoftSymbols,
+        SyncLock,
+        Triggers,
+    )
+
+__all__ = [
+    "Algorithm",
+    "BarSite",
+    "Beacon",
+    "CodebookMismatchError",
+    "ConfigError",
+    "Decoding",
+    "ErrorCorrection",
+    "EventSource",
+    "Events",
+    "EvlcpError",
+    "Fix",
+    "Frame",
+    "FrameView",
+    "InputError",
+    "InterruptedRunError",
+    "Link",
+    "Loss",
+    "Message",
+    "Modulation",
+    "Packet",
+    "Pilots",
+    "PluginError",
+    "PresenceMap",
+    "Range",
+    "Ranging",
+    "RawFormatError",
+    "ReceivedMessage",
+    "Receiver",
+    "Reception",
+    "Region",
+    "Registry",
+    "ReplaySource",
+    "Separation",
+    "SimulatedSource",
+    "SoftSymbols",
+    "StreamError",
+    "SyncLock",
+    "Synchronization",
+    "Tracking",
+    "Triggers",
+    "UnknownAlgorithmError",
+    "compose",
+    "frames_table",
+    "hookimpl",
+    "load_link",
+    "load_sites",
+    "open",
+    "read_events",
+    "receive",
+    "simulate",
+    "write_events",
+]
+
+_HOMES = {
+    "air.beacons": ("Beacon",),
+    "air.blocks": ("Message",),
+    "errors": (
+        "CodebookMismatchError",
+        "ConfigError",
+        "EvlcpError",
+        "InputError",
+        "InterruptedRunError",
+        "PluginError",
+        "RawFormatError",
+        "StreamError",
+        "UnknownAlgorithmError",
+    ),
+    "io.open": ("open_source", "read_events", "write_events"),
+    "io.sources": ("EventSource", "Loss", "ReplaySource"),
+    "link.compose": ("compose",),
+    "link.resolve": ("Link", "load_link"),
+    "plugin.hooks": ("Algorithm", "hookimpl"),
+    "plugin.registry": ("Registry",),
+    "plugin.roles": (
+        "Decoding",
+        "ErrorCorrection",
+        "Modulation",
+        "Pilots",
+        "Ranging",
+        "Separation",
+        "Synchronization",
+        "Tracking",
+    ),
+    "results.tables": ("frames_table",),
+    "run": ("Reception", "receive"),
+    "rx.receiver": ("Receiver",),
+    "scene.sites": ("BarSite", "load_sites"),
+    "simulated": ("SimulatedSource", "simulate"),
+    "values": (
+        "Events",
+        "Fix",
+        "Frame",
+        "FrameView",
+        "Packet",
+        "PresenceMap",
+        "Range",
+        "ReceivedMessage",
+        "Region",
+        "SoftSymbols",
+        "SyncLock",
+        "Triggers",
+    ),
+}
+"""Where each name lives; it is imported when it is first used, so that the package itself takes no time."""
+
+_RENAMED = {"open": "open_source"}
+
+
+if not TYPE_CHECKING:  # or else a misspelt name would pass for one that is found here
+
+    def __getattr__(name):
+        if name in __all__:
+            from importlib import import_module
+
+            wanted = _RENAMED.get(name, name)
+            for module, names in _HOMES.items():
+                if wanted in names:
+                    found = globals()[name] = getattr(import_module(f"{__name__}.{module}"), wanted)
+                    return found
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

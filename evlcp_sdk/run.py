@@ -1,17 +1,23 @@
 """The use cases: what a program does with a recording, and what the commands parse and print."""
 
 from collections.abc import Iterator
+from html import escape
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import EventSource, Loss, open_source
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.results.tables import frames_table
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Frame, Packet
+
+if TYPE_CHECKING:
+    import pandas
+    import pyarrow
 
 __all__ = ["Reception", "receive"]
 
@@ -84,6 +90,23 @@ class Reception(Iterator[Packet]):
         for packet in self:
             yield from packet.frames
 
+    def to_pandas(self) -> "pandas.DataFrame":
+        """The frames of the packets that follow as a table of pandas, with the columns of `frames.csv`.
+
+        Raises:
+            ConfigError: pandas is not installed.
+        """
+        frame: pandas.DataFrame = frames_table(self, "pandas")
+        return frame
+
+    def to_arrow(self) -> "pyarrow.Table":
+        """The same as a table of Arrow.
+
+        Raises:
+            ConfigError: pyarrow is not installed.
+        """
+        return frames_table(self, "arrow")
+
     @property
     def counts(self) -> dict[str, int]:
         """What the receiver has taken, found and dropped so far."""
@@ -98,6 +121,18 @@ class Reception(Iterator[Packet]):
         """Leave, where need be before the end: packets that are not complete are given up."""
         self._packets = iter(())
         self.source.close()
+
+    def __repr__(self) -> str:
+        counts = self.counts
+        found = ", ".join(f"{counts[name]} {name}" for name in ("events", "packets", "frames"))
+        return f"Reception({self.source.path}: {found} so far)"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: everything counted so far, and what was lost; reads nothing."""
+        rows = [(name.replace("_", " "), str(number)) for name, number in self.counts.items() if number]
+        rows += [("lost", str(loss)) for loss in self.losses.values()]
+        cells = "".join(f"<tr><td>{escape(name)}</td><td>{escape(text)}</td></tr>" for name, text in rows)
+        return f"<p>{escape(repr(self))}</p><table><tbody>{cells}</tbody></table>"
 
     def __enter__(self) -> Self:
         return self

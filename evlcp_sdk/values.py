@@ -1,19 +1,23 @@
 """The values that flow through the receiver: events, regions, locks, presence, symbols, ranges, frames."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Self
+from html import escape
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Block, Message
-from evlcp_sdk.errors import StreamError
+from evlcp_sdk.errors import ConfigError, StreamError
+
+if TYPE_CHECKING:
+    import pandas
+    import pyarrow
 
 __all__ = [
-    "EVENT_RECORD",
     "Events",
     "Fix",
     "Frame",
@@ -27,11 +31,9 @@ __all__ = [
     "SyncLock",
     "Triggers",
     "Trust",
+    "arrow_table",
+    "pandas_frame",
 ]
-
-EVENT_RECORD = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
-"""The structured record of Prophesee's Metavision SDK (`EventCD`)."""
-
 
 _COLUMNS = (
     ("t_us", np.dtype(np.int64)),
@@ -97,16 +99,24 @@ class Events:
             return cls.empty()
         return cls(*(np.concatenate([getattr(q, c) for q in ps]) for c in ("t_us", "x", "y", "p")))
 
-    @classmethod
-    def from_records(cls, records: NDArray[np.void]) -> Self:
-        """Events from Metavision records (fields x, y, p, t)."""
-        return cls.of(records["t"], records["x"], records["y"], records["p"])
+    def to_pandas(self) -> "pandas.DataFrame":
+        """The events as a table of pandas, with the columns t_us, x, y, p; copied.
 
-    def to_records(self) -> NDArray[np.void]:
-        """Metavision records (`EVENT_RECORD`)."""
-        out = np.empty(len(self), EVENT_RECORD)
-        out["x"], out["y"], out["p"], out["t"] = self.x, self.y, self.p, self.t_us
-        return out
+        Raises:
+            ConfigError: pandas is not installed.
+        """
+        return pandas_frame({name: getattr(self, name) for name, _ in _COLUMNS})
+
+    def to_arrow(self) -> "pyarrow.Table":
+        """The events as a table of Arrow, with the columns t_us, x, y, p.
+
+        Raises:
+            ConfigError: pyarrow is not installed.
+        """
+        return arrow_table({name: getattr(self, name) for name, _ in _COLUMNS})
+
+    def __repr__(self) -> str:
+        return f"Events({_counted(self.t_us, 'event')})"
 
     def __len__(self) -> int:
         return len(self.t_us)
@@ -150,6 +160,9 @@ class Triggers:
 
     def __len__(self) -> int:
         return len(self.t_us)
+
+    def __repr__(self) -> str:
+        return f"Triggers({_counted(self.t_us, 'edge')})"
 
 
 @dataclass(frozen=True)
@@ -211,6 +224,12 @@ class PresenceMap:
     selected: NDArray[np.bool_]
     pixels: NDArray[np.float32]
 
+    def __repr__(self) -> str:
+        clusters, rows, columns = self.selected.shape
+        seen = int(self.selected.any(axis=(1, 2)).sum())
+        cells = f"{columns} x {rows} cells of {self.grid_px} px"
+        return f"PresenceMap({seen} of {clusters} clusters seen, {cells})"
+
 
 @dataclass(frozen=True, eq=False)
 class SoftSymbols:
@@ -225,6 +244,9 @@ class SoftSymbols:
     symbols: NDArray[np.int64]
     llr: NDArray[np.float32]
     quality: float
+
+    def __repr__(self) -> str:
+        return f"SoftSymbols({_symbols(self)}, quality {self.quality:.2f})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,6 +266,10 @@ class FrameView:
     presence: PresenceMap
     soft: SoftSymbols
 
+    def __repr__(self) -> str:
+        chips, height, width = self.sums.shape
+        return f"FrameView({chips} chips of {width} x {height} px, {self.presence}, {self.soft})"
+
 
 @dataclass(frozen=True)
 class Range:
@@ -258,6 +284,9 @@ class Range:
     distance_m: float
     sigma_m: float
     pairs: int
+
+    def __repr__(self) -> str:
+        return f"Range({_distance(self)}, {self.pairs} pairs)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,6 +322,10 @@ class Frame:
     points_sigma_px: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     points_t_us: float = math.nan
 
+    def __repr__(self) -> str:
+        place = f"transmitter {self.transmitter}, packet {self.packet}, frame {self.frame}"
+        return f"Frame({place}, {self.t_us / 1e3:.1f} ms, {_symbols(self.soft)}, {_distance(self.range)})"
+
 
 Trust = Literal["verified", "unverified", "forged"]
 """Signed by a trusted key and not replayed; not known to be; or known not to be."""
@@ -320,6 +353,9 @@ class ReceivedMessage:
     trust: Trust
     reason: str
 
+    def __repr__(self) -> str:
+        return f"ReceivedMessage({_said(self)}, {self.t_us / 1e3:.1f} ms)"
+
 
 @dataclass(frozen=True, eq=False)
 class Packet:
@@ -346,6 +382,27 @@ class Packet:
     block: Block | None = None
     block_packets: int = 0
     messages: tuple[ReceivedMessage, ...] = ()
+
+    def __repr__(self) -> str:
+        found = f"{len(self.frames)} of {self.sent} frames"
+        number = len(self.messages)
+        messages = f", {number} message{'s' * (number != 1)}" if number else ""
+        place = f"transmitter {self.transmitter}, packet {self.packet}"
+        return f"Packet({place}, {self.t_us / 1e3:.1f} ms, {found}{messages})"
+
+    def _repr_html_(self) -> str:
+        """The packet as a notebook shows it: a row a frame, and what its messages say."""
+        rows = "".join(
+            f"<tr><td>{f.frame}</td><td>{f.t_us / 1e3:.2f}</td><td>{escape(_symbols(f.soft, most=1024))}</td>"
+            f"<td>{f.soft.quality:.2f}</td><td>{escape(_distance(f.range))}</td></tr>"
+            for f in self.frames
+        )
+        head = "".join(f"<th>{name}</th>" for name in ("frame", "ms", "symbols", "quality", "distance"))
+        messages = "".join(f"<li>{escape(_said(m))}</li>" for m in self.messages)
+        return (
+            f"<p>{escape(repr(self))}</p><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+            + (f"<ul>{messages}</ul>" if messages else "")
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,6 +445,14 @@ class Fix:
     refusal: str = ""
     detail: str = ""
 
+    def __repr__(self) -> str:
+        time = f"{self.t_us / 1e3:.1f} ms"
+        if self.refusal:
+            return f"Fix({time}, refused: {self.refusal})"
+        east_m, north_m, up_m = np.sqrt(np.maximum(np.diag(self.covariance_m2), 0))
+        place = f"{self.latitude_deg:.7f}, {self.longitude_deg:.7f} deg, {self.height_m:.2f} m"
+        return f"Fix({time}, {place}, ± {east_m:.2g} E {north_m:.2g} N {up_m:.2g} U m)"
+
     @classmethod
     def refused(cls, t_us: float, transmitters: tuple[int, ...], refusal: str, detail: str) -> Self:
         """A fix that is not given."""
@@ -396,3 +461,68 @@ class Fix:
         return cls(
             t_us, *geodetic, place, spread, spread, *angles, math.nan, transmitters, False, refusal, detail
         )
+
+
+def pandas_frame(columns: Mapping[str, Any]) -> "pandas.DataFrame":
+    """A table of pandas from columns of equal length.
+
+    Raises:
+        ConfigError: pandas is not installed.
+    """
+    try:
+        import pandas
+    except ImportError as fault:
+        raise ConfigError(
+            "pandas is not installed; it comes with the extra: pip install 'evlcp-sdk[pandas]'"
+        ) from fault
+    return pandas.DataFrame({name: column.copy() for name, column in columns.items()})
+
+
+def arrow_table(columns: Mapping[str, Any]) -> "pyarrow.Table":
+    """A table of Arrow from columns of equal length.
+
+    Raises:
+        ConfigError: pyarrow is not installed.
+    """
+    try:
+        import pyarrow
+    except ImportError as fault:
+        raise ConfigError(
+            "pyarrow is not installed; it comes with the extra: pip install 'evlcp-sdk[parquet]'"
+        ) from fault
+    return pyarrow.table(dict(columns))
+
+
+def _counted(t_us: NDArray[np.int64], what: str) -> str:
+    """How many there are, and from when to when."""
+    n = len(t_us)
+    if not n:
+        return f"no {what}s"
+    return f"{n} {what}{'s' * (n != 1)}, {t_us[0] / 1e3:.1f} to {t_us[-1] / 1e3:.1f} ms"
+
+
+def _symbols(soft: SoftSymbols, most: int = 16) -> str:
+    """The symbols one after another, the first `most` of them."""
+    symbols = soft.symbols.tolist()
+    text = " ".join(str(s) for s in symbols[:most])
+    return f"{text} ..." if len(symbols) > most else text
+
+
+def _distance(found: Range) -> str:
+    if math.isnan(found.distance_m):
+        return "no distance"
+    return f"{found.distance_m:.2f} ± {found.sigma_m:.2f} m"
+
+
+def _said(received: ReceivedMessage, most: int = 60) -> str:
+    """What a message says, its start at least, and who sent it."""
+    message = received.message
+    text = message.text
+    if received.beacon is not None:
+        latitude_deg, longitude_deg, height_m = received.beacon.place
+        what = f"beacon at {latitude_deg:.7f}, {longitude_deg:.7f} deg, {height_m:.2f} m"
+    elif text is not None:
+        what = repr(text if len(text) <= most else f"{text[:most]}...")
+    else:
+        what = f"{len(message.payload)} bytes of {message.kind.name.lower()}"
+    return f"{what} from {message.transmitter_id}, {received.trust}"

@@ -11,13 +11,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from evlcp_sdk.errors import EvlcpError
-from evlcp_sdk.io import open_source
-from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.plugin.hooks import hookimpl
-from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.values import Frame
+import evlcp_sdk as evlcp
 
 
 class SpeedDisplay:
@@ -30,10 +24,10 @@ class SpeedDisplay:
     def __init__(self, frames: int = 60) -> None:
         self._seen: dict[int, deque[tuple[float, float]]] = defaultdict(lambda: deque(maxlen=frames))
 
-    @hookimpl
+    @evlcp.hookimpl
     def evlcp_stage_finished(self, stage: str, value: object) -> None:
         """Print a line for every frame that has a distance."""
-        if stage != "frame" or not isinstance(value, Frame) or math.isnan(value.range.distance_m):
+        if stage != "frame" or not isinstance(value, evlcp.Frame) or math.isnan(value.range.distance_m):
             return
         self._seen[value.transmitter].append((value.t_us * 1e-6, value.range.distance_m))
         place = f"{value.t_us / 1e3:9.1f} ms  bar {value.transmitter}  {value.range.distance_m:7.2f} m"
@@ -41,7 +35,7 @@ class SpeedDisplay:
         shown = f"{speed_m_s:6.2f} ± {sigma_m_s:5.2f} m/s  {3.6 * speed_m_s:6.1f} km/h"
         print(place, "too early for a speed" if math.isnan(speed_m_s) else shown, sep="  ", flush=True)
 
-    @hookimpl
+    @evlcp.hookimpl
     def evlcp_register_commands(self, app: typer.Typer) -> None:
         """Add `speed`."""
 
@@ -50,13 +44,10 @@ class SpeedDisplay:
             recording: Annotated[str, typer.Argument(metavar="REC", help="A recording or a camera.")],
         ) -> None:
             """Show how fast the camera comes nearer to each bar."""
-            registry = Registry.load(self)
-            link = load_link(None, ["ranging.id=joint-scale"], registry)
-            receiver = Receiver(link, registry.hook)
-            with open_source(recording, registry) as source:
-                for events in source.chunks():
-                    receiver.feed(events)
-            receiver.close()
+            registry = evlcp.Registry.load(self)
+            link = evlcp.load_link(None, ["ranging.id=joint-scale"], registry)
+            for _ in evlcp.receive(recording, link, registry=registry):
+                pass  # the hook above has seen its frames
 
     def speed(self, transmitter: int) -> tuple[float, float]:
         """Speed towards a transmitter and its standard deviation, m/s; NaN before three distances.
@@ -78,9 +69,9 @@ def main() -> None:
     """Make a command line of what plugins add."""
     app = typer.Typer(no_args_is_help=True, add_completion=False)
     try:
-        Registry.load(SpeedDisplay()).hook.evlcp_register_commands(app=app)
+        evlcp.Registry.load(SpeedDisplay()).hook.evlcp_register_commands(app=app)
         app()
-    except EvlcpError as fault:
+    except evlcp.EvlcpError as fault:
         print(fault, file=sys.stderr)
         sys.exit(fault.exit_code)
 

@@ -1,16 +1,70 @@
 """Messages to the packets that a transmitter plays."""
 
+import time
 from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.beacons import Beacon
-from evlcp_sdk.air.blocks import Message, split
+from evlcp_sdk.air.blocks import Kind, Message, split
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.blocks import BlockCoder
+from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.scene.sites import BarSite
 
-__all__ = ["beacon_of_site", "packets_of"]
+__all__ = ["beacon_of_site", "compose", "packets_of"]
+
+
+def compose(
+    link: Link | None = None,
+    *,
+    text: str | None = None,
+    data: bytes | None = None,
+    beacon: Beacon | BarSite | None = None,
+    transmitter_id: int | None = None,
+    sequence: int | None = None,
+    repeat: int = 1,
+) -> NDArray[np.int64]:
+    """Put messages on packets: the symbols that a transmitter sends, int64 (packets, frames, clusters).
+
+    Several messages at once follow one another: beacon, text, data. Beacons are not signed here.
+
+    Args:
+        link: The configuration; None for all defaults.
+        text: A text.
+        data: Bytes.
+        beacon: What a beacon says; of a bar's site, where it stands.
+        transmitter_id: Who sends; None for the site's id, or 0.
+        sequence: Number of the messages; None for the seconds since 1970, so that it rises.
+        repeat: How many times in a row each packet is sent.
+
+    Raises:
+        ConfigError: Nothing to send, a message that is too long or a number out of range, or packets of the
+            link that are too short for messages.
+
+    >>> compose(text="Tempo 30", transmitter_id=7).shape
+    (1, 10, 16)
+    """
+    link = load_link() if link is None else link
+    if repeat < 1:
+        raise ConfigError(f"repeat = {repeat}, expected 1 or more")
+    if transmitter_id is None:
+        transmitter_id = beacon.transmitter_id if isinstance(beacon, BarSite) else 0
+    if sequence is None:
+        sequence = int(time.time())
+    payloads = []
+    if beacon is not None:
+        said = beacon_of_site(beacon) if isinstance(beacon, BarSite) else beacon
+        payloads.append((Kind.BEACON, said.pack()))
+    if text is not None:
+        payloads.append((Kind.TEXT, text.encode()))
+    if data is not None:
+        payloads.append((Kind.DATA, bytes(data)))
+    if not payloads:
+        raise ConfigError("nothing to send: give a text, data or a beacon")
+    messages = [Message(kind, transmitter_id, sequence, payload) for kind, payload in payloads]
+    return packets_of(messages, link.block_coder(), repeat)
 
 
 def packets_of(messages: Iterable[Message], coder: BlockCoder, repeat: int = 1) -> NDArray[np.int64]:

@@ -90,6 +90,11 @@ class Link:
     def __hash__(self) -> int:
         return hash(self.digest)
 
+    def __repr__(self) -> str:
+        book, packet = self.codebook, self.packet
+        codes = f"{book.profile}, {book.clusters} clusters, {packet.frames} frames a packet"
+        return f"Link({codes}, {self.air.chip_rate_hz:g} chips/s, digest {self.digest[:12]})"
+
     def algorithm(self, role: str) -> Any:
         """The algorithm of a role, e.g. `link.algorithm("ranging")`."""
         return self.algorithms[role]

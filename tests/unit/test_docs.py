@@ -15,6 +15,7 @@ from typing import Any, get_type_hints
 import pytest
 from pydantic.fields import FieldInfo
 
+import evlcp_sdk
 from evlcp_sdk.air.signing import make_key
 from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.plugin import hooks as hookspecs
@@ -83,6 +84,8 @@ def test_code_and_commands_run(path: Path, workplace: Path, evlcp: Callable[...,
     names: dict[str, Any] = {"__name__": "example"}
     modules = set(sys.modules)
     for code in blocks(path, "python"):
+        if ".to_arrow(" in code:
+            pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
         if name := re.match(r"# (\w+)\.py\n", code):
             (workplace / f"{name[1]}.py").write_text(code)
         exec(compile(code, f"{path.name}", "exec"), names)
@@ -223,6 +226,20 @@ def test_the_quickstart_is_the_example(capsys: pytest.CaptureFixture[str], workp
     exec((ROOT / "examples" / "quickstart.py").read_text(), names)
     names["main"]("REC.raw")
     assert len(capsys.readouterr().out.splitlines()) > 10
+
+
+@pytest.mark.parametrize(
+    "path", ["README.md", "docs/quickstart.md", "examples/quickstart.py", "examples/custom_app.py"]
+)
+def test_what_users_read_first_uses_the_public_face_only(path: str) -> None:
+    found = set(re.findall(r"^ *(?:import|from) +evlcp_sdk\b.*$", (ROOT / path).read_text(), re.MULTILINE))
+    assert found == {"import evlcp_sdk as evlcp"}
+
+
+def test_every_name_of_the_face_that_a_page_shows_exists() -> None:
+    for path in [*FILES, *(ROOT / "examples").glob("*.py")]:
+        for name in re.findall(r"\bevlcp\.(\w+)", path.read_text()):
+            assert name in evlcp_sdk.__all__, f"{path.name} names evlcp.{name}"
 
 
 def test_nothing_public_is_without_a_doc_page() -> None:

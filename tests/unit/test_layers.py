@@ -16,7 +16,7 @@ LAYERS = (
     {"link"},
     {"io", "rx", "place", "sim"},
     {"results", "jobs", "study"},
-    {"run"},
+    {"run", "simulated"},
     {"testing"},
     {"cli"},
 )

@@ -1,0 +1,61 @@
+"""The frames of packets as a table of pandas or Arrow."""
+
+import math
+from collections.abc import Iterable
+from typing import Any, Literal
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.results.outputs import FILTERED_COLUMNS, FRAME_COLUMNS
+from evlcp_sdk.values import Frame, Packet, Range, arrow_table, pandas_frame
+
+__all__ = ["frames_table"]
+
+
+def frames_table(packets: Iterable[Packet], kind: Literal["pandas", "arrow"] = "pandas") -> Any:
+    """The frames of packets as a table, a row a frame, with the columns of `frames.csv`, not rounded.
+
+    `symbols` holds lists; a distance that is not given is NaN in pandas, null in Arrow. The columns of the
+    filtered distance are there if any frame has one.
+
+    Args:
+        packets: What a receiver gives; read to the end.
+        kind: "pandas" for a `pandas.DataFrame`, "arrow" for a `pyarrow.Table`.
+
+    Raises:
+        ConfigError: The library is not installed, or `kind` is another word.
+    """
+    if kind not in ("pandas", "arrow"):
+        raise ConfigError(f"kind = {kind!r}, expected 'pandas' or 'arrow'")
+    frames = [frame for packet in packets for frame in packet.frames]
+    names: tuple[str, ...] = FRAME_COLUMNS
+    if any(frame.filtered is not None for frame in frames):
+        names += FILTERED_COLUMNS
+    columns = {name: [_value(frame, name) for frame in frames] for name in names}
+    if kind == "pandas":
+        return pandas_frame(columns)
+    for name, values in columns.items():
+        if values and isinstance(values[0], float):
+            columns[name] = [v if math.isfinite(v) else None for v in values]
+    return arrow_table(columns)
+
+
+def _value(frame: Frame, name: str) -> Any:
+    match name:
+        case "symbols":
+            return frame.soft.symbols.tolist()
+        case "quality":
+            return frame.soft.quality
+        case "distance_m":
+            return frame.range.distance_m
+        case "distance_sigma_m":
+            return frame.range.sigma_m
+        case "distance_filtered_m":
+            return _of(frame.filtered).distance_m
+        case "distance_filtered_sigma_m":
+            return _of(frame.filtered).sigma_m
+        case _:
+            return getattr(frame, name)
+
+
+def _of(range: Range | None) -> Range:
+    return Range(math.nan, math.nan, 0) if range is None else range

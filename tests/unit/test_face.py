@@ -1,0 +1,212 @@
+"""The public face: which names it has, that they are described, and that it imports nothing by itself."""
+
+import ast
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import evlcp_sdk as evlcp
+from evlcp_sdk import errors, values
+from evlcp_sdk.plugin.roles import ROLES
+
+FACE = Path(evlcp.__file__)
+
+NAMES = [
+    "Algorithm",
+    "BarSite",
+    "Beacon",
+    "CodebookMismatchError",
+    "ConfigError",
+    "Decoding",
+    "ErrorCorrection",
+    "EventSource",
+    "Events",
+    "EvlcpError",
+    "Fix",
+    "Frame",
+    "FrameView",
+    "InputError",
+    "InterruptedRunError",
+    "Link",
+    "Loss",
+    "Message",
+    "Modulation",
+    "Packet",
+    "Pilots",
+    "PluginError",
+    "PresenceMap",
+    "Range",
+    "Ranging",
+    "RawFormatError",
+    "ReceivedMessage",
+    "Receiver",
+    "Reception",
+    "Region",
+    "Registry",
+    "ReplaySource",
+    "Separation",
+    "SimulatedSource",
+    "SoftSymbols",
+    "StreamError",
+    "SyncLock",
+    "Synchronization",
+    "Tracking",
+    "Triggers",
+    "UnknownAlgorithmError",
+    "compose",
+    "frames_table",
+    "hookimpl",
+    "load_link",
+    "load_sites",
+    "open",
+    "read_events",
+    "receive",
+    "simulate",
+    "write_events",
+]
+
+
+def test_the_names_are_these() -> None:
+    assert evlcp.__all__ == sorted(NAMES)
+    assert set(NAMES) <= set(dir(evlcp))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_name_is_there_and_described(name: str) -> None:
+    found = getattr(evlcp, name)
+    doc = inspect.getdoc(found) or ""
+    assert doc.strip(), name
+    if dataclass_made(found):
+        pytest.fail(f"{name} has no docstring but the one that dataclass makes")
+    assert getattr(evlcp, name) is found
+
+
+def dataclass_made(found: object) -> bool:
+    return inspect.isclass(found) and (found.__doc__ or "").startswith(f"{found.__name__}(")
+
+
+def test_all_errors_and_roles_and_values_are_there() -> None:
+    wanted = {*errors.__all__, *(role.__name__ for role in ROLES.values())}
+    wanted |= {n for n in values.__all__ if inspect.isclass(getattr(values, n))}
+    assert wanted <= set(NAMES)
+
+
+def test_what_type_checkers_see_is_what_is_found() -> None:
+    """The imports under TYPE_CHECKING name the same objects."""
+    (typed,) = (
+        node
+        for node in ast.parse(FACE.read_text()).body
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    )
+    seen: dict[str, Any] = {}
+    for node in typed.body:
+        assert isinstance(node, ast.ImportFrom)
+        for alias in node.names:
+            module = __import__(str(node.module), fromlist=[alias.name])
+            seen[alias.asname or alias.name] = getattr(module, alias.name)
+    assert seen == {name: getattr(evlcp, name) for name in NAMES}
+
+
+def test_a_name_that_is_not_there() -> None:
+    with pytest.raises(AttributeError, match="module 'evlcp_sdk' has no attribute 'recieve'"):
+        evlcp.recieve  # type: ignore[attr-defined]
+
+
+def imported(code: str) -> set[str]:
+    """All modules that a fresh interpreter has after a statement."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys\n{code}\nprint(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    return set(done.stdout.split())
+
+
+def test_importing_the_package_imports_nothing_else() -> None:
+    more = imported("import evlcp_sdk as evlcp; dir(evlcp)") - imported("")
+    assert more == {"evlcp_sdk"}
+
+
+@pytest.mark.parametrize("name", ["load_link", "hookimpl", "Registry", "ConfigError"])
+def test_a_light_name_imports_no_kernels(name: str) -> None:
+    more = imported(f"import evlcp_sdk as evlcp; evlcp.{name}")
+    assert not {"numba", "scipy", "evlcp_sdk.rx", "evlcp_sdk.sim", "matplotlib"} & more
+
+
+def test_what_is_composed_is_sent_and_received() -> None:
+    link = evlcp.load_link()
+    symbols = evlcp.compose(link, text="Tempo 30", transmitter_id=7, sequence=3)
+    scene = {
+        "name": "sent",
+        "duration_s": 0.12,
+        "motion": {"distance_m": 40.0},
+        "bars": [{"symbols": symbols.tolist()}],
+    }
+    source = evlcp.simulate(scene, seed=2)
+    assert np.array_equal(source.truth.bars[0].symbols[0], symbols[0])
+    messages = [m for packet in evlcp.receive(source, link) for m in packet.messages]
+    assert {(m.message.text, m.message.transmitter_id, m.message.sequence) for m in messages} == {
+        ("Tempo 30", 7, 3)
+    }
+
+
+def test_compose_beacon_and_data_follow_one_another() -> None:
+    site = evlcp.BarSite(9, 35.0, 137.0, 50.0, heading_deg=90.0)
+    link = evlcp.load_link()
+    coder = link.block_coder()
+    symbols = evlcp.compose(link, data=b"\x00\xff", text="é", beacon=site, sequence=5, repeat=2)
+    assert symbols.shape == (6, 10, 16)
+    assert np.array_equal(symbols[::2], symbols[1::2])
+    assert symbols.dtype == np.int64
+    alone = [
+        evlcp.compose(link, **{kind: value}, transmitter_id=9, sequence=5)  # type: ignore[arg-type]
+        for kind, value in (("beacon", site), ("text", "é"), ("data", b"\x00\xff"))
+    ]
+    assert np.array_equal(symbols[::2], np.concatenate(alone))
+    assert coder.digest == bytes.fromhex(link.codebook.digest)[:4]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({}, "nothing to send: give a text, data or a beacon"),
+        ({"text": "x", "repeat": 0}, "repeat = 0, expected 1 or more"),
+        ({"text": ""}, "0 bytes of text"),
+        ({"text": "x", "sequence": -1}, "sequence = -1"),
+    ],
+)
+def test_compose_refuses(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(evlcp.ConfigError, match=message):
+        evlcp.compose(**arguments)
+
+
+def test_a_simulation_is_a_source_like_a_recording(tmp_path: Path, evlcp: Any) -> None:
+    import evlcp_sdk
+
+    settings = ["duration_s=0.05", "motion.distance_m=70"]
+    source = evlcp_sdk.simulate("night", seed=4, overrides=settings)
+    assert repr(source) == "SimulatedSource(night, 1 bar, 0.05 s, seed 4)"
+    events, triggers = source.read()
+    assert len(triggers) == 0
+    done = evlcp("simulate", "--preset", "night", "--seed", 4, "-o", tmp_path / "a.raw",
+                 *(word for s in settings for word in ("--set", s)))  # fmt: skip
+    assert done.code == 0
+    written = evlcp_sdk.read_events(tmp_path / "a.raw")
+    for column in ("t_us", "x", "y", "p"):
+        assert np.array_equal(getattr(events, column), getattr(written, column)), column
+    assert source.counts["events"] == source.counts["simulated_events"] == len(written)
+
+
+def test_a_simulation_that_is_closed_ends() -> None:
+    with evlcp.simulate("night", overrides={"duration_s": 0.05}) as source:
+        next(source.chunks(1000))
+    assert source.take(1000) is None
+    with pytest.raises(evlcp.ConfigError, match="overrides are of a preset or a file"):
+        evlcp.simulate({"bars": [{}]}, overrides=["duration_s=1"])

@@ -1,0 +1,229 @@
+"""Values: short reprs, pages for notebooks, tables for pandas and Arrow."""
+
+import builtins
+import math
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import evlcp_sdk as evlcp
+from evlcp_sdk.air.beacons import Beacon
+from evlcp_sdk.air.blocks import Kind, Message
+from evlcp_sdk.results.outputs import FILTERED_COLUMNS, FRAME_COLUMNS
+from evlcp_sdk.values import (
+    Events,
+    Fix,
+    Frame,
+    FrameView,
+    Packet,
+    PresenceMap,
+    Range,
+    ReceivedMessage,
+    SoftSymbols,
+    Triggers,
+)
+
+EVENTS = Events.of(
+    np.arange(65_536) * 12_300 // 65_535, np.full(65_536, 3), np.full(65_536, 4), np.ones(65_536)
+)
+SOFT = SoftSymbols(np.array([23, 18, 8, 51]), np.zeros((4, 6), np.float32), 0.973)
+PRESENCE = PresenceMap(
+    np.zeros((4, 6, 5), np.float32),
+    4,
+    np.arange(120).reshape(4, 6, 5) < 61,
+    np.zeros((4, 24, 20), np.float32),
+)
+PLACE = np.array([1.0, 2.0, 3.0])
+
+
+def frame(number: int = 3, found: Range | None = None, filtered: Range | None = None) -> Frame:
+    measured = Range(49.337, 0.088, 26) if found is None else found
+    return Frame(0, 1, number, 66_123.4, SOFT, measured, filtered, 640.0, 360.0)
+
+
+def text_message(text: str) -> ReceivedMessage:
+    return ReceivedMessage(0, 1, 66e3, Message(Kind.TEXT, 7, 2, text.encode()), None, "unverified", "")
+
+
+def packet(*messages: ReceivedMessage) -> Packet:
+    return Packet(
+        0, 1, 60_000.0, 100.0, (frame(3), frame(4, Range(math.nan, math.nan, 0))), 10, None, 0, messages
+    )
+
+
+BEACON = Beacon(35.156, 136.965, 52.4, 0.0, 0.0, 0.96)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (EVENTS, "Events(65536 events, 0.0 to 12.3 ms)"),
+        (EVENTS[:1], "Events(1 event, 0.0 to 0.0 ms)"),
+        (Events.empty(), "Events(no events)"),
+        (Triggers.of([1000, 2500], [0, 0], [1, 0]), "Triggers(2 edges, 1.0 to 2.5 ms)"),
+        (Triggers.empty(), "Triggers(no edges)"),
+        (PRESENCE, "PresenceMap(3 of 4 clusters seen, 5 x 6 cells of 4 px)"),
+        (SOFT, "SoftSymbols(23 18 8 51, quality 0.97)"),
+        (
+            SoftSymbols(np.arange(40), np.zeros((40, 6), np.float32), 1.0),
+            "SoftSymbols(0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 ..., quality 1.00)",
+        ),
+        (Range(49.337, 0.088, 26), "Range(49.34 ± 0.09 m, 26 pairs)"),
+        (Range(math.nan, math.nan, 0), "Range(no distance, 0 pairs)"),
+        (frame(), "Frame(transmitter 0, packet 1, frame 3, 66.1 ms, 23 18 8 51, 49.34 ± 0.09 m)"),
+        (packet(), "Packet(transmitter 0, packet 1, 60.0 ms, 2 of 10 frames)"),
+        (packet(text_message("a")), "Packet(transmitter 0, packet 1, 60.0 ms, 2 of 10 frames, 1 message)"),
+        (text_message("Tempo 30"), "ReceivedMessage('Tempo 30' from 7, unverified, 66.0 ms)"),
+        (text_message("x" * 900), f"ReceivedMessage('{'x' * 60}...' from 7, unverified, 66.0 ms)"),
+        (
+            ReceivedMessage(0, 1, 66e3, Message(Kind.DATA, 7, 2, bytes(60_000)), None, "unverified", ""),
+            "ReceivedMessage(60000 bytes of data from 7, unverified, 66.0 ms)",
+        ),
+        (
+            ReceivedMessage(0, 1, 66e3, Message(Kind.BEACON, 7, 2, BEACON.pack()), BEACON, "verified", ""),
+            "ReceivedMessage(beacon at 35.1560000, 136.9650000 deg, 52.40 m from 7, verified, 66.0 ms)",
+        ),
+        (Fix.refused(5e3, (0,), "one-bar", "a single bar"), "Fix(5.0 ms, refused: one-bar)"),
+        (
+            Fix(
+                5e3,
+                35.1,
+                137.2,
+                50.0,
+                PLACE,
+                np.diag([0.01, 0.04, 1.0]),
+                np.eye(3),
+                0.0,
+                0.0,
+                0.0,
+                0.1,
+                (0, 1),
+                True,
+            ),
+            "Fix(5.0 ms, 35.1000000, 137.2000000 deg, 50.00 m, ± 0.1 E 0.2 N 1 U m)",
+        ),
+    ],
+    ids=lambda v: type(v).__name__ if not isinstance(v, str) else "",
+)
+def test_reprs_are_short(value: object, text: str) -> None:
+    assert repr(value) == text
+
+
+def test_reprs_of_views_and_links() -> None:
+    view = FrameView(np.zeros((58, 24, 20), np.int16), np.zeros((2, 58)), PRESENCE, SOFT)
+    assert repr(view) == f"FrameView(58 chips of 20 x 24 px, {PRESENCE}, {SOFT})"
+    link = evlcp.load_link()
+    text = f"Link(wh4x2, 16 clusters, 10 frames a packet, 10000 chips/s, digest {link.digest[:12]})"
+    assert repr(link) == text
+
+
+class Cells(HTMLParser):
+    """Texts of a page's elements, by tag; every tag that opens must close."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.texts: dict[str, list[str]] = {}
+        self.feed(page)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        assert not attrs
+        self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.texts.setdefault(self.open[-1], []).append(data)
+
+
+def test_a_packet_in_a_notebook() -> None:
+    evil = "<script>alert('x')</script> & more"
+    page = packet(text_message(evil))._repr_html_()
+    assert "<script" not in page
+    found = Cells(page).texts
+    assert set(found) == {"p", "th", "td", "li"}
+    assert found["th"] == ["frame", "ms", "symbols", "quality", "distance"]
+    assert found["td"][:5] == ["3", "66.12", "23 18 8 51", "0.97", "49.34 ± 0.09 m"]
+    assert found["td"][5:] == ["4", "66.12", "23 18 8 51", "0.97", "no distance"]
+    assert found["li"][0].startswith('"<script>alert(')
+
+
+def test_a_reception_in_a_notebook(demo_raw: Path, tmp_path: Path) -> None:
+    evil = tmp_path / "<b>&.raw"
+    evil.symlink_to(demo_raw)
+    with evlcp.receive(evil) as reception:
+        first = next(reception)
+        page = reception._repr_html_()
+    found = Cells(page).texts
+    assert found["p"] == [repr(reception)]
+    assert repr(reception).startswith(f"Reception({evil}: ")
+    rows = dict(zip(found["td"][::2], found["td"][1::2], strict=True))
+    assert int(rows["frames"]) >= len(first.frames)
+    assert rows.keys() <= {name.replace("_", " ") for name in reception.counts} | {"lost"}
+
+
+def test_events_as_tables() -> None:
+    pandas = pytest.importorskip("pandas", reason="the extra pandas is not installed")
+    pyarrow = pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
+    frame, table = EVENTS.to_pandas(), EVENTS.to_arrow()
+    assert isinstance(frame, pandas.DataFrame)
+    assert isinstance(table, pyarrow.Table)
+    assert list(frame.columns) == table.column_names == ["t_us", "x", "y", "p"]
+    for name in table.column_names:
+        column = getattr(EVENTS, name)
+        assert frame[name].dtype == column.dtype
+        assert np.array_equal(frame[name], column)
+        assert np.array_equal(table[name].to_numpy(), column)
+    frame.loc[0, "x"] = 9
+    assert EVENTS.x[0] == 3
+
+
+def test_frames_as_a_table(demo_raw: Path) -> None:
+    pytest.importorskip("pandas", reason="the extra pandas is not installed")
+    packets = list(evlcp.receive(demo_raw))
+    frames = [f for p in packets for f in p.frames]
+    table = evlcp.receive(demo_raw).to_pandas()
+    assert list(table.columns) == list(FRAME_COLUMNS)
+    assert table["symbols"].tolist() == [f.soft.symbols.tolist() for f in frames]
+    assert table["t_us"].tolist() == [f.t_us for f in frames]
+    assert np.array_equal(table["distance_m"], [f.range.distance_m for f in frames], equal_nan=True)
+    assert table["frame"].tolist() == [f.frame for f in frames]
+    assert table.equals(evlcp.frames_table(packets, "pandas"))
+
+
+def test_frames_as_arrow_with_nulls_and_the_filtered_distance() -> None:
+    pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
+    none = Range(math.nan, math.nan, 0)
+    one = Packet(0, 1, 0.0, 100.0, (frame(0, none, Range(48.0, 0.1, 0)), frame(1)), 10)
+    table = evlcp.frames_table([one], "arrow")
+    assert table.column_names == [*FRAME_COLUMNS, *FILTERED_COLUMNS]
+    assert table["distance_m"].to_pylist() == [None, 49.337]
+    assert table["distance_filtered_m"].to_pylist() == [48.0, None]
+    assert table["symbols"].to_pylist() == [[23, 18, 8, 51]] * 2
+    assert evlcp.frames_table([], "arrow").num_rows == 0
+    with pytest.raises(evlcp.ConfigError, match="kind = 'csv', expected 'pandas' or 'arrow'"):
+        evlcp.frames_table([], "csv")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("method", "library", "extra"), [("to_pandas", "pandas", "pandas"), ("to_arrow", "pyarrow", "parquet")]
+)
+def test_a_library_that_is_missing_is_named(
+    method: str, library: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load = builtins.__import__
+
+    def without(name: str, *rest: Any) -> Any:
+        if name == library:
+            raise ImportError(name)
+        return load(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(evlcp.ConfigError, match=rf"{library} is not installed.*evlcp-sdk\[{extra}\]"):
+        getattr(EVENTS, method)()
