@@ -23,6 +23,7 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.testing import check, laws_of
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
+from tests.unit.test_layers import layer_of
 
 ROOT = Path(__file__).parents[2]
 PAGES = (
@@ -43,7 +44,7 @@ PAGES = (
     "conformance",
     "hooks",
 )
-FILES = [ROOT / "README.md", *(ROOT / "docs" / f"{page}.md" for page in PAGES)]
+FILES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs" / f"{page}.md" for page in PAGES)]
 HOOKS = [name for name in vars(hookspecs) if name.startswith("evlcp_")]
 
 
@@ -240,6 +241,28 @@ def test_every_name_of_the_face_that_a_page_shows_exists() -> None:
     for path in [*FILES, *(ROOT / "examples").glob("*.py")]:
         for name in re.findall(r"\bevlcp\.(\w+)", path.read_text()):
             assert name in evlcp_sdk.__all__, f"{path.name} names evlcp.{name}"
+
+
+def test_the_tree_of_contributing_is_the_tree() -> None:
+    text = next(text for text in blocks(ROOT / "CONTRIBUTING.md", "text") if "evlcp_sdk/errors.py" in text)
+    told = re.findall(r"^(\S+)  +\S", text, re.MULTILINE)
+    assert len(told) == len(text.splitlines())
+    for path in told:
+        found = ROOT / path
+        assert found.is_dir() if path.endswith("/") else found.is_file(), f"CONTRIBUTING.md: {path}"
+    rooms = {
+        f"evlcp_sdk/{path.name}{'/' * path.is_dir()}"
+        for path in (ROOT / "evlcp_sdk").iterdir()
+        if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
+    assert rooms == {path for path in told if path.startswith("evlcp_sdk/")}
+
+
+def test_the_tree_of_contributing_goes_from_the_ground_up() -> None:
+    text = next(text for text in blocks(ROOT / "CONTRIBUTING.md", "text") if "evlcp_sdk/errors.py" in text)
+    rooms = re.findall(r"^evlcp_sdk/(\w+?)(?:/|\.py) ", text, re.MULTILINE)
+    layers = [layer_of(room) for room in rooms if room != "__init__"]
+    assert layers == sorted(layers)
 
 
 def test_nothing_public_is_without_a_doc_page() -> None:
