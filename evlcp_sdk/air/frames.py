@@ -68,6 +68,14 @@ class PacketFormat:
         """Whether a frame of the packet begins with a pilot."""
         return frame % self.pilot_every == 0
 
+    def pilot_frame(self, frame: int) -> int:
+        """The frame of the packet whose pilot a frame goes by: itself, or the last before it with one.
+
+        >>> [PacketFormat(pilot_every=4).pilot_frame(n) for n in range(6)]
+        [0, 0, 0, 0, 4, 4]
+        """
+        return frame - frame % self.pilot_every
+
     def frame_start_chip(self, frame: int) -> int:
         """Chip of the packet at which a frame begins: with its pilot, or with its info segment."""
         pilots = -(-frame // self.pilot_every)

@@ -1,4 +1,6 @@
-"""The receiver's stages in the order of the signal's flow: regions, chips, payload, receiver.
+"""From events to packets.
 
-The stages do not know one another; `receiver.py` joins them.
+`receiver` joins the others: `timeline` (time steps), `detection` (regions), `steps` (the link's algorithms),
+`transmitters` and `grid` (whose frame is due when), `look` and `plausibility` (a frame with the bar held
+still), `points` (what positions are computed from), `packets` and `inbox` (packets and messages).
 """

@@ -3,7 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message
 from evlcp_sdk.air.signing import TrustedKeys
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.blocks import BlockCoder
+from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.sections import MessageSpec
 from evlcp_sdk.values import Packet, ReceivedMessage, Trust
 
@@ -49,12 +51,12 @@ class _Parts:
     Attributes:
         length: Its bytes.
         parts: Known parts by number.
-        told: The trust and reason last handed on; None before.
+        given: The trust and reason last handed on; None before.
     """
 
     length: int
     parts: dict[int, bytes] = field(default_factory=dict)
-    told: tuple[Trust, str] | None = None
+    given: tuple[Trust, str] | None = None
 
     def complete(self) -> bool:
         return sum(map(len, self.parts.values())) == self.length
@@ -92,7 +94,7 @@ class MessageAssembler:
         spec: The configuration.
 
     Raises:
-        ConfigError: A trusted key is none, or there are keys and the extra `sign` is not installed.
+        ConfigError: A trusted key is not valid, or there are keys and the extra `sign` is not installed.
     """
 
     def __init__(self, coder: BlockCoder, spec: MessageSpec) -> None:
@@ -121,6 +123,21 @@ class MessageAssembler:
             ),
             0,
         )
+
+    @classmethod
+    def of(cls, link: Link) -> Self | None:
+        """What reads a link's messages; None where that is turned off, or packets are too short for them.
+
+        Raises:
+            ConfigError: As above.
+        """
+        if not link.messages.decode:
+            return None
+        try:
+            coder = link.block_coder()
+        except ConfigError:
+            return None
+        return cls(coder, link.messages)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -224,18 +241,18 @@ class MessageAssembler:
             verdict = self._judge(inbox, message, beacon)
         elif message.kind is Kind.TEXT and message.text is None:
             return self._undecodable(parts)
-        if verdict == parts.told:
+        if verdict == parts.given:
             return []
-        self._counts["messages"] += parts.told is None
-        if beacon is not None and (parts.told is None or parts.told[0] != verdict[0]):
+        self._counts["messages"] += parts.given is None
+        if beacon is not None and (parts.given is None or parts.given[0] != verdict[0]):
             self._counts[f"beacons_{verdict[0]}"] += 1
-        parts.told = verdict
+        parts.given = verdict
         return [ReceivedMessage(packet.transmitter, packet.packet, packet.t_us, message, beacon, *verdict)]
 
     def _undecodable(self, parts: _Parts) -> list[ReceivedMessage]:
         """Count a message whose bytes mean nothing, once."""
-        if parts.told is None:
-            parts.told = ("unverified", "undecodable")
+        if parts.given is None:
+            parts.given = ("unverified", "undecodable")
             self._counts["messages_undecodable"] += 1
         return []
 

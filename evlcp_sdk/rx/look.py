@@ -1,13 +1,125 @@
-"""Chip-aligned polarity sums: the image of a moving bar, chip by chip, with the bar held still."""
+"""A frame with the bar held still: the image of a moving bar, chip by chip, and where its clusters are."""
 
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.values import Events, SyncLock
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.link.sections import RegionSpec
+from evlcp_sdk.rx.detection import Followed
+from evlcp_sdk.rx.grid import DueFrame
+from evlcp_sdk.rx.plausibility import clusters_in_place
+from evlcp_sdk.values import Events, PresenceMap, SyncLock
 
-__all__ = ["polarity_sums"]
+__all__ = ["Look", "Looker", "Pilot", "polarity_sums"]
+
+
+@dataclass(frozen=True, eq=False)
+class Pilot:
+    """The pilot that the frames up to the next one go by.
+
+    Attributes:
+        frame: Number of its frame on the packet grid.
+        size_px: (width, height) of the image, px.
+        sums: Its polarity sums, int16 (chips, height, width).
+        offset_px: The rest of the motion in it, float64 (2, chips), px.
+        presence: What it shows; the bar is held still, so it shows the same in the frames after it.
+    """
+
+    frame: int
+    size_px: tuple[int, int]
+    sums: NDArray[np.int16]
+    offset_px: NDArray[np.float64]
+    presence: PresenceMap
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A frame with the bar held still.
+
+    Attributes:
+        sums: Polarity sums of pilot and info segment, int16 (chips, height, width).
+        offset_px: The rest of the motion in them, float64 (2, chips), px.
+        presence: Where the clusters are.
+        centre_px: Column and row of the bar's centre in the chip that begins at `middle_us`.
+        middle_us: Middle of the pilot, or of the info segment of a frame without one, where a chip begins: a
+            chip's events show the image at its first edge.
+    """
+
+    sums: NDArray[np.int16]
+    offset_px: NDArray[np.float64]
+    presence: PresenceMap
+    centre_px: tuple[float, float]
+    middle_us: float
+
+
+class Looker:
+    """Looks at one frame after the other; a pilot is handed on to the frames after it.
+
+    Args:
+        packet: Lengths of a packet's parts.
+        spec: Length of a time step, seam, and least share of the clusters.
+        centres_m: Cluster centres of the layout, m, float64 (K, 2).
+        separate: From a pilot's polarity sums to where the clusters are.
+    """
+
+    def __init__(
+        self,
+        packet: PacketFormat,
+        spec: RegionSpec,
+        centres_m: NDArray[np.float64],
+        separate: Callable[[NDArray[np.int16]], PresenceMap],
+    ) -> None:
+        self._packet = packet
+        self._spec = spec
+        self._centres_m = centres_m
+        self._separate = separate
+
+    def look(self, region: Followed, due: DueFrame, pilot: Pilot | None) -> tuple[Look | None, Pilot | None]:
+        """Look at a frame.
+
+        Args:
+            region: The bar's.
+            due: Which frame.
+            pilot: The newest one of the bar.
+
+        Returns:
+            The frame, None if its clusters cannot be told; and the newest pilot, None if it showed no bar.
+        """
+        lock, packet = due.lock, self._packet
+        middles = due.start_us + (np.arange(due.chips, dtype=np.float64) + 0.5) * lock.chip_us
+        x, y = region.at(middles)
+        middle = min(due.chips, packet.pilot_chips) // 2
+        if due.has_pilot:
+            size = self._size(*region.size_at(middles[middle]))
+        elif pilot is None or pilot.frame != due.number - due.index + packet.pilot_frame(due.index):
+            return None, pilot
+        else:
+            size = pilot.size_px
+        pieces = [e for t, e in region.pieces if t < due.end_us and t + self._spec.step_us > due.start_us]
+        sums, offset_px = polarity_sums(pieces, lock, due.start_us, (x, y), size)
+        if due.has_pilot:
+            heard, moved = sums[: packet.pilot_chips], offset_px[:, : packet.pilot_chips]
+            presence = self._separate(heard)
+            in_place = clusters_in_place(presence, self._centres_m)
+            if in_place < self._spec.min_clusters_share * len(self._centres_m):
+                return None, None
+            pilot = Pilot(due.number, size, heard, moved, presence)
+        else:
+            assert pilot is not None
+            sums = np.concatenate([pilot.sums, sums])
+            offset_px = np.concatenate([pilot.offset_px, offset_px], axis=1)
+        centre_px = float(x[middle]), float(y[middle])
+        middle_us = float(middles[middle]) - lock.chip_us / 2
+        return Look(sums, offset_px, pilot.presence, centre_px, middle_us), pilot
+
+    def _size(self, width_px: float, height_px: float) -> tuple[int, int]:
+        """Of the image: a region's, its seam on both sides, made even."""
+        seam_px = 2 * self._spec.margin_px
+        return _even(width_px + seam_px), _even(height_px + seam_px)
 
 
 def polarity_sums(
@@ -53,3 +165,7 @@ def polarity_sums(
             sums,
         )
     return sums, corner_px - whole_px
+
+
+def _even(size: float) -> int:
+    return 2 * math.ceil(size / 2)

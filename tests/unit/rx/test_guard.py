@@ -102,6 +102,19 @@ def test_what_gives_another_thing_is_named(role: str, gives: object, says: str) 
         received(link_with(role, lambda *_: lambda *_: gives))
 
 
+def test_a_filter_of_places_that_fails_is_named() -> None:
+    with pytest.raises(PluginError, match=r"^tracking algorithm 'kalman': KeyError: 'boom'"):
+        received(link_with("tracking", lambda *_: Tracker(FailingFilter(), None)))
+
+
+def test_a_synchronization_that_gives_no_locks_is_named() -> None:
+    gives = SimpleNamespace(init=lambda: None, step=lambda *_: (None, [(0.0, 100.0)]))
+    with pytest.raises(
+        PluginError, match=r"^synchronization algorithm 'barker': gave tuple, expected SyncLock"
+    ):
+        received(link_with("synchronization", lambda *_: gives))
+
+
 def test_the_command_line_tells_it_in_one_line(
     evlcp: Callable[..., Any], demo_raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

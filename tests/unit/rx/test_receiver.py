@@ -245,6 +245,21 @@ def test_any_split_gives_the_same_with_few_pilots() -> None:
     assert rows(received(link, events, (slice(a, b) for a, b in pairwise(bounds)))) == whole
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_any_split_gives_the_same_where_two_regions_grow_together(seed: int) -> None:
+    still = ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 1)))
+    other = ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 2), x_px=440, start_us=8000 + 500 * seed))
+    nearer = np.minimum(other.t_us // 1500, 40)
+    events = merged(still, Events.of(other.t_us, other.x - nearer, other.y, other.p))
+    whole = Receiver(LINK)
+    packets = whole.feed(events) + whole.close()
+    assert whole.counts["regions_opened"] == 2
+    assert whole.counts["regions_released"] >= 1
+    assert rows(received(LINK, events, (slice(a, a + 60) for a in range(0, len(events), 60)))) == rows(
+        packets
+    )
+
+
 @pytest.mark.parametrize("size", [1000, 4096, 65_536])
 def test_even_pieces_give_the_same(size: int) -> None:
     pieces = (slice(a, a + size) for a in range(0, len(STREAM), size))

@@ -1,0 +1,168 @@
+"""A link's algorithms as the receiver calls them: compiled once, guarded, checked, announced."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pluggy
+from numpy.typing import NDArray
+
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.roles import Filter, Synchronizer, Tracker
+from evlcp_sdk.rx.guard import Guard
+from evlcp_sdk.values import Events, FrameView, PresenceMap, Range, SoftSymbols, SyncLock
+
+__all__ = ["Announcer", "Steps"]
+
+
+class Announcer:
+    """Says of each finished stage what it gave and how long it took.
+
+    Args:
+        hook: Where that is heard (`Registry.hook`); None for nowhere.
+    """
+
+    def __init__(self, hook: pluggy.HookRelay | None = None) -> None:
+        self._hook: Callable[..., Any] | None = None
+        if hook is not None and hook.evlcp_stage_finished.get_hookimpls():
+            self._hook = hook.evlcp_stage_finished
+        self._start_s = self._lap_s = time.perf_counter()
+
+    def start(self) -> None:
+        """Start the clock."""
+        self._start_s = self._lap_s = time.perf_counter()
+
+    def lap(self, stage: str, value: object) -> None:
+        """Announce what took the time since the last lap."""
+        now = time.perf_counter()
+        elapsed_s, self._lap_s = now - self._lap_s, now
+        self._say(stage, value, elapsed_s)
+
+    def total(self, stage: str, value: object) -> None:
+        """Announce what took all laps since the start together."""
+        self._say(stage, value, self._lap_s - self._start_s)
+
+    def _say(self, stage: str, value: object, elapsed_s: float) -> None:
+        if self._hook is not None:
+            self._hook(stage=stage, value=value, elapsed_s=elapsed_s)
+
+
+class Steps:
+    """The five roles of the receiver; it keeps no state of a stream.
+
+    Args:
+        link: The resolved configuration.
+        announcer: Hears of every result but the filters'.
+
+    Attributes:
+        position: Filter of a region's centre; None for centres as measured.
+    """
+
+    def __init__(self, link: Link, announcer: Announcer) -> None:
+        self._codebook = link.codebook
+        self._announcer = announcer
+        self._guards = guards = {
+            role: Guard(link, role)
+            for role in ("synchronization", "separation", "decoding", "ranging", "tracking")
+        }
+        with guards["synchronization"]:
+            self._synchronizer: Synchronizer = link.algorithm("synchronization").compile(
+                link.codebook, link.packet
+            )
+        with guards["separation"]:
+            self._separate = link.algorithm("separation").compile(link.codebook)
+        with guards["decoding"]:
+            self._decode = link.algorithm("decoding").compile(link.codebook)
+        with guards["ranging"]:
+            self._measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+        with guards["tracking"]:
+            tracker: Tracker = link.algorithm("tracking").compile()
+            position, distance = tracker.position, tracker.distance
+        self.position = _guarded(position, guards["tracking"])
+        self._distance = _guarded(distance, guards["tracking"])
+
+    def sync_init(self) -> Any:
+        """State of a region's synchronization before its first event."""
+        with self._guards["synchronization"]:
+            return self._synchronizer.init()
+
+    def distance_init(self) -> Any:
+        """State of a transmitter's distance filter before its first frame; None without a filter."""
+        return None if self._distance is None else self._distance.init()
+
+    def synchronize(self, state: Any, events: Events, until_us: int) -> tuple[Any, list[SyncLock]]:
+        """Take a region's events up to a time; give the new state and the packets that were heard."""
+        guard = self._guards["synchronization"]
+        self._announcer.start()
+        with guard:
+            state, locks = self._synchronizer.step(state, events.t_us, events.p, until_us)
+        for lock in locks:
+            guard.expect(lock, SyncLock)
+            self._announcer.lap("synchronization", lock)
+        return state, locks
+
+    def separate(self, sums: NDArray[np.int16]) -> PresenceMap:
+        """Where the clusters are, from a pilot's polarity sums, int16 (chips, height, width)."""
+        guard = self._guards["separation"]
+        with guard:
+            presence: PresenceMap = self._separate(sums)
+        guard.expect(presence, PresenceMap)
+        self._announcer.lap("separation", presence)
+        return presence
+
+    def decode(self, presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
+        """What the clusters say, from the polarity sums of pilot and info, int16 (chips, height, width)."""
+        guard = self._guards["decoding"]
+        with guard:
+            soft: SoftSymbols = self._decode(presence, sums)
+        guard.expect_symbols(soft, self._codebook)
+        self._announcer.lap("decoding", soft)
+        return soft
+
+    def measure(self, view: FrameView) -> Range:
+        """How far the bar is."""
+        guard = self._guards["ranging"]
+        self._announcer.lap("view", view)
+        with guard:
+            distance: Range = self._measure(view)
+        guard.expect(distance, Range)
+        self._announcer.lap("ranging", distance)
+        return distance
+
+    def filter(self, state: Any, t_us: float, measured: Range) -> tuple[Any, Range | None]:
+        """The distance filtered over time, and the new state; the prediction where a frame allows none."""
+        if self._distance is None:
+            return state, None
+        if np.isnan(measured.distance_m) or np.isnan(measured.sigma_m):
+            expected = self._distance.predict(state, t_us)
+            return state, None if expected is None else Range(float(expected[0][0]), expected[1], 0)
+        value = np.array([measured.distance_m])
+        state, value, sigma = self._distance.step(state, t_us, value, measured.sigma_m)
+        return state, Range(float(value[0]), sigma, measured.pairs)
+
+
+class _GuardedFilter(Filter):
+    """A filter of tracking whose faults are named."""
+
+    def __init__(self, filter_: Filter, guard: Guard) -> None:
+        self._filter = filter_
+        self._guard = guard
+
+    def init(self) -> Any:
+        with self._guard:
+            return self._filter.init()
+
+    def predict(self, state: Any, t_us: float) -> tuple[NDArray[np.float64], float] | None:
+        with self._guard:
+            return self._filter.predict(state, t_us)
+
+    def step(
+        self, state: Any, t_us: float, value: NDArray[np.float64], sigma: float
+    ) -> tuple[Any, NDArray[np.float64], float]:
+        with self._guard:
+            return self._filter.step(state, t_us, value, sigma)
+
+
+def _guarded(filter_: Filter | None, guard: Guard) -> Filter | None:
+    return None if filter_ is None else _GuardedFilter(filter_, guard)

@@ -1,0 +1,140 @@
+"""The transmitters that a receiver knows: numbered at their first lock, remembered when lost from sight."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.rx.detection import Followed
+from evlcp_sdk.rx.grid import PacketGrid
+from evlcp_sdk.rx.look import Pilot
+from evlcp_sdk.rx.packets import PacketAssembler
+from evlcp_sdk.values import SyncLock
+
+__all__ = ["Transmitter", "Transmitters"]
+
+_LOOKBACK_PACKETS = 2
+"""Packets of events kept while there is no lock: one to hear a preamble in, one to look back on."""
+
+_REMEMBER_US = 1e6
+"""How long a transmitter lost from sight is remembered: clocks 100 ppm apart drift by a chip in it."""
+
+_UNSEEN_STEPS = 5
+"""Steps without a position after which a region counts as lost: it blinks in every chip otherwise."""
+
+
+@dataclass
+class Transmitter:
+    """What the receiver knows of one region.
+
+    Attributes:
+        region: Where it is in the image, and its events.
+        sync: State of its synchronization.
+        packets: Collects its frames.
+        grid: Where its frames stand on the clock.
+        distance: State of its distance filter, None without one.
+        number: Transmitter number, None before the first lock.
+        first: Number of the first packet on the grid that had a frame, None before.
+        pilot: The newest pilot, None where it showed no bar.
+    """
+
+    region: Followed
+    sync: Any
+    packets: PacketAssembler
+    grid: PacketGrid
+    distance: Any = None
+    number: int | None = None
+    first: int | None = None
+    pilot: Pilot | None = None
+
+
+class Transmitters:
+    """Regions with what is known of them, by the region's number.
+
+    Args:
+        packet: What is on air.
+        step_us: Length of a time step, us.
+    """
+
+    def __init__(self, packet: PacketFormat, step_us: int) -> None:
+        self._packet = packet
+        self._step_us = step_us
+        self._alive: dict[int, Transmitter] = {}
+        self._released: list[Transmitter] = []
+        self._numbered = 0
+
+    def __contains__(self, region: Followed) -> bool:
+        return region.id in self._alive
+
+    def __getitem__(self, region: Followed) -> Transmitter:
+        return self._alive[region.id]
+
+    def open(self, region: Followed, sync: Any, distance: Any) -> None:
+        """Take a new region, with the first states of its synchronization and its distance filter."""
+        packets, grid = PacketAssembler(self._packet.frames), PacketGrid(self._packet)
+        self._alive[region.id] = Transmitter(region, sync, packets, grid, distance)
+
+    def adopt(self, transmitter: Transmitter, lock: SyncLock, first_us: int) -> bool:
+        """Take a new lock; frames go on where they were, or begin with the first whole one of the region.
+
+        Args:
+            transmitter: Whose preamble was heard.
+            lock: How.
+            first_us: The stream's first event, us.
+
+        Returns:
+            Whether it is another packet grid than before.
+        """
+        if transmitter.grid.follow(lock):
+            return False
+        transmitter.pilot = None
+        # Half a chip before the first event is still within the first edge's delay.
+        earliest_us = max(transmitter.region.first_us, first_us - lock.chip_us / 2)
+        if transmitter.grid.lock is None and self._inherit(transmitter, lock):
+            transmitter.grid.skip_before(earliest_us)
+            return True
+        if transmitter.number is None:
+            transmitter.number = self._numbered
+            self._numbered += 1
+        transmitter.grid.restart(lock, earliest_us)
+        return True
+
+    def _inherit(self, transmitter: Transmitter, lock: SyncLock) -> bool:
+        """Go on as a transmitter that was lost from sight, if the packets stand on its grid."""
+        for lost in [*self._alive.values(), *self._released]:
+            unseen_us = lock.packet_t_us - lost.region.latest.t_us
+            if lost is transmitter or not 0 < unseen_us < _REMEMBER_US:
+                continue
+            if unseen_us < _UNSEEN_STEPS * self._step_us or not lost.grid.follow(lock):
+                continue
+            transmitter.number, transmitter.first = lost.number, lost.first
+            transmitter.distance = lost.distance
+            transmitter.packets, lost.packets = lost.packets, transmitter.packets
+            transmitter.grid, lost.grid = lost.grid, PacketGrid(self._packet)
+            return True
+        return False
+
+    def forget(self, transmitter: Transmitter, now_us: float) -> None:
+        """Drop the events that no frame can need any more."""
+        region, grid = transmitter.region, transmitter.grid
+        if grid.lock is None:
+            packet_us = self._packet.packet_chips * self._packet.chip_us
+            keep_us = now_us - _LOOKBACK_PACKETS * packet_us
+            region.first_us = max(region.first_us, int(keep_us))
+        else:
+            # A later lock may move the next frame's start by a chip.
+            keep_us = grid.start_us(grid.frame) - grid.lock.chip_us
+        region.forget_before(keep_us, self._step_us)
+
+    def release(self, transmitter: Transmitter) -> None:
+        """Remember a transmitter whose region has ended, without its events."""
+        region = transmitter.region
+        del self._alive[region.id]
+        region.pieces.clear()
+        oldest_us = region.latest.t_us - _REMEMBER_US
+        self._released = [r for r in self._released if r.region.latest.t_us > oldest_us] + [transmitter]
+
+    def close(self) -> list[Transmitter]:
+        """Give those that are alive, and forget all."""
+        alive = list(self._alive.values())
+        self._alive, self._released = {}, []
+        return alive
