@@ -39,6 +39,7 @@ NAMES = [
     "Packet",
     "Pilots",
     "PluginError",
+    "PluginWarning",
     "PresenceMap",
     "Range",
     "Ranging",
