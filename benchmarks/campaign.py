@@ -18,7 +18,7 @@ from evlcp_sdk.study.campaign.plan import Case, Job, make_plan
 from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.tally import Statistics, Tally
 
-NOTHING = Statistics.of(1, 0, 0, 0, [(10 * n, Tally.found(96, 1, 0.01 * n)) for n in range(3, 10)])
+NOTHING = Statistics.of([(10 * n, Tally.distance(0.01 * n)) for n in range(3, 10)], tasks=1)
 
 
 def run(job: Job) -> Sequence[tuple[str, Statistics]]:

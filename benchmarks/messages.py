@@ -102,9 +102,9 @@ def recordings(folder: Path, packets: int) -> None:
         link = load_link(overrides=[f"modulation.id={bars[0].profile}"])
         coder, total, seed, began = link.block_coder(), Tally(), 0, time.perf_counter()
         while total.messages_sent < packets:
-            known, receiver = truth_of(scene, seed).to_table(), Receiver(link)
+            truth, receiver = truth_of(scene, seed), Receiver(link)
             found = [p for events in simulate(scene, seed) for p in receiver.feed(events)] + receiver.close()
-            total += sum((t for _, t in message_tallies(found, known, coder)), Tally())
+            total += Tally.together(tally for _, tally in message_tallies(found, truth, coder))
             seed += 1
         name = path.name.removesuffix(".truth.json")
         lost = total.messages_sent - total.messages_found

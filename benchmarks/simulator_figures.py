@@ -7,22 +7,28 @@ recording needs ../shared/recordings and is left out without it.
 """
 
 import argparse
-import json
 import math
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.stats import binomtest, chi2, norm
+from scipy.stats import binomtest, norm
 
 from evlcp_sdk.io import read_events
-from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.sim import BackgroundSpec, Scene, SensorSpec, scene_of_truth, simulate, truth_of
+from evlcp_sdk.sim import (
+    BackgroundSpec,
+    Scene,
+    SensorSpec,
+    Truth,
+    read_truth,
+    scene_of_truth,
+    simulate,
+    truth_of,
+)
 from evlcp_sdk.sim.validation import (
     MEASURED_AREA,
     MEASURED_LATENCY,
@@ -32,7 +38,10 @@ from evlcp_sdk.sim.validation import (
     pixel_events,
     step_response,
 )
-from evlcp_sdk.study.score import BarScore, score_frames
+from evlcp_sdk.study.frames import frames_of
+from evlcp_sdk.study.intervals import rms_interval
+from evlcp_sdk.study.measure import statistics_of
+from evlcp_sdk.study.tally import Tally
 from evlcp_sdk.values import Events
 
 SHARED = Path(__file__).parents[2] / "shared" / "recordings"
@@ -144,29 +153,11 @@ def statistics(events: Events, centre: np.ndarray, duration_s: float) -> dict[st
     }
 
 
-def receive(pieces: Iterable[Events], told: dict[str, Any]) -> BarScore:
-    """What the receiver finds of the first bar."""
-    receiver = Receiver(load_link(overrides=[f"modulation.id={told['bars'][0]['profile']}"]))
+def receive(pieces: Iterable[Events], truth: Truth) -> Tally:
+    """What the receiver finds."""
+    receiver = Receiver(truth.bars[0].link)
     packets = [packet for piece in pieces for packet in receiver.feed(piece)] + receiver.close()
-    rows = [
-        {
-            "t_us": str(f.t_us),
-            "symbols": " ".join(map(str, f.soft.symbols.tolist())),
-            "distance_m": "" if math.isnan(f.range.distance_m) else str(f.range.distance_m),
-            "x_px": str(f.x_px),
-            "y_px": str(f.y_px),
-        }
-        for packet in packets
-        for f in packet.frames
-    ]
-    return score_frames(rows, told).bars[0]
-
-
-def rmse_bounds(score: BarScore) -> tuple[float, float]:
-    """95 % bounds of the RMSE, by the chi-square distribution."""
-    n = len(score.error_m)
-    total = float((score.error_m**2).sum())
-    return math.sqrt(total / chi2.ppf(0.975, n)), math.sqrt(total / chi2.ppf(0.025, n))
+    return statistics_of(frames_of(packets), truth).total()
 
 
 def compare() -> None:
@@ -174,30 +165,30 @@ def compare() -> None:
     if not paths:
         print("no ../shared/recordings: comparison left out")
         return
-    told = json.loads((SHARED / "night-50m-30kmh.truth.json").read_text())
+    told = read_truth(SHARED / "night-50m-30kmh.truth.json")
     scene = scene_of_truth(told)
     columns = []
     for events, truth_ in (
         (read_events(SHARED / "night-50m-30kmh.raw"), told),
         *(
-            (Events.concat(list(simulate(made))), truth_of(made).to_table())
+            (Events.concat(list(simulate(made))), truth_of(made))
             for made in (scene, replace(scene, sensor=SENSOR))
         ),
     ):
-        columns.append(statistics(events, np.array(truth_["bar_centre_px"][0]), scene.duration_s))
+        columns.append(statistics(events, truth_.bars[0].centre_px.T, scene.duration_s))
     print("| | recording | its parameters here | defaults here |\n|---|---|---|---|")
     for key in columns[0]:
         print(f"| {key} | " + " | ".join(f"{c[key]:.4g}" for c in columns) + " |")
     print("| | Mev/s | ON share | frames | wrong bits | RMSE m (95 %) |\n|---|---|---|---|---|---|")
     for path in paths:
-        told = json.loads(path.with_suffix(".truth.json").read_text())
+        told = read_truth(path.with_suffix(".truth.json"))
         made = scene_of_truth(told)
         for name, events, truth_ in (
             (path.stem, read_events(path), told),
-            ("simulated", Events.concat(list(simulate(made))), truth_of(made).to_table()),
+            ("simulated", Events.concat(list(simulate(made))), truth_of(made)),
         ):
             score = receive([events], truth_)
-            low, high = rmse_bounds(score)
+            low, high = rms_interval(score.rmse_m, score.ranged)
             print(
                 f"| {name} | {len(events) / made.duration_s / 1e6:.2f} | {events.p.mean():.3f}"
                 f" | {score.frames_found}/{score.frames_sent} | {score.bit_errors}"

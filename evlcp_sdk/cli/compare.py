@@ -134,7 +134,7 @@ def _of_recordings(
     urls: Sequence[str], texts: Sequence[str], link_file: str | None, overrides: Sequence[str], workers: int
 ) -> tuple[int, "Comparison"]:
     from evlcp_sdk.errors import InterruptedRunError
-    from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.plugin.registry import Registry, installed_versions
     from evlcp_sdk.study.compare.run import truth_path
     from evlcp_sdk.study.compare.table import Comparison, total_of
     from evlcp_sdk.study.compare.variants import load_variants
@@ -163,12 +163,16 @@ def _of_recordings(
     for url in urls:
         if url in tables and not truth_path(url).exists():
             notes.append(f"{url}: no {truth_path(url).name} beside it, so no BER and no distance error")
-    ghosts = {v.name: sum(t.rows[i].measured.unmatched for t in ordered) for i, v in enumerate(variants)}
-    notes += [f"{name}: {n} frames match no true one" for name, n in ghosts.items() if n]
+    for i, variant in enumerate(variants):
+        counted = [one.rows[i].measured.statistics for one in ordered]
+        if ghosts := sum(one.unmatched for one in counted):
+            notes.append(f"{variant.name}: {ghosts} frames match no true one")
+        if echoes := sum(one.echoes for one in counted):
+            notes.append(f"{variant.name}: {echoes} frames are said to be reflections and left out")
     if len(ordered) > 1:
         ordered.append(total_of(ordered))
     about = {v.name: v.to_dict() for v in variants}
-    return code, Comparison(about, tuple(ordered), tuple(notes), registry.versions())
+    return code, Comparison(about, tuple(ordered), tuple(notes), installed_versions(registry))
 
 
 def _run(job: Job, *, variants: "tuple[Variant, ...]") -> "Table":
@@ -176,8 +180,8 @@ def _run(job: Job, *, variants: "tuple[Variant, ...]") -> "Table":
     from evlcp_sdk.io.open import open_source
     from evlcp_sdk.io.sensor import check_sensor
     from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.sim.truth import read_truth
     from evlcp_sdk.study.compare.run import measure_recording, truth_path
-    from evlcp_sdk.study.score import read_truth
 
     def opened() -> "EventSource":
         source = open_source(job.url, registry)
@@ -191,10 +195,10 @@ def _run(job: Job, *, variants: "tuple[Variant, ...]") -> "Table":
 
     registry = Registry.load()
     path = truth_path(job.url)
-    known = read_truth(path) if path.exists() else None
+    truth = read_truth(path, registry) if path.exists() else None
     with _bar(job) as advance:
         return measure_recording(
-            job.url, opened, variants, known, lambda s: advance(s.position_bytes, s.size_bytes)
+            job.url, opened, variants, truth, lambda s: advance(s.position_bytes, s.size_bytes)
         )
 
 

@@ -1,7 +1,5 @@
 """`evlcp demo`."""
 
-import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,31 +12,10 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.study.campaign.summary import Summary
 
-__all__ = ["Score", "demo", "demo_campaign", "demo_files", "register", "score"]
+__all__ = ["demo", "demo_campaign", "demo_files", "register"]
 
 DEMO_NAME = "night-50m-30kmh-cut"
 CAMPAIGN_NAME = "demo"
-
-
-@dataclass(frozen=True)
-class Score:
-    """Decoded frames held against the truth.
-
-    Attributes:
-        found: Frames decoded, of those sent.
-        sent: Frames sent.
-        unmatched: Rows that fit no sent frame.
-        bit_errors: Wrong bits of the found frames.
-        bits: Bits of the found frames.
-        rmse_m: Root mean square error of distance, m; NaN without any.
-    """
-
-    found: int
-    sent: int
-    unmatched: int
-    bit_errors: int
-    bits: int
-    rmse_m: float
 
 
 def register(app: typer.Typer) -> None:
@@ -65,28 +42,6 @@ def _shipped(folder: str, name: str) -> Path:
         if path.exists():
             return path
     raise FileNotFoundError(f"{name}: missing from the installation")
-
-
-def score(rows: "Sequence[Mapping[str, str]]", truth: "Mapping[str, Any]") -> Score:
-    """Hold rows of `frames.csv` against a demo truth: each beside the sent frame that began nearest."""
-    sent = truth["frames"]
-    found: set[int] = set()
-    unmatched = errors = bits = 0
-    squares = []
-    for row in rows:
-        t_us = float(row["t_us"])
-        i = min(range(len(sent)), key=lambda k: abs(sent[k]["t_us"] - t_us))
-        if abs(sent[i]["t_us"] - t_us) > truth["tolerance_us"] or i in found:
-            unmatched += 1
-            continue
-        found.add(i)
-        heard = [int(s) for s in row["symbols"].split()]
-        errors += sum((a ^ b).bit_count() for a, b in zip(heard, sent[i]["symbols"], strict=True))
-        bits += truth["bits_per_symbol"] * len(heard)
-        if row["distance_m"]:
-            squares.append((float(row["distance_m"]) - sent[i]["distance_m"]) ** 2)
-    rmse_m = math.sqrt(math.fsum(squares) / len(squares)) if squares else math.nan
-    return Score(len(found), len(sent), unmatched, errors, bits, rmse_m)
 
 
 def demo(
@@ -193,11 +148,13 @@ def show_drive(summary: "Summary") -> None:
 def _decode_recording(out: Path, as_json: bool) -> None:
     import csv
     import json
-    from dataclasses import asdict
 
     from evlcp_sdk.cli.receive import decode, show
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.sim.truth import read_truth
+    from evlcp_sdk.study.frames import read_frames
+    from evlcp_sdk.study.score import score_frames
 
     recording, truth_file = demo_files()
     link = load_link(None, (), Registry.load())
@@ -208,23 +165,23 @@ def _decode_recording(out: Path, as_json: bool) -> None:
     summary = decode(str(recording), out, link, lambda _done, _of: None, lambda: False, figures=True)
     with (out / "frames.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    result = score(rows, json.loads(truth_file.read_text(encoding="utf-8")))
+    found = score_frames(read_frames(out), read_truth(truth_file))
     if as_json:
-        typer.echo(json.dumps(summary | {"score": asdict(result)}))
+        typer.echo(json.dumps(summary | {"score": found}))
         return
     _show_frames(rows)
     # Most of so short a run is the loading of kernels: its speed says nothing.
     show(summary, out, speed=False)
-    print_score(result)
+    _show_score(found)
     console().print(f"figures: {out}/regions.png, presence.png, distance.png", style="dim")
 
 
-def print_score(result: Score) -> None:
-    """Print one line on how the frames compare with the truth."""
-    rmse = "-" if math.isnan(result.rmse_m) else f"{result.rmse_m:.3f} m"
+def _show_score(found: "Mapping[str, Any]") -> None:
+    (bar,) = found["bars"]
+    rmse = "-" if bar["rmse_m"] is None else f"{bar['rmse_m']:.3f} m"
     console().print(
-        f"against the truth: {result.found} of {result.sent} frames found, {result.unmatched} false,"
-        f" {result.bit_errors} of {result.bits} bits wrong, distance RMSE {rmse}"
+        f"against the truth: {bar['frames_found']} of {bar['frames_sent']} frames found,"
+        f" {found['unmatched']} false, {bar['bit_errors']} of {bar['bits']} bits wrong, distance RMSE {rmse}"
     )
 
 

@@ -1,11 +1,12 @@
 """`evlcp score`."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, console
+from evlcp_sdk.cli._common import Json, complain, console
 
 __all__ = ["register", "score"]
 
@@ -24,14 +25,31 @@ def score(
 
     [bold]evlcp score out REC.truth.json[/]
 
-    Each row of OUT/frames.csv is put beside the true frame that began nearest in time, on the bar nearest
-    in the image.
+    Each row of OUT/frames.csv is put beside the true frame that started nearest in time, on the bar nearest
+    in the image. Two scores are told: the plain one, for which a symbol that is not given counts as all bits
+    wrong; and the road score, which knows erased symbols, hidden clusters and reflections.
+
+    A result of another link than that of the truth is refused.
     """
     import json
 
-    from evlcp_sdk.study.score import read_frames, read_truth, score_frames
+    from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.sim.truth import read_truth
+    from evlcp_sdk.study.frames import read_frames
+    from evlcp_sdk.study.match import check_link
+    from evlcp_sdk.study.score import link_of_result, score_frames
 
-    found = score_frames(read_frames(folder), read_truth(truth_file)).to_dict()
+    registry = Registry.load()
+    frames = read_frames(folder)
+    truth = read_truth(truth_file, registry)
+    link = link_of_result(folder, registry)
+    if link is None:
+        complain(f"{folder}/summary.json: not there, so nothing says with which link it was received")
+    else:
+        check_link(truth, link, str(folder))
+    for warning in truth.warnings:
+        complain(warning)
+    found = score_frames(frames, truth)
     if as_json:
         typer.echo(json.dumps(found))
         return
@@ -42,5 +60,24 @@ def score(
             f"bar {i}: frames {bar['frames_found']}/{bar['frames_sent']}  BER {bar['ber']}"
             f"  RMSE {bar['rmse_m']} m over {bar['ranged']}  >=0.5 m: {bar['over_half_metre']}"
         )
-        for name, s in bar["segments"].items():
-            screen.print(f"   {name}: RMSE {s['rmse_m']} m, bias {s['bias_m']} m, n {s['n']}")
+        _show_segments(bar)
+    road = found["road"]
+    screen.print(
+        f"road: rows {road['rows']}, matching no true frame {road['unmatched']},"
+        f" said to be reflections {road['echoes']}"
+    )
+    for i, bar in enumerate(road["bars"]):
+        screen.print(
+            f"bar {i}: frames {bar['frames_found']}/{bar['frames_sent']}  BER {bar['ber']}"
+            f"  erased {bar['erased']}  claimed {bar['claimed']}"
+            f"  RMSE {bar['rmse_m']} m over {bar['ranged']}  bias {bar['bias_m']}  worst {bar['worst_m']}"
+            f"  NEES {bar['nees']}  >=0.5 m: {bar['over_half_metre']}"
+        )
+        _show_segments(bar)
+
+
+def _show_segments(bar: Mapping[str, Any]) -> None:
+    for name, segment in bar["segments"].items():
+        console().print(
+            f"   {name}: RMSE {segment['rmse_m']} m, bias {segment['bias_m']} m, n {segment['n']}"
+        )

@@ -1,4 +1,4 @@
-"""Statistics that add: what a task measured, exact in any order of summation."""
+"""Statistics that add: what was counted of decoded frames, exact in any order of summation."""
 
 import math
 from collections import Counter
@@ -13,11 +13,12 @@ __all__ = [
     "SEGMENT_M",
     "Statistics",
     "Tally",
+    "in_nm",
     "segment_of",
 ]
 
 SEGMENT_M = 10
-"""Length of the segments of distance that figures are told for, m."""
+"""Length of the segments of distance that figures are given for, m."""
 
 BIN_M = 0.02
 """Width of a bin of the histogram of distance errors, m."""
@@ -31,10 +32,13 @@ HALF_METRE_M = 0.5
 _FARTHEST_BIN = 150
 _FARTHEST_POSITION_BIN = 1000
 _HISTOGRAMS = ("histogram", "position_histogram")
+_LARGEST = ("worst_nm",)
+_MOST_SIGMAS = 1e6
+"""So many sigmas are wrong beyond all measure; an error in sigmas of 0 has no number."""
 
 
 def segment_of(distance_m: float) -> int:
-    """Where the segment of a distance begins, m.
+    """Where the segment of a distance starts, m.
 
     >>> segment_of(49.9)
     40
@@ -42,26 +46,49 @@ def segment_of(distance_m: float) -> int:
     return math.floor(distance_m / SEGMENT_M) * SEGMENT_M
 
 
+def in_nm(length_m: float) -> int:
+    """A length as a whole number of nanometres, so that sums are exact.
+
+    >>> in_nm(-0.05)
+    -50000000
+    """
+    return round(length_m * 1e9)
+
+
 @dataclass(frozen=True)
 class Tally:
     """What was counted in one segment of distance. Every field adds; all are integers, so sums are exact.
 
+    A found frame has for each visible cluster a symbol that is given or erased (`-`); for a hidden one, a
+    symbol that is given all the same is claimed. A cluster that was visible for a part of the frame does not
+    count.
+
     Attributes:
         frames_sent: Frames that were sent whole while the recording ran.
         frames_found: Those of them that were decoded.
-        bits: Bits of the found frames.
+        bits: Bits of the symbols that are given, of visible clusters.
         bit_errors: Wrong bits among them.
+        visible: Symbols of visible clusters.
+        erased: Those of them that are not given.
+        erased_bits: Their bits.
+        hidden: Symbols of hidden clusters.
+        claimed: Those of them that are given.
         ranged: Found frames with a distance.
-        sum_um: Sum of their distance errors, um.
-        squares_um2: Sum of the squares of these errors, um^2.
+        sum_nm: Sum of their distance errors, nm.
+        squares_nm2: Sum of the squares of these errors, nm^2.
         gross: Errors of half a metre or more.
+        worst_nm: The largest size of an error, nm; of a sum, the larger one.
+        with_sigma: Distances that come with a standard deviation.
+        nees_micro: Sum of (error / sigma)^2 of these, millionths.
+        filtered: Found frames with a filtered distance.
+        filtered_squares_nm2: Sum of the squares of the errors of these, nm^2.
         messages_sent: Packets with a message that were sent whole while the recording ran.
         messages_found: Those of them whose message was read.
         messages_wrong: Messages that were read and not sent so: undetected errors.
         fixes: Positions that were given.
         fixes_refused: Times at which a bar was in view, and no position was given.
-        position_squares_um2: Sum of the squares of the positions' errors in space, um^2.
-        position_nees_milli: Sum of these errors squared in their own sigmas, thousandths; 3000 each is ideal.
+        position_squares_nm2: Sum of the squares of the positions' errors in space, nm^2.
+        position_nees_micro: Sum of these errors squared in their own sigmas, millionths; 3 each is ideal.
         histogram: (bin, count) in order of the bin; bin b holds errors from `b * BIN_M` up to the next, the
             outermost ones also everything beyond.
         position_histogram: The same of the positions' errors, in bins of `POSITION_BIN_M` from 0.
@@ -71,44 +98,51 @@ class Tally:
     frames_found: int = 0
     bits: int = 0
     bit_errors: int = 0
+    visible: int = 0
+    erased: int = 0
+    erased_bits: int = 0
+    hidden: int = 0
+    claimed: int = 0
     ranged: int = 0
-    sum_um: int = 0
-    squares_um2: int = 0
+    sum_nm: int = 0
+    squares_nm2: int = 0
     gross: int = 0
+    worst_nm: int = 0
+    with_sigma: int = 0
+    nees_micro: int = 0
+    filtered: int = 0
+    filtered_squares_nm2: int = 0
     messages_sent: int = 0
     messages_found: int = 0
     messages_wrong: int = 0
     fixes: int = 0
     fixes_refused: int = 0
-    position_squares_um2: int = 0
-    position_nees_milli: int = 0
+    position_squares_nm2: int = 0
+    position_nees_micro: int = 0
     histogram: tuple[tuple[int, int], ...] = ()
     position_histogram: tuple[tuple[int, int], ...] = ()
 
     @classmethod
-    def sent(cls) -> Self:
-        """One frame that was sent."""
-        return cls(frames_sent=1)
+    def distance(cls, error_m: float, sigma_m: float = math.nan) -> Self:
+        """One distance.
 
-    @classmethod
-    def found(cls, bits: int, bit_errors: int, error_m: float | None) -> Self:
-        """One frame that was decoded; `error_m` is None where it has no distance.
+        Args:
+            error_m: Its error, m.
+            sigma_m: The standard deviation that comes with it, m; NaN for none.
 
-        >>> Tally.found(96, 1, -0.05).histogram
+        >>> Tally.distance(-0.05).histogram
         ((-3, 1),)
         """
-        if error_m is None:
-            return cls(frames_found=1, bits=bits, bit_errors=bit_errors)
-        error_um = round(error_m * 1e6)
-        bin = max(-_FARTHEST_BIN, min(_FARTHEST_BIN, error_um // round(BIN_M * 1e6)))
+        error_nm = in_nm(error_m)
+        bin = max(-_FARTHEST_BIN, min(_FARTHEST_BIN, error_nm // in_nm(BIN_M)))
         return cls(
-            frames_found=1,
-            bits=bits,
-            bit_errors=bit_errors,
             ranged=1,
-            sum_um=error_um,
-            squares_um2=error_um**2,
-            gross=int(abs(error_um) >= HALF_METRE_M * 1e6),
+            sum_nm=error_nm,
+            squares_nm2=error_nm**2,
+            gross=int(abs(error_m) >= HALF_METRE_M),
+            worst_nm=abs(error_nm),
+            with_sigma=int(not math.isnan(sigma_m)),
+            nees_micro=0 if math.isnan(sigma_m) else _nees_micro(_sigmas(error_m, sigma_m) ** 2),
             histogram=((bin, 1),),
         )
 
@@ -119,52 +153,90 @@ class Tally:
         >>> Tally.fix(0.012, 2.5).position_histogram
         ((2, 1),)
         """
-        error_um = round(error_m * 1e6)
-        bin = min(_FARTHEST_POSITION_BIN, error_um // round(POSITION_BIN_M * 1e6))
+        error_nm = in_nm(error_m)
+        bin = min(_FARTHEST_POSITION_BIN, error_nm // in_nm(POSITION_BIN_M))
         return cls(
             fixes=1,
-            position_squares_um2=error_um**2,
-            # A thousand sigmas are wrong beyond all measure.
-            position_nees_milli=round(min(nees, 1e6) * 1000),
+            position_squares_nm2=error_nm**2,
+            position_nees_micro=_nees_micro(nees),
             position_histogram=((bin, 1),),
         )
 
+    @classmethod
+    def together(cls, tallies: Iterable["Tally"]) -> "Tally":
+        """All of them together."""
+        columns: dict[str, list[Any]] = {f.name: [] for f in fields(cls)}
+        for tally in tallies:
+            for name, column in columns.items():
+                column.append(getattr(tally, name))
+        numbers: dict[str, Any] = {}
+        for name, column in columns.items():
+            if name in _HISTOGRAMS:
+                bins: Counter[int] = Counter()
+                for histogram in column:
+                    bins.update(dict(histogram))
+                numbers[name] = tuple(sorted(bins.items()))
+            else:
+                numbers[name] = max(column, default=0) if name in _LARGEST else sum(column)
+        return cls(**numbers)
+
     def __add__(self, other: "Tally") -> "Tally":
-        numbers: dict[str, Any] = {
-            f.name: getattr(self, f.name) + getattr(other, f.name)
-            for f in fields(self)
-            if f.name not in _HISTOGRAMS
-        }
-        for name in _HISTOGRAMS:
-            bins = Counter(dict(getattr(self, name)))
-            bins.update(dict(getattr(other, name)))
-            numbers[name] = tuple(sorted(bins.items()))
-        return Tally(**numbers)
+        return Tally.together((self, other))
 
     @property
     def ber(self) -> float:
-        """Share of wrong bits; NaN without bits."""
-        return self.bit_errors / self.bits if self.bits else math.nan
+        """Share of wrong bits among those given; NaN without bits."""
+        return _ratio(self.bit_errors, self.bits)
+
+    @property
+    def erased_share(self) -> float:
+        """Share of the visible clusters' symbols that are not given; NaN without any."""
+        return _ratio(self.erased, self.visible)
+
+    @property
+    def claimed_share(self) -> float:
+        """Share of the hidden clusters' symbols that are given all the same; NaN without any."""
+        return _ratio(self.claimed, self.hidden)
 
     @property
     def rmse_m(self) -> float:
         """Root mean square of the distance errors, m; NaN without any."""
-        return math.sqrt(self.squares_um2 / self.ranged) * 1e-6 if self.ranged else math.nan
+        return _rms_m(self.squares_nm2, self.ranged)
 
     @property
     def bias_m(self) -> float:
         """Mean of the distance errors, m; NaN without any."""
-        return self.sum_um / self.ranged * 1e-6 if self.ranged else math.nan
+        return _ratio(self.sum_nm, self.ranged) * 1e-9
+
+    @property
+    def worst_m(self) -> float:
+        """Size of the largest distance error, m; NaN without any."""
+        return self.worst_nm * 1e-9 if self.ranged else math.nan
+
+    @property
+    def nees(self) -> float:
+        """Mean of the distances' (error / sigma)^2, ideally 1; NaN without any."""
+        return _ratio(self.nees_micro, self.with_sigma) * 1e-6
+
+    @property
+    def filtered_rmse_m(self) -> float:
+        """Root mean square of the filtered distances' errors, m; NaN without any."""
+        return _rms_m(self.filtered_squares_nm2, self.filtered)
+
+    @property
+    def gross_share(self) -> float:
+        """Share of distance errors of half a metre or more; NaN without any."""
+        return _ratio(self.gross, self.ranged)
 
     @property
     def position_rmse_m(self) -> float:
         """Root mean square of the positions' errors in space, m; NaN without any."""
-        return math.sqrt(self.position_squares_um2 / self.fixes) * 1e-6 if self.fixes else math.nan
+        return _rms_m(self.position_squares_nm2, self.fixes)
 
     @property
     def position_nees(self) -> float:
         """Mean of the positions' errors squared in their own sigmas, ideally 3; NaN without any."""
-        return self.position_nees_milli / self.fixes / 1000 if self.fixes else math.nan
+        return _ratio(self.position_nees_micro, self.fixes) * 1e-6
 
     def position_quantile_m(self, share: float) -> float:
         """Error in space that a share of the positions stays below, to a bin, m; NaN without any.
@@ -179,10 +251,21 @@ class Tally:
                 return (bin + 1) * POSITION_BIN_M
         return math.nan
 
-    @property
-    def gross_share(self) -> float:
-        """Share of distance errors of half a metre or more; NaN without any."""
-        return self.gross / self.ranged if self.ranged else math.nan
+
+def _sigmas(error: float, sigma: float) -> float:
+    return min(abs(error / sigma), _MOST_SIGMAS) if sigma else _MOST_SIGMAS
+
+
+def _nees_micro(nees: float) -> int:
+    return round(min(nees, _MOST_SIGMAS**2) * 1e6)
+
+
+def _ratio(hits: int, of: int) -> float:
+    return hits / of if of else math.nan
+
+
+def _rms_m(squares_nm2: int, count: int) -> float:
+    return math.sqrt(squares_nm2 / count) * 1e-9 if count else math.nan
 
 
 @dataclass(frozen=True)
@@ -193,10 +276,15 @@ class Statistics:
         tasks: Number of tasks.
         events: Events that the sensor sent.
         duration_us: Simulated time, us.
-        unmatched: Decoded frames that match no sent one.
-        segments: (beginning of the segment in m, tally), in order.
+        packets: Decoded packets.
+        rows: Decoded frames.
+        echoes: Those of them that the receiver says are a reflection; they count nowhere else.
+        unmatched: Those of them that match no sent one.
+        stated: Distances that come with a standard deviation, of matched frames and others.
+        sigma_squares_nm2: Sum of the squares of these standard deviations, nm^2.
+        segments: (start of the segment in m, tally), in order.
 
-    >>> one = Statistics.of(1, 1000, 100_000, 0, [(30, Tally.found(96, 2, 0.1))])
+    >>> one = Statistics(rows=3, segments=((30, Tally(bits=96, bit_errors=2)),))
     >>> (one + one).total().bit_errors
     4
     """
@@ -204,69 +292,61 @@ class Statistics:
     tasks: int = 0
     events: int = 0
     duration_us: int = 0
+    packets: int = 0
+    rows: int = 0
+    echoes: int = 0
     unmatched: int = 0
+    stated: int = 0
+    sigma_squares_nm2: int = 0
     segments: tuple[tuple[int, Tally], ...] = ()
 
     @classmethod
-    def of(
-        cls,
-        tasks: int,
-        events: int,
-        duration_us: int,
-        unmatched: int,
-        tallies: Iterable[tuple[int, Tally]],
-    ) -> Self:
-        """Statistics from tallies in any order, several a segment."""
-        return cls(tasks, events, duration_us, unmatched, _by_segment(tallies))
+    def of(cls, tallies: Iterable[tuple[int, Tally]], **counts: int) -> Self:
+        """Statistics from tallies in any order, several a segment.
+
+        Args:
+            tallies: Each with the start of its segment, m.
+            counts: The other fields.
+        """
+        return cls(**counts, segments=_by_segment(tallies))
 
     def __add__(self, other: "Statistics") -> "Statistics":
-        return Statistics(
-            self.tasks + other.tasks,
-            self.events + other.events,
-            self.duration_us + other.duration_us,
-            self.unmatched + other.unmatched,
-            _by_segment([*self.segments, *other.segments]),
-        )
+        counts = {name: getattr(self, name) + getattr(other, name) for name in _COUNTS}
+        return Statistics.of([*self.segments, *other.segments], **counts)
 
     def total(self) -> Tally:
         """The tally of all segments."""
-        return _sum(tally for _, tally in self.segments)
+        return Tally.together(tally for _, tally in self.segments)
+
+    @property
+    def sigma_m(self) -> float:
+        """Root mean square of the standard deviations that come with distances, m; NaN without any."""
+        return _rms_m(self.sigma_squares_nm2, self.stated)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as for JSON."""
-        return {
-            "tasks": self.tasks,
-            "events": self.events,
-            "duration_us": self.duration_us,
-            "unmatched": self.unmatched,
-            "segments": {
-                str(begin): {
-                    f.name: getattr(tally, f.name) for f in fields(tally) if f.name not in _HISTOGRAMS
-                }
-                | {name: {str(b): n for b, n in getattr(tally, name)} for name in _HISTOGRAMS}
-                for begin, tally in self.segments
-            },
+        segments = {
+            str(start): {f.name: getattr(tally, f.name) for f in fields(tally) if f.name not in _HISTOGRAMS}
+            | {name: {str(b): n for b, n in getattr(tally, name)} for name in _HISTOGRAMS}
+            for start, tally in self.segments
         }
+        return {name: getattr(self, name) for name in _COUNTS} | {"segments": segments}
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
         """What `to_dict` gave."""
         tallies = []
-        for begin, values in table["segments"].items():
-            bins = {
-                name: tuple(sorted((int(b), n) for b, n in values.get(name, {}).items()))
-                for name in _HISTOGRAMS
-            }
-            tallies.append((int(begin), Tally(**{**values, **bins})))
-        return cls.of(table["tasks"], table["events"], table["duration_us"], table["unmatched"], tallies)
+        for start, values in table["segments"].items():
+            bins = {name: tuple(sorted((int(b), n) for b, n in values[name].items())) for name in _HISTOGRAMS}
+            tallies.append((int(start), Tally(**{**values, **bins})))
+        return cls.of(tallies, **{name: table[name] for name in _COUNTS})
 
 
-def _sum(tallies: Iterable[Tally]) -> Tally:
-    return sum(tallies, Tally())
+_COUNTS = tuple(f.name for f in fields(Statistics) if f.name != "segments")
 
 
 def _by_segment(tallies: Iterable[tuple[int, Tally]]) -> tuple[tuple[int, Tally], ...]:
     found: dict[int, list[Tally]] = {}
-    for begin, tally in tallies:
-        found.setdefault(begin, []).append(tally)
-    return tuple((begin, _sum(found[begin])) for begin in sorted(found))
+    for start, tally in tallies:
+        found.setdefault(start, []).append(tally)
+    return tuple((start, Tally.together(found[start])) for start in sorted(found))

@@ -7,7 +7,8 @@ import pytest
 
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.sim import load_scene, simulate, truth_of
+from evlcp_sdk.sim import Truth, load_scene, simulate, truth_of
+from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.study.tally import Tally
 from evlcp_sdk.values import Events
@@ -19,20 +20,19 @@ BEST = ("decoding.id=motion-feedback", "ranging.id=joint-scale", "tracking.id=ka
 
 
 @cache
-def rendered(scene: str, seed: int, settings: tuple[str, ...]) -> tuple[Events, dict[str, object]]:
+def rendered(scene: str, seed: int, settings: tuple[str, ...]) -> tuple[Events, Truth]:
     cut = load_scene(scene if scene.startswith("drive") else SCENES / f"{scene}.toml", settings)
-    return Events.concat(simulate(cut, seed=seed)), truth_of(cut, seed=seed).to_table()
+    return Events.concat(simulate(cut, seed=seed)), truth_of(cut, seed=seed)
 
 
 def received(scene: str, seeds: Iterable[int], settings: tuple[str, ...], link: tuple[str, ...]) -> Tally:
     """What a link finds in a scene, over seeds."""
     total = Tally()
     for seed in seeds:
-        events, known = rendered(scene, seed, settings)
+        events, truth = rendered(scene, seed, settings)
         receiver = Receiver(load_link(overrides=link))
         packets = receiver.feed(events) + receiver.close()
-        frames = [frame for packet in packets for frame in packet.frames]
-        found = statistics_of(frames, known, len(events))
+        found = statistics_of(frames_of(packets), truth)
         assert found.unmatched == 0
         total += found.total()
     return total

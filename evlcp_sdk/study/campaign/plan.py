@@ -8,7 +8,7 @@ once: a scene, rendered once, and all links that receive it.
 import hashlib
 import itertools
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -374,11 +374,3 @@ def _toml(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_toml, value))}]"
     return json.dumps(value, ensure_ascii=False) if isinstance(value, bool | str) else repr(value)
-
-
-def labels_of(points: Sequence[Point]) -> Iterator[str]:
-    """The keys that set points apart, in order of appearance."""
-    seen: dict[str, None] = {}
-    for point in points:
-        seen |= dict.fromkeys(key for key, _ in point.labels)
-    yield from seen

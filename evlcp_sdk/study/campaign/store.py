@@ -20,7 +20,7 @@ from evlcp_sdk.study.tally import Statistics
 
 __all__ = ["Store"]
 
-SCHEMA = 1
+SCHEMA = 2
 
 _TABLES = """
 CREATE TABLE IF NOT EXISTS plan (

@@ -113,7 +113,7 @@ class Series:
 
     def between(self, from_m: int, to_m: int) -> Tally:
         """The tally of the segments that lie between two distances."""
-        return sum((t for at, t in self.statistics.segments if from_m <= at < to_m), Tally())
+        return Tally.together(t for at, t in self.statistics.segments if from_m <= at < to_m)
 
 
 _UNITS = {"kmh": "km/h", "mps": "m/s", "m": "m", "us": "us", "s": "s", "hz": "Hz", "mm": "mm", "px": "px"}
@@ -167,7 +167,11 @@ class Summary:
                     "tasks": s.statistics.tasks,
                     "simulated_s": s.statistics.duration_us * 1e-6,
                     "events": s.statistics.events,
+                    "packets": s.statistics.packets,
+                    "frames": s.statistics.rows,
                     "unmatched": s.statistics.unmatched,
+                    "echoes": s.statistics.echoes,
+                    "sigma_m": s.statistics.sigma_m if s.statistics.stated else None,
                     "segments": [
                         {"from_m": at, "to_m": at + SEGMENT_M} | _figures(tally)
                         for at, tally in s.statistics.segments
@@ -192,7 +196,12 @@ def _figures(tally: Tally) -> dict[str, Any]:
     )
     counts = {name: getattr(tally, name) for name in names}
     others = {
+        "erased_share": tally.erased_share,
+        "claimed_share": tally.claimed_share,
         "bias_m": tally.bias_m,
+        "worst_m": tally.worst_m,
+        "nees": tally.nees,
+        "filtered_rmse_m": tally.filtered_rmse_m,
         "position_median_m": tally.position_quantile_m(0.5),
         "position_95_m": tally.position_quantile_m(0.95),
         "position_nees": tally.position_nees,

@@ -2,19 +2,23 @@
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import Link, load_link, resolve
-from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.link.resolve import load_link, resolve
+from evlcp_sdk.plugin.hooks import ROLE_NAMES
+from evlcp_sdk.plugin.registry import Registry, installed_versions
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene, Simulation, load_scene, truth_of
+from evlcp_sdk.sim.truth import Truth
 from evlcp_sdk.sim.world import attitude_log
 from evlcp_sdk.study.campaign.plan import Job, Plan, load_plan
+from evlcp_sdk.study.frames import frames_of
+from evlcp_sdk.study.match import check_link
 from evlcp_sdk.study.measure import message_tallies, position_tallies, statistics_of
 from evlcp_sdk.study.tally import Statistics
 from evlcp_sdk.values import Packet
@@ -22,7 +26,7 @@ from evlcp_sdk.values import Packet
 __all__ = ["environment_of", "plan_of", "run_job"]
 
 _PACKAGES = ("air", "link", "place", "plugin", "rx", "scene", "sim")
-_STUDY = ("measure.py", "tally.py", "campaign/task.py")
+_STUDY = ("frames.py", "match.py", "measure.py", "tally.py", "campaign/task.py")
 
 
 def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
@@ -65,14 +69,14 @@ def environment_of(registry: Registry) -> dict[str, Any]:
     files = {root / "values.py"} | {root / "study" / name for name in _STUDY}
     files |= {path for name in _PACKAGES for path in (root / name).rglob("*.py")}
     for installed in registry.installed():
-        if installed.distribution == "evlcp-sdk":
+        if installed.distribution == "evlcp-sdk" and installed.algorithm.role in ROLE_NAMES:
             spec = find_spec(installed.algorithm.target.partition(":")[0].partition(".")[0])
             if spec is not None and spec.origin is not None:
                 files |= set(Path(spec.origin).parent.rglob("*.py"))
     digest = hashlib.sha256()
     for path in sorted(files, key=lambda p: (p.parent.name, p.name)):
         digest.update(f"{path.parent.name}/{path.name}\0".encode() + path.read_bytes() + b"\0")
-    return {"source": digest.hexdigest(), "versions": registry.versions()}
+    return {"source": digest.hexdigest(), "versions": installed_versions(registry)}
 
 
 def _identity(scene: Scene) -> Any:
@@ -91,8 +95,8 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
     """Render the job's scene once, receive it with the link of every task, hold it against the truth.
 
     Raises:
-        ConfigError: This installation would not give what the task's id promises, or transmitter and
-            receiver do not share a modulation.
+        ConfigError: This installation would not give what the task's id promises, or the scene sends with
+            another link than a task receives with.
     """
     registry = Registry.load()
     if environment_of(registry) != job.environment:
@@ -102,7 +106,7 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
         )
     scene: Scene = job.scene
     simulation = Simulation(scene, job.seed)
-    known = truth_of(simulation).to_table()
+    truth = truth_of(simulation)
     attitude = attitude_log(scene, job.seed, simulation.path) if scene.world is not None else None
     links, receivers = [], []
     for task in job.tasks:
@@ -110,7 +114,7 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
         link = resolve(table, registry)
         if link.digest != digest:
             raise ConfigError(f"link {digest[:12]} resolves to {link.digest[:12]} here")
-        _check_shared(known, link)
+        check_link(truth, link, "the scene", messages=True)
         links.append(link)
         receivers.append(Receiver(link))
     packets: list[list[Packet]] = [[] for _ in receivers]
@@ -122,37 +126,13 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
     results = []
     for task, link, receiver, found in zip(job.tasks, links, receivers, packets, strict=True):
         found += receiver.close()
-        frames = (frame for packet in found for frame in packet.frames)
-        others = message_tallies(found, known, link.block_coder()) if _sends_messages(known) else []
+        others = message_tallies(found, truth, link.block_coder()) if _sends_messages(truth) else []
         if scene.world is not None:
-            others += position_tallies(found, known, link, attitude)
-        results.append((task.id, statistics_of(frames, known, number, others)))
+            others += position_tallies(found, truth, link, attitude)
+        counted = statistics_of(frames_of(found), truth, events=number, packets=len(found), others=others)
+        results.append((task.id, counted))
     return results
 
 
-def _sends_messages(known: Mapping[str, Any]) -> bool:
-    return any(bar.get("payload") for bar in known["bars"])
-
-
-def _check_shared(known: Mapping[str, Any], link: Link) -> None:
-    for bar in known["bars"]:
-        if bar.get("chips_file") is not None:
-            continue
-        for key, sent, expected, setting in (
-            ("profile", bar["profile"], link.codebook.profile, "modulation.id"),
-            ("frames", bar["frames"], link.air.frames_per_packet, "air.frames_per_packet"),
-            ("pilot_every", bar.get("pilot_every", 1), link.air.pilot_every, "air.pilot_every"),
-        ):
-            if sent != expected:
-                raise ConfigError(
-                    f"the scene's bar has {key} = {sent!r}, but the link {setting} = {expected!r};"
-                    f" set bars.{key} or {setting}"
-                )
-        if bar.get("payload"):
-            table = resolve({"error-correction": {"id": bar["error_correction"]}}).table["error-correction"]
-            if link.table["error-correction"] != table:
-                raise ConfigError(
-                    f"the scene's bar has error_correction = {bar['error_correction']!r} with its default"
-                    f" parameters, but the link [error-correction] {link.table['error-correction']};"
-                    " set bars.error_correction or error-correction.id"
-                )
+def _sends_messages(truth: Truth) -> bool:
+    return any(bar.sends_frames and bar.payload != "symbols" for bar in truth.bars)

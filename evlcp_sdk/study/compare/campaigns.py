@@ -5,9 +5,8 @@ from dataclasses import replace
 from typing import Any
 
 from evlcp_sdk.study.campaign.summary import Series, Summary
-from evlcp_sdk.study.compare.measured import Measured, Moments
+from evlcp_sdk.study.compare.measured import Measured
 from evlcp_sdk.study.compare.table import Comparison, Row, Table, total_of
-from evlcp_sdk.study.tally import Tally
 
 __all__ = ["of_campaign"]
 
@@ -15,8 +14,7 @@ __all__ = ["of_campaign"]
 def of_campaign(summary: Summary) -> Comparison:
     """The links of a campaign as variants, with a table a scene.
 
-    What a campaign does not keep, such as packets, time and stated sigmas, has no column; nor is there a
-    bound, which needs the events.
+    Time, which a campaign does not keep, has no column; nor is there a bound, which needs the events.
     """
     links: dict[str, Mapping[str, Any]] = {}
     scenes: dict[str, list[Row]] = {}
@@ -31,8 +29,7 @@ def of_campaign(summary: Summary) -> Comparison:
             "digest": identity.get("digest", ""),
             "configuration": identity.get("table", {}),
         }
-        tally = series.statistics.total()
-        scenes.setdefault(scene, []).append(Row(link, _of_tally(tally, series.statistics.unmatched)))
+        scenes.setdefault(scene, []).append(Row(link, Measured(series.statistics)))
     tables = [Table(name, tuple(rows)) for name, rows in scenes.items()]
     if len(tables) > 1:
         tables.append(total_of(tables, "all scenes"))
@@ -46,18 +43,3 @@ def _part(series: Series, prefix: str, otherwise: str) -> str:
     """The name that a series has by the labels of its scene or of its link."""
     labels = {key: value for key, value in series.labels.items() if key.startswith(prefix)}
     return replace(series, labels=labels).name if labels else otherwise
-
-
-def _of_tally(tally: Tally, unmatched: int) -> Measured:
-    errors = Moments(tally.ranged, tally.sum_um * 1e-6, tally.squares_um2 * 1e-12)
-    return Measured(
-        frames=tally.frames_found + unmatched,
-        packets=None,
-        frames_sent=tally.frames_sent,
-        frames_found=tally.frames_found,
-        unmatched=unmatched,
-        bits=tally.bits,
-        bit_errors=tally.bit_errors,
-        error_m=errors,
-        gross=tally.gross,
-    )

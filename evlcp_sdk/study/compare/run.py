@@ -1,36 +1,32 @@
 """A recording received with every variant at once, and scored.
 
 It is read once; each piece of its events goes through one `Receiver.feed` after the other, so that all see
-the same and time is told in one run. What comes out is scored as `evlcp score` scores `frames.csv`.
+the same and time is measured in one run. What comes out is counted as the road score of `evlcp score` counts.
 """
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from evlcp_sdk.errors import ConfigError, UnknownAlgorithmError
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io import EventSource
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.results.outputs import FILTERED_COLUMNS, FRAME_COLUMNS, filtered_row, frame_row
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.sim.truth import Truth
 from evlcp_sdk.study.bound import frame_bound
-from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments
+from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments, Times
 from evlcp_sdk.study.compare.table import Row, Table
 from evlcp_sdk.study.compare.variants import Variant
-from evlcp_sdk.study.score import score_frames
-from evlcp_sdk.values import Events, FrameView, Packet, Range
+from evlcp_sdk.study.frames import GivenFrame, frames_of
+from evlcp_sdk.study.match import check_link
+from evlcp_sdk.study.measure import statistics_of, without_truth
+from evlcp_sdk.values import Events, FrameView, Range
 
 __all__ = ["measure_recording", "truth_path"]
-
-_DARK_W_M2 = 1e-6
-"""Irradiance below which a bar of a truth is dark: it sends nothing that could be received."""
 
 _WARM_PACKETS = 2
 """Packets that a variant decodes beforehand: one may be cut, so that a whole one loads every kernel."""
@@ -94,13 +90,13 @@ class _Bound:
 
 
 class _Lane:
-    """One variant's receiver, its rows of `frames.csv` and its time."""
+    """One variant's receiver, its frames and its time."""
 
     def __init__(self, link: Link, bound: _Bound | None = None) -> None:
         self.watch = _Watch()
         others = [] if bound is None else [bound]
         self.receiver = Receiver(link, Registry.load(self.watch, *others).hook)
-        self.rows: list[dict[str, str]] = []
+        self.frames: list[GivenFrame] = []
         self.packets = 0
         self.cpu_s = 0.0
 
@@ -110,20 +106,14 @@ class _Lane:
         packets = self.receiver.close() if events is None else self.receiver.feed(events)
         self.cpu_s += time.process_time() - began
         self.packets += len(packets)
-        self.rows += [dict(row) for packet in packets for row in _rows(packet)]
-
-
-def _rows(packet: Packet) -> Iterator[Iterable[tuple[str, str]]]:
-    columns = (*FRAME_COLUMNS, *FILTERED_COLUMNS)
-    for frame in packet.frames:
-        yield zip(columns, (*frame_row(frame), *filtered_row(frame)), strict=True)
+        self.frames += frames_of(packets)
 
 
 def measure_recording(
     name: str,
     open_source: Callable[[], EventSource],
     variants: Sequence[Variant],
-    known: Mapping[str, Any] | None = None,
+    truth: Truth | None = None,
     advance: Callable[[EventSource], None] = lambda _: None,
 ) -> Table:
     """Receive a recording with every variant, and hold what came out against the truth.
@@ -136,16 +126,16 @@ def measure_recording(
         name: Of the table.
         open_source: Opens the recording at its beginning; called twice.
         variants: At least one.
-        known: What its `REC.truth.json` holds; None without one.
+        truth: What was sent; None where nobody knows.
         advance: Told after every piece.
 
     Raises:
-        ConfigError: The truth was sent with another modulation than a variant receives.
-        InputError: The recording cannot be read, or its truth cannot be used.
+        ConfigError: The recording was sent with another link than a variant receives.
+        InputError: The recording cannot be read.
     """
-    if known is not None:
+    if truth is not None:
         for variant in variants:
-            _check_shared(name, known, variant)
+            check_link(truth, variant.link, f"{name}: --variant {variant.name}")
     with open_source() as source:
         _warm(source, variants)
     bound = _bound_of(variants[0].link)
@@ -172,7 +162,7 @@ def measure_recording(
         bound.settle()
     recorded_s = 0.0 if first_us is None or last_us is None else (last_us - first_us) * 1e-6
     rows = tuple(
-        Row(variant.name, _measured(lane, known, recorded_s, reading_s))
+        Row(variant.name, _measured(lane, truth, recorded_s, reading_s))
         for variant, lane in zip(variants, lanes, strict=True)
     )
     sigma_m = [] if bound is None else bound.sigma_m
@@ -205,54 +195,13 @@ def _bound_of(link: Link) -> _Bound | None:
         return None
 
 
-def _sigmas(rows: Iterable[Mapping[str, str]]) -> NDArray[np.float64]:
-    return np.array([float(row["distance_sigma_m"] or "nan") for row in rows], np.float64)
-
-
-def _measured(lane: _Lane, known: Mapping[str, Any] | None, recorded_s: float, reading_s: float) -> Measured:
-    plain = Measured(
-        frames=len(lane.rows),
-        packets=lane.packets,
-        stated_sigma_m=Moments.of(_sigmas(lane.rows)),
+def _measured(lane: _Lane, truth: Truth | None, recorded_s: float, reading_s: float) -> Measured:
+    times = Times(
         frame_us=tuple(lane.watch.frame_us),
         stage_us={stage: tuple(lane.watch.stage_us[stage]) for stage in STAGES},
         recorded_s=recorded_s,
         cpu_s=reading_s + lane.cpu_s,
     )
-    if known is None:
-        return plain
-    score = score_frames(lane.rows, known)
-    return replace(
-        plain,
-        frames_sent=sum(bar.frames_sent for bar in score.bars),
-        frames_found=sum(bar.frames_found for bar in score.bars),
-        unmatched=score.unmatched,
-        bits=sum(bar.bits for bar in score.bars),
-        bit_errors=sum(bar.bit_errors for bar in score.bars),
-        error_m=sum((Moments.of(bar.error_m) for bar in score.bars), Moments()),
-        gross=sum(bar.gross for bar in score.bars),
-        filtered_error_m=sum((Moments.of(bar.filtered_error_m) for bar in score.bars), Moments()),
-    )
-
-
-def _check_shared(name: str, known: Mapping[str, Any], variant: Variant) -> None:
-    """Refuse a truth of other codewords than the variant's: a mismatch is an error, never a wrong answer."""
-    mine = variant.link.table["modulation"]["id"]
-    for bar in known["bars"]:
-        sent, light = bar.get("profile"), bar.get("led_w_m2")
-        dark = light is not None and light <= _DARK_W_M2
-        if sent == mine or dark or bar.get("chips_file") is not None:
-            continue
-        if not np.array_equal(_codewords(sent), variant.link.codebook.codewords):
-            raise ConfigError(
-                f"{name}: sent with '{sent}', but the variant '{variant.name}' receives '{mine}';"
-                f" set modulation.id={sent}"
-            )
-
-
-def _codewords(modulation: str) -> NDArray[np.int8]:
-    try:
-        words: NDArray[np.int8] = Registry.load().load_class("modulation", modulation)().codewords()
-    except UnknownAlgorithmError:
-        return np.empty((0, 0), np.int8)
-    return words
+    if truth is None:
+        return Measured(without_truth(lane.frames, lane.packets), times)
+    return Measured(statistics_of(lane.frames, truth, packets=lane.packets), times)

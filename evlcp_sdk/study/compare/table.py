@@ -21,9 +21,10 @@ MARK = "*"
 """Follows the best figure of a column, where bold type may be lost."""
 
 LEGEND = (
-    f"{MARK} best of its column. BER with its 95 % interval; filtered is the RMSE after tracking; sigma is"
-    " what the ranging itself states, root mean square; us/frame is the median processor time of separation,"
-    " decoding and ranging; x real time is recorded time over the processor time of reading and receiving."
+    f"{MARK} best of its column. BER of the symbols that are given, with its 95 % interval; filtered is the"
+    " RMSE after tracking; sigma is what the ranging itself states, root mean square; us/frame is the median"
+    " processor time of separation, decoding and ranging; x real time is recorded time over the processor"
+    " time of reading and receiving."
 )
 
 
@@ -49,43 +50,46 @@ def _text(value: float, form: str) -> str:
 
 
 def _frames(m: Measured) -> str:
-    return f"{m.frames_found}/{m.frames_sent}" if m.frames_sent else str(m.frames)
+    tally = m.tally
+    return f"{tally.frames_found}/{tally.frames_sent}" if tally.frames_sent else str(m.statistics.rows)
 
 
 def _ber(m: Measured) -> str:
-    return _text(m.ber, ".1e") if m.bit_errors else "-" if not m.bits else "0"
+    return _text(m.tally.ber, ".1e") if m.tally.bit_errors else "-" if not m.tally.bits else "0"
+
+
+def _interval(m: Measured) -> str:
+    if not m.tally.bits:
+        return "-"
+    low, high = m.ber_interval
+    return f"{low:.1e} to {high:.1e}" if m.tally.bit_errors else f"< {high:.1e}"
+
+
+def _some(count: int, of: int) -> str:
+    return f"{count / of:.1%}" if count else "-"
 
 
 def _gross(m: Measured) -> str:
-    return f"{m.gross_share:.1%} ({m.gross})" if m.error_m.count else "-"
+    return f"{m.tally.gross_share:.1%} ({m.tally.gross})" if m.tally.ranged else "-"
 
 
 COLUMNS = (
     Column("found_share", "frames", _frames, lambda m: -m.found_share),
-    Column("packets", "packets", lambda m: "-" if m.packets is None else str(m.packets), None),
-    Column("ber", "BER", _ber, lambda m: m.ber),
-    Column(
-        "ber_interval",
-        "95 %",
-        lambda m: (
-            "-"
-            if not m.bits
-            else "{:.1e} to {:.1e}".format(*m.ber_interval)
-            if m.bit_errors
-            else f"< {m.ber_interval[1]:.1e}"
-        ),
-        None,
-    ),
-    Column("rmse_m", "RMSE, m", lambda m: _text(m.rmse_m, ".4f"), lambda m: m.rmse_m),
-    Column("bias_m", "bias, m", lambda m: _text(m.bias_m, "+.4f"), lambda m: abs(m.bias_m)),
-    Column("gross_share", ">= 0.5 m", _gross, lambda m: m.gross_share),
+    Column("packets", "packets", lambda m: str(m.statistics.packets), None),
+    Column("ber", "BER", _ber, lambda m: m.tally.ber),
+    Column("ber_interval", "95 %", _interval, None),
+    Column("erased_share", "erased", lambda m: _some(m.tally.erased, m.tally.visible), None),
+    Column("claimed_share", "claimed", lambda m: _some(m.tally.claimed, m.tally.hidden), None),
+    Column("rmse_m", "RMSE, m", lambda m: _text(m.tally.rmse_m, ".4f"), lambda m: m.tally.rmse_m),
+    Column("bias_m", "bias, m", lambda m: _text(m.tally.bias_m, "+.4f"), lambda m: abs(m.tally.bias_m)),
+    Column("gross_share", ">= 0.5 m", _gross, lambda m: m.tally.gross_share),
     Column(
         "filtered_rmse_m",
         "filtered, m",
-        lambda m: _text(m.filtered_rmse_m, ".4f"),
-        lambda m: m.filtered_rmse_m,
+        lambda m: _text(m.tally.filtered_rmse_m, ".4f"),
+        lambda m: m.tally.filtered_rmse_m,
     ),
-    Column("sigma_m", "sigma, m", lambda m: _text(m.sigma_m, ".4f"), None),
+    Column("sigma_m", "sigma, m", lambda m: _text(m.statistics.sigma_m, ".4f"), None),
     Column("us_per_frame", "us/frame", lambda m: _text(m.us_per_frame, ".0f"), lambda m: m.us_per_frame),
     Column(
         "times_real_time",
@@ -160,32 +164,37 @@ class Table:
         found = []
         for row, keys in zip(self.rows, self.best(), strict=True):
             m = row.measured
+            tally, known = m.tally, m.tally.frames_sent > 0
             low, high = m.ber_interval
             values: dict[str, Any] = {
                 "recording": self.name,
                 "variant": row.variant,
-                "frames": m.frames,
-                "frames_sent": m.frames_sent if m.frames_sent else None,
-                "frames_found": m.frames_found if m.frames_sent else None,
+                "frames": m.statistics.rows,
+                "frames_sent": tally.frames_sent if known else None,
+                "frames_found": tally.frames_found if known else None,
                 "found_share": m.found_share,
-                "unmatched": m.unmatched if m.frames_sent else None,
-                "packets": m.packets,
-                "bits": m.bits,
-                "bit_errors": m.bit_errors if m.bits else None,
-                "ber": m.ber,
+                "unmatched": m.statistics.unmatched if known else None,
+                "echoes": m.statistics.echoes,
+                "packets": m.statistics.packets,
+                "bits": tally.bits,
+                "bit_errors": tally.bit_errors if tally.bits else None,
+                "ber": tally.ber,
                 "ber_low": low,
                 "ber_high": high,
-                "ranged": m.error_m.count,
-                "rmse_m": m.rmse_m,
-                "bias_m": m.bias_m,
-                "gross": m.gross if m.error_m.count else None,
-                "gross_share": m.gross_share,
-                "filtered_rmse_m": m.filtered_rmse_m,
-                "sigma_m": m.sigma_m,
+                "erased_share": tally.erased_share,
+                "claimed_share": tally.claimed_share,
+                "ranged": tally.ranged,
+                "rmse_m": tally.rmse_m,
+                "bias_m": tally.bias_m,
+                "nees": tally.nees,
+                "gross": tally.gross if tally.ranged else None,
+                "gross_share": tally.gross_share,
+                "filtered_rmse_m": tally.filtered_rmse_m,
+                "sigma_m": m.statistics.sigma_m,
                 "us_per_frame": m.us_per_frame,
-                **{f"{stage}_us": median(m.stage_us[stage]) for stage in STAGES},
-                "recorded_s": m.recorded_s,
-                "cpu_s": m.cpu_s if m.cpu_s else None,
+                **{f"{stage}_us": median(m.times.stage_us[stage]) for stage in STAGES},
+                "recorded_s": m.times.recorded_s,
+                "cpu_s": m.times.cpu_s if m.times.cpu_s else None,
                 "times_real_time": m.times_real_time,
                 "cramer_rao_bound_m": self.bound_m.rms,
                 "best": sorted(keys),

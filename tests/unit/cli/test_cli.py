@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evlcp_sdk.cli.demo import score
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource, open_source, write_events
 from evlcp_sdk.results.outputs import FIGURE_NAMES
@@ -323,35 +322,19 @@ def test_examples_are_links(evlcp: Evlcp) -> None:
 def test_demo_against_the_truth(evlcp: Evlcp, tmp_path: Path) -> None:
     done = evlcp("demo", "--recording", "-o", tmp_path, "--json")
     assert done.code == 0
-    result = json.loads(done.out)["score"]
-    assert result["found"] >= 0.9 * result["sent"]
-    assert result["unmatched"] == 0
+    told = json.loads(done.out)["score"]
+    truth = Path(__file__).parents[3] / "examples" / "recordings" / "night-50m-30kmh-cut.truth.json"
+    assert json.loads(evlcp("score", tmp_path, truth, "--json").out) == told
+    (result,) = told["bars"]
+    assert result["frames_found"] >= 0.9 * result["frames_sent"]
+    assert result["frames_sent"] == 21
+    assert told["unmatched"] == 0
     assert result["bit_errors"] <= 1e-3 * result["bits"]
     assert result["rmse_m"] <= 0.12
     assert names_in(tmp_path) == FILES | set(FIGURE_NAMES)
     shown = evlcp("demo", "--recording", "-o", tmp_path).out
     assert "against the truth: " in shown
     assert all(len(line) <= 80 for line in shown.splitlines() if "±" in line)
-
-
-def test_score_counts_errors() -> None:
-    truth = {
-        "bits_per_symbol": 6,
-        "tolerance_us": 800,
-        "frames": [
-            {"t_us": 1000.0, "symbols": [1, 2], "distance_m": 50.0},
-            {"t_us": 4200.0, "symbols": [3, 4], "distance_m": 49.0},
-        ],
-    }
-    rows = [
-        {"t_us": "1100", "symbols": "1 0", "distance_m": "50.3"},
-        {"t_us": "1200", "symbols": "1 2", "distance_m": "50.0"},
-        {"t_us": "9000", "symbols": "3 4", "distance_m": ""},
-    ]
-    result = score(rows, truth)
-    assert (result.found, result.sent, result.unmatched) == (1, 2, 2)
-    assert (result.bit_errors, result.bits) == (1, 12)
-    assert result.rmse_m == pytest.approx(0.3)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs a POSIX shell")

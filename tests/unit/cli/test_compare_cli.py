@@ -14,12 +14,17 @@ import pytest
 from rich.console import Console
 
 from evlcp_sdk.jobs.executor import Inline
+from evlcp_sdk.sim import read_truth
 from evlcp_sdk.study.campaign.collect import collect
 from evlcp_sdk.study.campaign.store import Store
-from evlcp_sdk.study.score import read_frames, read_truth
+from evlcp_sdk.study.frames import read_frames
 from tests.unit.study.campaign.fake import fake_plan, run_fake
 
 Evlcp = Callable[..., Any]
+REC_WH8 = (
+    "evlcp: REC.raw: --variant a: bar 0 was sent with another link:"
+    ' modulation.id: sent with "wh4x2", received with "wh8"'
+)
 VARIANTS = {
     "paper": (),
     "filtered": ("ranging.id=joint-scale", "tracking.id=kalman"),
@@ -46,7 +51,7 @@ def test_the_numbers_are_those_of_receive_and_score(evlcp: Evlcp, recording: Pat
         options = [part for setting in settings for part in ("--set", setting)]
         assert evlcp("receive", recording, "-o", tmp_path / name, *options).code == 0
         told = json.loads(evlcp("score", tmp_path / name, tmp_path / "REC.truth.json", "--json").out)
-        (bar,), row = told["bars"], rows[name]
+        (bar,), (road,), row = told["bars"], told["road"]["bars"], rows[name]
         for mine, theirs in (
             (row["frames"], told["rows"]),
             (row["unmatched"], told["unmatched"]),
@@ -56,18 +61,24 @@ def test_the_numbers_are_those_of_receive_and_score(evlcp: Evlcp, recording: Pat
             (row["bit_errors"], bar["bit_errors"]),
             (row["ranged"], bar["ranged"]),
             (round(row["ber"], 6), bar["ber"]),
-            (round(row["rmse_m"], 4), bar["rmse_m"]),
             (round(row["gross_share"], 4), bar["over_half_metre"]),
+            (row["bits"], road["bits"]),
+            (row["erased_share"], road["erased"]),
+            (row["claimed_share"], road["claimed"]),
         ):
             assert mine == theirs
+        # frames.csv has tenths of millimetres.
+        for key in ("rmse_m", "bias_m"):
+            assert row[key] == pytest.approx(road[key], abs=1.1e-4)
+        assert row["nees"] == pytest.approx(road["nees"], rel=0.02)
         frames = read_frames(tmp_path / name)
         assert row["packets"] == len((tmp_path / name / "packets.jsonl").read_text().splitlines())
-        stated = np.array([float(f["distance_sigma_m"]) for f in frames])
-        assert row["sigma_m"] == pytest.approx(np.sqrt(np.mean(stated**2)))
+        stated = np.array([f.sigma_m for f in frames])
+        assert row["sigma_m"] == pytest.approx(np.sqrt(np.mean(stated**2)), abs=5e-5)
         if name == "filtered":
-            t_us = np.array([float(f["t_us"]) for f in frames]) - truth["scene"]["t0_us"]
-            true_m = np.interp(t_us + 800, np.array(truth["t_s"]) * 1e6, truth["distance_m"][0])
-            off = np.array([float(f["distance_filtered_m"]) for f in frames]) - true_m
+            t_us = np.array([f.t_us for f in frames]) - truth.t0_us
+            true_m = np.interp(t_us + 800, truth.t_us, truth.bars[0].distance_m)
+            off = np.array([f.filtered_m for f in frames]) - true_m
             assert row["filtered_rmse_m"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=0.01)
         else:
             assert row["filtered_rmse_m"] is None
@@ -151,7 +162,7 @@ def test_a_camera_of_positive_events_has_no_bound(evlcp: Evlcp, recording: Path)
         (("REC.raw", "--variant", "a:"), 2, "REC.raw is named twice"),
         (("paper.toml",), 2, "evlcp sweep paper.toml -o R.sqlite, then evlcp compare R.sqlite"),
         (("none.sqlite",), 2, "stand alone"),
-        (("--variant", "a:modulation.id=wh8"), 2, "REC.raw: sent with 'wh4x2', but the variant 'a' receives"),
+        (("--variant", "a:modulation.id=wh8"), 2, REC_WH8),
         (("--variant", "a:camera.width=640"), 2, "recorded with 1280 x 720 pixels"),
     ],
 )
@@ -197,4 +208,5 @@ def test_results_of_a_campaign(evlcp: Evlcp, tmp_path: Path) -> None:
     assert (refused.code, refused.out) == (2, "")
     rows = json.loads(evlcp("compare", results, "--json").out)["rows"]
     assert len(rows) == 6
-    assert {row["packets"] for row in rows} == {None}
+    assert {row["packets"] for row in rows} == {8, 16}
+    assert {row["us_per_frame"] for row in rows} == {None}

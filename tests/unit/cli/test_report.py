@@ -90,8 +90,8 @@ def test_agreement_is_a_kept_bound_or_a_figure_within_30_percent(summary: Summar
             (0.5, reference.bound),
             (1.25, not reference.bound),
         ):
-            tally = Tally.found(96, 0, reference.value * factor)
-            at = Statistics.of(1, 0, 0, 0, [(reference.from_m, tally)])
+            tally = Tally.distance(reference.value * factor)
+            at = Statistics.of([(reference.from_m, tally)], tasks=1)
             (one,) = compare([Series({}, {"speed_kmh": 30}, link, at)], [reference])
             assert one.agrees is agrees, (reference, factor)
 

@@ -25,7 +25,8 @@ from evlcp_sdk.sim import (
     simulate,
     truth_of,
 )
-from evlcp_sdk.study.score import score_frames
+from evlcp_sdk.study.frames import frames_of
+from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.values import Events
 
 SHARED = Path(__file__).parents[4] / "shared" / "recordings"
@@ -137,34 +138,15 @@ def test_a_bar_that_leans_is_seen_leaning() -> None:
     assert np.polyfit(events.y.astype(float), events.x.astype(float), 1)[0] == pytest.approx(slope, rel=0.02)
 
 
-def received(scene: Scene, profile: str = "wh4x2") -> tuple[list[dict[str, str]], Simulation]:
-    simulation = Simulation(scene)
-    receiver = Receiver(load_link(overrides=[f"modulation.id={profile}"]))
-    packets = [p for events in simulation.stream() for p in receiver.feed(events)]
-    packets += receiver.close()
-    rows = [
-        {
-            "t_us": str(f.t_us),
-            "symbols": " ".join(map(str, f.soft.symbols.tolist())),
-            "distance_m": "" if np.isnan(f.range.distance_m) else str(f.range.distance_m),
-            "x_px": str(f.x_px),
-            "y_px": str(f.y_px),
-        }
-        for p in packets
-        for f in p.frames
-    ]
-    return rows, simulation
-
-
 def test_the_receiver_hears_the_simulated_bar() -> None:
-    scene = load_scene("drive-30kmh", ["motion.distance_m=50.0", "duration_s=0.1"])
-    rows, simulation = received(scene)
-    result = score_frames(rows, truth_of(simulation).to_table())
-    (bar,) = result.bars
-    assert result.unmatched == 0
+    simulation = Simulation(load_scene("drive-30kmh", ["motion.distance_m=50.0", "duration_s=0.1"]))
+    receiver = Receiver(load_link())
+    packets = [p for events in simulation.stream() for p in receiver.feed(events)] + receiver.close()
+    found = statistics_of(frames_of(packets), truth_of(simulation))
+    bar = found.total()
+    assert found.unmatched == 0
     assert bar.frames_found == bar.frames_sent > 20
-    assert bar.bit_errors == 0
-    assert bar.rmse_m is not None
+    assert bar.bit_errors == bar.erased == 0
     assert 0.01 < bar.rmse_m < 0.2
 
 

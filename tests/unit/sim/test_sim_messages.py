@@ -1,6 +1,7 @@
 """Bars that send messages: what the receiver reads is what they were told to say."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.sim import load_scene, resolve_scene, simulate, sites_of, truth_of
+from evlcp_sdk.sim import Truth, load_scene, resolve_scene, simulate, sites_of, truth_of
 from evlcp_sdk.sim.light import sources_of
 from evlcp_sdk.study.measure import message_tallies
 from evlcp_sdk.study.tally import Tally
@@ -81,32 +82,31 @@ def test_what_cannot_be_sent_is_told(bar: dict[str, Any], told: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def received() -> tuple[dict[str, Any], list[Packet]]:
+def received() -> tuple[Truth, list[Packet]]:
     scene = load_scene("drive-30kmh", {"duration_s": 0.15, "bars.payload": "data", "bars.start_chip": 300.0})
     receiver = Receiver(load_link())
     packets = [p for events in simulate(scene, 3) for p in receiver.feed(events)] + receiver.close()
-    return truth_of(scene, 3).to_table(), packets
+    return truth_of(scene, 3), packets
 
 
-def test_a_campaign_counts_messages(received: tuple[dict[str, Any], list[Packet]]) -> None:
+def test_a_campaign_counts_messages(received: tuple[Truth, list[Packet]]) -> None:
     known, packets = received
     coder = load_link().block_coder()
 
-    def total(packets: list[Packet], known: dict[str, Any] = known) -> tuple[int, int, int]:
-        tally = sum((t for _, t in message_tallies(packets, known, coder)), Tally())
+    def total(packets: list[Packet], known: Truth = known) -> tuple[int, int, int]:
+        tally = Tally.together(t for _, t in message_tallies(packets, known, coder))
         return tally.messages_sent, tally.messages_found, tally.messages_wrong
 
     # Packets begin 4.6, 39.2, 73.8, 108.4 and 143 ms after the scene: four are on air as a whole.
     assert total(packets) == (4, 4, 0)
     assert total([p for p in packets if p.packet != 2]) == (4, 3, 0)
-    other = [[[s ^ 1 for s in frame] for frame in packet] for packet in known["bars"][0]["symbols"]]
-    wrong = known | {"bars": [known["bars"][0] | {"symbols": other}]}
+    (bar,) = known.bars
+    wrong = replace(known, bars=(replace(bar, symbols=bar.symbols ^ 1),))
     assert total(packets, wrong)[1:] == (0, sum(p.block is not None for p in packets))
-    silent = {k: v for k, v in known["bars"][0].items() if k != "payload"}
-    assert message_tallies([], known | {"bars": [silent]}, coder) == []
+    assert message_tallies([], replace(known, bars=(replace(bar, payload="symbols"),)), coder) == []
 
 
-def test_chunks_do_not_matter(received: tuple[dict[str, Any], list[Packet]]) -> None:
+def test_chunks_do_not_matter(received: tuple[Truth, list[Packet]]) -> None:
     _, packets = received
     scene = load_scene("drive-30kmh", {"duration_s": 0.15, "bars.payload": "data", "bars.start_chip": 300.0})
     whole, receiver = Events.concat(simulate(scene, 3)), Receiver(load_link())
@@ -159,7 +159,7 @@ def test_ten_milliseconds_lost_in_every_packet(after_us: int) -> None:
     receiver, coder = Receiver(load_link()), load_link().block_coder()
     packets = receiver.feed(left) + receiver.close()
     assert min(len(p.frames) for p in packets[1:4]) <= 7
-    tally = sum((t for _, t in message_tallies(packets, truth_of(scene, 3).to_table(), coder)), Tally())
+    tally = Tally.together(t for _, t in message_tallies(packets, truth_of(scene, 3), coder))
     assert (tally.messages_sent, tally.messages_found, tally.messages_wrong) == (4, 4, 0)
 
 

@@ -50,12 +50,14 @@ def fake_statistics(scene: int, link: int, seed: int) -> Statistics:
     tallies = []
     for _ in range(20):
         begin = 30 + 10 * scene
-        tallies.append((begin, Tally.sent()))
+        tallies.append((begin, Tally(frames_sent=1)))
         if rng.random() < 0.95:
             errors = sum(rng.random() < 0.01 * (scene + 1) for _ in range(96))
             error_m = rng.gauss(0, 0.05 * (scene + 1) * (link + 1))
-            tallies.append((begin, Tally.found(96, errors, error_m)))
-    return Statistics.of(1, rng.randrange(10_000), 100_000, 0, tallies)
+            tallies.append((begin, Tally(frames_found=1, bits=96, bit_errors=errors)))
+            tallies.append((begin, Tally.distance(error_m, 0.05)))
+    counts = {"tasks": 1, "events": rng.randrange(10_000), "duration_us": 100_000, "packets": 2, "rows": 20}
+    return Statistics.of(tallies, **counts)
 
 
 def main(store: str, workers: str, scenes: str, links: str, seeds: str, seconds: str) -> None:

@@ -1,7 +1,7 @@
 """Statistics of decoded frames, beside the independent scorer's figures on its recordings."""
 
 import importlib.util
-import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,17 @@ import pytest
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import LocalFrame
-from evlcp_sdk.sim import Simulation, resolve_scene, sites_of, truth_of
+from evlcp_sdk.sim import (
+    Simulation,
+    Truth,
+    read_truth,
+    resolve_scene,
+    sites_of,
+    truth_from_table,
+    truth_of,
+)
 from evlcp_sdk.sim.world import attitude_log
+from evlcp_sdk.study.frames import frames_of, given
 from evlcp_sdk.study.measure import position_tallies, statistics_of
 from evlcp_sdk.study.tally import Statistics, Tally
 from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
@@ -21,22 +30,25 @@ from tests.conftest import ROOT, Run
 SHARED = ROOT.parent / "shared"
 
 CHIPS = 26 + 32 * 2
-TRUTH: dict[str, Any] = {
-    "scene": {"duration_s": 0.02, "t0_us": 1000},
-    "t_s": [0.0, 0.02],
-    "distance_m": [[40.002, 39.998]],
-    "bar_centre_px": [[[600.0, 600.0], [300.0, 300.0]]],
-    "bars": [
-        {
-            "profile": "wh4x2",
-            "frames": 2,
-            "packet_chips": CHIPS,
-            "ppm": 0.0,
-            "start_chip": 26.0,
-            "symbols": [[[1, 2], [3, 4]], [[5, 6], [7, 8]]],
-        }
-    ],
-}
+TRUTH = truth_from_table(
+    {
+        "scene": {"duration_s": 0.02, "t0_us": 1000},
+        "t_s": [0.0, 0.02],
+        "distance_m": [[40.002, 39.998]],
+        "bar_centre_px": [[[600.0, 600.0], [300.0, 300.0]]],
+        "bars": [
+            {
+                "profile": "wh4x2",
+                "frames": 2,
+                "packet_chips": CHIPS,
+                "ppm": 0.0,
+                "start_chip": 26.0,
+                "symbols": [[[1, 2], [3, 4]], [[5, 6], [7, 8]]],
+                "clusters": 2,
+            }
+        ],
+    }
+)
 
 
 def frame(t_us: float, symbols: list[int], distance_m: float, x_px: float = 601.0) -> Frame:
@@ -62,8 +74,10 @@ def test_each_frame_is_held_beside_the_sent_one() -> None:
         frame(9050, [5, 6], 39.9, x_px=700.0),
         frame(9050, [5, 7], 39.9),
     ]
-    found = statistics_of(frames, TRUTH, 123)
+    found = statistics_of(map(given, frames), TRUTH, events=123, packets=4)
     assert (found.tasks, found.events, found.duration_us, found.unmatched) == (1, 123, 20_000, 2)
+    assert (found.rows, found.packets, found.stated) == (5, 4, 4)
+    assert found.sigma_m == pytest.approx(0.1)
     (near, at_30), (far, at_40) = found.segments
     assert (near, far) == (30, 40)
     # Frames begin at 0, 3.2, 9 and 12.2 ms; the bar is 40 m away at 10 ms.
@@ -74,8 +88,8 @@ def test_each_frame_is_held_beside_the_sent_one() -> None:
 
 
 def test_a_scene_without_bars_has_only_ghosts() -> None:
-    found = statistics_of([frame(20, [1, 2], 40.5)], TRUTH | {"bars": []}, 0)
-    assert found == Statistics(1, 0, 20_000, 1)
+    found = statistics_of([given(frame(20, [1, 2], float("nan")))], replace(TRUTH, bars=()))
+    assert found == Statistics(tasks=1, duration_us=20_000, rows=1, unmatched=1)
 
 
 # The scorer, not this project's, leaves its files to the collector.
@@ -93,7 +107,7 @@ def test_figures_are_the_scorers(name: str, tmp_path: Path, evlcp: Any) -> None:
     assert done.code == 0
     truth_file = recording.with_suffix(".truth.json")
     expected = scorer.score(tmp_path, truth_file)
-    ours = statistics_of(received(recording), json.loads(truth_file.read_text()), 0)
+    ours = statistics_of(frames_of(received(recording)), read_truth(truth_file))
     assert ours.unmatched == expected["unmatched"]
     total = ours.total()
     bars = expected["bars"]
@@ -113,14 +127,13 @@ def test_figures_are_the_scorers(name: str, tmp_path: Path, evlcp: Any) -> None:
             assert abs(tally.ranged - segments[0]["n"]) <= 1
 
 
-def received(recording: Path) -> list[Frame]:
+def received(recording: Path) -> list[Packet]:
     from evlcp_sdk.io import open_source
     from evlcp_sdk.rx.receiver import Receiver
 
     receiver = Receiver(load_link())
     with open_source(str(recording)) as source:
-        packets = [p for events in source.chunks() for p in receiver.feed(events)] + receiver.close()
-    return [frame for packet in packets for frame in packet.frames]
+        return [p for events in source.chunks() for p in receiver.feed(events)] + receiver.close()
 
 
 GATE = {
@@ -131,11 +144,10 @@ GATE = {
 }
 
 
-def seen(known: dict[str, Any]) -> list[Packet]:
+def seen(truth: Truth) -> list[Packet]:
     """Packets whose frames show the clusters of a scene exactly, of the last bar first."""
     scene = resolve_scene(GATE)
-    path = known["camera_path"]
-    t_us = np.array(known["t_s"]) * 1e6
+    path, t_us = truth.camera_path, truth.t_us
     packets = []
     for number, i in ((0, 1), (1, 0)):
         frames = []
@@ -174,11 +186,11 @@ def seen(known: dict[str, Any]) -> list[Packet]:
 def test_positions_are_held_beside_the_cameras_path(attitude: str) -> None:
     scene = resolve_scene(GATE | {"world": GATE["world"] | {"attitude": attitude}})  # type: ignore[operator]
     simulation = Simulation(scene)
-    known = json.loads(json.dumps(truth_of(simulation).to_table()))
-    true_path = dict(known["camera_path"])
+    truth = truth_of(simulation)
+    packets = seen(truth)
     log = attitude_log(scene, 0, simulation.path)
-    tallies = position_tallies(seen(known), known, load_link(), log)
-    total = sum((tally for _, tally in tallies), Tally())
+    tallies = position_tallies(packets, truth, load_link(), log)
+    total = Tally.together(tally for _, tally in tallies)
     assert {begin for begin, _ in tallies} == {40}
     if attitude == "none":
         assert (total.fixes, total.fixes_refused) == (0, len(tallies))
@@ -189,9 +201,8 @@ def test_positions_are_held_beside_the_cameras_path(attitude: str) -> None:
     assert total.position_rmse_m < 2e-3
     assert total.position_nees < 1
     # A truth 1e-6 degrees further north is 0.111 m off.
-    path = known["camera_path"]
-    path["latitude_deg"] = [latitude + 1e-6 for latitude in path["latitude_deg"]]
-    tallies = position_tallies(seen(known | {"camera_path": true_path}), known, load_link(), log)
-    total = sum((tally for _, tally in tallies), Tally())
+    path = truth.camera_path
+    moved = replace(truth, camera_path={**path, "latitude_deg": path["latitude_deg"] + 1e-6})
+    total = Tally.together(tally for _, tally in position_tallies(packets, moved, load_link(), log))
     assert total.position_rmse_m == pytest.approx(0.111, abs=0.003)
     assert total.position_nees > 20

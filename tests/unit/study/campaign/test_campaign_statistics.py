@@ -12,21 +12,18 @@ from evlcp_sdk.study.intervals import proportion_interval, rms_interval
 from evlcp_sdk.study.tally import Statistics, Tally, segment_of
 
 TALLIES = st.one_of(
-    st.just(Tally.sent()),
-    st.builds(
-        Tally.found,
-        st.just(96),
-        st.integers(0, 96),
-        st.one_of(st.none(), st.floats(-20, 20, allow_nan=False)),
-    ),
+    st.just(Tally(frames_sent=1)),
+    st.builds(Tally, frames_found=st.just(1), bits=st.just(96), bit_errors=st.integers(0, 96)),
+    st.builds(Tally.distance, st.floats(-20, 20), st.one_of(st.just(math.nan), st.floats(0, 2))),
+    st.builds(Tally.fix, st.floats(0, 20), st.floats(0, 1e15)),
 )
 STATISTICS = st.builds(
     Statistics.of,
-    st.integers(0, 5),
-    st.integers(0, 10**9),
-    st.integers(0, 10**7),
-    st.integers(0, 3),
     st.lists(st.tuples(st.sampled_from([30, 40, 50]), TALLIES), max_size=12),
+    tasks=st.integers(0, 5),
+    events=st.integers(0, 10**9),
+    rows=st.integers(0, 10**7),
+    sigma_squares_nm2=st.integers(0, 10**20),
 )
 
 
@@ -43,21 +40,28 @@ def test_json_keeps_them(a: Statistics) -> None:
 
 def test_figures_are_those_of_the_errors() -> None:
     errors = np.random.default_rng(1).normal(0.03, 0.4, 500)
-    tally = sum((Tally.found(96, 1, float(e)) for e in errors), Tally())
-    assert tally.rmse_m == pytest.approx(math.sqrt((errors**2).mean()), abs=1e-6)
-    assert tally.bias_m == pytest.approx(errors.mean(), abs=1e-6)
+    tally = sum((Tally.distance(float(e), 0.4) for e in errors), Tally())
+    assert tally.rmse_m == pytest.approx(math.sqrt((errors**2).mean()), abs=1e-9)
+    assert tally.bias_m == pytest.approx(errors.mean(), abs=1e-9)
+    assert tally.worst_m == pytest.approx(abs(errors).max(), abs=1e-9)
+    assert tally.nees == pytest.approx(((errors / 0.4) ** 2).mean(), abs=1e-6)
     assert tally.gross_share == (np.abs(errors) >= 0.5).mean()
-    assert tally.ber == 1 / 96
     assert sum(n for _, n in tally.histogram) == 500
     assert math.isnan(Tally().rmse_m)
-    assert math.isnan(Tally().ber)
+    for name in ("ber", "erased_share", "claimed_share", "bias_m", "worst_m", "nees", "filtered_rmse_m"):
+        assert math.isnan(getattr(Tally(), name)), name
+    some = Tally(bits=96, bit_errors=3, visible=20, erased=4, hidden=8, claimed=2)
+    assert (some.ber, some.erased_share, some.claimed_share) == (3 / 96, 0.2, 0.25)
+    # A sigma of 0 is wrong beyond all measure, none counts not at all.
+    assert Tally.distance(0.1, 0.0).nees == 1e12
+    assert Tally.distance(0.1).with_sigma == 0
 
 
 def test_errors_at_the_edge_count_and_far_ones_have_a_bin() -> None:
-    assert Tally.found(6, 0, -0.5).gross == 1
-    assert Tally.found(6, 0, 0.499999).gross == 0
-    assert Tally.found(6, 0, 1e4).histogram == ((150, 1),)
-    assert Tally.found(6, 0, -1e4).histogram == ((-150, 1),)
+    assert Tally.distance(-0.5).gross == 1
+    assert Tally.distance(0.499999).gross == 0
+    assert Tally.distance(1e4).histogram == ((150, 1),)
+    assert Tally.distance(-1e4).histogram == ((-150, 1),)
     assert segment_of(50.0) == 50
 
 
@@ -90,4 +94,4 @@ def test_positions_have_quantiles() -> None:
         true = np.quantile(errors_m, share, method="higher")
         assert 0 <= total.position_quantile_m(share) - true <= 0.005 + 1e-9
     assert math.isnan(Tally().position_quantile_m(0.5))
-    assert Statistics.from_dict(Statistics.of(1, 0, 0, 0, [(40, total)]).to_dict()).total() == total
+    assert Statistics.from_dict(Statistics.of([(40, total)], tasks=1).to_dict()).total() == total

@@ -109,7 +109,7 @@ def test_a_bar_that_the_link_does_not_speak_to(evlcp: Evlcp, campaign: Path, tmp
         "sweep", campaign, "-o", tmp_path / "r.sqlite", "--set", "link.modulation.id=wh8", "--workers", "0"
     )
     assert done.code == 2
-    assert "the scene's bar has profile = 'wh4x2', but the link modulation.id = 'wh8'" in done.err
+    assert "the scene: bar 0 was sent with another link: modulation.id: sent with" in done.err
     assert len(done.err.splitlines()) == 1
 
 

@@ -19,36 +19,45 @@ from evlcp_sdk.study.campaign.collect import collect
 from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.campaign.summary import summarize
 from evlcp_sdk.study.compare.campaigns import of_campaign
-from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments
+from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments, Times
 from evlcp_sdk.study.compare.run import _Watch, truth_path
 from evlcp_sdk.study.compare.table import BOUND_NAME, COLUMNS, Comparison, Row, Table, total_of
 from evlcp_sdk.study.compare.variants import load_variants
+from evlcp_sdk.study.tally import Statistics, Tally
 from tests.unit.study.campaign.fake import fake_plan, run_fake
 
 
-def measured(**changes: Any) -> Measured:
+def errors(*errors_m: float) -> Tally:
+    return Tally.together(map(Tally.distance, errors_m))
+
+
+ERRORS = errors(0.1, -0.2, 0.6)
+FILTERED = Tally(filtered=2, filtered_squares_nm2=29 * 10**14)
+
+
+def measured(
+    error: Tally = ERRORS,
+    filtered: Tally = FILTERED,
+    times: dict[str, Any] | None = None,
+    **changes: int,
+) -> Measured:
     """A variant with truth and a tracking filter."""
-    values = {
-        "frames": 90,
-        "packets": 9,
-        "frames_sent": 100,
-        "frames_found": 88,
-        "unmatched": 2,
-        "bits": 8448,
-        "bit_errors": 3,
-        "error_m": Moments.of(np.array([0.1, -0.2, 0.6])),
-        "gross": 1,
-        "filtered_error_m": Moments.of(np.array([0.05, 0.02])),
-        "stated_sigma_m": Moments.of(np.array([0.1, 0.3])),
+    tally = Tally(**({"frames_sent": 100, "frames_found": 88, "bits": 8448, "bit_errors": 3} | changes))
+    counts = {"packets": 9, "rows": 90, "unmatched": 2, "stated": 2, "sigma_squares_nm2": 10**17}
+    took = {
         "frame_us": (500.0, 700.0, 9000.0),
         "stage_us": dict.fromkeys(STAGES, (100.0, 200.0, 300.0)),
         "recorded_s": 0.4,
         "cpu_s": 0.2,
     }
-    return Measured(**(values | changes))
+    return Measured(
+        Statistics.of([(30, tally), (40, error), (40, filtered)], **counts), Times(**(took | (times or {})))
+    )
 
 
-BLIND = Measured(frames=5, packets=1, stated_sigma_m=Moments.of(np.array([0.2])), recorded_s=0.1, cpu_s=0.1)
+BLIND = Measured(
+    Statistics(rows=5, packets=1, stated=1, sigma_squares_nm2=4 * 10**16), Times(recorded_s=0.1, cpu_s=0.1)
+)
 """A variant on a recording without truth."""
 
 
@@ -99,26 +108,26 @@ def test_moments_add(parts: list[list[float]]) -> None:
     assert found.count == len(together)
     if len(together):
         assert found.rms == pytest.approx(math.sqrt(np.mean(together**2)))
-        assert found.mean == pytest.approx(together.mean(), abs=1e-9)
     else:
         assert math.isnan(found.rms)
-        assert math.isnan(found.mean)
 
 
 def test_figures_by_hand() -> None:
     m = measured()
-    assert m.ber == 3 / 8448
+    assert m.tally.ber == 3 / 8448
     low, high = m.ber_interval
-    assert low < m.ber < high
-    assert m.rmse_m == pytest.approx(math.sqrt((0.01 + 0.04 + 0.36) / 3))
-    assert m.bias_m == pytest.approx(0.5 / 3)
-    assert m.gross_share == pytest.approx(1 / 3)
-    assert m.sigma_m == pytest.approx(math.sqrt(0.05))
+    assert low < m.tally.ber < high
+    assert m.tally.rmse_m == pytest.approx(math.sqrt((0.01 + 0.04 + 0.36) / 3))
+    assert m.tally.bias_m == pytest.approx(0.5 / 3)
+    assert m.tally.gross_share == pytest.approx(1 / 3)
+    assert m.tally.filtered_rmse_m == pytest.approx(math.sqrt((0.05**2 + 0.02**2) / 2))
+    assert m.statistics.sigma_m == pytest.approx(math.sqrt(0.05))
     assert (m.us_per_frame, m.times_real_time, m.found_share) == (700, 2, 0.88)
-    both = m + measured(bit_errors=5, packets=None)
-    assert (both.bits, both.bit_errors, both.packets, both.frames) == (16896, 8, None, 180)
-    assert both.frame_us == m.frame_us * 2
-    assert both.stage_us["ranging"] == m.stage_us["ranging"] * 2
+    both = m + measured(bit_errors=5)
+    assert (both.tally.bits, both.tally.bit_errors) == (16896, 8)
+    assert (both.statistics.packets, both.statistics.rows) == (18, 180)
+    assert both.times.frame_us == m.times.frame_us * 2
+    assert both.times.stage_us["ranging"] == m.times.stage_us["ranging"] * 2
     nothing = Measured()
     for column in COLUMNS:
         assert column.cell(nothing) in ("-", "0")
@@ -127,17 +136,16 @@ def test_figures_by_hand() -> None:
 
 
 def test_the_best_are_marked() -> None:
-    other = {"bit_errors": 2, "frames_found": 88, "frame_us": (800.0,), "cpu_s": 0.1}
-    other["error_m"] = Moments.of(np.array([-0.2, 0.15, 0.0]))
-    best = table(measured(), measured(**other)).best()
-    # As many frames and gross errors: both. BER by its value: the intervals of 2 and 3 errors overlap.
-    shared = {"found_share", "gross_share", "filtered_rmse_m"}
-    assert best[0] == shared | {"us_per_frame"}
-    assert best[1] == shared | {"ber", "rmse_m", "bias_m", "times_real_time"}
+    other = measured(errors(-0.2, 0.15, 0.7), times={"frame_us": (800.0,), "cpu_s": 0.1}, bit_errors=2)
+    best = table(measured(errors(0.5, -0.6, 0.0)), other).best()
+    # As many frames: both. BER by its value: the intervals of 2 and 3 errors overlap.
+    shared = {"found_share", "filtered_rmse_m"}
+    assert best[0] == shared | {"us_per_frame", "bias_m"}
+    assert best[1] == shared | {"ber", "rmse_m", "gross_share", "times_real_time"}
 
 
 def test_where_nothing_was_measured_nothing_is_best() -> None:
-    nan = measured(error_m=Moments(), gross=0, filtered_error_m=Moments())
+    nan = measured(Tally(), Tally())
     alone, other = table(measured(), nan).best()
     # Two have a BER, only one has distances.
     assert "ber" in alone & other
@@ -160,19 +168,25 @@ def test_cells() -> None:
         assert all(best == text.endswith("*") for text, best in line)
     head, lines = table(BLIND, bound=None).cells()
     assert head == ["variant", "frames", "packets", "sigma, m", "x real time"]
+    head, lines = table(
+        measured(visible=200, erased=1, hidden=50, claimed=20), measured(), bound=None
+    ).cells()
+    rows = [dict(zip(head, (text for text, _ in line), strict=True)) for line in lines]
+    assert [(row["erased"], row["claimed"]) for row in rows] == [("0.5%", "40.0%"), ("-", "-")]
+    head, lines = table(BLIND, bound=None).cells()
     assert [text for text, _ in lines[0]] == ["v0", "5", "1", "0.2000", "1.00"]
 
 
 def test_total_adds_recordings() -> None:
     one = table(measured(), measured(bit_errors=1))
     total = total_of([one, one])
-    assert total.rows[1].measured.bit_errors == 2
-    assert total.rows[0].measured.rmse_m == pytest.approx(measured().rmse_m)
+    assert total.rows[1].measured.tally.bit_errors == 2
+    assert total.rows[0].measured.tally.rmse_m == measured().tally.rmse_m
     assert total.bound_m.rms == pytest.approx(0.05)
     # A recording without truth adds frames and time, and takes nothing from the rest.
     mixed = total_of([one, table(BLIND, BLIND)])
-    assert mixed.rows[0].measured.ber == measured().ber
-    assert mixed.rows[0].measured.frames == 95
+    assert mixed.rows[0].measured.tally.ber == measured().tally.ber
+    assert mixed.rows[0].measured.statistics.rows == 95
 
 
 def test_json_csv_and_html_parse_back() -> None:
@@ -180,7 +194,7 @@ def test_json_csv_and_html_parse_back() -> None:
     parsed = json.loads(whole.to_json())
     assert parsed == json.loads(json.dumps(whole.to_dict(), allow_nan=False))
     first, second, third, _ = parsed["rows"]
-    assert first["rmse_m"] == measured().rmse_m
+    assert first["rmse_m"] == measured().tally.rmse_m
     assert (first["cramer_rao_bound_m"], third["cramer_rao_bound_m"]) == (pytest.approx(0.05), None)
     assert "ber" in second["best"]
     assert (third["ber"], third["frames_sent"], third["bit_errors"]) == (None, None, None)
@@ -257,18 +271,13 @@ def test_a_campaign_is_a_table_a_scene(tmp_path: Path) -> None:
     whole = of_campaign(summary)
     assert [one.name for one in whole.tables] == ["distance 30 m", "distance 40 m", "all scenes"]
     assert list(whole.variants) == ["link 0", "link 1"]
-    tallies = [series.statistics.total() for series in summary.series]
-    rows = [row.measured for one in whole.tables for row in one.rows]
-    for tally, m in zip(tallies, rows[:4], strict=True):
-        assert (m.frames_found, m.frames_sent, m.bits) == (tally.frames_found, tally.frames_sent, tally.bits)
-        assert (m.ber, m.gross_share) == (tally.ber, tally.gross_share)
-        assert m.rmse_m == pytest.approx(tally.rmse_m)
-        assert m.bias_m == pytest.approx(tally.bias_m)
-    both = tallies[1] + tallies[3]
-    assert rows[5].rmse_m == pytest.approx(both.rmse_m)
+    counted = [series.statistics for series in summary.series]
+    rows = [row.measured.statistics for one in whole.tables for row in one.rows]
+    assert rows == [*counted, counted[0] + counted[2], counted[1] + counted[3]]
     assert "link 1" in whole.to_html()
     # Twice the error in every frame.
     assert "rmse_m" in whole.tables[2].best()[0]
     head, lines = whole.tables[0].cells()
     assert "us/frame" not in head
+    assert "packets" in head
     assert len(lines) == 2

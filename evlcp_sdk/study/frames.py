@@ -1,0 +1,117 @@
+"""Decoded frames as far as they are scored: from a receiver's packets, or read back from `frames.csv`."""
+
+import csv
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.values import Frame, Packet
+
+__all__ = ["GivenFrame", "frames_of", "given", "read_frames"]
+
+
+@dataclass(frozen=True)
+class GivenFrame:
+    """What a receiver says of one frame.
+
+    Attributes:
+        transmitter: Number of the transmitter.
+        t_us: Start of the frame's first chip on the camera's clock, us.
+        symbols: Symbol of each cluster, cluster 0 first; -1 for one that is not given.
+        distance_m: Distance along the optical axis, m; NaN for none.
+        sigma_m: Its standard deviation, m; NaN for none.
+        filtered_m: The distance filtered over time, m; NaN for none.
+        x_px: Column of the bar's centre, px.
+        y_px: Row of the same, px.
+        echo_of: Transmitter whose reflection this is said to be; None for a frame of its own.
+    """
+
+    transmitter: int
+    t_us: float
+    symbols: tuple[int, ...]
+    distance_m: float
+    sigma_m: float
+    filtered_m: float
+    x_px: float
+    y_px: float
+    echo_of: int | None = None
+
+
+def given(frame: Frame) -> GivenFrame:
+    """What is scored of a frame."""
+    return GivenFrame(
+        transmitter=frame.transmitter,
+        t_us=frame.t_us,
+        symbols=tuple(frame.soft.symbols.tolist()),
+        distance_m=frame.range.distance_m,
+        sigma_m=frame.range.sigma_m,
+        filtered_m=math.nan if frame.filtered is None else frame.filtered.distance_m,
+        x_px=frame.x_px,
+        y_px=frame.y_px,
+    )
+
+
+def frames_of(packets: Iterable[Packet]) -> list[GivenFrame]:
+    """What is scored of packets, in order."""
+    return [given(frame) for packet in packets for frame in packet.frames]
+
+
+_NEEDED = ("transmitter", "t_us", "symbols", "distance_m", "x_px", "y_px")
+
+
+def read_frames(folder: Path | str) -> list[GivenFrame]:
+    """The rows of a result's `frames.csv`.
+
+    Needed are the columns transmitter, t_us, symbols, distance_m, x_px and y_px; distance_sigma_m,
+    distance_filtered_m and echo_of are read where they are there.
+
+    Raises:
+        InputError: It is not there, a column is missing, or a value is not a number; with file and line.
+    """
+    path = Path(folder) / "frames.csv"
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = csv.DictReader(file)
+            missing = [name for name in _NEEDED if name not in (rows.fieldnames or ())]
+            if missing:
+                raise InputError(f"{path}: without the columns {', '.join(missing)}")
+            return [_row(row, f"{path}:{rows.line_num}") for row in rows]
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+    except (UnicodeDecodeError, csv.Error) as fault:
+        raise InputError(f"{path}: not a CSV file: {fault}") from fault
+
+
+def _row(row: Mapping[str, str | None], place: str) -> GivenFrame:
+    def number(name: str, *, may_lack: bool = False) -> float:
+        text = row.get(name) or ""
+        if not text and may_lack:
+            return math.nan
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.inf
+        if not math.isfinite(value):
+            raise InputError(f"{place}: {name} = {text!r:.40}: expected a number")
+        return value
+
+    def whole(name: str, text: str) -> int:
+        try:
+            return int(text)
+        except ValueError:
+            raise InputError(f"{place}: {name} = {text!r:.40}: expected a whole number") from None
+
+    echo = row.get("echo_of")
+    return GivenFrame(
+        transmitter=whole("transmitter", row["transmitter"] or ""),
+        t_us=number("t_us"),
+        symbols=tuple(-1 if s == "-" else whole("symbols", s) for s in (row["symbols"] or "").split()),
+        distance_m=number("distance_m", may_lack=True),
+        sigma_m=number("distance_sigma_m", may_lack=True),
+        filtered_m=number("distance_filtered_m", may_lack=True),
+        x_px=number("x_px"),
+        y_px=number("y_px"),
+        echo_of=whole("echo_of", echo) if echo else None,
+    )

@@ -1,0 +1,278 @@
+"""The matcher: decoded frames and packets beside those that were sent.
+
+A frame is put beside the true one that started nearest in time, on the bar whose centre is nearest in the
+image. Every length follows from the link that the bar sends with.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.link.shared import differences
+from evlcp_sdk.sim.truth import SentBar, Truth
+from evlcp_sdk.study.frames import GivenFrame
+
+__all__ = ["BarFrames", "BarPackets", "Matched", "check_link", "frame_on_air_us", "match", "nearest_bar"]
+
+Floats = NDArray[np.float64]
+
+NEAREST_PX = 60.0
+"""How far from a bar's centre a frame may lie and still be the bar's: the image and the receiver's regions
+decide this, not the link."""
+
+TAIL_CHIPS = 2
+"""A frame was sent whole if the recording goes on for this long after it: its last events come late."""
+
+RECOVERY_CHIPS = 3
+"""How long after a cluster is uncovered the frames that start are still cut."""
+
+
+def _tail_us(packet: PacketFormat) -> float:
+    return TAIL_CHIPS * packet.chip_us
+
+
+def _near_us(packet: PacketFormat) -> float:
+    """How far from its true start a frame may start: half a pilot.
+
+    What is further off has not found the pilot. Frames without one follow each other by an info segment, so
+    that it is not more than half of that, either.
+    """
+    chips = packet.pilot_chips if packet.pilot_every == 1 else min(packet.pilot_chips, packet.info_chips)
+    return chips / 2 * packet.chip_us
+
+
+def frame_on_air_us(packet: PacketFormat) -> float:
+    """Time of a frame with its pilot, until its last events have come, us."""
+    return packet.frame_chips * packet.chip_us + _tail_us(packet)
+
+
+class _Placed(Protocol):
+    """What has a place in the image."""
+
+    @property
+    def x_px(self) -> float: ...
+
+    @property
+    def y_px(self) -> float: ...
+
+
+def apart_px(bar: SentBar, truth: Truth, t_us: float, placed: _Placed) -> float:
+    """How far from a bar's centre something lies at a time after the scene's start, px."""
+    x, y = (float(np.interp(t_us, truth.t_us, bar.centre_px[:, axis])) for axis in (0, 1))
+    return float(np.hypot(placed.x_px - x, placed.y_px - y))
+
+
+def nearest_bar(
+    bars: Sequence[SentBar], truth: Truth, t_us: float, placed: _Placed
+) -> tuple[int, float] | None:
+    """Number of the bar that is nearest in the image, and how far it is, px; None without bars."""
+    away = [apart_px(bar, truth, t_us, placed) for bar in bars]
+    nearest = min(range(len(bars)), key=away.__getitem__, default=None)
+    return None if nearest is None else (nearest, away[nearest])
+
+
+@dataclass(frozen=True, eq=False)
+class BarFrames:
+    """The frames that a bar sent whole while the recording ran.
+
+    Attributes:
+        bar: The bar.
+        start_us: Start of each after the scene's, us, float64 (n,).
+        symbols: What each says, int64 (n, clusters).
+        distance_m: Distance in the middle of its pilot, or of its info segment without one, m, float64 (n,).
+        hidden: Clusters that are hidden all the time, bool (n, clusters).
+        cut: Clusters that are hidden at any time, bool (n, clusters).
+    """
+
+    bar: SentBar
+    start_us: Floats
+    symbols: NDArray[np.int64]
+    distance_m: Floats
+    hidden: NDArray[np.bool_]
+    cut: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, bar: SentBar, truth: Truth, *, covers: bool) -> "BarFrames":
+        """Those of a bar.
+
+        Args:
+            bar: The bar.
+            truth: The truth that it is in.
+            covers: Mind what hides its clusters; a frame of which nothing is to be seen is then not sent.
+        """
+        packet = bar.link.packet
+        rate_hz = bar.rate_hz
+        numbers = range(packet.frames)
+        first = np.array([packet.frame_start_chip(f) for f in numbers], np.int64)
+        last = np.array([packet.frame_start_chip(f + 1) for f in numbers], np.int64)
+        packets = len(bar.symbols) if bar.sends_frames else 0
+        chip = (np.arange(packets)[:, None] * packet.packet_chips + first).ravel().astype(np.float64)
+        long = np.tile(last - first, packets)
+        start_us: Floats = (chip - bar.start_chip) / rate_hz * 1e6
+        end_us: Floats = start_us + long / rate_hz * 1e6
+        clusters = bar.link.codebook.clusters
+        hidden, cut = _hidden(bar, clusters, start_us, end_us) if covers else _nothing(len(chip), clusters)
+        sent = (start_us >= 0) & (end_us + _tail_us(packet) < truth.duration_us) & ~cut.all(1)
+        # Most of what ranging uses is the pilot, and its middle the time that the distance is of.
+        middle = (
+            np.where(long > packet.info_chips, packet.pilot_chips, packet.info_chips) / 2 * packet.chip_us
+        )
+        distance_m: Floats = np.interp(start_us[sent] + middle[sent], truth.t_us, bar.distance_m)
+        symbols = np.asarray(bar.symbols, np.int64).reshape(-1, clusters)[: len(chip)]
+        return cls(
+            bar,
+            start_us[sent],
+            symbols[sent],
+            distance_m,
+            hidden[sent],
+            cut[sent],
+        )
+
+    def number(self, t_us: float) -> int | None:
+        """The frame that started at a time after the scene's start; None if there is none."""
+        return _at(self.start_us, t_us, _near_us(self.bar.link.packet))
+
+
+def _at(starts_us: Floats, t_us: float, near_us: float) -> int | None:
+    if not len(starts_us):
+        return None
+    nearest = int(np.argmin(np.abs(starts_us - t_us)))
+    return nearest if abs(starts_us[nearest] - t_us) <= near_us else None
+
+
+def _nothing(frames: int, clusters: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    return np.zeros((frames, clusters), np.bool_), np.zeros((frames, clusters), np.bool_)
+
+
+def _hidden(
+    bar: SentBar, clusters: int, start_us: Floats, end_us: Floats
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Clusters hidden in the whole of each time, and those hidden in any part of it: bool (n, clusters)."""
+    whole, part = _nothing(len(start_us), clusters)
+    covered = list(bar.covered)
+    whole[:, covered] = part[:, covered] = True
+    recovery_us = RECOVERY_CHIPS * bar.link.packet.chip_us
+    for from_s, to_s, first, last in (*bar.cover_s, *((a, b, 0, clusters - 1) for a, b in bar.pole_s)):
+        behind = slice(int(first), int(last) + 1)
+        part[(start_us < to_s * 1e6 + recovery_us) & (end_us > from_s * 1e6), behind] = True
+        whole[(start_us >= from_s * 1e6) & (end_us <= to_s * 1e6), behind] = True
+    return whole, part
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """Decoded frames beside the sent ones.
+
+    Attributes:
+        bars: What the bars that are lit sent, in the truth's order.
+        pairs: For each of these bars, (decoded frame, number of the sent one), in the order of decoding.
+        unmatched: Decoded frames beside which there is no sent one, or one that was found before.
+        echoes: Decoded frames that are said to be reflections and were left out.
+    """
+
+    bars: tuple[BarFrames, ...]
+    pairs: tuple[list[tuple[GivenFrame, int]], ...]
+    unmatched: int
+    echoes: int
+
+
+def match(frames: Iterable[GivenFrame], truth: Truth, *, road: bool = True) -> Matched:
+    """Put each decoded frame beside the sent one.
+
+    A frame that is cut by an end of the recording, or by something that hides all of the bar, is neither
+    found nor unmatched.
+
+    Args:
+        frames: The decoded frames, in their order: of two beside the same sent one, the first is it.
+        truth: What was sent.
+        road: Mind what a road adds: leave out what is said to be a reflection, and mind what hides clusters.
+    """
+    bars = tuple(BarFrames.of(bar, truth, covers=road) for bar in truth.bars if bar.lit)
+    pairs: tuple[list[tuple[GivenFrame, int]], ...] = tuple([] for _ in bars)
+    found: tuple[set[int], ...] = tuple(set() for _ in bars)
+    unmatched = echoes = 0
+    for frame in frames:
+        if road and frame.echo_of is not None:
+            echoes += 1
+            continue
+        t_us = frame.t_us - truth.t0_us
+        nearest = nearest_bar([one.bar for one in bars], truth, t_us, frame)
+        if nearest is None:
+            unmatched += 1
+            continue
+        i, away_px = nearest
+        number = bars[i].number(t_us)
+        if away_px <= NEAREST_PX and number is not None and number not in found[i]:
+            found[i].add(number)
+            pairs[i].append((frame, number))
+        elif away_px > NEAREST_PX or not _is_cut(bars[i], truth, t_us, found[i], road=road):
+            unmatched += 1
+    return Matched(bars, pairs, unmatched, echoes)
+
+
+def _is_cut(sent: BarFrames, truth: Truth, t_us: float, found: set[int], *, road: bool) -> bool:
+    """Whether a frame of a bar at a time would be cut, and not one that was found before is nearest."""
+    packet = sent.bar.link.packet
+    tail_us, long_us = _tail_us(packet), frame_on_air_us(packet)
+    at_end = t_us < tail_us or t_us + long_us > truth.duration_us
+    dark = road and any(t_us < b * 1e6 + long_us and t_us + long_us > a * 1e6 for a, b in sent.bar.pole_s)
+    if not (at_end or dark):
+        return False
+    return not len(sent.start_us) or int(np.argmin(np.abs(sent.start_us - t_us))) not in found
+
+
+@dataclass(frozen=True, eq=False)
+class BarPackets:
+    """The packets that a bar sent, at least in part, while the recording ran.
+
+    Attributes:
+        bar: The bar.
+        start_us: Start of each after the scene's, us, float64 (n,).
+        whole: Those that were sent whole, bool (n,).
+        distance_m: Distance in the middle of each, m, float64 (n,).
+    """
+
+    bar: SentBar
+    start_us: Floats
+    whole: NDArray[np.bool_]
+    distance_m: Floats
+
+    @classmethod
+    def of(cls, bar: SentBar, truth: Truth) -> "BarPackets":
+        """Those of a bar."""
+        packet = bar.link.packet
+        period_us = packet.packet_chips / bar.rate_hz * 1e6
+        number = np.arange(len(bar.symbols), dtype=np.float64)
+        start_us: Floats = number * period_us - bar.start_chip / bar.rate_hz * 1e6
+        whole = (start_us >= 0) & (start_us + period_us + _tail_us(packet) < truth.duration_us)
+        distance_m: Floats = np.interp(start_us + period_us / 2, truth.t_us, bar.distance_m)
+        return cls(bar, start_us, whole, distance_m)
+
+    def number(self, t_us: float) -> int | None:
+        """The packet that started at a time after the scene's start; None if there is none."""
+        return _at(self.start_us, t_us, _near_us(self.bar.link.packet))
+
+
+def check_link(truth: Truth, link: Link, name: str, *, messages: bool = False) -> None:
+    """Refuse a link that a bar of the truth does not send with: a mismatch is an error, never a wrong answer.
+
+    Args:
+        truth: What was sent.
+        link: The link that it is received with.
+        name: What a fault names as its place, e.g. the recording.
+        messages: Also hold bars that send messages to the link's error correction.
+
+    Raises:
+        ConfigError: They differ; says where.
+    """
+    for i, bar in enumerate(truth.bars):
+        if bar.lit and bar.sends_frames:
+            found = differences(bar.link, link, messages=messages and bar.payload != "symbols")
+            if found:
+                raise ConfigError(f"{name}: bar {i} was sent with another link: {'; '.join(found)}")
