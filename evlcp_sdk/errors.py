@@ -5,12 +5,14 @@ EvlcpError                     1   anything the SDK raises on purpose
 ├── ConfigError                2   a configuration value; names its path, the value, what was expected
 │   ├── UnknownAlgorithmError  2   no algorithm of that role and id; suggests the nearest
 │   └── CodebookMismatchError  2   two ends that do not share one codebook
-├── PluginError                2   a plugin that cannot be loaded or fails, or two that claim one (role, id)
+├── PluginError                2   a plugin whose algorithm cannot be used or fails, or two of one (role, id)
 ├── InputError                 3   a file or stream that cannot be read
 │   └── RawFormatError         3   a RAW file's header or words; names byte offset, found, expected
 ├── InterruptedRunError      130   the user stopped the run; what was done until then is kept
 └── StreamError                1   events fed in an order or shape the receiver cannot take
 ```
+
+`PluginWarning` is a warning: a plugin is broken and left out, and all others go on.
 """
 
 from pathlib import Path
@@ -23,6 +25,7 @@ __all__ = [
     "InputError",
     "InterruptedRunError",
     "PluginError",
+    "PluginWarning",
     "RawFormatError",
     "StreamError",
     "UnknownAlgorithmError",
@@ -50,9 +53,13 @@ class CodebookMismatchError(ConfigError):
 
 
 class PluginError(EvlcpError):
-    """A plugin that cannot be loaded, one whose code fails, or two plugins that claim one (role, id)."""
+    """An algorithm of a broken plugin, one whose code fails, or one of two that claim one (role, id)."""
 
     exit_code = 2
+
+
+class PluginWarning(UserWarning):
+    """A plugin is broken and left out."""
 
 
 class InputError(EvlcpError):

@@ -134,7 +134,7 @@ def _of_recordings(
     urls: Sequence[str], texts: Sequence[str], link_file: str | None, overrides: Sequence[str], workers: int
 ) -> tuple[int, "Comparison"]:
     from evlcp_sdk.errors import InterruptedRunError
-    from evlcp_sdk.plugin.registry import Registry, installed_versions
+    from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.study.compare.run import truth_path
     from evlcp_sdk.study.compare.table import Comparison, total_of
     from evlcp_sdk.study.compare.variants import load_variants
@@ -172,7 +172,7 @@ def _of_recordings(
     if len(ordered) > 1:
         ordered.append(total_of(ordered))
     about = {v.name: v.to_dict() for v in variants}
-    return code, Comparison(about, tuple(ordered), tuple(notes), installed_versions(registry))
+    return code, Comparison(about, tuple(ordered), tuple(notes), registry.versions())
 
 
 def _run(job: Job, *, variants: "tuple[Variant, ...]") -> "Table":

@@ -1,9 +1,12 @@
 """Entry point of the `evlcp` command line."""
 
 import sys
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from evlcp_sdk.plugin.registry import Registry
 
 __all__ = ["main", "make_app"]
 
@@ -13,7 +16,8 @@ HELP = """Read data and distance from blinking LEDs with an event camera.
 [bold]evlcp receive REC.raw -o out[/] decodes yours.
 
 Exit codes: [bold]0[/] done (also when no transmitter was there), [bold]1[/] failed,
-[bold]2[/] usage or configuration, [bold]3[/] input that cannot be read, [bold]130[/] interrupted.
+[bold]2[/] usage, configuration or an algorithm that cannot be used, [bold]3[/] input that cannot be read,
+[bold]130[/] interrupted. A broken plugin is left out with a warning.
 """
 
 
@@ -44,6 +48,48 @@ def make_app() -> typer.Typer:
     return app
 
 
+def add_plugin_commands(app: typer.Typer, registry: "Registry") -> None:
+    """Add the commands of plugins; a plugin whose commands cannot be built, or are there, is left out."""
+    known = _names(app)
+    for plugin in registry.plugins("evlcp_register_commands"):
+        added = typer.Typer()
+        for _ in registry.ask("evlcp_register_commands", only=plugin, app=added):
+            reason = None
+            if registry.owner(plugin)[0] != "evlcp-sdk":
+                # Ours are built in any case, and tested.
+                reason = _fault_of(added, known)
+            if reason is not None:
+                registry.leave_out(plugin, reason)
+                continue
+            known |= _names(added)
+            app.registered_commands += added.registered_commands
+            app.registered_groups += added.registered_groups
+
+
+def _names(app: typer.Typer) -> set[str]:
+    """Names of its commands and groups, as they are called."""
+    named = {command.name or _called(command.callback) for command in app.registered_commands}
+    return named | {group.name or "" for group in app.registered_groups}
+
+
+def _called(function: Any) -> str:
+    return str(function.__name__).replace("_", "-")
+
+
+def _fault_of(added: typer.Typer, known: set[str]) -> str | None:
+    """What is wrong with the commands of a plugin, in one line."""
+    if not (added.registered_commands or added.registered_groups):
+        return None
+    # With a callback, a single command is built as one of a group, too.
+    added.callback()(lambda: None)
+    try:
+        typer.main.get_command(added)
+    except Exception as fault:
+        return f"its commands cannot be built: {type(fault).__name__}: {' '.join(str(fault).split())}"
+    twice = sorted(known & _names(added))
+    return f"has the command '{twice[0]}', which is there already" if twice else None
+
+
 def _version(show: bool) -> None:
     if show:
         from importlib.metadata import version
@@ -62,14 +108,31 @@ def _root(
 
 def main() -> None:
     """Run the command line; an SDK error becomes one line a fault on stderr and its exit code."""
+    import warnings
+
     from evlcp_sdk.cli._common import complain
-    from evlcp_sdk.errors import EvlcpError
+    from evlcp_sdk.errors import EvlcpError, PluginWarning
     from evlcp_sdk.plugin.registry import Registry
 
+    others = warnings.showwarning
+    said = set()
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if issubclass(category, PluginWarning):
+            # Every registry of the process finds it again.
+            if str(message) not in said:
+                complain(f"warning: {message}")
+            said.add(str(message))
+        else:
+            others(message, category, *place, **more)
+
     try:
-        app = make_app()
-        Registry.load().hook.evlcp_register_commands(app=app)
-        app()
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", PluginWarning)
+            warnings.showwarning = show
+            app = make_app()
+            add_plugin_commands(app, Registry.load())
+            app()
     except EvlcpError as fault:
         complain(str(fault))
         sys.exit(fault.exit_code)

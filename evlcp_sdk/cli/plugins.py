@@ -1,10 +1,15 @@
 """`evlcp plugins`."""
 
+from typing import TYPE_CHECKING, Any
+
 import typer
 
 from evlcp_sdk.cli._common import Json
 
-__all__ = ["register"]
+if TYPE_CHECKING:
+    from evlcp_sdk.plugin.registry import Registry
+
+__all__ = ["register", "table_of"]
 
 
 def register(app: typer.Typer) -> None:
@@ -13,29 +18,62 @@ def register(app: typer.Typer) -> None:
 
 
 def plugins(as_json: Json = False) -> None:
-    """List the installed algorithms: role, id, distribution, version, summary.
+    """List the roles with what they do, the installed algorithms of each, and broken plugins.
 
-    Select one by its id: [bold]evlcp receive REC.raw -o out --set modulation.id=wh8[/]
+    `*` marks the default of a role, `!` two algorithms of one id, of which none can be used. Select an
+    algorithm by its id: [bold]evlcp receive REC.raw -o out --set modulation.id=wh8[/]
+
+    Exit code 0, also when plugins are broken and left out.
     """
     import json
 
     from evlcp_sdk.plugin.registry import Registry
 
-    rows = [
-        {
-            "role": e.algorithm.role,
-            "id": e.algorithm.id,
-            "distribution": e.distribution,
-            "version": e.version,
-            "revision": e.algorithm.revision,
-            "summary": e.algorithm.summary,
-        }
-        for e in Registry.load().installed()
-    ]
-    if as_json:
-        typer.echo(json.dumps(rows, indent=2))
-        return
-    keys = ("role", "id", "distribution", "version", "summary")
-    widths = [max((len(str(r[k])) for r in rows), default=0) for k in keys]
-    for r in rows:
-        typer.echo("  ".join(f"{r[k]!s:<{w}}" for k, w in zip(keys, widths, strict=True)).rstrip())
+    table = table_of(Registry.load())
+    typer.echo(json.dumps(table, indent=2) if as_json else _text(table))
+
+
+def table_of(registry: "Registry") -> dict[str, list[dict[str, Any]]]:
+    """What is installed, as `--json` prints it: roles, algorithms, broken plugins."""
+    from collections import Counter
+
+    from evlcp_sdk.plugin.roles import ROLES
+
+    entries = registry.installed()
+    count = Counter((e.algorithm.role, e.algorithm.id) for e in entries)
+    return {
+        "roles": [{"role": r.name, "verb": r.verb, "default": r.default} for r in ROLES.values()],
+        "algorithms": [
+            {
+                "role": e.algorithm.role,
+                "id": e.algorithm.id,
+                "distribution": e.distribution,
+                "version": e.version,
+                "revision": e.algorithm.revision,
+                "summary": e.algorithm.summary,
+                "default": ROLES[e.algorithm.role].default == e.algorithm.id,
+                "conflict": count[e.algorithm.role, e.algorithm.id] > 1,
+            }
+            for e in entries
+        ],
+        "broken": [
+            {"plugin": b.plugin, "distribution": b.distribution, "reason": b.reason} for b in registry.broken
+        ],
+    }
+
+
+def _text(table: dict[str, list[dict[str, Any]]]) -> str:
+    keys = ("id", "distribution", "version", "summary")
+    widths = [max((len(str(a[k])) for a in table["algorithms"]), default=0) for k in keys]
+    lines = []
+    for role in table["roles"]:
+        lines.append(f"{role['role']}: {role['verb']}")
+        for a in table["algorithms"]:
+            if a["role"] == role["role"]:
+                mark = "!" if a["conflict"] else "*" if a["default"] else " "
+                cells = (f"{a[k]!s:<{w}}" for k, w in zip(keys, widths, strict=True))
+                lines.append(f"{mark} {'  '.join(cells)}".rstrip())
+    for b in table["broken"]:
+        owner = f" of {b['distribution']}" if b["distribution"] else ""
+        lines.append(f"broken: plugin {b['plugin']}{owner}: {b['reason']}")
+    return "\n".join(lines)

@@ -271,7 +271,7 @@ def decode(
 
     from evlcp_sdk.io.open import open_source
     from evlcp_sdk.io.sensor import check_sensor
-    from evlcp_sdk.plugin.registry import Registry, installed_versions
+    from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.results.outputs import ResultWriter, Status
     from evlcp_sdk.rx.receiver import Receiver
 
@@ -347,7 +347,7 @@ def decode(
                 },
                 counts=receiver.counts,
                 losses={kind: asdict(loss) for kind, loss in source.losses.items()},
-                versions=installed_versions(registry),
+                versions=registry.versions(),
                 error=error,
                 positions=positions.finish() if positions is not None else None,
             )

@@ -8,9 +8,9 @@ resolved table alone reproduces a result. See `docs/configuration.md`.
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, overload
 
 from pydantic import ValidationError
 
@@ -19,26 +19,23 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError, UnknownAlgorithmError
 from evlcp_sdk.link.blocks import BlockCoder, packet_bits
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
-from evlcp_sdk.plugin.hooks import ROLE_NAMES
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.roles import (
+    ROLES,
+    Decoding,
+    ErrorCorrection,
+    Modulation,
+    Pilots,
+    Ranging,
+    Separation,
+    Synchronization,
+    Tracking,
+)
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.specs import expected, nearest, parse_value, read_toml, shown, spec_model
 
-__all__ = ["DEFAULT_IDS", "Link", "load_link", "resolve"]
-
-DEFAULT_IDS = {
-    "pilots": "wh",
-    "modulation": "wh4x2",
-    "synchronization": "barker",
-    "separation": "wh-correlation",
-    "decoding": "wh-transform",
-    "ranging": "poc",
-    "tracking": "none",
-    "error-correction": "polar",
-}
-"""The algorithm of each role when the configuration names none."""
-
+__all__ = ["Link", "load_link", "resolve"]
 
 _SPECS: dict[str, type[Any]] = {
     "camera": CameraModel,
@@ -95,9 +92,58 @@ class Link:
         codes = f"{book.profile}, {book.clusters} clusters, {packet.frames} frames a packet"
         return f"Link({codes}, {self.air.chip_rate_hz:g} chips/s, digest {self.digest[:12]})"
 
+    @overload
+    def algorithm(self, role: Literal["pilots"]) -> Pilots: ...
+    @overload
+    def algorithm(self, role: Literal["modulation"]) -> Modulation: ...
+    @overload
+    def algorithm(self, role: Literal["synchronization"]) -> Synchronization: ...
+    @overload
+    def algorithm(self, role: Literal["separation"]) -> Separation: ...
+    @overload
+    def algorithm(self, role: Literal["decoding"]) -> Decoding: ...
+    @overload
+    def algorithm(self, role: Literal["ranging"]) -> Ranging: ...
+    @overload
+    def algorithm(self, role: Literal["tracking"]) -> Tracking: ...
+    @overload
+    def algorithm(self, role: Literal["error-correction"]) -> ErrorCorrection: ...
+    @overload
+    def algorithm(self, role: str) -> Any: ...
     def algorithm(self, role: str) -> Any:
         """The algorithm of a role, e.g. `link.algorithm("ranging")`."""
         return self.algorithms[role]
+
+    def with_algorithm(
+        self, role: str, algorithm: Any, *, id: str | None = None, revision: int = 0
+    ) -> "Link":
+        """The same link with another algorithm, installed or not.
+
+        Args:
+            role: The role that it fills.
+            algorithm: The algorithm, with its parameters.
+            id: What it is called in the table and in messages; None for the name of its class.
+            revision: Its revision.
+
+        Raises:
+            ConfigError: There is no such role, or the pilots have fewer codes than the bar has clusters.
+
+        >>> link = load_link()
+        >>> link.with_algorithm("ranging", link.algorithm("ranging"), id="mine").table["ranging"]["id"]
+        'mine'
+        """
+        if role not in ROLES:
+            raise ConfigError(f"no role named '{role}'{nearest(role, list(ROLES))}")
+        parts = self._parts() | {role: algorithm}
+        described = is_dataclass(algorithm) and not isinstance(algorithm, type)
+        parameters = asdict(algorithm) if described else {}
+        keys = {"id": id or type(algorithm).__name__} | json.loads(json.dumps(parameters, default=str))
+        return _assembled(parts, {**self.table, role: keys}, {**self.revisions, role: revision})
+
+    def with_air(self, **changes: Any) -> "Link":
+        """The same link with other values on air, e.g. `link.with_air(pilot_every=4)`."""
+        air = replace(self.air, **changes)
+        return _assembled(self._parts() | {"air": air}, {**self.table, "air": asdict(air)}, self.revisions)
 
     def block_coder(self) -> BlockCoder:
         """How packets carry blocks of messages.
@@ -107,6 +153,9 @@ class Link:
         """
         code = self.algorithm("error-correction").compile(packet_bits(self.codebook, self.packet))
         return BlockCoder(self.codebook, self.packet, code)
+
+    def _parts(self) -> dict[str, Any]:
+        return {section: getattr(self, section) for section in _SPECS} | dict(self.algorithms)
 
 
 def load_link(
@@ -171,7 +220,7 @@ def resolve(
         name = section if key is None else f"{section}.{key}"
         faults.append(f"{where}: {name}{text}" if where else f"{name}{text}")
 
-    known = [*_SPECS, *ROLE_NAMES]
+    known = [*_SPECS, *ROLES]
     for section, keys in table.items():
         if section not in known:
             from_set = (
@@ -195,7 +244,7 @@ def resolve(
         if section in _SPECS:
             cls = _SPECS[section]
         else:
-            head["id"] = name = keys.pop("id", DEFAULT_IDS[section])
+            head["id"] = name = keys.pop("id", ROLES[section].default)
             if not isinstance(name, str):
                 fault(section, "id", f" = {name!r}: expected a string")
                 continue
@@ -225,24 +274,26 @@ def resolve(
     if faults:
         raise ConfigError("\n".join(str(f) for f in faults))
 
-    bar, air = built["bar"], built["air"]
-    pilots, modulation = built["pilots"], built["modulation"]
+    return _assembled(built, resolved, revisions)
+
+
+def _assembled(
+    parts: Mapping[str, Any], table: Mapping[str, Mapping[str, Any]], revisions: Mapping[str, int]
+) -> Link:
+    """The link of checked parts, and the table that describes them."""
+    bar, air = parts["bar"], parts["air"]
+    pilots, modulation = parts["pilots"], parts["modulation"]
     codebook = Codebook(
-        resolved["modulation"]["id"], pilots.preamble(), pilots.codes(bar.clusters), modulation.codewords()
+        table["modulation"]["id"], pilots.preamble(), pilots.codes(bar.clusters), modulation.codewords()
     )
     return Link(
-        camera=built["camera"],
-        bar=bar,
-        air=air,
-        regions=built["regions"],
-        position=built["position"],
-        messages=built["messages"],
-        algorithms={role: built[role] for role in ROLE_NAMES},
+        **{section: parts[section] for section in _SPECS},
+        algorithms={role: parts[role] for role in ROLES},
         revisions=revisions,
         codebook=codebook,
         packet=PacketFormat.of(codebook, air.frames_per_packet, air.chip_rate_hz, air.pilot_every),
-        table=resolved,
-        digest=_digest(resolved, codebook, revisions),
+        table=table,
+        digest=_digest(table, codebook, revisions),
     )
 
 

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.plugin.hooks import ROLE_NAMES
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.specs import spec_model, toml_value
 
 __all__ = ["to_toml"]
@@ -43,8 +43,9 @@ def _toml_lines(link: Link, registry: Registry) -> Iterator[str]:
         schema = spec_model(type(thing)).model_json_schema()["properties"]
         yield f"# {_first_line(type(thing))}"
         yield f"[{section}]"
-        if section in ROLE_NAMES:
-            others = [e.algorithm.id for e in registry.installed(section) if e.algorithm.id != values["id"]]
+        if section in ROLES:
+            ids = dict.fromkeys(e.algorithm.id for e in registry.installed(section))
+            others = [id for id in ids if id != values["id"]]
             yield f'id = "{values["id"]}"' + (f"  # or {', '.join(others)}" if others else "")
         for key, value in values.items():
             if key in schema:

@@ -15,22 +15,10 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.io import EventSource
 
-__all__ = ["ENTRY_POINT_GROUP", "ROLE_NAMES", "Algorithm", "hookimpl", "hookspec"]
+__all__ = ["ENTRY_POINT_GROUP", "Algorithm", "hookimpl", "hookspec"]
 
 ENTRY_POINT_GROUP = "evlcp"
 """Entry-point group, and pluggy project name."""
-
-ROLE_NAMES = (
-    "pilots",
-    "modulation",
-    "synchronization",
-    "separation",
-    "decoding",
-    "ranging",
-    "tracking",
-    "error-correction",
-)
-"""The roles that algorithms fill, in the order of the signal's flow."""
 
 hookspec = pluggy.HookspecMarker(ENTRY_POINT_GROUP)
 hookimpl = pluggy.HookimplMarker(ENTRY_POINT_GROUP)
@@ -41,7 +29,7 @@ class Algorithm:
     """Where one algorithm is found, without importing it.
 
     Attributes:
-        role: The role it fills, one of `ROLE_NAMES`; its abstract class is `plugin.roles.ROLES[role]`.
+        role: The role it fills, a name of `plugin.roles.ROLES`.
         id: The name by which a configuration selects it.
         target: `module:Class` of its description.
         revision: Raised whenever its results may change; part of every result's digest.

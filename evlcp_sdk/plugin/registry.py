@@ -1,20 +1,27 @@
-"""The plugin manager: finds plugins by entry point, and algorithms by (role, id)."""
+"""The plugin manager: finds plugins by entry point, and algorithms by (role, id).
+
+A plugin that fails is left out with all its hooks, and shown: as a `PluginWarning` when that is found, by
+`Registry.broken`, and in the message to whoever asks for an algorithm that may be its own. All others go on.
+"""
 
 import difflib
 import importlib
+import multiprocessing
 import platform
-from collections.abc import Callable
+import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.metadata import entry_points, version
+from importlib.metadata import Distribution, EntryPoint, entry_points, version
 from typing import Any
 
 import pluggy
 
-from evlcp_sdk.errors import PluginError, UnknownAlgorithmError
+from evlcp_sdk.errors import PluginError, PluginWarning, UnknownAlgorithmError
 from evlcp_sdk.plugin import hooks as hookspecs
-from evlcp_sdk.plugin.hooks import ENTRY_POINT_GROUP, ROLE_NAMES, Algorithm
+from evlcp_sdk.plugin.hooks import ENTRY_POINT_GROUP, Algorithm
+from evlcp_sdk.plugin.roles import ROLES
 
-__all__ = ["Installed", "Registry", "installed_versions"]
+__all__ = ["Broken", "Installed", "Registry"]
 
 
 @dataclass(frozen=True)
@@ -26,70 +33,138 @@ class Installed:
     version: str
 
 
+@dataclass(frozen=True)
+class Broken:
+    """A plugin that is left out.
+
+    Attributes:
+        plugin: Its name, that of its entry point.
+        distribution: What brought it, with its version.
+        reason: What is wrong, in one line.
+        algorithms: (role, id) of its algorithms, as far as it could be asked.
+    """
+
+    plugin: str
+    distribution: str
+    reason: str
+    algorithms: frozenset[tuple[str, str]] = frozenset()
+
+    def __str__(self) -> str:
+        owner = f" of {self.distribution}" if self.distribution else ""
+        return f"plugin {self.plugin}{owner} is broken and left out: {self.reason}"
+
+
 class Registry:
     """The installed plugins; made by `Registry.load()`, passed to whoever needs it.
 
+    Algorithms are collected when the first is asked for.
+
     Args:
-        manager: A pluggy manager with its plugins registered.
+        plugins: Objects with hooks, e.g. a probe.
 
     Raises:
-        PluginError: Two algorithms with one (role, id), a record for an unknown role, or a hook that the
-            SDK does not know.
+        PluginError: Such an object has a hook that the SDK does not have.
     """
 
-    def __init__(self, manager: pluggy.PluginManager) -> None:
-        self.manager = manager
-        try:
-            manager.check_pending()
-        except pluggy.PluginValidationError as fault:
-            raise PluginError(f"plugin hook not known to this SDK: {fault}") from fault
-        self._installed = _collect(manager)
+    def __init__(self, *plugins: object) -> None:
+        self._manager = pluggy.PluginManager(ENTRY_POINT_GROUP)
+        self._manager.add_hookspecs(hookspecs)
+        self._owners: dict[str, Distribution | None] = {}
+        self._broken: list[Broken] = []
+        self._collected: dict[tuple[str, str], list[Installed]] | None = None
+        for plugin in plugins:
+            name = getattr(plugin, "__name__", type(plugin).__name__)
+            fault = self._join(plugin, f"{name}-{id(plugin):x}", None)
+            if fault is not None:
+                raise PluginError(f"plugin {name}: {fault}")
 
     @classmethod
     def load(cls, *plugins: object) -> "Registry":
         """Find all installed plugins; `plugins` are objects with hooks to add, e.g. a probe.
 
         Raises:
-            PluginError: A plugin fails to import, or two distributions have entry points of one name.
+            PluginError: Such an object has a hook that the SDK does not have.
         """
-        _expect_distinct_names()
-        manager = pluggy.PluginManager(ENTRY_POINT_GROUP)
-        manager.add_hookspecs(hookspecs)
-        try:
-            manager.load_setuptools_entrypoints(ENTRY_POINT_GROUP)
-        except Exception as fault:
-            raise PluginError(f"{_failing_plugin()} fails to load: {fault}") from fault
-        for plugin in plugins:
-            name = getattr(plugin, "__name__", type(plugin).__name__)
-            try:
-                manager.register(plugin, name=f"{name}-{id(plugin):x}")
-            except pluggy.PluginValidationError as fault:
-                raise PluginError(f"plugin {name} fails to load: {fault}") from fault
-        return cls(manager)
+        registry = cls(*plugins)
+        for entry in entry_points(group=ENTRY_POINT_GROUP):
+            registry._load(entry)
+        return registry
 
     @property
     def hook(self) -> pluggy.HookRelay:
         """The hooks, to call."""
-        return self.manager.hook
+        return self._manager.hook
+
+    @property
+    def broken(self) -> tuple[Broken, ...]:
+        """The plugins that are left out: those that failed so far."""
+        return tuple(self._broken)
+
+    def plugins(self, hook: str) -> list[str]:
+        """Names of the plugins that have a hook."""
+        return [impl.plugin_name for impl in getattr(self.hook, hook).get_hookimpls()]
+
+    def ask(self, hook: str, *, only: str | None = None, **given: Any) -> list[tuple[str, Any]]:
+        """Call a hook of every plugin: (name of the plugin, what it gave), what it yielded as a list.
+
+        A plugin that fails is left out from then on, with all its hooks.
+
+        Args:
+            hook: Name of the hook.
+            only: The only plugin to ask; None for all.
+            given: The hook's arguments.
+        """
+        answers = []
+        for impl in list(getattr(self.hook, hook).get_hookimpls()):
+            if only not in (None, impl.plugin_name):
+                continue
+            try:
+                answer = impl.function(*(given[name] for name in impl.argnames))
+                if isinstance(answer, Iterator):
+                    answer = list(answer)
+            except Exception as fault:
+                self.leave_out(impl.plugin_name, f"{hook}() fails: {_line(fault)}")
+                continue
+            answers.append((impl.plugin_name, answer))
+        return answers
+
+    def leave_out(self, plugin: str, reason: str) -> None:
+        """Leave out a plugin whose answer to a hook cannot be used.
+
+        Args:
+            plugin: Its name, as `ask` gave it.
+            reason: What is wrong, in one line.
+        """
+        found = self._manager.unregister(name=plugin)
+        self._note(plugin, reason, _known(found))
 
     def installed(self, role: str | None = None) -> list[Installed]:
-        """The algorithms, by role and id; of one role if given."""
-        return [entry for (r, _), entry in sorted(self._installed.items()) if role in (None, r)]
+        """The algorithms, by role and id; of one role if given. Two of one role and id are both there."""
+        found = sorted(self._algorithms().items())
+        return [entry for (r, _), entries in found if role in (None, r) for entry in entries]
 
     def find(self, role: str, id: str) -> Installed:
         """The algorithm of a role and id.
 
         Raises:
             UnknownAlgorithmError: None is installed; the message suggests the nearest name.
+            PluginError: Two are, or it is one of a broken plugin.
         """
-        entry = self._installed.get((role, id))
-        if entry is not None:
-            return entry
+        entries = self._algorithms().get((role, id), [])
+        if len(entries) == 1:
+            return entries[0]
+        if entries:
+            owners = ", ".join(f"one of {entry.distribution}" for entry in entries)
+            raise PluginError(f"two {role} algorithms named '{id}': {owners}; uninstall one")
+        for broken in self._broken:
+            if (role, id) in broken.algorithms:
+                raise PluginError(f"{role} algorithm '{id}': {broken}")
         names = [e.algorithm.id for e in self.installed(role)]
         near = difflib.get_close_matches(id, names, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
+        lost = "".join(f"; {broken}" for broken in self._broken if not broken.algorithms)
         raise UnknownAlgorithmError(
-            f"no {role} algorithm named '{id}'{hint} (installed: {', '.join(names) or 'none'})"
+            f"no {role} algorithm named '{id}'{hint} (installed: {', '.join(names) or 'none'}){lost}"
         )
 
     def load_class(self, role: str, id: str) -> type[Any]:
@@ -97,86 +172,114 @@ class Registry:
 
         Raises:
             UnknownAlgorithmError: None is installed.
-            PluginError: Its target cannot be imported, or does not fill the role.
+            PluginError: Its target cannot be imported, or does not fill the role; or as `find`.
         """
-        from evlcp_sdk.plugin.roles import ROLES
-
         entry = self.find(role, id)
-        module, _, name = entry.algorithm.target.partition(":")
+        target = entry.algorithm.target
+        who = f"{role} algorithm '{id}' of {entry.distribution}"
+        module, _, name = target.partition(":")
         try:
             found: type[Any] = getattr(importlib.import_module(module), name)
-        except (ImportError, AttributeError, ValueError) as fault:
-            raise PluginError(
-                f"{role} algorithm '{id}' of {entry.distribution}: cannot import"
-                f" {entry.algorithm.target}: {fault}"
-            ) from fault
-        if not (isinstance(found, type) and issubclass(found, ROLES[role])):
-            raise PluginError(
-                f"{role} algorithm '{id}' of {entry.distribution}: {entry.algorithm.target}"
-                f" is no {ROLES[role].__name__}"
-            )
+        except (Exception, SystemExit) as fault:
+            raise PluginError(f"{who}: cannot import {target}: {_line(fault)}") from fault
+        abstract = ROLES[role].abstract
+        if not (isinstance(found, type) and issubclass(found, abstract)):
+            raise PluginError(f"{who}: {target} is no {abstract.__name__}")
         return found
 
+    def versions(self) -> dict[str, str]:
+        """Versions of Python, the SDK, what it computes with, and all distributions that bring algorithms."""
+        found = {"python": platform.python_version()}
+        found |= {name: version(name) for name in ("evlcp-sdk", "numpy", "scipy", "numba")}
+        found |= {entry.distribution: entry.version for entry in self.installed()}
+        return found
 
-def installed_versions(registry: Registry) -> dict[str, str]:
-    """Versions of Python, the SDK, what it computes with, and every distribution that brings an algorithm."""
-    found = {"python": platform.python_version()}
-    found |= {name: version(name) for name in ("evlcp-sdk", "numpy", "scipy", "numba")}
-    found |= {entry.distribution: entry.version for entry in registry.installed()}
-    return found
+    def owner(self, plugin: str) -> tuple[str, str]:
+        """Name and version of the distribution that brought a plugin; of one without, its name and "-"."""
+        found = self._owners.get(plugin)
+        return (plugin, "-") if found is None else (found.name, found.version)
 
-
-def _expect_distinct_names() -> None:
-    """Refuse two entry points of one name: the plugin manager would pass over the second in silence."""
-    owners: dict[str, str] = {}
-    for entry in entry_points(group=ENTRY_POINT_GROUP):
-        name = entry.dist.name if entry.dist else "an unknown distribution"
-        first = owners.setdefault(entry.name, name)
-        if first != name:
-            raise PluginError(
-                f"two plugins with an entry point named '{entry.name}': one of {first}, one of {name};"
-                f" rename or uninstall one"
-            )
-
-
-def _failing_plugin() -> str:
-    for entry in entry_points(group=ENTRY_POINT_GROUP):
+    def _load(self, entry: EntryPoint) -> None:
+        name = entry.name
+        if name in self._owners:
+            # Another distribution's entry point has the same name.
+            name = f"{entry.name} ({entry.value})"
         try:
-            entry.load()
-        except Exception:
-            return f"plugin {entry.name} of {entry.dist.name if entry.dist else 'an unknown distribution'}"
-    return f"a plugin of group '{ENTRY_POINT_GROUP}'"
+            plugin = entry.load()
+        except (Exception, SystemExit) as fault:
+            self._owners[name] = entry.dist
+            self._note(name, f"cannot be imported: {_line(fault)}", frozenset())
+            return
+        fault_text = self._join(plugin, name, entry.dist)
+        if fault_text is not None:
+            self._note(name, fault_text, _known(plugin))
+
+    def _join(self, plugin: object, name: str, owner: Distribution | None) -> str | None:
+        """Register a plugin; what is wrong with its hooks, if anything is."""
+        self._owners[name] = owner
+        try:
+            self._manager.register(plugin, name=name)
+        except pluggy.PluginValidationError as fault:
+            # Those of its hooks that came before the wrong one are in.
+            self._manager.unregister(name=name)
+            return " ".join(str(fault.args[0]).split())
+        except ValueError:
+            return "it is registered twice"
+        for hook in self._manager.get_hookcallers(plugin) or []:
+            if not hook.has_spec():
+                self._manager.unregister(name=name)
+                return f"has the hook '{hook.name}', which this SDK does not have"
+        return None
+
+    def _note(self, name: str, reason: str, algorithms: frozenset[tuple[str, str]]) -> None:
+        owner = self._owners.get(name)
+        distribution = "" if owner is None else f"{owner.name} {owner.version}"
+        broken = Broken(name, distribution, reason, algorithms)
+        self._broken.append(broken)
+        # Worker processes would only say it again.
+        if multiprocessing.parent_process() is None:
+            warnings.warn(str(broken), PluginWarning, stacklevel=2)
+
+    def _algorithms(self) -> dict[tuple[str, str], list[Installed]]:
+        if self._collected is None:
+            self._collected = {}
+            for plugin, records in self.ask("evlcp_algorithms"):
+                fault = _records_fault(records)
+                if fault is not None:
+                    self.leave_out(plugin, fault)
+                    continue
+                for record in records:
+                    entry = Installed(record, *self.owner(plugin))
+                    self._collected.setdefault((record.role, record.id), []).append(entry)
+        return self._collected
 
 
-def _collect(manager: pluggy.PluginManager) -> dict[tuple[str, str], Installed]:
-    distributions: dict[int, tuple[str, str]] = {
-        id(plugin): (dist.project_name, dist.version) for plugin, dist in manager.list_plugin_distinfo()
-    }
-    found: dict[tuple[str, str], Installed] = {}
-    for impl in manager.hook.evlcp_algorithms.get_hookimpls():
-        name, version = distributions.get(id(impl.plugin), (impl.plugin_name, "-"))
-        for record in _records(impl.function, name):
-            key = (record.role, record.id)
-            if record.role not in ROLE_NAMES:
-                raise PluginError(
-                    f"plugin {name}: algorithm '{record.id}' has role '{record.role}',"
-                    f" expected one of {', '.join(ROLE_NAMES)}"
-                )
-            if key in found:
-                raise PluginError(
-                    f"two {record.role} algorithms named '{record.id}':"
-                    f" one of {found[key].distribution}, one of {name}; uninstall one"
-                )
-            found[key] = Installed(record, name, version)
-    return found
+def _line(fault: BaseException) -> str:
+    """An exception in one line."""
+    text = " ".join(str(fault).split())
+    return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
 
 
-def _records(algorithms: Callable[[], Any], name: str) -> list[Algorithm]:
-    try:
-        records = list(algorithms())
-    except Exception as fault:
-        raise PluginError(f"plugin {name}: evlcp_algorithms() fails: {fault}") from fault
+def _records_fault(records: Any) -> str | None:
+    """What is wrong with what `evlcp_algorithms` gave."""
+    if not isinstance(records, list | tuple):
+        return f"evlcp_algorithms() gave {type(records).__name__}, expected records of Algorithm"
+    seen = set()
     for record in records:
         if not isinstance(record, Algorithm):
-            raise PluginError(f"plugin {name}: evlcp_algorithms() gave {record!r}, expected an Algorithm")
-    return records
+            return f"evlcp_algorithms() gave {record!r}, expected an Algorithm"
+        if record.role not in ROLES:
+            return f"algorithm '{record.id}' has role '{record.role}', expected one of {', '.join(ROLES)}"
+        if (record.role, record.id) in seen:
+            return f"evlcp_algorithms() gave two {record.role} algorithms named '{record.id}'"
+        seen.add((record.role, record.id))
+    return None
+
+
+def _known(plugin: Any) -> frozenset[tuple[str, str]]:
+    """The algorithms of a broken plugin, as far as it can be asked."""
+    try:
+        records = list(plugin.evlcp_algorithms())
+    except Exception:
+        return frozenset()
+    return frozenset((r.role, r.id) for r in records if isinstance(r, Algorithm))

@@ -6,19 +6,24 @@ plain, picklable and JSON-round-trippable. `compile` precomputes and returns a p
 synchronization keeps state, and that state is explicit.
 """
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    # Commands that only list the roles need no NumPy.
+    import numpy as np
+    from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.scene.bar import BarLayout
-from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols, SyncLock
+    from evlcp_sdk.air.codebook import Codebook
+    from evlcp_sdk.air.frames import PacketFormat
+    from evlcp_sdk.scene.bar import BarLayout
+    from evlcp_sdk.scene.camera import CameraModel
+    from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols, SyncLock
 
 __all__ = [
     "ROLES",
@@ -32,6 +37,7 @@ __all__ = [
     "Modulation",
     "Pilots",
     "Ranging",
+    "Role",
     "Separate",
     "Separation",
     "Synchronization",
@@ -40,14 +46,26 @@ __all__ = [
     "Tracking",
 ]
 
-Separate = Callable[[NDArray[np.int16]], PresenceMap]
-"""Chip-aligned polarity sums of a pilot, int16 (chips, height, width) -> presence."""
 
-Decode = Callable[[PresenceMap, NDArray[np.int16]], SoftSymbols]
-"""Presence and a frame's polarity sums, pilot then info, int16 (chips, height, width) -> soft symbols."""
+class Separate(Protocol):
+    """What `Separation.compile` returns."""
 
-Measure = Callable[[FrameView], Range]
-"""A decoded frame's image -> distance."""
+    def __call__(self, pilot: NDArray[np.int16], /) -> PresenceMap:
+        """Chip-aligned polarity sums of a pilot, int16 (chips, height, width) -> presence."""
+
+
+class Decode(Protocol):
+    """What `Decoding.compile` returns."""
+
+    def __call__(self, presence: PresenceMap, sums: NDArray[np.int16], /) -> SoftSymbols:
+        """Presence and a frame's polarity sums, pilot then info, int16 (chips, height, width) -> symbols."""
+
+
+class Measure(Protocol):
+    """What `Ranging.compile` returns."""
+
+    def __call__(self, view: FrameView, /) -> Range:
+        """A decoded frame's image -> distance."""
 
 
 class Pilots(ABC):
@@ -224,14 +242,36 @@ class ErrorCorrection(ABC):
         """
 
 
-ROLES: dict[str, type[ABC]] = {
-    "pilots": Pilots,
-    "modulation": Modulation,
-    "synchronization": Synchronization,
-    "separation": Separation,
-    "decoding": Decoding,
-    "ranging": Ranging,
-    "tracking": Tracking,
-    "error-correction": ErrorCorrection,
-}
-"""The abstract class of each role name."""
+@dataclass(frozen=True)
+class Role:
+    """A step of the link that exactly one algorithm does.
+
+    Attributes:
+        name: The table that selects the algorithm in `link.toml`.
+        abstract: The class that its algorithms derive from.
+        default: Id of the algorithm where the link names none.
+        verb: What it does, in one line.
+    """
+
+    name: str
+    abstract: type[ABC]
+    default: str
+    verb: str
+
+
+ROLES: Mapping[str, Role] = MappingProxyType(
+    {
+        role.name: role
+        for role in (
+            Role("pilots", Pilots, "wh", "codes that find time and tell clusters apart"),
+            Role("modulation", Modulation, "wh4x2", "bits of a symbol <-> its codeword"),
+            Role("synchronization", Synchronization, "barker", "a region's events -> packet timing"),
+            Role("separation", Separation, "wh-correlation", "a pilot's image -> where each cluster is"),
+            Role("decoding", Decoding, "wh-transform", "a frame's image -> soft symbols"),
+            Role("ranging", Ranging, "poc", "a decoded frame's image -> distance"),
+            Role("tracking", Tracking, "none", "distance and image position over time"),
+            Role("error-correction", ErrorCorrection, "polar", "message bits <-> coded bits, soft input"),
+        )
+    }
+)
+"""Every role by its name, in the order of the signal's flow."""

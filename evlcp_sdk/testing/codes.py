@@ -5,8 +5,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import bits_of_symbols, symbols_of_bits
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.testing.exercises import link_of
+from evlcp_sdk.testing.exercises import base_link_of, link_of
 from evlcp_sdk.testing.law import InapplicableLawError, Law, Subject, expect
 from evlcp_sdk.testing.views import ideal_presence, ideal_sums
 
@@ -83,10 +82,11 @@ def codewords_come_back(subject: Subject) -> None:
     """Hold the law."""
     link = link_of(subject)
     book = link.codebook
-    decode = load_link().algorithm("decoding").compile(book)
+    decode = link.algorithm("decoding").compile(book)
     presence = ideal_presence(book.clusters)
-    every = np.resize(np.arange(len(book.codewords)), (-(-len(book.codewords) // 16) * 16,))
-    for symbols in every.reshape(-1, 16):
+    words, k = len(book.codewords), book.clusters
+    for first in range(0, words, k):
+        symbols = (first + np.arange(k)) % words
         bits = bits_of_symbols(symbols[None], book.bits_per_symbol)
         back = symbols_of_bits(bits, book.bits_per_symbol, book.clusters)[0]
         expect((back == symbols).all(), f"symbols {symbols.tolist()} from their bits, got {back.tolist()}")
@@ -99,7 +99,7 @@ def codewords_come_back(subject: Subject) -> None:
 
 def default_clusters(subject: Subject) -> None:
     """Hold the law."""
-    link = load_link()
+    link = base_link_of(subject)
     try:
         subject.algorithm.codes(link.bar.clusters)
     except ConfigError as few:
@@ -123,7 +123,7 @@ PILOTS = (
     Law("shapes", "int8 codes of -1 and +1, one a cluster", pilots_shapes),
     Law("pilots-apart", "any two pilots differ in 3 of 8 values at the least", pilots_apart),
     Law("sharp-preamble", "the preamble's sidelobes are a quarter of its peak at the most", sharp_preamble),
-    Law("tells-apart", "the default separation tells the clusters of an ideal image apart", default_clusters),
+    Law("tells-apart", "the link's separation tells the clusters of an ideal image apart", default_clusters),
 )
 """Laws of pilots."""
 

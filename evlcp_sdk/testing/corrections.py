@@ -9,8 +9,8 @@ from evlcp_sdk.air.frames import symbols_of_bits
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Corrected
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.testing.exercises import coded_bits_of, link_of
-from evlcp_sdk.testing.law import InapplicableLawError, Law, Subject, compiled, expect
+from evlcp_sdk.testing.exercises import compiled_subject, expect_column, link_of
+from evlcp_sdk.testing.law import InapplicableLawError, Law, Subject, expect
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events
 
 __all__ = ["ERROR_CORRECTION"]
@@ -27,8 +27,8 @@ _MOST_RATE = 0.9
 
 
 def _codes(subject: Subject) -> list[Any]:
-    """The code of each length that is not refused; that of the default packet among them."""
-    found = [compiled(lambda: subject.algorithm.compile(coded_bits_of(link_of(subject))))]
+    """The code of each length that is not refused; that of the link's packet among them."""
+    found = [compiled_subject(subject)]
     for n in _LENGTHS:
         try:
             found.append(subject.algorithm.compile(n))
@@ -139,7 +139,7 @@ def errors_found(subject: Subject) -> None:
 
 def corrects(subject: Subject) -> None:
     """Hold the law."""
-    code = compiled(lambda: subject.algorithm.compile(coded_bits_of(link_of(subject))))
+    code = compiled_subject(subject)
     if code.message_bits > _MOST_RATE * code.coded_bits:
         raise InapplicableLawError(
             f"{code.message_bits} message bits of {code.coded_bits}: no room to correct anything"
@@ -166,7 +166,8 @@ def corrects(subject: Subject) -> None:
 def clean_link(subject: Subject) -> None:
     """Hold the law."""
     link = link_of(subject)
-    code = compiled(lambda: subject.algorithm.compile(coded_bits_of(link)))
+    expect_column(link)
+    code = compiled_subject(subject)
     sent = [_message(code, seed) for seed in range(3)]
     book = link.codebook
     symbols = np.stack(
@@ -192,7 +193,7 @@ ERROR_CORRECTION = (
     Law("corrects", "one bit in 100 wrong, or one in 50 not received, is put right and counted", corrects),
     Law(
         "clean-link",
-        "messages pass through a clean recording, sent by packets of the default link",
+        "messages pass through a clean recording, sent by packets of the link",
         clean_link,
     ),
 )

@@ -1,19 +1,32 @@
 """One plain task a role: what the laws of form give an algorithm to do."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.link.blocks import packet_bits
 from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, compiled
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.testing.views import ideal_presence, ideal_sums, ideal_view
 
-__all__ = ["Exercise", "coded_bits_of", "exercise_of", "filters_of", "link_of", "symbols_of"]
+__all__ = [
+    "Exercise",
+    "arguments_of",
+    "base_link_of",
+    "compiled_subject",
+    "exercise_of",
+    "expect_column",
+    "filters_of",
+    "link_of",
+    "subject_of",
+    "symbols_of",
+]
 
 
 @dataclass(frozen=True)
@@ -29,27 +42,80 @@ class Exercise:
     prepare: Callable[[], Callable[[tuple[Any, ...]], Any]]
 
 
-def link_of(subject: Subject, overrides: Sequence[str] = ()) -> Link:
-    """The default link, but for what is overridden, with the subject in its role.
+def subject_of(role: str, algorithm: Any, link: Link | None = None) -> Subject:
+    """An algorithm under test, under the id by which a configuration selects it, if any does.
+
+    Args:
+        role: The role that it fills.
+        algorithm: The algorithm.
+        link: What the rest of the link is; None for the default.
+    """
+    if link is not None and link.algorithms[role] == algorithm:
+        return Subject(role, algorithm, link, link.table[role]["id"])
+    cls = type(algorithm)
+    target = f"{cls.__module__}:{cls.__qualname__}"
+    for entry in Registry.load().installed(role):
+        if entry.algorithm.target == target:
+            return Subject(role, algorithm, link, entry.algorithm.id)
+    return Subject(role, algorithm, link)
+
+
+@cache
+def _default_link() -> Link:
+    return load_link()
+
+
+def base_link_of(subject: Subject) -> Link:
+    """The link that the subject is tested on, without it."""
+    return _default_link() if subject.link is None else subject.link
+
+
+def link_of(subject: Subject, **air: Any) -> Link:
+    """The link with the subject in its role; `air` overrides values of its table `[air]`.
 
     Raises:
-        InapplicableLawError: The subject has no code for the default bar.
+        InapplicableLawError: The subject has no code for the link's bar.
     """
-    link = load_link(overrides=overrides)
-    algorithms = {**link.algorithms, subject.role: subject.algorithm}
-    codebook = link.codebook
-    if subject.role in ("pilots", "modulation"):
-        pilots, modulation = algorithms["pilots"], algorithms["modulation"]
-        codes = compiled(lambda: pilots.codes(link.bar.clusters))
-        codebook = Codebook("conformance", pilots.preamble(), codes, modulation.codewords())
-    air = link.air
-    packet = PacketFormat.of(codebook, air.frames_per_packet, air.chip_rate_hz, air.pilot_every)
-    return replace(link, algorithms=algorithms, codebook=codebook, packet=packet, digest="conformance")
+    link = base_link_of(subject)
+    if subject.role == "pilots":
+        compiled(lambda: subject.algorithm.codes(link.bar.clusters))
+    link = link.with_algorithm(subject.role, subject.algorithm, id=subject.id)
+    return link.with_air(**air) if air else link
 
 
-def coded_bits_of(link: Link) -> int:
-    """Bits of a link's packet."""
-    return link.packet.frames * link.codebook.clusters * link.codebook.bits_per_symbol
+def expect_column(link: Link) -> None:
+    """Pass over a law whose ideal images show a bar: two clusters or more, one above the other.
+
+    Raises:
+        InapplicableLawError: The link's bar is another.
+    """
+    if link.bar.clusters < 2 or np.ptp(link.bar.cluster_centres_m()[:, 0]) > 1e-9:
+        raise InapplicableLawError("the ideal images of this law show one column of two clusters or more")
+
+
+_ARGUMENTS: dict[str, Callable[[Link], tuple[Any, ...]]] = {
+    "synchronization": lambda link: (link.codebook, link.packet),
+    "separation": lambda link: (link.codebook,),
+    "decoding": lambda link: (link.codebook,),
+    "ranging": lambda link: (link.camera, link.bar, link.codebook),
+    "tracking": lambda _: (),
+    "error-correction": lambda link: (packet_bits(link.codebook, link.packet),),
+}
+
+
+def arguments_of(subject: Subject) -> tuple[Any, ...]:
+    """What the subject's `compile` is given."""
+    return _ARGUMENTS[subject.role](link_of(subject))
+
+
+def compiled_subject(subject: Subject) -> Any:
+    """What the subject compiles to on its link.
+
+    Raises:
+        InapplicableLawError: It refuses the link.
+    """
+    arguments = arguments_of(subject)
+    return compiled(lambda: subject.algorithm.compile(*arguments))
 
 
 def symbols_of(codebook: Codebook, seed: int = 0) -> np.ndarray[Any, np.dtype[np.int64]]:
@@ -72,47 +138,51 @@ def filters_of(subject: Subject) -> list[tuple[str, Any, int]]:
 
 
 def exercise_of(subject: Subject) -> Exercise:
-    """The task of the subject's role, on the default link."""
+    """The task of the subject's role, on its link."""
+    return _EXERCISES[subject.role](subject)
+
+
+def _pilots(subject: Subject) -> Exercise:
     algorithm = subject.algorithm
-    if subject.role == "pilots":
-        return Exercise((), lambda: lambda _: (algorithm.preamble(), algorithm.codes(4)))
-    if subject.role == "modulation":
-        return Exercise((), lambda: lambda _: algorithm.codewords())
+    return Exercise((), lambda: lambda _: (algorithm.preamble(), algorithm.codes(4)))
+
+
+def _modulation(subject: Subject) -> Exercise:
+    return Exercise((), lambda: lambda _: subject.algorithm.codewords())
+
+
+def _synchronization(subject: Subject) -> Exercise:
     link = link_of(subject)
-    book = link.codebook
-    symbols = symbols_of(book)
-    if subject.role == "separation":
-        pilot = ideal_sums(book, symbols, missing=0.1)[: link.packet.pilot_chips]
-        return Exercise((pilot,), lambda: _spread(compiled(lambda: algorithm.compile(book))))
-    if subject.role == "decoding":
-        inputs = (ideal_presence(book.clusters), ideal_sums(book, symbols, missing=0.1))
-        return Exercise(inputs, lambda: _spread(compiled(lambda: algorithm.compile(book))))
-    if subject.role == "ranging":
-        view = ideal_view(book, symbols, missing=0.1)
-        return Exercise(
-            (view,), lambda: _spread(compiled(lambda: algorithm.compile(link.camera, link.bar, book)))
-        )
-    if subject.role == "synchronization":
-        events = ideal_events(link, IdealBar(random_symbols(link, 2)))
-        until_us = int(events.t_us[-1]) + 1
+    events = ideal_events(link, IdealBar(random_symbols(link, 2)))
+    until_us = int(events.t_us[-1]) + 1
 
-        def synchronize() -> Callable[[tuple[Any, ...]], Any]:
-            synchronizer = compiled(lambda: algorithm.compile(book, link.packet))
-            return lambda given: synchronizer.step(synchronizer.init(), *given, until_us)[1]
+    def synchronize() -> Callable[[tuple[Any, ...]], Any]:
+        synchronizer = compiled_subject(subject)
+        return lambda given: synchronizer.step(synchronizer.init(), *given, until_us)[1]
 
-        return Exercise((events.t_us, events.p), synchronize)
+    return Exercise((events.t_us, events.p), synchronize)
+
+
+def _separation(subject: Subject) -> Exercise:
+    link = link_of(subject)
+    sums = ideal_sums(link.codebook, symbols_of(link.codebook), missing=0.1)
+    return Exercise((sums[: link.packet.pilot_chips],), lambda: _spread(compiled_subject(subject)))
+
+
+def _decoding(subject: Subject) -> Exercise:
+    book = link_of(subject).codebook
+    inputs = (ideal_presence(book.clusters), ideal_sums(book, symbols_of(book), missing=0.1))
+    return Exercise(inputs, lambda: _spread(compiled_subject(subject)))
+
+
+def _ranging(subject: Subject) -> Exercise:
+    book = link_of(subject).codebook
+    view = ideal_view(book, symbols_of(book), missing=0.1)
+    return Exercise((view,), lambda: _spread(compiled_subject(subject)))
+
+
+def _tracking(subject: Subject) -> Exercise:
     rng = np.random.default_rng(0)
-    if subject.role == "error-correction":
-        code = compiled(lambda: algorithm.compile(coded_bits_of(link)))
-        bits = rng.integers(0, 2, code.message_bits).astype(np.uint8)
-        llr = (4 * (1 - 2 * code.encode(bits).astype(np.float32))).astype(np.float32)
-        llr[::50] = 0
-
-        def correct() -> Callable[[tuple[Any, ...]], Any]:
-            again = compiled(lambda: algorithm.compile(coded_bits_of(link)))
-            return lambda given: (again.encode(given[0]), again.decode(given[1]))
-
-        return Exercise((bits, llr), correct)
     values = tuple(rng.normal(50.0, 0.1, (20, n)) for _, _, n in filters_of(subject))
 
     def track() -> Callable[[tuple[Any, ...]], Any]:
@@ -120,6 +190,31 @@ def exercise_of(subject: Subject) -> Exercise:
         return lambda given: [_filtered(f, v) for f, v in zip(filters, given, strict=True)]
 
     return Exercise(values, track)
+
+
+def _error_correction(subject: Subject) -> Exercise:
+    code = compiled_subject(subject)
+    bits = np.random.default_rng(0).integers(0, 2, code.message_bits).astype(np.uint8)
+    llr = (4 * (1 - 2 * code.encode(bits).astype(np.float32))).astype(np.float32)
+    llr[::50] = 0
+
+    def correct() -> Callable[[tuple[Any, ...]], Any]:
+        again = compiled_subject(subject)
+        return lambda given: (again.encode(given[0]), again.decode(given[1]))
+
+    return Exercise((bits, llr), correct)
+
+
+_EXERCISES: dict[str, Callable[[Subject], Exercise]] = {
+    "pilots": _pilots,
+    "modulation": _modulation,
+    "synchronization": _synchronization,
+    "separation": _separation,
+    "decoding": _decoding,
+    "ranging": _ranging,
+    "tracking": _tracking,
+    "error-correction": _error_correction,
+}
 
 
 def _spread(function: Callable[..., Any]) -> Callable[[tuple[Any, ...]], Any]:

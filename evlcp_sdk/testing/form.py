@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.specs import spec_model
-from evlcp_sdk.testing.exercises import coded_bits_of, exercise_of, link_of
+from evlcp_sdk.testing.exercises import arguments_of, exercise_of
 from evlcp_sdk.testing.law import Law, LawError, Subject, expect
 from evlcp_sdk.testing.trees import arrays_of, copied, difference, mapped, read_only, strided
 
@@ -29,7 +29,7 @@ def _parameters(subject: Subject) -> list[dataclasses.Field[Any]]:
 def defaults(subject: Subject) -> None:
     """Hold the law."""
     cls = type(subject.algorithm)
-    abstract = ROLES[subject.role]
+    abstract = ROLES[subject.role].abstract
     expect(isinstance(subject.algorithm, abstract), f"an instance of {abstract.__name__}")
     for f in _parameters(subject):
         bare = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
@@ -77,20 +77,11 @@ def picklable(subject: Subject) -> None:
 
 def compiles(subject: Subject) -> None:
     """Hold the law."""
-    link = link_of(subject)
-    algorithm = subject.algorithm
-    arguments: dict[str, tuple[Any, ...]] = {
-        "synchronization": (link.codebook, link.packet),
-        "separation": (link.codebook,),
-        "decoding": (link.codebook,),
-        "ranging": (link.camera, link.bar, link.codebook),
-        "tracking": (),
-        "error-correction": (coded_bits_of(link),),
-    }
     try:
-        algorithm.compile(*arguments[subject.role])
+        subject.algorithm.compile(*arguments_of(subject))
     except ConfigError as refused:
-        raise LawError(f"expected the default camera, bar and codebook to do, got: {refused}") from refused
+        which = "the default" if subject.link is None else "the link's"
+        raise LawError(f"expected {which} camera, bar and codebook to do, got: {refused}") from refused
 
 
 def deterministic(subject: Subject) -> None:
@@ -160,7 +151,7 @@ DESCRIPTION = (
 """Laws of the description."""
 
 FUNCTION = (
-    Law("compiles", "compiles for the default camera, bar and codebook", compiles),
+    Law("compiles", "compiles for the camera, bar and codebook of the link", compiles),
     Law("inputs-kept", "arrays that it is given stay as they were", inputs_kept),
     Law("read-only", "takes read-only arrays", accepts_read_only),
     Law("non-contiguous", "takes arrays whose elements do not lie side by side", accepts_strided),

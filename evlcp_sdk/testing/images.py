@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Decode
-from evlcp_sdk.testing.exercises import link_of, symbols_of
+from evlcp_sdk.testing.exercises import compiled_subject, expect_column, link_of, symbols_of
 from evlcp_sdk.testing.law import InapplicableLawError, Law, Subject, compiled, expect
 from evlcp_sdk.testing.views import GRID_PX, ideal_presence, ideal_sums, ideal_view
 from evlcp_sdk.values import PresenceMap, Range, SoftSymbols
@@ -46,7 +46,7 @@ def _pilot_sums(link: Link, missing: float = 0.0, seed: int = 0) -> NDArray[np.i
 def separation_shapes(subject: Subject) -> None:
     """Hold the law."""
     link = link_of(subject)
-    separate = compiled(lambda: subject.algorithm.compile(link.codebook))
+    separate = compiled_subject(subject)
     sums, k = _pilot_sums(link, missing=0.2), link.codebook.clusters
     for given in (sums, sums[:, :-3, :-1]):
         found = separate(given)
@@ -66,7 +66,7 @@ def separation_shapes(subject: Subject) -> None:
 def finds_clusters(subject: Subject) -> None:
     """Hold the law."""
     link = link_of(subject)
-    separate = compiled(lambda: subject.algorithm.compile(link.codebook))
+    separate = compiled_subject(subject)
     k = link.codebook.clusters
     shown = ideal_presence(k).pixels > 0
     for seed in range(_SEEDS):
@@ -86,7 +86,7 @@ def finds_clusters(subject: Subject) -> None:
 def sees_nothing(subject: Subject) -> None:
     """Hold the law."""
     link = link_of(subject)
-    separate = compiled(lambda: subject.algorithm.compile(link.codebook))
+    separate = compiled_subject(subject)
     found = separate(np.zeros((link.packet.pilot_chips, 40, 20), np.int16))
     expect(not found.selected.any(), f"no cell selected without events, got {found.selected.sum()}")
     expect(not found.pixels.any(), "pixels of 0 without events")
@@ -97,7 +97,7 @@ def separation_permutes(subject: Subject) -> None:
     link = link_of(subject)
     order = np.random.default_rng(1).permutation(link.codebook.clusters)
     sums = _pilot_sums(link, missing=0.2)
-    plain = compiled(lambda: subject.algorithm.compile(link.codebook))(sums)
+    plain = compiled_subject(subject)(sums)
     turned = compiled(lambda: subject.algorithm.compile(_permuted(link.codebook, order)))(sums)
     for name in ("probability", "selected", "pixels"):
         wanted, got = getattr(plain, name)[order], getattr(turned, name)
@@ -108,15 +108,18 @@ def separation_permutes(subject: Subject) -> None:
 
 
 def _decoders(subject: Subject) -> Iterator[tuple[Codebook, Decode]]:
-    """The subject compiled for every modulation of the SDK that it takes, with the default pilots.
+    """The subject compiled for every modulation of the SDK that it takes, with the link's pilots.
 
     Raises:
         InapplicableLawError: It takes none.
     """
     taken = False
-    for entry in Registry.load().installed("modulation"):
+    registry = Registry.load()
+    link = link_of(subject)
+    for entry in registry.installed("modulation"):
         if entry.distribution == "evlcp-sdk":
-            book = load_link(overrides=[f"modulation.id={entry.algorithm.id}"]).codebook
+            modulation = registry.load_class("modulation", entry.algorithm.id)()
+            book = link.with_algorithm("modulation", modulation, id=entry.algorithm.id).codebook
             try:
                 decode = subject.algorithm.compile(book)
             except ConfigError:
@@ -177,7 +180,7 @@ def decoding_permutes(subject: Subject) -> None:
     order = np.random.default_rng(1).permutation(book.clusters)
     presence = ideal_presence(book.clusters)
     sums = ideal_sums(book, symbols_of(book), missing=0.4)
-    plain = compiled(lambda: subject.algorithm.compile(book))(presence, sums)
+    plain = compiled_subject(subject)(presence, sums)
     other = PresenceMap(
         presence.probability[order], presence.grid_px, presence.selected[order], presence.pixels[order]
     )
@@ -199,7 +202,7 @@ def decodes_nothing(subject: Subject) -> None:
         np.zeros_like(presence.pixels),
     )
     sums = ideal_sums(book, symbols_of(book))
-    decode = compiled(lambda: subject.algorithm.compile(book))
+    decode = compiled_subject(subject)
     for seen, given, what in (
         (dark, np.zeros_like(sums), "nothing at all"),
         (presence, np.zeros_like(sums), "no events"),
@@ -214,7 +217,8 @@ def _measure(
     subject: Subject, cluster_px: int = 8, seed: int = 0, right_down: tuple[int, int] = (0, 0)
 ) -> Range:
     link = link_of(subject)
-    measure = compiled(lambda: subject.algorithm.compile(link.camera, link.bar, link.codebook))
+    expect_column(link)
+    measure = compiled_subject(subject)
     symbols = symbols_of(link.codebook, seed)
     found = measure(ideal_view(link.codebook, symbols, cluster_px=cluster_px, offset_px=right_down))
     expect(isinstance(found, Range), f"a Range, got {type(found).__name__}")
@@ -241,6 +245,7 @@ def range_shapes(subject: Subject) -> None:
 def exact(subject: Subject) -> None:
     """Hold the law."""
     link = link_of(subject)
+    expect_column(link)
     for px in _SPACINGS_PX:
         for seed in range(_SEEDS):
             got, true = _measure(subject, px, seed).distance_m, _true_m(link, px)
@@ -275,8 +280,9 @@ def stays_when_moved(subject: Subject) -> None:
 def scales_with_focal_length(subject: Subject) -> None:
     """Hold the law."""
     link = link_of(subject)
+    expect_column(link)
     view = ideal_view(link.codebook, symbols_of(link.codebook))
-    near = compiled(lambda: subject.algorithm.compile(link.camera, link.bar, link.codebook))(view)
+    near = compiled_subject(subject)(view)
     camera = replace(link.camera, focal_mm=2 * link.camera.focal_mm)
     far = compiled(lambda: subject.algorithm.compile(camera, link.bar, link.codebook))(view)
     expect(
@@ -289,7 +295,8 @@ def scales_with_focal_length(subject: Subject) -> None:
 def no_distance_of_nothing(subject: Subject) -> None:
     """Hold the law."""
     link = link_of(subject)
-    measure = compiled(lambda: subject.algorithm.compile(link.camera, link.bar, link.codebook))
+    expect_column(link)
+    measure = compiled_subject(subject)
     view = ideal_view(link.codebook, symbols_of(link.codebook))
     only_first = np.arange(link.codebook.clusters) == 0
     for seen, what in ((0 * only_first, "no cluster"), (only_first, "one cluster")):

@@ -2,9 +2,12 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from evlcp_sdk.errors import ConfigError
+
+if TYPE_CHECKING:
+    from evlcp_sdk.link.resolve import Link
 
 __all__ = [
     "InapplicableLawError",
@@ -37,10 +40,14 @@ class Subject:
     Attributes:
         role: The role that it fills.
         algorithm: The algorithm, with the parameters to be tested.
+        link: What the rest of the link is; None for the default.
+        id: What messages call it; None for the name of its class.
     """
 
     role: str
     algorithm: Any
+    link: "Link | None" = None
+    id: str | None = None
 
     def __str__(self) -> str:
         return f"{self.role} {type(self.algorithm).__name__}"

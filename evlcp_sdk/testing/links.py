@@ -6,7 +6,7 @@ import numpy as np
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.testing.exercises import link_of
+from evlcp_sdk.testing.exercises import expect_column, link_of
 from evlcp_sdk.testing.law import Law, Subject, compiled, expect
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.values import Frame
@@ -30,10 +30,11 @@ def clean_link(subject: Subject) -> None:
 
 def sparse_pilots(subject: Subject) -> None:
     """Hold the law."""
-    _expect_clean(link_of(subject, [f"air.pilot_every={_SPARSE}"]))
+    _expect_clean(link_of(subject, pilot_every=_SPARSE))
 
 
 def _expect_clean(link: Link) -> None:
+    expect_column(link)
     bar = IdealBar(random_symbols(link, _PACKETS), cluster_px=_CLUSTER_PX)
     receiver = compiled(lambda: Receiver(link))
     packets = receiver.feed(ideal_events(link, bar, missing=0.0)) + receiver.close()
@@ -63,7 +64,7 @@ def _expect_near(frames: Sequence[Frame], true_m: float) -> None:
 
 
 LINK = (
-    Law("clean-link", "no error in a clean recording with this algorithm in the default link", clean_link),
+    Law("clean-link", "no error in a clean recording with this algorithm in the link", clean_link),
     Law(
         "sparse-pilots",
         f"no error in a clean recording with the pilot in every {_SPARSE}th frame only",

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.testing.exercises import filters_of, link_of
-from evlcp_sdk.testing.law import Law, Subject, compiled, expect
+from evlcp_sdk.testing.exercises import compiled_subject, filters_of, link_of
+from evlcp_sdk.testing.law import Law, Subject, expect
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.testing.trees import difference
 from evlcp_sdk.values import Events, SyncLock
@@ -47,8 +47,7 @@ def _steps(events: Events) -> list[int]:
 
 
 def _synchronizer(subject: Subject) -> tuple[Link, Any]:
-    link = link_of(subject)
-    return link, compiled(lambda: subject.algorithm.compile(link.codebook, link.packet))
+    return link_of(subject), compiled_subject(subject)
 
 
 def locks_shapes(subject: Subject) -> None:

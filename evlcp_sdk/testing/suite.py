@@ -4,16 +4,31 @@ from collections.abc import Mapping
 from typing import Any
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.plugin.hooks import ROLE_NAMES
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.testing.codes import MODULATION, PILOTS
 from evlcp_sdk.testing.corrections import ERROR_CORRECTION
+from evlcp_sdk.testing.exercises import subject_of
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
 from evlcp_sdk.testing.images import DECODING, RANGING, SEPARATION
-from evlcp_sdk.testing.law import Law, Outcome, Subject, judge
+from evlcp_sdk.testing.law import Law, Outcome, judge
 from evlcp_sdk.testing.links import LINK
 from evlcp_sdk.testing.streams import SYNCHRONIZATION, TRACKING
 
 __all__ = ["check", "checked_excuses", "laws_of"]
+
+
+_EVERY = DESCRIPTION + FUNCTION + RESULT
+_LAWS: dict[str, tuple[Law, ...]] = {
+    "pilots": DESCRIPTION + RESULT + PILOTS + LINK,
+    "modulation": DESCRIPTION + RESULT + MODULATION + LINK,
+    "synchronization": _EVERY + SYNCHRONIZATION + LINK,
+    "separation": _EVERY + SEPARATION + LINK,
+    "decoding": _EVERY + DECODING + LINK,
+    "ranging": _EVERY + RANGING + LINK,
+    "tracking": _EVERY + TRACKING + LINK,
+    "error-correction": _EVERY + ERROR_CORRECTION,
+}
 
 
 def laws_of(role: str) -> tuple[Law, ...]:
@@ -25,22 +40,9 @@ def laws_of(role: str) -> tuple[Law, ...]:
     >>> [law.name for law in laws_of("ranging")][-3:]
     ['sees-nothing', 'clean-link', 'sparse-pilots']
     """
-    if role not in ROLE_NAMES:
-        raise ConfigError(f"no role named '{role}' (known: {', '.join(ROLE_NAMES)})")
-    if role == "pilots":
-        return DESCRIPTION + RESULT + PILOTS + LINK
-    if role == "modulation":
-        return DESCRIPTION + RESULT + MODULATION + LINK
-    if role == "error-correction":
-        return DESCRIPTION + FUNCTION + RESULT + ERROR_CORRECTION
-    own = {
-        "synchronization": SYNCHRONIZATION,
-        "separation": SEPARATION,
-        "decoding": DECODING,
-        "ranging": RANGING,
-        "tracking": TRACKING,
-    }
-    return DESCRIPTION + FUNCTION + RESULT + own[role] + LINK
+    if role not in _LAWS:
+        raise ConfigError(f"no role named '{role}' (known: {', '.join(ROLES)})")
+    return _LAWS[role]
 
 
 def checked_excuses(role: str, excuses: Mapping[str, str]) -> dict[str, str]:
@@ -58,14 +60,17 @@ def checked_excuses(role: str, excuses: Mapping[str, str]) -> dict[str, str]:
     return dict(excuses)
 
 
-def check(role: str, algorithm: Any, excuses: Mapping[str, str] | None = None) -> list[Outcome]:
+def check(
+    role: str, algorithm: Any, excuses: Mapping[str, str] | None = None, link: Link | None = None
+) -> list[Outcome]:
     """Hold an algorithm against every law of its role.
 
     Args:
-        role: One of `ROLE_NAMES`.
+        role: A name of `evlcp_sdk.plugin.roles.ROLES`.
         algorithm: The algorithm, with the parameters to be tested.
         excuses: Law to the reason why it is known to be broken. An excused law must be broken: if it holds,
             or does not apply, that is a failure.
+        link: What the rest of the link is: bar, air, the algorithms of the other roles; None for the default.
 
     Raises:
         ConfigError: There is no such role or law, or an excuse has no reason.
@@ -75,5 +80,5 @@ def check(role: str, algorithm: Any, excuses: Mapping[str, str] | None = None) -
     {'ok'}
     """
     known = checked_excuses(role, excuses or {})
-    subject = Subject(role, algorithm)
+    subject = subject_of(role, algorithm, link)
     return [judge(law, subject, known) for law in laws_of(role)]

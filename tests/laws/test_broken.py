@@ -18,8 +18,8 @@ from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.plugin.hooks import ROLE_NAMES
 from evlcp_sdk.plugin.roles import (
+    ROLES,
     Decoding,
     ErrorCorrection,
     Modulation,
@@ -549,7 +549,7 @@ def test_the_law_finds_the_fault(role: str, name: str, algorithm: Any, said: str
         law.hold(Subject(role, algorithm))
 
 
-@pytest.mark.parametrize("role", ROLE_NAMES)
+@pytest.mark.parametrize("role", ROLES)
 def test_every_law_has_a_broken_algorithm(role: str) -> None:
     of_form = {law.name for law in (*DESCRIPTION, *FUNCTION, *RESULT)}
     assert of_form <= {name for cases in BROKEN.values() for name, _, _ in cases}

@@ -65,7 +65,7 @@ class Environment:
 
     def plugins(self) -> dict[tuple[str, str], tuple[str, str]]:
         """(role, id) of each algorithm to its distribution and version."""
-        rows = json.loads(self.run("evlcp", "plugins", "--json"))
+        rows = json.loads(self.run("evlcp", "plugins", "--json"))["algorithms"]
         return {(r["role"], r["id"]): (r["distribution"], r["version"]) for r in rows}
 
 
@@ -141,7 +141,8 @@ def it_is_used(environment: Environment) -> None:
 
 def two_of_one_name_are_told_by_their_distributions(environment: Environment) -> None:
     with copycat(environment) as other:
-        said = environment.run("evlcp", "plugins", code=2)
+        assert environment.run("evlcp", "plugins").count("! median-pairs") == 2
+        said = environment.run("evlcp", "config", "--set", "ranging.id=median-pairs", code=2)
     assert "two ranging algorithms named 'median-pairs'" in said
     assert other in said
     assert "evlcp-robust" in said

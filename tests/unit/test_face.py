@@ -39,6 +39,7 @@ NAMES = [
     "Packet",
     "Pilots",
     "PluginError",
+    "PluginWarning",
     "PresenceMap",
     "Range",
     "Ranging",
@@ -91,7 +92,7 @@ def dataclass_made(found: object) -> bool:
 
 
 def test_all_errors_and_roles_and_values_are_there() -> None:
-    wanted = {*errors.__all__, *(role.__name__ for role in ROLES.values())}
+    wanted = {*errors.__all__, *(role.abstract.__name__ for role in ROLES.values())}
     wanted |= {n for n in values.__all__ if inspect.isclass(getattr(values, n))}
     assert wanted <= set(NAMES)
 

@@ -10,8 +10,7 @@ from typing import Any
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link, resolve
-from evlcp_sdk.plugin.hooks import ROLE_NAMES
-from evlcp_sdk.plugin.registry import Registry, installed_versions
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene, Simulation, load_scene, truth_of
 from evlcp_sdk.sim.truth import Truth
@@ -69,14 +68,14 @@ def environment_of(registry: Registry) -> dict[str, Any]:
     files = {root / "values.py"} | {root / "study" / name for name in _STUDY}
     files |= {path for name in _PACKAGES for path in (root / name).rglob("*.py")}
     for installed in registry.installed():
-        if installed.distribution == "evlcp-sdk" and installed.algorithm.role in ROLE_NAMES:
+        if installed.distribution == "evlcp-sdk":
             spec = find_spec(installed.algorithm.target.partition(":")[0].partition(".")[0])
             if spec is not None and spec.origin is not None:
                 files |= set(Path(spec.origin).parent.rglob("*.py"))
     digest = hashlib.sha256()
     for path in sorted(files, key=lambda p: (p.parent.name, p.name)):
         digest.update(f"{path.parent.name}/{path.name}\0".encode() + path.read_bytes() + b"\0")
-    return {"source": digest.hexdigest(), "versions": installed_versions(registry)}
+    return {"source": digest.hexdigest(), "versions": registry.versions()}
 
 
 def _identity(scene: Scene) -> Any:

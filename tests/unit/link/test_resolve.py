@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import pluggy
 import pytest
 from numpy.typing import NDArray
 from pydantic import Field
@@ -16,12 +15,12 @@ from pydantic import Field
 from evlcp_sdk.air.codebook import BARKER13, Codebook, hadamard
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError, UnknownAlgorithmError
-from evlcp_sdk.link.resolve import DEFAULT_IDS, Link, load_link, resolve
+from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.link.text import to_toml
-from evlcp_sdk.plugin import hooks as hookspecs
 from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
-from evlcp_sdk.plugin.registry import Registry, installed_versions
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import (
+    ROLES,
     Code,
     Decode,
     Decoding,
@@ -109,23 +108,16 @@ class Fakes:
 
     @hookimpl
     def evlcp_algorithms(self) -> Iterator[Algorithm]:
-        for role, name in DEFAULT_IDS.items():
-            target = f"{__name__}:Fake{role.title().replace('-', '')}"
-            yield Algorithm(role, name, target, self.revision if role == "ranging" else 1, "a fake")
+        for role in ROLES.values():
+            target = f"{__name__}:Fake{role.name.title().replace('-', '')}"
+            revision = self.revision if role.name == "ranging" else 1
+            yield Algorithm(role.name, role.default, target, revision, "a fake")
         yield Algorithm("ranging", "centroid", f"{__name__}:FakeRanging", 3, "another fake")
-
-
-def registry_of(*plugins: object) -> Registry:
-    manager = pluggy.PluginManager(hookspecs.ENTRY_POINT_GROUP)
-    manager.add_hookspecs(hookspecs)
-    for plugin in plugins:
-        manager.register(plugin)
-    return Registry(manager)
 
 
 @pytest.fixture
 def registry() -> Registry:
-    return registry_of(Fakes())
+    return Registry(Fakes())
 
 
 def faults_of(registry: Registry, text: str, tmp_path: Path, *overrides: str) -> list[str]:
@@ -281,7 +273,7 @@ def test_the_digest_holds_table_codebook_and_revisions(registry: Registry) -> No
     assert load_link(None, ["camera.focal_mm=35"], registry).digest == link.digest
     assert load_link(None, ["ranging.min_spacing=9"], registry).digest != link.digest
     assert load_link(None, ["ranging.id=centroid"], registry).digest != link.digest
-    assert load_link(None, (), registry_of(Fakes(revision=2))).digest != link.digest
+    assert load_link(None, (), Registry(Fakes(revision=2))).digest != link.digest
 
 
 OVERRIDES: list[list[str]] = [
@@ -326,5 +318,5 @@ def test_a_link_travels_to_another_process(registry: Registry) -> None:
 
 
 def test_versions_name_every_distribution(registry: Registry) -> None:
-    found = installed_versions(registry)
+    found = registry.versions()
     assert {"python", "evlcp-sdk", "numpy", "scipy", "numba"} <= set(found)

@@ -1,20 +1,17 @@
 """Plugins found by name: what is refused and how it is said, and what listing them must not import."""
 
-import importlib.metadata
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import pluggy
 import pytest
 
-from evlcp_sdk.errors import PluginError, UnknownAlgorithmError
-from evlcp_sdk.link.resolve import DEFAULT_IDS
-from evlcp_sdk.plugin import hooks as hookspecs
-from evlcp_sdk.plugin.hooks import ROLE_NAMES, Algorithm, hookimpl
+from evlcp_sdk.errors import PluginError, PluginWarning, UnknownAlgorithmError
+from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES, Ranging
 
@@ -30,20 +27,12 @@ class Brings:
         yield from self.records
 
 
-def registry_of(*plugins: object) -> Registry:
-    manager = pluggy.PluginManager(hookspecs.ENTRY_POINT_GROUP)
-    manager.add_hookspecs(hookspecs)
-    for i, plugin in enumerate(plugins):
-        manager.register(plugin, name=f"plugin{i}")
-    return Registry(manager)
-
-
 def ranging(name: str, target: str = "nowhere:Nothing") -> Algorithm:
     return Algorithm("ranging", name, target, 1, "a test")
 
 
 def test_one_wrong_id_has_one_answer() -> None:
-    registry = registry_of(Brings(ranging("poc"), ranging("centroid")))
+    registry = Registry(Brings(ranging("poc"), ranging("centroid")))
     with pytest.raises(UnknownAlgorithmError) as caught:
         registry.find("ranging", "pco")
     expected = "no ranging algorithm named 'pco'; did you mean 'poc'? (installed: centroid, poc)"
@@ -55,96 +44,243 @@ def test_one_wrong_id_has_one_answer() -> None:
         registry.find("pilots", "wh")
 
 
-def test_two_plugins_with_one_name_are_both_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    def entry(distribution: str, plugin: object) -> Any:
-        dist = SimpleNamespace(
-            metadata={"name": distribution}, version="1.0", entry_points=[], name=distribution
+def install(monkeypatch: pytest.MonkeyPatch, *found: tuple[str, str, Callable[[], object]]) -> None:
+    """Let entry points be these: name, distribution, what loads the plugin."""
+    points = [
+        SimpleNamespace(
+            name=name, value=f"{owner}:it", load=load, dist=SimpleNamespace(name=owner, version="1.0")
         )
-        point = SimpleNamespace(name=distribution, group="evlcp", load=lambda: plugin)
-        dist.entry_points = [point]
-        return dist
+        for name, owner, load in found
+    ]
+    monkeypatch.setattr("evlcp_sdk.plugin.registry.entry_points", lambda group: points)
 
-    found = [entry("evlcp-sdk", Brings(ranging("poc"))), entry("evlcp-fast-poc", Brings(ranging("poc")))]
-    monkeypatch.setattr(importlib.metadata, "distributions", lambda: found)
-    monkeypatch.setattr("evlcp_sdk.plugin.registry.entry_points", lambda group: [])
-    with pytest.raises(PluginError) as caught:
-        Registry.load()
-    assert str(caught.value) == (
-        "two ranging algorithms named 'poc': one of evlcp-sdk, one of evlcp-fast-poc; uninstall one"
+
+def test_two_algorithms_with_one_name_are_told_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours = Brings(ranging("poc"), ranging("centroid"))
+    install(
+        monkeypatch, ("a", "evlcp-sdk", lambda: ours), ("b", "evlcp-fast", lambda: Brings(ranging("poc")))
     )
+    registry = Registry.load()
+    assert registry.find("ranging", "centroid").distribution == "evlcp-sdk"
+    assert len(registry.installed("ranging")) == 3
+    with pytest.raises(PluginError) as caught:
+        registry.find("ranging", "poc")
+    assert str(caught.value).startswith("two ranging algorithms named 'poc': one of ")
+    assert "evlcp-sdk" in str(caught.value)
+    assert "evlcp-fast" in str(caught.value)
     assert caught.value.exit_code == 2
 
 
-def test_two_entry_points_with_one_name_are_both_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    def found(**given: str) -> Any:
-        names = ("evlcp-sdk", "evlcp-fast-poc")
-        return [SimpleNamespace(name="poc", dist=SimpleNamespace(name=name)) for name in names]
-
-    monkeypatch.setattr("evlcp_sdk.plugin.registry.entry_points", found)
-    with pytest.raises(PluginError) as caught:
-        Registry.load()
-    assert str(caught.value) == (
-        "two plugins with an entry point named 'poc': one of evlcp-sdk, one of evlcp-fast-poc;"
-        " rename or uninstall one"
+def test_entry_points_may_have_one_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    install(
+        monkeypatch,
+        ("poc", "evlcp-sdk", lambda: Brings(ranging("poc"))),
+        ("poc", "evlcp-fast-poc", lambda: Brings(ranging("fast"))),
     )
+    registry = Registry.load()
+    assert registry.find("ranging", "fast").distribution == "evlcp-fast-poc"
+    assert registry.broken == ()
 
 
-def test_a_role_that_does_not_exist() -> None:
-    with pytest.raises(
-        PluginError, match=r"plugin plugin0: algorithm 'x' has role 'rangin', expected one of"
-    ):
-        registry_of(Brings(Algorithm("rangin", "x", "a:B", 1, "")))
+class Typo(Brings):
+    @hookimpl
+    def evlcp_algoritms(self) -> None: ...
 
 
-def test_a_record_that_is_none() -> None:
-    with pytest.raises(PluginError, match=r"plugin plugin0: evlcp_algorithms\(\) gave 'poc', expected an"):
-        registry_of(Brings("poc"))
+class OtherArguments(Brings):
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str, nothing: str) -> None: ...
 
 
-def test_a_plugin_that_fails_is_named() -> None:
-    class Broken:
+class Failing:
+    @hookimpl
+    def evlcp_algorithms(self) -> Iterator[Algorithm]:
+        yield ranging("early")
+        raise ZeroDivisionError("by design")
+
+
+def missing() -> object:
+    raise ModuleNotFoundError("No module named 'camera_driver'")
+
+
+def quits() -> object:
+    raise SystemExit("not on this machine")
+
+
+BROKEN: dict[str, tuple[Callable[[], object], str]] = {
+    "import": (missing, "cannot be imported: ModuleNotFoundError: No module named 'camera_driver'"),
+    "exit": (quits, "cannot be imported: SystemExit: not on this machine"),
+    "role": (
+        lambda: Brings(ranging("mine"), Algorithm("rangin", "x", "a:B", 1, "")),
+        "algorithm 'x' has role 'rangin', expected one of pilots, modulation, ",
+    ),
+    "record": (lambda: Brings(ranging("mine"), "poc"), "evlcp_algorithms() gave 'poc', expected an Alg"),
+    "twice": (
+        lambda: Brings(ranging("mine"), ranging("mine")),
+        "evlcp_algorithms() gave two ranging algorithms named 'mine'",
+    ),
+    "nothing": (
+        lambda: SimpleNamespace(evlcp_algorithms=hookimpl(lambda: None)),
+        "evlcp_algorithms() gave NoneType, expected records of Algorithm",
+    ),
+    "fails": (Failing, "evlcp_algorithms() fails: ZeroDivisionError: by design"),
+    "typo": (
+        lambda: Typo(ranging("mine")),
+        "has the hook 'evlcp_algoritms', which this SDK does not have",
+    ),
+    "arguments": (lambda: OtherArguments(ranging("mine")), "nothing"),
+}
+
+
+@pytest.mark.parametrize("fault", BROKEN)
+def test_a_broken_plugin_is_left_out_and_told(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    load, reason = BROKEN[fault]
+    install(monkeypatch, ("good", "evlcp-sdk", lambda: Brings(ranging("poc"))), ("bad", "evlcp-cam", load))
+    with pytest.warns(PluginWarning, match="plugin bad of evlcp-cam 1.0 is broken and left out: ") as told:
+        entry = (registry := Registry.load()).find("ranging", "poc")
+    assert len(told) == 1
+    assert entry.distribution == "evlcp-sdk"
+    (broken,) = registry.broken
+    assert (broken.plugin, broken.distribution) == ("bad", "evlcp-cam 1.0")
+    assert reason in broken.reason
+    assert "\n" not in str(broken)
+    assert [e.algorithm.id for e in registry.installed()] == ["poc"]
+    assert registry.plugins("evlcp_stage_finished") == []
+    with pytest.raises((PluginError, UnknownAlgorithmError)) as asked:
+        registry.find("ranging", "mine")
+    assert "plugin bad of evlcp-cam 1.0 is broken and left out" in str(asked.value)
+    assert asked.value.exit_code == 2
+
+
+def test_the_algorithm_of_a_broken_plugin_is_known_as_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch, ("bad", "evlcp-cam", lambda: Typo(ranging("mine"))))
+    with pytest.warns(PluginWarning):
+        registry = Registry.load()
+    with pytest.raises(PluginError, match=r"^ranging algorithm 'mine': plugin bad of evlcp-cam 1\.0 is"):
+        registry.find("ranging", "mine")
+    with pytest.raises(UnknownAlgorithmError, match=r"named 'other' \(installed: none\)$"):
+        registry.find("ranging", "other")
+
+
+def test_a_plugin_that_fails_when_asked_is_left_out_from_then_on() -> None:
+    class Bad:
         @hookimpl
-        def evlcp_algorithms(self) -> Iterator[Algorithm]:
-            raise ZeroDivisionError("by design")
+        def evlcp_open_events(self, url: str) -> None:
+            raise KeyError(url)
 
-    with pytest.raises(PluginError, match=r"plugin plugin0: evlcp_algorithms\(\) fails: by design"):
-        registry_of(Broken())
-
-
-def test_a_hook_that_does_not_exist() -> None:
-    class Typo:
         @hookimpl
-        def evlcp_algoritms(self) -> None: ...
+        def evlcp_stage_finished(self, stage: str) -> None: ...
 
-    with pytest.raises(PluginError, match="hook not known to this SDK: unknown hook 'evlcp_algoritms'"):
+    class Good:
+        @hookimpl
+        def evlcp_open_events(self, url: str) -> str:
+            return f"source of {url}"
+
+    registry = Registry(Bad(), Good())
+    with pytest.warns(PluginWarning, match=r"plugin Bad-\w+ is .*: evlcp_open_events\(\) fails: KeyError"):
+        answers = registry.ask("evlcp_open_events", url="cam:0")
+    assert [answer for _, answer in answers] == ["source of cam:0"]
+    assert registry.plugins("evlcp_stage_finished") == []
+    assert registry.ask("evlcp_open_events", url="cam:0") == answers
+
+
+def test_the_own_object_of_a_program_must_fit() -> None:
+    with pytest.raises(PluginError, match="plugin Typo: has the hook 'evlcp_algoritms', which this SDK"):
         Registry.load(Typo())
+    with pytest.raises(PluginError, match=r"plugin OtherArguments: .*nothing"):
+        Registry.load(OtherArguments())
 
 
-def test_a_hook_with_other_arguments() -> None:
-    class Other:
-        @hookimpl
-        def evlcp_stage_finished(self, stage: str, nothing: str) -> None: ...
+BROKEN_STRANGER = "plugin stranger of evlcp-stranger 2.0 is broken and left out"
 
-    with pytest.raises(PluginError, match=r"plugin Other fails to load: (.|\n)*nothing"):
-        Registry.load(Other())
+COMMANDS = """
+from evlcp_sdk.plugin.hooks import hookimpl
+@hookimpl
+def evlcp_register_commands(app):
+    def {name}({arguments}) -> None:
+        "Added."
+        print("done")
+    app.command()({name})
+    {then}
+"""
 
 
-def test_a_package_that_cannot_be_imported(monkeypatch: pytest.MonkeyPatch) -> None:
-    def load() -> object:
-        raise ModuleNotFoundError("No module named 'camera_driver'")
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ("import camera_driver_that_is_not_there", "cannot be imported: ModuleNotFoundError"),
+        (COMMANDS.format(name="mine", arguments="", then="1 / 0"), "fails: ZeroDivisionError"),
+        (
+            COMMANDS.format(name="mine", arguments="x: 'Nothing'", then=""),
+            "its commands cannot be built: NameError",
+        ),
+        (COMMANDS.format(name="receive", arguments="", then=""), "has the command 'receive', which is there"),
+        (COMMANDS.format(name="mine", arguments="", then=""), None),
+    ],
+    ids=["import", "register", "build", "twice", "good"],
+)
+def test_the_command_line_goes_on_without_a_broken_plugin(
+    source: str, reason: str | None, tmp_path: Path
+) -> None:
+    (tmp_path / "evlcp_stranger.py").write_text(source)
+    info = tmp_path / "evlcp_stranger-2.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: evlcp-stranger\nVersion: 2.0\n")
+    (info / "entry_points.txt").write_text("[evlcp]\nstranger = evlcp_stranger\n")
 
-    point = SimpleNamespace(name="cam", group="evlcp", load=load, dist=SimpleNamespace(name="evlcp-cam"))
-    dist = SimpleNamespace(metadata={"name": "evlcp-cam"}, version="1", entry_points=[point])
-    monkeypatch.setattr(importlib.metadata, "distributions", lambda: [dist])
-    monkeypatch.setattr("evlcp_sdk.plugin.registry.entry_points", lambda group: [point])
-    with pytest.raises(PluginError, match="plugin cam of evlcp-cam fails to load: No module named"):
-        Registry.load()
+    def run(*given: str) -> "subprocess.CompletedProcess[str]":
+        code = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        code += "from evlcp_sdk.cli.main import main; main()"
+        return subprocess.run(
+            [sys.executable, "-c", code, *given], capture_output=True, text=True, check=False
+        )
+
+    helped = run("--help")
+    assert helped.returncode == 0
+    assert "receive" in helped.stdout
+    assert ("mine" in helped.stdout) == (reason is None)
+    listed = run("plugins")
+    assert listed.returncode == 0
+    if reason is None:
+        assert helped.stderr == listed.stderr == ""
+        assert run("mine").stdout == "done\n"
+        return
+    for done in (helped, listed):
+        (line,) = done.stderr.splitlines()
+        assert line.startswith(
+            "evlcp: warning: plugin stranger of evlcp-stranger 2.0 is broken and left out: "
+        )
+        assert reason in line
+    asked = run("config", "--set", "ranging.id=mine")
+    assert asked.returncode == 2
+    _, fault = asked.stderr.splitlines()
+    assert "no ranging algorithm named 'mine'" in fault
+    # A plugin whose commands alone are broken still brings its algorithms.
+    assert (BROKEN_STRANGER in fault) == ("import" in reason)
+
+
+def test_broken_and_conflicting_plugins_are_listed(monkeypatch: pytest.MonkeyPatch, evlcp: Any) -> None:
+    install(
+        monkeypatch,
+        ("a", "evlcp-sdk", lambda: Brings(ranging("poc"))),
+        ("b", "evlcp-fast", lambda: Brings(ranging("poc"))),
+        ("cam", "evlcp-cam", missing),
+    )
+    done = evlcp("plugins")
+    assert done.code == 0
+    assert [line[:6] for line in done.out.splitlines() if "poc" in line] == ["! poc "] * 2
+    assert "ranging: a decoded frame's image -> distance\n" in done.out
+    assert done.out.endswith("broken: plugin cam of evlcp-cam 1.0: " + BROKEN["import"][1] + "\n")
+    table = json.loads(evlcp("plugins", "--json").out)
+    assert [a["conflict"] for a in table["algorithms"]] == [True, True]
+    assert table["broken"][0]["plugin"] == "cam"
+    assert {"role": "ranging", "verb": ROLES["ranging"].verb, "default": "poc"} in table["roles"]
 
 
 @pytest.mark.parametrize(
     ("target", "told"),
     [
-        ("nowhere:Nothing", "cannot import nowhere:Nothing: No module named 'nowhere'"),
+        ("nowhere:Nothing", "cannot import nowhere:Nothing: ModuleNotFoundError: No module named 'nowhere'"),
         ("json:Nothing", "cannot import json:Nothing"),
         ("json", "cannot import json"),
         ("", "cannot import : "),
@@ -153,26 +289,25 @@ def test_a_package_that_cannot_be_imported(monkeypatch: pytest.MonkeyPatch) -> N
     ],
 )
 def test_a_target_that_cannot_be_used(target: str, told: str) -> None:
-    registry = registry_of(Brings(ranging("x", target)))
-    with pytest.raises(PluginError, match=r"^ranging algorithm 'x' of plugin0: ") as caught:
+    registry = Registry(Brings(ranging("x", target)))
+    with pytest.raises(PluginError, match=r"^ranging algorithm 'x' of Brings-\w+: ") as caught:
         registry.load_class("ranging", "x")
     assert told in str(caught.value)
 
 
 def test_the_built_in_algorithms_fill_every_role() -> None:
     registry = Registry.load()
-    assert tuple(ROLES) == ROLE_NAMES == tuple(DEFAULT_IDS)
-    for role, name in DEFAULT_IDS.items():
-        assert registry.find(role, name).distribution == "evlcp-sdk"
+    for role in ROLES.values():
+        assert registry.find(role.name, role.default).distribution == "evlcp-sdk"
     for entry in registry.installed():
         cls = registry.load_class(entry.algorithm.role, entry.algorithm.id)
-        assert issubclass(cls, ROLES[entry.algorithm.role])
+        assert issubclass(cls, ROLES[entry.algorithm.role].abstract)
         assert entry.algorithm.revision >= 1
         assert cls() == cls(), f"{cls.__name__}: every parameter needs a default"
     assert [e.algorithm.role for e in registry.installed("ranging")] == ["ranging"] * len(
         registry.installed("ranging")
     )
-    assert ROLES["ranging"] is Ranging
+    assert ROLES["ranging"].abstract is Ranging
 
 
 def test_listing_plugins_imports_no_kernel() -> None:
@@ -187,4 +322,4 @@ def test_listing_plugins_imports_no_kernel() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert json.loads(done.stderr) == []
-    assert {row["role"] for row in json.loads(done.stdout)} == set(ROLE_NAMES)
+    assert {a["role"] for a in json.loads(done.stdout)["algorithms"]} == set(ROLES)
