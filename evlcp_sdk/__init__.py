@@ -14,6 +14,8 @@ TYPE_CHECKING = False  # typing itself would take longer to import than all that
 if TYPE_CHECKING:
     from evlcp_sdk.air.beacons import Beacon
     from evlcp_sdk.air.blocks import Message
+    from evlcp_sdk.air.codebook import Codebook
+    from evlcp_sdk.air.frames import PacketFormat
     from evlcp_sdk.errors import (
         CodebookMismatchError,
         ConfigError,
@@ -34,18 +36,28 @@ if TYPE_CHECKING:
     from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.plugin.roles import (
+        Code,
+        Corrected,
+        Decode,
         Decoding,
         ErrorCorrection,
+        Filter,
+        Measure,
         Modulation,
         Pilots,
         Ranging,
+        Separate,
         Separation,
         Synchronization,
+        Synchronizer,
+        Tracker,
         Tracking,
     )
     from evlcp_sdk.results.tables import frames_table
     from evlcp_sdk.run import Reception, receive
     from evlcp_sdk.rx.receiver import Receiver
+    from evlcp_sdk.scene.bar import BarLayout
+    from evlcp_sdk.scene.camera import CameraModel
     from evlcp_sdk.scene.sites import BarSite, load_sites
     from evlcp_sdk.simulated import SimulatedSource, simulate
     from evlcp_sdk.values import (
@@ -65,15 +77,22 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Algorithm",
+    "BarLayout",
     "BarSite",
     "Beacon",
+    "CameraModel",
+    "Code",
+    "Codebook",
     "CodebookMismatchError",
     "ConfigError",
+    "Corrected",
+    "Decode",
     "Decoding",
     "ErrorCorrection",
     "EventSource",
     "Events",
     "EvlcpError",
+    "Filter",
     "Fix",
     "Frame",
     "FrameView",
@@ -81,9 +100,11 @@ __all__ = [
     "InterruptedRunError",
     "Link",
     "Loss",
+    "Measure",
     "Message",
     "Modulation",
     "Packet",
+    "PacketFormat",
     "Pilots",
     "PluginError",
     "PluginWarning",
@@ -97,12 +118,15 @@ __all__ = [
     "Region",
     "Registry",
     "ReplaySource",
+    "Separate",
     "Separation",
     "SimulatedSource",
     "SoftSymbols",
     "StreamError",
     "SyncLock",
     "Synchronization",
+    "Synchronizer",
+    "Tracker",
     "Tracking",
     "Triggers",
     "UnknownAlgorithmError",
@@ -121,6 +145,8 @@ __all__ = [
 _HOMES = {
     "air.beacons": ("Beacon",),
     "air.blocks": ("Message",),
+    "air.codebook": ("Codebook",),
+    "air.frames": ("PacketFormat",),
     "errors": (
         "CodebookMismatchError",
         "ConfigError",
@@ -140,18 +166,28 @@ _HOMES = {
     "plugin.hooks": ("Algorithm", "hookimpl"),
     "plugin.registry": ("Registry",),
     "plugin.roles": (
+        "Code",
+        "Corrected",
+        "Decode",
         "Decoding",
         "ErrorCorrection",
+        "Filter",
+        "Measure",
         "Modulation",
         "Pilots",
         "Ranging",
+        "Separate",
         "Separation",
         "Synchronization",
+        "Synchronizer",
+        "Tracker",
         "Tracking",
     ),
     "results.tables": ("frames_table",),
     "run": ("Reception", "receive"),
     "rx.receiver": ("Receiver",),
+    "scene.bar": ("BarLayout",),
+    "scene.camera": ("CameraModel",),
     "scene.sites": ("BarSite", "load_sites"),
     "simulated": ("SimulatedSource", "simulate"),
     "values": (

@@ -6,10 +6,10 @@ import numpy as np
 from evlcp_robust.decoding import Majority
 from evlcp_robust.ranging import MedianPairs
 
-from evlcp_sdk.link.resolve import load_link
+import evlcp_sdk as evlcp
 from evlcp_sdk.testing import conformance, ideal_presence, ideal_sums, ideal_view
 
-LINK = load_link()
+LINK = evlcp.load_link()
 SYMBOLS = np.random.default_rng(7).integers(0, len(LINK.codebook.codewords), LINK.bar.clusters)
 
 

@@ -2,17 +2,17 @@
 
 from collections.abc import Iterator
 
-from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
+import evlcp_sdk as evlcp
 
 __all__ = ["evlcp_algorithms"]
 
 
-@hookimpl
-def evlcp_algorithms() -> Iterator[Algorithm]:
+@evlcp.hookimpl
+def evlcp_algorithms() -> Iterator[evlcp.Algorithm]:
     """The algorithms of this package."""
-    yield Algorithm(
+    yield evlcp.Algorithm(
         "ranging", "median-pairs", "evlcp_robust.ranging:MedianPairs", 1, "median over all pairs of clusters"
     )
-    yield Algorithm(
+    yield evlcp.Algorithm(
         "decoding", "majority", "evlcp_robust.decoding:Majority", 1, "one vote a cell, odds from the pilots"
     )

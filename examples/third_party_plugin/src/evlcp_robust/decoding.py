@@ -7,15 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.plugin.roles import Decode, Decoding
-from evlcp_sdk.values import PresenceMap, SoftSymbols
+import evlcp_sdk as evlcp
 
 __all__ = ["Majority"]
 
 
 @dataclass(frozen=True)
-class Majority(Decoding):
+class Majority(evlcp.Decoding):
     """One vote a cell and value, whatever the number of its events.
 
     A cell that shows a cluster votes for each of its values: with the sign of the second chip's polarity
@@ -28,14 +26,14 @@ class Majority(Decoding):
         float, Field(ge=0, lt=1, description="Presence probability above which a cell may vote.")
     ] = 0.5
 
-    def compile(self, codebook: Codebook) -> Decode:
+    def compile(self, codebook: evlcp.Codebook) -> evlcp.Decode:
         """Precompute which codewords have a 0 in each bit."""
         words = codebook.codewords.astype(np.int64)
         pilots = codebook.pilots.astype(np.int64)
         m = codebook.bits_per_symbol
         zero = (np.arange(len(words)) >> np.arange(m - 1, -1, -1)[:, None] & 1) == 0
 
-        def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
+        def decode(presence: evlcp.PresenceMap, sums: NDArray[np.int16]) -> evlcp.SoftSymbols:
             votes = _votes(sums, presence.grid_px)
             voters = (presence.probability > self.min_presence).astype(np.int64)
             count = np.tensordot(voters, votes, ([1, 2], [1, 2]))
@@ -52,7 +50,7 @@ class Majority(Decoding):
             llr = np.subtract(*(np.logaddexp.reduce(side, -1) for side in sides))
             total = int(heard[:, pilots.shape[1] :].sum())
             quality = max(int(fit.max(1).sum()), 0) / total if total else 0.0
-            return SoftSymbols(fit.argmax(1), llr.astype(np.float32), quality)
+            return evlcp.SoftSymbols(fit.argmax(1), llr.astype(np.float32), quality)
 
         return decode
 

@@ -6,16 +6,11 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.plugin.roles import Measure, Ranging
-from evlcp_sdk.scene.bar import BarLayout
-from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import FrameView, Range
+import evlcp_sdk as evlcp
 
 __all__ = ["MedianPairs"]
 
-_NONE = Range(float("nan"), float("nan"), 0)
+_NONE = evlcp.Range(float("nan"), float("nan"), 0)
 
 _SIGMA_OF_MAD = 1.4826
 """Standard deviation of a Gaussian whose median absolute deviation is 1."""
@@ -25,7 +20,7 @@ _EFFICIENCY = 3 / np.pi
 
 
 @dataclass(frozen=True)
-class MedianPairs(Ranging):
+class MedianPairs(evlcp.Ranging):
     """Median of the image scale over all pairs of clusters that are far apart (Theil 1950, Sen 1968).
 
     A cluster stands where its map's centre of gravity is. Up to a quarter of the clusters may stand anywhere
@@ -38,14 +33,16 @@ class MedianPairs(Ranging):
     ] = 0.25
     min_clusters: Annotated[int, Field(ge=3, description="Clusters that must be seen.")] = 5
 
-    def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
+    def compile(
+        self, camera: evlcp.CameraModel, bar: evlcp.BarLayout, codebook: evlcp.Codebook
+    ) -> evlcp.Measure:
         """Precompute the pairs.
 
         Raises:
             ConfigError: The bar has fewer clusters than must be seen.
         """
         if bar.clusters < self.min_clusters:
-            raise ConfigError(
+            raise evlcp.ConfigError(
                 f"ranging.min_clusters = {self.min_clusters}: expected at most the bar's {bar.clusters}"
             )
         centres = bar.cluster_centres_m()
@@ -55,7 +52,7 @@ class MedianPairs(Ranging):
         far = apart >= self.min_spacing * apart.max()
         first, second, apart = first[far], second[far], apart[far]
 
-        def measure(view: FrameView) -> Range:
+        def measure(view: evlcp.FrameView) -> evlcp.Range:
             maps = view.presence.pixels.astype(np.float64)
             weight = maps.sum((1, 2))
             seen = weight > 0
@@ -78,7 +75,7 @@ class MedianPairs(Ranging):
             power = float((np.abs(spread) ** 2).sum())
             sigma = error_px / np.sqrt(power * _EFFICIENCY)
             distance = camera.distance_m(1.0, scale)
-            return Range(distance, distance * float(sigma) / scale, int(pairs.sum()))
+            return evlcp.Range(distance, distance * float(sigma) / scale, int(pairs.sum()))
 
         return measure
 
