@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import unquote
 
-from evlcp_sdk.errors import EvlcpError, InputError, PluginError, StreamError
+from evlcp_sdk.errors import EvlcpError, InputError, StreamError
 from evlcp_sdk.io.faery import FORMATS, FaerySource
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
 from evlcp_sdk.io.sources import EventSource
@@ -24,8 +24,9 @@ _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 def open_source(url: Path | str, registry: Registry | None = None) -> EventSource:
     """Open a recording, a camera or whatever else a plugin knows, as an event source: a context manager.
 
-    Plugins are asked first, by the hook `evlcp_open_events`. Of a file the content says the format, or else
-    the suffix of its name; `file:` before its name does no harm.
+    Plugins are asked first, by the hook `evlcp_open_events`; one that fails is left out, with a
+    `PluginWarning`. Of a file the content says the format, or else the suffix of its name; `file:` before its
+    name does no harm.
 
     Args:
         url: A file, or what a plugin opens, e.g. `cam:0`.
@@ -33,7 +34,6 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
 
     Raises:
         InputError: It cannot be opened or is not of a known format, or nobody knows its scheme.
-        PluginError: The plugin that opens it fails.
     """
     registry = Registry.load() if registry is None else registry
     source = _ask_plugins(str(url), registry)
@@ -44,25 +44,31 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
         return _open_file(url)
     if scheme[1].lower() == "file":
         return _open_file(unquote(str(url)[len(scheme[0]) :].removeprefix("//")))
-    asked = sorted({impl.plugin_name for impl in registry.hook.evlcp_open_events.get_hookimpls()})
+    asked = sorted(registry.plugins("evlcp_open_events"))
+    broken = "".join(f"; {plugin}" for plugin in registry.broken)
     raise InputError(
         f"{url}: scheme '{scheme[1]}', expected file: or one that a plugin opens"
-        f" (asked: {', '.join(asked) or 'no plugin that opens sources is installed'})"
+        f" (asked: {', '.join(asked) or 'no plugin that opens sources is installed'}){broken}"
     )
 
 
 def _ask_plugins(url: str, registry: Registry) -> EventSource | None:
-    """The source that the first plugin gives; None where no plugin knows the url."""
-    try:
-        source: object = registry.hook.evlcp_open_events(url=url)
-    except EvlcpError:
-        raise
-    except Exception as fault:
-        what = f"{type(fault).__name__}: {fault}".splitlines()[0]
-        raise PluginError(f"{url}: the plugin that opens it fails: {what}") from fault
-    if source is None or isinstance(source, EventSource):
-        return source
-    raise PluginError(f"{url}: a plugin opens it as {type(source).__name__}, expected an EventSource")
+    """The source that the first plugin gives; None where none knows the url. One that fails is left out."""
+    for impl in reversed(registry.hook.evlcp_open_events.get_hookimpls()):
+        try:
+            source: object = impl.function(*(url for _ in impl.argnames))
+        except EvlcpError:
+            raise
+        except Exception as fault:
+            what = " ".join(f"{type(fault).__name__}: {fault}".split())
+            registry.leave_out(impl.plugin_name, f"evlcp_open_events({url!r}) fails: {what}")
+            continue
+        if isinstance(source, EventSource):
+            return source
+        if source is not None:
+            what = f"gave {type(source).__name__}, expected an EventSource"
+            registry.leave_out(impl.plugin_name, f"evlcp_open_events({url!r}) {what}")
+    return None
 
 
 def _open_file(path: Path | str) -> EventSource:

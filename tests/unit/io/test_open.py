@@ -1,6 +1,7 @@
 """Opening: plugins first, then the readers; a scheme that nobody knows is named."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 import evlcp_sdk.io
-from evlcp_sdk.errors import InputError, PluginError
+from evlcp_sdk.errors import InputError, PluginWarning
 from evlcp_sdk.io import EventSource, open_source, read_events, write_events
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
@@ -116,15 +117,40 @@ def test_a_file_with_a_colon_in_its_name(recording: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.usefixtures("installed")
 @pytest.mark.parametrize(
-    ("url", "message"),
+    ("url", "reason"),
     [
-        ("cam:broken", "cam:broken: the plugin that opens it fails: KeyError: 'no such device'"),
-        ("cam:file", "cam:file: a plugin opens it as PosixPath, expected an EventSource"),
+        ("cam:broken", "evlcp_open_events('cam:broken') fails: KeyError: 'no such device'"),
+        ("cam:file", "evlcp_open_events('cam:file') gave PosixPath, expected an EventSource"),
     ],
 )
-def test_a_plugin_that_fails_is_one_line(url: str, message: str, evlcp: Callable[..., Any]) -> None:
-    with pytest.raises(PluginError) as fault:
+def test_a_plugin_that_fails_is_named(url: str, reason: str, evlcp: Callable[..., Any]) -> None:
+    with pytest.warns(PluginWarning, match=re.escape(reason)), pytest.raises(InputError) as fault:
         open_source(url)
-    assert str(fault.value) == message
+    assert str(fault.value).startswith(f"{url}: scheme 'cam', expected file:")
+    assert str(fault.value).endswith(f"is broken and left out: {reason}")
     done = evlcp("info", url)
-    assert (done.code, done.err) == (2, f"evlcp: {message}\n")
+    assert done.code == 3
+    assert reason in done.err
+    assert "Traceback" not in done.err
+
+
+def test_a_plugin_that_fails_does_not_keep_files_shut(recording: Path) -> None:
+    class Broken:
+        @hookimpl
+        def evlcp_open_events(self, url: str) -> Any:
+            raise OSError("no driver")
+
+    with pytest.warns(PluginWarning, match="OSError: no driver"):
+        source = open_source(recording, Registry.load(Broken()))
+    with source:
+        assert len(source.read()[0]) == 50
+
+
+def test_a_camera_that_is_not_there_says_so() -> None:
+    class Unplugged:
+        @hookimpl
+        def evlcp_open_events(self, url: str) -> Any:
+            raise InputError(f"{url}: no camera is plugged in")
+
+    with pytest.raises(InputError, match=r"^cam:0: no camera is plugged in$"):
+        open_source("cam:0", Registry.load(Unplugged()))
