@@ -75,6 +75,17 @@ def test_the_registry_that_is_given_is_asked() -> None:
 
 
 @pytest.mark.usefixtures("installed")
+def test_the_public_face_sees_it() -> None:
+    with evlcp_sdk.open("cam:0") as source:
+        assert isinstance(source, CameraSource)
+    reception = evlcp_sdk.receive("cam:0")
+    assert list(reception) == []
+    assert reception.counts["events"] == 50
+    assert isinstance(reception.source, CameraSource)
+    assert reception.source.closed
+
+
+@pytest.mark.usefixtures("installed")
 def test_the_command_line_sees_it(evlcp: Callable[..., Any], tmp_path: Path) -> None:
     done = evlcp("info", "cam:0", "--json")
     assert done.code == 0
