@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from evlcp_sdk.link.resolve import Link
-    from evlcp_sdk.place.calibration import Calibrated, CalibrationView, KnownPose
+    from evlcp_sdk.place.calibration import Calibrated, CalibrationView
+    from evlcp_sdk.place.poses import KnownPose
     from evlcp_sdk.scene.sites import BarSite, LocalFrame
 
 __all__ = ["register"]
@@ -52,7 +53,7 @@ def calibrate(
 
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.place.calibration import calibrate as fit
-    from evlcp_sdk.place.calibration import read_poses
+    from evlcp_sdk.place.poses import read_poses
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.sites import LocalFrame, load_sites
 
@@ -98,9 +99,9 @@ def _views(
     from evlcp_sdk.io.open import open_source
     from evlcp_sdk.io.sensor import check_sensor
     from evlcp_sdk.place.calibration import CalibrationView
+    from evlcp_sdk.place.observations import BarView
     from evlcp_sdk.place.points import points_at
-    from evlcp_sdk.place.pose import BarView
-    from evlcp_sdk.place.positioner import Positioner
+    from evlcp_sdk.place.whereabouts import Whereabouts
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.rx.receiver import Receiver
     from evlcp_sdk.scene.sites import LocalFrame
@@ -110,8 +111,7 @@ def _views(
     receiver = Receiver(link, registry.hook)
     clusters, spec = link.bar.clusters, link.position
     period_us = link.packet.packet_chips * link.packet.chip_us
-    # Only to learn which bar is which; positions are what is known here.
-    who = Positioner(link.camera, clusters, period_us, sites, lambda _t_us: None, spec)
+    who = Whereabouts(sites, spec)
     frames: dict[int, list[Frame]] = {}
 
     def take(packets: list[Packet]) -> None:

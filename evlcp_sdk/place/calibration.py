@@ -4,23 +4,19 @@ One least-squares problem over all views: the camera's parameters and each view'
 far as these are not known. A parameter that the views do not determine keeps its configured value.
 """
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.sections import PositionSpec
-from evlcp_sdk.place.pose import BarView, project_bars
-from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.scene.camera import CameraModel
 
-__all__ = ["PARAMETERS", "Calibrated", "CalibrationView", "KnownPose", "calibrate", "read_poses"]
+__all__ = ["PARAMETERS", "Calibrated", "CalibrationView", "calibrate"]
 
 Floats = NDArray[np.float64]
 
@@ -42,45 +38,12 @@ of the columns: what lenses and their mounts have. What is not determined widens
 _LEARNT = 0.5
 """Share of that sigma below which the views, not it, determine a parameter."""
 
-_RANGES = {
-    "latitude_deg": (-90.0, 90.0),
-    "longitude_deg": (-180.0, 180.0),
-    "position_sigma_m": (1e-6, math.inf),
-    "attitude_sigma_deg": (1e-6, math.inf),
-}
-"""What a pose's values may be, least and most; exact ones would outweigh all in double precision."""
-
 _STEPS = 60
 _FREE_SIGMA_RAD = 0.5
 """Sigma of an attitude that is not known, about its closed-form start."""
 
 _MOST_MISFIT = 4.0
 """Mean square of the misses, in sigmas, above which nothing is believed."""
-
-
-@dataclass(frozen=True)
-class KnownPose:
-    """Where a camera was, and how it was turned if that is known: a row of `poses.csv`.
-
-    Attributes:
-        recording: Name of the recording's file; empty where there is only one.
-        t_us: When, camera clock, us.
-        latitude_deg: WGS-84.
-        longitude_deg: The same.
-        height_m: Above the ellipsoid, m.
-        position_sigma_m: Standard deviation of each of these, m.
-        attitude: With heading; None where it is not known.
-        attitude_sigma_deg: Standard deviation of a turn about each axis, degrees.
-    """
-
-    recording: str
-    t_us: float
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
-    position_sigma_m: float
-    attitude: Attitude | None
-    attitude_sigma_deg: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,65 +85,6 @@ class Calibrated:
     views: int
     points: int
     misfit: float
-
-
-def read_poses(path: Path | str) -> list[KnownPose]:
-    """Read a CSV of known poses.
-
-    Columns t_us, latitude_deg, longitude_deg, height_m; optional recording, position_sigma_m (0.01),
-    heading_deg, pitch_deg and roll_deg together, and attitude_sigma_deg (0.1).
-
-    Raises:
-        InputError: The file cannot be read.
-        ConfigError: A column is missing, or a value is no number or out of range.
-    """
-    try:
-        # Spreadsheets begin a file with a byte order mark; empty lines give no row.
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            rows = [(reader.line_num, row) for row in reader]
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
-    except (UnicodeDecodeError, csv.Error) as fault:
-        raise InputError(f"{path}: not a CSV file: {fault}") from fault
-    if not rows:
-        raise ConfigError(f"{path}: expected one line of values or more")
-    poses = []
-    for line, row in rows:
-
-        def value(name: str, usual: float | None = None, line: int = line, row: Any = row) -> float:
-            text = row.get(name)
-            if usual is not None and text in (None, ""):
-                return usual
-            try:
-                number = float(text)
-            except (TypeError, ValueError):
-                number = math.nan
-            if not math.isfinite(number):
-                raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected a number")
-            low, high = _RANGES.get(name, (number, number))
-            if not low <= number <= high:
-                expected = f"{low:g} to {high:g}" if math.isfinite(high) else f"{low:g} or more"
-                raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected {expected}")
-            return number
-
-        angles = [name for name in ("heading_deg", "pitch_deg", "roll_deg") if row.get(name)]
-        attitude = None
-        if angles:
-            attitude = Attitude(value("pitch_deg"), value("roll_deg"), value("heading_deg"))
-        poses.append(
-            KnownPose(
-                row.get("recording") or "",
-                value("t_us"),
-                value("latitude_deg"),
-                value("longitude_deg"),
-                value("height_m"),
-                value("position_sigma_m", 0.01),
-                attitude,
-                value("attitude_sigma_deg", 0.1),
-            )
-        )
-    return poses
 
 
 def calibrate(
@@ -320,7 +224,7 @@ def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, dict
     from scipy.spatial.transform import Rotation
 
     names, shared = PARAMETERS, len(PARAMETERS)
-    begin = np.array([float(getattr(camera, name)) for name in names] + [0.0] * (6 * len(views)))
+    start = np.array([float(getattr(camera, name)) for name in names] + [0.0] * (6 * len(views)))
     usual = _usual_sigma(camera)
     loose = np.array([1 / usual[name] for name in names])
 
@@ -331,7 +235,7 @@ def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, dict
 
     def parts(x: Floats) -> tuple[Floats, Floats]:
         now = camera_of(x)
-        misses, rows = [(x[:shared] - begin[:shared]) * loose], [np.diag(loose) @ np.eye(shared, len(x))]
+        misses, rows = [(x[:shared] - start[:shared]) * loose], [np.diag(loose) @ np.eye(shared, len(x))]
         for i, view in enumerate(views):
             at = shared + 6 * i
             turn = x[at + 3 : at + 6]
@@ -361,7 +265,7 @@ def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, dict
     def slope_of(x: Floats) -> Floats:
         return parts(x)[1]
 
-    fit = least_squares(miss, begin, slope_of, x_scale="jac", max_nfev=_STEPS)
+    fit = least_squares(miss, start, slope_of, x_scale="jac", max_nfev=_STEPS)
     misses, rows = parts(fit.x)
     scale = 1 / np.sqrt((rows**2).sum(0))
     half = np.linalg.inv(np.linalg.qr(rows * scale, mode="r"))

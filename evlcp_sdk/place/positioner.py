@@ -1,43 +1,22 @@
-"""Packets to positions: which bar stands where, and a pose at each time that bars are seen."""
+"""Packets to positions: a pose at each time that bars are seen."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.observations import BarView
 from evlcp_sdk.place.points import points_at
-from evlcp_sdk.place.pose import BarView, Refusal, solve_pose
+from evlcp_sdk.place.pose import solve_pose
+from evlcp_sdk.place.refusals import Refusal
+from evlcp_sdk.place.whereabouts import Whereabouts
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.scene.sites import BarSite, LocalFrame, site_of_transmitter
+from evlcp_sdk.scene.sites import BarSite, LocalFrame
 from evlcp_sdk.values import Fix, Frame, Packet
 
 __all__ = ["Positioner"]
-
-Floats = NDArray[np.float64]
-
-_LENGTH_SHARE = 0.01
-"""Share by which a beacon's length may differ from its site's: a lone bar's distance is wrong by as much."""
-
-
-@dataclass(eq=False)
-class _Seen:
-    """What is known of one transmitter.
-
-    Attributes:
-        frames: Frames with points that a coming fix may need, in order.
-        transmitter_id: What its beacon said, None before.
-        beacon: Its place by its own word.
-        trust: How far that is believed; `forged` shuts it out until a verified one comes.
-    """
-
-    frames: list[Frame]
-    transmitter_id: int | None = None
-    beacon: BarSite | None = None
-    trust: str = "unverified"
 
 
 class Positioner:
@@ -70,35 +49,34 @@ class Positioner:
         self._camera = camera
         self._clusters = clusters
         self._packet_us = packet_us
-        self._sites = tuple(sites)
         self._attitude_at = attitude_at
         self._spec = PositionSpec() if spec is None else spec
-        self._seen: dict[int, _Seen] = {}
+        self._bars = Whereabouts(sites, self._spec)
+        self._frames: dict[int, list[Frame]] = {}
         self._next: int | None = None
-        self._counts = dict.fromkeys(("fixes", "refused", "frames_late", "beacons_forged"), 0)
+        self._counts = dict.fromkeys(("fixes", "refused", "frames_late"), 0)
 
     @property
     def counts(self) -> dict[str, int]:
         """Fixes given and refused, frames that came too late for theirs, forged beacons."""
-        return dict(self._counts)
+        return self._counts | {"beacons_forged": self._bars.forged}
 
     @property
     def stands_at(self) -> dict[int, BarSite]:
         """Where the transmitters stand of which that is known."""
-        found = {number: self._site(number) for number in sorted(self._seen)}
-        return {number: site for number, site in found.items() if site is not None}
+        return self._bars.stands_at
 
     @property
     def contradicted(self) -> dict[int, str]:
         """Transmitters that are left out as their beacons contradict their sites, and how."""
-        found = {number: self._contradiction(number) for number in sorted(self._seen)}
-        return {number: how for number, how in found.items() if how}
+        return self._bars.contradicted
 
     def feed(self, packets: Iterable[Packet]) -> list[Fix]:
         """Take the next packets; return the fixes that no later packet can change."""
         fixes = []
         for packet in packets:
-            seen = self.hear(packet)
+            self._bars.hear(packet)
+            kept = self._frames.setdefault(packet.transmitter, [])
             for frame in packet.frames:
                 if len(frame.points_px) == self._clusters and np.isfinite(frame.points_t_us):
                     number = math.ceil(frame.points_t_us / self._packet_us - 0.5)
@@ -106,68 +84,15 @@ class Positioner:
                         self._next = number
                     # What is late for its own grid time may still serve the next as a neighbour.
                     self._counts["frames_late"] += number < self._next
-                    seen.frames.append(frame)
+                    kept.append(frame)
             # A packet of another bar that begins half a packet after a fix is complete one packet later.
             fixes += self._until(packet.t_us / self._packet_us - 1.5)
         return fixes
 
     def close(self) -> list[Fix]:
         """End the stream; return the rest of the fixes."""
-        last = max((f.points_t_us for s in self._seen.values() for f in s.frames), default=-math.inf)
+        last = max((f.points_t_us for kept in self._frames.values() for f in kept), default=-math.inf)
         return self._until(last / self._packet_us + 0.5) if math.isfinite(last) else []
-
-    def hear(self, packet: Packet) -> _Seen:
-        """Take what a packet's beacons say of its transmitter, and nothing else."""
-        seen = self._seen.setdefault(packet.transmitter, _Seen([]))
-        for heard in packet.messages:
-            if heard.trust == "forged":
-                self._counts["beacons_forged"] += 1
-                seen.trust, seen.beacon = "forged", None
-            if heard.beacon is None or heard.trust == "forged":
-                continue
-            if seen.trust in ("forged", "verified") and heard.trust != "verified":
-                # Once signed, or once forged, only a signature counts.
-                continue
-            b = heard.beacon
-            seen.transmitter_id, seen.trust = heard.message.transmitter_id, heard.trust
-            seen.beacon = BarSite(
-                heard.message.transmitter_id, b.latitude_deg, b.longitude_deg, b.height_m,
-                b.heading_deg % 360, b.tilt_deg, b.length_m,
-            )  # fmt: skip
-        return seen
-
-    def _listed(self, number: int) -> BarSite | None:
-        """The site of the list that a transmitter stands at."""
-        alone = len(self._seen) == 1
-        return site_of_transmitter(self._sites, number, self._seen[number].transmitter_id, alone=alone)
-
-    def _contradiction(self, number: int) -> str:
-        """How a transmitter's own beacon contradicts its site; empty where it does not.
-
-        A lamp that is not where its site is would move the camera by as much, and so would two bars that are
-        mixed up. Nearer than a bar's length, two places are taken for one.
-        """
-        site, beacon = self._listed(number), self._seen[number].beacon
-        if site is None or beacon is None or self._spec.beacons == "none":
-            return ""
-        place = (beacon.latitude_deg, beacon.longitude_deg, beacon.height_m)
-        apart = float(np.linalg.norm(LocalFrame.of([site]).to_enu(*place)))
-        if apart > site.length_m:
-            return f"transmitter {number} says that it is {apart:.1f} m from the site of its id"
-        if abs(beacon.length_m - site.length_m) > _LENGTH_SHARE * site.length_m:
-            long = f"{beacon.length_m:g} m long, its site {site.length_m:g} m"
-            return f"transmitter {number} says that it is {long}"
-        return ""
-
-    def _site(self, number: int) -> BarSite | None:
-        seen = self._seen[number]
-        if seen.trust == "forged" or self._contradiction(number):
-            return None
-        site = self._listed(number)
-        believed = {"none": (), "verified": ("verified",), "any": ("verified", "unverified")}
-        if site is None and seen.trust in believed[self._spec.beacons]:
-            site = seen.beacon
-        return site
 
     def _until(self, limit: float) -> list[Fix]:
         """The fixes of the grid times up to a limit, in packet times."""
@@ -179,10 +104,10 @@ class Positioner:
                 self._counts["refused" if fix.refusal else "fixes"] += 1
                 fixes.append(fix)
             self._next += 1
-            for seen in self._seen.values():
-                oldest = (self._next - 1) * self._packet_us
-                seen.frames = [f for f in seen.frames if f.points_t_us > oldest]
-            coming = [f.points_t_us for s in self._seen.values() for f in s.frames]
+            oldest = (self._next - 1) * self._packet_us
+            for kept in self._frames.values():
+                kept[:] = [f for f in kept if f.points_t_us > oldest]
+            coming = [f.points_t_us for kept in self._frames.values() for f in kept]
             # Where nothing is in view, the grid goes on with the next frame.
             first = math.ceil(min(coming) / self._packet_us - 0.5) if coming else None
             self._next = None if first is None else max(self._next, first)
@@ -191,24 +116,24 @@ class Positioner:
     def _fix(self, t_us: float) -> Fix | None:
         views, sited = [], []
         here: LocalFrame | None = None
-        for number, seen in sorted(self._seen.items()):
-            points = points_at(seen.frames, t_us, self._packet_us, self._clusters, self._spec)
+        for number, frames in sorted(self._frames.items()):
+            points = points_at(frames, t_us, self._packet_us, self._clusters, self._spec)
             if points is None:
                 continue
             views.append(number)
-            site = self._site(number)
+            site = self._bars.site(number)
             if site is None:
                 continue
             if self.frame is None:
                 self.frame = LocalFrame.of([site])
-            # Gravity and north are those of here, which may be far from the origin of the track.
+            # Gravity and north are those of here, which may be far from the origin of the trajectory.
             here = LocalFrame.of([site]) if here is None else here
             enu = site.cluster_positions_m(self._clusters, here)
             sited.append(BarView(number, enu, *points))
         if not views:
             return None
         if here is None or self.frame is None:
-            how = [text for number in views if (text := self._contradiction(number))]
+            how = [text for number in views if (text := self._bars.contradiction(number))]
             if how:
                 return Fix.refused(t_us, tuple(views), "site-contradicted", "; ".join(how))
             which = ", ".join(map(str, views))
@@ -216,7 +141,7 @@ class Positioner:
         pose = solve_pose(sited, self._camera, self._attitude_at(t_us), self._spec)
         if isinstance(pose, Refusal):
             return Fix.refused(t_us, tuple(views), pose.kind, pose.detail)
-        verified = all(self._seen[n].trust == "verified" for n in pose.transmitters)
+        verified = all(self._bars.verified(n) for n in pose.transmitters)
         attitude = Attitude.of_rotation(pose.rotation)
         latitude, longitude, height = (float(v) for v in here.to_geodetic(pose.enu_m))
         turn = self.frame.turn_from(here)

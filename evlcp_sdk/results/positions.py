@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.files import hidden_path
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.place.pose import REFUSALS
 from evlcp_sdk.place.positioner import Positioner
+from evlcp_sdk.place.refusals import REFUSALS
 from evlcp_sdk.place.trajectory import TrajectoryPoint, smooth_trajectory, trajectory_step
 from evlcp_sdk.results.mcap import McapFixes, check_mcap
 from evlcp_sdk.results.nmea import gga, rmc

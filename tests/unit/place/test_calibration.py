@@ -18,9 +18,9 @@ from evlcp_sdk.place.calibration import (
     _slopes,
     _turn_slope,
     calibrate,
-    read_poses,
 )
-from evlcp_sdk.place.pose import BarView, project_bars
+from evlcp_sdk.place.observations import BarView, project_bars
+from evlcp_sdk.place.poses import read_poses
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel
 

@@ -12,15 +12,11 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.link.sections import PositionSpec
-from evlcp_sdk.place.pose import (
-    REFUSALS,
-    BarView,
-    Pose,
-    Refusal,
-    project_bars,
-    solve_pose,
-    three_point_poses,
-)
+from evlcp_sdk.place.judgement import Pose
+from evlcp_sdk.place.observations import BarView, project_bars
+from evlcp_sdk.place.pose import solve_pose
+from evlcp_sdk.place.refusals import REFUSALS, Refusal
+from evlcp_sdk.place.starts import three_point_poses
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel
 

@@ -13,7 +13,7 @@ from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import PositionSpec
-from evlcp_sdk.place.pose import project_bars
+from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.positioner import Positioner
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog

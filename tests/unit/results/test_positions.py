@@ -15,7 +15,7 @@ import pytest
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.place.pose import project_bars
+from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.results import positions
 from evlcp_sdk.results.figures import TrackProbe, draw_track, save_track
 from evlcp_sdk.results.outputs import ResultWriter, hidden_path

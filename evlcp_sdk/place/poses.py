@@ -1,0 +1,104 @@
+"""Where a camera was when: the poses that a calibration goes by, from a file."""
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.scene.attitude import Attitude
+
+__all__ = ["KnownPose", "read_poses"]
+
+_RANGES = {
+    "latitude_deg": (-90.0, 90.0),
+    "longitude_deg": (-180.0, 180.0),
+    "position_sigma_m": (1e-6, math.inf),
+    "attitude_sigma_deg": (1e-6, math.inf),
+}
+"""What a pose's values may be, least and most; exact ones would outweigh all in double precision."""
+
+
+@dataclass(frozen=True)
+class KnownPose:
+    """Where a camera was, and how it was turned if that is known: a row of `poses.csv`.
+
+    Attributes:
+        recording: Name of the recording's file; empty where there is only one.
+        t_us: When, camera clock, us.
+        latitude_deg: WGS-84.
+        longitude_deg: The same.
+        height_m: Above the ellipsoid, m.
+        position_sigma_m: Standard deviation of each of these, m.
+        attitude: With heading; None where it is not known.
+        attitude_sigma_deg: Standard deviation of a turn about each axis, degrees.
+    """
+
+    recording: str
+    t_us: float
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    position_sigma_m: float
+    attitude: Attitude | None
+    attitude_sigma_deg: float
+
+
+def read_poses(path: Path | str) -> list[KnownPose]:
+    """Read a CSV of known poses.
+
+    Columns t_us, latitude_deg, longitude_deg, height_m; optional recording, position_sigma_m (0.01),
+    heading_deg, pitch_deg and roll_deg together, and attitude_sigma_deg (0.1).
+
+    Raises:
+        InputError: The file cannot be read.
+        ConfigError: A column is missing, or a value is not a number or is out of range.
+    """
+    try:
+        # Spreadsheets start a file with a byte order mark; empty lines give no row.
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            rows = [(reader.line_num, row) for row in reader]
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+    except (UnicodeDecodeError, csv.Error) as fault:
+        raise InputError(f"{path}: not a CSV file: {fault}") from fault
+    if not rows:
+        raise ConfigError(f"{path}: expected one line of values or more")
+    poses = []
+    for line, row in rows:
+
+        def value(name: str, usual: float | None = None, line: int = line, row: Any = row) -> float:
+            text = row.get(name)
+            if usual is not None and text in (None, ""):
+                return usual
+            try:
+                number = float(text)
+            except (TypeError, ValueError):
+                number = math.nan
+            if not math.isfinite(number):
+                raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected a number")
+            low, high = _RANGES.get(name, (number, number))
+            if not low <= number <= high:
+                expected = f"{low:g} to {high:g}" if math.isfinite(high) else f"{low:g} or more"
+                raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected {expected}")
+            return number
+
+        angles = [name for name in ("heading_deg", "pitch_deg", "roll_deg") if row.get(name)]
+        attitude = None
+        if angles:
+            attitude = Attitude(value("pitch_deg"), value("roll_deg"), value("heading_deg"))
+        poses.append(
+            KnownPose(
+                row.get("recording") or "",
+                value("t_us"),
+                value("latitude_deg"),
+                value("longitude_deg"),
+                value("height_m"),
+                value("position_sigma_m", 0.01),
+                attitude,
+                value("attitude_sigma_deg", 0.1),
+            )
+        )
+    return poses

@@ -1,0 +1,32 @@
+"""Why there is no position."""
+
+from dataclasses import dataclass
+
+__all__ = ["REFUSALS", "Refusal"]
+
+REFUSALS = {
+    "no-site": "no bar in view stands at a known place",
+    "site-contradicted": "the bars' own beacons say other places or lengths than their sites",
+    "too-few-clusters": "no bar shows as many clusters as a position needs",
+    "heading-unknown": "one bar alone, and the camera's heading is not known",
+    "gravity-unknown": "fewer than three bars, or bars in line, and gravity is not known",
+    "not-determined": "no start, no end of the fit, or equations that are singular",
+    "two-solutions": "two places fit the image alike",
+    "end-on": "a lone bar points along the line of sight",
+    "misfit": "the image does not fit the sites: another place, bar or attitude than was said",
+    "uncertain": "the position is less certain than `position.max_sigma_m`, or along a curve",
+}
+"""Kinds of refusal, and what they mean."""
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why there is no position.
+
+    Attributes:
+        kind: One of `REFUSALS`.
+        detail: The same in words, with the figures of this case.
+    """
+
+    kind: str
+    detail: str

@@ -1,0 +1,119 @@
+"""Which bar a transmitter is, and where it stands: by the user's sites, and by what beacons say."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.scene.sites import BarSite, LocalFrame, site_of_transmitter
+from evlcp_sdk.values import Packet
+
+__all__ = ["Whereabouts"]
+
+_LENGTH_SHARE = 0.01
+"""Share by which a beacon's length may differ from its site's: a lone bar's distance is wrong by as much."""
+
+_BELIEVED = {"none": (), "verified": ("verified",), "any": ("verified", "unverified")}
+"""Trust that `position.beacons` asks for."""
+
+
+@dataclass
+class _Said:
+    """What a transmitter's beacons said.
+
+    Attributes:
+        transmitter_id: Its id, None before.
+        beacon: Its place by its own word.
+        trust: How far that is believed; `forged` shuts it out until a verified one comes.
+    """
+
+    transmitter_id: int | None = None
+    beacon: BarSite | None = None
+    trust: str = "unverified"
+
+
+class Whereabouts:
+    """Where the transmitters of a receiver stand.
+
+    Args:
+        sites: Where bars stand; may be empty where beacons are believed.
+        spec: Which beacons are believed.
+
+    Attributes:
+        forged: Messages so far that were forged.
+    """
+
+    def __init__(self, sites: Sequence[BarSite], spec: PositionSpec) -> None:
+        self.forged = 0
+        self._sites = tuple(sites)
+        self._spec = spec
+        self._said: dict[int, _Said] = {}
+
+    @property
+    def stands_at(self) -> dict[int, BarSite]:
+        """Where the transmitters stand of which that is known."""
+        found = {number: self.site(number) for number in sorted(self._said)}
+        return {number: site for number, site in found.items() if site is not None}
+
+    @property
+    def contradicted(self) -> dict[int, str]:
+        """Transmitters that are left out as their beacons contradict their sites, and how."""
+        found = {number: self.contradiction(number) for number in sorted(self._said)}
+        return {number: how for number, how in found.items() if how}
+
+    def hear(self, packet: Packet) -> None:
+        """Take what a packet's beacons say of its transmitter."""
+        said = self._said.setdefault(packet.transmitter, _Said())
+        for heard in packet.messages:
+            if heard.trust == "forged":
+                self.forged += 1
+                said.trust, said.beacon = "forged", None
+            if heard.beacon is None or heard.trust == "forged":
+                continue
+            if said.trust in ("forged", "verified") and heard.trust != "verified":
+                # Once signed, or once forged, only a signature counts.
+                continue
+            b = heard.beacon
+            said.transmitter_id, said.trust = heard.message.transmitter_id, heard.trust
+            said.beacon = BarSite(
+                heard.message.transmitter_id, b.latitude_deg, b.longitude_deg, b.height_m,
+                b.heading_deg % 360, b.tilt_deg, b.length_m,
+            )  # fmt: skip
+
+    def verified(self, number: int) -> bool:
+        """Whether the newest beacon that counts was signed by a trusted key."""
+        return self._said[number].trust == "verified"
+
+    def site(self, number: int) -> BarSite | None:
+        """Where a transmitter that was heard stands; None if that is not known, or not believed."""
+        said = self._said[number]
+        if said.trust == "forged" or self.contradiction(number):
+            return None
+        site = self._listed(number)
+        if site is None and said.trust in _BELIEVED[self._spec.beacons]:
+            site = said.beacon
+        return site
+
+    def contradiction(self, number: int) -> str:
+        """How a transmitter's own beacon contradicts its site; empty where it does not.
+
+        A lamp that is not where its site is would move the camera by as much, and so would two bars that are
+        mixed up. Nearer than a bar's length, two places are taken for one.
+        """
+        site, beacon = self._listed(number), self._said[number].beacon
+        if site is None or beacon is None or self._spec.beacons == "none":
+            return ""
+        place = (beacon.latitude_deg, beacon.longitude_deg, beacon.height_m)
+        apart = float(np.linalg.norm(LocalFrame.of([site]).to_enu(*place)))
+        if apart > site.length_m:
+            return f"transmitter {number} says that it is {apart:.1f} m from the site of its id"
+        if abs(beacon.length_m - site.length_m) > _LENGTH_SHARE * site.length_m:
+            long = f"{beacon.length_m:g} m long, its site {site.length_m:g} m"
+            return f"transmitter {number} says that it is {long}"
+        return ""
+
+    def _listed(self, number: int) -> BarSite | None:
+        """The site of the list that a transmitter stands at."""
+        alone = len(self._said) == 1
+        return site_of_transmitter(self._sites, number, self._said[number].transmitter_id, alone=alone)
