@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from evlcp_sdk.link.resolve import load_link
 from firmware_host.board.bank import Bank, random_symbols, symbol_chips
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.processes import start_qemu
 from firmware_host.protocol.client import RequestOutcome
-from firmware_host.protocol.generate import codebook_of
 from firmware_host.protocol.requests import StatusReply, StatusRequest
 from firmware_host.protocol.wire import WireMessage
 
@@ -25,10 +25,10 @@ CHIPS = 20_000
 TICKS_PER_US = 25.0
 
 
-def play(leds: Path, payload: Bank) -> tuple[int, StatusReply]:
+def play(leds: Path, bank: Bank) -> tuple[int, StatusReply]:
     with Session(start_qemu(leds)) as session:
         board = Board(session)
-        provision(board, payload, Settings())
+        provision(board, bank, Settings())
         asked, last = 0, board.status()
 
         def requests() -> Iterator[StatusRequest]:
@@ -46,7 +46,7 @@ def play(leds: Path, payload: Bank) -> tuple[int, StatusReply]:
 
 
 def main() -> None:
-    book = codebook_of("wh4x2")
+    book = load_link().codebook
     symbols = random_symbols(8, 10, book, np.random.default_rng(5))
     with tempfile.TemporaryDirectory() as folder:
         leds = Path(folder) / "leds.bin"

@@ -164,13 +164,6 @@ class Codebook:
             raise CodebookMismatchError(f"{source}: digest {digest}, but its codes have {book.digest}")
         return book
 
-    def check_same(self, other_digest: str, who: str) -> None:
-        """Raise CodebookMismatchError unless `other_digest`, of `who`, is this codebook's."""
-        if other_digest != self.digest:
-            raise CodebookMismatchError(
-                f"{who} has codebook {other_digest[:16]}, this end has {self.digest[:16]} ({self.profile})"
-            )
-
     def to_c(self) -> str:
         """The codebook as a C11 header: chip words, most significant bit first on air.
 

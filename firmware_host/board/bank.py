@@ -1,9 +1,8 @@
-"""What a driver board is sent: symbols or chip masks, as bank content, words and chip tables."""
+"""What a driver board is sent: symbols or chip masks, as the content of a bank."""
 
-import json
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,20 +11,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.air.frames import PacketFormat, info_words, packet_chips, pilot_words
+from evlcp_sdk.air.frames import PacketFormat, info_words, packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
-from firmware_host.errors import IncompatibleError
-from firmware_host.protocol.requests import ROW_BYTES, Format
+from evlcp_sdk.link.resolve import Link
+from firmware_host.protocol.requests import CLUSTERS, LEDS, ROW_BYTES, Format
 from firmware_host.protocol.rows import rows_of_chips
 
-__all__ = [
-    "Bank",
-    "random_symbols",
-    "read_masks",
-    "read_symbols",
-    "symbol_chips",
-    "word_table",
-]
+__all__ = ["Bank", "bank_of", "check_link", "limits", "random_symbols", "read_masks", "symbol_chips"]
+
+WORD_CHIPS = 16
+"""Chips of a pilot, and of an info segment, that the board composes."""
+
+PREAMBLE_CHIPS = 32
+"""Chips of a preamble at most."""
+
+MOST_FRAMES = 65_535
+"""Frames of a packet at most."""
 
 Symbols = NDArray[np.int64]
 
@@ -37,57 +38,62 @@ class Bank:
     Attributes:
         format: Info words or chip masks.
         packets: Packets in it.
-        frames: Frames per packet.
         content: The bank's bytes.
         codebook: The codebook it was made with.
-        pilot_every: Frames from one pilot to the next.
+        packet: Lengths of a packet's parts, and the chip rate.
     """
 
     format: Format
     packets: int
-    frames: int
     content: bytes
     codebook: Codebook
-    pilot_every: int = 1
+    packet: PacketFormat
 
     @classmethod
-    def of_symbols(cls, symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -> "Bank":
+    def of_symbols(
+        cls, symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1, chip_rate_hz: float = 10_000.0
+    ) -> "Bank":
         """Info words of symbols (packets, frames, clusters).
 
         Raises:
-            ConfigError: Symbols of another shape or outside the codebook.
+            ConfigError: Symbols of another shape or outside the codebook, or a board cannot play them.
 
-        >>> from firmware_host.protocol.generate import codebook_of
-        >>> Bank.of_symbols([[[0] * 16]], codebook_of("wh4x2")).content[:2].hex()
+        >>> from evlcp_sdk.link.resolve import resolve
+        >>> Bank.of_symbols([[[0] * 16]], resolve({}).codebook).content[:2].hex()
         '5555'
         """
-        s = np.asarray(symbols)
-        if s.ndim != 3 or not s.size:
-            raise ConfigError(f"symbols of shape {s.shape}: expected (packets, frames, clusters)")
-        words = np.concatenate([info_words(packet, codebook) for packet in s])
-        return cls(Format.WORDS, len(s), s.shape[1], words.astype("<u2").tobytes(), codebook, pilot_every)
+        s = _checked(symbols)
+        packet = PacketFormat.of(codebook, s.shape[1], chip_rate_hz, pilot_every)
+        _refuse(limits(codebook, packet))
+        words = np.concatenate([info_words(one, codebook) for one in s])
+        return cls(Format.WORDS, len(s), words.astype("<u2").tobytes(), codebook, packet)
 
     @classmethod
-    def of_masks(
-        cls, chips: ArrayLike, packets: int, frames: int, codebook: Codebook, pilot_every: int = 1
-    ) -> "Bank":
-        """Precomposed chips, uint8 (chips, 96 LEDs), that fill `packets` packets.
+    def of_masks(cls, chips: ArrayLike, codebook: Codebook, packet: PacketFormat) -> "Bank":
+        """Precomposed chips, uint8 (chips, 96 LEDs or 16 clusters), that fill whole packets.
 
         Raises:
-            ConfigError: Another number of chips.
+            ConfigError: Another number of chips, or a board cannot play them.
         """
-        rows = rows_of_chips(chips)
-        expected = packets * _packet_chips(codebook, frames, pilot_every)
-        if len(rows) != expected:
+        _refuse(limits(codebook, packet))
+        c = np.asarray(chips)
+        if c.ndim != 2 or not len(c) or len(c) % packet.packet_chips:
             raise ConfigError(
-                f"{len(rows)} chips: expected {expected} for {packets} packets of {frames} frames"
+                f"array of shape {c.shape}, expected whole packets of {packet.packet_chips} chips"
+                f" ({packet.frames} frames)"
             )
-        return cls(Format.MASKS, packets, frames, rows.tobytes(), codebook, pilot_every)
+        rows = rows_of_chips(c)
+        return cls(Format.MASKS, len(rows) // packet.packet_chips, rows.tobytes(), codebook, packet)
+
+    @property
+    def chip_rate_hz(self) -> int:
+        """Chips per second."""
+        return int(self.packet.chip_rate_hz)
 
     def packet_bytes(self, frames: int) -> int:
         """Bytes a packet of this format with another number of frames takes in a bank."""
         if self.format == Format.MASKS:
-            return ROW_BYTES * _packet_chips(self.codebook, frames, self.pilot_every)
+            return ROW_BYTES * replace(self.packet, frames=frames).packet_chips
         return 2 * self.codebook.clusters * frames
 
     @cached_property
@@ -96,8 +102,54 @@ class Bank:
         return zlib.crc32(self.content)
 
 
-def _packet_chips(codebook: Codebook, frames: int, pilot_every: int) -> int:
-    return PacketFormat.of(codebook, frames, pilot_every=pilot_every).packet_chips
+def limits(codebook: Codebook, packet: PacketFormat) -> list[str]:
+    """What of a link a driver board cannot play; empty if it can."""
+    faults = []
+    if codebook.clusters != CLUSTERS:
+        faults.append(f"bar of {codebook.clusters} clusters, the board has {CLUSTERS}")
+    for name, chips in (("pilots", packet.pilot_chips), ("modulation", packet.info_chips)):
+        if chips != WORD_CHIPS:
+            faults.append(f"{name}: codes of {chips} chips, the board's words have {WORD_CHIPS}")
+    if packet.preamble_chips > PREAMBLE_CHIPS:
+        faults.append(f"preamble of {packet.preamble_chips} chips, the board's has at most {PREAMBLE_CHIPS}")
+    if packet.frames > MOST_FRAMES:
+        faults.append(f"air.frames_per_packet = {packet.frames}, at most {MOST_FRAMES}")
+    if packet.chip_rate_hz != round(packet.chip_rate_hz):
+        faults.append(f"air.chip_rate_hz = {packet.chip_rate_hz}: a board takes whole chips a second")
+    return faults
+
+
+def check_link(link: Link) -> None:
+    """Raise ConfigError, one line, if a driver board cannot play a link; see `limits`."""
+    faults = limits(link.codebook, link.packet)
+    leds = set(np.bincount(link.bar.led_clusters()).tolist())
+    if link.codebook.clusters == CLUSTERS and leds != {LEDS // CLUSTERS}:
+        few, many = min(leds), max(leds)
+        found = few if few == many else f"{few} to {many}"
+        faults.insert(0, f"bar of {found} LEDs a cluster, the board has {LEDS // CLUSTERS}")
+    _refuse(faults)
+
+
+def bank_of(symbols: ArrayLike, link: Link) -> Bank:
+    """Info words of symbols (packets, frames, clusters) of a link.
+
+    Raises:
+        ConfigError: The symbols are not the link's, or a board cannot play it.
+    """
+    check_link(link)
+    return Bank.of_symbols(symbols, link.codebook, link.packet.pilot_every, link.packet.chip_rate_hz)
+
+
+def _refuse(faults: list[str]) -> None:
+    if faults:
+        raise ConfigError(f"the driver board cannot play this link: {'; '.join(faults)}")
+
+
+def _checked(symbols: ArrayLike) -> NDArray[Any]:
+    s = np.asarray(symbols)
+    if s.ndim != 3 or not s.size:
+        raise ConfigError(f"symbols of shape {s.shape}: expected (packets, frames, clusters)")
+    return s
 
 
 def random_symbols(packets: int, frames: int, codebook: Codebook, generator: np.random.Generator) -> Symbols:
@@ -112,89 +164,17 @@ def symbol_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -
     Raises:
         ConfigError: Symbols of another shape or outside the codebook.
     """
-    s = np.asarray(symbols)
-    if s.ndim != 3 or not s.size:
-        raise ConfigError(f"symbols of shape {s.shape}: expected (packets, frames, clusters)")
-    return np.concatenate([packet_chips(packet, codebook, pilot_every) for packet in s])
+    return np.concatenate([packet_chips(packet, codebook, pilot_every) for packet in _checked(symbols)])
 
 
-def word_table(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.uint16]:
-    """Pilot and info words, uint16 (packets, frames, clusters, 2)."""
-    s = np.asarray(symbols)
-    info = np.stack([info_words(packet, codebook) for packet in s])
-    pilots = np.broadcast_to(pilot_words(codebook), info.shape)
-    return np.stack([pilots, info], axis=-1)
-
-
-def read_symbols(path: Path, codebook: Codebook, pilot_every: int = 1) -> Symbols:
-    """Symbols of a JSON file: `[packet][frame][cluster]`, or an object with the key `symbols`.
-
-    An object's `profile` and `digest`, where given, must be the codebook's, and its `pilot_every` that of the
-    packets.
+def read_masks(path: Path, codebook: Codebook, packet: PacketFormat) -> Bank:
+    """Precomposed chips of a `.npy` file: uint8 (chips, 96) or (chips, 16), whole packets.
 
     Raises:
-        IncompatibleError: The file's digest is another one.
-        InputError: The file cannot be read, is no JSON, or an element is missing, out of range or no integer;
-            the message names the place.
-    """
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
-    except (ValueError, RecursionError) as fault:
-        raise InputError(f"{path}: not JSON: {fault}") from fault
-    place = "symbols"
-    if isinstance(table, dict):
-        profile = table.get("profile", codebook.profile)
-        if profile != codebook.profile:
-            raise InputError(
-                f"{path}: profile = {profile!r}, expected {codebook.profile!r}; choose it with --profile"
-            )
-        digest = table.get("digest", codebook.digest)
-        if digest != codebook.digest:
-            raise IncompatibleError(
-                f"{path}: digest = {json.dumps(digest)[:18]}, expected {codebook.digest[:16]}"
-                f" ({codebook.profile}): made with another codebook; make the file again"
-            )
-        every = table.get("pilot_every", pilot_every)
-        if every != pilot_every:
-            raise InputError(
-                f"{path}: pilot_every = {json.dumps(every)}, expected {pilot_every};"
-                " choose it with --pilot-every"
-            )
-        if "symbols" not in table:
-            raise InputError(f"{path}: key symbols is missing, expected symbols[packet][frame][cluster]")
-        table = table["symbols"]
-    packets = _list(path, place, table, "packets")
-    frames = len(_list(path, f"{place}[0]", packets[0], "frames"))
-    for p, packet in enumerate(packets):
-        _list(path, f"{place}[{p}]", packet, "frames", frames)
-        for f, frame in enumerate(packet):
-            _list(path, f"{place}[{p}][{f}]", frame, "symbols, one a cluster", codebook.clusters)
-            for k, symbol in enumerate(frame):
-                top = len(codebook.codewords) - 1
-                if type(symbol) is not int or not 0 <= symbol <= top:
-                    raise InputError(
-                        f"{path}: {place}[{p}][{f}][{k}] = {json.dumps(symbol)},"
-                        f" expected an integer 0 to {top} ({codebook.profile})"
-                    )
-    return np.array(packets, np.int64)
-
-
-def _list(path: Path, place: str, value: Any, of: str, length: int | None = None) -> list[Any]:
-    if not isinstance(value, list) or not value or (length is not None and len(value) != length):
-        found = f"{len(value)} elements" if isinstance(value, list) else json.dumps(value)[:40]
-        wanted = f"{length} {of}" if length is not None else f"a list of {of}"
-        raise InputError(f"{path}: {place}: found {found}, expected {wanted}")
-    return value
-
-
-def read_masks(path: Path, frames: int, codebook: Codebook, pilot_every: int = 1) -> Bank:
-    """Precomposed chips of a `.npy` file: uint8 (chips, 96) or (chips, 16), whole packets of `frames` frames.
-
-    Raises:
+        ConfigError: A board cannot play such packets.
         InputError: The file cannot be read, or holds something else.
     """
+    _refuse(limits(codebook, packet))
     try:
         with path.open("rb") as file:
             chips = np.load(file, allow_pickle=False)
@@ -204,13 +184,7 @@ def read_masks(path: Path, frames: int, codebook: Codebook, pilot_every: int = 1
         raise InputError(f"{path}: not a .npy file of plain numbers: {fault}") from fault
     if not isinstance(chips, np.ndarray):
         raise InputError(f"{path}: not a .npy file, but an archive of several")
-    length = _packet_chips(codebook, frames, pilot_every)
-    if chips.ndim != 2 or not len(chips) or len(chips) % length:
-        raise InputError(
-            f"{path}: array of shape {chips.shape},"
-            f" expected whole packets of {length} chips ({frames} frames)"
-        )
     try:
-        return Bank.of_masks(chips, len(chips) // length, frames, codebook, pilot_every)
+        return Bank.of_masks(chips, codebook, packet)
     except ConfigError as fault:
         raise InputError(f"{path}: {fault}") from fault

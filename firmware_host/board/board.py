@@ -11,8 +11,9 @@ from evlcp_sdk.air.frames import pilot_words
 from evlcp_sdk.errors import ConfigError
 from firmware_host.board.bank import Bank
 from firmware_host.board.session import Session
-from firmware_host.errors import IncompatibleError, LineError, RefusedError, VerifyError
+from firmware_host.errors import LineError, RefusedError, VerifyError
 from firmware_host.protocol.client import RequestOutcome
+from firmware_host.protocol.profiles import DIGESTS
 from firmware_host.protocol.requests import (
     NO_BANK,
     BlankReply,
@@ -87,17 +88,15 @@ class Programmed:
 
 @dataclass(frozen=True)
 class Settings:
-    """What a board is set to besides its payload.
+    """What a board is set to besides its bank.
 
     Attributes:
-        chip_rate_hz: Chips per second.
         level_ma: LED current, mA; None leaves it.
         watchdog: What to do when the host falls silent; None leaves it.
         watchdog_ms: After which silence, ms.
         start: Whether to play when all is done.
     """
 
-    chip_rate_hz: int = 10_000
     level_ma: int | None = None
     watchdog: Watchdog | None = None
     watchdog_ms: int = 5_000
@@ -185,15 +184,15 @@ class Board:
 
     # -- programming
 
-    def prepare(self, payload: Bank, chip_rate_hz: int) -> None:
+    def prepare(self, bank: Bank) -> None:
         """Set chip rate, profile and codebook for the next commit.
 
         Raises:
             IncompatibleError: The firmware was built with another codebook.
             RefusedError: The board cannot take a value.
         """
-        book = payload.codebook
-        configure = ConfigureRequest(chip_rate_hz, profile_number(book), payload.frames, payload.pilot_every)
+        book, packet, chip_rate_hz = bank.codebook, bank.packet, bank.chip_rate_hz
+        configure = ConfigureRequest(chip_rate_hz, profile_number(book), packet.frames, packet.pilot_every)
         try:
             self.session.call(configure, ConfigureReply)
         except RefusedError as fault:
@@ -208,15 +207,14 @@ class Board:
                 fault.status,
                 fault.detail,
             ) from fault
-        chips = 2 * len(book.preamble)
-        if chips > 32:
-            raise IncompatibleError(f"preamble of {chips} chips: the board's has at most 32")
         pilots = tuple(int(w) for w in pilot_words(book))
-        request = CodebookRequest(chips, word_of_values(book.preamble), pilots, bytes.fromhex(book.digest))
+        request = CodebookRequest(
+            packet.preamble_chips, word_of_values(book.preamble), pilots, bytes.fromhex(book.digest)
+        )
         self.session.call(request, CodebookReply)
 
-    def holds(self, payload: Bank, chip_rate_hz: int, status: StatusReply) -> bool:
-        """Whether the active bank is this payload."""
+    def holds(self, bank: Bank, status: StatusReply) -> bool:
+        """Whether the active bank is this one."""
         return status.active_bank != NO_BANK and (
             status.format,
             status.packets,
@@ -228,79 +226,73 @@ class Board:
             status.profile,
             status.digest.hex(),
         ) == (
-            payload.format,
-            payload.packets,
-            payload.frames,
-            payload.pilot_every,
-            len(payload.content),
-            payload.crc,
-            chip_rate_hz,
-            profile_number(payload.codebook),
-            payload.codebook.digest,
+            bank.format,
+            bank.packets,
+            bank.packet.frames,
+            bank.packet.pilot_every,
+            len(bank.content),
+            bank.crc,
+            bank.chip_rate_hz,
+            profile_number(bank.codebook),
+            bank.codebook.digest,
         )
 
-    def program(
-        self,
-        payload: Bank,
-        chip_rate_hz: int = 10_000,
-        verify: bool = True,
-        progress: Progress | None = None,
-    ) -> Programmed:
-        """Bring a payload onto the board and make it active; what is there already is not sent again.
+    def program(self, content: Bank, verify: bool = True, progress: Progress | None = None) -> Programmed:
+        """Bring a bank's content onto the board and make it active; what is there already is not sent again.
 
         A board that plays goes on with the old bank until the new one is complete and checked, and changes
         between two packets.
 
         Raises:
-            ConfigError: The payload is larger than a bank, or of other clusters than the board.
+            ConfigError: The content is larger than a bank, or of other clusters than the board.
             RefusedError: The board refuses a value.
             VerifyError: The bank does not hold what was sent.
             LineError: The line fails; what was active stays so.
         """
-        self.check_fits(payload)
+        self.check_fits(content)
         before = self.session.client.retries
-        total = len(payload.content)
+        total = len(content.content)
         status = self._settled()
-        if self.holds(payload, chip_rate_hz, status):
+        if self.holds(content, status):
             if progress:
                 progress(total, total)
             return Programmed(0, total, False, status.active_bank, self.session.client.retries - before)
-        self.prepare(payload, chip_rate_hz)
+        self.prepare(content)
         bank = 1 if status.active_bank == 0 else 0
-        written = self.fill(bank, payload.content, progress)
-        if verify and written and self.crc(bank, 0, total) != payload.crc:
+        written = self.fill(bank, content.content, progress)
+        if verify and written and self.crc(bank, 0, total) != content.crc:
             raise VerifyError(
                 f"{self.session.name}: bank {bank} does not hold what was sent; the old one goes on;"
                 " program it again, or with --baud of a lower rate"
             )
-        digest = bytes.fromhex(payload.codebook.digest)
-        commit = CommitRequest(bank, payload.format, payload.packets, total, payload.crc, digest)
+        digest = bytes.fromhex(content.codebook.digest)
+        commit = CommitRequest(bank, content.format, content.packets, total, content.crc, digest)
         self.session.call(commit, CommitReply)
         status = self._settled()
-        if verify and not self.holds(payload, chip_rate_hz, status):
+        if verify and not self.holds(content, status):
             raise VerifyError(
                 f"{self.session.name}: bank {status.active_bank} is active, expected {bank}; program it again"
             )
         return Programmed(written, total, True, bank, self.session.client.retries - before)
 
-    def check_fits(self, payload: Bank) -> None:
-        """Raise ConfigError unless the payload fits the board's clusters and bank."""
-        if payload.codebook.clusters != self.about.clusters:
+    def check_fits(self, bank: Bank) -> None:
+        """Raise ConfigError unless the content fits the board's clusters and bank."""
+        if bank.codebook.clusters != self.about.clusters:
             raise ConfigError(
-                f"payload for {payload.codebook.clusters} clusters,"
-                f" {self.session.name} has {self.about.clusters}"
+                f"packets of {bank.codebook.clusters} clusters, {self.session.name} has {self.about.clusters}"
             )
-        each = len(payload.content) // payload.packets
+        each = len(bank.content) // bank.packets
         room = self.about.bank_bytes
+        frames = bank.packet.frames
         if each > room:
-            fits = bisect_right(range(1, payload.frames + 1), room, key=payload.packet_bytes)
+            fits = bisect_right(range(1, frames + 1), room, key=bank.packet_bytes)
             raise ConfigError(
-                f"a packet of {payload.frames} frames takes {each} bytes, a bank of {self.session.name} has"
+                f"a packet of {frames} frames takes {each} bytes, a bank of {self.session.name} has"
                 f" {room}: not one fits; a packet may have at most {fits} frames"
             )
-        if len(payload.content) > room:
+        if len(bank.content) > room:
             raise ConfigError(
-                f"{payload.packets} packets of {each} bytes, a bank of {self.session.name} has"
+                f"{bank.packets} packets of {each} bytes, a bank of {self.session.name} has"
                 f" {room} bytes: send at most {room // each} packets"
             )
 
@@ -392,24 +384,24 @@ class Board:
 
 
 def provision(
-    board: Board, payload: Bank, settings: Settings, verify: bool = True, progress: Progress | None = None
+    board: Board, bank: Bank, settings: Settings, verify: bool = True, progress: Progress | None = None
 ) -> Programmed:
-    """Bring a board to payload and settings; what is so already is left alone.
+    """Bring a board to a bank and settings; what is so already is left alone.
 
-    The level comes first: a board that cannot take it keeps its old payload.
+    The level comes first: a board that cannot take it keeps its old bank.
 
     Raises:
         BoardError: See `Board.program` and `Board.level`.
-        ConfigError: The payload does not fit the board.
+        ConfigError: The bank does not fit the board.
     """
-    board.check_fits(payload)
+    board.check_fits(bank)
     status = board.status()
     if settings.level_ma is not None and status.level_ma != settings.level_ma:
         board.level(settings.level_ma)
     wanted = (settings.watchdog, settings.watchdog_ms)
     if settings.watchdog is not None and (status.watchdog, status.watchdog_ms) != wanted:
         board.watchdog(settings.watchdog, settings.watchdog_ms)
-    done = board.program(payload, settings.chip_rate_hz, verify, progress)
+    done = board.program(bank, verify, progress)
     if settings.start and status.state != State.PLAYING:
         board.start()
     return done
@@ -425,8 +417,5 @@ def _silent(done: int, total: int) -> None:
 
 
 def profile_number(book: Codebook) -> int:
-    """The protocol's number of a codebook's profile; `custom` for one that the firmware cannot know."""
-    try:
-        return Profile[book.profile.upper()]
-    except KeyError:
-        return Profile.CUSTOM
+    """The protocol's number of a codebook; `custom` for one that the firmware was not built with."""
+    return next((p for p, digest in DIGESTS.items() if digest == book.digest), Profile.CUSTOM)

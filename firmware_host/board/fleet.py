@@ -1,28 +1,28 @@
 """Many boards at once, from one inventory."""
 
+import json
 import time
-import tomllib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import Field, ValidationError
 
-from evlcp_sdk.errors import EvlcpError, InputError
-from firmware_host.board.bank import Bank, random_symbols, read_masks, read_symbols
+from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
+from evlcp_sdk.link.resolve import Link, load_link, resolve
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.specs import expected, nearest, read_toml, shown, spec_model
+from firmware_host.board.bank import Bank, bank_of, check_link, random_symbols, read_masks
 from firmware_host.board.board import Board, Programmed, Settings, provision
 from firmware_host.board.session import Session
+from firmware_host.board.symbols import read_symbols
 from firmware_host.emulators.opening import open_port
 from firmware_host.errors import FleetError, IncompatibleError
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.generate import codebook_of
 from firmware_host.protocol.requests import DEFAULT_BAUD, Watchdog
-
-if TYPE_CHECKING:
-    from evlcp_sdk.air.codebook import Codebook
 
 __all__ = ["Entry", "Inventory", "Result", "program_fleet", "raise_failures", "read_inventory"]
 
@@ -31,7 +31,8 @@ _MOST_FRAMES = 1_000_000
 """Random frames of a board at most; far beyond any bank, and within memory."""
 
 
-class Entry(BaseModel):
+@dataclass(frozen=True)
+class Entry:
     """One board of an inventory.
 
     Attributes:
@@ -41,59 +42,51 @@ class Entry(BaseModel):
         payload: Symbols `[packet][frame][cluster]` in a JSON file, or chip masks in a `.npy` file.
         random: Instead of `payload`: that many packets of random symbols.
         seed: Seed of `random`.
+        link: The link: a file, its path relative to the inventory's, or its tables. Without it a payload's
+            own, or all defaults.
         unique_id: The part's own number in hex, as `evlcp board hello` shows it; another board is refused.
-        profile: Info-segment profile.
-        frames: Frames per packet of `random` and of chip masks.
-        pilot_every: Frames from one pilot to the next.
-        chip_rate_hz: Chips per second.
         level_ma: LED current, mA.
         watchdog: What the board does when the host is silent.
         watchdog_ms: After which silence, ms.
         start: Whether to play when done.
         baud: Line rate, bit/s.
-    """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    Raises:
+        ConfigError: Not exactly one of payload and random is given.
+    """
 
     id: Annotated[str, Field(min_length=1)]
     port: Annotated[str, Field(min_length=1)]
-    position_m: Annotated[list[FiniteFloat | int], Field(min_length=3, max_length=3)]
+    position_m: Annotated[list[float], Field(min_length=3, max_length=3)]
     payload: str | None = None
     random: Annotated[int, Field(ge=1, le=65535)] | None = None
     seed: Annotated[int, Field(ge=0)] = 0
+    link: str | dict[str, Any] | None = None
     unique_id: Annotated[str, Field(pattern="^[0-9a-f]{24}$")] | None = None
-    profile: str = "wh4x2"
-    frames: Annotated[int, Field(ge=1, le=65535)] = 10
-    pilot_every: Annotated[int, Field(ge=1, le=64)] = 1
-    chip_rate_hz: Annotated[int, Field(ge=1, le=1_000_000)] = 10_000
     level_ma: Annotated[int, Field(ge=0, le=65535)] | None = None
     watchdog: Literal["keep", "idle", "dark"] | None = None
     watchdog_ms: Annotated[int, Field(ge=100, le=2**32 - 1)] = 5_000
     start: bool = True
     baud: Annotated[int, Field(ge=1200)] = DEFAULT_BAUD
 
-    @model_validator(mode="after")
-    def _one_payload(self) -> "Entry":
+    def __post_init__(self) -> None:
         if (self.payload is None) == (self.random is None):
-            raise ValueError("give payload or random, one of the two")
-        if self.random is not None and self.random * self.frames > _MOST_FRAMES:
-            raise ValueError(f"random x frames = {self.random * self.frames}, at most {_MOST_FRAMES}")
-        return self
+            raise ConfigError("give payload or random, one of the two")
 
     @property
     def settings(self) -> Settings:
         """What the board is set to."""
         watchdog = None if self.watchdog is None else Watchdog[self.watchdog.upper()]
-        return Settings(self.chip_rate_hz, self.level_ma, watchdog, self.watchdog_ms, self.start)
+        return Settings(self.level_ma, watchdog, self.watchdog_ms, self.start)
 
 
 @dataclass(frozen=True)
 class Inventory:
-    """The boards of a file, each with its payload.
+    """The boards of a file, each with what it plays.
 
     Attributes:
         path: The file.
-        boards: Entry and payload of each board.
+        boards: Entry and bank of each board.
     """
 
     path: Path
@@ -146,63 +139,97 @@ def read_inventory(path: Path) -> Inventory:
     """Read an inventory: `[[board]]` tables, and `[defaults]` with any key of a board.
 
     Raises:
-        InputError: The file or a payload it names cannot be read, or a value is wrong; the message names the
-            place, the value and what was expected.
+        ConfigError: The inventory cannot be read, a value or a link is wrong, or a board cannot play a link;
+            the message names the place, the value and what was expected.
+        InputError: A payload cannot be read.
+        IncompatibleError: A payload was made with another link.
     """
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as fault:
-        raise InputError(f"{path}: cannot be read: {fault}") from fault
-    except (tomllib.TOMLDecodeError, RecursionError) as fault:
-        raise InputError(f"{path}: not TOML: {fault}") from fault
+    table = read_toml(path)
     unknown = sorted(set(table) - {"defaults", "board"})
     if unknown:
-        raise InputError(f"{path}: {unknown[0]}: unknown table, expected [defaults] and [[board]]")
+        raise ConfigError(f"{path}: {unknown[0]}: unknown table, expected [defaults] and [[board]]")
     defaults, rows = table.get("defaults", {}), table.get("board", [])
     if not isinstance(defaults, dict):
-        raise InputError(f"{path}: defaults = {defaults!r}, expected a table [defaults]")
+        raise ConfigError(f"{path}: defaults = {shown(defaults)}, expected a table [defaults]")
     if not isinstance(rows, list) or not rows or not all(isinstance(r, dict) for r in rows):
-        raise InputError(f"{path}: board: expected at least one [[board]] table")
-    books: dict[str, Codebook] = {}
+        raise ConfigError(f"{path}: board: expected at least one [[board]] table")
     entries = [_entry(path, i, defaults | row) for i, row in enumerate(rows)]
     for key in ("id", "port"):
         first: dict[str, int] = {}
         for i, entry in enumerate(entries):
             value = getattr(entry, key)
             if value in first and not value.startswith(("native:", "qemu:")):
-                raise InputError(
-                    f"{path}: board[{i}].{key} = {value!r}, expected another than board[{first[value]}]'s"
+                raise ConfigError(
+                    f"{path}: board[{i}].{key} = {shown(value)},"
+                    f" expected another than board[{first[value]}]'s"
                 )
             first[value] = i
-    return Inventory(path, tuple((e, _payload(path, i, e, books)) for i, e in enumerate(entries)))
+    links = _Links(path)
+    return Inventory(path, tuple((e, _bank(path, i, e, links)) for i, e in enumerate(entries)))
 
 
 def _entry(path: Path, index: int, row: dict[str, Any]) -> Entry:
+    place = f"{path}: board[{index}]"
     try:
-        return Entry.model_validate(row)
-    except ValidationError as fault:
-        first = fault.errors()[0]
-        place = ".".join([f"board[{index}]", *(str(part) for part in first["loc"])])
-        value = "" if first["type"] in ("missing", "value_error") else f" = {first['input']!r}"
-        raise InputError(f"{path}: {place}{value}: {first['msg']}") from fault
+        values = spec_model(Entry).model_validate_json(json.dumps(row, default=str))
+        return Entry(**{k: getattr(values, k) for k in type(values).model_fields})
+    except ConfigError as fault:
+        raise ConfigError(f"{place}: {fault}") from fault
+    except ValidationError as refused:
+        error = refused.errors()[0]
+        key = str(error["loc"][0])
+        given = f" = {shown(row[key])}" if key in row else ""
+        says = expected(error["msg"])
+        if error["type"] == "extra_forbidden":
+            says = f"unknown key{nearest(key, [f.name for f in fields(Entry)])}"
+        raise ConfigError(f"{place}.{'.'.join(map(str, error['loc']))}{given}: {says}") from refused
 
 
-def _payload(path: Path, index: int, entry: Entry, books: "dict[str, Codebook]") -> Bank:
+class _Links:
+    """The links of an inventory, each resolved once."""
+
+    def __init__(self, path: Path) -> None:
+        self._folder = path.parent
+        self._found: dict[str, Link] = {}
+        self.registry = Registry.load()
+
+    def of(self, named: str | dict[str, Any]) -> Link:
+        key = json.dumps(named, sort_keys=True, default=str)
+        if key not in self._found:
+            self._found[key] = (
+                load_link(self._folder / named, (), self.registry)
+                if isinstance(named, str)
+                else resolve(named, self.registry, source="link")
+            )
+        return self._found[key]
+
+
+def _bank(path: Path, index: int, entry: Entry, links: _Links) -> Bank:
+    place = f"{path}: board[{index}]"
     try:
-        book = books.setdefault(entry.profile, codebook_of(entry.profile))
-        if entry.random is not None:
-            generator = np.random.default_rng(entry.seed)
-            symbols = random_symbols(entry.random, entry.frames, book, generator)
-            return Bank.of_symbols(symbols, book, entry.pilot_every)
-        file = path.parent / str(entry.payload)
-        if file.suffix == ".npy":
-            return read_masks(file, entry.frames, book, entry.pilot_every)
-        return Bank.of_symbols(read_symbols(file, book, entry.pilot_every), book, entry.pilot_every)
+        given = None if entry.link is None else links.of(entry.link)
+        if entry.payload is not None and not entry.payload.endswith(".npy"):
+            symbols, link = read_symbols(path.parent / entry.payload, given, links.registry)
+            return bank_of(symbols, link)
+        link = given or links.of({})
+        check_link(link)
+        if entry.payload is not None:
+            return read_masks(path.parent / entry.payload, link.codebook, link.packet)
+        packets, frames = entry.random or 0, link.packet.frames
+        if packets * frames > _MOST_FRAMES:
+            raise ConfigError(
+                f"random = {packets}: {packets * frames} frames, expected at most {_MOST_FRAMES}"
+            )
+        generator = np.random.default_rng(entry.seed)
+        return bank_of(random_symbols(packets, frames, link.codebook, generator), link)
     except EvlcpError as fault:
-        raise InputError(f"{path}: board[{index}]: {fault}") from fault
+        kind = next(
+            k for k in (IncompatibleError, InputError, ConfigError, EvlcpError) if isinstance(fault, k)
+        )
+        raise kind("\n".join(f"{place}: {line}" for line in str(fault).splitlines())) from fault
 
 
-def _program(entry: Entry, payload: Bank, verify: bool) -> Result:
+def _program(entry: Entry, bank: Bank, verify: bool) -> Result:
     start = time.monotonic()
     try:
         with Session(open_port(entry.port, entry.baud), Timing(entry.baud)) as session:
@@ -213,7 +240,7 @@ def _program(entry: Entry, payload: Bank, verify: bool) -> Result:
                     f"{entry.port}: unique_id {found}, the inventory expects {entry.unique_id};"
                     " plug in that board or correct the inventory"
                 )
-            done = provision(board, payload, entry.settings, verify)
+            done = provision(board, bank, entry.settings, verify)
         return Result(entry, done, None, time.monotonic() - start)
     except EvlcpError as fault:
         return Result(entry, None, fault, time.monotonic() - start)

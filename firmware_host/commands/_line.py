@@ -1,51 +1,148 @@
-"""A board on a line, as commands open it, and what they say of programming it."""
+"""A board on a line: the options that say which, once for all commands, and how commands open it."""
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
+from typer.core import TyperCommand
 
 if TYPE_CHECKING:
     from firmware_host.board.board import Board
 
-__all__ = ["open_board", "progress_bar", "tell"]
+__all__ = [
+    "LINE",
+    "BoardLine",
+    "LineCommand",
+    "SurveyCommand",
+    "from_command_line",
+    "line_options",
+    "open_board",
+    "progress_bar",
+    "tell",
+]
+
+_BAUD = 1_000_000
+
+
+@dataclass(frozen=True)
+class BoardLine:
+    """Where the board is.
+
+    Attributes:
+        port: Port; None to ask all.
+        baud: Line rate, bit/s.
+        trace: File to record the wire in.
+        replay: Recorded wire to play back, without a board.
+    """
+
+    port: str | None = None
+    baud: int = _BAUD
+    trace: Path | None = None
+    replay: Path | None = None
+
+    @contextlib.contextmanager
+    def open(self) -> "Iterator[Board]":
+        """The board on the line, or the recorded one."""
+        from evlcp_sdk.errors import ConfigError, EvlcpError
+        from firmware_host.board.board import Board
+        from firmware_host.board.session import Session
+        from firmware_host.board.survey import find
+        from firmware_host.emulators.opening import open_port
+        from firmware_host.ports.transport import ReplayTransport, TraceTransport, Transport
+        from firmware_host.protocol.client import Timing
+
+        transport: Transport
+        first = nonce = None
+        baud = self.baud
+        if self.replay is not None:
+            if self.trace is not None:
+                raise ConfigError("--trace and --replay: give one of the two")
+            transport = played = ReplayTransport(self.replay)
+            first, nonce, baud = played.first, played.nonce, played.baud
+        else:
+            transport = open_port(self.port or find(baud), baud)
+            if self.trace is not None:
+                import random
+
+                draw = random.SystemRandom()
+                first, nonce = draw.randrange(1 << 16), draw.randrange(1 << 32)
+                try:
+                    file = self.trace.open("w", encoding="utf-8")
+                except OSError as fault:
+                    transport.close()
+                    raise EvlcpError(f"{self.trace}: cannot be written: {fault.strerror}") from fault
+                transport = TraceTransport(transport, file, baud, first, nonce)
+        with Session(transport, Timing(baud), first, nonce) as session:
+            yield Board(session)
+
+
+LINE = tuple(field.name for field in fields(BoardLine))
+"""The options of a line."""
+
+
+def line_options(
+    context: typer.Context,
+    port: Annotated[
+        str | None,
+        typer.Option(
+            envvar="EVLCP_PORT",
+            help="Device, pyserial URL, unix:PATH, tcp:HOST:PORT, native: or qemu:;"
+            " by default all are asked.",
+        ),
+    ] = None,
+    baud: Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)] = _BAUD,
+    trace: Annotated[Path | None, typer.Option(metavar="FILE", help="Record the wire.")] = None,
+    replay: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Play a recorded wire back; no board.")
+    ] = None,
+) -> None:
+    """The callback of a group whose commands work on a board."""
+    name = context.invoked_subcommand or ""
+    taken = getattr(getattr(context.command, "commands", {}).get(name), "line", ())
+    for option in LINE:
+        if option not in taken and from_command_line(context, option):
+            raise typer.BadParameter(f"'{name}' takes no --{option}", param_hint=f"--{option}")
+    context.obj = BoardLine(port, baud, trace, replay)
+
+
+class LineCommand(TyperCommand):
+    """A command on a board: the group's options of the line may stand behind its name, too."""
+
+    line: ClassVar[tuple[str, ...]] = LINE
+
+    def get_params(self, ctx: Any) -> Any:
+        """The command's own parameters, and those of the group."""
+        group = ctx.parent.command.params if ctx.parent is not None else []
+        return [*super().get_params(ctx), *(p for p in group if p.name in self.line)]
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run it; what stands behind its name counts more than what stands before."""
+        given = {name: ctx.params.pop(name) for name in self.line}
+        here = {name: value for name, value in given.items() if from_command_line(ctx, name)}
+        ctx.obj = replace(ctx.obj or BoardLine(), **here)
+        return super().invoke(ctx)
+
+
+class SurveyCommand(LineCommand):
+    """A command that asks all ports."""
+
+    line = ("baud",)
+
+
+def from_command_line(context: Any, name: str) -> bool:
+    """Whether a parameter was given as an option or argument."""
+    return getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE"
 
 
 @contextlib.contextmanager
-def open_board(port: str | None, baud: int, trace: Path | None, replay: Path | None) -> "Iterator[Board]":
-    """The board at a port, or a recorded one."""
-    from evlcp_sdk.errors import ConfigError, InputError
-    from firmware_host.board.board import Board
-    from firmware_host.board.session import Session
-    from firmware_host.board.survey import find
-    from firmware_host.emulators.opening import open_port
-    from firmware_host.ports.transport import ReplayTransport, TraceTransport, Transport
-    from firmware_host.protocol.client import Timing
-
-    transport: Transport
-    first = nonce = None
-    if replay is not None:
-        if trace is not None:
-            raise ConfigError("--trace and --replay: give one of the two")
-        transport = played = ReplayTransport(replay)
-        first, nonce, baud = played.first, played.nonce, played.baud
-    else:
-        transport = open_port(port or find(baud), baud)
-        if trace is not None:
-            import random
-
-            draw = random.SystemRandom()
-            first, nonce = draw.randrange(1 << 16), draw.randrange(1 << 32)
-            try:
-                file = trace.open("w", encoding="utf-8")
-            except OSError as fault:
-                transport.close()
-                raise InputError(f"{trace}: cannot be written: {fault.strerror}") from fault
-            transport = TraceTransport(transport, file, baud, first, nonce)
-    with Session(transport, Timing(baud), first, nonce) as session:
-        yield Board(session)
+def open_board(context: typer.Context) -> "Iterator[Board]":
+    """The board that a command's options name."""
+    line: BoardLine = context.obj
+    with line.open() as board:
+        yield board
 
 
 @contextlib.contextmanager

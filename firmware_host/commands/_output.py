@@ -1,4 +1,4 @@
-"""What commands write."""
+"""What commands write; a file is there whole or as it was before."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,14 +14,11 @@ def save_array(path: Path, array: "NDArray[np.generic]") -> None:
     """Write an array as `.npy` under exactly this name.
 
     Raises:
-        InputError: The file cannot be written.
+        EvlcpError: The file cannot be written.
     """
     import numpy as np
 
-    from evlcp_sdk.errors import InputError
+    from evlcp_sdk.files import whole_file
 
-    try:
-        with path.open("wb") as file:
-            np.save(file, array)
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be written: {fault.strerror}") from fault
+    with whole_file(path) as part, part.open("wb") as file:
+        np.save(file, array)

@@ -7,9 +7,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli._common import LinkFile, Overrides
 from firmware_host.commands import _source
-from firmware_host.commands._line import open_board, progress_bar, tell
-from firmware_host.commands._source import Frames, PilotEvery, ProfileName, RandomPackets, Seed, SymbolsFile
+from firmware_host.commands._line import (
+    LINE,
+    BoardLine,
+    LineCommand,
+    SurveyCommand,
+    from_command_line,
+    line_options,
+    open_board,
+    progress_bar,
+    tell,
+)
+from firmware_host.commands._source import RandomPackets, Seed, SymbolsFile
 
 if TYPE_CHECKING:
     from firmware_host.board.bank import Bank
@@ -28,22 +39,13 @@ app = typer.Typer(
     """,
 )
 
-Port = Annotated[
-    str | None,
-    typer.Option(
-        envvar="EVLCP_PORT",
-        help="Device, pyserial URL, unix:PATH, tcp:HOST:PORT, native: or qemu:; by default all are asked.",
-    ),
-]
-Baud = Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)]
-Trace = Annotated[Path | None, typer.Option(metavar="FILE", help="Record the wire.")]
-Replay = Annotated[Path | None, typer.Option(metavar="FILE", help="Play a recorded wire back; no board.")]
+app.callback()(line_options)
+
 AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
 Masks = Annotated[
     Path | None,
     typer.Option(metavar="FILE.npy", help="Chips instead: uint8, a column an LED or a cluster."),
 ]
-DEFAULT_BAUD = 1_000_000
 
 
 class Silence(StrEnum):
@@ -59,28 +61,6 @@ class Emulator(StrEnum):
 
     NATIVE = "native"
     QEMU = "qemu"
-
-
-def _payload(
-    symbols: Path | None,
-    random: int | None,
-    masks: Path | None,
-    seed: int,
-    frames: int,
-    pilot_every: int,
-    profile: str,
-) -> "Bank":
-    from evlcp_sdk.errors import ConfigError
-    from firmware_host.board.bank import Bank, read_masks
-
-    book = _source.codebook(profile)
-    if masks is not None:
-        if symbols is not None or random is not None:
-            raise ConfigError("--masks, --random and SYMBOLS.json: give one of them")
-        return read_masks(masks, frames, book, pilot_every)
-    return Bank.of_symbols(
-        _source.symbols(symbols, random, seed, frames, pilot_every, book), book, pilot_every
-    )
 
 
 def _about(about: "HelloReply") -> dict[str, Any]:
@@ -168,15 +148,16 @@ def _show(table: dict[str, Any], as_json: bool) -> None:
         typer.echo(f"{key:20} {'-' if text in ('', None) else text}")
 
 
-@app.command()
-def ports(baud: Baud = DEFAULT_BAUD, as_json: AsJson = False) -> None:
+@app.command(cls=SurveyCommand)
+def ports(context: typer.Context, as_json: AsJson = False) -> None:
     """List the serial ports, and which have a board.
 
     For example: [bold]evlcp board ports[/]
     """
     from firmware_host.board.survey import survey
 
-    found = survey(baud)
+    line: BoardLine = context.obj
+    found = survey(line.baud)
     if as_json:
         import json
 
@@ -196,45 +177,36 @@ def ports(baud: Baud = DEFAULT_BAUD, as_json: AsJson = False) -> None:
         typer.echo("no serial ports; emulated boards: --port native: or --port qemu:")
 
 
-@app.command()
+@app.command(cls=LineCommand)
 def hello(
-    port: Port = None,
-    baud: Baud = DEFAULT_BAUD,
-    trace: Trace = None,
-    replay: Replay = None,
+    context: typer.Context,
     as_json: AsJson = False,
 ) -> None:
     """Show what a board is and what it can.
 
-    For example: [bold]evlcp board hello --port native:[/]
+    For example: [bold]evlcp board --port native: hello[/]
     """
-    with open_board(port, baud, trace, replay) as board:
+    with open_board(context) as board:
         _show(_about(board.about), as_json)
 
 
-@app.command()
+@app.command(cls=LineCommand)
 def program(
     context: typer.Context,
     symbols: SymbolsFile = None,
     random: RandomPackets = None,
     masks: Masks = None,
     seed: Seed = 0,
-    frames: Frames = 10,
-    pilot_every: PilotEvery = 1,
-    profile: ProfileName = "wh4x2",
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
     inventory: Annotated[
         Path | None, typer.Option(metavar="FILE.toml", help="Program all boards of an inventory at once.")
     ] = None,
-    chip_rate: Annotated[int, typer.Option(help="Chips per second.", min=1, max=1_000_000)] = 10_000,
     level: Annotated[int | None, typer.Option(help="LED current, mA.", min=0, max=65535)] = None,
     watchdog: Annotated[Silence | None, typer.Option(help="What to do when the host is silent.")] = None,
     watchdog_ms: Annotated[int, typer.Option(help="After which silence, ms.", min=100, max=2**32 - 1)] = 5000,
     verify: Annotated[bool, typer.Option(help="Compare what the board holds.")] = True,
     start: Annotated[bool, typer.Option(help="Play when done.")] = True,
-    port: Port = None,
-    baud: Baud = DEFAULT_BAUD,
-    trace: Trace = None,
-    replay: Replay = None,
     as_json: AsJson = False,
 ) -> None:
     """Program a board, or all boards of an inventory: codebook, settings and payload.
@@ -242,17 +214,19 @@ def program(
     What is there already is not sent again. A board that plays changes between two packets, without a dark
     chip.
 
-    For example: [bold]evlcp board program SYMBOLS.json --port /dev/ttyUSB0[/]
+    For example: [bold]evlcp board --port /dev/ttyUSB0 program SYMBOLS.json[/]
     """
     if inventory is not None:
         from evlcp_sdk.errors import ConfigError
 
         given = [
             "/".join([*parameter.opts, *parameter.secondary_opts])
-            for parameter in context.command.params
+            for parameter in context.command.get_params(context)
             if parameter.name not in ("inventory", "verify", "as_json")
-            and getattr(context.get_parameter_source(parameter.name or ""), "name", "") == "COMMANDLINE"
+            and from_command_line(context, parameter.name or "")
         ]
+        group = context.parent
+        given += [f"--{name}" for name in LINE if group is not None and from_command_line(group, name)]
         if given:
             raise ConfigError(
                 f"--inventory names ports, payloads and settings itself: write {given[0]} there,"
@@ -264,10 +238,10 @@ def program(
     from firmware_host.protocol.requests import Watchdog
 
     action = None if watchdog is None else Watchdog[watchdog.name]
-    payload = _payload(symbols, random, masks, seed, frames, pilot_every, profile)
-    settings = Settings(chip_rate, level, action, watchdog_ms, start)
-    with open_board(port, baud, trace, replay) as board, progress_bar("programming") as progress:
-        done = provision(board, payload, settings, verify, progress)
+    bank = _source.bank(symbols, random, masks, seed, link_file, overrides)
+    settings = Settings(level, action, watchdog_ms, start)
+    with open_board(context) as board, progress_bar("programming") as progress:
+        done = provision(board, bank, settings, verify, progress)
     tell(done, as_json)
 
 
@@ -284,128 +258,116 @@ def _program_fleet(path: Path, verify: bool, as_json: bool) -> None:
     raise_failures(inventory, program_fleet(inventory, verify, report))
 
 
-@app.command()
+@app.command(cls=LineCommand)
 def send(
+    context: typer.Context,
     symbols: SymbolsFile = None,
     random: RandomPackets = None,
     masks: Masks = None,
     seed: Seed = 0,
-    frames: Frames = 10,
-    pilot_every: PilotEvery = 1,
-    profile: ProfileName = "wh4x2",
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
     verify: Annotated[bool, typer.Option(help="Compare what the board holds.")] = True,
-    port: Port = None,
-    baud: Baud = DEFAULT_BAUD,
-    trace: Trace = None,
-    replay: Replay = None,
     as_json: AsJson = False,
 ) -> None:
     """Replace the payload of a programmed board, and nothing else.
 
-    For example: [bold]evlcp board send --random 4 --seed 7 --port unix:/tmp/board[/]
+    For example: [bold]evlcp board --port unix:/tmp/board send --random 4 --seed 7[/]
     """
     from firmware_host.errors import RefusedError
     from firmware_host.protocol.requests import NO_BANK, Status
 
-    payload = _payload(symbols, random, masks, seed, frames, pilot_every, profile)
-    with open_board(port, baud, trace, replay) as board, progress_bar("sending") as progress:
+    bank = _source.bank(symbols, random, masks, seed, link_file, overrides)
+    with open_board(context) as board, progress_bar("sending") as progress:
         status = board.status()
         if status.active_bank == NO_BANK:
             raise RefusedError(
                 f"{board.session.name}: nothing is programmed; 'evlcp board program' first",
                 Status.NOTHING_COMMITTED,
             )
-        _check_codebook(board, payload, status)
-        done = board.program(payload, status.chip_rate_hz, verify, progress)
+        _check_same_air(board, bank, status)
+        done = board.program(bank, verify, progress)
     tell(done, as_json)
 
 
-def _check_codebook(board: "Board", payload: "Bank", status: "StatusReply") -> None:
+def _check_same_air(board: "Board", bank: "Bank", status: "StatusReply") -> None:
+    """What plays and what comes must be of one codebook and one chip rate."""
     from firmware_host.errors import IncompatibleError
 
-    if status.digest.hex() != payload.codebook.digest:
-        raise IncompatibleError(
-            f"{board.session.name}: plays codebook {status.digest.hex()[:16]}, this payload is of"
-            f" {payload.codebook.digest[:16]} ({payload.codebook.profile}); choose its --profile, or"
-            " 'evlcp board program' to change it"
-        )
+    plays, comes = f"codebook {status.digest.hex()[:16]}", f"codebook {bank.codebook.digest[:16]}"
+    if status.digest.hex() == bank.codebook.digest:
+        if status.chip_rate_hz == bank.chip_rate_hz:
+            return
+        plays, comes = f"{status.chip_rate_hz} chips a second", f"air.chip_rate_hz = {bank.chip_rate_hz}"
+    raise IncompatibleError(
+        f"{board.session.name}: plays {plays}, this payload's link has {comes} ({bank.codebook.profile});"
+        " give its link with -c or --set, or 'evlcp board program' to change it"
+    )
 
 
-@app.command()
-def start(port: Port = None, baud: Baud = DEFAULT_BAUD, trace: Trace = None, replay: Replay = None) -> None:
+@app.command(cls=LineCommand)
+def start(context: typer.Context) -> None:
     """Play what is programmed."""
-    with open_board(port, baud, trace, replay) as board:
+    with open_board(context) as board:
         board.start()
 
 
-@app.command()
-def stop(port: Port = None, baud: Baud = DEFAULT_BAUD, trace: Trace = None, replay: Replay = None) -> None:
+@app.command(cls=LineCommand)
+def stop(context: typer.Context) -> None:
     """Finish the packet, then dark."""
-    with open_board(port, baud, trace, replay) as board:
+    with open_board(context) as board:
         board.stop()
         board.wait_dark()
 
 
-@app.command()
-def blank(port: Port = None, baud: Baud = DEFAULT_BAUD, trace: Trace = None, replay: Replay = None) -> None:
+@app.command(cls=LineCommand)
+def blank(context: typer.Context) -> None:
     """Dark at once."""
-    with open_board(port, baud, trace, replay) as board:
+    with open_board(context) as board:
         board.blank()
 
 
-@app.command()
+@app.command(cls=LineCommand)
 def level(
+    context: typer.Context,
     level_ma: Annotated[int, typer.Argument(metavar="MA", help="LED current, mA.", min=0, max=65535)],
-    port: Port = None,
-    baud: Baud = DEFAULT_BAUD,
-    trace: Trace = None,
-    replay: Replay = None,
 ) -> None:
     """Set the LED current; above the board's maximum it is refused.
 
-    For example: [bold]evlcp board level 20 --port /dev/ttyUSB0[/]
+    For example: [bold]evlcp board --port /dev/ttyUSB0 level 20[/]
     """
-    with open_board(port, baud, trace, replay) as board:
+    with open_board(context) as board:
         board.level(level_ma)
 
 
-@app.command()
+@app.command(cls=LineCommand)
 def watchdog(
+    context: typer.Context,
     action: Annotated[Silence, typer.Argument(help="What to do when the host is silent.")],
     after_ms: Annotated[int, typer.Option(help="After which silence, ms.", min=100, max=2**32 - 1)] = 5000,
-    port: Port = None,
-    baud: Baud = DEFAULT_BAUD,
-    trace: Trace = None,
-    replay: Replay = None,
 ) -> None:
     """Choose what the board does when the host falls silent: keep playing, idle pattern, or dark."""
     from firmware_host.protocol.requests import Watchdog
 
-    with open_board(port, baud, trace, replay) as board:
+    with open_board(context) as board:
         board.watchdog(Watchdog[action.name], after_ms)
 
 
-@app.command()
+@app.command(cls=LineCommand)
 def status(
-    port: Port = None,
-    baud: Baud = DEFAULT_BAUD,
-    trace: Trace = None,
-    replay: Replay = None,
+    context: typer.Context,
     as_json: AsJson = False,
 ) -> None:
     """Show what a board does, and what went wrong since its reset."""
-    with open_board(port, baud, trace, replay) as board:
+    with open_board(context) as board:
         _show(_status(board.status()), as_json)
 
 
-@app.command()
+@app.command(cls=LineCommand)
 def monitor(
+    context: typer.Context,
     interval: Annotated[float, typer.Option(help="Seconds between lines.", min=0.01)] = 1.0,
     count: Annotated[int | None, typer.Option(help="End after so many lines.", min=1)] = None,
-    port: Port = None,
-    baud: Baud = DEFAULT_BAUD,
-    trace: Trace = None,
-    replay: Replay = None,
     as_json: AsJson = False,
 ) -> None:
     """Show a line of status again and again; end with Ctrl-C."""
@@ -414,7 +376,7 @@ def monitor(
 
     from firmware_host.protocol.requests import State
 
-    with open_board(port, baud, trace, replay) as board, contextlib.suppress(KeyboardInterrupt):
+    with open_board(context) as board, contextlib.suppress(KeyboardInterrupt):
         for n in itertools.count(1):
             s = board.status()
             if as_json:
@@ -431,97 +393,84 @@ def monitor(
             board.session.transport.read(interval)
 
 
-@app.command()
+@app.command(cls=LineCommand)
 def verify(
+    context: typer.Context,
     symbols: SymbolsFile = None,
     random: RandomPackets = None,
     masks: Masks = None,
     seed: Seed = 0,
-    frames: Frames = 10,
-    pilot_every: PilotEvery = 1,
-    profile: ProfileName = "wh4x2",
-    port: Port = None,
-    baud: Baud = DEFAULT_BAUD,
-    trace: Trace = None,
-    replay: Replay = None,
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
 ) -> None:
     """Read the active bank back and compare it with a payload; ends with 7 if it differs.
 
-    For example: [bold]evlcp board verify SYMBOLS.json --port /dev/ttyUSB0[/]
+    For example: [bold]evlcp board --port /dev/ttyUSB0 verify SYMBOLS.json[/]
     """
     from firmware_host.errors import VerifyError
     from firmware_host.protocol.requests import NO_BANK
 
-    payload = _payload(symbols, random, masks, seed, frames, pilot_every, profile)
-    with open_board(port, baud, trace, replay) as board:
+    bank = _source.bank(symbols, random, masks, seed, link_file, overrides)
+    with open_board(context) as board:
         s = board.status()
         again = "'evlcp board program' brings it there"
         if s.active_bank == NO_BANK:
             raise VerifyError(f"{board.session.name}: nothing is programmed; {again}")
-        _check_codebook(board, payload, s)
+        _check_same_air(board, bank, s)
+        packet = bank.packet
         shape = (s.format, s.packets, s.frames, s.pilot_every, s.length)
-        expected = (
-            *(payload.format, payload.packets, payload.frames),
-            *(payload.pilot_every, len(payload.content)),
-        )
-        if shape != expected:
+        if shape != (bank.format, bank.packets, packet.frames, packet.pilot_every, len(bank.content)):
             raise VerifyError(
                 f"{board.session.name}: holds {s.packets} packets of {s.frames} frames, pilot in every"
-                f" {s.pilot_every}, {s.length} bytes; expected {payload.packets} of {payload.frames},"
-                f" pilot in every {payload.pilot_every}, {len(payload.content)} bytes; {again}"
+                f" {s.pilot_every}, {s.length} bytes; expected {bank.packets} of {packet.frames},"
+                f" pilot in every {packet.pilot_every}, {len(bank.content)} bytes; {again}"
             )
         held = board.read(s.active_bank, 0, s.length)
-        differ = next((i for i, (a, b) in enumerate(zip(held, payload.content, strict=True)) if a != b), None)
+        differ = next((i for i, (a, b) in enumerate(zip(held, bank.content, strict=True)) if a != b), None)
         if differ is not None:
             raise VerifyError(
                 f"{board.session.name}: byte {differ} of bank {s.active_bank} is {held[differ]:#04x},"
-                f" expected {payload.content[differ]:#04x}; {again}"
+                f" expected {bank.content[differ]:#04x}; {again}"
             )
-    typer.echo(f"same: {len(held)} bytes in bank {s.active_bank}, CRC {payload.crc:08x}")
+    typer.echo(f"same: {len(held)} bytes in bank {s.active_bank}, CRC {bank.crc:08x}")
 
 
-@app.command("test-leds")
+@app.command("test-leds", cls=LineCommand)
 def walk_leds(
+    context: typer.Context,
     first: Annotated[int, typer.Option(help="First LED.", min=0, max=95)] = 0,
     last: Annotated[int, typer.Option(help="Last LED.", min=0, max=95)] = 95,
     dwell_ms: Annotated[int, typer.Option(help="Time each LED is on, ms.", min=1, max=65535)] = 100,
     wait: Annotated[bool, typer.Option(help="Wait until the walk has ended.")] = True,
-    port: Port = None,
-    baud: Baud = DEFAULT_BAUD,
-    trace: Trace = None,
-    replay: Replay = None,
 ) -> None:
     """Light the LEDs one by one.
 
-    For example: [bold]evlcp board test-leds --dwell-ms 50 --port /dev/ttyUSB0[/]
+    For example: [bold]evlcp board --port /dev/ttyUSB0 test-leds --dwell-ms 50[/]
     """
-    with open_board(port, baud, trace, replay) as board:
+    with open_board(context) as board:
         board.test_leds(first, last, dwell_ms)
         if wait:
             board.wait_dark(10.0 + (last - first + 1) * dwell_ms * 2e-3)
 
 
-@app.command()
+@app.command(cls=LineCommand)
 def save(
+    context: typer.Context,
     autostart: Annotated[bool, typer.Option(help="Recall and play after a reset.")] = False,
-    port: Port = None,
-    baud: Baud = DEFAULT_BAUD,
-    trace: Trace = None,
-    replay: Replay = None,
 ) -> None:
     """Save payload and settings to the board's flash; stop it first.
 
-    For example: [bold]evlcp board save --autostart --port /dev/ttyUSB0[/]
+    For example: [bold]evlcp board --port /dev/ttyUSB0 save --autostart[/]
     """
-    with open_board(port, baud, trace, replay) as board:
+    with open_board(context) as board:
         reply = board.save(autostart)
     typer.echo(f"saved in slot {reply.slot}, number {reply.save_sequence}")
 
 
-@app.command()
-def recall(port: Port = None, baud: Baud = DEFAULT_BAUD, trace: Trace = None, replay: Replay = None) -> None:
+@app.command(cls=LineCommand)
+def recall(context: typer.Context) -> None:
     """Take payload and settings from the board's flash."""
-    with open_board(port, baud, trace, replay) as board:
+    with open_board(context) as board:
         reply = board.recall()
     typer.echo(f"recalled slot {reply.slot}, number {reply.save_sequence}")
 

@@ -5,6 +5,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli._common import LinkFile, Overrides
+from firmware_host.commands._line import BoardLine, progress_bar, tell
+from firmware_host.commands._output import save_array
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -48,17 +52,14 @@ def message(
     ] = None,
     port: Annotated[
         str | None,
-        typer.Option(help="Program a board and play: device, pyserial URL, native:, as for 'evlcp board'."),
+        typer.Option(
+            help="Program a board and play: device, pyserial URL, native:, as for 'evlcp board';"
+            " EVLCP_PORT does not count here."
+        ),
     ] = None,
     baud: Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)] = 1_000_000,
-    link_file: Annotated[
-        str | None,
-        typer.Option("-c", "--config", metavar="link.toml", help="The link; all defaults without it."),
-    ] = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="TABLE.KEY=VALUE", help="Override one value; may be repeated."),
-    ] = None,
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="One JSON object on stdout, with the symbols.")
     ] = False,
@@ -76,23 +77,21 @@ def message(
     from evlcp_sdk.link.compose import packets_of
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
+    from firmware_host.board.symbols import symbols_table
 
     link = load_link(link_file, overrides or [], Registry.load())
     coder = link.block_coder()
     messages = _messages(text, file, beacon, user, key, transmitter_id, sequence, coder)
     symbols = packets_of(messages, coder, repeat)
-    table = {
-        "profile": link.codebook.profile,
-        "digest": link.codebook.digest,
-        "pilot_every": link.packet.pilot_every,
-        "symbols": symbols.tolist(),
-    }
+    table = symbols_table(symbols, link, messages=True)
     if out is not None:
-        _write_text(out, json.dumps(table) + "\n")
-    if chips is not None:
-        from firmware_host.commands._output import save_array
+        from evlcp_sdk.files import write_text
 
-        save_array(chips, _chips(symbols, link))
+        write_text(json.dumps(table) + "\n", out)
+    if chips is not None:
+        from firmware_host.board.bank import symbol_chips
+
+        save_array(chips, symbol_chips(symbols, link.codebook, link.packet.pilot_every))
     programmed = None if port is None else _program(symbols, link, port, baud)
     packet_s = link.packet.packet_chips / link.air.chip_rate_hz
     summary: dict[str, Any] = {
@@ -118,10 +117,16 @@ def message(
         typer.echo(
             f"{m['kind']:9} {m['bytes']:5} bytes, transmitter {m['transmitter_id']}, sequence {m['sequence']}"
         )
-    typer.echo(f"{summary['packets']} packets, {summary['duration_s']:.4g} s, again and again")
+    said = f"{summary['packets']} packets, {summary['duration_s']:.4g} s"
+    written = [str(path) for path in (out, chips) if path is not None]
+    if written:
+        said += f", in {' and '.join(written)}"
     if programmed is not None:
-        from firmware_host.commands._line import tell
-
+        said += ", again and again"
+    elif not written:
+        said += "; nothing is sent or written: give --port, -o or --chips"
+    typer.echo(said)
+    if programmed is not None:
         tell(programmed, as_json=False)
 
 
@@ -214,32 +219,10 @@ def _read(path: Path) -> bytes:
         raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
 
 
-def _write_text(path: Path, text: str) -> None:
-    from evlcp_sdk.errors import InputError
-
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be written: {fault.strerror}") from fault
-
-
-def _chips(symbols: "NDArray[np.int64]", link: "Link") -> "NDArray[np.uint8]":
-    import numpy as np
-
-    from evlcp_sdk.air.frames import packet_chips
-
-    return np.concatenate([packet_chips(p, link.codebook, link.air.pilot_every) for p in symbols])
-
-
 def _program(symbols: "NDArray[np.int64]", link: "Link", port: str, baud: int) -> Any:
-    from evlcp_sdk.errors import ConfigError
-    from firmware_host.board.bank import Bank
+    from firmware_host.board.bank import bank_of
     from firmware_host.board.board import Settings, provision
-    from firmware_host.commands._line import open_board, progress_bar
 
-    if link.air.chip_rate_hz != round(link.air.chip_rate_hz):
-        raise ConfigError(f"air.chip_rate_hz = {link.air.chip_rate_hz}: a board takes whole chips a second")
-    payload = Bank.of_symbols(symbols, link.codebook, link.packet.pilot_every)
-    settings = Settings(round(link.air.chip_rate_hz))
-    with open_board(port, baud, None, None) as board, progress_bar("programming") as progress:
-        return provision(board, payload, settings, True, progress)
+    bank = bank_of(symbols, link)
+    with BoardLine(port, baud).open() as board, progress_bar("programming") as progress:
+        return provision(board, bank, Settings(), True, progress)

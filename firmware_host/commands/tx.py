@@ -6,16 +6,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evlcp_sdk.cli._common import LinkFile, Overrides
 from firmware_host.commands import _source
 from firmware_host.commands._output import save_array
-from firmware_host.commands._source import Frames, PilotEvery, ProfileName, RandomPackets, Seed, SymbolsFile
+from firmware_host.commands._source import RandomPackets, Seed, SymbolsFile
 from firmware_host.commands.message import keygen, message
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from evlcp_sdk.air.codebook import Codebook
+    from evlcp_sdk.link.resolve import Link
 
 __all__ = ["app"]
 
@@ -40,9 +41,8 @@ def frames(
     symbols: SymbolsFile = None,
     random: RandomPackets = None,
     seed: Seed = 0,
-    frames: Frames = 10,
-    pilot_every: PilotEvery = 1,
-    profile: ProfileName = "wh4x2",
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
     form: Annotated[Form, typer.Option("--format", help="How the words are printed.")] = Form.TABLE,
     chips: Annotated[
         Path | None,
@@ -51,74 +51,82 @@ def frames(
         ),
     ] = None,
 ) -> None:
-    """Show the words that a board would be sent for these symbols.
+    """Show the words that go on air for these symbols; with the file's own link unless one is given.
 
     For example: [bold]evlcp tx frames --random 2 --seed 1 --chips chips.npy[/]
     """
-    book = _source.codebook(profile)
-    table = _source.symbols(symbols, random, seed, frames, pilot_every, book)
+    table, link = _source.symbols(symbols, random, seed, link_file, overrides)
     if chips is not None:
         from firmware_host.board.bank import symbol_chips
 
-        save_array(chips, symbol_chips(table, book, pilot_every))
-    typer.echo(_FORMS[form](table, book, pilot_every))
+        save_array(chips, symbol_chips(table, link.codebook, link.packet.pilot_every))
+    typer.echo(_FORMS[form](table, link))
 
 
-def _table(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
-    from firmware_host.board.bank import word_table
+def _words(codes: "NDArray[np.int8]") -> list[str]:
+    """Codes as words in hex, the last chip the least significant bit."""
+    from evlcp_sdk.air.codebook import word_of_values
 
+    width = -(-2 * codes.shape[1] // 4)
+    return [f"{word_of_values(code):0{width}x}" for code in codes]
+
+
+def _table(symbols: "NDArray[np.int64]", link: "Link") -> str:
+    pilots, info = _words(link.codebook.pilots), _words(link.codebook.codewords)
+    none = "-".rjust(len(pilots[0]))
     lines = ["packet frame cluster symbol pilot info"]
-    for p, packet in enumerate(word_table(symbols, book)):
+    for p, packet in enumerate(symbols.tolist()):
         for f, frame in enumerate(packet):
-            for k, (pilot, info) in enumerate(frame):
-                shown = f"{pilot:04x}" if f % pilot_every == 0 else "   -"
-                lines.append(f"{p:6} {f:5} {k:7} {symbols[p, f, k]:6}  {shown} {info:04x}")
+            for k, symbol in enumerate(frame):
+                pilot = pilots[k] if link.packet.has_pilot(f) else none
+                lines.append(f"{p:6} {f:5} {k:7} {symbol:6}  {pilot} {info[symbol]}")
     return "\n".join(lines)
 
 
-def _hex(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
-    from firmware_host.board.bank import word_table
-
-    words = word_table(symbols, book)
+def _hex(symbols: "NDArray[np.int64]", link: "Link") -> str:
+    pilots, info = _words(link.codebook.pilots), _words(link.codebook.codewords)
     return "\n".join(
-        " ".join(f"{p:04x}{i:04x}" if f % pilot_every == 0 else f"{i:04x}" for p, i in frame)
-        for packet in words
+        " ".join(
+            (pilots[k] if link.packet.has_pilot(f) else "") + info[symbol] for k, symbol in enumerate(frame)
+        )
+        for packet in symbols.tolist()
         for f, frame in enumerate(packet)
     )
 
 
-def _c(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
-    from firmware_host.board.bank import word_table
+def _c(symbols: "NDArray[np.int64]", link: "Link") -> str:
+    from evlcp_sdk.errors import ConfigError
 
-    info = word_table(symbols, book)[..., 1]
-    packets, frames, clusters = info.shape
+    book = link.codebook
+    bits = next((n for n in (16, 32, 64) if n >= link.packet.info_chips), None)
+    if bits is None:
+        raise ConfigError(f"--format c: info segments of {link.packet.info_chips} chips, at most 64")
+    info = _words(book.codewords)
+    packets, frames, clusters = symbols.shape
     lines = [
         "/* Info words of evlcp tx frames; pilots and preamble are in codebook.h. */",
         "#include <stdint.h>",
         f"/* Codebook {book.digest[:16]}, profile {book.profile}, pilot in every frame f with"
-        f" f % {pilot_every} == 0. */",
-        f"static const uint16_t evlcp_info[{packets}][{frames}][{clusters}] = {{",
+        f" f % {link.packet.pilot_every} == 0. */",
+        f"static const uint{bits}_t evlcp_info[{packets}][{frames}][{clusters}] = {{",
     ]
-    for packet in info:
-        rows = [", ".join(f"0x{w:04x}u" for w in frame) for frame in packet]
+    for packet in symbols.tolist():
+        rows = [", ".join(f"0x{info[symbol]}u" for symbol in frame) for frame in packet]
         lines.append("    {" + ",\n     ".join(f"{{{row}}}" for row in rows) + "},")
     return "\n".join([*lines, "};"])
 
 
-def _json(symbols: "NDArray[np.int64]", book: "Codebook", pilot_every: int) -> str:
+def _json(symbols: "NDArray[np.int64]", link: "Link") -> str:
     import json
 
-    from firmware_host.board.bank import word_table
+    from firmware_host.board.symbols import symbols_table
 
-    words = word_table(symbols, book)
+    info = _words(link.codebook.codewords)
     return json.dumps(
-        {
-            "profile": book.profile,
-            "digest": book.digest,
-            "pilot_every": pilot_every,
-            "symbols": symbols.tolist(),
-            "pilot_words": [f"{w:04x}" for w in words[0, 0, :, 0]],
-            "info_words": [[[f"{w:04x}" for w in frame] for frame in packet] for packet in words[..., 1]],
+        symbols_table(symbols, link)
+        | {
+            "pilot_words": _words(link.codebook.pilots),
+            "info_words": [[[info[s] for s in frame] for frame in packet] for packet in symbols.tolist()],
         }
     )
 
@@ -131,10 +139,8 @@ def check(
     symbols: SymbolsFile = None,
     random: RandomPackets = None,
     seed: Seed = 0,
-    frames: Frames = 10,
-    pilot_every: PilotEvery = 1,
-    profile: ProfileName = "wh4x2",
-    chip_rate: Annotated[float, typer.Option(help="Chips per second.", min=1.0, max=1e6)] = 10_000.0,
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
     """Check balance and flicker: on-share, longest run, lines below 3 kHz against IEEE Std 1789-2015.
@@ -146,9 +152,9 @@ def check(
     from firmware_host.board.bank import symbol_chips
     from firmware_host.flicker import check as measure
 
-    book = _source.codebook(profile)
-    table = symbol_chips(_source.symbols(symbols, random, seed, frames, pilot_every, book), book, pilot_every)
-    rows = measure(table, chip_rate)
+    sent, link = _source.symbols(symbols, random, seed, link_file, overrides)
+    chip_rate = link.packet.chip_rate_hz
+    rows = measure(symbol_chips(sent, link.codebook, link.packet.pilot_every), chip_rate)
     if as_json:
         import json
 

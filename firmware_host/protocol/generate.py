@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.link.resolve import resolve
 
 __all__ = ["Field", "codebook_of", "generated_files", "main", "schema_hash"]
 
@@ -86,17 +87,12 @@ def schema_hash(definition: dict[str, Any]) -> str:
 
 
 def codebook_of(profile: str) -> Codebook:
-    """The codebook of a profile with the 16 Walsh-Hadamard pilots of the board.
+    """The codebook of the default link with another profile.
 
     Raises:
         UnknownAlgorithmError: No modulation has that name.
     """
-    from evlcp_sdk.plugin.registry import Registry
-
-    registry = Registry.load()
-    codewords = registry.load_class("modulation", profile)().codewords()
-    pilots = registry.load_class("pilots", "wh")()
-    return Codebook(profile, pilots.preamble(), pilots.codes(16), codewords)
+    return resolve({"modulation": {"id": profile}}).codebook
 
 
 def _messages(definition: dict[str, Any]) -> Iterator[tuple[dict[str, Any], list[Field], list[Field]]]:
@@ -343,6 +339,26 @@ def profiles_header() -> str:
     return "\n".join([*out, "};", "#endif", ""])
 
 
+def profiles_module() -> str:
+    """The Python module of the same digests."""
+    rows = [f'    Profile.{p.upper()}: "{codebook_of(p).digest}",' for p in PROFILES]
+    return "\n".join(
+        [
+            '"""Codebooks of the firmware; `python -m firmware_host.protocol.generate` writes this file."""',
+            "",
+            "from firmware_host.protocol.requests import Profile",
+            "",
+            '__all__ = ["DIGESTS"]',
+            "",
+            "DIGESTS = {",
+            *rows,
+            "}",
+            '"""Digest of each profile\'s codebook, 64 hex digits."""',
+            "",
+        ]
+    )
+
+
 _MARK = "<!-- What follows is generated from protocol.toml by firmware_host.protocol.generate. -->\n"
 
 
@@ -383,6 +399,7 @@ def generated_files() -> dict[Path, str]:
     generated = HERE / "firmware" / "generated"
     files = {
         HERE / "protocol" / "requests.py": python_module(definition),
+        HERE / "protocol" / "profiles.py": profiles_module(),
         generated / "protocol.h": c_header(definition),
         generated / "codebook.h": codebook_of("wh4x2").to_c(),
         generated / "profiles.h": profiles_header(),

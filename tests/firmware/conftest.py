@@ -9,7 +9,7 @@ from collections.abc import Callable
 import pytest
 
 from evlcp_sdk.air.codebook import Codebook
-from firmware_host.protocol.generate import codebook_of
+from evlcp_sdk.link.resolve import load_link
 
 INSTALL = "sh firmware_host/firmware/install-toolchain.sh installs it (as root)"
 
@@ -23,7 +23,7 @@ def tool(*names: str) -> None:
 
 @pytest.fixture(scope="session")
 def book() -> Codebook:
-    return codebook_of("wh4x2")
+    return load_link().codebook
 
 
 @pytest.fixture(scope="session")

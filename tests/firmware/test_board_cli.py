@@ -95,8 +95,18 @@ def test_a_users_first_hour(cli, native: str, tmp_path: Path) -> None:
     assert other.returncode == 7
     assert "byte 0 of bank 0" in other.stderr
     assert board("verify", "--random", 9, "--seed", 4).returncode == 7
-    foreign = board("send", "--random", 1, "--profile", "wh8")
-    assert foreign.returncode == 8
+    for other_air, says in (
+        ("modulation.id=wh8", "this payload's link has codebook"),
+        (
+            "air.chip_rate_hz=5000.0",
+            "plays 10000 chips a second, this payload's link has air.chip_rate_hz = 5000",
+        ),
+    ):
+        for command in ("send", "verify"):
+            foreign = board(command, "--random", 8, "--seed", 3, "--set", other_air)
+            assert foreign.returncode == 8
+            assert says in foreign.stderr
+            assert foreign.stderr.count("\n") == 1
     assert board("send", "--random", 2, "--seed", 9, "--json").returncode == 0
     lines = board("monitor", "--count", 2, "--interval", 0.05).stdout.splitlines()
     assert len(lines) == 2
@@ -316,7 +326,8 @@ def test_programming_is_near_the_wire_time() -> None:
 
 
 @pytest.mark.parametrize(
-    "option", [("--no-start",), ("--level", 30), ("--seed", 1), ("--port", "native:"), ("--frames", 10)]
+    "option",
+    [("--no-start",), ("--level", 30), ("--seed", 1), ("--port", "native:"), ("--set", "air.pilot_every=2")],
 )
 def test_an_inventory_takes_no_settings_from_the_command_line(cli, option: tuple[object, ...]) -> None:
     done = cli("board", "program", "--inventory", "x.toml", *option)
@@ -324,13 +335,46 @@ def test_an_inventory_takes_no_settings_from_the_command_line(cli, option: tuple
     assert str(option[0]) in done.stderr
 
 
+def test_nor_before_the_command(cli) -> None:
+    done = cli("board", "--port", "native:", "program", "--inventory", "x.toml")
+    assert done.returncode == 2
+    assert "write --port there" in done.stderr
+
+
+def test_options_of_the_line_stand_before_or_behind_the_command(cli, native: str, tmp_path: Path) -> None:
+    before = cli("board", "--port", native, "hello", "--json")
+    behind = cli("board", "hello", "--json", "--port", native)
+    assert (before.returncode, behind.returncode) == (0, 0)
+    assert json.loads(before.stdout)["unique_id"] == json.loads(behind.stdout)["unique_id"]
+    # behind counts more, and either more than the environment
+    assert cli("board", "--port", "unix:/nowhere", "start", "--port", native).returncode == 5
+    env = os.environ | {"EVLCP_PORT": "unix:/nowhere"}
+    done = subprocess.run(
+        [*EVLCP, "board", "--port", native, "hello"], env=env, capture_output=True, check=False
+    )
+    assert done.returncode == 0
+    trace = tmp_path / "wire.jsonl"
+    assert cli("board", "--port", native, "--trace", trace, "status").returncode == 0
+    assert cli("board", "--replay", trace, "status").returncode == 0
+    for command in (("leds", "x", "--chips", "y"), ("emulate", "native"), ("ports",)):
+        refused = cli("board", "--port", native, *command)
+        assert refused.returncode == 2
+        assert f"'{command[0]}' takes no --port" in refused.stderr
+
+
+@pytest.mark.parametrize("command", ["hello", "program", "start", "level", "test-leds", "recall"])
+def test_a_command_on_a_board_has_the_options_of_the_line(evlcp, command: str) -> None:
+    said = evlcp("board", command, "--help").out
+    assert [o for o in ("--port", "--baud", "--trace", "--replay") if o not in said] == []
+
+
 @pytest.mark.parametrize(
     "command",
     [
         ("tx", "frames", "--random", 1, "--seed", -1),
         ("tx", "frames", "--random", 10**12),
-        ("tx", "frames", "--random", 1, "--frames", 10**12),
-        ("tx", "check", "--random", 1, "--chip-rate", "inf"),
+        ("tx", "frames", "--random", 1, "--set", f"air.frames_per_packet={10**12}"),
+        ("tx", "check", "--random", 1, "--set", "air.chip_rate_hz=inf"),
     ],
 )
 def test_numbers_beyond_reason_are_usage(cli, command: tuple[object, ...]) -> None:
@@ -392,7 +436,7 @@ def test_a_flash_file_is_replaced_whole(tmp_path: Path, book: Codebook) -> None:
     assert flash.read_bytes() == saved
     with started() as (_, board):
         assert board.recall().save_sequence == 5
-        assert board.holds(payload, 10_000, board.status())
+        assert board.holds(payload, board.status())
 
 
 @pytest.mark.parametrize("through", ["--flash", "native:"])

@@ -1,6 +1,7 @@
 """The transmitter's page holds: its commands run, its inventory is valid, its tables are complete."""
 
 import re
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -24,10 +25,17 @@ def test_commands_run(cli, block: str, tmp_path: Path) -> None:
 
 
 def test_inventory_is_valid(tmp_path: Path) -> None:
-    (tmp_path / "t01.json").write_text(str([[[0] * 16]]))
+    (tmp_path / "t01.json").write_text(str([[[0] * 16] * 10]))
+    (tmp_path / "link.toml").write_text("[air]\npilot_every = 4\n")
     (tmp_path / "tunnel.toml").write_text(blocks("toml")[0])
     boards = read_inventory(tmp_path / "tunnel.toml").boards
-    assert [(e.id, e.level_ma, p.packets) for e, p in boards] == [("T01", 20, 1), ("T02", 20, 16)]
+    assert [(e.id, e.level_ma, b.packets) for e, b in boards] == [("T01", 20, 1), ("T02", 20, 16)]
+    assert [bank.packet.pilot_every for _, bank in boards] == [1, 4]
+
+
+def test_file_of_symbols_is_one(evlcp, tmp_path: Path) -> None:
+    (tmp_path / "s.json").write_text(blocks("json")[0])
+    assert evlcp("tx", "frames", tmp_path / "s.json").code == 0
 
 
 def test_every_command_is_told() -> None:
@@ -43,4 +51,4 @@ def test_every_key_of_an_inventory_is_told() -> None:
     from firmware_host.board.fleet import Entry
 
     section = PAGE.split("## Many boards")[1].split("## Emulated")[0]
-    assert [k for k in Entry.model_fields if k not in section] == []
+    assert [field.name for field in fields(Entry) if field.name not in section] == []

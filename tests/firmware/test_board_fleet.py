@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from evlcp_sdk.errors import InputError
+from evlcp_sdk.errors import ConfigError
 from firmware_host.board.fleet import read_inventory
 from firmware_host.emulators.processes import native_command
+from firmware_host.errors import IncompatibleError
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -36,7 +37,7 @@ def boards(tmp_path: Path) -> Iterator[list[str]]:
 
 
 def inventory(path: Path, ports: list[str], extra: dict[int, str]) -> Path:
-    tables = ["[defaults]\nrandom = 16\nframes = 10"]
+    tables = ["[defaults]\nrandom = 16"]
     for n, port in enumerate(ports):
         line = f'[[board]]\nid = "T{n:02}"\nport = "{port}"\nposition_m = [0.0, {n}.5, 5]\nseed = {n}\n'
         tables.append(line + extra.get(n, ""))
@@ -44,11 +45,38 @@ def inventory(path: Path, ports: list[str], extra: dict[int, str]) -> Path:
     return path
 
 
-def test_a_boards_pilots(tmp_path: Path) -> None:
-    file = inventory(tmp_path / "two.toml", ["unix:/a", "unix:/b"], {1: "pilot_every = 4\n"})
-    assert [payload.pilot_every for _, payload in read_inventory(file).boards] == [1, 4]
-    inventory(file, ["unix:/a"], {0: "pilot_every = 0\n"})
-    with pytest.raises(InputError, match=r"board\[0\]\.pilot_every = 0"):
+def test_a_boards_link(tmp_path: Path) -> None:
+    (tmp_path / "links").mkdir()
+    (tmp_path / "links" / "fast.toml").write_text("[air]\nchip_rate_hz = 20000.0\n")
+    extra = {1: "link = {air = {pilot_every = 4, frames_per_packet = 8}}\n", 2: 'link = "links/fast.toml"\n'}
+    file = inventory(tmp_path / "three.toml", ["unix:/a", "unix:/b", "unix:/c"], extra)
+    banks = [bank for _, bank in read_inventory(file).boards]
+    assert [b.packet.pilot_every for b in banks] == [1, 4, 1]
+    assert [b.packet.frames for b in banks] == [10, 8, 10]
+    assert [b.chip_rate_hz for b in banks] == [10_000, 10_000, 20_000]
+    inventory(file, ["unix:/a"], {0: "link = {air = {pilot_every = 0}}\n"})
+    with pytest.raises(ConfigError, match=r"board\[0\]: link: air\.pilot_every = 0"):
+        read_inventory(file)
+
+
+def test_a_link_for_all_boards(tmp_path: Path) -> None:
+    file = inventory(tmp_path / "two.toml", ["unix:/a", "unix:/b"], {1: "link = {}\n"})
+    file.write_text(
+        file.read_text().replace("random = 16", 'random = 16\nlink = {modulation = {id = "wh8"}}')
+    )
+    assert [bank.codebook.profile for _, bank in read_inventory(file).boards] == ["wh8", "wh4x2"]
+
+
+def test_a_payload_has_its_own_link(evlcp, tmp_path: Path) -> None:
+    options = ("--set", "modulation.id=wh8", "--set", "air.chip_rate_hz=5000.0")
+    assert evlcp("tx", "message", "--text", "a", "-o", tmp_path / "m.json", *options).code == 0
+    file = tmp_path / "one.toml"
+    entry = 'id = "a"\nport = "native:"\nposition_m = [0, 0, 0]\npayload = "m.json"\n'
+    file.write_text("[[board]]\n" + entry)
+    ((_, bank),) = read_inventory(file).boards
+    assert (bank.codebook.profile, bank.chip_rate_hz) == ("wh8", 5000)
+    file.write_text("[[board]]\n" + entry + "link = {air = {chip_rate_hz = 5000.0}}\n")
+    with pytest.raises(IncompatibleError, match=r"board\[0\]: .*modulation\.id: sent with .*wh8"):
         read_inventory(file)
 
 
@@ -100,13 +128,26 @@ GOOD = 'id = "a"\nport = "native:"\nposition_m = [0, 0, 0]\nrandom = 1\n'
         ("[other]\n", "other: unknown table"),
         ("defaults = 3\n[[board]]\n" + GOOD, "defaults = 3"),
         ("[[board]]\n" + GOOD.replace("random = 1", ""), "give payload or random"),
-        ("[[board]]\n" + GOOD + 'colour = "red"', "board[0].colour = 'red'"),
+        ("[[board]]\n" + GOOD + 'colour = "red"', 'board[0].colour = "red": unknown key'),
         ("[[board]]\n" + GOOD.replace("[0, 0, 0]", "[0, 0]"), "board[0].position_m = [0, 0]"),
         ("[[board]]\n" + GOOD.replace("[0, 0, 0]", "[0, 0, nan]"), "board[0].position_m.2"),
-        ("[[board]]\n" + GOOD.replace("random = 1", 'random = "1"'), "board[0].random = '1'"),
-        ("[[board]]\n" + GOOD + 'watchdog = "sleep"', "board[0].watchdog = 'sleep'"),
-        ("[[board]]\n" + GOOD + 'profile = "wh9"', "board[0]: no modulation algorithm named 'wh9'"),
-        ("[[board]]\n" + GOOD + "[[board]]\n" + GOOD, "board[1].id = 'a', expected another than board[0]'s"),
+        ("[[board]]\n" + GOOD.replace("random = 1", 'random = "1"'), 'board[0].random = "1"'),
+        ("[[board]]\n" + GOOD + 'watchdog = "sleep"', 'board[0].watchdog = "sleep"'),
+        ("[[board]]\n" + GOOD + 'profile = "wh8"', 'board[0].profile = "wh8": unknown key'),
+        (
+            '[[board]]\nlink = {modulation = {id = "wh9"}}\n' + GOOD,
+            "board[0]: no modulation algorithm named 'wh9'",
+        ),
+        ('[[board]]\nlink = "no.toml"\n' + GOOD, "no.toml: cannot be read"),
+        (
+            "[[board]]\nlink = {bar = {rows = 48}}\n" + GOOD,
+            "board[0]: the driver board cannot play this link: bar",
+        ),
+        (
+            "[[board]]\nlink = {air = {chip_rate_hz = 12.5}}\n" + GOOD,
+            "air.chip_rate_hz = 12.5: a board takes whole",
+        ),
+        ("[[board]]\n" + GOOD + "[[board]]\n" + GOOD, 'board[1].id = "a", expected another than board[0]\'s'),
         ("[[board]]\n" + GOOD.replace("random = 1", 'payload = "no.json"'), "no.json: cannot be read"),
     ],
 )
@@ -114,7 +155,7 @@ def test_wrong_inventory_is_one_line(cli, tmp_path: Path, text: str, expected: s
     file = tmp_path / "tunnel.toml"
     file.write_text(text)
     done = cli("board", "program", "--inventory", file)
-    assert done.returncode == 3
+    assert done.returncode == (3 if "payload" in text else 2)
     assert done.stdout == ""
     assert done.stderr.startswith(f"evlcp: {file}: ")
     assert expected in done.stderr

@@ -71,6 +71,11 @@ def test_no_import_circle() -> None:
     assert done == set(MODULES)
 
 
+def test_the_generator_is_a_developers_tool() -> None:
+    users = [module for module in MODULES if "protocol.generate" in own_imports(module)]
+    assert users == []
+
+
 def public_classes(package: str) -> set[str]:
     trees = (ast.parse(path.read_text()) for path in (ROOT / package).rglob("*.py"))
     return {

@@ -93,11 +93,11 @@ def test_a_text_a_file_and_a_beacon(evlcp: Evlcp, site: Path, tmp_path: Path) ->
         "beacon       34 bytes, transmitter 7, sequence 5",
         "text         18 bytes, transmitter 7, sequence 5",
         "data        100 bytes, transmitter 7, sequence 5",
-        "5 packets, 0.173 s, again and again",
+        f"5 packets, 0.173 s, in {out} and {chips}",
     ]
     link = load_link()
     table = json.loads(out.read_text())
-    assert (table["profile"], table["digest"]) == ("wh4x2", link.codebook.digest)
+    assert (table["link"]["modulation"]["id"], table["codebook"]) == ("wh4x2", link.codebook.digest)
     found = messages_of(np.array(table["symbols"]), link)
     assert found[Kind.TEXT] == Message(Kind.TEXT, 7, 5, "Tempo 30 für 2 km".encode())
     assert found[Kind.DATA].payload == bytes(range(100))
@@ -162,13 +162,86 @@ def test_faults_are_one_line(evlcp: Evlcp, site: Path, tmp_path: Path) -> None:
         (("--beacon", two), 2, "2 bars: choose one with --id, of 7, 8"),
         (("--beacon", two, "--id", "9"), 2, "no bar has transmitter_id 9, but 7, 8"),
         (("--text", "a", "--set", "air.frames_per_packet=2"), 2, "expected at least 18"),
-        (("--text", "a", "-o", tmp_path), 3, "cannot be written"),
+        (("--text", "a", "-o", tmp_path), 1, "cannot be written"),
     ):
         done = evlcp("tx", "message", *options)
         assert done.code == code, done.err
         assert told in done.err
         assert done.err.count("\n") == 1
     assert evlcp("tx", "message", "--beacon", two, "--id", 8).code == 0
+
+
+def test_what_tx_wrote_tx_shows(evlcp: Evlcp, tmp_path: Path) -> None:
+    out, chips, again = tmp_path / "m.json", tmp_path / "c.npy", tmp_path / "again.npy"
+    (tmp_path / "link.toml").write_text('[pilots]\nid = "barker13"\n')
+    options = ("--set", "pilots.id=barker13")
+    assert evlcp("tx", "message", "--text", "hi", "-o", out, "--chips", chips, *options).code == 0
+    for named in ((), options, ("-c", tmp_path / "link.toml"), (*options, "--set", "camera.focal_mm=50.0")):
+        done = evlcp("tx", "frames", out, "--chips", again, *named)
+        assert done.code == 0, done.err
+        assert (np.load(again) == np.load(chips)).all()
+        again.unlink()
+        assert evlcp("tx", "check", out, *named).code == 0
+    # a word is the chips, most significant first: the first pilot stands behind the preamble
+    word = evlcp("tx", "frames", out, "--format", "json").out
+    bits = "".join(str(chip) for chip in np.load(chips)[26:52, 0])
+    assert int(json.loads(word)["pilot_words"][0], 16) == int(bits, 2)
+
+
+@pytest.mark.parametrize(
+    ("other", "differ"),
+    [
+        ("modulation.id=wh8", 'modulation.id: sent with "wh4x2", received with "wh8"'),
+        ("pilots.id=wh", 'pilots.id: sent with "barker13", received with "wh"'),
+        ("air.chip_rate_hz=5000.0", "air.chip_rate_hz: sent with 10000.0, received with 5000.0"),
+        ("error-correction.id=reed-solomon", "error-correction.id: sent with"),
+    ],
+)
+def test_another_link_is_refused_and_says_where(
+    evlcp: Evlcp, tmp_path: Path, other: str, differ: str
+) -> None:
+    out = tmp_path / "m.json"
+    assert evlcp("tx", "message", "--text", "hi", "-o", out, "--set", "pilots.id=barker13").code == 0
+    for command in (("tx", "frames"), ("tx", "check"), ("board", "--port", "native:", "program")):
+        done = evlcp(*command, out, "--set", "pilots.id=barker13", "--set", other)
+        assert (done.code, done.out) == (8, "")
+        assert done.err.startswith(f"evlcp: {out}: made with another link: ")
+        assert differ in done.err
+        assert done.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        (("pilots.id=barker13",), "pilots: codes of 26 chips, the board's words have 16"),
+        (("bar.rows=48",), "bar of 8 clusters, the board has 16"),
+        (("bar.rows=64", "bar.cluster_rows=4"), "bar of 4 LEDs a cluster, the board has 6"),
+        (("air.chip_rate_hz=12.5",), "air.chip_rate_hz = 12.5: a board takes whole chips a second"),
+        (("bar.rows=48", "air.chip_rate_hz=0.5"), "8 clusters, the board has 16; air.chip_rate_hz = 0.5"),
+    ],
+)
+def test_a_link_that_no_board_can_play_is_one_line(
+    evlcp: Evlcp, tmp_path: Path, settings: tuple[str, ...], says: str
+) -> None:
+    options = [part for setting in settings for part in ("--set", setting)]
+    for command in (
+        ("tx", "message", "--text", "hi", "--repeat", 2, "--port", "native:"),
+        ("board", "--port", "native:", "program", "--random", 1),
+        ("board", "--port", "native:", "verify", "--masks", tmp_path / "no.npy"),
+    ):
+        done = evlcp(*command, *options)
+        assert done.code == 2, done.err
+        assert done.err.startswith("evlcp: the driver board cannot play this link: ")
+        assert says in done.err
+        assert done.err.count("\n") == 1
+
+
+def test_without_an_output_nothing_is_said_to_be_sent(evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EVLCP_PORT", "unix:/nowhere")
+    done = evlcp("tx", "message", "--text", "hi")
+    assert done.code == 0
+    last = "1 packets, 0.0346 s; nothing is sent or written: give --port, -o or --chips"
+    assert done.out.splitlines()[-1] == last
 
 
 @pytest.mark.usefixtures("compiler")
@@ -178,6 +251,7 @@ def test_a_board_plays_it(cli: Evlcp, site: Path, tmp_path: Path) -> None:
     done = cli("tx", "message", "--text", "Tempo 30 " * 20, "--beacon", site, "--sequence", 3, "--port", port)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "sent 1920 of 1920 bytes; bank 0 is active"
+    assert done.stdout.splitlines()[-2].endswith(", again and again")
     # More packets than a bank holds are refused, and what plays goes on.
     (tmp_path / "big").write_bytes(bytes(60_000))
     refused = cli("tx", "message", "--file", tmp_path / "big", "--port", port)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.air.frames import packet_chips
+from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
 from firmware_host import flicker
 from firmware_host.board.bank import (
@@ -33,9 +33,12 @@ def example(tmp_path: Path) -> Path:
     return path
 
 
+TWO_FRAMES = ("--set", "air.frames_per_packet=2")
+
+
 def test_chips_are_the_air_vectors(cli, example: Path, tmp_path: Path) -> None:
     out = tmp_path / "chips.npy"
-    assert cli("tx", "frames", example, "--chips", out).returncode == 0
+    assert cli("tx", "frames", example, "--chips", out, *TWO_FRAMES).returncode == 0
     chips = np.load(out)
     assert chips.dtype == np.uint8
     assert chips.shape == (90, 16)
@@ -43,24 +46,24 @@ def test_chips_are_the_air_vectors(cli, example: Path, tmp_path: Path) -> None:
 
 
 def test_every_form_has_the_same_words(cli, example: Path) -> None:
-    table = json.loads(cli("tx", "frames", example, "--format", "json").stdout)
+    table = json.loads(cli("tx", "frames", example, "--format", "json", *TWO_FRAMES).stdout)
     assert table["pilot_words"] == AIR["pilot_words"]
     info = [w for frame in table["info_words"][0] for w in frame]
     expected = [AIR["info_words"]["wh4x2"][s] for frame in EXAMPLE["symbols"] for s in frame]
     assert info == expected
-    hexed = cli("tx", "frames", example, "--format", "hex").stdout.split()
+    hexed = cli("tx", "frames", example, "--format", "hex", *TWO_FRAMES).stdout.split()
     assert [h[4:] for h in hexed] == expected
     assert [h[:4] for h in hexed] == 2 * AIR["pilot_words"]
-    c = cli("tx", "frames", example, "--format", "c").stdout
+    c = cli("tx", "frames", example, "--format", "c", *TWO_FRAMES).stdout
     assert [w for w in expected if f"0x{w}u" not in c] == []
-    rows = cli("tx", "frames", example).stdout.splitlines()[1:]
+    rows = cli("tx", "frames", example, *TWO_FRAMES).stdout.splitlines()[1:]
     assert [r.split()[5] for r in rows] == expected
 
 
 @pytest.mark.parametrize("profile", ["wh4x2", "wh8", "raw8"])
 def test_random_is_a_seed(cli, profile: str, tmp_path: Path) -> None:
     def run(seed: int) -> str:
-        options = ("--random", 2, "--seed", seed, "--profile", profile, "--format", "hex")
+        options = ("--random", 2, "--seed", seed, "--set", f"modulation.id={profile}", "--format", "hex")
         return str(cli("tx", "frames", *options).stdout)
 
     assert run(1) == run(1) != run(2)
@@ -70,7 +73,7 @@ def test_random_is_a_seed(cli, profile: str, tmp_path: Path) -> None:
 def test_payload_is_what_the_chips_say(book: Codebook) -> None:
     symbols = random_symbols(3, 2, book, np.random.default_rng(0))
     words = Bank.of_symbols(symbols, book)
-    masks = Bank.of_masks(symbol_chips(symbols, book), 3, 2, book)
+    masks = Bank.of_masks(symbol_chips(symbols, book), book, PacketFormat.of(book, 2))
     assert len(words.content) == 3 * 2 * 16 * 2
     assert len(masks.content) == 3 * 90 * 12
     rows = np.frombuffer(masks.content, np.uint8).reshape(-1, 12)
@@ -94,15 +97,17 @@ def test_torn_cluster_is_told() -> None:
         ("[" * 100_000, "not JSON"),
         ("3", "symbols: found 3, expected a list of packets"),
         ("[]", "symbols: found 0 elements"),
-        ("[3]", "symbols[0]: found 3, expected a list of frames"),
-        ("[[[1]]]", "symbols[0][0]: found 1 elements, expected 16 symbols, one a cluster"),
+        ("[3]", "symbols[0]: found 3, expected 10 frames"),
+        (json.dumps([[[1]] * 10]), "symbols[0][0]: found 1 elements, expected 16 symbols, one a cluster"),
+        ("[[[1]]]", "symbols[0]: found 1 elements, expected 10 frames, air.frames_per_packet"),
         ('{"symbol": []}', "key symbols is missing"),
-        ('{"profile": "wh8", "symbols": []}', "profile = 'wh8', expected 'wh4x2'"),
-        ('{"pilot_every": 4, "symbols": []}', "pilot_every = 4, expected 1; choose it with --pilot-every"),
-        (json.dumps([[[0] * 15 + [64]]]), "symbols[0][0][15] = 64, expected an integer 0 to 63"),
-        (json.dumps([[[0] * 15 + [True]]]), "symbols[0][0][15] = true, expected an integer"),
-        (json.dumps([[[0] * 15 + [1.5]]]), "symbols[0][0][15] = 1.5, expected an integer"),
-        (json.dumps([[[0] * 16], [[0] * 16] * 2]), "symbols[1]: found 2 elements, expected 1 frames"),
+        ('{"link": 3, "symbols": []}', "link = 3, expected the tables of a link"),
+        ('{"link": {"pilots": {"id": "w"}}}', "link: no pilots algorithm named 'w'"),
+        ('{"link": {"air": {"pilot_every": 0}}}', "link: air.pilot_every = 0: expected greater than"),
+        (json.dumps([[[0] * 15 + [64]] * 10]), "symbols[0][0][15] = 64, expected an integer 0 to 63"),
+        (json.dumps([[[0] * 15 + [True]] * 10]), "symbols[0][0][15] = true, expected an integer"),
+        (json.dumps([[[0] * 15 + [1.5]] * 10]), "symbols[0][0][15] = 1.5, expected an integer"),
+        (json.dumps([[[0] * 16] * 10, [[0] * 16] * 2]), "symbols[1]: found 2 elements, expected 10 frames"),
     ],
 )
 def test_wrong_symbols_are_one_line(cli, tmp_path: Path, text: str, expected: str) -> None:
@@ -121,11 +126,11 @@ def test_symbols_of_another_codebook_are_refused(cli, tmp_path: Path, digest: st
     path = tmp_path / "s.json"
     path.write_text(said)
     assert cli("tx", "frames", path, "--format", "json").stdout == said
-    own = json.loads(said)["digest"]
+    own = json.loads(said)["codebook"]
     path.write_text(said.replace(f'"{own}"', digest))
     done = cli("tx", "frames", path)
     assert done.returncode == 8
-    assert f"{path}: digest = {digest}" in done.stderr
+    assert f"{path}: codebook = {digest}" in done.stderr
     assert f"expected {own[:16]}" in done.stderr
     assert done.stderr.count("\n") == 1
 
@@ -135,10 +140,11 @@ def test_missing_files_and_usage(cli, tmp_path: Path) -> None:
     assert missing.returncode == 3
     assert "cannot be read" in missing.stderr
     assert cli("tx", "frames").returncode == 2
-    assert cli("tx", "frames", "--random", 1, "--profile", "wh9").returncode == 2
-    assert "did you mean" in cli("tx", "frames", "--random", 1, "--profile", "wh9").stderr
+    assert cli("tx", "frames", "--random", 1, "--set", "modulation.id=wh9").returncode == 2
+    assert "did you mean" in cli("tx", "frames", "--random", 1, "--set", "modulation.id=wh9").stderr
     unwritable = cli("tx", "frames", "--random", 1, "--chips", tmp_path / "no" / "x.npy")
-    assert unwritable.returncode == 3
+    assert unwritable.returncode == 1
+    assert unwritable.stderr.count("\n") == 1
 
 
 def test_wrong_masks_are_told(book: Codebook, tmp_path: Path) -> None:
@@ -151,21 +157,21 @@ def test_wrong_masks_are_told(book: Codebook, tmp_path: Path) -> None:
     ):
         np.save(path, array)
         with pytest.raises(InputError, match=expected):
-            read_masks(path, 10, book)
+            read_masks(path, book, PacketFormat.of(book, 10))
     np.savez(tmp_path / "m.npz", np.zeros((346, 16), np.uint8))
     (tmp_path / "m.npz").rename(path)
     with pytest.raises(InputError, match="an archive of several"):
-        read_masks(path, 10, book)
+        read_masks(path, book, PacketFormat.of(book, 10))
     path.write_bytes(b"")
     with pytest.raises(InputError, match=r"not a \.npy file"):
-        read_masks(path, 10, book)
+        read_masks(path, book, PacketFormat.of(book, 10))
     path.write_text("no array")
     with pytest.raises(InputError, match=r"not a \.npy file"):
-        read_masks(path, 10, book)
+        read_masks(path, book, PacketFormat.of(book, 10))
     loaded = symbol_chips(random_symbols(2, 10, book, np.random.default_rng(0)), book)
     np.save(path, loaded)
-    payload = read_masks(path, 10, book)
-    assert (payload.packets, payload.frames, len(payload.content)) == (2, 10, 2 * 346 * 12)
+    payload = read_masks(path, book, PacketFormat.of(book, 10))
+    assert (payload.packets, payload.packet.frames, len(payload.content)) == (2, 10, 2 * 346 * 12)
 
 
 def test_codebook_packets_are_balanced_and_do_not_flicker(cli) -> None:
@@ -194,28 +200,30 @@ def test_flicker_of_known_waves() -> None:
 
 def test_a_flickering_payload_ends_with_one(cli, tmp_path: Path) -> None:
     # at 300 chips/s the codes themselves are slow enough to see
-    done = cli("tx", "check", "--random", 10, "--chip-rate", 300)
+    done = cli("tx", "check", "--random", 10, "--set", "air.chip_rate_hz=300.0")
     assert done.returncode == 1
     assert "FLICKERS" in done.stdout
 
 
 def test_pilots_in_some_frames_only(cli, tmp_path: Path, book: Codebook) -> None:
     file = tmp_path / "chips.npy"
-    options = ("tx", "frames", "--random", 2, "--seed", 3, "--frames", 6, "--pilot-every", 4)
+    sparse = ("--set", "air.frames_per_packet=6", "--set", "air.pilot_every=4")
+    options = ("tx", "frames", "--random", 2, "--seed", 3, *sparse)
     symbols = random_symbols(2, 6, book, np.random.default_rng(3))
     assert cli(*options, "--chips", file).returncode == 0
     expected = np.concatenate([packet_chips(packet, book, 4) for packet in symbols])
     assert np.load(file).tolist() == expected.tolist()
-    masks = read_masks(file, 6, book, 4)
+    masks = read_masks(file, book, PacketFormat.of(book, 6, pilot_every=4))
     assert masks.packets == 2
-    assert masks.pilot_every == 4
+    assert masks.packet.pilot_every == 4
     rows = [line.split() for line in cli(*options, "--format", "table").stdout.splitlines()[1:]]
     assert {row[1] for row in rows if row[4] == "-"} == {"1", "2", "3", "5"}
     words = cli(*options, "--format", "hex").stdout.splitlines()
     assert [len(line.split()[0]) for line in words] == [8, 4, 4, 4, 8, 4] * 2
-    assert json.loads(cli(*options, "--format", "json").stdout)["pilot_every"] == 4
+    assert json.loads(cli(*options, "--format", "json").stdout)["link"]["air"]["pilot_every"] == 4
     for profile in ("wh4x2", "wh8", "raw8"):
-        options = ("--random", 20, "--frames", 20, "--pilot-every", 4, "--profile", profile)
+        settings = ("air.frames_per_packet=20", "air.pilot_every=4", f"modulation.id={profile}")
+        options = ("--random", 20, *(part for setting in settings for part in ("--set", setting)))
         assert cli("tx", "check", *options).returncode == 0
 
 
@@ -223,16 +231,17 @@ def test_masks_that_are_no_array_are_one_line(book: Codebook, tmp_path: Path) ->
     path = tmp_path / "chips.npy"
     path.write_bytes(b"PK\x03\x04junk")
     with pytest.raises(InputError, match=r"not a \.npy file"):
-        read_masks(path, 10, book)
+        read_masks(path, book, PacketFormat.of(book, 10))
     with path.open("wb") as file:
         header = {"descr": "|u1", "fortran_order": False, "shape": (10**13, 16)}
         np.lib.format.write_array_header_1_0(file, header)
     with pytest.raises(InputError, match=r"not a \.npy file"):
-        read_masks(path, 10, book)
+        read_masks(path, book, PacketFormat.of(book, 10))
 
 
 def test_check_without_a_line_below_3_khz_is_json(cli) -> None:
-    done = cli("tx", "check", "--random", 1, "--frames", 1, "--chip-rate", 1_000_000, "--json")
+    one = ("--set", "air.frames_per_packet=1", "--set", "air.chip_rate_hz=1e6")
+    done = cli("tx", "check", "--random", 1, "--json", *one)
 
     def no_number(name: str) -> None:
         raise AssertionError(f"{name} is no JSON")

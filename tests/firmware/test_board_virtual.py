@@ -15,8 +15,9 @@ from board_lines import (
 )
 
 from evlcp_sdk.air.codebook import Codebook, hadamard
-from evlcp_sdk.air.frames import packet_chips
+from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import load_link
 from firmware_host.board.bank import Bank, random_symbols, symbol_chips
 from firmware_host.board.board import Board, Settings, profile_number, provision
 from firmware_host.board.session import Session
@@ -30,7 +31,6 @@ from firmware_host.errors import (
     VerifyError,
 )
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.generate import codebook_of
 from firmware_host.protocol.requests import (
     NO_BANK,
     BoardFault,
@@ -54,6 +54,11 @@ from firmware_host.protocol.requests import (
     WriteReply,
     WriteRequest,
 )
+
+
+def codebook_of(profile: str) -> Codebook:
+    return load_link(overrides=[f"modulation.id={profile}"]).codebook
+
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -93,8 +98,8 @@ def test_plays_pilots_in_some_frames_only(
 ) -> None:
     symbols = random_symbols(3, frames, book, np.random.default_rng(frames))
     provision(board, Bank.of_symbols(symbols, book, every), Settings())
-    assert board.holds(Bank.of_symbols(symbols, book, every), 10_000, board.status())
-    assert not board.holds(Bank.of_symbols(symbols, book), 10_000, board.status())
+    assert board.holds(Bank.of_symbols(symbols, book, every), board.status())
+    assert not board.holds(Bank.of_symbols(symbols, book), board.status())
     device.run(400_000)
     chips = device.records().played().chips()
     expected = np.concatenate([packet_chips(packet, book, every) for packet in symbols])
@@ -125,16 +130,17 @@ def test_from_one_pilot_rate_to_another_without_a_torn_packet(
 def test_masks_play_as_they_are(device: SimulatedBoard, board: Board, book: Codebook) -> None:
     random = np.random.default_rng(0)
     leds = random.integers(0, 2, (2 * PACKET, 96), dtype=np.uint8)
-    provision(board, Bank.of_masks(leds, 2, 10, book), Settings(chip_rate_hz=20_000))
+    provision(board, Bank.of_masks(leds, book, PacketFormat.of(book, 10, 20_000.0)), Settings())
     device.run(100_000)
     played = device.records().played()
     assert (played.chips(96)[: len(leds)] == leds).all()
     assert (np.diff(played.ticks) == device.TICK_HZ // 20_000).all()
 
 
-def test_a_codebook_of_ones_own(device: SimulatedBoard, board: Board) -> None:
+@pytest.mark.parametrize("name", ["barker5", "wh8"])
+def test_a_codebook_of_ones_own(name: str, device: SimulatedBoard, board: Board) -> None:
     rows = hadamard(8)
-    book = Codebook("barker5", np.array([1, 1, 1, -1, 1], np.int8), np.concatenate([-rows, rows]), rows)
+    book = Codebook(name, np.array([1, 1, 1, -1, 1], np.int8), np.concatenate([-rows, rows]), rows)
     assert profile_number(book) == Profile.CUSTOM
     symbols = random_symbols(2, 3, book, np.random.default_rng(0))
     provision(board, Bank.of_symbols(symbols, book), Settings())
@@ -185,7 +191,7 @@ def test_wrong_crc_or_codebook_never_plays(device: SimulatedBoard, board: Board,
     old = symbols_of(2, 1, book)
     provision(board, Bank.of_symbols(old, book), Settings())
     payload = Bank.of_symbols(symbols_of(2, 2, book), book)
-    board.prepare(payload, 10_000)
+    board.prepare(payload)
     board.fill(1, payload.content)
     length, digest = len(payload.content), bytes.fromhex(book.digest)
     foreign = bytes.fromhex(codebook_of("wh8").digest)
@@ -297,7 +303,7 @@ def test_host_killed_at_100_moments(book: Codebook) -> None:
         # the next host finishes the work
         board = board_on(SimulatedLine(device))
         done = provision(board, Bank.of_symbols(new, book), Settings())
-        assert board.holds(Bank.of_symbols(new, book), 10_000, board.status())
+        assert board.holds(Bank.of_symbols(new, book), board.status())
         assert done.swapped == (order[-1] == "old")
     assert min(ends.values()) > 5
 
@@ -327,9 +333,9 @@ def test_board_reset_at_100_moments(book: Codebook) -> None:
             assert "run the command again" in fault
         board = board_on(SimulatedLine(device))
         if board.status().state == State.PLAYING:
-            assert board.holds(payload, 10_000, board.status())
+            assert board.holds(payload, board.status())
         provision(board, payload, Settings())
-        assert board.holds(payload, 10_000, board.status())
+        assert board.holds(payload, board.status())
         assert board.status().state == State.PLAYING
     # a reset before HELLO arrives, or after the last request, goes unnoticed by right
     assert told > 80
@@ -366,21 +372,22 @@ def test_too_much_is_told_before_anything_is_sent(board: Board, book: Codebook) 
     with pytest.raises(ConfigError, match=r"1281 frames takes 40992 bytes.*at most 1280 frames"):
         board.program(one)
     # 12 bytes a chip: 3413 chips, 26 of the preamble and 32 a frame
-    masks = Bank.of_masks(np.zeros((26 + 32 * 106, 96), np.uint8), 1, 106, book)
+    masks = Bank.of_masks(np.zeros((26 + 32 * 106, 96), np.uint8), book, PacketFormat.of(book, 106))
     with pytest.raises(ConfigError, match="at most 105 frames"):
         board.program(masks)
 
 
 def test_a_chip_rate_that_cannot_be_is_told_with_the_nearest(board: Board, book: Codebook) -> None:
-    payload = Bank.of_symbols(symbols_of(1, 0, book), book)
+    symbols = symbols_of(1, 0, book)
     for rate in (7777, 20_001, 1_000_000):
         nearest = min((r for r in range(1, 20_001) if 10_000_000 % r == 0), key=lambda r: abs(r - rate))
         with pytest.raises(
             RefusedError, match=f"no chip rate of {rate} Hz.* nearest .* is {nearest}$"
         ) as told:
-            board.program(payload, rate)
+            board.program(Bank.of_symbols(symbols, book, chip_rate_hz=rate))
         assert told.value.detail == nearest
-        assert board.program(payload, nearest).swapped or rate > 20_001
+        slower = Bank.of_symbols(symbols, book, chip_rate_hz=nearest)
+        assert board.program(slower).swapped or rate > 20_001
 
 
 def test_flash_waits_for_the_end_of_a_led_test(board: Board, book: Codebook) -> None:
@@ -413,13 +420,13 @@ def test_save_survives_reset_and_damage(device: SimulatedBoard, book: Codebook) 
     board = board_on(SimulatedLine(device))
     assert board.recall().slot == 1
     status = board.status()
-    assert board.holds(Bank.of_symbols(second, book), 10_000, status)
+    assert board.holds(Bank.of_symbols(second, book), status)
     assert (status.level_ma, status.watchdog, status.watchdog_ms) == (33, Watchdog.IDLE, 700)
     device.flip_flash(1, 200)
     device.reset()
     board = board_on(SimulatedLine(device))
     assert board.recall().slot == 0
-    assert board.holds(Bank.of_symbols(first, book), 10_000, board.status())
+    assert board.holds(Bank.of_symbols(first, book), board.status())
     board.save(autostart=True)
     device.reset()
     device.records()
@@ -481,10 +488,11 @@ def test_a_packet_may_take_longer_than_ten_seconds(
 ) -> None:
     # 400 frames at 1000 chips/s: 12.8 s
     old, new = (
-        Bank.of_symbols(random_symbols(1, 400, book, np.random.default_rng(seed)), book) for seed in (0, 1)
+        Bank.of_symbols(random_symbols(1, 400, book, np.random.default_rng(n)), book, chip_rate_hz=1000)
+        for n in (0, 1)
     )
-    provision(board, old, Settings(chip_rate_hz=1000))
+    provision(board, old, Settings())
     device.run(10_000)
-    assert provision(board, new, Settings(chip_rate_hz=1000)).swapped
+    assert provision(board, new, Settings()).swapped
     board.stop()
     assert board.wait_dark().state == State.DARK

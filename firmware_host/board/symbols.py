@@ -1,0 +1,120 @@
+"""Files of symbols, with the link that they are sent with.
+
+JSON: a list `[packet][frame][cluster]`, or an object with `symbols` and, as `evlcp tx` writes it, `link` (the
+tables of the link that are on air) and `codebook`; further keys are not read.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.link.shared import differences
+from evlcp_sdk.plugin.registry import Registry
+from firmware_host.errors import IncompatibleError
+
+__all__ = ["read_symbols", "symbols_table"]
+
+ON_AIR = ("air", "bar", "pilots", "modulation")
+"""Tables of a link that symbols and chips follow from; blocks follow from the error correction, too."""
+
+_CORRECTION = "error-correction"
+
+Symbols = NDArray[np.int64]
+
+
+def symbols_table(symbols: Symbols, link: Link, *, messages: bool = False) -> dict[str, Any]:
+    """What a file of symbols holds; plain values.
+
+    Args:
+        symbols: Symbols, int64 (packets, frames, clusters).
+        link: What they are sent with.
+        messages: They carry messages, so that the error correction counts.
+    """
+    tables = (*ON_AIR, _CORRECTION) if messages else ON_AIR
+    return {
+        "link": {name: dict(link.table[name]) for name in tables},
+        "codebook": link.codebook.digest,
+        "symbols": symbols.tolist(),
+    }
+
+
+def read_symbols(path: Path, link: Link | None, registry: Registry | None = None) -> tuple[Symbols, Link]:
+    """Symbols of a file, int64 (packets, frames, clusters), and the link that they are sent with.
+
+    Args:
+        path: The file.
+        link: The link that the user names; None for the file's own, or all defaults if it has none.
+        registry: Where algorithms are found; None for all that are installed.
+
+    Raises:
+        IncompatibleError: The file was made with another link, or with other codes than those of its link.
+        InputError: The file cannot be read, is no JSON, or an element is missing, out of range or no integer;
+            the message names the place.
+    """
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+    except (ValueError, RecursionError) as fault:
+        raise InputError(f"{path}: not JSON: {fault}") from fault
+    if isinstance(table, dict):
+        if "link" in table:
+            link = _own_link(path, table, link, registry)
+        if "symbols" not in table:
+            raise InputError(f"{path}: key symbols is missing, expected symbols[packet][frame][cluster]")
+        table = table["symbols"]
+    if link is None:
+        link = resolve({}, registry)
+    return _symbols(path, table, link), link
+
+
+def _own_link(path: Path, table: dict[str, Any], given: Link | None, registry: Registry | None) -> Link:
+    tables = table["link"]
+    if not isinstance(tables, dict):
+        raise InputError(f"{path}: link = {json.dumps(tables)[:40]}, expected the tables of a link")
+    try:
+        own = resolve(tables, registry)
+    except ConfigError as fault:
+        raise InputError("\n".join(f"{path}: link: {line}" for line in str(fault).splitlines())) from fault
+    digest = table.get("codebook", own.codebook.digest)
+    if digest != own.codebook.digest:
+        raise IncompatibleError(
+            f"{path}: codebook = {json.dumps(digest)[:18]}, expected {own.codebook.digest[:16]}"
+            f" ({own.codebook.profile}): made with other codes than those of its link; make the file again"
+        )
+    if given is not None:
+        differ = differences(own, given, messages=_CORRECTION in tables)
+        if differ:
+            raise IncompatibleError(
+                f"{path}: made with another link: {'; '.join(differ)}; leave out -c and --set to use its own"
+            )
+    return own
+
+
+def _symbols(path: Path, packets: Any, link: Link) -> Symbols:
+    book, frames = link.codebook, link.packet.frames
+    place, top = "symbols", len(book.codewords) - 1
+    _list(path, place, packets, "packets")
+    for p, packet in enumerate(packets):
+        _list(path, f"{place}[{p}]", packet, "frames", frames, "air.frames_per_packet")
+        for f, frame in enumerate(packet):
+            _list(path, f"{place}[{p}][{f}]", frame, "symbols", book.clusters, "one a cluster")
+            for k, symbol in enumerate(frame):
+                if type(symbol) is not int or not 0 <= symbol <= top:
+                    raise InputError(
+                        f"{path}: {place}[{p}][{f}][{k}] = {json.dumps(symbol)},"
+                        f" expected an integer 0 to {top} ({book.profile})"
+                    )
+    return np.array(packets, np.int64)
+
+
+def _list(path: Path, place: str, value: Any, of: str, length: int | None = None, why: str = "") -> None:
+    if not isinstance(value, list) or not value or (length is not None and len(value) != length):
+        found = f"{len(value)} elements" if isinstance(value, list) else json.dumps(value)[:40]
+        wanted = f"a list of {of}" if length is None else f"{length} {of}, {why}"
+        raise InputError(f"{path}: {place}: found {found}, expected {wanted}")
