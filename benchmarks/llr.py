@@ -26,7 +26,8 @@ SCENES = (
     ("tunnel", 120.0),
     ("sun", 60.0),
 )
-# A sensor and a road worse than the guesses of examples/paper.toml: bits must be wrong to be counted.
+# A sensor and a road worse than the guesses of examples/campaigns/paper.toml: bits must be wrong
+# to be counted.
 HARD = {
     "duration_s": 0.3,
     "motion.vib_rate_rad_s": 0.12,

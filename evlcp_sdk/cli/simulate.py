@@ -31,6 +31,10 @@ def simulate(
     preset: Annotated[
         str | None, typer.Option("--preset", metavar="NAME", help="A scene that comes with the package.")
     ] = None,
+    link: Annotated[
+        str | None,
+        typer.Option("-c", "--config", metavar="link.toml", help="Link of the bars, instead of the scene's."),
+    ] = None,
     seed: Annotated[
         int | None, typer.Option("--seed", min=0, help="Seed of everything random, instead of the scene's.")
     ] = None,
@@ -55,6 +59,10 @@ def simulate(
     A scene of yours:      [bold]evlcp simulate scene.toml -o REC.raw[/]
 
     A preset, varied:      [bold]evlcp simulate --preset night -o REC.raw --set motion.distance_m=70[/]
+
+    Your link on air:      [bold]evlcp simulate --preset night -c link.toml -o REC.raw[/]
+
+    Slower chips:          [bold]evlcp simulate --preset night -o REC.raw --set link.air.chip_rate_hz=5e3[/]
 
     What presets there are: [bold]evlcp simulate --presets[/]
 
@@ -91,7 +99,7 @@ def simulate(
         raise typer.BadParameter("where should the recording go?", param_hint="-o REC.raw")
     if out.suffix != ".raw":
         raise ConfigError(f"{out}: a recording is written as NAME.raw")
-    scene = load_scene(source, overrides or [])
+    scene = load_scene(source, overrides or [], link=link)
     simulation = Simulation(scene, seed, threads)
     truth_path = out.with_suffix(".truth.json")
     began = time.perf_counter()

@@ -49,11 +49,11 @@ def sweep(
 ) -> None:
     """Simulate, receive and score every point of a campaign; go on where an earlier run stopped.
 
-    A campaign:            [bold]evlcp sweep examples/paper.toml -o paper.sqlite[/]
+    A campaign:            [bold]evlcp sweep examples/campaigns/paper.toml -o paper.sqlite[/]
 
-    A quick look at it:    [bold]evlcp sweep examples/paper.toml -o look.sqlite --set campaign.seeds=1[/]
+    A quick look at it:    [bold]evlcp sweep examples/campaigns/paper.toml --set campaign.seeds=1[/]
 
-    On a Dask cluster:     [bold]evlcp sweep examples/paper.toml --dask tcp://host:8786[/]
+    On a Dask cluster:     [bold]evlcp sweep examples/campaigns/paper.toml --dask tcp://host:8786[/]
 
     What came out:         [bold]evlcp report paper.sqlite -o report.html[/]
 

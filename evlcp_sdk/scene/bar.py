@@ -46,6 +46,11 @@ class BarLayout:
         """Number of clusters K."""
         return (self.rows // self.cluster_rows) * (self.columns // self.cluster_columns)
 
+    @property
+    def length_m(self) -> float:
+        """From the outer edge of the first row of LEDs to that of the last, m."""
+        return self.rows * self.led_pitch_m
+
     def led_positions_m(self) -> NDArray[np.float64]:
         """LED centres (x right, y down) from the bar's centre, m, float64 (rows * columns, 2)."""
         y, x = np.mgrid[: self.rows, : self.columns]

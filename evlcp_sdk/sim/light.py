@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Protocol
 
@@ -13,14 +12,15 @@ from evlcp_sdk.air.blocks import HEADER_BYTES, Kind, Message
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.compose import beacon_of_site, packets_of
-from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.sim.motion import Strip
-from evlcp_sdk.sim.optics import led_light_w_m2
-from evlcp_sdk.sim.scene import BarSpec, LampSpec, Scene
-from evlcp_sdk.sim.world import bar_axis, sites_of
+from evlcp_sdk.sim.optics import led_light_w_m2, strip_width_m
+from evlcp_sdk.sim.scene import MOST_SOURCES, BarSpec, LampSpec, Scene, links_of
+from evlcp_sdk.sim.world import bar_across, bar_axis, sites_of
 
-__all__ = ["BarLight", "LampLight", "Source", "sources_of"]
+__all__ = ["BarLight", "ColumnLight", "LampLight", "Source", "sources_of"]
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ _SINE_STEPS = 32
 
 
 class Source(Protocol):
-    """A strip of light."""
+    """A strip of light that switches as a whole or cluster by cluster."""
 
     @property
     def strip(self) -> Strip:
@@ -54,25 +54,14 @@ class Source(Protocol):
         ...
 
 
-@lru_cache(maxsize=16)
-def _link(
-    profile: str, clusters: int, frames: int, pilot_every: int, error_correction: str, rate_hz: float
-) -> Link:
-    return resolve(
-        {
-            "modulation": {"id": profile},
-            "bar": {"rows": 6 * clusters, "cluster_rows": 6},
-            "air": {"frames_per_packet": frames, "pilot_every": pilot_every, "chip_rate_hz": rate_hz},
-            "error-correction": {"id": error_correction},
-        }
-    )
-
-
 class BarLight:
     """A transmitter's light: packets, one after another, or the chips of a file.
 
+    Its `strips` are what shines: one for each column of clusters, all switched by the same chips.
+
     Args:
         bar: The bar.
+        link: The link that it sends with.
         light_w_m2: Irradiance of a pixel that it fills.
         seed: Of its payload and its start, where the bar has none of its own.
         source: What faults name.
@@ -80,13 +69,14 @@ class BarLight:
         site: What its beacon says; None for none.
 
     Raises:
-        ConfigError: Its profile, symbols, messages or chips cannot be sent.
+        ConfigError: Its symbols, messages or chips cannot be sent.
         InputError: The file of chips cannot be read.
     """
 
     def __init__(
         self,
         bar: BarSpec,
+        link: Link,
         light_w_m2: float,
         seed: int,
         source: str = "bars",
@@ -94,34 +84,22 @@ class BarLight:
         site: BarSite | None = None,
     ) -> None:
         self.bar = bar
+        self.link = link
         self.light_w_m2 = light_w_m2
-        x, y, z = (bar.length_m * part for part in bar_axis(bar))
-        self.strip = Strip((bar.x_m, bar.y_m, bar.z_m), (x, y, z), bar.width_m, bar.clusters)
-        self.rate_hz = bar.chip_rate_hz * (1 + bar.ppm * 1e-6)
+        self.centre_m = (bar.x_m, bar.y_m, bar.z_m)
+        self.rate_hz = link.air.chip_rate_hz * (1 + bar.ppm * 1e-6)
         # The codes rest for two chips at most, and by half their swing from their mean.
         self.longest_us = 1e6 / self.rate_hz
         self.payload_seed = seed if bar.seed is None else bar.seed
         self._chips: NDArray[np.uint8] | None = None
         self._packets: dict[int, NDArray[np.uint8]] = {}
-        try:
-            self.link = link = _link(
-                bar.profile,
-                bar.clusters,
-                bar.frames,
-                bar.pilot_every,
-                bar.error_correction,
-                bar.chip_rate_hz,
-            )
-        except ConfigError as refused:
-            raise ConfigError(f"{source}: {refused}") from refused
+        self._transmitter_id = transmitter_id
         if bar.chips_file is not None:
-            self._chips = _read_chips(Path(bar.chips_file), bar.clusters)
+            self._chips = _read_chips(Path(bar.chips_file), link.codebook.clusters)
             self.packet_chips = len(self._chips)
             self.longest_us *= _longest_run(self._chips)
         else:
             try:
-                self._codebook = link.codebook
-                self._transmitter_id = transmitter_id
                 if bar.payload != "symbols":
                     self._coder = link.block_coder()
                 if bar.payload == "messages":
@@ -137,6 +115,22 @@ class BarLight:
                 float(np.random.default_rng([self.payload_seed, 1]).uniform(0, self.packet_chips)), 1
             )
         self.start_chip = start
+        self.strips = self._strips()
+
+    def _strips(self) -> tuple["ColumnLight", ...]:
+        """One strip for each column of clusters, from the left."""
+        bar, layout = self.bar, self.link.bar
+        x, y, z = (layout.length_m * part for part in bar_axis(bar))
+        across = np.array(bar_across(bar))
+        columns = layout.columns // layout.cluster_columns
+        rows = layout.rows // layout.cluster_rows
+        found = []
+        for column in range(columns):
+            aside = ((column + 0.5) * layout.cluster_columns - layout.columns / 2) * layout.led_pitch_m
+            centre = tuple((np.array(self.centre_m) + aside * across).tolist())
+            strip = Strip(centre, (x, y, z), strip_width_m(bar, layout), rows)
+            found.append(ColumnLight(self, strip, slice(column, None, columns)))
+        return tuple(found)
 
     def _check(self, bar: BarSpec, source: str) -> None:
         assert bar.symbols is not None
@@ -145,10 +139,11 @@ class BarLight:
                 f"{source}.payload = {bar.payload!r}: expected 'symbols' where symbols are given"
             )
         for q, packet in enumerate(bar.symbols):
-            if len(packet) != bar.frames:
-                raise ConfigError(f"{source}.symbols.{q}: {len(packet)} frames, expected {bar.frames}")
+            frames = self.link.packet.frames
+            if len(packet) != frames:
+                raise ConfigError(f"{source}.symbols.{q}: {len(packet)} frames, expected {frames}")
             try:
-                packet_chips(np.array(packet, np.int64), self._codebook)
+                packet_chips(np.array(packet, np.int64), self.link.codebook)
             except (ConfigError, ValueError) as refused:
                 raise ConfigError(f"{source}.symbols.{q}: {refused}") from refused
         if not bar.symbols:
@@ -178,7 +173,8 @@ class BarLight:
             message = Message(Kind.DATA, self._transmitter_id, packet, part)
             one: NDArray[np.int64] = packets_of([message], self._coder)[0]
             return one
-        return rng.integers(0, len(self._codebook.codewords), (self.bar.frames, self.bar.clusters))
+        book = self.link.codebook
+        return rng.integers(0, len(book.codewords), (self.link.packet.frames, book.clusters))
 
     def sent_symbols(self, duration_s: float) -> list[list[list[int]]]:
         """Symbols [packet][frame][cluster] of every packet that is at least begun in the scene."""
@@ -195,14 +191,14 @@ class BarLight:
         self._packets = {
             q: self._packets[q]
             if q in self._packets
-            else packet_chips(self.symbols(q), self._codebook, self.bar.pilot_every)
+            else packet_chips(self.symbols(q), self.link.codebook, self.link.packet.pilot_every)
             for q in range(begin, end)
         }
         rows = np.concatenate([self._packets[q] for q in range(begin, end)])
         return rows[first - begin * self.packet_chips : last - begin * self.packet_chips]
 
     def switches(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
-        """See `Source.switches`."""
+        """Times of switching and levels of all clusters; see `Source.switches`."""
         first = math.floor(self.start_chip + begin_us * 1e-6 * self.rate_hz) - 1
         last = math.ceil(self.start_chip + end_us * 1e-6 * self.rate_hz) + 2
         first = max(first, 0)
@@ -211,6 +207,36 @@ class BarLight:
         begin = first + int((when <= begin_us).sum()) - 1
         end = begin + 1 + int(inside.sum())
         return when[inside], self.chips(begin, end).astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class ColumnLight:
+    """The light of one column of a bar's clusters.
+
+    Attributes:
+        bar: The bar.
+        strip: Where the column is.
+        clusters: Which of the bar's clusters stand in it, from its top.
+    """
+
+    bar: BarLight
+    strip: Strip
+    clusters: slice
+
+    @property
+    def light_w_m2(self) -> float:
+        """Irradiance of a pixel that it fills."""
+        return self.bar.light_w_m2
+
+    @property
+    def longest_us(self) -> float:
+        """How long its light may do the same."""
+        return self.bar.longest_us
+
+    def switches(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
+        """See `Source.switches`."""
+        when, levels = self.bar.switches(begin_us, end_us)
+        return when, levels[:, self.clusters]
 
 
 def _read_chips(path: Path, clusters: int) -> NDArray[np.uint8]:
@@ -306,23 +332,36 @@ def _random_lamps(scene: Scene) -> list[LampSpec]:
     return lamps
 
 
-def sources_of(scene: Scene) -> tuple[list[BarLight], list[LampLight]]:
+def sources_of(scene: Scene, registry: Registry | None = None) -> tuple[list[BarLight], list[LampLight]]:
     """The bars and the lamps of a scene, ready to send.
 
+    Args:
+        scene: The scene.
+        registry: Where the algorithms of its links are found; None for all that are installed.
+
     Raises:
-        ConfigError: A bar cannot send what it should.
+        ConfigError: A bar cannot send what it should, or its columns are too many.
         InputError: A file of chips cannot be read.
     """
-    sites = sites_of(scene) if scene.world is not None else (None,) * len(scene.bars)
+    links = links_of(scene, registry)
+    sites = sites_of(scene, registry) if scene.world is not None else (None,) * len(scene.bars)
     bars = [
         BarLight(
             bar,
-            led_light_w_m2(bar, scene.lens),
+            link,
+            led_light_w_m2(bar, link.bar, scene.lens),
             scene.seed + i,
             f"bars.{i}",
             i + 1 if bar.transmitter_id is None else bar.transmitter_id,
             site,
         )
-        for i, (bar, site) in enumerate(zip(scene.bars, sites, strict=True))
+        for i, (bar, link, site) in enumerate(zip(scene.bars, links, sites, strict=True))
     ]
-    return bars, [LampLight(lamp) for lamp in (*scene.lamps, *_random_lamps(scene))]
+    lamps = [LampLight(lamp) for lamp in (*scene.lamps, *_random_lamps(scene))]
+    columns = sum(len(bar.strips) for bar in bars)
+    if columns + len(lamps) > MOST_SOURCES:
+        raise ConfigError(
+            f"bars and lamps: {columns} columns of clusters and {len(lamps)} lamps, expected at most"
+            f" {MOST_SOURCES} together"
+        )
+    return bars, lamps

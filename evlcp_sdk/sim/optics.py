@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim.scene import BarSpec, LensSpec
 
-__all__ = ["blur_sigma_px", "led_light_w_m2", "lit_share", "step_table"]
+__all__ = ["blur_sigma_px", "led_light_w_m2", "lit_share", "step_table", "strip_width_m"]
 
 Floats = NDArray[np.float64]
 
@@ -28,15 +29,21 @@ def blur_sigma_px(depth_m: float, lens: LensSpec, camera: CameraModel) -> float:
     return math.hypot(math.hypot(diffraction_um, disk_um / 4) / camera.pitch_um, lens.blur_px)
 
 
-def led_light_w_m2(bar: BarSpec, lens: LensSpec) -> float:
-    """Irradiance of a pixel that the strip fills, W/m2: E = pi L tau / (4 N^2).
+def strip_width_m(bar: BarSpec, layout: BarLayout) -> float:
+    """Lit width of a column of clusters: from its first column of LEDs to its last, m."""
+    return bar.width_m + (layout.cluster_columns - 1) * layout.led_pitch_m
 
-    The radiance L is that of the LEDs' intensity spread over the strip; 20 mW/sr each, 1 cm apart on 5 mm
+
+def led_light_w_m2(bar: BarSpec, layout: BarLayout, lens: LensSpec) -> float:
+    """Irradiance of a pixel that a column of clusters fills, W/m2: E = pi L tau / (4 N^2).
+
+    The radiance L is that of the LEDs' intensity spread over the column; 20 mW/sr each, 1 cm apart on 5 mm
     of width, at f/2 give 51 W/m2.
     """
     if bar.led_w_m2 is not None:
         return bar.led_w_m2
-    radiance = bar.led_mw_sr * 1e-3 / (bar.width_m * bar.led_pitch_m)
+    of_row = layout.cluster_columns * bar.led_mw_sr * 1e-3
+    radiance = of_row / (strip_width_m(bar, layout) * layout.led_pitch_m)
     return math.pi * radiance * lens.transmission / (4 * lens.f_number**2)
 
 

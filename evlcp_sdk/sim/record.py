@@ -6,18 +6,21 @@ from typing import Any
 
 import numpy as np
 
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.sim.motion import project
 from evlcp_sdk.sim.optics import blur_sigma_px
 from evlcp_sdk.sim.scene import Scene, resolve_scene
 from evlcp_sdk.sim.simulation import Simulation, scene_table
-from evlcp_sdk.sim.truth import Truth, truth_from_table
+from evlcp_sdk.sim.truth import Truth, link_table_of, truth_from_table
 from evlcp_sdk.sim.world import camera_on_earth, sites_of
 
 __all__ = ["scene_of_truth", "truth_of"]
 
 
-def truth_of(simulated: Simulation | Scene, seed: int | None = None) -> Truth:
+def truth_of(
+    simulated: Simulation | Scene, seed: int | None = None, registry: Registry | None = None
+) -> Truth:
     """The truth of a simulation, with the counts when it has run; or of a scene without rendering it.
 
     Of its table, `scene` holds the scene's parameters; `psf_sigma_px` and `e_led` the blur and the light of
@@ -27,17 +30,20 @@ def truth_of(simulated: Simulation | Scene, seed: int | None = None) -> Truth:
     Args:
         simulated: The simulation, or the scene.
         seed: Instead of the scene's.
+        registry: Where the algorithms of its links are found; None for all that are installed.
 
     Raises:
         ConfigError: The scene cannot be rendered.
         InputError: One of its files cannot be read.
     """
-    simulation = simulated if isinstance(simulated, Simulation) else Simulation(simulated, seed)
+    simulation = (
+        simulated if isinstance(simulated, Simulation) else Simulation(simulated, seed, registry=registry)
+    )
     scene = simulation.scene
     camera, sensor, motion = scene.camera, scene.sensor, scene.motion
     t_s = np.arange(max(1, round(scene.duration_s * 1000))) / 1000
     position, attitude = simulation.path.at(t_s * 1e6)
-    centres = np.array([b.strip.centre_m for b in simulation.bars]).reshape(-1, 3)
+    centres = np.array([b.centre_m for b in simulation.bars]).reshape(-1, 3)
     place, depth = project(centres, position, attitude, camera)
     bars = []
     for light in simulation.bars:
@@ -47,7 +53,7 @@ def truth_of(simulated: Simulation | Scene, seed: int | None = None) -> Truth:
                 "x_m": bar.x_m,
                 "y_m": bar.y_m,
                 "z_m": bar.z_m,
-                "length_m": bar.length_m,
+                "length_m": light.link.bar.length_m,
                 "width_m": bar.width_m,
                 "link": light.link.digest,
                 "seed": light.payload_seed,
@@ -114,7 +120,7 @@ def truth_of(simulated: Simulation | Scene, seed: int | None = None) -> Truth:
         "simulator": scene_table(scene),
     }
     if scene.world is not None:
-        found["sites"] = [asdict(site) for site in sites_of(scene)]
+        found["sites"] = [asdict(site) for site in sites_of(scene, registry)]
         found["camera_path"] |= camera_on_earth(scene, position, attitude)
     if simulation.done_s:
         found |= simulation.counts
@@ -155,11 +161,7 @@ def scene_of_truth(truth: Truth | Mapping[str, Any]) -> Scene:
             "x_m",
             "y_m",
             "z_m",
-            "length_m",
             "width_m",
-            "clusters",
-            "profile",
-            "frames",
             "ppm",
             "led_w_m2",
         )
@@ -180,10 +182,20 @@ def scene_of_truth(truth: Truth | Mapping[str, Any]) -> Scene:
             "sensor": {key: told[key] for key in same} | {"hot_share": told["hot_pixels"] / pixels},
             "bars": [
                 {key: bar[key] for key in (*shape, "start_chip", "chips_file")}
+                | {"link": _link_table(truth, bar, f"bars.{i}")}
                 | ({"symbols": bar["symbols"]} if bar["symbols"] else {})
-                for bar in truth["bars"]
+                for i, bar in enumerate(truth["bars"])
             ],
         }
     except (KeyError, TypeError) as fault:
         raise ConfigError(f"truth: not a scene's truth: {fault}") from fault
+    except InputError as fault:
+        raise ConfigError(str(fault)) from fault
     return resolve_scene(table, source="truth")
+
+
+def _link_table(truth: Mapping[str, Any], bar: Mapping[str, Any], where: str) -> Any:
+    """The table of a bar's link, which it names, or which follows from what it says of its frames."""
+    if bar.get("link") is None:
+        return link_table_of(bar, "truth", where)
+    return truth["links"][bar["link"]]["table"]

@@ -9,6 +9,7 @@ import difflib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,6 +18,9 @@ import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.specs import parse_toml, parse_value, read_toml
 
@@ -28,6 +32,8 @@ __all__ = [
     "MotionSpec",
     "Scene",
     "SensorSpec",
+    "WorldSpec",
+    "links_of",
     "load_scene",
     "preset_names",
     "preset_text",
@@ -40,27 +46,31 @@ MOST_PIXELS = 4096
 """Columns and rows of a sensor."""
 
 MOST_SOURCES = 64
-"""Bars and lamps of one scene."""
+"""Bars and lamps of one scene; a bar counts once for each column of its clusters."""
+
+LinkTable = Mapping[str, Any]
+"""A link, or what is different about it: tables as in `link.toml`."""
 
 
 @dataclass(frozen=True)
 class BarSpec:
-    """A transmitter: a strip of light, cut into clusters from its top, that sends packets without end."""
+    """A transmitter: columns of light, cut into clusters from their top, that send packets without end."""
 
     __pydantic_config__ = _STRICT
 
     x_m: Annotated[float, Field(description="Its centre, to the right of the path's begin.")] = -1.5
     y_m: Annotated[float, Field(description="The same, downward.")] = 0.0
     z_m: Annotated[float, Field(description="The same, beyond `motion.distance_m`.")] = 0.0
-    length_m: Annotated[float, Field(gt=0, description="From its first to its last LED's outer edge.")] = 0.96
-    width_m: Annotated[float, Field(gt=0, description="Width of the lit strip.")] = 0.005
+    link: Annotated[
+        dict[str, Any] | str | None,
+        Field(
+            description="What it sends, and how its LEDs stand: a `link.toml`, or tables laid over the"
+            " scene's link; none: the scene's link."
+        ),
+    ] = None
+    width_m: Annotated[float, Field(gt=0, description="Width of one column of LEDs, as it is lit.")] = 0.005
     lean_deg: Annotated[float, Field(gt=-90, lt=90, description="Its top leans to the right.")] = 0.0
     tilt_deg: Annotated[float, Field(gt=-90, lt=90, description="Its top leans away from the camera.")] = 0.0
-    clusters: Annotated[int, Field(ge=1, le=64, description="Clusters that it is cut into.")] = 16
-    profile: Annotated[str, Field(description="Modulation of its symbols, as in `link.toml`.")] = "wh4x2"
-    frames: Annotated[int, Field(ge=1, description="Frames of a packet.")] = 10
-    pilot_every: Annotated[int, Field(ge=1, le=64, description="Frames from one pilot to the next.")] = 1
-    chip_rate_hz: Annotated[float, Field(gt=0, description="Chips sent a second, by its own clock.")] = 1e4
     ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="How much faster its clock runs.")] = 0.0
     start_chip: Annotated[
         float | None, Field(ge=0, description="Chip of a packet on air as the scene begins; none: random.")
@@ -77,9 +87,6 @@ class BarSpec:
         ),
     ] = "symbols"
     text: Annotated[str | None, Field(description="Text among its messages.")] = None
-    error_correction: Annotated[
-        str, Field(description="Error correction of its messages, with its default parameters.")
-    ] = "polar"
     symbols: Annotated[
         tuple[tuple[tuple[int, ...], ...], ...] | None,
         Field(description="Symbols [packet][frame][cluster], sent again and again; none: random."),
@@ -93,7 +100,6 @@ class BarSpec:
         Field(ge=0, description="Light of a fully lit pixel; none: from the LED's intensity and the lens."),
     ] = None
     led_mw_sr: Annotated[float, Field(gt=0, description="Intensity of one LED.")] = 20.0
-    led_pitch_m: Annotated[float, Field(gt=0, description="Spacing of the LEDs.")] = 0.01
 
 
 @dataclass(frozen=True)
@@ -251,8 +257,8 @@ class Scene:
     Raises:
         ConfigError: It asks for what cannot be: a bar behind the camera, too many sources.
 
-    >>> Scene().bars[0].clusters
-    16
+    >>> len(Scene().bars)
+    1
     """
 
     __pydantic_config__ = _STRICT
@@ -264,6 +270,10 @@ class Scene:
     flicker_lamps: Annotated[
         int, Field(ge=0, le=48, description="Lamps at random places, beside those listed.")
     ] = 0
+    link: Annotated[
+        dict[str, Any] | str | None,
+        Field(description="Link of its bars: a `link.toml`, or tables as in one; none: the default link."),
+    ] = None
     camera: CameraModel = field(default_factory=CameraModel)
     lens: LensSpec = field(default_factory=LensSpec)
     motion: MotionSpec = field(default_factory=MotionSpec)
@@ -313,13 +323,23 @@ def preset_text(name: str) -> str:
     return (resources.files("evlcp_sdk.sim") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
 
 
-def load_scene(source: Path | str, overrides: Sequence[str] | Mapping[str, Any] = ()) -> Scene:
+def load_scene(
+    source: Path | str,
+    overrides: Sequence[str] | Mapping[str, Any] = (),
+    registry: Registry | None = None,
+    *,
+    link: Path | str | None = None,
+) -> Scene:
     """Read a scene from a TOML file or a preset.
 
     Args:
         source: The file, or a preset's name.
         overrides: `"table.key=value"` texts, or a mapping from `"table.key"` to values; `bars.ppm` is that
-            of every bar, `bars.1.ppm` that of the second, `duration_s` a key without a table.
+            of every bar, `bars.1.ppm` that of the second, `duration_s` a key without a table;
+            `link.air.chip_rate_hz` is a key of the scene's link, `bars.1.link.air.chip_rate_hz` one of the
+            second bar's.
+        registry: Where the algorithms of its links are found; None for all that are installed.
+        link: A `link.toml` instead of the scene's link.
 
     Raises:
         ConfigError: The file cannot be read, is no TOML, or does not describe a scene; one line a fault.
@@ -340,24 +360,40 @@ def load_scene(source: Path | str, overrides: Sequence[str] | Mapping[str, Any] 
                 f"{name}: no such file, and no preset of that name{_nearest(name, preset_names())}"
             )
         table = read_toml(path)
+    if link is not None:
+        table["link"] = _Whole(read_toml(link))
+    _read_links(table, folder, f"{where}: ")
     pairs = overrides.items() if isinstance(overrides, Mapping) else map(_parse_override, overrides)
     for key, value in pairs:
         _set(table, key, value)
-    return resolve_scene(table, source=where, folder=folder)
+        _read_links(table, folder, "--set ")
+    return resolve_scene(table, registry, source=where, folder=folder)
 
 
-def resolve_scene(table: Mapping[str, Any], *, source: str = "", folder: Path | None = None) -> Scene:
-    """Check a scene's table, with every default.
+def resolve_scene(
+    table: Mapping[str, Any],
+    registry: Registry | None = None,
+    *,
+    source: str = "",
+    folder: Path | None = None,
+) -> Scene:
+    """Check a scene's table, with every default; its files of links are read, and each bar has its own.
 
     Args:
         table: As read from TOML.
+        registry: Where the algorithms of its links are found; None for all that are installed.
         source: What faults name as their place.
-        folder: What `path_file` and `chips_file` are relative to; None for the current folder.
+        folder: What `path_file`, `chips_file` and the files of links are relative to; None for the current
+            folder.
 
     Raises:
         ConfigError: One line a fault, each with its path.
     """
     before = f"{source}: " if source else ""
+    table = dict(table)
+    default = _give_links(table, folder, before)
+    if default:
+        _resolve_link(default, registry, f"{before}link")
     try:
         scene = _ADAPTER.validate_json(json.dumps(table, default=str))
     except ValidationError as refused:
@@ -366,8 +402,11 @@ def resolve_scene(table: Mapping[str, Any], *, source: str = "", folder: Path | 
             where = [str(part) for part in error["loc"]]
             shown = f" = {error['input']!r}" if not isinstance(error["input"], dict) else ""
             if error["type"] == "unexpected_keyword_argument":
+                instead = _IN_LINK.get(where[-1]) if where[0] == "bars" else None
+                hint = f"; its link says it: bars.link.{instead}" if instead else None
                 lines.append(
-                    f"{before}{'.'.join(where)}{shown}: unknown key{_nearest(where[-1], _keys(where))}"
+                    f"{before}{'.'.join(where)}{shown}: unknown key"
+                    f"{hint or _nearest(where[-1], _keys(where))}"
                 )
             else:
                 text = error["msg"].replace("Input should be", "expected", 1)
@@ -377,7 +416,108 @@ def resolve_scene(table: Mapping[str, Any], *, source: str = "", folder: Path | 
         raise ConfigError(f"{before}{refused}") from refused
     if folder is not None:
         scene = _with_folder(scene, folder)
+    links_of(scene, registry, source=source)
     return scene
+
+
+def links_of(scene: Scene, registry: Registry | None = None, *, source: str = "") -> tuple[Link, ...]:
+    """The link of each bar, resolved.
+
+    Args:
+        scene: The scene.
+        registry: Where the algorithms are found; None for all that are installed.
+        source: What faults name as their place.
+
+    Raises:
+        ConfigError: A bar's link is none; one line a fault.
+    """
+    before = f"{source}: " if source else ""
+    table: dict[str, Any] = {"link": scene.link, "bars": [{"link": bar.link} for bar in scene.bars]}
+    _give_links(table, None, before)
+    return tuple(
+        _resolve_link(bar.get("link") or {}, registry, f"{before}bars.{i}.link")
+        for i, bar in enumerate(table["bars"])
+    )
+
+
+def _resolve_link(table: LinkTable, registry: Registry | None, where: str) -> Link:
+    try:
+        return _resolved(json.dumps(table, default=str), registry)
+    except ConfigError as refused:
+        lines = (f"{where}: {line}" for line in str(refused).splitlines())
+        raise ConfigError("\n".join(lines)) from refused
+
+
+@lru_cache(maxsize=64)
+def _resolved(text: str, registry: Registry | None) -> Link:
+    return resolve(json.loads(text), registry)
+
+
+class _Whole(dict[str, Any]):
+    """A link from a file: it stands for itself and is not laid over another."""
+
+
+def _read_links(table: dict[str, Any], folder: Path | None, before: str) -> None:
+    """Put the tables of files of links in their places."""
+
+    def read(holder: dict[str, Any], where: str) -> None:
+        link = holder.get("link")
+        if isinstance(link, str):
+            try:
+                holder["link"] = _Whole(read_toml(link if folder is None else folder / link))
+            except ConfigError as fault:
+                raise ConfigError(f"{before}{where}: {fault}") from fault
+        elif link is not None and not isinstance(link, Mapping):
+            raise ConfigError(f"{before}{where} = {link!r}: expected a link.toml, or tables as in one")
+
+    read(table, "link")
+    bars = table.get("bars")
+    for i, bar in enumerate(bars if isinstance(bars, list) else []):
+        if isinstance(bar, dict):
+            read(bar, f"bars.{i}.link")
+
+
+def _give_links(table: dict[str, Any], folder: Path | None, before: str) -> LinkTable | None:
+    """Move the scene's link into those of its bars, so that each says all of its own; return it."""
+    bars = table.get("bars")
+    if table.get("link") is not None and bars is None:
+        bars = [{}]
+    if isinstance(bars, list | tuple):
+        table["bars"] = [dict(bar) if isinstance(bar, Mapping) else bar for bar in bars]
+    _read_links(table, folder, before)
+    default: LinkTable | None = table.pop("link", None)
+    if default is not None and isinstance(table["bars"], list):
+        for bar in table["bars"]:
+            if isinstance(bar, dict) and not isinstance(bar.get("link"), _Whole):
+                bar["link"] = _laid_over(default, bar.get("link") or {})
+    return default
+
+
+def _laid_over(under: LinkTable, over: LinkTable) -> dict[str, Any]:
+    """Two links' tables in one, section by section; another algorithm brings its own parameters."""
+    found = dict(under)
+    for section, keys in over.items():
+        below = under.get(section, {})
+        if not isinstance(keys, Mapping) or not isinstance(below, Mapping):
+            found[section] = keys
+            continue
+        default = ROLES[section].default if section in ROLES else None
+        same = keys.get("id", below.get("id", default)) == below.get("id", default)
+        found[section] = {**below, **keys} if same else dict(keys)
+    return found
+
+
+_IN_LINK = {
+    "clusters": "bar.rows, bar.cluster_rows",
+    "length_m": "bar.rows, bar.led_pitch_m",
+    "led_pitch_m": "bar.led_pitch_m",
+    "profile": "modulation.id",
+    "frames": "air.frames_per_packet",
+    "pilot_every": "air.pilot_every",
+    "chip_rate_hz": "air.chip_rate_hz",
+    "error_correction": "error-correction.id",
+}
+"""What one looks for at a bar, and the keys of its link."""
 
 
 _ADAPTER: TypeAdapter[Scene] = TypeAdapter(Scene)
@@ -423,16 +563,46 @@ def _set(table: dict[str, Any], key: str, value: Any) -> None:
         value = value.item()
     if len(parts) == 1:
         table[parts[0]] = value
+    elif parts[0] == "link":
+        _set_link(table, parts[1:], value, key)
     elif len(parts) == 2 and parts[0] in _TABLES:
         table.setdefault(parts[0], {})[parts[1]] = value
+    elif parts[0] == "bars" and "link" in parts[1:3] and parts[-1] != "link":
+        rows = _rows(table, "bars")
+        at = parts.index("link")
+        for row in rows if at == 1 else [_row(rows, parts, key)]:
+            _set_link(row, parts[at + 1 :], value, key)
     elif len(parts) in (2, 3) and parts[0] in _LISTS:
-        rows = table.setdefault(parts[0], [{}] if parts[0] == "bars" else [])
+        rows = _rows(table, parts[0])
         if len(parts) == 2:
             for row in rows:
                 row[parts[1]] = value
-        elif parts[1].isdigit() and int(parts[1]) < len(rows):
-            rows[int(parts[1])][parts[2]] = value
         else:
-            raise ConfigError(f"--set {key}: there are {len(rows)} {parts[0]}, counted from 0")
+            _row(rows, parts, key)[parts[2]] = value
     else:
-        raise ConfigError(f"--set {key}: unknown table{_nearest(parts[0], [*_TABLES, *_LISTS])}")
+        raise ConfigError(f"--set {key}: unknown table{_nearest(parts[0], [*_TABLES, *_LISTS, 'link'])}")
+
+
+def _rows(table: dict[str, Any], name: str) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = table.setdefault(name, [{}] if name == "bars" else [])
+    return rows
+
+
+def _row(rows: list[dict[str, Any]], parts: Sequence[str], key: str) -> dict[str, Any]:
+    if not parts[1].isdigit() or int(parts[1]) >= len(rows):
+        raise ConfigError(f"--set {key}: there are {len(rows)} {parts[0]}, counted from 0")
+    return rows[int(parts[1])]
+
+
+def _set_link(holder: dict[str, Any], parts: Sequence[str], value: Any, key: str) -> None:
+    """Set a key of the link of a scene or a bar."""
+    if len(parts) > 2:
+        raise ConfigError(f"--set {key}: expected link.TABLE.KEY, e.g. link.air.chip_rate_hz")
+    link = holder.get("link")
+    if not isinstance(link, dict):
+        link = holder["link"] = {}
+    if len(parts) == 1:
+        link[parts[0]] = value
+        return
+    keys = link.get(parts[0])
+    link[parts[0]] = {**keys, parts[1]: value} if isinstance(keys, Mapping) else {parts[1]: value}

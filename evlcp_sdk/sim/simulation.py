@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.sim import _kernels
 from evlcp_sdk.sim.light import Source, sources_of
 from evlcp_sdk.sim.motion import CameraPath, project
@@ -111,17 +112,25 @@ class Simulation:
         scene: What to render.
         seed: Instead of the scene's.
         threads: Threads that share the pixels; the events do not depend on it.
+        registry: Where the algorithms of its links are found; None for all that are installed.
 
     Raises:
         ConfigError: The scene cannot be rendered.
         InputError: One of its files cannot be read.
     """
 
-    def __init__(self, scene: Scene, seed: int | None = None, threads: int = 1) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        seed: int | None = None,
+        threads: int = 1,
+        registry: Registry | None = None,
+    ) -> None:
         self.scene = scene if seed is None else replace(scene, seed=seed)
         scene = self.scene
-        self.bars, self.lamps = sources_of(scene)
-        self._sources: list[Source] = [*self.bars, *self.lamps]
+        self.bars, self.lamps = sources_of(scene, registry)
+        strips = [strip for bar in self.bars for strip in bar.strips]
+        self._sources: list[Source] = [*strips, *self.lamps]
         self.path = CameraPath(scene.motion, scene.duration_s, scene.seed)
         self._check_ahead()
         self._threads = max(1, threads)
@@ -142,7 +151,7 @@ class Simulation:
         self._done_us = 0.0
 
     def _check_ahead(self) -> None:
-        centres = np.array([bar.strip.centre_m for bar in self.bars]).reshape(-1, 3)
+        centres = np.array([bar.centre_m for bar in self.bars]).reshape(-1, 3)
         _, depth = project(centres, *self.path.at([0.0]), self.scene.camera)
         for i in np.flatnonzero(depth[0] <= NEAREST_M):
             raise ConfigError(
@@ -435,7 +444,12 @@ class Simulation:
 
 
 def simulate(
-    scene: Scene, seed: int | None = None, *, threads: int = 1, max_events: int = 1 << 16
+    scene: Scene,
+    seed: int | None = None,
+    *,
+    threads: int = 1,
+    max_events: int = 1 << 16,
+    registry: Registry | None = None,
 ) -> Iterator[Events]:
     """Yield a scene's events in order of time, in pieces of at most `max_events`.
 
@@ -444,12 +458,13 @@ def simulate(
         seed: Instead of the scene's.
         threads: Threads that share the pixels; the events do not depend on it.
         max_events: Length of a piece; the events do not depend on it.
+        registry: Where the algorithms of its links are found; None for all that are installed.
 
     Raises:
         ConfigError: The scene cannot be rendered.
         InputError: One of its files cannot be read.
     """
-    for events in Simulation(scene, seed, threads).stream():
+    for events in Simulation(scene, seed, threads, registry).stream():
         for begin in range(0, len(events), max_events):
             yield events[begin : begin + max_events]
 

@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import BarSite, LocalFrame
 from evlcp_sdk.sim.motion import CameraPath
-from evlcp_sdk.sim.scene import BarSpec, Scene, WorldSpec
+from evlcp_sdk.sim.scene import BarSpec, Scene, WorldSpec, links_of
 
-__all__ = ["attitude_log", "bar_axis", "camera_on_earth", "scene_to_enu", "sites_of"]
+__all__ = ["attitude_log", "bar_across", "bar_axis", "camera_on_earth", "scene_to_enu", "sites_of"]
 
 Floats = NDArray[np.float64]
 
@@ -25,6 +26,12 @@ def bar_axis(bar: BarSpec) -> tuple[float, float, float]:
     """Unit vector from a bar's top to its bottom in the scene's axes."""
     lean, tilt = math.radians(bar.lean_deg), math.radians(bar.tilt_deg)
     return -math.sin(lean) * math.cos(tilt), math.cos(lean) * math.cos(tilt), -math.sin(tilt)
+
+
+def bar_across(bar: BarSpec) -> tuple[float, float, float]:
+    """Unit vector from the left of a bar to its right in the scene's axes."""
+    lean = math.radians(bar.lean_deg)
+    return math.cos(lean), math.sin(lean), 0.0
 
 
 def scene_to_enu(vectors: Floats, heading_deg: float) -> Floats:
@@ -40,15 +47,19 @@ def scene_to_enu(vectors: Floats, heading_deg: float) -> Floats:
     return np.stack([east, north, -y], -1)
 
 
-def sites_of(scene: Scene) -> tuple[BarSite, ...]:
+def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, ...]:
     """The bars of a scene as sites; the first bar is transmitter 1 unless it has an id.
 
+    Args:
+        scene: With its `[world]`.
+        registry: Where the algorithms of its links are found; None for all that are installed.
+
     Raises:
-        ConfigError: The scene has no `[world]`.
+        ConfigError: The scene has no `[world]`, or a bar's link is none.
     """
     world, frame = _world(scene)
     sites = []
-    for i, bar in enumerate(scene.bars):
+    for i, (bar, link) in enumerate(zip(scene.bars, links_of(scene, registry), strict=True)):
         latitude, longitude, height = frame.to_geodetic(
             scene_to_enu(np.array([bar.x_m, bar.y_m, bar.z_m]), world.heading_deg)
         )
@@ -64,7 +75,7 @@ def sites_of(scene: Scene) -> tuple[BarSite, ...]:
                 height_m=float(height),
                 heading_deg=heading,
                 tilt_deg=math.degrees(math.atan2(lean, up)),
-                length_m=bar.length_m,
+                length_m=link.bar.length_m,
             )
         )
     return tuple(sites)

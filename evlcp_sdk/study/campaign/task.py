@@ -43,7 +43,7 @@ def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
     def scene_of(base: str | None, settings: Sequence[str]) -> tuple[Any, Any]:
         if base is None:
             raise ConfigError("base: missing; expected a preset or a scene file")
-        scene = load_scene(base, settings)
+        scene = load_scene(base, settings, registry)
         return scene, _identity(scene)
 
     def link_of(base: str | None, settings: Sequence[str]) -> tuple[Any, Any]:
@@ -104,7 +104,7 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
             " (run it again), or other than on the machine that asks (install the same)"
         )
     scene: Scene = job.scene
-    simulation = Simulation(scene, job.seed)
+    simulation = Simulation(scene, job.seed, registry=registry)
     truth = truth_of(simulation)
     attitude = attitude_log(scene, job.seed, simulation.path) if scene.world is not None else None
     links, receivers = [], []

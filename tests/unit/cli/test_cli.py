@@ -315,7 +315,7 @@ def test_examples_are_links(evlcp: Evlcp) -> None:
     examples = Path(__file__).parents[3] / "examples"
     default = evlcp("config", "--digest").out
     assert evlcp("config", "-c", examples / "link.toml", "--digest").out == default
-    table = json.loads(evlcp("config", "-c", examples / "two-clusters.toml", "--json").out)
+    table = json.loads(evlcp("config", "-c", examples / "campaigns" / "two-clusters.toml", "--json").out)
     assert table["configuration"]["ranging"]["clusters"] == [1, 14]
 
 

@@ -435,7 +435,7 @@ def test_a_pair_weighs_by_its_spacing(power):
 
 
 def test_two_clusters_are_one_pair():
-    link = load_link(EXAMPLES / "two-clusters.toml")
+    link = load_link(EXAMPLES / "campaigns" / "two-clusters.toml")
     measure = link.algorithm("ranging").compile(CAMERA, link.bar, link.codebook)
     maps = image_of(BAR, 50)
     found = measure(view_of(maps))

@@ -132,7 +132,7 @@ def test_points_of_a_simulated_drive_lie_where_its_truth_has_them() -> None:
     found = [f for p in packets for f in p.frames]
     assert len(found) > 20
     (bar,) = simulation.bars
-    cuts = bar.strip.cuts_m()
+    cuts = bar.strips[0].strip.cuts_m()
     position, attitude = simulation.path.at([f.points_t_us for f in found])
     want, _ = project((cuts[1:] + cuts[:-1]) / 2, position, attitude, scene.camera)
     error = np.array([f.points_px for f in found]) - want

@@ -43,8 +43,12 @@ def test_random_data_is_a_message_a_packet() -> None:
         ]
         assert len({b.part for b in blocks}) == 3
         assert {(len(b.part), b.length) for b in blocks} == {(40, 40)}
-    other = {"payload": "data", "profile": "raw8", "frames": 20, "pilot_every": 4, "error_correction": "none"}
-    light = sources_of(resolve_scene({"bars": [other]}))[0][0]
+    other = {
+        "modulation": {"id": "raw8"},
+        "air": {"frames_per_packet": 20, "pilot_every": 4},
+        "error-correction": {"id": "none"},
+    }
+    light = sources_of(resolve_scene({"bars": [{"payload": "data", "link": other}]}))[0][0]
     (block,) = blocks_of(
         [light.symbols(5)],
         **{"modulation__id": "raw8", "air__frames_per_packet": 20, "error-correction__id": "none"},
@@ -71,8 +75,8 @@ def test_a_bar_in_the_world_sends_its_beacon() -> None:
     ("bar", "told"),
     [
         ({"payload": "messages"}, r'bars.0: payload = "messages": expected a text, or a \[world\]'),
-        ({"payload": "data", "frames": 2}, "bars.0: .* expected at least"),
-        ({"payload": "data", "error_correction": "pole"}, "bars.0: .*did you mean 'polar'"),
+        ({"payload": "data", "link": {"air": {"frames_per_packet": 2}}}, "bars.0: .* expected at least"),
+        ({"link": {"error-correction": {"id": "pole"}}}, "bars.0.link: .*did you mean 'polar'"),
         ({"payload": "data", "symbols": [[[0] * 16] * 10]}, "bars.0.payload = 'data': expected 'symbols'"),
     ],
 )

@@ -52,7 +52,7 @@ def test_sites_and_camera_say_what_the_image_shows() -> None:
         position, attitude = simulation.path.at(truth["t_s"][i] * 1e6)
         for site, light in zip(sites, simulation.bars, strict=True):
             seen = camera.project(site.cluster_positions_m(16, frame) @ axes.T)
-            strip = light.strip
+            strip = light.strips[0].strip
             parts = (np.arange(16) + 0.5) / 16 - 0.5
             ends = np.array(strip.centre_m) + parts[:, None] * np.array(strip.along_m)
             places, _ = project(ends, position, attitude, camera)
