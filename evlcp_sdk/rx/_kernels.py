@@ -208,11 +208,11 @@ def add_polarity(
 ) -> None:
     """Add events to polarity sums (chips, height, width); a shift is the sensor pixel of (0, 0) in a chip."""
     chips, height, width = sums.shape
-    begin = np.searchsorted(t_us, min(start_on_us, start_off_us))
+    first = np.searchsorted(t_us, min(start_on_us, start_off_us))
     # Time never runs backward, so each polarity's chip only moves on.
     chip_on, next_on = -1, start_on_us
     chip_off, next_off = -1, start_off_us
-    for i in range(begin, t_us.size):
+    for i in range(first, t_us.size):
         t = t_us[i]
         while t >= next_on:
             chip_on += 1

@@ -182,7 +182,7 @@ class MessageAssembler:
         return np.copysign(size, known).astype(np.float32)
 
     def _content(self, inbox: _Inbox, llr: NDArray[np.float32]) -> tuple[bytes | None, int]:
-        """The bytes of a packet's block and the packets it took; None if it cannot be told yet."""
+        """The bytes of a packet's block and the packets it took; None if that is not known yet."""
         found = self._coder.block(llr)
         if found is not None or not self._spec.combine_packets:
             return found, 1

@@ -87,7 +87,7 @@ class Looker:
             pilot: The newest one of the bar.
 
         Returns:
-            The frame, None if its clusters cannot be told; and the newest pilot, None if it showed no bar.
+            The frame, None if it does not show its clusters; and the newest pilot, None if it showed no bar.
         """
         lock, packet = due.lock, self._packet
         middles = due.start_us + (np.arange(due.chips, dtype=np.float64) + 0.5) * lock.chip_us

@@ -150,7 +150,7 @@ class Receiver:
         return packets
 
     def _decode(self, transmitter: Transmitter, due: DueFrame) -> Frame | None:
-        """Read a frame; None if its clusters cannot be told."""
+        """Read a frame; None if it does not show where the clusters are."""
         assert transmitter.number is not None
         self._announcer.start()
         look, transmitter.pilot = self._looker.look(transmitter.region, due, transmitter.pilot)

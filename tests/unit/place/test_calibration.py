@@ -121,8 +121,8 @@ def test_slopes_are_the_numerical_ones() -> None:
 
 @pytest.mark.parametrize("turn", [np.array([0.2, -0.3, 0.1]), np.full(3, 1e-9)])
 def test_the_slope_of_a_turn_is_the_numerical_one(turn: NDArray[np.float64]) -> None:
-    begin = Rotation.from_rotvec(turn).inv()
-    want = approx_fprime(np.zeros(3), lambda d: (Rotation.from_rotvec(turn + d) * begin).as_rotvec(), 1e-7)
+    start = Rotation.from_rotvec(turn).inv()
+    want = approx_fprime(np.zeros(3), lambda d: (Rotation.from_rotvec(turn + d) * start).as_rotvec(), 1e-7)
     np.testing.assert_allclose(_turn_slope(turn), want, atol=1e-6)
 
 

@@ -46,10 +46,10 @@ def packets_of(bar: BarSite, transmitter: int, count: int, start_us: float = 500
     """What a receiver of a bar gives while the camera drives, without noise."""
     enu, found = bar.cluster_positions_m(16, ORIGIN), []
     for n in range(count):
-        begin = start_us + n * PACKET_US
+        start = start_us + n * PACKET_US
         frames = []
         for k in range(10):
-            t_us = begin + 2600 + k * FRAME_US
+            t_us = start + 2600 + k * FRAME_US
             points, _ = project_bars(enu, camera_at(t_us + 800), attitude.rotation(), CAMERA)
             points[list(dark)] = np.nan
             frames.append(
@@ -57,7 +57,7 @@ def packets_of(bar: BarSite, transmitter: int, count: int, start_us: float = 500
                       points, np.full(16, 0.1), t_us + 800)
             )  # fmt: skip
         heard = (messages or {}).get(n, ())
-        found.append(Packet(transmitter, n, begin, 100.0, tuple(frames), 10, messages=heard))
+        found.append(Packet(transmitter, n, start, 100.0, tuple(frames), 10, messages=heard))
     return found
 
 
