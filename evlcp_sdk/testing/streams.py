@@ -17,6 +17,8 @@ __all__ = ["SYNCHRONIZATION", "TRACKING"]
 
 _PACKETS = 4
 _STEP_US = 1500
+_RATE_CHIPS = 0.0104
+"""Error of the clock rate over a packet, in chips: 30 ppm of the default packet's 346 chips."""
 _SAME_US = 1e-9
 """Relative: 0.1 ns in the times of these recordings."""
 _FRAME_US = 3200.0
@@ -82,7 +84,8 @@ def finds_time(subject: Subject) -> None:
                 f"packets at {start_us} us and whole periods later, to half a chip; got {off_us:+.1f} us",
             )
         rate = (locks[-1].chip_us / chip_us - 1) * 1e6
-        expect(abs(rate) <= 30, f"chips of {chip_us:.4f} us within 30 ppm, got {rate:+.0f} ppm")
+        most = 1e6 * _RATE_CHIPS / link.packet.packet_chips
+        expect(abs(rate) <= most, f"chips of {chip_us:.4f} us within {most:.0f} ppm, got {rate:+.0f} ppm")
 
 
 def any_split(subject: Subject) -> None:

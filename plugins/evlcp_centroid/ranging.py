@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
@@ -31,9 +32,18 @@ class CentroidRanging(Ranging):
     min_clusters: Annotated[int, Field(ge=3, description="Clusters that must be seen.")] = 5
 
     def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
-        """Precompute the layout as complex numbers, right + 1j * down."""
+        """Precompute the layout as complex numbers, right + 1j * down.
+
+        Raises:
+            ConfigError: Fewer clusters are left than a distance needs.
+        """
         centres = bar.cluster_centres_m()
         used = np.arange(self.skip_outer, bar.clusters - self.skip_outer)
+        if len(used) < self.min_clusters:
+            raise ConfigError(
+                f"ranging 'centroid' uses {len(used)} of {bar.clusters} clusters (skip_outer ="
+                f" {self.skip_outer}), expected at least min_clusters = {self.min_clusters}"
+            )
         layout = centres[used, 0] + 1j * centres[used, 1]
 
         def measure(view: FrameView) -> Range:

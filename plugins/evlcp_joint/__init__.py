@@ -14,6 +14,6 @@ def evlcp_algorithms() -> Iterator[Algorithm]:
         "ranging",
         "joint-scale",
         "evlcp_joint.ranging:JointScaleRanging",
-        1,
+        2,
         "one fit over all boundaries",
     )

@@ -49,20 +49,25 @@ class JointScaleRanging(Ranging):
         float, Field(gt=0, description="Residual, in full values, beyond which a row weighs less.")
     ] = 0.5
     min_boundaries: Annotated[
-        int, Field(ge=2, description="Boundaries with both clusters seen that a distance needs.")
+        int,
+        Field(
+            ge=2,
+            description="Boundaries with both clusters seen that a distance needs, or all of a smaller bar.",
+        ),
     ] = 6
 
     def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
         """Precompute for a bar of one column.
 
         Raises:
-            ConfigError: The layout has more than one column of clusters.
+            ConfigError: The layout has more than one column of clusters, or fewer than three.
         """
         centres = bar.cluster_centres_m()
         if np.ptp(centres[:, 0]) > 1e-9 or len(centres) < 3:
             raise ConfigError(
-                "ranging 'joint-scale' needs one column of three clusters or more; use 'poc' for this layout"
+                "ranging 'joint-scale' needs one column of three clusters or more; " + _instead(len(centres))
             )
+        least = min(self.min_boundaries, len(centres) - 1)
         spacing_m = float(centres[1, 1] - centres[0, 1])
         pilots, words = codebook.pilots.astype(np.int64), codebook.codewords.astype(np.int64)
 
@@ -72,7 +77,7 @@ class JointScaleRanging(Ranging):
             if place is None:
                 return _NONE
             rows, columns, seen, half_width = place
-            if int((seen[1:] & seen[:-1]).sum()) < self.min_boundaries:
+            if int((seen[1:] & seen[:-1]).sum()) < least:
                 return _NONE
             sums, offset = view.sums, view.offset_px[:, 0::2] / 2 + view.offset_px[:, 1::2] / 2
             if np.ptp(columns[seen]) > np.ptp(rows[seen]):
@@ -156,6 +161,14 @@ class JointScaleRanging(Ranging):
         return fit, float(np.sqrt(max(variance, 0.0)))
 
 
+def _instead(clusters: int) -> str:
+    """The ranging for a layout that this one refuses, if any is."""
+    if clusters < 2:
+        return "no ranging measures the distance of one cluster"
+    # Of few clusters, `poc` must not leave out the outermost.
+    return "use 'poc' for this layout" + (", with ranging.skip_outer = 0" if clusters < 4 else "")
+
+
 def _place(
     presence: PresenceMap,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], float] | None:
@@ -177,7 +190,7 @@ def _place(
 
 
 def _straight(x: NDArray[np.float64] | NDArray[np.int64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """Slope and intercept of the line through the medians (Theil-Sen): deaf to clusters out of place."""
+    """Slope and intercept of the line through the medians (Theil-Sen), robust against outliers."""
     i, j = np.triu_indices(len(x), 1)
     apart = x[j] - x[i]
     far = np.abs(apart) > 1e-9

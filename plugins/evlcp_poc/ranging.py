@@ -173,9 +173,16 @@ class PocRanging(Ranging):
 
     def _used(self, clusters: int) -> NDArray[np.int64]:
         used = np.array(self.clusters or range(self.skip_outer, clusters - self.skip_outer), np.int64)
+        if clusters < 2:
+            raise ConfigError("ranging 'poc' needs two clusters; no ranging measures the distance of one")
+        if not self.clusters and len(used) < 2:
+            raise ConfigError(
+                f"ranging.skip_outer = {self.skip_outer}: leaves {len(used)} of {clusters} clusters,"
+                f" expected two or more; set ranging.skip_outer = {(clusters - 2) // 2}"
+            )
         if len(used) < 2 or used.min() < 0 or used.max() >= clusters or len(set(used)) != len(used):
             raise ConfigError(
-                f"ranging.clusters = {list(self.clusters)}, skip_outer = {self.skip_outer}:"
+                f"ranging.clusters = {list(self.clusters)}:"
                 f" expected two or more different clusters of 0 to {clusters - 1}"
             )
         return np.sort(used)

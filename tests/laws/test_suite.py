@@ -12,7 +12,8 @@ import pytest
 from evlcp_centroid.ranging import CentroidRanging
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.plugin.roles import Filter, Ranging, Tracker, Tracking
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.plugin.roles import ROLES, Filter, Ranging, Tracker, Tracking
 from evlcp_sdk.testing import check, laws_of
 from evlcp_sdk.testing.law import Subject
 from evlcp_sdk.testing.trees import difference
@@ -154,14 +155,14 @@ def test_the_command_says_one_line_a_law(evlcp: Evlcp) -> None:
 
 
 def test_the_command_fails_with_what_was_expected(evlcp: Evlcp) -> None:
-    given = ("--set", "min_clusters=14", "--set", "skip_outer=2")
-    done = evlcp("check", "ranging", "centroid", *given)
+    given = ("--set", "min_pixels=100000", "--set", "skip_outer=2")
+    done = evlcp("check", "ranging", "poc", *given)
     assert done.code == 1
     assert "failed   exact           expected 108.025 m within 0.1%" in done.out
-    done = evlcp("check", "ranging", "centroid", *given, "--json")
+    done = evlcp("check", "ranging", "poc", *given, "--json")
     table = json.loads(done.out)
     assert done.code == 1
-    assert table["parameters"] == {"skip_outer": 2, "min_clusters": 14}
+    assert (table["parameters"]["skip_outer"], table["parameters"]["min_pixels"]) == (2, 100000)
     assert table["failed"] == sum(law["status"] == "failed" for law in table["laws"]) > 0
     assert {"law", "says", "status", "detail"} == set(table["laws"][0])
 
@@ -181,6 +182,10 @@ def test_the_command_takes_excuses(evlcp: Evlcp) -> None:
         (("ranging", "pco"), "did you mean 'poc'?"),
         (("rangin", "poc"), "no role named 'rangin' (known: pilots,"),
         (("ranging", "poc", "--set", "foo=3"), "ranging.foo = 3: unknown key"),
+        (("ranging", "poc", "--set", "air.foo=3"), "--set: air.foo = 3: unknown key"),
+        (("ranging", "poc", "--set", "foo"), "--set foo: expected KEY=VALUE or TABLE.KEY=VALUE"),
+        (("ranging", "poc", "--set", ".foo=1"), "--set .foo=1: expected KEY=VALUE or TABLE.KEY=VALUE"),
+        (("ranging", "poc", "-c", "nowhere.toml"), "nowhere.toml: cannot be read"),
         (("ranging", "poc", "--excuse", "exact"), "expected LAW=REASON"),
         (("ranging", "poc", "--excuse", "exakt=no"), "no ranging law named 'exakt'"),
     ],
@@ -190,3 +195,86 @@ def test_what_is_unknown_ends_with_2(evlcp: Evlcp, given: tuple[str, ...], said:
     assert done.code == 2
     assert said in done.err
     assert not done.out
+
+
+@dataclass(frozen=True)
+class Crashing(Ranging):
+    """A stranger's ranging with a fault."""
+
+    def compile(self, camera: Any, bar: Any, codebook: Any) -> Any:
+        def measure(view: Any) -> Any:
+            raise KeyError("cluster")
+
+        return measure
+
+
+def test_the_algorithm_under_test_is_blamed_by_its_own_name() -> None:
+    found = {o.law.name: o for o in check("ranging", Crashing())}
+    for law in ("clean-link", "sparse-pilots"):
+        assert found[law].status == "failed"
+        assert "ranging algorithm 'Crashing': KeyError: 'cluster'" in found[law].detail
+        assert "poc" not in found[law].detail
+
+
+def test_an_installed_algorithm_is_blamed_by_its_id(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(CentroidRanging, "compile", Crashing.compile)
+    found = {o.law.name: o for o in check("ranging", CentroidRanging())}
+    assert "ranging algorithm 'centroid': KeyError: 'cluster'" in found["clean-link"].detail
+
+
+LINKS = [
+    ("bar.rows=24", "air.chip_rate_hz=5000", "air.frames_per_packet=12"),
+    (
+        "pilots.id=barker13",
+        "bar.rows=78",
+        "modulation.id=wh8",
+        "air.chip_rate_hz=20000",
+        "decoding.id=ml-soft",
+    ),
+]
+
+
+@pytest.mark.parametrize("overrides", LINKS, ids=" ".join)
+@pytest.mark.parametrize("role", ROLES)
+def test_the_defaults_keep_their_laws_on_other_links(role: str, overrides: tuple[str, ...]) -> None:
+    link = load_link(overrides=overrides)
+    for outcome in check(role, link.algorithms[role], link=link):
+        refused = outcome.status == "skipped" and "leaves every quantity as measured" in outcome.detail
+        assert outcome.status == "ok" or refused, f"{outcome.law.name}: {outcome.detail}"
+
+
+def test_a_law_sees_the_link_that_it_is_given() -> None:
+    panel = load_link(
+        overrides=["bar.rows=16", "bar.columns=16", "bar.cluster_rows=4", "bar.cluster_columns=4"]
+    )
+    found = {o.law.name: o for o in check("ranging", CentroidRanging(), link=panel)}
+    assert found["compiles"].status == "ok"
+    assert found["exact"].status == "skipped"
+    assert found["exact"].detail == "the ideal images of this law show one column of two clusters or more"
+    short = load_link(overrides=["bar.rows=24"])
+    found = {o.law.name: o for o in check("ranging", CentroidRanging(), link=short)}
+    assert found["compiles"].status == "failed"
+    assert "the link's camera, bar and codebook to do, got: ranging 'centroid' uses 2 of 4" in (
+        found["compiles"].detail
+    )
+
+
+def test_the_command_checks_on_any_link(evlcp: Evlcp, tmp_path: Path) -> None:
+    file = tmp_path / "link.toml"
+    file.write_text("[bar]\nrows = 24\n[ranging]\nid = 'joint-scale'\nmin_boundaries = 3\n")
+    done = evlcp("check", "ranging", "centroid", "-c", file)
+    assert done.code == 1
+    assert "ranging 'centroid' uses 2 of 4 clusters (skip_outer = 1), expected at least" in done.out
+    # A name without a table, or with the role's, is a parameter of the algorithm; others are the link's.
+    given = ("--set", "skip_outer=0", "--set", "ranging.min_clusters=3", "--set", "air.chip_rate_hz=5000.0")
+    done = evlcp("check", "ranging", "centroid", "-c", file, *given, "--json")
+    table = json.loads(done.out)
+    assert done.code == table["failed"] == 0
+    assert table["parameters"] == {"skip_outer": 0, "min_clusters": 3}
+    settings = [f"ranging.{key}" for key in ("id=centroid", "skip_outer=0", "min_clusters=3")]
+    wanted = load_link(overrides=["bar.rows=24", "air.chip_rate_hz=5000.0", *settings])
+    assert table["link"] == wanted.digest
+    # The parameters that the file gives the algorithm are kept.
+    table = json.loads(evlcp("check", "ranging", "joint-scale", "-c", file, "--json").out)
+    assert table["parameters"]["min_boundaries"] == 3
+    assert table["failed"] == 0

@@ -454,10 +454,16 @@ def test_clusters_that_the_bar_has_not_are_refused(clusters):
 
 
 @pytest.mark.parametrize(
-    ("bar", "skip"), [(BAR, 8), (BAR, 20), (BarLayout(rows=12), 1), (BarLayout(rows=6), 0)]
+    ("bar", "skip", "said"),
+    [
+        (BAR, 8, "skip_outer = 8: leaves 0 of 16"),
+        (BAR, 20, "set ranging.skip_outer = 7$"),
+        (BarLayout(rows=12), 1, "set ranging.skip_outer = 0$"),
+        (BarLayout(rows=6), 0, "needs two clusters"),
+    ],
 )
-def test_too_few_clusters_are_refused(bar, skip):
-    with pytest.raises(ConfigError, match="skip_outer"):
+def test_too_few_clusters_are_refused(bar, skip, said):
+    with pytest.raises(ConfigError, match=said):
         PocRanging(skip_outer=skip).compile(CAMERA, bar, LINK.codebook)
 
 

@@ -94,14 +94,14 @@ def test_what_gives_another_thing_is_named(role: str, gives: object, says: str) 
 
 
 def test_a_filter_of_places_that_fails_is_named() -> None:
-    with pytest.raises(PluginError, match=r"^tracking algorithm 'kalman': KeyError: 'boom'"):
+    with pytest.raises(PluginError, match=r"^tracking algorithm 'mine': KeyError: 'boom'"):
         received(link_with("tracking", lambda *_: Tracker(FailingFilter(), None)))
 
 
 def test_a_synchronization_that_gives_no_locks_is_named() -> None:
     gives = SimpleNamespace(init=lambda: None, step=lambda *_: (None, [(0.0, 100.0)]))
     with pytest.raises(
-        PluginError, match=r"^synchronization algorithm 'barker': gave tuple, expected SyncLock"
+        PluginError, match=r"^synchronization algorithm 'mine': gave tuple, expected SyncLock"
     ):
         received(link_with("synchronization", lambda *_: gives))
 

@@ -1,0 +1,75 @@
+"""Rangings on bars of few clusters: what one refuses, another takes where its message says so."""
+
+import re
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.testing import ideal_view
+
+PANEL = ("bar.rows=16", "bar.columns=16", "bar.cluster_rows=4", "bar.cluster_columns=4")
+LAYOUTS = {
+    **{f"{n} clusters": (f"bar.rows={6 * n}",) for n in (1, 2, 3, 4, 5, 6, 7, 16)},
+    "4x4 panel": PANEL,
+    "two columns": ("bar.rows=96", "bar.columns=2", "bar.cluster_rows=12"),
+    "one row of two": ("bar.rows=1", "bar.columns=2", "bar.cluster_rows=1"),
+}
+RANGINGS = [entry.algorithm.id for entry in Registry.load().installed("ranging")]
+
+
+def link_with(layout: str, *overrides: str) -> Link:
+    return load_link(overrides=[*LAYOUTS[layout], *overrides])
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("name", RANGINGS)
+def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name: str, layout: str) -> None:
+    link = link_with(layout, f"ranging.id={name}")
+    try:
+        measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+    except ConfigError as refused:
+        said = str(refused)
+        settings = [f"ranging.{key}={value}" for key, value in re.findall(r"ranging\.(\w+) = (\d+)$", said)]
+        other = re.search(r"use '([\w-]+)' for this layout", said)
+        if other is not None:
+            settings.append(f"ranging.id={other[1]}")
+        elif settings:
+            settings.append(f"ranging.id={name}")
+        if settings:
+            better = link_with(layout, *settings)
+            better.algorithm("ranging").compile(better.camera, better.bar, better.codebook)
+        else:
+            assert "expected at least min_clusters" in said or link.bar.clusters == 1
+        return
+    if np.ptp(link.bar.cluster_centres_m()[:, 0]) > 0:
+        return
+    # What accepts a bar measures it: 8 px from cluster to cluster.
+    view = ideal_view(link.codebook, np.arange(link.bar.clusters) % len(link.codebook.codewords))
+    found = measure(view)
+    true_m = link.camera.distance_m(0.06, 8)
+    assert found.distance_m == pytest.approx(true_m, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("layout", "said"),
+    [
+        ("1 clusters", "needs one column of three clusters or more; no ranging measures the distance of one"),
+        ("2 clusters", "needs .* or more; use 'poc' for this layout, with ranging.skip_outer = 0$"),
+        ("4x4 panel", "needs .* or more; use 'poc' for this layout$"),
+        ("one row of two", "needs .* or more; use 'poc' for this layout, with ranging.skip_outer = 0$"),
+    ],
+)
+def test_joint_scale_says_what_works_instead(layout: str, said: str) -> None:
+    link = link_with(layout, "ranging.id=joint-scale")
+    with pytest.raises(ConfigError, match=said):
+        link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+
+
+def test_one_cluster_has_no_distance() -> None:
+    for name in RANGINGS:
+        link = link_with("1 clusters", f"ranging.id={name}")
+        with pytest.raises(ConfigError):
+            link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
