@@ -229,7 +229,6 @@ LINKS = [
         "bar.rows=78",
         "modulation.id=wh8",
         "air.chip_rate_hz=20000",
-        "decoding.id=ml-soft",
     ),
 ]
 
