@@ -1,15 +1,23 @@
 """A simulation as a source of events, like a recording or a camera."""
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, EvlcpError, StreamError
+from evlcp_sdk.files import write_text
+from evlcp_sdk.io.open import open_writer
 from evlcp_sdk.io.sources import EventSource
-from evlcp_sdk.sim import Scene, Simulation, Truth, load_scene, resolve_scene, truth_of
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.scene.sites import to_toml
+from evlcp_sdk.sim import Scene, Simulation, Truth, load_scene, resolve_scene, sites_of, truth_of
+from evlcp_sdk.sim.world import attitude_log
 from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["SimulatedSource", "simulate"]
+
+Advance = Callable[[float], None]
 
 
 class SimulatedSource(EventSource):
@@ -47,6 +55,40 @@ class SimulatedSource(EventSource):
         """Stop rendering."""
         self._pieces = iter(())
 
+    def save(self, path: Path | str, advance: Advance | None = None) -> tuple[Path, ...]:
+        """Render the scene into a recording with its truth beside it; return the files that were written.
+
+        `NAME.raw` (EVT3) and `NAME.truth.json`; of a scene on earth also `NAME.site.toml`, where its bars
+        stand, and `NAME.attitude.csv`, what an IMU measures.
+
+        Args:
+            path: `NAME.raw`.
+            advance: Called after every piece with the seconds of the scene that are rendered.
+
+        Raises:
+            StreamError: Events of the source have been taken already.
+            ConfigError: The file's name does not end in `.raw`.
+            EvlcpError: A file cannot be written.
+        """
+        out, simulation = Path(path), self.simulation
+        if out.suffix != ".raw":
+            raise ConfigError(f"{out}: a recording is written as NAME.raw")
+        if simulation.done_s:
+            raise StreamError(f"{out}: the simulation has been read already; simulate it again to save it")
+        with open_writer(out, self.width, self.height, "EVT3") as writer:
+            for events in self._pieces:
+                writer.write(events)
+                if advance is not None:
+                    advance(simulation.done_s)
+        truth_path = out.with_suffix(".truth.json")
+        try:
+            write_text(json.dumps(self.truth.to_table() | {"bytes": out.stat().st_size}), truth_path)
+        except EvlcpError as fault:
+            # An older truth may lie there; the scores of another recording would look like this one's.
+            out.unlink(missing_ok=True)
+            raise type(fault)(f"{fault}; {out} is taken away, as it would be without its truth") from fault
+        return (out, truth_path, *_on_earth(simulation, out))
+
     @property
     def counts(self) -> dict[str, int]:
         """Events given out so far, and what the sensor did: its events, those dropped, those of light."""
@@ -61,10 +103,25 @@ class SimulatedSource(EventSource):
         return f"SimulatedSource({scene.name}, {bars}, {scene.duration_s:g} s, seed {scene.seed})"
 
 
+def _on_earth(simulation: Simulation, out: Path) -> list[Path]:
+    """Write where the bars stand and how the camera does, if the scene says so; return the files."""
+    scene = simulation.scene
+    if scene.world is None:
+        return []
+    written = [out.with_suffix(".site.toml")]
+    write_text(to_toml(sites_of(scene)), written[0])
+    log = attitude_log(scene, scene.seed, simulation.path)
+    if log is not None:
+        written.append(out.with_suffix(".attitude.csv"))
+        write_text(log.to_csv(), written[1])
+    return written
+
+
 def simulate(
     scene: str | Path | Mapping[str, Any] | Scene,
     seed: int | None = None,
     *,
+    link: Link | Path | str | None = None,
     overrides: Sequence[str] | Mapping[str, Any] = (),
     threads: int = 1,
 ) -> SimulatedSource:
@@ -73,6 +130,8 @@ def simulate(
     Args:
         scene: A preset's name, a `scene.toml`, its table, or a scene that is loaded.
         seed: Of everything random, instead of the scene's.
+        link: What the bars send with, a link or a `link.toml`, instead of the scene's link; of a preset or a
+            file.
         overrides: What `--set` takes, e.g. `"motion.distance_m=70"`, or a mapping from key to value; of a
             preset or a file.
         threads: Threads that share the pixels; the events do not depend on it.
@@ -85,9 +144,9 @@ def simulate(
     SimulatedSource(night, 1 bar, 0.1 s, seed 1)
     """
     if isinstance(scene, str | Path):
-        scene = load_scene(scene, overrides)
-    elif overrides:
-        raise ConfigError("overrides are of a preset or a file; write the values into the scene's table")
+        scene = load_scene(scene, overrides, link=link)
+    elif overrides or link is not None:
+        raise ConfigError("link and overrides are of a preset or a file; write them into the scene's table")
     if isinstance(scene, Mapping):
         scene = resolve_scene(scene)
     return SimulatedSource(Simulation(scene, seed, threads))

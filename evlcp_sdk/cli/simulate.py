@@ -3,15 +3,11 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
 from evlcp_sdk.cli._common import Json, console
-from evlcp_sdk.files import write_text
-
-if TYPE_CHECKING:
-    from evlcp_sdk.sim import Simulation
 
 __all__ = ["register", "simulate"]
 
@@ -71,9 +67,9 @@ def simulate(
     import json
     import time
 
-    from evlcp_sdk.errors import ConfigError, EvlcpError
-    from evlcp_sdk.io import open_writer
-    from evlcp_sdk.sim import Simulation, load_scene, preset_names, preset_text, truth_of
+    from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.sim import preset_names, preset_text
+    from evlcp_sdk.simulated import simulate as render
 
     if presets:
         if as_json:
@@ -99,33 +95,21 @@ def simulate(
         raise typer.BadParameter("where should the recording go?", param_hint="-o REC.raw")
     if out.suffix != ".raw":
         raise ConfigError(f"{out}: a recording is written as NAME.raw")
-    scene = load_scene(source, overrides or [], link=link)
-    simulation = Simulation(scene, seed, threads)
-    truth_path = out.with_suffix(".truth.json")
+    simulated = render(source, seed, link=link, overrides=overrides or [], threads=threads)
+    scene = simulated.scene
     began = time.perf_counter()
     with _progress(out.name, scene.duration_s) as advance:
-        camera = scene.camera
-        with open_writer(out, camera.width, camera.height, "EVT3") as writer:
-            for events in simulation.stream():
-                writer.write(events)
-                advance(simulation.done_s)
-    truth = truth_of(simulation).to_table() | {"bytes": out.stat().st_size}
-    try:
-        write_text(json.dumps(truth), truth_path)
-    except EvlcpError as fault:
-        # An older truth may lie there; the scores of another recording would look like this one's.
-        out.unlink(missing_ok=True)
-        raise type(fault)(f"{fault}; {out} is taken away, as it would be without its truth") from fault
-    written = [out, truth_path, *_on_earth(simulation, out)]
+        written = simulated.save(out, advance)
     elapsed_s = time.perf_counter() - began
-    counts = simulation.counts
-    summary = {
+    counts = simulated.simulation.counts
+    size = out.stat().st_size
+    summary: dict[str, Any] = {
         "recording": str(out),
-        "truth": str(truth_path),
+        "truth": str(written[1]),
         "name": scene.name,
-        "seed": simulation.scene.seed,
+        "seed": scene.seed,
         "duration_s": scene.duration_s,
-        "bytes": truth["bytes"],
+        "bytes": size,
         **counts,
         "elapsed_s": round(elapsed_s, 6),
         "events_per_s": round(counts["events"] / elapsed_s),
@@ -136,29 +120,12 @@ def simulate(
     screen = console()
     screen.print(
         f"{out.name}: {counts['events'] / 1e6:.2f} Mev in {scene.duration_s:g} s of time,"
-        f" {truth['bytes'] / 1e6:.1f} MB; rendered in {elapsed_s:.1f} s"
+        f" {size / 1e6:.1f} MB; rendered in {elapsed_s:.1f} s"
         f" ({summary['events_per_s'] / 1e6:.1f} Mev/s)"
     )
     if counts["dropped_by_rate_cap"]:
         screen.print(f"lost to the event-rate limit: {counts['dropped_by_rate_cap']} events", style="yellow")
     screen.print(f"written: {', '.join(map(str, written))}", style="dim")
-
-
-def _on_earth(simulation: "Simulation", out: Path) -> list[Path]:
-    """Write where the bars stand and how the camera does, if the scene says so; return the files."""
-    from evlcp_sdk.scene.sites import to_toml
-    from evlcp_sdk.sim.world import attitude_log, sites_of
-
-    scene = simulation.scene
-    if scene.world is None:
-        return []
-    written = [out.with_suffix(".site.toml")]
-    write_text(to_toml(sites_of(scene)), written[0])
-    log = attitude_log(scene, scene.seed, simulation.path)
-    if log is not None:
-        written.append(out.with_suffix(".attitude.csv"))
-        write_text(log.to_csv(), written[1])
-    return written
 
 
 @contextmanager

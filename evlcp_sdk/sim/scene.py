@@ -328,7 +328,7 @@ def load_scene(
     overrides: Sequence[str] | Mapping[str, Any] = (),
     registry: Registry | None = None,
     *,
-    link: Path | str | None = None,
+    link: Link | Path | str | None = None,
 ) -> Scene:
     """Read a scene from a TOML file or a preset.
 
@@ -339,7 +339,7 @@ def load_scene(
             `link.air.chip_rate_hz` is a key of the scene's link, `bars.1.link.air.chip_rate_hz` one of the
             second bar's.
         registry: Where the algorithms of its links are found; None for all that are installed.
-        link: A `link.toml` instead of the scene's link.
+        link: A link, or a `link.toml`, instead of the scene's link.
 
     Raises:
         ConfigError: The file cannot be read, is no TOML, or does not describe a scene; one line a fault.
@@ -361,7 +361,7 @@ def load_scene(
             )
         table = read_toml(path)
     if link is not None:
-        table["link"] = _Whole(read_toml(link))
+        table["link"] = _Whole(link.table if isinstance(link, Link) else read_toml(link))
     _read_links(table, folder, f"{where}: ")
     pairs = overrides.items() if isinstance(overrides, Mapping) else map(_parse_override, overrides)
     for key, value in pairs:

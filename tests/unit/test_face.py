@@ -212,9 +212,39 @@ def test_a_simulation_is_a_source_like_a_recording(tmp_path: Path, evlcp: Any) -
     assert source.counts["events"] == source.counts["simulated_events"] == len(written)
 
 
+def test_a_simulation_is_saved_as_the_command_does(tmp_path: Path, evlcp: Any) -> None:
+    import evlcp_sdk
+
+    settings = ["duration_s=0.03", "motion.distance_m=70"]
+    source = evlcp_sdk.simulate("night", seed=4, overrides=settings)
+    written = source.save(tmp_path / "a.raw")
+    assert written == (tmp_path / "a.raw", tmp_path / "a.truth.json")
+    done = evlcp("simulate", "--preset", "night", "--seed", 4, "-o", tmp_path / "b.raw",
+                 *(word for s in settings for word in ("--set", s)))  # fmt: skip
+    assert done.code == 0
+    assert written[0].read_bytes() == (tmp_path / "b.raw").read_bytes()
+    assert written[1].read_text() == (tmp_path / "b.truth.json").read_text()
+    with pytest.raises(evlcp_sdk.StreamError, match="has been read already"):
+        source.save(tmp_path / "c.raw")
+    with pytest.raises(evlcp_sdk.ConfigError, match=r"a recording is written as NAME\.raw"):
+        evlcp_sdk.simulate("night").save(tmp_path / "c.csv")
+
+
+def test_a_simulation_sends_the_link_that_it_is_given() -> None:
+    link = evlcp.load_link(overrides=["air.chip_rate_hz=5000.0", "modulation.id=wh8"])
+    source = evlcp.simulate("night", seed=3, link=link, overrides=["duration_s=0.12"])
+    (bar,) = source.truth.bars
+    assert bar.link.codebook.digest == link.codebook.digest
+    assert bar.link.air == link.air
+    frames = list(evlcp.receive(source, link).frames())
+    sent = bar.symbols.reshape(-1, 16).tolist()
+    assert frames
+    assert all(frame.soft.symbols.tolist() in sent for frame in frames)
+
+
 def test_a_simulation_that_is_closed_ends() -> None:
     with evlcp.simulate("night", overrides={"duration_s": 0.05}) as source:
         next(source.chunks(1000))
     assert source.take(1000) is None
-    with pytest.raises(evlcp.ConfigError, match="overrides are of a preset or a file"):
+    with pytest.raises(evlcp.ConfigError, match="link and overrides are of a preset or a file"):
         evlcp.simulate({"bars": [{}]}, overrides=["duration_s=1"])
