@@ -17,9 +17,9 @@ from pathlib import Path
 
 from evt3_decode import tile
 
-from evlcp_sdk.cli.receive import decode
 from evlcp_sdk.io import open_source, read_events
 from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.run import receive_to_folder
 
 SHARED = Path(__file__).parents[2] / "shared" / "recordings"
 FIRST = "night-50m-30kmh.raw"
@@ -33,7 +33,7 @@ def link_of(path: Path) -> Link:
 
 def receive(path: Path, folder: Path) -> dict[str, float]:
     """Receive a recording; return its times."""
-    summary = decode(str(path), folder, link_of(path), lambda _done, _all: None, lambda: False)
+    summary = receive_to_folder(path, folder, link_of(path))
     return summary["processing"] | {"events": summary["recording"]["counts"]["events"]}
 
 

@@ -1,25 +1,55 @@
 """The use cases: what a program does with a recording, and what the commands parse and print."""
 
-from collections.abc import Iterator
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from types import FrameType, TracebackType
+from typing import TYPE_CHECKING, Any, Self
 
-from evlcp_sdk.errors import InputError
+from numba.core.event import install_timer
+
+from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.io import EventSource, Loss, open_source
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.place.calibration import Calibrated, CalibrationView
+from evlcp_sdk.place.calibration import calibrate as fit_camera
+from evlcp_sdk.place.navigator import PositionPlan
+from evlcp_sdk.place.observations import BarView
+from evlcp_sdk.place.points import points_at
+from evlcp_sdk.place.poses import KnownPose
+from evlcp_sdk.place.whereabouts import Whereabouts
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.results.summary import Status
 from evlcp_sdk.results.tables import frames_table
+from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.scene.sites import BarSite, LocalFrame
 from evlcp_sdk.values import Frame, Packet
 
 if TYPE_CHECKING:
     import pandas
     import pyarrow
 
-__all__ = ["Reception", "receive"]
+__all__ = [
+    "Advance",
+    "Reception",
+    "Stopped",
+    "calibrate",
+    "receive",
+    "receive_to_folder",
+    "stop_on_request",
+]
+
+Advance = Callable[[int, int | None], None]
+"""Called after each piece with the bytes that are done, and of how many if that is known."""
+
+Stopped = Callable[[], bool]
+"""Asked after each piece whether to end early."""
 
 
 def receive(
@@ -141,3 +171,205 @@ class Reception(Iterator[Packet]):
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def receive_to_folder(
+    source: EventSource | str | Path,
+    folder: Path,
+    link: Link | None = None,
+    *,
+    registry: Registry | None = None,
+    plan: PositionPlan | None = None,
+    sinks: Sequence[str] = (),
+    advance: Advance = lambda _done, _of: None,
+    stopped: Stopped = lambda: False,
+) -> dict[str, Any]:
+    """Receive a recording into a folder: source, receiver, positions, sinks; in constant memory.
+
+    Args:
+        source: What to open, plugins asked first; or a source that is open, which is read on and closed.
+        folder: Where the result goes; made if need be. An earlier result is replaced when the new one is
+            complete.
+        link: The configuration; None for all defaults.
+        registry: The plugins; None for all that are installed.
+        plan: What positions are computed from; None for none.
+        sinks: Output formats beside the default ones, by name, e.g. `parquet`.
+        advance: Says how far the reading is.
+        stopped: Ends the run early; what was decoded until then is written.
+
+    Returns:
+        The summary; its `status` is `failed` when the recording cannot be read on.
+
+    Raises:
+        InputError: The recording cannot be opened; nothing is written.
+        ConfigError: The recording's sensor is not the link's, a sink cannot be used, or the folder cannot be
+            written.
+        PluginError: A plugin's code fails; nothing is written.
+    """
+    registry = Registry.load() if registry is None else registry
+    link = load_link(registry=registry) if link is None else link
+    url = str(source.path if isinstance(source, EventSource) else source)
+    with source if isinstance(source, EventSource) else open_source(source, registry) as opened:
+        check_sensor(opened, url, link.camera)
+        with ResultWriter(folder, link, registry, name=Path(url).name, plan=plan, sinks=sinks) as writer:
+            return _run(opened, url, Receiver(link, registry.hook), writer, advance, stopped)
+
+
+def _run(
+    source: EventSource,
+    url: str,
+    receiver: Receiver,
+    writer: ResultWriter,
+    advance: Advance,
+    stopped: Stopped,
+) -> dict[str, Any]:
+    """Read a source to its end, or until it is stopped or fails; return the summary."""
+    status: Status = "complete"
+    error = None
+    first_us = last_us = None
+    compiled_s: list[float] = []
+    began = time.perf_counter()
+    with install_timer("numba:compile", compiled_s.append):
+        try:
+            for events in source.chunks():
+                first_us = int(events.t_us[0]) if first_us is None else first_us
+                last_us = int(events.t_us[-1])
+                writer.events(events)
+                writer.write(receiver.feed(events))
+                advance(source.position_bytes, source.size_bytes)
+                if stopped():
+                    status = "interrupted"
+                    break
+        except InputError as fault:
+            status, error = "failed", str(fault)
+        writer.write(receiver.close())
+    # Kernels are compiled once on a machine, which says nothing of the receiver's speed.
+    elapsed_s = time.perf_counter() - began - sum(compiled_s)
+    read = source.counts["events"]
+    duration_s = (last_us - first_us) * 1e-6 if first_us is not None and last_us is not None else 0.0
+    return writer.finish(
+        status,
+        recording={
+            "path": url,
+            "format": source.format,
+            "bytes": source.size_bytes,
+            "width": source.width,
+            "height": source.height,
+            "first_us": first_us,
+            "last_us": last_us,
+            "duration_s": round(duration_s, 6),
+            "events_per_s": round(read / duration_s) if duration_s else None,
+            "counts": dict(source.counts),
+        },
+        processing={
+            "elapsed_s": round(elapsed_s, 6),
+            "compiled_s": round(sum(compiled_s), 6),
+            "events_per_s": round(read / elapsed_s),
+            "times_real_time": round(duration_s / elapsed_s, 3),
+        },
+        counts=receiver.counts,
+        losses={kind: asdict(loss) for kind, loss in source.losses.items()},
+        error=error,
+    )
+
+
+@contextmanager
+def stop_on_request() -> Iterator[Stopped]:
+    """Let Ctrl-C end a run after the piece in hand; a second one ends it at once.
+
+    Gives what `receive_to_folder` takes as `stopped`. Only a main thread can listen.
+    """
+    asked = False
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield lambda: asked
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def calibrate(
+    recordings: Sequence[str],
+    sites: Sequence[BarSite],
+    poses: Sequence[KnownPose],
+    link: Link | None = None,
+    *,
+    registry: Registry | None = None,
+    limit_px: float = 2.0,
+) -> Calibrated:
+    """Estimate focal length, principal point and distortion from bars at known places.
+
+    Args:
+        recordings: Recordings of the bars.
+        sites: Where the bars stand.
+        poses: Where the camera was, and when.
+        link: The configuration; None for all defaults.
+        registry: The plugins; None for all that are installed.
+        limit_px: Uncertainty of the image's corners that is allowed.
+
+    Raises:
+        InputError: A recording cannot be read.
+        ConfigError: A pose names no recording, a site contradicts its beacon, or too little was seen.
+    """
+    registry = Registry.load() if registry is None else registry
+    link = load_link(registry=registry) if link is None else link
+    frame = LocalFrame.of(sites)
+    views: list[CalibrationView] = []
+    for url in recordings:
+        mine = [pose for pose in poses if pose.recording in ("", Path(url).name)]
+        views += _views(url, mine, link, sites, frame, registry)
+    return fit_camera(views, link.camera, link.position, limit_px=limit_px)
+
+
+def _views(
+    url: str,
+    poses: Sequence[KnownPose],
+    link: Link,
+    sites: Sequence[BarSite],
+    frame: LocalFrame,
+    registry: Registry,
+) -> list[CalibrationView]:
+    """What a recording shows at the times of known poses."""
+    clusters, spec = link.bar.clusters, link.position
+    period_us = link.packet.packet_chips * link.packet.chip_us
+    who = Whereabouts(sites, spec)
+    frames: dict[int, list[Frame]] = {}
+    with receive(url, link, registry=registry) as packets:
+        for packet in packets:
+            who.hear(packet)
+            kept = frames.setdefault(packet.transmitter, [])
+            for one in packet.frames:
+                if len(one.points_px) == clusters and any(
+                    abs(one.points_t_us - pose.t_us) <= period_us for pose in poses
+                ):
+                    kept.append(one)
+    for how in who.contradicted.values():
+        raise ConfigError(f"{url}: {how}")
+    stands_at = who.stands_at
+    views = []
+    for pose in poses:
+        bars = []
+        for number, seen in frames.items():
+            points = points_at(seen, pose.t_us, period_us, clusters, spec)
+            if points is not None and number in stands_at:
+                enu = stands_at[number].cluster_positions_m(clusters, frame)
+                bars.append(BarView(number, enu, *points))
+        place = (pose.latitude_deg, pose.longitude_deg, pose.height_m)
+        rotation = None
+        if pose.attitude is not None:
+            rotation = frame.turn_from(LocalFrame(*place)) @ pose.attitude.rotation()
+        views.append(
+            CalibrationView(
+                tuple(bars),
+                frame.to_enu(*place),
+                pose.position_sigma_m,
+                rotation,
+                pose.attitude_sigma_deg,
+            )
+        )
+    return views

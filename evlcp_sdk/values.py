@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.beacons import Beacon
-from evlcp_sdk.air.blocks import Block, Message
+from evlcp_sdk.air.blocks import Block, Kind, Message
+from evlcp_sdk.air.kinds import MessageKind
 from evlcp_sdk.errors import ConfigError, StreamError
 
 if TYPE_CHECKING:
@@ -340,7 +341,8 @@ class ReceivedMessage:
         packet: Number of the packet that completed it, or that changed how far it may be believed.
         t_us: Start of that packet's first preamble chip on the camera's clock, us.
         message: What was received.
-        beacon: What a beacon says; None for other kinds.
+        kind: What it is.
+        value: What it says: a `Beacon`, a text, bytes, or what a plugin's kind makes of its payload.
         trust: How far it may be believed. Texts and data are not signed, so they are `unverified`.
         reason: Why it is not `verified`; empty where it is.
     """
@@ -349,9 +351,15 @@ class ReceivedMessage:
     packet: int
     t_us: float
     message: Message
-    beacon: Beacon | None
+    kind: MessageKind
+    value: Any
     trust: Trust
     reason: str
+
+    @property
+    def beacon(self) -> Beacon | None:
+        """What a beacon says; None for other kinds."""
+        return self.value if self.message.kind == Kind.BEACON else None
 
     def __repr__(self) -> str:
         return f"ReceivedMessage({_said(self)}, {self.t_us / 1e3:.1f} ms)"
@@ -523,6 +531,9 @@ def _said(received: ReceivedMessage, most: int = 60) -> str:
         what = f"beacon at {latitude_deg:.7f}, {longitude_deg:.7f} deg, {height_m:.2f} m"
     elif text is not None:
         what = repr(text if len(text) <= most else f"{text[:most]}...")
+    elif isinstance(received.value, bytes):
+        what = f"{len(message.payload)} bytes of {received.kind.name}"
     else:
-        what = f"{len(message.payload)} bytes of {message.kind.name.lower()}"
+        value = repr(received.value)
+        what = f"{received.kind.name} {value if len(value) <= most else f'{value[:most]}...'}"
     return f"{what} from {message.transmitter_id}, {received.trust}"

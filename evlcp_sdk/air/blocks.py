@@ -2,7 +2,7 @@
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -41,12 +41,16 @@ _MOST_NUMBER = 0xFFFFFFFF
 
 
 class Kind(IntEnum):
-    """What a message is."""
+    """Numbers of the kinds that are built in; what they mean is in `air.kinds`."""
 
     BEACON = 1
     TEXT = 2
     DATA = 3
     SIGNATURE = 4
+
+
+_KINDS = frozenset(Kind)
+_MOST_KIND = 15
 
 
 class BlockError(EvlcpError):
@@ -58,7 +62,7 @@ class Message:
     """A message as its transmitter made it.
 
     Attributes:
-        kind: What the payload is.
+        kind: Number of its kind: what the payload is, 1 to 15.
         transmitter_id: Identity of the transmitter, 0 to 2**32 - 1.
         sequence: Number of the message, rising from each to the next of a transmitter, 0 to 2**32 - 1.
         payload: Its bytes.
@@ -67,26 +71,32 @@ class Message:
         ConfigError: A number or the payload's length is out of range.
     """
 
-    kind: Kind
+    kind: int
     transmitter_id: int
     sequence: int
     payload: bytes
 
     def __post_init__(self) -> None:
+        if not 1 <= self.kind <= _MOST_KIND:
+            raise ConfigError(f"message: kind = {self.kind}, expected 1 to {_MOST_KIND}")
         for name in ("transmitter_id", "sequence"):
             value = getattr(self, name)
             if not 0 <= value <= _MOST_NUMBER:
                 raise ConfigError(f"message: {name} = {value}, expected 0 to {_MOST_NUMBER}")
         if not 1 <= len(self.payload) <= MOST_MESSAGE_BYTES:
             raise ConfigError(
-                f"message: {len(self.payload)} bytes of {self.kind.name.lower()},"
-                f" expected 1 to {MOST_MESSAGE_BYTES}"
+                f"message: {len(self.payload)} bytes of {self.kind_name}, expected 1 to {MOST_MESSAGE_BYTES}"
             )
+
+    @property
+    def kind_name(self) -> str:
+        """Name of a built-in kind, e.g. `text`; of another one `kind 7`."""
+        return Kind(self.kind).name.lower() if self.kind in _KINDS else f"kind {self.kind}"
 
     @property
     def text(self) -> str | None:
         """The payload as text; None if it is not UTF-8, or the message is no text."""
-        if self.kind is not Kind.TEXT:
+        if self.kind != Kind.TEXT:
             return None
         try:
             return self.payload.decode("utf-8")
@@ -99,7 +109,7 @@ class Block:
     """A part of a message, with the header that every part carries.
 
     Attributes:
-        kind: Kind of the message.
+        kind: Number of the message's kind.
         transmitter_id: As in `Message`.
         sequence: As in `Message`.
         index: Number of the part, from 0.
@@ -112,7 +122,7 @@ class Block:
     True
     """
 
-    kind: Kind
+    kind: int
     transmitter_id: int
     sequence: int
     index: int
@@ -133,8 +143,12 @@ class Block:
         return head + _whitened(head, self.part.ljust(size - HEADER_BYTES, b"\0"))
 
     @classmethod
-    def unpack(cls, block: bytes) -> "Block":
+    def unpack(cls, block: bytes, kinds: Collection[int] = _KINDS) -> "Block":
         """Read what `pack` wrote.
+
+        Args:
+            block: The bytes.
+            kinds: Numbers of the kinds that are known.
 
         Raises:
             BlockError: Another version, an unknown kind, a part that no message of that length has, or bytes
@@ -144,8 +158,8 @@ class Block:
         version, kind = first >> 4, first & 15
         if version != FORMAT_VERSION:
             raise BlockError(f"block of format version {version}, expected {FORMAT_VERSION}")
-        if kind not in Kind._value2member_map_:
-            raise BlockError(f"block of kind {kind}, expected 1 to {max(Kind)}")
+        if kind not in kinds:
+            raise BlockError(f"block of kind {kind}, expected one of {', '.join(map(str, sorted(kinds)))}")
         room = len(block) - HEADER_BYTES
         if not index * room < length:
             raise BlockError(f"part {index} of a message of {length} bytes, {room} in a part")
@@ -153,7 +167,15 @@ class Block:
         end = min(room, length - index * room)
         if any(rest[end:]):
             raise BlockError(f"bytes {HEADER_BYTES + end} to {len(block) - 1} of the block: expected zeros")
-        return cls(Kind(kind), transmitter_id, sequence, index, length, codebook, rest[:end])
+        return cls(
+            Kind(kind) if kind in _KINDS else kind,
+            transmitter_id,
+            sequence,
+            index,
+            length,
+            codebook,
+            rest[:end],
+        )
 
 
 def _whitened(head: bytes, rest: bytes) -> bytes:

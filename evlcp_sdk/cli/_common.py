@@ -1,14 +1,18 @@
 """What the commands share: their options, where jobs run, what goes to stderr."""
 
 import os
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from rich.console import Console
 
     from evlcp_sdk.jobs.executor import Executor
+    from evlcp_sdk.run import Advance
 
 __all__ = [
     "Dask",
@@ -16,6 +20,7 @@ __all__ = [
     "LinkFile",
     "Overrides",
     "Workers",
+    "bytes_bar",
     "complain",
     "console",
     "make_executor",
@@ -80,3 +85,16 @@ def make_executor(workers: int | None, dask: str | None) -> "Executor":
     if workers == 0:
         return Inline()
     return Processes(workers or os.cpu_count() or 1)
+
+
+@contextmanager
+def bytes_bar(name: str) -> "Iterator[Advance]":
+    """A bar by bytes read, on a terminal only."""
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+    err = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task(name, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -10,10 +10,8 @@ from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from evlcp_sdk.link.resolve import Link
-    from evlcp_sdk.place.calibration import Calibrated, CalibrationView
+    from evlcp_sdk.place.calibration import Calibrated
     from evlcp_sdk.place.poses import KnownPose
-    from evlcp_sdk.scene.sites import BarSite, LocalFrame
 
 __all__ = ["register"]
 
@@ -51,27 +49,22 @@ def calibrate(
     """
     import json
 
+    from evlcp_sdk import run
     from evlcp_sdk.link.resolve import load_link
-    from evlcp_sdk.place.calibration import calibrate as fit
     from evlcp_sdk.place.poses import read_poses
     from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.scene.sites import LocalFrame, load_sites
+    from evlcp_sdk.scene.sites import load_sites
 
-    link = load_link(link_file, overrides or [], Registry.load())
-    known = load_sites(sites)
-    frame = LocalFrame.of(known)
-    told = read_poses(poses)
-    _check_names(recordings, told, poses)
-    views: list[CalibrationView] = []
-    for url in recordings:
-        name = Path(url).name
-        mine = [pose for pose in told if pose.recording in ("", name)]
-        views += _views(url, mine, link, known, frame)
-    found = fit(views, link.camera, link.position, limit_px=limit_px)
+    registry = Registry.load()
+    link = load_link(link_file, overrides or [], registry)
+    bars = load_sites(sites)
+    known = read_poses(poses)
+    _check_names(recordings, known, poses)
+    found = run.calibrate(recordings, bars, known, link, registry=registry, limit_px=limit_px)
     if as_json:
-        typer.echo(json.dumps(_table(found) | {"poses": len(told)}))
+        typer.echo(json.dumps(_table(found) | {"poses": len(known)}))
     else:
-        console().print(_toml(found, len(told)), markup=False)
+        console().print(_toml(found, len(known)), markup=False)
 
 
 def _check_names(recordings: list[str], poses: "Sequence[KnownPose]", path: Path) -> None:
@@ -85,75 +78,6 @@ def _check_names(recordings: list[str], poses: "Sequence[KnownPose]", path: Path
             )
         if not pose.recording and len(names) > 1:
             raise ConfigError(f"{path}: line {line}: recording: expected one, as there are {len(names)}")
-
-
-def _views(
-    url: str,
-    poses: "Sequence[KnownPose]",
-    link: "Link",
-    sites: "Sequence[BarSite]",
-    frame: "LocalFrame",
-) -> "list[CalibrationView]":
-    """What a recording shows at the times of known poses."""
-    from evlcp_sdk.errors import ConfigError
-    from evlcp_sdk.io.open import open_source
-    from evlcp_sdk.io.sensor import check_sensor
-    from evlcp_sdk.place.calibration import CalibrationView
-    from evlcp_sdk.place.observations import BarView
-    from evlcp_sdk.place.points import points_at
-    from evlcp_sdk.place.whereabouts import Whereabouts
-    from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.rx.receiver import Receiver
-    from evlcp_sdk.scene.sites import LocalFrame
-    from evlcp_sdk.values import Frame, Packet
-
-    registry = Registry.load()
-    receiver = Receiver(link, registry.hook)
-    clusters, spec = link.bar.clusters, link.position
-    period_us = link.packet.packet_chips * link.packet.chip_us
-    who = Whereabouts(sites, spec)
-    frames: dict[int, list[Frame]] = {}
-
-    def take(packets: list[Packet]) -> None:
-        for packet in packets:
-            who.hear(packet)
-            kept = frames.setdefault(packet.transmitter, [])
-            for frame in packet.frames:
-                if len(frame.points_px) == clusters and any(
-                    abs(frame.points_t_us - pose.t_us) <= period_us for pose in poses
-                ):
-                    kept.append(frame)
-
-    with open_source(url, registry) as source:
-        check_sensor(source, url, link.camera)
-        for events in source.chunks():
-            take(receiver.feed(events))
-        take(receiver.close())
-    for how in who.contradicted.values():
-        raise ConfigError(f"{url}: {how}")
-    stands_at = who.stands_at
-    views = []
-    for pose in poses:
-        bars = []
-        for number, seen in frames.items():
-            points = points_at(seen, pose.t_us, period_us, clusters, spec)
-            if points is not None and number in stands_at:
-                enu = stands_at[number].cluster_positions_m(clusters, frame)
-                bars.append(BarView(number, enu, *points))
-        place = (pose.latitude_deg, pose.longitude_deg, pose.height_m)
-        rotation = None
-        if pose.attitude is not None:
-            rotation = frame.turn_from(LocalFrame(*place)) @ pose.attitude.rotation()
-        views.append(
-            CalibrationView(
-                tuple(bars),
-                frame.to_enu(*place),
-                pose.position_sigma_m,
-                rotation,
-                pose.attitude_sigma_deg,
-            )
-        )
-    return views
 
 
 def _table(found: "Calibrated") -> dict[str, Any]:

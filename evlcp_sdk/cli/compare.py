@@ -204,7 +204,7 @@ def _run(job: Job, *, variants: "tuple[Variant, ...]") -> "Table":
 
 @contextmanager
 def _bar(job: Job) -> Iterator[Callable[[int, int | None], None]]:
-    from evlcp_sdk.cli.receive import bytes_bar
+    from evlcp_sdk.cli._common import bytes_bar
 
     if not job.here:
         yield lambda _done, _total: None

@@ -149,9 +149,10 @@ def _decode_recording(out: Path, as_json: bool) -> None:
     import csv
     import json
 
-    from evlcp_sdk.cli.receive import decode, show
+    from evlcp_sdk.cli._summary import show
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.run import receive_to_folder
     from evlcp_sdk.sim.truth import read_truth
     from evlcp_sdk.study.frames import read_frames
     from evlcp_sdk.study.score import score_frames
@@ -162,7 +163,7 @@ def _decode_recording(out: Path, as_json: bool) -> None:
         console().print(
             f"decoding {recording.name} (the first run also compiles the kernels) ...", style="dim"
         )
-    summary = decode(str(recording), out, link, lambda _done, _of: None, lambda: False, figures=True)
+    summary = receive_to_folder(recording, out, link, sinks=["figures"])
     with (out / "frames.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     found = score_frames(read_frames(out), read_truth(truth_file))

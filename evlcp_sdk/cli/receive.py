@@ -1,30 +1,24 @@
 """`evlcp receive`."""
 
-import signal
 import threading
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Dask, LinkFile, Overrides, complain, console, make_executor
+from evlcp_sdk.cli._common import Dask, LinkFile, Overrides, bytes_bar, complain, make_executor
+from evlcp_sdk.cli._summary import show
 from evlcp_sdk.errors import InputError, InterruptedRunError
 
 if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
-    from evlcp_sdk.results.positions import PositionPlan
-    from evlcp_sdk.values import Packet
+    from evlcp_sdk.place.navigator import PositionPlan
 
-__all__ = ["bytes_bar", "decode", "register", "show"]
-
-Advance = Callable[[int, int | None], None]
-"""Told, after each piece, how many bytes are done, and of how many if that is known."""
+__all__ = ["register"]
 
 
 @dataclass(frozen=True)
@@ -84,6 +78,10 @@ def receive(
         typer.Option("--clock-zero", metavar="UTC", help="UTC of the camera clock's 0, for NMEA and MCAP."),
     ] = None,
     mcap: Annotated[bool, typer.Option("--mcap", help="Also write fixes.mcap, for Foxglove.")] = False,
+    sinks: Annotated[
+        list[str] | None,
+        typer.Option("--sink", metavar="NAME", help="Also write this format; may be repeated."),
+    ] = None,
 ) -> None:
     """Decode recordings: symbols and distances into OUT.
 
@@ -105,29 +103,36 @@ def receive(
     Positions, with an IMU's log: [bold]evlcp receive REC.raw -o out --sites site.toml --attitude imu.csv[/]
 
     OUT gets frames.csv (a row a frame), packets.jsonl (a line a packet or message) and summary.json.
-    With --sites it gets fixes.csv, track.csv, fixes.geojson and fixes.nmea, too.
+    With --sites it gets fixes.csv, track.csv, fixes.geojson and fixes.nmea, too. --figures, --parquet and
+    --mcap are short for --sink figures, parquet and mcap; plugins bring other formats.
     An earlier result there is replaced when the new one is complete.
     """
     import json
 
     from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.plugin.records import choose_sinks
     from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.results.sinks import load_sinks
+    from evlcp_sdk.run import stop_on_request
 
     jobs = _jobs(recordings, out)
-    link = load_link(link_file, overrides or [], Registry.load())
+    registry = Registry.load()
+    link = load_link(link_file, overrides or [], registry)
     angles = (heading_deg, pitch_deg, roll_deg)
     plan = _position_plan(sites, attitude, angles, (gravity_sigma_deg, heading_sigma_deg), clock_zero, mcap)
+    short = {"figures": figures, "parquet": parquet, "mcap": mcap}
+    asked = tuple(dict.fromkeys([*(name for name, given in short.items() if given), *(sinks or [])]))
+    load_sinks(choose_sinks(registry, asked, positions=plan is not None))
     here = dask is None and (not workers or len(jobs) == 1)
     executor = make_executor(0 if here else workers or None, dask)
     worst = 0
     interrupted: list[Path] = []
-    with _stop_on_request() as stopped, _recordings_bar(0 if here else len(jobs)) as count:
+    with stop_on_request() as stopped, _recordings_bar(0 if here else len(jobs)) as count:
         run = partial(
             _decode_job,
             link=link,
-            figures=figures,
-            parquet=parquet,
             plan=plan,
+            sinks=asked,
             stopped=stopped if here else None,
         )
         for outcome in executor.run(run, _until(stopped, jobs)):
@@ -175,7 +180,7 @@ def _position_plan(
     import math
     from datetime import UTC, datetime
 
-    from evlcp_sdk.results.positions import PositionPlan
+    from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
     from evlcp_sdk.scene.sites import load_sites
 
@@ -205,29 +210,28 @@ def _position_plan(
         # MCAP counts from 1970 on, and NMEA has two digits of the year.
         if not datetime(1970, 1, 1, tzinfo=UTC) <= zero < datetime(2200, 1, 1, tzinfo=UTC):
             raise typer.BadParameter(f"{clock_zero!r}: expected 1970 to 2199", param_hint="--clock-zero")
-    return PositionPlan(load_sites(sites), attitude, zero, mcap)
+    return PositionPlan(load_sites(sites), attitude, zero)
 
 
 def _decode_job(
     job: Job,
     *,
     link: "Link",
-    figures: bool,
-    parquet: bool,
     plan: "PositionPlan | None",
+    sinks: tuple[str, ...],
     stopped: Callable[[], bool] | None,
 ) -> dict[str, Any]:
     """Decode a recording here, with a bar; or, without `stopped`, quietly in a worker."""
-    extras: dict[str, Any] = {"figures": figures, "parquet": parquet, "plan": plan}
+    from evlcp_sdk.run import receive_to_folder, stop_on_request
+
+    decode = partial(receive_to_folder, job.url, job.folder, link, plan=plan, sinks=sinks)
     if stopped is not None:
         with bytes_bar(Path(job.url).name) as advance:
-            return decode(job.url, job.folder, link, advance, stopped, **extras)
+            return decode(advance=advance, stopped=stopped)
     # A terminal sends Ctrl-C to workers, too; only a main thread can listen to it.
     main = threading.current_thread() is threading.main_thread()
-    listening: AbstractContextManager[Callable[[], bool]]
-    listening = _stop_on_request() if main else nullcontext(lambda: False)
-    with listening as asked:
-        return decode(job.url, job.folder, link, lambda _a, _b: None, asked, **extras)
+    with stop_on_request() if main else nullcontext(lambda: False) as asked:
+        return decode(stopped=asked)
 
 
 def _until(stopped: Callable[[], bool], jobs: Sequence[Job]) -> Iterator[Job]:
@@ -235,213 +239,6 @@ def _until(stopped: Callable[[], bool], jobs: Sequence[Job]) -> Iterator[Job]:
         if stopped():
             return
         yield job
-
-
-def decode(
-    url: str,
-    folder: Path,
-    link: "Link",
-    advance: Advance,
-    stopped: Callable[[], bool],
-    *,
-    figures: bool = False,
-    parquet: bool = False,
-    plan: "PositionPlan | None" = None,
-) -> dict[str, Any]:
-    """Decode one recording into a folder, in constant memory.
-
-    Args:
-        url: The recording.
-        folder: Where the result goes.
-        link: The configuration.
-        advance: Told how far the reading is.
-        stopped: Asked after every piece whether to end early.
-        figures: Draw the figures.
-        parquet: Write Parquet, too.
-        plan: What positions are computed from; None for none.
-
-    Returns:
-        The summary; its `status` is `failed` when the recording cannot be read on.
-
-    Raises:
-        InputError: The recording cannot be opened; nothing is written.
-        ConfigError: The recording's sensor is not the link's, or the folder cannot be written.
-    """
-    from numba.core.event import install_timer
-
-    from evlcp_sdk.io.open import open_source
-    from evlcp_sdk.io.sensor import check_sensor
-    from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.results.outputs import ResultWriter, Status
-    from evlcp_sdk.rx.receiver import Receiver
-
-    compiled_s: list[float] = []
-    probes: list[Any] = []
-    if figures:
-        from evlcp_sdk.results.figures import FigureProbe
-
-        probes.append(FigureProbe(link.camera))
-    tracks = []
-    if figures and plan is not None:
-        from evlcp_sdk.results.figures import TrackProbe
-
-        tracks.append(TrackProbe())
-    registry = Registry.load(*probes)
-    with open_source(url, registry) as source:
-        check_sensor(source, url, link.camera)
-        with ResultWriter(folder, link, parquet=parquet) as writer, ExitStack() as closing:
-            receiver = Receiver(link, registry.hook)
-            positions = None
-            if plan is not None:
-                from evlcp_sdk.results.positions import PositionWriter
-
-                positions = closing.enter_context(PositionWriter(folder, link, plan, tracks))
-
-            def write(packets: list["Packet"]) -> None:
-                writer.write(packets)
-                if positions is not None:
-                    positions.write(packets)
-
-            status: Status = "complete"
-            error = None
-            first_us = last_us = None
-            began = time.perf_counter()
-            with install_timer("numba:compile", compiled_s.append):
-                try:
-                    for events in source.chunks():
-                        first_us = int(events.t_us[0]) if first_us is None else first_us
-                        last_us = int(events.t_us[-1])
-                        for probe in probes:
-                            probe.watch(events)
-                        write(receiver.feed(events))
-                        advance(source.position_bytes, source.size_bytes)
-                        if stopped():
-                            status = "interrupted"
-                            break
-                except InputError as fault:
-                    status, error = "failed", str(fault)
-                write(receiver.close())
-            # Kernels are compiled once on a machine, which says nothing of the receiver's speed.
-            elapsed_s = time.perf_counter() - began - sum(compiled_s)
-            read = source.counts["events"]
-            duration_s = (last_us - first_us) * 1e-6 if first_us is not None and last_us is not None else 0.0
-            summary = writer.finish(
-                status,
-                recording={
-                    "path": url,
-                    "format": source.format,
-                    "bytes": source.size_bytes,
-                    "width": source.width,
-                    "height": source.height,
-                    "first_us": first_us,
-                    "last_us": last_us,
-                    "duration_s": round(duration_s, 6),
-                    "events_per_s": round(read / duration_s) if duration_s else None,
-                    "counts": dict(source.counts),
-                },
-                processing={
-                    "elapsed_s": round(elapsed_s, 6),
-                    "compiled_s": round(sum(compiled_s), 6),
-                    "events_per_s": round(read / elapsed_s),
-                    "times_real_time": round(duration_s / elapsed_s, 3),
-                },
-                counts=receiver.counts,
-                losses={kind: asdict(loss) for kind, loss in source.losses.items()},
-                versions=registry.versions(),
-                error=error,
-                positions=positions.finish() if positions is not None else None,
-            )
-    if figures:
-        from evlcp_sdk.results.figures import save_figures
-
-        for probe in probes:
-            save_figures(probe, Path(url).name, folder)
-    for track in tracks:
-        from evlcp_sdk.results.figures import save_track
-
-        assert positions is not None
-        save_track(track, positions.bars_enu_m(), Path(url).name, folder / "track.png")
-    return summary
-
-
-def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
-    """Print what was found, what was lost, where the result is, and how fast it went."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    out = console()
-    recording, processing = summary["recording"], summary["processing"]
-    out.print(f"[bold]{escape(Path(recording['path']).name)}[/]: {summary['result']}")
-    if summary["transmitters"]:
-        table = Table(box=None, pad_edge=False, header_style="dim")
-        for name in ("transmitter", "frames", "quality", "clock", "distance"):
-            table.add_column(name, justify="right")
-        for t in summary["transmitters"]:
-            table.add_row(
-                str(t["transmitter"]),
-                f"{t['frames_found']} of {t['frames_expected']}",
-                _or_dash(t["quality"], "{:.2f}"),
-                _or_dash(t["clock_ppm"], "{:+.0f} ppm"),
-                _or_dash(t["distance_first_m"], "{:.2f}")
-                + " to "
-                + _or_dash(t["distance_last_m"], "{:.2f} m"),
-            )
-        out.print(table)
-    if text := _messages(summary["counts"]):
-        out.print(text)
-    if "positions" in summary:
-        out.print(_positions(summary["positions"]))
-    if speed:
-        out.print(
-            f"{recording['counts']['events'] / 1e6:.2f} Mev of {recording['duration_s']:.3f} s"
-            f" in {processing['elapsed_s']:.2f} s:"
-            f" {processing['events_per_s'] / 1e6:.1f} Mev/s, {processing['times_real_time']:.2f} x real time"
-        )
-        if processing["compiled_s"] > 1:
-            out.print(f"kernels compiled, once for all, in {processing['compiled_s']:.0f} s", style="dim")
-    for loss in summary["losses"].values():
-        out.print(
-            f"lost: {loss['count']} {loss['meaning']} (first at {loss['unit']} {loss['first']})",
-            style="yellow",
-        )
-    out.print(f"written: {escape(str(folder))}/frames.csv, packets.jsonl, summary.json", style="dim")
-
-
-def _positions(told: Mapping[str, Any]) -> str:
-    """How many positions there are, and why not more, in one line."""
-    text = f"{told['fixes']} position{'s' * (told['fixes'] != 1)}"
-    if told["fixes_verified"]:
-        text += f", {told['fixes_verified']} verified"
-    for kind, number in told["refused"].items():
-        text += f"; {number} refused: {kind}"
-    for how in told["sites_contradicted"].values():
-        text += f"; left out: {how}"
-    return text
-
-
-def _messages(counts: Mapping[str, int]) -> str:
-    """What was read of messages, in one line; empty where there was nothing to read."""
-    if not counts.get("blocks_decoded", 0) + counts.get("blocks_combined", 0):
-        return ""
-    number = counts["messages"]
-    text = f"{number} message{'s' * (number != 1)}"
-    trusts = {t: counts[f"beacons_{t}"] for t in ("verified", "unverified", "forged")}
-    if any(trusts.values()):
-        text += f"; beacons told {', '.join(f'{n} times {t}' for t, n in trusts.items() if n)}"
-    for key, lost in (
-        ("blocks_failed", "packets not readable"),
-        ("blocks_other_codebook", "packets of another codebook"),
-        ("blocks_malformed", "packets with no block of this format"),
-        ("parts_missing", "parts missing"),
-        ("messages_undecodable", "messages without meaning"),
-    ):
-        if counts[key]:
-            text += f"; {counts[key]} {lost}"
-    return text
-
-
-def _or_dash(value: float | None, form: str) -> str:
-    return "-" if value is None else form.format(value)
 
 
 def _jobs(recordings: Sequence[str], out: Path) -> list[Job]:
@@ -465,19 +262,6 @@ def _stem(url: str) -> str:
 
 
 @contextmanager
-def bytes_bar(name: str) -> Iterator[Advance]:
-    """A bar by bytes read, on a terminal only."""
-    from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
-
-    err = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task(name, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-@contextmanager
 def _recordings_bar(number: int) -> Iterator[Callable[[], None]]:
     """A bar by recordings, on a terminal only; none for 0."""
     from rich.console import Console
@@ -487,20 +271,3 @@ def _recordings_bar(number: int) -> Iterator[Callable[[], None]]:
     with Progress(console=err, transient=True, disable=not (number and err.is_terminal)) as bar:
         task = bar.add_task("recordings", total=number)
         yield lambda: bar.advance(task)
-
-
-@contextmanager
-def _stop_on_request() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C end the run after the piece in hand; a second one ends it at once."""
-    asked = False
-
-    def ask(_number: int, _frame: FrameType | None) -> None:
-        nonlocal asked
-        asked = True
-        signal.signal(signal.SIGINT, before)
-
-    before = signal.signal(signal.SIGINT, ask)
-    try:
-        yield lambda: asked
-    finally:
-        signal.signal(signal.SIGINT, before)

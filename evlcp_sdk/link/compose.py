@@ -1,13 +1,15 @@
 """Messages to the packets that a transmitter plays."""
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Kind, Message, split
+from evlcp_sdk.air.kinds import kind_named
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.resolve import Link, load_link
@@ -22,26 +24,28 @@ def compose(
     text: str | None = None,
     data: bytes | None = None,
     beacon: Beacon | BarSite | None = None,
+    other: Mapping[str, Any] | None = None,
     transmitter_id: int | None = None,
     sequence: int | None = None,
     repeat: int = 1,
 ) -> NDArray[np.int64]:
     """Put messages on packets: the symbols that a transmitter sends, int64 (packets, frames, clusters).
 
-    Several messages at once follow one another: beacon, text, data. Beacons are not signed here.
+    Several messages at once follow one another: beacon, text, data, others. Beacons are not signed here.
 
     Args:
         link: The configuration; None for all defaults.
         text: A text.
         data: Bytes.
         beacon: What a beacon says; of a bar's site, where it stands.
+        other: What messages of other installed kinds say, by the kind's name.
         transmitter_id: Who sends; None for the site's id, or 0.
         sequence: Number of the messages; None for the seconds since 1970, so that it rises.
         repeat: How many times in a row each packet is sent.
 
     Raises:
-        ConfigError: Nothing to send, a message that is too long or a number out of range, or packets of the
-            link that are too short for messages.
+        ConfigError: Nothing to send, a kind that is not installed, a message that is too long or a number out
+            of range, or packets of the link that are too short for messages.
 
     >>> compose(text="Tempo 30", transmitter_id=7).shape
     (1, 10, 16)
@@ -53,7 +57,7 @@ def compose(
         transmitter_id = beacon.transmitter_id if isinstance(beacon, BarSite) else 0
     if sequence is None:
         sequence = int(time.time())
-    payloads = []
+    payloads: list[tuple[int, bytes]] = []
     if beacon is not None:
         said = beacon_of_site(beacon) if isinstance(beacon, BarSite) else beacon
         payloads.append((Kind.BEACON, said.pack()))
@@ -61,6 +65,9 @@ def compose(
         payloads.append((Kind.TEXT, text.encode()))
     if data is not None:
         payloads.append((Kind.DATA, bytes(data)))
+    for name, value in (other or {}).items():
+        kind = kind_named(name, link.kinds)
+        payloads.append((kind.number, kind.pack(value)))
     if not payloads:
         raise ConfigError("nothing to send: give a text, data or a beacon")
     messages = [Message(kind, transmitter_id, sequence, payload) for kind, payload in payloads]

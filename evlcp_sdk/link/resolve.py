@@ -8,7 +8,7 @@ resolved table alone reproduces a result. See `docs/configuration.md`.
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, overload
 
@@ -16,9 +16,11 @@ from pydantic import ValidationError
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.errors import ConfigError, UnknownAlgorithmError
 from evlcp_sdk.link.blocks import BlockCoder, packet_bits
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
+from evlcp_sdk.plugin.records import message_kinds
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import (
     ROLES,
@@ -64,6 +66,7 @@ class Link:
         packet: Lengths of a packet's parts.
         table: The resolved configuration, every default written out; plain values as in TOML.
         digest: SHA-256 of table, codebook digest and revisions, 64 hex digits.
+        kinds: The kinds of messages that are understood, by number; those that are installed.
 
     Two links are equal when their digests are.
     """
@@ -80,6 +83,7 @@ class Link:
     packet: PacketFormat
     table: Mapping[str, Mapping[str, Any]]
     digest: str
+    kinds: Mapping[int, MessageKind] = field(default_factory=lambda: BUILT_IN_KINDS)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Link) and self.digest == other.digest
@@ -138,12 +142,14 @@ class Link:
         described = is_dataclass(algorithm) and not isinstance(algorithm, type)
         parameters = asdict(algorithm) if described else {}
         keys = {"id": id or type(algorithm).__name__} | json.loads(json.dumps(parameters, default=str))
-        return _assembled(parts, {**self.table, role: keys}, {**self.revisions, role: revision})
+        table, revisions = {**self.table, role: keys}, {**self.revisions, role: revision}
+        return _assembled(parts, table, revisions, self.kinds)
 
     def with_air(self, **changes: Any) -> "Link":
         """The same link with other values on air, e.g. `link.with_air(pilot_every=4)`."""
         air = replace(self.air, **changes)
-        return _assembled(self._parts() | {"air": air}, {**self.table, "air": asdict(air)}, self.revisions)
+        parts, table = self._parts() | {"air": air}, {**self.table, "air": asdict(air)}
+        return _assembled(parts, table, self.revisions, self.kinds)
 
     def block_coder(self) -> BlockCoder:
         """How packets carry blocks of messages.
@@ -274,11 +280,14 @@ def resolve(
     if faults:
         raise ConfigError("\n".join(str(f) for f in faults))
 
-    return _assembled(built, resolved, revisions)
+    return _assembled(built, resolved, revisions, message_kinds(registry))
 
 
 def _assembled(
-    parts: Mapping[str, Any], table: Mapping[str, Mapping[str, Any]], revisions: Mapping[str, int]
+    parts: Mapping[str, Any],
+    table: Mapping[str, Mapping[str, Any]],
+    revisions: Mapping[str, int],
+    kinds: Mapping[int, MessageKind],
 ) -> Link:
     """The link of checked parts, and the table that describes them."""
     bar, air = parts["bar"], parts["air"]
@@ -294,6 +303,7 @@ def _assembled(
         packet=PacketFormat.of(codebook, air.frames_per_packet, air.chip_rate_hz, air.pilot_every),
         table=table,
         digest=_digest(table, codebook, revisions),
+        kinds=kinds,
     )
 
 

@@ -2,5 +2,6 @@
 
 `positioner` joins the others: `whereabouts` (which bar stands where), `points` (a bar at a time between its
 frames) and `pose`, which fits: `observations` (misses and slopes), `starts`, `fit`, `judgement`, `refusals`.
-Beside it: `trajectory` (filter and smoother of fixes), `calibration` (of a camera, from known `poses`).
+`navigator` joins it with `trajectory` (filter and smoother of fixes); beside them: `calibration` (of a
+camera, from known `poses`).
 """

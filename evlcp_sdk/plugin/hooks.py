@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import pluggy
 
+from evlcp_sdk.air.kinds import MessageKind
+
 if TYPE_CHECKING:
     import typer
 
     from evlcp_sdk.io import EventSource
 
-__all__ = ["ENTRY_POINT_GROUP", "Algorithm", "hookimpl", "hookspec"]
+__all__ = ["ENTRY_POINT_GROUP", "Algorithm", "SinkRecord", "hookimpl", "hookspec"]
 
 ENTRY_POINT_GROUP = "evlcp"
 """Entry-point group, and pluggy project name."""
@@ -43,9 +45,44 @@ class Algorithm:
     summary: str
 
 
+@dataclass(frozen=True)
+class SinkRecord:
+    """Where one output format is found, without importing it.
+
+    Attributes:
+        name: The name by which `evlcp receive --sink` asks for it.
+        target: `module:Class` of its sink, a class derived from `results.sink.Sink`.
+        files: Names of the files that it may leave in the result's folder.
+        summary: One line for help and messages.
+        default: It is written without being asked for.
+        positions: It is written only where positions are computed.
+        packages: Modules that must be installed for it.
+        extra: What `pip install` brings them.
+    """
+
+    name: str
+    target: str
+    files: tuple[str, ...]
+    summary: str
+    default: bool = False
+    positions: bool = False
+    packages: tuple[str, ...] = ()
+    extra: str = ""
+
+
 @hookspec
 def evlcp_algorithms() -> Iterable[Algorithm]:  # type: ignore[empty-body]
     """Yield a record for each algorithm the package brings; import no kernel here."""
+
+
+@hookspec
+def evlcp_sinks() -> Iterable[SinkRecord]:  # type: ignore[empty-body]
+    """Yield a record for each output format the package brings; import no format's library here."""
+
+
+@hookspec
+def evlcp_message_kinds() -> Iterable[MessageKind]:  # type: ignore[empty-body]
+    """Yield each kind of message that the package brings; import nothing heavy for it."""
 
 
 @hookspec(firstresult=True)

@@ -10,6 +10,7 @@ import multiprocessing
 import platform
 import warnings
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import Distribution, EntryPoint, entry_points, version
 from typing import Any
@@ -127,6 +128,27 @@ class Registry:
                 continue
             answers.append((impl.plugin_name, answer))
         return answers
+
+    @contextmanager
+    def joined(self, *plugins: object) -> Iterator[None]:
+        """Have objects with hooks join for a while, e.g. a run's sinks that watch the receiver.
+
+        Raises:
+            PluginError: One has a hook that the SDK does not have.
+        """
+        names: list[str] = []
+        try:
+            for plugin in plugins:
+                name = f"{type(plugin).__name__}-{id(plugin):x}"
+                if (fault := self._join(plugin, name, None)) is not None:
+                    raise PluginError(f"plugin {type(plugin).__name__}: {fault}")
+                names.append(name)
+            yield
+        finally:
+            for name in names:
+                self._owners.pop(name, None)
+                if self._manager.has_plugin(name):
+                    self._manager.unregister(name=name)
 
     def leave_out(self, plugin: str, reason: str) -> None:
         """Leave out a plugin whose answer to a hook cannot be used.

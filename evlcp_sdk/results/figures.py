@@ -1,14 +1,13 @@
 """Figures of one recording: where the regions were, which pixels show which cluster, distance over time.
 
 A `FigureProbe` listens to the receiver's stages and keeps a bounded share of what it hears, so that the
-figures of a recording of any length take constant memory; `save_figures` draws them.
+figures of a recording of any length take constant memory; `Figures` draws them in the end.
 """
 
 import colorsys
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -17,22 +16,22 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Ellipse, Rectangle
 from numpy.typing import NDArray
 
-from evlcp_sdk.files import whole_file
-from evlcp_sdk.place.trajectory import TrajectoryPoint
+from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import Events, Fix, Frame, PresenceMap, Region
+from evlcp_sdk.values import Events, Frame, PresenceMap, Region
 
 __all__ = [
     "FigureProbe",
+    "Figures",
     "Thinned",
     "TrackProbe",
     "draw_distance",
     "draw_presence",
     "draw_regions",
     "draw_track",
-    "save_figures",
-    "save_track",
 ]
 
 TRANSMITTER_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -128,68 +127,67 @@ class FigureProbe:
                 self.clearest[value.transmitter] = _Shown(value, self._presence)
 
 
-def save_figures(probe: FigureProbe, title: str, folder: Path) -> list[Path]:
-    """Draw what the probe has seen into `regions.png`, `presence.png` and `distance.png`.
+class Figures(Sink):
+    """Draws `regions.png`, `presence.png`, `distance.png`, and with positions `track.png`.
 
-    Args:
-        probe: Has watched a receiver to its end.
-        title: What the figures are of, e.g. the recording's name.
-        folder: Where they go; a figure without anything to show is left out.
-
-    Returns:
-        The files written.
-
-    Raises:
-        EvlcpError: A file cannot be written.
+    A figure without anything to show is left out.
     """
-    written = []
-    drawn: list[tuple[str, Figure]] = [("regions.png", draw_regions(probe, title))]
-    if probe.clearest:
-        drawn.append(("presence.png", draw_presence(probe, title)))
-    if probe.frames:
-        drawn.append(("distance.png", draw_distance(probe, title)))
-    for name, figure in drawn:
-        _save(figure, folder / name)
-        written.append(folder / name)
-    return written
 
+    def __init__(self, folder: ResultFolder, run: Run) -> None:
+        super().__init__(folder, run)
+        self.probe = FigureProbe(run.link.camera)
+        self.track = TrackProbe()
 
-def _save(figure: Figure, path: Path) -> None:
-    with whole_file(path) as part:
-        figure.savefig(part, format="png", dpi=_DPI)
+    def events(self, events: Events) -> None:
+        """Add events to the accumulated image."""
+        self.probe.watch(events)
+
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str, value: Any) -> None:
+        """Keep regions, presence maps and frames."""
+        self.probe.evlcp_stage_finished(stage, value)
+
+    def settle(self, settled: Sequence[Settled]) -> None:
+        """Keep places."""
+        for one in settled:
+            self.track.add(one)
+
+    def finish(self) -> Mapping[str, Any]:
+        """Draw."""
+        probe, name = self.probe, self.run.name
+        self._save(draw_regions(probe, name), "regions.png")
+        if probe.clearest:
+            self._save(draw_presence(probe, name), "presence.png")
+        if probe.frames:
+            self._save(draw_distance(probe, name), "distance.png")
+        if self.run.navigator is not None:
+            self._save(draw_track(self.track, self.run.navigator.bars_enu_m(), name), "track.png")
+        return {}
+
+    def _save(self, figure: Figure, name: str) -> None:
+        figure.savefig(self.folder.path(name), format="png", dpi=_DPI)
 
 
 class TrackProbe:
-    """Watches a `PositionWriter` for the figure of the track.
+    """Keeps a bounded share of a trajectory for its figure.
 
     Args:
         points: How many points to keep.
     """
 
     def __init__(self, points: int = 4096) -> None:
-        self.points: Thinned[tuple[Fix, TrajectoryPoint, TrajectoryPoint]] = Thinned(points)
+        self.points: Thinned[Settled] = Thinned(points)
 
-    def add(self, fix: Fix, filtered: TrajectoryPoint, smoothed: TrajectoryPoint) -> None:
-        """Take a fix with its points of the track."""
-        self.points.add((fix, filtered, smoothed))
-
-
-def save_track(
-    probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]], title: str, path: Path
-) -> None:
-    """Draw the track into a file.
-
-    Raises:
-        EvlcpError: The file cannot be written.
-    """
-    _save(draw_track(probe, bars_enu_m, title), path)
+    def add(self, settled: Settled) -> None:
+        """Take the next fix with its places."""
+        self.points.add(settled)
 
 
 def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]], title: str) -> Figure:
     """A map of fixes with their 95 % ellipses, the track and the bars; height and sigma over time.
 
     Args:
-        probe: Has watched a `PositionWriter` to its end.
+        probe: Has the whole trajectory.
         bars_enu_m: Centre of each bar in the local frame, m, float64 (3,), by transmitter.
         title: What the figure is of.
     """
@@ -205,13 +203,13 @@ def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]],
             f"bar {number}", (enu[0], enu[1]), xytext=(6, 4), textcoords="offset points", fontsize=9
         )
     if points:
-        fixed = np.array([fix.enu_m for fix, _, _ in points])
-        live = np.array([filtered.mean for _, filtered, _ in points])
-        smooth = np.array([smoothed.mean for _, _, smoothed in points])
-        t_s = np.array([fix.t_us for fix, _, _ in points]) * 1e-6
+        fixed = np.array([point.fix.enu_m for point in points])
+        live = np.array([point.filtered.enu_m for point in points])
+        smooth = np.array([point.smoothed.enu_m for point in points])
+        t_s = np.array([point.fix.t_us for point in points]) * 1e-6
         for axis in (plan, close):
-            for fix, _, _ in points[:: max(1, len(points) // _MOST_ELLIPSES)]:
-                axis.add_patch(_ellipse(fix.enu_m[:2], fix.covariance_m2[:2, :2]))
+            for point in points[:: max(1, len(points) // _MOST_ELLIPSES)]:
+                axis.add_patch(_ellipse(point.fix.enu_m[:2], point.fix.covariance_m2[:2, :2]))
             axis.plot(fixed[:, 0], fixed[:, 1], ".", ms=4, color=_INK, label="fix, with 95 % ellipse")
         for way, colour, label in ((live, "#56b4e9", "filtered"), (smooth, "#d55e00", "smoothed")):
             for axis in (plan, close):
@@ -219,7 +217,7 @@ def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]],
             height.plot(t_s, way[:, 2], "-", lw=1.4, color=colour)
         height.plot(t_s, fixed[:, 2], ".", ms=3, color=_INK)
         for i, name in enumerate(("east", "north", "up")):
-            sigma = [math.sqrt(fix.covariance_m2[i, i]) for fix, _, _ in points]
+            sigma = [math.sqrt(point.fix.covariance_m2[i, i]) for point in points]
             spread.plot(t_s, sigma, lw=1.2, color=TRANSMITTER_COLOURS[i], label=name)
         close.legend(frameon=False, fontsize=9)
         spread.legend(frameon=False, fontsize=9, ncols=3)

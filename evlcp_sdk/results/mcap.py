@@ -1,63 +1,49 @@
-"""Positions as MCAP with Foxglove's well-known schemas: `/fix`, `/pose`, `/track`."""
+"""`fixes.mcap`: positions as MCAP with Foxglove's well-known schemas: `/fix`, `/pose`, `/track`."""
 
-from importlib.util import find_spec
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.place.navigator import Place
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.values import Fix
 
-__all__ = ["McapFixes", "check_mcap"]
+__all__ = ["Mcap"]
 
 FRAME_ID = "enu"
 """Name of the local frame; camera axes in it are x right, y down, z forward."""
 
 
-def check_mcap() -> None:
-    """See whether the packages are there.
-
-    Raises:
-        ConfigError: They are not.
-    """
-    if any(find_spec(name) is None for name in ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf")):
-        raise ConfigError("MCAP needs the extra: pip install 'evlcp-sdk[mcap]', or leave --mcap out")
-
-
-class McapFixes:
-    """Writes fixes and a filtered track, message by message.
+class Mcap(Sink):
+    """Writes `fixes.mcap`, message by message.
 
     `/fix` (foxglove.LocationFix) and `/pose` (foxglove.PoseInFrame, camera axes in ENU) hold each fix as it
     was measured; `/track` (foxglove.LocationFix) the filtered position at its time.
-
-    Args:
-        path: The file.
-        zero_us: Unix time of the camera clock's 0, us.
     """
 
-    def __init__(self, path: Path, zero_us: int) -> None:
+    def __init__(self, folder: ResultFolder, run: Run) -> None:
         from mcap_protobuf.writer import Writer
 
-        self._file = path.open("wb")
-        self._writer: Any = Writer(self._file)
-        self._zero_us = zero_us
+        super().__init__(folder, run)
+        zero = run.plan.clock_zero if run.plan is not None else None
+        self._zero_us = round(zero.timestamp() * 1e6) if zero is not None else 0
+        self._writer: Any = Writer(folder.open_binary("fixes.mcap"))
 
-    def add(
-        self,
-        fix: Fix,
-        place: tuple[float, float, float],
-        covariance_m2: NDArray[np.float64],
-    ) -> None:
-        """Take a fix that is given, and the filtered place at its time with its covariance."""
+    def fix(self, fix: Fix, filtered: Place | None) -> None:
+        """Write a fix that is given, and the filtered place at its time."""
         from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
         from scipy.spatial.transform import Rotation
 
+        if filtered is None:
+            return
         measured = (fix.latitude_deg, fix.longitude_deg, fix.height_m)
+        place = (filtered.latitude_deg, filtered.longitude_deg, filtered.height_m)
         self._location("/fix", fix.t_us, measured, fix.covariance_m2)
-        self._location("/track", fix.t_us, place, covariance_m2)
+        self._location("/track", fix.t_us, place, filtered.covariance_m2)
         axes = Attitude(fix.pitch_deg, fix.roll_deg, fix.heading_deg).rotation()
         turn = Rotation.from_matrix(axes).as_quat()
         pose = PoseInFrame(frame_id=FRAME_ID)
@@ -66,6 +52,11 @@ class McapFixes:
         where.x, where.y, where.z = fix.enu_m.tolist()
         how.x, how.y, how.z, how.w = turn.tolist()
         self._write("/pose", fix.t_us, pose)
+
+    def finish(self) -> Mapping[str, Any]:
+        """Write the file's index."""
+        self._writer.finish()
+        return {}
 
     def _location(
         self, topic: str, t_us: float, place: tuple[float, float, float], covariance_m2: NDArray[np.float64]
@@ -90,9 +81,3 @@ class McapFixes:
 
     def _at_ns(self, t_us: float) -> int:
         return self._zero_us * 1000 + round(t_us * 1000)
-
-    def close(self) -> None:
-        """Write the file's index and end it."""
-        if not self._file.closed:
-            self._writer.finish()
-            self._file.close()

@@ -1,4 +1,4 @@
-"""NMEA-0183 sentences of a fix: GGA and RMC.
+"""`fixes.nmea`: NMEA-0183 sentences of a fix, GGA and RMC.
 
 Talker `IN`, integrated navigation; quality 6 and mode E, estimated, as nothing here is a satellite's. The
 altitude is that above the WGS-84 ellipsoid; the geoid's height is not known and left empty. The number of
@@ -9,9 +9,37 @@ import math
 from datetime import UTC, datetime, timedelta
 from functools import reduce
 
-__all__ = ["checksum", "gga", "rmc"]
+from evlcp_sdk.place.navigator import Place
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.sink import Run, Sink
+from evlcp_sdk.results.text import sigmas
+from evlcp_sdk.values import Fix
+
+__all__ = ["Nmea", "checksum", "gga", "rmc"]
 
 _KNOTS_PER_M_S = 3600 / 1852
+
+
+class Nmea(Sink):
+    """Writes `fixes.nmea`: place, speed and course are the filter's."""
+
+    def __init__(self, folder: ResultFolder, run: Run) -> None:
+        super().__init__(folder, run)
+        self._file = folder.open("fixes.nmea")
+        self._zero = run.plan.clock_zero if run.plan is not None else None
+
+    def fix(self, fix: Fix, filtered: Place | None) -> None:
+        """Write two sentences; those of a refused fix have no place."""
+        zero = self._zero
+        if filtered is None:
+            self._file.write(gga(fix.t_us, zero, None, 0, 0.0) + rmc(fix.t_us, zero, None, None))
+            return
+        place = (filtered.latitude_deg, filtered.longitude_deg, filtered.height_m)
+        way = None if filtered.starts else (filtered.speed_m_s, filtered.course_deg)
+        east, north, _ = sigmas(filtered.covariance_m2)
+        bars = len(fix.transmitters)
+        self._file.write(gga(fix.t_us, zero, place, bars, math.hypot(east, north)))
+        self._file.write(rmc(fix.t_us, zero, place, way))
 
 
 def checksum(body: str) -> str:

@@ -5,7 +5,8 @@ from collections.abc import Iterable
 from typing import Any, Literal
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.results.outputs import FILTERED_COLUMNS, FRAME_COLUMNS
+from evlcp_sdk.results.frames_csv import FILTERED_COLUMNS, FRAME_COLUMNS
+from evlcp_sdk.results.text import symbol_list
 from evlcp_sdk.values import Frame, Packet, Range, arrow_table, pandas_frame
 
 __all__ = ["frames_table"]
@@ -14,8 +15,8 @@ __all__ = ["frames_table"]
 def frames_table(packets: Iterable[Packet], kind: Literal["pandas", "arrow"] = "pandas") -> Any:
     """The frames of packets as a table, a row a frame, with the columns of `frames.csv`, not rounded.
 
-    `symbols` holds lists; a distance that is not given is NaN in pandas, null in Arrow. The columns of the
-    filtered distance are there if any frame has one.
+    `symbols` holds lists, None for a symbol that is not given; a distance that is not given is NaN in pandas,
+    null in Arrow. The columns of the filtered distance are there if any frame has one.
 
     Args:
         packets: What a receiver gives; read to the end.
@@ -42,7 +43,7 @@ def frames_table(packets: Iterable[Packet], kind: Literal["pandas", "arrow"] = "
 def _value(frame: Frame, name: str) -> Any:
     match name:
         case "symbols":
-            return frame.soft.symbols.tolist()
+            return symbol_list(frame.soft.symbols)
         case "quality":
             return frame.soft.quality
         case "distance_m":

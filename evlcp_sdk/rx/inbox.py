@@ -1,7 +1,7 @@
 """Packets to messages: soft bits to blocks, blocks to messages, signatures to trust."""
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Self, TypeVar
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message
+from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.air.signing import TrustedKeys
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.blocks import BlockCoder
@@ -31,7 +32,7 @@ _MOST_MESSAGES = 8
 _MOST_VERIFIED = 4096
 """Transmitter ids whose last verified beacon is remembered; the one not heard for longest makes way."""
 
-_Key = tuple[int, Kind, int]
+_Key = tuple[int, int, int]
 _K = TypeVar("_K")
 _V = TypeVar("_V")
 
@@ -92,13 +93,17 @@ class MessageAssembler:
     Args:
         coder: How packets carry blocks.
         spec: The configuration.
+        kinds: The kinds of messages that are understood, by number; blocks of others count as malformed.
 
     Raises:
         ConfigError: A trusted key is not valid, or there are keys and the extra `sign` is not installed.
     """
 
-    def __init__(self, coder: BlockCoder, spec: MessageSpec) -> None:
+    def __init__(
+        self, coder: BlockCoder, spec: MessageSpec, kinds: Mapping[int, MessageKind] = BUILT_IN_KINDS
+    ) -> None:
         self._coder = coder
+        self._kinds = kinds
         self._spec = spec
         self._room = coder.block_bytes - HEADER_BYTES
         self._keys = TrustedKeys(spec.trusted_keys)
@@ -137,7 +142,7 @@ class MessageAssembler:
             coder = link.block_coder()
         except ConfigError:
             return None
-        return cls(coder, link.messages)
+        return cls(coder, link.messages, link.kinds)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -156,7 +161,7 @@ class MessageAssembler:
             return packet
         self._counts["blocks_decoded" if packets == 1 else "blocks_combined"] += 1
         try:
-            block = Block.unpack(content)
+            block = Block.unpack(content, self._kinds)
         except BlockError:
             self._counts["blocks_malformed"] += 1
             return packet
@@ -223,31 +228,32 @@ class MessageAssembler:
 
     def _hand_on(self, inbox: _Inbox, key: _Key, packet: Packet) -> list[ReceivedMessage]:
         """A complete message, if it is new or its trust has changed; a signature's is its beacon."""
-        transmitter_id, kind, sequence = key
-        if kind is Kind.SIGNATURE:
+        transmitter_id, number, sequence = key
+        if number == Kind.SIGNATURE:
             key = (transmitter_id, Kind.BEACON, sequence)
         parts = inbox.done.get(key)
         if parts is None:
             return []
         inbox.done.move_to_end(key)
         message = Message(key[1], transmitter_id, sequence, parts.payload())
-        beacon = None
-        verdict: tuple[Trust, str] = ("unverified", "not signed")
-        if message.kind is Kind.BEACON:
-            try:
-                beacon = Beacon.unpack(message.payload)
-            except BlockError:
-                return self._undecodable(parts)
-            verdict = self._judge(inbox, message, beacon)
-        elif message.kind is Kind.TEXT and message.text is None:
+        kind = self._kinds[message.kind]
+        try:
+            value = kind.unpack(message.payload)
+        except Exception:
+            # Whatever a lamp says, and whatever a plugin makes of it, the receiver goes on.
             return self._undecodable(parts)
+        beacon = value if message.kind == Kind.BEACON else None
+        verdict: tuple[Trust, str] = ("unverified", "not signed")
+        if beacon is not None:
+            verdict = self._judge(inbox, message, beacon)
         if verdict == parts.given:
             return []
         self._counts["messages"] += parts.given is None
         if beacon is not None and (parts.given is None or parts.given[0] != verdict[0]):
             self._counts[f"beacons_{verdict[0]}"] += 1
         parts.given = verdict
-        return [ReceivedMessage(packet.transmitter, packet.packet, packet.t_us, message, beacon, *verdict)]
+        where = (packet.transmitter, packet.packet, packet.t_us)
+        return [ReceivedMessage(*where, message, kind, value, *verdict)]
 
     def _undecodable(self, parts: _Parts) -> list[ReceivedMessage]:
         """Count a message whose bytes mean nothing, once."""

@@ -97,7 +97,7 @@ def message(
     summary: dict[str, Any] = {
         "messages": [
             {
-                "kind": m.kind.name.lower(),
+                "kind": m.kind_name,
                 "transmitter_id": m.transmitter_id,
                 "sequence": m.sequence,
                 "bytes": len(m.payload),

@@ -12,7 +12,8 @@ import pytest
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Kind, Message
-from evlcp_sdk.results.outputs import FILTERED_COLUMNS, FRAME_COLUMNS
+from evlcp_sdk.air.kinds import BeaconKind, DataKind, TextKind
+from evlcp_sdk.results.frames_csv import FILTERED_COLUMNS, FRAME_COLUMNS
 from evlcp_sdk.values import (
     Events,
     Fix,
@@ -45,7 +46,9 @@ def frame(number: int = 3, found: Range | None = None, filtered: Range | None = 
 
 
 def text_message(text: str) -> ReceivedMessage:
-    return ReceivedMessage(0, 1, 66e3, Message(Kind.TEXT, 7, 2, text.encode()), None, "unverified", "")
+    return ReceivedMessage(
+        0, 1, 66e3, Message(Kind.TEXT, 7, 2, text.encode()), TextKind(), text, "unverified", ""
+    )
 
 
 def packet(*messages: ReceivedMessage) -> Packet:
@@ -79,11 +82,22 @@ BEACON = Beacon(35.156, 136.965, 52.4, 0.0, 0.0, 0.96)
         (text_message("Tempo 30"), "ReceivedMessage('Tempo 30' from 7, unverified, 66.0 ms)"),
         (text_message("x" * 900), f"ReceivedMessage('{'x' * 60}...' from 7, unverified, 66.0 ms)"),
         (
-            ReceivedMessage(0, 1, 66e3, Message(Kind.DATA, 7, 2, bytes(60_000)), None, "unverified", ""),
+            ReceivedMessage(
+                0,
+                1,
+                66e3,
+                Message(Kind.DATA, 7, 2, bytes(60_000)),
+                DataKind(),
+                bytes(60_000),
+                "unverified",
+                "",
+            ),
             "ReceivedMessage(60000 bytes of data from 7, unverified, 66.0 ms)",
         ),
         (
-            ReceivedMessage(0, 1, 66e3, Message(Kind.BEACON, 7, 2, BEACON.pack()), BEACON, "verified", ""),
+            ReceivedMessage(
+                0, 1, 66e3, Message(Kind.BEACON, 7, 2, BEACON.pack()), BeaconKind(), BEACON, "verified", ""
+            ),
             "ReceivedMessage(beacon at 35.1560000, 136.9650000 deg, 52.40 m from 7, verified, 66.0 ms)",
         ),
         (Fix.refused(5e3, (0,), "one-bar", "a single bar"), "Fix(5.0 ms, refused: one-bar)"),

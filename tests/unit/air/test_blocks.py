@@ -58,7 +58,7 @@ def test_a_message_is_the_sum_of_its_blocks(
     [
         ({0: 0x22}, "format version 2, expected 1"),
         ({0: 0x00}, "format version 0"),
-        ({0: 0x1F}, "kind 15, expected 1 to 4"),
+        ({0: 0x1F}, "kind 15, expected one of 1, 2, 3, 4"),
         ({0: 0x10}, "kind 0"),
         ({9: 1}, "part 1 of a message of 2 bytes, 7 in a part"),
         ({11: 0}, "part 0 of a message of 0 bytes"),

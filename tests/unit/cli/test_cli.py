@@ -16,10 +16,10 @@ import pytest
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource, open_source, write_events
-from evlcp_sdk.results.outputs import FIGURE_NAMES
 from evlcp_sdk.values import Events, Triggers
 
 Evlcp = Callable[..., Any]
+FIGURE_NAMES = ("regions.png", "presence.png", "distance.png")
 FILES = {"frames.csv", "packets.jsonl", "summary.json"}
 
 

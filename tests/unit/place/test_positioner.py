@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Kind, Message
+from evlcp_sdk.air.kinds import BeaconKind
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import PositionSpec
@@ -156,7 +157,8 @@ def heard(bar: BarSite, trust: Trust, packet: int) -> ReceivedMessage:
         bar.latitude_deg, bar.longitude_deg, bar.height_m, bar.heading_deg, bar.tilt_deg, bar.length_m
     )
     message = Message(Kind.BEACON, bar.transmitter_id, packet, beacon.pack())
-    return ReceivedMessage(0, packet, 0.0, message, beacon, trust, "" if trust == "verified" else "why")
+    why = "" if trust == "verified" else "why"
+    return ReceivedMessage(0, packet, 0.0, message, BeaconKind(), beacon, trust, why)
 
 
 def test_beacons_tell_who_and_where() -> None:

@@ -7,15 +7,18 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.results.figures import (
     FigureProbe,
+    Figures,
     Thinned,
     cluster_colours,
     draw_distance,
     draw_presence,
     draw_regions,
-    save_figures,
 )
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.sink import Run
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Frame, PresenceMap, Range, Region, SoftSymbols
 
@@ -70,10 +73,13 @@ def test_the_clearest_frame_is_shown() -> None:
 
 @pytest.mark.parametrize("transmitters", [0, 1, 2, 7])
 def test_any_number_of_transmitters(transmitters: int, tmp_path: Path) -> None:
-    probe = told(FigureProbe(CameraModel()), transmitters, 5)
-    written = save_figures(probe, "a.raw", tmp_path)
-    names = ["regions.png", "presence.png", "distance.png"][: 3 if transmitters else 1]
-    assert [path.name for path in written] == names
+    names = ["regions.png", "presence.png", "distance.png"]
+    with ResultFolder(tmp_path, names) as folder:
+        sink = Figures(folder, Run("a.raw", load_link()))
+        told(sink.probe, transmitters, 5)
+        sink.finish()
+        folder.finish()
+    names = names[: 3 if transmitters else 1]
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
 
 

@@ -18,10 +18,13 @@ from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat, symbols_of_bits
+from evlcp_sdk.air.kinds import BUILT_IN_KINDS
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
-from evlcp_sdk.results.outputs import FIGURE_NAMES, FRAME_COLUMNS, ResultWriter, TransmitterTally
+from evlcp_sdk.results.frames_csv import FRAME_COLUMNS
+from evlcp_sdk.results.tallies import TransmitterTally
+from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Frame, Packet, Range, ReceivedMessage, SoftSymbols
@@ -71,7 +74,6 @@ def finish(writer: ResultWriter, **kw: Any) -> dict[str, Any]:
         "processing": {"elapsed_s": 1.0},
         "counts": {"events": 3},
         "losses": {"odd_byte": {"count": 1, "first": 7}},
-        "versions": {"evlcp-sdk": "0"},
     }
     return writer.finish(**(given | kw))
 
@@ -134,14 +136,16 @@ def test_a_message_is_a_line_after_its_packet(tmp_path: Path) -> None:
     beacon = Beacon(35.1, 136.9, 52.0, 90.0, 1.0, 0.96, b"\x01\x02")
 
     def received(kind: Kind, payload: bytes, **more: Any) -> ReceivedMessage:
-        given = {"beacon": None, "trust": "unverified", "reason": "not signed"} | more
-        return ReceivedMessage(1, 4, 12.3456, Message(kind, 7, 9, payload), **given)
+        meaning = BUILT_IN_KINDS[kind]
+        given = {"trust": "unverified", "reason": "not signed"} | more
+        value = meaning.unpack(payload)
+        return ReceivedMessage(1, 4, 12.3456, Message(kind, 7, 9, payload), meaning, value, **given)
 
     messages = (
         received(Kind.TEXT, "Tempo 30 für \n 2 km".encode()),
         received(Kind.DATA, b"\x00\xff"),
-        received(Kind.BEACON, beacon.pack(), beacon=beacon, trust="verified", reason=""),
-        received(Kind.BEACON, beacon.pack(), beacon=beacon, trust="forged", reason="replayed"),
+        received(Kind.BEACON, beacon.pack(), trust="verified", reason=""),
+        received(Kind.BEACON, beacon.pack(), trust="forged", reason="replayed"),
     )
     with ResultWriter(tmp_path, LINK) as writer:
         writer.write([replace(packet(4, (frame(4, 0),)), messages=messages), packet(5, ())])
@@ -165,6 +169,33 @@ def test_packets_too_short_for_messages_are_said(tmp_path: Path) -> None:
         assert "expected at least 18" in finish(writer)["messages_off"]
 
 
+def test_a_symbol_that_is_not_given_is_a_dash_and_null(tmp_path: Path) -> None:
+    one = frame(0, 0)
+    symbols = one.soft.symbols.copy()
+    symbols[[0, 5]] = -1
+    hidden = replace(one, soft=replace(one.soft, symbols=symbols))
+    with ResultWriter(tmp_path, LINK) as writer:
+        writer.write([packet(0, (hidden,))])
+        finish(writer)
+    (row,) = rows_of(tmp_path)
+    assert row["symbols"] == "- 1 2 3 4 - 6 7 8 9 10 11 12 13 14 15"
+    (line,) = [json.loads(text) for text in (tmp_path / "packets.jsonl").read_text().splitlines()]
+    assert line["symbols"][0] == [None, 1, 2, 3, 4, None, *range(6, 16)]
+    assert line["bits"][:24] == "????" + "0001" + "0010" + "0011" + "0100" + "????"
+    assert line["bits"][24:64] == "".join(f"{symbol:04b}" for symbol in range(6, 16))
+
+
+def test_parquet_has_null_for_a_symbol_that_is_not_given(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
+    one = frame(0, 0)
+    hidden = replace(one, soft=replace(one.soft, symbols=np.where(np.arange(16) == 3, -1, 7)))
+    with ResultWriter(tmp_path, LINK, sinks=["parquet"]) as writer:
+        writer.write([packet(0, (hidden,))])
+        finish(writer)
+    (row,) = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
+    assert row["symbols"] == [7, 7, 7, None, *[7] * 12]
+
+
 def test_no_transmitter_is_said_plainly(tmp_path: Path) -> None:
     with ResultWriter(tmp_path, LINK) as writer:
         table = finish(writer)
@@ -175,7 +206,7 @@ def test_no_transmitter_is_said_plainly(tmp_path: Path) -> None:
 
 
 def test_a_new_result_replaces_all_of_the_old_one_and_only_at_the_end(tmp_path: Path) -> None:
-    for name in (*FIGURE_NAMES, "frames.parquet", "frames.csv", "notes.txt"):
+    for name in ("regions.png", "track.png", "frames.parquet", "frames.csv", "notes.txt"):
         (tmp_path / name).write_text("old")
     with ResultWriter(tmp_path, LINK) as writer:
         writer.write([packet(0, (frame(0, 0),))])
@@ -233,15 +264,15 @@ def test_a_full_disk_is_told_and_leaves_the_old_result(tmp_path: Path, packets: 
 
 
 def test_parquet_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("evlcp_sdk.results.outputs.find_spec", lambda name: None)
+    monkeypatch.setattr("evlcp_sdk.plugin.records.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match="needs the extra: pip install"):
-        ResultWriter(tmp_path / "out", LINK, parquet=True)
+        ResultWriter(tmp_path / "out", LINK, sinks=["parquet"])
     assert not (tmp_path / "out").exists()
 
 
 def test_parquet_holds_the_same_frames(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
-    with ResultWriter(tmp_path, LINK, parquet=True) as writer:
+    with ResultWriter(tmp_path, LINK, sinks=["parquet"]) as writer:
         writer.write([packet(0, (frame(0, 0), frame(0, 1, math.nan)))])
         finish(writer)
     table = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
@@ -273,7 +304,7 @@ def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path, parquet: boo
     if parquet:
         pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
     link = load_link(overrides=["tracking.id=kalman"])
-    with ResultWriter(tmp_path, link, parquet=parquet) as writer:
+    with ResultWriter(tmp_path, link, sinks=["parquet"] * parquet) as writer:
         writer.write([packet(0, (frame(0, 0), frame(0, 1, math.nan)))])
         finish(writer)
     with (tmp_path / "frames.csv").open() as file:

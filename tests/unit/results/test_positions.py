@@ -4,22 +4,25 @@ import csv
 import dataclasses
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pynmea2
 import pytest
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import hidden_path
 from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.place import navigator
+from evlcp_sdk.place.navigator import Navigator, PositionPlan
 from evlcp_sdk.place.observations import project_bars
-from evlcp_sdk.results import positions
-from evlcp_sdk.results.figures import TrackProbe, draw_track, save_track
-from evlcp_sdk.results.outputs import ResultWriter, hidden_path
-from evlcp_sdk.results.positions import PositionPlan, PositionWriter
+from evlcp_sdk.results.figures import TrackProbe, draw_track
+from evlcp_sdk.results.geojson import cut
+from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite, LocalFrame
 from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
@@ -52,12 +55,11 @@ def packets(count: int, seed: int = 1, transmitter: int = 0) -> list[Packet]:
 
 
 def write(
-    folder: Path, stream: Iterable[Packet], plan: PositionPlan, probes: tuple[TrackProbe, ...] = ()
-) -> dict[str, object]:
-    with ResultWriter(folder, LINK) as results, PositionWriter(folder, LINK, plan, probes) as positions:
-        positions.write(stream)
-        told = positions.finish()
-        results.finish("complete", {}, {}, {}, {}, {}, positions=told)
+    folder: Path, stream: Iterable[Packet], plan: PositionPlan, sinks: Sequence[str] = ()
+) -> dict[str, Any]:
+    with ResultWriter(folder, LINK, plan=plan, sinks=sinks) as results:
+        results.write(stream)
+        told: dict[str, Any] = results.finish("complete", {}, {}, {}, {})["positions"]
     return told
 
 
@@ -67,8 +69,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 def test_files_of_a_drive(tmp_path: Path) -> None:
-    probe = TrackProbe()
-    told = write(tmp_path, packets(13), PositionPlan((SITE,), ATTITUDE, ZERO), probes=(probe,))
+    told = write(tmp_path, packets(13), PositionPlan((SITE,), ATTITUDE, ZERO), ["figures"])
     fixes = rows(tmp_path / "fixes.csv")
     assert told["fixes"] == len(fixes) == 12
     assert told["bars"] == {"0": 7}
@@ -97,12 +98,18 @@ def test_files_of_a_drive(tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["positions"] == json.loads(json.dumps(told))
     assert not list(tmp_path.glob(".*"))
-    bars = {0: np.zeros(3)}
-    save_track(probe, bars, "a drive", tmp_path / "track.png")
     assert (tmp_path / "track.png").read_bytes().startswith(b"\x89PNG")
-    (ellipse, *_) = draw_track(probe, bars, "").axes[0].patches
+
+
+def test_the_figure_of_a_track(tmp_path: Path) -> None:
+    probe = TrackProbe()
+    way = Navigator(LINK, PositionPlan((SITE,), ATTITUDE))
+    way.feed(packets(13))
+    for settled in way.close()[1]:
+        probe.add(settled)
+    (ellipse, *_) = draw_track(probe, way.bars_enu_m(), "").axes[0].patches
     # 95 % of a normal distribution of the plane lies within 2.4477 sigma.
-    fix = next(iter(probe.points))[0]
+    fix = next(iter(probe.points)).fix
     values = np.linalg.eigvalsh(fix.covariance_m2[:2, :2])
     want = (2 * 2.44775 * np.sqrt(values)).tolist()
     assert sorted((ellipse.width, ellipse.height)) == pytest.approx(want, rel=1e-4)
@@ -115,14 +122,14 @@ def test_a_track_across_the_180th_meridian_is_cut(tmp_path: Path) -> None:
     shapes = json.loads((tmp_path / "fixes.geojson").read_text())["features"]
     (line,) = (s["geometry"]["coordinates"] for s in shapes if s["geometry"]["type"] == "LineString")
     assert all(-180 <= point[0] < -179.9999 for point in line)
-    assert positions._cut([]) == [[]]
+    assert cut([]) == [[]]
     for sign in (1.0, -1.0):
         way = [
             [sign * (180 - 1e-5), 35.0, 1.0],
             [sign * (-180 + 2e-5), 35.3, 4.0],
             [sign * (-180 + 3e-5), 35.4, 5.0],
         ]
-        one, two = positions._cut(way)
+        one, two = cut(way)
         assert one == [way[0], pytest.approx([sign * 180, 35.1, 2.0])]
         assert two == [pytest.approx([sign * -180, 35.1, 2.0]), way[1], way[2]]
 
@@ -144,7 +151,7 @@ def test_refused_fixes_are_listed_and_counted(tmp_path: Path) -> None:
 def test_a_long_track_is_smoothed_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan, stream = PositionPlan((SITE,), ATTITUDE), packets(60)
     write(tmp_path / "whole", stream, plan)
-    monkeypatch.setattr(positions, "_BLOCK", 16)
+    monkeypatch.setattr(navigator, "_BLOCK", 16)
     write(tmp_path / "blocks", stream, plan)
     whole, blocks = (rows(tmp_path / name / "track.csv") for name in ("whole", "blocks"))
     assert [r["t_us"] for r in whole] == [r["t_us"] for r in blocks]
@@ -161,14 +168,14 @@ def test_a_run_without_sites_drops_an_earlier_ones_positions(tmp_path: Path) -> 
     write(tmp_path, packets(3), PositionPlan((SITE,), ATTITUDE))
     assert (tmp_path / "fixes.csv").exists()
     with ResultWriter(tmp_path, LINK) as results:
-        results.finish("complete", {}, {}, {}, {}, {})
+        results.finish("complete", {}, {}, {}, {})
     assert {p.name for p in tmp_path.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
 
 
 def test_a_run_that_breaks_off_leaves_nothing(tmp_path: Path) -> None:
     plan = PositionPlan((SITE,), ATTITUDE)
-    with ResultWriter(tmp_path, LINK), PositionWriter(tmp_path, LINK, plan) as positions:
-        positions.write(packets(5))
+    with ResultWriter(tmp_path, LINK, plan=plan) as results:
+        results.write(packets(5))
         assert list(tmp_path.glob(".fixes.csv.*"))
     assert not list(tmp_path.iterdir())
 
@@ -178,7 +185,7 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
     from mcap_protobuf.decoder import DecoderFactory
     from scipy.spatial.transform import Rotation
 
-    write(tmp_path, packets(6), PositionPlan((SITE,), ATTITUDE, ZERO, mcap=True))
+    write(tmp_path, packets(6), PositionPlan((SITE,), ATTITUDE, ZERO), ["mcap"])
     fixes = rows(tmp_path / "fixes.csv")
     found: dict[str, list[tuple[str, int, object]]] = {}
     with (tmp_path / "fixes.mcap").open("rb") as file:
@@ -203,14 +210,16 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
 
 
 def test_mcap_without_the_extra_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("evlcp_sdk.results.mcap.find_spec", lambda _name: None)
-    with pytest.raises(ConfigError, match=r"evlcp-sdk\[mcap\]"):
-        PositionWriter(tmp_path, LINK, PositionPlan((SITE,), ATTITUDE, mcap=True))
+    monkeypatch.setattr("evlcp_sdk.plugin.records.find_spec", lambda _name: None)
+    with pytest.raises(ConfigError, match=r"sink 'mcap' of evlcp-sdk needs the extra: .*evlcp-sdk\[mcap\]"):
+        ResultWriter(tmp_path / "out", LINK, plan=PositionPlan((SITE,), ATTITUDE), sinks=["mcap"])
+    assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="cannot be written"):
-        PositionWriter(tmp_path / "none", LINK, PositionPlan((SITE,), ATTITUDE))
+def test_what_writes_positions_needs_them(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="sink 'mcap' needs --sites"):
+        ResultWriter(tmp_path / "out", LINK, sinks=["mcap"])
+    assert not (tmp_path / "out").exists()
 
 
 def test_beacons_that_are_not_believed_give_no_positions(tmp_path: Path) -> None:

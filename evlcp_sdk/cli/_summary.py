@@ -1,0 +1,89 @@
+"""How a summary is printed."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from evlcp_sdk.cli._common import console
+
+__all__ = ["show"]
+
+
+def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
+    """Print what was found, what was lost, where the result is, and how fast it went."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    out = console()
+    recording, processing = summary["recording"], summary["processing"]
+    out.print(f"[bold]{escape(Path(recording['path']).name)}[/]: {summary['result']}")
+    if summary["transmitters"]:
+        table = Table(box=None, pad_edge=False, header_style="dim")
+        for name in ("transmitter", "frames", "quality", "clock", "distance"):
+            table.add_column(name, justify="right")
+        for t in summary["transmitters"]:
+            table.add_row(
+                str(t["transmitter"]),
+                f"{t['frames_found']} of {t['frames_expected']}",
+                _or_dash(t["quality"], "{:.2f}"),
+                _or_dash(t["clock_ppm"], "{:+.0f} ppm"),
+                _or_dash(t["distance_first_m"], "{:.2f}")
+                + " to "
+                + _or_dash(t["distance_last_m"], "{:.2f} m"),
+            )
+        out.print(table)
+    if text := _messages(summary["counts"]):
+        out.print(text)
+    if "positions" in summary:
+        out.print(_positions(summary["positions"]))
+    if speed:
+        out.print(
+            f"{recording['counts']['events'] / 1e6:.2f} Mev of {recording['duration_s']:.3f} s"
+            f" in {processing['elapsed_s']:.2f} s:"
+            f" {processing['events_per_s'] / 1e6:.1f} Mev/s, {processing['times_real_time']:.2f} x real time"
+        )
+        if processing["compiled_s"] > 1:
+            out.print(f"kernels compiled, once for all, in {processing['compiled_s']:.0f} s", style="dim")
+    for loss in summary["losses"].values():
+        out.print(
+            f"lost: {loss['count']} {loss['meaning']} (first at {loss['unit']} {loss['first']})",
+            style="yellow",
+        )
+    out.print(f"written: {escape(str(folder))}/frames.csv, packets.jsonl, summary.json", style="dim")
+
+
+def _positions(told: Mapping[str, Any]) -> str:
+    """How many positions there are, and why not more, in one line."""
+    text = f"{told['fixes']} position{'s' * (told['fixes'] != 1)}"
+    if told["fixes_verified"]:
+        text += f", {told['fixes_verified']} verified"
+    for kind, number in told["refused"].items():
+        text += f"; {number} refused: {kind}"
+    for how in told["sites_contradicted"].values():
+        text += f"; left out: {how}"
+    return text
+
+
+def _messages(counts: Mapping[str, int]) -> str:
+    """What was read of messages, in one line; empty where there was nothing to read."""
+    if not counts.get("blocks_decoded", 0) + counts.get("blocks_combined", 0):
+        return ""
+    number = counts["messages"]
+    text = f"{number} message{'s' * (number != 1)}"
+    trusts = {t: counts[f"beacons_{t}"] for t in ("verified", "unverified", "forged")}
+    if any(trusts.values()):
+        text += f"; beacons told {', '.join(f'{n} times {t}' for t, n in trusts.items() if n)}"
+    for key, lost in (
+        ("blocks_failed", "packets not readable"),
+        ("blocks_other_codebook", "packets of another codebook"),
+        ("blocks_malformed", "packets with no block of this format"),
+        ("parts_missing", "parts missing"),
+        ("messages_undecodable", "messages without meaning"),
+    ):
+        if counts[key]:
+            text += f"; {counts[key]} {lost}"
+    return text
+
+
+def _or_dash(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)

@@ -1,0 +1,59 @@
+"""`fixes.csv`: a row a fix, given or refused."""
+
+import csv
+
+from evlcp_sdk.place.navigator import Place
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.sink import Run, Sink
+from evlcp_sdk.results.text import sigmas, text_or_empty
+from evlcp_sdk.values import Fix
+
+__all__ = ["FIX_COLUMNS", "FixesCsv"]
+
+FIX_COLUMNS = (
+    "t_us",
+    "latitude_deg",
+    "longitude_deg",
+    "height_m",
+    "sigma_east_m",
+    "sigma_north_m",
+    "sigma_up_m",
+    "heading_deg",
+    "heading_sigma_deg",
+    "pitch_deg",
+    "roll_deg",
+    "bars",
+    "verified",
+    "refusal",
+    "detail",
+)
+"""Columns of `fixes.csv`."""
+
+
+class FixesCsv(Sink):
+    """Writes `fixes.csv`."""
+
+    def __init__(self, folder: ResultFolder, run: Run) -> None:
+        super().__init__(folder, run)
+        self._rows = csv.writer(folder.open("fixes.csv"), lineterminator="\n")
+        self._rows.writerow(FIX_COLUMNS)
+
+    def fix(self, fix: Fix, filtered: Place | None) -> None:
+        """Write a row."""
+        self._rows.writerow(
+            [
+                f"{fix.t_us:.1f}",
+                text_or_empty(fix.latitude_deg, 10),
+                text_or_empty(fix.longitude_deg, 10),
+                text_or_empty(fix.height_m, 4),
+                *(text_or_empty(value, 4) for value in sigmas(fix.covariance_m2)),
+                text_or_empty(fix.heading_deg, 4),
+                text_or_empty(fix.heading_sigma_deg, 4),
+                text_or_empty(fix.pitch_deg, 4),
+                text_or_empty(fix.roll_deg, 4),
+                " ".join(map(str, fix.transmitters)),
+                str(int(fix.verified)),
+                fix.refusal,
+                fix.detail,
+            ]
+        )

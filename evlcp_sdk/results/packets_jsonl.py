@@ -1,0 +1,81 @@
+"""`packets.jsonl`: a line of JSON a packet, and one a message after the packet that completed it."""
+
+import json
+from typing import Any
+
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import bits_of_symbols
+from evlcp_sdk.errors import PluginError
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.sink import Run, Sink
+from evlcp_sdk.results.text import symbol_list
+from evlcp_sdk.values import Packet, ReceivedMessage
+
+__all__ = ["PacketsJsonl", "message_line", "packet_line"]
+
+
+class PacketsJsonl(Sink):
+    """Writes `packets.jsonl`."""
+
+    def __init__(self, folder: ResultFolder, run: Run) -> None:
+        super().__init__(folder, run)
+        self._file = folder.open("packets.jsonl")
+
+    def packet(self, packet: Packet) -> None:
+        """Write the packet's line, and those of its messages."""
+        self._file.write(json.dumps(packet_line(packet, self.run.link.codebook)) + "\n")
+        for message in packet.messages:
+            self._file.write(message_line(message) + "\n")
+
+
+def packet_line(packet: Packet, codebook: Codebook) -> dict[str, Any]:
+    """A packet's line, as JSON values; null and `?` for what was not received."""
+    symbols: list[list[int | None] | None] = [None] * packet.sent
+    bits = ["?" * (codebook.clusters * codebook.bits_per_symbol)] * packet.sent
+    for frame in packet.frames:
+        given = frame.soft.symbols >= 0
+        symbols[frame.frame] = symbol_list(frame.soft.symbols)
+        one = bits_of_symbols(frame.soft.symbols[None] * given, codebook.bits_per_symbol)
+        text = (one + ord("0")).reshape(len(given), -1)
+        text[~given] = ord("?")
+        bits[frame.frame] = text.tobytes().decode("ascii")
+    return {
+        "kind": "packet",
+        "transmitter": packet.transmitter,
+        "packet": packet.packet,
+        "t_us": round(packet.t_us, 2),
+        "chip_us": round(packet.chip_us, 6),
+        "frames_sent": packet.sent,
+        "frames_received": len(packet.frames),
+        "symbols": symbols,
+        "bits": "".join(bits),
+    }
+
+
+def message_line(received: ReceivedMessage) -> str:
+    """A message's line: what every message has, and then what its kind shows.
+
+    Raises:
+        PluginError: The kind fails, or shows a key that every message has.
+    """
+    message, kind = received.message, received.kind
+    line: dict[str, Any] = {
+        "kind": kind.name,
+        "transmitter": received.transmitter,
+        "packet": received.packet,
+        "t_us": round(received.t_us, 2),
+        "transmitter_id": message.transmitter_id,
+        "sequence": message.sequence,
+        "verified": received.trust == "verified",
+        "trust": received.trust,
+        "reason": received.reason,
+    }
+    who = f"message kind '{kind.name}'"
+    try:
+        shown = dict(kind.to_dict(received.value))
+        text = json.dumps(line | shown, ensure_ascii=False)
+    except Exception as fault:
+        raise PluginError(f"{who}: to_dict() fails: {type(fault).__name__}: {fault}") from fault
+    if twice := line.keys() & shown.keys():
+        raise PluginError(f"{who}: to_dict() shows '{min(twice)}', which every message has")
+    return text

@@ -1,0 +1,61 @@
+"""What every output format is to a run: a sink that takes packets and positions as they come."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan, Settled
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.values import Events, Fix, Packet
+
+__all__ = ["Run", "Sink"]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What a sink may know of the run that it writes down.
+
+    Attributes:
+        name: Name of the recording, for titles.
+        link: The configuration that the receiver runs with.
+        plan: What positions are computed from; None where none are computed.
+        navigator: Computes them; at the end it says where the bars stand. None where none are computed.
+    """
+
+    name: str
+    link: Link
+    plan: PositionPlan | None = None
+    navigator: Navigator | None = None
+
+
+class Sink:
+    """One output format: a derived class takes what it needs, and writes it as it comes, in constant memory.
+
+    A method that is not overridden does nothing. A sink that has a method of the hook `evlcp_stage_finished`,
+    marked with `@hookimpl`, watches the receiver's stages, too.
+
+    Args:
+        folder: Where its files are opened; they are moved into place together when the run ends.
+        run: What is written down.
+    """
+
+    def __init__(self, folder: ResultFolder, run: Run) -> None:
+        self.folder = folder
+        self.run = run
+
+    def events(self, events: Events) -> None:
+        """Take events as they are read, in pieces of any size."""
+
+    def packet(self, packet: Packet) -> None:
+        """Take the next packet, with its frames and messages."""
+
+    def fix(self, fix: Fix, filtered: Place | None) -> None:
+        """Take the next fix, given or refused, and the filtered place at its time; None for a refused one."""
+
+    def settle(self, settled: Sequence[Settled]) -> None:
+        """Take the next fixes that are smoothed: all that are given, in order of time, many at a time."""
+
+    def finish(self) -> Mapping[str, Any]:
+        """Write the rest; return what the summary shall say under `sinks`, as JSON values."""
+        return {}

@@ -1,0 +1,111 @@
+"""All sinks of one run as one, and whose fault it is when one of them fails."""
+
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from evlcp_sdk.errors import ConfigError, EvlcpError, PluginError
+from evlcp_sdk.place.navigator import Placed, Settled
+from evlcp_sdk.plugin.records import InstalledSink
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.sink import Run, Sink
+from evlcp_sdk.values import Events, Packet
+
+__all__ = ["Sinks", "load_sinks"]
+
+
+def load_sinks(chosen: Sequence[InstalledSink]) -> list[tuple[InstalledSink, type[Sink]]]:
+    """Import the classes of sinks.
+
+    Raises:
+        ConfigError: A package that one needs is not installed.
+        PluginError: One cannot be imported, or is no sink.
+    """
+    classes = []
+    for installed in chosen:
+        cls = installed.load_class()
+        if not issubclass(cls, Sink):
+            raise PluginError(f"{installed}: {installed.record.target} is no Sink")
+        classes.append((installed, cls))
+    return classes
+
+
+class Sinks:
+    """Hands on what a run finds to each of its sinks.
+
+    What a sink raises becomes a `PluginError` that names it, or an `EvlcpError` where the disk refuses.
+
+    Args:
+        classes: The sinks with their classes, in the order in which they are called.
+        folder: Where they write.
+        run: What is written down.
+
+    Raises:
+        ConfigError: A file cannot be opened.
+    """
+
+    def __init__(
+        self, classes: Sequence[tuple[InstalledSink, type[Sink]]], folder: ResultFolder, run: Run
+    ) -> None:
+        self._folder = folder
+        self._sinks: list[tuple[InstalledSink, Sink]] = []
+        for installed, cls in classes:
+            with self._blame(installed, ConfigError):
+                self._sinks.append((installed, cls(folder, run)))
+
+    @property
+    def all(self) -> tuple[Sink, ...]:
+        """The sinks themselves."""
+        return tuple(sink for _, sink in self._sinks)
+
+    def events(self, events: Events) -> None:
+        """Hand on events."""
+        for installed, sink in self._sinks:
+            with self._blame(installed):
+                sink.events(events)
+
+    def packet(self, packet: Packet) -> None:
+        """Hand on a packet."""
+        for installed, sink in self._sinks:
+            with self._blame(installed):
+                sink.packet(packet)
+
+    def placed(self, placed: Placed) -> None:
+        """Hand on a fix, and what it settles."""
+        for installed, sink in self._sinks:
+            with self._blame(installed):
+                sink.fix(placed.fix, placed.filtered)
+                if placed.settled:
+                    sink.settle(placed.settled)
+
+    def settle(self, settled: Sequence[Settled]) -> None:
+        """Hand on the last fixes that are settled."""
+        for installed, sink in self._sinks:
+            with self._blame(installed):
+                sink.settle(settled)
+
+    def finish(self) -> dict[str, Mapping[str, Any]]:
+        """End the sinks; return what they say, by name."""
+        said: dict[str, Mapping[str, Any]] = {}
+        for installed, sink in self._sinks:
+            with self._blame(installed):
+                if part := sink.finish():
+                    said[installed.record.name] = dict(part)
+        return said
+
+    @contextmanager
+    def _blame(self, installed: InstalledSink, refused: type[EvlcpError] = EvlcpError) -> Iterator[None]:
+        try:
+            yield
+        except EvlcpError:
+            raise
+        except OSError as fault:
+            why = fault.strerror or fault
+            raise refused(f"{self._folder.folder}: cannot be written: {why}") from fault
+        except Exception as fault:
+            last = traceback.extract_tb(fault.__traceback__)[-1]
+            what = f"{type(fault).__name__}: {fault}".splitlines()[0]
+            where = f"{Path(last.filename).name}, line {last.lineno}"
+            raise PluginError(f"{installed}: {what} ({where})") from fault

@@ -1,0 +1,87 @@
+"""`summary.json`: what a run found, from what, how fast, and what was lost."""
+
+import json
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from evlcp_sdk.errors import ConfigError, EvlcpError
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.results.folder import SUMMARY, ResultFolder
+from evlcp_sdk.results.tallies import Tally
+
+__all__ = ["Status", "summary_of", "write_summary"]
+
+Status = Literal["complete", "interrupted", "failed"]
+"""How a run ended: read to the end, stopped by the user, or stopped by input that cannot be read."""
+
+
+def summary_of(
+    status: Status,
+    link: Link,
+    tally: Tally,
+    *,
+    recording: Mapping[str, Any],
+    processing: Mapping[str, Any],
+    counts: Mapping[str, int],
+    losses: Mapping[str, Mapping[str, Any]],
+    versions: Mapping[str, str],
+    error: str | None = None,
+    positions: Mapping[str, Any] | None = None,
+    sinks: Mapping[str, Mapping[str, Any]] | None = None,
+) -> dict[str, Any]:
+    """The content of `summary.json`.
+
+    Args:
+        status: How the run ended.
+        link: The configuration that the receiver ran with.
+        tally: Figures of the transmitters.
+        recording: What was read: path, format, size, duration, events.
+        processing: How long it took.
+        counts: The receiver's counts.
+        losses: What the reader skipped, by kind, with byte offsets.
+        versions: Installed versions.
+        error: The message, when `status` is `failed`.
+        positions: Figures of the positions, where they were computed.
+        sinks: What sinks say, by name; those that say nothing are left out.
+    """
+    return {
+        "status": status,
+        "error": error,
+        "result": tally.headline(),
+        "transmitters": tally.to_list(),
+        "recording": dict(recording),
+        "processing": dict(processing),
+        "counts": dict(counts),
+        "messages_off": _messages_off(link),
+        "losses": {kind: dict(loss) for kind, loss in losses.items()},
+        "digest": link.digest,
+        "codebook": {"digest": link.codebook.digest, "profile": link.codebook.profile},
+        "revisions": dict(link.revisions),
+        "configuration": {section: dict(keys) for section, keys in link.table.items()},
+        "versions": dict(versions),
+        **({"positions": dict(positions)} if positions is not None else {}),
+        **({"sinks": {name: dict(part) for name, part in sinks.items()}} if sinks else {}),
+    }
+
+
+def write_summary(table: Mapping[str, Any], folder: ResultFolder) -> None:
+    """Write `summary.json`.
+
+    Raises:
+        EvlcpError: It cannot be written.
+    """
+    try:
+        folder.open(SUMMARY).write(json.dumps(table, indent=2) + "\n")
+    except OSError as fault:
+        raise EvlcpError(f"{folder.folder}: cannot be written: {fault.strerror}") from fault
+
+
+def _messages_off(link: Link) -> str | None:
+    """Why messages were not read; None where they were."""
+    if not link.messages.decode:
+        return "messages.decode = false"
+    try:
+        link.block_coder()
+    except ConfigError as fault:
+        return str(fault)
+    return None

@@ -1,0 +1,166 @@
+"""The figures of a summary, counted as packets and positions come, in constant memory."""
+
+import math
+from collections import Counter
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.place.navigator import Placed
+from evlcp_sdk.place.positioner import Positioner
+from evlcp_sdk.place.refusals import REFUSALS
+from evlcp_sdk.results.text import number_or_none
+from evlcp_sdk.values import Packet
+
+__all__ = ["PositionTally", "Tally", "TransmitterTally"]
+
+_CELL_M = 0.01
+_FARTHEST_M = 10_000.0
+_MOST_CLOCK_ERROR = 0.01
+
+
+@dataclass
+class TransmitterTally:
+    """Running figures of one transmitter, in constant memory.
+
+    Args:
+        packet_frames: Frames that a packet has.
+        nominal_packet_us: Length of a packet that the configuration states, us.
+    """
+
+    packet_frames: int
+    nominal_packet_us: float
+    packets: int = 0
+    frames: int = 0
+    first_frame: int = -1
+    last_frame: int = -1
+    last_packet: tuple[int, float] = (0, math.nan)
+    steps_us: float = 0.0
+    nominal_steps_us: float = 0.0
+    quality_sum: float = 0.0
+    ranged: int = 0
+    first_m: float = math.nan
+    last_m: float = math.nan
+    cells: Counter[int] = field(default_factory=Counter)
+
+    def add(self, packet: Packet) -> None:
+        """Count a packet and its frames."""
+        self.packets += 1
+        self.frames += len(packet.frames)
+        number, t_us = self.last_packet
+        step_us, nominal_us = packet.t_us - t_us, (packet.packet - number) * self.nominal_packet_us
+        if abs(step_us - nominal_us) < _MOST_CLOCK_ERROR * nominal_us:
+            self.steps_us += step_us
+            self.nominal_steps_us += nominal_us
+        self.last_packet = (packet.packet, packet.t_us)
+        for frame in packet.frames:
+            number = frame.packet * self.packet_frames + frame.frame
+            self.first_frame = number if self.first_frame < 0 else self.first_frame
+            self.last_frame = number
+            self.quality_sum += frame.soft.quality
+            distance_m = frame.range.distance_m
+            if math.isfinite(distance_m):
+                self.ranged += 1
+                self.last_m = distance_m
+                if self.ranged == 1:
+                    self.first_m = distance_m
+                self.cells[round(min(distance_m, _FARTHEST_M) / _CELL_M)] += 1
+
+    def median_m(self) -> float:
+        """Median distance to the centimetre, m; NaN without any."""
+        seen = 0
+        for cell in sorted(self.cells):
+            seen += self.cells[cell]
+            if 2 * seen >= self.ranged:
+                return round(cell * _CELL_M, 2)
+        return math.nan
+
+    def clock_ppm(self) -> float:
+        """The transmitter's chip rate against the camera's clock, ppm; NaN before the second packet.
+
+        Taken from the times of the packets, so it is the surer the longer the recording; a step from one
+        packet to the next that no clock explains, as after a loss of lock, is left out.
+        """
+        return (self.nominal_steps_us / self.steps_us - 1) * 1e6 if self.steps_us else math.nan
+
+    def to_dict(self) -> dict[str, Any]:
+        """The figures as JSON values; what was never measured is null.
+
+        `frames_expected` counts what was sent from the first decoded frame to the last.
+        """
+        return {
+            "packets": self.packets,
+            "frames_found": self.frames,
+            "frames_expected": self.last_frame - self.first_frame + 1 if self.frames else 0,
+            "quality": number_or_none(self.quality_sum / self.frames if self.frames else math.nan, 4),
+            "clock_ppm": number_or_none(self.clock_ppm(), 2),
+            "frames_ranged": self.ranged,
+            "distance_first_m": number_or_none(self.first_m, 4),
+            "distance_last_m": number_or_none(self.last_m, 4),
+            "distance_median_m": number_or_none(self.median_m(), 2),
+        }
+
+
+class Tally:
+    """Running figures of all transmitters.
+
+    Args:
+        form: Lengths of a packet's parts.
+    """
+
+    def __init__(self, form: PacketFormat) -> None:
+        self.transmitters: dict[int, TransmitterTally] = {}
+        self._packet_us = form.packet_chips * form.chip_us
+
+    def add(self, packet: Packet) -> None:
+        """Count a packet and its frames."""
+        tally = self.transmitters.get(packet.transmitter)
+        if tally is None:
+            tally = self.transmitters[packet.transmitter] = TransmitterTally(packet.sent, self._packet_us)
+        tally.add(packet)
+
+    def headline(self) -> str:
+        """What was found, in one sentence."""
+        if not self.transmitters:
+            return "no transmitter was found"
+        found = sum(tally.frames for tally in self.transmitters.values())
+        number = len(self.transmitters)
+        return f"{number} transmitter{'s' * (number > 1)}, {found} frame{'s' * (found != 1)}"
+
+    def to_list(self) -> list[dict[str, Any]]:
+        """The figures of each transmitter as JSON values."""
+        return [{"transmitter": n} | tally.to_dict() for n, tally in sorted(self.transmitters.items())]
+
+
+@dataclass
+class PositionTally:
+    """Running figures of the positions."""
+
+    given: int = 0
+    verified: int = 0
+    left_out: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+
+    def add(self, placed: Placed) -> None:
+        """Count a fix."""
+        if placed.filtered is None:
+            self.refused[placed.fix.refusal] += 1
+            return
+        self.given += 1
+        self.verified += placed.fix.verified
+        self.left_out += placed.filtered.left_out
+
+    def to_dict(self, positioner: Positioner) -> dict[str, Any]:
+        """The figures as JSON values, with what is known of the bars in the end."""
+        frame = positioner.frame
+        return {
+            "fixes": self.given,
+            "fixes_verified": self.verified,
+            "refused": {kind: self.refused[kind] for kind in REFUSALS if self.refused[kind]},
+            "left_out_of_track": self.left_out,
+            "frames_late": positioner.counts["frames_late"],
+            "beacons_forged": positioner.counts["beacons_forged"],
+            "sites_contradicted": {str(n): how for n, how in positioner.contradicted.items()},
+            "origin": asdict(frame) if frame is not None else None,
+            "bars": {str(n): s.transmitter_id for n, s in positioner.stands_at.items()},
+        }

@@ -1,0 +1,51 @@
+"""`track.csv`: a row a fix that is given, its place smoothed and filtered."""
+
+import csv
+from collections.abc import Sequence
+
+from evlcp_sdk.place.navigator import Place, Settled
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.sink import Run, Sink
+from evlcp_sdk.results.text import sigmas
+
+__all__ = ["TRACK_COLUMNS", "TrackCsv"]
+
+_PLACE_COLUMNS = ("latitude_deg", "longitude_deg", "height_m", "sigma_east_m", "sigma_north_m", "sigma_up_m")
+
+TRACK_COLUMNS = (
+    "t_us",
+    *_PLACE_COLUMNS,
+    "speed_m_s",
+    "course_deg",
+    *(f"filtered_{name}" for name in _PLACE_COLUMNS),
+    "left_out",
+)
+"""Columns of `track.csv`: smoothed, then filtered."""
+
+
+class TrackCsv(Sink):
+    """Writes `track.csv`."""
+
+    def __init__(self, folder: ResultFolder, run: Run) -> None:
+        super().__init__(folder, run)
+        self._rows = csv.writer(folder.open("track.csv"), lineterminator="\n")
+        self._rows.writerow(TRACK_COLUMNS)
+
+    def settle(self, settled: Sequence[Settled]) -> None:
+        """Write a row a fix."""
+        for one in settled:
+            self._rows.writerow(
+                [
+                    f"{one.fix.t_us:.1f}",
+                    *_place_row(one.smoothed),
+                    f"{one.smoothed.speed_m_s:.3f}",
+                    f"{one.smoothed.course_deg:.2f}",
+                    *_place_row(one.filtered),
+                    int(one.filtered.left_out),
+                ]
+            )
+
+
+def _place_row(place: Place) -> list[str]:
+    where = [f"{place.latitude_deg:.10f}", f"{place.longitude_deg:.10f}", f"{place.height_m:.4f}"]
+    return where + [f"{value:.4f}" for value in sigmas(place.covariance_m2)]

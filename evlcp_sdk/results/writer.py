@@ -1,0 +1,141 @@
+"""One run's result: packets in; tallies, positions and files out."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.place.navigator import Navigator, Placed, PositionPlan
+from evlcp_sdk.plugin.records import choose_sinks, installed_sinks
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.sink import Run
+from evlcp_sdk.results.sinks import Sinks, load_sinks
+from evlcp_sdk.results.summary import Status, summary_of, write_summary
+from evlcp_sdk.results.tallies import PositionTally, Tally
+from evlcp_sdk.values import Events, Packet
+
+__all__ = ["ResultWriter"]
+
+
+class ResultWriter:
+    """Writes one recording's result into a folder; use as a context manager, end with `finish`.
+
+    In the context, sinks that have hooks are called by the registry: make the receiver in it.
+
+    Args:
+        folder: Made if need be; an earlier result in it is replaced by `finish`.
+        link: The configuration that the receiver runs with.
+        registry: Where sinks are found; None for all that are installed.
+        name: Name of the recording, for titles.
+        plan: What positions are computed from; None for none.
+        sinks: Output formats beside the default ones, by name.
+
+    Raises:
+        ConfigError: The folder cannot be written, or a sink cannot be used.
+        PluginError: A sink fails.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        link: Link,
+        registry: Registry | None = None,
+        *,
+        name: str = "",
+        plan: PositionPlan | None = None,
+        sinks: Sequence[str] = (),
+    ) -> None:
+        self._registry = Registry.load() if registry is None else registry
+        self._link = link
+        self._tally, self._positions = Tally(link.packet), PositionTally()
+        self._navigator = Navigator(link, plan) if plan is not None else None
+        classes = load_sinks(choose_sinks(self._registry, sinks, positions=plan is not None))
+        files = [file for s in installed_sinks(self._registry).values() for file in s.record.files]
+        with ExitStack() as stack:
+            self._folder = stack.enter_context(ResultFolder(folder, files))
+            self._sinks = Sinks(classes, self._folder, Run(name, link, plan, self._navigator))
+            stack.enter_context(self._registry.joined(*self._sinks.all))
+            self._stack = stack.pop_all()
+
+    def events(self, events: Events) -> None:
+        """Take events that the receiver gets."""
+        self._sinks.events(events)
+
+    def write(self, packets: Iterable[Packet]) -> None:
+        """Take the receiver's next packets.
+
+        Raises:
+            EvlcpError: A file cannot be written, e.g. the disk is full.
+            PluginError: A sink fails.
+        """
+        for packet in packets:
+            self._tally.add(packet)
+            self._sinks.packet(packet)
+            if self._navigator is not None:
+                self._place(self._navigator.feed([packet]))
+
+    def finish(
+        self,
+        status: Status,
+        recording: Mapping[str, Any],
+        processing: Mapping[str, Any],
+        counts: Mapping[str, int],
+        losses: Mapping[str, Mapping[str, Any]],
+        error: str | None = None,
+    ) -> dict[str, Any]:
+        """End the sinks, move all files into place, the summary last, and drop what an earlier run left.
+
+        Args:
+            status: How the run ended.
+            recording: What was read: path, format, size, duration, events.
+            processing: How long it took.
+            counts: The receiver's counts.
+            losses: What the reader skipped, by kind, with byte offsets.
+            error: The message, when `status` is `failed`.
+
+        Returns:
+            The content of `summary.json`.
+
+        Raises:
+            EvlcpError: A file cannot be written, e.g. the disk is full.
+            PluginError: A sink fails.
+        """
+        positions = None
+        if self._navigator is not None:
+            fixes, settled = self._navigator.close()
+            self._place(fixes)
+            self._sinks.settle(settled)
+            positions = self._positions.to_dict(self._navigator.positioner)
+        table = summary_of(
+            status,
+            self._link,
+            self._tally,
+            recording=recording,
+            processing=processing,
+            counts=counts,
+            losses=losses,
+            versions=self._registry.versions(),
+            error=error,
+            positions=positions,
+            sinks=self._sinks.finish(),
+        )
+        write_summary(table, self._folder)
+        self._folder.finish()
+        return table
+
+    def _place(self, fixes: Iterable[Placed]) -> None:
+        for placed in fixes:
+            self._positions.add(placed)
+            self._sinks.placed(placed)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Drop what `finish` has not moved into place."""
+        self._stack.__exit__(kind, value, trace)
