@@ -13,9 +13,10 @@ TYPE_CHECKING = False  # typing itself would take longer to import than all that
 
 if TYPE_CHECKING:
     from evlcp_sdk.air.beacons import Beacon
-    from evlcp_sdk.air.blocks import Message
+    from evlcp_sdk.air.blocks import BlockError, Message
     from evlcp_sdk.air.codebook import Codebook
     from evlcp_sdk.air.frames import PacketFormat
+    from evlcp_sdk.air.kinds import MessageKind
     from evlcp_sdk.errors import (
         CodebookMismatchError,
         ConfigError,
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
     from evlcp_sdk.io.sources import EventSource, Loss, ReplaySource
     from evlcp_sdk.link.compose import compose
     from evlcp_sdk.link.resolve import Link, load_link
-    from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
+    from evlcp_sdk.place.navigator import PositionPlan
+    from evlcp_sdk.plugin.hooks import Algorithm, SinkRecord, hookimpl
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.plugin.roles import (
         Code,
@@ -53,9 +55,11 @@ if TYPE_CHECKING:
         Tracker,
         Tracking,
     )
+    from evlcp_sdk.results.sink import Sink
     from evlcp_sdk.results.tables import frames_table
-    from evlcp_sdk.run import Reception, receive
+    from evlcp_sdk.run import Reception, receive, receive_to_folder
     from evlcp_sdk.rx.receiver import Receiver
+    from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
     from evlcp_sdk.scene.bar import BarLayout
     from evlcp_sdk.scene.camera import CameraModel
     from evlcp_sdk.scene.sites import BarSite, load_sites
@@ -77,9 +81,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Algorithm",
+    "Attitude",
+    "AttitudeLog",
     "BarLayout",
     "BarSite",
     "Beacon",
+    "BlockError",
     "CameraModel",
     "Code",
     "Codebook",
@@ -102,12 +109,14 @@ __all__ = [
     "Loss",
     "Measure",
     "Message",
+    "MessageKind",
     "Modulation",
     "Packet",
     "PacketFormat",
     "Pilots",
     "PluginError",
     "PluginWarning",
+    "PositionPlan",
     "PresenceMap",
     "Range",
     "Ranging",
@@ -121,6 +130,8 @@ __all__ = [
     "Separate",
     "Separation",
     "SimulatedSource",
+    "Sink",
+    "SinkRecord",
     "SoftSymbols",
     "StreamError",
     "SyncLock",
@@ -138,15 +149,17 @@ __all__ = [
     "open",
     "read_events",
     "receive",
+    "receive_to_folder",
     "simulate",
     "write_events",
 ]
 
 _HOMES = {
     "air.beacons": ("Beacon",),
-    "air.blocks": ("Message",),
+    "air.blocks": ("BlockError", "Message"),
     "air.codebook": ("Codebook",),
     "air.frames": ("PacketFormat",),
+    "air.kinds": ("MessageKind",),
     "errors": (
         "CodebookMismatchError",
         "ConfigError",
@@ -163,7 +176,8 @@ _HOMES = {
     "io.sources": ("EventSource", "Loss", "ReplaySource"),
     "link.compose": ("compose",),
     "link.resolve": ("Link", "load_link"),
-    "plugin.hooks": ("Algorithm", "hookimpl"),
+    "place.navigator": ("PositionPlan",),
+    "plugin.hooks": ("Algorithm", "SinkRecord", "hookimpl"),
     "plugin.registry": ("Registry",),
     "plugin.roles": (
         "Code",
@@ -183,9 +197,11 @@ _HOMES = {
         "Tracker",
         "Tracking",
     ),
+    "results.sink": ("Sink",),
     "results.tables": ("frames_table",),
-    "run": ("Reception", "receive"),
+    "run": ("Reception", "receive", "receive_to_folder"),
     "rx.receiver": ("Receiver",),
+    "scene.attitude": ("Attitude", "AttitudeLog"),
     "scene.bar": ("BarLayout",),
     "scene.camera": ("CameraModel",),
     "scene.sites": ("BarSite", "load_sites"),

@@ -140,7 +140,7 @@ def test_every_hook_has_a_section_with_a_full_example(hook: str) -> None:
         "typing.", ""
     )
     assert "\nCalled " in section
-    assert "@hookimpl" in section
+    assert "@evlcp.hookimpl" in section
     assert f"def {hook}(" in section
 
 
