@@ -2,7 +2,7 @@
 
 A point is one scene with one link; its tasks are its seeds. A task's id is the SHA-256 of everything that
 determines its result, so a result is found again whatever file asks for it. A job is what one worker does at
-once: a scene, rendered once, and all links that receive it.
+once: a scene, rendered once, and all links that receive this rendering.
 """
 
 import hashlib
@@ -80,7 +80,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Job:
-    """A scene with a seed, and the tasks that receive it.
+    """A scene with a seed, and the tasks that receive its rendering.
 
     Attributes:
         scene: The scene's value, as `Case.value` has it.
@@ -175,6 +175,7 @@ def make_plan(
     rule: StopRule = StopRule(),
     merge: Sequence[str] = (),
     environment: Mapping[str, Any] | None = None,
+    share: Callable[[Case], Any] = lambda _: None,
 ) -> Plan:
     """Every scene with every link and every seed.
 
@@ -186,6 +187,7 @@ def make_plan(
         rule: When a point has enough.
         merge: Labels over which a report adds points up.
         environment: Code and versions, part of every task's id.
+        share: Links for which it gives the same receive the same rendering of a scene.
     """
     environment = dict(environment or {})
 
@@ -198,12 +200,17 @@ def make_plan(
         tasks = tuple(id_of(scene, link, seed) for seed in seeds)
         labels = (*(("scene." + a, b) for a, b in scene.labels), *(("link." + a, b) for a, b in link.labels))
         points.append(Point(labels, s, k, tasks))
+    together: dict[Any, list[int]] = {}
+    for k, link in enumerate(links):
+        together.setdefault(share(link), []).append(k)
     jobs = []
-    for (n, seed), (s, scene) in itertools.product(enumerate(seeds), enumerate(scenes)):
-        numbers = range(s * len(links), (s + 1) * len(links))
+    for (n, seed), (s, scene), some in itertools.product(
+        enumerate(seeds), enumerate(scenes), together.values()
+    ):
         # Links that differ in name only are one task.
         tasks_of = {
-            points[p].tasks[n]: Task(points[p].tasks[n], p, links[points[p].link].value) for p in numbers
+            points[p].tasks[n]: Task(points[p].tasks[n], p, links[points[p].link].value)
+            for p in (s * len(links) + k for k in some)
         }
         jobs.append(Job(scene.value, seed, tuple(tasks_of.values()), environment))
     return Plan(
@@ -255,6 +262,7 @@ def load_plan(
     link_of: SceneCases,
     environment: Mapping[str, Any],
     overrides: Sequence[str] = (),
+    share: Callable[[Case], Any] = lambda _: None,
 ) -> Plan:
     """Read a campaign file and lay out its points.
 
@@ -264,6 +272,7 @@ def load_plan(
         link_of: Makes a link likewise.
         environment: Code and versions, part of every task's id.
         overrides: What `--set` takes, e.g. `"campaign.seeds=2"`; the value is TOML, or else plain text.
+        share: Links for which it gives the same receive the same rendering of a scene.
 
     Raises:
         ConfigError: All faults of the file, one line each.
@@ -299,6 +308,7 @@ def load_plan(
         rule=StopRule(head.max_bits, head.max_errors),
         merge=merge,
         environment=environment,
+        share=share,
     )
 
 

@@ -2,8 +2,8 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene, Simulation, load_scene, truth_of
 from evlcp_sdk.sim.truth import Truth
 from evlcp_sdk.sim.world import attitude_log
-from evlcp_sdk.study.campaign.plan import Job, Plan, load_plan
+from evlcp_sdk.study.campaign.plan import Case, Job, Plan, digest_of, load_plan
 from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.match import check_link
 from evlcp_sdk.study.measure import message_tallies, position_tallies, statistics_of
@@ -25,6 +25,9 @@ from evlcp_sdk.values import Packet
 __all__ = ["environment_of", "plan_of", "run_job"]
 
 _PACKAGES = ("air", "link", "place", "plugin", "rx", "scene", "sim")
+_ON_AIR = ("air", "bar", "pilots", "modulation", "error-correction")
+"""Sections of a link that say what a bar sends, and from where."""
+
 _STUDY = ("frames.py", "match.py", "measure.py", "tally.py", "campaign/task.py")
 
 
@@ -57,7 +60,22 @@ def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
         }
         return (table, link.digest), json.loads(json.dumps(identity))
 
-    return load_plan(path, scene_of, link_of, environment_of(registry), overrides)
+    return load_plan(path, scene_of, link_of, environment_of(registry), overrides, _air_of)
+
+
+def _air_of(link: Case) -> str:
+    """Digest of what is on air with a link: a scene is rendered once for all links with the same."""
+    said = link.identity
+    sections = {section: said["table"][section] for section in _ON_AIR}
+    revisions = {role: said["revisions"][role] for role in _ON_AIR if role in said["revisions"]}
+    return digest_of([sections, revisions, said["codebook"]])
+
+
+def _sending(scene: Scene, table: Mapping[str, Any]) -> Scene:
+    """The scene, its bars that say no link of their own sending with that of the campaign."""
+    link = {section: table[section] for section in _ON_AIR}
+    bars = (replace(bar, link=link) if bar.link is None else bar for bar in scene.bars)
+    return scene if scene.link is not None else replace(scene, bars=tuple(bars))
 
 
 def environment_of(registry: Registry) -> dict[str, Any]:
@@ -65,7 +83,7 @@ def environment_of(registry: Registry) -> dict[str, Any]:
     import evlcp_sdk
 
     root = Path(evlcp_sdk.__file__).parent
-    files = {root / "values.py"} | {root / "study" / name for name in _STUDY}
+    files = {root / "values.py", root / "specs.py"} | {root / "study" / name for name in _STUDY}
     files |= {path for name in _PACKAGES for path in (root / name).rglob("*.py")}
     for installed in registry.installed():
         if installed.distribution == "evlcp-sdk":
@@ -93,6 +111,8 @@ def _identity(scene: Scene) -> Any:
 def run_job(job: Job) -> list[tuple[str, Statistics]]:
     """Render the job's scene once, receive it with the link of every task, hold it against the truth.
 
+    A bar that says no link sends with that of the tasks, which are alike in what is on air.
+
     Raises:
         ConfigError: This installation would not give what the task's id promises, or the scene sends with
             another link than a task receives with.
@@ -103,9 +123,9 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
             "code or versions here are not those of the campaign's plan: changed since it began"
             " (run it again), or other than on the machine that asks (install the same)"
         )
-    scene: Scene = job.scene
+    scene = _sending(job.scene, job.tasks[0].link[0])
     simulation = Simulation(scene, job.seed, registry=registry)
-    truth = truth_of(simulation)
+    truth = truth_of(simulation, registry=registry)
     attitude = attitude_log(scene, job.seed, simulation.path) if scene.world is not None else None
     links, receivers = [], []
     for task in job.tasks:

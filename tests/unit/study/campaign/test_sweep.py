@@ -105,9 +105,8 @@ def test_bad_campaigns_are_one_line(
 
 
 def test_a_bar_that_the_link_does_not_speak_to(evlcp: Evlcp, campaign: Path, tmp_path: Path) -> None:
-    done = evlcp(
-        "sweep", campaign, "-o", tmp_path / "r.sqlite", "--set", "link.modulation.id=wh8", "--workers", "0"
-    )
+    options = ("--set", "scene.bars.link.modulation.id=wh4x2", "--set", "link.modulation.id=wh8")
+    done = evlcp("sweep", campaign, "-o", tmp_path / "r.sqlite", *options, "--workers", "0")
     assert done.code == 2
     assert "the scene: bar 0 was sent with another link: modulation.id: sent with" in done.err
     assert len(done.err.splitlines()) == 1

@@ -1,0 +1,169 @@
+"""Links of every kind through simulate, receive, score, compare and sweep, which agree with each other."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from evlcp_sdk.air.codebook import hadamard
+from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.roles import Modulation
+from evlcp_sdk.specs import toml_value
+
+Evlcp = Callable[..., Any]
+Settings = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Four(Modulation):
+    """Two bits a symbol: a modulation of somebody else's."""
+
+    def codewords(self) -> NDArray[np.int8]:
+        return np.repeat(hadamard(4), 2, axis=1)
+
+
+class Stranger:
+    """A package with a modulation."""
+
+    @hookimpl
+    def evlcp_algorithms(self) -> list[Algorithm]:
+        return [Algorithm("modulation", "four", f"{__name__}:Four", 3, "two bits")]
+
+
+@pytest.fixture
+def _stranger(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The stranger's package is installed."""
+    load, stranger = Registry.load, Stranger()
+    monkeypatch.setattr(Registry, "load", lambda *plugins: load(stranger, *plugins))
+
+
+def column(clusters: int, leds: int) -> Settings:
+    return {"bar.rows": clusters * leds, "bar.cluster_rows": leds, "bar.led_pitch_m": 0.96 / clusters / leds}
+
+
+PANEL = {"rows": 16, "columns": 16, "led_pitch_m": 0.02, "cluster_rows": 4, "cluster_columns": 4}
+TWO_COLUMNS = {"rows": 24, "columns": 2, "led_pitch_m": 0.04, "cluster_rows": 3}
+
+LINKS: dict[str, Settings] = {
+    "5 kchip/s": {"air.chip_rate_hz": 5000.0},
+    "8 kchip/s": {"air.chip_rate_hz": 8000.0},
+    "20 kchip/s": {"air.chip_rate_hz": 20_000.0},
+    "4 clusters": column(4, 6),
+    "8 clusters": column(8, 6),
+    "32 clusters": column(32, 3),
+    "a panel": {f"bar.{key}": value for key, value in PANEL.items()},
+    "two columns": {f"bar.{key}": value for key, value in TWO_COLUMNS.items()},
+    "barker13": {"pilots.id": "barker13"},
+    "few pilots": {"air.pilot_every": 4, "air.frames_per_packet": 20},
+    "a stranger's modulation": {"modulation.id": "four"},
+}
+DURATIONS_S = {"5 kchip/s": 0.12, "20 kchip/s": 0.06, "a panel": 0.07}
+DISTANCE_M, DURATION_S, SEED = 40.0, 0.09, 2
+
+
+def options(settings: Settings, before: str = "") -> list[str]:
+    return [part for k, v in settings.items() for part in ("--set", f"{before}{k}={toml_value(v)}")]
+
+
+def run(evlcp: Evlcp, *args: str | Path) -> str:
+    done = evlcp(*args)
+    assert (done.code, done.err) == (0, "")
+    out: str = done.out
+    return out
+
+
+@pytest.mark.usefixtures("_stranger")
+@pytest.mark.parametrize("name", LINKS)
+def test_all_commands_agree(name: str, evlcp: Evlcp, tmp_path: Path) -> None:
+    link = LINKS[name]
+    raw, out, results = tmp_path / "r.raw", tmp_path / "out", tmp_path / "r.sqlite"
+    scene: Settings = {
+        "duration_s": DURATIONS_S.get(name, DURATION_S),
+        "motion.distance_m": DISTANCE_M,
+    }
+    scene_options = [*options(scene), *options(link, "link.")]
+    run(evlcp, "simulate", "--preset", "drive-30kmh", "-o", raw, "--seed", str(SEED), *scene_options)
+    run(evlcp, "receive", raw, "-o", out, *options(link))
+    score = json.loads(run(evlcp, "score", out, raw.with_suffix(".truth.json"), "--json"))
+    (plain,), (road,) = score["bars"], score["road"]["bars"]
+    # Frames before the first pilot, and those from which no pilot follows, may be lost.
+    most_lost = 2 * (link.get("air.pilot_every", 1) - 1)
+    assert 12 <= plain["frames_sent"] - most_lost <= plain["frames_found"]
+    assert score["unmatched"] == 0
+    assert plain["ber"] == 0 or (name == "20 kchip/s" and plain["ber"] < 0.02)
+
+    told = json.loads(run(evlcp, "compare", raw, "--variant", "it:", *options(link), "--json"))
+    (row,) = told["rows"]
+    (tmp_path / "c.toml").write_text(
+        f'[campaign]\nname = "one"\nfirst_seed = {SEED}\n[scene]\nbase = "drive-30kmh"\n'
+        + "".join(f"set.{key} = {toml_value(value)}\n" for key, value in scene.items())
+        + "[link]\n"
+        + "".join(f"set.{key} = {toml_value(value)}\n" for key, value in link.items())
+    )
+    run(evlcp, "sweep", tmp_path / "c.toml", "-o", results, "--workers", "0")
+    (swept,) = json.loads(run(evlcp, "compare", results, "--json"))["rows"]
+    for one in (row, swept):
+        assert (one["frames"], one["unmatched"], one["echoes"]) == (score["rows"], 0, 0)
+        for key in ("frames_sent", "frames_found", "bits", "bit_errors", "ranged"):
+            assert one[key] == plain[key] == road[key], key
+        assert (one["erased_share"], one["claimed_share"]) == (road["erased"], road["claimed"])
+        for key in ("rmse_m", "bias_m"):
+            # frames.csv has tenths of millimetres.
+            assert one[key] == pytest.approx(road[key], abs=1.1e-4), key
+    for key in ("packets", "rmse_m", "bias_m", "nees", "sigma_m", "gross", "filtered_rmse_m"):
+        assert row[key] == swept[key], key
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"air.chip_rate_hz": 5000.0}, "air.chip_rate_hz: sent with 10000.0, received with 5000.0"),
+        ({"bar.rows": 48}, "bar.rows: sent with 96, received with 48"),
+        ({"pilots.id": "barker13"}, 'pilots.id: sent with "wh", received with "barker13"'),
+        ({"error-correction.id": "none"}, None),
+    ],
+)
+def test_another_link_is_refused_by_all(
+    settings: Settings, says: str | None, evlcp: Evlcp, tmp_path: Path
+) -> None:
+    raw, campaign = tmp_path / "r.raw", tmp_path / "c.toml"
+    run(evlcp, "simulate", "--preset", "night", "-o", raw, "--set", "duration_s=0.002")
+    run(evlcp, "receive", raw, "-o", tmp_path / "out", *options(settings))
+    campaign.write_text(
+        '[campaign]\nname = "other"\n[scene]\nbase = "night"\n[scene.set]\nduration_s = 0.002\n'
+        'link.modulation.id = "wh4x2"\n'
+    )
+    for name, place, command in (
+        ("score", f"{tmp_path}/out", ("score", tmp_path / "out", tmp_path / "r.truth.json")),
+        ("compare", f"{raw}: --variant v", ("compare", raw, "--variant", "v:", *options(settings))),
+        (
+            *("sweep", "1 job failed: the scene"),
+            ("sweep", campaign, "-o", tmp_path / "r.sqlite", "--workers", "0", *options(settings, "link.")),
+        ),
+    ):
+        done = evlcp(*command)
+        assert done.code == (0 if says is None else 2), name
+        line = f"evlcp: {place}: bar 0 was sent with another link: {says}\n"
+        assert done.err == ("" if says is None else line)
+
+
+def test_links_that_share_what_is_on_air_share_a_rendering(evlcp: Evlcp, tmp_path: Path) -> None:
+    from evlcp_sdk.study.campaign.task import plan_of
+
+    (tmp_path / "c.toml").write_text(
+        '[campaign]\nname = "some"\nseeds = 2\n[scene]\nbase = "night"\n[link.variants]\n'
+        'paper = {}\nbest = { ranging.id = "joint-scale" }\nslow = { air.chip_rate_hz = 5000.0 }\n'
+        'other = { pilots.id = "barker13" }\nlike = { pilots.id = "barker13", decoding.id = "ml-soft" }\n'
+    )
+    plan = plan_of(tmp_path / "c.toml")
+    assert [len(job.tasks) for job in plan.jobs] == [2, 1, 2] * 2
+    assert [job.seed for job in plan.jobs] == [0] * 3 + [1] * 3
+    tasks = [task for job in plan.jobs for task in job.tasks]
+    assert sorted(task.id for task in tasks) == sorted(id for point in plan.points for id in point.tasks)
+    assert all(task.id in plan.points[task.point].tasks for task in tasks)
