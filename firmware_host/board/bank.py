@@ -28,6 +28,9 @@ PREAMBLE_CHIPS = 32
 MOST_FRAMES = 65_535
 """Frames of a packet at most."""
 
+MOST_CHIPS_A_SECOND = 1_000_000
+"""Chips a second that no board takes more of; each says its own maximum, too."""
+
 Symbols = NDArray[np.int64]
 
 
@@ -116,17 +119,17 @@ def limits(codebook: Codebook, packet: PacketFormat) -> list[str]:
         faults.append(f"air.frames_per_packet = {packet.frames}, at most {MOST_FRAMES}")
     if packet.chip_rate_hz != round(packet.chip_rate_hz):
         faults.append(f"air.chip_rate_hz = {packet.chip_rate_hz}: a board takes whole chips a second")
+    elif packet.chip_rate_hz > MOST_CHIPS_A_SECOND:
+        faults.append(f"air.chip_rate_hz = {packet.chip_rate_hz}, at most {MOST_CHIPS_A_SECOND}")
     return faults
 
 
 def check_link(link: Link) -> None:
     """Raise ConfigError, one line, if a driver board cannot play a link; see `limits`."""
     faults = limits(link.codebook, link.packet)
-    leds = set(np.bincount(link.bar.led_clusters()).tolist())
-    if link.codebook.clusters == CLUSTERS and leds != {LEDS // CLUSTERS}:
-        few, many = min(leds), max(leds)
-        found = few if few == many else f"{few} to {many}"
-        faults.insert(0, f"bar of {found} LEDs a cluster, the board has {LEDS // CLUSTERS}")
+    leds = link.bar.cluster_rows * link.bar.cluster_columns
+    if link.codebook.clusters == CLUSTERS and leds != LEDS // CLUSTERS:
+        faults.insert(0, f"bar of {leds} LEDs a cluster, the board has {LEDS // CLUSTERS}")
     _refuse(faults)
 
 

@@ -108,7 +108,7 @@ class Board:
 
     Attributes:
         session: The session.
-        about: What HELLO told.
+        about: What HELLO said.
 
     Raises:
         NoBoardError: Nobody answers.

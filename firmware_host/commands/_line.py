@@ -21,7 +21,7 @@ __all__ = [
     "line_options",
     "open_board",
     "progress_bar",
-    "tell",
+    "say_done",
 ]
 
 _BAUD = 1_000_000
@@ -157,7 +157,7 @@ def progress_bar(what: str) -> "Iterator[Any]":
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def tell(done: Any, as_json: bool) -> None:
+def say_done(done: Any, as_json: bool) -> None:
     """Say what programming did."""
     if as_json:
         import dataclasses

@@ -18,7 +18,7 @@ from firmware_host.commands._line import (
     line_options,
     open_board,
     progress_bar,
-    tell,
+    say_done,
 )
 from firmware_host.commands._source import RandomPackets, Seed, SymbolsFile
 
@@ -242,7 +242,7 @@ def program(
     settings = Settings(level, action, watchdog_ms, start)
     with open_board(context) as board, progress_bar("programming") as progress:
         done = provision(board, bank, settings, verify, progress)
-    tell(done, as_json)
+    say_done(done, as_json)
 
 
 def _program_fleet(path: Path, verify: bool, as_json: bool) -> None:
@@ -287,7 +287,7 @@ def send(
             )
         _check_same_air(board, bank, status)
         done = board.program(bank, verify, progress)
-    tell(done, as_json)
+    say_done(done, as_json)
 
 
 def _check_same_air(board: "Board", bank: "Bank", status: "StatusReply") -> None:
@@ -512,7 +512,7 @@ def emulate(
     else:
         command = native_command(listen, leds, flash, link, baud, unique_id)
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
-    # The emulator ends with this command, however that is told to end.
+    # The emulator ends with this command, however that comes.
     signal.signal(signal.SIGTERM, lambda *_: process.terminate())
     try:
         if emulator is Emulator.QEMU and (line := wait_for(listen, process)) is not None:
@@ -524,7 +524,7 @@ def emulate(
         process.wait()
         return
     if code == InputError.exit_code:
-        raise typer.Exit(code)  # a file of the board's, which has told of it
+        raise typer.Exit(code)  # a file of the board's, which has said so
     if code not in (0, -signal.SIGTERM, -signal.SIGINT):
         raise ToolchainError(f"the {emulator} board ended with {code}; see its message above")
 

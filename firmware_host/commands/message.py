@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evlcp_sdk.cli._common import LinkFile, Overrides
-from firmware_host.commands._line import BoardLine, progress_bar, tell
+from firmware_host.commands._line import BoardLine, progress_bar, say_done
 from firmware_host.commands._output import save_array
 
 if TYPE_CHECKING:
@@ -117,7 +117,8 @@ def message(
         typer.echo(
             f"{m['kind']:9} {m['bytes']:5} bytes, transmitter {m['transmitter_id']}, sequence {m['sequence']}"
         )
-    said = f"{summary['packets']} packets, {summary['duration_s']:.4g} s"
+    number = summary["packets"]
+    said = f"{number} packet{'s' * (number != 1)}, {summary['duration_s']:.4g} s"
     written = [str(path) for path in (out, chips) if path is not None]
     if written:
         said += f", in {' and '.join(written)}"
@@ -127,7 +128,7 @@ def message(
         said += "; nothing is sent or written: give --port, -o or --chips"
     typer.echo(said)
     if programmed is not None:
-        tell(programmed, as_json=False)
+        say_done(programmed, as_json=False)
 
 
 def keygen(

@@ -94,7 +94,7 @@ class Client:
 
     Args:
         timing: How long an answer may take.
-        window: Requests under way at once; HELLO tells how many the board takes.
+        window: Requests under way at once; HELLO says how many the board takes.
         session: Session that HELLO gave.
         first: First sequence number, by default drawn at random.
         tries: How often a request is sent before it is given up.

@@ -1,6 +1,6 @@
 """Writes the C headers and the Python module that `protocol.toml` and the codebook define.
 
-`python -m firmware_host.protocol.generate` writes them; `--check` only tells which are stale and ends with 1.
+`python -m firmware_host.protocol.generate` writes them; `--check` only says which are stale and ends with 1.
 """
 
 import argparse
@@ -414,7 +414,7 @@ def generated_files() -> dict[Path, str]:
 def main(arguments: list[str] | None = None) -> int:
     """Write the generated files, or with `--check` name the stale ones and return 1."""
     parser = argparse.ArgumentParser(prog="python -m firmware_host.protocol.generate", description=__doc__)
-    parser.add_argument("--check", action="store_true", help="only tell which files are stale")
+    parser.add_argument("--check", action="store_true", help="only say which files are stale")
     check = parser.parse_args(arguments).check
     stale = [p for p, text in generated_files().items() if not p.exists() or p.read_text() != text]
     for path in stale:

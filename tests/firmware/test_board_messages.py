@@ -217,6 +217,8 @@ def test_another_link_is_refused_and_says_where(
         (("bar.rows=48",), "bar of 8 clusters, the board has 16"),
         (("bar.rows=64", "bar.cluster_rows=4"), "bar of 4 LEDs a cluster, the board has 6"),
         (("air.chip_rate_hz=12.5",), "air.chip_rate_hz = 12.5: a board takes whole chips a second"),
+        (("air.chip_rate_hz=1e300",), "air.chip_rate_hz = 1e+300, at most 1000000"),
+        (("bar.rows=1600000000", "bar.cluster_rows=100000000"), "bar of 100000000 LEDs a cluster"),
         (("bar.rows=48", "air.chip_rate_hz=0.5"), "8 clusters, the board has 16; air.chip_rate_hz = 0.5"),
     ],
 )
@@ -240,7 +242,7 @@ def test_without_an_output_nothing_is_said_to_be_sent(evlcp: Evlcp, monkeypatch:
     monkeypatch.setenv("EVLCP_PORT", "unix:/nowhere")
     done = evlcp("tx", "message", "--text", "hi")
     assert done.code == 0
-    last = "1 packets, 0.0346 s; nothing is sent or written: give --port, -o or --chips"
+    last = "1 packet, 0.0346 s; nothing is sent or written: give --port, -o or --chips"
     assert done.out.splitlines()[-1] == last
 
 
@@ -265,3 +267,36 @@ def test_a_board_plays_it(cli: Evlcp, site: Path, tmp_path: Path) -> None:
     found = messages_of(symbols_of(np.load(chips), link), link)
     assert found[Kind.TEXT].text == "Tempo 30 " * 20
     assert Beacon.unpack(found[Kind.BEACON].payload).height_m == 52.4
+
+
+@pytest.mark.usefixtures("compiler")
+def test_a_board_is_programmed_with_the_files_own_link(evlcp: Evlcp, cli: Evlcp, tmp_path: Path) -> None:
+    port, leds, chips = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin", tmp_path / "c.npy"
+    settings = (
+        "modulation.id=wh8",
+        "air.chip_rate_hz=5000.0",
+        "air.frames_per_packet=12",
+        "air.pilot_every=3",
+    )
+    options = [part for setting in settings for part in ("--set", setting)]
+    for text in ("one", "two"):
+        assert evlcp("tx", "message", "--text", text, "-o", tmp_path / f"{text}.json", *options).code == 0
+    emulated = Emulated("native", "--listen", port, "--leds", leds)
+    board = ("board", "--port", port)
+    assert cli(*board, "program", tmp_path / "one.json").returncode == 0
+    status = json.loads(cli(*board, "status", "--json").stdout)
+    assert (status["profile"], status["chip_rate_hz"]) == ("wh8", 5000)
+    assert (status["frames"], status["pilot_every"]) == (12, 3)
+    assert cli(*board, "verify", tmp_path / "one.json", *options).returncode == 0
+    assert cli(*board, "verify", tmp_path / "two.json").returncode == 7
+    assert cli(*board, "send", tmp_path / "two.json").returncode == 0
+    time.sleep(0.5)
+    assert cli(*board, "stop").returncode == 0
+    assert emulated.end() == 0
+    assert cli("board", "leds", leds, "--chips", chips).returncode == 0
+    link = load_link(overrides=settings)
+    packets = symbols_of(np.load(chips), link)
+    texts = [messages_of(packet[None], link)[Kind.TEXT].text for packet in packets]
+    assert texts[0] == "one"
+    assert texts[-1] == "two"
+    assert texts == sorted(texts)
