@@ -26,6 +26,7 @@ from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import scene_of_truth, simulate, truth_of
+from evlcp_sdk.sim.scene import links_of
 from evlcp_sdk.study.measure import message_tallies
 from evlcp_sdk.study.tally import Tally
 
@@ -99,7 +100,7 @@ def recordings(folder: Path, packets: int) -> None:
             continue
         bars = [replace(b, symbols=None, payload="data", start_chip=None) for b in bars]
         scene = replace(scene, bars=tuple(bars))
-        link = load_link(overrides=[f"modulation.id={bars[0].profile}"])
+        link = links_of(scene)[0]
         coder, total, seed, began = link.block_coder(), Tally(), 0, time.perf_counter()
         while total.messages_sent < packets:
             truth, receiver = truth_of(scene, seed), Receiver(link)

@@ -183,7 +183,7 @@ def truth_from_table(
 _OWN = ("link", "symbols", "start_chip", "ppm", "payload", "covered", "cover_s", "pole_s")
 """Keys of a bar's table that `SentBar` holds, and those that follow from its link."""
 
-_OF_LINK = ("profile", "clusters", "frames", "pilot_every", "packet_chips", "error_correction")
+_OF_LINK = ("profile", "clusters", "frames", "pilot_every", "packet_chips")
 
 
 def _table_of(bar: SentBar) -> dict[str, Any]:
@@ -197,11 +197,7 @@ def _table_of(bar: SentBar) -> dict[str, Any]:
         "packet_chips": form.packet_chips,
         "ppm": bar.ppm,
         "start_chip": bar.start_chip,
-        **(
-            {"payload": bar.payload, "error_correction": bar.link.table["error-correction"]["id"]}
-            if bar.payload != "symbols"
-            else {}
-        ),
+        "payload": bar.payload,
         "symbols": bar.symbols.tolist(),
         "led_w_m2": None if bar.lit else 0.0,
         "chips_file": None,
@@ -371,7 +367,7 @@ class _Reader:
             raise self._fault(f"{where}.symbols", told, wanted)
         if symbols.min() < 0 or symbols.max() >= top:
             q, f, k = np.argwhere((symbols < 0) | (symbols >= top))[0].tolist()
-            raise self._fault(f"{where}.symbols.{q}.{f}.{k}", symbols[q, f, k], f"0 to {top - 1}")
+            raise self._fault(f"{where}.symbols.{q}.{f}.{k}", int(symbols[q, f, k]), f"0 to {top - 1}")
         return symbols.astype(np.int64)
 
     def _sites(self, told: Any) -> tuple[BarSite, ...]:

@@ -21,6 +21,7 @@ from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.plugin import hooks as hookspecs
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
+from evlcp_sdk.sim.scene import resolve_scene
 from evlcp_sdk.testing import check, laws_of
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
 from tests.unit.test_layers import layer_of
@@ -103,10 +104,14 @@ def test_code_and_commands_run(path: Path, workplace: Path, evlcp: Callable[...,
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
-def test_toml_examples_are_links(path: Path) -> None:
+def test_toml_examples_are_links_or_scenes(path: Path, tmp_path: Path) -> None:
+    for name in ("link.toml", "other.toml"):
+        (tmp_path / name).touch()
     for text in blocks(path, "toml"):
         table = tomllib.loads(text)
-        if "project" not in table:
+        if "bars" in table:
+            resolve_scene(table, folder=tmp_path)
+        elif "project" not in table:
             resolve(table)
 
 

@@ -356,7 +356,10 @@ def _cases(
         its_base = variant.pop("base", base)
         for values in itertools.product(*axes.values()):
             chosen = dict(zip(axes, values, strict=True))
-            overrides = [f"{key}={_toml(value)}" for key, value in (fixed | chosen | variant).items()]
+            overrides = [
+                f"{key}={_toml(_located(value, folder.resolve()) if key.endswith('link') else value)}"
+                for key, value in (fixed | chosen | variant).items()
+            ]
             try:
                 value, identity = make(_located(its_base, folder), overrides)
             except ConfigError as fault:

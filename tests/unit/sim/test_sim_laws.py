@@ -189,7 +189,7 @@ def test_the_truth_has_the_schema_of_the_recordings() -> None:
     ours = truth_of(simulation).to_table() | {"bytes": 0}
     assert set(theirs) <= set(ours)
     assert set(theirs["scene"]) == set(ours["scene"])
-    assert set(theirs["bars"][0]) | {"link", "pilot_every"} == set(ours["bars"][0])
+    assert set(theirs["bars"][0]) | {"link", "pilot_every", "payload"} == set(ours["bars"][0])
     assert theirs["camera"] == ours["camera"]
 
 

@@ -1,0 +1,200 @@
+"""The truth beside a recording: what a file says comes back, and what it cannot mean is refused."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.link.resolve import resolve
+from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.sim import Truth, load_scene, read_truth, resolve_scene, truth_from_table, truth_of
+
+SHARED = Path(__file__).parents[4] / "shared" / "recordings"
+WORLD = {"latitude_deg": 35.1, "longitude_deg": 136.9}
+
+
+class Revised:
+    """A package whose algorithms have a revision."""
+
+    def __init__(self, role: str, target: str, revision: int) -> None:
+        self._record = Algorithm(role, "own", target, revision, "a test")
+
+    @hookimpl
+    def evlcp_algorithms(self) -> list[Algorithm]:
+        return [self._record]
+
+
+def plain(truth: Truth) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(json.dumps(truth.to_table()))
+    return found
+
+
+def same(one: Truth, two: Truth) -> None:
+    assert (one.t0_us, one.duration_us, one.sites) == (two.t0_us, two.duration_us, two.sites)
+    assert one.t_us == pytest.approx(two.t_us)
+    assert set(one.camera_path) == set(two.camera_path)
+    for key, values in one.camera_path.items():
+        assert (values == two.camera_path[key]).all()
+    for a, b in zip(one.bars, two.bars, strict=True):
+        assert (a.link, a.start_chip, a.ppm, a.payload) == (b.link, b.start_chip, b.ppm, b.payload)
+        assert (a.lit, a.sends_frames) == (b.lit, b.sends_frames)
+        assert (a.covered, a.cover_s, a.pole_s) == (b.covered, b.cover_s, b.pole_s)
+        for name in ("symbols", "centre_px", "distance_m"):
+            assert (getattr(a, name) == getattr(b, name)).all()
+
+
+def test_a_truth_comes_back_from_its_file(tmp_path: Path) -> None:
+    bars = [
+        {"payload": "messages", "ppm": 30.0},
+        {"link": {"air": {"chip_rate_hz": 5000.0}, "modulation": {"id": "wh8"}}, "z_m": 5.0},
+        {"led_w_m2": 1e-9, "link": {"bar": {"rows": 48}}},
+    ]
+    known = truth_of(resolve_scene({"duration_s": 0.1, "t0_us": 5, "world": WORLD, "bars": bars}))
+    assert [bar.payload for bar in known.bars] == ["messages", "symbols", "symbols"]
+    assert [bar.lit for bar in known.bars] == [True, True, False]
+    assert [bar.clusters for bar in known.bars] == [16, 16, 8]
+    assert [bar.bits_per_symbol for bar in known.bars] == [6, 4, 6]
+    assert [bar.rate_hz for bar in known.bars] == pytest.approx([10_000.3, 5000.0, 10_000.0])
+    assert len(known.sites) == 3
+    path = tmp_path / "REC.truth.json"
+    path.write_text(json.dumps(known.to_table()))
+    same(read_truth(path), known)
+    table = plain(known)
+    assert sorted(table["links"]) == sorted({bar.link.digest for bar in known.bars})
+    assert table["links"][known.bars[1].link.digest]["table"]["air"]["chip_rate_hz"] == 5000.0
+    assert plain(truth_from_table(table)) == table
+
+
+def test_chips_of_a_file_are_no_frames(tmp_path: Path) -> None:
+    np.save(tmp_path / "chips.npy", np.eye(16, dtype=np.uint8))
+    known = truth_of(load_scene("night", {"bars.chips_file": str(tmp_path / "chips.npy")}))
+    (bar,) = truth_from_table(plain(known)).bars
+    assert (bar.lit, bar.sends_frames, bar.symbols.shape) == (True, False, (0, 10, 16))
+    assert plain(known)["bars"][0]["packet_chips"] == 16
+
+
+def test_a_file_without_a_link_is_of_the_default_link() -> None:
+    table = plain(truth_of(load_scene("two-bars", ["duration_s=0.1"])))
+    del table["links"]
+    for bar in table["bars"]:
+        del bar["link"], bar["pilot_every"], bar["payload"]
+    assert [bar.link for bar in truth_from_table(table).bars] == [resolve({})] * 2
+    other = {
+        "modulation": {"id": "wh8"},
+        "bar": {"rows": 48},
+        "air": {"frames_per_packet": 20, "pilot_every": 4},
+    }
+    known = plain(truth_of(load_scene("night", {"link": other})))
+    del known["links"], known["bars"][0]["link"]
+    assert truth_from_table(known).bars[0].link == resolve(other)
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="the recordings of ../shared are not there")
+@pytest.mark.parametrize("path", sorted(SHARED.glob("**/*.truth.json")), ids=lambda path: path.stem)
+def test_files_of_another_generator_are_read(path: Path) -> None:
+    truth, table = read_truth(path), json.loads(path.read_text())
+    assert len(truth.bars) == len(table["bars"])
+    for i, (bar, row) in enumerate(zip(truth.bars, table["bars"], strict=True)):
+        assert bar.link == resolve({"modulation": {"id": row["profile"]}})
+        assert bar.symbols.tolist() == row["symbols"]
+        assert bar.packet.packet_chips == row["packet_chips"]
+        assert bar.distance_m.tolist() == table["distance_m"][i]
+        assert bar.centre_px.T.tolist() == table["bar_centre_px"][i]
+        assert bar.lit == (row["led_w_m2"] is None)
+        assert list(bar.covered) == row.get("covered", [])
+        assert [list(span) for span in bar.cover_s] == row.get("cover_s", [])
+    again = plain(truth)
+    assert {key: again[key] for key in ("scene", "t_s")} == {key: table[key] for key in ("scene", "t_s")}
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "says"),
+    [
+        ("bars", 3, "bars = 3: expected a list"),
+        ("bars.0", 3, "bars.0 = 3: expected a table"),
+        ("scene", 3, "scene = 3: expected a table"),
+        ("scene.t0_us", "x", "scene.t0_us = 'x': expected a number"),
+        ("scene.duration_s", -1.0, "scene.duration_s = -1.0: expected a number, at least 0"),
+        ("t_s", [], "t_s = []: expected at least one time"),
+        ("t_s", [0.0, "soon"], "t_s = [0.0, 'soon']: expected"),
+        ("t_s", [1.0, 0.5], "t_s = [1.0, 0.5]: expected rising times"),
+        ("distance_m", [], "distance_m = []: expected one list a bar, 1"),
+        ("distance_m.0", [1.0], "distance_m.0 = [1.0]: expected finite numbers, 50"),
+        ("bar_centre_px.0", [[1.0]], "bar_centre_px.0 = [[1.0]]: expected finite numbers, 2 x 50"),
+        ("bars.0.ppm", None, "bars.0.ppm = None: expected a number"),
+        ("bars.0.ppm", True, "bars.0.ppm = True: expected a number"),
+        ("bars.0.start_chip", -3, "bars.0.start_chip = -3: expected a number, at least 0"),
+        ("bars.0.payload", "songs", "bars.0.payload = 'songs': expected one of symbols, data, messages"),
+        ("bars.0.symbols", [[[1]]], "bars.0.symbols = [[[1]]]: expected packets of 10 frames of 16 symbols"),
+        ("bars.0.symbols.1.2.3", 64, "bars.0.symbols.1.2.3 = 64: expected 0 to 63"),
+        ("bars.0.symbols.1.2.3", 0.5, "expected packets of 10 frames of 16 symbols, 0 to 63"),
+        ("bars.0.link", "abc", "bars.0.link = 'abc': expected the digest of one of the links"),
+        ("bars.0.pole_s", [[1.0]], "bars.0.pole_s = [[1.0]]: expected a list of lists of 2 numbers"),
+        ("bars.0.covered", ["all"], "bars.0.covered = [['all']]: expected"),
+        ("links", 3, "links = 3: expected a table"),
+        ("sites", 3, "sites = 3: expected a list"),
+        ("sites", [{"x": 1}], "sites = [{'x': 1}]: expected tables with the keys of a site"),
+        ("camera_path", 3, "camera_path = 3: expected a table"),
+    ],
+)
+def test_what_no_truth_says_is_refused_in_one_line(path: str, value: Any, says: str, tmp_path: Path) -> None:
+    table = plain(truth_of(load_scene("night", ["duration_s=0.05"])))
+    holder: Any = table
+    *above, last = path.split(".")
+    for part in above:
+        holder = holder[int(part) if part.isdigit() else part]
+    holder[int(last) if last.isdigit() else last] = value
+    (tmp_path / "t.json").write_text(json.dumps(table))
+    with pytest.raises(InputError) as fault:
+        read_truth(tmp_path / "t.json")
+    assert says in str(fault.value)
+    assert str(fault.value).startswith(f"{tmp_path}/t.json: ")
+    assert len(str(fault.value).splitlines()) == 1
+
+
+def test_files_that_are_no_truth_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        read_truth(tmp_path / "none.json")
+    (tmp_path / "t.json").write_text("{")
+    with pytest.raises(InputError, match="not JSON"):
+        read_truth(tmp_path / "t.json")
+    (tmp_path / "t.json").write_text("[]")
+    with pytest.raises(InputError, match="not a scene's truth: bar_centre_px, bars"):
+        read_truth(tmp_path / "t.json")
+
+
+def test_codes_made_otherwise_here_are_refused() -> None:
+    scene = {"duration_s": 0.05, "link": {"modulation": {"id": "own"}}}
+    there = Registry.load(Revised("modulation", "evlcp_wh.modulation:Wh8", 1))
+    table = plain(truth_of(resolve_scene(scene, there), registry=there))
+    same(truth_from_table(table, there), truth_of(resolve_scene(scene, there), registry=there))
+    with pytest.raises(InputError, match=r"links.*: not a link here: no modulation algorithm named 'own'"):
+        truth_from_table(table)
+    here = Registry.load(Revised("modulation", "evlcp_wh.modulation:Raw8", 2))
+    with pytest.raises(InputError) as fault:
+        truth_from_table(table, here, source="t.json")
+    assert "its settings give" in str(fault.value)
+    assert "(revisions: modulation own 1 there, 2 here); install the versions" in str(fault.value)
+
+
+def test_another_revision_with_the_same_codes_is_a_warning() -> None:
+    scene = {"duration_s": 0.05, "link": {"ranging": {"id": "own"}}}
+    target = "evlcp_poc.ranging:PocRanging"
+    there, here = (Registry.load(Revised("ranging", target, revision)) for revision in (1, 2))
+    table = plain(truth_of(resolve_scene(scene, there), registry=there))
+    assert truth_from_table(table, there).warnings == ()
+    (warning,) = truth_from_table(table, here, source="t.json").warnings
+    assert warning.startswith("t.json: links.")
+    assert "(revisions: ranging own 1 there, 2 here); the codes are the same" in warning
+
+
+def test_a_truth_is_read_without_the_kernels() -> None:
+    says = "import sys, evlcp_sdk.sim.truth; print('numba' in sys.modules, 'scipy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", says], capture_output=True, text=True, check=True)
+    assert done.stdout == "False False\n"
