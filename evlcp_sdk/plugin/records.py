@@ -117,8 +117,10 @@ def message_kinds(registry: Registry) -> dict[int, MessageKind]:
             who = f"message kind '{kind.name}' of {owner}"
             if not (isinstance(kind.number, int) and 1 <= kind.number <= _MOST_KIND):
                 raise PluginError(f"{who}: number = {kind.number!r}, expected 5 to {_MOST_KIND}")
+            if kind.name == "packet":
+                raise PluginError(f"{who}: its name is that of a packet's line; choose another")
             for other in found.values():
-                if kind.number == other.number or kind.name in (other.name, "packet"):
+                if kind.number == other.number or kind.name == other.name:
                     raise PluginError(
                         f"{who}: number {kind.number} or its name is that of '{other.name}' of"
                         f" {owners[other.number]}; the SDK's are 1 to 4; uninstall one"

@@ -15,6 +15,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "third_party_plugin"
+FORMATS = ROOT / "examples" / "third_party_formats"
 RECORDING = ROOT / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
 
 
@@ -73,7 +74,7 @@ class Environment:
 def environment(tmp_path: Path) -> Iterator[Environment]:
     """The environment with both wheels."""
     made = Environment(tmp_path)
-    made.pip("install", made.build(ROOT), made.build(EXAMPLE))
+    made.pip("install", made.build(ROOT), made.build(EXAMPLE), made.build(FORMATS))
     yield made
     # Borrowed packages are links: only these go.
     shutil.rmtree(made.folder)
@@ -114,8 +115,8 @@ def it_is_checked(environment: Environment, role: str, id: str) -> None:
     assert {law["status"] for law in told["laws"]} == {"ok"}
 
 
-def its_own_tests_pass(environment: Environment) -> None:
-    said = environment.run("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=EXAMPLE)
+def its_own_tests_pass(environment: Environment, folder: Path = EXAMPLE) -> None:
+    said = environment.run("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=folder)
     assert " passed" in said
     assert "skipped" not in said
 
@@ -137,6 +138,23 @@ def it_is_used(environment: Environment) -> None:
     assert bar["frames_found"] == bar["frames_sent"] > 10
     assert bar["ber"] < 0.02
     assert bar["rmse_m"] < 0.5
+
+
+def its_format_is_written(environment: Environment) -> None:
+    out = environment.folder / "lines"
+    environment.run("evlcp", "receive", RECORDING, "-o", out, "--sink", "distance-lines")
+    lines = (out / "distances.line").read_text().splitlines()
+    summary = json.loads((out / "summary.json").read_text())
+    assert len(lines) == summary["transmitters"][0]["frames_ranged"] > 10
+    assert summary["sinks"] == {"distance-lines": {"lines": len(lines)}}
+
+
+def without_it_its_format_is_not_known(environment: Environment) -> None:
+    environment.pip("uninstall", "evlcp-roadside")
+    out = environment.folder / "none"
+    said = environment.run("evlcp", "receive", RECORDING, "-o", out, "--sink", "distance-lines", code=2)
+    assert "no sink named 'distance-lines'" in said
+    assert not out.exists()
 
 
 def two_of_one_name_are_told_by_their_distributions(environment: Environment) -> None:
@@ -164,5 +182,8 @@ def test_a_strangers_package_is_as_good_as_a_built_in(environment: Environment) 
     it_is_checked(environment, "decoding", "majority")
     its_own_tests_pass(environment)
     it_is_used(environment)
+    its_own_tests_pass(environment, FORMATS)
+    its_format_is_written(environment)
+    without_it_its_format_is_not_known(environment)
     two_of_one_name_are_told_by_their_distributions(environment)
     uninstalled_it_is_gone(environment)

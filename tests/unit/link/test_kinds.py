@@ -1,0 +1,145 @@
+"""Kinds of messages: one file and one hook, from compose to packets.jsonl."""
+
+import json
+import pickle
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.air.blocks import Block, Kind, Message, split
+from evlcp_sdk.air.frames import bits_of_symbols
+from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
+from evlcp_sdk.errors import ConfigError, PluginError
+from evlcp_sdk.link.compose import compose, packets_of
+from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.plugin.records import message_kinds
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.results.packets_jsonl import message_line
+from evlcp_sdk.run import receive_to_folder
+from evlcp_sdk.rx.inbox import MessageAssembler
+from evlcp_sdk.sim import load_scene
+from evlcp_sdk.simulated import simulate
+from evlcp_sdk.values import Frame, Packet, Range, ReceivedMessage, SoftSymbols
+from tests.unit.link import wind
+
+REGISTRY = Registry.load(wind)
+LINK = load_link(registry=REGISTRY)
+NOTHING = Range(float("nan"), float("nan"), 0)
+
+
+def packet_of(symbols: np.ndarray, link: Link) -> Packet:
+    """A packet as it is received without an error."""
+    bits = bits_of_symbols(symbols, link.codebook.bits_per_symbol)
+    llr = (8 * (1 - 2.0 * bits)).astype(np.float32).reshape(*symbols.shape, -1)
+    frames = tuple(
+        Frame(0, 0, n, 3200.0 * n, SoftSymbols(symbols[n], llr[n], 1.0), NOTHING, None, 0.0, 0.0)
+        for n in range(len(symbols))
+    )
+    return Packet(0, 0, 0.0, 100.0, frames, len(symbols))
+
+
+def heard(messages: list[Message], link: Link) -> tuple[list[ReceivedMessage], dict[str, int]]:
+    inbox = MessageAssembler.of(link)
+    assert inbox is not None
+    found = [
+        message
+        for symbols in packets_of(messages, link.block_coder())
+        for message in inbox.add(packet_of(symbols, link)).messages
+    ]
+    return found, {name: count for name, count in inbox.counts.items() if count}
+
+
+def test_a_kind_is_one_file_and_one_hook(tmp_path: Path) -> None:
+    symbols = compose(LINK, text="Tempo 30", other={"wind": (7.5, 270.0)}, transmitter_id=3, sequence=9)
+    scene = load_scene("drive-30kmh", {"duration_s": 0.12, "bars.start_chip": 1300.0})
+    (bar,) = scene.bars
+    sent = tuple(tuple(tuple(frame) for frame in packet) for packet in symbols.tolist())
+    scene = replace(scene, bars=(replace(bar, symbols=sent),))
+    summary = receive_to_folder(simulate(scene), tmp_path, LINK, registry=REGISTRY)
+    lines = [json.loads(line) for line in (tmp_path / "packets.jsonl").read_text().splitlines()]
+    found = {line["kind"]: line for line in lines if line["kind"] != "packet"}
+    assert found.keys() == {"text", "wind"}
+    assert (found["wind"]["speed_m_s"], found["wind"]["from_deg"]) == (7.5, 270.0)
+    assert (found["wind"]["transmitter_id"], found["wind"]["sequence"]) == (3, 9)
+    assert (found["wind"]["trust"], found["wind"]["reason"]) == ("unverified", "not signed")
+    assert summary["counts"]["messages"] == 2
+
+
+def test_a_receiver_without_the_kind_counts_its_blocks() -> None:
+    message = Message(wind.Wind.number, 3, 9, wind.Wind().pack((7.5, 270.0)))
+    found, counts = heard([message], LINK)
+    assert [(m.kind.name, m.value, m.beacon) for m in found] == [("wind", (7.5, 270.0), None)]
+    found, counts = heard([message], load_link())
+    assert found == []
+    assert counts == {"blocks_tried": 1, "blocks_decoded": 1, "blocks_malformed": 1}
+
+
+def test_what_a_kind_does_not_understand_is_counted_once_and_ends_nothing() -> None:
+    found, counts = heard([Message(15, 3, 9, b"abc")] * 2 + [Message(15, 3, 10, bytes(8))], LINK)
+    assert [m.value for m in found] == [(0.0, 0.0)]
+    assert (counts["messages_undecodable"], counts["messages"]) == (1, 1)
+
+
+def test_the_number_is_what_the_header_says() -> None:
+    block = next(iter(split(Message(15, 3, 9, bytes(8)), bytes(4), 40))).pack(40)
+    assert block[0] == 0x1F
+    assert Block.unpack(block, LINK.kinds).kind == 15
+    for number in (0, 16, -1):
+        with pytest.raises(ConfigError, match=f"kind = {number}, expected 1 to 15"):
+            Message(number, 3, 9, b"a")
+
+
+def test_the_kinds_go_with_the_link() -> None:
+    assert LINK.kinds.keys() == {1, 2, 3, 4, 15}
+    assert pickle.loads(pickle.dumps(LINK)).kinds[15].name == "wind"
+    assert LINK.with_air(pilot_every=2).kinds is LINK.kinds
+    assert LINK.digest == load_link().digest
+    for number, kind in BUILT_IN_KINDS.items():
+        assert (kind.number, kind.name) == (number, Kind(number).name.lower())
+
+
+def bring(number: Any, name: str, shown: Mapping[str, Any] | None = None) -> tuple[object, MessageKind]:
+    class Other(wind.Wind):
+        def to_dict(self, value: Any) -> Mapping[str, Any]:
+            return shown or {}
+
+    Other.number, Other.name = number, name
+    kind = Other()
+
+    class Plugin:
+        @hookimpl
+        def evlcp_message_kinds(self) -> Iterator[MessageKind]:
+            yield kind
+
+    return Plugin(), kind
+
+
+@pytest.mark.parametrize(
+    ("number", "name", "told"),
+    [
+        (3, "wind", r"number 3 or its name is that of 'data' of evlcp-sdk"),
+        (7, "text", r"number 7 or its name is that of 'text' of evlcp-sdk"),
+        (7, "packet", r"its name is that of a packet's line"),
+        (16, "wind", r"number = 16, expected 5 to 15"),
+        ("5", "wind", r"number = '5', expected 5 to 15"),
+    ],
+)
+def test_two_of_one_number_or_name_are_told(number: Any, name: str, told: str) -> None:
+    with pytest.raises(PluginError, match=told):
+        message_kinds(Registry.load(bring(number, name)[0]))
+
+
+def test_a_kind_cannot_change_what_every_message_says() -> None:
+    for shown, told in (
+        ({"trust": "verified"}, "shows 'trust'"),
+        ({"a": {1}}, r"to_dict\(\) fails: TypeError"),
+    ):
+        _, kind = bring(9, "odd", shown)
+        message = ReceivedMessage(0, 0, 0.0, Message(9, 1, 1, b"a"), kind, None, "unverified", "not signed")
+        with pytest.raises(PluginError, match=told):
+            message_line(message)
