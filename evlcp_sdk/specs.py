@@ -2,18 +2,20 @@
 
 import difflib
 import json
+import re
 import tomllib
-from collections.abc import Sequence
-from dataclasses import MISSING, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, create_model
+from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
 from evlcp_sdk.errors import ConfigError
 
 __all__ = [
-    "expected",
+    "SpecError",
+    "build",
     "nearest",
     "parse_toml",
     "parse_value",
@@ -22,6 +24,87 @@ __all__ = [
     "spec_model",
     "toml_value",
 ]
+
+T = TypeVar("T")
+
+
+class SpecError(ConfigError):
+    """A table that does not describe a dataclass.
+
+    Args:
+        faults: (path, what follows it in a message) of each, e.g. `(("air", "ppm"), " = 3: unknown key")`.
+    """
+
+    def __init__(self, faults: Sequence[tuple[tuple[str, ...], str]]) -> None:
+        self.faults = tuple(faults)
+        super().__init__("\n".join(self.lines()))
+
+    def lines(self, before: str = "") -> list[str]:
+        """One line a fault, with `before` in front of each path."""
+        return [f"{before}{'.'.join(path)}{text}" for path, text in self.faults]
+
+
+def build(
+    cls: type[T], table: Mapping[str, Any], *, hint: Callable[[tuple[str, ...]], str | None] = lambda _: None
+) -> T:
+    """The dataclass that a table describes, with those nested in it.
+
+    Args:
+        cls: A dataclass whose fields have types that pydantic knows; the class itself stays free of pydantic.
+        table: As read from TOML.
+        hint: What to say of the unknown key at a path; None for the nearest that is known.
+
+    Raises:
+        SpecError: Keys or values are wrong.
+        ConfigError: The dataclass itself refuses values that are right each by itself.
+
+    >>> from evlcp_sdk.scene.camera import CameraModel
+    >>> build(CameraModel, {"width": 0, "hight": 3}).width
+    Traceback (most recent call last):
+    evlcp_sdk.specs.SpecError: width = 0: expected greater than 0
+    hight = 3: unknown key; did you mean 'height'? (known: ...
+    """
+    try:
+        values = spec_model(cls).model_validate_json(json.dumps(table, default=str))
+    except ValidationError as refused:
+        raise SpecError([_fault(cls, dict(error), hint) for error in refused.errors()]) from refused
+    return cls(**{name: getattr(values, name) for name in type(values).model_fields})
+
+
+def _fault(
+    cls: type[Any], error: Mapping[str, Any], hint: Callable[[tuple[str, ...]], str | None]
+) -> tuple[tuple[str, ...], str]:
+    path, kind, value = tuple(map(str, error["loc"])), error["type"], error["input"]
+    if kind == "missing":
+        return path, ": missing"
+    rows = value if isinstance(value, list) and value else [value]
+    tables = all(isinstance(row, Mapping) for row in rows)
+    given = "" if tables else f" = {shown(value)}"
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+        near = hint(path) or nearest(path[-1], _known_keys(cls, path[:-1]))
+        return path, f"{given}: unknown {'table' if tables else 'key'}{near}"
+    if kind in ("dataclass_type", "model_type", "dict_type"):
+        return path, f"{given}: expected a table"
+    text = error["msg"].replace("Input should be", "expected", 1).replace("a valid array", "a list")
+    return path, f"{given}: {re.sub(r'^[A-Z][a-z]+ should ', 'expected to ', text)}"
+
+
+def _known_keys(cls: type[Any], path: Sequence[str]) -> list[str]:
+    """The keys of the dataclass that stands at a path within another."""
+    for part in path:
+        if not part.isdigit():
+            inner = _dataclass_in(get_type_hints(cls).get(part))
+            if inner is None:
+                return []
+            cls = inner
+    return [f.name for f in fields(cls) if f.init]
+
+
+def _dataclass_in(hint: Any) -> type[Any] | None:
+    """The dataclass of `Spec`, `Spec | None` or `tuple[Spec, ...]`."""
+    if isinstance(hint, type) and is_dataclass(hint):
+        return hint
+    return next((found for inner in get_args(hint) if (found := _dataclass_in(inner)) is not None), None)
 
 
 def read_toml(path: Path | str) -> dict[str, Any]:
@@ -65,8 +148,14 @@ def parse_value(text: str) -> Any:
         return text.strip()
 
 
+_MODELS: dict[type[Any], type[BaseModel]] = {}
+"""The models made so far: making one takes as long as checking many tables."""
+
+
 def spec_model(cls: type[Any]) -> type[BaseModel]:
     """A pydantic model of a dataclass's parameters, which stays free of pydantic itself."""
+    if cls in _MODELS:
+        return _MODELS[cls]
     hints = get_type_hints(cls, include_extras=True)
     parameters: dict[str, Any] = {}
     for f in fields(cls):
@@ -78,12 +167,8 @@ def spec_model(cls: type[Any]) -> type[BaseModel]:
     config = ConfigDict(
         extra="forbid", strict=True, allow_inf_nan=False, validate_default=True, protected_namespaces=()
     )
-    return create_model(cls.__name__, __config__=config, **parameters)
-
-
-def expected(message: str) -> str:
-    """Pydantic's message in the words of this SDK."""
-    return message.replace("Input should be", "expected", 1)
+    model: type[BaseModel] = create_model(cls.__name__, __config__=config, **parameters)
+    return _MODELS.setdefault(cls, model)
 
 
 def shown(value: Any) -> str:

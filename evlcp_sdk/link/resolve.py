@@ -8,11 +8,9 @@ resolved table alone reproduces a result. See `docs/configuration.md`.
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, overload
-
-from pydantic import ValidationError
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
@@ -35,7 +33,7 @@ from evlcp_sdk.plugin.roles import (
 )
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.specs import expected, nearest, parse_value, read_toml, shown, spec_model
+from evlcp_sdk.specs import SpecError, build, nearest, parse_value, read_toml
 
 __all__ = ["Link", "load_link", "resolve"]
 
@@ -261,18 +259,11 @@ def resolve(
                 continue
             cls = registry.load_class(section, name)
         try:
-            values = spec_model(cls).model_validate_json(json.dumps(keys, default=str))
-            built[section] = cls(**{k: getattr(values, k) for k in type(values).model_fields})
+            built[section] = build(cls, keys)
             resolved[section] = head | json.loads(json.dumps(asdict(built[section])))
-        except ValidationError as refused:
-            names = [f.name for f in fields(cls) if f.init]
-            for error in refused.errors():
-                key = str(error["loc"][0])
-                given = f" = {shown(keys[key])}" if key in keys else ""
-                if error["type"] == "extra_forbidden":
-                    fault(section, key, f"{given}: unknown key{nearest(key, names)}")
-                else:
-                    fault(section, key, f"{given}: {expected(error['msg'])}")
+        except SpecError as refused:
+            for path, text in refused.faults:
+                fault(section, path[0], "".join(f".{part}" for part in path[1:]) + text)
         except ConfigError as refused:
             faults.append(f"{source}: {refused}" if source else str(refused))
     if len(faults) == 1 and isinstance(faults[0], UnknownAlgorithmError):

@@ -4,8 +4,6 @@ Heights are above the WGS-84 ellipsoid. A local frame has its axes to the east, 
 an origin near the bars. See `docs/position.md`.
 """
 
-import difflib
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -14,10 +12,10 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.specs import read_toml
+from evlcp_sdk.specs import SpecError, build, nearest, read_toml
 
 __all__ = ["BarSite", "LocalFrame", "load_sites", "resolve_sites", "site_of_transmitter", "to_toml"]
 
@@ -32,8 +30,6 @@ class BarSite:
     >>> BarSite(7, 35.0, 137.0, 50.0, tilt_deg=90.0, heading_deg=90.0).axis_enu().round(6).tolist()
     [1.0, 0.0, 0.0]
     """
-
-    __pydantic_config__ = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
     transmitter_id: Annotated[
         int, Field(ge=0, lt=2**32, description="Number of the transmitter, as its beacon sends it.")
@@ -149,7 +145,9 @@ class LocalFrame:
         return latitude, longitude, height
 
 
-_ADAPTER: TypeAdapter[BarSite] = TypeAdapter(BarSite)
+@dataclass(frozen=True)
+class _File:
+    bar: tuple[BarSite, ...]
 
 
 def load_sites(path: Path | str) -> tuple[BarSite, ...]:
@@ -176,38 +174,25 @@ def resolve_sites(table: Mapping[str, Any], *, source: str = "") -> tuple[BarSit
     0.96
     """
     before = f"{source}: " if source else ""
-    faults = [f"{before}{key}: unknown table{_nearest(key, ['bar'])}" for key in table if key != "bar"]
     rows = table.get("bar")
     if not isinstance(rows, list) or not rows:
-        faults.append(f"{before}bar: expected one [[bar]] or more")
-        rows = []
-    sites: list[BarSite] = []
-    names = [f.name for f in fields(BarSite)]
-    for i, row in enumerate(rows):
-        try:
-            sites.append(_ADAPTER.validate_json(json.dumps(row, default=str)))
-        except ValidationError as refused:
-            for error in refused.errors():
-                where = ".".join(["bar", str(i), *map(str, error["loc"])])
-                if error["type"] == "missing":
-                    faults.append(f"{before}{where}: missing")
-                elif error["type"] == "unexpected_keyword_argument":
-                    near = _nearest(str(error["loc"][-1]), names)
-                    faults.append(f"{before}{where} = {error['input']!r}: unknown key{near}")
-                else:
-                    expected = error["msg"].replace("Input should be", "expected", 1)
-                    faults.append(f"{before}{where} = {error['input']!r}: {expected}")
-    if not faults:
-        for name in ("transmitter_id", "transmitter"):
-            first: dict[int, int] = {}
-            for i, site in enumerate(sites):
-                number = getattr(site, name)
-                if number is not None and first.setdefault(number, i) != i:
-                    same = f"bar.{first[number]} has it, too; expected one each"
-                    faults.append(f"{before}bar.{i}.{name} = {number}: {same}")
+        lines = [f"{before}{key}: unknown table{nearest(key, ['bar'])}" for key in table if key != "bar"]
+        raise ConfigError("\n".join([*lines, f"{before}bar: expected one [[bar]] or more"]))
+    try:
+        sites = build(_File, table).bar
+    except SpecError as refused:
+        raise ConfigError("\n".join(refused.lines(before))) from refused
+    faults = []
+    for name in ("transmitter_id", "transmitter"):
+        first: dict[int, int] = {}
+        for i, site in enumerate(sites):
+            number = getattr(site, name)
+            if number is not None and first.setdefault(number, i) != i:
+                same = f"bar.{first[number]} has it, too; expected one each"
+                faults.append(f"{before}bar.{i}.{name} = {number}: {same}")
     if faults:
         raise ConfigError("\n".join(faults))
-    return tuple(sites)
+    return sites
 
 
 def to_toml(sites: Sequence[BarSite]) -> str:
@@ -239,8 +224,3 @@ def site_of_transmitter(
     if named is None and alone and len(sites) == 1 and sites[0].transmitter is None:
         return sites[0]
     return named
-
-
-def _nearest(word: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(word, known, n=1)
-    return (f"; did you mean '{near[0]}'?" if near else "") + f" (known: {', '.join(known)})"

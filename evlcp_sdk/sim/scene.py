@@ -5,7 +5,6 @@ z; a bar with `z_m = 0` then stands `motion.distance_m` ahead. Defaults are thos
 number is an engineering guess, its description says so.
 """
 
-import difflib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,14 +14,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.specs import parse_toml, parse_value, read_toml
+from evlcp_sdk.specs import SpecError, build, nearest, parse_toml, parse_value, read_toml
 
 __all__ = [
     "BackgroundSpec",
@@ -40,8 +39,6 @@ __all__ = [
     "resolve_scene",
 ]
 
-_STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, validate_default=False)
-
 MOST_PIXELS = 4096
 """Columns and rows of a sensor."""
 
@@ -55,8 +52,6 @@ LinkTable = Mapping[str, Any]
 @dataclass(frozen=True)
 class BarSpec:
     """A transmitter: columns of light, cut into clusters from their top, that send packets without end."""
-
-    __pydantic_config__ = _STRICT
 
     x_m: Annotated[float, Field(description="Its centre, to the right of the path's begin.")] = -1.5
     y_m: Annotated[float, Field(description="The same, downward.")] = 0.0
@@ -106,8 +101,6 @@ class BarSpec:
 class LampSpec:
     """A rectangle of flickering light."""
 
-    __pydantic_config__ = _STRICT
-
     x_m: Annotated[float, Field(description="Its centre, to the right of the path's begin.")] = 4.0
     y_m: Annotated[float, Field(description="The same, downward.")] = -3.0
     z_m: Annotated[float, Field(description="The same, beyond `motion.distance_m`.")] = 0.0
@@ -130,8 +123,6 @@ class LampSpec:
 class LensSpec:
     """What the lens does beside projecting: its light, its blur, its halo."""
 
-    __pydantic_config__ = _STRICT
-
     f_number: Annotated[float, Field(gt=0, description="Focal length over aperture.")] = 2.0
     focus_m: Annotated[float, Field(gt=0, description="Distance that is sharp.")] = 50.0
     transmission: Annotated[
@@ -148,8 +139,6 @@ class LensSpec:
 @dataclass(frozen=True)
 class MotionSpec:
     """How the camera moves: an approach along z or a path from a file, and the vehicle's vibration."""
-
-    __pydantic_config__ = _STRICT
 
     distance_m: Annotated[
         float, Field(gt=0, le=10_000, description="Depth of z_m = 0 as the scene begins.")
@@ -174,8 +163,6 @@ class MotionSpec:
 class WorldSpec:
     """Where the scene's origin, x_m = y_m = z_m = 0, is on earth, and z points; what an IMU tells."""
 
-    __pydantic_config__ = _STRICT
-
     latitude_deg: Annotated[float, Field(ge=-90, le=90, description="WGS-84.")] = 0.0
     longitude_deg: Annotated[float, Field(ge=-180, le=180, description="The same.")] = 0.0
     height_m: Annotated[float, Field(ge=-12_000, le=20_000, description="Above the WGS-84 ellipsoid.")] = 0.0
@@ -194,8 +181,6 @@ class WorldSpec:
 class BackgroundSpec:
     """The light of everything else."""
 
-    __pydantic_config__ = _STRICT
-
     light_w_m2: Annotated[
         float, Field(gt=0, le=100, description="On the sensor: night 1e-4, tunnel 0.1, sun 3 to 12.")
     ] = 0.05
@@ -208,8 +193,6 @@ class BackgroundSpec:
 @dataclass(frozen=True)
 class SensorSpec:
     """Pixels and readout; a logarithmic receptor, solved exactly for light constant between edges."""
-
-    __pydantic_config__ = _STRICT
 
     th_on: Annotated[float, Field(gt=0, le=2, description="ON threshold, ln units.")] = 0.223
     th_off: Annotated[float, Field(gt=0, le=2, description="OFF threshold, ln units.")] = 0.223
@@ -260,8 +243,6 @@ class Scene:
     >>> len(Scene().bars)
     1
     """
-
-    __pydantic_config__ = _STRICT
 
     name: Annotated[str, Field(pattern=r"^[\w.+-]+$", description="Name of the recording.")] = "scene"
     duration_s: Annotated[float, Field(gt=0, le=86_400, description="Its length.")] = 0.25
@@ -319,7 +300,7 @@ def preset_text(name: str) -> str:
     """
     known = preset_names()
     if name not in known:
-        raise ConfigError(f"no preset named '{name}'{_nearest(name, known)}")
+        raise ConfigError(f"no preset named '{name}'{nearest(name, known)}")
     return (resources.files("evlcp_sdk.sim") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
 
 
@@ -357,7 +338,7 @@ def load_scene(
         where = name
         if not path.exists() and not path.suffix:
             raise ConfigError(
-                f"{name}: no such file, and no preset of that name{_nearest(name, preset_names())}"
+                f"{name}: no such file, and no preset of that name{nearest(name, preset_names())}"
             )
         table = read_toml(path)
     if link is not None:
@@ -395,23 +376,9 @@ def resolve_scene(
     if default:
         _resolve_link(default, registry, f"{before}link")
     try:
-        scene = _ADAPTER.validate_json(json.dumps(table, default=str))
-    except ValidationError as refused:
-        lines = []
-        for error in refused.errors():
-            where = [str(part) for part in error["loc"]]
-            shown = f" = {error['input']!r}" if not isinstance(error["input"], dict) else ""
-            if error["type"] == "unexpected_keyword_argument":
-                instead = _IN_LINK.get(where[-1]) if where[0] == "bars" else None
-                hint = f"; its link says it: bars.link.{instead}" if instead else None
-                lines.append(
-                    f"{before}{'.'.join(where)}{shown}: unknown key"
-                    f"{hint or _nearest(where[-1], _keys(where))}"
-                )
-            else:
-                text = error["msg"].replace("Input should be", "expected", 1)
-                lines.append(f"{before}{'.'.join(where)}{shown}: {text}")
-        raise ConfigError("\n".join(lines)) from refused
+        scene = build(Scene, table, hint=_hint)
+    except SpecError as refused:
+        raise ConfigError("\n".join(refused.lines(before))) from refused
     except ConfigError as refused:
         raise ConfigError(f"{before}{refused}") from refused
     if folder is not None:
@@ -520,7 +487,10 @@ _IN_LINK = {
 """What one looks for at a bar, and the keys of its link."""
 
 
-_ADAPTER: TypeAdapter[Scene] = TypeAdapter(Scene)
+def _hint(path: tuple[str, ...]) -> str | None:
+    """What to say of an unknown key that a bar's link has."""
+    instead = _IN_LINK.get(path[-1]) if path[0] == "bars" else None
+    return f"; its link says it: bars.link.{instead}" if instead else None
 
 
 def _with_folder(scene: Scene, folder: Path) -> Scene:
@@ -532,22 +502,6 @@ def _with_folder(scene: Scene, folder: Path) -> Scene:
     bars = tuple(replace(bar, chips_file=found(bar.chips_file)) for bar in scene.bars)
     motion = replace(scene.motion, path_file=found(scene.motion.path_file))
     return replace(scene, bars=bars, motion=motion)
-
-
-def _keys(where: Sequence[str]) -> list[str]:
-    """Known keys beside the one at a path."""
-    cls: Any = Scene
-    for part in where[:-1]:
-        if not part.isdigit():
-            cls = {"bars": BarSpec, "lamps": LampSpec, "world": WorldSpec}.get(part) or type(
-                getattr(Scene(), part)
-            )
-    return list(cls.__dataclass_fields__)
-
-
-def _nearest(word: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(word, known, n=1)
-    return (f"; did you mean '{near[0]}'?" if near else "") + f" (known: {', '.join(known) or 'none'})"
 
 
 def _parse_override(text: str) -> tuple[str, Any]:
@@ -580,7 +534,7 @@ def _set(table: dict[str, Any], key: str, value: Any) -> None:
         else:
             _row(rows, parts, key)[parts[2]] = value
     else:
-        raise ConfigError(f"--set {key}: unknown table{_nearest(parts[0], [*_TABLES, *_LISTS, 'link'])}")
+        raise ConfigError(f"--set {key}: unknown table{nearest(parts[0], [*_TABLES, *_LISTS, 'link'])}")
 
 
 def _rows(table: dict[str, Any], name: str) -> list[dict[str, Any]]:

@@ -4,17 +4,17 @@ import json
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.specs import expected, nearest, read_toml, shown, spec_model
+from evlcp_sdk.specs import SpecError, build, read_toml, shown
 from firmware_host.board.bank import Bank, bank_of, check_link, random_symbols, read_masks
 from firmware_host.board.board import Board, Programmed, Settings, provision
 from firmware_host.board.session import Session
@@ -171,18 +171,11 @@ def read_inventory(path: Path) -> Inventory:
 def _entry(path: Path, index: int, row: dict[str, Any]) -> Entry:
     place = f"{path}: board[{index}]"
     try:
-        values = spec_model(Entry).model_validate_json(json.dumps(row, default=str))
-        return Entry(**{k: getattr(values, k) for k in type(values).model_fields})
+        return build(Entry, row)
+    except SpecError as refused:
+        raise ConfigError("\n".join(refused.lines(f"{place}."))) from refused
     except ConfigError as fault:
         raise ConfigError(f"{place}: {fault}") from fault
-    except ValidationError as refused:
-        error = refused.errors()[0]
-        key = str(error["loc"][0])
-        given = f" = {shown(row[key])}" if key in row else ""
-        says = expected(error["msg"])
-        if error["type"] == "extra_forbidden":
-            says = f"unknown key{nearest(key, [f.name for f in fields(Entry)])}"
-        raise ConfigError(f"{place}.{'.'.join(map(str, error['loc']))}{given}: {says}") from refused
 
 
 class _Links:

@@ -222,21 +222,18 @@ def test_an_installed_algorithm_is_blamed_by_its_id(monkeypatch: pytest.MonkeyPa
     assert "ranging algorithm 'centroid': KeyError: 'cluster'" in found["clean-link"].detail
 
 
-LINKS = [
-    ("bar.rows=24", "air.chip_rate_hz=5000", "air.frames_per_packet=12"),
-    (
-        "pilots.id=barker13",
-        "bar.rows=78",
-        "modulation.id=wh8",
-        "air.chip_rate_hz=20000",
-    ),
-]
+OTHER = (
+    "pilots.id=barker13",
+    "bar.rows=78",
+    "modulation.id=wh8",
+    "air.chip_rate_hz=5000",
+    "air.frames_per_packet=12",
+)
 
 
-@pytest.mark.parametrize("overrides", LINKS, ids=" ".join)
 @pytest.mark.parametrize("role", ROLES)
-def test_the_defaults_keep_their_laws_on_other_links(role: str, overrides: tuple[str, ...]) -> None:
-    link = load_link(overrides=overrides)
+def test_the_defaults_keep_their_laws_on_another_link(role: str) -> None:
+    link = load_link(overrides=OTHER)
     for outcome in check(role, link.algorithms[role], link=link):
         refused = outcome.status == "skipped" and "leaves every quantity as measured" in outcome.detail
         assert outcome.status == "ok" or refused, f"{outcome.law.name}: {outcome.detail}"

@@ -9,14 +9,14 @@ import hashlib
 import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.specs import parse_value, read_toml
+from evlcp_sdk.specs import SpecError, build, parse_value, read_toml
 from evlcp_sdk.study.tally import Statistics
 
 __all__ = ["Case", "Job", "Plan", "Point", "StopRule", "Task", "digest_of", "load_plan", "make_plan"]
@@ -226,27 +226,26 @@ def make_plan(
     )
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class _Campaign(_Strict):
+@dataclass(frozen=True)
+class _Campaign:
     name: Annotated[str, Field(pattern=r"^[\w.-]+$")]
     seeds: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     first_seed: Annotated[int, Field(ge=0)] = 0
     max_bits: Annotated[int | None, Field(ge=1)] = None
     max_errors: Annotated[int | None, Field(ge=1)] = None
-    merge: list[str] | None = None
+    merge: tuple[str, ...] | None = None
 
 
-class _Grid(_Strict):
+@dataclass(frozen=True)
+class _Grid:
     base: str | None = None
-    set: dict[str, Any] = {}
-    grid: dict[str, Any] = {}
-    variants: dict[str, dict[str, Any]] = {}
+    set: dict[str, Any] = field(default_factory=dict)
+    grid: dict[str, Any] = field(default_factory=dict)
+    variants: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
-class _File(_Strict):
+@dataclass(frozen=True)
+class _File:
     campaign: _Campaign
     scene: _Grid = _Grid()
     link: _Grid = _Grid()
@@ -281,9 +280,9 @@ def load_plan(
     for override in overrides:
         _override(table, override)
     try:
-        file = TypeAdapter(_File).validate_python(table)
-    except ValidationError as refused:
-        raise ConfigError("\n".join(_fault_line(path, e) for e in refused.errors())) from refused
+        file = build(_File, table)
+    except SpecError as refused:
+        raise ConfigError("\n".join(refused.lines(f"{path}: "))) from refused
     folder = Path(path).parent
     faults: list[str] = []
     scenes = _cases("scene", file.scene, folder, scene_of, faults, path)
@@ -292,7 +291,7 @@ def load_plan(
     varied |= {"link." + key for k in links for key, _ in k.labels}
     merge = file.campaign.merge
     if merge is None:
-        merge = sorted(key for key in varied if key.endswith("distance_m"))
+        merge = tuple(sorted(key for key in varied if key.endswith("distance_m")))
     for key in merge:
         if key not in varied:
             known = ", ".join(sorted(varied)) or "nothing"
@@ -326,15 +325,6 @@ def _override(table: dict[str, Any], text: str) -> None:
         keys = keys["set"]
     if isinstance(keys, dict):
         keys[key] = parsed
-
-
-def _fault_line(path: Path | str, error: Any) -> str:
-    where = ".".join(str(part) for part in error["loc"])
-    if error["type"] == "extra_forbidden":
-        return f"{path}: {where}: unknown key"
-    if error["type"] == "missing":
-        return f"{path}: {where}: missing"
-    return f"{path}: {where} = {error['input']!r}: {error['msg'].replace('Input should be', 'expected', 1)}"
 
 
 def _cases(

@@ -97,14 +97,14 @@ def test_a_site_file(tmp_path: Path) -> None:
         ({"bars": [BAR], "bar": [BAR]}, r"s: bars: unknown table; did you mean 'bar'\? \(known: bar\)"),
         ({"bar": [BAR, {**BAR, "transmitter_id": 2, "latitude_deg": 95.0}]},
          "s: bar.1.latitude_deg = 95.0: expected less than or equal to 90"),
-        ({"bar": [{**BAR, "height_m": "low"}]}, "s: bar.0.height_m = 'low': expected a valid number"),
+        ({"bar": [{**BAR, "height_m": "low"}]}, 's: bar.0.height_m = "low": expected a valid number'),
         ({"bar": [{**BAR, "heading": 3}]},
          "s: bar.0.heading = 3: unknown key; did you mean 'heading_deg'"),
         ({"bar": [{k: v for k, v in BAR.items() if k != "height_m"}]}, "s: bar.0.height_m: missing"),
         ({"bar": [BAR, BAR]}, "s: bar.1.transmitter_id = 1: bar.0 has it, too; expected one each"),
         ({"bar": [{**BAR, "transmitter": 0}, {**BAR, "transmitter_id": 2, "transmitter": 0}]},
          "s: bar.1.transmitter = 0: bar.0 has it, too; expected one each"),
-        ({"bar": [3]}, "s: bar.0 = 3: expected an object"),
+        ({"bar": [3]}, "s: bar.0 = 3: expected a table"),
     ],
 )  # fmt: skip
 def test_faults_name_their_place(table: dict[str, object], message: str) -> None:

@@ -50,10 +50,10 @@ def test_examples_can_be_rendered(path: Path) -> None:
     [
         ({"motion": {"distance_m": -3.0}}, "motion.distance_m = -3.0: expected greater than 0"),
         ({"motion": {"distnce_m": 3.0}}, "motion.distnce_m = 3.0: unknown key; did you mean 'distance_m'?"),
-        ({"bars": [{}, {"ppm": "fast"}]}, "bars.1.ppm = 'fast': expected a valid number"),
+        ({"bars": [{}, {"ppm": "fast"}]}, 'bars.1.ppm = "fast": expected a valid number'),
         ({"bars": [{"z_m": -60.0}]}, "bars.0.z_m = -60.0: the bar is behind the camera"),
-        ({"lamps": [{"waveform": "saw"}]}, "lamps.0.waveform = 'saw': expected 'square' or 'sine'"),
-        ({"camra": {}}, "camra: unknown key; did you mean 'camera'?"),
+        ({"lamps": [{"waveform": "saw"}]}, "lamps.0.waveform = \"saw\": expected 'square' or 'sine'"),
+        ({"camra": {}}, "camra: unknown table; did you mean 'camera'?"),
         ({"sensor": {"refr_us": 0}}, "sensor.refr_us = 0: expected greater than or equal to 1"),
         ({"lens": {"focus_m": 0.01}}, "lens.focus_m = 0.01: expected beyond the focal length"),
         ({"camera": {"width": 5000}}, "camera: expected at most 4096"),

@@ -1,0 +1,78 @@
+"""A table against a nested dataclass: each fault with its path, its value, what was expected."""
+
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+import pytest
+from pydantic import Field
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.specs import SpecError, build
+
+
+@dataclass(frozen=True)
+class Inner:
+    width_m: Annotated[float, Field(gt=0)] = 1.0
+    name: Annotated[str, Field(pattern="^[a-z]+$")] = "x"
+
+
+@dataclass(frozen=True)
+class Outer:
+    count: int
+    inner: Inner = field(default_factory=Inner)
+    rows: tuple[Inner, ...] = ()
+    maybe: Inner | None = None
+
+    def __post_init__(self) -> None:
+        if self.count == 13:
+            raise ConfigError("count = 13: expected another")
+
+
+def test_a_right_table_becomes_the_dataclass_with_every_default() -> None:
+    table: dict[str, Any] = {"count": 2, "rows": [{"width_m": 3}, {}], "maybe": {"name": "y"}}
+    wanted = Outer(2, rows=(Inner(3.0), Inner()), maybe=Inner(name="y"))
+    assert build(Outer, table) == wanted
+    assert isinstance(build(Outer, table).rows[0].width_m, float)
+
+
+@pytest.mark.parametrize(
+    ("table", "says"),
+    [
+        ({}, "count: missing"),
+        ({"count": 1.5}, "count = 1.5: expected a valid integer"),
+        ({"count": "1"}, 'count = "1": expected a valid integer'),
+        ({"count": 1, "cuont": 1}, "cuont = 1: unknown key; did you mean 'count'? (known: count, inner,"),
+        ({"count": 1, "iner": {}}, "iner: unknown table; did you mean 'inner'?"),
+        ({"count": 1, "inner": 3}, "inner = 3: expected a table"),
+        (
+            {"count": 1, "inner": {"width": 3}},
+            "inner.width = 3: unknown key; did you mean 'width_m'? (known: w",
+        ),
+        ({"count": 1, "rows": {}}, "rows: expected a list"),
+        ({"count": 1, "rows": [{}, {"width_m": -1}]}, "rows.1.width_m = -1: expected greater than 0"),
+        ({"count": 1, "rows": [{"nam": "y"}]}, "rows.0.nam = \"y\": unknown key; did you mean 'name'?"),
+        ({"count": 1, "maybe": {"nam": "y"}}, "maybe.nam = \"y\": unknown key; did you mean 'name'?"),
+        ({"count": 1, "inner": {"name": "X"}}, 'inner.name = "X": expected to match pattern'),
+        ({"count": 1, "inner": {"width_m": float("nan")}}, "inner.width_m = nan: expected a finite number"),
+    ],
+)
+def test_a_fault_is_one_line_with_path_value_and_what_was_expected(table: dict[str, Any], says: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        build(Outer, table)
+    (line,) = caught.value.lines("f.toml: ")
+    assert line.startswith(f"f.toml: {says}")
+    assert caught.value.exit_code == 2
+
+
+def test_all_faults_are_told_at_once() -> None:
+    with pytest.raises(SpecError) as caught:
+        build(Outer, {"inner": {"width_m": 0, "name": 3}, "foo": 1})
+    paths = {path for path, _ in caught.value.faults}
+    assert paths == {("count",), ("inner", "width_m"), ("inner", "name"), ("foo",)}
+
+
+def test_what_the_dataclass_refuses_passes_and_a_hint_stands_for_the_nearest() -> None:
+    with pytest.raises(ConfigError, match=r"^count = 13: expected another"):
+        build(Outer, {"count": 13})
+    with pytest.raises(SpecError, match=r"^rows\.0\.wide = 3: unknown key; see width$"):
+        build(Outer, {"count": 1, "rows": [{"wide": 3}]}, hint=lambda path: f"; see {path[-1][:3]}th")
