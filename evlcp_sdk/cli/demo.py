@@ -70,8 +70,8 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     import json
     from contextlib import suppress
 
+    from evlcp_sdk.cli._campaign import progress_bar, tell_faults
     from evlcp_sdk.cli._common import make_executor
-    from evlcp_sdk.cli.sweep import progress_bar, tell_faults
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.study.campaign.charts import charts_of, save_charts
     from evlcp_sdk.study.campaign.collect import collect

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import pluggy
 
-from evlcp_sdk.air.kinds import MessageKind
-
 if TYPE_CHECKING:
     import typer
 
+    from evlcp_sdk.air.kinds import MessageKind
     from evlcp_sdk.io import EventSource
 
 __all__ = ["ENTRY_POINT_GROUP", "Algorithm", "SinkRecord", "hookimpl", "hookspec"]
@@ -81,7 +80,7 @@ def evlcp_sinks() -> Iterable[SinkRecord]:  # type: ignore[empty-body]
 
 
 @hookspec
-def evlcp_message_kinds() -> Iterable[MessageKind]:  # type: ignore[empty-body]
+def evlcp_message_kinds() -> Iterable["MessageKind"]:  # type: ignore[empty-body]
     """Yield each kind of message that the package brings; import nothing heavy for it."""
 
 

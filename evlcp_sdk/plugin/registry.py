@@ -6,7 +6,6 @@ A plugin that fails is left out with all its hooks, and shown: as a `PluginWarni
 
 import difflib
 import importlib
-import multiprocessing
 import platform
 import warnings
 from collections.abc import Iterator
@@ -258,6 +257,9 @@ class Registry:
         distribution = "" if owner is None else f"{owner.name} {owner.version}"
         broken = Broken(name, distribution, reason, algorithms)
         self._broken.append(broken)
+        # Not imported at start-up, as it takes long and is needed only here.
+        import multiprocessing
+
         # Worker processes would only say it again.
         if multiprocessing.parent_process() is None:
             warnings.warn(str(broken), PluginWarning, stacklevel=2)

@@ -111,3 +111,12 @@ def test_receiver_stages_do_not_import_one_another() -> None:
             other = name.removeprefix("evlcp_sdk.")
             if other.startswith("rx.") and not other.startswith("rx._"):
                 assert row[other.removeprefix("rx.")] < row[module], f"{module} imports {name}"
+
+
+def test_commands_do_not_import_one_another() -> None:
+    commands = [m for m in MODULES if m.startswith("cli.") and not m.startswith("cli._") and m != "cli.main"]
+    assert len(commands) > 8
+    for module in commands:
+        for name in imports_of(MODULES[module]):
+            other = name.removeprefix("evlcp_sdk.")
+            assert not other.startswith("cli.") or other.startswith("cli._"), f"{module} imports {name}"

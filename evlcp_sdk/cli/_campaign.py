@@ -1,0 +1,50 @@
+"""How a campaign is shown while it runs: a bar, and the jobs that failed."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from evlcp_sdk.cli._common import complain
+
+if TYPE_CHECKING:
+    from evlcp_sdk.study.campaign.collect import Progress
+
+__all__ = ["progress_bar", "tell_faults"]
+
+_MOST_FAULTS = 5
+
+
+def tell_faults(progress: "Progress") -> None:
+    """Say which jobs failed, one line each, equal faults once."""
+    lines = dict.fromkeys(fault.message for _, fault in progress.faults)
+    for line in list(lines)[:_MOST_FAULTS]:
+        number = sum(fault.message == line for _, fault in progress.faults)
+        complain(f"{number} job{'s' * (number > 1)} failed: {line}")
+    if len(lines) > _MOST_FAULTS:
+        complain(f"{len(lines) - _MOST_FAULTS} more kinds of failure")
+
+
+@contextmanager
+def progress_bar(name: str) -> "Iterator[Callable[[Progress], None]]":
+    """A bar by tasks, with the errors so far, on a terminal only."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    err = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[errors]}"),
+        TimeRemainingColumn(),
+    )
+    with Bar(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task(name, total=None, errors="")
+
+        def show(progress: "Progress") -> None:
+            failed = f", {len(progress.faults)} failed" if progress.faults else ""
+            errors = f"{progress.bit_errors:,} errors in {progress.bits:,} bits{failed}"
+            bar.update(task, completed=progress.done, total=progress.tasks, errors=errors)
+
+        yield show
