@@ -26,7 +26,7 @@ def score(
     [bold]evlcp score out REC.truth.json[/]
 
     Each row of OUT/frames.csv is put beside the true frame that started nearest in time, on the bar nearest
-    in the image. Two scores are told: the plain one, for which a symbol that is not given counts as all bits
+    in the image. There are two scores: the plain one, for which a symbol that is not given counts as all bits
     wrong; and the road score, which knows erased symbols, hidden clusters and reflections.
 
     A result of another link than that of the truth is refused.

@@ -52,7 +52,7 @@ def sweep(
     What came out:         [bold]evlcp report paper.sqlite -o report.html[/]
 
     A result is kept as soon as it is there: stopped or killed at any moment, the same command goes on.
-    One process a core unless told otherwise.
+    One process a core, or as many as you say.
     """
     import json
     from dataclasses import asdict

@@ -186,7 +186,7 @@ def match(frames: Iterable[GivenFrame], truth: Truth, *, road: bool = True) -> M
     """Put each decoded frame beside the sent one.
 
     A frame that is cut by an end of the recording, or by something that hides all of the bar, is neither
-    found nor unmatched.
+    found nor unmatched, unless the sent frame nearest to it was found before.
 
     Args:
         frames: The decoded frames, in their order: of two beside the same sent one, the first is it.

@@ -41,7 +41,7 @@ class Dot:
         y: The figure; where there was not one error on a logarithmic axis, the upper end of its interval.
         low: Lower end of the interval.
         high: Upper end.
-        text: What a reader who points at it is told.
+        text: What a reader who points at it sees.
         limit: Only an upper limit is known.
     """
 
@@ -184,7 +184,7 @@ def _mark_name(clusters: int | None, speed_kmh: float | None) -> str:
 
 
 def _lines(series: Sequence[Series], dots: Callable[[Series, float], tuple[Dot, ...]]) -> tuple[Line, ...]:
-    """Colour tells the scene, dash and symbol the link; neighbours stand a little apart."""
+    """Colour is the scene, dash and symbol the link; neighbours stand a little apart."""
     scenes = list(dict.fromkeys(_part(one, "scene.") for one in series))
     links = list(dict.fromkeys(_part(one, "link.") for one in series))
     lines = []

@@ -19,7 +19,7 @@ class Reference:
         clusters: Clusters that the distance is measured from: 16, or the 2 of the method it compares with;
             None where it does not matter.
         speed_kmh: Speed of the car; None for 20, 30 and 40 km/h alike.
-        from_m: Begin of the distances it holds for, m.
+        from_m: Start of the distances it holds for, m.
         to_m: Their end, m.
         value: The figure.
         bound: The paper says at most this, not this.

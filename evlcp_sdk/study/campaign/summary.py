@@ -97,7 +97,7 @@ class Series:
 
     @property
     def clusters(self) -> int | None:
-        """Clusters that its distances are measured from; None where the link does not tell."""
+        """Clusters that its distances are measured from; None where the link does not say."""
         try:
             table = self.link["table"]
             chosen, bar = table["ranging"].get("clusters"), table["bar"]
@@ -108,7 +108,7 @@ class Series:
 
     @property
     def speed_kmh(self) -> float | None:
-        """Speed of the camera, km/h; None where the scene does not tell."""
+        """Speed of the camera, km/h; None where the scene does not say."""
         return _speed_kmh(self.scene)
 
     def between(self, from_m: int, to_m: int) -> Tally:
@@ -250,7 +250,7 @@ class Comparison:
         reference: The paper's.
         series: Name of the series that it is held against.
         ours: The measured one; where the paper gives a bound, that of the worst segment.
-        from_m: Begin of the distances that ours was measured at, m.
+        from_m: Start of the distances that ours was measured at, m.
         to_m: Their end, m.
         agrees: Ours keeps the paper's bound, or lies within 30 % of its figure.
     """

@@ -42,7 +42,7 @@ def truth_path(url: str) -> Path:
 class _Watch:
     """Notes the processor time of the stages of each frame, us.
 
-    A stage's time is what passed since the stage before was told, on the clock of the thread's processor, or
+    A stage's time is what passed since the stage before finished, on the clock of the thread's processor, or
     on that of the wall where that is less: between two frames, work of other stages lies before the first.
     """
 
@@ -124,10 +124,10 @@ def measure_recording(
 
     Args:
         name: Of the table.
-        open_source: Opens the recording at its beginning; called twice.
+        open_source: Opens the recording at its start; called twice.
         variants: At least one.
         truth: What was sent; None where nobody knows.
-        advance: Told after every piece.
+        advance: Called after every piece.
 
     Raises:
         ConfigError: The recording was sent with another link than a variant receives.
