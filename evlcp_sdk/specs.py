@@ -137,7 +137,7 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
 
 
 def parse_value(text: str) -> Any:
-    """A TOML value; what is none is a string, so that a shell needs no second quotes.
+    """A TOML value; any other text is a string, so that a shell needs no second quotes.
 
     >>> parse_value("[1, 2.5]"), parse_value("joint-scale")
     ([1, 2.5], 'joint-scale')

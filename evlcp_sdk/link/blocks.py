@@ -14,7 +14,7 @@ from evlcp_sdk.plugin.roles import Code
 __all__ = ["BlockCoder", "interleaver", "packet_bits"]
 
 _SEED = 2463534242
-"""Begin of the interleaver's sequence, Marsaglia's own."""
+"""Seed of the interleaver's sequence, Marsaglia's own."""
 
 
 def packet_bits(codebook: Codebook, packet: PacketFormat) -> int:

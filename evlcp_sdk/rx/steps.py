@@ -9,7 +9,7 @@ import pluggy
 from numpy.typing import NDArray
 
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.plugin.roles import Filter, Synchronizer, Tracker
+from evlcp_sdk.plugin.roles import ROLES, Filter, Synchronizer, Tracker
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.values import Events, FrameView, PresenceMap, Range, SoftSymbols, SyncLock
 
@@ -62,10 +62,7 @@ class Steps:
     def __init__(self, link: Link, announcer: Announcer) -> None:
         self._codebook = link.codebook
         self._announcer = announcer
-        self._guards = guards = {
-            role: Guard(link, role)
-            for role in ("synchronization", "separation", "decoding", "ranging", "tracking")
-        }
+        self._guards = guards = {role: Guard(link, role) for role in ROLES}
         with guards["synchronization"]:
             self._synchronizer: Synchronizer = link.algorithm("synchronization").compile(
                 link.codebook, link.packet

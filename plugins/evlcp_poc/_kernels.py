@@ -115,7 +115,7 @@ def pair_shifts(
 def middles(maps: Array, used: Array, min_pixels: int, out: Array) -> None:
     """Weighted median (row, column) of the maps used, -1 where a map has too few lit pixels.
 
-    Unlike the mean, the median is deaf to stray pixels.
+    Unlike the mean, the median is robust against stray pixels.
     """
     _, height, width = maps.shape
     rows = np.empty(height)
