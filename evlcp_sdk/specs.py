@@ -40,7 +40,7 @@ class SpecError(ConfigError):
         super().__init__("\n".join(self.lines()))
 
     def lines(self, before: str = "") -> list[str]:
-        """One line a fault, with `before` in front of each path."""
+        """One line per fault, with `before` in front of each path."""
         return [f"{before}{'.'.join(path)}{text}" for path, text in self.faults]
 
 
@@ -111,7 +111,7 @@ def read_toml(path: Path | str) -> dict[str, Any]:
     """The table of a TOML file.
 
     Raises:
-        ConfigError: The file cannot be read, or is no TOML.
+        ConfigError: The file cannot be read, or is not TOML.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
@@ -126,7 +126,7 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
     """The table of a TOML text; `source` says in the message where it comes from.
 
     Raises:
-        ConfigError: It is no TOML.
+        ConfigError: It is not TOML.
     """
     try:
         return tomllib.loads(text)

@@ -376,8 +376,8 @@ class Packet:
         chip_us: Length of a chip on the camera's clock, us.
         frames: The decoded frames in order; a frame that was not received is missing here.
         sent: Number of frames that a packet has.
-        block: What its bits carry; None if that cannot be told.
-        block_packets: Packets whose LLRs were added to tell the block; 0 without one.
+        block: What its bits carry; None if that is not known.
+        block_packets: Packets whose LLRs were added to decode the block; 0 without one.
         messages: Those that are complete with this packet, or whose trust changed.
     """
 
@@ -399,7 +399,7 @@ class Packet:
         return f"Packet({place}, {self.t_us / 1e3:.1f} ms, {found}{messages})"
 
     def _repr_html_(self) -> str:
-        """The packet as a notebook shows it: a row a frame, and what its messages say."""
+        """The packet as a notebook shows it: a row per frame, and what its messages say."""
         rows = "".join(
             f"<tr><td>{f.frame}</td><td>{f.t_us / 1e3:.2f}</td><td>{escape(_symbols(f.soft, most=1024))}</td>"
             f"<td>{f.soft.quality:.2f}</td><td>{escape(_distance(f.range))}</td></tr>"
@@ -432,7 +432,7 @@ class Fix:
         heading_sigma_deg: Standard deviation of the heading.
         transmitters: Numbers of the bars that count; of those in view where the fix is refused.
         verified: The places of all of them come from verified beacons, or from the user's file under an id
-            that a verified beacon told.
+            that a verified beacon sent.
         refusal: Kind of refusal, empty for a fix that is given.
         detail: The refusal in words.
     """

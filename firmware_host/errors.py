@@ -11,7 +11,7 @@ EvlcpError
     ├── IncompatibleError          8   protocol or codebook is another one than the host's
     ├── FleetError                 *   boards of an inventory failed; the exit code of the first that did
     └── ToolchainError             1   a compiler or emulator is missing or failed
-DatagramError                          bytes that are no datagram of this protocol (never leaves the client)
+DatagramError                          bytes that are not a datagram of the protocol (never leaves the client)
 ```
 """
 
@@ -32,7 +32,7 @@ __all__ = [
 
 
 class DatagramError(ValueError):
-    """Bytes that are no datagram, or a payload of another length than its message's."""
+    """Bytes that are not a datagram, or a payload of another length than its message's."""
 
 
 class BoardError(EvlcpError):

@@ -27,7 +27,7 @@ DIGEST_BYTES = 4
 """Bytes of the codebook's digest in a header: two codebooks agree in them by chance once in 2**32."""
 
 MOST_MESSAGE_BYTES = 0xFFFF
-"""Longest message: what the header's length can tell."""
+"""Longest message: what the header's length can express."""
 
 _HEADER = struct.Struct("<BIIHH4s")
 
@@ -35,7 +35,7 @@ HEADER_BYTES = _HEADER.size
 """Bytes of a block's header."""
 
 _WHITE_SEED = 2463534242
-"""Begin of the whitening where the header's CRC is 0: xorshift32 would stay there."""
+"""Start of the whitening where the header's CRC is 0: xorshift32 would stay there."""
 
 _MOST_NUMBER = 0xFFFFFFFF
 
@@ -54,7 +54,7 @@ _MOST_KIND = 15
 
 
 class BlockError(EvlcpError):
-    """Bytes that are no block of this format."""
+    """Bytes that are not a block of this format."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Message:
 
     @property
     def text(self) -> str | None:
-        """The payload as text; None if it is not UTF-8, or the message is no text."""
+        """The payload as text; None if it is not UTF-8, or the message is not a text."""
         if self.kind != Kind.TEXT:
             return None
         try:
@@ -113,7 +113,7 @@ class Block:
         transmitter_id: As in `Message`.
         sequence: As in `Message`.
         index: Number of the part, from 0.
-        length: Bytes of the whole message; with the size of a block it tells how many parts there are.
+        length: Bytes of the whole message; with the size of a block it gives the number of parts.
         codebook: First `DIGEST_BYTES` bytes of the codebook's digest.
         part: The part's bytes; all parts but the last fill their block.
 
@@ -179,7 +179,7 @@ class Block:
 
 
 def _whitened(head: bytes, rest: bytes) -> bytes:
-    """The bytes behind a header, added modulo 2 to the numbers of xorshift32 that begins with its CRC-32.
+    """The bytes behind a header, added modulo 2 to the numbers of xorshift32 that starts with its CRC-32.
 
     The numbers are those of Marsaglia 2003 (shifts 13, 17, 5), four bytes each, least significant first.
     Equal bytes so do not make equal symbols, a light that repeats itself frame by frame; and two blocks of

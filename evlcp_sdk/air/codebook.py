@@ -76,7 +76,7 @@ class Codebook:
 
     Raises:
         ConfigError: A code has other values than -1 and +1, two rows are equal, or the number of codewords
-            is no power of two.
+            is not a power of two.
 
     Two codebooks are equal when their digests are.
     """
@@ -140,7 +140,7 @@ class Codebook:
         """Read what `to_json` wrote.
 
         Raises:
-            ConfigError: The text is no JSON, or a key is missing.
+            ConfigError: The text is not JSON, or a key is missing.
             CodebookMismatchError: The air interface is another one, or the digest does not fit the codes.
         """
         try:

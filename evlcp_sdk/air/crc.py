@@ -1,7 +1,7 @@
 """CRC-24 of a message's bits, by which an error-correction algorithm knows that it decoded what was sent.
 
 Polynomial CRC24C of 3GPP TS 38.212, 5.1: x^24 + x^23 + x^21 + x^20 + x^17 + x^15 + x^13 + x^12 + x^8 + x^4 +
-x^2 + x + 1. The register begins with ones, so that zeros alone, a block of which nothing was received, do not
+x^2 + x + 1. The register starts with ones, so that zeros alone, a block of which nothing was received, do not
 pass; bits enter as they are, first bit first, and the register is sent as it is, highest power first.
 """
 

@@ -65,7 +65,7 @@ class PacketFormat:
         return 1e6 / self.chip_rate_hz
 
     def has_pilot(self, frame: int) -> bool:
-        """Whether a frame of the packet begins with a pilot."""
+        """Whether a frame of the packet starts with a pilot."""
         return frame % self.pilot_every == 0
 
     def pilot_frame(self, frame: int) -> int:
@@ -77,7 +77,7 @@ class PacketFormat:
         return frame - frame % self.pilot_every
 
     def frame_start_chip(self, frame: int) -> int:
-        """Chip of the packet at which a frame begins: with its pilot, or with its info segment."""
+        """Chip of the packet at which a frame starts: with its pilot, or with its info segment."""
         pilots = -(-frame // self.pilot_every)
         return self.preamble_chips + frame * self.info_chips + pilots * self.pilot_chips
 

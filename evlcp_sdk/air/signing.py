@@ -114,7 +114,7 @@ class TrustedKeys:
         keys: Public keys, 64 hex digits each.
 
     Raises:
-        ConfigError: A key is none, or there are keys and the extra is not installed.
+        ConfigError: A key is not valid, or there are keys and the extra is not installed.
     """
 
     def __init__(self, keys: tuple[str, ...]) -> None:

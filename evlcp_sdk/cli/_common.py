@@ -41,7 +41,7 @@ Workers = Annotated[
         "--workers",
         min=0,
         metavar="N",
-        help="Local processes, one a core without it; 0: this one.",
+        help="Local processes, one per core without it; 0: this one.",
         show_default=False,
     ),
 ]
@@ -56,20 +56,20 @@ Dask = Annotated[
 
 
 def complain(text: str) -> None:
-    """Print one line a fault on stderr."""
+    """Print one line per fault on stderr."""
     for line in text.splitlines():
         typer.echo(f"evlcp: {line}", err=True)
 
 
 def console() -> "Console":
-    """Where tables go: stdout, without colour where it is no terminal or NO_COLOR is set."""
+    """Where tables go: stdout, without colour where it is not a terminal or NO_COLOR is set."""
     from rich.console import Console
 
     return Console(highlight=False, soft_wrap=True)
 
 
 def make_executor(workers: int | None, dask: str | None) -> "Executor":
-    """Where jobs run: on a cluster, in processes (None: one a core), or in this one for 0.
+    """Where jobs run: on a cluster, in processes (None: one per core), or in this one for 0.
 
     Raises:
         ConfigError: The cluster is not there.

@@ -72,7 +72,7 @@ def _messages(counts: Mapping[str, int]) -> str:
     text = f"{number} message{'s' * (number != 1)}"
     trusts = {t: counts[f"beacons_{t}"] for t in ("verified", "unverified", "forged")}
     if any(trusts.values()):
-        text += f"; beacons told {', '.join(f'{n} times {t}' for t, n in trusts.items() if n)}"
+        text += f"; beacons {', '.join(f'{n} times {t}' for t, n in trusts.items() if n)}"
     for key, lost in (
         ("blocks_failed", "packets not readable"),
         ("blocks_other_codebook", "packets of another codebook"),

@@ -45,7 +45,7 @@ def calibrate(
 
     poses.csv: t_us, latitude_deg, longitude_deg, height_m; optional recording (the file's name),
     position_sigma_m, heading_deg, pitch_deg, roll_deg, attitude_sigma_deg. What the views do not
-    determine keeps its configured value, and is told.
+    determine keeps its configured value, and is named.
     """
     import json
 

@@ -55,7 +55,7 @@ def check(
     For a script:        [bold]evlcp check decoding ml-soft --json[/]
 
     `-c` and `--set TABLE.KEY` say what the rest of the link is; without them it is the default.
-    One line a law: ok, failed (what was expected), skipped (why it does not apply), excused (by you).
+    One line per law: ok, failed (what was expected), skipped (why it does not apply), excused (by you).
     An excused law that holds is a failure. Exit code 0: no failure, 1: a law is broken.
     """
     import json

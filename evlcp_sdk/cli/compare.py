@@ -73,7 +73,7 @@ def compare(
 
     As a page:        [bold]evlcp compare *.raw --variant a: --variant b:ranging.id=centroid -o table.html[/]
 
-    A campaign:       [bold]evlcp compare paper.sqlite[/] holds its links against each other, a table a scene
+    A campaign:       [bold]evlcp compare paper.sqlite[/] compares its links, a table per scene
 
     Truth is taken from REC.truth.json beside REC.raw; without it there is no BER and no distance error. -c
     and --set hold for all variants. The best of each column has a *. The last row is the Cramer-Rao bound of

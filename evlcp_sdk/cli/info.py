@@ -37,7 +37,7 @@ def info(
 
 
 def describe(source: "EventSource", name: str) -> dict[str, Any]:
-    """Read a source to its end and tell what it holds, in constant memory."""
+    """Read a source to its end and say what it holds, in constant memory."""
     from dataclasses import asdict
 
     import numpy as np

@@ -107,7 +107,7 @@ def _root(
 
 
 def main() -> None:
-    """Run the command line; an SDK error becomes one line a fault on stderr and its exit code."""
+    """Run the command line; an SDK error becomes one line per fault on stderr and its exit code."""
     import warnings
 
     from evlcp_sdk.cli._common import complain

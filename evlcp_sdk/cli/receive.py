@@ -67,7 +67,7 @@ def receive(
     heading_sigma_deg: Annotated[
         float,
         typer.Option(
-            "--heading-sigma-deg", min=0, help="Standard deviation of the heading, unless a file tells it."
+            "--heading-sigma-deg", min=0, help="Standard deviation of the heading, unless a file has it."
         ),
     ] = 0.5,
     gravity_sigma_deg: Annotated[
@@ -102,7 +102,7 @@ def receive(
 
     Positions, with an IMU's log: [bold]evlcp receive REC.raw -o out --sites site.toml --attitude imu.csv[/]
 
-    OUT gets frames.csv (a row a frame), packets.jsonl (a line a packet or message) and summary.json.
+    OUT gets frames.csv (a row per frame), packets.jsonl (a line per packet or message) and summary.json.
     With --sites it gets fixes.csv, track.csv, fixes.geojson and fixes.nmea, too. --figures, --parquet and
     --mcap are short for --sink figures, parquet and mcap; plugins bring other formats.
     An earlier result there is replaced when the new one is complete.

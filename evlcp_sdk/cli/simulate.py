@@ -43,14 +43,14 @@ def simulate(
     ] = 1,
     presets: Annotated[bool, typer.Option("--presets", help="List the presets and end.")] = False,
     show: Annotated[
-        bool, typer.Option("--show", help="Print the preset's TOML, to begin a scene with, and end.")
+        bool, typer.Option("--show", help="Print the preset's TOML, to start a scene from, and end.")
     ] = False,
     as_json: Json = False,
 ) -> None:
     """Render a scene: REC.raw (EVT3) and its truth, REC.truth.json.
 
     A scene that says where on earth it is also gives REC.site.toml, where its bars stand, and
-    REC.attitude.csv, what an IMU tells, for [bold]evlcp receive --sites[/].
+    REC.attitude.csv, what an IMU measures, for [bold]evlcp receive --sites[/].
 
     A scene of yours:      [bold]evlcp simulate scene.toml -o REC.raw[/]
 
@@ -62,7 +62,7 @@ def simulate(
 
     What presets there are: [bold]evlcp simulate --presets[/]
 
-    A scene to begin with:  [bold]evlcp simulate --preset night --show > scene.toml[/]
+    A scene to start from:  [bold]evlcp simulate --preset night --show > scene.toml[/]
     """
     import json
     import time

@@ -90,4 +90,4 @@ COUNTS: Final = {
     "time_gaps": (TIME_GAPS, "steps of TIME_HIGH by more than one"),
     "other_words": (OTHER_WORDS, "OTHERS and CONTINUED words, which carry no events"),
 }
-"""What is worth knowing about a RAW file and is no loss: name -> (row of the tally, meaning)."""
+"""What is worth knowing about a RAW file and is not a loss: name -> (row of the tally, meaning)."""

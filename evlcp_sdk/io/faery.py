@@ -25,7 +25,7 @@ class FaerySource(EventSource):
     What `faery` skips without a word, such as the rest of a DAT file cut within an event, is in no loss.
 
     Args:
-        path: The file; its suffix tells the format.
+        path: The file; its suffix decides the format.
 
     Raises:
         InputError: `faery` is not installed, or cannot read the file.

@@ -118,7 +118,7 @@ def open_writer(
     """Create a recording to write piece by piece, a context manager.
 
     Args:
-        path: The file; `.raw`, `.npz`, `.csv` or `.csv.gz` tells the format.
+        path: The file; `.raw`, `.npz`, `.csv` or `.csv.gz` decides the format.
         width: Columns of the sensor; RAW needs it, the tables do not.
         height: Rows of the sensor, likewise.
         format: `EVT3` (the default for `.raw`), `EVT2`, `NPZ` or `CSV`, whatever the file's name.

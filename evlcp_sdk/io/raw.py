@@ -44,8 +44,8 @@ class RawHeader:
     Attributes:
         fields: The text of each line by its first word, such as `{"evt": "3.0", "geometry": "1280x720"}`.
         codec: The encoding of the words behind it.
-        width: Columns of the sensor, or None if no line tells.
-        height: Rows of the sensor, or None if no line tells.
+        width: Columns of the sensor, or None if no line says so.
+        height: Rows of the sensor, or None if no line says so.
         size_bytes: Where the words start.
         closed: Whether it ends with `% end`.
     """
@@ -64,7 +64,7 @@ def parse_header(data: bytes, path: Path | str) -> RawHeader:
     The header ends behind the line `% end`, or else before the first line that does not start with `% `.
 
     Raises:
-        RawFormatError: There is no header, or it does not tell the encoding, tells one that is not EVT2 or
+        RawFormatError: There is no header, or it does not say the encoding, names one that is not EVT2 or
             EVT3, or contradicts itself.
     """
     if not data:
@@ -118,7 +118,7 @@ def format_header(codec: Codec, width: int, height: int) -> bytes:
 def _interpret(
     fields: Mapping[str, str], offsets: Mapping[str, int], path: Path | str
 ) -> tuple[Codec, int | None, int | None]:
-    """Return the encoding and the size of the sensor that header lines tell."""
+    """Return the encoding and the size of the sensor that header lines give."""
     known = " or ".join(CODECS)
     by_version = {codec.version: codec for codec in CODECS.values()}
     name, *options = fields.get("format", "").split(";")
@@ -340,7 +340,7 @@ class RawWriter(EventWriter):
         StreamError: The sensor is larger than the words can address.
     """
 
-    # A word does not tell how often the clock has rolled over. Before a first time beyond its range (EVT3:
+    # A word does not say how often the clock has rolled over. Before a first time beyond its range (EVT3:
     # 16.8 s) the writer lets it roll over that often; this keeps those words below 1 MB.
     times_us = (0, (1 << 40) - 1)
 

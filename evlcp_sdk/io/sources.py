@@ -182,7 +182,7 @@ class ReplaySource(EventSource):
         source: The recording; closed with the replay.
         speed: Camera seconds for each second that passes.
         slice_us: Camera time between two pieces, us; each comes when its time is over.
-        clock: Tells the time, s.
+        clock: Gives the time, s.
         sleep: Waits, s.
 
     Attributes:

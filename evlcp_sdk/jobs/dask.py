@@ -20,8 +20,8 @@ _WAITING_PER_THREAD = 2
 class DaskCluster:
     """Runs jobs on the workers of a Dask scheduler, as `Processes` does on this machine's.
 
-    Workers may come, go and die while it runs: a job is begun anew on another, at most `ATTEMPTS` times. Only
-    as many jobs are handed over as keep the workers busy.
+    Workers may come, go and die while it runs: a job is started again on another, at most `ATTEMPTS` times.
+    Only as many jobs are handed over as keep the workers busy.
 
     Args:
         address: Of the scheduler, e.g. `tcp://10.0.0.1:8786`.

@@ -23,7 +23,7 @@ from evlcp_sdk.errors import EvlcpError
 __all__ = ["ATTEMPTS", "Executor", "Fault", "Inline", "Outcome", "Processes", "attempt"]
 
 ATTEMPTS = 3
-"""How often a job is begun whose worker dies, before it counts as failed."""
+"""How often a job is started whose worker dies, before it counts as failed."""
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -88,7 +88,7 @@ class Inline:
 class Processes:
     """Runs jobs in processes of this machine.
 
-    A process that dies is replaced, and its job begun anew, at most `ATTEMPTS` times in all. The processes
+    A process that dies is replaced, and its job started again, at most `ATTEMPTS` times in all. The processes
     end with this one, however it ends.
 
     Args:

@@ -70,7 +70,7 @@ class BlockCoder:
 
     @cached_property
     def digest(self) -> bytes:
-        """The codebook's digest as blocks tell it."""
+        """The codebook's digest as blocks carry it."""
         return bytes.fromhex(self.codebook.digest)[:DIGEST_BYTES]
 
     def symbols(self, block: bytes) -> NDArray[np.int64]:

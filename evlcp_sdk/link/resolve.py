@@ -173,7 +173,7 @@ def load_link(
         registry: Where algorithms are found; None for all that are installed.
 
     Raises:
-        ConfigError: The file cannot be read, is no TOML, or does not describe a link.
+        ConfigError: The file cannot be read, is not TOML, or does not describe a link.
 
     >>> load_link(overrides=["modulation.id=wh8"]).codebook.bits_per_symbol
     4

@@ -1,4 +1,4 @@
-"""The sections of a link that are no algorithm: the air, regions, messages, positions."""
+"""The sections of a link that are not algorithms: the air, regions, messages, positions."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -73,7 +73,7 @@ class RegionSpec:
         int, Field(ge=1000, description="Time without blinking after which a region is released.")
     ] = 50_000
     positive_only: Annotated[
-        bool, Field(description="The camera sends positive events only: tell blinking from their times.")
+        bool, Field(description="The camera sends positive events only: blinking is found from their times.")
     ] = False
     min_clusters_share: Annotated[
         float,

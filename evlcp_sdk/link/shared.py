@@ -47,7 +47,7 @@ def _differences(sent: Link, received: Link, messages: bool) -> Iterator[str]:
 
 
 def _codes(sent: Link, received: Link) -> Iterator[str]:
-    """Why the codebooks differ; more clusters of one family are told by the layout."""
+    """Why the codebooks differ; more clusters of one family show in the layout."""
     ours, theirs = sent.codebook, received.codebook
     both = min(ours.clusters, theirs.clusters)
     if not (

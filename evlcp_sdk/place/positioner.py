@@ -20,7 +20,7 @@ __all__ = ["Positioner"]
 
 
 class Positioner:
-    """Fixes on a fixed time grid, one a packet time, from the packets of a receiver.
+    """Fixes on a fixed time grid, one per packet time, from the packets of a receiver.
 
     A fix takes the bars that are seen within half a packet time before and after it. The image moves in that
     time, with the vehicle's vibration, but a bar's shape hardly changes: the shape is a straight line in
@@ -85,7 +85,7 @@ class Positioner:
                     # What is late for its own grid time may still serve the next as a neighbour.
                     self._counts["frames_late"] += number < self._next
                     kept.append(frame)
-            # A packet of another bar that begins half a packet after a fix is complete one packet later.
+            # A packet of another bar that starts half a packet after a fix is complete one packet later.
             fixes += self._until(packet.t_us / self._packet_us - 1.5)
         return fixes
 

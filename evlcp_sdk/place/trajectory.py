@@ -18,7 +18,7 @@ _SPEED_M_S = 30.0
 """Speeds that are likely at first (sigma): a car's."""
 
 _MOST_MISSES = 10
-"""Fixes in a row that are left out before the trajectory starts anew: so many are no outliers."""
+"""Fixes in a row that are left out before the trajectory starts anew: so many are not outliers."""
 
 
 @dataclass(frozen=True, eq=False)

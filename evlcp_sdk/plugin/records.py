@@ -44,7 +44,7 @@ class InstalledSink:
         except Exception as fault:
             raise PluginError(f"{self}: cannot import {record.target}: {fault}") from fault
         if not isinstance(found, type):
-            raise PluginError(f"{self}: {record.target} is no class")
+            raise PluginError(f"{self}: {record.target} is not a class")
         return found
 
 

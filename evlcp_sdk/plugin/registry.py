@@ -205,7 +205,7 @@ class Registry:
             raise PluginError(f"{who}: cannot import {target}: {_line(fault)}") from fault
         abstract = ROLES[role].abstract
         if not (isinstance(found, type) and issubclass(found, abstract)):
-            raise PluginError(f"{who}: {target} is no {abstract.__name__}")
+            raise PluginError(f"{who}: {target} is not a {abstract.__name__}")
         return found
 
     def versions(self) -> dict[str, str]:

@@ -11,12 +11,14 @@ __all__ = ["evlcp_sinks"]
 def evlcp_sinks() -> Iterator[SinkRecord]:
     """The formats that come with the SDK."""
     here = "evlcp_sdk.results"
-    yield SinkRecord("frames", f"{here}.frames_csv:FramesCsv", ("frames.csv",), "a row a frame", default=True)
+    yield SinkRecord(
+        "frames", f"{here}.frames_csv:FramesCsv", ("frames.csv",), "a row per frame", default=True
+    )
     yield SinkRecord(
         "packets",
         f"{here}.packets_jsonl:PacketsJsonl",
         ("packets.jsonl",),
-        "a line a packet or message",
+        "a line per packet or message",
         default=True,
     )
     yield SinkRecord(

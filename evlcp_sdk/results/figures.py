@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 TRANSMITTER_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's colours, told apart by colour-blind readers too."""
+"""Okabe and Ito's colours, which colour-blind readers can distinguish, too."""
 
 _INK = "#333333"
 _DPI = 150
@@ -90,7 +90,7 @@ class FigureProbe:
     """Watches a receiver for the figures; register it with `Registry.load(probe)`.
 
     Args:
-        camera: Tells the size of the image.
+        camera: Has the size of the image.
         points: How many frames of a transmitter, and places of a region, to keep.
     """
 

@@ -1,4 +1,4 @@
-"""`fixes.csv`: a row a fix, given or refused."""
+"""`fixes.csv`: a row per fix, given or refused."""
 
 import csv
 

@@ -37,7 +37,7 @@ class FramesCsv(Sink):
         self._rows.writerow(FRAME_COLUMNS + (FILTERED_COLUMNS if self._filtered else ()))
 
     def packet(self, packet: Packet) -> None:
-        """Write a row a frame."""
+        """Write a row per frame."""
         for frame in packet.frames:
             self._rows.writerow(frame_row(frame) + (filtered_row(frame) if self._filtered else []))
 

@@ -42,7 +42,7 @@ class GeoJson(Sink):
         )
 
     def settle(self, settled: Sequence[Settled]) -> None:
-        """Write the smoothed places as a line, one a trajectory."""
+        """Write the smoothed places as a line, one per trajectory."""
         line = self._line_end
         for one in settled:
             if one.filtered.starts and line:

@@ -1,4 +1,4 @@
-"""`packets.jsonl`: a line of JSON a packet, and one a message after the packet that completed it."""
+"""`packets.jsonl`: a line of JSON a packet, and one per message after the packet that completed it."""
 
 import json
 from typing import Any

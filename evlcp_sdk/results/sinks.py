@@ -21,13 +21,13 @@ def load_sinks(chosen: Sequence[InstalledSink]) -> list[tuple[InstalledSink, typ
 
     Raises:
         ConfigError: A package that one needs is not installed.
-        PluginError: One cannot be imported, or is no sink.
+        PluginError: One cannot be imported, or is not a sink.
     """
     classes = []
     for installed in chosen:
         cls = installed.load_class()
         if not issubclass(cls, Sink):
-            raise PluginError(f"{installed}: {installed.record.target} is no Sink")
+            raise PluginError(f"{installed}: {installed.record.target} is not a Sink")
         classes.append((installed, cls))
     return classes
 

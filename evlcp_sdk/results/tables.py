@@ -13,7 +13,7 @@ __all__ = ["frames_table"]
 
 
 def frames_table(packets: Iterable[Packet], kind: Literal["pandas", "arrow"] = "pandas") -> Any:
-    """The frames of packets as a table, a row a frame, with the columns of `frames.csv`, not rounded.
+    """The frames of packets as a table, a row per frame, with the columns of `frames.csv`, not rounded.
 
     `symbols` holds lists, None for a symbol that is not given; a distance that is not given is NaN in pandas,
     null in Arrow. The columns of the filtered distance are there if any frame has one.

@@ -1,4 +1,4 @@
-"""`track.csv`: a row a fix that is given, its place smoothed and filtered."""
+"""`track.csv`: a row per fix that is given, its place smoothed and filtered."""
 
 import csv
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ class TrackCsv(Sink):
         self._rows.writerow(TRACK_COLUMNS)
 
     def settle(self, settled: Sequence[Settled]) -> None:
-        """Write a row a fix."""
+        """Write a row per fix."""
         for one in settled:
             self._rows.writerow(
                 [

@@ -285,7 +285,7 @@ def most_in_place(image: Array, area: Array, layout: Array, least_spacing: float
 
 @njit(cache=True, nogil=True)
 def _placement(image: Array, seen: Array, layout: Array, spacing: float) -> tuple[complex, complex]:
-    """Scale and turn, and shift, that bring a layout to its image: medians over pairs, deaf to outliers."""
+    """Scale, turn and shift that bring a layout to its image: medians of pairs, robust against outliers."""
     clusters = layout.shape[0]
     re = np.empty(clusters * clusters)
     im = np.empty(clusters * clusters)

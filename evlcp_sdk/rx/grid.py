@@ -75,7 +75,7 @@ class PacketGrid:
         self.skip_before(earliest_us)
 
     def skip_before(self, earliest_us: float) -> None:
-        """Pass over the frames that begin before a time."""
+        """Pass over the frames that start before a time."""
         while self.start_us(self.frame) < earliest_us:
             self.frame += 1
 

@@ -44,8 +44,8 @@ class Look:
         sums: Polarity sums of pilot and info segment, int16 (chips, height, width).
         offset_px: The rest of the motion in them, float64 (2, chips), px.
         presence: Where the clusters are.
-        centre_px: Column and row of the bar's centre in the chip that begins at `middle_us`.
-        middle_us: Middle of the pilot, or of the info segment of a frame without one, where a chip begins: a
+        centre_px: Column and row of the bar's centre in the chip that starts at `middle_us`.
+        middle_us: Middle of the pilot, or of the info segment of a frame without one, where a chip starts: a
             chip's events show the image at its first edge.
     """
 

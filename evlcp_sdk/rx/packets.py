@@ -18,7 +18,7 @@ class PacketAssembler:
         self._start: tuple[float, float] = (0.0, 0.0)
 
     def add(self, frame: Frame, packet_t_us: float, chip_us: float) -> list[Packet]:
-        """Take a frame; return the packet before it, if this frame begins another."""
+        """Take a frame; return the packet before it, if this frame starts another."""
         done = self.flush() if self._frames and self._frames[-1].packet != frame.packet else []
         if not self._frames:
             self._start = (packet_t_us, chip_us)

@@ -125,7 +125,7 @@ class Timeline:
         return events[keep]
 
     def _bounds(self, events: Events, start_us: int) -> list[int]:
-        """Where each new time step begins among the events."""
+        """Where each new time step starts among the events."""
         t_us, step_us = events.t_us, self._step_us
         first_us = max(self._grid_us(int(t_us[0])), start_us)
         if int(t_us[-1]) - first_us > step_us * len(events):

@@ -74,7 +74,7 @@ class Transmitters:
         self._alive[region.id] = Transmitter(region, sync, packets, grid, distance)
 
     def adopt(self, transmitter: Transmitter, lock: SyncLock, first_us: int) -> bool:
-        """Take a new lock; frames go on where they were, or begin with the first whole one of the region.
+        """Take a new lock; frames go on where they were, or start with the first whole one of the region.
 
         Args:
             transmitter: Whose preamble was heard.

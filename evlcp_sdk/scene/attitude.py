@@ -93,11 +93,11 @@ class AttitudeLog:
 
         Raises:
             InputError: The file cannot be read.
-            ConfigError: A column is missing, a value is no number, or times do not rise.
+            ConfigError: A column is missing, a value is not a number, or times do not rise.
         """
         usual = Attitude() if usual is None else usual
         try:
-            # Spreadsheets begin a file with a byte order mark.
+            # Spreadsheets start a file with a byte order mark.
             with Path(path).open(newline="", encoding="utf-8-sig") as file:
                 reader = csv.DictReader(file)
                 names = tuple(reader.fieldnames or ())

@@ -50,7 +50,7 @@ class BarSite:
     ] = 0.96
     transmitter: Annotated[
         int | None,
-        Field(ge=0, description="Number that the receiver gives it, where no beacon tells its id."),
+        Field(ge=0, description="Number that the receiver gives it, where no beacon sends its id."),
     ] = None
 
     def axis_enu(self) -> NDArray[np.float64]:
@@ -154,7 +154,7 @@ def load_sites(path: Path | str) -> tuple[BarSite, ...]:
     """Read a `site.toml`: one `[[bar]]` or more.
 
     Raises:
-        ConfigError: The file cannot be read, is no TOML, or does not describe bars; one line a fault.
+        ConfigError: The file cannot be read, is not TOML, or does not describe bars; one line per fault.
     """
     return resolve_sites(read_toml(path), source=str(path))
 
@@ -167,7 +167,7 @@ def resolve_sites(table: Mapping[str, Any], *, source: str = "") -> tuple[BarSit
         source: What faults name as their place.
 
     Raises:
-        ConfigError: One line a fault, each with its path, e.g. `bar.0.latitude_deg`.
+        ConfigError: One line per fault, each with its path, e.g. `bar.0.latitude_deg`.
 
     >>> bar = {"transmitter_id": 1, "latitude_deg": 35.0, "longitude_deg": 137.0, "height_m": 5.0}
     >>> resolve_sites({"bar": [bar]})[0].length_m
@@ -207,7 +207,7 @@ def to_toml(sites: Sequence[BarSite]) -> str:
 def site_of_transmitter(
     sites: Sequence[BarSite], transmitter: int, transmitter_id: int | None = None, *, alone: bool = False
 ) -> BarSite | None:
-    """Which site a received transmitter stands at; None when nothing tells.
+    """Which site a received transmitter stands at; None when nothing says so.
 
     Its beacon's id decides; without one the `transmitter` of a site does; and a transmitter that is the only
     one received stands at the only site.

@@ -400,8 +400,8 @@ def run_pixels(
     It ends early, at a pixel for which the output might have no room.
 
     Bit i of `masks[j]` says that source i lights pixel j. `first_rows` are the rows of `levels` in force when
-    the block begins; pose 0 holds then. (pose, source) arrays tell where each strip is: `origin`, its first
-    end, px; `axis`, the unit vector along it; `bounds`, where its clusters begin and end along it, px;
+    the block begins; pose 0 holds then. (pose, source) arrays say where each strip is: `origin`, its first
+    end, px; `axis`, the unit vector along it; `bounds`, where its clusters start and end along it, px;
     `strip_px`, its width; `turn_px` is how far the texture has moved. `halo` is the halo's light of each row
     of `levels` on a grid along the strip, as a share of full light, for the pose in the middle. `background`
     is (irradiance on the sensor, dark current as light), W/m2; `sensor` comes from `sensor_vector`.

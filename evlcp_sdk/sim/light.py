@@ -157,7 +157,9 @@ class BarLight:
         if self.bar.text is not None:
             found.append(Message(Kind.TEXT, identity, 0, self.bar.text.encode()))
         if not found:
-            raise ConfigError('payload = "messages": expected a text, or a [world] to tell a beacon of')
+            raise ConfigError(
+                'payload = "messages": expected a text, or a [world] whose place a beacon can send'
+            )
         return packets_of(found, self._coder)
 
     def symbols(self, packet: int) -> NDArray[np.int64]:
@@ -177,7 +179,7 @@ class BarLight:
         return rng.integers(0, len(book.codewords), (self.link.packet.frames, book.clusters))
 
     def sent_symbols(self, duration_s: float) -> list[list[list[int]]]:
-        """Symbols [packet][frame][cluster] of every packet that is at least begun in the scene."""
+        """Symbols [packet][frame][cluster] of every packet that at least starts in the scene."""
         if self._chips is not None:
             return []
         packets = math.floor((self.start_chip + duration_s * self.rate_hz) / self.packet_chips) + 1

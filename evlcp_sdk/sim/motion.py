@@ -88,7 +88,7 @@ class CameraPath:
 
     Raises:
         InputError: The file cannot be read.
-        ConfigError: It is no path, or too short.
+        ConfigError: It is not a path, or too short.
     """
 
     def __init__(self, motion: MotionSpec, duration_s: float, seed: int) -> None:
@@ -157,7 +157,7 @@ class Strip:
     clusters: int
 
     def cuts_m(self) -> Floats:
-        """Where its clusters begin and end: float64 (clusters + 1, 3)."""
+        """Where its clusters start and end: float64 (clusters + 1, 3)."""
         share = np.linspace(-0.5, 0.5, self.clusters + 1)
         cuts: Floats = np.asarray(self.centre_m) + share[:, None] * np.asarray(self.along_m)
         return cuts

@@ -1,6 +1,6 @@
 """The scene: bars, lamps, lens, motion, background and sensor, from TOML to checked objects.
 
-Coordinates: x right, y down, z forward, m. The camera's path begins at the origin of x and y, looking along
+Coordinates: x right, y down, z forward, m. The camera's path starts at the origin of x and y, looking along
 z; a bar with `z_m = 0` then stands `motion.distance_m` ahead. Defaults are those of the sensor model; where a
 number is an engineering guess, its description says so.
 """
@@ -68,7 +68,7 @@ class BarSpec:
     tilt_deg: Annotated[float, Field(gt=-90, lt=90, description="Its top leans away from the camera.")] = 0.0
     ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="How much faster its clock runs.")] = 0.0
     start_chip: Annotated[
-        float | None, Field(ge=0, description="Chip of a packet on air as the scene begins; none: random.")
+        float | None, Field(ge=0, description="Chip of a packet on air as the scene starts; none: random.")
     ] = None
     transmitter_id: Annotated[
         int | None, Field(ge=0, lt=2**32, description="Its number as a site; none: 1 for the first bar.")
@@ -114,7 +114,7 @@ class LampSpec:
     ] = "square"
     duty: Annotated[float, Field(gt=0, lt=1, description="Share of a period that a square is on.")] = 0.5
     depth: Annotated[float, Field(gt=0, le=1, description="Share of its light that flickers.")] = 1.0
-    phase: Annotated[float, Field(ge=0, lt=1, description="Share of a period gone as the scene begins.")] = (
+    phase: Annotated[float, Field(ge=0, lt=1, description="Share of a period gone as the scene starts.")] = (
         0.0
     )
 
@@ -141,7 +141,7 @@ class MotionSpec:
     """How the camera moves: an approach along z or a path from a file, and the vehicle's vibration."""
 
     distance_m: Annotated[
-        float, Field(gt=0, le=10_000, description="Depth of z_m = 0 as the scene begins.")
+        float, Field(gt=0, le=10_000, description="Depth of z_m = 0 as the scene starts.")
     ] = 50.0
     speed_mps: Annotated[float, Field(ge=-100, le=100, description="Speed towards it.")] = 8.333
     lateral_mps: Annotated[float, Field(ge=-100, le=100, description="Speed to the right.")] = 0.0
@@ -161,7 +161,7 @@ class MotionSpec:
 
 @dataclass(frozen=True)
 class WorldSpec:
-    """Where the scene's origin, x_m = y_m = z_m = 0, is on earth, and z points; what an IMU tells."""
+    """Where the scene's origin, x_m = y_m = z_m = 0, is on earth, and z points; what an IMU measures."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90, description="WGS-84.")] = 0.0
     longitude_deg: Annotated[float, Field(ge=-180, le=180, description="The same.")] = 0.0
@@ -246,7 +246,7 @@ class Scene:
 
     name: Annotated[str, Field(pattern=r"^[\w.+-]+$", description="Name of the recording.")] = "scene"
     duration_s: Annotated[float, Field(gt=0, le=86_400, description="Its length.")] = 0.25
-    t0_us: Annotated[int, Field(ge=0, le=10**15, description="Camera clock as it begins.")] = 0
+    t0_us: Annotated[int, Field(ge=0, le=10**15, description="Camera clock as it starts.")] = 0
     seed: Annotated[int, Field(ge=0, lt=2**63, description="Seed of everything random.")] = 0
     flicker_lamps: Annotated[
         int, Field(ge=0, le=48, description="Lamps at random places, beside those listed.")
@@ -274,7 +274,7 @@ class Scene:
         for i, bar in enumerate(self.bars):
             if self.motion.path_file is None and self.motion.distance_m + bar.z_m <= NEAREST_M:
                 raise ConfigError(
-                    f"bars.{i}.z_m = {bar.z_m}: the bar is behind the camera, which begins"
+                    f"bars.{i}.z_m = {bar.z_m}: the bar is behind the camera, which starts"
                     f" {self.motion.distance_m} m before z_m = 0"
                 )
 
@@ -323,7 +323,7 @@ def load_scene(
         link: A link, or a `link.toml`, instead of the scene's link.
 
     Raises:
-        ConfigError: The file cannot be read, is no TOML, or does not describe a scene; one line a fault.
+        ConfigError: The file cannot be read, is not TOML, or does not describe a scene; one line per fault.
 
     >>> load_scene("drive-30kmh", ["motion.distance_m=60"]).motion.distance_m
     60.0
@@ -368,7 +368,7 @@ def resolve_scene(
             folder.
 
     Raises:
-        ConfigError: One line a fault, each with its path.
+        ConfigError: One line per fault, each with its path.
     """
     before = f"{source}: " if source else ""
     table = dict(table)
@@ -396,7 +396,7 @@ def links_of(scene: Scene, registry: Registry | None = None, *, source: str = ""
         source: What faults name as their place.
 
     Raises:
-        ConfigError: A bar's link is none; one line a fault.
+        ConfigError: A bar's link is not valid; one line per fault.
     """
     before = f"{source}: " if source else ""
     table: dict[str, Any] = {"link": scene.link, "bars": [{"link": bar.link} for bar in scene.bars]}

@@ -155,7 +155,7 @@ class Simulation:
         _, depth = project(centres, *self.path.at([0.0]), self.scene.camera)
         for i in np.flatnonzero(depth[0] <= NEAREST_M):
             raise ConfigError(
-                f"bars.{i}: the bar is behind the camera as the scene begins (depth {depth[0, i]:.2f} m)"
+                f"bars.{i}: the bar is behind the camera as the scene starts (depth {depth[0, i]:.2f} m)"
             )
 
     @property
@@ -293,7 +293,7 @@ class Simulation:
         return [part for job in jobs for part in job.result()]
 
     def _moves(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
-        """When the image has moved by a step: begins and middles of the poses, us, float64 (n,)."""
+        """When the image has moved by a step: starts and middles of the poses, us, float64 (n,)."""
         ends = np.array([s.strip.cuts_m()[[0, -1]] for s in self._sources]).reshape(-1, 3)
         cells = np.append(np.arange(begin_us, end_us, _CELL_US), end_us)
         t = np.linspace(cells[:-1], cells[1:], 3, axis=1)

@@ -144,7 +144,7 @@ def read_truth(path: Path | str, registry: Registry | None = None) -> Truth:
         registry: Where the algorithms of its links are found; None for all that are installed.
 
     Raises:
-        InputError: It cannot be read, is no scene's truth, or names codes that are not those of this
+        InputError: It cannot be read, is not a scene's truth, or names codes that are not those of this
             installation; one line.
     """
     try:
@@ -175,7 +175,7 @@ def truth_from_table(
         links: Links by digest, instead of those of the table.
 
     Raises:
-        InputError: It is no scene's truth, or names codes that are not those of this installation.
+        InputError: It is not a scene's truth, or names codes that are not those of this installation.
     """
     return _Reader(source, registry).truth(table, links)
 

@@ -62,7 +62,7 @@ def pixel_events(
 
     Args:
         sensor: Its pixels.
-        edge_us: When each light begins, rising, (n,).
+        edge_us: When each light starts, rising, (n,).
         light_w_m2: The lights, background and dark current included, (n,).
         end_us: End of the last.
         pixels: How many pixels, each with its own thresholds and noise.

@@ -110,7 +110,7 @@ def camera_on_earth(scene: Scene, position_m: Floats, attitude_rad: Floats) -> d
 
 
 def attitude_log(scene: Scene, seed: int, path: CameraPath) -> AttitudeLog | None:
-    """What an IMU tells of the camera's attitude, every millisecond: the truth and one error a recording.
+    """What an IMU measures of the camera's attitude, every millisecond: the truth and one error a recording.
 
     Args:
         scene: With its `[world]`.

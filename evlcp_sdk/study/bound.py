@@ -27,10 +27,10 @@ _CORE_SHARE = 0.3
 """Of the rows of the widest column: columns lit in fewer show stray cells beside the bar."""
 
 _LEAST_BOUNDARIES = 3
-"""Boundaries without which spacing, position and drift cannot be told apart."""
+"""Boundaries without which spacing, position and drift cannot be separated."""
 
 _MOST_OFF = 0.2
-"""How far, as a share, a fit's spacing may lie from that of the clusters' middles: beyond, it is no fit."""
+"""How far, as a share, a fit's spacing may lie from that of the clusters' middles: not a fit beyond."""
 
 _LEAST_GAIN = 0.01
 """Share of a full value below which a fit has found no light: one event in some thirty values."""

@@ -35,7 +35,7 @@ class Score:
         rows: Decoded frames.
         unmatched: Those of them that match no true frame.
         echoes: Those that are said to be reflections and were left out; 0 in the plain score.
-        bars: One a bar that shone, its tallies by segment of distance.
+        bars: One per bar that shone, its tallies by segment of distance.
     """
 
     rows: int

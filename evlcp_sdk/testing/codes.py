@@ -120,7 +120,7 @@ def default_clusters(subject: Subject) -> None:
 
 
 PILOTS = (
-    Law("shapes", "int8 codes of -1 and +1, one a cluster", pilots_shapes),
+    Law("shapes", "int8 codes of -1 and +1, one per cluster", pilots_shapes),
     Law("pilots-apart", "any two pilots differ in 3 of 8 values at the least", pilots_apart),
     Law("sharp-preamble", "the preamble's sidelobes are a quarter of its peak at the most", sharp_preamble),
     Law("tells-apart", "the link's separation tells the clusters of an ideal image apart", default_clusters),

@@ -14,7 +14,7 @@ __all__ = ["conformance"]
 def conformance(
     role: str, *algorithms: Any, excuses: Mapping[str, str] | None = None, link: Link | None = None
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a test of pytest one test a law (and algorithm); its argument `check` holds the law.
+    """Make a test of pytest one test per law (and algorithm); its argument `check` holds the law.
 
     Args:
         role: The role that the algorithms fill.

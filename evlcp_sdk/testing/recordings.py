@@ -23,7 +23,7 @@ class IdealBar:
         cluster_px: Spacing of its clusters in the image, px.
         width_px: Its width, px.
         ppm: How much faster than nominal its clock runs.
-        start_us: When its first packet begins, us.
+        start_us: When its first packet starts, us.
         shake_px: Radius of the circle, px.
         shake_hz: Turns a second.
     """

@@ -118,7 +118,7 @@ def limits(codebook: Codebook, packet: PacketFormat) -> list[str]:
     if packet.frames > MOST_FRAMES:
         faults.append(f"air.frames_per_packet = {packet.frames}, at most {MOST_FRAMES}")
     if packet.chip_rate_hz != round(packet.chip_rate_hz):
-        faults.append(f"air.chip_rate_hz = {packet.chip_rate_hz}: a board takes whole chips a second")
+        faults.append(f"air.chip_rate_hz = {packet.chip_rate_hz}: a board takes whole chips per second")
     elif packet.chip_rate_hz > MOST_CHIPS_A_SECOND:
         faults.append(f"air.chip_rate_hz = {packet.chip_rate_hz}, at most {MOST_CHIPS_A_SECOND}")
     return faults

@@ -53,8 +53,8 @@ def read_symbols(path: Path, link: Link | None, registry: Registry | None = None
 
     Raises:
         IncompatibleError: The file was made with another link, or with other codes than those of its link.
-        InputError: The file cannot be read, is no JSON, or an element is missing, out of range or no integer;
-            the message names the place.
+        InputError: The file cannot be read, is not JSON, or an element is missing, out of range or not an
+            integer; the message names the place.
     """
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
@@ -103,7 +103,7 @@ def _symbols(path: Path, packets: Any, link: Link) -> Symbols:
     for p, packet in enumerate(packets):
         _list(path, f"{place}[{p}]", packet, "frames", frames, "air.frames_per_packet")
         for f, frame in enumerate(packet):
-            _list(path, f"{place}[{p}][{f}]", frame, "symbols", book.clusters, "one a cluster")
+            _list(path, f"{place}[{p}][{f}]", frame, "symbols", book.clusters, "one per cluster")
             for k, symbol in enumerate(frame):
                 if type(symbol) is not int or not 0 <= symbol <= top:
                     raise InputError(

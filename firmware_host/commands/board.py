@@ -44,7 +44,7 @@ app.callback()(line_options)
 AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
 Masks = Annotated[
     Path | None,
-    typer.Option(metavar="FILE.npy", help="Chips instead: uint8, a column an LED or a cluster."),
+    typer.Option(metavar="FILE.npy", help="Chips instead: uint8, a column per LED or cluster."),
 ]
 
 
@@ -298,7 +298,7 @@ def _check_same_air(board: "Board", bank: "Bank", status: "StatusReply") -> None
     if status.digest.hex() == bank.codebook.digest:
         if status.chip_rate_hz == bank.chip_rate_hz:
             return
-        plays, comes = f"{status.chip_rate_hz} chips a second", f"air.chip_rate_hz = {bank.chip_rate_hz}"
+        plays, comes = f"{status.chip_rate_hz} chips per second", f"air.chip_rate_hz = {bank.chip_rate_hz}"
     raise IncompatibleError(
         f"{board.session.name}: plays {plays}, this payload's link has {comes} ({bank.codebook.profile});"
         " give its link with -c or --set, or 'evlcp board program' to change it"
@@ -533,14 +533,14 @@ def emulate(
 def leds(
     record: Annotated[Path, typer.Argument(metavar="FILE", help="LED record of an emulator.")],
     chips: Annotated[
-        Path, typer.Option(metavar="OUT.npy", help="Chips: uint8, one row a chip, one column a cluster.")
+        Path, typer.Option(metavar="OUT.npy", help="Chips: uint8, one row per chip, one column per cluster.")
     ],
     per_led: Annotated[bool, typer.Option("--per-led", help="One column an LED instead.")] = False,
 ) -> None:
     """Turn an LED record into a chip table; the ticks go into OUT.ticks.npy.
 
-    Rows that are no chip (dark, single-LED test) are left out. So is a last record that is cut off, and then
-    the command ends with 3.
+    Rows that are not a chip (dark, single-LED test) are left out. So is a last record that is cut off, and
+    then the command ends with 3.
 
     For example: [bold]evlcp board leds leds.bin --chips chips.npy[/]
     """

@@ -48,7 +48,9 @@ def message(
     ] = None,
     chips: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.npy", help="Write the chips: uint8, a row a chip, a column a cluster."),
+        typer.Option(
+            metavar="FILE.npy", help="Write the chips: uint8, a row per chip, a column per cluster."
+        ),
     ] = None,
     port: Annotated[
         str | None,
@@ -200,14 +202,14 @@ def _beacon(
 
 
 def _utf8(option: str, text: str) -> bytes:
-    """The bytes of a text; the shell's bytes that are no UTF-8 arrive as lone surrogates."""
+    """The bytes of a text; the shell's bytes that are not UTF-8 arrive as lone surrogates."""
     from evlcp_sdk.errors import ConfigError
 
     try:
         return text.encode()
     except UnicodeEncodeError as fault:
         raise ConfigError(
-            f"{option}: character {fault.start + 1} is no UTF-8; send bytes by --file"
+            f"{option}: character {fault.start + 1} is not UTF-8; send bytes by --file"
         ) from fault
 
 

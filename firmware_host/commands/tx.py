@@ -47,7 +47,7 @@ def frames(
     chips: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE.npy", help="Write the chips: uint8, one row a chip, one column a cluster."
+            metavar="FILE.npy", help="Write the chips: uint8, one row per chip, one column per cluster."
         ),
     ] = None,
 ) -> None:

@@ -80,7 +80,7 @@ class LedRecord:
         return replace(cls.of_records(records), cut_bytes=cut)
 
     def played(self) -> "LedRecord":
-        """Without the records that are no chip: dark, and the single-LED test."""
+        """Without the records that are not a chip: dark, and the single-LED test."""
         keep = (self.numbers != CHIP_DARK) & (self.numbers != CHIP_TEST)
         return LedRecord(self.ticks[keep], self.numbers[keep], self.rows[keep], self.cut_bytes)
 

@@ -91,7 +91,7 @@ class SimulatedBoard:
         return np.unpackbits(np.frombuffer(row.raw, np.uint8))[:LEDS]
 
     def set_health(self, temperature_c: float = 25.0, faults: int = 0, open_led: int = 255) -> None:
-        """What the sensors tell from now on; an `open_led` of 255 is none."""
+        """What the sensors report from now on; an `open_led` of 255 is none."""
         self._c.board_set_health(self._board, round(10 * temperature_c), faults, open_led)
 
     def set_late(self, ticks: int) -> None:

@@ -59,14 +59,14 @@ class Datagram:
         """Read the bytes between two delimiters.
 
         Raises:
-            DatagramError: They are no datagram: COBS, length or CRC is wrong.
+            DatagramError: They are not a datagram: COBS, length or CRC is wrong.
         """
         try:
             body = cobs.decode(wire)
         except cobs.DecodeError as fault:
             raise DatagramError(f"no COBS: {fault}") from fault
         if not HEADER_BYTES + CRC_BYTES <= len(body) <= HEADER_BYTES + CRC_BYTES + MAX_PAYLOAD:
-            raise DatagramError(f"{len(body)} bytes are no datagram")
+            raise DatagramError(f"{len(body)} bytes are not a datagram")
         head, crc = body[:-CRC_BYTES], int.from_bytes(body[-CRC_BYTES:], "little")
         if zlib.crc32(head) != crc:
             raise DatagramError(f"CRC {crc:08x}, expected {zlib.crc32(head):08x}")
@@ -84,7 +84,7 @@ class Counts:
 
 @dataclass(slots=True)
 class DatagramDecoder:
-    """Bytes in any portions -> datagrams; what is no datagram is counted and dropped.
+    """Bytes in any portions -> datagrams; what is not a datagram is counted and dropped.
 
     >>> wire = Datagram(0x0C, 0, 7, 1, b"").encode()
     >>> decoder = DatagramDecoder()

@@ -1,4 +1,4 @@
-"""LED rows, as a bank of chip masks and an LED record hold them: 12 bytes a chip, LED 0 the first bit."""
+"""LED rows, as a bank of chip masks and an LED record hold them: 12 bytes per chip, LED 0 the first bit."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,7 +10,7 @@ __all__ = ["chips_of_rows", "rows_of_chips"]
 
 
 def rows_of_chips(chips: ArrayLike) -> NDArray[np.uint8]:
-    """LED rows of chips, uint8 (chips, 12): from one column an LED, or one a cluster of equal size.
+    """LED rows of chips, uint8 (chips, 12): from one column per LED, or one per cluster of equal size.
 
     LED 0 is the most significant bit of the first byte.
 

@@ -16,7 +16,7 @@ __all__ = ["Barker13Pilots"]
 class Barker13Pilots(Pilots):
     """The 13 cyclic shifts of Barker-13, then the same inverted.
 
-    Two shifts correlate by 1 of 13, so 26 clusters are told apart with pilots of 26 chips.
+    Two shifts correlate by 1 of 13, so 26 clusters are distinguished with pilots of 26 chips.
 
     >>> codes = Barker13Pilots().codes(13)
     >>> sorted(set((codes.astype(int) @ codes.T).ravel().tolist()))

@@ -23,7 +23,7 @@ _TIMING_SIGMA_US = 2.0
 """Spread of one packet's time, from the grid of the correlation and the jitter of the pixels."""
 
 _CLEARLY = 0.1
-"""Difference in correlation that tells a preamble from data: from packet to packet it varies by 0.02."""
+"""Difference in correlation that separates a preamble from data: from packet to packet it varies by 0.02."""
 
 _FIT_PACKETS = 8
 """Packets of the clock fit: 0.3 s, in which a quartz does not drift by 0.1 us."""
@@ -112,7 +112,7 @@ class BarkerSynchronizer:
         guard = n * _GUARD_CHIPS
         until_bin = int(until_us // self._bin_us)
         if state.first_bin is None:
-            # A preamble begins with a dark chip: the first event may already be the edge at its end.
+            # A preamble starts with a dark chip: the first event may already be the edge at its end.
             first = (int(t_us[0] // self._bin_us) if len(t_us) else until_bin) - guard
             state = replace(state, first_bin=first, next_bin=first)
         assert state.first_bin is not None

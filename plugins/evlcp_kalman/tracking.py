@@ -112,7 +112,7 @@ class _ConstantVelocity(Filter):
         if float(np.abs(innovation).max()) > self.gate * np.sqrt(spread):
             missed = state.missed + 1
             if missed > self.pooled // 2:
-                # So many in a row are no outliers: what is tracked has changed.
+                # So many in a row are not outliers: what is tracked has changed.
                 return self.step(None, t_us, value, sigma)
         else:
             gain = covariance[:, 0] / spread

@@ -124,7 +124,7 @@ class PocRanging(Ranging):
         first, second, spacing = used[i[far]], used[j[far]], spacing[far]
         neighbour = float(np.min(np.hypot(*(centres[1:] - centres[:-1]).T)))
 
-        # The scale that all clusters agree on tells which ones are out of place.
+        # The scale that all clusters agree on shows which ones are out of place.
         every = np.arange(bar.clusters)
         i, j = np.triu_indices(bar.clusters, 1)
         apart = np.hypot(*(centres[j] - centres[i]).T)

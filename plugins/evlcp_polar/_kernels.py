@@ -35,7 +35,7 @@ def crc_holds(bits: Array, polynomial: int) -> bool:
 
 @njit(cache=True, nogil=True)
 def discrepancy_limit(weight: Array, log_share: float) -> float:
-    """Largest total of flipped weights that is no accident; negative if any total may be one.
+    """Largest total of flipped weights that is not an accident; negative if any total may be one.
 
     A word of random signs lies within D of a given codeword with a probability of at most
     exp(z D) prod((1 + exp(-z w)) / 2) for every z > 0 (Chernoff). The D is found at which the least of these

@@ -34,7 +34,7 @@ class Polar(ErrorCorrection):
 
     Reliability order, shortening, puncturing and CRC are those of 5G NR (3GPP TS 38.212). A block of more
     than 1024 bits is split into codewords of equal length, each with its own CRC; see
-    `docs/error-correction.md`. Decoding begins with one path and goes on to `list_size` and, doubled each
+    `docs/error-correction.md`. Decoding starts with one path and goes on to `list_size` and, doubled each
     time, `max_list_size`, until a path passes.
 
     A path passes if its CRC holds and it explains the LLRs so well that a word of random signs would come as
@@ -135,7 +135,7 @@ def sent_bits(length: int, information_bits: int) -> NDArray[np.int64]:
 def information_set(length: int, information_bits: int) -> NDArray[np.bool_]:
     """Which inputs of the mother code carry information, bool (N,); 3GPP TS 38.212, 5.4.1.1.
 
-    Shortened and punctured code bits are no information bits, nor are the first inputs of a punctured code;
+    Shortened and punctured code bits are not information bits, nor are the first inputs of a punctured code;
     of the others the most reliable are chosen.
     """
     n = _mother_bits(length)

@@ -30,7 +30,7 @@ class MotionFeedback(Decoding):
     """Decision feedback of motion: find from the chips where the bar was, take it back, decode, again.
 
     The clusters' pixel maps and the values that they send make the image that each value should give; its
-    match with the events, pixel by pixel in log-likelihood ratios as `ml-soft` learns them, tells how
+    match with the events, pixel by pixel in log-likelihood ratios as `ml-soft` learns them, shows how
     likely the bar was so many pixels off its place then. In the first round the pilot's values are known,
     and each info value of a cluster is the one that fits better; in the second all are known from the
     decision. The likeliest smooth path over all values (Viterbi) is taken back from the sums, the clusters

@@ -99,7 +99,7 @@ def test_a_users_first_hour(cli, native: str, tmp_path: Path) -> None:
         ("modulation.id=wh8", "this payload's link has codebook"),
         (
             "air.chip_rate_hz=5000.0",
-            "plays 10000 chips a second, this payload's link has air.chip_rate_hz = 5000",
+            "plays 10000 chips per second, this payload's link has air.chip_rate_hz = 5000",
         ),
     ):
         for command in ("send", "verify"):

@@ -98,7 +98,7 @@ def test_torn_cluster_is_told() -> None:
         ("3", "symbols: found 3, expected a list of packets"),
         ("[]", "symbols: found 0 elements"),
         ("[3]", "symbols[0]: found 3, expected 10 frames"),
-        (json.dumps([[[1]] * 10]), "symbols[0][0]: found 1 elements, expected 16 symbols, one a cluster"),
+        (json.dumps([[[1]] * 10]), "symbols[0][0]: found 1 elements, expected 16 symbols, one per cluster"),
         ("[[[1]]]", "symbols[0]: found 1 elements, expected 10 frames, air.frames_per_packet"),
         ('{"symbol": []}', "key symbols is missing"),
         ('{"link": 3, "symbols": []}', "link = 3, expected the tables of a link"),
@@ -244,7 +244,7 @@ def test_check_without_a_line_below_3_khz_is_json(cli) -> None:
     done = cli("tx", "check", "--random", 1, "--json", *one)
 
     def no_number(name: str) -> None:
-        raise AssertionError(f"{name} is no JSON")
+        raise AssertionError(f"{name} is not JSON")
 
     rows = json.loads(done.stdout, parse_constant=no_number)["clusters"]
     assert {row["limit_percent"] for row in rows} == {None}

@@ -371,7 +371,7 @@ def test_too_much_is_told_before_anything_is_sent(board: Board, book: Codebook) 
     one = Bank.of_symbols(random_symbols(1, 1281, book, np.random.default_rng(0)), book)
     with pytest.raises(ConfigError, match=r"1281 frames takes 40992 bytes.*at most 1280 frames"):
         board.program(one)
-    # 12 bytes a chip: 3413 chips, 26 of the preamble and 32 a frame
+    # 12 bytes per chip: 3413 chips, 26 of the preamble and 32 a frame
     masks = Bank.of_masks(np.zeros((26 + 32 * 106, 96), np.uint8), book, PacketFormat.of(book, 106))
     with pytest.raises(ConfigError, match="at most 105 frames"):
         board.program(masks)

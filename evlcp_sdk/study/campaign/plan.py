@@ -100,7 +100,7 @@ class Point:
     """One scene with one link.
 
     Attributes:
-        labels: What sets it apart: keys begin with `scene.` or `link.`.
+        labels: What sets it apart: keys start with `scene.` or `link.`.
         scene: Number of its scene.
         link: Number of its link.
         tasks: Ids of its tasks, by seed.

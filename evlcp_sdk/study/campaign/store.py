@@ -126,7 +126,7 @@ class Store:
             row = self._base.execute("SELECT body FROM plan").fetchone()
             table: dict[str, Any] | None = None if row is None else json.loads(row[0])
         if table is None:
-            raise InputError(f"{self.path}: no campaign has begun in it")
+            raise InputError(f"{self.path}: no campaign has started in it")
         return table
 
     def put(self, results: list[tuple[str, Statistics]]) -> None:

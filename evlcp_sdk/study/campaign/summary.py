@@ -217,7 +217,7 @@ def summarize(store: Store) -> Summary:
     """Add up what counts in a store.
 
     Raises:
-        InputError: No campaign has begun in it.
+        InputError: No campaign has started in it.
     """
     plan = store.plan()
     results = store.results()

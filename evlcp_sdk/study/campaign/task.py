@@ -1,4 +1,4 @@
-"""One job of a campaign: render a scene, receive it with every link, hold what came out against the truth."""
+"""One job of a campaign: render a scene, receive it with every link, compare what came out with the truth."""
 
 import hashlib
 import json
@@ -109,7 +109,7 @@ def _identity(scene: Scene) -> Any:
 
 
 def run_job(job: Job) -> list[tuple[str, Statistics]]:
-    """Render the job's scene once, receive it with the link of every task, hold it against the truth.
+    """Render the job's scene once, receive it with the link of every task, compare it with the truth.
 
     A bar that says no link sends with that of the tasks, which are alike in what is on air.
 

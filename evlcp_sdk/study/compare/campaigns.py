@@ -12,7 +12,7 @@ __all__ = ["of_campaign"]
 
 
 def of_campaign(summary: Summary) -> Comparison:
-    """The links of a campaign as variants, with a table a scene.
+    """The links of a campaign as variants, with a table per scene.
 
     Time, which a campaign does not keep, has no column; nor is there a bound, which needs the events.
     """

@@ -116,7 +116,7 @@ def measure_recording(
     truth: Truth | None = None,
     advance: Callable[[EventSource], None] = lambda _: None,
 ) -> Table:
-    """Receive a recording with every variant, and hold what came out against the truth.
+    """Receive a recording with every variant, and compare what came out with the truth.
 
     Its first packets are read and received once before, so that no kernel is loaded or compiled while time
     runs. The bound is that of the frames as the first variant decodes them; a bar of several columns, or a

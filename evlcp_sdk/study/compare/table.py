@@ -211,7 +211,7 @@ class Comparison:
 
     Attributes:
         variants: Name to what sets it apart, with digest and resolved table.
-        tables: One a recording; over all, the last, where there are several.
+        tables: One per recording; over all, the last, where there are several.
         notes: What a reader must know.
         versions: What was installed.
     """

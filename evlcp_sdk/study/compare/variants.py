@@ -89,6 +89,6 @@ def load_variants(
 
 
 def _is_about(fault: str, settings: Iterable[str]) -> bool:
-    """Whether a fault is one of these settings: it begins with the key, or names the unknown id."""
+    """Whether a fault is one of these settings: it starts with the key, or names the unknown id."""
     pairs = [[part.strip() for part in setting.split("=", 1)] for setting in settings]
     return any(fault.startswith(key) or f"named '{value}'" in fault for key, value in pairs)

@@ -284,8 +284,8 @@ def test_broken_and_conflicting_plugins_are_listed(monkeypatch: pytest.MonkeyPat
         ("json:Nothing", "cannot import json:Nothing"),
         ("json", "cannot import json"),
         ("", "cannot import : "),
-        ("json:JSONDecoder", "json:JSONDecoder is no Ranging"),
-        ("json:loads", "json:loads is no Ranging"),
+        ("json:JSONDecoder", "json:JSONDecoder is not a Ranging"),
+        ("json:loads", "json:loads is not a Ranging"),
     ],
 )
 def test_a_target_that_cannot_be_used(target: str, told: str) -> None:

@@ -91,7 +91,7 @@ def bring(name: str, target: str, *files: str, **more: Any) -> object:
     [
         ("fails", f"{__name__}:Failing", r"sink 'fails' of .*: KeyError: 'boom' \(test_sinks.py, line \d+\)"),
         ("strays", f"{__name__}:Stray", r"sink 'strays' of .*: 'stray.txt' is not among the files"),
-        ("none", f"{__name__}:NoSink", r"sink 'none' of .*: .*:NoSink is no Sink"),
+        ("none", f"{__name__}:NoSink", r"sink 'none' of .*: .*:NoSink is not a Sink"),
         ("away", f"{__name__}:Away", r"sink 'away' of .*: cannot import .*:Away"),
         ("gone", "no_such_module:Sink", r"sink 'gone' of .*: cannot import no_such_module:Sink"),
     ],

@@ -148,7 +148,7 @@ def test_from_a_scene_to_the_lines_of_a_result(evlcp: Any, tmp_path: Path) -> No
     assert (text["text"], text["transmitter_id"], text["sequence"]) == ("Tempo_30", 7, 5)
     (beacon,) = (m for m in messages if m["verified"])
     assert (beacon["latitude_deg"], beacon["longitude_deg"], beacon["height_m"]) == (35.1, 136.9, 52.4)
-    assert "2 messages; beacons told 1 times verified, 1 times unverified" in told.out
+    assert "2 messages; beacons 1 times verified, 1 times unverified" in told.out
     counts = json.loads((out / "summary.json").read_text())["counts"]
     assert counts["blocks_decoded"] == counts["blocks_tried"] - counts["blocks_failed"] >= 4
 

@@ -32,7 +32,7 @@ class DistanceLines(Sink):
         self._lines = 0
 
     def packet(self, packet: Packet) -> None:
-        """Write a line a frame that has a distance; time is the camera's clock, in ns."""
+        """Write a line per frame that has a distance; time is the camera's clock, in ns."""
         for frame in packet.frames:
             if math.isfinite(frame.range.distance_m):
                 values = f"depth_m={frame.range.distance_m:.4f},sigma_m={frame.range.sigma_m:.4f}"

@@ -247,7 +247,7 @@ def test_stores_that_cannot_be_opened(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="unable to open"):
         Store(tmp_path / "no" / "such" / "a.sqlite", create=True)
     with Store(tmp_path / "a.sqlite", create=True) as store:
-        with pytest.raises(InputError, match="no campaign has begun"):
+        with pytest.raises(InputError, match="no campaign has started"):
             store.plan()
         store.adopt(fake_plan())
 
