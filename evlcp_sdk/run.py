@@ -301,6 +301,7 @@ def calibrate(
     *,
     registry: Registry | None = None,
     limit_px: float = 2.0,
+    name: str = "poses",
 ) -> Calibrated:
     """Estimate focal length, principal point and distortion from bars at known places.
 
@@ -311,19 +312,34 @@ def calibrate(
         link: The configuration; None for all defaults.
         registry: The plugins; None for all that are installed.
         limit_px: Uncertainty of the image's corners that is allowed.
+        name: What a message calls the poses: the file they come from, which has a heading and a line a pose.
 
     Raises:
         InputError: A recording cannot be read.
-        ConfigError: A pose names no recording, a site contradicts its beacon, or too little was seen.
+        ConfigError: A pose belongs to none of the recordings, a site contradicts its beacon, or too little was
+            seen.
     """
     registry = Registry.load() if registry is None else registry
     link = load_link(registry=registry) if link is None else link
+    _check_names(recordings, poses, name)
     frame = LocalFrame.of(sites)
     views: list[CalibrationView] = []
     for url in recordings:
         mine = [pose for pose in poses if pose.recording in ("", Path(url).name)]
         views += _views(url, mine, link, sites, frame, registry)
     return fit_camera(views, link.camera, link.position, limit_px=limit_px)
+
+
+def _check_names(recordings: Sequence[str], poses: Sequence[KnownPose], source: str) -> None:
+    names = [Path(url).name for url in recordings]
+    for line, pose in enumerate(poses, 2):
+        if pose.recording not in ("", *names):
+            known = ", ".join(names)
+            raise ConfigError(
+                f"{source}: line {line}: recording = {pose.recording!r}: expected one of {known}"
+            )
+        if not pose.recording and len(names) > 1:
+            raise ConfigError(f"{source}: line {line}: recording: expected one, as there are {len(names)}")
 
 
 def _views(

@@ -8,10 +8,7 @@ import typer
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from evlcp_sdk.place.calibration import Calibrated
-    from evlcp_sdk.place.poses import KnownPose
 
 __all__ = ["register"]
 
@@ -59,25 +56,13 @@ def calibrate(
     link = load_link(link_file, overrides or [], registry)
     bars = load_sites(sites)
     known = read_poses(poses)
-    _check_names(recordings, known, poses)
-    found = run.calibrate(recordings, bars, known, link, registry=registry, limit_px=limit_px)
+    found = run.calibrate(
+        recordings, bars, known, link, registry=registry, limit_px=limit_px, name=str(poses)
+    )
     if as_json:
         typer.echo(json.dumps(_table(found) | {"poses": len(known)}))
     else:
         console().print(_toml(found, len(known)), markup=False)
-
-
-def _check_names(recordings: list[str], poses: "Sequence[KnownPose]", path: Path) -> None:
-    from evlcp_sdk.errors import ConfigError
-
-    names = [Path(url).name for url in recordings]
-    for line, pose in enumerate(poses, 2):
-        if pose.recording not in ("", *names):
-            raise ConfigError(
-                f"{path}: line {line}: recording = {pose.recording!r}: expected one of {', '.join(names)}"
-            )
-        if not pose.recording and len(names) > 1:
-            raise ConfigError(f"{path}: line {line}: recording: expected one, as there are {len(names)}")
 
 
 def _table(found: "Calibrated") -> dict[str, Any]:
