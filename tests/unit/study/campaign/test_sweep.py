@@ -10,6 +10,7 @@ import pytest
 from evlcp_sdk.cli.demo import demo_campaign
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.jobs.executor import Inline
+from evlcp_sdk.sim.scene import links_of
 from evlcp_sdk.study.campaign.plan import Job
 from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.campaign.summary import summarize
@@ -124,6 +125,19 @@ def test_other_code_is_refused(campaign: Path) -> None:
     job = plan.jobs[0]
     with pytest.raises(ConfigError, match="not those of the campaign's plan"):
         run_job(Job(job.scene, job.seed, job.tasks, {"source": "0" * 64}))
+
+
+def test_a_link_of_a_scene_is_a_file_beside_the_campaign(campaign: Path, tmp_path: Path) -> None:
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "mine.toml").write_text("duration_s = 0.05\n")
+    (tmp_path / "link.toml").write_text("[air]\nchip_rate_hz = 5000.0\n")
+    for base in ("drive-30kmh", "scenes/mine.toml"):
+        campaign.write_text(CAMPAIGN.replace('"drive-30kmh"', f'"{base}"'))
+        for key in ("link", "bars.link", "bars.0.link"):
+            scene = plan_of(campaign, [f"scene.{key}=link.toml"]).scenes[0].value
+            assert links_of(scene)[0].air.chip_rate_hz == 5000.0
+    with pytest.raises(ConfigError, match=r"other\.toml: cannot be read"):
+        plan_of(campaign, ["scene.link=other.toml"])
 
 
 def test_files_of_a_scene_count_by_what_they_hold(campaign: Path, tmp_path: Path) -> None:
