@@ -316,8 +316,8 @@ def calibrate(
 
     Raises:
         InputError: A recording cannot be read.
-        ConfigError: A pose belongs to none of the recordings, a site contradicts its beacon, or too little was
-            seen.
+        ConfigError: A pose belongs to none of the recordings, a site contradicts its beacon, or too little
+            was seen.
     """
     registry = Registry.load() if registry is None else registry
     link = load_link(registry=registry) if link is None else link
