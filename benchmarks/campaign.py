@@ -12,7 +12,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from evlcp_sdk.jobs.executor import Executor, Inline, Processes
+from evlcp_sdk.jobs.executor import Executor
+from evlcp_sdk.jobs.inline import Inline
+from evlcp_sdk.jobs.processes import Processes
 from evlcp_sdk.study.campaign.collect import collect
 from evlcp_sdk.study.campaign.plan import Case, Job, make_plan
 from evlcp_sdk.study.campaign.store import Store

@@ -74,7 +74,8 @@ def make_executor(workers: int | None, dask: str | None) -> "Executor":
     Raises:
         ConfigError: The cluster is not there.
     """
-    from evlcp_sdk.jobs.executor import Inline, Processes
+    from evlcp_sdk.jobs.inline import Inline
+    from evlcp_sdk.jobs.processes import Processes
 
     if dask is not None:
         if workers is not None:

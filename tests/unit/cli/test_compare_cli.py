@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from evlcp_sdk.jobs.executor import Inline
+from evlcp_sdk.jobs.inline import Inline
 from evlcp_sdk.sim import read_truth
 from evlcp_sdk.study.campaign.collect import collect
 from evlcp_sdk.study.campaign.store import Store

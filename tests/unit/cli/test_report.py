@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.jobs.executor import Inline
+from evlcp_sdk.jobs.inline import Inline
 from evlcp_sdk.study.campaign.charts import charts_of, save_charts
 from evlcp_sdk.study.campaign.collect import collect
 from evlcp_sdk.study.campaign.paper import PAPER

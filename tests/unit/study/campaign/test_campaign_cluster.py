@@ -13,7 +13,7 @@ import pytest
 
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.jobs.dask import DaskCluster
-from evlcp_sdk.jobs.executor import Inline
+from evlcp_sdk.jobs.inline import Inline
 from evlcp_sdk.study.campaign.collect import Counted, Progress, collect
 from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.tally import Statistics

@@ -14,7 +14,9 @@ from pathlib import Path
 import pytest
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
-from evlcp_sdk.jobs.executor import Executor, Inline, Processes
+from evlcp_sdk.jobs.executor import Executor
+from evlcp_sdk.jobs.inline import Inline
+from evlcp_sdk.jobs.processes import Processes
 from evlcp_sdk.study.campaign.collect import Counted, Progress, collect
 from evlcp_sdk.study.campaign.plan import Plan, StopRule
 from evlcp_sdk.study.campaign.store import Store

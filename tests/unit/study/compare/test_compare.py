@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.jobs.executor import Inline
+from evlcp_sdk.jobs.inline import Inline
 from evlcp_sdk.study.campaign.collect import collect
 from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.campaign.summary import summarize
