@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     )
     from evlcp_sdk.io.open import open_source as open
     from evlcp_sdk.io.open import read_events, write_events
-    from evlcp_sdk.io.sources import EventSource, Loss, ReplaySource
+    from evlcp_sdk.io.replay import ReplaySource
     from evlcp_sdk.link.compose import compose
     from evlcp_sdk.link.resolve import Link, load_link
     from evlcp_sdk.place.navigator import PositionPlan
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
         Tracker,
         Tracking,
     )
+    from evlcp_sdk.plugin.source import EventSource, Loss
     from evlcp_sdk.results.sink import Sink
     from evlcp_sdk.results.tables import frames_table
     from evlcp_sdk.run import Reception, receive, receive_to_folder
@@ -173,12 +174,13 @@ _HOMES = {
         "UnknownAlgorithmError",
     ),
     "io.open": ("open_source", "read_events", "write_events"),
-    "io.sources": ("EventSource", "Loss", "ReplaySource"),
+    "io.replay": ("ReplaySource",),
     "link.compose": ("compose",),
     "link.resolve": ("Link", "load_link"),
     "place.navigator": ("PositionPlan",),
     "plugin.hooks": ("Algorithm", "SinkRecord", "hookimpl"),
     "plugin.registry": ("Registry",),
+    "plugin.source": ("EventSource", "Loss"),
     "plugin.roles": (
         "Code",
         "Corrected",

@@ -8,8 +8,8 @@ from typing import Any
 from evlcp_sdk.errors import ConfigError, EvlcpError, StreamError
 from evlcp_sdk.files import write_text
 from evlcp_sdk.io.open import open_writer
-from evlcp_sdk.io.sources import EventSource
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.scene.sites import to_toml
 from evlcp_sdk.sim import Scene, Simulation, Truth, load_scene, resolve_scene, sites_of, truth_of
 from evlcp_sdk.sim.world import attitude_log

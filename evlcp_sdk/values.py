@@ -162,6 +162,10 @@ class Triggers:
     def __len__(self) -> int:
         return len(self.t_us)
 
+    def __getitem__(self, rows: Any) -> "Triggers":
+        """The triggers of a slice or a mask (a view for a slice)."""
+        return Triggers(self.t_us[rows], self.channel[rows], self.value[rows])
+
     def __repr__(self) -> str:
         return f"Triggers({_counted(self.t_us, 'edge')})"
 

@@ -3,9 +3,10 @@
 from evlcp_sdk.io.faery import FaerySource
 from evlcp_sdk.io.open import open_source, open_writer, read_events, write_events
 from evlcp_sdk.io.raw import RawHeader, RawSource, RawWriter
-from evlcp_sdk.io.sources import DEFAULT_MAX_EVENTS, EventSource, Loss, ReplaySource
+from evlcp_sdk.io.replay import ReplaySource
 from evlcp_sdk.io.tables import CsvSource, CsvWriter, NpzSource, NpzWriter
 from evlcp_sdk.io.writers import EventWriter
+from evlcp_sdk.plugin.source import DEFAULT_MAX_EVENTS, EventSource, Loss
 
 __all__ = [
     "DEFAULT_MAX_EVENTS",

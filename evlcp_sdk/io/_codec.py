@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.io import _words
-from evlcp_sdk.io.sources import Loss
+from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["Codec", "Columns", "Decoder"]

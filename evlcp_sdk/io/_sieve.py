@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.io.sources import Loss
+from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.values import Events
 
 __all__ = ["Sieve"]

@@ -8,7 +8,7 @@ import numpy as np
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io._sieve import Sieve
-from evlcp_sdk.io.sources import EventSource, Loss
+from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["FORMATS", "FaerySource"]

@@ -8,10 +8,10 @@ from urllib.parse import unquote
 from evlcp_sdk.errors import EvlcpError, InputError, StreamError
 from evlcp_sdk.io.faery import FORMATS, FaerySource
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
-from evlcp_sdk.io.sources import EventSource
 from evlcp_sdk.io.tables import CSV_HEADER, CsvSource, CsvWriter, NpzSource, NpzWriter
 from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["open_source", "open_writer", "read_events", "write_events"]

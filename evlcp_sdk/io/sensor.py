@@ -1,7 +1,7 @@
 """Whether a recording is of the sensor that a receiver is set up for."""
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.io.sources import EventSource
+from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.scene.camera import CameraModel
 
 __all__ = ["check_sensor"]

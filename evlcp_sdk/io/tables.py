@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError, StreamError
 from evlcp_sdk.io._sieve import Sieve
-from evlcp_sdk.io.sources import EventSource, Loss
 from evlcp_sdk.io.writers import LAST_TIME_US, EventWriter
+from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["CsvSource", "CsvWriter", "NpzSource", "NpzWriter"]

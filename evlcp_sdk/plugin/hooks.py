@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import typer
 
     from evlcp_sdk.air.kinds import MessageKind
-    from evlcp_sdk.io import EventSource
+    from evlcp_sdk.plugin.source import EventSource
 
 __all__ = ["ENTRY_POINT_GROUP", "Algorithm", "SinkRecord", "hookimpl", "hookspec"]
 

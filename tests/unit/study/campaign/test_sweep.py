@@ -9,12 +9,8 @@ import pytest
 
 from evlcp_sdk.cli.demo import demo_campaign
 from evlcp_sdk.errors import ConfigError
-<<<<<<< HEAD
 from evlcp_sdk.jobs.inline import Inline
 from evlcp_sdk.sim.scene import links_of
-=======
-from evlcp_sdk.jobs.inline import Inline
->>>>>>> 2c10dba (Jobs: executor, in this process, and in local processes are a module each)
 from evlcp_sdk.study.campaign.plan import Job
 from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.campaign.summary import summarize

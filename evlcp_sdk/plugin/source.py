@@ -1,19 +1,16 @@
 """What every recording, camera and replay is to a receiver: a stream of events, with what it lost."""
 
-import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import numpy as np
-
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["DEFAULT_MAX_EVENTS", "EventSource", "Loss", "ReplaySource"]
+__all__ = ["DEFAULT_MAX_EVENTS", "EventSource", "Loss"]
 
 DEFAULT_MAX_EVENTS = 1 << 16
 """Events of a piece unless asked otherwise: under 1 MB, so that it is still in the cache when it is used."""
@@ -131,8 +128,8 @@ class EventSource(ABC):
             if len(events) <= max_events and len(triggers) <= max_events:
                 self._rest = nothing
             else:
-                self._rest = events[max_events:], _rows(triggers, slice(max_events, None))
-                events, triggers = events[:max_events], _rows(triggers, slice(max_events))
+                self._rest = events[max_events:], triggers[max_events:]
+                events, triggers = events[:max_events], triggers[:max_events]
             self._given["events"] += len(events)
             self._given["triggers"] += len(triggers)
             yield events, triggers
@@ -169,90 +166,3 @@ class EventSource(ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _rows(triggers: Triggers, rows: slice) -> Triggers:
-    return Triggers(triggers.t_us[rows], triggers.channel[rows], triggers.value[rows])
-
-
-class ReplaySource(EventSource):
-    """A recording given out at the pace of its own clock, as a camera would.
-
-    Args:
-        source: The recording; closed with the replay.
-        speed: Camera seconds for each second that passes.
-        slice_us: Camera time between two pieces, us; each comes when its time is over.
-        clock: Gives the time, s.
-        sleep: Waits, s.
-
-    Attributes:
-        lag_s: How much later than due the last piece was asked for, s; it grows if the receiver is too slow.
-
-    Raises:
-        StreamError: `speed` or `slice_us` is not positive.
-    """
-
-    def __init__(
-        self,
-        source: EventSource,
-        speed: float = 1.0,
-        slice_us: int = 1000,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        if not speed > 0 or slice_us < 1:
-            raise StreamError(f"replay at speed {speed} in slices of {slice_us} us, expected both positive")
-        super().__init__(
-            source.path, source.format, source.width, source.height, source.header, source.size_bytes
-        )
-        self.lag_s = 0.0
-        self._source = source
-        self._s_per_us = 1e-6 / speed
-        self._slice_us = slice_us
-        self._clock = clock
-        self._sleep = sleep
-        self._piece = (Events.empty(), Triggers.empty())
-        self._origin: tuple[int, float] | None = (
-            None  # camera clock, us, and own clock, s, of the first piece
-        )
-
-    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
-        """Wait until the next slice of time is over and return its events, at most `max_events`."""
-        if not any(len(half) for half in self._piece):
-            piece = next(self._source.stream(max_events), None)
-            if piece is None:
-                return None
-            self._piece = piece
-        events, triggers = self._piece
-        first = min(int(column[0]) for column in (events.t_us, triggers.t_us) if len(column))
-        if self._origin is None:
-            self._origin = first, self._clock()
-        start_us, start_s = self._origin
-        end_us = first + self._slice_us - (first - start_us) % self._slice_us
-        n, m = (int(np.searchsorted(column, end_us)) for column in (events.t_us, triggers.t_us))
-        self._piece = events[n:], _rows(triggers, slice(m, None))
-
-        early_s = start_s + (end_us - start_us) * self._s_per_us - self._clock()
-        self.lag_s = max(-early_s, 0.0)
-        if early_s > 0:
-            self._sleep(early_s)
-        return events[:n], _rows(triggers, slice(m))
-
-    def close(self) -> None:
-        """Close the recording."""
-        self._source.close()
-
-    @property
-    def position_bytes(self) -> int:
-        """As the recording's."""
-        return self._source.position_bytes
-
-    @property
-    def losses(self) -> dict[str, Loss]:
-        """As the recording's."""
-        return self._source.losses
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """As the recording's, with the events and triggers replayed so far."""
-        return self._source.counts | self._given

@@ -1,0 +1,95 @@
+"""A recording given out at the pace of its own clock."""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from evlcp_sdk.errors import StreamError
+from evlcp_sdk.plugin.source import EventSource, Loss
+from evlcp_sdk.values import Events, Triggers
+
+__all__ = ["ReplaySource"]
+
+
+class ReplaySource(EventSource):
+    """A recording given out at the pace of its own clock, as a camera would.
+
+    Args:
+        source: The recording; closed with the replay.
+        speed: Camera seconds for each second that passes.
+        slice_us: Camera time between two pieces, us; each comes when its time is over.
+        clock: Gives the time, s.
+        sleep: Waits, s.
+
+    Attributes:
+        lag_s: How much later than due the last piece was asked for, s; it grows if the receiver is too slow.
+
+    Raises:
+        StreamError: `speed` or `slice_us` is not positive.
+    """
+
+    def __init__(
+        self,
+        source: EventSource,
+        speed: float = 1.0,
+        slice_us: int = 1000,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        if not speed > 0 or slice_us < 1:
+            raise StreamError(f"replay at speed {speed} in slices of {slice_us} us, expected both positive")
+        super().__init__(
+            source.path, source.format, source.width, source.height, source.header, source.size_bytes
+        )
+        self.lag_s = 0.0
+        self._source = source
+        self._s_per_us = 1e-6 / speed
+        self._slice_us = slice_us
+        self._clock = clock
+        self._sleep = sleep
+        self._piece = (Events.empty(), Triggers.empty())
+        self._origin: tuple[int, float] | None = (
+            None  # camera clock, us, and own clock, s, of the first piece
+        )
+
+    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
+        """Wait until the next slice of time is over and return its events, at most `max_events`."""
+        if not any(len(half) for half in self._piece):
+            piece = next(self._source.stream(max_events), None)
+            if piece is None:
+                return None
+            self._piece = piece
+        events, triggers = self._piece
+        first = min(int(column[0]) for column in (events.t_us, triggers.t_us) if len(column))
+        if self._origin is None:
+            self._origin = first, self._clock()
+        start_us, start_s = self._origin
+        end_us = first + self._slice_us - (first - start_us) % self._slice_us
+        n, m = (int(np.searchsorted(column, end_us)) for column in (events.t_us, triggers.t_us))
+        self._piece = events[n:], triggers[m:]
+
+        early_s = start_s + (end_us - start_us) * self._s_per_us - self._clock()
+        self.lag_s = max(-early_s, 0.0)
+        if early_s > 0:
+            self._sleep(early_s)
+        return events[:n], triggers[:m]
+
+    def close(self) -> None:
+        """Close the recording."""
+        self._source.close()
+
+    @property
+    def position_bytes(self) -> int:
+        """As the recording's."""
+        return self._source.position_bytes
+
+    @property
+    def losses(self) -> dict[str, Loss]:
+        """As the recording's."""
+        return self._source.losses
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """As the recording's, with the events and triggers replayed so far."""
+        return self._source.counts | self._given
