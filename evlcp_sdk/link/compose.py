@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,13 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Kind, Message, split
 from evlcp_sdk.air.kinds import kind_named
+from evlcp_sdk.air.signing import read_key, sign
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.scene.sites import BarSite
 
-__all__ = ["beacon_of_site", "compose", "packets_of"]
+__all__ = ["beacon_of_site", "compose", "messages_of", "packets_of", "utf8"]
 
 
 def compose(
@@ -24,6 +26,8 @@ def compose(
     text: str | None = None,
     data: bytes | None = None,
     beacon: Beacon | BarSite | None = None,
+    user: bytes = b"",
+    key: Path | str | None = None,
     other: Mapping[str, Any] | None = None,
     transmitter_id: int | None = None,
     sequence: int | None = None,
@@ -31,13 +35,15 @@ def compose(
 ) -> NDArray[np.int64]:
     """Put messages on packets: the symbols that a transmitter sends, int64 (packets, frames, clusters).
 
-    Several messages at once follow one another: beacon, text, data, others. Beacons are not signed here.
+    Several messages at once follow one another: beacon, its signature, text, data, others.
 
     Args:
         link: The configuration; None for all defaults.
         text: A text.
         data: Bytes.
         beacon: What a beacon says; of a bar's site, where it stands.
+        user: The user's own bytes in the beacon of a site.
+        key: File of the private key that signs the beacon (needs the extra `sign`).
         other: What messages of other installed kinds say, by the kind's name.
         transmitter_id: Who sends; None for the site's id, or 0.
         sequence: Number of the messages; None for the seconds since 1970, so that it rises.
@@ -45,7 +51,8 @@ def compose(
 
     Raises:
         ConfigError: Nothing to send, a kind that is not installed, a message that is too long or a number out
-            of range, or packets of the link that are too short for messages.
+            of range, packets of the link that are too short for messages, or the extra is not installed.
+        InputError: The key cannot be read.
 
     >>> compose(text="Tempo 30", transmitter_id=7).shape
     (1, 10, 16)
@@ -53,25 +60,65 @@ def compose(
     link = load_link() if link is None else link
     if repeat < 1:
         raise ConfigError(f"repeat = {repeat}, expected 1 or more")
+    messages = messages_of(
+        link,
+        text=text,
+        data=data,
+        beacon=beacon,
+        user=user,
+        key=key,
+        other=other,
+        transmitter_id=transmitter_id,
+        sequence=sequence,
+    )
+    return packets_of(messages, link.block_coder(), repeat)
+
+
+def messages_of(
+    link: Link,
+    *,
+    text: str | None = None,
+    data: bytes | None = None,
+    beacon: Beacon | BarSite | None = None,
+    user: bytes = b"",
+    key: Path | str | None = None,
+    other: Mapping[str, Any] | None = None,
+    transmitter_id: int | None = None,
+    sequence: int | None = None,
+) -> list[Message]:
+    """The messages that `compose` puts on packets; arguments and faults as there."""
     if transmitter_id is None:
         transmitter_id = beacon.transmitter_id if isinstance(beacon, BarSite) else 0
-    if sequence is None:
-        sequence = int(time.time())
-    payloads: list[tuple[int, bytes]] = []
+    number = int(time.time()) if sequence is None else sequence
+    found: list[Message] = []
     if beacon is not None:
-        said = beacon_of_site(beacon) if isinstance(beacon, BarSite) else beacon
-        payloads.append((Kind.BEACON, said.pack()))
+        said = beacon_of_site(beacon, user) if isinstance(beacon, BarSite) else beacon
+        found.append(Message(Kind.BEACON, transmitter_id, number, said.pack()))
+        if key is not None:
+            digest = link.block_coder().digest
+            found.append(sign(found[0], digest, read_key(Path(key))))
     if text is not None:
-        payloads.append((Kind.TEXT, text.encode()))
+        found.append(Message(Kind.TEXT, transmitter_id, number, utf8(text, "text")))
     if data is not None:
-        payloads.append((Kind.DATA, bytes(data)))
+        found.append(Message(Kind.DATA, transmitter_id, number, bytes(data)))
     for name, value in (other or {}).items():
         kind = kind_named(name, link.kinds)
-        payloads.append((kind.number, kind.pack(value)))
-    if not payloads:
+        found.append(Message(kind.number, transmitter_id, number, kind.pack(value)))
+    if not found:
         raise ConfigError("nothing to send: give a text, data or a beacon")
-    messages = [Message(kind, transmitter_id, sequence, payload) for kind, payload in payloads]
-    return packets_of(messages, link.block_coder(), repeat)
+    return found
+
+
+def utf8(text: str, name: str) -> bytes:
+    """The bytes of a text; a shell's bytes that are not UTF-8 arrive as lone surrogates.
+
+    Raises:
+        ConfigError: There are such.
+    """
+    try:
+        return text.encode()
+    except UnicodeEncodeError as fault:
+        raise ConfigError(f"{name}: character {fault.start + 1} is not UTF-8; send bytes as data") from fault
 
 
 def packets_of(messages: Iterable[Message], coder: BlockCoder, repeat: int = 1) -> NDArray[np.int64]:

@@ -13,9 +13,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from evlcp_sdk.air.blocks import Message
-    from evlcp_sdk.link.blocks import BlockCoder
     from evlcp_sdk.link.resolve import Link
+    from evlcp_sdk.scene.sites import BarSite
 
 __all__ = ["keygen", "message"]
 
@@ -76,15 +75,30 @@ def message(
     """
     import json
 
-    from evlcp_sdk.link.compose import packets_of
+    from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.link.compose import messages_of, packets_of, utf8
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
     from firmware_host.board.symbols import symbols_table
 
     link = load_link(link_file, overrides or [], Registry.load())
-    coder = link.block_coder()
-    messages = _messages(text, file, beacon, user, key, transmitter_id, sequence, coder)
-    symbols = packets_of(messages, coder, repeat)
+    if text is None and file is None and beacon is None:
+        raise ConfigError("give what to send: --text TEXT, --file FILE or --beacon site.toml")
+    if beacon is None and (key is not None or user):
+        raise ConfigError("--key and --user belong to a beacon: give --beacon site.toml, too")
+    for option, given in (("--text", text), ("--user", user)):
+        utf8(given or "", option)
+    messages = messages_of(
+        link,
+        text=text,
+        data=None if file is None else _read(file),
+        beacon=None if beacon is None else _site(beacon, transmitter_id),
+        user=user.encode(),
+        key=key,
+        transmitter_id=transmitter_id,
+        sequence=sequence,
+    )
+    symbols = packets_of(messages, link.block_coder(), repeat)
     table = symbols_table(symbols, link, messages=True)
     if out is not None:
         from evlcp_sdk.files import write_text
@@ -145,44 +159,9 @@ def keygen(
     typer.echo(make_key(private))
 
 
-def _messages(
-    text: str | None,
-    file: Path | None,
-    site: Path | None,
-    user: str,
-    key: Path | None,
-    transmitter_id: int | None,
-    sequence: int | None,
-    coder: "BlockCoder",
-) -> "list[Message]":
-    import time
-
-    from evlcp_sdk.air.blocks import Kind, Message
+def _site(path: Path, transmitter_id: int | None) -> "BarSite":
+    """The bar of a file of sites that sends."""
     from evlcp_sdk.errors import ConfigError
-
-    if text is None and file is None and site is None:
-        raise ConfigError("give what to send: --text TEXT, --file FILE or --beacon site.toml")
-    if site is None and (key is not None or user):
-        raise ConfigError("--key and --user belong to a beacon: give --beacon site.toml, too")
-    number = int(time.time()) if sequence is None else sequence
-    found = []
-    if site is not None:
-        found = _beacon(site, user, key, transmitter_id, number, coder)
-        transmitter_id = found[0].transmitter_id
-    identity = transmitter_id or 0
-    if text is not None:
-        found.append(Message(Kind.TEXT, identity, number, _utf8("--text", text)))
-    if file is not None:
-        found.append(Message(Kind.DATA, identity, number, _read(file)))
-    return found
-
-
-def _beacon(
-    path: Path, user: str, key: Path | None, transmitter_id: int | None, sequence: int, coder: "BlockCoder"
-) -> "list[Message]":
-    from evlcp_sdk.air.blocks import Kind, Message
-    from evlcp_sdk.errors import ConfigError
-    from evlcp_sdk.link.compose import beacon_of_site
     from evlcp_sdk.scene.sites import load_sites
 
     sites = load_sites(path)
@@ -192,25 +171,7 @@ def _beacon(
     chosen = [s for s in sites if transmitter_id in (None, s.transmitter_id)]
     if not chosen:
         raise ConfigError(f"{path}: no bar has transmitter_id {transmitter_id}, but {ids}")
-    payload = beacon_of_site(chosen[0], _utf8("--user", user)).pack()
-    beacon = Message(Kind.BEACON, chosen[0].transmitter_id, sequence, payload)
-    if key is None:
-        return [beacon]
-    from evlcp_sdk.air.signing import read_key, sign
-
-    return [beacon, sign(beacon, coder.digest, read_key(key))]
-
-
-def _utf8(option: str, text: str) -> bytes:
-    """The bytes of a text; the shell's bytes that are not UTF-8 arrive as lone surrogates."""
-    from evlcp_sdk.errors import ConfigError
-
-    try:
-        return text.encode()
-    except UnicodeEncodeError as fault:
-        raise ConfigError(
-            f"{option}: character {fault.start + 1} is not UTF-8; send bytes by --file"
-        ) from fault
+    return chosen[0]
 
 
 def _read(path: Path) -> bytes:

@@ -221,9 +221,9 @@ class BoardFault(IntFlag):
     OPEN_LED = 2
     """A LED or its wire is open; playing goes on."""
     CLOCK = 4
-    """The crystal did not start: LEDs dark, timing would be wrong."""
+    """The crystal did not start, or stopped: LEDs dark, timing would be wrong."""
     CHIP_LOST = 8
-    """A chip interrupt came a whole chip late: LEDs dark."""
+    """A chip interrupt came a whole chip late, or chips stopped: LEDs dark."""
     WATCHDOG = 16
     """The host fell silent and the watchdog acted; cleared by the next request."""
 

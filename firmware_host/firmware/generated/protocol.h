@@ -101,8 +101,8 @@ enum evlcp_capability {
 enum evlcp_fault {
     EVLCP_FAULT_OVER_TEMPERATURE = 1, /* The drivers are too hot: LEDs dark until they cool and START. */
     EVLCP_FAULT_OPEN_LED = 2, /* A LED or its wire is open; playing goes on. */
-    EVLCP_FAULT_CLOCK = 4, /* The crystal did not start: LEDs dark, timing would be wrong. */
-    EVLCP_FAULT_CHIP_LOST = 8, /* A chip interrupt came a whole chip late: LEDs dark. */
+    EVLCP_FAULT_CLOCK = 4, /* The crystal did not start, or stopped: LEDs dark, timing would be wrong. */
+    EVLCP_FAULT_CHIP_LOST = 8, /* A chip interrupt came a whole chip late, or chips stopped: LEDs dark. */
     EVLCP_FAULT_WATCHDOG = 16, /* The host fell silent and the watchdog acted; cleared by the next request. */
 };
 
