@@ -1,6 +1,5 @@
 """TOML to checked values, with one clear line for what is wrong."""
 
-import difflib
 import json
 import re
 import tomllib
@@ -12,11 +11,11 @@ from typing import Any, TypeVar, get_args, get_type_hints
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.spelling import nearest
 
 __all__ = [
     "SpecError",
     "build",
-    "nearest",
     "parse_toml",
     "parse_value",
     "read_toml",
@@ -174,13 +173,6 @@ def spec_model(cls: type[Any]) -> type[BaseModel]:
 def shown(value: Any) -> str:
     """A value as a message shows it."""
     return toml_value(value) if isinstance(value, bool | int | float | str | list) else str(value)
-
-
-def nearest(word: str, known: Sequence[str]) -> str:
-    """The end of a message about an unknown word: the nearest that is known, and all that are."""
-    near = difflib.get_close_matches(word, known, n=1)
-    hint = f"; did you mean '{near[0]}'?" if near else ""
-    return f"{hint} (known: {', '.join(known) or 'none'})"
 
 
 def toml_value(value: Any) -> str:

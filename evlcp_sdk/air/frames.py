@@ -37,7 +37,11 @@ class PacketFormat:
 
     @classmethod
     def of(
-        cls, codebook: Codebook, frames: int, chip_rate_hz: float = 10_000.0, pilot_every: int = 1
+        cls,
+        codebook: Codebook,
+        frames: int,
+        chip_rate_hz: float = chip_rate_hz,
+        pilot_every: int = pilot_every,
     ) -> "PacketFormat":
         """The format that a codebook's code lengths imply."""
         return cls(

@@ -9,12 +9,12 @@ from evlcp_sdk.cli._common import complain
 if TYPE_CHECKING:
     from evlcp_sdk.study.campaign.collect import Progress
 
-__all__ = ["progress_bar", "tell_faults"]
+__all__ = ["progress_bar", "show_faults"]
 
 _MOST_FAULTS = 5
 
 
-def tell_faults(progress: "Progress") -> None:
+def show_faults(progress: "Progress") -> None:
     """Say which jobs failed, one line each, equal faults once."""
     lines = dict.fromkeys(fault.message for _, fault in progress.faults)
     for line in list(lines)[:_MOST_FAULTS]:

@@ -10,7 +10,7 @@ from evlcp_sdk.cli._common import Json, LinkFile, console
 if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
     from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.testing import Outcome
+    from evlcp_sdk.testing import Verdict
 
 __all__ = ["check", "register"]
 
@@ -131,7 +131,7 @@ def _link(
     )
 
 
-def _show(outcomes: "list[Outcome]") -> None:
+def _show(outcomes: "list[Verdict]") -> None:
     from rich.markup import escape
 
     out = console()

@@ -27,7 +27,7 @@ _GAP = 2
 
 
 @dataclass(frozen=True)
-class Job:
+class CompareJob:
     """One recording, and whether it is received in this process."""
 
     url: str
@@ -151,7 +151,9 @@ def _of_recordings(
     notes: list[str] = []
     code = 0
     try:
-        for outcome in executor.run(partial(_run, variants=variants), [Job(url, here) for url in urls]):
+        for outcome in executor.run(
+            partial(_run, variants=variants), [CompareJob(url, here) for url in urls]
+        ):
             if outcome.value is not None:
                 tables[outcome.job.url] = outcome.value
             elif outcome.fault is not None:
@@ -175,7 +177,7 @@ def _of_recordings(
     return code, Comparison(about, tuple(ordered), tuple(notes), registry.versions())
 
 
-def _run(job: Job, *, variants: "tuple[Variant, ...]") -> "Table":
+def _run(job: CompareJob, *, variants: "tuple[Variant, ...]") -> "Table":
     """Receive a recording with every variant, in this process or in a worker."""
     from evlcp_sdk.io.open import open_source
     from evlcp_sdk.io.sensor import check_sensor
@@ -203,7 +205,7 @@ def _run(job: Job, *, variants: "tuple[Variant, ...]") -> "Table":
 
 
 @contextmanager
-def _bar(job: Job) -> Iterator[Callable[[int, int | None], None]]:
+def _bar(job: CompareJob) -> Iterator[Callable[[int, int | None], None]]:
     from evlcp_sdk.cli._common import bytes_bar
 
     if not job.here:

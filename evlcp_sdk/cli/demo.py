@@ -70,7 +70,7 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     import json
     from contextlib import suppress
 
-    from evlcp_sdk.cli._campaign import progress_bar, tell_faults
+    from evlcp_sdk.cli._campaign import progress_bar, show_faults
     from evlcp_sdk.cli._common import make_executor
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.study.campaign.charts import charts_of, save_charts
@@ -99,7 +99,7 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
         with progress_bar(plan.name) as show_progress:
             progress = collect(plan, store, make_executor(workers, None), run_job, show_progress)
         summary = summarize(store)
-    tell_faults(progress)
+    show_faults(progress)
     if progress.faults:
         raise typer.Exit(max(fault.exit_code for _, fault in progress.faults))
     save_charts(charts_of(summary), summary.name, out)
@@ -119,13 +119,13 @@ def show_drive(summary: "Summary") -> None:
     """Print BER and RMSE of each segment of distance beside the paper's."""
     from rich.table import Table
 
-    from evlcp_sdk.study.campaign.summary import compare, measure
+    from evlcp_sdk.study.campaign.summary import beside_paper, measure
     from evlcp_sdk.study.tally import SEGMENT_M
 
     (series,) = summary.series
     paper = {
         (c.reference.measure, begin): f"{'at most ' if c.reference.bound else ''}{c.reference.value:g}"
-        for c in compare([series])
+        for c in beside_paper([series])
         for begin in range(c.reference.from_m, c.reference.to_m, SEGMENT_M)
     }
     table = Table(box=None, pad_edge=False, header_style="dim")
@@ -146,10 +146,10 @@ def show_drive(summary: "Summary") -> None:
 
 
 def _decode_recording(out: Path, as_json: bool) -> None:
-    import csv
     import json
 
     from evlcp_sdk.cli._summary import show
+    from evlcp_sdk.files import read_csv
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import receive_to_folder
@@ -164,13 +164,12 @@ def _decode_recording(out: Path, as_json: bool) -> None:
             f"decoding {recording.name} (the first run also compiles the kernels) ...", style="dim"
         )
     summary = receive_to_folder(recording, out, link, sinks=["figures"])
-    with (out / "frames.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    _, rows = read_csv(out / "frames.csv")
     found = score_frames(read_frames(out), read_truth(truth_file))
     if as_json:
         typer.echo(json.dumps(summary | {"score": found}))
         return
-    _show_frames(rows)
+    _show_frames([row for _, row in rows])
     # Most of so short a run is the loading of kernels: its speed says nothing.
     show(summary, out, speed=False)
     _show_score(found)

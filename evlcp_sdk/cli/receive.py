@@ -22,7 +22,7 @@ __all__ = ["register"]
 
 
 @dataclass(frozen=True)
-class Job:
+class ReceiveJob:
     """One recording and the folder that its result goes to."""
 
     url: str
@@ -214,7 +214,7 @@ def _position_plan(
 
 
 def _decode_job(
-    job: Job,
+    job: ReceiveJob,
     *,
     link: "Link",
     plan: "PositionPlan | None",
@@ -234,17 +234,17 @@ def _decode_job(
         return decode(stopped=asked)
 
 
-def _until(stopped: Callable[[], bool], jobs: Sequence[Job]) -> Iterator[Job]:
+def _until(stopped: Callable[[], bool], jobs: Sequence[ReceiveJob]) -> Iterator[ReceiveJob]:
     for job in jobs:
         if stopped():
             return
         yield job
 
 
-def _jobs(recordings: Sequence[str], out: Path) -> list[Job]:
+def _jobs(recordings: Sequence[str], out: Path) -> list[ReceiveJob]:
     if len(recordings) == 1:
-        return [Job(recordings[0], out)]
-    jobs = [Job(url, out / _stem(url)) for url in recordings]
+        return [ReceiveJob(recordings[0], out)]
+    jobs = [ReceiveJob(url, out / _stem(url)) for url in recordings]
     folders = [job.folder for job in jobs]
     for job in jobs:
         if folders.count(job.folder) > 1:

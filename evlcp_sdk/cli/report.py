@@ -142,9 +142,9 @@ def _within(tally: "Tally") -> str:
 
 def _paper_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
     from evlcp_sdk.study.campaign.report import comparison_rows
-    from evlcp_sdk.study.campaign.summary import compare
+    from evlcp_sdk.study.campaign.summary import beside_paper
 
-    rows = [list(row) for row in comparison_rows(compare(summary.series))]
+    rows = [list(row) for row in comparison_rows(beside_paper(summary.series))]
     return ["figure", "distance", "series", "paper", "here", "95 %", "agrees"], rows
 
 

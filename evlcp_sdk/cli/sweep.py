@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from evlcp_sdk.cli._campaign import progress_bar, tell_faults
+from evlcp_sdk.cli._campaign import progress_bar, show_faults
 from evlcp_sdk.cli._common import Dask, Json, Workers, console, make_executor
 
 __all__ = ["register", "sweep"]
@@ -80,7 +80,7 @@ def sweep(
                 so_far = progress_of(plan, store.results())
                 done = f"{so_far.done} of {so_far.tasks} tasks are in {path}"
                 raise InterruptedRunError(f"interrupted; {done}; the same command goes on") from None
-    tell_faults(progress)
+    show_faults(progress)
     if as_json:
         numbers = {k: v for k, v in asdict(progress).items() if k != "faults"}
         typer.echo(json.dumps({"results": str(path), **numbers, "failed": len(progress.faults)}))

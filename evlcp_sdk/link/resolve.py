@@ -33,7 +33,8 @@ from evlcp_sdk.plugin.roles import (
 )
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.specs import SpecError, build, nearest, parse_value, read_toml
+from evlcp_sdk.specs import SpecError, build, parse_value, read_toml
+from evlcp_sdk.spelling import nearest
 
 __all__ = ["Link", "load_link", "resolve"]
 

@@ -5,6 +5,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from evlcp_sdk.air.frames import PacketFormat
+
 __all__ = ["AirSpec", "MessageSpec", "PositionSpec", "RegionSpec"]
 
 
@@ -12,11 +14,15 @@ __all__ = ["AirSpec", "MessageSpec", "PositionSpec", "RegionSpec"]
 class AirSpec:
     """What is on air: the rate of the chips and the length of a packet."""
 
-    chip_rate_hz: Annotated[float, Field(gt=0, description="Chips sent a second.")] = 10_000.0
-    frames_per_packet: Annotated[int, Field(gt=0, description="Frames between two preambles.")] = 10
+    chip_rate_hz: Annotated[float, Field(gt=0, description="Chips sent a second.")] = (
+        PacketFormat.chip_rate_hz
+    )
+    frames_per_packet: Annotated[int, Field(gt=0, description="Frames between two preambles.")] = (
+        PacketFormat.frames
+    )
     pilot_every: Annotated[
         int, Field(gt=0, le=64, description="Frames from one pilot to the next; 1: every frame has one.")
-    ] = 1
+    ] = PacketFormat.pilot_every
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,12 @@
 """Where a camera was when: the poses that a calibration goes by, from a file."""
 
-import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import read_csv
 from evlcp_sdk.scene.attitude import Attitude
 
 __all__ = ["KnownPose", "read_poses"]
@@ -55,15 +55,7 @@ def read_poses(path: Path | str) -> list[KnownPose]:
         InputError: The file cannot be read.
         ConfigError: A column is missing, or a value is not a number or is out of range.
     """
-    try:
-        # Spreadsheets start a file with a byte order mark; empty lines give no row.
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            rows = [(reader.line_num, row) for row in reader]
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
-    except (UnicodeDecodeError, csv.Error) as fault:
-        raise InputError(f"{path}: not a CSV file: {fault}") from fault
+    _, rows = read_csv(path)
     if not rows:
         raise ConfigError(f"{path}: expected one line of values or more")
     poses = []

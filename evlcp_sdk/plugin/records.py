@@ -1,6 +1,5 @@
 """What plugins bring besides algorithms: output formats by name, kinds of messages by number."""
 
-import difflib
 import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.errors import ConfigError, PluginError
 from evlcp_sdk.plugin.hooks import SinkRecord
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.spelling import nearest
 
 __all__ = ["InstalledSink", "choose_sinks", "installed_sinks", "message_kinds"]
 
@@ -88,9 +88,7 @@ def choose_sinks(registry: Registry, names: Sequence[str], *, positions: bool) -
     sinks = installed_sinks(registry)
     for name in names:
         if name not in sinks:
-            near = difflib.get_close_matches(name, sinks, n=1)
-            hint = f"; did you mean '{near[0]}'?" if near else ""
-            raise ConfigError(f"no sink named '{name}'{hint} (installed: {', '.join(sorted(sinks))})")
+            raise ConfigError(f"no sink named '{name}'{nearest(name, sorted(sinks), 'installed')}")
         if sinks[name].record.positions and not positions:
             raise ConfigError(f"sink '{name}' needs --sites: it writes positions")
     return [

@@ -4,7 +4,6 @@ A plugin that fails is left out with all its hooks, and shown: as a `PluginWarni
 `Registry.broken`, and in the message to whoever asks for an algorithm that may be its own. All others go on.
 """
 
-import difflib
 import importlib
 import platform
 import warnings
@@ -20,6 +19,7 @@ from evlcp_sdk.errors import PluginError, PluginWarning, UnknownAlgorithmError
 from evlcp_sdk.plugin import hooks as hookspecs
 from evlcp_sdk.plugin.hooks import ENTRY_POINT_GROUP, Algorithm
 from evlcp_sdk.plugin.roles import ROLES
+from evlcp_sdk.spelling import nearest
 
 __all__ = ["Broken", "Installed", "Registry"]
 
@@ -181,11 +181,9 @@ class Registry:
             if (role, id) in broken.algorithms:
                 raise PluginError(f"{role} algorithm '{id}': {broken}")
         names = [e.algorithm.id for e in self.installed(role)]
-        near = difflib.get_close_matches(id, names, n=1)
-        hint = f"; did you mean '{near[0]}'?" if near else ""
         lost = "".join(f"; {broken}" for broken in self._broken if not broken.algorithms)
         raise UnknownAlgorithmError(
-            f"no {role} algorithm named '{id}'{hint} (installed: {', '.join(names) or 'none'}){lost}"
+            f"no {role} algorithm named '{id}'{nearest(id, names, 'installed')}{lost}"
         )
 
     def load_class(self, role: str, id: str) -> type[Any]:

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.results.folder import SUMMARY, ResultFolder
-from evlcp_sdk.results.tallies import Tally
+from evlcp_sdk.results.tallies import RunTally
 
 __all__ = ["Status", "summary_of", "write_summary"]
 
@@ -18,7 +18,7 @@ Status = Literal["complete", "interrupted", "failed"]
 def summary_of(
     status: Status,
     link: Link,
-    tally: Tally,
+    tally: RunTally,
     *,
     recording: Mapping[str, Any],
     processing: Mapping[str, Any],

@@ -12,7 +12,7 @@ from evlcp_sdk.place.refusals import REFUSALS
 from evlcp_sdk.results.text import number_or_none
 from evlcp_sdk.values import Packet
 
-__all__ = ["PositionTally", "Tally", "TransmitterTally"]
+__all__ = ["PositionTally", "RunTally", "TransmitterTally"]
 
 _CELL_M = 0.01
 _FARTHEST_M = 10_000.0
@@ -101,7 +101,7 @@ class TransmitterTally:
         }
 
 
-class Tally:
+class RunTally:
     """Running figures of all transmitters.
 
     Args:

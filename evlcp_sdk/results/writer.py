@@ -14,7 +14,7 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.sinks import Sinks, load_sinks
 from evlcp_sdk.results.summary import Status, summary_of, write_summary
-from evlcp_sdk.results.tallies import PositionTally, Tally
+from evlcp_sdk.results.tallies import PositionTally, RunTally
 from evlcp_sdk.values import Events, Packet
 
 __all__ = ["ResultWriter"]
@@ -50,7 +50,7 @@ class ResultWriter:
     ) -> None:
         self._registry = Registry.load() if registry is None else registry
         self._link = link
-        self._tally, self._positions = Tally(link.packet), PositionTally()
+        self._tally, self._positions = RunTally(link.packet), PositionTally()
         self._navigator = Navigator(link, plan) if plan is not None else None
         classes = load_sinks(choose_sinks(self._registry, sinks, positions=plan is not None))
         files = [file for s in installed_sinks(self._registry).values() for file in s.record.files]

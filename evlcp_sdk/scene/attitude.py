@@ -1,6 +1,5 @@
 """The camera's attitude: at one time, and over time from a file such as an IMU's log."""
 
-import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import read_csv
 
 __all__ = ["Attitude", "AttitudeLog"]
 
@@ -96,20 +96,8 @@ class AttitudeLog:
             ConfigError: A column is missing, a value is not a number, or times do not rise.
         """
         usual = Attitude() if usual is None else usual
-        try:
-            # Spreadsheets start a file with a byte order mark.
-            with Path(path).open(newline="", encoding="utf-8-sig") as file:
-                reader = csv.DictReader(file)
-                names = tuple(reader.fieldnames or ())
-                # Empty lines give no row.
-                lines, rows = [], []
-                for row in reader:
-                    lines.append(reader.line_num)
-                    rows.append(row)
-        except OSError as fault:
-            raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
-        except (UnicodeDecodeError, csv.Error) as fault:
-            raise InputError(f"{path}: not a CSV file: {fault}") from fault
+        names, rows = read_csv(path)
+        lines = [line for line, _ in rows]
         missing = [name for name in _NEEDED if name not in names]
         if missing:
             known = ", ".join(_NEEDED + _OPTIONAL)
@@ -117,9 +105,7 @@ class AttitudeLog:
         table: dict[str, NDArray[np.float64]] = {}
         for name in _NEEDED + _OPTIONAL:
             if name in names:
-                table[name] = np.array(
-                    [_number(path, line, name, row[name]) for line, row in zip(lines, rows, strict=True)]
-                )
+                table[name] = np.array([_number(path, line, name, row[name]) for line, row in rows])
         t_us = table["t_us"]
         if len(t_us) < 2:
             raise ConfigError(f"{path}: expected two lines or more with rising t_us")

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.specs import SpecError, build, nearest, read_toml
+from evlcp_sdk.specs import SpecError, build, read_toml
+from evlcp_sdk.spelling import nearest
 
 __all__ = ["BarSite", "LocalFrame", "load_sites", "resolve_sites", "site_of_transmitter", "to_toml"]
 

@@ -1,6 +1,5 @@
 """How the camera moves, and where that puts a strip of light in the image."""
 
-import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import read_csv
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim.scene import NEAREST_M, MotionSpec
 
@@ -115,21 +115,15 @@ class CameraPath:
 
 def _read_path(path: Path, duration_s: float) -> CubicSpline:
     names = ("t_s", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
-    except (UnicodeDecodeError, csv.Error) as fault:
-        raise InputError(f"{path}: not a CSV file: {fault}") from fault
+    _, rows = read_csv(path)
     table = np.empty((len(rows), len(names)))
-    for i, row in enumerate(rows):
+    for i, (line, row) in enumerate(rows):
         for j, name in enumerate(names):
             try:
                 table[i, j] = float(row[name])
             except (KeyError, TypeError, ValueError) as fault:
                 raise ConfigError(
-                    f"{path}: line {i + 2}: no number in column {name} (columns: {', '.join(names)})"
+                    f"{path}: line {line}: no number in column {name} (columns: {', '.join(names)})"
                 ) from fault
     if len(table) < 2 or not np.isfinite(table).all() or (np.diff(table[:, 0]) <= 0).any():
         raise ConfigError(f"{path}: expected two or more lines of finite numbers with rising t_s")

@@ -10,7 +10,7 @@ from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim.scene import BarSpec, LensSpec
 
-__all__ = ["blur_sigma_px", "led_light_w_m2", "lit_share", "step_table", "strip_width_m"]
+__all__ = ["blur_sigma_px", "led_light_w_m2", "step_table", "strip_width_m"]
 
 Floats = NDArray[np.float64]
 
@@ -67,11 +67,3 @@ def step_table(sigma_px: float, reach_px: float, nodes: int) -> Floats:
     """
     z = np.linspace(-reach_px, reach_px, nodes)
     return _integral(z + 0.5, sigma_px) - _integral(z - 0.5, sigma_px)
-
-
-def lit_share(z: Floats, width_px: float | Floats, sigma_px: float) -> Floats:
-    """Share of a pixel at `z` from the middle of a blurred strip that the strip lights; by the formula."""
-    half = np.asarray(width_px) / 2
-    outer = _integral(z + half + 0.5, sigma_px) - _integral(z + half - 0.5, sigma_px)
-    inner = _integral(z - half + 0.5, sigma_px) - _integral(z - half - 0.5, sigma_px)
-    return outer - inner

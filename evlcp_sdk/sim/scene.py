@@ -21,7 +21,8 @@ from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.specs import SpecError, build, nearest, parse_toml, parse_value, read_toml
+from evlcp_sdk.specs import SpecError, build, parse_toml, parse_value, read_toml
+from evlcp_sdk.spelling import nearest
 
 __all__ = [
     "BackgroundSpec",
@@ -53,7 +54,7 @@ LinkTable = Mapping[str, Any]
 class BarSpec:
     """A transmitter: columns of light, cut into clusters from their top, that send packets without end."""
 
-    x_m: Annotated[float, Field(description="Its centre, to the right of the path's begin.")] = -1.5
+    x_m: Annotated[float, Field(description="Its centre, to the right of the path's start.")] = -1.5
     y_m: Annotated[float, Field(description="The same, downward.")] = 0.0
     z_m: Annotated[float, Field(description="The same, beyond `motion.distance_m`.")] = 0.0
     link: Annotated[
@@ -101,7 +102,7 @@ class BarSpec:
 class LampSpec:
     """A rectangle of flickering light."""
 
-    x_m: Annotated[float, Field(description="Its centre, to the right of the path's begin.")] = 4.0
+    x_m: Annotated[float, Field(description="Its centre, to the right of the path's start.")] = 4.0
     y_m: Annotated[float, Field(description="The same, downward.")] = -3.0
     z_m: Annotated[float, Field(description="The same, beyond `motion.distance_m`.")] = 0.0
     width_m: Annotated[float, Field(gt=0, description="Its width.")] = 0.2

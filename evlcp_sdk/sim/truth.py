@@ -1,6 +1,5 @@
 """The truth beside a recording: what each bar sent, with which link, and where it was in the image."""
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import EvlcpError, InputError
+from evlcp_sdk.files import read_json
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.sites import BarSite
@@ -147,13 +147,7 @@ def read_truth(path: Path | str, registry: Registry | None = None) -> Truth:
         InputError: It cannot be read, is not a scene's truth, or names codes that are not those of this
             installation; one line.
     """
-    try:
-        table = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
-    except (ValueError, RecursionError) as fault:
-        raise InputError(f"{path}: not JSON: {fault}") from fault
-    return truth_from_table(table, registry, source=str(path))
+    return truth_from_table(read_json(path), registry, source=str(path))
 
 
 def truth_from_table(

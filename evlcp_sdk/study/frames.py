@@ -1,12 +1,12 @@
 """Decoded frames as far as they are scored: from a receiver's packets, or read back from `frames.csv`."""
 
-import csv
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from evlcp_sdk.errors import InputError
+from evlcp_sdk.files import read_csv
 from evlcp_sdk.values import Frame, Packet
 
 __all__ = ["GivenFrame", "frames_of", "given", "read_frames"]
@@ -71,17 +71,11 @@ def read_frames(folder: Path | str) -> list[GivenFrame]:
         InputError: It is not there, a column is missing, or a value is not a number; with file and line.
     """
     path = Path(folder) / "frames.csv"
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = csv.DictReader(file)
-            missing = [name for name in _NEEDED if name not in (rows.fieldnames or ())]
-            if missing:
-                raise InputError(f"{path}: without the columns {', '.join(missing)}")
-            return [_row(row, f"{path}:{rows.line_num}") for row in rows]
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
-    except (UnicodeDecodeError, csv.Error) as fault:
-        raise InputError(f"{path}: not a CSV file: {fault}") from fault
+    names, rows = read_csv(path)
+    missing = [name for name in _NEEDED if name not in names]
+    if missing:
+        raise InputError(f"{path}: without the columns {', '.join(missing)}")
+    return [_row(row, f"{path}:{line}") for line, row in rows]
 
 
 def _row(row: Mapping[str, str | None], place: str) -> GivenFrame:

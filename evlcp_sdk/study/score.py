@@ -5,7 +5,6 @@ bits wrong. The road score knows what a road adds: rows that are said to be refl
 that is not given is erased and no error, and one of a hidden cluster is claimed.
 """
 
-import json
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.files import read_json
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.sim.truth import Truth
@@ -147,18 +147,9 @@ def link_of_result(folder: Path | str, registry: Registry | None = None) -> Link
         ConfigError: The configuration cannot be resolved here.
     """
     path = Path(folder) / "summary.json"
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
-    except UnicodeDecodeError as fault:
-        raise InputError(f"{path}: not JSON: {fault}") from fault
-    try:
-        summary = json.loads(text)
-    except ValueError as fault:
-        raise InputError(f"{path}: not JSON: {fault}") from fault
+    summary = read_json(path)
     table = summary.get("configuration") if isinstance(summary, dict) else None
     if not isinstance(table, dict):
         raise InputError(f"{path}: configuration: expected a table")

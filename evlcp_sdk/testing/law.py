@@ -13,9 +13,9 @@ __all__ = [
     "InapplicableLawError",
     "Law",
     "LawError",
-    "Outcome",
     "Status",
     "Subject",
+    "Verdict",
     "compiled",
     "expect",
     "judge",
@@ -84,7 +84,7 @@ class Law:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Verdict:
     """How a law was kept.
 
     Attributes:
@@ -117,7 +117,7 @@ def compiled(make: Callable[[], Any]) -> Any:
         raise InapplicableLawError(f"refused: {refused}") from refused
 
 
-def judge(law: Law, subject: Subject, excuses: Mapping[str, str]) -> Outcome:
+def judge(law: Law, subject: Subject, excuses: Mapping[str, str]) -> Verdict:
     """Hold a subject against a law; an excuse must be needed, or it is a failure itself.
 
     Args:
@@ -130,10 +130,10 @@ def judge(law: Law, subject: Subject, excuses: Mapping[str, str]) -> Outcome:
         law.hold(subject)
     except InapplicableLawError as why:
         if reason is not None:
-            return Outcome(law, "failed", f"excused ({reason}), but the law does not apply: {why}")
-        return Outcome(law, "skipped", str(why))
+            return Verdict(law, "failed", f"excused ({reason}), but the law does not apply: {why}")
+        return Verdict(law, "skipped", str(why))
     except LawError as fault:
-        return Outcome(law, "failed", str(fault)) if reason is None else Outcome(law, "excused", reason)
+        return Verdict(law, "failed", str(fault)) if reason is None else Verdict(law, "excused", reason)
     if reason is not None:
-        return Outcome(law, "failed", f"excused ({reason}), but it holds: drop the excuse")
-    return Outcome(law, "ok")
+        return Verdict(law, "failed", f"excused ({reason}), but it holds: drop the excuse")
+    return Verdict(law, "ok")

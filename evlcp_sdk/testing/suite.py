@@ -11,7 +11,7 @@ from evlcp_sdk.testing.corrections import ERROR_CORRECTION
 from evlcp_sdk.testing.exercises import subject_of
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
 from evlcp_sdk.testing.images import DECODING, RANGING, SEPARATION
-from evlcp_sdk.testing.law import Law, Outcome, judge
+from evlcp_sdk.testing.law import Law, Verdict, judge
 from evlcp_sdk.testing.links import LINK
 from evlcp_sdk.testing.streams import SYNCHRONIZATION, TRACKING
 
@@ -62,7 +62,7 @@ def checked_excuses(role: str, excuses: Mapping[str, str]) -> dict[str, str]:
 
 def check(
     role: str, algorithm: Any, excuses: Mapping[str, str] | None = None, link: Link | None = None
-) -> list[Outcome]:
+) -> list[Verdict]:
     """Hold an algorithm against every law of its role.
 
     Args:

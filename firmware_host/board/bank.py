@@ -54,7 +54,11 @@ class Bank:
 
     @classmethod
     def of_symbols(
-        cls, symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1, chip_rate_hz: float = 10_000.0
+        cls,
+        symbols: ArrayLike,
+        codebook: Codebook,
+        pilot_every: int = PacketFormat.pilot_every,
+        chip_rate_hz: float = PacketFormat.chip_rate_hz,
     ) -> "Bank":
         """Info words of symbols (packets, frames, clusters).
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from evlcp_sdk.air.codebook import Codebook, word_of_values
 from evlcp_sdk.air.frames import pilot_words
 from evlcp_sdk.errors import ConfigError
-from firmware_host.board.bank import Bank
+from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank
 from firmware_host.board.session import Session
 from firmware_host.errors import LineError, RefusedError, VerifyError
 from firmware_host.protocol.client import RequestOutcome
@@ -408,8 +408,8 @@ def provision(
 
 
 def _packet_s(status: StatusReply) -> float:
-    """Time a packet of the active bank takes at most, s: a preamble of 32 chips, a pilot in every frame."""
-    return 32.0 * (1 + status.frames) / status.chip_rate_hz
+    """Time a packet of the active bank takes at most, s: the longest preamble, a pilot in every frame."""
+    return (PREAMBLE_CHIPS + 2 * WORD_CHIPS * status.frames) / status.chip_rate_hz
 
 
 def _silent(done: int, total: int) -> None:

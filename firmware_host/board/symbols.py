@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.files import read_json
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.link.shared import differences
 from evlcp_sdk.plugin.registry import Registry
@@ -56,12 +57,7 @@ def read_symbols(path: Path, link: Link | None, registry: Registry | None = None
         InputError: The file cannot be read, is not JSON, or an element is missing, out of range or not an
             integer; the message names the place.
     """
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
-    except (ValueError, RecursionError) as fault:
-        raise InputError(f"{path}: not JSON: {fault}") from fault
+    table = read_json(path)
     if isinstance(table, dict):
         if "link" in table:
             link = _own_link(path, table, link, registry)

@@ -8,7 +8,7 @@ import hashlib
 import json
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ from evlcp_sdk.link.resolve import resolve
 __all__ = ["Field", "codebook_of", "generated_files", "main", "schema_hash"]
 
 HERE = Path(__file__).parents[1]
-PROFILES = ("wh4x2", "wh8", "raw8")
 
 _SIZES = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "i16": 2}
 _CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "i16": "h"}
@@ -84,6 +83,11 @@ def schema_hash(definition: dict[str, Any]) -> str:
 
     text = json.dumps(bare(definition), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def profiles_of(definition: dict[str, Any]) -> list[str]:
+    """The profiles that the firmware is built with: those of the definition but `custom`, by number."""
+    return [name for name in definition["enums"]["profile"] if name not in ("doc", "custom")]
 
 
 def codebook_of(profile: str) -> Codebook:
@@ -322,26 +326,26 @@ def c_header(definition: dict[str, Any]) -> str:
     return "\n".join(out)
 
 
-def profiles_header() -> str:
+def profiles_header(profiles: Sequence[str]) -> str:
     """The C header of the codebook digests that the firmware knows."""
     out = [
         "/* Codebook digests of the built-in profiles; generated, do not edit. */",
         "#ifndef EVLCP_PROFILES_H",
         "#define EVLCP_PROFILES_H",
         "#include <stdint.h>",
-        f"#define EVLCP_PROFILES {len(PROFILES)}u",
-        f"static const uint8_t evlcp_profile_digests[{len(PROFILES)}][32] = {{",
+        f"#define EVLCP_PROFILES {len(profiles)}u",
+        f"static const uint8_t evlcp_profile_digests[{len(profiles)}][32] = {{",
     ]
-    for profile in PROFILES:
+    for profile in profiles:
         digest = bytes.fromhex(codebook_of(profile).digest)
         rows = [", ".join(f"0x{b:02x}u" for b in digest[i : i + 16]) for i in (0, 16)]
         out.append(f"    /* {profile} */\n    {{{rows[0]},\n     {rows[1]}}},")
     return "\n".join([*out, "};", "#endif", ""])
 
 
-def profiles_module() -> str:
+def profiles_module(profiles: Sequence[str]) -> str:
     """The Python module of the same digests."""
-    rows = [f'    Profile.{p.upper()}: "{codebook_of(p).digest}",' for p in PROFILES]
+    rows = [f'    Profile.{p.upper()}: "{codebook_of(p).digest}",' for p in profiles]
     return "\n".join(
         [
             '"""Codebooks of the firmware; `python -m firmware_host.protocol.generate` writes this file."""',
@@ -399,10 +403,10 @@ def generated_files() -> dict[Path, str]:
     generated = HERE / "firmware" / "generated"
     files = {
         HERE / "protocol" / "requests.py": python_module(definition),
-        HERE / "protocol" / "profiles.py": profiles_module(),
+        HERE / "protocol" / "profiles.py": profiles_module(profiles_of(definition)),
         generated / "protocol.h": c_header(definition),
-        generated / "codebook.h": codebook_of("wh4x2").to_c(),
-        generated / "profiles.h": profiles_header(),
+        generated / "codebook.h": resolve({}).codebook.to_c(),
+        generated / "profiles.h": profiles_header(profiles_of(definition)),
     }
     page = HERE.parent / "docs" / "protocol.md"
     if page.exists():  # in a checkout; an installed package has no docs

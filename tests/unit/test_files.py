@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from evlcp_sdk.errors import ConfigError, EvlcpError
-from evlcp_sdk.files import whole_file, write_text
+from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
+from evlcp_sdk.files import read_csv, read_json, whole_file, write_text
 from evlcp_sdk.specs import parse_value, read_toml
 
 
@@ -23,7 +23,7 @@ def test_a_table_is_read(tmp_path: Path) -> None:
         (b"a = " + 2000 * b"[", r"a\.toml: not TOML: "),
     ],
 )
-def test_what_is_no_toml_is_told(content: bytes, says: str, tmp_path: Path) -> None:
+def test_what_is_no_toml_is_one_line(content: bytes, says: str, tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_bytes(content)
     with pytest.raises(ConfigError, match=says):
         read_toml(tmp_path / "a.toml")
@@ -77,3 +77,34 @@ def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, monkeypatch: py
 def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
     with pytest.raises(EvlcpError, match=r"a\.txt: cannot be written: No such file"):
         write_text("x", tmp_path / "none" / "a.txt")
+
+
+def test_a_csv_file_is_read_by_line(tmp_path: Path) -> None:
+    file = tmp_path / "a.csv"
+    file.write_bytes(b"\xef\xbb\xbft_s,name\r\n1,a\r\n\r\n2\r\n")
+    assert read_csv(file) == (
+        ("t_s", "name"),
+        [(2, {"t_s": "1", "name": "a"}), (4, {"t_s": "2", "name": None})],
+    )
+    file.write_bytes(b"")
+    assert read_csv(file) == ((), [])
+
+
+@pytest.mark.parametrize("content", [b"a\n\xff\n", b'a,b\n"' + 140_000 * b"x" + b'",1\n'])
+def test_what_is_no_csv_is_one_line(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.csv: not a CSV file: ") as caught:
+        read_csv(tmp_path / "a.csv")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match=r"b\.csv: cannot be read: No such file"):
+        read_csv(tmp_path / "b.csv")
+
+
+@pytest.mark.parametrize("content", [b"{", b'"\xff"', 200_000 * b"["])
+def test_what_is_no_json_is_one_line(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.json: not JSON: ") as caught:
+        read_json(tmp_path / "a.json")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match=r"b\.json: cannot be read: No such file"):
+        read_json(tmp_path / "b.json")

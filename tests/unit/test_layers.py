@@ -9,7 +9,7 @@ import pytest
 SDK = Path(__file__).parents[2] / "evlcp_sdk"
 
 LAYERS = (
-    {"errors", "files", "specs"},
+    {"errors", "files", "specs", "spelling"},
     {"air"},
     {"values", "scene"},
     {"plugin"},

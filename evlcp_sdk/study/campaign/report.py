@@ -16,7 +16,7 @@ from evlcp_sdk.files import write_text
 from evlcp_sdk.study.campaign.charts import Chart, charts_of, decades
 from evlcp_sdk.study.campaign.paper import PAPER_NAME
 from evlcp_sdk.study.campaign.plan import digest_of
-from evlcp_sdk.study.campaign.summary import Comparison, Figure, Summary, compare, measure
+from evlcp_sdk.study.campaign.summary import Figure, PaperComparison, Summary, beside_paper, measure
 from evlcp_sdk.study.markup import details, document, table
 from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
@@ -50,7 +50,7 @@ def page(summary: Summary) -> str:
     for chart in charts:
         body.append(f'<h2>{html.escape(chart.title)}</h2><div class="chart" id="{chart.id}"></div>')
         body.append(f'<p class="note">{html.escape(chart.note)}</p>')
-    body += [_paper_table(compare(summary.series)), _figures_table(summary), _configuration(summary)]
+    body += [_paper_table(beside_paper(summary.series)), _figures_table(summary), _configuration(summary)]
     drawn = {chart.id: _plotly(chart) for chart in charts}
     # "</script>" in a name would end the script element, "<!--<script>" keep it from ending.
     data = json.dumps(drawn, allow_nan=False).replace("<", "\\u003c")
@@ -149,7 +149,7 @@ def _plotly(chart: Chart) -> dict[str, Any]:
     return {"data": data, "layout": layout}
 
 
-def _paper_table(comparisons: Sequence[Comparison]) -> str:
+def _paper_table(comparisons: Sequence[PaperComparison]) -> str:
     if not comparisons:
         return ""
     rows = []
@@ -167,7 +167,7 @@ def _paper_table(comparisons: Sequence[Comparison]) -> str:
 _MEASURES = {"ber": "bit error rate", "rmse_m": "distance RMSE, m", "gross_share": "errors of 0.5 m or more"}
 
 
-def comparison_rows(comparisons: Iterable[Comparison]) -> list[tuple[str, ...]]:
+def comparison_rows(comparisons: Iterable[PaperComparison]) -> list[tuple[str, ...]]:
     """Figure, distance, series, paper, here, its interval, and whether they agree, as text."""
     rows: list[tuple[str, ...]] = []
     for one in comparisons:

@@ -13,7 +13,7 @@ from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.intervals import proportion_interval, rms_interval
 from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
 
-__all__ = ["Comparison", "Figure", "Series", "Summary", "compare", "measure", "summarize"]
+__all__ = ["Figure", "PaperComparison", "Series", "Summary", "beside_paper", "measure", "summarize"]
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class Summary:
                 asdict(c.reference)
                 | {"series": c.series, "ours": _plain(asdict(c.ours)), "ours_at_m": [c.from_m, c.to_m]}
                 | {"agrees": c.agrees}
-                for c in compare(self.series)
+                for c in beside_paper(self.series)
             ],
         }
 
@@ -243,7 +243,7 @@ def summarize(store: Store) -> Summary:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PaperComparison:
     """A figure of the paper beside ours.
 
     Attributes:
@@ -266,7 +266,7 @@ class Comparison:
 AGREEMENT = 0.3
 
 
-def compare(series: Iterable[Series], references: Iterable[Reference] = PAPER) -> list[Comparison]:
+def beside_paper(series: Iterable[Series], references: Iterable[Reference] = PAPER) -> list[PaperComparison]:
     """Hold series against the paper, each figure beside every series that it speaks of and that has data."""
     series = list(series)
     found = []
@@ -283,7 +283,7 @@ def compare(series: Iterable[Series], references: Iterable[Reference] = PAPER) -
             if ours.count:
                 ratio = ours.value / reference.value
                 agrees = ratio <= 1 if reference.bound else abs(ratio - 1) <= AGREEMENT
-                found.append(Comparison(reference, one.name, ours, *at, agrees))
+                found.append(PaperComparison(reference, one.name, ours, *at, agrees))
     return found
 
 

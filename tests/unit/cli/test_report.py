@@ -16,7 +16,7 @@ from evlcp_sdk.study.campaign.paper import PAPER
 from evlcp_sdk.study.campaign.plan import Case, Plan, make_plan
 from evlcp_sdk.study.campaign.report import page, save_page
 from evlcp_sdk.study.campaign.store import Store
-from evlcp_sdk.study.campaign.summary import Series, Summary, compare, measure, summarize
+from evlcp_sdk.study.campaign.summary import Series, Summary, beside_paper, measure, summarize
 from evlcp_sdk.study.tally import Statistics, Tally
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
 from tests.unit.study.campaign.fake import run_fake
@@ -70,13 +70,13 @@ def test_points_that_differ_in_distance_only_are_one_series(summary: Summary) ->
 
 
 def test_the_paper_is_held_beside_the_series_it_speaks_of(summary: Summary) -> None:
-    found = compare(summary.series)
+    found = beside_paper(summary.series)
     by_name = {(c.reference.measure, c.reference.from_m, c.reference.clusters): c.series for c in found}
     assert by_name["rmse_m", 30, 16].startswith("30 km/h, 16")
     assert by_name["rmse_m", 30, 2].startswith("30 km/h, two")
     assert sum(c.reference.measure == "ber" for c in found) == 2
     ours = Series({}, {"speed_kmh": 30}, summary.series[0].link, Statistics())
-    assert compare([ours]) == []
+    assert beside_paper([ours]) == []
 
 
 def test_agreement_is_a_kept_bound_or_a_figure_within_30_percent(summary: Summary) -> None:
@@ -92,7 +92,7 @@ def test_agreement_is_a_kept_bound_or_a_figure_within_30_percent(summary: Summar
         ):
             tally = Tally.distance(reference.value * factor)
             at = Statistics.of([(reference.from_m, tally)], tasks=1)
-            (one,) = compare([Series({}, {"speed_kmh": 30}, link, at)], [reference])
+            (one,) = beside_paper([Series({}, {"speed_kmh": 30}, link, at)], [reference])
             assert one.agrees is agrees, (reference, factor)
 
 

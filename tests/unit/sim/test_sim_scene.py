@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.stats import norm
 
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
@@ -26,7 +28,7 @@ from evlcp_sdk.sim import (
 )
 from evlcp_sdk.sim.light import BarLight, LampLight
 from evlcp_sdk.sim.motion import CameraPath, Vibration, project
-from evlcp_sdk.sim.optics import blur_sigma_px, lit_share, step_table
+from evlcp_sdk.sim.optics import blur_sigma_px, step_table
 
 LINK = resolve({})
 EXAMPLES = Path(__file__).parents[3] / "examples" / "scenes"
@@ -162,6 +164,15 @@ def test_lamps_keep_their_period_and_duty() -> None:
     assert len(when) == 31
     assert levels.max() > 0.99
     assert levels.min() < 0.01
+
+
+def lit_share(z: NDArray[np.float64], width_px: float, sigma_px: float) -> NDArray[np.float64]:
+    """Share of a pixel at `z` from a strip's middle that the strip, blurred, lights: its light, summed."""
+    at, weights = np.polynomial.legendre.leggauss(40)
+    x = z[:, None] + at / 2
+    light = norm.cdf(x + width_px / 2, scale=sigma_px) - norm.cdf(x - width_px / 2, scale=sigma_px)
+    share: NDArray[np.float64] = light @ weights / 2
+    return share
 
 
 def test_the_step_table_is_the_formula() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from evlcp_sdk.study.campaign.paper import PAPER, Reference
 from evlcp_sdk.study.campaign.report import comparison_rows
-from evlcp_sdk.study.campaign.summary import Comparison, Figure
+from evlcp_sdk.study.campaign.summary import Figure, PaperComparison
 from tests.conftest import ROOT
 
 PAGE = (ROOT / "docs" / "paper.md").read_text()
@@ -15,9 +15,9 @@ RESULT: dict[str, Any] = json.loads((ROOT / "docs" / "paper.json").read_text())
 FIELDS = ("measure", "clusters", "speed_kmh", "from_m", "to_m", "value", "bound")
 
 
-def comparison(table: dict[str, Any]) -> Comparison:
+def comparison(table: dict[str, Any]) -> PaperComparison:
     reference = Reference(**{name: table[name] for name in FIELDS})
-    return Comparison(
+    return PaperComparison(
         reference, table["series"], Figure(**table["ours"]), *table["ours_at_m"], table["agrees"]
     )
 
