@@ -132,7 +132,7 @@ def test_another_algorithm_brings_its_own_parameters() -> None:
         ),
         (
             {"bars": [{"profile": "wh8"}]},
-            "bars.0.profile = 'wh8': unknown key; its link says it: bars.link.m",
+            'bars.0.profile = "wh8": unknown key; its link says it: bars.link.m',
         ),
         ({"bars": [{"chip_rate_hz": 5e3}]}, "unknown key; its link says it: bars.link.air.chip_rate_hz"),
         ({"bars": [{"length_m": 2.0}]}, "unknown key; its link says it: bars.link.bar.rows, bar.led_pitch_m"),
@@ -249,7 +249,7 @@ def test_a_site_is_as_long_as_the_link_s_bar() -> None:
 LINKS: dict[str, dict[str, Any]] = {
     "5 kchip/s": {"air": {"chip_rate_hz": 5000.0}},
     "8 kchip/s": {"air": {"chip_rate_hz": 8000.0}},
-    "4 clusters": {"bar": {"cluster_rows": 24}, "ranging": {"id": "centroid"}},
+    "4 clusters": {"bar": {"cluster_rows": 24}, "ranging": {"id": "joint-scale"}},
     "8 clusters": {"bar": {"cluster_rows": 12}},
     "32 clusters": {"bar": {"cluster_rows": 3}},
     "panel": {"bar": PANEL},
