@@ -33,8 +33,7 @@ from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.sim import read_truth
-from evlcp_sdk.study.compare.run import truth_path
+from evlcp_sdk.sim import read_truth, truth_path
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
 SHIPPED = Path(__file__).parents[1] / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
@@ -77,7 +76,7 @@ def caught(path: Path, link: Link) -> list[tuple[PresenceMap, float]]:
         for events in source.chunks():
             receiver.feed(events)
     receiver.close()
-    truth = read_truth(truth_path(str(path)))
+    truth = read_truth(truth_path(path))
     t_us, true_m = truth.t_us + truth.t0_us, truth.bars[0].distance_m
     return [(presence, float(np.interp(begin + 800, t_us, true_m))) for begin, presence in catch.frames]
 

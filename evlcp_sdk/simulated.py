@@ -11,7 +11,7 @@ from evlcp_sdk.io.open import open_writer
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.scene.sites import to_toml
-from evlcp_sdk.sim import Scene, Simulation, Truth, load_scene, resolve_scene, sites_of, truth_of
+from evlcp_sdk.sim import Scene, Simulation, Truth, load_scene, resolve_scene, sites_of, truth_of, truth_path
 from evlcp_sdk.sim.world import attitude_log
 from evlcp_sdk.values import Events, Triggers
 
@@ -80,14 +80,14 @@ class SimulatedSource(EventSource):
                 writer.write(events)
                 if advance is not None:
                     advance(simulation.done_s)
-        truth_path = out.with_suffix(".truth.json")
+        truth_file = truth_path(out)
         try:
-            write_text(json.dumps(self.truth.to_table() | {"bytes": out.stat().st_size}), truth_path)
+            write_text(json.dumps(self.truth.to_table() | {"bytes": out.stat().st_size}), truth_file)
         except EvlcpError as fault:
             # An older truth may lie there; the scores of another recording would look like this one's.
             out.unlink(missing_ok=True)
             raise type(fault)(f"{fault}; {out} is taken away, as it would be without its truth") from fault
-        return (out, truth_path, *_on_earth(simulation, out))
+        return (out, truth_file, *_on_earth(simulation, out))
 
     @property
     def counts(self) -> dict[str, int]:

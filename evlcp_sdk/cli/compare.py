@@ -15,7 +15,6 @@ from evlcp_sdk.errors import ConfigError
 if TYPE_CHECKING:
     from rich.table import Table as Grid
 
-    from evlcp_sdk.io import EventSource
     from evlcp_sdk.study.compare.table import Comparison, Table
     from evlcp_sdk.study.compare.variants import Variant
 
@@ -135,8 +134,7 @@ def _of_recordings(
 ) -> tuple[int, "Comparison"]:
     from evlcp_sdk.errors import InterruptedRunError
     from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.study.compare.run import truth_path
-    from evlcp_sdk.study.compare.table import Comparison, total_of
+    from evlcp_sdk.study.compare.recordings import comparison_of
     from evlcp_sdk.study.compare.variants import load_variants
 
     if not texts:
@@ -148,7 +146,6 @@ def _of_recordings(
     here = not workers or len(urls) == 1
     executor = make_executor(0 if here else workers, None)
     tables: dict[str, Table] = {}
-    notes: list[str] = []
     code = 0
     try:
         for outcome in executor.run(
@@ -162,46 +159,15 @@ def _of_recordings(
     except KeyboardInterrupt:
         raise InterruptedRunError("interrupted; nothing is written") from None
     ordered = [tables[url] for url in urls if url in tables]
-    for url in urls:
-        if url in tables and not truth_path(url).exists():
-            notes.append(f"{url}: no {truth_path(url).name} beside it, so no BER and no distance error")
-    for i, variant in enumerate(variants):
-        counted = [one.rows[i].measured.statistics for one in ordered]
-        if ghosts := sum(one.unmatched for one in counted):
-            notes.append(f"{variant.name}: {ghosts} frames match no true one")
-        if echoes := sum(one.echoes for one in counted):
-            notes.append(f"{variant.name}: {echoes} frames are said to be reflections and left out")
-    if len(ordered) > 1:
-        ordered.append(total_of(ordered))
-    about = {v.name: v.to_dict() for v in variants}
-    return code, Comparison(about, tuple(ordered), tuple(notes), registry.versions())
+    return code, comparison_of(ordered, variants, registry.versions())
 
 
 def _run(job: CompareJob, *, variants: "tuple[Variant, ...]") -> "Table":
-    """Receive a recording with every variant, in this process or in a worker."""
-    from evlcp_sdk.io.open import open_source
-    from evlcp_sdk.io.sensor import check_sensor
-    from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.sim.truth import read_truth
-    from evlcp_sdk.study.compare.run import measure_recording, truth_path
+    """Compare the variants on one recording, here or in a worker."""
+    from evlcp_sdk.study.compare.recordings import compare_recording
 
-    def opened() -> "EventSource":
-        source = open_source(job.url, registry)
-        try:
-            for variant in variants:
-                check_sensor(source, job.url, variant.link.camera)
-        except ConfigError:
-            source.close()
-            raise
-        return source
-
-    registry = Registry.load()
-    path = truth_path(job.url)
-    truth = read_truth(path, registry) if path.exists() else None
     with _bar(job) as advance:
-        return measure_recording(
-            job.url, opened, variants, truth, lambda s: advance(s.position_bytes, s.size_bytes)
-        )
+        return compare_recording(job.url, variants, advance=advance)
 
 
 @contextmanager

@@ -25,8 +25,10 @@ def register(app: typer.Typer) -> None:
 
 def demo_files() -> tuple[Path, Path]:
     """The demo's recording and its truth: in the wheel, or in a checkout's `examples/recordings`."""
+    from evlcp_sdk.sim.truth import truth_path
+
     raw = _shipped("recordings", f"{DEMO_NAME}.raw")
-    return raw, raw.with_name(f"{DEMO_NAME}.truth.json")
+    return raw, truth_path(raw)
 
 
 def demo_campaign() -> Path:

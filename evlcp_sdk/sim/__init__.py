@@ -20,7 +20,7 @@ if TYPE_CHECKING:
         resolve_scene,
     )
     from evlcp_sdk.sim.simulation import Simulation, scene_table, simulate
-    from evlcp_sdk.sim.truth import SentBar, Truth, read_truth, truth_from_table
+    from evlcp_sdk.sim.truth import SentBar, Truth, read_truth, truth_from_table, truth_path
     from evlcp_sdk.sim.world import sites_of
 
 __all__ = [
@@ -46,6 +46,7 @@ __all__ = [
     "sites_of",
     "truth_from_table",
     "truth_of",
+    "truth_path",
 ]
 
 _HOMES = {
@@ -65,7 +66,7 @@ _HOMES = {
         "resolve_scene",
     ),
     "simulation": ("Simulation", "scene_table", "simulate"),
-    "truth": ("SentBar", "Truth", "read_truth", "truth_from_table"),
+    "truth": ("SentBar", "Truth", "read_truth", "truth_from_table", "truth_path"),
     "world": ("sites_of",),
 }
 """Where each name is: the kernels are imported by what renders, not by a truth."""

@@ -16,7 +16,7 @@ from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.sites import BarSite
 
-__all__ = ["SentBar", "Truth", "read_truth", "truth_from_table"]
+__all__ = ["SentBar", "Truth", "read_truth", "truth_from_table", "truth_path"]
 
 Floats = NDArray[np.float64]
 
@@ -134,6 +134,13 @@ class Truth:
         if self.camera_path:
             found["camera_path"] = {key: values.tolist() for key, values in self.camera_path.items()}
         return found
+
+
+def truth_path(url: Path | str) -> Path:
+    """Where the truth of a recording lies: `night.raw` and `night.csv.gz` have `night.truth.json`."""
+    path = Path(url)
+    stem = path.name.removesuffix(".gz").rsplit(".", 1)[0] or path.name
+    return path.with_name(f"{stem}.truth.json")
 
 
 def read_truth(path: Path | str, registry: Registry | None = None) -> Truth:

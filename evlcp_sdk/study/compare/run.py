@@ -6,7 +6,6 @@ the same and time is measured in one run. What comes out is counted as the road 
 
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -26,17 +25,10 @@ from evlcp_sdk.study.match import check_link
 from evlcp_sdk.study.measure import statistics_of, without_truth
 from evlcp_sdk.values import Events, FrameView, Range
 
-__all__ = ["measure_recording", "truth_path"]
+__all__ = ["measure_recording"]
 
 _WARM_PACKETS = 2
 """Packets that a variant decodes beforehand: one may be cut, so that a whole one loads every kernel."""
-
-
-def truth_path(url: str) -> Path:
-    """Where the truth of a recording lies: `night.raw` and `night.csv.gz` have `night.truth.json`."""
-    path = Path(url)
-    stem = path.name.removesuffix(".gz").rsplit(".", 1)[0] or path.name
-    return path.with_name(f"{stem}.truth.json")
 
 
 class _Watch:

@@ -1,0 +1,67 @@
+"""What a recording holds, without decoding its light."""
+
+from collections import Counter
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from evlcp_sdk.plugin.source import EventSource
+
+__all__ = ["RATE_WINDOW_US", "describe"]
+
+RATE_WINDOW_US = 10_000
+"""The peak rate is the most events in a window of this length on a fixed grid."""
+
+
+def describe(source: EventSource, name: str) -> dict[str, Any]:
+    """What a source holds, read to its end in constant memory.
+
+    Args:
+        source: Read from where it stands; not closed.
+        name: What the result calls it.
+
+    Returns:
+        Format, size, header, time, rates, triggers and losses as JSON values.
+
+    Raises:
+        InputError: It cannot be read on.
+    """
+    first_us = last_us = None
+    positive = 0
+    window, in_window, peak = -1, 0, 0
+    edges: Counter[tuple[int, int]] = Counter()
+    for events, triggers in source.stream():
+        edges.update(zip(triggers.channel.tolist(), triggers.value.tolist(), strict=True))
+        if not len(events):
+            continue
+        first_us = int(events.t_us[0]) if first_us is None else first_us
+        last_us = int(events.t_us[-1])
+        positive += int(events.p.sum(dtype=np.int64))
+        windows, counts = np.unique(events.t_us // RATE_WINDOW_US, return_counts=True)
+        for w, n in zip(windows.tolist(), counts.tolist(), strict=True):
+            in_window = in_window + n if w == window else n
+            window, peak = w, max(peak, in_window)
+    total = source.counts["events"]
+    duration_s = (last_us - first_us) * 1e-6 if first_us is not None and last_us is not None else 0.0
+    return {
+        "path": name,
+        "format": source.format,
+        "bytes": source.size_bytes,
+        "width": source.width,
+        "height": source.height,
+        "header": dict(source.header),
+        "first_us": first_us,
+        "last_us": last_us,
+        "duration_s": round(duration_s, 6),
+        "events_per_s": round(total / duration_s) if duration_s else None,
+        "peak_events_per_s": round(peak * 1e6 / RATE_WINDOW_US),
+        "positive_share": round(positive / total, 4) if total else None,
+        "counts": dict(source.counts),
+        "triggers": [
+            {"channel": channel, "edge": "rising" if value else "falling", "count": count}
+            for (channel, value), count in sorted(edges.items())
+        ],
+        "losses": {kind: asdict(loss) for kind, loss in source.losses.items()},
+        "anomalies": [str(loss) for loss in source.losses.values()],
+    }
