@@ -8,11 +8,9 @@ from typing import IO, Any, BinaryIO, Self, TextIO
 
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.files import hidden_path
+from evlcp_sdk.plugin.records import SUMMARY
 
-__all__ = ["SUMMARY", "ResultFolder"]
-
-SUMMARY = "summary.json"
-"""Moved into place last: where it is, the result is complete."""
+__all__ = ["ResultFolder"]
 
 
 class ResultFolder:
@@ -74,7 +72,9 @@ class ResultFolder:
         return file
 
     def finish(self) -> None:
-        """Move all files into place, the summary last, and drop what an earlier run left.
+        """Move all files into place and drop what an earlier run left.
+
+        The summary comes last: where it is, the result is complete.
 
         Raises:
             EvlcpError: A file cannot be written, e.g. the disk is full.

@@ -1,5 +1,6 @@
 """All sinks of one run as one, and whose fault it is when one of them fails."""
 
+import json
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -92,6 +93,8 @@ class Sinks:
         for installed, sink in self._sinks:
             with self._blame(installed):
                 if part := sink.finish():
+                    # What JSON cannot say is the sink's fault, not the summary's.
+                    json.dumps(dict(part))
                     said[installed.record.name] = dict(part)
         return said
 

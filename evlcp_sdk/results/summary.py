@@ -6,7 +6,8 @@ from typing import Any, Literal
 
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.results.folder import SUMMARY, ResultFolder
+from evlcp_sdk.plugin.records import SUMMARY
+from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.tallies import RunTally
 
 __all__ = ["Status", "summary_of", "write_summary"]

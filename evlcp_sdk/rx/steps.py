@@ -1,13 +1,16 @@
 """A link's algorithms as the receiver calls them: compiled once, guarded, checked, announced."""
 
 import time
+import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pluggy
 from numpy.typing import NDArray
 
+from evlcp_sdk.errors import EvlcpError, PluginError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import ROLES, Filter, Synchronizer, Tracker
 from evlcp_sdk.rx.guard import Guard
@@ -45,7 +48,15 @@ class Announcer:
 
     def _say(self, stage: str, value: object, elapsed_s: float) -> None:
         if self._hook is not None:
-            self._hook(stage=stage, value=value, elapsed_s=elapsed_s)
+            try:
+                self._hook(stage=stage, value=value, elapsed_s=elapsed_s)
+            except EvlcpError:
+                raise
+            except Exception as fault:
+                last = traceback.extract_tb(fault.__traceback__)[-1]
+                what = f"{type(fault).__name__}: {fault}".splitlines()[0]
+                where = f"{Path(last.filename).name}, line {last.lineno}"
+                raise PluginError(f"evlcp_stage_finished() of a plugin: {what} ({where})") from fault
 
 
 class Steps:

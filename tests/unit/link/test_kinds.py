@@ -13,7 +13,7 @@ import pytest
 from evlcp_sdk.air.blocks import Block, Kind, Message, split
 from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
-from evlcp_sdk.errors import ConfigError, PluginError
+from evlcp_sdk.errors import ConfigError, PluginError, PluginWarning
 from evlcp_sdk.link.compose import compose, packets_of
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.hooks import hookimpl
@@ -103,7 +103,7 @@ def test_the_kinds_go_with_the_link() -> None:
         assert (kind.number, kind.name) == (number, Kind(number).name.lower())
 
 
-def bring(number: Any, name: str, shown: Mapping[str, Any] | None = None) -> tuple[object, MessageKind]:
+def bring(number: Any, name: Any, shown: Mapping[str, Any] | None = None) -> tuple[object, MessageKind]:
     class Other(wind.Wind):
         def to_dict(self, value: Any) -> Mapping[str, Any]:
             return shown or {}
@@ -126,12 +126,25 @@ def bring(number: Any, name: str, shown: Mapping[str, Any] | None = None) -> tup
         (7, "text", r"number 7 or its name is that of 'text' of evlcp-sdk"),
         (7, "packet", r"its name is that of a packet's line"),
         (16, "wind", r"number = 16, expected 5 to 15"),
+        (7, None, r"name = None, expected text"),
         ("5", "wind", r"number = '5', expected 5 to 15"),
     ],
 )
-def test_two_of_one_number_or_name_are_told(number: Any, name: str, told: str) -> None:
-    with pytest.raises(PluginError, match=told):
-        message_kinds(Registry.load(bring(number, name)[0]))
+def test_a_kind_that_clashes_is_left_out(number: Any, name: Any, told: str) -> None:
+    registry = Registry.load(bring(number, name)[0], bring(9, "fine")[0])
+    with pytest.warns(PluginWarning, match=told):
+        kinds = message_kinds(registry)
+    assert kinds.keys() == {1, 2, 3, 4, 9}
+    # The next link is resolved without another word.
+    assert message_kinds(registry).keys() == kinds.keys()
+
+
+def test_of_two_kinds_of_one_number_one_stays() -> None:
+    registry = Registry.load(bring(9, "here")[0], bring(9, "there")[0])
+    with pytest.warns(PluginWarning, match="number 9 or its name is that of"):
+        kinds = message_kinds(registry)
+    assert len(kinds) == 5
+    assert len(registry.broken) == 1
 
 
 def test_a_kind_cannot_change_what_every_message_says() -> None:

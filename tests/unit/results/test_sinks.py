@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from evlcp_sdk.errors import ConfigError, PluginError
+from evlcp_sdk.errors import ConfigError, PluginError, PluginWarning
 from evlcp_sdk.plugin.hooks import SinkRecord, hookimpl
 from evlcp_sdk.plugin.records import installed_sinks
 from evlcp_sdk.plugin.registry import Registry
@@ -90,6 +90,16 @@ def bring(name: str, target: str, *files: str, **more: Any) -> object:
     ("name", "target", "told"),
     [
         ("fails", f"{__name__}:Failing", r"sink 'fails' of .*: KeyError: 'boom' \(test_sinks.py, line \d+\)"),
+        (
+            "objects",
+            f"{__name__}:Unsayable",
+            r"sink 'objects' of .*: TypeError: Object of type object is not",
+        ),
+        (
+            "watches",
+            f"{__name__}:Watching",
+            r"evlcp_stage_finished\(\) of a plugin: KeyError: '.*' \(test_sinks.py, line \d+\)",
+        ),
         ("strays", f"{__name__}:Stray", r"sink 'strays' of .*: 'stray.txt' is not among the files"),
         ("none", f"{__name__}:NoSink", r"sink 'none' of .*: .*:NoSink is not a Sink"),
         ("away", f"{__name__}:Away", r"sink 'away' of .*: cannot import .*:Away"),
@@ -115,11 +125,41 @@ def test_a_format_that_is_not_there(demo_raw: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_two_of_one_name_or_file_are_told() -> None:
-    with pytest.raises(PluginError, match=r"two sinks named 'frames': one of .*, one of .*; uninstall one"):
-        installed_sinks(Registry.load(bring("frames", "a:B", "other.csv")))
-    with pytest.raises(PluginError, match=r"frames.csv is a file of the sink .* and of"):
-        installed_sinks(Registry.load(bring("other", "a:B", "frames.csv")))
+@pytest.mark.parametrize(
+    ("plugin", "told"),
+    [
+        (("frames", "a:B", "other.csv"), r"sink 'frames': evlcp-sdk has one of this name"),
+        (
+            ("other", "a:B", "frames.csv"),
+            r"sink 'other': frames.csv is a file of the sink 'frames' of evlcp-",
+        ),
+        (("other", "a:B", "summary.json"), r"sink 'other': summary.json is the summary's file"),
+        (("other", "a:B", "../x"), r"sink 'other': files = \('\.\./x',\), expected names of files in"),
+        (("other", "a:B", "/x"), r"sink 'other': files = "),
+        (("other", "a:B", ""), r"sink 'other': files = "),
+        (("other", None), r"sink 'other': target = None, expected text"),
+        ((7, "a:B"), r"sink 7: name = 7, expected text"),
+    ],
+)
+def test_a_format_that_clashes_is_left_out(plugin: Any, told: str, demo_raw: Path, tmp_path: Path) -> None:
+    registry = Registry.load(bring(*plugin))
+    with pytest.warns(PluginWarning, match=told):
+        sinks = installed_sinks(registry)
+    assert sinks.keys() == installed_sinks(Registry.load()).keys()
+    assert {sink.distribution for sink in sinks.values()} == {"evlcp-sdk"}
+    # The run goes on without it.
+    assert receive_to_folder(demo_raw, tmp_path, registry=registry)["status"] == "complete"
+
+
+class Unsayable(Sink):
+    def finish(self) -> dict[str, Any]:
+        return {"what": object()}
+
+
+class Watching(Sink):
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str) -> None:
+        raise KeyError(stage)
 
 
 def test_the_command_line_asks_for_formats(evlcp: Any, demo_raw: Path, tmp_path: Path) -> None:
