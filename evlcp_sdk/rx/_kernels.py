@@ -319,6 +319,9 @@ def _boundary(pixels: Array, k: int, other: int, a: complex, b: complex, reach: 
     """
     _, height, width = pixels.shape
     step = b - a
+    # Centres within a pixel have no way between them that its lines could share out.
+    if max(abs(step.real), abs(step.imag)) < 1.0:
+        return np.nan
     rows = abs(step.imag) >= abs(step.real)
     start, end = (a.imag, b.imag) if rows else (a.real, b.real)
     side, slope = (a.real, step.real / step.imag) if rows else (a.imag, step.imag / step.real)
@@ -339,7 +342,7 @@ def _boundary(pixels: Array, k: int, other: int, a: complex, b: complex, reach: 
         else:
             empty += 1
             total += 0.5
-    if 2 * empty > lines or abs(end - start) < 1.0:
+    if 2 * empty > lines:
         return np.nan
     return (first + sign * (total - 0.5) - start) / (end - start)
 

@@ -289,7 +289,11 @@ class RegionFollower:
             self._fresh = []
             return
         near = np.ones((3, 3), bool)
-        areas, _ = ndimage.label(ndimage.binary_dilation(hits > 0, near, merge >> (_CELL_SHIFT + 1)), near)
+        lit = hits > 0
+        # For no iterations at all SciPy dilates until nothing changes.
+        if reach := merge >> (_CELL_SHIFT + 1):
+            lit = ndimage.binary_dilation(lit, near, reach)
+        areas, _ = ndimage.label(lit, near)
         boxes = []
         for number, where in enumerate(ndimage.find_objects(areas), 1):
             inside = np.where(areas[where] == number, hits[where], 0)

@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -184,3 +185,13 @@ def test_a_moving_edge_is_no_region() -> None:
         np.repeat([1, 0], 3 * column.size)[order],
     )
     assert not any(followed(events, 100_000).values())
+
+
+@pytest.mark.parametrize("merge_px", [8, 15, 16, 32])
+def test_bars_farther_apart_than_the_gap_are_two_regions_for_every_gap(merge_px: int) -> None:
+    one, two = IdealBar(random_symbols(LINK, 1)), IdealBar(random_symbols(LINK, 1), x_px=500, start_us=5300)
+    events = merged(ideal_events(LINK, one), ideal_events(LINK, two))
+    regions = RegionFollower(replace(SPEC, merge_px=merge_px), CameraModel(), LINK.packet.chip_us)
+    for start, part in steps(events, 30_000):
+        found = regions.step(start, part)
+    assert sorted(round(t.latest.x_px) for t in found) == [400, 500]

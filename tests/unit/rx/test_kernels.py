@@ -186,3 +186,11 @@ def test_most_clusters_in_place(seed, clusters):
     image[rng.random(clusters) < 0.4] += rng.normal(0, 5, 2)
     got = _kernels.most_in_place(image, area, layout, least)
     assert got == twins.most_in_place(image, area, layout, 0.06, least)
+
+
+@pytest.mark.parametrize("apart", [0j, 0.5 + 0.5j, -0.9j])
+def test_centres_in_one_pixel_have_no_boundary(apart):
+    """A reflection beside a bar may bring the centres of two neighbours together."""
+    pixels = np.ones((2, 9, 9), np.float32)
+    assert np.isnan(_kernels._boundary(pixels, 0, 1, 4 + 4j, 4 + 4j + apart, 3.0))
+    assert _kernels._boundary(pixels, 0, 1, 4 + 3j, 4 + 5j, 3.0) == pytest.approx(0.5)
