@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.io.replay import ReplaySource
     from evlcp_sdk.link.compose import compose
     from evlcp_sdk.link.resolve import Link, load_link
-    from evlcp_sdk.place.navigator import PositionPlan
+    from evlcp_sdk.place.navigator import Place, PositionPlan, Settled
     from evlcp_sdk.plugin.hooks import Algorithm, SinkRecord, hookimpl
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.plugin.roles import (
@@ -56,7 +56,8 @@ if TYPE_CHECKING:
         Tracking,
     )
     from evlcp_sdk.plugin.source import EventSource, Loss
-    from evlcp_sdk.results.sink import Sink
+    from evlcp_sdk.results.folder import ResultFolder
+    from evlcp_sdk.results.sink import Run, Sink
     from evlcp_sdk.results.tables import frames_table
     from evlcp_sdk.run import Reception, receive, receive_to_folder
     from evlcp_sdk.rx.receiver import Receiver
@@ -115,6 +116,7 @@ __all__ = [
     "Packet",
     "PacketFormat",
     "Pilots",
+    "Place",
     "PluginError",
     "PluginWarning",
     "PositionPlan",
@@ -128,8 +130,11 @@ __all__ = [
     "Region",
     "Registry",
     "ReplaySource",
+    "ResultFolder",
+    "Run",
     "Separate",
     "Separation",
+    "Settled",
     "SimulatedSource",
     "Sink",
     "SinkRecord",
@@ -177,7 +182,7 @@ _HOMES = {
     "io.replay": ("ReplaySource",),
     "link.compose": ("compose",),
     "link.resolve": ("Link", "load_link"),
-    "place.navigator": ("PositionPlan",),
+    "place.navigator": ("Place", "PositionPlan", "Settled"),
     "plugin.hooks": ("Algorithm", "SinkRecord", "hookimpl"),
     "plugin.registry": ("Registry",),
     "plugin.source": ("EventSource", "Loss"),
@@ -199,7 +204,8 @@ _HOMES = {
         "Tracker",
         "Tracking",
     ),
-    "results.sink": ("Sink",),
+    "results.folder": ("ResultFolder",),
+    "results.sink": ("Run", "Sink"),
     "results.tables": ("frames_table",),
     "run": ("Reception", "receive", "receive_to_folder"),
     "rx.receiver": ("Receiver",),

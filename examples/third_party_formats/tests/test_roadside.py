@@ -8,28 +8,29 @@ import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.inbox import MessageAssembler
-from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
 
 
-def packet_of(symbols: np.ndarray, link: evlcp.Link) -> Packet:
+def packet_of(symbols: np.ndarray, link: evlcp.Link) -> evlcp.Packet:
     """A packet as it is received without an error: symbols (frames, clusters)."""
     bits = bits_of_symbols(symbols, link.codebook.bits_per_symbol)
     llr = (8 * (1 - 2.0 * bits)).astype(np.float32).reshape(*symbols.shape, -1)
     frames = tuple(
-        Frame(
+        evlcp.Frame(
             transmitter=0,
             packet=0,
             frame=number,
             t_us=3200.0 * number,
-            soft=SoftSymbols(symbols[number], llr[number], 1.0),
-            range=Range(50.0 - number, 0.25, 9) if number % 2 else Range(float("nan"), float("nan"), 0),
+            soft=evlcp.SoftSymbols(symbols[number], llr[number], 1.0),
+            range=evlcp.Range(50.0 - number, 0.25, 9)
+            if number % 2
+            else evlcp.Range(float("nan"), float("nan"), 0),
             filtered=None,
             x_px=0.0,
             y_px=0.0,
         )
         for number in range(len(symbols))
     )
-    return Packet(0, 0, 0.0, 100.0, frames, len(symbols))
+    return evlcp.Packet(0, 0, 0.0, 100.0, frames, len(symbols))
 
 
 def test_both_are_received(tmp_path: Path) -> None:

@@ -4,18 +4,15 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from evlcp_sdk.plugin.hooks import SinkRecord, hookimpl
-from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.values import Packet
+import evlcp_sdk as evlcp
 
 __all__ = ["DistanceLines", "evlcp_sinks"]
 
 
-@hookimpl
-def evlcp_sinks() -> Iterator[SinkRecord]:
+@evlcp.hookimpl
+def evlcp_sinks() -> Iterator[evlcp.SinkRecord]:
     """The format of this module; its class is imported when it is asked for."""
-    yield SinkRecord(
+    yield evlcp.SinkRecord(
         name="distance-lines",
         target="evlcp_roadside.distance_lines:DistanceLines",
         files=("distances.line",),
@@ -23,15 +20,15 @@ def evlcp_sinks() -> Iterator[SinkRecord]:
     )
 
 
-class DistanceLines(Sink):
+class DistanceLines(evlcp.Sink):
     """Writes `distances.line`."""
 
-    def __init__(self, folder: ResultFolder, run: Run) -> None:
+    def __init__(self, folder: evlcp.ResultFolder, run: evlcp.Run) -> None:
         super().__init__(folder, run)
         self._file = folder.open("distances.line")
         self._lines = 0
 
-    def packet(self, packet: Packet) -> None:
+    def packet(self, packet: evlcp.Packet) -> None:
         """Write a line per frame that has a distance; time is the camera's clock, in ns."""
         for frame in packet.frames:
             if math.isfinite(frame.range.distance_m):

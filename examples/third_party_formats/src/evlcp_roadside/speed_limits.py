@@ -4,17 +4,14 @@ import struct
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from evlcp_sdk.air.blocks import BlockError
-from evlcp_sdk.air.kinds import MessageKind
-from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.plugin.hooks import hookimpl
+import evlcp_sdk as evlcp
 
 __all__ = ["SpeedLimit", "evlcp_message_kinds"]
 
 _FORM = struct.Struct("<BH")
 
 
-class SpeedLimit(MessageKind):
+class SpeedLimit(evlcp.MessageKind):
     """A speed limit: (km/h, metres)."""
 
     number = 5
@@ -24,13 +21,13 @@ class SpeedLimit(MessageKind):
         """Three bytes."""
         speed_km_h, length_m = value
         if not (0 < speed_km_h < 256 and 0 < length_m < 65536):
-            raise ConfigError(f"speed-limit: {value}, expected 1 to 255 km/h and 1 to 65535 m")
+            raise evlcp.ConfigError(f"speed-limit: {value}, expected 1 to 255 km/h and 1 to 65535 m")
         return _FORM.pack(speed_km_h, length_m)
 
     def unpack(self, payload: bytes) -> tuple[int, int]:
         """The two numbers."""
         if len(payload) != _FORM.size:
-            raise BlockError(f"speed-limit of {len(payload)} bytes, expected {_FORM.size}")
+            raise evlcp.BlockError(f"speed-limit of {len(payload)} bytes, expected {_FORM.size}")
         speed_km_h, length_m = _FORM.unpack(payload)
         return speed_km_h, length_m
 
@@ -39,7 +36,7 @@ class SpeedLimit(MessageKind):
         return {"speed_km_h": value[0], "length_m": value[1]}
 
 
-@hookimpl
-def evlcp_message_kinds() -> Iterator[MessageKind]:
+@evlcp.hookimpl
+def evlcp_message_kinds() -> Iterator[evlcp.MessageKind]:
     """The kind of this module."""
     yield SpeedLimit()
