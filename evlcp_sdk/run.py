@@ -28,7 +28,7 @@ from evlcp_sdk.results.summary import Status
 from evlcp_sdk.results.tables import frames_table
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.scene.sites import BarSite, LocalFrame
+from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Frame, Packet
 
 if TYPE_CHECKING:
@@ -322,11 +322,11 @@ def calibrate(
     registry = Registry.load() if registry is None else registry
     link = load_link(registry=registry) if link is None else link
     _check_names(recordings, poses, name)
-    frame = LocalFrame.of(sites)
+    axes = LocalAxes.of(sites)
     views: list[CalibrationView] = []
     for url in recordings:
         mine = [pose for pose in poses if pose.recording in ("", Path(url).name)]
-        views += _views(url, mine, link, sites, frame, registry)
+        views += _views(url, mine, link, sites, axes, registry)
     return fit_camera(views, link.camera, link.position, limit_px=limit_px)
 
 
@@ -347,7 +347,7 @@ def _views(
     poses: Sequence[KnownPose],
     link: Link,
     sites: Sequence[BarSite],
-    frame: LocalFrame,
+    axes: LocalAxes,
     registry: Registry,
 ) -> list[CalibrationView]:
     """What a recording shows at the times of known poses."""
@@ -373,16 +373,16 @@ def _views(
         for number, seen in frames.items():
             points = points_at(seen, pose.t_us, period_us, clusters, spec)
             if points is not None and number in stands_at:
-                enu = stands_at[number].cluster_positions_m(clusters, frame)
+                enu = stands_at[number].cluster_positions_m(clusters, axes)
                 bars.append(BarView(number, enu, *points))
         place = (pose.latitude_deg, pose.longitude_deg, pose.height_m)
         rotation = None
         if pose.attitude is not None:
-            rotation = frame.turn_from(LocalFrame(*place)) @ pose.attitude.rotation()
+            rotation = axes.turn_from(LocalAxes(*place)) @ pose.attitude.rotation()
         views.append(
             CalibrationView(
                 tuple(bars),
-                frame.to_enu(*place),
+                axes.to_enu(*place),
                 pose.position_sigma_m,
                 rotation,
                 pose.attitude_sigma_deg,

@@ -426,7 +426,7 @@ class Fix:
         latitude_deg: WGS-84; NaN, as all values, where the fix is refused.
         longitude_deg: The same.
         height_m: Above the ellipsoid, m.
-        enu_m: The same place in the local frame, m, float64 (3,).
+        enu_m: The same place in the local axes, m, float64 (3,).
         covariance_m2: Of `enu_m`, float64 (3, 3).
         noise_m2: The part of it that is new with every fix; the rest comes from what was said about the
             attitude, and stays, float64 (3, 3).

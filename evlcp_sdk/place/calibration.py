@@ -52,7 +52,7 @@ class CalibrationView:
 
     Attributes:
         bars: What was seen.
-        enu_m: The camera's place in the local frame, m, float64 (3,).
+        enu_m: The camera's place in the local axes, m, float64 (3,).
         position_sigma_m: Its standard deviation, m.
         rotation: Camera axes as columns in ENU, float64 (3, 3); None where they are not known.
         attitude_sigma_deg: Standard deviation of a turn about each axis, degrees.

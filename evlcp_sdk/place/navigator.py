@@ -48,7 +48,7 @@ class Place:
         latitude_deg: WGS-84.
         longitude_deg: The same.
         height_m: Above the ellipsoid, m.
-        enu_m: The same place in the local frame, m, float64 (3,).
+        enu_m: The same place in the local axes, m, float64 (3,).
         covariance_m2: Of `enu_m`, float64 (3, 3).
         speed_m_s: Over ground.
         course_deg: Where it moves to, clockwise from north.
@@ -129,12 +129,12 @@ class Navigator:
         return placed, self._settle(len(self._window))
 
     def bars_enu_m(self) -> dict[int, Floats]:
-        """Centres of the bars whose places are known, in the local frame, m, float64 (3,) each."""
-        frame = self.positioner.frame
-        if frame is None:
+        """Centres of the bars whose places are known, in the local axes, m, float64 (3,) each."""
+        axes = self.positioner.axes
+        if axes is None:
             return {}
         return {
-            number: frame.to_enu(site.latitude_deg, site.longitude_deg, site.height_m)
+            number: axes.to_enu(site.latitude_deg, site.longitude_deg, site.height_m)
             for number, site in self.positioner.stands_at.items()
         }
 
@@ -157,9 +157,9 @@ class Navigator:
         return settled
 
     def _place(self, point: TrajectoryPoint) -> Place:
-        frame = self.positioner.frame
-        assert frame is not None
-        latitude, longitude, height = frame.to_geodetic(point.mean[:3])
+        axes = self.positioner.axes
+        assert axes is not None
+        latitude, longitude, height = axes.to_geodetic(point.mean[:3])
         east, north = float(point.mean[3]), float(point.mean[4])
         return Place(
             t_us=point.t_us,

@@ -30,7 +30,7 @@ class BarView:
 
     Attributes:
         transmitter: Number that the receiver gave it.
-        enu_m: Centres of its clusters in the local frame, m, float64 (K, 3).
+        enu_m: Centres of its clusters in the local axes, m, float64 (K, 3).
         points_px: Where they are seen, px, float64 (K, 2); NaN where unseen.
         sigma_px: Their standard deviations, px, float64 (K,).
     """
@@ -72,7 +72,7 @@ class Problem:
         camera: The camera.
         attitude: What is known of its attitude; None for nothing.
         spec: Bounds and weights.
-        enu_m: The clusters that are seen, in the local frame, m, float64 (n, 3).
+        enu_m: The clusters that are seen, in the local axes, m, float64 (n, 3).
         points_px: Where they are seen, px, float64 (n, 2).
         sigma_px: Their standard deviations, px, float64 (n,).
         bar: Number of each point's bar, int64 (n,).

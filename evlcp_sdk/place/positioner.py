@@ -13,7 +13,7 @@ from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.place.whereabouts import Whereabouts
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.scene.sites import BarSite, LocalFrame
+from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Fix, Frame, Packet
 
 __all__ = ["Positioner"]
@@ -45,7 +45,7 @@ class Positioner:
         attitude_at: Callable[[float], Attitude | None],
         spec: PositionSpec | None = None,
     ) -> None:
-        self.frame: LocalFrame | None = LocalFrame.of(sites) if sites else None
+        self.axes: LocalAxes | None = LocalAxes.of(sites) if sites else None
         self._camera = camera
         self._clusters = clusters
         self._packet_us = packet_us
@@ -115,7 +115,7 @@ class Positioner:
 
     def _fix(self, t_us: float) -> Fix | None:
         views, sited = [], []
-        here: LocalFrame | None = None
+        here: LocalAxes | None = None
         for number, frames in sorted(self._frames.items()):
             points = points_at(frames, t_us, self._packet_us, self._clusters, self._spec)
             if points is None:
@@ -124,15 +124,15 @@ class Positioner:
             site = self._bars.site(number)
             if site is None:
                 continue
-            if self.frame is None:
-                self.frame = LocalFrame.of([site])
+            if self.axes is None:
+                self.axes = LocalAxes.of([site])
             # Gravity and north are those of here, which may be far from the origin of the trajectory.
-            here = LocalFrame.of([site]) if here is None else here
+            here = LocalAxes.of([site]) if here is None else here
             enu = site.cluster_positions_m(self._clusters, here)
             sited.append(BarView(number, enu, *points))
         if not views:
             return None
-        if here is None or self.frame is None:
+        if here is None or self.axes is None:
             how = [text for number in views if (text := self._bars.contradiction(number))]
             if how:
                 return Fix.refused(t_us, tuple(views), "site-contradicted", "; ".join(how))
@@ -144,14 +144,14 @@ class Positioner:
         verified = all(self._bars.verified(n) for n in pose.transmitters)
         attitude = Attitude.of_rotation(pose.rotation)
         latitude, longitude, height = (float(v) for v in here.to_geodetic(pose.enu_m))
-        turn = self.frame.turn_from(here)
+        turn = self.axes.turn_from(here)
         assert attitude.heading_deg is not None
         return Fix(
             t_us=t_us,
             latitude_deg=latitude,
             longitude_deg=longitude,
             height_m=height,
-            enu_m=self.frame.to_enu(latitude, longitude, height),
+            enu_m=self.axes.to_enu(latitude, longitude, height),
             covariance_m2=turn @ pose.covariance[:3, :3] @ turn.T,
             noise_m2=turn @ pose.noise[:3, :3] @ turn.T,
             heading_deg=attitude.heading_deg,

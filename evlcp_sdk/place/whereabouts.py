@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evlcp_sdk.link.sections import PositionSpec
-from evlcp_sdk.scene.sites import BarSite, LocalFrame, site_of_transmitter
+from evlcp_sdk.scene.sites import BarSite, LocalAxes, site_of_transmitter
 from evlcp_sdk.values import Packet
 
 __all__ = ["Whereabouts"]
@@ -105,7 +105,7 @@ class Whereabouts:
         if site is None or beacon is None or self._spec.beacons == "none":
             return ""
         place = (beacon.latitude_deg, beacon.longitude_deg, beacon.height_m)
-        apart = float(np.linalg.norm(LocalFrame.of([site]).to_enu(*place)))
+        apart = float(np.linalg.norm(LocalAxes.of([site]).to_enu(*place)))
         if apart > site.length_m:
             return f"transmitter {number} says that it is {apart:.1f} m from the site of its id"
         if abs(beacon.length_m - site.length_m) > _LENGTH_SHARE * site.length_m:

@@ -188,7 +188,7 @@ def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]],
 
     Args:
         probe: Has the whole trajectory.
-        bars_enu_m: Centre of each bar in the local frame, m, float64 (3,), by transmitter.
+        bars_enu_m: Centre of each bar in the local axes, m, float64 (3,), by transmitter.
         title: What the figure is of.
     """
     figure = Figure(figsize=(11, 7.6), layout="constrained")

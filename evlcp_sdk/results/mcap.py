@@ -15,7 +15,7 @@ from evlcp_sdk.values import Fix
 __all__ = ["Mcap"]
 
 FRAME_ID = "enu"
-"""Name of the local frame; camera axes in it are x right, y down, z forward."""
+"""Name of the local axes; camera axes in it are x right, y down, z forward."""
 
 
 class Mcap(Sink):

@@ -152,7 +152,7 @@ class PositionTally:
 
     def to_dict(self, positioner: Positioner) -> dict[str, Any]:
         """The figures as JSON values, with what is known of the bars in the end."""
-        frame = positioner.frame
+        axes = positioner.axes
         return {
             "fixes": self.given,
             "fixes_verified": self.verified,
@@ -161,6 +161,6 @@ class PositionTally:
             "frames_late": positioner.counts["frames_late"],
             "beacons_forged": positioner.counts["beacons_forged"],
             "sites_contradicted": {str(n): how for n, how in positioner.contradicted.items()},
-            "origin": asdict(frame) if frame is not None else None,
+            "origin": asdict(axes) if axes is not None else None,
             "bars": {str(n): s.transmitter_id for n, s in positioner.stands_at.items()},
         }

@@ -61,7 +61,7 @@ class CameraModel:
         return self.width / 2 if x is None else x, self.height / 2 if y is None else y
 
     def project(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where points of the camera's frame are seen, px; NaN for points that are not in front of it.
+        """Where points along the camera's axes are seen, px; NaN for points that are not in front of it.
 
         Args:
             points_m: x right, y down, z forward, m, float64 (..., 3).

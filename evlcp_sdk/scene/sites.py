@@ -1,6 +1,6 @@
-"""Where transmitters stand on earth: `site.toml`, and the local frame that positions are computed in.
+"""Where transmitters stand on earth: `site.toml`, and the local axes that positions are computed in.
 
-Heights are above the WGS-84 ellipsoid. A local frame has its axes to the east, to the north and up (ENU) at
+Heights are above the WGS-84 ellipsoid. Local axes point to the east, to the north and up (ENU) at
 an origin near the bars. See `docs/position.md`.
 """
 
@@ -18,7 +18,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.specs import SpecError, build, read_toml
 from evlcp_sdk.spelling import nearest
 
-__all__ = ["BarSite", "LocalFrame", "load_sites", "resolve_sites", "site_of_transmitter", "to_toml"]
+__all__ = ["BarSite", "LocalAxes", "load_sites", "resolve_sites", "site_of_transmitter", "to_toml"]
 
 
 @dataclass(frozen=True)
@@ -55,17 +55,17 @@ class BarSite:
     ] = None
 
     def axis_enu(self) -> NDArray[np.float64]:
-        """Unit vector from its bottom to its top, in the ENU frame of its own centre, float64 (3,)."""
+        """Unit vector from its bottom to its top, in east, north and up at its own centre, float64 (3,)."""
         heading, tilt = math.radians(self.heading_deg), math.radians(self.tilt_deg)
         lean = math.sin(tilt)
         return np.array([lean * math.sin(heading), lean * math.cos(heading), math.cos(tilt)])
 
-    def cluster_positions_m(self, clusters: int, frame: "LocalFrame") -> NDArray[np.float64]:
-        """Centres of its clusters in a local frame, from its top, m, float64 (clusters, 3).
+    def cluster_positions_m(self, clusters: int, axes: "LocalAxes") -> NDArray[np.float64]:
+        """Centres of its clusters in local axes, from its top, m, float64 (clusters, 3).
 
         Args:
             clusters: How many equal parts the bar is cut into.
-            frame: The local frame.
+            axes: The local axes.
         """
         import pymap3d
 
@@ -73,15 +73,15 @@ class BarSite:
         offset = along[:, None] * self.axis_enu()
         here = (self.latitude_deg, self.longitude_deg, self.height_m)
         ecef = pymap3d.enu2ecef(*offset.T, *here)
-        return np.stack(pymap3d.ecef2enu(*ecef, *frame.origin), -1)
+        return np.stack(pymap3d.ecef2enu(*ecef, *axes.origin), -1)
 
 
 @dataclass(frozen=True)
-class LocalFrame:
+class LocalAxes:
     """East, north and up at an origin on earth.
 
-    >>> frame = LocalFrame(35.0, 137.0, 50.0)
-    >>> frame.to_enu(*frame.to_geodetic([10.0, 20.0, 3.0])).round(6).tolist()
+    >>> axes = LocalAxes(35.0, 137.0, 50.0)
+    >>> axes.to_enu(*axes.to_geodetic([10.0, 20.0, 3.0])).round(6).tolist()
     [10.0, 20.0, 3.0]
     """
 
@@ -90,14 +90,14 @@ class LocalFrame:
     height_m: float
 
     @classmethod
-    def of(cls, sites: Sequence[BarSite]) -> "LocalFrame":
-        """The frame at the centre of the first of these bars.
+    def of(cls, sites: Sequence[BarSite]) -> "LocalAxes":
+        """The axes at the centre of the first of these bars.
 
         Raises:
             ConfigError: There is none.
         """
         if not sites:
-            raise ConfigError("a local frame needs one bar or more")
+            raise ConfigError("local axes need one bar or more")
         first = sites[0]
         return cls(first.latitude_deg, first.longitude_deg, first.height_m)
 
@@ -106,18 +106,18 @@ class LocalFrame:
         """Latitude, longitude and height of the origin."""
         return self.latitude_deg, self.longitude_deg, self.height_m
 
-    def turn_from(self, other: "LocalFrame") -> NDArray[np.float64]:
-        """What turns vectors of another frame into this one, float64 (3, 3): 0.009 degrees a kilometre.
+    def turn_from(self, other: "LocalAxes") -> NDArray[np.float64]:
+        """What turns vectors along other axes into these, float64 (3, 3): 0.009 degrees a kilometre.
 
-        >>> far = LocalFrame(35.1, 137.0, 50.0)
-        >>> up = LocalFrame(35.0, 137.0, 50.0).turn_from(far)[:, 2]
+        >>> far = LocalAxes(35.1, 137.0, 50.0)
+        >>> up = LocalAxes(35.0, 137.0, 50.0).turn_from(far)[:, 2]
         >>> round(float(np.degrees(np.arctan2(up[1], up[2]))), 3)
         0.1
         """
-        return np.asarray(self._axes() @ other._axes().T)
+        return np.asarray(self._in_ecef() @ other._in_ecef().T)
 
-    def _axes(self) -> NDArray[np.float64]:
-        """East, north and up in the earth's frame (ECEF), as rows."""
+    def _in_ecef(self) -> NDArray[np.float64]:
+        """East, north and up along the earth's axes (ECEF), as rows."""
         sin_lat, sin_lon = np.sin(np.radians([self.latitude_deg, self.longitude_deg]))
         cos_lat, cos_lon = np.cos(np.radians([self.latitude_deg, self.longitude_deg]))
         return np.array(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.attitude import AttitudeLog
-from evlcp_sdk.scene.sites import BarSite, LocalFrame
+from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.sim.motion import CameraPath
 from evlcp_sdk.sim.scene import BarSpec, Scene, WorldSpec, links_of
 
@@ -57,10 +57,10 @@ def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, .
     Raises:
         ConfigError: The scene has no `[world]`, or a bar's link is none.
     """
-    world, frame = _world(scene)
+    world, axes = _world(scene)
     sites = []
     for i, (bar, link) in enumerate(zip(scene.bars, links_of(scene, registry), strict=True)):
-        latitude, longitude, height = frame.to_geodetic(
+        latitude, longitude, height = axes.to_geodetic(
             scene_to_enu(np.array([bar.x_m, bar.y_m, bar.z_m]), world.heading_deg)
         )
         east, north, up = -scene_to_enu(np.array(bar_axis(bar)), world.heading_deg)
@@ -95,8 +95,8 @@ def camera_on_earth(scene: Scene, position_m: Floats, attitude_rad: Floats) -> d
     Raises:
         ConfigError: The scene has no `[world]`.
     """
-    world, frame = _world(scene)
-    latitude, longitude, height = frame.to_geodetic(scene_to_enu(position_m, world.heading_deg))
+    world, axes = _world(scene)
+    latitude, longitude, height = axes.to_geodetic(scene_to_enu(position_m, world.heading_deg))
     yaw, pitch, roll = np.degrees(attitude_rad).T
     # 1e-9 degrees are 0.1 mm.
     return {
@@ -140,8 +140,8 @@ def attitude_log(scene: Scene, seed: int, path: CameraPath) -> AttitudeLog | Non
     )
 
 
-def _world(scene: Scene) -> tuple[WorldSpec, LocalFrame]:
+def _world(scene: Scene) -> tuple[WorldSpec, LocalAxes]:
     world = scene.world
     if world is None:
         raise ConfigError("the scene has no [world]: nothing says where on earth it is")
-    return world, LocalFrame(world.latitude_deg, world.longitude_deg, world.height_m)
+    return world, LocalAxes(world.latitude_deg, world.longitude_deg, world.height_m)

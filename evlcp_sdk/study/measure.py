@@ -173,8 +173,8 @@ def position_tallies(
         (lambda _: None) if attitude is None else attitude.at,
         link.position,
     )
-    frame_of = positioner.frame
-    assert frame_of is not None
+    axes = positioner.axes
+    assert axes is not None
     path = truth.camera_path
     tallies = []
     for fix in [*positioner.feed(packets), *positioner.close()]:
@@ -186,7 +186,7 @@ def position_tallies(
         place = (
             np.interp(at, truth.t_us, path[key]) for key in ("latitude_deg", "longitude_deg", "height_m")
         )
-        error = fix.enu_m - frame_of.to_enu(*place)
+        error = fix.enu_m - axes.to_enu(*place)
         nees = float(error @ np.linalg.solve(fix.covariance_m2, error))
         tallies.append((segment, Tally.fix(float(np.linalg.norm(error)), nees)))
     return tallies

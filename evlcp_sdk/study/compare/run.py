@@ -42,11 +42,11 @@ class _Watch:
         self.stage_us: dict[str, list[float]] = {stage: [] for stage in STAGES}
         self.frame_us: list[float] = []
         self._frame: dict[str, float] = {}
-        self._told_s = time.thread_time()
+        self._finished_s = time.thread_time()
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, elapsed_s: float) -> None:
-        spent_s = min(elapsed_s, time.thread_time() - self._told_s)
+        spent_s = min(elapsed_s, time.thread_time() - self._finished_s)
         if stage in STAGES:
             self._frame[stage] = spent_s * 1e6
         elif stage == "frame":
@@ -54,7 +54,7 @@ class _Watch:
                 self.stage_us[name].append(us)
             self.frame_us.append(sum(self._frame.values()))
             self._frame = {}
-        self._told_s = time.thread_time()
+        self._finished_s = time.thread_time()
 
 
 class _Bound:

@@ -37,7 +37,7 @@ struct evlcp_cursor {
     uint32_t packet;
     uint32_t chip;      /* of the packet */
     const uint8_t *at;  /* words of the frame, or row of the chip */
-    uint32_t in_frame;  /* chip of the frame; without a pilot it begins at EVLCP_PILOT_CHIPS */
+    uint32_t in_frame;  /* chip of the frame; without a pilot it starts at EVLCP_PILOT_CHIPS */
     uint8_t to_pilot;   /* frames until the next one with a pilot */
 };
 

@@ -71,7 +71,7 @@ void evlcp_receive(struct evlcp *e, const uint8_t *bytes, uint32_t count);
 void evlcp_chip(struct evlcp *e);
 
 /* The hardware failed, and the HAL has gone dark by itself: from the main loop, once for each failure. The fault is
-   what the health tells, or CHIP_LOST; the LEDs stay dark until START finds it gone. */
+   what the health says, or CHIP_LOST; the LEDs stay dark until START finds it gone. */
 void evlcp_failed(struct evlcp *e);
 
 /* Everything that is not urgent. */

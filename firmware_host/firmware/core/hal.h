@@ -19,7 +19,7 @@ struct evlcp_hal_info {
     uint8_t name[12]; /* of the hardware layer, ASCII, zero-padded */
 };
 
-/* What the sensors tell; a temperature of INT16_MIN is not measured. `faults` holds over_temperature, open_led and clock of enum evlcp_fault. */
+/* What the sensors say; a temperature of INT16_MIN is not measured. `faults` holds over_temperature, open_led and clock of enum evlcp_fault. */
 struct evlcp_health {
     int16_t temperature_dc;
     uint8_t faults;

@@ -31,7 +31,7 @@ struct evlcp_player {
 
 void evlcp_player_init(struct evlcp_player *player);
 
-/* Begin with the active bank's first packet; must not run, and a bank must be active. */
+/* Start with the active bank's first packet; must not run, and a bank must be active. */
 void evlcp_player_begin(struct evlcp_player *player, struct evlcp_banks *banks);
 
 /* Dark at once. */

@@ -613,7 +613,7 @@ static void test_hardware_that_fails_darkens(void)
         run_chips(board, 10u);
         EXPECT(is_dark(board) && ask_status(&h).state == EVLCP_STATE_FAULT);
     }
-    /* What the health tells is the fault's name. */
+    /* What the health says is the fault's name. */
     EXPECT(ask(&h, EVLCP_TYPE_START, NULL, 0) == EVLCP_STATUS_OK);
     run_chips(board, 10u);
     board->health.faults = EVLCP_FAULT_CLOCK;
@@ -661,7 +661,7 @@ static void test_save_and_recall(void)
     /* The next SAVE goes into the slot that is not the newest valid header. */
     autostart = 1u;
     EXPECT(ask(&h, EVLCP_TYPE_SAVE, &autostart, 1) == EVLCP_STATUS_OK && h.payload[0] == 0u);
-    native_reset(board); /* begins to play by itself */
+    native_reset(board); /* starts to play by itself */
     watch_leds(board);
     run_chips(board, 50u);
     EXPECT(kept_count == 50u);
@@ -815,7 +815,7 @@ static void test_sparse_pilots(void)
             }
         }
         EXPECT(at == 2u * chips && same == 2u * (chips - EVLCP_PREAMBLE_CHIPS));
-        /* Then the first packet begins anew, with its preamble. */
+        /* Then the first packet starts anew, with its preamble. */
         uint32_t preamble = 0u;
         for (uint32_t chip = 0; chip < EVLCP_PREAMBLE_CHIPS; chip++)
             preamble = preamble << 1 | (kept[at + chip][8] == 0xffu);

@@ -19,7 +19,7 @@ from evlcp_sdk.place.positioner import Positioner
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.scene.sites import BarSite, LocalFrame
+from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.sim import Simulation
 from evlcp_sdk.sim.scene import resolve_scene
 from evlcp_sdk.sim.world import scene_to_enu, sites_of
@@ -27,7 +27,7 @@ from evlcp_sdk.values import Fix, Frame, Packet, Range, ReceivedMessage, SoftSym
 
 CAMERA = CameraModel()
 PACKET_US, FRAME_US = 34_600.0, 3200.0
-ORIGIN = LocalFrame(35.0, 137.0, 40.0)
+ORIGIN = LocalAxes(35.0, 137.0, 40.0)
 EXACT = Attitude(4.0, 1.0, 0.0, 0.0, 0.0)
 SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
 
@@ -116,14 +116,14 @@ def test_gravity_and_north_are_those_of_the_place_not_of_the_first_site() -> Non
     p = positioner([far, LEFT])
     fixes = p.feed(packets_of(LEFT, 0, 6)) + p.close()
     assert_right(fixes)
-    assert p.frame == LocalFrame.of([far])
+    assert p.axes == LocalAxes.of([far])
     heading = fixes[0].heading_deg
     assert min(heading, 360 - heading) < 1e-3
     # The covariance turns along: its size stays, its axes are those of the track's frame.
     near = positioner([LEFT])
     plain = near.feed(packets_of(LEFT, 0, 6)) + near.close()
-    here = LocalFrame.of([LEFT])
-    turn = LocalFrame.of([far]).turn_from(here)
+    here = LocalAxes.of([LEFT])
+    turn = LocalAxes.of([far]).turn_from(here)
     np.testing.assert_allclose(fixes[1].covariance_m2, turn @ plain[1].covariance_m2 @ turn.T, atol=1e-9)
 
 
@@ -313,7 +313,7 @@ def test_a_simulated_drive_past_two_bars() -> None:
     fixes = p.feed(packets) + p.close()
     given = [f for f in fixes if not f.refusal]
     assert len(given) >= 4
-    world = LocalFrame(35.1, 137.0, 50.0)
+    world = LocalAxes(35.1, 137.0, 50.0)
     error = []
     for fix in given:
         place, ((yaw, _pitch, _roll),) = simulation.path.at([fix.t_us])

@@ -24,7 +24,7 @@ from evlcp_sdk.results.figures import TrackProbe, draw_track
 from evlcp_sdk.results.geojson import cut
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.scene.sites import BarSite, LocalFrame
+from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
 
 LINK = load_link()
@@ -37,7 +37,7 @@ SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
 
 def packets(count: int, seed: int = 1, transmitter: int = 0) -> list[Packet]:
     """A camera that drives north at 10 m/s towards a bar."""
-    rng, enu = np.random.default_rng(seed), SITE.cluster_positions_m(16, LocalFrame.of([SITE]))
+    rng, enu = np.random.default_rng(seed), SITE.cluster_positions_m(16, LocalAxes.of([SITE]))
     found = []
     for n in range(count):
         frames = []
@@ -73,10 +73,10 @@ def test_files_of_a_drive(tmp_path: Path) -> None:
     fixes = rows(tmp_path / "fixes.csv")
     assert told["fixes"] == len(fixes) == 12
     assert told["bars"] == {"0": 7}
-    frame = LocalFrame.of([SITE])
+    axes = LocalAxes.of([SITE])
     for row in fixes + rows(tmp_path / "track.csv"):
         t_us = float(row["t_us"])
-        place = frame.to_enu(*(float(row[k]) for k in ("latitude_deg", "longitude_deg", "height_m")))
+        place = axes.to_enu(*(float(row[k]) for k in ("latitude_deg", "longitude_deg", "height_m")))
         sigma = [float(row[f"sigma_{axis}_m"]) for axis in ("east", "north", "up")]
         assert (np.abs(place - [2.0, -60 + 10e-6 * t_us, -4.0]) < 5 * np.array(sigma)).all()
         assert row.get("refusal", "") == ""

@@ -1,4 +1,4 @@
-"""Where bars stand: the file and its faults, and the local frame against closed forms."""
+"""Where bars stand: the file and its faults, and the local axes against closed forms."""
 
 import math
 from pathlib import Path
@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.scene.sites import BarSite, LocalFrame, load_sites, resolve_sites, site_of_transmitter
+from evlcp_sdk.scene.sites import BarSite, LocalAxes, load_sites, resolve_sites, site_of_transmitter
 
 A_WGS84, F_WGS84 = 6_378_137.0, 1 / 298.257223563
 BAR = {"transmitter_id": 1, "latitude_deg": 35.0, "longitude_deg": 137.0, "height_m": 5.0}
@@ -49,27 +49,27 @@ def test_clusters_stand_where_the_ellipsoid_says(
     lat: float, lon: float, height: float, heading: float, tilt: float, dlat: float, dlon: float
 ) -> None:
     site = BarSite(1, lat, lon, height, heading, tilt, 1.6)
-    frame = LocalFrame(lat + dlat, lon + dlon, height - 3)
+    axes = LocalAxes(lat + dlat, lon + dlon, height - 3)
     h, t = math.radians(heading), math.radians(tilt)
     axis = np.array([math.sin(t) * math.sin(h), math.sin(t) * math.cos(h), math.cos(t)])
     along = 1.6 * (np.array([0.375, 0.125, -0.125, -0.375]))
     world = ecef(lat, lon, height) + (along[:, None] * axis) @ enu_axes(lat, lon)
-    want = (world - ecef(*frame.origin)) @ enu_axes(frame.latitude_deg, frame.longitude_deg).T
-    np.testing.assert_allclose(site.cluster_positions_m(4, frame), want, atol=2e-8)
+    want = (world - ecef(*axes.origin)) @ enu_axes(axes.latitude_deg, axes.longitude_deg).T
+    np.testing.assert_allclose(site.cluster_positions_m(4, axes), want, atol=2e-8)
 
 
 @given(st.floats(-85, 85), st.floats(-179, 179), st.tuples(*[st.floats(-500, 500)] * 3))
 def test_the_local_frame_and_back(lat: float, lon: float, place: tuple[float, float, float]) -> None:
-    frame = LocalFrame(lat, lon, 40.0)
-    found = frame.to_geodetic(np.array([place, place]))
-    np.testing.assert_allclose(frame.to_enu(*found), [place, place], atol=1e-6)
+    axes = LocalAxes(lat, lon, 40.0)
+    found = axes.to_geodetic(np.array([place, place]))
+    np.testing.assert_allclose(axes.to_enu(*found), [place, place], atol=1e-6)
     world = ecef(lat, lon, 40.0) + np.array(place) @ enu_axes(lat, lon)
     np.testing.assert_allclose(ecef(*(float(v[0]) for v in found)), world, atol=1e-6)
 
 
 @given(st.floats(-85, 85), st.floats(-179, 179), st.floats(-1, 1), st.floats(-1, 1))
 def test_vectors_turn_between_frames(lat: float, lon: float, dlat: float, dlon: float) -> None:
-    one, two = LocalFrame(lat, lon, 10.0), LocalFrame(lat + dlat, lon + dlon, 40.0)
+    one, two = LocalAxes(lat, lon, 10.0), LocalAxes(lat + dlat, lon + dlon, 40.0)
     want = enu_axes(one.latitude_deg, one.longitude_deg) @ enu_axes(two.latitude_deg, two.longitude_deg).T
     np.testing.assert_allclose(one.turn_from(two), want, atol=1e-12)
     step = one.to_enu(*two.to_geodetic([3.0, -4.0, 5.0])) - one.to_enu(*two.to_geodetic([0.0, 0.0, 0.0]))
@@ -86,7 +86,7 @@ def test_a_site_file(tmp_path: Path) -> None:
     first, second = load_sites(path)
     assert first == BarSite(7, 35.0, 137.0, 5.0, 90.0, 3.0, 0.96, 1)
     assert second == BarSite(9, 35.0, 137.0, 7.0)
-    assert LocalFrame.of([first, second]).origin == (35.0, 137.0, 5.0)
+    assert LocalAxes.of([first, second]).origin == (35.0, 137.0, 5.0)
 
 
 @pytest.mark.parametrize(
@@ -134,4 +134,4 @@ def test_which_site_a_transmitter_stands_at() -> None:
     assert site_of_transmitter([plain], 5) is None
     assert site_of_transmitter([numbered], 0, alone=True) is None
     with pytest.raises(ConfigError, match="one bar or more"):
-        LocalFrame.of([])
+        LocalAxes.of([])

@@ -8,7 +8,7 @@ import pytest
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.attitude import AttitudeLog
-from evlcp_sdk.scene.sites import LocalFrame, load_sites, to_toml
+from evlcp_sdk.scene.sites import LocalAxes, load_sites, to_toml
 from evlcp_sdk.sim import Simulation, load_scene, resolve_scene, sites_of, truth_of
 from evlcp_sdk.sim.motion import project
 from evlcp_sdk.sim.world import attitude_log
@@ -48,10 +48,10 @@ def test_sites_and_camera_say_what_the_image_shows() -> None:
     for i in (0, 19):
         here = tuple(path[key][i] for key in ("latitude_deg", "longitude_deg", "height_m"))
         axes = turned(path["heading_deg"][i], path["pitch_deg"][i], path["roll_deg"][i])
-        frame = LocalFrame(*here)
+        local = LocalAxes(*here)
         position, attitude = simulation.path.at(truth["t_s"][i] * 1e6)
         for site, light in zip(sites, simulation.bars, strict=True):
-            seen = camera.project(site.cluster_positions_m(16, frame) @ axes.T)
+            seen = camera.project(site.cluster_positions_m(16, local) @ axes.T)
             strip = light.strips[0].strip
             parts = (np.arange(16) + 0.5) / 16 - 0.5
             ends = np.array(strip.centre_m) + parts[:, None] * np.array(strip.along_m)

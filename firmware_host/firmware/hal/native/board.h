@@ -18,7 +18,7 @@ struct native {
     uint64_t reset_at;  /* ticks at the last reset */
     uint64_t due;       /* next chip */
     uint32_t period;    /* ticks a chip; 0: no chips */
-    uint32_t late;      /* what hal_lateness tells, to test a chip that comes late */
+    uint32_t late;      /* what hal_lateness says, to test a chip that comes late */
     uint8_t unique_id[12];
     struct evlcp_health health;
     bool level_fails;

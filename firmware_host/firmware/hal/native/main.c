@@ -368,7 +368,7 @@ int main(int argc, char **argv)
         load_flash(&board, o.flash);
         if (realpath(o.flash, target) != NULL)
             flash_file = target; /* a link stays one */
-        store_flash(&board, flash_file); /* a place that takes no SAVE is told now */
+        store_flash(&board, flash_file); /* a place that takes no SAVE is known now */
     }
     FILE *leds = NULL;
     if (o.leds != NULL) {

@@ -10,7 +10,7 @@ import pytest
 
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.scene.sites import LocalFrame
+from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.sim import (
     Simulation,
     Truth,
@@ -155,7 +155,7 @@ def seen(truth: Truth) -> list[Packet]:
             keys = ("latitude_deg", "longitude_deg", "height_m", "pitch_deg", "roll_deg", "heading_deg")
             here = [float(np.interp(at, t_us, path[key])) for key in keys]
             turned = Attitude(*here[3:]).rotation()
-            clusters = sites_of(scene)[i].cluster_positions_m(16, LocalFrame(*here[:3]))
+            clusters = sites_of(scene)[i].cluster_positions_m(16, LocalAxes(*here[:3]))
             points = scene.camera.project(clusters @ turned)
             symbols = SoftSymbols(np.zeros(16, int), np.zeros((16, 6), np.float32), 1.0)
             middle = points.mean(0)
