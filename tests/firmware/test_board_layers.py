@@ -74,17 +74,3 @@ def test_no_import_circle() -> None:
 def test_the_generator_is_a_developers_tool() -> None:
     users = [module for module in MODULES if "protocol.generate" in own_imports(module)]
     assert users == []
-
-
-def public_classes(package: str) -> set[str]:
-    trees = (ast.parse(path.read_text()) for path in (ROOT / package).rglob("*.py"))
-    return {
-        node.name
-        for tree in trees
-        for node in tree.body
-        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
-    }
-
-
-def test_no_class_has_a_name_of_the_sdks() -> None:
-    assert public_classes("firmware_host") & public_classes("evlcp_sdk") == set()

@@ -15,8 +15,8 @@ from firmware_host.errors import DatagramError
 from firmware_host.protocol import generate
 from firmware_host.protocol import requests as messages
 from firmware_host.protocol.datagram import MAX_WIRE_BYTES, Datagram, DatagramDecoder
-from firmware_host.protocol.vectors import read_vectors
 from firmware_host.protocol.wire import WireMessage
+from tests.firmware.wire_vectors import read_vectors
 
 VECTORS = list(read_vectors())
 PAYLOADS = [

@@ -236,11 +236,31 @@ def test_the_quickstart_is_the_example(capsys: pytest.CaptureFixture[str], workp
 
 
 @pytest.mark.parametrize(
-    "path", ["README.md", "docs/quickstart.md", "examples/quickstart.py", "examples/custom_app.py"]
+    "path",
+    [
+        "README.md",
+        "docs/quickstart.md",
+        "examples/quickstart.py",
+        "examples/custom_app.py",
+        "examples/third_party_formats/src/evlcp_roadside/distance_lines.py",
+        "examples/third_party_formats/src/evlcp_roadside/speed_limits.py",
+        "examples/third_party_plugin/src/evlcp_robust/__init__.py",
+        "examples/third_party_plugin/src/evlcp_robust/decoding.py",
+        "examples/third_party_plugin/src/evlcp_robust/ranging.py",
+    ],
 )
 def test_what_users_read_first_uses_the_public_face_only(path: str) -> None:
     found = set(re.findall(r"^ *(?:import|from) +evlcp_sdk\b.*$", (ROOT / path).read_text(), re.MULTILINE))
     assert found == {"import evlcp_sdk as evlcp"}
+
+
+@pytest.mark.parametrize(
+    "path", [*FILES[:2], *sorted((ROOT / "docs").glob("*.md"))], ids=lambda path: path.stem
+)
+def test_files_of_the_repository_that_a_page_names_exist(path: Path) -> None:
+    rooms = "evlcp_sdk|firmware_host|plugins|examples|tests|benchmarks|docs"
+    named = set(re.findall(rf"(?<![\w/.])(?:{rooms})/[\w./-]*[\w/](?!\w)", path.read_text()))
+    assert not [name for name in named if "NAME" not in name and not (ROOT / name).exists()]
 
 
 def test_every_name_of_the_face_that_a_page_shows_exists() -> None:

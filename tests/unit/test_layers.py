@@ -112,3 +112,34 @@ def test_commands_do_not_import_one_another() -> None:
         for name in imports_of(MODULES[module]):
             other = name.removeprefix("evlcp_sdk.")
             assert not other.startswith("cli.") or other.startswith("cli._"), f"{module} imports {name}"
+
+
+def test_no_import_circle() -> None:
+    """Imports inside functions and for typing count, too; that of a package's own parts does not."""
+    done: set[str] = set()
+
+    def visit(module: str, path: tuple[str, ...]) -> None:
+        assert module not in path, f"circle: {' > '.join([*path, module])}"
+        if module in done:
+            return
+        for name in imports_of(MODULES[module]):
+            other = name.removeprefix("evlcp_sdk.")
+            if other != name and other in MODULES and other != module:
+                visit(other, (*path, module))
+        done.add(module)
+
+    for module in MODULES:
+        visit(module, ())
+    assert done == set(MODULES)
+
+
+def test_no_two_public_classes_have_one_name() -> None:
+    homes: dict[str, list[Path]] = {}
+    root = SDK.parent
+    for path in (
+        p for room in ("evlcp_sdk", "firmware_host", "plugins") for p in (root / room).rglob("*.py")
+    ):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                homes.setdefault(node.name, []).append(path)
+    assert {name: paths for name, paths in homes.items() if len(paths) > 1} == {}
