@@ -53,7 +53,10 @@ Stopped = Callable[[], bool]
 
 
 def receive(
-    source: EventSource | str | Path, link: Link | None = None, *, registry: Registry | None = None
+    source: EventSource | str | Path,
+    link: Link | Path | str | None = None,
+    *,
+    registry: Registry | None = None,
 ) -> "Reception":
     """Receive a recording or a camera: an iterator over its packets, in constant memory.
 
@@ -61,15 +64,15 @@ def receive(
 
     Args:
         source: What to open, plugins asked first; or a source that is open, which is read on and closed.
-        link: The configuration; None for all defaults.
+        link: The configuration, or a `link.toml`; None for all defaults.
         registry: Plugins whose hooks are called; None for all that are installed.
 
     Raises:
         InputError: The source cannot be opened.
-        ConfigError: The recording's sensor is not the link's.
+        ConfigError: The file does not describe a link, or the recording's sensor is not the link's.
     """
     registry = Registry.load() if registry is None else registry
-    link = load_link(registry=registry) if link is None else link
+    link = link if isinstance(link, Link) else load_link(link, registry=registry)
     opened = source if isinstance(source, EventSource) else open_source(source, registry)
     try:
         check_sensor(opened, opened.path if isinstance(source, EventSource) else source, link.camera)
@@ -176,7 +179,7 @@ class Reception(Iterator[Packet]):
 def receive_to_folder(
     source: EventSource | str | Path,
     folder: Path,
-    link: Link | None = None,
+    link: Link | Path | str | None = None,
     *,
     registry: Registry | None = None,
     plan: PositionPlan | None = None,
@@ -190,7 +193,7 @@ def receive_to_folder(
         source: What to open, plugins asked first; or a source that is open, which is read on and closed.
         folder: Where the result goes; made if need be. An earlier result is replaced when the new one is
             complete.
-        link: The configuration; None for all defaults.
+        link: The configuration, or a `link.toml`; None for all defaults.
         registry: The plugins; None for all that are installed.
         plan: What positions are computed from; None for none.
         sinks: Output formats beside the default ones, by name, e.g. `parquet`.
@@ -207,7 +210,7 @@ def receive_to_folder(
         PluginError: A plugin's code fails; nothing is written.
     """
     registry = Registry.load() if registry is None else registry
-    link = load_link(registry=registry) if link is None else link
+    link = link if isinstance(link, Link) else load_link(link, registry=registry)
     url = str(source.path if isinstance(source, EventSource) else source)
     with source if isinstance(source, EventSource) else open_source(source, registry) as opened:
         check_sensor(opened, url, link.camera)
@@ -309,7 +312,7 @@ def calibrate(
         recordings: Recordings of the bars.
         sites: Where the bars stand.
         poses: Where the camera was, and when.
-        link: The configuration; None for all defaults.
+        link: The configuration, or a `link.toml`; None for all defaults.
         registry: The plugins; None for all that are installed.
         limit_px: Uncertainty of the image's corners that is allowed.
         name: What a message calls the poses: the file they come from, which has a heading and a line a pose.
@@ -320,7 +323,7 @@ def calibrate(
             was seen.
     """
     registry = Registry.load() if registry is None else registry
-    link = load_link(registry=registry) if link is None else link
+    link = link if isinstance(link, Link) else load_link(link, registry=registry)
     _check_names(recordings, poses, name)
     axes = LocalAxes.of(sites)
     views: list[CalibrationView] = []

@@ -66,8 +66,26 @@ def build(
     try:
         values = spec_model(cls).model_validate_json(json.dumps(table, default=str))
     except ValidationError as refused:
-        raise SpecError([_fault(cls, dict(error), hint) for error in refused.errors()]) from refused
+        raise SpecError(_faults(cls, refused, hint)) from refused
     return cls(**{name: getattr(values, name) for name in type(values).model_fields})
+
+
+def _faults(
+    cls: type[Any], refused: ValidationError, hint: Callable[[tuple[str, ...]], str | None]
+) -> list[tuple[tuple[str, ...], str]]:
+    """The faults of a table; of a value that may be one of several types, one for all of them."""
+    found: dict[tuple[str, ...], str] = {}
+    for error in refused.errors():
+        path, text = _fault(cls, dict(error), hint)
+        if path and _TYPE_TAG.fullmatch(path[-1]):
+            path = path[:-1]
+        text = f"{found[path]} or {text.partition(': expected ')[2]}" if path in found else text
+        found[path] = text
+    return list(found.items())
+
+
+_TYPE_TAG = re.compile(r"str|(dict|list|tuple)\[.*\]")
+"""What pydantic puts behind the path of a value that may be one of several types."""
 
 
 def _fault(

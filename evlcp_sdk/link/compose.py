@@ -21,7 +21,7 @@ __all__ = ["beacon_of_site", "compose", "messages_of", "packets_of", "utf8"]
 
 
 def compose(
-    link: Link | None = None,
+    link: Link | Path | str | None = None,
     *,
     text: str | None = None,
     data: bytes | None = None,
@@ -38,7 +38,7 @@ def compose(
     Several messages at once follow one another: beacon, its signature, text, data, others.
 
     Args:
-        link: The configuration; None for all defaults.
+        link: The configuration, or a `link.toml`; None for all defaults.
         text: A text.
         data: Bytes.
         beacon: What a beacon says; of a bar's site, where it stands.
@@ -57,7 +57,7 @@ def compose(
     >>> compose(text="Tempo 30", transmitter_id=7).shape
     (1, 10, 16)
     """
-    link = load_link() if link is None else link
+    link = link if isinstance(link, Link) else load_link(link)
     if repeat < 1:
         raise ConfigError(f"repeat = {repeat}, expected 1 or more")
     messages = messages_of(

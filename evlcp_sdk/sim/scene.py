@@ -343,7 +343,7 @@ def load_scene(
             )
         table = read_toml(path)
     if link is not None:
-        table["link"] = _Whole(link.table if isinstance(link, Link) else read_toml(link))
+        table["link"] = _Whole(link.table) if isinstance(link, Link) else _Whole.read(link)
     _read_links(table, folder, f"{where}: ")
     pairs = overrides.items() if isinstance(overrides, Mapping) else map(_parse_override, overrides)
     for key, value in pairs:
@@ -376,6 +376,10 @@ def resolve_scene(
     default = _give_links(table, folder, before)
     if default:
         _resolve_link(default, registry, f"{before}link")
+    bars = table.get("bars")
+    for i, bar in enumerate(bars if isinstance(bars, list) else []):
+        if isinstance(bar, dict) and isinstance(bar.get("link"), _Whole):
+            _resolve_link(bar["link"], registry, f"{before}bars.{i}.link")
     try:
         scene = build(Scene, table, hint=_hint)
     except SpecError as refused:
@@ -412,6 +416,8 @@ def _resolve_link(table: LinkTable, registry: Registry | None, where: str) -> Li
     try:
         return _resolved(json.dumps(table, default=str), registry)
     except ConfigError as refused:
+        if isinstance(table, _Whole) and table.file:
+            where = f"{where}: {table.file}"
         lines = (f"{where}: {line}" for line in str(refused).splitlines())
         raise ConfigError("\n".join(lines)) from refused
 
@@ -422,7 +428,15 @@ def _resolved(text: str, registry: Registry | None) -> Link:
 
 
 class _Whole(dict[str, Any]):
-    """A link from a file: it stands for itself and is not laid over another."""
+    """A link from a file: it stands for itself and is not laid over another; faults name its file."""
+
+    file = ""
+
+    @classmethod
+    def read(cls, path: Path | str) -> "_Whole":
+        whole = cls(read_toml(path))
+        whole.file = str(path)
+        return whole
 
 
 def _read_links(table: dict[str, Any], folder: Path | None, before: str) -> None:
@@ -432,7 +446,7 @@ def _read_links(table: dict[str, Any], folder: Path | None, before: str) -> None
         link = holder.get("link")
         if isinstance(link, str):
             try:
-                holder["link"] = _Whole(read_toml(link if folder is None else folder / link))
+                holder["link"] = _Whole.read(link if folder is None else folder / link)
             except ConfigError as fault:
                 raise ConfigError(f"{before}{where}: {fault}") from fault
         elif link is not None and not isinstance(link, Mapping):

@@ -177,6 +177,17 @@ def test_what_is_composed_is_sent_and_received() -> None:
     }
 
 
+def test_a_link_may_be_a_file(demo_raw: Path, tmp_path: Path) -> None:
+    file = tmp_path / "link.toml"
+    file.write_text("[ranging]\nid = 'centroid'\n[air]\nframes_per_packet = 10\n")
+    with evlcp.receive(demo_raw, file) as reception:
+        assert reception.link.digest == evlcp.load_link(file).digest
+    assert evlcp.receive_to_folder(demo_raw, tmp_path, str(file))["digest"] == evlcp.load_link(file).digest
+    assert evlcp.compose(file, text="a", sequence=1).tolist() == evlcp.compose(text="a", sequence=1).tolist()
+    with pytest.raises(evlcp.ConfigError, match=r"gone\.toml: cannot be read"):
+        evlcp.receive(demo_raw, "gone.toml")
+
+
 def test_compose_beacon_and_data_follow_one_another() -> None:
     site = evlcp.BarSite(9, 35.0, 137.0, 50.0, heading_deg=90.0)
     link = evlcp.load_link()

@@ -22,6 +22,7 @@ class Outer:
     inner: Inner = field(default_factory=Inner)
     rows: tuple[Inner, ...] = ()
     maybe: Inner | None = None
+    either: str | dict[str, Any] = ""
 
     def __post_init__(self) -> None:
         if self.count == 13:
@@ -62,6 +63,13 @@ def test_a_fault_is_one_line_with_path_value_and_what_was_expected(table: dict[s
     (line,) = caught.value.lines("f.toml: ")
     assert line.startswith(f"f.toml: {says}")
     assert caught.value.exit_code == 2
+
+
+def test_a_value_that_may_be_of_two_types_has_one_line() -> None:
+    assert build(Outer, {"count": 1, "either": {"a": 1}}).either == {"a": 1}
+    with pytest.raises(SpecError) as refused:
+        build(Outer, {"count": 1, "either": 3})
+    assert refused.value.lines() == ["either = 3: expected a valid string or a table"]
 
 
 def test_all_faults_are_told_at_once() -> None:

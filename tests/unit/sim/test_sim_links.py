@@ -145,6 +145,19 @@ def test_faults_of_links_are_told_with_their_path(table: dict[str, Any], says: s
     assert len(str(fault.value).splitlines()) == 1
 
 
+def test_a_fault_in_a_file_of_a_link_names_the_file(tmp_path: Path) -> None:
+    file, scene = tmp_path / "link.toml", tmp_path / "scene.toml"
+    file.write_text("[bar]\nnope = 1\n")
+    scene.write_text("[[bars]]\nlink = 'link.toml'\n")
+    for load, place in (
+        (lambda: load_scene(scene), f"{scene}: bars.0.link: {file}: bar.nope = 1: unknown key"),
+        (lambda: load_scene("night", link=file), f"preset night: link: {file}: bar.nope = 1: unknown key"),
+    ):
+        with pytest.raises(ConfigError) as refused:
+            load()
+        assert str(refused.value).startswith(place)
+
+
 def test_too_many_columns_are_told() -> None:
     wide = {"rows": 1, "columns": 65, "cluster_rows": 1}
     pilots = {"bar": wide | {"columns": 33}}
