@@ -1,13 +1,14 @@
 """`frames.parquet`: the rows of `frames.csv` with their types."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
+from evlcp_sdk.results.columns import FILTERED_COLUMNS, FRAME_COLUMNS, frame_value
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.frames_csv import FILTERED_COLUMNS, FRAME_COLUMNS, is_filtered
+from evlcp_sdk.results.frames_csv import is_filtered
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.results.text import number_or_none, symbol_list
-from evlcp_sdk.values import Frame, Packet
+from evlcp_sdk.values import Packet
 
 __all__ = ["FramesParquet"]
 
@@ -34,27 +35,10 @@ class FramesParquet(Sink):
     def packet(self, packet: Packet) -> None:
         """Keep the frames, and write a group when there are enough."""
         for frame in packet.frames:
-            self._waiting.append(dict(zip(self._columns, self._values(frame), strict=True)))
+            found = {name: frame_value(frame, name) for name in self._columns}
+            self._waiting.append({name: _given(value) for name, value in found.items()})
             if len(self._waiting) == self.GROUP:
                 self._flush()
-
-    def _values(self, frame: Frame) -> tuple[Any, ...]:
-        filtered = len(self._columns) > len(FRAME_COLUMNS)
-        distances = [frame.range, frame.filtered] if filtered else [frame.range]
-        found = [(None, None) if r is None else (r.distance_m, r.sigma_m) for r in distances]
-        numbers = [[None if v is None else number_or_none(v, 15) for v in pair] for pair in found]
-        return (
-            frame.transmitter,
-            frame.packet,
-            frame.frame,
-            frame.t_us,
-            symbol_list(frame.soft.symbols),
-            frame.soft.quality,
-            *numbers[0],
-            frame.x_px,
-            frame.y_px,
-            *(numbers[1] if filtered else ()),
-        )
 
     def _flush(self) -> None:
         self._writer.write_table(self._arrow.Table.from_pylist(self._waiting, schema=self._schema))
@@ -66,3 +50,8 @@ class FramesParquet(Sink):
             self._flush()
         self._writer.close()
         return {}
+
+
+def _given(value: Any) -> Any:
+    """A value as it is; None for NaN and infinity."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value

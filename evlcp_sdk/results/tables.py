@@ -5,9 +5,8 @@ from collections.abc import Iterable
 from typing import Any, Literal
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.results.frames_csv import FILTERED_COLUMNS, FRAME_COLUMNS
-from evlcp_sdk.results.text import symbol_list
-from evlcp_sdk.values import Frame, Packet, Range, arrow_table, pandas_frame
+from evlcp_sdk.results.columns import FILTERED_COLUMNS, FRAME_COLUMNS, frame_value
+from evlcp_sdk.values import Packet, arrow_table, pandas_frame
 
 __all__ = ["frames_table"]
 
@@ -31,32 +30,10 @@ def frames_table(packets: Iterable[Packet], kind: Literal["pandas", "arrow"] = "
     names: tuple[str, ...] = FRAME_COLUMNS
     if any(frame.filtered is not None for frame in frames):
         names += FILTERED_COLUMNS
-    columns = {name: [_value(frame, name) for frame in frames] for name in names}
+    columns = {name: [frame_value(frame, name) for frame in frames] for name in names}
     if kind == "pandas":
         return pandas_frame(columns)
     for name, values in columns.items():
         if values and isinstance(values[0], float):
             columns[name] = [v if math.isfinite(v) else None for v in values]
     return arrow_table(columns)
-
-
-def _value(frame: Frame, name: str) -> Any:
-    match name:
-        case "symbols":
-            return symbol_list(frame.soft.symbols)
-        case "quality":
-            return frame.soft.quality
-        case "distance_m":
-            return frame.range.distance_m
-        case "distance_sigma_m":
-            return frame.range.sigma_m
-        case "distance_filtered_m":
-            return _of(frame.filtered).distance_m
-        case "distance_filtered_sigma_m":
-            return _of(frame.filtered).sigma_m
-        case _:
-            return getattr(frame, name)
-
-
-def _of(range: Range | None) -> Range:
-    return Range(math.nan, math.nan, 0) if range is None else range

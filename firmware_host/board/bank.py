@@ -28,6 +28,9 @@ PREAMBLE_CHIPS = 32
 MOST_FRAMES = 65_535
 """Frames of a packet at most."""
 
+MOST_RANDOM_FRAMES = 1_000_000
+"""Random frames at most: minutes of light, far beyond any bank, and within memory."""
+
 MOST_CHIPS_A_SECOND = 1_000_000
 """Chips a second that no board takes more of; each says its own maximum, too."""
 

@@ -15,7 +15,7 @@ from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.specs import SpecError, build, read_toml, shown
-from firmware_host.board.bank import Bank, bank_of, check_link, random_symbols, read_masks
+from firmware_host.board.bank import MOST_RANDOM_FRAMES, Bank, bank_of, check_link, random_symbols, read_masks
 from firmware_host.board.board import Board, Programmed, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.board.symbols import read_symbols
@@ -25,10 +25,6 @@ from firmware_host.protocol.client import Timing
 from firmware_host.protocol.requests import DEFAULT_BAUD, Watchdog
 
 __all__ = ["Entry", "Inventory", "Result", "program_fleet", "raise_failures", "read_inventory"]
-
-
-_MOST_FRAMES = 1_000_000
-"""Random frames of a board at most; far beyond any bank, and within memory."""
 
 
 @dataclass(frozen=True)
@@ -209,9 +205,9 @@ def _bank(path: Path, index: int, entry: Entry, links: _Links) -> Bank:
         if entry.payload is not None:
             return read_masks(path.parent / entry.payload, link.codebook, link.packet)
         packets, frames = entry.random or 0, link.packet.frames
-        if packets * frames > _MOST_FRAMES:
+        if packets * frames > MOST_RANDOM_FRAMES:
             raise ConfigError(
-                f"random = {packets}: {packets * frames} frames, expected at most {_MOST_FRAMES}"
+                f"random = {packets}: {packets * frames} frames, expected at most {MOST_RANDOM_FRAMES}"
             )
         generator = np.random.default_rng(entry.seed)
         return bank_of(random_symbols(packets, frames, link.codebook, generator), link)

@@ -25,9 +25,6 @@ RandomPackets = Annotated[
 ]
 Seed = Annotated[int, typer.Option(help="Seed of --random.", min=0)]
 
-MOST = 1_000_000
-"""Random frames at most: minutes of light at 10 000 chips/s, far beyond any bank, and within memory."""
-
 
 def _given(link_file: str | None, overrides: list[str] | None) -> "Link | None":
     """The link that -c and --set name; None if neither is given."""
@@ -63,14 +60,14 @@ def symbols(
         return read_symbols(path, link)
     import numpy as np
 
-    from firmware_host.board.bank import random_symbols
+    from firmware_host.board.bank import MOST_RANDOM_FRAMES, random_symbols
 
     link = link or _default()
     frames = link.packet.frames
-    if random is None or not (random >= 1 and random * frames <= MOST):
+    if random is None or not (random >= 1 and random * frames <= MOST_RANDOM_FRAMES):
         raise ConfigError(
             f"--random {random}, air.frames_per_packet = {frames}: expected at least 1 packet,"
-            f" at most {MOST} frames in all"
+            f" at most {MOST_RANDOM_FRAMES} frames in all"
         )
     return random_symbols(random, frames, link.codebook, np.random.default_rng(seed)), link
 

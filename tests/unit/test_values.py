@@ -13,7 +13,7 @@ import evlcp_sdk as evlcp
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.air.kinds import BeaconKind, DataKind, TextKind
-from evlcp_sdk.results.frames_csv import FILTERED_COLUMNS, FRAME_COLUMNS
+from evlcp_sdk.results.columns import FILTERED_COLUMNS, FRAME_COLUMNS
 from evlcp_sdk.values import (
     Events,
     Fix,

@@ -22,7 +22,7 @@ from evlcp_sdk.air.kinds import BUILT_IN_KINDS
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
-from evlcp_sdk.results.frames_csv import FRAME_COLUMNS
+from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.tallies import TransmitterTally
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.bar import BarLayout
