@@ -37,8 +37,12 @@ def table_of(registry: "Registry") -> dict[str, list[dict[str, Any]]]:
     """What is installed, as `--json` prints it: roles, algorithms, broken plugins."""
     from collections import Counter
 
+    from evlcp_sdk.plugin.records import installed_sinks, message_kinds
     from evlcp_sdk.plugin.roles import ROLES
 
+    # Asked for what else they bring, more of them may turn out to be broken.
+    installed_sinks(registry)
+    message_kinds(registry)
     entries = registry.installed()
     count = Counter((e.algorithm.role, e.algorithm.id) for e in entries)
     return {

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from evlcp_sdk.cli.plugins import table_of
 from evlcp_sdk.errors import ConfigError, PluginError, PluginWarning
 from evlcp_sdk.plugin.hooks import SinkRecord, hookimpl
 from evlcp_sdk.plugin.records import installed_sinks
@@ -147,6 +148,8 @@ def test_a_format_that_clashes_is_left_out(plugin: Any, told: str, demo_raw: Pat
         sinks = installed_sinks(registry)
     assert sinks.keys() == installed_sinks(Registry.load()).keys()
     assert {sink.distribution for sink in sinks.values()} == {"evlcp-sdk"}
+    (broken,) = registry.broken
+    assert [row["reason"] for row in table_of(registry)["broken"]] == [broken.reason]
     # The run goes on without it.
     assert receive_to_folder(demo_raw, tmp_path, registry=registry)["status"] == "complete"
 
@@ -160,6 +163,13 @@ class Watching(Sink):
     @hookimpl
     def evlcp_stage_finished(self, stage: str) -> None:
         raise KeyError(stage)
+
+
+def test_the_list_of_plugins_asks_for_formats() -> None:
+    registry = Registry.load(bring("frames", "a:B"))
+    with pytest.warns(PluginWarning, match="has one of this name"):
+        rows = table_of(registry)["broken"]
+    assert [row["reason"] for row in rows] == ["sink 'frames': evlcp-sdk has one of this name"]
 
 
 def test_the_command_line_asks_for_formats(evlcp: Any, demo_raw: Path, tmp_path: Path) -> None:
