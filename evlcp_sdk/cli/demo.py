@@ -1,16 +1,19 @@
 """`evlcp demo`."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from evlcp_sdk.cli._common import Json, Workers, console
+from evlcp_sdk.plugin.hooks import hookimpl
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from evlcp_sdk.study.campaign.summary import Summary
+    from evlcp_sdk.values import Frame
 
 __all__ = ["demo", "demo_campaign", "demo_files", "register"]
 
@@ -147,31 +150,45 @@ def show_drive(summary: "Summary") -> None:
     console().print(table)
 
 
+class _Frames:
+    """Keeps the frames as the receiver announces them."""
+
+    def __init__(self) -> None:
+        self.found: list[Frame] = []
+
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str, value: object) -> None:
+        from evlcp_sdk.values import Frame
+
+        if stage == "frame" and isinstance(value, Frame):
+            self.found.append(value)
+
+
 def _decode_recording(out: Path, as_json: bool) -> None:
     import json
 
     from evlcp_sdk.cli._summary import show
-    from evlcp_sdk.files import read_csv
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import receive_to_folder
     from evlcp_sdk.sim.truth import read_truth
-    from evlcp_sdk.study.frames import read_frames
+    from evlcp_sdk.study.frames import given
     from evlcp_sdk.study.score import score_frames
 
     recording, truth_file = demo_files()
-    link = load_link(None, (), Registry.load())
+    frames = _Frames()
+    registry = Registry.load(frames)
+    link = load_link(None, (), registry)
     if not as_json:
         console().print(
             f"decoding {recording.name} (the first run also compiles the kernels) ...", style="dim"
         )
-    summary = receive_to_folder(recording, out, link, sinks=["figures"])
-    _, rows = read_csv(out / "frames.csv")
-    found = score_frames(read_frames(out), read_truth(truth_file))
+    summary = receive_to_folder(recording, out, link, registry=registry, sinks=["figures"])
+    found = score_frames([given(frame) for frame in frames.found], read_truth(truth_file))
     if as_json:
         typer.echo(json.dumps(summary | {"score": found}))
         return
-    _show_frames([row for _, row in rows])
+    _show_frames(frames.found)
     # Most of so short a run is the loading of kernels: its speed says nothing.
     show(summary, out, speed=False)
     _show_score(found)
@@ -187,7 +204,7 @@ def _show_score(found: "Mapping[str, Any]") -> None:
     )
 
 
-def _show_frames(rows: "Sequence[Mapping[str, str]]") -> None:
+def _show_frames(frames: "Sequence[Frame]") -> None:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="dim")
@@ -199,12 +216,13 @@ def _show_frames(rows: "Sequence[Mapping[str, str]]") -> None:
     )
     for name, side in columns:
         table.add_column(name, justify=side, no_wrap=True)
-    for row in rows:
-        sigma = f"{float(row['distance_sigma_m']):.2f}" if row["distance_sigma_m"] else "?"
+    for frame in frames:
+        distance_m, sigma_m = frame.range.distance_m, frame.range.sigma_m
+        sigma = f"{sigma_m:.2f}" if math.isfinite(sigma_m) else "?"
         table.add_row(
-            f"{row['packet']}/{row['frame']}",
-            f"{float(row['t_us']) / 1e3:.1f}",
-            " ".join(f"{int(s):2}" for s in row["symbols"].split()),
-            f"{float(row['distance_m']):.2f} ± {sigma}" if row["distance_m"] else "-",
+            f"{frame.packet}/{frame.frame}",
+            f"{frame.t_us / 1e3:.1f}",
+            " ".join(f"{s:2}" for s in frame.soft.symbols.tolist()),
+            f"{distance_m:.2f} ± {sigma}" if math.isfinite(distance_m) else "-",
         )
     console().print(table)
