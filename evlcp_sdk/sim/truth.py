@@ -350,6 +350,10 @@ class _Reader:
             if not isinstance(digest, str) or digest not in links:
                 raise self._fault(f"{where}.link", digest, "the digest of one of the links")
             return links[digest]
+        if links:
+            raise InputError(
+                f"{self._source}: {where}.link: missing; expected the digest of one of the links"
+            )
         return self._resolved(link_table_of(row, self._source, where), where)
 
     def _symbols(self, row: Mapping[str, Any], where: str, link: Link) -> NDArray[np.int64]:

@@ -135,6 +135,7 @@ def test_files_of_another_generator_are_read(path: Path) -> None:
         ("bars.0.symbols.1.2.3", 64, "bars.0.symbols.1.2.3 = 64: expected 0 to 63"),
         ("bars.0.symbols.1.2.3", 0.5, "expected packets of 10 frames of 16 symbols, 0 to 63"),
         ("bars.0.link", "abc", "bars.0.link = 'abc': expected the digest of one of the links"),
+        ("bars.0.link", None, "bars.0.link: missing; expected the digest of one of the links"),
         ("bars.0.pole_s", [[1.0]], "bars.0.pole_s = [[1.0]]: expected a list of lists of 2 numbers"),
         ("bars.0.covered", ["all"], "bars.0.covered = [['all']]: expected"),
         ("links", 3, "links = 3: expected a table"),
