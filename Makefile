@@ -16,7 +16,7 @@ demo: $(VENV)/.installed  ## Simulate four stretches of a drive, receive them, c
 	$(BIN)/evlcp demo
 
 test: $(VENV)/.dev lint toolchain  ## Format, lint, types, then every test
-	$(BIN)/pytest -q -n auto
+	$(BIN)/pytest -q -n auto --dist worksteal
 
 lint: $(VENV)/.dev  ## Format, lint and types only
 	$(BIN)/ruff format --check
