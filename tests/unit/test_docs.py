@@ -17,7 +17,7 @@ from pydantic.fields import FieldInfo
 
 import evlcp_sdk
 from evlcp_sdk.air.signing import make_key
-from evlcp_sdk.link.resolve import resolve
+from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.plugin import hooks as hookspecs
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
@@ -113,6 +113,15 @@ def test_toml_examples_are_links_or_scenes(path: Path, tmp_path: Path) -> None:
             resolve_scene(table, folder=tmp_path)
         elif "project" not in table:
             resolve(table)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [ROOT / "examples" / "link.toml", *sorted((ROOT / "examples" / "links").glob("*.toml"))],
+    ids=lambda p: p.stem,
+)
+def test_links_of_the_examples_are_links(path: Path) -> None:
+    load_link(path)
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)

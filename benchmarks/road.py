@@ -1,0 +1,503 @@
+"""What the receiver finds on a road, beside the figures to reach, and what its parts cost: one table each.
+
+    python benchmarks/road.py [RECORDING or FOLDER ...] [--only NAME ...] [--link LINK.toml]
+        [--set TABLE.KEY=VALUE] [--against LINK.toml or NAME:TABLE.KEY=VALUE,...]
+        [--rounds 3] [--tiled 20000000] [--json]
+
+Without names, all recordings of `../shared/recordings/road` and one folder up. Each has its truth beside it,
+and is received by what `evlcp receive` calls, in this process and on one thread, with the modulation that it
+was sent with; its `frames.csv` is counted as the road score of `evlcp score` counts. Where the scorer that is
+not this project's is at hand, `tools/score_road.py` above the recordings, the table says whether it agrees.
+Figures to reach are in `benchmarks/road.toml`, by the recording's name.
+
+`--against` puts another link beside the first one, from a file or as settings; it may be repeated.
+
+Speed is processor time, kernels warm, the best of the rounds (0 leaves it out): recorded time and events over
+it, and its parts in milliseconds a recorded second. Then one recording is tiled in time to `--tiled` events
+(0 leaves it out). Speed is printed, and is never a miss. The exit code is 1 where a figure is missed.
+"""
+
+import argparse
+import json
+import math
+import os
+import runpy
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial, wraps
+from pathlib import Path
+from typing import Any
+
+from evt3_decode import tile
+
+from evlcp_sdk.errors import EvlcpError
+from evlcp_sdk.io import read_events
+from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.run import receive_to_folder
+from evlcp_sdk.rx.detection import RegionFollower
+from evlcp_sdk.rx.look import Looker
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.rx.steps import Steps
+from evlcp_sdk.sim import Truth, read_truth, truth_path
+from evlcp_sdk.study.compare.variants import load_variants
+from evlcp_sdk.study.frames import read_frames
+from evlcp_sdk.study.score import Score
+from evlcp_sdk.study.tally import Statistics, Tally
+
+SHARED = Path(__file__).parents[2] / "shared" / "recordings"
+TARGETS = Path(__file__).with_suffix(".toml")
+
+PARTS: Mapping[str, tuple[tuple[type, str], ...]] = {
+    "regions": ((RegionFollower, "step"),),
+    "synchronization": ((Steps, "synchronize"),),
+    "image": ((Looker, "look"),),
+    "separation": ((Steps, "separate"),),
+    "decoding": ((Steps, "decode"),),
+    "ranging": ((Steps, "measure"),),
+    "rest of the receiver": ((Receiver, "feed"), (Receiver, "close")),
+}
+"""The calls whose own time, without others inside, is a part; the rest is reading and writing files."""
+
+Make = Callable[[str], Link]
+"""A link for recordings of a modulation."""
+
+Plain = dict[str, Any]
+
+
+class Clock:
+    """Processor time of each part, s, without that of other parts inside it."""
+
+    def __init__(self) -> None:
+        self.spent_s = dict.fromkeys([*PARTS, "files"], 0.0)
+        self._open = ["files"]
+        self._since_s = time.process_time()
+
+    def _turn(self) -> None:
+        now_s = time.process_time()
+        self.spent_s[self._open[-1]] += now_s - self._since_s
+        self._since_s = now_s
+
+    def timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        """The same call, its time counted."""
+
+        @wraps(call)
+        def run(*args: Any, **kwargs: Any) -> Any:
+            self._turn()
+            self._open.append(part)
+            try:
+                return call(*args, **kwargs)
+            finally:
+                self._turn()
+                self._open.pop()
+
+        return run
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Count while inside."""
+        with ExitStack() as undo:
+            for part, calls in PARTS.items():
+                for owner, name in calls:
+                    call = getattr(owner, name)
+                    undo.callback(setattr, owner, name, call)
+                    setattr(owner, name, self.timed(part, call))
+            self._since_s = time.process_time()
+            yield
+            self._turn()
+
+
+def targets_of(table: Mapping[str, Any], name: str, bar: int) -> Plain:
+    """What one bar of a recording is held against."""
+    values = {**table["every"], **table.get(name, {})}
+    return {
+        key: value[min(bar, len(value) - 1)] if isinstance(value, list) and key != "nees" else value
+        for key, value in values.items()
+    }
+
+
+def missed(tally: Tally | None, ghosts: int, targets: Mapping[str, Any]) -> list[str]:
+    """Names of the figures that do not reach what they are held against; a figure that is not there does not.
+
+    Args:
+        tally: What was counted of one bar; None for a recording without one.
+        ghosts: Rows of the recording that match no true frame.
+        targets: What `targets_of` gave.
+    """
+    found = ["ghosts"] if ghosts > targets["ghosts"] else []
+    if tally is None:
+        return found
+
+    def over(name: str, value: float, key: str) -> None:
+        if key in targets and not value <= targets[key]:
+            found.append(name)
+
+    if "found" in targets and tally.frames_found < targets["found"] * tally.frames_sent:
+        found.append("frames")
+    over("BER", tally.ber, "ber")
+    if tally.hidden:
+        over("claimed", tally.claimed_share, "claimed")
+    over("RMSE", tally.rmse_m, "rmse_m")
+    over("worst", tally.worst_m, "worst_m")
+    if tally.filtered:
+        over("filtered", tally.filtered_rmse_m, "rmse_m")
+    low, high = targets["nees"]
+    if tally.ranged and not low <= tally.nees <= high:
+        found.append("NEES")
+    return found
+
+
+def independent(tool: Path, folder: Path, truth: Path) -> Plain | None:
+    """What the scorer that is not this project's says; None where it is not there."""
+    if not tool.is_file():
+        return None
+    result: Plain = runpy.run_path(str(tool))["score"](folder, truth)
+    return result
+
+
+def speed(path: Path, folder: Path, link: Link, rounds: int) -> Plain:
+    """Processor time of a recording and of its parts, the round with the least of them."""
+    best: Plain = {}
+    for _ in range(rounds):
+        clock = Clock()
+        with clock.running():
+            recording = receive_to_folder(path, folder, link)["recording"]
+        total_s = sum(clock.spent_s.values())
+        if not best or total_s < best["processor_s"]:
+            recorded_s, events = recording["duration_s"], recording["counts"]["events"]
+            best = {
+                "processor_s": total_s,
+                "recorded_s": recorded_s,
+                "events": events,
+                "real_time": recorded_s / total_s,
+                "mev_s": events / total_s / 1e6,
+                "parts_ms_per_s": {part: s / recorded_s * 1e3 for part, s in clock.spent_s.items()},
+            }
+    return best
+
+
+def measured(path: Path, make: Make, table: Mapping[str, Any], tool: Path, rounds: int) -> Plain:
+    """Everything about a recording and a link; `fault` is in it where it cannot be received."""
+    truth: Truth = read_truth(truth_path(path))
+    lit = [bar for bar in truth.bars if bar.sends_frames]
+    profile = (lit[0] if lit else truth.bars[0]).link.table["modulation"]["id"] if truth.bars else "wh4x2"
+    name = path.name.split(".")[0]
+    result: Plain = {"recording": name, "bars": [], "ghosts": 0, "echoes": 0, "rows": 0}
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
+        try:
+            summary = receive_to_folder(path, out, make(profile))
+            if summary["status"] != "complete":
+                raise EvlcpError(str(summary["error"]))
+            score = Score.of(read_frames(out), truth, road=True)
+        except Exception as fault:  # whatever ends one recording must not end the table
+            return result | {"fault": f"{type(fault).__name__}: {fault}".splitlines()[0]}
+        other = independent(tool, out, truth_path(path))
+        result |= {
+            "rows": score.rows,
+            "ghosts": score.unmatched,
+            "echoes": score.echoes,
+            "independent": "absent" if other is None else "agrees" if other == score.to_road() else "differs",
+        }
+        for number, bar in enumerate(score.bars):
+            targets = targets_of(table, name, number)
+            result["bars"].append(
+                {
+                    "statistics": bar,
+                    "targets": targets,
+                    "missed": missed(bar.total(), score.unmatched if number == 0 else 0, targets),
+                }
+            )
+        if not score.bars:
+            targets = targets_of(table, name, 0)
+            result["bars"].append(
+                {"statistics": None, "targets": targets, "missed": missed(None, score.unmatched, targets)}
+            )
+        if rounds:
+            result["speed"] = speed(path, out, make(profile), rounds)
+    return result
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A figure, `-` for none; never as a power of ten."""
+    if math.isnan(value):
+        return "-"
+    return "0" if value == 0 else f"{value:.{digits}f}"
+
+
+def beside(value: float, limit: float | None, digits: int = 3) -> str:
+    """A figure and the limit that it is held against."""
+    said = number(value, digits)
+    if limit is None or math.isnan(value):
+        return said
+    return f"{said} {'<=' if value <= limit else '>'} {limit:g}"
+
+
+HEAD = [
+    *("link", "recording", "frames", "BER", "erased", "claimed", "ranged", "RMSE, m", "bias", "worst"),
+    *("filtered", "NEES", "ghosts", "echoes", "missed"),
+]
+
+
+def lines_of(result: Plain, link: str) -> list[list[str]]:
+    """The rows of a recording."""
+    if "fault" in result:
+        return [
+            [link, result["recording"], *["-"] * (len(HEAD) - 3), f"cannot be received: {result['fault']}"]
+        ]
+    rows = []
+    for i, bar in enumerate(result["bars"]):
+        tally = Tally() if bar["statistics"] is None else bar["statistics"].total()
+        targets = bar["targets"]
+        share = targets.get("found")
+        frames = f"{tally.frames_found}/{tally.frames_sent}"
+        if share is not None and tally.frames_sent:
+            frames += f" {'>=' if 'frames' not in bar['missed'] else '<'} {share:.0%}"
+        low, high = targets["nees"]
+        nees = number(tally.nees, 2)
+        if tally.ranged:
+            nees += "" if "NEES" not in bar["missed"] else f" not {low:g}..{high:g}"
+        word = ", ".join(bar["missed"]) or "none"
+        if result["independent"] == "differs":
+            word += "; the independent scorer differs"
+        rows.append(
+            [
+                link,
+                result["recording"] if i == 0 else "  bar " + str(i),
+                frames,
+                beside(tally.ber, targets.get("ber"), 5),
+                number(tally.erased_share),
+                beside(tally.claimed_share, targets.get("claimed") if tally.hidden else None),
+                str(tally.ranged),
+                beside(tally.rmse_m, targets.get("rmse_m"), 4),
+                number(tally.bias_m),
+                beside(tally.worst_m, targets.get("worst_m")),
+                number(tally.filtered_rmse_m),
+                nees,
+                str(result["ghosts"]) if i == 0 else "",
+                str(result["echoes"]) if i == 0 else "",
+                word,
+            ]
+        )
+    return rows
+
+
+def total_of(results: Sequence[Plain], link: str) -> list[str]:
+    """The row of all recordings together."""
+    bars = [bar for result in results for bar in result["bars"]]
+    seen = [bar["statistics"] for bar in bars if bar["statistics"] is not None]
+    tally = sum(seen, Statistics()).total()
+    lines = len(bars) + sum("fault" in result for result in results)
+    misses = lines - sum(not bar["missed"] for bar in bars)
+    return [
+        link,
+        f"all {lines}",
+        f"{tally.frames_found}/{tally.frames_sent}",
+        number(tally.ber, 5),
+        number(tally.erased_share),
+        number(tally.claimed_share),
+        str(tally.ranged),
+        number(tally.rmse_m),
+        number(tally.bias_m),
+        number(tally.worst_m),
+        number(tally.filtered_rmse_m),
+        number(tally.nees, 2),
+        str(sum(result["ghosts"] for result in results)),
+        str(sum(result["echoes"] for result in results)),
+        f"{misses} of {lines} lines miss a figure",
+    ]
+
+
+def show(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table, without the columns that have nothing to say."""
+    kept = [j for j in range(len(head)) if any(row[j] not in ("", "-") for row in rows)]
+    widths = [max(len(line[j]) for line in [head, *rows]) for j in kept]
+    for line in [head, *rows]:
+        print("  ".join(line[j].ljust(w) for j, w in zip(kept, widths, strict=True)).rstrip())
+
+
+SPEED_HEAD = [
+    "link",
+    "recording",
+    "Mev",
+    "x real time",
+    "Mev/s",
+    *[f"{part}, ms/s" for part in [*PARTS, "files"]],
+]
+
+
+def speed_line(name: str, link: str, found: Plain, real_time: float | None, mev_s: float | None) -> list[str]:
+    def least(value: float, limit: float | None, digits: int) -> str:
+        said = f"{value:.{digits}f}"
+        return said if limit is None else f"{said} {'>=' if value >= limit else '<'} {limit:g}"
+
+    return [
+        link,
+        name,
+        f"{found['events'] / 1e6:.2f}",
+        least(found["real_time"], real_time, 2),
+        least(found["mev_s"], mev_s, 1),
+        *(f"{ms:.0f}" for ms in found["parts_ms_per_s"].values()),
+    ]
+
+
+def links_of(args: argparse.Namespace) -> dict[str, Make]:
+    """Links by name; all faults are told at once, before anything is received."""
+
+    def with_file(file: Path | None, sets: Sequence[str], profile: str) -> Link:
+        return load_link(file, [f"modulation.id={profile}", *sets])
+
+    def with_settings(text: str, profile: str) -> Link:
+        return load_variants([text], args.link, [f"modulation.id={profile}", *args.set])[0].link
+
+    links: dict[str, Make] = {
+        args.link.stem if args.link else "link" if args.set else "default": partial(
+            with_file, args.link, args.set
+        )
+    }
+    for text in args.against:
+        from_file = text.endswith(".toml")
+        name = Path(text).stem if from_file else text.partition(":")[0]
+        make: Make = partial(with_file, Path(text), []) if from_file else partial(with_settings, text)
+        if name in links:
+            sys.exit(f"--against {text}: the name '{name}' is taken by another link")
+        links[name] = make
+    for make in links.values():
+        make("wh4x2")
+    return links
+
+
+def recordings_of(args: argparse.Namespace) -> list[Path]:
+    """The recordings that were named, of which each has its truth beside it."""
+    if args.recordings:
+        named = args.recordings
+    elif SHARED.is_dir():
+        named = [SHARED / "road", SHARED]
+    else:
+        sys.exit("no recording is named, and ../shared/recordings is not there: name some that have truth")
+    found: list[Path] = []
+    for path in named:
+        if not path.exists():
+            sys.exit(f"{path}: no such file or folder")
+        found += sorted(path.glob("*.raw")) if path.is_dir() else [path]
+    found = [p for p in found if not args.only or any(word in p.name for word in args.only)]
+    lone = [str(p) for p in found if not truth_path(p).is_file()]
+    if lone or not found:
+        sys.exit(f"without a truth beside it: {', '.join(lone)}" if lone else "no recording with these names")
+    return found
+
+
+FIGURES = (
+    *(
+        "frames_sent",
+        "frames_found",
+        "bits",
+        "bit_errors",
+        "visible",
+        "erased",
+        "hidden",
+        "claimed",
+        "ranged",
+    ),
+    *("ber", "erased_share", "claimed_share", "rmse_m", "bias_m", "worst_m", "filtered_rmse_m", "nees"),
+)
+"""Of a tally, what JSON gets."""
+
+
+def plain(results: Mapping[str, Sequence[Plain]], tiled: Mapping[str, Plain]) -> Plain:
+    """Everything as JSON values; null where nothing was measured."""
+
+    def bar_of(bar: Plain) -> Plain:
+        tally = None if bar["statistics"] is None else bar["statistics"].total()
+        values = {} if tally is None else {name: getattr(tally, name) for name in FIGURES}
+        values = {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()}
+        return values | {"targets": bar["targets"], "missed": bar["missed"]}
+
+    return {
+        link: {
+            "recordings": [one | {"bars": [bar_of(bar) for bar in one["bars"]]} for one in found],
+            **({"tiled": tiled[link]} if link in tiled else {}),
+        }
+        for link, found in results.items()
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("recordings", nargs="*", type=Path)
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME")
+    parser.add_argument("--link", type=Path)
+    parser.add_argument("--set", action="append", default=[], metavar="TABLE.KEY=VALUE")
+    parser.add_argument("--against", action="append", default=[], metavar="LINK")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--tiled", type=int, default=20_000_000)
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    if "OPENBLAS_NUM_THREADS" not in os.environ:
+        # The library reads it when it is loaded: begin anew.
+        os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | {"OPENBLAS_NUM_THREADS": "1"})
+    recordings = recordings_of(args)
+    try:
+        links = links_of(args)
+    except EvlcpError as fault:
+        sys.exit(str(fault))
+    table = tomllib.loads(TARGETS.read_text())
+    results: dict[str, list[Plain]] = {name: [] for name in links}
+    for path in recordings:
+        tool = next(
+            (p / "tools" / "score_road.py" for p in path.resolve().parents if (p / "tools").is_dir()), Path()
+        )
+        for name, make in links.items():
+            results[name].append(measured(path, make, table, tool, args.rounds))
+    tiled: dict[str, Plain] = {}
+    one = next((p for p in recordings if p.name.startswith(table["tiled"]["recording"])), None)
+    if args.rounds and args.tiled and one is not None:
+        with tempfile.TemporaryDirectory() as folder:
+            big = Path(folder) / one.name
+            tile(read_events(one), big, args.tiled)
+            for name, make in links.items():
+                tiled[name] = speed(big, Path(folder) / "out", make("wh4x2"), 1)
+    if args.json:
+        print(json.dumps(plain(results, tiled), indent=2))
+    else:
+        print_tables(results, tiled, table)
+    sys.exit(
+        any("fault" in one or any(b["missed"] for b in one["bars"]) for one in results[next(iter(links))])
+    )
+
+
+def print_tables(
+    results: Mapping[str, Sequence[Plain]], tiled: Mapping[str, Plain], table: Mapping[str, Any]
+) -> None:
+    """Print what was found, and then the speed."""
+    alone = len(results) == 1
+    names = {name: "" if alone else name for name in results}
+    rows = [
+        line
+        for found in zip(*results.values(), strict=True)
+        for name, one in zip(results, found, strict=True)
+        for line in lines_of(one, names[name])
+    ]
+    show(HEAD, [*rows, *(total_of(found, names[name]) for name, found in results.items())])
+    agreed = [one.get("independent") for found in results.values() for one in found]
+    if "absent" not in agreed:
+        print(f"The independent scorer says the same of {agreed.count('agrees')} of {len(agreed)}.")
+    rows = []
+    for found in zip(*results.values(), strict=True):
+        for name, one in zip(results, found, strict=True):
+            if "speed" in one:
+                least = table.get(one["recording"], {}).get("real_time")
+                rows.append(speed_line(one["recording"], names[name], one["speed"], least, None))
+    for name, one in tiled.items():
+        text = f"{table['tiled']['recording']}, tiled"
+        rows.append(speed_line(text, names[name], one, None, table["tiled"]["mev_s"]))
+    if rows:
+        print()
+        show(SPEED_HEAD, rows)
+
+
+if __name__ == "__main__":
+    main()
