@@ -54,13 +54,14 @@ def model(
     middle = (rows - 1) / 2
     for i in range(values):
         for v in range(rows):
-            value[i, v] = np.nan
-            slope[:, i, v] = 0.0
             at = v - middle - offset[i] - centre - drift * when[i]
             place = at / spacing + clusters / 2
             # The nearest boundary; the others are too far to be felt through the blur.
             b = int(np.floor(place + 0.5))
             if b < 1 or b > clusters - 1 or not (seen[b - 1] and seen[b]):
+                value[i, v] = np.nan
+                for a in range(4):
+                    slope[a, i, v] = 0.0
                 continue
             z = (at - spacing * (b - clusters / 2)) / blur
             step = float(codes[b, i] - codes[b - 1, i])
@@ -97,10 +98,16 @@ def step_of(
             size = abs(residual)
             weight = 1.0 if size <= huber else huber / size
             cost += residual * residual / 2 if size <= huber else huber * (size - huber / 2)
-            for a in range(4):
-                right[a] += weight * slope[a, i, v] * residual
-                for b in range(4):
-                    normal[a, b] += weight * slope[a, i, v] * slope[b, i, v]
+            # Away from boundaries, where most rows are, the value depends on the gain alone.
+            first = 0 if slope[1, i, v] != 0 else 3
+            for a in range(first, 4):
+                weighted = weight * slope[a, i, v]
+                right[a] += weighted * residual
+                for b in range(a, 4):
+                    normal[a, b] += weighted * slope[b, i, v]
+    for a in range(4):
+        for b in range(a):
+            normal[a, b] = normal[b, a]
     return cost
 
 
