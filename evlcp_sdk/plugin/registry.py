@@ -70,6 +70,7 @@ class Registry:
         self._manager = pluggy.PluginManager(ENTRY_POINT_GROUP)
         self._manager.add_hookspecs(hookspecs)
         self._owners: dict[str, Distribution | None] = {}
+        self._names: dict[int, tuple[str, str]] = {}
         self._broken: list[Broken] = []
         self._collected: dict[tuple[str, str], list[Installed]] | None = None
         for plugin in plugins:
@@ -216,7 +217,13 @@ class Registry:
     def owner(self, plugin: str) -> tuple[str, str]:
         """Name and version of the distribution that brought a plugin; of one without, its name and "-"."""
         found = self._owners.get(plugin)
-        return (plugin, "-") if found is None else (found.name, found.version)
+        return (plugin, "-") if found is None else self._told(found)
+
+    def _told(self, owner: Distribution) -> tuple[str, str]:
+        """Name and version of a distribution: each parses all its metadata, and one brings many plugins."""
+        if id(owner) not in self._names:
+            self._names[id(owner)] = owner.name, owner.version
+        return self._names[id(owner)]
 
     def _load(self, entry: EntryPoint) -> None:
         name = entry.name
@@ -252,7 +259,7 @@ class Registry:
 
     def _note(self, name: str, reason: str, algorithms: frozenset[tuple[str, str]]) -> None:
         owner = self._owners.get(name)
-        distribution = "" if owner is None else f"{owner.name} {owner.version}"
+        distribution = "" if owner is None else " ".join(self._told(owner))
         broken = Broken(name, distribution, reason, algorithms)
         self._broken.append(broken)
         # Not imported at start-up, as it takes long and is needed only here.
