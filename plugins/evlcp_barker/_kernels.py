@@ -62,3 +62,17 @@ def correlate(counts: Array, chips: Array, steps: int, min_events: int, rho: Arr
             rho[lag] = min(fit / seen, fit / np.sqrt(chips.size * power))
         top = max(top, rho[lag])
     return top
+
+
+@njit(cache=True, nogil=True)
+def mean_squares(rho: Array, power: float, known: int, memory: int, out: Array) -> tuple[float, int]:
+    """Mean square of the positive correlations up to each, of which `known` came before; the last two.
+
+    The newest `memory` of them weigh most. Infinite as long as less than half as many are known.
+    """
+    for lag in range(rho.size):
+        if rho[lag] > 0:
+            known = min(known + 1, memory)
+            power += (rho[lag] ** 2 - power) / known
+        out[lag] = power if 2 * known >= memory else np.inf
+    return power, known

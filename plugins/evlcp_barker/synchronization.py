@@ -1,7 +1,7 @@
 """Packet timing by sliding correlation with the preamble."""
 
+import math
 from dataclasses import dataclass, field, replace
-from statistics import fmean
 from typing import Annotated
 
 import numpy as np
@@ -22,21 +22,37 @@ one and two chips away."""
 _TIMING_SIGMA_US = 2.0
 """Spread of one packet's time, from the grid of the correlation and the jitter of the pixels."""
 
+_LATENCY_SIGMA_US = 0.5
+"""Change of the pixels' latency from packet to packet: it is 3.3 us W/m2 over the light, 20 us at 0.17 W/m2,
+and changes by as much where the light changes by 2.5 %, as when a bar comes nearer."""
+
+_CHANGED_SIGMAS = 3.0
+"""Beyond so many sigmas it is the latency that has changed (a wiper, a shadow), by what is measured: a clock
+cannot."""
+
+_WANDER_PPM = 0.1
+"""Change of a quartz's rate in a second, from its warming up."""
+
 _CLEARLY = 0.1
 """Difference in correlation that separates a preamble from data: from packet to packet it varies by 0.02."""
 
-_FIT_PACKETS = 8
-"""Packets of the clock fit: 0.3 s, in which a quartz does not drift by 0.1 us."""
+_QUALITY_PACKETS = 8
+"""Packets over which a lock's correlation is averaged."""
+
+_OUTSTANDS = 6.0
+"""A correlation so many times the rms of a packet's others is a preamble: random data reach 5 in 20 s."""
 
 
 @dataclass(frozen=True)
 class BarkerSync(Synchronization):
-    """Preamble correlation at sub-chip steps, then a clock fitted to the packets heard.
+    """Preamble correlation at sub-chip steps, then a Kalman filter of clock and latency.
 
     In a preamble all clusters blink in phase; in pilots they cancel, and in info segments they differ. So the
     signed events of a whole region, summed over windows of one chip, correlate with the preamble's chips
     there and nowhere else. Positive and negative events come with different delays, which are
-    measured apart at every packet.
+    measured apart at every packet. The clock's rate is all but constant and within a bound; latency
+    wanders with the light, and jumps where the light does. A measurement far from its prediction is a jump
+    of the latency and says nothing of the rate.
     """
 
     steps_per_chip: Annotated[int, Field(ge=4, le=100, description="Correlation steps in a chip.")] = 10
@@ -45,17 +61,23 @@ class BarkerSync(Synchronization):
         Field(
             gt=0,
             lt=1,
-            description="Normalised correlation that makes a preamble; random data on 16 clusters have"
-            " 0.07 rms, a preamble 0.7 or more.",
+            description="Normalised correlation that makes a preamble, which has 0.7 or more; half as much"
+            " where it stands out, 6 times the rms of a packet's others.",
         ),
     ] = 0.5
     min_events: Annotated[int, Field(ge=26, description="Events in a preamble that count as heard.")] = 100
     clock_tolerance_ppm: Annotated[
-        float, Field(gt=0, le=10_000, description="How far apart the two clocks may be.")
+        float, Field(gt=0, le=10_000, description="How far apart the two clocks may be: a bound.")
     ] = 100.0
     on_grid_chips: Annotated[
-        float, Field(gt=0, lt=1, description="How far from its expected time a preamble keeps the lock.")
-    ] = 0.3
+        float,
+        Field(
+            gt=0,
+            lt=1,
+            description="How far from its expected time a preamble keeps the lock; latency"
+            " grows by 0.5 behind a wiper.",
+        ),
+    ] = 0.6
 
     def compile(self, codebook: Codebook, packet: PacketFormat) -> "BarkerSynchronizer":
         """Precompute the correlation's weights."""
@@ -64,23 +86,68 @@ class BarkerSync(Synchronization):
 
 @dataclass(frozen=True)
 class _Heard:
-    """One preamble: its number since the first of this lock, and its times, us."""
+    """One preamble's times, us; `off_us` is NaN without negative events."""
 
-    packet: int
     on_us: float
     off_us: float
     onset_us: float
     quality: float
 
 
+@dataclass(frozen=True)
+class _Level:
+    """A value that wanders and jumps, and its variance."""
+
+    value: float
+    variance: float
+
+    def measured(self, value: float, walk: float, noise: float) -> "_Level":
+        """Take a measurement: Kalman's step; variances of the way since the last, and of the measurement."""
+        apart, spread = value - self.value, self.variance + walk + noise
+        # What is too far to have wandered has jumped: that much, then, was the way.
+        spread = max(spread, apart**2) if apart**2 > _CHANGED_SIGMAS**2 * spread else spread
+        gain = 1 - noise / spread
+        return _Level(self.value + gain * apart, gain * noise)
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """A lock: the newest preamble as filtered.
+
+    Attributes:
+        packet: Its number since the first of this lock.
+        heard: Preambles that it comes from.
+        on_us: Time of its positive events.
+        rate_us: How much longer than nominal a packet is.
+        variances: Of the time, of both together, of the rate.
+        apart: How much later negative events come.
+        onset: How much later the first positive events come.
+        quality: Mean correlation of the newest.
+    """
+
+    packet: int
+    heard: int
+    on_us: float
+    rate_us: float
+    variances: tuple[float, float, float]
+    apart: _Level
+    onset: _Level
+    quality: float
+
+
 @dataclass(frozen=True, eq=False)
 class SyncState:
-    """What synchronization remembers: recent event counts (OFF, ON) a step, and the preambles of its lock."""
+    """What synchronization remembers: recent event counts (OFF, ON) a step, its lock, and a preamble off it.
+
+    `power` and `known` are the mean square of the positive correlations lately, and their number.
+    """
 
     first_bin: int | None = None
     counts: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 0)))
     next_bin: int = 0
-    heard: tuple[_Heard, ...] = ()
+    power: float = 0.0
+    known: int = 0
+    clock: _Clock | None = None
     stray: _Heard | None = None
 
 
@@ -122,25 +189,33 @@ class BarkerSynchronizer:
         _kernels.count_bins(t_us, p, state.first_bin, self._bin_us, state.counts, counts)
 
         locks: list[SyncLock] = []
-        heard, stray = state.heard, state.stray
+        power, known, clock, stray = state.power, state.known, state.clock, state.stray
         lags = bins - span + 1
         lo = state.next_bin - state.first_bin
         if lags - guard > lo:
             rho = np.empty(lags)
             top = _kernels.correlate(counts[:, :bins], self._chips, n, self._spec.min_events, rho)
-            for lag in self._peaks(rho, lo, guard) if top >= self._spec.min_correlation else ():
-                found = self._refine(lag, counts, state.first_bin, float(rho[lag]))
-                heard, stray = self._accept(heard, stray, found)
-                if stray is None:
-                    locks.append(self._lock(heard))
+            enough = np.empty(lags - guard - lo)
+            # Half of a packet's correlations are positive.
+            memory = n * self._packet.packet_chips // 2
+            power, known = _kernels.mean_squares(rho[lo : lags - guard], power, known, memory, enough)
+            if 2 * top >= self._spec.min_correlation:
+                least = _OUTSTANDS * np.sqrt(enough)
+                least = np.clip(least, self._spec.min_correlation / 2, self._spec.min_correlation)
+                for lag in self._peaks(rho, lo, guard, least):
+                    found = self._refine(lag, counts, state.first_bin, float(rho[lag]))
+                    clock, stray = self._accept(clock, stray, found)
+                    if stray is None:
+                        assert clock is not None
+                        locks.append(self._lock(clock, found.quality))
             lo = lags - guard
         drop = max(lo - guard, 0)
         first = state.first_bin + drop
-        return SyncState(first, counts[:, drop:], state.first_bin + lo, heard, stray), locks
+        return SyncState(first, counts[:, drop:], state.first_bin + lo, power, known, clock, stray), locks
 
-    def _peaks(self, rho: NDArray[np.float64], lo: int, guard: int) -> list[int]:
-        """Lags from `lo` on that correlate best within `guard` on both sides; the first of equals."""
-        high = lo + np.flatnonzero(rho[lo : len(rho) - guard] >= self._spec.min_correlation)
+    def _peaks(self, rho: NDArray[np.float64], lo: int, guard: int, least: NDArray[np.float64]) -> list[int]:
+        """Lags from `lo` on that correlate enough, best within `guard` on both sides; the first of equals."""
+        high = lo + np.flatnonzero(rho[lo : len(rho) - guard] >= least)
         return [lag for lag in high.tolist() if lag == _first_maximum(rho, lag - guard, lag + guard + 1)]
 
     def _refine(self, lag: int, counts: NDArray[np.float64], first_bin: int, quality: float) -> _Heard:
@@ -154,14 +229,16 @@ class BarkerSynchronizer:
         def centre(count: NDArray[np.float64], sign: float) -> float:
             running = np.concatenate([[0.0], np.cumsum(count)])
             part = sign * (running[bounds] @ self._weights)
+            if part.max() <= 0:
+                return math.nan
             # The top is flat where a window holds all events of an edge: its middle is the best window.
-            weight = np.maximum(part - 0.9 * part.max(), 0) if part.max() > 0 else np.zeros(len(part))
-            if weight.sum() == 0:
-                return float(lag)
+            weight = np.maximum(part - 0.9 * part.max(), 0)
             return start + float(weight @ np.arange(len(part)) / weight.sum())
 
         off, on = counts
         middle_on, middle_off = centre(on, 1), centre(off, -1)
+        if math.isnan(middle_on):
+            middle_on = middle_off
         # The onset of the positive events, averaged over the rising edges inside the preamble.
         edges = lag + n * self._rising
         steps = np.arange(-n, n)
@@ -170,63 +247,103 @@ class BarkerSynchronizer:
         k = int(np.argmax(response >= half))
         below = response[k - 1] if k else 0.0
         rise = (half - below) / (response[k] - below) if response[k] > below else 0.0
-        onset = lag + float(steps[k]) - 0.5 + rise
+        onset = lag + float(steps[k] - 0.5 + rise)
         at = [(first_bin + v) * self._bin_us for v in (middle_on, middle_off, onset)]
-        return _Heard(0, at[0], at[1], at[2], quality)
+        return _Heard(at[0], at[1], at[2], quality)
 
     def _accept(
-        self, heard: tuple[_Heard, ...], stray: _Heard | None, found: _Heard
-    ) -> tuple[tuple[_Heard, ...], _Heard | None]:
+        self, clock: _Clock | None, stray: _Heard | None, found: _Heard
+    ) -> tuple[_Clock | None, _Heard | None]:
         """Add a preamble to the lock it fits; a better one, or a second one as good, off it starts anew.
 
         One symbol on all clusters at once blinks in phase, too, but can agree with 16 chips of 26 only.
         """
-        quality = float(np.mean([h.quality for h in heard])) if heard else 0.0
-        if found.quality > quality + _CLEARLY:
-            return (found,), None
-        steps = self._packets_between(heard, found)
-        if steps is not None:
-            return (*heard, replace(found, packet=heard[-1].packet + steps))[-_FIT_PACKETS:], None
-        if found.quality < quality - _CLEARLY:
-            return heard, stray
+        if clock is None:
+            return self._first(found), None
+        packets = self._packets_between(clock, found)
+        if packets is not None:
+            return self._next(clock, found, packets), None
+        if found.quality > clock.quality + _CLEARLY:
+            return self._first(found), None
+        if found.quality < clock.quality - _CLEARLY:
+            return clock, stray
         if stray is not None:
-            steps = self._packets_between((stray,), found)
-            if steps is not None:
-                return (stray, replace(found, packet=steps)), None
-        return heard, found
+            anew = self._first(stray)
+            packets = self._packets_between(anew, found)
+            if packets is not None:
+                return self._next(anew, found, packets), None
+        return clock, found
 
-    def _packets_between(self, heard: tuple[_Heard, ...], found: _Heard) -> int | None:
-        """Whole packets from the last of a lock to another preamble, None if it is off the grid."""
-        _, chip_us = self._fit(heard)
-        period = self._packet.packet_chips * chip_us
-        apart = found.on_us - heard[-1].on_us
-        steps = round(apart / period)
-        drift = self._spec.clock_tolerance_ppm * 1e-6 * abs(apart) / max(len(heard) - 1, 1)
-        off_grid = abs(apart - steps * period) - drift
-        return steps if steps > 0 and off_grid < self._spec.on_grid_chips * chip_us else None
+    def _most_us(self) -> float:
+        """How much longer or shorter than nominal a packet may be."""
+        return self._spec.clock_tolerance_ppm * 1e-6 * self._packet.packet_chips * self._packet.chip_us
 
-    def _fit(self, heard: tuple[_Heard, ...]) -> tuple[float, float]:
-        """(time of the last preamble, chip length), us: least squares with the nominal rate as prior."""
-        nominal = self._packet.chip_us
-        chips = [(h.packet - heard[-1].packet) * self._packet.packet_chips for h in heard]
-        late = [h.on_us - heard[-1].on_us - c * nominal for h, c in zip(heard, chips, strict=True)]
-        prior = _TIMING_SIGMA_US / (self._spec.clock_tolerance_ppm * 1e-6 * nominal)
-        mean_chips, mean_late = fmean(chips), fmean(late)
-        # The prior stands at chip 0 without lateness, whatever the grid: it bears on the slope alone.
-        power = sum((c - mean_chips) ** 2 for c in chips) + prior**2
-        slope = sum((c - mean_chips) * t for c, t in zip(chips, late, strict=True)) / power
-        return heard[-1].on_us + mean_late - slope * mean_chips, nominal + slope
+    def _first(self, found: _Heard) -> _Clock:
+        noise = _TIMING_SIGMA_US**2
+        apart = found.off_us - found.on_us
+        return _Clock(
+            packet=0,
+            heard=1,
+            on_us=found.on_us,
+            rate_us=0.0,
+            # The bound is two sigmas of what clocks have.
+            variances=(noise, 0.0, (self._most_us() / 2) ** 2),
+            apart=_Level(0.0, self._packet.chip_us**2) if math.isnan(apart) else _Level(apart, 2 * noise),
+            onset=_Level(found.onset_us - found.on_us, 2 * noise),
+            quality=found.quality,
+        )
 
-    def _lock(self, heard: tuple[_Heard, ...]) -> SyncLock:
-        grid_us, chip_us = self._fit(heard)
-        onset = float(np.mean([h.onset_us - h.on_us for h in heard]))
-        apart = float(np.mean([h.off_us - h.on_us for h in heard]))
+    def _ahead(self, clock: _Clock, packets: int) -> tuple[float, float, float, float]:
+        """Time of the preamble so many packets after the lock's, and the variances there (see `_Clock`)."""
+        time, both, rate = clock.variances
+        nominal_us = self._packet.packet_chips * self._packet.chip_us
+        rate += (_WANDER_PPM * 1e-6 * nominal_us) ** 2 * packets * nominal_us * 1e-6
+        time += 2 * packets * both + packets**2 * rate + packets * _LATENCY_SIGMA_US**2
+        return clock.on_us + packets * (nominal_us + clock.rate_us), time, both + packets * rate, rate
+
+    def _packets_between(self, clock: _Clock, found: _Heard) -> int | None:
+        """Whole packets from a lock's newest preamble to another, None if it is off the grid."""
+        apart = found.on_us - clock.on_us
+        packets = round(apart / (self._packet.packet_chips * self._packet.chip_us + clock.rate_us))
+        if packets <= 0:
+            return None
+        expected, variance, _, _ = self._ahead(clock, packets)
+        off_grid = abs(found.on_us - expected) - min(2 * math.sqrt(variance), packets * self._most_us())
+        return packets if off_grid < self._spec.on_grid_chips * self._packet.chip_us else None
+
+    def _next(self, clock: _Clock, found: _Heard, packets: int) -> _Clock:
+        """The lock with a preamble more."""
+        noise = _TIMING_SIGMA_US**2
+        expected, time, both, rate = self._ahead(clock, packets)
+        late = found.on_us - expected
+        if late**2 > _CHANGED_SIGMAS**2 * (time + noise):
+            # The latency's jump adds to the time's variance alone, so that hardly any of it goes to the rate.
+            time = late**2 - noise
+        spread = time + noise
+        most_us = self._most_us()
+        rate_us = min(max(clock.rate_us + both / spread * late, -most_us), most_us)
+        walk = packets * _LATENCY_SIGMA_US**2
+        apart = found.off_us - found.on_us
+        heard = min(clock.heard + 1, _QUALITY_PACKETS)
+        return _Clock(
+            packet=clock.packet + packets,
+            heard=heard,
+            on_us=expected + time / spread * late,
+            rate_us=rate_us,
+            variances=(time * noise / spread, both * noise / spread, rate - both**2 / spread),
+            apart=clock.apart if math.isnan(apart) else clock.apart.measured(apart, walk, 2 * noise),
+            onset=clock.onset.measured(found.onset_us - found.on_us, walk, 2 * noise),
+            quality=clock.quality + (found.quality - clock.quality) / heard,
+        )
+
+    def _lock(self, clock: _Clock, quality: float) -> SyncLock:
+        onset = clock.onset.value
         return SyncLock(
-            packet_t_us=grid_us + onset,
-            chip_us=chip_us,
+            packet_t_us=clock.on_us + onset,
+            chip_us=self._packet.chip_us + clock.rate_us / self._packet.packet_chips,
             delay_on_us=-onset,
-            delay_off_us=apart - onset,
-            quality=heard[-1].quality,
+            delay_off_us=clock.apart.value - onset,
+            quality=quality,
         )
 
 

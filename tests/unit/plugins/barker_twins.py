@@ -27,6 +27,18 @@ def correlate(counts, chips, steps, min_events, lags):
     return rho
 
 
+def mean_squares(rho, memory):
+    """Mean square of the positive values up to each, as a moving average that starts as a plain one."""
+    out, power, known = [], 0.0, 0
+    for value in rho:
+        if value > 0:
+            known += 1
+            weight = max(1 / known, 1 / memory)
+            power = (1 - weight) * power + weight * value**2
+        out.append(power if known >= memory / 2 else np.inf)
+    return np.array(out)
+
+
 def events_of(
     chips, rng, start_us=5000.0, ppm=0.0, delay_us=(20.0, 45.0), missing_off=0.0, per_edge=2, jitter_us=4.0
 ):

@@ -115,6 +115,20 @@ def test_correlation(seed, steps, min_events):
     assert abs(int(rho.argmax()) - at) <= 1
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_mean_square_of_the_positive(seed):
+    rng = np.random.default_rng(seed)
+    rho = np.maximum(rng.normal(0, 0.1, 300), 0)
+    out, parts = np.empty(300), np.empty(300)
+    power, known = _kernels.mean_squares(rho, 0.0, 0, 100, out)
+    want = twins.mean_squares(rho, 100)
+    assert_allclose(out, want, rtol=1e-12)
+    assert (power, known) == (out[-1], 100)
+    middle = _kernels.mean_squares(rho[:77], 0.0, 0, 100, parts[:77])
+    assert _kernels.mean_squares(rho[77:], *middle, 100, parts[77:]) == (power, known)
+    assert_array_equal(parts, out)
+
+
 # Timing
 
 
@@ -194,7 +208,7 @@ def test_a_lock_does_not_wait_for_the_next_packet():
 
 def told(state):
     """All that a state holds, as plain values."""
-    return state.first_bin, state.counts.tolist(), state.next_bin, state.heard, state.stray
+    return tuple(v.tolist() if isinstance(v, np.ndarray) else v for v in vars(state).values())
 
 
 def test_the_state_passed_in_is_not_changed():
@@ -211,13 +225,13 @@ def test_the_state_passed_in_is_not_changed():
         assert told(state) == before
         assert (told(after), locks) == (told(again), locks_again)
         state = after
-    assert len(state.heard) == 4
+    assert state.clock.packet == 3
 
 
 def test_memory_does_not_grow():
     rng = np.random.default_rng(0)
     _, state = locks_of(*twins.events_of(packets_of(rng, 12), rng, START_US))
-    assert len(state.heard) == 8
+    assert (state.clock.packet, state.clock.heard) == (11, 8)
     # A preamble, a guard on both sides, and a time step.
     assert state.counts.shape[1] < 10 * (26 + 2 * 3 + 10) + 10
 
@@ -283,7 +297,7 @@ def test_the_lock_is_kept_across_missing_preambles():
     hidden = (number > 4.9) & (number < 9.5)
     locks, state = locks_of(t[~hidden], p[~hidden])
     assert_allclose(numbers(locks), [0, 1, 2, 3, 4, 10, 11, 12, 13], atol=2e-3)
-    assert [h.packet for h in state.heard] == [1, 2, 3, 4, 10, 11, 12, 13]
+    assert state.clock.packet == 13
     # Times known to 1 us, 0.3 s apart.
     assert locks[-1].chip_us == pytest.approx(twins.CHIP_US * (1 - 40e-6), rel=6e-6)
 
@@ -295,7 +309,7 @@ def test_one_stray_preamble_does_not_move_the_lock():
     chips[at : at + 26] = chips[:26]
     locks, state = locks_of(*twins.events_of(chips, rng, START_US))
     assert_allclose(numbers(locks), np.arange(8), atol=2e-3)
-    assert [h.packet for h in state.heard] == list(range(8))
+    assert state.clock.packet == 7
 
 
 @pytest.mark.parametrize("jump_us", [1_234, 17_300, -9_000])
@@ -308,5 +322,105 @@ def test_the_second_preamble_after_a_jump_is_believed(jump_us):
     locks, state = locks_of(*(np.concatenate(c) for c in zip(before, after, strict=True)))
     want = np.r_[0:4, 6:10] + np.r_[np.zeros(4), np.full(4, jump_us / PERIOD_US)]
     assert_allclose(numbers(locks), want, atol=2e-3)
-    assert len(state.heard) == 5
+    assert state.clock.packet == 4
     assert state.stray is None
+
+
+# Latency that changes, preambles that are half seen
+
+
+def late(events, from_packet, to_packet, by_us):
+    """The events of some packets, later by as much; in order."""
+    t, p = events
+    number = (t - START_US) / PERIOD_US
+    t = t + np.where((number > from_packet) & (number < to_packet), by_us, 0)
+    order = np.argsort(t, kind="stable")
+    return t[order], p[order]
+
+
+@pytest.mark.parametrize("ppm", [-60, 0, 60])
+@pytest.mark.parametrize("by_us", [15, 30, 50])
+@pytest.mark.parametrize("packets", [(1.9, 3.9), (3.9, 4.9), (4.9, 20)])
+def test_latency_is_no_clock(ppm, by_us, packets):
+    rng = np.random.default_rng(9)
+    events = twins.events_of(packets_of(rng, 12), rng, START_US, ppm=ppm, missing_off=0.2)
+    locks, state = locks_of(*late(events, *packets, by_us))
+    assert len(locks) == 12
+    assert state.clock.packet == 11
+    # What is heard late is read late: both polarities, at once.
+    steady, _ = locks_of(*events)
+    for k, (lock, usual) in enumerate(zip(locks, steady, strict=True)):
+        dark = packets[0] < k < packets[1]
+        for which in ("delay_on_us", "delay_off_us"):
+            window, before = (v.packet_t_us + getattr(v, which) for v in (lock, usual))
+            assert window - before == pytest.approx(by_us if dark else 0, abs=4)
+        # A jump of 50 us from one packet to the next looks like 1445 ppm.
+        assert abs(lock.chip_us / usual.chip_us - 1) < 50e-6
+
+
+def test_one_polarity_alone_may_come_later():
+    rng = np.random.default_rng(10)
+    chips = packets_of(rng, 10)
+    t, p = twins.events_of(chips, rng, START_US)
+    number = (t - START_US) / PERIOD_US
+    t = t + np.where((number > 4.9) & (p == 0), 25, 0)
+    order = np.argsort(t, kind="stable")
+    locks, _ = locks_of(t[order], p[order])
+    apart = np.array([lock.delay_off_us - lock.delay_on_us for lock in locks])
+    assert_allclose(apart[5:] - apart[:5].mean(), 25, atol=3)
+    assert np.abs(np.array([lock.chip_us for lock in locks]) / twins.CHIP_US - 1).max() < 15e-6
+
+
+@pytest.mark.parametrize("tolerance_ppm", [20.0, 100.0])
+@pytest.mark.parametrize("ppm", [-400, 400])
+def test_the_clock_tolerance_is_a_bound(ppm, tolerance_ppm):
+    rng = np.random.default_rng(11)
+    t, p = twins.events_of(packets_of(rng, 10), rng, START_US, ppm=ppm)
+    sync = BarkerSync(clock_tolerance_ppm=tolerance_ppm).compile(BOOKS["wh4x2"], FORMAT)
+    _, locks = sync.step(sync.init(), t, p, int(t[-1]) + 5000)
+    rates = 1e6 * (np.array([lock.chip_us for lock in locks]) / twins.CHIP_US - 1)
+    assert np.abs(rates).max() <= tolerance_ppm + 1e-6
+    # The packets are heard where they are all the same.
+    late = [lock.packet_t_us - START_US - k * PERIOD_US * (1 + ppm * 1e-6) for k, lock in enumerate(locks)]
+    assert np.ptp(late) < 8
+
+
+@pytest.mark.parametrize("half", [0, 1])
+def test_a_preamble_half_in_the_dark_spoils_nothing(half):
+    rng = np.random.default_rng(12)
+    t, p = twins.events_of(packets_of(rng, 10), rng, START_US, ppm=30)
+    chip = (t - START_US) / twins.CHIP_US - 5 * FORMAT.packet_chips
+    dark = (chip > 13 * half) & (chip < 13 * (half + 1))
+    locks, state = locks_of(t[~dark], p[~dark])
+    steady, _ = locks_of(t, p)
+    usual = {round(n): lock for n, lock in zip(numbers(steady), steady, strict=True)}
+    assert len(locks) >= 9
+    assert state.clock.packet == 9
+    for n, lock in zip(numbers(locks), locks, strict=True):
+        assert n == pytest.approx(round(n), abs=2e-3)
+        assert lock.packet_t_us == pytest.approx(usual[round(n)].packet_t_us, abs=4)
+        assert abs(lock.chip_us / usual[round(n)].chip_us - 1) < 30e-6
+
+
+def test_positive_events_alone_are_enough():
+    rng = np.random.default_rng(13)
+    t, p = twins.events_of(packets_of(rng, 6), rng, START_US, per_edge=4)
+    locks, _ = locks_of(t[p == 1], p[p == 1])
+    assert_allclose(numbers(locks), np.arange(6), atol=2e-3)
+    for lock in locks:
+        # No negative event says where their window is: it is that of the positive ones.
+        assert lock.delay_off_us == lock.delay_on_us
+
+
+def test_a_weak_preamble_counts_where_data_are_quiet():
+    """Rows read up to 60 us apart, and two in five pixels answer one chip late."""
+    rng = np.random.default_rng(14)
+    t, p = twins.events_of(packets_of(rng, 5), rng, START_US, per_edge=4)
+    t = t + rng.integers(0, 60, len(t)) + 100 * (rng.random(len(t)) < 0.4)
+    order = np.argsort(t, kind="stable")
+    t, p = t[order], p[order]
+    locks, _ = locks_of(t, p)
+    assert max(lock.quality for lock in locks) < 0.5
+    # The first comes before data are known.
+    assert_allclose(np.diff(numbers(locks)), 1, atol=2e-3)
+    assert len(locks) == 4
