@@ -235,80 +235,143 @@ def add_polarity(
 
 
 @njit(cache=True, nogil=True)
-def cell_centres(selected: Array, centres: Array, area: Array) -> None:
-    """Mean (column, row) and number of each cluster's selected cells; `centres` (K, 2)."""
+def blobs(selected: Array, at: Array, cluster: Array, cells: Array) -> int:
+    """Connected cells (8 neighbours) of each cluster: mean column + row * 1j, cluster, number; how many."""
     clusters, rows, columns = selected.shape
+    done = np.zeros((rows, columns), np.bool_)
+    stack = np.empty((rows * columns, 2), np.int64)
+    n = 0
     for k in range(clusters):
-        area[k] = 0
-        centres[k, :] = 0.0
+        done[:] = False
         for r in range(rows):
             for c in range(columns):
-                if selected[k, r, c]:
-                    area[k] += 1
-                    centres[k, 0] += c
-                    centres[k, 1] += r
-        if area[k]:
-            centres[k, :] /= area[k]
-
-
-@njit(cache=True, nogil=True)
-def most_in_place(image: Array, area: Array, layout: Array, least_spacing: float) -> int:
-    """Most clusters that one similarity of the layout brings to within half a spacing of the image's.
-
-    Each pair of seen clusters half the layout apart proposes a similarity (as complex numbers: a turn and
-    scale `s`, then a shift); those that bring neighbours nearer than `least_spacing` do not count.
-    """
-    clusters = area.size
-    spacing = np.inf
-    for k in range(1, clusters):
-        across, down = layout[k, 0] - layout[k - 1, 0], layout[k, 1] - layout[k - 1, 1]
-        spacing = min(spacing, max(abs(across), abs(down)))
-    best = 0
-    for i in range(clusters - clusters // 2):
-        j = i + clusters // 2
-        if area[i] == 0 or area[j] == 0 or i == j:
-            continue
-        a = complex(layout[i, 0], layout[i, 1])
-        origin = complex(image[i, 0], image[i, 1])
-        s = (complex(image[j, 0], image[j, 1]) - origin) / (complex(layout[j, 0], layout[j, 1]) - a)
-        if abs(s) * spacing < least_spacing:
-            continue
-        fits = 0
-        for k in range(clusters):
-            if area[k] > 0:
-                placed = origin + s * (complex(layout[k, 0], layout[k, 1]) - a)
-                off = abs(placed - complex(image[k, 0], image[k, 1]))
-                fits += int(off <= abs(s) * spacing / 2 + 0.5)
-        best = max(best, fits)
-    return best
-
-
-@njit(cache=True, nogil=True)
-def _placement(image: Array, seen: Array, layout: Array, spacing: float) -> tuple[complex, complex]:
-    """Scale, turn and shift that bring a layout to its image: medians of pairs, robust against outliers."""
-    clusters = layout.shape[0]
-    re = np.empty(clusters * clusters)
-    im = np.empty(clusters * clusters)
-    n = 0
-    for i in range(clusters):
-        for j in range(i + 1, clusters):
-            apart = complex(layout[j, 0] - layout[i, 0], layout[j, 1] - layout[i, 1])
-            if seen[i] and seen[j] and abs(apart) > 1.5 * spacing:
-                s = complex(image[j, 0] - image[i, 0], image[j, 1] - image[i, 1]) / apart
-                re[n] = s.real
-                im[n] = s.imag
+                if not selected[k, r, c] or done[r, c]:
+                    continue
+                done[r, c] = True
+                stack[0, 0], stack[0, 1] = r, c
+                top, count, down, right = 1, 0, 0, 0
+                while top > 0:
+                    top -= 1
+                    a, b = stack[top, 0], stack[top, 1]
+                    count += 1
+                    down += a
+                    right += b
+                    for v in range(max(a - 1, 0), min(a + 2, rows)):
+                        for u in range(max(b - 1, 0), min(b + 2, columns)):
+                            if selected[k, v, u] and not done[v, u]:
+                                done[v, u] = True
+                                stack[top, 0], stack[top, 1] = v, u
+                                top += 1
+                at[n] = complex(right / count, down / count)
+                cluster[n] = k
+                cells[n] = count
                 n += 1
-    if n == 0:
-        return complex(0.0, 0.0), complex(0.0, 0.0)
-    s = complex(np.median(re[:n]), np.median(im[:n]))
-    n = 0
-    for k in range(clusters):
-        if seen[k]:
-            z = complex(image[k, 0], image[k, 1]) - s * complex(layout[k, 0], layout[k, 1])
-            re[n] = z.real
-            im[n] = z.imag
-            n += 1
-    return s, complex(np.median(re[:n]), np.median(im[:n]))
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _score(
+    at: Array, cluster: Array, cells: Array, layout: Array, s: complex, shift: complex, reach: float
+) -> float:
+    """Cells of the blobs within reach of their cluster's place, those off it less by the square."""
+    score = 0.0
+    for i in range(at.size):
+        off = at[i] - (s * layout[cluster[i]] + shift)
+        square = (off.real * off.real + off.imag * off.imag) / (reach * reach)
+        if square < 1:
+            score += cells[i] * (1 - square)
+    return score
+
+
+@njit(cache=True, nogil=True)
+def best_similarity(
+    at: Array,
+    cluster: Array,
+    cells: Array,
+    proposers: int,
+    layout: Array,
+    spacing: float,
+    slack: float,
+    least_spacing: float,
+    scale: complex,
+) -> tuple[float, complex, complex]:
+    """Score, scale and shift of the similarity that has most cells of all blobs in their place.
+
+    The first blobs propose: each pair of different clusters, or, if `scale` is not 0, each one with this
+    scale. A place reaches half a spacing and `slack` around; scales with neighbours nearer than
+    `least_spacing` do not count. Of two that score alike, the earlier is taken.
+    """
+    best, best_s, best_shift = 0.0, complex(0.0, 0.0), complex(0.0, 0.0)
+    known = abs(scale) > 0
+    for i in range(proposers):
+        for j in range(i, i + 1 if known else proposers):
+            s = scale
+            if not known:
+                if cluster[i] == cluster[j]:
+                    continue
+                s = (at[j] - at[i]) / (layout[cluster[j]] - layout[cluster[i]])
+            gap = abs(s) * spacing
+            if gap < least_spacing:
+                continue
+            shift = at[i] - s * layout[cluster[i]]
+            score = _score(at, cluster, cells, layout, s, shift, gap / 2 + slack)
+            if score > best:
+                best, best_s, best_shift = score, s, shift
+    return best, best_s, best_shift
+
+
+@njit(cache=True, nogil=True)
+def refined_similarity(
+    at: Array,
+    cluster: Array,
+    cells: Array,
+    layout: Array,
+    spacing: float,
+    slack: float,
+    scale: complex,
+    s: complex,
+    shift: complex,
+) -> tuple[complex, complex]:
+    """Least squares over the blobs in reach, three times; a `scale` known before is worth as many cells
+    again.
+
+    The known scale counts as if every cluster of the layout had been seen with it, with as many cells as
+    those seen have on average.
+    """
+    for _ in range(3):
+        reach = abs(s) * spacing / 2 + slack
+        total = 0.0
+        image_mean, layout_mean = complex(0.0, 0.0), complex(0.0, 0.0)
+        for i in range(at.size):
+            c = layout[cluster[i]]
+            if abs(at[i] - s * c - shift) < reach:
+                total += cells[i]
+                image_mean += cells[i] * at[i]
+                layout_mean += cells[i] * c
+        if total == 0:
+            return s, shift
+        image_mean /= total
+        layout_mean /= total
+        cross, power = complex(0.0, 0.0), 0.0
+        for i in range(at.size):
+            c = layout[cluster[i]]
+            if abs(at[i] - s * c - shift) < reach:
+                d = c - layout_mean
+                cross += cells[i] * d.conjugate() * (at[i] - image_mean)
+                power += cells[i] * (d.real * d.real + d.imag * d.imag)
+        if abs(scale) > 0:
+            middle = layout.mean()
+            full = 0.0
+            for c in layout:
+                full += abs(c - middle) ** 2
+            full *= total / layout.size
+            cross += full * scale
+            power += full
+        if power <= 0:
+            return s, shift
+        s = cross / power
+        shift = image_mean - s * layout_mean
+    return s, shift
 
 
 @njit(cache=True, nogil=True)
@@ -350,33 +413,31 @@ def _boundary(pixels: Array, k: int, other: int, a: complex, b: complex, reach: 
 @njit(cache=True, nogil=True)
 def place_clusters(
     pixels: Array,
-    cells: Array,
-    area: Array,
+    shown: Array,
     layout: Array,
     spacing: float,
+    s: complex,
+    shift: complex,
     neighbours: Array,
     points: Array,
     ends: Array,
 ) -> float:
     """Centres of the clusters in the image, `points` (K, 2), NaN where unseen; squares left by a similarity.
 
-    `neighbours` (2, K) holds the cluster to the right and the one below, -1 for none; `ends` (K,) becomes 1
-    where a cluster has a boundary on one side only, else 0, NaN where unseen.
+    `shown` (K,) says which clusters to seek about their places s * layout + shift; `neighbours` (2, K) holds
+    the cluster to the right and the one below, -1 for none; `ends` (K,) becomes 1 where a cluster has a
+    boundary on one side only, else 0, NaN where unseen.
     """
     clusters, height, width = pixels.shape
     points[:] = np.nan
     ends[:] = np.nan
-    s, shift = _placement(cells, area > 0, layout, spacing)
     reach = abs(s) * spacing
-    # Placed so that neighbours fall into one pixel, there is nothing to measure.
-    if reach < 1.0:
-        return 0.0
     window = 0.5 * reach + 1.5
     seen = np.zeros(clusters, np.bool_)
     for k in range(clusters):
-        if area[k] == 0:
+        if not shown[k]:
             continue
-        at = s * complex(layout[k, 0], layout[k, 1]) + shift
+        at = s * layout[k] + shift
         sum_w, sum_x, sum_y = 0.0, 0.0, 0.0
         for v in range(max(int(np.ceil(at.imag - window)), 0), min(int(at.imag + window), height - 1) + 1):
             for u in range(max(int(np.ceil(at.real - window)), 0), min(int(at.real + window), width - 1) + 1):
@@ -394,7 +455,6 @@ def place_clusters(
     for k in range(clusters):
         if seen[k]:
             ends[k] = 0
-    s, shift = _placement(points, seen, layout, spacing)
     mean = points.copy()
     gap = abs(s) * spacing
     for axis in range(2):
@@ -435,19 +495,19 @@ def place_clusters(
         if seen[k]:
             n += 1
             image_mean += complex(points[k, 0], points[k, 1])
-            layout_mean += complex(layout[k, 0], layout[k, 1])
+            layout_mean += layout[k]
     image_mean /= n
     layout_mean /= n
     cross, power = complex(0.0, 0.0), 0.0
     for k in range(clusters):
         if seen[k]:
-            c = complex(layout[k, 0], layout[k, 1]) - layout_mean
+            c = layout[k] - layout_mean
             cross += c.conjugate() * (complex(points[k, 0], points[k, 1]) - image_mean)
             power += abs(c) ** 2
     squares = 0.0
     for k in range(clusters):
         if seen[k]:
-            c = complex(layout[k, 0], layout[k, 1]) - layout_mean
+            c = layout[k] - layout_mean
             off = abs(complex(points[k, 0], points[k, 1]) - image_mean - cross / power * c)
             squares += off * off
     return squares

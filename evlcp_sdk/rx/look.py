@@ -11,7 +11,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.detection import Followed
 from evlcp_sdk.rx.grid import DueFrame
-from evlcp_sdk.rx.plausibility import clusters_in_place
+from evlcp_sdk.rx.placement import Placement, layout_of, masked, placements
 from evlcp_sdk.values import Events, PresenceMap, SyncLock
 
 __all__ = ["Look", "Looker", "Pilot", "polarity_sums"]
@@ -27,6 +27,8 @@ class Pilot:
         sums: Its polarity sums, int16 (chips, height, width).
         offset_px: The rest of the motion in it, float64 (2, chips), px.
         presence: What it shows; the bar is held still, so it shows the same in the frames after it.
+        placement: Where it shows the layout.
+        others: Other instances of it in the same image, best first: mirror images, and bars in step with it.
     """
 
     frame: int
@@ -34,6 +36,8 @@ class Pilot:
     sums: NDArray[np.int16]
     offset_px: NDArray[np.float64]
     presence: PresenceMap
+    placement: Placement
+    others: tuple[Placement, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +47,11 @@ class Look:
     Attributes:
         sums: Polarity sums of pilot and info segment, int16 (chips, height, width).
         offset_px: The rest of the motion in them, float64 (2, chips), px.
-        presence: Where the clusters are.
-        centre_px: Column and row of the bar's centre in the chip that starts at `middle_us`.
+        presence: Where the clusters are, in their footprints only.
+        placement: Where the image shows the layout.
+        others: Other instances of it in the image.
+        corner_px: Column and row on the sensor of the image's pixel (0, 0) in the chip that starts at
+            `middle_us`.
         middle_us: Middle of the pilot, or of the info segment of a frame without one, where a chip starts: a
             chip's events show the image at its first edge.
     """
@@ -52,8 +59,16 @@ class Look:
     sums: NDArray[np.int16]
     offset_px: NDArray[np.float64]
     presence: PresenceMap
-    centre_px: tuple[float, float]
+    placement: Placement
+    others: tuple[Placement, ...]
+    corner_px: tuple[float, float]
     middle_us: float
+
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        """Column and row on the sensor of the bar's centre at that time, whatever part of it is seen."""
+        centre = self.placement.shift + complex(*self.corner_px)
+        return centre.real, centre.imag
 
 
 class Looker:
@@ -75,7 +90,7 @@ class Looker:
     ) -> None:
         self._packet = packet
         self._spec = spec
-        self._centres_m = centres_m
+        self._layout = layout_of(centres_m)
         self._separate = separate
 
     def look(self, region: Followed, due: DueFrame, pilot: Pilot | None) -> tuple[Look | None, Pilot | None]:
@@ -84,10 +99,10 @@ class Looker:
         Args:
             region: The bar's.
             due: Which frame.
-            pilot: The newest one of the bar.
+            pilot: The newest one of the bar that showed it.
 
         Returns:
-            The frame, None if it does not show its clusters; and the newest pilot, None if it showed no bar.
+            The frame, None if it does not show its clusters; and the newest pilot that showed the bar.
         """
         lock, packet = due.lock, self._packet
         middles = due.start_us + (np.arange(due.chips, dtype=np.float64) + 0.5) * lock.chip_us
@@ -104,17 +119,26 @@ class Looker:
         if due.has_pilot:
             heard, moved = sums[: packet.pilot_chips], offset_px[:, : packet.pilot_chips]
             presence = self._separate(heard)
-            in_place = clusters_in_place(presence, self._centres_m)
-            if in_place < self._spec.min_clusters_share * len(self._centres_m):
-                return None, None
-            pilot = Pilot(due.number, size, heard, moved, presence)
+            before = pilot.placement if pilot is not None else None
+            found = placements(presence, self._layout, before, self._spec.min_clusters_share)
+            if not found:
+                return None, pilot
+            presence = masked(presence, self._layout, found[0])
+            pilot = Pilot(due.number, size, heard, moved, presence, found[0], tuple(found[1:]))
         else:
             assert pilot is not None
             sums = np.concatenate([pilot.sums, sums])
             offset_px = np.concatenate([pilot.offset_px, offset_px], axis=1)
-        centre_px = float(x[middle]), float(y[middle])
+        # The image shows the pilot's mean, read from each value's second chip, whose events follow the edge
+        # at its start; the bar's centre at the instant is that of its region.
+        rest_px = pilot.offset_px[:, 1::2].mean(1)
+        corner_px = (
+            float(x[middle]) - (size[0] - 1) / 2 - float(rest_px[0]),
+            float(y[middle]) - (size[1] - 1) / 2 - float(rest_px[1]),
+        )
         middle_us = float(middles[middle]) - lock.chip_us / 2
-        return Look(sums, offset_px, pilot.presence, centre_px, middle_us), pilot
+        look = Look(sums, offset_px, pilot.presence, pilot.placement, pilot.others, corner_px, middle_us)
+        return look, pilot
 
     def _size(self, width_px: float, height_px: float) -> tuple[int, int]:
         """Of the image: a region's, its seam on both sides, made even."""

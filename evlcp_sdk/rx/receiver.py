@@ -11,6 +11,7 @@ from evlcp_sdk.rx.detection import Followed, RegionFollower
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.look import Looker
+from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.steps import Announcer, Steps
 from evlcp_sdk.rx.timeline import Timeline, TimeStep
@@ -63,7 +64,7 @@ class Receiver:
         self._regions = RegionFollower(link.regions, link.camera, link.packet.chip_us, self._steps.position)
         self._transmitters = Transmitters(link.packet, self._step_us)
         self._looker = Looker(link.packet, link.regions, centres_m, self._steps.separate)
-        self._find_points = points_finder(centres_m)
+        self._find_points = points_finder(layout_of(centres_m))
         self._messages = MessageAssembler.of(link)
         self._closed = False
         self._counts = dict.fromkeys(_COUNTS, 0)
@@ -161,9 +162,8 @@ class Receiver:
         if due.has_pilot:
             # Another distance of the same pilot, or other points, would say nothing new.
             distance = self._steps.measure(FrameView(look.sums, look.offset_px, look.presence, soft))
-            # A value is read from its second chip, and a chip's events follow the edge at its start.
-            read_px = look.offset_px[:, 1 : self._packet.pilot_chips : 2]
-            points = self._find_points(look.presence, read_px, look.centre_px)
+            points_px, sigma_px = self._find_points(look.presence, look.placement)
+            points = points_px + look.corner_px, sigma_px
         transmitter.distance, filtered = self._steps.filter(transmitter.distance, due.start_us, distance)
         if transmitter.first is None:
             transmitter.first = due.packet

@@ -1,6 +1,7 @@
 """The receiver's kernels once more, in NumPy or plain Python, as slow and plain as it gets."""
 
 import numpy as np
+from scipy import ndimage
 
 
 def ordered(t_us, x, y, width, height):
@@ -69,23 +70,49 @@ def polarity_sums(events, start_on_us, start_off_us, chip_us, shift_x, shift_y, 
     return sums
 
 
-def cell_centres(selected):
-    cells = [np.argwhere(s)[:, ::-1] for s in selected]
-    return [c.mean(0) if len(c) else np.zeros(2) for c in cells], [len(c) for c in cells]
+def blobs(selected):
+    """By SciPy: (mean column + row * 1j, cluster, cells), clusters in order, each blob by its first cell."""
+    found = []
+    for k, s in enumerate(selected):
+        labels, n = ndimage.label(s, np.ones((3, 3)))
+        for i in range(1, n + 1):
+            v, u = np.nonzero(labels == i)
+            found.append((u.mean() + 1j * v.mean(), k, len(u)))
+    return found
 
 
-def most_in_place(image, area, layout, spacing, least_spacing):
-    """By two-point similarities as real 2x2 matrices."""
-    best, half = 0, len(area) // 2
-    for i in range(len(area) - half):
-        j = i + half
-        if i == j or not (area[i] and area[j]):
-            continue
-        (ax, ay), (bx, by) = layout[j] - layout[i], image[j] - image[i]
-        turn = np.array([[ax * bx + ay * by, ay * bx - ax * by], [ax * by - ay * bx, ax * bx + ay * by]])
-        turn = turn / (ax * ax + ay * ay)
-        px = np.sqrt(abs(np.linalg.det(turn))) * spacing
-        if px >= least_spacing:
-            off = np.linalg.norm(image[i] + (layout - layout[i]) @ turn.T - image, axis=1)
-            best = max(best, int(((off <= px / 2 + 0.5) & (area > 0)).sum()))
+def score(at, cluster, cells, layout, s, shift, reach):
+    off = np.abs(at - (s * layout[cluster] + shift)) / reach
+    return float((cells * np.maximum(1 - off**2, 0)).sum())
+
+
+def best_similarity(at, cluster, cells, proposers, layout, spacing, slack, least, scale):
+    best = 0.0
+    for i in range(proposers):
+        for j in range(proposers):
+            if scale == 0 and cluster[i] == cluster[j]:
+                continue
+            s = scale or (at[j] - at[i]) / (layout[cluster[j]] - layout[cluster[i]])
+            if abs(s) * spacing >= least:
+                shift = at[i] - s * layout[cluster[i]]
+                reach = abs(s) * spacing / 2 + slack
+                best = max(best, score(at, cluster, cells, layout, s, shift, reach))
     return best
+
+
+def refined_similarity(at, cluster, cells, layout, spacing, slack, scale, s, shift):
+    """By `lstsq`; the known scale as a difference observed with the weight of all clusters."""
+    for _ in range(3):
+        near = np.abs(at - s * layout[cluster] - shift) < abs(s) * spacing / 2 + slack
+        if not near.any():
+            break
+        root = np.sqrt(cells[near])
+        rows = np.stack([layout[cluster[near]], np.ones(near.sum())], 1) * root[:, None]
+        right = at[near] * root
+        if scale:
+            worth = np.sqrt(cells[near].sum() * np.var(layout))
+            rows, right = np.vstack([rows, [worth, 0]]), np.append(right, worth * scale)
+        if np.linalg.matrix_rank(rows) < 2:
+            break
+        s, shift = np.linalg.lstsq(rows, right)[0]
+    return s, shift

@@ -158,34 +158,45 @@ def test_polarity_sums(seed, freeze):
 
 @pytest.mark.parametrize("clusters", [1, 2, 5, 16])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_centres_of_selected_cells(seed, clusters):
+def test_connected_cells_of_each_cluster(seed, clusters):
     rng = np.random.default_rng(seed)
-    selected = rng.random((clusters, 11, 5)) < 0.1
+    selected = rng.random((clusters, 11, 5)) < 0.3
     selected[rng.integers(clusters)] = False
-    centres, area = np.empty((clusters, 2)), np.empty(clusters, np.int64)
-    _kernels.cell_centres(selected, centres, area)
-    want, count = twins.cell_centres(selected)
-    assert_allclose(centres, want, rtol=1e-12)
-    assert area.tolist() == count
+    most = int(selected.sum())
+    at, cluster, cells = np.empty(most, complex), np.empty(most, np.int64), np.empty(most, np.int64)
+    n = _kernels.blobs(selected, at, cluster, cells)
+    want = twins.blobs(selected)
+    assert n == len(want)
+    assert_allclose(at[:n], [w[0] for w in want], rtol=1e-12)
+    assert cluster[:n].tolist() == [w[1] for w in want]
+    assert cells[:n].tolist() == [w[2] for w in want]
 
 
-@pytest.mark.parametrize("clusters", [1, 2, 3, 8, 15, 16])
+def some_blobs(rng, clusters):
+    """Blobs of a layout in its place, of which some are strays."""
+    layout = rng.normal(0, 0.01, clusters) + 0.06j * np.arange(clusters)
+    s, shift = rng.uniform(10, 200) * np.exp(1j * rng.uniform(0, 2 * np.pi)), rng.normal(0, 50) + 20j
+    n = 3 * clusters
+    cluster = np.concatenate([np.arange(clusters), rng.integers(0, clusters, n - clusters)])
+    at = s * layout[cluster] + shift + rng.normal(0, 0.3, (n, 2)) @ [1, 1j]
+    at[clusters:] += rng.normal(0, 30, (n - clusters, 2)) @ [1, 1j]
+    return layout, s, shift, at, cluster, rng.integers(1, 9, n)
+
+
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("clusters", [2, 3, 8, 16])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_most_clusters_in_place(seed, clusters):
-    rng = np.random.default_rng(seed)
-    layout = np.stack([rng.normal(0, 0.01, clusters), 0.06 * np.arange(clusters)], 1)
-    angle, scale = rng.uniform(0, 2 * np.pi), rng.uniform(10, 60)
-    turn = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    image = layout @ turn.T + rng.uniform(-50, 50, 2)
-    least = rng.uniform(0, 1.5)
-    area = (rng.random(clusters) < 0.9).astype(np.int64)
-    lit = int(area.sum())
-    pairs = (area[: clusters - clusters // 2] * area[clusters // 2 :]).any() and clusters > 1
-    exact = _kernels.most_in_place(image, area, layout, least)
-    assert exact == (lit if pairs and scale * 0.06 >= least else 0)
-    image[rng.random(clusters) < 0.4] += rng.normal(0, 5, 2)
-    got = _kernels.most_in_place(image, area, layout, least)
-    assert got == twins.most_in_place(image, area, layout, 0.06, least)
+def test_the_similarity_that_most_cells_are_for(seed, clusters, known):
+    layout, s, shift, at, cluster, cells = some_blobs(np.random.default_rng(seed), clusters)
+    scale = 1.01 * s if known else 0j
+    got = _kernels.best_similarity(at, cluster, cells, len(at), layout, 0.06, 1.0, 1.0, scale)
+    assert got[0] == pytest.approx(twins.score(at, cluster, cells, layout, *got[1:], abs(got[1]) * 0.03 + 1))
+    assert got[0] == pytest.approx(
+        twins.best_similarity(at, cluster, cells, len(at), layout, 0.06, 1.0, 1.0, scale)
+    )
+    refined = _kernels.refined_similarity(at, cluster, cells, layout, 0.06, 1.0, scale, s, shift)
+    want = twins.refined_similarity(at, cluster, cells, layout, 0.06, 1.0, scale, s, shift)
+    assert_allclose(refined, want, rtol=1e-9)
 
 
 @pytest.mark.parametrize("apart", [0j, 0.5 + 0.5j, -0.9j])

@@ -1,5 +1,6 @@
 """Cluster points: on drawn bars, and on a simulated drive with its truth, and on a recording."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.io import open_source
 from evlcp_sdk.link.resolve import load_link, resolve
+from evlcp_sdk.rx.placement import layout_of, placements
 from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.bar import BarLayout
@@ -38,6 +40,13 @@ def drawn(layout: NDArray[np.float64], turn: complex, shift: complex, half_m: ND
     return PresenceMap(cells.astype(np.float32), 2, cells, pixels)
 
 
+def points_of(
+    presence: PresenceMap, centres_m: NDArray[np.float64] = CENTRES
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    layout = layout_of(centres_m)
+    return points_finder(layout)(presence, placements(presence, layout)[0])
+
+
 def truth_of(turn: complex, shift: complex, layout: NDArray[np.float64]) -> NDArray[np.float64]:
     z = turn * (layout[:, 0] + 1j * layout[:, 1]) + shift
     return np.stack([z.real, z.imag], -1)
@@ -48,7 +57,7 @@ def truth_of(turn: complex, shift: complex, layout: NDArray[np.float64]) -> NDAr
 def test_points_of_an_ideal_bar(px_per_m: float, roll: float, dx: float, dy: float) -> None:
     turn, shift = px_per_m * np.exp(1j * roll), complex(24 + dx, 112 + dy)
     presence = drawn(CENTRES, turn, shift, np.array([1.2 / px_per_m, 0.03]), (48, 224))
-    points, sigma = points_finder(CENTRES)(presence, np.zeros((2, 16)), (23.5, 111.5))
+    points, sigma = points_of(presence)
     want = truth_of(turn, shift, CENTRES)
     assert np.abs(points - want).max() < 0.2
     # Drawn in eighths of a pixel.
@@ -62,17 +71,8 @@ def test_a_lying_bar_and_one_upside_down() -> None:
         size = (48, 200) if turn.real else (200, 48)
         shift = complex(size[0] / 2 + 0.3, size[1] / 2 - 0.2)
         presence = drawn(CENTRES, turn, shift, np.array([0.008, 0.03]), size)
-        at = ((size[0] - 1) / 2, (size[1] - 1) / 2)
-        points, _ = points_finder(CENTRES)(presence, np.zeros((2, 16)), at)
+        points, _ = points_of(presence)
         assert np.abs(points - truth_of(turn, shift, CENTRES)).max() < 0.2
-
-
-def test_the_motion_and_the_place_on_the_sensor_enter() -> None:
-    presence = drawn(CENTRES, 150, 24 + 100j, np.array([0.008, 0.03]), (48, 200))
-    find = points_finder(CENTRES)
-    still, _ = find(presence, np.zeros((2, 16)), (23.5, 99.5))
-    moved, _ = find(presence, np.tile([[0.25], [-0.125]], 16), (623.5, 299.5))
-    np.testing.assert_allclose(moved - still, np.tile([600 - 0.25, 200 + 0.125], (16, 1)), atol=1e-9)
 
 
 def test_dark_clusters_are_unseen_and_cells_out_of_place_are_left_out() -> None:
@@ -81,9 +81,7 @@ def test_dark_clusters_are_unseen_and_cells_out_of_place_are_left_out() -> None:
     selected, pixels = presence.selected.copy(), presence.pixels.copy()
     selected[4], pixels[4] = False, 0
     selected[9, 5:8, 2], pixels[9, 10:16, 4:6] = True, 0.9
-    points, sigma = points_finder(CENTRES)(
-        PresenceMap(presence.probability, 2, selected, pixels), np.zeros((2, 16)), (23.5, 99.5)
-    )
+    points, sigma = points_of(PresenceMap(presence.probability, 2, selected, pixels))
     assert np.isnan(points[4]).all()
     assert np.isnan(sigma[4])
     others = np.arange(16) != 4
@@ -96,18 +94,15 @@ def test_a_panel_has_neighbours_on_both_axes() -> None:
     layout = panel.cluster_centres_m()
     turn, shift = 700 * np.exp(0.05j), 64.2 + 63.7j
     presence = drawn(layout, turn, shift, np.array([0.02, 0.02]), (128, 128))
-    points, _ = points_finder(layout)(presence, np.zeros((2, 16)), (63.5, 63.5))
+    points, _ = points_of(presence, layout)
     assert np.abs(points - truth_of(turn, shift, layout)).max() < 0.25
 
 
-def test_nothing_seen_gives_no_points() -> None:
-    nothing = PresenceMap(
-        np.zeros((16, 20, 10), np.float32),
-        2,
-        np.zeros((16, 20, 10), bool),
-        np.zeros((16, 40, 20), np.float32),
-    )
-    points, sigma = points_finder(CENTRES)(nothing, np.zeros((2, 16)), (9.5, 19.5))
+def test_two_clusters_give_no_points() -> None:
+    presence = drawn(CENTRES, 150, 24 + 100j, np.array([0.008, 0.03]), (48, 200))
+    layout = layout_of(CENTRES)
+    placement = replace(placements(presence, layout)[0], seen=np.arange(16) < 2)
+    points, sigma = points_finder(layout)(presence, placement)
     assert np.isnan(points).all()
     assert np.isnan(sigma).all()
     assert points.shape == (16, 2)

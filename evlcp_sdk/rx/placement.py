@@ -1,0 +1,307 @@
+"""Where a bar's layout lies in an image of presence: one similarity for all clusters, found by votes."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.values import PresenceMap
+
+__all__ = ["Layout", "Placement", "layout_of", "masked", "placements"]
+
+_LEAST_SPACING_PX = 1.0
+"""A placement that puts neighbours into one pixel would fit anything."""
+
+_MAX_CHANCE = 1e-3
+"""Probability that clusters stand in their place by chance, above which they are not believed without more:
+of a thousand frames read at a wrong time, one would pass, and a lock needs two preambles at the right
+distance before."""
+
+_PROPOSERS = 64
+"""Blobs that propose placements, the largest first: four for each of 16 clusters, a bar and its mirror image
+among them. More would make the time grow with the square of the clutter."""
+
+_MOST = 4
+"""Instances sought in one image: a bar, its mirror image on the road, one in a rail, and a neighbour."""
+
+_OTHER_CELLS = 0.25
+"""Share of the best instance's cells that another one has at the least: a pixel shows contrast, so that a
+mirror image is as wide as the bar, while a lens' halo shows one cluster here and another there."""
+
+_CORE = 0.75
+"""Quantile of the cells' distance from a column's axis that counts as half its width: up to a quarter may be
+strays, and a bar two or three cells wide keeps all its columns."""
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """A layout's clusters as complex numbers, right + down * 1j.
+
+    Attributes:
+        at_m: Cluster centres, m, complex128 (K,).
+        spacing_m: From one cluster to its nearest neighbour, m; 0 for a single cluster.
+        line: Whether the clusters stand in one line, which looks the same from behind.
+    """
+
+    at_m: NDArray[np.complex128]
+    spacing_m: float
+    line: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A layout's place in an image: image = scale * layout + shift, as complex numbers, right + down * 1j.
+
+    Attributes:
+        scale: Size and turn, px/m; 0 for a layout of one cluster, which has none.
+        shift: Image of the layout's origin, px.
+        mirrored: The layout's mirror image lies so. A line of clusters is its own mirror image; there, the
+            order of the clusters runs up the image, or to the left: in a mirror on the road, and in a camera
+            upside down.
+        seen: Clusters that stand in their place, bool (K,).
+        cells: Grid cells that show a cluster in its place.
+        chance: Bound of the probability that chance puts so many clusters into their places.
+    """
+
+    scale: complex
+    shift: complex
+    mirrored: bool
+    seen: NDArray[np.bool_]
+    cells: float
+    chance: float
+
+    def places(self, layout: Layout) -> NDArray[np.complex128]:
+        """Cluster centres in the image, px, complex128 (K,)."""
+        return self.scale * _turned(layout, self.mirrored) + self.shift
+
+    def moved(self, by_px: complex) -> "Placement":
+        """The same in an image whose origin lies elsewhere."""
+        return replace(self, shift=self.shift + by_px)
+
+
+@dataclass(frozen=True, eq=False)
+class _Blobs:
+    """Connected cells of one cluster: centre in px, cluster, number of cells."""
+
+    at: NDArray[np.complex128]
+    cluster: NDArray[np.int64]
+    cells: NDArray[np.int64]
+
+    def __getitem__(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "_Blobs":
+        return _Blobs(self.at[rows], self.cluster[rows], self.cells[rows])
+
+
+def layout_of(centres_m: NDArray[np.float64]) -> Layout:
+    """A layout by its cluster centres (x right, y down), m, float64 (K, 2).
+
+    >>> layout_of(np.array([[0.0, -0.06], [0.0, 0.0], [0.0, 0.06]])).spacing_m
+    0.06
+    """
+    at = centres_m @ np.array([1, 1j])
+    gaps = np.abs(at[:, None] - at[None])
+    apart = gaps[gaps > 1e-9]
+    return Layout(at, float(apart.min()) if len(apart) else 0.0, bool((np.ptp(centres_m, 0) < 1e-9).any()))
+
+
+def placements(
+    presence: PresenceMap, layout: Layout, before: Placement | None = None, min_share: float = 0.5
+) -> list[Placement]:
+    """Find where a layout lies in an image, best first; several in one image: a bar, and its mirror image.
+
+    Each pair of blobs of different clusters proposes a similarity, or, where the scale is known from a frame
+    before, each blob a shift; the one that has most cells in their place counts, those nearer to it more.
+    Blobs of neighbours, mirror images and strays propose in vain. Least squares over its blobs make it exact;
+    they are taken away, and the rest votes again.
+
+    Sixteen pilots of eight values are half of what chance can say, so that a frame read at a wrong time shows
+    clusters, too; but not in their order. One that is in its place without having proposed it is there with a
+    chance of one in K. The best counts if that is unlikely, or if `min_share` of the clusters are in their
+    place: with few clusters no order is unlikely. All others count if they are unlikely.
+
+    Args:
+        presence: Of one frame.
+        layout: What to find.
+        before: In a frame shortly before: its scale still holds.
+        min_share: Least share of the clusters in place that counts without a doubt.
+    """
+    blobs = _blobs_of(presence)
+    clusters = len(layout.at_m)
+    if not len(blobs.at):
+        return []
+    if clusters == 1:
+        share = blobs.cells / blobs.cells.sum()
+        return [
+            Placement(
+                0j, complex(share @ blobs.at), False, np.ones(1, np.bool_), float(blobs.cells.sum()), 1.0
+            )
+        ]
+    slack_px = presence.grid_px / 2
+    found: list[Placement] = []
+    while len(found) < _MOST:
+        best = None
+        if before is not None and not found:
+            best = _voted(blobs, layout, slack_px, before)
+        if best is None or best.chance > _MAX_CHANCE:
+            other = _voted(blobs, layout, slack_px, None)
+            if best is None or (other is not None and other.chance < best.chance):
+                best = other
+        if best is None:
+            break
+        if best.chance > _MAX_CHANCE and (found or best.seen.sum() < min_share * clusters):
+            break
+        if found and best.cells < _OTHER_CELLS * found[0].cells:
+            break
+        found.append(best)
+        blobs = blobs[~_covered(blobs, layout, best, slack_px)]
+    return found
+
+
+def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> PresenceMap:
+    """Presence in the clusters' footprints only: half a spacing about the centre, across a line the bar's
+    width.
+
+    Cells beyond are lit by a halo, by neighbours or by reflections. Pixel maps keep a spacing, so that they
+    still show where a cluster ends.
+    """
+    if placement.scale == 0:
+        return presence
+    _, height, width = presence.pixels.shape
+    grid = presence.grid_px
+    _, rows, columns = presence.selected.shape
+    middle = (grid - 1) / 2
+    places = placement.places(layout)
+    cell_x, cell_y = np.arange(columns) * grid + middle, np.arange(rows) * grid + middle
+    spacing_px = abs(placement.scale) * layout.spacing_m
+    unit = placement.scale / abs(placement.scale)
+    if layout.line:
+        unit *= _direction(layout)
+    along, across = _apart(places, unit, cell_x, cell_y)
+    near = along <= (spacing_px + grid) / 2
+    half = spacing_px / 2
+    if layout.line:
+        core = across[presence.selected & near & (across <= spacing_px / 2 + grid)]
+        half = float(np.quantile(core, _CORE)) if len(core) else half
+    near &= across <= half + grid
+    pixel_along, pixel_across = _apart(places, unit, np.arange(width), np.arange(height))
+    wide = (pixel_along <= spacing_px) & (pixel_across <= half + grid)
+    if not layout.line:
+        wide = (pixel_along <= spacing_px) & (pixel_across <= spacing_px)
+    return PresenceMap(
+        np.where(near, presence.probability, np.float32(0)),
+        grid,
+        presence.selected & near,
+        np.where(wide, presence.pixels, np.float32(0)),
+    )
+
+
+def _apart(
+    places: NDArray[np.complex128], unit: complex, x: NDArray[Any], y: NDArray[Any]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Distance along a direction and across it from each place, float64 (K, rows, columns) each."""
+    off = (x[None, None] + 1j * y[None, :, None] - places[:, None, None]) * np.conj(unit)
+    return np.abs(off.real), np.abs(off.imag)
+
+
+def _direction(layout: Layout) -> complex:
+    """From the first to the last cluster of a line."""
+    way = complex(layout.at_m[-1] - layout.at_m[0])
+    return way / abs(way)
+
+
+def _turned(layout: Layout, mirrored: bool) -> NDArray[np.complex128]:
+    return np.conj(layout.at_m) if mirrored and not layout.line else layout.at_m
+
+
+def _blobs_of(presence: PresenceMap) -> _Blobs:
+    """Connected cells of one cluster, those of most cells first."""
+    from evlcp_sdk.rx import _kernels
+
+    selected = presence.selected
+    most = int(np.count_nonzero(selected))
+    at, cluster, cells = np.empty(most, np.complex128), np.empty(most, np.int64), np.empty(most, np.int64)
+    n = _kernels.blobs(selected, at, cluster, cells)
+    order = np.argsort(-cells[:n], kind="stable")
+    grid = presence.grid_px
+    return _Blobs(at[order] * grid + (grid - 1) / 2 * (1 + 1j), cluster[order], cells[order])
+
+
+def _voted(blobs: _Blobs, layout: Layout, slack_px: float, before: Placement | None) -> Placement | None:
+    """The placement that most cells are for; None without blobs that could propose one."""
+    from evlcp_sdk.rx import _kernels
+
+    best_score, best = 0.0, None
+    ways = (False,) if layout.line else (False, True)
+    for mirrored in ways if before is None or layout.line else (before.mirrored,):
+        at_m = _turned(layout, mirrored)
+        scale = 0j if before is None else before.scale
+        score, s, shift = _kernels.best_similarity(
+            blobs.at,
+            blobs.cluster,
+            blobs.cells,
+            min(len(blobs.at), _PROPOSERS),
+            at_m,
+            layout.spacing_m,
+            slack_px,
+            _LEAST_SPACING_PX,
+            scale,
+        )
+        if score > best_score:
+            s, shift = _kernels.refined_similarity(
+                blobs.at, blobs.cluster, blobs.cells, at_m, layout.spacing_m, slack_px, scale, s, shift
+            )
+            best_score, best = score, (s, shift, mirrored)
+    if best is None:
+        return None
+    s, shift, mirrored = best
+    return _judged(blobs, layout, slack_px, s, shift, mirrored, 1 if before is not None else 2)
+
+
+def _judged(
+    blobs: _Blobs,
+    layout: Layout,
+    slack_px: float,
+    scale: complex,
+    shift: complex,
+    mirrored: bool,
+    proposed: int,
+) -> Placement:
+    """A similarity with what is in its place, and how likely that is by chance."""
+    clusters = len(layout.at_m)
+    places = scale * _turned(layout, mirrored) + shift
+    spacing_px = abs(scale) * layout.spacing_m
+    reach = spacing_px / 2 + slack_px
+    right = np.abs(blobs.at - places[blobs.cluster]) <= reach
+    off = np.abs(blobs.at[:, None] - places[None])
+    nearest = off.argmin(1)
+    wrong = ~right & (off.min(1) <= spacing_px / 2)
+    in_place = np.bincount(blobs.cluster[right], blobs.cells[right], clusters)
+    out_of_place = np.bincount(nearest[wrong], blobs.cells[wrong], clusters)
+    seen = in_place > out_of_place
+    shown = int(np.count_nonzero(in_place + out_of_place))
+    # Where clusters are small, a cell stands in the place of two.
+    odds = min(1.0, (2 * reach / spacing_px) ** (1 if layout.line else 2) / clusters)
+    # As many similarities could have been proposed as there are choices of the clusters that fix one.
+    tries = math.comb(max(shown, proposed), proposed)
+    chance = min(1.0, tries * _at_least(int(seen.sum()) - proposed, shown - proposed, odds))
+    if layout.line:
+        way = scale * _direction(layout)
+        mirrored = way.real + way.imag < 0
+    return Placement(scale, shift, mirrored, seen, float(in_place[seen].sum()), chance)
+
+
+def _at_least(hits: int, of: int, odds: float) -> float:
+    """Probability of so many hits or more (binomial)."""
+    if hits <= 0:
+        return 1.0
+    return float(sum(math.comb(of, n) * odds**n * (1 - odds) ** (of - n) for n in range(hits, of + 1)))
+
+
+def _covered(blobs: _Blobs, layout: Layout, placement: Placement, slack_px: float) -> NDArray[np.bool_]:
+    """Blobs that a placement has used up: those in the clusters' places, and what lies in the bar."""
+    places = placement.places(layout)
+    reach = abs(placement.scale) * layout.spacing_m / 2 + slack_px
+    off = np.abs(blobs.at[:, None] - places[None])
+    covered: NDArray[np.bool_] = off.min(1) <= reach
+    return covered

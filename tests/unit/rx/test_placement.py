@@ -1,0 +1,154 @@
+"""Where a layout lies in an image: drawn bars with neighbours, mirror images, covers and clutter."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from evlcp_sdk.rx.placement import layout_of, masked, placements
+from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.values import PresenceMap
+
+CENTRES = BarLayout().cluster_centres_m()
+LINE = layout_of(CENTRES)
+PANEL = BarLayout(rows=16, columns=16, led_pitch_m=0.02, cluster_rows=4, cluster_columns=4)
+SIZE = (48, 224)
+SEEDS = range(6)
+
+
+def drawn(
+    centres_m: NDArray[np.float64],
+    *instances: tuple[complex, complex],
+    size: tuple[int, int] = SIZE,
+    half_px: float = 2.0,
+    conj: bool = False,
+) -> PresenceMap:
+    """Cells of 2 px whose middle lies in a cluster of an instance (scale, shift)."""
+    width, height = size
+    y, x = np.mgrid[: height // 2, : width // 2] * 2 + 0.5
+    at = centres_m @ [1, 1j]
+    gap = np.abs(at[0] - at[1:]).min() if len(at) > 1 else 0.0
+    selected = np.zeros((len(at), height // 2, width // 2), bool)
+    for scale, shift in instances:
+        off = (x + 1j * y - shift) / scale
+        off = np.conj(off) if conj else off
+        for k, c in enumerate(at):
+            across = half_px / abs(scale) if np.ptp(at.real) == 0 else gap / 2
+            selected[k] |= (np.abs((off - c).imag) <= gap / 2) & (np.abs((off - c).real) <= across)
+    pixels = selected.repeat(2, 1).repeat(2, 2).astype(np.float32)
+    return PresenceMap(selected.astype(np.float32), 2, selected, pixels)
+
+
+def cluttered(presence: PresenceMap, rng: np.random.Generator, share: float) -> PresenceMap:
+    """A share of all cells shows clusters at random."""
+    selected = presence.selected.copy()
+    hit = rng.random(selected.shape[1:]) < share
+    which = rng.integers(0, len(selected), hit.shape)
+    selected[:, hit] = np.arange(len(selected))[:, None] == which[hit]
+    pixels = selected.repeat(2, 1).repeat(2, 2).astype(np.float32)
+    return PresenceMap(selected.astype(np.float32), 2, selected, pixels)
+
+
+def covered(presence: PresenceMap, clusters: list[int]) -> PresenceMap:
+    keep = ~np.isin(np.arange(len(presence.selected)), clusters)[:, None, None]
+    return PresenceMap(presence.probability * keep, 2, presence.selected & keep, presence.pixels * keep)
+
+
+@settings(max_examples=40)
+@given(st.floats(40, 200), st.floats(-math.pi, math.pi), st.floats(0, 2), st.floats(0, 2))
+def test_a_bar_at_any_size_and_turn(px_per_m: float, turn: float, right: float, down: float) -> None:
+    scale, shift = px_per_m * np.exp(1j * turn), complex(112 + right, 112 + down)
+    (found,) = placements(drawn(CENTRES, (scale, shift), size=(224, 224)), LINE)
+    # A cell is two pixels wide.
+    assert np.abs(found.places(LINE) - scale * LINE.at_m - shift).max() < 1.5
+    assert found.seen.all()
+    assert found.chance < 1e-6
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_clutter_and_a_cover(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    hidden = sorted(rng.choice(16, 8, replace=False).tolist())
+    scale, shift = 150 * np.exp(0.02j), 24.3 + 110.2j
+    presence = cluttered(covered(drawn(CENTRES, (scale, shift)), hidden), rng, 0.05)
+    found = placements(presence, LINE)[0]
+    # The centre is the layout's, not that of the part that is seen.
+    assert abs(found.shift - shift) < 1.5
+    assert abs(found.scale - scale) < 4
+    assert not set(np.flatnonzero(~found.seen)) - set(hidden)
+
+
+def test_a_mirror_image_is_another_and_runs_up_the_image() -> None:
+    bar, image = (100 + 0j, 24 + 52j), (-100 + 0j, 26.0 + 164j)
+    presence = covered(drawn(CENTRES, bar, image), [])
+    own, other = placements(presence, LINE)
+    assert (own.mirrored, other.mirrored) == (False, True)
+    for found, (scale, shift) in ((own, bar), (other, image)):
+        assert abs(found.scale - scale) < 2
+        assert abs(found.shift - shift) < 1
+
+
+def test_a_reflection_beside_stays_out_of_the_footprints() -> None:
+    bar, image = (100 + 0j, 12.0 + 60j), (100 + 0j, 34.0 + 60j)
+    presence = drawn(CENTRES, bar, image, size=(48, 120))
+    found = placements(presence, LINE)
+    assert len(found) == 2
+    assert sorted(round(f.shift.real) for f in found) == [12, 34]
+    for f in found:
+        only = masked(presence, LINE, f)
+        assert only.selected.any((1, 2)).all()
+        columns = np.flatnonzero(only.selected.any((0, 1))) * 2 + 0.5
+        assert np.abs(columns - f.shift.real).max() < 4
+        assert not (only.selected & ~presence.selected).any()
+
+
+def test_few_clusters_are_enough_where_the_scale_is_known() -> None:
+    whole = drawn(CENTRES, (150, 24 + 110j))
+    (before,) = placements(whole, LINE)
+    for hidden in (range(11), range(5, 16), [k for k in range(16) if k not in (2, 6, 7, 8, 13)]):
+        rest = covered(whole, list(hidden))
+        found = placements(rest, LINE, before)
+        assert len(found) == 1
+        assert abs(found[0].shift - (24 + 110j)) < 2
+        assert found[0].seen.sum() == 5
+    # Three could be there by chance.
+    assert not placements(covered(whole, list(range(13))), LINE, before)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_clusters_out_of_their_order_are_no_bar(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(16)
+    presence = drawn(CENTRES[order], (150, 24 + 110j))
+    assert not placements(presence, LINE)
+    (before,) = placements(drawn(CENTRES, (150, 24 + 110j)), LINE)
+    assert not placements(presence, LINE, before)
+
+
+@pytest.mark.parametrize("conj", [False, True])
+def test_a_panel_and_its_mirror_image(conj: bool) -> None:
+    centres = PANEL.cluster_centres_m()
+    layout = layout_of(centres)
+    scale, shift = 300 * np.exp(0.1j), 64.2 + 63.7j
+    (found,) = placements(drawn(centres, (scale, shift), size=(128, 128), conj=conj), layout)
+    assert found.mirrored == conj
+    assert abs(found.shift - shift) < 1
+    assert np.abs(found.scale - scale) < 6
+    places = found.places(layout)
+    assert np.abs(places[1] - places[0]) == pytest.approx(300 * 0.08, rel=0.03)
+
+
+def test_one_cluster_is_where_its_cells_are() -> None:
+    layout = layout_of(np.zeros((1, 2)))
+    presence = drawn(np.zeros((1, 2)), size=(40, 40))
+    presence.selected[0, 3:5, 7:9] = True
+    (found,) = placements(presence, layout)
+    assert found.shift == 15.5 + 7.5j
+    assert masked(presence, layout, found) is presence
+
+
+def test_nothing_seen_is_nowhere() -> None:
+    assert placements(drawn(CENTRES), LINE) == []
