@@ -361,6 +361,9 @@ def _views(
     with receive(url, link, registry=registry) as packets:
         for packet in packets:
             who.hear(packet)
+            if packet.echo_of is not None:
+                frames.pop(packet.transmitter, None)
+                continue
             kept = frames.setdefault(packet.transmitter, [])
             for one in packet.frames:
                 if len(one.points_px) == clusters and any(

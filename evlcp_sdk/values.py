@@ -241,8 +241,10 @@ class SoftSymbols:
     """What one frame says, with how sure.
 
     Attributes:
-        symbols: Most likely symbol of each cluster, int64 (K,).
-        llr: Log-likelihood ratio ln P(bit 0) / P(bit 1) of each bit, most significant first, float32 (K, m).
+        symbols: Most likely symbol of each cluster, int64 (K,); -1 where a cluster was not seen, which says
+            nothing.
+        llr: Log-likelihood ratio ln P(bit 0) / P(bit 1) of each bit, most significant first, float32 (K, m);
+            0 where a cluster was not seen.
         quality: Share of the received energy that the decided codewords explain, 0 to 1.
     """
 
@@ -312,6 +314,7 @@ class Frame:
             where a cluster is not seen; empty for a frame without a pilot.
         points_sigma_px: Their standard deviations, px, float64 (K,).
         points_t_us: That time, camera clock, us.
+        echo_of: Number of the transmitter that this is a reflection of; None for a frame of its own.
     """
 
     transmitter: int
@@ -326,9 +329,10 @@ class Frame:
     points_px: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
     points_sigma_px: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     points_t_us: float = math.nan
+    echo_of: int | None = None
 
     def __repr__(self) -> str:
-        place = f"transmitter {self.transmitter}, packet {self.packet}, frame {self.frame}"
+        place = f"{_who(self.transmitter, self.echo_of)}, packet {self.packet}, frame {self.frame}"
         return f"Frame({place}, {self.t_us / 1e3:.1f} ms, {_symbols(self.soft)}, {_distance(self.range)})"
 
 
@@ -395,11 +399,16 @@ class Packet:
     block_packets: int = 0
     messages: tuple[ReceivedMessage, ...] = ()
 
+    @property
+    def echo_of(self) -> int | None:
+        """Number of the transmitter that its frames, all of them, are a reflection of; None if of none."""
+        return self.frames[-1].echo_of if self.frames else None
+
     def __repr__(self) -> str:
         found = f"{len(self.frames)} of {self.sent} frames"
         number = len(self.messages)
         messages = f", {number} message{'s' * (number != 1)}" if number else ""
-        place = f"transmitter {self.transmitter}, packet {self.packet}"
+        place = f"{_who(self.transmitter, self.echo_of)}, packet {self.packet}"
         return f"Packet({place}, {self.t_us / 1e3:.1f} ms, {found}{messages})"
 
     def _repr_html_(self) -> str:
@@ -513,10 +522,14 @@ def _counted(t_us: NDArray[np.int64], what: str) -> str:
     return f"{n} {what}{'s' * (n != 1)}, {t_us[0] / 1e3:.1f} to {t_us[-1] / 1e3:.1f} ms"
 
 
+def _who(transmitter: int, echo_of: int | None) -> str:
+    return f"transmitter {transmitter}" + ("" if echo_of is None else f", a reflection of {echo_of}")
+
+
 def _symbols(soft: SoftSymbols, most: int = 16) -> str:
-    """The symbols one after another, the first `most` of them."""
+    """The symbols one after another, the first `most` of them; `-` for one that is not given."""
     symbols = soft.symbols.tolist()
-    text = " ".join(str(s) for s in symbols[:most])
+    text = " ".join(str(s) if s >= 0 else "-" for s in symbols[:most])
     return f"{text} ..." if len(symbols) > most else text
 
 

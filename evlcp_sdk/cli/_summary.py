@@ -19,12 +19,13 @@ def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
     out.print(f"[bold]{escape(Path(recording['path']).name)}[/]: {summary['result']}")
     if summary["transmitters"]:
         table = Table(box=None, pad_edge=False, header_style="dim")
-        for name in ("transmitter", "frames", "quality", "clock", "distance"):
+        for name in ("transmitter", "frames", "not seen", "quality", "clock", "distance"):
             table.add_column(name, justify="right")
         for t in summary["transmitters"]:
             table.add_row(
-                str(t["transmitter"]),
+                _who(t),
                 f"{t['frames_found']} of {t['frames_expected']}",
+                _erased(t),
                 _or_dash(t["quality"], "{:.2f}"),
                 _or_dash(t["clock_ppm"], "{:+.0f} ppm"),
                 _or_dash(t["distance_first_m"], "{:.2f}")
@@ -49,7 +50,21 @@ def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
             f"lost: {loss['count']} {loss['meaning']} (first at {loss['unit']} {loss['first']})",
             style="yellow",
         )
+    for warning in summary["warnings"]:
+        out.print(f"look: {escape(warning)}", style="yellow")
     out.print(f"written: {escape(str(folder))}/frames.csv, packets.jsonl, summary.json", style="dim")
+
+
+def _who(told: Mapping[str, Any]) -> str:
+    """A transmitter's number, and of which one it is a reflection."""
+    echo_of = told["echo_of"]
+    return f"{told['transmitter']}" if echo_of is None else f"{told['transmitter']}, reflection of {echo_of}"
+
+
+def _erased(told: Mapping[str, Any]) -> str:
+    """The share of symbols that are not given."""
+    erased = told["symbols_erased"]
+    return f"{erased / (erased + told['symbols_given']):.1%}" if erased else "-"
 
 
 def _positions(told: Mapping[str, Any]) -> str:

@@ -188,7 +188,7 @@ def _decode_recording(out: Path, as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps(summary | {"score": found}))
         return
-    _show_frames(frames.found)
+    _show_frames([frame for frame in frames.found if frame.echo_of is None])
     # Most of so short a run is the loading of kernels: its speed says nothing.
     show(summary, out, speed=False)
     _show_score(found)
@@ -222,7 +222,7 @@ def _show_frames(frames: "Sequence[Frame]") -> None:
         table.add_row(
             f"{frame.packet}/{frame.frame}",
             f"{frame.t_us / 1e3:.1f}",
-            " ".join(f"{s:2}" for s in frame.soft.symbols.tolist()),
+            " ".join(f"{s:2}" if s >= 0 else " -" for s in frame.soft.symbols.tolist()),
             f"{distance_m:.2f} ± {sigma}" if math.isfinite(distance_m) else "-",
         )
     console().print(table)

@@ -25,7 +25,7 @@ class Positioner:
     A fix takes the bars that are seen within half a packet time before and after it. The image moves in that
     time, with the vehicle's vibration, but a bar's shape hardly changes: the shape is a straight line in
     time through all frames, the place is interpolated between the frames next to the fix. Feeding packet by
-    packet or all at once gives the same fixes.
+    packet or all at once gives the same fixes. Reflections are left out.
 
     Args:
         camera: The receiving camera.
@@ -76,18 +76,25 @@ class Positioner:
         fixes = []
         for packet in packets:
             self._bars.hear(packet)
-            kept = self._frames.setdefault(packet.transmitter, [])
-            for frame in packet.frames:
-                if len(frame.points_px) == self._clusters and np.isfinite(frame.points_t_us):
-                    number = math.ceil(frame.points_t_us / self._packet_us - 0.5)
-                    if self._next is None:
-                        self._next = number
-                    # What is late for its own grid time may still serve the next as a neighbour.
-                    self._counts["frames_late"] += number < self._next
-                    kept.append(frame)
+            if packet.echo_of is None:
+                self._take(packet)
+            else:
+                # What was not known to be a reflection before is no bar at a place, either.
+                self._frames.pop(packet.transmitter, None)
             # A packet of another bar that starts half a packet after a fix is complete one packet later.
             fixes += self._until(packet.t_us / self._packet_us - 1.5)
         return fixes
+
+    def _take(self, packet: Packet) -> None:
+        kept = self._frames.setdefault(packet.transmitter, [])
+        for frame in packet.frames:
+            if len(frame.points_px) == self._clusters and np.isfinite(frame.points_t_us):
+                number = math.ceil(frame.points_t_us / self._packet_us - 0.5)
+                if self._next is None:
+                    self._next = number
+                # What is late for its own grid time may still serve the next as a neighbour.
+                self._counts["frames_late"] += number < self._next
+                kept.append(frame)
 
     def close(self) -> list[Fix]:
         """End the stream; return the rest of the fixes."""

@@ -63,7 +63,10 @@ class Whereabouts:
         return {number: how for number, how in found.items() if how}
 
     def hear(self, packet: Packet) -> None:
-        """Take what a packet's beacons say of its transmitter."""
+        """Take what a packet's beacons say of its transmitter; a reflection is left out."""
+        if packet.echo_of is not None:
+            self._said.pop(packet.transmitter, None)
+            return
         said = self._said.setdefault(packet.transmitter, _Said())
         for heard in packet.messages:
             if heard.trust == "forged":

@@ -19,6 +19,7 @@ FRAME_COLUMNS = (
     "distance_sigma_m",
     "x_px",
     "y_px",
+    "echo_of",
 )
 """Columns of every frame."""
 
@@ -29,7 +30,8 @@ FILTERED_COLUMNS = ("distance_filtered_m", "distance_filtered_sigma_m")
 def frame_value(frame: Frame, column: str) -> Any:
     """A frame's value in a column, not rounded.
 
-    `symbols` is a list, None for a symbol that is not given; a distance that is not given is NaN.
+    `symbols` is a list, None for a symbol that is not given; a distance that is not given is NaN; `echo_of`
+    is None where the frame is not a reflection.
     """
     match column:
         case "symbols":

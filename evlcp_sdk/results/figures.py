@@ -367,7 +367,7 @@ def _draw_one_presence(part: SubFigure, best: _Shown) -> None:
             )
     profile.set(xlabel="pilot correlation of the row", xlim=(0, None))
     _plain(profile)
-    _title(profile, f"transmitter {frame.transmitter}, packet {frame.packet}, frame {frame.frame}")
+    _title(profile, f"{_who(frame)}, packet {frame.packet}, frame {frame.frame}")
 
 
 def draw_distance(probe: FigureProbe, title: str) -> Figure:
@@ -388,7 +388,7 @@ def draw_distance(probe: FigureProbe, title: str) -> Figure:
         near, far = (distance - sigma)[known], (distance + sigma)[known]
         axis.fill_between(t_s[known], near, far, color=colour, alpha=0.25, lw=0, label="one sigma")
         axis.set_ylabel("distance, m")
-        _title(axis, f"transmitter {number}, {known.sum()} distances")
+        _title(axis, f"{_who(frames[-1])}, {known.sum()} distances")
         axis.legend(frameon=False, fontsize=9)
         last.plot(t_s, [f.soft.quality for f in frames], "o", ms=2.5, color=colour)
     last.set(ylabel="quality", xlabel="time since the first event, s", ylim=(0, 1.05))
@@ -422,6 +422,13 @@ def _bounds(path: Iterable[Region]) -> tuple[float, float, float, float]:
         right.append(x + region.width_px)
         lower.append(y + region.height_px)
     return min(left), min(upper), max(right), max(lower)
+
+
+def _who(frame: Frame) -> str:
+    """The transmitter of a frame, and of which it is a reflection."""
+    return f"transmitter {frame.transmitter}" + (
+        "" if frame.echo_of is None else f" (reflection of {frame.echo_of})"
+    )
 
 
 def _title(axis: Axes, text: str) -> None:

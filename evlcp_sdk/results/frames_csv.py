@@ -40,4 +40,6 @@ def _text(column: str, value: Any) -> str:
     """A value as text; empty where there is none, `-` for a symbol not given."""
     if isinstance(value, list):
         return " ".join("-" if symbol is None else str(symbol) for symbol in value)
-    return text_or_empty(value, _DIGITS.get(column, 4)) if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return text_or_empty(value, _DIGITS.get(column, 4))
+    return "" if value is None else str(value)

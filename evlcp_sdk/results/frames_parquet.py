@@ -24,7 +24,7 @@ class FramesParquet(Sink):
 
         super().__init__(folder, run)
         whole, real = pyarrow.int64(), pyarrow.float64()
-        types = [whole, whole, whole, real, pyarrow.list_(whole), real, real, real, real, real]
+        types = [whole, whole, whole, real, pyarrow.list_(whole), *[real] * 5, whole]
         self._columns = FRAME_COLUMNS + (FILTERED_COLUMNS if is_filtered(run) else ())
         types += [real] * (len(self._columns) - len(types))
         self._schema = pyarrow.schema(list(zip(self._columns, types, strict=True)))

@@ -43,6 +43,7 @@ def packet_line(packet: Packet, codebook: Codebook) -> dict[str, Any]:
         "kind": "packet",
         "transmitter": packet.transmitter,
         "packet": packet.packet,
+        "echo_of": packet.echo_of,
         "t_us": round(packet.t_us, 2),
         "chip_us": round(packet.chip_us, 6),
         "frames_sent": packet.sent,

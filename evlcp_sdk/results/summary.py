@@ -7,6 +7,7 @@ from typing import Any, Literal
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.records import SUMMARY
+from evlcp_sdk.results.doubts import warnings_of
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.tallies import RunTally
 
@@ -53,7 +54,8 @@ def summary_of(
         "recording": dict(recording),
         "processing": dict(processing),
         "counts": dict(counts),
-        "messages_off": _messages_off(link),
+        "messages_off": (off := _messages_off(link)),
+        "warnings": warnings_of(tally, counts, link, reads_messages=off is None),
         "losses": {kind: dict(loss) for kind, loss in losses.items()},
         "digest": link.digest,
         "codebook": {"digest": link.codebook.digest, "profile": link.codebook.profile},

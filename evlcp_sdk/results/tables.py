@@ -15,7 +15,8 @@ def frames_table(packets: Iterable[Packet], kind: Literal["pandas", "arrow"] = "
     """The frames of packets as a table, a row per frame, with the columns of `frames.csv`, not rounded.
 
     `symbols` holds lists, None for a symbol that is not given; a distance that is not given is NaN in pandas,
-    null in Arrow. The columns of the filtered distance are there if any frame has one.
+    null in Arrow; `echo_of` is null in both where a frame is not a reflection. The columns of the filtered
+    distance are there if any frame has one.
 
     Args:
         packets: What a receiver gives; read to the end.
@@ -32,8 +33,10 @@ def frames_table(packets: Iterable[Packet], kind: Literal["pandas", "arrow"] = "
         names += FILTERED_COLUMNS
     columns = {name: [frame_value(frame, name) for frame in frames] for name in names}
     if kind == "pandas":
-        return pandas_frame(columns)
+        return pandas_frame(columns).astype({"echo_of": "Int64"})
     for name, values in columns.items():
         if values and isinstance(values[0], float):
             columns[name] = [v if math.isfinite(v) else None for v in values]
-    return arrow_table(columns)
+    table, at = arrow_table(columns), names.index("echo_of")
+    # Where nothing is a reflection, the column has no type of its own.
+    return table.set_column(at, "echo_of", table.column(at).cast("int64"))

@@ -42,6 +42,10 @@ class TransmitterTally:
     first_m: float = math.nan
     last_m: float = math.nan
     cells: Counter[int] = field(default_factory=Counter)
+    echoes: int = 0
+    echo_of: int | None = None
+    values: Counter[int] = field(default_factory=Counter)
+    unseen: Counter[int] = field(default_factory=Counter)
 
     def add(self, packet: Packet) -> None:
         """Count a packet and its frames."""
@@ -58,6 +62,11 @@ class TransmitterTally:
             self.first_frame = number if self.first_frame < 0 else self.first_frame
             self.last_frame = number
             self.quality_sum += frame.soft.quality
+            self.echoes += frame.echo_of is not None
+            self.echo_of = frame.echo_of
+            symbols = frame.soft.symbols.tolist()
+            self.values.update(s for s in symbols if s >= 0)
+            self.unseen.update(k for k, s in enumerate(symbols) if s < 0)
             distance_m = frame.range.distance_m
             if math.isfinite(distance_m):
                 self.ranged += 1
@@ -75,6 +84,16 @@ class TransmitterTally:
                 return round(cell * _CELL_M, 2)
         return math.nan
 
+    @property
+    def given(self) -> int:
+        """Symbols that are given."""
+        return self.values.total()
+
+    @property
+    def erased(self) -> int:
+        """Symbols that are not, as their cluster was not seen."""
+        return self.unseen.total()
+
     def clock_ppm(self) -> float:
         """The transmitter's chip rate against the camera's clock, ppm; NaN before the second packet.
 
@@ -86,12 +105,17 @@ class TransmitterTally:
     def to_dict(self) -> dict[str, Any]:
         """The figures as JSON values; what was never measured is null.
 
-        `frames_expected` counts what was sent from the first decoded frame to the last.
+        `frames_expected` counts what was sent from the first decoded frame to the last; `echo_of` is what the
+        newest frame says.
         """
         return {
             "packets": self.packets,
             "frames_found": self.frames,
             "frames_expected": self.last_frame - self.first_frame + 1 if self.frames else 0,
+            "echo_of": self.echo_of,
+            "frames_echo": self.echoes,
+            "symbols_given": self.given,
+            "symbols_erased": self.erased,
             "quality": number_or_none(self.quality_sum / self.frames if self.frames else math.nan, 4),
             "clock_ppm": number_or_none(self.clock_ppm(), 2),
             "frames_ranged": self.ranged,
@@ -123,9 +147,15 @@ class RunTally:
         """What was found, in one sentence."""
         if not self.transmitters:
             return "no transmitter was found"
-        found = sum(tally.frames for tally in self.transmitters.values())
-        number = len(self.transmitters)
-        return f"{number} transmitter{'s' * (number > 1)}, {found} frame{'s' * (found != 1)}"
+        tallies = self.transmitters.values()
+        own = [t.frames - t.echoes for t in tallies if t.frames > t.echoes or not t.echoes]
+        echoes = [t.echoes for t in tallies if t.echoes]
+        parts = ((own, "transmitter"), (echoes, "reflection"))
+        return "; ".join(
+            f"{len(frames)} {what}{'s' * (len(frames) > 1)}, {sum(frames)} frame{'s' * (sum(frames) != 1)}"
+            for frames, what in parts
+            if frames
+        )
 
     def to_list(self) -> list[dict[str, Any]]:
         """The figures of each transmitter as JSON values."""

@@ -111,6 +111,7 @@ class MessageAssembler:
         self._verified: OrderedDict[int, _Verified] = OrderedDict()
         self._counts = dict.fromkeys(
             (
+                "blocks_reflected",
                 "blocks_tried",
                 "blocks_decoded",
                 "blocks_combined",
@@ -150,7 +151,13 @@ class MessageAssembler:
         return dict(self._counts)
 
     def add(self, packet: Packet) -> Packet:
-        """Read a packet; return it with its block and the messages that it completes."""
+        """Read a packet; return it with its block and the messages that it completes.
+
+        A reflection is left out: it repeats what its transmitter says, with more errors.
+        """
+        if packet.echo_of is not None:
+            self._counts["blocks_reflected"] += 1
+            return packet
         inbox = _kept(self._inboxes, packet.transmitter, _Inbox)
         while len(self._inboxes) > _MOST_TRANSMITTERS:
             self._give_up(self._inboxes.popitem(last=False)[1])

@@ -50,6 +50,7 @@ def given(frame: Frame) -> GivenFrame:
         filtered_m=math.nan if frame.filtered is None else frame.filtered.distance_m,
         x_px=frame.x_px,
         y_px=frame.y_px,
+        echo_of=frame.echo_of,
     )
 
 

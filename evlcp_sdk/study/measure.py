@@ -125,7 +125,7 @@ def message_tallies(packets: Iterable[Packet], truth: Truth, coder: BlockCoder) 
         for at in sent.distance_m[sent.whole].tolist()
     ]
     for packet in packets:
-        if packet.block is None or not packet.frames:
+        if packet.block is None or not packet.frames or packet.echo_of is not None:
             continue
         t_us = packet.t_us - truth.t0_us
         nearest = nearest_bar([sent.bar for sent in bars], truth, t_us, packet.frames[0])
@@ -160,7 +160,8 @@ def position_tallies(
     first: dict[int, Frame] = {}
     for packet in packets:
         for frame in packet.frames:
-            first.setdefault(packet.transmitter, frame)
+            if frame.echo_of is None:
+                first.setdefault(packet.transmitter, frame)
     for number, frame in first.items():
         nearest = nearest_bar(truth.bars, truth, frame.t_us - truth.t0_us, frame)
         if nearest is not None and nearest[1] <= NEAREST_PX and sites[nearest[0]].transmitter is None:

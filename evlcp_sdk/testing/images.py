@@ -139,8 +139,12 @@ def decoding_shapes(subject: Subject) -> None:
         _array(soft.llr, np.float32, (book.clusters, book.bits_per_symbol), "llr")
         expect(0 <= soft.quality <= 1, f"a quality from 0 to 1, got {soft.quality}")
         top = len(book.codewords) - 1
-        expect(soft.symbols.min() >= 0 and soft.symbols.max() <= top, f"symbols from 0 to {top}")
+        expect(
+            soft.symbols.min() >= -1 and soft.symbols.max() <= top,
+            f"symbols from 0 to {top}, or -1 for a cluster that is not seen",
+        )
         expect(np.isfinite(soft.llr).all(), "finite llr")
+        expect(not soft.llr[soft.symbols < 0].any(), "llr 0 for a cluster that is not seen")
 
 
 def decoding_inverts(subject: Subject) -> None:
@@ -164,7 +168,7 @@ def llr_agrees(subject: Subject) -> None:
             symbols = symbols_of(book, seed)
             soft = decode(ideal_presence(book.clusters), ideal_sums(book, symbols, missing=0.1, seed=seed))
             zero = (soft.symbols[:, None] >> np.arange(m - 1, -1, -1) & 1) == 0
-            wrong = np.argwhere((soft.llr > 0) != zero)
+            wrong = np.argwhere(((soft.llr > 0) != zero) & (soft.symbols[:, None] >= 0))
             if len(wrong):
                 c, b = wrong[0]
                 expect(
@@ -330,7 +334,7 @@ SEPARATION = (
 DECODING = (
     Law("shapes", "SoftSymbols of the documented shapes and types, values in range", decoding_shapes),
     Law("inverts", "every symbol of every profile comes back from an ideal image", decoding_inverts),
-    Law("llr-agrees", "the signs of the log-likelihood ratios spell the symbols", llr_agrees),
+    Law("llr-agrees", "the signs of the log-likelihood ratios spell the symbols that are given", llr_agrees),
     Law("permutes", "clusters in another order say the same in that order", decoding_permutes),
     Law("knows-nothing", "without events the log-likelihood ratios are 0", decodes_nothing),
 )

@@ -2,6 +2,7 @@
 
 import builtins
 import math
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -156,6 +157,18 @@ class Cells(HTMLParser):
         self.texts.setdefault(self.open[-1], []).append(data)
 
 
+def test_a_reflection_and_a_symbol_that_is_not_given_are_seen_in_reprs() -> None:
+    hidden = replace(SOFT, symbols=np.array([23, -1, 8, 51]))
+    echo = replace(frame(), soft=hidden, echo_of=2)
+    assert repr(echo).startswith("Frame(transmitter 0, a reflection of 2, packet 1, frame 3, ")
+    assert "23 - 8 51" in repr(echo)
+    assert "-1" not in repr(echo) + repr(hidden)
+    one = replace(packet(), frames=(echo,))
+    assert (one.echo_of, packet().echo_of, replace(one, frames=()).echo_of) == (2, None, None)
+    assert "transmitter 0, a reflection of 2, packet 1" in repr(one)
+    assert "23 - 8 51" in one._repr_html_()
+
+
 def test_a_packet_in_a_notebook() -> None:
     evil = "<script>alert('x')</script> & more"
     page = packet(text_message(evil))._repr_html_()
@@ -209,6 +222,9 @@ def test_frames_as_a_table(demo_raw: Path) -> None:
     assert np.array_equal(table["distance_m"], [f.range.distance_m for f in frames], equal_nan=True)
     assert table["frame"].tolist() == [f.frame for f in frames]
     assert table.equals(evlcp.frames_table(packets, "pandas"))
+    assert (str(table["echo_of"].dtype), table["echo_of"].notna().any()) == ("Int64", False)
+    marked = [replace(p, frames=tuple(replace(f, echo_of=3) for f in p.frames)) for p in packets]
+    assert set(evlcp.frames_table(marked, "pandas")["echo_of"]) == {3}
 
 
 def test_frames_as_arrow_with_nulls_and_the_filtered_distance() -> None:
@@ -220,6 +236,7 @@ def test_frames_as_arrow_with_nulls_and_the_filtered_distance() -> None:
     assert table["distance_m"].to_pylist() == [None, 49.337]
     assert table["distance_filtered_m"].to_pylist() == [48.0, None]
     assert table["symbols"].to_pylist() == [[23, 18, 8, 51]] * 2
+    assert (str(table["echo_of"].type), table["echo_of"].to_pylist()) == ("int64", [None, None])
     assert evlcp.frames_table([], "arrow").num_rows == 0
     with pytest.raises(evlcp.ConfigError, match="kind = 'csv', expected 'pandas' or 'arrow'"):
         evlcp.frames_table([], "csv")  # type: ignore[arg-type]

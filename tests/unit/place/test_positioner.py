@@ -136,6 +136,31 @@ def test_feeding_by_packets_or_all_at_once_is_the_same() -> None:
     np.testing.assert_array_equal([f.enu_m for f in whole], [f.enu_m for f in parts])
 
 
+@pytest.mark.parametrize("known_from", [0, 2])
+def test_a_mirror_image_is_no_bar(known_from: int) -> None:
+    """The bar's image in a wet road, upside down under it, repeats its beacon; fixes are those of the bar."""
+    told = {n: (heard(LEFT, "verified", 0),) for n in range(8)}
+    own = packets_of(LEFT, 0, 8, messages=told)
+    image = []
+    for n, packet in enumerate(packets_of(LEFT, 1, 8, messages=told)):
+        echo_of = 0 if n >= known_from else None
+        frames = tuple(
+            dataclasses.replace(f, echo_of=echo_of, points_px=f.points_px * [1, -1] + [0, 1100])
+            for f in packet.frames
+        )
+        image.append(dataclasses.replace(packet, frames=frames, messages=() if echo_of == 0 else told[0]))
+    # No site names a transmitter, so that only a bar that is alone stands there by its number.
+    alone, both = positioner([LEFT]), positioner([LEFT])
+    want = alone.feed(own) + alone.close()
+    fixes = both.feed(merged(own, image)) + both.close()
+    # A fix waits for half a packet on both sides.
+    late = [f for f in fixes if f.t_us > known_from * PACKET_US]
+    assert_right(late)
+    assert {f.transmitters for f in late} == {(0,)}
+    assert [repr(f) for f in late] == [repr(f) for f in want[-len(late) :]]
+    assert set(both.stands_at) == {0}
+
+
 def test_dark_clusters_and_a_gap_in_time() -> None:
     p = positioner([LEFT])
     fixes = p.feed(packets_of(LEFT, 0, 4, dark=(2, 9)))

@@ -27,6 +27,7 @@ from evlcp_sdk.results.tallies import TransmitterTally
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.values import Frame, Packet, Range, ReceivedMessage, SoftSymbols
 
 BOOK = Codebook("wh8", WhPilots().preamble(), WhPilots().codes(16), Wh8().codewords())
@@ -95,7 +96,7 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
     assert tuple(rows[0]) == FRAME_COLUMNS
     assert list(rows[0].values()) == [
         *("0", "0", "0", "12345.68", "0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15", "0.8750"),
-        *("50.0000", "0.0500", "640.123", "360.500"),
+        *("50.0000", "0.0500", "640.123", "360.500", ""),
     ]
     assert (rows[1]["distance_m"], rows[1]["distance_sigma_m"]) == ("", "")
 
@@ -120,6 +121,10 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
         "packets": 2,
         "frames_found": 3,
         "frames_expected": 8,
+        "echo_of": None,
+        "frames_echo": 0,
+        "symbols_given": 48,
+        "symbols_erased": 0,
         "quality": 0.875,
         "clock_ppm": 10.0,
         "frames_ranged": 2,
@@ -194,6 +199,25 @@ def test_parquet_has_null_for_a_symbol_that_is_not_given(tmp_path: Path) -> None
         finish(writer)
     (row,) = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
     assert row["symbols"] == [7, 7, 7, None, *[7] * 12]
+
+
+def test_a_reflection_is_named_as_one(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
+    import pyarrow.parquet
+
+    own, echo = frame(0, 0), replace(frame(0, 0, transmitter=1), echo_of=0)
+    with ResultWriter(tmp_path, LINK, sinks=["parquet"]) as writer:
+        writer.write([packet(0, (own,)), packet(0, (echo,), transmitter=1)])
+        table = finish(writer)
+    assert [row["echo_of"] for row in rows_of(tmp_path)] == ["", "0"]
+    lines = [json.loads(text) for text in (tmp_path / "packets.jsonl").read_text().splitlines()]
+    assert [line["echo_of"] for line in lines] == [None, 0]
+    column = pyarrow.parquet.read_table(tmp_path / "frames.parquet")["echo_of"]
+    assert (str(column.type), column.to_pylist()) == ("int64", [None, 0])
+    assert table["result"] == "1 transmitter, 1 frame; 1 reflection, 1 frame"
+    told = [(t["transmitter"], t["echo_of"], t["frames_echo"]) for t in table["transmitters"]]
+    assert told == [(0, None, 0), (1, 0, 1)]
+    assert [(f.transmitter, f.echo_of) for f in read_frames(tmp_path)] == [(0, None), (1, 0)]
 
 
 def test_no_transmitter_is_said_plainly(tmp_path: Path) -> None:

@@ -166,6 +166,28 @@ def test_lost_frames_count_as_unknown(lost: range) -> None:
     assert packet.block_packets == 1
 
 
+@pytest.mark.parametrize("hidden", [[4, 5, 6, 12], range(10, 16), [0, 1, 7, 8, 14, 15]])
+def test_hidden_clusters_count_as_unknown(hidden: Iterable[int]) -> None:
+    """Clusters that are not given have LLR 0, and the error correction carries the message over them."""
+    block = blocks_of(Message(Kind.TEXT, 1, 0, b"Hello"))[0]
+    llr = noisy(block, 0.01, np.random.default_rng(3)).reshape(10, 16, 6)
+    llr[:, list(hidden)] = 0
+    assembler = MessageAssembler(CODER, MessageSpec())
+    packet = assembler.add(packet_of(llr, 0))
+    assert [m.message.text for m in packet.messages] == ["Hello"]
+    assert (packet.block, packet.block_packets) == (Block.unpack(block), 1)
+
+
+def test_a_reflection_says_nothing_new() -> None:
+    blocks = blocks_of(Message(Kind.TEXT, 1, 0, b"Hello"))
+    packet = packet_of(noisy(blocks[0], 0.01, np.random.default_rng(3)), 0, transmitter=1)
+    echo = replace(packet, frames=tuple(replace(f, echo_of=0) for f in packet.frames))
+    assembler = MessageAssembler(CODER, MessageSpec())
+    assert assembler.add(echo) is echo
+    assert {k: n for k, n in assembler.counts.items() if n} == {"blocks_reflected": 1}
+    assert assembler.add(packet).messages
+
+
 def test_another_codebook_is_told() -> None:
     feed = Feed()
     assert not feed(blocks_of(Message(Kind.TEXT, 1, 0, b"Hi"), digest=b"\0\0\0\0"))

@@ -1,0 +1,89 @@
+"""What looks wrong in a result, in words, each with the next step to try."""
+
+import math
+from collections.abc import Iterator, Mapping
+
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.results.tallies import RunTally, TransmitterTally
+
+__all__ = ["warnings_of"]
+
+_FEW_FRAMES = 10
+"""Frames of a packet by default: of fewer, nothing is said."""
+
+_REJECTED_SHARE = 0.1
+"""Rejected frames of which more is said: a bar that comes into view, or leaves it, loses a frame or two."""
+
+_CRYSTALS_PPM = 200.0
+"""Two crystals are this far apart at most, 100 ppm each."""
+
+_BY_CHANCE = 1e-6
+"""Probability of a finding by chance below which it is told."""
+
+
+def warnings_of(
+    tally: RunTally, counts: Mapping[str, int], link: Link, *, reads_messages: bool = True
+) -> list[str]:
+    """What looks wrong in a result, a line each.
+
+    Args:
+        tally: Figures of the transmitters; what is said to be a reflection is not doubted.
+        counts: The receiver's counts.
+        link: The configuration that it ran with.
+        reads_messages: Whether messages were looked for.
+    """
+    found = [*_frames(counts)]
+    for number, one in sorted(tally.transmitters.items()):
+        if one.frames - one.echoes >= _FEW_FRAMES:
+            found += [f"transmitter {number}: {text}" for text in _transmitter(one, link)]
+    if reads_messages:
+        found += _blocks(counts, tally)
+    return found
+
+
+def _frames(counts: Mapping[str, int]) -> Iterator[str]:
+    rejected, frames = counts.get("frames_rejected", 0), counts.get("frames", 0)
+    if rejected >= _FEW_FRAMES and rejected > _REJECTED_SHARE * (frames + rejected):
+        yield (
+            f"{rejected} of {frames + rejected} frames rejected, as their clusters do not stand where the bar"
+            " has them: compare the link's [bar] and [pilots] with the transmitter's, and see --figures"
+        )
+
+
+def _transmitter(one: TransmitterTally, link: Link) -> Iterator[str]:
+    ppm = one.clock_ppm()
+    if abs(ppm) > _CRYSTALS_PPM:
+        fits = link.packet.chip_rate_hz * (1 + ppm * 1e-6)
+        yield (
+            f"its clock is {ppm:+.0f} ppm off the link's, crystals stay within {_CRYSTALS_PPM:.0f}:"
+            f" air.chip_rate_hz = {fits:.6g} would fit"
+        )
+    codewords = len(link.codebook.codewords)
+    never = codewords - len(one.values)
+    # Equally likely codewords; the union of all sets of so many bounds the chance that they never occur.
+    ways = math.lgamma(codewords + 1) - math.lgamma(never + 1) - math.lgamma(codewords - never + 1)
+    if one.given and never and ways + one.given * math.log1p(-never / codewords) < math.log(_BY_CHANCE):
+        yield (
+            f"{never} of {codewords} codewords never occur in {one.given} symbols: data that repeats,"
+            " or another modulation than modulation.id"
+        )
+    hidden = [k for k in range(link.codebook.clusters) if one.unseen[k] == one.frames]
+    if hidden:
+        yield (
+            f"clusters never seen: {', '.join(map(str, hidden))}: something covers them, or the bar has other"
+            " clusters than the link's"
+        )
+
+
+def _blocks(counts: Mapping[str, int], tally: RunTally) -> Iterator[str]:
+    tried = counts.get("blocks_tried", 0)
+    read = counts.get("blocks_decoded", 0) + counts.get("blocks_combined", 0)
+    if other := counts.get("blocks_other_codebook", 0):
+        yield f"{other} packets were sent with another codebook: compare both ends' `evlcp config`"
+    # Packets with frames missing may fail by themselves.
+    whole = sum(one.frames - one.echoes for one in tally.transmitters.values()) >= _FEW_FRAMES
+    if tried and not read and whole:
+        yield (
+            f"none of {tried} packets has a block that can be read: another error correction than"
+            " error-correction.id, or no messages were sent (say messages.decode = false)"
+        )

@@ -1,0 +1,80 @@
+"""What looks wrong is said, and nothing of what looks right."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.results.doubts import warnings_of
+from evlcp_sdk.results.tallies import RunTally
+from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
+
+LINK = load_link()
+NONE = Range(float("nan"), float("nan"), 0)
+
+
+def tally_of(symbols: np.ndarray, *, ppm: float = 0.0, echo_of: int | None = None) -> RunTally:
+    """Packets of ten frames with these symbols, (packets, 10, 16)."""
+    tally = RunTally(LINK.packet)
+    for n, packet in enumerate(symbols):
+        frames = tuple(
+            Frame(0, n, f, 0.0, SoftSymbols(said, np.zeros((16, 6), np.float32), 1.0), NONE, None, 0.0, 0.0)
+            for f, said in enumerate(packet)
+        )
+        frames = tuple(replace(frame, echo_of=echo_of) for frame in frames)
+        period_us = LINK.packet.packet_chips * 100.0 / (1 + ppm * 1e-6)
+        tally.add(Packet(0, n, n * period_us, 100.0, frames, 10))
+    return tally
+
+
+def told(tally: RunTally, link: Link = LINK, **counts: int) -> list[str]:
+    return warnings_of(tally, counts, link)
+
+
+RANDOM = np.random.default_rng(1).integers(0, 64, (6, 10, 16))
+
+
+def test_what_is_right_is_not_doubted() -> None:
+    assert (
+        told(tally_of(RANDOM, ppm=100), frames=60, frames_rejected=6, blocks_tried=6, blocks_decoded=1) == []
+    )
+    assert told(RunTally(LINK.packet)) == []
+    # Of one packet, a dozen codewords are missing by chance.
+    assert len(np.unique(RANDOM[0])) < 64
+    assert told(tally_of(RANDOM[:1])) == []
+
+
+def test_codewords_that_never_occur() -> None:
+    (line,) = told(tally_of(RANDOM % 16))
+    assert line.startswith("transmitter 0: 48 of 64 codewords never occur in 960 symbols")
+    assert "modulation.id" in line
+
+
+@pytest.mark.parametrize("ppm", [-5000.0, 300.0])
+def test_a_clock_that_no_crystal_has(ppm: float) -> None:
+    (line,) = told(tally_of(RANDOM, ppm=ppm))
+    assert f"{ppm:+.0f} ppm off" in line
+    assert f"air.chip_rate_hz = {10_000 + ppm / 100:.6g} would fit" in line
+
+
+def test_clusters_that_are_never_seen() -> None:
+    hidden = RANDOM.copy()
+    hidden[:, :, [4, 12]] = -1
+    hidden[:3, :, 7] = -1
+    (line,) = told(tally_of(hidden))
+    assert line.startswith("transmitter 0: clusters never seen: 4, 12: ")
+
+
+def test_frames_rejected_and_blocks_that_cannot_be_read() -> None:
+    (line,) = told(tally_of(RANDOM), frames=60, frames_rejected=20)
+    assert line.startswith("20 of 80 frames rejected")
+    (line,) = told(tally_of(RANDOM), blocks_tried=6)
+    assert "error-correction.id" in line
+    assert warnings_of(tally_of(RANDOM), {"blocks_tried": 6}, LINK, reads_messages=False) == []
+    (line,) = told(tally_of(RANDOM), blocks_tried=6, blocks_decoded=4, blocks_other_codebook=2)
+    assert line.startswith("2 packets were sent with another codebook")
+
+
+def test_a_reflection_is_not_doubted() -> None:
+    assert told(tally_of(RANDOM % 16, ppm=5000, echo_of=3), blocks_tried=0) == []
