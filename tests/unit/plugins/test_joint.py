@@ -5,7 +5,7 @@ import pytest
 from evlcp_joint import _kernels
 from evlcp_joint.ranging import JointScaleRanging
 from numpy.testing import assert_allclose
-from scipy.stats import norm
+from scipy.stats import norm, theilslopes
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
@@ -83,8 +83,8 @@ def measured(view: FrameView, **parameters: float) -> Range:
 @pytest.mark.parametrize("distance_m", [30.0, 41.7, 50.0, 66.6, 80.0, 100.0])
 @pytest.mark.parametrize("shift_px", [-0.4, 0.0, 0.25])
 def test_ideal_images_give_their_distance(distance_m: float, shift_px: float) -> None:
-    found = measured(view_of(distance_m, shift_px=shift_px))
-    # Whole events of three at most, and no noise to smooth them, leave some tenths of a pixel a boundary.
+    # A little noise, as without it whole events of three at most put all pixels of a row into one step.
+    found = measured(view_of(distance_m, shift_px=shift_px, noise=0.5))
     assert found.distance_m == pytest.approx(distance_m, rel=3e-3)
     assert found.sigma_m < 4e-3 * distance_m
     assert found.pairs == 15
@@ -110,6 +110,64 @@ def test_it_stands_tilt_motion_and_damage(how: dict[str, float]) -> None:
     assert found.pairs == (13 if "dark" in how else 15)
 
 
+def test_unknown_symbols_leave_the_pilot_of_their_clusters() -> None:
+    view = view_of(50.0, noise=0.5, seed=4)
+    symbols = view.soft.symbols.copy()
+    symbols[[2, 3, 9]] = -1
+    soft = SoftSymbols(symbols, view.soft.llr, 1.0)
+    found = measured(FrameView(view.sums, view.offset_px, view.presence, soft))
+    assert found.distance_m == pytest.approx(50, rel=4e-3)
+    assert found.pairs == 15
+    # Guessed at, they would be left out or bend the fit.
+    symbols[[2, 3, 9]] = (view.soft.symbols[[2, 3, 9]] + 1) % 64
+    guessed = measured(FrameView(view.sums, view.offset_px, view.presence, soft))
+    assert found.sigma_m < guessed.sigma_m
+
+
+def test_a_reflection_beside_the_bar_does_not_matter() -> None:
+    view = view_of(50.0, noise=0.5, seed=4)
+    beside = np.pad(view.sums, ((0, 0), (0, 0), (0, 24)))
+    dim = np.random.default_rng(1).random(view.sums.shape) < 0.4
+    beside[:, :, 24:] += view.sums * dim
+    cells = view.presence.selected
+    selected = np.pad(cells, ((0, 0), (0, 0), (0, 12)))
+    selected[:, :, 12:] |= cells & (np.random.default_rng(2).random(cells.shape) < 0.6)
+    presence = PresenceMap(
+        selected.astype(np.float32), 2, selected, np.zeros((K, *beside.shape[1:]), np.float32)
+    )
+    found = measured(FrameView(beside, view.offset_px, presence, view.soft))
+    alone = measured(view)
+    assert found.distance_m == pytest.approx(alone.distance_m, abs=0.3 * alone.sigma_m)
+    assert found.pairs == 15
+
+
+@pytest.mark.parametrize("shift", [0, 7])
+def test_values_that_the_fit_does_not_explain_give_no_distance(shift: int) -> None:
+    """Noise with the cells of a bar, and a bar whose cells lie a cluster off."""
+    view = view_of(50.0, noise=0.5, seed=4)
+    sums = np.roll(view.sums, shift, 1)
+    if not shift:
+        sums = np.random.default_rng(3).integers(-3, 4, view.sums.shape).astype(np.int16)
+    found = measured(FrameView(sums, view.offset_px, view.presence, view.soft))
+    assert np.isnan(found.distance_m)
+    assert found.pairs == 0
+
+
+def test_whole_pixels_between_a_value_s_chips_do_not_move_the_bar() -> None:
+    """A bar that moves on by whole pixels, held still chip by chip: its values know of none of it."""
+    still, moving = view_of(50.0, noise=0.5, seed=4), view_of(50.0, noise=0.5, seed=4)
+    speed = 0.17
+    place = speed * (np.arange(32) + 0.5)
+    # A value's events show the bar half a chip before its second chip's middle.
+    shown = np.rint(speed * np.arange(32) - np.rint(place)).astype(int)
+    sums = np.stack([np.roll(s, by, 0) for s, by in zip(moving.sums, shown, strict=True)])
+    offset = np.stack([np.zeros(32), place - np.rint(place)])
+    found = measured(FrameView(sums, offset, moving.presence, moving.soft))
+    want = measured(still)
+    # The image moves by whole pixels only, which leaves a uniform error of a pixel.
+    assert found.distance_m == pytest.approx(want.distance_m, abs=0.05)
+
+
 def test_sigma_is_the_spread() -> None:
     errors = []
     for seed in range(60):
@@ -133,69 +191,182 @@ def test_panels_are_refused() -> None:
         JointScaleRanging().compile(CameraModel(), panel, LINK.codebook)
 
 
+PROFILE = (0.2, 0.6, 0.4)
+
+
+def profile_of(z: np.ndarray, width: float) -> np.ndarray:
+    """The twin of a boundary's profile."""
+    core, tail, share = PROFILE[0] * np.exp(width), PROFILE[1] * np.exp(width), PROFILE[2]
+    return share * norm.cdf(z / core) + (1 - share) * norm.cdf(z / tail)
+
+
+def model_of(
+    fit: np.ndarray, codes: np.ndarray, known: np.ndarray, offset: np.ndarray, when: np.ndarray, rows: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    values = codes.shape[1]
+    value, slope = np.empty((values, rows)), np.empty((5, values, rows))
+    nearest = np.empty((values, rows), np.int64)
+    _kernels.model(codes, known, offset, when, PROFILE, fit, value, slope, nearest)
+    return value, slope, nearest
+
+
 @pytest.mark.parametrize("seed", range(3))
-def test_model_is_the_normal_distribution_and_its_slopes_are_differences(seed: int) -> None:
+def test_model_is_the_profile_and_its_slopes_are_differences(seed: int) -> None:
     rng = np.random.default_rng(seed)
     codes = rng.choice([-1, 1], (K, 4))
-    seen = rng.random(K) > 0.1
+    known = rng.random((K + 1, 4)) > 0.1
     offset, when = rng.uniform(-0.5, 0.5, 4), np.linspace(-0.5, 0.5, 4)
-    fit = np.array([7.3, 0.4, 0.3, 0.8])
-
-    def value_of(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        value, slope = np.empty((4, 130)), np.empty((4, 4, 130))
-        _kernels.model(codes, seen, offset, when, 0.5, at, value, slope)
-        return value, slope
-
-    value, slope = value_of(fit)
+    fit = np.array([7.3, 0.4, 0.3, 0.8, 0.1])
+    value, slope, nearest = model_of(fit, codes, known, offset, when, 130)
     rows = np.arange(130) - 64.5
     for i in range(4):
         at = rows - offset[i] - fit[1] - fit[2] * when[i]
-        cdf = norm.cdf((at[:, None] - fit[0] * (np.arange(1, K) - K / 2)) / 0.5)
-        want = fit[3] * (codes[0, i] + cdf @ np.diff(codes[:, i]))
+        share = profile_of(at[:, None] - fit[0] * (np.arange(1, K) - K / 2), fit[4])
+        want = fit[3] * (codes[0, i] + share @ np.diff(codes[:, i]))
         counts = ~np.isnan(value[i])
         assert counts.sum() > 60
-        # Further boundaries are left out: seven spacings of blur away.
-        assert_allclose(value[i, counts], want[counts], atol=1e-9)
-    for a in range(4):
-        step = np.zeros(4)
+        # The tails end at four of their sigmas.
+        assert_allclose(value[i, counts], want[counts], atol=2e-4)
+        assert np.array_equal(nearest[i] >= 0, counts)
+        place = np.rint(at / fit[0] + K / 2).astype(int)
+        assert np.array_equal(nearest[i, counts], place[counts])
+        inside = (place >= 1) & (place <= K - 1)
+        assert np.array_equal(counts, inside & known[np.clip(place, 0, K), i])
+    for a in range(5):
+        step = np.zeros(5)
         step[a] = 1e-6
-        up, down = value_of(fit + step)[0], value_of(fit - step)[0]
-        both = ~np.isnan(up) & ~np.isnan(down)
-        assert_allclose(slope[a][both], ((up - down) / 2e-6)[both], atol=1e-5)
+        up = model_of(fit + step, codes, known, offset, when, 130)[0]
+        down = model_of(fit - step, codes, known, offset, when, 130)[0]
+        both = ~np.isnan(up) & ~np.isnan(down) & (np.abs(up - down) < 1e-5)
+        assert both.sum() > 240
+        assert_allclose(slope[a][both], ((up - down) / 2e-6)[both], atol=1e-4)
 
 
-def test_row_values_are_clipped_means() -> None:
+def test_column_light_is_the_mean_size_beside_the_line() -> None:
+    rng = np.random.default_rng(3)
+    sums = rng.integers(-6, 7, (8, 20, 15)).astype(np.int16)
+    line = np.array([5.0, 0.2])
+    out = np.empty(9)
+    _kernels.column_light(sums, line, 3, 16, 3.0, out)
+    want = np.zeros(9)
+    for v in range(3, 17):
+        middle = int(np.rint(5 + 0.2 * v))
+        for off in range(-4, 5):
+            if 0 <= middle + off < 15:
+                want[4 + off] += np.minimum(np.abs(sums[1::2, v, middle + off]) / 3.0, 1).sum()
+    assert_allclose(out, want / (14 * 4))
+
+
+def test_row_values_are_clipped_weighted_means() -> None:
     rng = np.random.default_rng(1)
     sums = rng.integers(-6, 7, (8, 20, 15)).astype(np.int16)
     line = np.array([5.0, 0.2])
+    weight = np.array([0.1, 0.5, 1.0, 0.6, 0.0])
     out = np.empty((4, 20))
-    _kernels.row_values(sums, line, 2.0, 3.0, out)
+    _kernels.row_values(sums, line, weight, 3.0, out)
     for v in range(20):
-        middle = 5 + 0.2 * v
-        columns = [u for u in range(15) if abs(u - middle) <= 2.0]
-        want = np.clip(sums[1::2, v][:, columns] / 3.0, -1, 1).mean(1)
-        assert_allclose(out[:, v], want)
+        columns = int(np.rint(5 + 0.2 * v)) + np.arange(-2, 3)
+        inside = (columns >= 0) & (columns < 15)
+        clipped = np.clip(sums[1::2, v][:, columns[inside]] / 3.0, -1, 1)
+        assert_allclose(out[:, v], np.average(clipped, axis=1, weights=weight[inside]))
 
 
-def test_normal_equations_are_huber_s() -> None:
-    rng = np.random.default_rng(2)
-    seen, value = rng.normal(size=(3, 12)), rng.normal(size=(3, 12))
-    value[1, 4] = np.nan
-    slope = rng.normal(size=(4, 3, 12))
-    normal, right, meat = np.empty((4, 4)), np.empty(4), np.empty((4, 4))
-    cost = _kernels.step_of(seen, value, slope, 0.5, normal, right)
-    rows = _kernels.row_scores(seen, value, slope, 0.5, meat)
+@pytest.mark.parametrize("seed", range(3))
+def test_normal_equations_scores_and_shifts_are_huber_s(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    codes = rng.choice([-1, 1], (K, 6))
+    known = rng.random((K + 1, 6)) > 0.1
+    offset, when = rng.uniform(-0.5, 0.5, 6), np.linspace(-0.5, 0.5, 6)
+    fit = np.array([6.1, 0.2, 0.1, 0.7, 0.2])
+    value, slope, nearest = model_of(fit, codes, known, offset, when, 90)
+    seen = np.nan_to_num(value) + rng.normal(0, 0.5, value.shape)
+    normal, right, meat = np.empty((5, 5)), np.empty(5), np.empty((5, 5))
+    cost = _kernels.equations(codes, known, offset, when, PROFILE, 0.5, 2.0, seen, fit, normal, right)
     good = ~np.isnan(value)
     r = (seen - value)[good]
-    J = slope[:, good]
+    j = slope[:, good]
     w = np.minimum(1, 0.5 / np.abs(r))
-    assert_allclose(normal, (J * w) @ J.T)
-    assert_allclose(right, (J * w) @ r)
-    assert cost == pytest.approx(np.where(np.abs(r) <= 0.5, r**2 / 2, 0.5 * (np.abs(r) - 0.25)).sum())
+    prior = np.diag([0, 0, 0, 0, 2.0])
+    assert_allclose(normal, (j * w) @ j.T + prior, atol=1e-10)
+    assert_allclose(right, (j * w) @ r - prior @ fit, atol=1e-10)
+    want = np.where(np.abs(r) <= 0.5, r**2 / 2, 0.5 * (np.abs(r) - 0.25)).sum()
+    assert cost == pytest.approx(want + 2.0 * fit[4] ** 2 / 2)
+    rows = _kernels.row_scores(seen, value, slope, 0.5, meat)
     clipped = np.where(good, np.clip(seen - value, -0.5, 0.5), 0)
     scores = (slope * clipped).sum(1)
     assert_allclose(meat, scores @ scores.T)
-    assert rows == 12
+    assert rows == good.any(0).sum()
+    by_boundary, by_value = np.empty((2, K + 1)), np.empty((2, 6))
+    noise = _kernels.shifts(seen, value, slope, nearest, 0.5, by_boundary, by_value)
+    assert noise == pytest.approx(np.square(clipped[good]).mean())
+    for got, which in ((by_boundary, nearest), (by_value, np.indices(nearest.shape)[0])):
+        for n in range(got.shape[1]):
+            own = good & (which == n)
+            information = np.square(slope[1][own]).sum()
+            assert got[1, n] == pytest.approx(information)
+            if information:
+                assert got[0, n] == pytest.approx((slope[1] * clipped)[own].sum() / information)
+
+
+def test_solve_leaves_no_score() -> None:
+    rng = np.random.default_rng(5)
+    codes = rng.choice([-1, 1], (K, 16))
+    known = np.ones((K + 1, 16), np.bool_)
+    offset, when = rng.uniform(-0.5, 0.5, 16), (np.arange(16) + 0.5) / 16 - 0.5
+    truth = np.array([7.31, 0.3, 0.4, 0.7, 0.1])
+    seen = np.nan_to_num(model_of(truth, codes, known, offset, when, 124)[0])
+    seen += rng.normal(0, 0.3, seen.shape)
+    fit, normal = truth * [1.004, 1, 1, 1, 0], np.empty((5, 5))
+    assert _kernels.solve(codes, known, offset, when, PROFILE, 0.5, 2.0, seen, 50, 1e-12, fit, normal)
+
+    value, slope, _ = model_of(fit, codes, known, offset, when, 124)
+    good = ~np.isnan(value)
+    left = np.clip(seen - value, -0.5, 0.5)[good]
+    score = slope[:, good] @ left - 2.0 * fit * [0, 0, 0, 0, 1]
+    # No score is left: a thousandth of a standard deviation of each.
+    assert (np.abs(score) < 1e-3 * np.sqrt(np.diag(normal))).all()
+    sigma = np.sqrt(np.diag(np.linalg.inv(normal))) * 0.3
+    assert (np.abs(fit - truth) < 4 * sigma).all()
+
+
+def test_cells_out_of_place_do_not_count() -> None:
+    rng = np.random.default_rng(6)
+    selected = np.zeros((K, 60, 30), np.bool_)
+    for k in range(K):
+        selected[k, 4 + 3 * k : 7 + 3 * k, 10:12] = True
+    # A dimmer image beside it, and strays.
+    for k in range(0, K, 2):
+        selected[k, 4 + 3 * k : 6 + 3 * k, 22] = True
+    selected[3, 50:53, 10:12] = True
+    selected |= rng.random(selected.shape) < 0.001
+    medians = np.empty((K, 2))
+    _kernels.cell_medians(selected, medians)
+    for k in range(K):
+        rows, columns = np.nonzero(selected[k])
+        # Within the half cell that the bins leave.
+        assert abs(medians[k, 0] - np.median(rows)) <= 1
+        assert abs(medians[k, 1] - np.median(columns)) <= 1
+    line = (5.0, 3.0, 10.5, 0.0)
+    across, found = np.empty(5, np.int64), np.empty((K, 2))
+    _kernels.cells_in_place(selected, line, 2.5, across, found)
+    counts = np.zeros(5, np.int64)
+    for k in range(K):
+        rows, columns = np.nonzero(selected[k])
+        off = np.rint(columns - 10.5).astype(int)
+        near = (np.abs(rows - 5 - 3 * k) <= 2.5) & (np.abs(off) <= 2)
+        counts += np.bincount(off[near] + 2, minlength=5)
+        assert_allclose(found[k], [rows[near].mean(), columns[near].mean()])
+    assert np.array_equal(across, counts)
+
+
+def test_straight_is_theil_sen() -> None:
+    rng = np.random.default_rng(7)
+    x = np.arange(12.0)
+    y = 2.5 * x + 1 + rng.normal(0, 0.1, 12)
+    y[3] = 90.0
+    slope, left = _kernels.straight(x, y)
+    assert slope == pytest.approx(theilslopes(y, x)[0])
+    assert left == pytest.approx(np.median(y - slope * x))
 
 
 def noisy_fit(distance_m: float, noise: float, seed: int) -> tuple[float, np.ndarray]:
@@ -205,13 +376,16 @@ def noisy_fit(distance_m: float, noise: float, seed: int) -> tuple[float, np.nda
     codes = np.concatenate([PILOTS, WORDS[symbols]], axis=1).astype(np.int64)
     spacing = LINK.camera.focal_px * 0.06 / distance_m
     rows = 2 * int(spacing * 8 + 4)
-    fit = np.array([spacing, 0.0, 0.0, 0.8])
-    value, slope = np.empty((16, rows)), np.empty((4, 16, rows))
-    seen, when = np.ones(K, bool), np.arange(16) / 16 - 0.5
-    _kernels.model(codes, seen, np.zeros(16), when, 0.45, fit, value, slope)
-    seen_values = np.nan_to_num(value) + rng.normal(0, noise / np.sqrt(5), value.shape)
-    start = fit * [1.005, 1, 1, 1] + [0, 0.1, 0, 0]
-    found = JointScaleRanging(huber=9.0)._fit(codes, seen, np.zeros(16), seen_values, start)
+    at = np.arange(rows) - (rows - 1) / 2
+    share = norm.cdf((at[:, None] - spacing * (np.arange(1, K) - K / 2)) / 0.45)
+    ideal = 0.8 * (codes[0] + share @ np.diff(codes, axis=0)).T
+    values = ideal + rng.normal(0, noise / np.sqrt(5), ideal.shape)
+    start = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0])
+    known = np.ones((K + 1, 16), np.bool_)
+    known[[0, K]] = False
+    # With the profile of the bound: a normal distribution.
+    joint = JointScaleRanging(huber=9.0, blur_px=0.45, core_share=1.0)
+    found = joint._fit(codes, known, np.zeros(16), values, start, 6)
     assert found is not None
     return LINK.camera.focal_px * 0.06 / found[0][0], symbols
 
