@@ -66,21 +66,18 @@ class RegionSpec:
         int,
         Field(ge=2, le=40, description="Score at which a pixel is a candidate: 2 for each run of one chip."),
     ] = 8
-    min_runs: Annotated[
-        int, Field(ge=1, description="Runs of candidate pixels in a step that a new region needs.")
+    min_rises: Annotated[
+        int, Field(ge=1, description="Rises of candidate pixels in a step that a new region needs.")
     ] = 20
     margin_px: Annotated[
         int, Field(ge=2, le=64, description="Seam around a region: how far it may move in a step, and blur.")
     ] = 5
     merge_px: Annotated[
-        int, Field(ge=8, le=256, description="Gap below which two blinking areas are one region.")
-    ] = 16
+        int, Field(ge=1, le=256, description="Gap below which two blinking areas are one region.")
+    ] = 11
     fade_us: Annotated[
         int, Field(ge=1000, description="Time without blinking after which a region is released.")
     ] = 50_000
-    positive_only: Annotated[
-        bool, Field(description="The camera sends positive events only: blinking is found from their times.")
-    ] = False
     min_clusters_share: Annotated[
         float,
         Field(ge=0, le=1, description="Share of the clusters that must be in their place in a frame."),

@@ -46,81 +46,63 @@ def keep_ordered(
 
 
 @njit(cache=True, nogil=True)
-def score_pixels(
+def score_rises(
     t_us: Array,
     x: Array,
     y: Array,
     p: Array,
     pixels: Array,
     hits: Array,
-    run_us: tuple[int, int, int],
+    chip_us: float,
     min_score: int,
     cell_shift: int,
 ) -> None:
-    """Update each pixel's score of runs at the chip rate; count the runs of candidate pixels in cells.
+    """Score each pixel by the rhythm of its rises; add the rises of candidates to their cell's `hits`.
 
-    `pixels` (height, width) packs a pixel into one number, since memory sets the pace here: the time of its
-    last change of polarity in the upper bits, then 7 bits of score, 1 bit of polarity. `run_us` holds the
-    bounds of a run's length: below [0] noise, to [1] one chip, to [2] two chips, above: slower than any code
-    of the air interface.
+    A pixel's state holds the time of its last rise, us (bits 12 up), the whole chips between that and the one
+    before (bits 8 to 11, 0: none), and its score (bits 1 to 7).
     """
-    shortest, single, double = run_us
-    # Whether an event changes its pixel's polarity is as good as random, so it is found without a branch.
-    changes = np.empty(t_us.size + 1, np.int32)
+    soon = int(1.5 * chip_us)
+    late = 12.5 * chip_us
+    stray = 0.3 * chip_us
+    shift = np.uint64(cell_shift)
+    # Polarity is as good as random, so that rises are found without a branch.
+    rises = np.empty(t_us.size + 1, np.int32)
     n = 0
     for i in range(t_us.size):
-        u, v = np.uint64(x[i]), np.uint64(y[i])
-        change = (pixels[v, u] ^ p[i]) & 1
-        pixels[v, u] ^= change
-        changes[n] = i
-        n += change
-    shift = np.uint64(cell_shift)
-    for i in changes[:n]:
+        rises[n] = i
+        n += p[i]
+    for i in rises[:n]:
         u, v = np.uint64(x[i]), np.uint64(y[i])
         state = pixels[v, u]
-        run = t_us[i] - (state >> 8)
-        score = (state >> 1) & 127
-        score += 2 * (np.int64(run >= shortest) & np.int64(run < single)) - 2 * np.int64(run >= double)
-        score = min(max(score, 0), 40)
-        pixels[v, u] = (t_us[i] << 8) | (score << 1) | (state & 1)
-        hits[v >> shift, u >> shift] += np.int32(score >= min_score)
-
-
-@njit(cache=True, nogil=True)
-def score_rises(
-    t_us: Array,
-    x: Array,
-    y: Array,
-    pixels: Array,
-    hits: Array,
-    run_us: tuple[int, int],
-    min_score: int,
-    cell_shift: int,
-) -> None:
-    """Do as `score_pixels` for a camera that sends positive events only: runs go from rise to rise.
-
-    `run_us` holds the bounds: below [0] events of one rise, to [1] the codes of the air interface (two to
-    four chips), above: slower.
-    """
-    shortest, longest = run_us
-    for i in range(t_us.size):
-        u, v = np.int64(x[i]), np.int64(y[i])
-        state = pixels[v, u]
-        run = t_us[i] - (state >> 8)
-        if run < shortest:
+        run = t_us[i] - (state >> 12)
+        # More events of the same rise.
+        if run < soon:
             continue
+        chips = 0
         score = (state >> 1) & 127
-        score = min(score + 2, 40) if run < longest else max(score - 2, 0)
-        pixels[v, u] = (t_us[i] << 8) | (score << 1) | 1
-        if score >= min_score:
-            hits[v >> cell_shift, u >> cell_shift] += 1
+        if run > late:
+            score -= 1
+        else:
+            chips = int(run / chip_us + 0.5)
+            if abs(run - chips * chip_us) > stray:
+                score -= 3
+            elif chips <= 4:
+                score += 2
+            elif chips == (state >> 8) & 15:
+                score -= 2
+            else:
+                score += 1
+        score = min(max(score, 0), 40)
+        pixels[v, u] = (t_us[i] << 12) | (chips << 8) | (score << 1)
+        hits[v >> shift, u >> shift] += np.int32(score >= min_score)
 
 
 @njit(cache=True, nogil=True)
 def measure_box(
     pixels: Array, box: tuple[int, int, int, int], since_us: int, min_score: int, rows: Array
 ) -> tuple[int, float, int, int, float, float]:
-    """Where in a box pixels blink at the chip rate and changed polarity since `since_us`.
+    """Where in a box pixels blink in the rhythm of the chips and rose since `since_us`.
 
     Returns:
         (pixels, mean column, first column, last column, upper edge, lower edge); an edge row that holds
@@ -135,7 +117,7 @@ def measure_box(
         n = 0
         for u in range(left, right):
             state = pixels[v, u]
-            if (state >> 8) >= since_us and ((state >> 1) & 127) >= min_score:
+            if (state >> 12) >= since_us and ((state >> 1) & 127) >= min_score:
                 n += 1
                 weighted += u
                 first_column = min(first_column, u)

@@ -1,11 +1,14 @@
-"""Finds regions that blink at the chip rate and follows them while the camera moves.
+"""Finds regions that blink in the rhythm of the chips and follows them while the camera moves.
 
-The frequency filter works per pixel on runs: the time between two changes of polarity. A code of the air
-interface has runs of one or two chips only, as many of the one as of the other on average. A lamp on AC mains
-or a PWM lamp of up to 2 kHz changes polarity every 250 us or slower, that is after 2.5 chips; a moving edge
-and a hot pixel, slower still. So a run of one chip raises a pixel's score by two, a run longer than two chips
-lowers it by two, and a run of two chips, which both kinds may have, leaves it: a lamp of short pulses gains
-nothing on balance. One pass, one number a pixel.
+The rhythm is judged per pixel, from rise to rise: the times at which it starts to get brighter. In a code
+of the air interface rises come two, three or four chips apart, and where events go missing a few chips
+more, but whole chips always. So a rise two to four whole chips after the one before raises a pixel's score
+by two, one after five to twelve by one. A rise off the chips, as of a lamp with pulse width modulation of 4
+kHz (two and a half chips) or of a moving texture, lowers it by three: more than the two that chance, which
+is on the chips in six cases of ten, would bring. One after the very same number of chips as before lowers
+it by two from five chips on: a lamp of 1 or 2 kHz repeats its period, a code with missing events does not.
+Falls are not looked at: they come later or sooner than rises by the light, they are the first to go
+missing, and some cameras send none. One pass, one number a pixel.
 """
 
 from bisect import bisect_left
@@ -25,20 +28,11 @@ from evlcp_sdk.values import Events, Region
 
 __all__ = ["Followed", "RegionFollower"]
 
-_CELL_SHIFT = 3
-"""Cells of 8 x 8 px: smaller than any bar in range (34 px at 100 m), and few enough to label each step."""
+_CELL_SHIFT = 2
+"""Cells of 4 x 4 px: no larger than the gap at which two bars are two, and few enough to label each step."""
 
-_RUN_CHIPS = (0.4, 1.5, 2.7)
-"""Bounds between runs of noise, one chip, two chips, and slower; ON and OFF delays differ by up to 0.3."""
-
-_RISE_CHIPS = (1.5, 4.5)
-"""Bounds of the time from rise to rise: two to four chips in any code, five for a lamp of 2 kHz."""
-
-_RISE_MEASURE_CHIPS = 5
-"""A blinking pixel rises at least once in four chips."""
-
-_MEASURE_CHIPS = 4
-"""A blinking pixel changes polarity at least once in two chips; twice that allows for a missed event."""
+_MEASURE_CHIPS = 6
+"""A blinking pixel rises at least once in four chips; half of that again allows for a late event."""
 
 _AGE_CHIPS = 5
 """Age of a measured centre. A moving bar's leading end counts once its pixels have had two runs of one chip,
@@ -152,15 +146,12 @@ class RegionFollower:
         self._spec = spec
         self._position = position
         self._camera = camera
-        shortest, single, double = _RUN_CHIPS
-        self._run_us = (round(shortest * chip_us), round(single * chip_us), round(double * chip_us))
-        shortest, longest = _RISE_CHIPS
-        self._rise_us = (round(shortest * chip_us), round(longest * chip_us))
-        self._measure_us = round((_RISE_MEASURE_CHIPS if spec.positive_only else _MEASURE_CHIPS) * chip_us)
+        self._chip_us = chip_us
+        self._measure_us = round(_MEASURE_CHIPS * chip_us)
         self._age_us = _AGE_CHIPS * chip_us
         shape = (camera.height, camera.width)
-        self._pixels = np.full(shape, _LONG_AGO_US << 8, np.int64)
-        self._hits = np.zeros([-(-n >> _CELL_SHIFT) for n in (camera.height + 7, camera.width + 7)], np.int32)
+        self._pixels = np.full(shape, _LONG_AGO_US << 12, np.int64)
+        self._hits = np.zeros([(n - 1 >> _CELL_SHIFT) + 1 for n in shape], np.int32)
         self._fresh: list[Box] = []
         self._recent: deque[Piece] = deque(maxlen=_BACKFILL_STEPS)
         self._next_id = 0
@@ -174,14 +165,9 @@ class RegionFollower:
         self._recent.append((start_us, events))
         self._hits[:] = 0
         t_us, x, y, p = events.t_us, events.x, events.y, events.p
-        score = self._pixels, self._hits
-        if spec.positive_only:
-            lit = p == 1
-            _kernels.score_rises(
-                t_us[lit], x[lit], y[lit], *score, self._rise_us, spec.min_score, _CELL_SHIFT
-            )
-        else:
-            _kernels.score_pixels(t_us, x, y, p, *score, self._run_us, spec.min_score, _CELL_SHIFT)
+        _kernels.score_rises(
+            t_us, x, y, p, self._pixels, self._hits, self._chip_us, spec.min_score, _CELL_SHIFT
+        )
         end_us = start_us + spec.step_us
         boxes = [
             self._reach(self._expected(followed, start_us + spec.step_us / 2)) for followed in self.alive
@@ -280,41 +266,29 @@ class RegionFollower:
         hits = self._hits
         merge = self._spec.merge_px
         for followed in self.alive:
-            left, top, right, bottom = _grown(self._reach(followed.latest), merge)
-            hits[
-                top >> _CELL_SHIFT : (bottom >> _CELL_SHIFT) + 1,
-                left >> _CELL_SHIFT : (right >> _CELL_SHIFT) + 1,
-            ] = 0
+            _inside(hits, _grown(self._reach(followed.latest), merge))[:] = 0
         if hits.max() == 0:
             self._fresh = []
             return
-        near = np.ones((3, 3), bool)
-        lit = hits > 0
-        # For no iterations at all SciPy dilates until nothing changes.
-        if reach := merge >> (_CELL_SHIFT + 1):
-            lit = ndimage.binary_dilation(lit, near, reach)
-        areas, _ = ndimage.label(lit, near)
-        boxes = []
-        for number, where in enumerate(ndimage.find_objects(areas), 1):
-            inside = np.where(areas[where] == number, hits[where], 0)
-            if inside.sum() < self._spec.min_runs:
-                continue
-            v, u = np.nonzero(inside)
-            v, u = v + where[0].start, u + where[1].start
-            boxes.append(
-                (
-                    int(u.min()) << _CELL_SHIFT,
-                    int(v.min()) << _CELL_SHIFT,
-                    min(int(u.max() + 1) << _CELL_SHIFT, self._camera.width),
-                    min(int(v.max() + 1) << _CELL_SHIFT, self._camera.height),
-                )
-            )
+        areas, _ = ndimage.label(hits, np.ones((3, 3), bool))
+        lit = [self._lit(where, end_us) for where in ndimage.find_objects(areas)]
+        joined = _joined([box for box in lit if box is not None], merge)
+        boxes = [box for box in joined if _inside(hits, box).sum() >= self._spec.min_rises]
         fresh, self._fresh = self._fresh, []
         for box in boxes:
             if any(_overlap(_grown(box, merge), other) for other in fresh):
                 self._start(box, end_us)
             else:
                 self._fresh.append(box)
+
+    def _lit(self, cells: tuple[slice, ...], end_us: int) -> Box | None:
+        """The box around the pixels that blink in a rectangle of cells, None if there are none."""
+        v, u = cells
+        left, top = u.start << _CELL_SHIFT, v.start << _CELL_SHIFT
+        right = min(u.stop << _CELL_SHIFT, self._camera.width)
+        bottom = min(v.stop << _CELL_SHIFT, self._camera.height)
+        region = self._measure(0, (left, top, right, bottom), end_us, np.empty(bottom - top, np.int64))
+        return None if region is None else _tight(region)
 
     def _start(self, box: Box, end_us: int) -> None:
         region = self._measure(self._next_id, box, end_us, np.empty(box[3] - box[1], np.int64))
@@ -346,6 +320,27 @@ def _select(events: Events, boxes: list[Box]) -> list[Events]:
     p, taken = np.empty(shape, np.uint8), np.empty(len(boxes), np.int64)
     _kernels.select_boxes(events.t_us, events.x, events.y, events.p, np.array(boxes), t, x, y, p, taken)
     return [Events(t[i, :n], x[i, :n], y[i, :n], p[i, :n]) for i, n in enumerate(taken)]
+
+
+def _inside(hits: NDArray[np.int32], box: Box) -> NDArray[np.int32]:
+    """The cells that a box touches."""
+    left, top, right, bottom = box
+    return hits[
+        top >> _CELL_SHIFT : (bottom - 1 >> _CELL_SHIFT) + 1,
+        left >> _CELL_SHIFT : (right - 1 >> _CELL_SHIFT) + 1,
+    ]
+
+
+def _joined(boxes: list[Box], gap: int) -> list[Box]:
+    """Boxes with less than a gap between them as one."""
+    done: list[Box] = []
+    for box in boxes:
+        while near := [b for b in done if _overlap(_grown(box, gap), b)]:
+            done = [b for b in done if b not in near]
+            parts = np.array([box, *near])
+            box = (*parts[:, :2].min(0).tolist(), *parts[:, 2:].max(0).tolist())
+        done.append(box)
+    return done
 
 
 def _tight(region: Region) -> Box:

@@ -82,7 +82,8 @@ def learned_worth(
         sums: The frame's polarity sums, pilot first, int16 (chips, height, width).
         pilots: The codes, int64 (K, values).
         max_events: n; sums beyond count as this many.
-        prior_count: Observations added to every cell of the two histograms.
+        prior_count: Observations added to every cell of the two histograms, on average of the two: to each as
+            its value is frequent, so that what comes with both alike is worth nothing.
 
     Returns:
         float64 (2 n + 1, 2 n + 1), by the first chip's sum and the second's.
@@ -90,9 +91,11 @@ def learned_worth(
     from evlcp_wh import _kernels
 
     side = 2 * max_events + 1
-    counts = np.full((2, side, side), prior_count)
+    counts = np.zeros((2, side, side))
     pilot = sums[: 2 * pilots.shape[1]]
     _kernels.count_pairs(pilot, pilots, presence.probability, presence.grid_px, max_events, counts)
+    seen = counts.sum((1, 2), keepdims=True)
+    counts += prior_count * (seen / seen.mean() if seen.min() > 0 else 1.0)
     share = counts / counts.sum((1, 2), keepdims=True)
     worth: NDArray[np.float64] = np.log(share[1] / share[0])
     return worth

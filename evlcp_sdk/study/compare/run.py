@@ -111,8 +111,7 @@ def measure_recording(
     """Receive a recording with every variant, and compare what came out with the truth.
 
     Its first packets are read and received once before, so that no kernel is loaded or compiled while time
-    runs. The bound is that of the frames as the first variant decodes them; a bar of several columns, or a
-    camera that sends positive events only, has none.
+    runs. The bound is that of the frames as the first variant decodes them; a bar of several columns has none.
 
     Args:
         name: Of the table.
@@ -179,8 +178,6 @@ def _warm(source: EventSource, variants: Sequence[Variant]) -> None:
 
 def _bound_of(link: Link) -> _Bound | None:
     """What gives the bound of each frame; None where the bound's model does not hold."""
-    if link.regions.positive_only:
-        return None
     try:
         return _Bound(frame_bound(link.camera, link.bar, link.codebook))
     except ConfigError:

@@ -144,12 +144,6 @@ def test_no_figure_is_cut_on_a_narrow_screen(
             assert f"{float(row['bias_m']):+.4f}" in text
 
 
-def test_a_camera_of_positive_events_has_no_bound(evlcp: Evlcp, recording: Path) -> None:
-    done = evlcp("compare", recording, "--variant", "a:", "--set", "regions.positive_only=true")
-    assert done.code == 0
-    assert "Cramer-Rao" not in done.out.split("* best")[0]
-
-
 @pytest.mark.parametrize(
     ("arguments", "code", "told"),
     [

@@ -344,6 +344,14 @@ def test_learned_likelihoods_decode_every_symbol(profile, positive_only):
         assert soft.quality > 0.9
 
 
+def test_what_comes_with_both_values_alike_is_worth_nothing():
+    # Codes of five values, of which one or two are +1: a plain prior would take silence for a hint.
+    pilots = np.array([[1, -1, -1, -1, -1], [1, 1, -1, -1, -1]], np.int64)
+    presence = ideal_presence(2)
+    silent = np.zeros((10, *(presence.grid_px * n for n in presence.probability.shape[1:])), np.int16)
+    assert_allclose(learned_worth(presence, silent, pilots, 3, 1.0), 0, atol=1e-12)
+
+
 def drifting(book, symbols, right_down, missing=0.3, seed=0, **image):
     """A frame of a bar that stands still while its pilot is on air and drifts away while its info is."""
     still = ideal_sums(book, symbols, missing=missing, seed=seed, **image)

@@ -19,23 +19,30 @@ def keep_ordered(t_us, x, y, width, height, last_us):
     return keep, (off, backward, last_us)
 
 
-def score_pixels(events, shape, start, run_us, min_score, cell_shift):
-    """Last change, score and polarity of each pixel, and hits; `start` is the same three before."""
-    (changed, score, polarity), hits = (a.copy() for a in start), {}
+def score_rises(events, shape, start, chip_us, min_score, cell_shift):
+    """Last rise, chips before it and score of each pixel, and hits; `start` is the same three before."""
+    (rose, chips, score), hits = (a.copy() for a in start), {}
     for t, u, v, p in events:
-        if polarity[v, u] == p:
+        run = t - rose[v, u]
+        if not p or run < int(1.5 * chip_us):
             continue
-        run = t - changed[v, u]
-        if run_us[0] <= run < run_us[1]:
-            score[v, u] += 2
-        elif run >= run_us[2]:
-            score[v, u] -= 2
+        whole = 0
+        if run > 12.5 * chip_us:
+            score[v, u] -= 1
+        else:
+            whole = int(np.floor(run / chip_us + 0.5))
+            if abs(run - whole * chip_us) > 0.3 * chip_us:
+                score[v, u] -= 3
+            elif whole <= 4:
+                score[v, u] += 2
+            else:
+                score[v, u] += -2 if whole == chips[v, u] else 1
         score[v, u] = sorted((0, score[v, u], 40))[1]
-        changed[v, u], polarity[v, u] = t, p
+        rose[v, u], chips[v, u] = t, whole
         if score[v, u] >= min_score:
             cell = v >> cell_shift, u >> cell_shift
             hits[cell] = hits.get(cell, 0) + 1
-    return (changed, score, polarity), hits
+    return (rose, chips, score), hits
 
 
 def measure_box(lit, box):

@@ -143,7 +143,7 @@ def test_two_bars_are_two_regions() -> None:
 def test_a_bar_in_two_pieces_is_one_region() -> None:
     bar = IdealBar(random_symbols(LINK, 1))
     events = ideal_events(LINK, bar)
-    middle = (events.y >= 345) & (events.y < 355)
+    middle = (events.y >= 345) & (events.y < 349)
     by_step = followed(events[~middle], 30_000)
     (region,) = by_step[29_000]
     assert region.latest.height_px == pytest.approx(128, abs=1.5)

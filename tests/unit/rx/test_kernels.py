@@ -11,7 +11,7 @@ from evlcp_sdk.values import Events
 WIDTH, HEIGHT = 24, 16
 SEEDS = range(8)
 LONG_AGO_US = -(10**12)
-RUN_US = (40, 150, 270)
+CHIP_US = 100.0
 
 
 def random_events(rng, n, step_us=3, width=WIDTH, height=HEIGHT):
@@ -56,8 +56,8 @@ def test_the_first_event_too_may_be_off_the_sensor(x, y):
 
 def scored(events, pixels, min_score=8, cell_shift=2):
     hits = np.zeros((HEIGHT >> cell_shift, WIDTH >> cell_shift), np.int32)
-    _kernels.score_pixels(
-        events.t_us, events.x, events.y, events.p, pixels, hits, RUN_US, min_score, cell_shift
+    _kernels.score_rises(
+        events.t_us, events.x, events.y, events.p, pixels, hits, CHIP_US, min_score, cell_shift
     )
     return hits
 
@@ -68,30 +68,61 @@ def test_scores_of_pixels(seed, freeze):
     rng = np.random.default_rng(seed)
     # Few pixels and many events, so that scores reach both of their ends.
     events = random_events(rng, 4000, step_us=[3, 8, 20][seed % 3], width=6, height=4)
-    pixels = np.full((HEIGHT, WIDTH), LONG_AGO_US << 8, np.int64)
+    # Three in four of them in the rhythm of the chips.
+    t_us = np.where(rng.random(len(events)) < 0.75, (events.t_us / 100).round() * 100, events.t_us)
+    order = np.argsort(t_us, kind="stable")
+    events = Events.of(t_us[order], events.x[order], events.y[order], events.p[order])
+    pixels = np.full((HEIGHT, WIDTH), LONG_AGO_US << 12, np.int64)
     start = (np.full(pixels.shape, LONG_AGO_US), np.zeros(pixels.shape, int), np.zeros(pixels.shape, int))
     hits = scored(frozen(events, freeze), pixels)
     rows = zip(*(c.tolist() for c in (events.t_us, events.x, events.y, events.p)), strict=True)
-    (changed, score, polarity), want = twins.score_pixels(rows, pixels.shape, start, RUN_US, 8, 2)
-    assert_array_equal(pixels >> 8, changed)
+    (rose, chips, score), want = twins.score_rises(rows, pixels.shape, start, CHIP_US, 8, 2)
+    assert_array_equal(pixels >> 12, rose)
+    assert_array_equal(pixels >> 8 & 15, chips)
     assert_array_equal(pixels >> 1 & 127, score)
-    assert_array_equal(pixels & 1, polarity)
     assert {tuple(c): hits[tuple(c)] for c in np.argwhere(hits).tolist()} == want
-    assert 0 <= score.min() <= score.max() <= 40
+    assert 0 <= score.min() < score.max() <= 40
 
 
 @pytest.mark.parametrize(
-    ("run_us", "score"), [(39, 0), (40, 2), (149, 2), (150, 0), (269, 0), (270, -2), (10**9, -2)]
+    ("run_us", "score"),
+    [
+        (149, None),
+        (150, -3),
+        (169, -3),
+        (170, 2),
+        (230, 2),
+        (231, -3),
+        (250, -3),
+        (400, 2),
+        (500, 1),
+        (700, -2),
+        (1200, 1),
+        (1251, -1),
+        (10**9, -1),
+    ],
 )
-def test_a_run_counts_by_its_length(run_us, score):
-    pixels = np.full((HEIGHT, WIDTH), (1000 << 8) | (10 << 1), np.int64)
+def test_a_rise_counts_by_its_time_since_the_last(run_us, score):
+    """Seven chips lay between the two before."""
+    before = (1000 << 12) | (7 << 8) | (10 << 1)
+    pixels = np.full((HEIGHT, WIDTH), before, np.int64)
     assert not scored(Events.of([1000 + run_us], [3], [2], [1]), pixels, min_score=13).any()
-    assert pixels[2, 3] >> 1 & 127 == 10 + score
+    if score is None:
+        assert pixels[2, 3] == before
+    else:
+        assert (pixels[2, 3] >> 12, pixels[2, 3] >> 1 & 127) == (1000 + run_us, 10 + score)
+
+
+def test_falls_are_not_looked_at():
+    pixels = np.full((HEIGHT, WIDTH), 1000 << 12, np.int64)
+    before = pixels.copy()
+    assert not scored(Events.of([1200, 1400], [3, 3], [2, 2], [0, 0]), pixels).any()
+    assert_array_equal(pixels, before)
 
 
 def test_scores_do_not_care_how_the_stream_is_cut():
     events = random_events(np.random.default_rng(0), 1000, step_us=8, width=4, height=4)
-    whole, parts = np.full((2, HEIGHT, WIDTH), LONG_AGO_US << 8, np.int64)
+    whole, parts = np.full((2, HEIGHT, WIDTH), LONG_AGO_US << 12, np.int64)
     want = scored(events, whole)
     got = sum(scored(events[a:b], parts) for a, b in [(0, 0), (0, 1), (1, 700), (700, 1000)])
     assert_array_equal(parts, whole)
@@ -104,7 +135,7 @@ def test_what_blinks_in_a_box(box, share):
     rng = np.random.default_rng(round(100 * share))
     changed = rng.integers(900, 1100, (HEIGHT, WIDTH))
     score = np.where(rng.random(changed.shape) < share, 5, 3)
-    pixels = changed << 8 | score << 1 | rng.integers(0, 2, changed.shape)
+    pixels = changed << 12 | score << 1 | rng.integers(0, 2, changed.shape)
     since_us = 1000 if share < 1 else 900
     rows = np.empty(box[3] - box[1], np.int64)
     got = _kernels.measure_box(pixels, box, since_us, 5, rows)
@@ -115,7 +146,7 @@ def test_what_blinks_in_a_box(box, share):
 
 def test_an_edge_row_counts_by_its_share():
     pixels = np.zeros((HEIGHT, WIDTH), np.int64)
-    pixels[4:8, 2:10] = pixels[8, 2:4] = 1000 << 8 | 40 << 1
+    pixels[4:8, 2:10] = pixels[8, 2:4] = 1000 << 12 | 40 << 1
     *_, upper, lower = _kernels.measure_box(
         pixels, (0, 0, WIDTH, HEIGHT), 1000, 5, np.empty(HEIGHT, np.int64)
     )
