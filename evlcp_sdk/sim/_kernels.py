@@ -19,8 +19,8 @@ the log signal behind the source follower, where that has a time constant."""
 DRAW, ARMED, BLOCK = range(3)
 """Columns of a pixel's counters."""
 
-TEXTURE_STEPS = 8
-"""Poses after which the texture is looked up anew: it changes slowly over the image."""
+POSE, SHADE = -1, -2
+"""Entries of the time line that are no source: the image moves, or the share of all light that passes."""
 
 LIGHT_STEP = 1e-3
 """Relative change of a pixel's light that is not worth a new piece: the light stays until it is more."""
@@ -377,12 +377,16 @@ def run_pixels(
     halo: Array,
     halo_first: Array,
     halo_per_px: Array,
-    halo_share: float,
+    halo_share: Array,
+    halo_every: Array,
+    core_share: float,
     core_table: Array,
     core_per_px: Array,
     wide_table: Array,
-    wide_per_px: float,
+    wide_per_px: Array,
+    shade: Array,
     turn_px: Array,
+    texture_every: int,
     field: Array,
     background: Array,
     seed: Any,
@@ -396,17 +400,21 @@ def run_pixels(
     """Run pixels [first, last) through one block of time; return (next pixel, number of events).
 
     The light on a pixel is constant between the entries of the time line: an entry with `line_source` >= 0
-    switches that source to row `line_row` of `levels`; one with -1 moves the image to pose `line_row`.
+    switches that source to row `line_row` of `levels`; `POSE` moves the image to pose `line_row`; from
+    `SHADE` on, `shade[line_row]` is the share of all light that passes, `shade[0]` as the block begins.
     It ends early, at a pixel for which the output might have no room.
 
     Bit i of `masks[j]` says that source i lights pixel j. `first_rows` are the rows of `levels` in force when
     the block begins; pose 0 holds then. (pose, source) arrays say where each strip is: `origin`, its first
     end, px; `axis`, the unit vector along it; `bounds`, where its clusters start and end along it, px;
-    `strip_px`, its width; `turn_px` is how far the texture has moved. `halo` is the halo's light of each row
-    of `levels` on a grid along the strip, as a share of full light, for the pose in the middle. `background`
-    is (irradiance on the sensor, dark current as light), W/m2; `sensor` comes from `sensor_vector`.
+    `strip_px`, its width; `turn_px` is how far the texture has moved, looked up every `texture_every` poses.
+    `core_share` of the light is in the core and `halo_share` in each halo: `halo[q]` is the light of halo q
+    of each row of `levels` on a grid along the strip, as a share of full light; it stands where the strip is
+    in the pose in the middle, or follows it every `halo_every[q]` poses where that is not 0. `background` is
+    (irradiance on the sensor, dark current as light), W/m2; `sensor` comes from `sensor_vector`.
     """
     sources = gain.size
+    halos = halo_share.size
     halfway = origin.shape[0] // 2
     followed = sensor[12] > 0.0
     none = np.empty(0)
@@ -415,9 +423,9 @@ def run_pixels(
     weights = np.zeros(sources, np.int64)
     weight_first = np.zeros(sources, np.int64)
     near = np.zeros(sources)
-    far = np.zeros(sources)
-    grid = np.zeros(sources, np.int64)
-    between = np.zeros(sources)
+    far = np.zeros((halos, sources))
+    grid = np.zeros((halos, sources), np.int64)
+    between = np.zeros((halos, sources))
     row = np.zeros(sources, np.int64)
     part = np.zeros(sources)
     n = 0
@@ -442,33 +450,43 @@ def run_pixels(
         t_ready, t_last_out, light, z = s[T_READY], s[T_LAST_OUT], s[LIGHT], s[FOLLOWER]
         draw, armed = c[DRAW], c[ARMED]
         around = 0.0
+        passing = shade[0]
         for g in range(sources):
             row[g] = first_rows[g]
             part[g] = 0.0
-            if not (mask >> np.uint64(g)) & np.uint64(1):
-                continue
-            dx, dy = x - origin[halfway, g, 0], y - origin[halfway, g, 1]
-            ax, ay = axis[halfway, g, 0], axis[halfway, g, 1]
-            across = dx * ay - dy * ax
-            half = 0.5 * strip_px[halfway, g]
-            far[g] = (
-                gain[g]
-                * halo_share
-                * (
-                    _step(wide_table, wide_per_px, across + half)
-                    - _step(wide_table, wide_per_px, across - half)
-                )
-            )
-            at = (dx * ax + dy * ay - halo_first[g]) * halo_per_px[g]
-            at = min(max(at, 0.0), halo.shape[1] - 1.001)
-            grid[g] = int(at)
-            between[g] = at - grid[g]
         for e in range(-1, line_t.size):
-            source = line_source[e] if e >= 0 else -1
+            source = line_source[e] if e >= 0 else POSE
+            if source >= 0 and not (mask >> np.uint64(source)) & np.uint64(1):
+                continue
             t = line_t[e] if e >= 0 else begin_us
-            if source < 0:
+            if source == SHADE:
+                passing = shade[line_row[e]]
+            elif source == POSE:
                 pose = line_row[e] if e >= 0 else 0
-                if pose % TEXTURE_STEPS == 0:
+                for q in range(halos):
+                    if pose != 0 and (halo_every[q] == 0 or pose % halo_every[q] != 0):
+                        continue
+                    seen = halfway if halo_every[q] == 0 else pose
+                    for g in range(sources):
+                        if not (mask >> np.uint64(g)) & np.uint64(1):
+                            continue
+                        dx, dy = x - origin[seen, g, 0], y - origin[seen, g, 1]
+                        ax, ay = axis[seen, g, 0], axis[seen, g, 1]
+                        across = dx * ay - dy * ax
+                        half = 0.5 * strip_px[seen, g]
+                        far[q, g] = (
+                            gain[g]
+                            * halo_share[q]
+                            * (
+                                _step(wide_table[q], wide_per_px[q], across + half)
+                                - _step(wide_table[q], wide_per_px[q], across - half)
+                            )
+                        )
+                        at = (dx * ax + dy * ay - halo_first[q]) * halo_per_px[q]
+                        at = min(max(at, 0.0), halo.shape[2] - 1.001)
+                        grid[q, g] = int(at)
+                        between[q, g] = at - grid[q, g]
+                if pose % texture_every == 0:
                     around = background[1] + background[0] * texture_at(
                         field, x + turn_px[pose, 0], y + turn_px[pose, 1]
                     )
@@ -483,7 +501,7 @@ def run_pixels(
                     per_px = core_per_px[g]
                     near[g] = (
                         gain[g]
-                        * (1.0 - halo_share)
+                        * core_share
                         * (
                             _step(core_table[g], per_px, across + half)
                             - _step(core_table[g], per_px, across - half)
@@ -508,21 +526,28 @@ def run_pixels(
                             m += 1
                             k += 1
                         weights[g] = m
+            moved = source == POSE
             total = around
             for g in range(sources):
                 if not (mask >> np.uint64(g)) & np.uint64(1):
                     continue
-                if source < 0 or source == g:
+                if moved or source == g:
                     if source == g:
                         row[g] = line_row[e]
                     r = row[g]
                     core = 0.0
                     for m in range(weights[g]):
                         core += weight[g, m] * levels[r, weight_first[g] + m]
-                    h = halo[r, grid[g]] + between[g] * (halo[r, grid[g] + 1] - halo[r, grid[g]])
-                    now = near[g] * core + far[g] * h
+                    now = near[g] * core
+                    for q in range(halos):
+                        k = grid[q, g]
+                        now += far[q, g] * (
+                            halo[q, r, k] + between[q, g] * (halo[q, r, k + 1] - halo[q, r, k])
+                        )
                     part[g] = now
                 total += part[g]
+            if passing != 1.0:
+                total = background[1] + passing * (total - background[1])
             if new:
                 new = False
                 light = total

@@ -1,7 +1,8 @@
 """What the sources send: strips of light whose parts switch at exact times."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -17,14 +18,47 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.sim.motion import Strip
 from evlcp_sdk.sim.optics import led_light_w_m2, strip_width_m
-from evlcp_sdk.sim.scene import MOST_SOURCES, BarSpec, LampSpec, Scene, links_of
+from evlcp_sdk.sim.scene import (
+    MOST_SOURCES,
+    BarSpec,
+    LampSpec,
+    ReflectionSpec,
+    Scene,
+    WiperSpec,
+    links_of,
+)
 from evlcp_sdk.sim.world import bar_across, bar_axis, sites_of
 
-__all__ = ["BarLight", "ColumnLight", "LampLight", "Source", "sources_of"]
+__all__ = [
+    "BarLight",
+    "ColumnLight",
+    "LampLight",
+    "Pane",
+    "Source",
+    "reflections_of",
+    "sources_of",
+    "wiper_switches",
+]
 
 Floats = NDArray[np.float64]
 
 _SINE_STEPS = 32
+
+_WIPER_STEP_LN = 0.05
+"""Steps of the light while a wiper's edge passes: a quarter of a threshold, so that none is an event."""
+
+
+@dataclass(frozen=True)
+class Pane:
+    """What a pane of glass does to the place of an image.
+
+    Attributes:
+        turn_rad: By how much it turns the light's direction, to the right and down.
+        shift_px: By how much it shifts the image, to the right and down.
+    """
+
+    turn_rad: tuple[float, float] = (0.0, 0.0)
+    shift_px: tuple[float, float] = (0.0, 0.0)
 
 
 class Source(Protocol):
@@ -45,6 +79,16 @@ class Source(Protocol):
         """How long its light may move a slow pixel the same way at full swing, us."""
         ...
 
+    @property
+    def blur_px(self) -> float:
+        """Sigma of the blur that it has beside the lens's, px."""
+        ...
+
+    @property
+    def pane(self) -> Pane | None:
+        """The pane that shows it; None for the direct view."""
+        ...
+
     def switches(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
         """Return times of switching after `begin_us` and before `end_us`, and the levels 0 to 1 from each on.
 
@@ -57,7 +101,8 @@ class Source(Protocol):
 class BarLight:
     """A transmitter's light: packets, one after another, or the chips of a file.
 
-    Its `strips` are what shines: one for each column of clusters, all switched by the same chips.
+    Its `strips` are what shines: one for each column of clusters, all switched by the same chips; its
+    `images` the same again for each reflection.
 
     Args:
         bar: The bar.
@@ -67,9 +112,10 @@ class BarLight:
         source: What faults name.
         transmitter_id: What its messages say who it is.
         site: What its beacon says; None for none.
+        reflections: Its images.
 
     Raises:
-        ConfigError: Its symbols, messages or chips cannot be sent.
+        ConfigError: Its symbols, messages or chips cannot be sent, or what covers it is none of its clusters.
         InputError: The file of chips cannot be read.
     """
 
@@ -82,6 +128,7 @@ class BarLight:
         source: str = "bars",
         transmitter_id: int = 1,
         site: BarSite | None = None,
+        reflections: Sequence[ReflectionSpec] = (),
     ) -> None:
         self.bar = bar
         self.link = link
@@ -115,7 +162,9 @@ class BarLight:
                 float(np.random.default_rng([self.payload_seed, 1]).uniform(0, self.packet_chips)), 1
             )
         self.start_chip = start
+        self._covers = self._checked_covers(source)
         self.strips = self._strips()
+        self.images = tuple(image for one in reflections for image in self._images(one))
 
     def _strips(self) -> tuple["ColumnLight", ...]:
         """One strip for each column of clusters, from the left."""
@@ -131,6 +180,79 @@ class BarLight:
             strip = Strip(centre, (x, y, z), strip_width_m(bar, layout), rows)
             found.append(ColumnLight(self, strip, slice(column, None, columns)))
         return tuple(found)
+
+    def _images(self, reflection: ReflectionSpec) -> tuple["ColumnLight", ...]:
+        """The columns as a reflection shows them."""
+        ends = np.concatenate([column.strip.cuts_m()[[0, -1]] for column in self.strips])
+        if reflection.kind == "road":
+            plane, axis = ends[:, 1].max() + 0.5 * reflection.gap_m, 1
+        else:
+            plane, axis = self.centre_m[0] + 0.5 * reflection.gap_m, 0
+        right, down = reflection.turn_deg
+        pane = Pane((math.radians(right), math.radians(down)), reflection.shift_px)
+        found = []
+        for column in self.strips:
+            strip = column.strip
+            if reflection.kind != "window":
+                centre, along = list(strip.centre_m), list(strip.along_m)
+                centre[axis], along[axis] = 2 * plane - centre[axis], -along[axis]
+                strip = replace(
+                    strip,
+                    centre_m=(centre[0], centre[1], centre[2]),
+                    along_m=(along[0], along[1], along[2]),
+                )
+            found.append(
+                replace(
+                    column,
+                    strip=strip,
+                    share=reflection.share,
+                    blur_px=reflection.blur_px,
+                    pane=pane if reflection.kind == "window" else None,
+                    direct=False,
+                )
+            )
+        return tuple(found)
+
+    def _checked_covers(self, source: str) -> tuple[tuple[float, float, int, int], ...]:
+        """What passes before it, poles included: (from us, to us, first cluster, last cluster)."""
+        bar, last = self.bar, self.link.codebook.clusters - 1
+        if not all(0 <= k <= last for k in bar.covered):
+            raise ConfigError(f"{source}.covered = {list(bar.covered)}: expected clusters, 0 to {last}")
+        for key, spans in (("cover_s", bar.cover_s), ("pole_s", bar.pole_s)):
+            for i, span in enumerate(spans):
+                if not 0 <= span[0] < span[1]:
+                    raise ConfigError(f"{source}.{key}.{i} = {list(span)}: expected a time, and a later one")
+        for i, (_, _, a, b) in enumerate(bar.cover_s):
+            if not 0 <= a <= b <= last:
+                raise ConfigError(
+                    f"{source}.cover_s.{i} = {list(bar.cover_s[i])}: expected the first and the last of its"
+                    f" clusters, 0 to {last}"
+                )
+        poles = tuple((a, b, 0, last) for a, b in bar.pole_s)
+        return tuple((a * 1e6, b * 1e6, first, end) for a, b, first, end in (*bar.cover_s, *poles))
+
+    def cover(self, when_us: Floats, levels: Floats, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
+        """Put out what is hidden.
+
+        Args:
+            when_us: Times of switching after `begin_us` and before `end_us`, float64 (n,).
+            levels: From each on, float64 (n + 1, clusters).
+            begin_us: When the first levels hold.
+            end_us: Until when the last hold.
+
+        Returns:
+            The same with the times at which something begins or ends to hide clusters.
+        """
+        if not self._covers and not self.bar.covered:
+            return when_us, levels
+        edges = np.array([t for cover in self._covers for t in cover[:2] if begin_us < t < end_us])
+        when = np.sort(np.concatenate([when_us, edges]))
+        start = np.append(begin_us, when)
+        seen: Floats = levels[np.searchsorted(when_us, start, side="right")]
+        seen[:, list(self.bar.covered)] = 0.0
+        for from_us, to_us, first, last in self._covers:
+            seen[(start >= from_us) & (start < to_us), first : last + 1] = 0.0
+        return when, seen
 
     def _check(self, bar: BarSpec, source: str) -> None:
         assert bar.symbols is not None
@@ -213,22 +335,30 @@ class BarLight:
 
 @dataclass(frozen=True, eq=False)
 class ColumnLight:
-    """The light of one column of a bar's clusters.
+    """The light of one column of a bar's clusters, or of an image of it.
 
     Attributes:
         bar: The bar.
         strip: Where the column is.
         clusters: Which of the bar's clusters stand in it, from its top.
+        share: Share of the bar's light.
+        blur_px: Sigma of the blur that it has beside the lens's, px.
+        pane: The pane that shows it; None for none.
+        direct: Whether it is the bar itself, before which covers stand.
     """
 
     bar: BarLight
     strip: Strip
     clusters: slice
+    share: float = 1.0
+    blur_px: float = 0.0
+    pane: Pane | None = None
+    direct: bool = True
 
     @property
     def light_w_m2(self) -> float:
         """Irradiance of a pixel that it fills."""
-        return self.bar.light_w_m2
+        return self.bar.light_w_m2 * self.share
 
     @property
     def longest_us(self) -> float:
@@ -238,6 +368,8 @@ class ColumnLight:
     def switches(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
         """See `Source.switches`."""
         when, levels = self.bar.switches(begin_us, end_us)
+        if self.direct:
+            when, levels = self.bar.cover(when, levels, begin_us, end_us)
         return when, levels[:, self.clusters]
 
 
@@ -272,6 +404,8 @@ class LampLight:
     """A lamp's light: a square wave, or the square of a sine in steps."""
 
     lamp: LampSpec
+    blur_px: float = 0.0
+    pane: Pane | None = None
 
     @property
     def strip(self) -> Strip:
@@ -306,6 +440,40 @@ class LampLight:
         begin = int((when <= begin_us).sum()) - 1
         which = np.arange(begin, begin + 1 + int(inside.sum())) % n
         return when[inside], (1 - lamp.depth + lamp.depth * values[which])[:, None]
+
+
+def wiper_switches(wiper: WiperSpec, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
+    """Return when a wiper changes the light after `begin_us` and before `end_us`, and its share from each on.
+
+    While an edge passes, the light falls or rises evenly with time, in steps that are even in the logarithm.
+
+    Returns:
+        Times float64 (n,), us; shares of the light that passes float64 (n + 1,), from `begin_us` on.
+    """
+    lowest = 1 - wiper.share
+    steps = max(1, math.ceil(-math.log(lowest) / _WIPER_STEP_LN))
+    # Step i falls as the line passes the geometric middle between its level and the last one's.
+    levels = lowest ** (np.arange(1, steps + 1) / steps)
+    fall_us = (
+        (1 - lowest ** ((np.arange(steps) + 0.5) / steps)) / max(wiper.share, 1e-12) * wiper.edge_s * 1e6
+    )
+    once_us = np.concatenate([fall_us, wiper.lasts_s * 1e6 - fall_us[::-1]])
+    once = np.concatenate([levels, np.append(1.0, levels[:-1])[::-1]])
+    first_us, every_us = wiper.at_s * 1e6, wiper.every_s * 1e6
+    wipes = np.zeros(1)
+    if every_us > 0:
+        first, last = (max(0, math.floor((t_us - first_us) / every_us)) for t_us in (begin_us, end_us))
+        wipes = np.arange(first, last + 1, dtype=np.float64) * every_us
+    when: Floats = (first_us + wipes[:, None] + once_us).ravel()
+    share = np.append(1.0, np.tile(once, len(wipes)))
+    inside = (when > begin_us) & (when < end_us)
+    begin = int((when <= begin_us).sum())
+    return when[inside], share[begin : begin + 1 + int(inside.sum())]
+
+
+def reflections_of(scene: Scene, bar: int) -> tuple[ReflectionSpec, ...]:
+    """The reflections of a bar of a scene."""
+    return tuple(one for one in scene.reflections if one.bar in (None, bar))
 
 
 def _random_lamps(scene: Scene) -> list[LampSpec]:
@@ -356,14 +524,15 @@ def sources_of(scene: Scene, registry: Registry | None = None) -> tuple[list[Bar
             f"bars.{i}",
             i + 1 if bar.transmitter_id is None else bar.transmitter_id,
             site,
+            reflections_of(scene, i),
         )
         for i, (bar, link, site) in enumerate(zip(scene.bars, links, sites, strict=True))
     ]
     lamps = [LampLight(lamp) for lamp in (*scene.lamps, *_random_lamps(scene))]
-    columns = sum(len(bar.strips) for bar in bars)
+    columns = sum(len(bar.strips) + len(bar.images) for bar in bars)
     if columns + len(lamps) > MOST_SOURCES:
         raise ConfigError(
             f"bars and lamps: {columns} columns of clusters and {len(lamps)} lamps, expected at most"
-            f" {MOST_SOURCES} together"
+            f" {MOST_SOURCES} together, reflections included"
         )
     return bars, lamps

@@ -13,7 +13,7 @@ from evlcp_sdk.files import read_csv
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim.scene import NEAREST_M, MotionSpec
 
-__all__ = ["CameraPath", "Strip", "Vibration", "project"]
+__all__ = ["CameraPath", "Strip", "Vibration", "pothole_angle_rad", "project"]
 
 Floats = NDArray[np.float64]
 
@@ -109,8 +109,26 @@ class CameraPath:
         else:
             values: Floats = self._spline(t_us * 1e-6)
             position, attitude = values[:, :3], np.radians(values[:, 3:])
-        attitude[:, :2] += self._vibration.angle_rad(t_us).T
+        shaken = self._vibration.angle_rad(t_us)
+        attitude[:, 0] += m.vib_yaw_share * shaken[0]
+        attitude[:, 1] += shaken[1]
+        if m.pothole_s:
+            attitude[:, 1] += pothole_angle_rad(m, t_us)
         return position, attitude
+
+
+def pothole_angle_rad(motion: MotionSpec, t_us: ArrayLike) -> Floats:
+    """Pitch that potholes add at times (n,): after each, a spring's with a damper after a blow.
+
+    A sin(2 pi f t) exp(-t / decay) / (2 pi f): its rate begins with A, `pothole_rad_s`, and it comes to rest
+    where it was.
+    """
+    t_s = np.asarray(t_us, np.float64) * 1e-6
+    after = np.maximum(t_s[:, None] - np.array(motion.pothole_s), 0.0)
+    turn = 2 * math.pi * motion.pothole_hz
+    rung: Floats = np.sin(turn * after) * np.exp(-after / motion.pothole_decay_s)
+    total: Floats = motion.pothole_rad_s / turn * rung.sum(1)
+    return total
 
 
 def _read_path(path: Path, duration_s: float) -> CubicSpline:

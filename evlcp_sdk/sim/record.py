@@ -1,13 +1,17 @@
 """What a simulation leaves beside its recording: the truth, and the scene that a truth describes."""
 
+import math
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.sim.light import reflections_of
 from evlcp_sdk.sim.motion import project
 from evlcp_sdk.sim.optics import blur_sigma_px
 from evlcp_sdk.sim.scene import Scene, resolve_scene
@@ -17,6 +21,8 @@ from evlcp_sdk.sim.world import camera_on_earth, sites_of
 
 __all__ = ["scene_of_truth", "truth_of"]
 
+Floats = NDArray[np.float64]
+
 
 def truth_of(
     simulated: Simulation | Scene, seed: int | None = None, registry: Registry | None = None
@@ -24,8 +30,9 @@ def truth_of(
     """The truth of a simulation, with the counts when it has run; or of a scene without rendering it.
 
     Of its table, `scene` holds the scene's parameters; `psf_sigma_px` and `e_led` the blur and the light of
-    each bar; `simulator` the resolved scene, which renders the recording again. Bars and camera are sampled
-    every millisecond.
+    each bar; `others` the reflections: of which bar (`src`), how bright beside it (`gain`) and where in the
+    image; `simulator` the resolved scene, which renders the recording again. Bars, reflections and camera are
+    sampled every millisecond.
 
     Args:
         simulated: The simulation, or the scene.
@@ -63,6 +70,9 @@ def truth_of(
                 "chips_file": bar.chips_file,
                 "payload": bar.payload,
                 "symbols": light.sent_symbols(scene.duration_s),
+                "covered": list(bar.covered),
+                "cover_s": [list(span) for span in bar.cover_s],
+                "pole_s": [list(span) for span in bar.pole_s],
                 **({"packet_chips": light.packet_chips} if bar.chips_file is not None else {}),
             }
         )
@@ -96,8 +106,10 @@ def truth_of(
             "seed": scene.seed,
             "flicker_lamps": scene.flicker_lamps,
             "t0_us": scene.t0_us,
+            **_of_a_road(scene),
         },
         "bars": bars,
+        "others": _others(simulation, position, attitude),
         "camera": {
             "focal_mm": camera.focal_mm,
             "pitch_um": camera.pitch_um,
@@ -127,11 +139,48 @@ def truth_of(
     return truth_from_table(found, links={light.link.digest: light.link for light in simulation.bars})
 
 
+def _of_a_road(scene: Scene) -> dict[str, Any]:
+    """What a scene's table says of bloom, wiper and potholes, where there are any."""
+    found: dict[str, Any] = {}
+    lens, motion, wiper = scene.lens, scene.motion, scene.wiper
+    if lens.bloom > 0:
+        found |= {"bloom": lens.bloom, "bloom_px": lens.bloom_px}
+    if wiper.share > 0:
+        found["wiper"] = [wiper.at_s, wiper.lasts_s, wiper.share]
+    if motion.pothole_s:
+        found["pothole_px_ms"] = motion.pothole_rad_s * scene.camera.focal_px / 1000
+        found["pothole_s"] = motion.pothole_s[0]
+        found["pothole_hz"] = motion.pothole_hz
+    return found
+
+
+def _others(simulation: Simulation, position: Floats, attitude: Floats) -> list[dict[str, Any]]:
+    """The reflections of all bars, each with the places of its centre, px."""
+    found = []
+    for i, light in enumerate(simulation.bars):
+        columns = len(light.strips)
+        for j, reflection in enumerate(reflections_of(simulation.scene, i)):
+            images = light.images[j * columns : (j + 1) * columns]
+            # The middle of the columns' middles is the bar's.
+            strips = [replace(one, strip=replace(one.strip, clusters=2)) for one in images]
+            place = np.mean([simulation.seen(one, position, attitude)[0][:, 1] for one in strips], 0)
+            found.append(
+                {
+                    "kind": "mirror" if reflection.kind == "road" else "ghost",
+                    "src": i,
+                    "gain": reflection.share,
+                    "centre_px": [[round(float(v), 3) for v in axis] for axis in place.T],
+                }
+            )
+    return found
+
+
 def scene_of_truth(truth: Truth | Mapping[str, Any]) -> Scene:
     """The scene of a recording, from its truth: the same bars, symbols, light and sensor; another vibration.
 
     A truth written here gives exactly its scene. Of another generator's, with the same keys, everything is
-    taken over that both know; lamps are as many, but at other places.
+    taken over that both know: covers, wiper, bloom, potholes, mirror images, ghost images and panels among
+    it. Lamps at random places are as many, but at other places.
 
     Raises:
         ConfigError: Keys are missing, or ask for what is not modelled (`hpf_us`).
@@ -173,25 +222,95 @@ def scene_of_truth(truth: Truth | Mapping[str, Any]) -> Scene:
             "seed": told["seed"],
             "flicker_lamps": told["flicker_lamps"],
             "camera": {key: camera[key] for key in ("width", "height", "focal_mm", "pitch_um")},
-            "lens": {key: told[key] for key in ("f_number", "focus_m", "halo")},
-            "motion": {key: told[key] for key in ("distance_m", "speed_mps", "vib_rate_rad_s")},
+            "lens": {key: told[key] for key in ("f_number", "focus_m", "halo")}
+            | {key: told[key] for key in ("bloom", "bloom_px") if key in told},
+            "motion": {key: told[key] for key in ("distance_m", "speed_mps", "vib_rate_rad_s")}
+            | _motion_told(told, CameraModel(**{key: camera[key] for key in ("focal_mm", "pitch_um")})),
             "background": {
                 "light_w_m2": told["background_w_m2"],
                 "texture": told["background_texture"],
-            },
+            }
+            | {key: told[key] for key in ("texture_px",) if key in told}
+            # How far around the bar such recordings have events of a background that moves.
+            | ({"around_px": 24, "texture_step_px": 0.4} if told.get("bg_moves") else {}),
+            "wiper": dict(zip(("at_s", "lasts_s", "share"), told["wiper"], strict=True)) | {"edge_s": 0.0}
+            if told.get("wiper")
+            else {},
             "sensor": {key: told[key] for key in same} | {"hot_share": told["hot_pixels"] / pixels},
             "bars": [
-                {key: bar[key] for key in (*shape, "start_chip", "chips_file")}
+                {key: bar[key] for key in (*shape, "start_chip")}
+                | {key: bar[key] for key in _WHERE_TOLD if key in bar}
+                | ({"led_w_m2": told["led_w_m2_all"]} if told.get("led_w_m2_all") else {})
                 | {"link": _link_table(truth, bar, f"bars.{i}")}
                 | ({"symbols": bar["symbols"]} if bar["symbols"] else {})
                 for i, bar in enumerate(truth["bars"])
             ],
         }
+        table |= _others_told(truth)
     except (KeyError, TypeError) as fault:
         raise ConfigError(f"truth: not a scene's truth: {fault}") from fault
     except InputError as fault:
         raise ConfigError(str(fault)) from fault
     return resolve_scene(table, source="truth")
+
+
+_WHERE_TOLD = ("chips_file", "lean_deg", "tilt_deg", "covered", "cover_s", "pole_s")
+"""Keys of a bar that a scene has under the same name, and a truth where there is something to say."""
+
+
+def _motion_told(told: Mapping[str, Any], camera: CameraModel) -> dict[str, Any]:
+    """What another generator's scene says of yaw, attitude and potholes, as keys of `[motion]`."""
+    names = {
+        "lateral_mps": "lateral_mps",
+        "cam_yaw_deg": "yaw_deg",
+        "cam_pitch_deg": "pitch_deg",
+        "cam_roll_deg": "roll_deg",
+        "yaw_share": "vib_yaw_share",
+    }
+    found = {ours: told[theirs] for theirs, ours in names.items() if theirs in told}
+    if told.get("pothole_px_ms"):
+        found["pothole_s"] = [told["pothole_s"]]
+        found["pothole_rad_s"] = told["pothole_px_ms"] * 1000 / camera.focal_px
+        found["pothole_hz"] = told["pothole_hz"]
+    return found
+
+
+def _others_told(truth: Mapping[str, Any]) -> dict[str, Any]:
+    """What another generator's truth says of mirror images, ghost images and panels."""
+    camera, distance = truth["camera"], truth["scene"]["distance_m"]
+    m_per_px = distance / CameraModel(focal_mm=camera["focal_mm"], pitch_um=camera["pitch_um"]).focal_px
+    reflections, lamps = [], []
+    for i, other in enumerate(truth.get("others", [])):
+        kind = other["kind"]
+        if kind == "pwm":
+            lamps.append(
+                {
+                    "x_m": (other["u_px"] - camera["cx"]) * m_per_px,
+                    "y_m": (other["v_px"] - camera["cy"]) * m_per_px,
+                    "width_m": other["w_px"] * m_per_px,
+                    "height_m": other["h_px"] * m_per_px,
+                    "light_w_m2": other["led_w_m2"],
+                    "flicker_hz": other["pwm_hz"],
+                    "duty": other["duty"],
+                }
+            )
+            continue
+        bar = truth["bars"][other["src"]]
+        one = {"bar": other["src"], "share": other["gain"]}
+        if kind == "mirror":
+            low = bar["y_m"] + bar["length_m"] / 2
+            sigma = truth["psf_sigma_px"][other["src"]]
+            one |= {
+                "kind": "road",
+                "gap_m": 2 * (other["road_y_m"] - low),
+                "blur_px": sigma * math.sqrt(other["streak"] ** 2 - 1),
+            }
+        elif kind == "ghost":
+            one |= {"kind": "window", "shift_px": [other["dx_px"], other["dy_px"]]}
+        else:
+            raise ConfigError(f"truth: others.{i}.kind = {kind!r}: expected mirror, ghost or pwm")
+        reflections.append(one)
+    return {"reflections": reflections, "lamps": lamps}
 
 
 def _link_table(truth: Mapping[str, Any], bar: Mapping[str, Any], where: str) -> Any:

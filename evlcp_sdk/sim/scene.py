@@ -1,4 +1,4 @@
-"""The scene: bars, lamps, lens, motion, background and sensor, from TOML to checked objects.
+"""The scene: bars, reflections, lamps, lens, motion, background and sensor, from TOML to checked objects.
 
 Coordinates: x right, y down, z forward, m. The camera's path starts at the origin of x and y, looking along
 z; a bar with `z_m = 0` then stands `motion.distance_m` ahead. Defaults are those of the sensor model; where a
@@ -30,8 +30,10 @@ __all__ = [
     "LampSpec",
     "LensSpec",
     "MotionSpec",
+    "ReflectionSpec",
     "Scene",
     "SensorSpec",
+    "WiperSpec",
     "WorldSpec",
     "links_of",
     "load_scene",
@@ -44,7 +46,7 @@ MOST_PIXELS = 4096
 """Columns and rows of a sensor."""
 
 MOST_SOURCES = 64
-"""Bars and lamps of one scene; a bar counts once for each column of its clusters."""
+"""Bars, lamps and reflections of one scene; a bar counts once for each column of its clusters."""
 
 LinkTable = Mapping[str, Any]
 """A link, or what is different about it: tables as in `link.toml`."""
@@ -96,11 +98,58 @@ class BarSpec:
         Field(ge=0, description="Light of a fully lit pixel; none: from the LED's intensity and the lens."),
     ] = None
     led_mw_sr: Annotated[float, Field(gt=0, description="Intensity of one LED.")] = 20.0
+    covered: Annotated[
+        tuple[int, ...], Field(description="Clusters that are hidden all the time, counted from 0.")
+    ] = ()
+    cover_s: Annotated[
+        tuple[tuple[float, float, int, int], ...],
+        Field(description="What passes: [from s, to s, first cluster, last cluster] that are hidden then."),
+    ] = ()
+    pole_s: Annotated[
+        tuple[tuple[float, float], ...], Field(description="[from s, to s] when all of it is hidden.")
+    ] = ()
+
+
+@dataclass(frozen=True)
+class ReflectionSpec:
+    """A second image of a bar: upside down in the road, beside it in a rail, or shifted by a window.
+
+    Every image has the bar's chips at the same times. What covers a bar stands in the direct view and covers
+    none of its images.
+    """
+
+    kind: Annotated[
+        Literal["road", "rail", "window"],
+        Field(
+            description="road: mirrored in a level plane; rail: mirrored in an upright plane that holds the"
+            " viewing direction; window: the same image, shifted."
+        ),
+    ] = "road"
+    bar: Annotated[
+        int | None, Field(ge=0, description="Number of the bar, counted from 0; none: every bar.")
+    ] = None
+    share: Annotated[float, Field(gt=0, le=1, description="Share of the bar's light.")] = 0.2
+    gap_m: Annotated[
+        float,
+        Field(
+            description="road: from the bar's lower end down to its image; rail: from the bar to its image,"
+            " to the right."
+        ),
+    ] = 0.1
+    shift_px: Annotated[
+        tuple[float, float], Field(description="window: shift of the image to the right and down.")
+    ] = (0.0, 0.0)
+    turn_deg: Annotated[
+        tuple[float, float], Field(description="window: the same as angles, to the right and down.")
+    ] = (0.0, 0.0)
+    blur_px: Annotated[
+        float, Field(ge=0, le=20, description="Sigma of the blur that a rough surface adds.")
+    ] = 0.0
 
 
 @dataclass(frozen=True)
 class LampSpec:
-    """A rectangle of flickering light."""
+    """A rectangle of flickering light: a lamp, a sign, a panel that is dimmed by switching."""
 
     x_m: Annotated[float, Field(description="Its centre, to the right of the path's start.")] = 4.0
     y_m: Annotated[float, Field(description="The same, downward.")] = -3.0
@@ -135,6 +184,10 @@ class LensSpec:
     ] = 0.36
     halo: Annotated[float, Field(ge=0, lt=1, description="Share of the light in the halo; a guess.")] = 0.02
     halo_px: Annotated[float, Field(ge=2, le=400, description="Sigma of the halo; a guess.")] = 40.0
+    bloom: Annotated[
+        float, Field(ge=0, lt=1, description="Share of the light in a second halo: a dirty windscreen.")
+    ] = 0.0
+    bloom_px: Annotated[float, Field(ge=2, le=400, description="Sigma of the second halo.")] = 12.0
 
 
 @dataclass(frozen=True)
@@ -152,6 +205,19 @@ class MotionSpec:
     vib_rate_rad_s: Annotated[
         float, Field(ge=0, le=2, description="Rms of the vibration's pitch and yaw rates; a guess.")
     ] = 0.06
+    vib_yaw_share: Annotated[float, Field(ge=0, le=10, description="The yaw's rate beside the pitch's.")] = (
+        1.0
+    )
+    pothole_s: Annotated[
+        tuple[float, ...], Field(description="When a wheel hits a pothole: pitch is struck, rings, decays.")
+    ] = ()
+    pothole_rad_s: Annotated[
+        float, Field(ge=-4, le=4, description="Pitch rate right after the blow, upward; 1 rad/s: 7.2 px/ms.")
+    ] = 1.0
+    pothole_hz: Annotated[float, Field(gt=0, le=200, description="What it rings with; a guess.")] = 12.0
+    pothole_decay_s: Annotated[
+        float, Field(gt=0, le=10, description="Time constant of its decay; a guess.")
+    ] = 0.1
     path_file: Annotated[
         str | None,
         Field(
@@ -186,9 +252,37 @@ class BackgroundSpec:
         float, Field(gt=0, le=100, description="On the sensor: night 1e-4, tunnel 0.1, sun 3 to 12.")
     ] = 0.05
     texture: Annotated[
-        float, Field(ge=0, le=1, description="Rms of its logarithm over the image; a guess.")
+        float, Field(ge=0, le=2, description="Rms of its logarithm over the image; a guess.")
     ] = 0.3
     texture_px: Annotated[float, Field(ge=2, le=64, description="Size of its patches; a guess.")] = 12.0
+    texture_step_px: Annotated[
+        float,
+        Field(
+            ge=0.1, le=4, description="How far it moves in the image until the light on a pixel follows it."
+        ),
+    ] = 0.8
+    around_px: Annotated[
+        int,
+        Field(
+            ge=0,
+            le=MOST_PIXELS,
+            description="How far around bars and lamps its own events are simulated, too; 0: only on pixels"
+            " that these light; as many as the image is wide: everywhere.",
+        ),
+    ] = 0
+
+
+@dataclass(frozen=True)
+class WiperSpec:
+    """What takes a share of all light for a time: a wiper's blade before the lens, out of focus."""
+
+    share: Annotated[float, Field(ge=0, le=0.999, description="Share of the light that it takes.")] = 0.0
+    at_s: Annotated[float, Field(ge=0, description="When it first begins to.")] = 0.05
+    lasts_s: Annotated[float, Field(gt=0, description="How long it does, its edges included.")] = 0.03
+    edge_s: Annotated[
+        float, Field(ge=0, description="How long the blade's edge takes to pass the lens; a guess.")
+    ] = 0.005
+    every_s: Annotated[float, Field(ge=0, description="From one time to the next; 0: only once.")] = 0.0
 
 
 @dataclass(frozen=True)
@@ -261,13 +355,30 @@ class Scene:
     motion: MotionSpec = field(default_factory=MotionSpec)
     background: BackgroundSpec = field(default_factory=BackgroundSpec)
     sensor: SensorSpec = field(default_factory=SensorSpec)
+    wiper: WiperSpec = field(default_factory=WiperSpec)
     world: WorldSpec | None = None
     bars: tuple[BarSpec, ...] = (BarSpec(),)
+    reflections: tuple[ReflectionSpec, ...] = ()
     lamps: tuple[LampSpec, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.bars) + len(self.lamps) + self.flicker_lamps > MOST_SOURCES:
             raise ConfigError(f"bars and lamps: expected at most {MOST_SOURCES} together")
+        for i, reflection in enumerate(self.reflections):
+            if reflection.bar is not None and reflection.bar >= len(self.bars):
+                raise ConfigError(
+                    f"reflections.{i}.bar = {reflection.bar}: there are {len(self.bars)} bars, counted from 0"
+                )
+        if self.lens.halo + self.lens.bloom >= 1:
+            raise ConfigError(
+                f"lens.bloom = {self.lens.bloom}: expected less than 1 together with lens.halo ="
+                f" {self.lens.halo}"
+            )
+        wiper = self.wiper
+        if 2 * wiper.edge_s > wiper.lasts_s:
+            raise ConfigError(f"wiper.edge_s = {wiper.edge_s}: expected at most half of lasts_s")
+        if 0 < wiper.every_s < wiper.lasts_s:
+            raise ConfigError(f"wiper.every_s = {wiper.every_s}: expected at least lasts_s")
         if max(self.camera.width, self.camera.height) > MOST_PIXELS:
             raise ConfigError(f"camera: expected at most {MOST_PIXELS} columns and rows")
         if self.lens.focus_m * 1e3 <= self.camera.focal_mm:
@@ -283,8 +394,8 @@ class Scene:
 NEAREST_M = 0.5
 """Depth from which a source is rendered."""
 
-_TABLES = ("camera", "lens", "motion", "background", "sensor", "world")
-_LISTS = ("bars", "lamps")
+_TABLES = ("camera", "lens", "motion", "background", "sensor", "wiper", "world")
+_LISTS = ("bars", "reflections", "lamps")
 
 
 def preset_names() -> list[str]:
@@ -553,7 +664,7 @@ def _set(table: dict[str, Any], key: str, value: Any) -> None:
 
 
 def _rows(table: dict[str, Any], name: str) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = table.setdefault(name, [{}] if name == "bars" else [])
+    rows: list[dict[str, Any]] = table.setdefault(name, [{}])
     return rows
 
 

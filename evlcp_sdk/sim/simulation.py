@@ -14,7 +14,7 @@ from scipy.special import ndtr, ndtri
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.sim import _kernels
-from evlcp_sdk.sim.light import Source, sources_of
+from evlcp_sdk.sim.light import Source, sources_of, wiper_switches
 from evlcp_sdk.sim.motion import CameraPath, project
 from evlcp_sdk.sim.optics import blur_sigma_px, step_table
 from evlcp_sdk.sim.scene import NEAREST_M, Scene, SensorSpec
@@ -34,6 +34,8 @@ _CELL_US = 1000.0
 _CELLS = 4
 _BLOCK_US = _CELLS * _CELL_US
 _MOST_MOVES = 40
+_MOST_MOVES_STRUCK = 400
+_BLOOM_EVERY = 8  # poses
 _CORE_NODES = 513
 _WIDE_NODES = 1025
 _ROOM = 1 << 17
@@ -82,6 +84,8 @@ def _texture(scene: Scene) -> Floats:
 
 def _merge(marked: list[NDArray[np.int64]]) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
     """All pixels of several lists, sorted, each with the set of lists that it is in."""
+    if not marked:
+        return np.empty(0, np.int32), np.empty(0, np.uint64)
     pixels = np.concatenate(marked)
     bits = np.repeat(np.uint64(1) << np.arange(len(marked), dtype=np.uint64), [len(m) for m in marked])
     if len(marked) > 1:
@@ -90,6 +94,41 @@ def _merge(marked: list[NDArray[np.int64]]) -> tuple[NDArray[np.int32], NDArray[
         first = np.flatnonzero(np.append(True, pixels[1:] != pixels[:-1]))
         pixels, bits = pixels[first], np.bitwise_or.reduceat(bits, first)
     return pixels.astype(np.int32), bits
+
+
+@dataclass(frozen=True, eq=False)
+class _Halo:
+    """A wide Gaussian that holds a share of the light.
+
+    Attributes:
+        share: Share of the light.
+        reach_px: How far it is sampled around an edge.
+        table: Share of a pixel lit beyond an edge, float64 (1025,), at -reach_px to reach_px.
+        per_px: Samples a pixel along a strip.
+        every: Poses after which its place in the image is computed anew; 0: it stays for a block of time.
+    """
+
+    share: float
+    reach_px: float
+    table: Floats
+    per_px: float
+    every: int
+
+    @classmethod
+    def of(cls, share: float, sigma_px: float, every: int) -> "_Halo":
+        reach = 4.5 * sigma_px + 1
+        return cls(share, reach, step_table(sigma_px, reach, _WIDE_NODES), 8 / sigma_px, every)
+
+    def step(self, at_px: Floats) -> Floats:
+        """Share of a pixel lit that is so far beyond an edge."""
+        return np.interp(at_px, np.linspace(-self.reach_px, self.reach_px, _WIDE_NODES), self.table)
+
+    def along(self, cuts_px: Floats) -> Floats:
+        """Share of each cluster's light, float64 (clusters, n), along a strip with these cuts."""
+        grid = np.arange(-self.reach_px, cuts_px[-1] + self.reach_px, 1 / self.per_px)
+        edge = self.step(grid[:, None] - cuts_px)
+        found: Floats = (edge[:, :-1] - edge[:, 1:]).T
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +168,7 @@ class Simulation:
         self.scene = scene if seed is None else replace(scene, seed=seed)
         scene = self.scene
         self.bars, self.lamps = sources_of(scene, registry)
-        strips = [strip for bar in self.bars for strip in bar.strips]
+        strips = [strip for bar in self.bars for strip in (*bar.strips, *bar.images)]
         self._sources: list[Source] = [*strips, *self.lamps]
         self.path = CameraPath(scene.motion, scene.duration_s, scene.seed)
         self._check_ahead()
@@ -145,8 +184,13 @@ class Simulation:
         self._counters[:, _kernels.BLOCK] = -2
         hot = np.empty(size, np.int64)
         self._hot = hot[: _kernels.find_hot_pixels(size, scene.sensor.hot_share, self._key, hot)].copy()
-        self._wide_reach = 4.5 * scene.lens.halo_px + 1
-        self._wide_table = step_table(scene.lens.halo_px, self._wide_reach, _WIDE_NODES)
+        self._halos = [_Halo.of(scene.lens.halo, scene.lens.halo_px, 0)]
+        # A halo of few pixels follows the image; a wide one changes little while it moves for 4 ms.
+        self._texture_every = max(1, round(scene.background.texture_step_px / MOTION_STEP_PX))
+        if scene.lens.bloom > 0:
+            self._halos.append(_Halo.of(scene.lens.bloom, scene.lens.bloom_px, _BLOOM_EVERY))
+        self._core_share = 1 - sum(halo.share for halo in self._halos)
+        self._wide_reach = max(halo.reach_px for halo in self._halos)
         self._counts = dict.fromkeys(("events", "signal_events", "dropped_by_rate_cap", "dropped_blind"), 0)
         self._done_us = 0.0
 
@@ -306,7 +350,8 @@ class Simulation:
             if shown.any():
                 step = np.diff(place[:, shown].reshape(len(t), 3, -1, 2), axis=1)
                 moved = np.maximum(moved, np.hypot(step[..., 0], step[..., 1]).max((1, 2)))
-        moves = np.clip(np.ceil(2 * moved / MOTION_STEP_PX), 1, _MOST_MOVES).astype(int)
+        most = _MOST_MOVES_STRUCK if self.scene.motion.pothole_s else _MOST_MOVES
+        moves = np.clip(np.ceil(2 * moved / MOTION_STEP_PX), 1, most).astype(int)
         starts = np.concatenate(
             [a + np.arange(n) / n * (b - a) for a, b, n in zip(cells, cells[1:], moves, strict=False)]
         )
@@ -320,36 +365,48 @@ class Simulation:
         starts, middles = self._moves(begin_us, end_us)
         position, attitude = self.path.at(middles)
         turn = np.stack([attitude[:, 0], -attitude[:, 1]], 1) * camera.focal_px
-        darkest = sensor.dark_w_m2 + scene.background.light_w_m2 * float(self._texture.min())
+        wiped_us, shade = np.empty(0), np.ones(1)
+        if scene.wiper.share > 0:
+            wiped_us, shade = wiper_switches(scene.wiper, begin_us, end_us)
+        lightest = float(shade.max())
+        darkest = sensor.dark_w_m2 + scene.background.light_w_m2 * float(self._texture.min() * shade.min())
         shown: list[tuple[Source, Floats, Floats, float]] = []
         marked: list[NDArray[np.int64]] = []
         for source in self._sources:
-            place, depth = project(source.strip.cuts_m(), position, attitude, camera)
+            place, depth = self.seen(source, position, attitude)
             if depth.min() <= NEAREST_M:
                 continue
             middle_depth = depth.mean(1)
             strip_px = camera.focal_px * source.strip.width_m / middle_depth
             sigma = blur_sigma_px(float(middle_depth[len(middle_depth) // 2]), lens, camera)
+            if source.blur_px > 0:
+                sigma = math.hypot(sigma, source.blur_px)
             least = ACTIVITY_FLOOR * max(darkest, sensor.charge_us_w_m2 / source.longest_us)
-            lit = self._lit_pixels(place, float(strip_px.max()), sigma, source.light_w_m2, least)
+            light = source.light_w_m2 * lightest
+            lit = self._lit_pixels(place, float(strip_px.max()), sigma, light, least)
             if len(lit):
                 marked.append(lit)
                 shown.append((source, place, strip_px, sigma))
-        if not shown:
+        around = scene.background.around_px
+        if not shown and around < camera.width:
             return None
         pixels, masks = _merge(marked)
+        if around > 0:
+            pixels, masks = self._with_background(pixels, masks, [place for _, place, *_ in shown])
 
         g = len(shown)
-        most = max(source.strip.clusters for source, *_ in shown)
+        most = max((source.strip.clusters for source, *_ in shown), default=1)
         poses = len(starts)
         origin, axis = np.empty((poses, g, 2)), np.empty((poses, g, 2))
         bounds, strips = np.zeros((poses, g, most + 1)), np.empty((poses, g))
         clusters, gain = np.empty(g, np.int64), np.empty(g)
         core, core_per_px = np.empty((g, _CORE_NODES)), np.empty(g)
-        halo_first, halo_per_px = np.empty(g), np.full(g, 8 / lens.halo_px)
         first_rows = np.empty(g, np.int64)
-        lines_t, lines_source, lines_row = [starts[1:]], [np.full(poses - 1, -1)], [np.arange(1, poses)]
-        levels_of, halo_of = [], []
+        lines_t, lines_source = [starts[1:], wiped_us], [np.full(poses - 1, _kernels.POSE)]
+        lines_source.append(np.full(len(wiped_us), _kernels.SHADE))
+        lines_row = [np.arange(1, poses), np.arange(1, len(shade))]
+        levels_of: list[Floats] = []
+        halos_of: list[list[Floats]] = [[] for _ in self._halos]
         total = 0
         for i, (source, place, strip_px, sigma) in enumerate(shown):
             k = source.strip.clusters
@@ -369,52 +426,80 @@ class Simulation:
             total += len(levels)
             levels_of.append(np.pad(levels, ((0, 0), (0, most - k))))
             cut = bounds[poses // 2, i, : k + 1]
-            halo_first[i] = -self._wide_reach
-            grid = np.arange(halo_first[i], cut[-1] + self._wide_reach, 1 / halo_per_px[i])
-            edge = np.interp(
-                grid[:, None] - cut,
-                np.linspace(-self._wide_reach, self._wide_reach, _WIDE_NODES),
-                self._wide_table,
-            )
-            halo_of.append(levels @ (edge[:, :-1] - edge[:, 1:]).T)
-        longest = max(h.shape[1] for h in halo_of) + 1
-        halo = np.concatenate([np.pad(h, ((0, 0), (0, longest - h.shape[1]))) for h in halo_of])
+            for one, of in zip(self._halos, halos_of, strict=True):
+                of.append(levels @ one.along(cut))
+        longest = max((h.shape[1] for of in halos_of for h in of), default=1) + 1
+        halo = np.zeros((len(self._halos), total, longest))
+        for q, of in enumerate(halos_of):
+            for i, h in enumerate(of):
+                halo[q, first_rows[i] : first_rows[i] + len(h), : h.shape[1]] = h
         when = np.concatenate(lines_t)
         order = np.argsort(when, kind="stable")
         shared = (
             when[order],
             np.concatenate(lines_source)[order].astype(np.int64),
             np.concatenate(lines_row)[order].astype(np.int64),
-            first_rows, origin, axis, bounds, strips, clusters, gain, np.concatenate(levels_of), halo,
-            halo_first, halo_per_px, lens.halo, core, core_per_px, self._wide_table,
-            (_WIDE_NODES - 1) / (2 * self._wide_reach), turn, self._texture,
-            np.array([scene.background.light_w_m2, sensor.dark_w_m2]),
+            first_rows, origin, axis, bounds, strips, clusters, gain,
+            np.concatenate([np.zeros((0, most)), *levels_of]), halo,
+            np.array([-one.reach_px for one in self._halos]), np.array([one.per_px for one in self._halos]),
+            np.array([one.share for one in self._halos]), np.array([one.every for one in self._halos]),
+            self._core_share, core, core_per_px, np.stack([one.table for one in self._halos]),
+            np.array([(_WIDE_NODES - 1) / (2 * one.reach_px) for one in self._halos]), shade, turn,
+            self._texture_every, self._texture, np.array([scene.background.light_w_m2, sensor.dark_w_m2]),
         )  # fmt: skip
         return _Block(pixels, masks, shared)
+
+    def seen(self, source: Source, position: Floats, attitude: Floats) -> tuple[Floats, Floats]:
+        """Where a source's clusters start and end in the image, and their depths; see `project`."""
+        pane = source.pane
+        if pane is None:
+            return project(source.strip.cuts_m(), position, attitude, self.scene.camera)
+        # Light that comes from further to the right is light seen by a camera that looks further to the left.
+        turned = attitude + np.array([-pane.turn_rad[0], pane.turn_rad[1], 0.0])
+        place, depth = project(source.strip.cuts_m(), position, turned, self.scene.camera)
+        return place + np.array(pane.shift_px), depth
+
+    def _with_background(
+        self, pixels: NDArray[np.int32], masks: NDArray[np.uint64], places: list[Floats]
+    ) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
+        """Add the pixels around the sources on which only the background moves, in the order of pixels."""
+        width, height = self.scene.camera.width, self.scene.camera.height
+        around = self.scene.background.around_px
+        marked = np.full((height, width), around >= width)
+        for place in places:
+            left, top = np.clip(np.floor(place.min((0, 1))) - around, 0, (width, height)).astype(int)
+            right, low = np.clip(np.ceil(place.max((0, 1))) + around + 1, 0, (width, height)).astype(int)
+            marked[top:low, left:right] = True
+        flat = marked.ravel()
+        flat[pixels] = True
+        every = np.flatnonzero(flat).astype(np.int32)
+        found = np.zeros(len(every), np.uint64)
+        found[np.searchsorted(every, pixels)] = masks
+        return every, found
 
     def _lit_pixels(
         self, place: Floats, strip_px: float, sigma: float, light_w_m2: float, least_w_m2: float
     ) -> NDArray[np.int64]:
         """Pixels, row by row, that a source lights by `least_w_m2` or more at any pose."""
         nothing = np.empty(0, np.int64)
-        lens = self.scene.lens
         z = np.arange(0, self._wide_reach, 0.25)
         half = strip_px / 2
-        wide = np.linspace(-self._wide_reach, self._wide_reach, _WIDE_NODES)
         table = step_table(sigma, 5 * sigma + 0.5, _CORE_NODES)
         near = np.linspace(-5 * sigma - 0.5, 5 * sigma + 0.5, _CORE_NODES)
 
-        def step(at: Floats, core: bool) -> Floats:
-            return np.interp(at, near, table) if core else np.interp(at, wide, self._wide_table)
+        def core(at: Floats) -> Floats:
+            return np.interp(at, near, table)
 
-        across_core = step(z + half, True) - step(z - half, True)
-        across_halo = step(z + half, False) - step(z - half, False)
-        across = light_w_m2 * ((1 - lens.halo) * across_core + lens.halo * across_halo)
+        across, along = np.zeros(len(z)), np.zeros(len(z))
+        steps = [(self._core_share, core), *((halo.share, halo.step) for halo in self._halos)]
+        for share, step in steps:
+            part = step(z + half) - step(z - half)
+            across += share * part
+            along += share * part[0] * step(-z)
+        across *= light_w_m2
+        along *= light_w_m2
         if across[0] < least_w_m2:
             return nothing
-        along = light_w_m2 * (
-            (1 - lens.halo) * across_core[0] * step(-z, True) + lens.halo * across_halo[0] * step(-z, False)
-        )
         reach_across = float(z[across >= least_w_m2].max(initial=0)) + 0.5
         reach_along = float(z[along >= least_w_m2].max(initial=0)) + 0.5
         first, last = place[:, 0], place[:, -1]

@@ -1,0 +1,475 @@
+"""What a road adds: images, covers, wiper, bloom, potholes, background; against other ways to them."""
+
+import csv
+import json
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.io import read_events
+from evlcp_sdk.link.resolve import resolve
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.sim import (
+    BackgroundSpec,
+    BarSpec,
+    LampSpec,
+    MotionSpec,
+    ReflectionSpec,
+    Scene,
+    SensorSpec,
+    Simulation,
+    WiperSpec,
+    load_scene,
+    resolve_scene,
+    scene_of_truth,
+    scene_table,
+    simulate,
+    truth_of,
+)
+from evlcp_sdk.sim._kernels import texture_at
+from evlcp_sdk.sim.light import BarLight, wiper_switches
+from evlcp_sdk.sim.motion import pothole_angle_rad
+from evlcp_sdk.sim.optics import blur_sigma_px
+from evlcp_sdk.sim.validation import pixel_events
+from evlcp_sdk.study.frames import read_frames
+from evlcp_sdk.study.score import Score
+from evlcp_sdk.values import Events
+
+SHARED = Path(__file__).parents[4] / "shared"
+TOOL = SHARED / "tools" / "score_road.py"
+IDEAL = SensorSpec(
+    noise_hz=0.0, hot_share=0.0, noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0, t_row_us=0.0,
+    cap_mev_s=0.0,
+)  # fmt: skip
+STILL = MotionSpec(distance_m=50.0, speed_mps=0.0, vib_rate_rad_s=0.0)
+EVEN = BackgroundSpec(light_w_m2=0.3, texture=0.0)
+FOCAL_PX = Scene().camera.focal_px
+
+Floats = NDArray[np.float64]
+
+
+def every(scene: Scene, **options: int) -> Events:
+    return Events.concat(list(simulate(scene, **options)))
+
+
+def rows(events: Events) -> list[tuple[int, int, int, int]]:
+    columns = (events.t_us, events.x, events.y, events.p)
+    return sorted(zip(*(c.tolist() for c in columns), strict=True))
+
+
+def alike(one: Events, two: Events, share: float = 0.999) -> None:
+    """But for crossings at the turn of a microsecond, which the rounding of sums moves."""
+    a, b = set(rows(one)), set(rows(two))
+    assert min(len(a), len(b)) > 5000
+    assert len(a & b) > share * max(len(a), len(b))
+
+
+def chips(tmp_path: Path, upside_down: bool) -> str:
+    sent = np.random.default_rng(5).integers(0, 2, (100, 16))
+    path = tmp_path / f"{upside_down}.npy"
+    np.save(path, sent[:, ::-1] if upside_down else sent)
+    return str(path)
+
+
+@pytest.mark.parametrize("kind", ["road", "rail", "window"])
+def test_an_image_is_a_dimmer_bar_at_another_place(kind: str, tmp_path: Path) -> None:
+    first = BarSpec(chips_file=chips(tmp_path, False), start_chip=0.0, led_w_m2=40.0)
+    scene = Scene(duration_s=0.01, sensor=IDEAL, motion=STILL, background=EVEN, bars=(first,))
+    image = {
+        "road": ReflectionSpec("road", share=0.25, gap_m=0.3),
+        "rail": ReflectionSpec("rail", share=0.25, gap_m=0.4),
+        "window": ReflectionSpec("window", share=0.25, shift_px=(0.4 / 50 * FOCAL_PX, 0.0)),
+    }[kind]
+    second = replace(first, led_w_m2=10.0)
+    if kind == "road":
+        # The bar is 0.96 m long: from its middle, 0.48 + 0.3 + 0.48 m down.
+        second = replace(second, y_m=1.26, chips_file=chips(tmp_path, True))
+    else:
+        second = replace(second, x_m=first.x_m + 0.4)
+    alike(every(replace(scene, reflections=(image,))), every(replace(scene, bars=(first, second))))
+
+
+def test_an_image_leans_as_a_mirror_shows_it() -> None:
+    bar = BarSpec(lean_deg=10.0, tilt_deg=20.0, x_m=0.5)
+    scene = Scene(bars=(bar,), reflections=(ReflectionSpec("road", gap_m=0.2), ReflectionSpec("rail")))
+    (light,) = Simulation(scene).bars
+    direct, road, rail = (one.strip.cuts_m() for one in (*light.strips, *light.images))
+    low = direct[:, 1].max()
+    np.testing.assert_allclose(road * [1, -1, 1] + [0, 2 * low + 0.2, 0], direct, atol=1e-12)
+    np.testing.assert_allclose(rail * [-1, 1, 1] + [1.0 + 0.1, 0, 0], direct, atol=1e-12)
+
+
+def test_a_window_turns_the_light() -> None:
+    image = ReflectionSpec("window", turn_deg=(0.4, -0.2))
+    scene = Scene(motion=STILL, reflections=(image,))
+    table = truth_of(scene).to_table()
+    (column, row), (ghost_column, ghost_row) = (
+        [axis[0] for axis in place] for place in (table["bar_centre_px"][0], table["others"][0]["centre_px"])
+    )
+    turned = FOCAL_PX * math.tan(math.atan((column - 640) / FOCAL_PX) + math.radians(0.4))
+    assert ghost_column - 640 == pytest.approx(turned, abs=0.02)
+    # Off the axis, the same angle is a little more: by 1 / cos.
+    assert ghost_row - row == pytest.approx(-math.radians(0.2) * FOCAL_PX, rel=2e-3)
+    assert table["others"][0] | {"centre_px": 0} == {"kind": "ghost", "src": 0, "gain": 0.2, "centre_px": 0}
+
+
+def test_covers_put_out_clusters_and_only_those() -> None:
+    link = resolve({})
+    covers: dict[str, Any] = {
+        "covered": (3,), "cover_s": ((0.0012, 0.0033, 6, 8),), "pole_s": ((0.004, 0.0041),)
+    }  # fmt: skip
+    plain, hidden = (
+        BarLight(BarSpec(start_chip=2.3, **more), link, 1.0, 7, reflections=[ReflectionSpec()])
+        for more in ({}, covers)
+    )
+
+    def at(source: Any, t_us: float) -> Floats:
+        when, levels = source.switches(1000.0, 5000.0)
+        found: Floats = levels[np.searchsorted(when, t_us, side="right")]
+        return found
+
+    for t_us in (1000.0, 1199.9, 1200.0, 3299.9, 3300.1, 4050.0, 4100.1, 4999.0):
+        want = at(plain.strips[0], t_us).copy()
+        want[3] = 0
+        if 1200 <= t_us < 3300:
+            want[6:9] = 0
+        if 4000 <= t_us < 4100:
+            want[:] = 0
+        assert (at(hidden.strips[0], t_us) == want).all()
+        assert (at(hidden.images[0], t_us) == at(plain.images[0], t_us)).all()
+    # However time is cut, it is switched at the same times.
+    whole = hidden.strips[0].switches(1000.0, 5000.0)[0]
+    cuts = [
+        hidden.strips[0].switches(a, b)[0] for a, b in ((1000.0, 1200.0), (1200.0, 2717.3), (2717.3, 5000.0))
+    ]
+    assert set(np.concatenate(cuts)) | {1200.0} == set(whole)
+
+
+def test_a_wiper_dims_along_its_line() -> None:
+    wiper = WiperSpec(share=0.96, at_s=0.01, lasts_s=0.03, edge_s=0.008, every_s=0.1)
+    when, share = wiper_switches(wiper, 0.0, 3e5)
+    t = np.linspace(1, 3e5 - 1, 20_011)
+    after = np.mod(t / 1e6 - 0.01, 0.1)
+    line = 1 - 0.96 * np.clip(np.minimum(after, 0.03 - after) / 0.008, 0, 1)
+    found = share[np.searchsorted(when, t, side="right")]
+    assert np.abs(np.log(found / line)).max() < 0.026
+    assert found.min() == pytest.approx(0.04)
+    assert share[0] == share[-1] == 1
+    for a, b in ((0.0, 3e5), (12_345.6, 34_567.8), (103_000.0, 103_100.0), (2e5, 2.01e5)):
+        part_when, part = wiper_switches(wiper, a, b)
+        inside = (when > a) & (when < b)
+        assert (part_when == when[inside]).all()
+        assert part[0] == share[int((when <= a).sum())]
+        assert (part[1:] == share[1:][inside]).all()
+    once = wiper_switches(replace(wiper, every_s=0.0), 0.0, 3e5)[0]
+    assert (once == when[when < 50_000]).all()
+
+
+def lit(z_px: Floats, sigma: float) -> Floats:
+    """Share of a pixel beyond a blurred edge, by quadrature: independent of the simulator's closed form."""
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    shares = norm.cdf((z_px[..., None] + 0.5 * nodes) / sigma)
+    found: Floats = shares @ weights * 0.5
+    return found
+
+
+def light_on(scene: Scene, column: int, row: int) -> tuple[Floats, Floats]:
+    """Light on a pixel of a still scene from each edge on, in W/m2: every image and halo, added up."""
+    simulation = Simulation(scene)
+    end_us = scene.duration_s * 1e6
+    sources = [*(one for bar in simulation.bars for one in (*bar.strips, *bar.images)), *simulation.lamps]
+    switched = [source.switches(0.0, end_us) for source in sources]
+    wiped = wiper_switches(scene.wiper, 0.0, end_us)
+    edges = np.unique(np.concatenate([[0.0], wiped[0], *(when for when, _ in switched)]))
+    total = np.full(len(edges), scene.background.light_w_m2)
+    lens = scene.lens
+    parts = ((1 - lens.halo - lens.bloom, None), (lens.halo, lens.halo_px), (lens.bloom, lens.bloom_px))
+    for source, (when, levels) in zip(sources, switched, strict=True):
+        cuts = source.strip.cuts_m()
+        depth = scene.motion.distance_m
+        shift = source.pane.shift_px if source.pane is not None else (0.0, 0.0)
+        x = 640 + cuts[:, 0] / depth * FOCAL_PX + shift[0]
+        y = 360 + cuts[:, 1] / depth * FOCAL_PX + shift[1]
+        half = source.strip.width_m / depth * FOCAL_PX / 2
+        sharp = math.hypot(blur_sigma_px(depth, lens, scene.camera), source.blur_px)
+        weight = np.zeros(len(cuts) - 1)
+        for share, halo_px in parts:
+            sigma = sharp if halo_px is None else halo_px
+            across = lit(column - x[:1] + half, sigma) - lit(column - x[:1] - half, sigma)
+            weight += share * across * np.abs(np.diff(lit(row - y, sigma)))
+        total += source.light_w_m2 * levels[np.searchsorted(when, edges, side="right")] @ weight
+    total *= wiped[1][np.searchsorted(wiped[0], edges, side="right")]
+    return edges, total + scene.sensor.dark_w_m2
+
+
+ROAD = {
+    "mirror": {"reflections": (ReflectionSpec(share=0.5, gap_m=0.05, blur_px=0.9),)},
+    "ghost over the bar": {"reflections": (ReflectionSpec("window", share=0.7, shift_px=(1.4, 3.0)),)},
+    "bloom": {"lens": {"bloom": 0.3, "bloom_px": 6.0}},
+    "panel": {"lamps": (LampSpec(-1.5, 0.0, 0.0, 0.3, 0.3, light_w_m2=2.0, flicker_hz=4000.0, duty=0.3),)},
+    "wiper": {"wiper": WiperSpec(share=0.9, at_s=0.004, lasts_s=0.012, edge_s=0.002)},
+    "covers": {"bars": {"covered": (7,), "cover_s": ((0.0051, 0.0107, 8, 12),)}},
+}
+
+
+@pytest.mark.parametrize("name", [*ROAD, "all"])
+def test_a_pixel_sees_the_sum_of_all_light(name: str) -> None:
+    scene = Scene(
+        duration_s=0.02, sensor=IDEAL, motion=STILL, background=EVEN, bars=(BarSpec(start_chip=5.0, seed=2),)
+    )
+    for changes in ROAD.values() if name == "all" else [ROAD[name]]:
+        for key, value in changes.items():
+            if key == "bars":
+                value = (replace(scene.bars[0], **value),)
+            elif key == "lens":
+                value = replace(scene.lens, **value)
+            elif key == "reflections":
+                value = (*scene.reflections, *value)
+            scene = replace(scene, **{key: value})
+    events = every(scene)
+    centre = round(640 - 1.5 / 50 * FOCAL_PX)
+    last = round(360 + 0.48 / 50 * FOCAL_PX)
+    for column, row in ((centre, 360), (centre + 2, 372), (centre - 1, last), (centre, last + 9)):
+        seen = events[(events.x == column) & (events.y == row)]
+        edges, light = light_on(scene, column, row)
+        want = pixel_events(IDEAL, edges, light, scene.duration_s * 1e6)
+        inside = want.request_us < scene.duration_s * 1e6 - 100
+        t_us, on = want.request_us[inside], want.on[inside]
+        if row > last and not len(seen):
+            # No source moves it far enough.
+            continue
+        assert len(t_us) > 10
+        # Light is not followed within 0.1 %: a crossing of a slow slope may move, and one that just touches
+        # the threshold may be missing.
+        assert abs(len(seen) - len(want.on)) <= 0.02 * len(t_us) + 2
+        away = [
+            np.abs(t_us[on == rise] - t - 0.5).min(initial=9e9)
+            for t, rise in zip(seen.t_us, seen.p == 1, strict=True)
+        ]
+        # In the halo, under a wiper, a signal creeps along its threshold for a hundred microseconds.
+        assert light.max() < 1 or np.quantile(away, 0.97) < 6.0
+
+
+def test_bloom_follows_the_image() -> None:
+    """A halo of few pixels is where the bar is, also while that moves by 30 px within a block of time."""
+    turning = MotionSpec(
+        distance_m=50.0, speed_mps=0.0, vib_rate_rad_s=0.0, pothole_s=(0.0,), pothole_decay_s=9.0
+    )
+    scene = Scene(duration_s=0.004, sensor=IDEAL, motion=turning, background=EVEN)
+    scene = replace(scene, lens=replace(scene.lens, halo=0.0, bloom=0.6, bloom_px=3.0))
+    events = every(scene)
+    centre = truth_of(scene).bars[0].centre_px
+    away = events.y - np.interp(events.t_us, np.arange(len(centre)) * 1000.0, centre[:, 1])
+    ends = [float(np.abs(away[(a <= events.t_us) & (events.t_us < a + 1000)]).max()) for a in (0, 2000)]
+    assert np.ptp(centre[:, 1]) > 20
+    assert abs(ends[0] - ends[1]) < 4
+
+
+def test_a_pothole_strikes_rings_and_decays() -> None:
+    motion = MotionSpec(vib_rate_rad_s=0.0, pothole_s=(0.05, 0.3), pothole_rad_s=0.8, pothole_hz=15.0)
+    t_us = np.arange(0, 2e6, 10.0)
+    angle = pothole_angle_rad(motion, t_us)
+    rate = np.gradient(angle, 1e-5)
+    turn, decay = 2 * math.pi * 15, motion.pothole_decay_s
+    want = np.zeros(len(t_us))
+    for begin in motion.pothole_s:
+        after = t_us * 1e-6 - begin
+        ringing = np.exp(-after / decay) * (np.cos(turn * after) - np.sin(turn * after) / (turn * decay))
+        want += np.where(after >= 0, 0.8 * ringing, 0.0)
+    kinks = np.isin(np.arange(len(t_us)), [4999, 5000, 5001, 29_999, 30_000, 30_001])
+    np.testing.assert_allclose(rate[1:-1][~kinks[1:-1]], want[1:-1][~kinks[1:-1]], atol=2e-3)
+    assert not angle[t_us <= 50_000].any()
+    assert abs(angle[-1]) < 1e-6
+    place = truth_of(Scene(duration_s=0.1, motion=replace(motion, speed_mps=0.0))).bars[0].centre_px
+    assert np.diff(place[:, 1])[50] == pytest.approx(0.8 * FOCAL_PX / 1000, rel=0.03)
+
+
+def test_yaw_may_shake_less_than_pitch() -> None:
+    places = [
+        truth_of(Scene(duration_s=0.2, motion=replace(STILL, vib_rate_rad_s=0.06, vib_yaw_share=share)))
+        for share in (1.0, 0.5)
+    ]
+    full, less = (truth.bars[0].centre_px for truth in places)
+    still = truth_of(Scene(duration_s=0.2, motion=STILL)).bars[0].centre_px
+    np.testing.assert_allclose(less[:, 1] - still[:, 1], full[:, 1] - still[:, 1], atol=0.02)
+    np.testing.assert_allclose(less[:, 0] - still[:, 0], (full[:, 0] - still[:, 0]) / 2, atol=0.05)
+
+
+def panned(tmp_path: Path, **background: Any) -> Scene:
+    """A camera that turns to the right by 0.3 degrees in 40 ms, and then rests."""
+    lines = ["t_s,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg"]
+    lines += [f"{t},0,0,-50,{min(t, 0.04) * 7.5},0,0" for t in np.arange(0, 0.0601, 0.002)]
+    (tmp_path / "path.csv").write_text("\n".join(lines))
+    motion = MotionSpec(vib_rate_rad_s=0.0, path_file=str(tmp_path / "path.csv"))
+    return Scene(
+        duration_s=0.06,
+        camera=CameraModel(width=320, height=200),
+        sensor=replace(IDEAL, refr_us=1.0),
+        motion=motion,
+        background=BackgroundSpec(light_w_m2=5.0, **background),
+        bars=(),
+    )
+
+
+def test_texture_that_moves_gives_the_events_of_its_own_contrast(tmp_path: Path) -> None:
+    scene = panned(tmp_path, texture=0.8, texture_px=8.0, texture_step_px=0.1, around_px=320)
+    simulation = Simulation(scene)
+    events = Events.concat(list(simulation.stream()))
+    net, count = np.zeros((2, 200, 320))
+    np.add.at(net, (events.y, events.x), np.where(events.p == 1, 1, -1))
+    np.add.at(count, (events.y, events.x), 1)
+    turned = math.radians(0.3) * FOCAL_PX
+    field = simulation._texture
+    spots = [(int(x), int(y)) for x, y in np.random.default_rng(1).integers(0, (320, 200), (300, 2))]
+    for x, y in spots:
+        path = np.log([texture_at(field, x + d, float(y)) for d in np.linspace(0, turned, 400)])
+        # A pixel without noise counts thresholds: one may be under way, and each is passed by up to a step.
+        assert abs(net[y, x] * 0.223 - (path[-1] - path[0])) < 0.223 + 0.02 * (1 + count[y, x])
+        assert count[y, x] * 0.223 <= np.abs(np.diff(path)).sum() + 0.05
+    assert abs(float(count.mean())) > 1
+
+
+def test_background_is_simulated_around_the_sources() -> None:
+    scene = Scene(
+        duration_s=0.03,
+        sensor=IDEAL,
+        motion=replace(STILL, vib_rate_rad_s=0.3),
+        background=BackgroundSpec(
+            light_w_m2=3.0, texture=1.0, texture_px=4.0, around_px=60, texture_step_px=0.2
+        ),
+        bars=(BarSpec(led_w_m2=10.0),),
+    )
+    events = every(scene)
+    assert rows(events) == rows(every(scene, threads=3))
+    centre = truth_of(scene).bars[0].centre_px.mean(0)
+    away = np.abs(events.x - centre[0])
+    assert 60 <= away.max() < 60 + 25
+    assert (away > 30).sum() > 3000
+    # A background at rest has no events, and leaves the bar's as they are.
+    scene = replace(scene, motion=STILL)
+    alone = every(replace(scene, background=replace(scene.background, around_px=0)))
+    assert rows(every(scene)) == rows(alone)
+
+
+def test_all_that_a_road_adds_does_not_depend_on_threads_or_length() -> None:
+    scene = resolve_scene(
+        {
+            "duration_s": 0.02,
+            "motion": {"pothole_s": [0.006]},
+            "wiper": {"share": 0.9, "at_s": 0.003, "lasts_s": 0.012},
+            "lens": {"bloom": 0.1, "bloom_px": 5.0},
+            "background": {"around_px": 20, "light_w_m2": 0.5},
+            "bars": [{"cover_s": [[0.002, 0.011, 0, 4]]}],
+            "reflections": [{}, {"kind": "rail"}, {"kind": "window", "shift_px": [5, 5]}],
+        }
+    )
+    events = every(scene)
+    assert rows(events) == rows(every(scene, threads=3))
+    long = every(replace(scene, duration_s=0.024))
+    until = 15_900
+    assert rows(events[events.t_us < until]) == rows(long[long.t_us < until])
+    table = json.loads(json.dumps(truth_of(scene).to_table()))
+    assert scene_of_truth(table) == scene
+    assert resolve_scene(json.loads(json.dumps(scene_table(scene)))) == scene
+
+
+@pytest.mark.parametrize(
+    ("table", "says"),
+    [
+        ({"reflections": [{"kind": "puddle"}]}, "reflections.0.kind = \"puddle\": expected 'road', 'rail'"),
+        ({"reflections": [{"bar": 1}]}, "reflections.0.bar = 1: there are 1 bars, counted from 0"),
+        ({"reflections": [{"share": 0.0}]}, "reflections.0.share = 0.0: expected greater than 0"),
+        ({"lens": {"bloom": 0.99}}, "lens.bloom = 0.99: expected less than 1 together with lens.halo = 0.02"),
+        ({"wiper": {"share": 1.0}}, "wiper.share = 1.0: expected less than or equal to 0.999"),
+        ({"wiper": {"edge_s": 0.02}}, "wiper.edge_s = 0.02: expected at most half of lasts_s"),
+        ({"wiper": {"every_s": 0.01}}, "wiper.every_s = 0.01: expected at least lasts_s"),
+        ({"background": {"around_px": -1}}, "background.around_px = -1: expected greater than or equal to 0"),
+        ({"bars": [{"cover_s": [[0.1, 0.2, 3]]}]}, "bars.0.cover_s.0"),
+    ],
+)  # fmt: skip
+def test_faults_are_told_with_their_path(table: dict[str, Any], says: str) -> None:
+    with pytest.raises(ConfigError) as fault:
+        resolve_scene(table, source="scene.toml")
+    assert f"scene.toml: {says}" in str(fault.value)
+
+
+@pytest.mark.parametrize(
+    ("bar", "says"),
+    [
+        ({"covered": [16]}, "bars.0.covered = [16]: expected clusters, 0 to 15"),
+        (
+            {"cover_s": [[0.0, 0.1, 5, 2]]},
+            "bars.0.cover_s.0 = [0.0, 0.1, 5, 2]: expected the first and the last",
+        ),
+        ({"pole_s": [[0.2, 0.1]]}, "bars.0.pole_s.0 = [0.2, 0.1]: expected a time, and a later one"),
+    ],
+)
+def test_covers_that_cover_nothing_are_told(bar: dict[str, Any], says: str) -> None:
+    with pytest.raises(ConfigError) as fault:
+        Simulation(resolve_scene({"bars": [bar]}))
+    assert says in str(fault.value)
+
+
+def test_overrides_make_what_they_set() -> None:
+    scene = load_scene("night", ["reflections.share=0.4", "wiper.share=0.5", "bars.covered=[1, 2]"])
+    assert [(one.kind, one.share) for one in scene.reflections] == [("road", 0.4)]
+    assert (scene.wiper.share, scene.bars[0].covered) == (0.5, (1, 2))
+
+
+@pytest.mark.skipif(not TOOL.exists(), reason="the scorers of ../shared are not there")
+def test_scores_agree_on_what_is_hidden(tmp_path: Path) -> None:
+    """A receiver that gives every symbol, also of hidden clusters, and errs in some: both scores say so."""
+    bar = {"covered": [2], "cover_s": [[0.03, 0.07, 9, 12]], "pole_s": [[0.09, 0.1]], "ppm": 20.0}
+    scene = resolve_scene({"duration_s": 0.15, "bars": [bar], "reflections": [{}]})
+    truth = truth_of(scene)
+    (tmp_path / "a.truth.json").write_text(json.dumps(truth.to_table()))
+    sent, rng = truth.bars[0], np.random.default_rng(3)
+    with (tmp_path / "frames.csv").open("w", newline="") as file:
+        out = csv.writer(file)
+        out.writerow(
+            ["transmitter", "t_us", "symbols", "distance_m", "distance_sigma_m", "x_px", "y_px", "echo_of"]
+        )
+        for q, packet in enumerate(sent.symbols):
+            for f, frame in enumerate(packet):
+                t_us = (q * 346 + 26 + 32 * f - sent.start_chip) / sent.rate_hz * 1e6
+                if not 0 <= t_us < 146_000:
+                    continue
+                said = np.where(rng.random(16) < 0.1, rng.integers(0, 64, 16), frame)
+                text = " ".join("-" if rng.random() < 0.05 else str(v) for v in said)
+                out.writerow([0, t_us, text, 50.1, 0.1, *sent.centre_px[int(t_us // 1000)], ""])
+                out.writerow([1, t_us, text, 50.1, 0.1, 424.0, 500.0, 0])
+    command = [sys.executable, TOOL, tmp_path, tmp_path / "a.truth.json", "--json"]
+    theirs = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    ours = Score.of(read_frames(tmp_path), truth, road=True).to_road()
+    assert theirs["echoes"] == ours["echoes"] > 40
+    (their_bar,), (our_bar,) = theirs["bars"], ours["bars"]
+    assert their_bar["claimed"] > 0.9
+    for key in ("frames_sent", "frames_found", "bit_errors", "bits", "erased", "claimed", "rmse_m"):
+        assert our_bar[key] == pytest.approx(their_bar[key], rel=1e-4), key
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="the recordings of ../shared are not there")
+@pytest.mark.parametrize(
+    "name", ["wet-road-80m", "rail-reflection-40m", "truck-55m", "bloom-40m", "panel-1khz-55m", "pothole-40m"]
+)
+def test_events_are_as_many_as_in_the_independent_recording(name: str) -> None:
+    path = SHARED / "recordings" / "road" / f"{name}.raw"
+    if not path.exists():
+        pytest.skip("this recording is not there")
+    scene = scene_of_truth(json.loads(path.with_suffix(".truth.json").read_text()))
+    scene = replace(scene, duration_s=0.05)
+    theirs = read_events(path)
+    theirs = theirs[theirs.t_us < scene.duration_s * 1e6]
+    ours = every(scene, threads=2)
+    # Another vibration moves the image over other pixels.
+    assert len(ours) == pytest.approx(len(theirs), rel=0.15)
+    assert float(ours.p.mean()) == pytest.approx(float(theirs.p.mean()), abs=0.03)
