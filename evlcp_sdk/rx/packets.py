@@ -1,5 +1,7 @@
 """Frames to packets."""
 
+from dataclasses import replace
+
 from evlcp_sdk.values import Frame, Packet
 
 __all__ = ["PacketAssembler"]
@@ -7,6 +9,8 @@ __all__ = ["PacketAssembler"]
 
 class PacketAssembler:
     """Collects a transmitter's frames until their packet is over.
+
+    A packet is a reflection as a whole, as its last frame, which knows most, says.
 
     Args:
         sent: Frames of a packet.
@@ -29,7 +33,8 @@ class PacketAssembler:
         """The packet of the frames held, if any."""
         if not self._frames:
             return []
-        first = self._frames[0]
-        packet = Packet(first.transmitter, first.packet, *self._start, tuple(self._frames), self._sent)
+        first, echo_of = self._frames[0], self._frames[-1].echo_of
+        frames = tuple(f if f.echo_of == echo_of else replace(f, echo_of=echo_of) for f in self._frames)
+        packet = Packet(first.transmitter, first.packet, *self._start, frames, self._sent)
         self._frames = []
         return [packet]

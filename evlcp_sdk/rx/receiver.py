@@ -8,6 +8,7 @@ import pluggy
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.detection import Followed, RegionFollower
+from evlcp_sdk.rx.echoes import Echoes, EchoQueue, Sighting
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.look import Looker
@@ -31,6 +32,7 @@ _COUNTS = (
     "preambles",
     "frames",
     "frames_rejected",
+    "frames_reflected",
     "packets",
 )
 
@@ -65,6 +67,8 @@ class Receiver:
         self._transmitters = Transmitters(link.packet, self._step_us)
         self._looker = Looker(link.packet, link.regions, centres_m, self._steps.separate)
         self._find_points = points_finder(layout_of(centres_m))
+        self._echoes = Echoes(link.packet, len(link.codebook.codewords))
+        self._judged = EchoQueue(self._echoes)
         self._messages = MessageAssembler.of(link)
         self._closed = False
         self._counts = dict.fromkeys(_COUNTS, 0)
@@ -85,7 +89,7 @@ class Receiver:
         """
         if self._closed:
             raise StreamError("the receiver is closed: make a new one for a new stream")
-        steps = self._timeline.feed(events, lambda: bool(self._regions.alive))
+        steps = self._timeline.feed(events, lambda: bool(self._regions.alive or self._judged))
         return self._read([packet for step in steps for packet in self._run(step)])
 
     def close(self) -> list[Packet]:
@@ -95,8 +99,8 @@ class Receiver:
         self._closed = True
         packets = [packet for step in self._timeline.close() for packet in self._run(step)]
         for transmitter in self._transmitters.close():
-            packets += self._end(transmitter, self._timeline.last_us)
-        packets = self._read(packets)
+            self._end(transmitter, self._timeline.last_us)
+        packets = self._read(packets + self._judged.close())
         if self._messages is not None:
             self._messages.close()
         return packets
@@ -109,16 +113,15 @@ class Receiver:
         regions = self._regions.step(step.start_us, step.events)
         for region in regions:
             self._announcer.lap("regions", region.latest)
-        packets: list[Packet] = []
         for region in regions:
             transmitter = self._hear(region, step)
-            packets += self._decode_due(transmitter, step.end_us)
+            self._decode_due(transmitter, step.end_us)
             self._transmitters.forget(transmitter, step.end_us)
             if region.released:
                 self._counts["regions_released"] += 1
-                packets += self._end(transmitter, step.end_us)
+                self._end(transmitter, step.end_us)
                 self._transmitters.release(transmitter)
-        return packets
+        return self._judged.step()
 
     def _hear(self, region: Followed, step: TimeStep) -> Transmitter:
         """Listen to a region's events of a time step, or to all that it has if it is new."""
@@ -136,21 +139,18 @@ class Receiver:
                 self._counts["locks"] += self._transmitters.adopt(transmitter, lock, self._timeline.first_us)
         return transmitter
 
-    def _decode_due(self, transmitter: Transmitter, until_us: float) -> list[Packet]:
+    def _decode_due(self, transmitter: Transmitter, until_us: float) -> None:
         """Decode the frames that lie before a time, with the events after their last edge."""
-        packets: list[Packet] = []
         while (due := transmitter.grid.due(until_us)) is not None:
-            frame = self._decode(transmitter, due)
+            sighting = self._decode(transmitter, due)
             transmitter.grid.frame += 1
-            if frame is None:
+            if sighting is None:
                 self._counts["frames_rejected"] += 1
                 continue
             self._counts["frames"] += 1
-            packets += transmitter.packets.add(frame, due.packet_us, due.lock.chip_us)
-        self._counts["packets"] += len(packets)
-        return packets
+            self._judged.add(transmitter.packets, due, sighting)
 
-    def _decode(self, transmitter: Transmitter, due: DueFrame) -> Frame | None:
+    def _decode(self, transmitter: Transmitter, due: DueFrame) -> Sighting | None:
         """Read a frame; None if it does not show where the clusters are."""
         assert transmitter.number is not None
         self._announcer.start()
@@ -180,20 +180,22 @@ class Receiver:
             points_px=points[0],
             points_sigma_px=points[1],
             points_t_us=look.middle_us,
+            echo_of=self._echoes.echo_of(transmitter.number),
         )
         self._announcer.total("frame", frame)
-        return frame
+        light = float(look.presence.pixels.sum()) / int(look.placement.seen.sum())
+        return Sighting(frame, light, look.placement.mirrored)
 
-    def _end(self, transmitter: Transmitter, now_us: float) -> list[Packet]:
-        """Decode what a region that has ended still shows, and give its last packet."""
+    def _end(self, transmitter: Transmitter, now_us: float) -> None:
+        """Decode what a region that has ended still shows; its last packet is over."""
         seen_us = transmitter.region.latest.t_us + self._step_us
-        packets = self._decode_due(transmitter, min(now_us, seen_us))
-        rest = transmitter.packets.flush()
-        self._counts["packets"] += len(rest)
-        return packets + rest
+        self._decode_due(transmitter, min(now_us, seen_us))
+        self._judged.end(transmitter.packets)
 
     def _read(self, packets: list[Packet]) -> list[Packet]:
         """Read the messages that packets carry."""
+        self._counts["packets"] += len(packets)
+        self._counts["frames_reflected"] += sum(len(p.frames) for p in packets if p.echo_of is not None)
         if self._messages is None:
             return packets
         read = []

@@ -1,0 +1,282 @@
+"""Which transmitter is the reflection of which, and frames that wait until that is known.
+
+A wet road, a guard rail or a window shows a bar a second time: the same chips at the same time, weaker, and
+in a mirror on the road in the opposite order. Whatever repeats the symbols of another transmitter on its
+packet grid is its reflection: two transmitters on one clock that send other data agree in one symbol of as
+many as there are codewords.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.rx.grid import DueFrame
+from evlcp_sdk.rx.packets import PacketAssembler
+from evlcp_sdk.values import Frame, Packet
+
+__all__ = ["EchoQueue", "Echoes", "Sighting", "originals", "repeats"]
+
+_REPEATED = 0.25
+"""Share of the symbols that a reflection repeats at the least; with fewer, nothing would be read of it."""
+
+_ALIKE = 1 / 32
+"""Share of the symbols that two transmitters on one clock may have in common beside those of chance."""
+
+_SURE = math.log(1e4)
+"""Log-likelihood ratio from which on two transmitters are one, or two, until as much speaks against it."""
+
+_MIRRORED = 5.0
+"""Log odds that of two images in opposite order of the clusters the one that stands as the layout says is the
+bar: one installation in 150 hangs upside down over a mirror."""
+
+_LIGHT = 0.3
+"""Logarithm of the events of the bar's image over those of its reflection, and how much it varies with the
+blur: a pixel answers a step with few events, however high it is, so a fifth of the light takes a third."""
+
+_STAYS = 3.0
+"""Log odds for what was said to be the bar before: twenty times likelier, another takes its place."""
+
+_ROW_US = 0.35
+"""Longest time that a sensor takes to read a row, us: of two images, the lower one may come as much later."""
+
+_LOOKBACK_PACKETS = 3
+"""Packets of frames remembered: a new transmitter begins with the last two packets before its lock."""
+
+_REMEMBER_US = 1e6
+"""How long two transmitters stay one without a frame in common; so long one lost from sight is remembered."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """A decoded frame, and what tells a bar from its reflection.
+
+    Attributes:
+        frame: The frame.
+        light: Events that follow the pilots, a cluster.
+        mirrored: The order of the clusters is the opposite of the layout's.
+    """
+
+    frame: Frame
+    light: float
+    mirrored: bool
+
+
+def repeats(one: NDArray[np.int64], other: NDArray[np.int64], codewords: int) -> float:
+    """Log-likelihood ratio of one frame repeating another's symbols against being independent of it.
+
+    Clusters that are not given in either, -1, say nothing.
+
+    Args:
+        one: Symbols of a frame, int64 (K,).
+        other: Symbols of another at the same time.
+        codewords: How many symbols there are.
+
+    >>> said = np.arange(16)
+    >>> repeats(said, said, 64) > 20, repeats(said, said[::-1], 64) < -3
+    (True, True)
+    >>> repeats(said, np.full(16, -1), 64)
+    0.0
+    """
+    given = (one >= 0) & (other >= 0)
+    alike = int((one[given] == other[given]).sum())
+    chance = 1 / codewords
+    here, there = (chance + share * (1 - chance) for share in (_REPEATED, _ALIKE))
+    unlike = int(given.sum()) - alike
+    return alike * math.log(here / there) + unlike * math.log((1 - here) / (1 - there))
+
+
+def originals(
+    members: Sequence[int], odds: Mapping[tuple[int, int], float], before: Iterable[int] = ()
+) -> int:
+    """Which of several images of one bar is the bar itself.
+
+    Args:
+        members: Numbers of the transmitters.
+        odds: Log odds of the first being the bar rather than the second, for pairs of them.
+        before: Those of which others are said to be reflections already.
+
+    >>> originals([0, 1, 2], {(0, 1): -4.0, (0, 2): 1.0, (1, 2): 6.0})
+    1
+    >>> originals([0, 1], {(0, 1): -1.0}, before=[0])
+    0
+    """
+    known = set(before)
+    score = {m: _STAYS if m in known else 0.0 for m in members}
+    for (one, other), value in odds.items():
+        if one in score and other in score:
+            score[one] += value / 2
+            score[other] -= value / 2
+    return max(sorted(members), key=score.__getitem__)
+
+
+@dataclass
+class _Pair:
+    """What the frames in common say of two transmitters.
+
+    Attributes:
+        evidence: That one repeats the other, a log-likelihood ratio within bounds.
+        same: Whether they are one.
+        frames: Frames in common.
+        light: Sum of the logarithms of the first one's light over the second's.
+        mirrored: Frames in which only the second is mirrored less those in which only the first is.
+        last_us: Time of the newest frame in common, us.
+    """
+
+    evidence: float = 0.0
+    same: bool = False
+    frames: int = 0
+    light: float = 0.0
+    mirrored: int = 0
+    last_us: float = -math.inf
+
+    def add(self, one: Sighting, other: Sighting, codewords: int) -> None:
+        """Take a frame in common."""
+        change = repeats(one.frame.soft.symbols, other.frame.soft.symbols, codewords)
+        self.evidence = min(max(self.evidence + change, -2 * _SURE), 2 * _SURE)
+        if abs(self.evidence) >= _SURE:
+            self.same = self.evidence > 0
+        self.frames += 1
+        if one.light > 0 and other.light > 0:
+            self.light += math.log(one.light / other.light)
+        self.mirrored += other.mirrored - one.mirrored
+        self.last_us = max(one.frame.t_us, other.frame.t_us, self.last_us)
+
+    def odds(self) -> float:
+        """Log odds of the first being the bar and the second its reflection."""
+        # Two normal distributions, as far apart as they are wide.
+        return (_MIRRORED * self.mirrored + 2 * self.light / _LIGHT) / max(self.frames, 1)
+
+
+class Echoes:
+    """Judges which transmitter is a reflection of which, from the frames that they have in common.
+
+    Args:
+        packet: Lengths of a packet's parts.
+        codewords: How many symbols there are.
+    """
+
+    def __init__(self, packet: PacketFormat, codewords: int) -> None:
+        self._codewords = codewords
+        self._chip_us = packet.chip_us
+        self._keep_us = _LOOKBACK_PACKETS * packet.packet_chips * packet.chip_us
+        self._seen: dict[int, deque[Sighting]] = {}
+        self._pairs: dict[tuple[int, int], _Pair] = {}
+        self._echo_of: dict[int, int] = {}
+        self._now_us = -math.inf
+
+    def echo_of(self, transmitter: int) -> int | None:
+        """Of which transmitter one is a reflection, by all frames so far; None if of none."""
+        return self._echo_of.get(transmitter)
+
+    def judge(self, seen: Iterable[Sighting]) -> None:
+        """Take the frames of a time step, in any order.
+
+        Args:
+            seen: Of one transmitter in order of time.
+        """
+        fresh = sorted(seen, key=lambda s: (s.frame.t_us, s.frame.transmitter))
+        if not fresh:
+            return
+        self._now_us = max(self._now_us, fresh[-1].frame.t_us)
+        for sighting in fresh:
+            for number, known in self._seen.items():
+                if number != sighting.frame.transmitter and (other := self._beside(sighting, known)):
+                    first, second = sorted((sighting, other), key=lambda s: s.frame.transmitter)
+                    key = first.frame.transmitter, second.frame.transmitter
+                    self._pairs.setdefault(key, _Pair()).add(first, second, self._codewords)
+            self._seen.setdefault(sighting.frame.transmitter, deque()).append(sighting)
+        self._forget()
+        self._decide()
+
+    def _beside(self, sighting: Sighting, known: Iterable[Sighting]) -> Sighting | None:
+        """The frame of another transmitter that began at the same time, to half a chip; None without one."""
+        frame = sighting.frame
+
+        def apart_us(other: Sighting) -> float:
+            return abs(other.frame.t_us - frame.t_us)
+
+        nearest = min(known, key=apart_us, default=None)
+        if nearest is None:
+            return None
+        within_us = self._chip_us / 2 + _ROW_US * abs(nearest.frame.y_px - frame.y_px)
+        return nearest if apart_us(nearest) < within_us else None
+
+    def _forget(self) -> None:
+        for known in self._seen.values():
+            while known and known[0].frame.t_us < self._now_us - self._keep_us:
+                known.popleft()
+        self._seen = {number: known for number, known in self._seen.items() if known}
+        oldest_us = self._now_us - _REMEMBER_US
+        self._pairs = {key: pair for key, pair in self._pairs.items() if pair.last_us >= oldest_us}
+
+    def _decide(self) -> None:
+        before = set(self._echo_of.values())
+        self._echo_of = {}
+        odds = {key: pair.odds() for key, pair in self._pairs.items() if pair.same}
+        groups: list[set[int]] = []
+        for key in sorted(odds):
+            joined = [group for group in groups if group & set(key)]
+            groups = [group for group in groups if group not in joined] + [set(key).union(*joined)]
+        for group in groups:
+            bar = originals(sorted(group), odds, before)
+            self._echo_of |= dict.fromkeys(group - {bar}, bar)
+
+
+@dataclass
+class _Waiting:
+    """A frame that waits for its judgement, or, without one, the end of its transmitter's frames."""
+
+    packets: PacketAssembler
+    due: DueFrame | None = None
+    sighting: Sighting | None = None
+
+
+@dataclass
+class EchoQueue:
+    """Keeps decoded frames for one time step, so that a bar and its reflection are judged together.
+
+    Their frames end within a chip of each other, but maybe not in the same step, and a transmitter that is
+    new begins with the frames before its lock. What the queue gives is marked by all frames up to the step
+    after its own.
+
+    Attributes:
+        echoes: The judge.
+    """
+
+    echoes: Echoes
+    _old: list[_Waiting] = field(default_factory=list)
+    _new: list[_Waiting] = field(default_factory=list)
+
+    def __bool__(self) -> bool:
+        """Whether anything waits."""
+        return bool(self._old or self._new)
+
+    def add(self, packets: PacketAssembler, due: DueFrame, sighting: Sighting) -> None:
+        """Take a frame, and where it goes."""
+        self._new.append(_Waiting(packets, due, sighting))
+
+    def end(self, packets: PacketAssembler) -> None:
+        """Take the end of a transmitter's frames, or of the stream."""
+        self._new.append(_Waiting(packets))
+
+    def step(self) -> list[Packet]:
+        """End a time step; give the packets that are complete with the frames of the step before it."""
+        self.echoes.judge(w.sighting for w in self._new if w.sighting is not None)
+        due, self._old, self._new = self._old, self._new, []
+        return [packet for waiting in due for packet in self._emit(waiting)]
+
+    def close(self) -> list[Packet]:
+        """End the stream; give the packets of all frames that wait."""
+        return self.step() + self.step()
+
+    def _emit(self, waiting: _Waiting) -> list[Packet]:
+        if waiting.sighting is None or waiting.due is None:
+            return waiting.packets.flush()
+        frame = waiting.sighting.frame
+        frame = replace(frame, echo_of=self.echoes.echo_of(frame.transmitter))
+        return waiting.packets.add(frame, waiting.due.packet_us, waiting.due.lock.chip_us)
