@@ -247,7 +247,7 @@ def test_a_pixel_sees_the_sum_of_all_light(name: str) -> None:
         if row > last and not len(seen):
             # No source moves it far enough.
             continue
-        assert len(t_us) > 10
+        assert light.max() < 1 or len(t_us) > 100
         # Light is not followed within 0.1 %: a crossing of a slow slope may move, and one that just touches
         # the threshold may be missing.
         assert abs(len(seen) - len(want.on)) <= 0.02 * len(t_us) + 2
