@@ -203,6 +203,9 @@ class SyncLock:
             of an edge at that start best, us; negative where these events last nearly a chip.
         delay_off_us: The same for negative events.
         quality: Normalised preamble correlation, 0 to 1.
+        row_us: How much later the events of a row of the bar come than those of the row above, us; the delays
+            hold in its centre. The receiver measures it, synchronization leaves it 0.
+        last_row_us: How much later than in its centre they come in its last row, us.
     """
 
     packet_t_us: float
@@ -210,6 +213,8 @@ class SyncLock:
     delay_on_us: float
     delay_off_us: float
     quality: float
+    row_us: float = 0.0
+    last_row_us: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

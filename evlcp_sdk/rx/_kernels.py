@@ -184,36 +184,53 @@ def add_polarity(
     start_on_us: float,
     start_off_us: float,
     chip_us: float,
+    row_us: float,
+    row_px: float,
     shift_x: Array,
     shift_y: Array,
     sums: Array,
 ) -> None:
-    """Add events to polarity sums (chips, height, width); a shift is the sensor pixel of (0, 0) in a chip."""
+    """Add events to polarity sums (chips, height, width); a shift is the sensor pixel of (0, 0) in a chip.
+
+    The starts hold in row `row_px` of the sensor; in each row after it, events come `row_us` later.
+    """
     chips, height, width = sums.shape
-    first = np.searchsorted(t_us, min(start_on_us, start_off_us))
-    # Time never runs backward, so each polarity's chip only moves on.
-    chip_on, next_on = -1, start_on_us
-    chip_off, next_off = -1, start_off_us
-    for i in range(first, t_us.size):
-        t = t_us[i]
-        while t >= next_on:
-            chip_on += 1
-            next_on = start_on_us + (chip_on + 1) * chip_us
-        while t >= next_off:
-            chip_off += 1
-            next_off = start_off_us + (chip_off + 1) * chip_us
+    upper = row_us * (shift_y.min() - row_px)
+    lower = row_us * (shift_y.max() + height - row_px)
+    first = np.searchsorted(t_us, min(start_on_us, start_off_us) + min(upper, lower))
+    end = max(start_on_us, start_off_us) + max(upper, lower) + chips * chip_us
+    last = np.searchsorted(t_us, end)
+    origin = start_off_us - row_us * row_px
+    apart = start_on_us - start_off_us
+    rate = 1 / chip_us
+    for i in range(first, last):
         # Arithmetic, not a branch: polarity is as good as random.
         on = np.int64(p[i])
-        c = chip_off + (chip_on - chip_off) * on
-        if c < 0 or c >= chips:
-            if min(chip_on, chip_off) >= chips:
-                break
+        row = np.int64(y[i])
+        late = t_us[i] - origin - row_us * row - apart * on
+        if late < 0:
+            continue
+        c = np.uint64(late * rate)
+        if c >= np.uint64(chips):
             continue
         # Unsigned, a pixel to the left of the image is far to its right: one comparison for both edges.
         u = np.uint64(np.int64(x[i]) - shift_x[c])
-        v = np.uint64(np.int64(y[i]) - shift_y[c])
+        v = np.uint64(row - shift_y[c])
         if u < np.uint64(width) and v < np.uint64(height):
-            sums[np.uint64(c), v, u] += np.int16(2 * on - 1)
+            sums[c, v, u] += np.int16(2 * on - 1)
+
+
+@njit(cache=True, nogil=True)
+def count_rows(
+    t_us: Array, y: Array, p: Array, start_us: Array, step_us: float, top: float, block: float, counts: Array
+) -> None:
+    """Add events to counts (polarity, blocks of rows, steps), from `start_us` (2,) and edge `top` on."""
+    _, blocks, steps = counts.shape
+    for i in range(np.searchsorted(t_us, start_us.min()), t_us.size):
+        s = int(np.floor((t_us[i] - start_us[p[i]]) / step_us))
+        b = int(np.floor((y[i] - top) / block))
+        if 0 <= s < steps and 0 <= b < blocks:
+            counts[p[i], b, s] += 1
 
 
 @njit(cache=True, nogil=True)

@@ -96,7 +96,8 @@ class PacketGrid:
         has_pilot = self.format.has_pilot(index)
         chips = self.format.frame_chips if has_pilot else self.format.info_chips
         start_us = self.start_us(self.frame)
-        end_us = start_us + chips * lock.chip_us + max(lock.delay_on_us, lock.delay_off_us, 0.0)
+        late_us = max(lock.delay_on_us, lock.delay_off_us, 0.0) + lock.last_row_us
+        end_us = start_us + chips * lock.chip_us + late_us
         if end_us > until_us:
             return None
         packet_us = start_us - self.format.frame_start_chip(index) * lock.chip_us

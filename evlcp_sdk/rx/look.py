@@ -161,7 +161,7 @@ def polarity_sums(
 
     Args:
         events: Pieces of the stream that hold the chips; events outside them are passed over.
-        lock: Length of a chip, and the delays of positive and negative events.
+        lock: Length of a chip, and the delays of positive and negative events, and by row.
         start_us: Start of the first chip, us.
         centre_px: Column and row of the bar's centre in each chip, float64 (chips,) each, px.
         size_px: (width, height) of the image, px.
@@ -175,6 +175,8 @@ def polarity_sums(
     whole_px = np.rint(corner_px)
     shift_x, shift_y = whole_px.astype(np.int64)
     sums = np.zeros((len(shift_x), height, width), np.int16)
+    # Rows wait for the bar's own, wherever they are.
+    row_px = float(np.mean(centre_px[1]))
     for e in events:
         _kernels.add_polarity(
             e.t_us,
@@ -184,6 +186,8 @@ def polarity_sums(
             start_us + lock.delay_on_us,
             start_us + lock.delay_off_us,
             lock.chip_us,
+            lock.row_us,
+            row_px,
             shift_x,
             shift_y,
             sums,

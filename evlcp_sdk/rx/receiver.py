@@ -7,6 +7,7 @@ import pluggy
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.rx.delays import RowDelays
 from evlcp_sdk.rx.detection import Followed, RegionFollower
 from evlcp_sdk.rx.echoes import Echoes, EchoQueue, Sighting
 from evlcp_sdk.rx.grid import DueFrame
@@ -17,7 +18,7 @@ from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.steps import Announcer, Steps
 from evlcp_sdk.rx.timeline import Timeline, TimeStep
 from evlcp_sdk.rx.transmitters import Transmitter, Transmitters
-from evlcp_sdk.values import Events, Frame, FrameView, Packet, Range
+from evlcp_sdk.values import Events, Frame, FrameView, Packet, Range, SyncLock
 
 __all__ = ["Receiver"]
 
@@ -66,6 +67,7 @@ class Receiver:
         self._regions = RegionFollower(link.regions, link.camera, link.packet.chip_us, self._steps.position)
         self._transmitters = Transmitters(link.packet, self._step_us)
         self._looker = Looker(link.packet, link.regions, centres_m, self._steps.separate)
+        self._rows = RowDelays(link.codebook.preamble)
         self._find_points = points_finder(layout_of(centres_m))
         self._echoes = Echoes(link.packet, len(link.codebook.codewords))
         self._judged = EchoQueue(self._echoes)
@@ -134,10 +136,22 @@ class Receiver:
             self._counts["events_in_regions"] += len(events)
             until_us = min(start_us + self._step_us, step.end_us)
             transmitter.sync, locks = self._steps.synchronize(transmitter.sync, events, until_us)
-            for lock in locks:
+            for heard in locks:
                 self._counts["preambles"] += 1
+                lock = self._late_rows(transmitter, heard)
                 self._counts["locks"] += self._transmitters.adopt(transmitter, lock, self._timeline.first_us)
         return transmitter
+
+    def _late_rows(self, transmitter: Transmitter, lock: SyncLock) -> SyncLock:
+        """A lock with what its preamble says of the rows of its bar."""
+        region = transmitter.region
+        middle_us = lock.packet_t_us + self._packet.preamble_chips / 2 * lock.chip_us
+        _, y = region.at(np.array([middle_us]))
+        _, height_px = region.size_at(middle_us)
+        transmitter.rows, lock = self._rows.hear(
+            transmitter.rows, lock, region.pieces, float(y[0]), height_px
+        )
+        return lock
 
     def _decode_due(self, transmitter: Transmitter, until_us: float) -> None:
         """Decode the frames that lie before a time, with the events after their last edge."""

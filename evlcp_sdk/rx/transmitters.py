@@ -1,9 +1,10 @@
 """The transmitters that a receiver knows: numbered at their first lock, remembered when lost from sight."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.rx.delays import RowDelay
 from evlcp_sdk.rx.detection import Followed
 from evlcp_sdk.rx.grid import PacketGrid
 from evlcp_sdk.rx.look import Pilot
@@ -34,6 +35,7 @@ class Transmitter:
         distance: State of its distance filter, None without one.
         number: Transmitter number, None before the first lock.
         first: Number of the first packet on the grid that had a frame, None before.
+        rows: How late the rows of its bar are read.
         pilot: The newest pilot, None where it showed no bar.
     """
 
@@ -44,6 +46,7 @@ class Transmitter:
     distance: Any = None
     number: int | None = None
     first: int | None = None
+    rows: RowDelay = field(default_factory=RowDelay)
     pilot: Pilot | None = None
 
 
@@ -121,8 +124,11 @@ class Transmitters:
             keep_us = now_us - _LOOKBACK_PACKETS * packet_us
             region.first_us = max(region.first_us, int(keep_us))
         else:
-            # A later lock may move the next frame's start by a chip.
+            # A later lock may move the next frame's start by a chip; the preamble before a packet's first
+            # frame has yet to say how late the rows are.
             keep_us = grid.start_us(grid.frame) - grid.lock.chip_us
+            if grid.frame % self._packet.frames == 0:
+                keep_us -= self._packet.preamble_chips * grid.lock.chip_us
         region.forget_before(keep_us, self._step_us)
 
     def release(self, transmitter: Transmitter) -> None:

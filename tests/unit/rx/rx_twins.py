@@ -65,16 +65,28 @@ def select_box(events, box):
     return events[(events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)]
 
 
-def polarity_sums(events, start_on_us, start_off_us, chip_us, shift_x, shift_y, shape):
+def polarity_sums(
+    events, start_on_us, start_off_us, chip_us, shift_x, shift_y, shape, row_us=0.0, row_px=0.0
+):
     sums = np.zeros(shape, np.int16)
     start = np.where(events.p > 0, start_on_us, start_off_us)
-    chip = np.floor((events.t_us - start) / chip_us).astype(int)
+    late = row_us * (events.y.astype(float) - row_px)
+    chip = np.floor((events.t_us - start - late) / chip_us).astype(int)
     inside = (chip >= 0) & (chip < shape[0])
     chip, events = chip[inside], events[inside]
     u, v = events.x.astype(int) - shift_x[chip], events.y.astype(int) - shift_y[chip]
     seen = (u >= 0) & (u < shape[2]) & (v >= 0) & (v < shape[1])
     np.add.at(sums, (chip[seen], v[seen], u[seen]), np.where(events.p[seen] > 0, 1, -1))
     return sums
+
+
+def count_rows(t_us, y, p, start_us, step_us, top, block, shape):
+    counts = np.zeros(shape)
+    step = np.floor((t_us - start_us[p]) / step_us).astype(int)
+    row = np.floor((y - top) / block).astype(int)
+    inside = (step >= 0) & (step < shape[2]) & (row >= 0) & (row < shape[1])
+    np.add.at(counts, (p[inside], row[inside], step[inside]), 1)
+    return counts
 
 
 def blobs(selected):

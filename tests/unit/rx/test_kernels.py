@@ -175,15 +175,19 @@ def test_events_in_boxes(n, freeze):
 def test_polarity_sums(seed, freeze):
     rng = np.random.default_rng(seed)
     events = random_events(rng, 3000)
-    # Eighths of us are exact in binary: the twin may divide where the kernel compares.
-    start_on, start_off = 1000 + rng.integers(0, 8 * 400, 2) / 8
+    # Eighths of us are exact in binary, and no event is at a chip's very end, where rounding would decide.
+    start_on, start_off = 1000 + rng.integers(0, 8 * 400, 2) / 8 + 1 / 16
     chip_us = rng.integers(8 * 60, 8 * 140) / 8
+    row_us, row_px = rng.integers(-3 * 8, 3 * 8) / 8, float(rng.integers(0, 12))
     shape = (24, 9, 7)
     shifts = rng.integers(-3, 12, (2, shape[0]))
     sums = np.zeros(shape, np.int16)
     e = frozen(events, freeze)
-    _kernels.add_polarity(e.t_us, e.x, e.y, e.p, start_on, start_off, chip_us, *shifts, sums)
-    assert_array_equal(sums, twins.polarity_sums(events, start_on, start_off, chip_us, *shifts, shape))
+    for row in (0.0, row_us):
+        sums[:] = 0
+        _kernels.add_polarity(e.t_us, e.x, e.y, e.p, start_on, start_off, chip_us, row, row_px, *shifts, sums)
+        want = twins.polarity_sums(events, start_on, start_off, chip_us, *shifts, shape, row, row_px)
+        assert_array_equal(sums, want)
     assert sums.any()
 
 

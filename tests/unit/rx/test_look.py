@@ -1,5 +1,6 @@
 """Chip-aligned polarity sums: the laws of the public function."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -78,6 +79,16 @@ def test_each_polarity_has_its_own_first_and_last_chip(p, delay_us):
         want = [] if chip is None else [[chip, 6, 3]]
         assert np.argwhere(sums).tolist() == want, f"event at {t}"
         assert sums.sum() == (0 if chip is None else 2 * p - 1)
+
+
+@pytest.mark.parametrize("row_us", [-2.0, 2.0])
+def test_rows_further_down_are_read_later(row_us):
+    lock = replace(LOCK, row_us=row_us)
+    for y in (200, 206, 213):
+        edge = 1000 + LOCK.delay_on_us + row_us * (y - 206.5) + 3 * LOCK.chip_us
+        for t, chip in [(np.ceil(edge) - 1, 2), (np.ceil(edge), 3)]:
+            sums, _ = polarity_sums([one(int(t), 1, y=y)], lock, 1000.0, STILL, SIZE)
+            assert np.argwhere(sums).tolist() == [[chip, y - 200, 3]]
 
 
 @pytest.mark.parametrize(
