@@ -15,12 +15,15 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.special import j0, j1
 from scipy.stats import binomtest, norm
 
 from evlcp_sdk.io import read_events
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
     BackgroundSpec,
+    LensSpec,
     Scene,
     SensorSpec,
     Truth,
@@ -29,6 +32,7 @@ from evlcp_sdk.sim import (
     simulate,
     truth_of,
 )
+from evlcp_sdk.sim.optics import blur_of
 from evlcp_sdk.sim.validation import (
     MEASURED_AREA,
     MEASURED_LATENCY,
@@ -137,6 +141,19 @@ def draw_intervals(axis: Axes) -> None:
     print(f"shortest interval {gaps.min():.3f} us, refractory time {SENSOR.refr_us:g} us")
 
 
+def print_lens() -> None:
+    """Light beyond a radius: an ideal lens's closed form, its mean over a ring of the pattern, and ours."""
+    camera, lens = CameraModel(), LensSpec(blur_px=0.05)
+    ring_px = lens.wavelength_nm * 1e-3 * lens.f_number / camera.pitch_um
+    blur = blur_of(lens.focus_m, lens, camera)
+    print("| radius px | Airy | over a ring | here |\n|---|---|---|---|")
+    for radius in (1.0, 2.0, 5.0, 10.0):
+        v = math.pi * (radius + ring_px * np.linspace(-0.5, 0.5, 101)) / ring_px
+        closed = j0(v) ** 2 + j1(v) ** 2
+        ours = float((blur.share * np.exp(-0.5 * (radius / blur.sigma_px) ** 2)).sum())
+        print(f"| {radius:g} | {closed[50]:.2%} | {closed.mean():.2%} | {ours:.2%} |")
+
+
 def statistics(events: Events, centre: np.ndarray, duration_s: float) -> dict[str, float]:
     """Rate, share of ON events, busy pixels and their events, width of the bar in events."""
     per_pixel = np.bincount(events.y.astype(int) * 1280 + events.x, minlength=1280 * 720) / duration_s
@@ -172,11 +189,15 @@ def compare() -> None:
         (read_events(SHARED / "night-50m-30kmh.raw"), told),
         *(
             (Events.concat(list(simulate(made))), truth_of(made))
-            for made in (scene, replace(scene, sensor=SENSOR))
+            for made in (
+                scene,
+                replace(scene, sensor=SENSOR),
+                replace(scene, sensor=SENSOR, lens=replace(scene.lens, wings=True)),
+            )
         ),
     ):
         columns.append(statistics(events, truth_.bars[0].centre_px.T, scene.duration_s))
-    print("| | recording | its parameters here | defaults here |\n|---|---|---|---|")
+    print("| | recording | its parameters here | our sensor | our sensor and lens |\n|---|---|---|---|---|")
     for key in columns[0]:
         print(f"| {key} | " + " | ".join(f"{c[key]:.4g}" for c in columns) + " |")
     print("| | Mev/s | ON share | frames | wrong bits | RMSE m (95 %) |\n|---|---|---|---|---|---|")
@@ -227,6 +248,7 @@ def main() -> None:
     for axis, draw in zip(axes, draws, strict=True):
         draw(axis)
     figure.savefig(args.out / "simulator-pixel.png", dpi=110)
+    print_lens()
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     draw_scene(figure)
     figure.savefig(args.out / "simulator-scene.png", dpi=110)

@@ -338,6 +338,18 @@ def _step(table: Array, per_px: float, z: float) -> float:
     return float(table[i] + (at - i) * (table[i + 1] - table[i]))
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _beside(table: Array, row: int, between: float, scale: float, z: float) -> float:
+    """Share of a pixel lit by a strip's part beyond an edge, `z` px before the pixel; see `strip_table`."""
+    half = 0.5 * (table.shape[1] - 1)
+    at = half + half * z / (abs(z) + scale)
+    i = min(int(at), table.shape[1] - 2)
+    part = at - i
+    low = table[row, i] + part * (table[row, i + 1] - table[row, i])
+    high = table[row + 1, i] + part * (table[row + 1, i + 1] - table[row + 1, i])
+    return float(low + between * (high - low))
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def texture_at(field: Array, u: float, v: float) -> float:
     """Bilinear value of the periodic texture (size a power of two) at column u, row v."""
@@ -379,9 +391,10 @@ def run_pixels(
     halo_per_px: Array,
     halo_share: Array,
     halo_every: Array,
-    core_share: float,
-    core_table: Array,
-    core_per_px: Array,
+    near_share: float,
+    near_tables: Array,
+    near_scale: Array,
+    near_reach: Array,
     wide_table: Array,
     wide_per_px: Array,
     shade: Array,
@@ -408,8 +421,9 @@ def run_pixels(
     the block begins; pose 0 holds then. (pose, source) arrays say where each strip is: `origin`, its first
     end, px; `axis`, the unit vector along it; `bounds`, where its clusters start and end along it, px;
     `strip_px`, its width; `turn_px` is how far the texture has moved, looked up every `texture_every` poses.
-    `core_share` of the light is in the core and `halo_share` in each halo: `halo[q]` is the light of halo q
-    of each row of `levels` on a grid along the strip, as a share of full light; it stands where the strip is
+    `halo_share` of the light is in each halo and `near_share` in the rest of the image of a point, which
+    `near_tables` hold, from `strip_table`, followed for `near_reach` px. `halo[q]` is the light of halo q of
+    each row of `levels` on a grid along the strip, as a share of full light; it stands where the strip is
     in the pose in the middle, or follows it every `halo_every[q]` poses where that is not 0. `background` is
     (irradiance on the sensor, dark current as light), W/m2; `sensor` comes from `sensor_vector`.
     """
@@ -422,7 +436,7 @@ def run_pixels(
     weight = np.zeros((sources, most_clusters))
     weights = np.zeros(sources, np.int64)
     weight_first = np.zeros(sources, np.int64)
-    near = np.zeros(sources)
+    near_gain = gain * near_share
     far = np.zeros((halos, sources))
     grid = np.zeros((halos, sources), np.int64)
     between = np.zeros((halos, sources))
@@ -497,19 +511,13 @@ def run_pixels(
                     ax, ay = axis[pose, g, 0], axis[pose, g, 1]
                     along = dx * ax + dy * ay
                     across = dx * ay - dy * ax
-                    half = 0.5 * strip_px[pose, g]
-                    per_px = core_per_px[g]
-                    near[g] = (
-                        gain[g]
-                        * core_share
-                        * (
-                            _step(core_table[g], per_px, across + half)
-                            - _step(core_table[g], per_px, across - half)
-                        )
-                    )
                     weights[g] = 0
-                    if near[g] > 0.0:
-                        reach = 0.5 * (core_table.shape[1] - 1) / per_px
+                    reach = near_reach[g]
+                    if abs(across) < reach + 0.5 * strip_px[pose, g]:
+                        table, scale = near_tables[g], near_scale[g]
+                        side = (table.shape[0] - 1) * abs(across) / (abs(across) + scale)
+                        i = min(int(side), table.shape[0] - 2)
+                        side -= i
                         edges = bounds[pose, g]
                         k = weight_first[g]
                         while k > 0 and edges[k] > along - reach:
@@ -517,11 +525,11 @@ def run_pixels(
                         while k < clusters[g] and edges[k + 1] <= along - reach:
                             k += 1
                         weight_first[g] = k
-                        before = _step(core_table[g], per_px, along - edges[k]) if k < clusters[g] else 0.0
+                        before = _beside(table, i, side, scale, along - edges[k]) if k < clusters[g] else 0.0
                         m = 0
                         while k < clusters[g] and edges[k] < along + reach:
-                            behind = _step(core_table[g], per_px, along - edges[k + 1])
-                            weight[g, m] = before - behind
+                            behind = _beside(table, i, side, scale, along - edges[k + 1])
+                            weight[g, m] = near_gain[g] * (before - behind)
                             before = behind
                             m += 1
                             k += 1
@@ -538,7 +546,7 @@ def run_pixels(
                     core = 0.0
                     for m in range(weights[g]):
                         core += weight[g, m] * levels[r, weight_first[g] + m]
-                    now = near[g] * core
+                    now = core
                     for q in range(halos):
                         k = grid[q, g]
                         now += far[q, g] * (

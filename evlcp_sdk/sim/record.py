@@ -222,7 +222,9 @@ def scene_of_truth(truth: Truth | Mapping[str, Any]) -> Scene:
             "seed": told["seed"],
             "flicker_lamps": told["flicker_lamps"],
             "camera": {key: camera[key] for key in ("width", "height", "focal_mm", "pitch_um")},
+            # Its blur is told as one sigma: a Gaussian without wings.
             "lens": {key: told[key] for key in ("f_number", "focus_m", "halo")}
+            | {"wings": False}
             | {key: told[key] for key in ("bloom", "bloom_px") if key in told},
             "motion": {key: told[key] for key in ("distance_m", "speed_mps", "vib_rate_rad_s")}
             | _motion_told(told, CameraModel(**{key: camera[key] for key in ("focal_mm", "pitch_um")})),

@@ -171,7 +171,7 @@ class LampSpec:
 
 @dataclass(frozen=True)
 class LensSpec:
-    """What the lens does beside projecting: its light, its blur, its halo."""
+    """What the lens does beside projecting: its light, its blur, near and far, its halo."""
 
     f_number: Annotated[float, Field(gt=0, description="Focal length over aperture.")] = 2.0
     focus_m: Annotated[float, Field(gt=0, description="Distance that is sharp.")] = 50.0
@@ -182,6 +182,12 @@ class LensSpec:
     blur_px: Annotated[
         float, Field(ge=0.05, description="Sigma of the blur that is left in focus; a guess.")
     ] = 0.36
+    wings: Annotated[
+        bool,
+        Field(
+            description="The near skirt of an ideal lens: its Airy pattern's wings; without: its core only."
+        ),
+    ] = True
     halo: Annotated[float, Field(ge=0, lt=1, description="Share of the light in the halo; a guess.")] = 0.02
     halo_px: Annotated[float, Field(ge=2, le=400, description="Sigma of the halo; a guess.")] = 40.0
     bloom: Annotated[

@@ -16,7 +16,7 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.sim import _kernels
 from evlcp_sdk.sim.light import Source, sources_of, wiper_switches
 from evlcp_sdk.sim.motion import CameraPath, project
-from evlcp_sdk.sim.optics import blur_sigma_px, step_table
+from evlcp_sdk.sim.optics import Blur, blur_of, step_table, strip_table
 from evlcp_sdk.sim.scene import NEAREST_M, Scene, SensorSpec
 from evlcp_sdk.values import Events
 
@@ -36,7 +36,8 @@ _BLOCK_US = _CELLS * _CELL_US
 _MOST_MOVES = 40
 _MOST_MOVES_STRUCK = 400
 _BLOOM_EVERY = 8  # poses
-_CORE_NODES = 513
+_NEAR_NODES = 64
+_NEAR_SCALE = 5.0
 _WIDE_NODES = 1025
 _ROOM = 1 << 17
 _TEXTURE_SIZE = 512
@@ -189,7 +190,7 @@ class Simulation:
         self._texture_every = max(1, round(scene.background.texture_step_px / MOTION_STEP_PX))
         if scene.lens.bloom > 0:
             self._halos.append(_Halo.of(scene.lens.bloom, scene.lens.bloom_px, _BLOOM_EVERY))
-        self._core_share = 1 - sum(halo.share for halo in self._halos)
+        self._near_share = 1 - sum(halo.share for halo in self._halos)
         self._wide_reach = max(halo.reach_px for halo in self._halos)
         self._counts = dict.fromkeys(("events", "signal_events", "dropped_by_rate_cap", "dropped_blind"), 0)
         self._done_us = 0.0
@@ -370,7 +371,7 @@ class Simulation:
             wiped_us, shade = wiper_switches(scene.wiper, begin_us, end_us)
         lightest = float(shade.max())
         darkest = sensor.dark_w_m2 + scene.background.light_w_m2 * float(self._texture.min() * shade.min())
-        shown: list[tuple[Source, Floats, Floats, float]] = []
+        shown: list[tuple[Source, Floats, Floats, Blur]] = []
         marked: list[NDArray[np.int64]] = []
         for source in self._sources:
             place, depth = self.seen(source, position, attitude)
@@ -378,15 +379,13 @@ class Simulation:
                 continue
             middle_depth = depth.mean(1)
             strip_px = camera.focal_px * source.strip.width_m / middle_depth
-            sigma = blur_sigma_px(float(middle_depth[len(middle_depth) // 2]), lens, camera)
-            if source.blur_px > 0:
-                sigma = math.hypot(sigma, source.blur_px)
+            blur = blur_of(float(middle_depth[len(middle_depth) // 2]), lens, camera, source.blur_px)
             least = ACTIVITY_FLOOR * max(darkest, sensor.charge_us_w_m2 / source.longest_us)
             light = source.light_w_m2 * lightest
-            lit = self._lit_pixels(place, float(strip_px.max()), sigma, light, least)
+            lit = self._lit_pixels(place, float(strip_px.max()), blur, light, least)
             if len(lit):
                 marked.append(lit)
-                shown.append((source, place, strip_px, sigma))
+                shown.append((source, place, strip_px, blur))
         around = scene.background.around_px
         if not shown and around < camera.width:
             return None
@@ -400,7 +399,8 @@ class Simulation:
         origin, axis = np.empty((poses, g, 2)), np.empty((poses, g, 2))
         bounds, strips = np.zeros((poses, g, most + 1)), np.empty((poses, g))
         clusters, gain = np.empty(g, np.int64), np.empty(g)
-        core, core_per_px = np.empty((g, _CORE_NODES)), np.empty(g)
+        near = np.empty((g, _NEAR_NODES + 1, 2 * _NEAR_NODES + 1))
+        near_scale, near_reach = np.empty(g), np.empty(g)
         first_rows = np.empty(g, np.int64)
         lines_t, lines_source = [starts[1:], wiped_us], [np.full(poses - 1, _kernels.POSE)]
         lines_source.append(np.full(len(wiped_us), _kernels.SHADE))
@@ -408,16 +408,15 @@ class Simulation:
         levels_of: list[Floats] = []
         halos_of: list[list[Floats]] = [[] for _ in self._halos]
         total = 0
-        for i, (source, place, strip_px, sigma) in enumerate(shown):
+        for i, (source, place, strip_px, blur) in enumerate(shown):
             k = source.strip.clusters
             vector = place[:, -1] - place[:, 0]
             axis[:, i] = vector / np.hypot(*vector.T)[:, None]
             origin[:, i] = place[:, 0]
             bounds[:, i, : k + 1] = ((place - place[:, :1]) * axis[:, i, None]).sum(-1)
             strips[:, i], clusters[i], gain[i] = strip_px, k, source.light_w_m2
-            reach = 5 * sigma + 0.5
-            core[i] = step_table(sigma, reach, _CORE_NODES)
-            core_per_px[i] = (_CORE_NODES - 1) / (2 * reach)
+            near_scale[i], near_reach[i] = _NEAR_SCALE * blur.sigma_px[0], blur.reach_px
+            near[i] = strip_table(blur, float(strip_px[poses // 2]), near_scale[i], _NEAR_NODES)
             when, levels = source.switches(begin_us, end_us)
             lines_t.append(when)
             lines_source.append(np.full(len(when), i))
@@ -443,7 +442,7 @@ class Simulation:
             np.concatenate([np.zeros((0, most)), *levels_of]), halo,
             np.array([-one.reach_px for one in self._halos]), np.array([one.per_px for one in self._halos]),
             np.array([one.share for one in self._halos]), np.array([one.every for one in self._halos]),
-            self._core_share, core, core_per_px, np.stack([one.table for one in self._halos]),
+            self._near_share, near, near_scale, near_reach, np.stack([one.table for one in self._halos]),
             np.array([(_WIDE_NODES - 1) / (2 * one.reach_px) for one in self._halos]), shade, turn,
             self._texture_every, self._texture, np.array([scene.background.light_w_m2, sensor.dark_w_m2]),
         )  # fmt: skip
@@ -478,24 +477,21 @@ class Simulation:
         return every, found
 
     def _lit_pixels(
-        self, place: Floats, strip_px: float, sigma: float, light_w_m2: float, least_w_m2: float
+        self, place: Floats, strip_px: float, blur: Blur, light_w_m2: float, least_w_m2: float
     ) -> NDArray[np.int64]:
         """Pixels, row by row, that a source lights by `least_w_m2` or more at any pose."""
         nothing = np.empty(0, np.int64)
         z = np.arange(0, self._wide_reach, 0.25)
         half = strip_px / 2
-        table = step_table(sigma, 5 * sigma + 0.5, _CORE_NODES)
-        near = np.linspace(-5 * sigma - 0.5, 5 * sigma + 0.5, _CORE_NODES)
-
-        def core(at: Floats) -> Floats:
-            return np.interp(at, near, table)
-
-        across, along = np.zeros(len(z)), np.zeros(len(z))
-        steps = [(self._core_share, core), *((halo.share, halo.step) for halo in self._halos)]
-        for share, step in steps:
-            part = step(z + half) - step(z - half)
-            across += share * part
-            along += share * part[0] * step(-z)
+        scale = _NEAR_SCALE * float(blur.sigma_px[0])
+        table = strip_table(blur, strip_px, scale, _NEAR_NODES)
+        node, nodes = _NEAR_NODES * z / (z + scale), np.arange(_NEAR_NODES + 1)
+        across = self._near_share * np.interp(node, nodes, table[:, -1])
+        along = self._near_share * np.interp(node, nodes, table[0, _NEAR_NODES::-1])
+        for halo in self._halos:
+            part = halo.step(z + half) - halo.step(z - half)
+            across += halo.share * part
+            along += halo.share * part[0] * halo.step(-z)
         across *= light_w_m2
         along *= light_w_m2
         if across[0] < least_w_m2:

@@ -38,7 +38,7 @@ from evlcp_sdk.sim import (
 from evlcp_sdk.sim._kernels import texture_at
 from evlcp_sdk.sim.light import BarLight, wiper_switches
 from evlcp_sdk.sim.motion import pothole_angle_rad
-from evlcp_sdk.sim.optics import blur_sigma_px
+from evlcp_sdk.sim.optics import blur_of
 from evlcp_sdk.sim.validation import pixel_events
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.study.score import Score
@@ -192,7 +192,7 @@ def light_on(scene: Scene, column: int, row: int) -> tuple[Floats, Floats]:
     edges = np.unique(np.concatenate([[0.0], wiped[0], *(when for when, _ in switched)]))
     total = np.full(len(edges), scene.background.light_w_m2)
     lens = scene.lens
-    parts = ((1 - lens.halo - lens.bloom, None), (lens.halo, lens.halo_px), (lens.bloom, lens.bloom_px))
+    halos = ((lens.halo, lens.halo_px), (lens.bloom, lens.bloom_px))
     for source, (when, levels) in zip(sources, switched, strict=True):
         cuts = source.strip.cuts_m()
         depth = scene.motion.distance_m
@@ -200,10 +200,10 @@ def light_on(scene: Scene, column: int, row: int) -> tuple[Floats, Floats]:
         x = 640 + cuts[:, 0] / depth * FOCAL_PX + shift[0]
         y = 360 + cuts[:, 1] / depth * FOCAL_PX + shift[1]
         half = source.strip.width_m / depth * FOCAL_PX / 2
-        sharp = math.hypot(blur_sigma_px(depth, lens, scene.camera), source.blur_px)
+        blur = blur_of(depth, lens, scene.camera, source.blur_px)
+        near = (1 - lens.halo - lens.bloom) * blur.share
         weight = np.zeros(len(cuts) - 1)
-        for share, halo_px in parts:
-            sigma = sharp if halo_px is None else halo_px
+        for share, sigma in (*zip(near, blur.sigma_px, strict=True), *halos):
             across = lit(column - x[:1] + half, sigma) - lit(column - x[:1] - half, sigma)
             weight += share * across * np.abs(np.diff(lit(row - y, sigma)))
         total += source.light_w_m2 * levels[np.searchsorted(when, edges, side="right")] @ weight
@@ -265,7 +265,7 @@ def test_bloom_follows_the_image() -> None:
         distance_m=50.0, speed_mps=0.0, vib_rate_rad_s=0.0, pothole_s=(0.0,), pothole_decay_s=9.0
     )
     scene = Scene(duration_s=0.004, sensor=IDEAL, motion=turning, background=EVEN)
-    scene = replace(scene, lens=replace(scene.lens, halo=0.0, bloom=0.6, bloom_px=3.0))
+    scene = replace(scene, lens=replace(scene.lens, wings=False, halo=0.0, bloom=0.6, bloom_px=3.0))
     events = every(scene)
     centre = truth_of(scene).bars[0].centre_px
     away = events.y - np.interp(events.t_us, np.arange(len(centre)) * 1000.0, centre[:, 1])

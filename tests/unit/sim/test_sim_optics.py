@@ -1,0 +1,177 @@
+"""The lens against closed forms and brute force: the Airy pattern's wings, a strip's light on the pixels."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import quad
+from scipy.ndimage import map_coordinates
+from scipy.special import j0, j1
+
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.sim import BackgroundSpec, BarSpec, MotionSpec, Scene, SensorSpec, Simulation, _kernels
+from evlcp_sdk.sim.motion import project
+from evlcp_sdk.sim.optics import blur_of, blur_sigma_px, strip_table
+from evlcp_sdk.sim.scene import LensSpec
+
+Floats = NDArray[np.float64]
+
+CAMERA = CameraModel()
+IDEAL = LensSpec(blur_px=0.05)
+
+
+def beyond(radius_px: Floats | float, lens: LensSpec) -> Floats:
+    """Share of the light that an ideal lens throws further than a radius."""
+    v = math.pi * np.asarray(radius_px) * CAMERA.pitch_um / (lens.wavelength_nm * 1e-3 * lens.f_number)
+    found: Floats = j0(v) ** 2 + j1(v) ** 2
+    return found
+
+
+def image_of_rectangle(
+    lens: LensSpec, width_px: float, length_px: float, sigma_px: float, *, size: int = 2048, per_px: int = 8
+) -> Floats:
+    """Share of the pixels around a rectangle that it lights, by the transfer functions of all that blurs it.
+
+    Returns:
+        float64 (size, size): along and across from the middle, `per_px` samples a px.
+    """
+    nu = np.fft.fftfreq(size, 1 / per_px)
+    along, across = nu[:, None], nu[None, :]
+    radius = np.hypot(along, across) * lens.wavelength_nm * 1e-3 * lens.f_number / CAMERA.pitch_um
+    x = np.minimum(radius, 1)
+    aperture = 2 / math.pi * (np.arccos(x) - x * np.sqrt(1 - x**2))
+    transfer = aperture * np.exp(-2 * (math.pi * sigma_px) ** 2 * (along**2 + across**2))
+    transfer = transfer * np.sinc(along) * np.sinc(across)
+    rectangle = length_px * np.sinc(length_px * along) * width_px * np.sinc(width_px * across)
+    return np.fft.fftshift(np.fft.ifft2(transfer * rectangle).real) * per_px**2
+
+
+def table_at(table: Floats, scale_px: float, across_px: Floats, along_px: Floats) -> Floats:
+    """Bilinear values of a strip's table: the kernel's twin."""
+    nodes = len(table) - 1
+    n = np.abs(across_px)
+    i = nodes * n / (n + scale_px)
+    j = nodes + nodes * along_px / (np.abs(along_px) + scale_px)
+    i0 = np.minimum(i.astype(int), nodes - 1)
+    j0_ = np.minimum(j.astype(int), 2 * nodes - 1)
+    a, b = i - i0, j - j0_
+    low = (1 - b) * table[i0, j0_] + b * table[i0, j0_ + 1]
+    high = (1 - b) * table[i0 + 1, j0_] + b * table[i0 + 1, j0_ + 1]
+    found: Floats = (1 - a) * low + a * high
+    return found
+
+
+def test_the_closed_form_is_that_of_the_airy_pattern() -> None:
+    assert float(beyond(1.0, IDEAL)) == pytest.approx(0.051, abs=0.0005)
+    assert float(beyond(2.0, IDEAL)) == pytest.approx(0.026, abs=0.0005)
+    unit = 1.26 / CAMERA.pitch_um
+    for radius in (0.2, 1.0):
+        inside = quad(lambda v: 2 * j1(v) ** 2 / v, 0, math.pi * radius / unit, limit=200)[0]
+        assert 1 - inside == pytest.approx(float(beyond(radius, IDEAL)), abs=1e-6)
+
+
+@pytest.mark.parametrize("f_number", [1.4, 2.0, 4.0])
+def test_the_gaussians_throw_as_much_light_aside_as_the_airy_pattern(f_number: float) -> None:
+    lens = replace(IDEAL, f_number=f_number)
+    blur = blur_of(lens.focus_m, lens, CAMERA)
+    assert blur.share.sum() == pytest.approx(1, abs=1e-12)
+    assert (blur.share > 0).all()
+    radius = np.linspace(0.4 * f_number, 10.0, 60)
+    found = (blur.share * np.exp(-(radius[:, None] ** 2) / (2 * blur.sigma_px**2))).sum(1)
+    # The rings are averaged out, as pixels and blur do: over one of them about each radius.
+    ring = lens.wavelength_nm * 1e-3 * f_number / CAMERA.pitch_um * np.linspace(-0.5, 0.5, 41)
+    closed = beyond(radius[:, None] + ring, lens).mean(1)
+    np.testing.assert_allclose(found, closed, rtol=0.07)
+    np.testing.assert_allclose(found[radius < 4], closed[radius < 4], rtol=0.03)
+
+
+def test_without_wings_there_is_one_gaussian() -> None:
+    for depth_m in (5.0, 50.0):
+        blur = blur_of(depth_m, LensSpec(wings=False), CAMERA)
+        assert blur.share.tolist() == [1.0]
+        assert blur.sigma_px.tolist() == [blur_sigma_px(depth_m, LensSpec(), CAMERA)]
+    near, sharp = (blur_of(d, LensSpec(), CAMERA).sigma_px for d in (5.0, 50.0))
+    assert (near > sharp).all()
+
+
+@pytest.mark.parametrize("width_px", [0.3, 2.4])
+def test_a_strips_light_is_that_of_brute_force(width_px: float) -> None:
+    lens, length, per_px, nodes, scale = LensSpec(), 8.6, 8, 64, 2.0
+    table = strip_table(blur_of(lens.focus_m, lens, CAMERA), width_px, scale, nodes)
+    image = image_of_rectangle(lens, width_px, length, lens.blur_px)
+    middle = len(image) // 2
+    step = per_px // 4
+    grid = np.arange(-20 * per_px, 20 * per_px + 1, step)
+    brute = image[middle + grid][:, middle + grid]
+    along, across = np.meshgrid(grid / per_px, grid / per_px, indexing="ij")
+    found = table_at(table, scale, across, along + length / 2)
+    found -= table_at(table, scale, across, along - length / 2)
+    np.testing.assert_allclose(found, brute, atol=1e-3 * brute.max())
+    # Away from the core, where the wings are all there is.
+    away = (np.abs(across) > width_px / 2 + 1.5) & (np.abs(across) < 10) & (np.abs(along) < 10)
+    np.testing.assert_allclose(found[away], brute[away], rtol=0.06)
+    assert np.abs(found[away] / brute[away] - 1).mean() < 0.02
+
+
+def test_all_the_light_of_a_strip_arrives() -> None:
+    table = strip_table(blur_of(50.0, LensSpec(), CAMERA), 0.7, 2.0, 64)
+    pixels = np.arange(-60.0, 61.0)
+    along, across = np.meshgrid(pixels + 0.2, pixels + 0.3, indexing="ij")
+    found = table_at(table, 2.0, across, along + 4.0) - table_at(table, 2.0, across, along - 4.0)
+    assert found.sum() == pytest.approx(0.7 * 8.0, rel=5e-3)
+    # And nothing else: a pixel far inside a wide strip is lit whole, one far before its edge is dark.
+    wide = strip_table(blur_of(50.0, LensSpec(), CAMERA), 200.0, 2.0, 64)
+    assert wide[0, -1] == pytest.approx(1, abs=1e-5)
+    assert wide[0, 0] == wide[-1, -1] == pytest.approx(0, abs=1e-9)
+
+
+def test_the_kernel_looks_up_what_the_table_says() -> None:
+    table = strip_table(blur_of(50.0, LensSpec(), CAMERA), 0.7, 1.9, 64)
+    rng = np.random.default_rng(1)
+    across, along = rng.normal(0, 5, 200), rng.normal(0, 20, 200)
+    along[0] = 1e20
+    expected = table_at(table, 1.9, across, along)
+    for n, z, value in zip(np.abs(across), along, expected, strict=True):
+        at = 64 * n / (n + 1.9)
+        assert _kernels._beside(table, int(at), at - int(at), 1.9, z) == pytest.approx(value, abs=1e-12)
+
+
+def test_the_light_on_each_pixel_is_that_of_the_lens(tmp_path: Path) -> None:
+    """A bar that stands still, as its pixels see it, beside the transfer functions of all that blurs it."""
+    lit = np.array([1, 0, 0, 1, 1, 0, 0, 0, 1, 0, 1, 1, 0, 0, 0, 1])
+    # A last chip of darkness, never sent in this time, says that the bar blinks.
+    np.save(tmp_path / "chips.npy", np.concatenate([np.tile(lit, (99, 1)), np.zeros((1, 16), int)]))
+    lens = LensSpec(halo=0.0)
+    scene = Scene(
+        duration_s=0.004,
+        lens=lens,
+        motion=MotionSpec(speed_mps=0.0, vib_rate_rad_s=0.0),
+        background=BackgroundSpec(light_w_m2=0.01, texture=0.0),
+        sensor=SensorSpec(noise_hz=0.0, hot_share=0.0),
+        bars=(BarSpec(chips_file=str(tmp_path / "chips.npy"), start_chip=10.0),),
+    )
+    simulation = Simulation(scene)
+    for _ in simulation.stream():
+        pass
+    light = simulation._state[:, _kernels.LIGHT].reshape(CAMERA.height, CAMERA.width)
+    place, _ = project(
+        np.array([[-1.5, -0.48, 0.0], [-1.5, 0.48, 0.0]]), *simulation.path.at([2000.0]), CAMERA
+    )
+    (x, top), (_, bottom) = place[0]
+    cluster_px, width_px = (bottom - top) / 16, 0.005 / 50 * CAMERA.focal_px
+    image = image_of_rectangle(lens, width_px, cluster_px, lens.blur_px)
+    rows, columns = np.arange(round(top) - 8, round(bottom) + 9), np.arange(round(x) - 9, round(x) + 10)
+    expected = np.full((len(rows), len(columns)), 0.01 + scene.sensor.dark_w_m2)
+    for k in np.flatnonzero(lit):
+        along = (rows - (top + (k + 0.5) * cluster_px)) * 8 + 1024
+        place_ = np.meshgrid(along, (columns - x) * 8 + 1024, indexing="ij")
+        # What is 128 px away and more is not in the image, and not to be seen.
+        expected += simulation.bars[0].light_w_m2 * map_coordinates(image, place_, order=3)
+    seen = light[rows][:, columns]
+    active = seen > 0
+    assert active.mean() > 0.9
+    np.testing.assert_allclose(seen[active], expected[active], rtol=0.03, atol=5e-4)
+    assert seen[active].sum() == pytest.approx(expected[active].sum(), rel=1e-3)
