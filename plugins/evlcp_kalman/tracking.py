@@ -27,7 +27,8 @@ class KalmanTracking(Tracking):
 
     The measurement's variance is pooled over frames, as a single frame's sigma is itself a rough estimate,
     and weights by it would favour frames that look better than they are. A measurement far from its
-    prediction is left out.
+    prediction is left out. In the image, a pothole changes the speed at once: a measurement that such a jolt
+    explains, and nothing else, is followed, as if the speed had become unknown by so much at the last one.
     """
 
     acceleration_m2_s3: Annotated[
@@ -42,8 +43,15 @@ class KalmanTracking(Tracking):
     speed_px_s: Annotated[
         float, Field(gt=0, description="Image speeds that are likely at first: peaks of vibration.")
     ] = 1500.0
+    jolt_px_s: Annotated[
+        float,
+        Field(ge=0, description="Change of image speed in a jolt (sigma): a pothole peaks at 7000 px/s."),
+    ] = 3000.0
     gate: Annotated[
-        float, Field(gt=1, description="Sigmas from the prediction beyond which a measurement is left out.")
+        float,
+        Field(
+            gt=1, description="Sigmas from the prediction beyond which a measurement is a jolt's or left out."
+        ),
     ] = 5.0
     pooled_frames: Annotated[
         int, Field(ge=1, description="Frames over which the measurement's variance is averaged.")
@@ -53,10 +61,10 @@ class KalmanTracking(Tracking):
         """Filters of position (px) and distance (m)."""
         return Tracker(
             position=_ConstantVelocity(
-                self.acceleration_px2_s3, self.speed_px_s, self.gate, self.pooled_frames
+                self.acceleration_px2_s3, self.speed_px_s, self.jolt_px_s, self.gate, self.pooled_frames
             ),
             distance=_ConstantVelocity(
-                self.acceleration_m2_s3, self.speed_m_s, self.gate, self.pooled_frames
+                self.acceleration_m2_s3, self.speed_m_s, 0.0, self.gate, self.pooled_frames
             ),
         )
 
@@ -77,6 +85,7 @@ class _State:
 class _ConstantVelocity(Filter):
     density: float
     speed: float
+    jolt: float
     gate: float
     pooled: int
 
@@ -107,9 +116,16 @@ class _ConstantVelocity(Filter):
         variance = state.variance + (sigma**2 - state.variance) / count
         mean, covariance = self._ahead(state, t_us)
         innovation = value - mean[0]
+        off = float(np.abs(innovation).max())
         spread = covariance[0, 0] + variance
+        if off > self.gate * np.sqrt(spread):
+            dt = t_s - state.t_s
+            covariance = covariance + self.jolt**2 * np.array([[dt**2, dt], [dt, 1.0]])
+            spread = covariance[0, 0] + variance
         missed = 0
-        if float(np.abs(innovation).max()) > self.gate * np.sqrt(spread):
+        if off > self.gate * np.sqrt(spread):
+            # No jolt explains it either: what it says is not taken, and neither is that there was one.
+            mean, covariance = self._ahead(state, t_us)
             missed = state.missed + 1
             if missed > self.pooled // 2:
                 # So many in a row are not outliers: what is tracked has changed.

@@ -85,6 +85,52 @@ def test_what_changed_for_good_is_believed() -> None:
     assert run(distance_filter(), t_us, z, 0.1)[-1, 0] == pytest.approx(70, abs=0.1)
 
 
+def position_errors(measured: np.ndarray, true: np.ndarray, **parameters: float) -> np.ndarray:
+    """Of the values and of the predictions a step ahead, (n, 2); 1.5 ms a step, 0.25 px of noise."""
+    filter_ = KalmanTracking(**parameters).compile().position
+    assert filter_ is not None
+    state, out = filter_.init(), []
+    for k, z in enumerate(measured):
+        ahead = filter_.predict(state, 1500.0 * k)
+        state, value, _ = filter_.step(state, 1500.0 * k, z, 0.25)
+        out.append((np.abs(value - true[k]).max(), 0 if ahead is None else np.abs(ahead[0] - true[k]).max()))
+    return np.array(out)
+
+
+def shaken(n: int, jolt_px_s: float = 0.0) -> np.ndarray:
+    """A bar's centre on a shaking camera, whose speed changes at once in the middle."""
+    t = 1.5e-3 * np.arange(n)
+    after = np.maximum(t - t[n // 2], 0)
+    y = 360 + 10 * np.sin(2 * np.pi * 12 * t) + jolt_px_s / 75 * np.sin(75 * after) * np.exp(-after / 0.05)
+    return np.stack([400 + 4 * np.cos(2 * np.pi * 9 * t), y], axis=1)
+
+
+@pytest.mark.parametrize("jolt_px_s", [-7000.0, 3000.0, 7000.0])
+def test_a_pothole_is_followed(jolt_px_s: float) -> None:
+    true = shaken(120, jolt_px_s)
+    measured = true + np.random.default_rng(3).normal(0, 0.25, true.shape)
+    errors = position_errors(measured, true)
+    assert errors[:, 0].max() < 1.5
+    # Nothing can tell a jolt before it is measured.
+    assert np.delete(errors[1:, 1], 60).max() < 4
+    # Without jolts, what comes after one is lost for a while.
+    assert position_errors(measured, true, jolt_px_s=0.0)[:, 0].max() > 10
+
+
+def test_a_stray_position_is_no_jolt() -> None:
+    true = shaken(120)
+    measured = true + np.random.default_rng(4).normal(0, 0.25, true.shape)
+    measured[50] += (60.0, 0.0)
+    errors = position_errors(measured, true)
+    assert errors[:, 0].max() < 2
+
+
+def test_without_jolts_nothing_changes() -> None:
+    true = shaken(400)
+    measured = true + np.random.default_rng(5).normal(0, 0.25, true.shape)
+    assert_allclose(position_errors(measured, true), position_errors(measured, true, jolt_px_s=0.0))
+
+
 def test_states_are_not_changed_and_predict_goes_straight_on() -> None:
     filter_ = distance_filter()
     assert filter_.predict(filter_.init(), 0) is None
