@@ -145,6 +145,33 @@ def _across(z: float, core: float, tail: float, share: float) -> tuple[float, fl
     return 0.5 * (1 + shape), (first + second) / sqrt(2 * pi)
 
 
+_PER_SIGMA = 256
+_NORMAL = np.array([0.5 * erf(i / _PER_SIGMA / sqrt(2.0)) for i in range(16 * _PER_SIGMA)])
+_DENSITY = np.array([exp(-0.5 * (i / _PER_SIGMA) ** 2) / sqrt(2 * pi) for i in range(16 * _PER_SIGMA)])
+"""The standard normal distribution above its middle, and its density; straight lines between are good to a
+millionth. Far more sigmas than `_REACH` of the wider of two normal ones are cut off."""
+
+
+@njit(cache=True, nogil=True)
+def _from_tables(z: float) -> tuple[float, float]:
+    """The standard normal distribution and its density."""
+    at = min(abs(z) * _PER_SIGMA, _NORMAL.size - 1.5)
+    i = int(at)
+    rest = at - i
+    half = _NORMAL[i] + rest * (_NORMAL[i + 1] - _NORMAL[i])
+    density = _DENSITY[i] + rest * (_DENSITY[i + 1] - _DENSITY[i])
+    return 0.5 + half if z > 0 else 0.5 - half, density
+
+
+@njit(cache=True, nogil=True)
+def _quickly_across(z: float, core: float, tail: float, share: float) -> tuple[float, float]:
+    """As `_across`, to a millionth in a third of the time: what each step of the fit asks for most."""
+    first, first_slope = _from_tables(z / core)
+    second, second_slope = _from_tables(z / tail)
+    slope = share * first_slope / core + (1 - share) * second_slope / tail
+    return share * first + (1 - share) * second, slope
+
+
 _REACH = 4.0
 """Sigmas of the tails beyond which a boundary is not felt: 6 of 100000 are left."""
 
@@ -232,45 +259,71 @@ def equations(
     core, tail, share = profile[0] * stretch, profile[1] * stretch, profile[2]
     reach = _REACH * max(core, tail)
     middle = (rows - 1) / 2
-    slope = np.empty(5)
     normal[:] = 0.0
     right[:] = 0.0
     cost = 0.0
     for i in range(values):
         moved = middle + offset[i] + centre + drift * when[i]
-        for v in range(rows):
-            at = v - moved
-            b = int(np.floor(at / spacing + clusters / 2 + 0.5))
-            if b < 1 or b > clusters - 1 or not known[b, i]:
+        for b in range(1, clusters):
+            if not known[b, i]:
                 continue
             place = b - clusters / 2
-            z = at - spacing * place
-            step = float(codes[b, i] - codes[b - 1, i])
-            felt = step != 0 and abs(z) < reach
-            level = float(codes[b, i] if z > 0 else codes[b - 1, i])
-            if felt:
-                share_of, density = _across(z, core, tail, share)
-                level = codes[b - 1, i] + step * share_of
-                steep = gain * step * density
-                slope[0] = -steep * place
-                slope[1] = -steep
-                slope[2] = -steep * when[i]
-                slope[4] = -steep * z
-            slope[3] = level
-            residual = seen_values[i, v] - gain * level
-            size = abs(residual)
-            weight = 1.0 if size <= huber else huber / size
-            cost += residual * residual / 2 if size <= huber else huber * (size - huber / 2)
-            if felt:
-                for a in range(5):
-                    pull = weight * slope[a]
-                    right[a] += pull * residual
-                    for c in range(a + 1):
-                        normal[a, c] += pull * slope[c]
-            else:
-                # Away from boundaries, where most rows are, the value depends on the gain alone.
-                right[3] += weight * level * residual
-                normal[3, 3] += weight * level * level
+            at = moved + spacing * place
+            # The rows that are nearer to this boundary than to the others.
+            top = max(int(np.ceil(at - spacing / 2)), 0)
+            bottom = min(int(np.ceil(at + spacing / 2)), rows)
+            above, below = float(codes[b - 1, i]), float(codes[b, i])
+            # Sums over these rows of weighted products: e of the slope by the centre, l of that by the gain,
+            # z of the place from the boundary, r of the residual.
+            ee = eez = eezz = el = elz = ll = er = erz = lr = 0.0
+            for v in range(top, bottom):
+                z = v - at
+                level = below if z > 0 else above
+                steep = 0.0
+                if above != below and abs(z) < reach:
+                    share_of, density = _quickly_across(z, core, tail, share)
+                    level = above + (below - above) * share_of
+                    steep = gain * (above - below) * density
+                residual = seen_values[i, v] - gain * level
+                size = abs(residual)
+                weight = 1.0
+                if size <= huber:
+                    cost += residual * residual / 2
+                else:
+                    weight = huber / size
+                    cost += huber * (size - huber / 2)
+                ll += weight * level * level
+                lr += weight * level * residual
+                pull = weight * steep
+                ee += pull * steep
+                eez += pull * steep * z
+                eezz += pull * steep * z * z
+                el += pull * level
+                elz += pull * level * z
+                er += pull * residual
+                erz += pull * residual * z
+            # All slopes but that by the gain are the one by the centre, times what is alike for these rows.
+            t = when[i]
+            normal[0, 0] += place * place * ee
+            normal[1, 0] += place * ee
+            normal[1, 1] += ee
+            normal[2, 0] += place * t * ee
+            normal[2, 1] += t * ee
+            normal[2, 2] += t * t * ee
+            normal[3, 0] += place * el
+            normal[3, 1] += el
+            normal[3, 2] += t * el
+            normal[3, 3] += ll
+            normal[4, 0] += place * eez
+            normal[4, 1] += eez
+            normal[4, 2] += t * eez
+            normal[4, 3] += elz
+            normal[4, 4] += eezz
+            right[0] += place * er
+            right[1] += er
+            right[2] += t * er
+            right[3] += lr
+            right[4] += erz
     for a in range(5):
         for c in range(a):
             normal[c, a] = normal[a, c]
