@@ -2,7 +2,7 @@
 
     python benchmarks/road.py [RECORDING or FOLDER ...] [--only NAME ...] [--link LINK.toml]
         [--set TABLE.KEY=VALUE] [--against LINK.toml or NAME:TABLE.KEY=VALUE,...]
-        [--rounds 3] [--tiled 20000000] [--json]
+        [--rounds 3] [--tiled 20000000] [--json | --markdown]
 
 Without names, all recordings of `../shared/recordings/road` and one folder up. Each has its truth beside it,
 and is received by what `evlcp receive` calls, in this process and on one thread, with the modulation that it
@@ -11,6 +11,7 @@ not this project's is at hand, `tools/score_road.py` above the recordings, the t
 Figures to reach are in `benchmarks/road.toml`, by the recording's name.
 
 `--against` puts another link beside the first one, from a file or as settings; it may be repeated.
+`--markdown` prints the tables of docs/compare.md: what each link finds, side by side.
 
 Speed is processor time, kernels warm, the best of the rounds (0 leaves it out): recorded time and events over
 it, and its parts in milliseconds a recorded second. Then one recording is tiled in time to `--tiled` events
@@ -30,6 +31,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial, wraps
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from evt3_decode import tile
@@ -434,7 +436,9 @@ def main() -> None:
     parser.add_argument("--against", action="append", default=[], metavar="LINK")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--tiled", type=int, default=20_000_000)
-    parser.add_argument("--json", action="store_true")
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true")
+    form.add_argument("--markdown", action="store_true")
     args = parser.parse_args()
     if "OPENBLAS_NUM_THREADS" not in os.environ:
         # The library reads it when it is loaded: begin anew.
@@ -462,11 +466,59 @@ def main() -> None:
                 tiled[name] = speed(big, Path(folder) / "out", make("wh4x2"), 1)
     if args.json:
         print(json.dumps(plain(results, tiled), indent=2))
+    elif args.markdown:
+        print_markdown(results)
     else:
         print_tables(results, tiled, table)
     sys.exit(
         any("fault" in one or any(b["missed"] for b in one["bars"]) for one in results[next(iter(links))])
     )
+
+
+def print_markdown(results: Mapping[str, Sequence[Plain]]) -> None:
+    """Print one table: a row a bar, and of each link the frames found, bit error rate and RMSE."""
+
+    def cells(tally: Tally) -> list[str]:
+        frames = f"{tally.frames_found} of {tally.frames_sent}"
+        return [frames, number(tally.ber, 4), number(tally.rmse_m)]
+
+    def line(words: Sequence[str]) -> None:
+        print(f"| {' | '.join(words)} |")
+
+    line(["recording", *(f"{what}, {name}" for name in results for what in ("frames", "BER", "RMSE, m"))])
+    line(["---"] * (1 + 3 * len(results)))
+    for found in zip(*results.values(), strict=True):
+        for i in range(max(len(one["bars"]) for one in found)):
+            tallies = [
+                Tally()
+                if i >= len(one["bars"]) or one["bars"][i]["statistics"] is None
+                else one["bars"][i]["statistics"].total()
+                for one in found
+            ]
+            if any(tally.frames_sent for tally in tallies):
+                name = found[0]["recording"] + (f", bar {i}" if len(found[0]["bars"]) > 1 else "")
+                line([name, *(cell for tally in tallies for cell in cells(tally))])
+    totals = [
+        sum((bar["statistics"] for one in found for bar in one["bars"] if bar["statistics"]), Statistics())
+        for found in results.values()
+    ]
+    line(["all", *(cell for total in totals for cell in cells(total.total()))])
+    print()
+    line(["link", "ghosts", "said to be reflections", "erased", "claimed", "x real time, median"])
+    line(["---"] * 6)
+    for (name, found), total in zip(results.items(), totals, strict=True):
+        tally = total.total()
+        times = sorted(one["speed"]["real_time"] for one in found if "speed" in one and one["rows"])
+        line(
+            [
+                name,
+                str(sum(one["ghosts"] for one in found)),
+                str(sum(one["echoes"] for one in found)),
+                number(100 * tally.erased_share, 1) + " %",
+                number(100 * tally.claimed_share, 1) + " %",
+                number(median(times), 2) if times else "-",
+            ]
+        )
 
 
 def print_tables(
