@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -227,12 +227,34 @@ class PresenceMap:
         selected: Cells that show a cluster, bool (K, rows, columns).
         pixels: Pilot correlation of the pixels in and around each cluster's selected cells, float32
             (K, height, width), 0 elsewhere; the maps that ranging needs.
+        prior: The same probability by the bar's place alone, float32 (K, rows, columns); None where it is not
+            known. `probability` has it in already.
     """
 
     probability: NDArray[np.float32]
     grid_px: int
     selected: NDArray[np.bool_]
     pixels: NDArray[np.float32]
+    prior: NDArray[np.float32] | None = None
+
+    def informed(self, prior: NDArray[np.float32]) -> "PresenceMap":
+        """Take in what the bar's place says, by Bayes' rule; `probability` is for K equal chances, and none.
+
+        Args:
+            prior: Probability by place alone, float32 (K, rows, columns); the rest, of showing no cluster.
+        """
+        clusters = len(prior)
+        inside = prior.any(0)
+        share, place = self.probability[:, inside], prior[:, inside]
+        unheard = ~share.any(0)
+        # Not even a cell that fits a code in all its values is sure to show a cluster, nor a place.
+        share *= clusters / np.maximum(1 - share.sum(0), np.float32(1e-6))
+        share[:, unheard] = 1
+        share *= place
+        share /= share.sum(0) + np.maximum(1 - place.sum(0), np.float32(1e-6))
+        probability = np.zeros_like(prior)
+        probability[:, inside] = share
+        return replace(self, probability=probability, prior=prior)
 
     def __repr__(self) -> str:
         clusters, rows, columns = self.selected.shape

@@ -374,6 +374,97 @@ def refined_similarity(
 
 
 @njit(cache=True, nogil=True)
+def _share(off: float, half: float, grid: float) -> float:
+    """Part of a cell, `off` from a footprint's middle, that the footprint covers."""
+    return max(min(off + grid / 2, half) - max(off - grid / 2, -half), 0.0) / grid
+
+
+@njit(cache=True, nogil=True)
+def across_profile(
+    probability: Array,
+    seen: Array,
+    places: Array,
+    unit: complex,
+    spacing: float,
+    grid: int,
+    hits: Array,
+    cells: Array,
+) -> None:
+    """Presence of clusters in their place, less that of others, by distance from their line: sums and cells.
+
+    A cell, in bins of 1 px, belongs to the seen cluster between whose ends, half a spacing on both sides, its
+    middle lies; its two neighbours may show in it, too.
+    """
+    _, rows, columns = probability.shape
+    far = np.zeros((places.size, places.size), np.bool_)
+    for k in range(places.size):
+        for other in range(places.size):
+            far[k, other] = abs(places[other] - places[k]) > 1.5 * spacing
+    half = spacing / 2 + grid
+    # Of the box that holds the strip about a place, whatever its turn.
+    reach = np.hypot(half, hits.size)
+    for k in range(places.size):
+        if not seen[k]:
+            continue
+        x, y = places[k].real, places[k].imag
+        for r in range(max(int((y - reach) / grid), 0), min(int((y + reach) / grid) + 1, rows)):
+            for c in range(max(int((x - reach) / grid), 0), min(int((x + reach) / grid) + 1, columns)):
+                off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - places[k]
+                off *= unit.conjugate()
+                share = _share(off.real, spacing / 2, grid)
+                if share > 0 and abs(off.imag) < hits.size:
+                    i = int(abs(off.imag))
+                    cells[i] += share * share
+                    hits[i] += share * probability[k, r, c]
+                    for other in range(places.size):
+                        if far[k, other]:
+                            hits[i] -= share * share * probability[other, r, c]
+
+
+@njit(cache=True, nogil=True)
+def line_prior(places: Array, unit: complex, spacing: float, grid: int, profile: Array, out: Array) -> None:
+    """Probability of each cluster of a line in each cell, by its share of the cell and its distance off."""
+    _, rows, columns = out.shape
+    reach = np.hypot(spacing / 2 + grid, profile.size)
+    for k in range(places.size):
+        x, y = places[k].real, places[k].imag
+        for r in range(max(int((y - reach) / grid), 0), min(int((y + reach) / grid) + 1, rows)):
+            for c in range(max(int((x - reach) / grid), 0), min(int((x + reach) / grid) + 1, columns)):
+                off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - places[k]
+                off *= unit.conjugate()
+                if abs(off.imag) < profile.size:
+                    out[k, r, c] = _share(off.real, spacing / 2, grid) * profile[int(abs(off.imag))]
+
+
+@njit(cache=True, nogil=True)
+def block_prior(places: Array, unit: complex, spacing: float, grid: int, out: Array) -> None:
+    """Probability of each cluster of a panel in each cell, by its share of the cell."""
+    _, rows, columns = out.shape
+    reach = spacing + grid
+    for k in range(places.size):
+        x, y = places[k].real, places[k].imag
+        for r in range(max(int((y - reach) / grid), 0), min(int((y + reach) / grid) + 1, rows)):
+            for c in range(max(int((x - reach) / grid), 0), min(int((x + reach) / grid) + 1, columns)):
+                off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - places[k]
+                off *= unit.conjugate()
+                out[k, r, c] = _share(off.real, spacing / 2, grid) * _share(off.imag, spacing / 2, grid)
+
+
+@njit(cache=True, nogil=True)
+def copy_near(pixels: Array, places: Array, unit: complex, along: float, across: float, out: Array) -> None:
+    """Copy what lies within reach of each cluster's place, along a direction and across it."""
+    _, height, width = pixels.shape
+    reach = along + across
+    for k in range(places.size):
+        x, y = places[k].real, places[k].imag
+        for v in range(max(int(y - reach), 0), min(int(y + reach) + 2, height)):
+            for u in range(max(int(x - reach), 0), min(int(x + reach) + 2, width)):
+                off = (complex(u, v) - places[k]) * unit.conjugate()
+                if abs(off.real) <= along and abs(off.imag) <= across:
+                    out[k, v, u] = pixels[k, v, u]
+
+
+@njit(cache=True, nogil=True)
 def _boundary(pixels: Array, k: int, other: int, a: complex, b: complex, reach: float) -> float:
     """Where clusters `k` and `other`, centred at `a` and `b`, meet: a share of the way between; NaN: unseen.
 

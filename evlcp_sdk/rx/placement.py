@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +29,12 @@ _OTHER_CELLS = 0.25
 """Share of the best instance's cells that another one has at the least: a pixel shows contrast, so that a
 mirror image is as wide as the bar, while a lens' halo shows one cluster here and another there."""
 
-_CORE = 0.75
-"""Quantile of the cells' distance from a column's axis that counts as half its width: up to a quarter may be
-strays, and a bar two or three cells wide keeps all its columns."""
+_WIDEST_PX = 8
+"""How far from a line's axis its light is sought, beyond a spacing: motion within a frame, and blur."""
+
+_EDGE = 0.5
+"""Share of the likeliest distance from the axis below which cells are no longer the line's: its width at half
+maximum. A lens' halo shows the clusters around, one here and another there, at up to a third."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,49 +161,46 @@ def placements(
 
 
 def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> PresenceMap:
-    """Presence in the clusters' footprints only: half a spacing about the centre, across a line the bar's
-    width.
+    """Presence, the layout's place taken in: each cluster in its footprint, and nowhere else.
 
-    Cells beyond are lit by a halo, by neighbours or by reflections. Pixel maps keep a spacing, so that they
-    still show where a cluster ends.
+    Along the layout a cell shows the clusters whose shares of it are in it. Across a line, whose width the
+    layout does not say, the cells of all clusters together show how likely a cell is so far from the axis.
+    Beyond are a halo, neighbours and reflections. Pixel maps keep a spacing, so that they still show where a
+    cluster ends.
     """
+    from evlcp_sdk.rx import _kernels
+
     if placement.scale == 0:
         return presence
-    _, height, width = presence.pixels.shape
-    grid = presence.grid_px
-    _, rows, columns = presence.selected.shape
-    middle = (grid - 1) / 2
-    places = placement.places(layout)
-    cell_x, cell_y = np.arange(columns) * grid + middle, np.arange(rows) * grid + middle
-    spacing_px = abs(placement.scale) * layout.spacing_m
     unit = placement.scale / abs(placement.scale)
     if layout.line:
         unit *= _direction(layout)
-    along, across = _apart(places, unit, cell_x, cell_y)
-    near = along <= (spacing_px + grid) / 2
-    half = spacing_px / 2
+    spacing_px = abs(placement.scale) * layout.spacing_m
+    places = placement.places(layout)
+    grid = presence.grid_px
+    prior = np.zeros_like(presence.probability)
+    pixels = np.zeros_like(presence.pixels)
+    across_px = spacing_px
     if layout.line:
-        core = across[presence.selected & near & (across <= spacing_px / 2 + grid)]
-        half = float(np.quantile(core, _CORE)) if len(core) else half
-    near &= across <= half + grid
-    pixel_along, pixel_across = _apart(places, unit, np.arange(width), np.arange(height))
-    wide = (pixel_along <= spacing_px) & (pixel_across <= half + grid)
-    if not layout.line:
-        wide = (pixel_along <= spacing_px) & (pixel_across <= spacing_px)
-    return PresenceMap(
-        np.where(near, presence.probability, np.float32(0)),
-        grid,
-        presence.selected & near,
-        np.where(wide, presence.pixels, np.float32(0)),
-    )
+        hits, cells = np.zeros((2, math.ceil(spacing_px + _WIDEST_PX)))
+        seen, probability = placement.seen, presence.probability
+        _kernels.across_profile(probability, seen, places, unit, spacing_px, grid, hits, cells)
+        profile = _core(hits / np.maximum(cells, 1))
+        across_px = float(len(profile))
+        _kernels.line_prior(places, unit, spacing_px, grid, profile, prior)
+    else:
+        _kernels.block_prior(places, unit, spacing_px, grid, prior)
+    _kernels.copy_near(presence.pixels, places, unit, spacing_px, across_px, pixels)
+    placed = presence.informed(prior)
+    return replace(placed, selected=presence.selected & (prior > 0), pixels=pixels)
 
 
-def _apart(
-    places: NDArray[np.complex128], unit: complex, x: NDArray[Any], y: NDArray[Any]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distance along a direction and across it from each place, float64 (K, rows, columns) each."""
-    off = (x[None, None] + 1j * y[None, :, None] - places[:, None, None]) * np.conj(unit)
-    return np.abs(off.real), np.abs(off.imag)
+def _core(profile: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A profile from its axis to where, beyond its peak, it first falls below `_EDGE` of it."""
+    peak = int(profile.argmax())
+    low = np.flatnonzero(profile[peak:] < _EDGE * profile[peak])
+    core: NDArray[np.float64] = np.clip(profile[: peak + low[0] if len(low) else None], 0, 1)
+    return core
 
 
 def _direction(layout: Layout) -> complex:

@@ -106,8 +106,13 @@ class MotionFeedback(Decoding):
         values, seam, side = len(sums) // 2, self.reach_px, 2 * self.reach_px + 1
         images = np.empty((height + 2 * seam, width + 2 * seam, values), np.float32)
         _kernels.worth_images(sums, worth.astype(np.float32), len(worth) // 2, seam, images)
-        out = np.empty((len(presence.pixels), side, side, values), np.float32)
-        _kernels.cluster_matches(presence.pixels, images, out)
+        maps = presence.pixels
+        if presence.prior is not None:
+            # Pixels in a cluster's own cells; those in its neighbours' tell nothing.
+            own = (presence.prior > 0).repeat(presence.grid_px, 1).repeat(presence.grid_px, 2)
+            maps = np.where(own, maps[:, : own.shape[1], : own.shape[2]], np.float32(0))
+        out = np.empty((len(maps), side, side, values), np.float32)
+        _kernels.cluster_matches(maps, images, out)
         return self.independent_pixels * out
 
     def _path(self, matches: NDArray[np.float32], known: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -134,7 +139,8 @@ class MotionFeedback(Decoding):
         probability = np.zeros_like(before.probability)
         pilot = sums[: 2 * pilots.shape[1]]
         _kernels.presence(pilot, pilots, before.grid_px, agree, disagree, self.min_values, probability)
-        return replace(before, probability=probability)
+        after = replace(before, probability=probability)
+        return after if before.prior is None else after.informed(before.prior)
 
 
 def _taken_back(sums: NDArray[np.int16], path: NDArray[np.int64]) -> NDArray[np.int16]:

@@ -135,3 +135,43 @@ def refined_similarity(at, cluster, cells, layout, spacing, slack, scale, s, shi
             break
         s, shift = np.linalg.lstsq(rows, right)[0]
     return s, shift
+
+
+def offsets(shape, places, unit, grid):
+    """Along and across from each place to each cell's middle, (K, rows, columns) each."""
+    y, x = np.mgrid[: shape[1], : shape[2]] * grid + (grid - 1) / 2
+    off = (x + 1j * y - places[:, None, None]) * np.conj(unit)
+    return off.real, off.imag
+
+
+def share(off, half, grid):
+    """By corners of the cell and of the footprint."""
+    low, high = np.maximum(off - grid / 2, -half), np.minimum(off + grid / 2, half)
+    return np.maximum(high - low, 0) / grid
+
+
+def across_profile(probability, seen, places, unit, spacing, grid, bins):
+    along, across = offsets(probability.shape, places, unit, grid)
+    part = share(along, spacing / 2, grid) * seen[:, None, None]
+    far = np.abs(places[:, None] - places[None]) > 1.5 * spacing
+    others = np.einsum("jk,krc->jrc", far.astype(float), probability)
+    value = part * probability - part**2 * others
+    which = np.abs(across).astype(int)
+    keep = (part > 0) & (np.abs(across) < bins)
+    return [np.bincount(which[keep], v[keep], bins) for v in (value, part**2)]
+
+
+def line_prior(shape, places, unit, spacing, grid, profile):
+    along, across = offsets(shape, places, unit, grid)
+    which = np.abs(across).astype(int)
+    return share(along, spacing / 2, grid) * np.append(profile, 0)[np.minimum(which, len(profile))]
+
+
+def block_prior(shape, places, unit, spacing, grid):
+    along, across = offsets(shape, places, unit, grid)
+    return share(along, spacing / 2, grid) * share(across, spacing / 2, grid)
+
+
+def copy_near(pixels, places, unit, along_px, across_px):
+    along, across = offsets(pixels.shape, places, unit, 1)
+    return np.where((np.abs(along) <= along_px) & (np.abs(across) <= across_px), pixels, 0)

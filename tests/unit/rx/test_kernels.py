@@ -234,6 +234,30 @@ def test_the_similarity_that_most_cells_are_for(seed, clusters, known):
     assert_allclose(refined, want, rtol=1e-9)
 
 
+@pytest.mark.parametrize("grid", [1, 2, 3])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_footprints(seed, grid):
+    rng = np.random.default_rng(seed)
+    unit = np.exp(1j * rng.uniform(0, 2 * np.pi))
+    spacing, shape = rng.uniform(1.5, 9), (5, 40 // grid, 30 // grid)
+    places = 15.3 + 20.2j + unit * spacing * (np.arange(5) - rng.uniform(1, 3))
+    probability = rng.random(shape).astype(np.float32)
+    seen = rng.random(5) < 0.8
+    hits, cells = np.zeros((2, 7))
+    _kernels.across_profile(probability, seen, places, unit, spacing, grid, hits, cells)
+    want = twins.across_profile(probability, seen, places, unit, spacing, grid, 7)
+    assert_allclose([hits, cells], want, rtol=1e-9, atol=1e-9)
+    profile, out = rng.random(7), np.zeros(shape, np.float32)
+    _kernels.line_prior(places, unit, spacing, grid, profile, out)
+    assert_allclose(out, twins.line_prior(shape, places, unit, spacing, grid, profile), rtol=1e-5, atol=1e-6)
+    out[:] = 0
+    _kernels.block_prior(places, unit, spacing, grid, out)
+    assert_allclose(out, twins.block_prior(shape, places, unit, spacing, grid), rtol=1e-5, atol=1e-6)
+    near = np.zeros(shape, np.float32)
+    _kernels.copy_near(probability, places, unit, spacing, 3.0, near)
+    assert_allclose(near, twins.copy_near(probability, places, unit, spacing, 3.0))
+
+
 @pytest.mark.parametrize("apart", [0j, 0.5 + 0.5j, -0.9j])
 def test_centres_in_one_pixel_have_no_boundary(apart):
     """A reflection beside a bar may bring the centres of two neighbours together."""

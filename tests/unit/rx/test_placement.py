@@ -105,6 +105,33 @@ def test_a_reflection_beside_stays_out_of_the_footprints() -> None:
         assert not (only.selected & ~presence.selected).any()
 
 
+def test_a_halo_is_not_in_the_footprints() -> None:
+    """Around a bar four pixels wide, cells show the cluster in their row, or one of any row as often."""
+    rng = np.random.default_rng(1)
+    presence = drawn(CENTRES, (150, 24 + 110j))
+    halo = drawn(CENTRES, (150, 24 + 110j), half_px=12)
+    hit = rng.random(halo.selected.shape[1:]) < 0.4
+    any_row = rng.integers(0, 16, hit.shape) == np.arange(16)[:, None, None]
+    core = presence.selected.any(0)
+    selected = np.where(core, presence.selected, np.where(hit, any_row, halo.selected) & halo.selected.any(0))
+    blurred = PresenceMap(selected.astype(np.float32), 2, selected, selected.repeat(2, 1).repeat(2, 2) * 1.0)
+    only = masked(blurred, LINE, placements(blurred, LINE)[0])
+    assert (only.probability[presence.selected] > 0.5).all()
+    assert only.probability.sum() < 1.1 * presence.selected.sum()
+
+
+def test_where_the_place_is_known_presence_is_that_of_bayes() -> None:
+    """Of two clusters and none: likelihoods 8, 2 and 1; then one of which nothing was seen."""
+    probability = np.array([[[8 / 12, 0]], [[2 / 12, 0]]], np.float32)
+    prior = np.array([[[0.3, 0.6]], [[0.5, 0.2]]], np.float32)
+    nothing = np.zeros((2, 1, 2), bool)
+    placed = PresenceMap(probability, 2, nothing, np.zeros((2, 2, 4), np.float32)).informed(prior)
+    want = np.array([0.3 * 8, 0.5 * 2])
+    # Of twelve parts two are for none: one for it, by as many chances as there are clusters.
+    np.testing.assert_allclose(placed.probability[:, 0, 0], want / (want.sum() + 0.2), rtol=1e-5)
+    np.testing.assert_allclose(placed.probability[:, 0, 1], prior[:, 0, 1], rtol=1e-5)
+
+
 def test_few_clusters_are_enough_where_the_scale_is_known() -> None:
     whole = drawn(CENTRES, (150, 24 + 110j))
     (before,) = placements(whole, LINE)
