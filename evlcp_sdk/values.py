@@ -268,11 +268,12 @@ class SoftSymbols:
     """What one frame says, with how sure.
 
     Attributes:
-        symbols: Most likely symbol of each cluster, int64 (K,); -1 where a cluster was not seen, which says
-            nothing.
+        symbols: Most likely symbol of each cluster, int64 (K,); -1 where it is not given: the cluster was not
+            seen, or the symbol is rather wrong than right.
         llr: Log-likelihood ratio ln P(bit 0) / P(bit 1) of each bit, most significant first, float32 (K, m);
             0 where a cluster was not seen.
-        quality: Share of the received energy that the decided codewords explain, 0 to 1.
+        quality: Probability that all symbols given are right, 0 to 1: of frames with quality q, about 1 - q
+            have a wrong bit. The receiver takes it from the LLRs, whatever a decoding gives here.
     """
 
     symbols: NDArray[np.int64]

@@ -451,6 +451,34 @@ def block_prior(places: Array, unit: complex, spacing: float, grid: int, out: Ar
 
 
 @njit(cache=True, nogil=True)
+def pilot_light(sums: Array, codes: Array, prior: Array, grid: int, out: Array) -> None:
+    """How far the pixels in each cluster's place follow its pilot, -1 to 1, `out` (K,); 0 without a place.
+
+    A pixel's value is the sign of its second chip's sum, or else the opposite of its first's, or 0.
+    """
+    clusters, rows, columns = prior.shape
+    length = codes.shape[1]
+    for k in range(clusters):
+        total, place = 0.0, 0.0
+        for r in range(rows):
+            for c in range(columns):
+                weight = prior[k, r, c]
+                if weight == 0:
+                    continue
+                place += weight * grid * grid
+                agree = 0
+                for v in range(r * grid, (r + 1) * grid):
+                    for u in range(c * grid, (c + 1) * grid):
+                        for i in range(length):
+                            value = np.sign(sums[2 * i + 1, v, u])
+                            if value == 0:
+                                value = -np.sign(sums[2 * i, v, u])
+                            agree += codes[k, i] * value
+                total += weight * agree
+        out[k] = total / (length * place) if place > 0 else 0.0
+
+
+@njit(cache=True, nogil=True)
 def copy_near(pixels: Array, places: Array, unit: complex, along: float, across: float, out: Array) -> None:
     """Copy what lies within reach of each cluster's place, along a direction and across it."""
     _, height, width = pixels.shape

@@ -11,7 +11,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.detection import Followed
 from evlcp_sdk.rx.grid import DueFrame
-from evlcp_sdk.rx.placement import Placement, layout_of, masked, placements
+from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements
 from evlcp_sdk.values import Events, PresenceMap, SyncLock
 
 __all__ = ["Look", "Looker", "Pilot", "polarity_sums"]
@@ -78,6 +78,7 @@ class Looker:
         packet: Lengths of a packet's parts.
         spec: Length of a time step, seam, and least share of the clusters.
         centres_m: Cluster centres of the layout, m, float64 (K, 2).
+        pilots: The clusters' pilot codes, (K, values), +1 and -1.
         separate: From a pilot's polarity sums to where the clusters are.
     """
 
@@ -86,11 +87,13 @@ class Looker:
         packet: PacketFormat,
         spec: RegionSpec,
         centres_m: NDArray[np.float64],
+        pilots: NDArray[np.int8],
         separate: Callable[[NDArray[np.int16]], PresenceMap],
     ) -> None:
         self._packet = packet
         self._spec = spec
         self._layout = layout_of(centres_m)
+        self._pilots = pilots.astype(np.int64)
         self._separate = separate
 
     def look(self, region: Followed, due: DueFrame, pilot: Pilot | None) -> tuple[Look | None, Pilot | None]:
@@ -124,7 +127,10 @@ class Looker:
             if not found:
                 return None, pilot
             presence = masked(presence, self._layout, found[0])
-            pilot = Pilot(due.number, size, heard, moved, presence, found[0], tuple(found[1:]))
+            presence, placement = lit(heard, self._pilots, presence, found[0])
+            if not placement.seen.any():
+                return None, pilot
+            pilot = Pilot(due.number, size, heard, moved, presence, placement, tuple(found[1:]))
         else:
             assert pilot is not None
             sums = np.concatenate([pilot.sums, sums])

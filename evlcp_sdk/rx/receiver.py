@@ -7,6 +7,7 @@ import pluggy
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.rx.belief import believed
 from evlcp_sdk.rx.delays import RowDelays
 from evlcp_sdk.rx.detection import Followed, RegionFollower
 from evlcp_sdk.rx.echoes import Echoes, EchoQueue, Sighting
@@ -66,7 +67,9 @@ class Receiver:
         self._timeline = Timeline(self._step_us, link.camera.width, link.camera.height)
         self._regions = RegionFollower(link.regions, link.camera, link.packet.chip_us, self._steps.position)
         self._transmitters = Transmitters(link.packet, self._step_us)
-        self._looker = Looker(link.packet, link.regions, centres_m, self._steps.separate)
+        self._looker = Looker(
+            link.packet, link.regions, centres_m, link.codebook.pilots, self._steps.separate
+        )
         self._rows = RowDelays(link.codebook.preamble)
         self._find_points = points_finder(layout_of(centres_m))
         self._echoes = Echoes(link.packet, len(link.codebook.codewords))
@@ -186,7 +189,7 @@ class Receiver:
             packet=due.packet - transmitter.first,
             frame=due.index,
             t_us=due.start_us,
-            soft=soft,
+            soft=believed(soft, look.placement.seen),
             range=distance,
             filtered=filtered,
             x_px=look.centre_px[0],

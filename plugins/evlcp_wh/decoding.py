@@ -43,13 +43,13 @@ class WhTransform(Decoding):
             energy = float(np.vdot(values, values))
             amplitude = fit.max(1) / length
             explained = float(np.vdot(amplitude, amplitude)) * length
-            # One noise for all clusters of a frame: eight values are too few for one each. A dim cluster,
-            # whose amplitude is small beside it, is unsure.
+            # One amplitude and one noise for all clusters of a frame: eight values are too few for one each.
+            # A dim cluster, whose correlations are small beside them, is unsure.
             rest = max(energy - explained, 1e-3 * energy, 1e-9)
-            scale = np.maximum(amplitude, 0) * values.size / rest
+            scale = max(float(amplitude.mean()), 0.0) * values.size / rest
             zero, one = np.empty((2, len(values), m))
             _kernels.max_log(fit, m, zero, one)
-            llr = ((zero - one) * scale[:, None]).astype(np.float32)
+            llr = ((zero - one) * scale).astype(np.float32)
             return SoftSymbols(symbols, llr, explained / energy if energy else 0.0)
 
         return decode

@@ -62,15 +62,17 @@ def max_log(fit, bits):
 
 
 def llr(values, words):
-    """Symbols, ln P(bit 0) / P(bit 1), and share of energy explained: nearest words at each one's amplitude.
+    """Symbols, ln P(bit 0) / P(bit 1), and share of energy explained: nearest words at the mean amplitude.
 
-    The amplitude is that of the least-squares fit; all clusters have one noise.
+    The amplitudes are those of the least-squares fit; all clusters have one noise.
     """
     amplitude = np.array([max(w @ v / len(w) for w in words) for v in values])
-    cost = np.array(
-        [[((v - a * w) ** 2).sum() for w in words] for v, a in zip(values, amplitude, strict=True)]
+    cost = np.array([[((v - amplitude.mean() * w) ** 2).sum() for w in words] for v in values])
+    kept = (amplitude**2).sum() * words.shape[1]
+    rest = sum(
+        ((v - a * words[cost[k].argmin()]) ** 2).sum()
+        for k, (v, a) in enumerate(zip(values, amplitude, strict=True))
     )
-    rest, kept = cost.min(1).sum(), (amplitude**2).sum() * words.shape[1]
     variance = rest / values.size
     bits = len(words).bit_length() - 1
     out = np.empty((len(values), bits))

@@ -175,3 +175,13 @@ def block_prior(shape, places, unit, spacing, grid):
 def copy_near(pixels, places, unit, along_px, across_px):
     along, across = offsets(pixels.shape, places, unit, 1)
     return np.where((np.abs(along) <= along_px) & (np.abs(across) <= across_px), pixels, 0)
+
+
+def pilot_light(sums, codes, prior, grid):
+    first, second = sums[0::2].astype(int), sums[1::2].astype(int)
+    values = np.where(second != 0, np.sign(second), -np.sign(first))
+    weight = prior.repeat(grid, 1).repeat(grid, 2)
+    values = values[:, : weight.shape[1], : weight.shape[2]]
+    agree = np.einsum("khw,ihw,ki->k", weight, values, codes)
+    place = weight.sum((1, 2))
+    return np.where(place > 0, agree / (codes.shape[1] * np.maximum(place, 1e-9)), 0)

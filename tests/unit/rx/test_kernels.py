@@ -258,6 +258,20 @@ def test_footprints(seed, grid):
     assert_allclose(near, twins.copy_near(probability, places, unit, spacing, 3.0))
 
 
+@pytest.mark.parametrize("grid", [1, 2])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_light_in_step_with_the_pilot(seed, grid):
+    rng = np.random.default_rng(seed)
+    codes = rng.choice([-1, 1], (5, 8))
+    sums = rng.integers(-2, 3, (16, 12, 9)).astype(np.int16)
+    prior = np.where(rng.random((5, 12 // grid, 9 // grid)) < 0.3, rng.random(), 0).astype(np.float32)
+    prior[2] = 0
+    out = np.empty(5)
+    _kernels.pilot_light(sums, codes, prior, grid, out)
+    assert_allclose(out, twins.pilot_light(sums, codes, prior, grid), rtol=1e-6, atol=1e-9)
+    assert out[2] == 0
+
+
 @pytest.mark.parametrize("apart", [0j, 0.5 + 0.5j, -0.9j])
 def test_centres_in_one_pixel_have_no_boundary(apart):
     """A reflection beside a bar may bring the centres of two neighbours together."""

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from evlcp_sdk.rx.placement import layout_of, masked, placements
+from evlcp_sdk.air.codebook import hadamard
+from evlcp_sdk.rx.placement import layout_of, lit, masked, placements
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.values import PresenceMap
 
@@ -130,6 +131,26 @@ def test_where_the_place_is_known_presence_is_that_of_bayes() -> None:
     # Of twelve parts two are for none: one for it, by as many chances as there are clusters.
     np.testing.assert_allclose(placed.probability[:, 0, 0], want / (want.sum() + 0.2), rtol=1e-5)
     np.testing.assert_allclose(placed.probability[:, 0, 1], prior[:, 0, 1], rtol=1e-5)
+
+
+def test_a_hidden_cluster_is_not_lit_by_its_neighbours() -> None:
+    """Clusters 5 and 6 are covered; blur carries a tenth of their neighbours' light into their places."""
+    codes = np.concatenate([hadamard(8), -hadamard(8)]).astype(np.int64)
+    whole = drawn(CENTRES, (150, 24 + 110j))
+    rng = np.random.default_rng(2)
+    light = whole.pixels.copy()
+    for k, neighbour in ((5, 4), (6, 7)):
+        spill = (rng.random(light.shape[1:]) < 0.2) * light[k]
+        light[neighbour] += spill
+        light[k] = 0
+    sums = np.zeros((16, *light.shape[1:]), np.int16)
+    sums[1::2] = 2 * np.einsum("ki,khw->ihw", codes, light)
+    presence = masked(covered(whole, [5, 6]), LINE, placements(covered(whole, [5, 6]), LINE)[0])
+    only, placement = lit(sums, codes, presence, placements(whole, LINE)[0])
+    assert np.flatnonzero(~placement.seen).tolist() == [5, 6]
+    assert not only.probability[[5, 6]].any()
+    assert not only.selected[[5, 6]].any()
+    assert only.probability[[4, 7]].any((1, 2)).all()
 
 
 def test_few_clusters_are_enough_where_the_scale_is_known() -> None:

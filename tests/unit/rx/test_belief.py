@@ -1,0 +1,72 @@
+"""How far symbols are believed: against a channel whose errors are counted."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from evlcp_sdk.air.codebook import hadamard
+from evlcp_sdk.rx.belief import believed
+from evlcp_sdk.values import SoftSymbols
+
+ALL = np.ones(16, bool)
+ROWS = hadamard(8)
+WORDS = np.concatenate([ROWS, -ROWS])
+BITS = np.arange(16)[:, None] >> np.arange(3, -1, -1) & 1
+
+
+def sent_and_read(
+    rng: np.random.Generator, noise: float, scale: float
+) -> tuple[NDArray[np.int64], SoftSymbols]:
+    """A frame over a Gaussian channel, by max-log, its LLRs off by a factor."""
+    sent = rng.integers(0, 16, 16)
+    gain = rng.uniform(0.8, 1.2, 16)
+    values = gain[:, None] * WORDS[sent] + rng.normal(0, noise, (16, 8))
+    fit = values @ WORDS.T * scale
+    llr = np.stack(
+        [fit[:, BITS[:, b] == 0].max(1) - fit[:, BITS[:, b] == 1].max(1) for b in range(4)], axis=1
+    )
+    return sent, SoftSymbols(fit.argmax(1), llr.astype(np.float32), 1.0)
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.0, 50.0])
+@pytest.mark.parametrize("noise", [0.9, 1.1, 1.4])
+def test_of_frames_with_quality_q_one_less_q_are_wrong(noise: float, scale: float) -> None:
+    rng = np.random.default_rng(7)
+    wrong, doubt = [], []
+    for _ in range(400):
+        sent, read = sent_and_read(rng, noise, scale)
+        soft = believed(read, ALL)
+        given = soft.symbols >= 0
+        wrong.append((soft.symbols != sent)[given].any())
+        doubt.append(1 - soft.quality)
+    assert np.mean(wrong) > 0.05
+    assert 0.5 < np.mean(doubt) / np.mean(wrong) < 2
+
+
+def test_what_is_rather_wrong_is_not_given() -> None:
+    rng = np.random.default_rng(3)
+    hidden = right = 0
+    for _ in range(300):
+        sent, read = sent_and_read(rng, 1.6, 1.0)
+        soft = believed(read, ALL)
+        hidden += int((soft.symbols < 0).sum())
+        right += int((read.symbols == sent)[soft.symbols < 0].sum())
+        # Their LLRs say so: they stay, for the error correction.
+        assert (soft.llr != 0).all()
+        assert ((soft.llr > 0) == (read.llr > 0)).all()
+    assert hidden > 100
+    assert right < 0.6 * hidden
+
+
+def test_of_what_is_not_seen_nothing_is_given() -> None:
+    _, read = sent_and_read(np.random.default_rng(0), 0.1, 1.0)
+    seen = np.arange(16) != 5
+    soft = believed(read, seen)
+    assert soft.symbols[5] == -1
+    assert not soft.llr[5].any()
+    np.testing.assert_array_equal(soft.symbols[seen], read.symbols[seen])
+    assert soft.quality > 0.999
+    for none in (believed(read, ~ALL), believed(SoftSymbols(read.symbols, 0 * read.llr, 1.0), ALL)):
+        assert (none.symbols == -1).all()
+        assert not none.llr.any()
+        assert none.quality == 0
