@@ -67,6 +67,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.scene.sites import BarSite, load_sites
     from evlcp_sdk.simulated import SimulatedSource, simulate
     from evlcp_sdk.values import (
+        Bend,
         Events,
         Fix,
         Frame,
@@ -88,6 +89,7 @@ __all__ = [
     "BarLayout",
     "BarSite",
     "Beacon",
+    "Bend",
     "BlockError",
     "CameraModel",
     "Code",
@@ -215,6 +217,7 @@ _HOMES = {
     "scene.sites": ("BarSite", "load_sites"),
     "simulated": ("SimulatedSource", "simulate"),
     "values": (
+        "Bend",
         "Events",
         "Fix",
         "Frame",

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import pyarrow
 
 __all__ = [
+    "Bend",
     "Events",
     "Fix",
     "Frame",
@@ -306,6 +307,22 @@ class FrameView:
         return f"FrameView({chips} chips of {width} x {height} px, {self.presence}, {self.soft})"
 
 
+@dataclass(frozen=True, eq=False)
+class Bend:
+    """How far boundaries between clusters lie off an even scale: what the lean of a bar shows in.
+
+    Attributes:
+        place: Where the boundaries are on the bar, from its middle, in spacings of clusters, float64 (n,).
+        off: How far each lies off, along the bar, in what a lean of sine 1 moves the boundary at place 1,
+            which is spacing_px * spacing_m / distance_m pixels; a lean moves others by place^2. float64 (n,).
+        weight: Inverse variances of these, up to a factor that all share; 0 where unseen, float64 (n,).
+    """
+
+    place: NDArray[np.float64]
+    off: NDArray[np.float64]
+    weight: NDArray[np.float64]
+
+
 @dataclass(frozen=True)
 class Range:
     """A distance along the optical axis.
@@ -314,11 +331,16 @@ class Range:
         distance_m: Depth, m; NaN when the maps do not allow one.
         sigma_m: Its standard deviation, m.
         pairs: Number of cluster pairs that entered.
+        late_chips: Of a ranging: chips from the middle of the pilot, which a frame's distance is for, to when
+            the distance holds.
+        bend: Of a ranging: what it says of the bar's lean; None for nothing.
     """
 
     distance_m: float
     sigma_m: float
     pairs: int
+    late_chips: float = 0.0
+    bend: Bend | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
         return f"Range({_distance(self)}, {self.pairs} pairs)"

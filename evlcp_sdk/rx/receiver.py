@@ -181,7 +181,9 @@ class Receiver:
             distance = self._steps.measure(FrameView(look.sums, look.offset_px, look.presence, soft))
             points_px, sigma_px = self._find_points(look.presence, look.placement)
             points = points_px + look.corner_px, sigma_px
-        transmitter.distance, filtered = self._steps.filter(transmitter.distance, due.start_us, distance)
+        transmitter.distance, distance, filtered = self._steps.follow(
+            transmitter.distance, due.start_us, due.lock.chip_us, distance
+        )
         if transmitter.first is None:
             transmitter.first = due.packet
         frame = Frame(

@@ -14,6 +14,7 @@ from evlcp_sdk.errors import EvlcpError, PluginError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import ROLES, Filter, Synchronizer, Tracker
 from evlcp_sdk.rx.guard import Guard
+from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
 from evlcp_sdk.values import Events, FrameView, PresenceMap, Range, SoftSymbols, SyncLock
 
 __all__ = ["Announcer", "Steps"]
@@ -72,6 +73,7 @@ class Steps:
 
     def __init__(self, link: Link, announcer: Announcer) -> None:
         self._codebook = link.codebook
+        self._keeper = RangeKeeper()
         self._announcer = announcer
         self._guards = guards = {role: Guard(link, role) for role in ROLES}
         with guards["synchronization"]:
@@ -95,9 +97,9 @@ class Steps:
         with self._guards["synchronization"]:
             return self._synchronizer.init()
 
-    def distance_init(self) -> Any:
-        """State of a transmitter's distance filter before its first frame; None without a filter."""
-        return None if self._distance is None else self._distance.init()
+    def distance_init(self) -> tuple[Ranges, Any]:
+        """What is known of a transmitter's distance before its first frame."""
+        return Ranges(), None if self._distance is None else self._distance.init()
 
     def synchronize(self, state: Any, events: Events, until_us: int) -> tuple[Any, list[SyncLock]]:
         """Take a region's events up to a time; give the new state and the packets that were heard."""
@@ -138,8 +140,18 @@ class Steps:
         self._announcer.lap("ranging", distance)
         return distance
 
-    def filter(self, state: Any, t_us: float, measured: Range) -> tuple[Any, Range | None]:
-        """The distance filtered over time, and the new state; the prediction where a frame allows none."""
+    def follow(
+        self, state: tuple[Ranges, Any], t_us: float, chip_us: float, measured: Range
+    ) -> tuple[tuple[Ranges, Any], Range, Range | None]:
+        """Take a frame's distance as the ranging gave it; the new state, the distance, and that filtered.
+
+        The filtered one is the prediction where a frame allows no distance, None without tracking.
+        """
+        ranges, distance = self._keeper.step(state[0], t_us, chip_us, measured)
+        filter_state, filtered = self._filter(state[1], t_us, distance)
+        return (ranges, filter_state), distance, filtered
+
+    def _filter(self, state: Any, t_us: float, measured: Range) -> tuple[Any, Range | None]:
         if self._distance is None:
             return state, None
         if np.isnan(measured.distance_m) or np.isnan(measured.sigma_m):

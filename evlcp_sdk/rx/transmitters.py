@@ -32,7 +32,7 @@ class Transmitter:
         sync: State of its synchronization.
         packets: Collects its frames.
         grid: Where its frames stand on the clock.
-        distance: State of its distance filter, None without one.
+        distance: What is known of its distance.
         number: Transmitter number, None before the first lock.
         first: Number of the first packet on the grid that had a frame, None before.
         rows: How late the rows of its bar are read.

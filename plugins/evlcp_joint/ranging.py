@@ -14,7 +14,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import FrameView, PresenceMap, Range
+from evlcp_sdk.values import Bend, FrameView, PresenceMap, Range
 
 __all__ = ["JointScaleRanging"]
 
@@ -152,7 +152,7 @@ class JointScaleRanging(Ranging):
             fitted = self._fit(codes, known, moved, values, fit, least)
             if fitted is None:
                 return _NONE
-            fit, sigma_px, boundaries = fitted
+            fit, sigma_px, off = fitted
             # From the start, which cells gave, an end moves by the size of a cell and a pixel of blur.
             most_px = view.presence.grid_px + 1
             if abs(fit[0] - spacing) * (clusters - 1) / 2 + abs(fit[1] - centre) > most_px:
@@ -160,7 +160,15 @@ class JointScaleRanging(Ranging):
             # Rows measure the bar along one axis; a tilted bar is longer by its slope.
             stretch = float(np.hypot(1.0, place.line[1]))
             distance = camera.distance_m(spacing_m, float(fit[0]) * stretch)
-            return Range(distance, distance * sigma_px / float(fit[0]), boundaries)
+            late_chips = (len(sums) - 2 * pilots.shape[1]) / 2
+            one_px = spacing_m * float(fit[0]) * stretch / distance
+            return Range(
+                distance,
+                distance * sigma_px / float(fit[0]),
+                int(np.count_nonzero(off[1])),
+                late_chips,
+                Bend(_places(clusters), off[0] / one_px, off[1] * one_px**2),
+            )
 
         return measure
 
@@ -172,8 +180,11 @@ class JointScaleRanging(Ranging):
         values: Floats,
         fit: Floats,
         least: int,
-    ) -> tuple[Floats, float, int] | None:
-        """The fit, the standard deviation of its spacing, px, and the boundaries that count."""
+    ) -> tuple[Floats, float, Floats] | None:
+        """The fit, its spacing's standard deviation, px, and where boundaries lie off it.
+
+        Of each boundary, float64 (2, K - 1), the shift, px, and its weight, 0 where it does not count.
+        """
         from evlcp_joint import _kernels
 
         when = _when(len(values))
@@ -220,7 +231,7 @@ class JointScaleRanging(Ranging):
             return None
         by_row = (inverse @ meat @ inverse)[0, 0] * rows / max(rows - 5, 1)
         by_scatter = spread * float((weight * off**2).sum()) / max(len(off) - 2, 1)
-        return fit, float(np.sqrt(max((by_row + by_scatter) / 2, 0.0))), len(off)
+        return fit, float(np.sqrt(max((by_row + by_scatter) / 2, 0.0))), by_boundary[:, 1:-1]
 
 
 def _own_motion(shift: Floats, information: Floats, when: Floats) -> Floats:
@@ -250,6 +261,12 @@ def _offsets(offset_px: Floats) -> Floats:
     second = offset_px[:, 1::2]
     step = second - offset_px[:, 0::2]
     return second - (step - np.rint(step)) / 2
+
+
+@cache
+def _places(clusters: int) -> Floats:
+    """Of the boundaries between neighbours, from the bar's middle, in spacings."""
+    return np.arange(1.0, clusters) - clusters / 2
 
 
 @cache

@@ -23,6 +23,7 @@ NAMES = [
     "BarLayout",
     "BarSite",
     "Beacon",
+    "Bend",
     "BlockError",
     "CameraModel",
     "Code",

@@ -86,7 +86,7 @@ def test_the_middle_packages_do_not_import_one_another(package: str) -> None:
 
 
 RX = (
-    {"belief", "delays", "detection", "grid", "guard", "inbox", "packets", "placement", "timeline"},
+    {"belief", "delays", "detection", "grid", "guard", "inbox", "packets", "placement", "ranges", "timeline"},
     {"echoes", "look", "points", "steps"},
     {"transmitters"},
     {"receiver"},

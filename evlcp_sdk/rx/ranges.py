@@ -1,0 +1,176 @@
+"""A transmitter's distances together: when they hold, how the bar leans, and how much they scatter."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.values import Bend, Range
+
+__all__ = ["RangeKeeper", "Ranges"]
+
+_MEMORY_S = 0.3
+"""Distances that are looked back on: a bicycle's swerve or a brake changes the acceleration in no less."""
+
+_SPEED_M_S = 20.0
+"""Speeds at which distances change before any is measured (sigma): 72 km/h."""
+
+_ACCELERATION_M_S2 = 3.0
+"""Accelerations (sigma): a hard brake has 8."""
+
+_SCATTER_WORTH = 8.0
+"""Frames that the sigmas of a ranging are worth against the scatter of its distances."""
+
+_OUTLIER = 4.0
+"""Sigmas from the others, 1 of 16000 by chance, beyond which how far off a distance is becomes its sigma."""
+
+_LEVEL_DEG, _LEANING_DEG, _LEANING_SHARE = 0.7, 6.0, 0.03
+"""What is likely of a bar's lean before it is measured: none but for a mount's error and the car's springs
+(sigma), and of one camera in thirty, whose mount nobody levelled, anything up to the steepest."""
+
+_TILT_MEMORY_S = 1.0
+"""A car's pitch changes within a second when it brakes."""
+
+_STEP_DEG = 0.1
+"""Grid of leans that are weighed: a third of the sigma that the bends of a second have at 30 m."""
+
+_LEAST_WEIGHT = 0.1
+"""Of the heaviest boundary: below, one is not seen."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Ranges:
+    """What is remembered of a transmitter's distances.
+
+    Attributes:
+        past: Time (s), distance (m) and variance (m2) of each, oldest first, float64 (n, 3).
+        bend: Sum of the boundaries' bends and of their weights, float64 (2, n); empty without any.
+        bend_s: When that was, s.
+    """
+
+    past: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    bend: Floats = field(default_factory=lambda: np.empty((2, 0)))
+    bend_s: float = math.nan
+
+
+class RangeKeeper:
+    """Brings distances to the middle of their pilot, corrects for the bar's lean, and makes sigmas true.
+
+    A distance itself stays that of its frame: the others say three things about it only. A ranging that reads
+    all of a frame measures at the frame's middle; how fast distances change takes that to the pilot's. A bar
+    that leans towards or from the camera by an angle a looks shorter by cos(a); its boundaries then
+    lie on a parabola, whose bend is far below a frame's noise and adds up over frames. And distances of a
+    moving car lie on a smooth line: their scatter about it, against the sigmas that the ranging gave,
+    says what these are worth.
+    """
+
+    def __init__(self) -> None:
+        lean_deg = np.arange(-_LEANING_DEG, _LEANING_DEG + _STEP_DEG / 2, _STEP_DEG)
+        self._sine, self._cosine = np.sin(np.radians(lean_deg)), np.cos(np.radians(lean_deg))
+        level = _bell(lean_deg, _LEVEL_DEG) / math.sqrt(2 * math.pi)
+        self._prior = (1 - _LEANING_SHARE) * level + _LEANING_SHARE / (2 * _LEANING_DEG)
+
+    def step(self, state: Ranges, t_us: float, chip_us: float, measured: Range) -> tuple[Ranges, Range]:
+        """Take a frame's distance; give the new state and the distance as it should be.
+
+        Args:
+            state: What is remembered; not changed.
+            t_us: Start of the frame, us.
+            chip_us: Length of a chip, us.
+            measured: As the ranging gave it; without a distance, or a sigma, it is given back.
+        """
+        distance_m, sigma_m = measured.distance_m, measured.sigma_m
+        if not (math.isfinite(distance_m) and math.isfinite(sigma_m) and sigma_m > 0):
+            return state, measured
+        t_s, late_s = t_us * 1e-6, measured.late_chips * chip_us * 1e-6
+        past = np.concatenate([state.past, [[t_s, distance_m, sigma_m**2]]])
+        past = past[past[:, 0] > t_s - _MEMORY_S]
+        speed_m_s, speed_variance, variance = _smooth(past)
+        distance_m -= speed_m_s * late_s
+        variance += speed_variance * late_s**2
+        bend, bend_s = state.bend, state.bend_s
+        if measured.bend is not None:
+            bend, bend_s = _add(state, t_s, measured.bend), t_s
+        cosine, cosine_variance = self._leaning(bend, measured.bend)
+        variance = variance * cosine**2 + distance_m**2 * cosine_variance
+        found = Range(distance_m * cosine, math.sqrt(variance), measured.pairs)
+        return Ranges(past, bend, bend_s), found
+
+    def _leaning(self, sums: Floats, newest: Bend | None) -> tuple[float, float]:
+        """Mean and variance of the cosine of the lean, by what is likely and by what was seen."""
+        chance = self._prior
+        seen = None if newest is None else _parabola(newest.place, sums)
+        if seen is not None:
+            chance = chance * _bell(self._sine - seen[0], seen[1])
+        total = float(chance.sum())
+        if not total > 0:
+            # A bend that no lean makes says nothing of one.
+            chance, total = self._prior, float(self._prior.sum())
+        mean = float(chance @ self._cosine) / total
+        return mean, max(float(chance @ self._cosine**2) / total - mean**2, 0.0)
+
+
+def _bell(off: Floats, sigma: float) -> Floats:
+    return np.asarray(np.exp(-0.5 * np.minimum((off / sigma) ** 2, 1400.0)) / sigma)
+
+
+def _smooth(past: Floats) -> tuple[float, float, float]:
+    """Speed (m/s) and its variance, and the variance (m2) of the newest distance, by all of them.
+
+    Distances follow a parabola whose speed and acceleration are likely as above; the squares of what is left,
+    in those that the sigmas expect, scale the variances.
+    """
+    t_s = past[:, 0] - past[-1, 0]
+    terms = np.stack([np.ones(len(t_s)), t_s, t_s**2 / 2])
+    weight, value = 1 / past[:, 2], past[:, 1] - past[-1, 1]
+    likely = np.diag([0.0, _SPEED_M_S**-2, _ACCELERATION_M_S2**-2])
+    scale = 1.0
+    # The scale says how much the likely counts against the distances, and hardly changes after the first.
+    for _ in range(2):
+        weighted = terms * (weight / scale)
+        inverse = np.linalg.inv(weighted @ terms.T + likely)
+        path = inverse @ (weighted @ value)
+        left = (value - path @ terms) ** 2 * weight
+        free = len(value) - float(np.einsum("an,ab,bn->", weighted, inverse, terms))
+        counted = np.minimum(left, _OUTLIER**2 * scale)
+        scale = (_SCATTER_WORTH + float(counted.sum())) / (_SCATTER_WORTH + max(free, 0.0))
+    newest = max(scale, float(left[-1])) if left[-1] > _OUTLIER**2 * scale else scale
+    return float(path[1]), float(inverse[1, 1]), newest / float(weight[-1])
+
+
+def _add(state: Ranges, t_s: float, bend: Bend) -> Floats:
+    """Sums with a frame's bend; older ones fade."""
+    new = np.stack([bend.weight * bend.off, bend.weight])
+    if state.bend.shape != new.shape:
+        return new
+    return np.asarray(new + state.bend * math.exp(-max(t_s - state.bend_s, 0.0) / _TILT_MEMORY_S))
+
+
+def _parabola(place: Floats, sums: Floats) -> tuple[float, float] | None:
+    """Sine of the lean and its sigma, from the scatter of the boundaries about a parabola; None of too few.
+
+    What bends every frame alike is in the scatter, too. Pilots put boundaries of even and odd number
+    off to both sides, by a hundredth of a pixel, which is fitted beside.
+    """
+    weight = sums[1]
+    use = weight > _LEAST_WEIGHT * weight.max()
+    n = int(use.sum())
+    place, weight = place[use], weight[use]
+    # Boundaries lie at whole or half places.
+    even = np.where(np.floor(place) % 2, -1.0, 1.0)
+    terms = np.stack([place**2, np.ones(n), place, even])
+    free = n - len(terms)
+    # The variance of a normal variable over an estimated sigma is finite from three degrees of freedom on.
+    if free < 3:
+        return None
+    off = sums[0, use] / weight
+    try:
+        inverse = np.linalg.inv((terms * weight) @ terms.T)
+    except np.linalg.LinAlgError:
+        return None
+    path = inverse @ (terms @ (weight * off))
+    left = float((weight * (off - path @ terms) ** 2).sum()) / (free - 2)
+    return float(path[0]), math.sqrt(max(float(inverse[0, 0]) * left, 1e-12))

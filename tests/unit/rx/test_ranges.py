@@ -1,0 +1,164 @@
+"""Distances together: drives whose truth is known, with errors drawn as the sigmas say, or not so."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
+
+from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
+from evlcp_sdk.values import Bend, Range
+
+CHIP_US = 100.0
+FRAME_US = 3200.0
+PLACES = np.arange(1.0, 16) - 8
+SPACING_M = 0.06
+FOCAL_PX = 7200.0
+
+
+def bend_of(lean_deg: float, distance_m: float, noise_px: float, rng: np.random.Generator) -> Bend:
+    """Boundaries of a leaning bar, where a pinhole sees them: by perspective, not by a parabola."""
+    sine, cosine = math.sin(math.radians(lean_deg)), math.cos(math.radians(lean_deg))
+    along = PLACES * SPACING_M
+    seen_px = FOCAL_PX * along * cosine / (distance_m - along * sine)
+    spacing_px = FOCAL_PX * SPACING_M * cosine / distance_m
+    off_px = seen_px - spacing_px * PLACES + noise_px * rng.standard_normal(len(PLACES))
+    one_px = spacing_px * SPACING_M / distance_m
+    return Bend(PLACES, off_px / one_px, np.full(len(PLACES), one_px**2))
+
+
+def drive(
+    *,
+    frames: int,
+    sigma_m: float,
+    said_m: float | None = None,
+    start_m: float = 50.0,
+    speed_m_s: float = -10.0,
+    late_chips: float = 8.0,
+    lean_deg: float = 0.0,
+    bend_px: float | None = None,
+    outliers: tuple[int, ...] = (),
+    seed: int = 0,
+) -> np.ndarray:
+    """Errors and sigmas, float64 (frames, 2), of a drive whose distances err by `sigma_m`, said `said_m`."""
+    rng = np.random.default_rng(seed)
+    keeper, state, out = RangeKeeper(), Ranges(), []
+    for i in range(frames):
+        t_us = 7e6 + i * FRAME_US
+        true_m = start_m + speed_m_s * i * FRAME_US * 1e-6
+        late_m = true_m + speed_m_s * late_chips * CHIP_US * 1e-6
+        seen_m = late_m / math.cos(math.radians(lean_deg)) + sigma_m * rng.standard_normal()
+        seen_m += 0.5 * (i in outliers)
+        bend = None if bend_px is None else bend_of(lean_deg, true_m, bend_px, rng)
+        measured = Range(seen_m, said_m or sigma_m, 15, late_chips, bend)
+        state, found = keeper.step(state, t_us, CHIP_US, measured)
+        assert found.pairs == 15
+        out.append((found.distance_m - true_m, found.sigma_m))
+    return np.array(out)
+
+
+def nees(errors: np.ndarray) -> float:
+    return float(np.mean((errors[:, 0] / errors[:, 1]) ** 2))
+
+
+def test_without_a_distance_nothing_changes() -> None:
+    keeper, state = RangeKeeper(), Ranges()
+    for measured in (Range(math.nan, math.nan, 0), Range(50.0, math.nan, 3), Range(50.0, 0.0, 3)):
+        assert keeper.step(state, 0.0, CHIP_US, measured) == (state, measured)
+
+
+def test_a_first_distance_stays_but_for_the_lean_that_is_likely() -> None:
+    _, found = RangeKeeper().step(Ranges(), 0.0, CHIP_US, Range(50.0, 0.02, 15))
+
+    def chance(a: float) -> float:
+        return 0.97 * norm.pdf(a, 0, math.radians(0.7)) + 0.03 / math.radians(12)
+
+    most = math.radians(6)
+    mean = quad(lambda a: chance(a) * math.cos(a), -most, most, points=[0])[0]
+    square = quad(lambda a: chance(a) * (math.cos(a) - mean) ** 2, -most, most, points=[0])[0]
+    assert found.distance_m == pytest.approx(50 * mean, abs=2e-4)
+    assert found.sigma_m == pytest.approx(math.hypot(0.02 * mean, 50 * math.sqrt(square)), rel=0.02)
+
+
+def test_distances_are_brought_to_the_pilot() -> None:
+    """A frame is read in 3.2 ms, in whose second half a car at 30 m/s is nearer by 24 mm."""
+    errors = drive(frames=60, sigma_m=0.002, speed_m_s=-30.0, bend_px=0.01, seed=1)
+    assert abs(errors[20:, 0].mean()) < 0.005
+    # The first frame knows no speed, and says so.
+    assert abs(errors[0, 0]) < 3 * errors[0, 1]
+    assert errors[0, 1] > 0.015
+
+
+@pytest.mark.parametrize("truth", [0.6, 1.0, 3.0])
+def test_sigmas_become_true(truth: float) -> None:
+    """Errors of three times the sigma that the ranging says, or of little more than half."""
+    late = np.concatenate(
+        [drive(frames=90, sigma_m=0.05 * truth, said_m=0.05, bend_px=0.01, seed=s)[20:] for s in range(12)]
+    )
+    # 840 errors; the sigmas of a drive are known from its frames alone.
+    assert 0.75 < nees(late) < 1.35
+
+
+def test_braking_is_no_scatter() -> None:
+    rng = np.random.default_rng(3)
+    keeper, state, sigmas = RangeKeeper(), Ranges(), []
+    for i in range(150):
+        t_s = i * FRAME_US * 1e-6
+        true_m = 40 - 15 * t_s + 8 * t_s**2 / 2
+        measured = Range(true_m + 0.01 * rng.standard_normal(), 0.01, 15)
+        state, found = keeper.step(state, t_s * 1e6, CHIP_US, measured)
+        sigmas.append(found.sigma_m)
+    plain = drive(frames=150, sigma_m=0.01, start_m=40.0, late_chips=0.0, seed=3)
+    assert np.mean(sigmas[60:]) < 1.15 * np.mean(plain[60:, 1])
+
+
+def test_an_outlier_says_so_and_leaves_the_others() -> None:
+    errors = drive(frames=60, sigma_m=0.02, outliers=(40,), seed=4)
+    without = drive(frames=60, sigma_m=0.02, seed=4)
+    assert errors[40, 1] > 0.4
+    assert errors[41:, 1].max() < 2 * without[41:, 1].max()
+
+
+@pytest.mark.parametrize("lean_deg", [-5.0, -3.0, 0.0, 4.0])
+def test_a_lean_is_found_in_the_bend(lean_deg: float) -> None:
+    errors = np.stack(
+        [
+            drive(frames=60, sigma_m=0.015, start_m=42.0, lean_deg=lean_deg, bend_px=0.04, seed=s)
+            for s in range(8)
+        ]
+    )
+    # A frame tells a lean to 2.5 degrees here: the first ten cannot tell a lean from none.
+    assert 0.5 < nees(errors[:, 10:].reshape(-1, 2)) < 2
+    # What is left of 1 - cos(lean), up to 0.16 m.
+    assert abs(errors[:, -1, 0].mean()) < 0.02
+
+
+def test_a_level_bar_costs_nothing_to_speak_of() -> None:
+    """Sigmas of a level bar at 45 m, against those of a keeper that knows that it is level."""
+    errors = drive(frames=60, sigma_m=0.015, start_m=45.0, bend_px=0.04, seed=3)
+    assert errors[15:, 1].mean() < 1.3 * 0.015
+
+
+def test_a_distance_keeps_nothing_of_old_bends_and_distances() -> None:
+    keeper, state = RangeKeeper(), Ranges()
+    rng = np.random.default_rng(5)
+    for i in range(400):
+        bend = bend_of(4.0, 45.0, 0.04, rng)
+        state, _ = keeper.step(state, i * FRAME_US, CHIP_US, Range(45.1, 0.01, 15, 8.0, bend))
+    assert len(state.past) <= 0.3 / (FRAME_US * 1e-6) + 1
+    assert state.bend[1].max() < 1.01 * bend.weight.max() / (1 - math.exp(-FRAME_US * 1e-6))
+    new, _ = keeper.step(state, 400 * FRAME_US + 20e6, CHIP_US, Range(45.1, 0.01, 15, 8.0, bend))
+    assert len(new.past) == 1
+    assert new.bend[1] == pytest.approx(bend.weight)
+
+
+def test_another_layout_s_bend_starts_anew() -> None:
+    keeper, rng = RangeKeeper(), np.random.default_rng(6)
+    bend = bend_of(0.0, 45.0, 0.04, rng)
+    state, _ = keeper.step(Ranges(), 0.0, CHIP_US, Range(45.0, 0.01, 15, 8.0, bend))
+    few = Bend(bend.place[:4], bend.off[:4], bend.weight[:4])
+    state, found = keeper.step(state, FRAME_US, CHIP_US, Range(45.0, 0.01, 4, 8.0, few))
+    assert state.bend.shape == (2, 4)
+    # Four boundaries say nothing of a parabola beside scale, place and the pilots' pattern.
+    assert math.isfinite(found.sigma_m)
