@@ -260,7 +260,9 @@ class BackgroundSpec:
     texture: Annotated[
         float, Field(ge=0, le=2, description="Rms of its logarithm over the image; a guess.")
     ] = 0.3
-    texture_px: Annotated[float, Field(ge=2, le=64, description="Size of its patches; a guess.")] = 12.0
+    texture_px: Annotated[
+        float, Field(ge=2, le=64, description="Distance at which its correlation is 1 / e; a guess.")
+    ] = 12.0
     texture_step_px: Annotated[
         float,
         Field(

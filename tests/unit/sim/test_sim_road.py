@@ -338,6 +338,16 @@ def test_texture_that_moves_gives_the_events_of_its_own_contrast(tmp_path: Path)
     assert abs(float(count.mean())) > 1
 
 
+@pytest.mark.parametrize("texture_px", [3.0, 12.0])
+def test_texture_is_correlated_over_its_length(texture_px: float) -> None:
+    field = np.log(Simulation(Scene(background=BackgroundSpec(texture=0.7, texture_px=texture_px)))._texture)
+    field -= field.mean()
+    assert field.std() == pytest.approx(0.7, rel=1e-6)
+    for axis in (0, 1):
+        lagged = (field * np.roll(field, round(texture_px), axis)).mean() / field.var()
+        assert lagged == pytest.approx(math.exp(-1), abs=0.05)
+
+
 def test_background_is_simulated_around_the_sources() -> None:
     scene = Scene(
         duration_s=0.03,

@@ -10,6 +10,7 @@ import pytest
 from evlcp_sdk.cli.demo import demo_campaign
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.jobs.inline import Inline
+from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.sim.scene import links_of
 from evlcp_sdk.study.campaign.plan import Job
 from evlcp_sdk.study.campaign.store import Store
@@ -163,6 +164,17 @@ def test_the_shipped_campaigns_are_read() -> None:
     # The guesses are set in one way wherever the paper's drive is simulated.
     guesses = {json.dumps([s.identity["sensor"], s.identity["lens"]]) for s in [*demo.scenes, *paper.scenes]}
     assert len(guesses) == 1
+
+
+def test_a_road_is_swept_in_steps_by_the_default_link_and_the_papers() -> None:
+    plan = plan_of(ROOT / "examples" / "campaigns" / "road.toml")
+    assert [dict(link.labels)["variant"] for link in plan.links] == ["default", "paper"]
+    assert plan.links[0].identity["digest"] == resolve({}).digest
+    names = [str(dict(scene.labels)["variant"]).split(": ") for scene in plan.scenes]
+    assert names.pop(0) == ["clean road", "nothing"]
+    assert all(len({condition for condition, _ in names[i : i + 4]}) == 1 for i in range(0, len(names), 4))
+    digests = {json.dumps(scene.identity) for scene in plan.scenes}
+    assert len(digests) == len(plan.scenes)
 
 
 def test_the_demo(evlcp: Evlcp, tmp_path: Path) -> None:
