@@ -226,11 +226,34 @@ def count_rows(
 ) -> None:
     """Add events to counts (polarity, blocks of rows, steps), from `start_us` (2,) and edge `top` on."""
     _, blocks, steps = counts.shape
-    for i in range(np.searchsorted(t_us, start_us.min()), t_us.size):
+    first = np.searchsorted(t_us, start_us.min())
+    last = np.searchsorted(t_us, start_us.max() + steps * step_us)
+    for i in range(first, last):
         s = int(np.floor((t_us[i] - start_us[p[i]]) / step_us))
         b = int(np.floor((y[i] - top) / block))
         if 0 <= s < steps and 0 <= b < blocks:
             counts[p[i], b, s] += 1
+
+
+@njit(cache=True, nogil=True)
+def fit_rows(counts: Array, chips: Array, chip_steps: int, fit: Array) -> None:
+    """How well each block's counts (polarity, blocks, steps) fit chips (-1, +1) at each lag: `fit`.
+
+    Positive events are where chips are +1, negative ones where they are -1.
+    """
+    steps = counts.shape[2]
+    running = np.empty(steps + 1)
+    for polarity in range(2):
+        for b in range(counts.shape[1]):
+            running[0] = 0.0
+            for s in range(steps):
+                running[s + 1] = running[s] + counts[polarity, b, s]
+            for lag in range(fit.shape[2]):
+                total = 0.0
+                for c in range(chips.size):
+                    at = lag + c * chip_steps
+                    total += chips[c] * (running[at + chip_steps] - running[at])
+                fit[polarity, b, lag] = total if polarity else -total
 
 
 @njit(cache=True, nogil=True)

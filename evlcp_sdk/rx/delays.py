@@ -66,10 +66,7 @@ class RowDelays:
     """
 
     def __init__(self, preamble: NDArray[np.int8]) -> None:
-        chips = 2.0 * chips_of_values(preamble) - 1
-        padded = np.concatenate([[0.0], chips, [0.0]])
-        self._chips = len(chips)
-        self._weights = padded[:-1] - padded[1:]
+        self._chips = 2.0 * chips_of_values(preamble) - 1
 
     def hear(
         self,
@@ -106,16 +103,14 @@ class RowDelays:
         step_us = lock.chip_us / _STEPS
         top_px = centre_px - (height_px - 1) / 2
         start_us = np.array([lock.delay_off_us, lock.delay_on_us]) + lock.packet_t_us - reach * step_us
-        counts = np.zeros((2, blocks, self._chips * _STEPS + 2 * reach))
+        counts = np.zeros((2, blocks, len(self._chips) * _STEPS + 2 * reach))
         for _, e in pieces:
             if len(e) and e.t_us[-1] >= start_us.min():
                 _kernels.count_rows(
                     e.t_us, e.y, e.p, start_us, step_us, top_px - 0.5, height_px / blocks, counts
                 )
-        # A sum over chips of a window's count is a difference of the running count at the chips' bounds.
-        running = np.concatenate([np.zeros((2, blocks, 1)), np.cumsum(counts, axis=2)], axis=2)
-        bounds = np.arange(2 * reach + 1)[:, None] + _STEPS * np.arange(self._chips + 1)
-        fit = (running[:, :, bounds] @ self._weights) * np.array([-1.0, 1.0])[:, None, None]
+        fit = np.empty((2, blocks, 2 * reach + 1))
+        _kernels.fit_rows(counts, self._chips, _STEPS, fit)
         rows_px = (np.arange(blocks) + 0.5) * height_px / blocks
         total, weight = 0.0, 0.0
         for part, seen in zip(fit, counts.sum(2), strict=True):

@@ -89,6 +89,13 @@ def count_rows(t_us, y, p, start_us, step_us, top, block, shape):
     return counts
 
 
+def fit_rows(counts, chips, chip_steps, lags):
+    """Each block's counts correlated with the chips laid out in steps."""
+    laid = np.repeat(chips, chip_steps)
+    signed = counts * np.array([-1, 1])[:, None, None]
+    return np.array([[np.correlate(block, laid)[:lags] for block in part] for part in signed])
+
+
 def blobs(selected):
     """By SciPy: (mean column + row * 1j, cluster, cells), clusters in order, each blob by its first cell."""
     found = []
