@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.grid import DueFrame
+from evlcp_sdk.rx.look import Look
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.values import Frame, Packet
 
-__all__ = ["EchoQueue", "Echoes", "Sighting", "originals", "repeats"]
+__all__ = ["EchoQueue", "Echoes", "Sighting", "brighter", "originals", "repeats"]
 
 _REPEATED = 0.25
 """Share of the symbols that a reflection repeats at the least; with fewer, nothing would be read of it."""
@@ -35,11 +36,14 @@ _MIRRORED = 5.0
 bar: one installation in 150 hangs upside down over a mirror."""
 
 _LIGHT = 0.3
-"""Logarithm of the events of the bar's image over those of its reflection, and how much it varies with the
-blur: a pixel answers a step with few events, however high it is, so a fifth of the light takes a third."""
+"""Logarithm of the events of the bar's image over those of its reflection, and how much it varies: a pixel
+answers a step with few events, however high it is, so that a fifth of the light takes a third of them."""
 
-_STAYS = 3.0
-"""Log odds for what was said to be the bar before: twenty times likelier, another takes its place."""
+_MOST_LIGHT = 3.0
+"""Log odds that light can give at the most: a reflection that is blurred wakes more pixels than the bar."""
+
+_STAYS = 0.5
+"""Log odds for what was said to be the bar before: what wavers by less changes nothing."""
 
 _ROW_US = 0.35
 """Longest time that a sensor takes to read a row, us: of two images, the lower one may come as much later."""
@@ -64,6 +68,12 @@ class Sighting:
     frame: Frame
     light: float
     mirrored: bool
+
+    @classmethod
+    def of(cls, frame: Frame, look: Look) -> "Sighting":
+        """What a frame's image shows."""
+        light = float(look.presence.pixels.sum()) / int(look.placement.seen.sum())
+        return cls(frame, light, look.placement.mirrored)
 
 
 def repeats(one: NDArray[np.int64], other: NDArray[np.int64], codewords: int) -> float:
@@ -90,6 +100,16 @@ def repeats(one: NDArray[np.int64], other: NDArray[np.int64], codewords: int) ->
     return alike * math.log(here / there) + unlike * math.log((1 - here) / (1 - there))
 
 
+def brighter(light: float) -> float:
+    """Log odds of the first of two images being the bar, by the logarithm of its light over the other's.
+
+    >>> [round(brighter(light), 1) for light in (0.0, 0.3, -1.2)]
+    [0.0, 2.0, -3.0]
+    """
+    # Two normal distributions, as far from 0 as they are wide.
+    return min(max(2 * light / _LIGHT, -_MOST_LIGHT), _MOST_LIGHT)
+
+
 def originals(
     members: Sequence[int], odds: Mapping[tuple[int, int], float], before: Iterable[int] = ()
 ) -> int:
@@ -102,7 +122,7 @@ def originals(
 
     >>> originals([0, 1, 2], {(0, 1): -4.0, (0, 2): 1.0, (1, 2): 6.0})
     1
-    >>> originals([0, 1], {(0, 1): -1.0}, before=[0])
+    >>> originals([0, 1], {(0, 1): -0.4}, before=[0])
     0
     """
     known = set(before)
@@ -122,6 +142,7 @@ class _Pair:
         evidence: That one repeats the other, a log-likelihood ratio within bounds.
         same: Whether they are one.
         frames: Frames in common.
+        lit: Those of them that show light in both.
         light: Sum of the logarithms of the first one's light over the second's.
         mirrored: Frames in which only the second is mirrored less those in which only the first is.
         last_us: Time of the newest frame in common, us.
@@ -130,6 +151,7 @@ class _Pair:
     evidence: float = 0.0
     same: bool = False
     frames: int = 0
+    lit: int = 0
     light: float = 0.0
     mirrored: int = 0
     last_us: float = -math.inf
@@ -142,14 +164,15 @@ class _Pair:
             self.same = self.evidence > 0
         self.frames += 1
         if one.light > 0 and other.light > 0:
+            self.lit += 1
             self.light += math.log(one.light / other.light)
         self.mirrored += other.mirrored - one.mirrored
         self.last_us = max(one.frame.t_us, other.frame.t_us, self.last_us)
 
     def odds(self) -> float:
         """Log odds of the first being the bar and the second its reflection."""
-        # Two normal distributions, as far apart as they are wide.
-        return (_MIRRORED * self.mirrored + 2 * self.light / _LIGHT) / max(self.frames, 1)
+        turned = _MIRRORED * self.mirrored / max(self.frames, 1)
+        return turned + brighter(self.light / max(self.lit, 1))
 
 
 class Echoes:

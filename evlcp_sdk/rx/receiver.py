@@ -26,6 +26,9 @@ __all__ = ["Receiver"]
 _NO_RANGE = Range(math.nan, math.nan, 0)
 _NO_POINTS = (np.empty((0, 2)), np.empty(0))
 
+_TAIL_CHIPS = 2
+"""A frame is whole if the stream goes on for this long after it: its last events come late."""
+
 _COUNTS = (
     "events_in_regions",
     "regions_opened",
@@ -62,6 +65,7 @@ class Receiver:
         centres_m = link.bar.cluster_centres_m()
         self._packet = link.packet
         self._step_us = link.regions.step_us
+        self._tail_us = _TAIL_CHIPS * link.packet.chip_us
         self._announcer = Announcer(hook)
         self._steps = Steps(link, self._announcer)
         self._timeline = Timeline(self._step_us, link.camera.width, link.camera.height)
@@ -120,7 +124,7 @@ class Receiver:
             self._announcer.lap("regions", region.latest)
         for region in regions:
             transmitter = self._hear(region, step)
-            self._decode_due(transmitter, step.end_us)
+            self._decode_due(transmitter, step.end_us - self._tail_us)
             self._transmitters.forget(transmitter, step.end_us)
             if region.released:
                 self._counts["regions_released"] += 1
@@ -202,13 +206,12 @@ class Receiver:
             echo_of=self._echoes.echo_of(transmitter.number),
         )
         self._announcer.total("frame", frame)
-        light = float(look.presence.pixels.sum()) / int(look.placement.seen.sum())
-        return Sighting(frame, light, look.placement.mirrored)
+        return Sighting.of(frame, look)
 
     def _end(self, transmitter: Transmitter, now_us: float) -> None:
         """Decode what a region that has ended still shows; its last packet is over."""
         seen_us = transmitter.region.latest.t_us + self._step_us
-        self._decode_due(transmitter, min(now_us, seen_us))
+        self._decode_due(transmitter, min(now_us - self._tail_us, seen_us))
         self._judged.end(transmitter.packets)
 
     def _read(self, packets: list[Packet]) -> list[Packet]:

@@ -111,7 +111,7 @@ def measure_recording(
     """Receive a recording with every variant, and compare what came out with the truth.
 
     Its first packets are read and received once before, so that no kernel is loaded or compiled while time
-    runs. The bound is that of the frames as the first variant decodes them; a bar of several columns has none.
+    runs. The bound is of the frames as the first variant decodes them; a bar of several columns has none.
 
     Args:
         name: Of the table.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.rx.echoes import Echoes, EchoQueue, Sighting, originals, repeats
+from evlcp_sdk.rx.echoes import Echoes, EchoQueue, Sighting, brighter, originals, repeats
 from evlcp_sdk.rx.grid import PacketGrid
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.receiver import Receiver
@@ -95,7 +95,7 @@ def test_a_reflection_of_which_most_is_misread_is_found_within_a_packet() -> Non
     for _ in range(50):
         echoes = Echoes(FORMAT, CODEWORDS)
         for n in range(10):
-            echoes.judge([sighting(0, n, said(n)), sighting(1, n, misread(said(n), 4, rng), light=50)])
+            echoes.judge([sighting(0, n, said(n)), sighting(1, n, misread(said(n), 4, rng), light=70)])
         assert echoes.echo_of(1) == 0
 
 
@@ -120,7 +120,7 @@ def test_frames_at_other_times_are_not_compared() -> None:
         echoes.judge([sighting(0, n, said(n)), sighting(1, n, said(n), late_us=60)])
     assert echoes.echo_of(0) is echoes.echo_of(1) is None
     # The lower of two images is read later: 150 rows of 0.2 us are 30 us.
-    echoes.judge([sighting(0, 20, said(20)), sighting(2, 20, said(20), late_us=75, y_px=450, light=50)])
+    echoes.judge([sighting(0, 20, said(20)), sighting(2, 20, said(20), late_us=75, y_px=450, light=70)])
     assert echoes.echo_of(2) == 0
 
 
@@ -145,20 +145,34 @@ def test_what_comes_late_is_judged_by_what_was_before() -> None:
     echoes = Echoes(FORMAT, CODEWORDS)
     for n in range(25):
         echoes.judge([sighting(0, n, said(n))])
-    echoes.judge([sighting(1, n, said(n), light=50) for n in range(5, 25)])
+    echoes.judge([sighting(1, n, said(n), light=70) for n in range(5, 25)])
     assert echoes.echo_of(1) == 0
 
 
 def test_the_verdict_is_stable() -> None:
     rng = np.random.default_rng(5)
-    echoes = Echoes(FORMAT, CODEWORDS)
-    for n in range(200):
-        # By light alone, the two of them are alike, and now the one is brighter, now the other.
-        light = 100 * math.exp(rng.normal(0, 0.3))
-        echoes.judge([sighting(0, n, said(n), light=110), sighting(1, n, said(n), light=light)])
-        if n == 0:
-            first = echoes.echo_of(0), echoes.echo_of(1)
-        assert (echoes.echo_of(0), echoes.echo_of(1)) == first
+    for light in (100.0, 85.0, 50.0, 30.0):
+        echoes, verdicts = Echoes(FORMAT, CODEWORDS), []
+        for n in range(200):
+            # Frame by frame, now the one has more light, now the other.
+            now = light * math.exp(rng.normal(0, 0.15))
+            echoes.judge([sighting(0, n, said(n)), sighting(1, n, said(n), light=now)])
+            verdicts.append((echoes.echo_of(0), echoes.echo_of(1)))
+        assert sum(a != b for a, b in pairwise(verdicts)) <= 1
+        assert len(set(verdicts[10:])) == 1
+        if light != 100:
+            assert verdicts[-1] == (None, 0)
+
+
+def test_light_tells_the_bar_unless_one_stands_upside_down() -> None:
+    for light in (0.05, 0.3, 3.0):
+        assert brighter(light) == -brighter(-light) > 0
+    for light in (70, 150, 500):
+        echoes = Echoes(FORMAT, CODEWORDS)
+        for n in range(5):
+            image = sighting(0, n, said(n), light=light, mirrored=True)
+            echoes.judge([image, sighting(1, n, said(n))])
+            assert (echoes.echo_of(0), echoes.echo_of(1)) == (1, None)
 
 
 def test_a_bar_that_appears_after_its_reflection_takes_its_place() -> None:
@@ -170,19 +184,19 @@ def test_a_bar_that_appears_after_its_reflection_takes_its_place() -> None:
         echoes.judge([sighting(0, n, said(n), light=60, mirrored=True), sighting(1, n, said(n), light=100)])
         assert (echoes.echo_of(0), echoes.echo_of(1)) == (1, None)
     # A weaker reflection that comes later changes nothing.
-    echoes.judge([sighting(k, 12, said(12), light=light) for k, light in ((0, 60), (1, 100), (2, 40))])
+    echoes.judge([sighting(k, 12, said(12), light=light) for k, light in ((0, 60), (1, 100), (2, 65))])
     assert [echoes.echo_of(k) for k in range(3)] == [1, None, 1]
 
 
 def test_a_reflection_outlives_its_bar_by_a_second() -> None:
     echoes = Echoes(FORMAT, CODEWORDS)
-    echoes.judge([sighting(0, 0, said(0)), sighting(1, 0, said(0), light=50)])
+    echoes.judge([sighting(0, 0, said(0)), sighting(1, 0, said(0), light=70)])
     for n in range(1, 400):
-        echoes.judge([sighting(1, n, said(n), light=50)])
+        echoes.judge([sighting(1, n, said(n), light=70)])
         t_us = sighting(1, n, said(n)).frame.t_us - sighting(1, 0, said(0)).frame.t_us
         assert echoes.echo_of(1) == (0 if t_us <= 1e6 else None)
     # It is in sight again.
-    echoes.judge([sighting(0, 400, said(400)), sighting(1, 400, said(400), light=50)])
+    echoes.judge([sighting(0, 400, said(400)), sighting(1, 400, said(400), light=70)])
     assert echoes.echo_of(1) == 0
 
 
@@ -221,7 +235,7 @@ def test_originals_against_every_choice() -> None:
         matrix -= matrix.T
         before = {int(rng.integers(0, size))} if rng.random() < 0.5 else set()
         odds = {(i, j): float(matrix[i, j]) for i in range(size) for j in range(i + 1, size)}
-        score = [matrix[i].sum() / 2 + 3.0 * (i in before) for i in range(size)]
+        score = [matrix[i].sum() / 2 + 0.5 * (i in before) for i in range(size)]
         assert originals(range(size), odds, before) == int(np.argmax(score))
 
 
@@ -234,7 +248,7 @@ def test_the_queue_marks_what_the_next_step_tells() -> None:
     assert due is not None
     bar, image = PacketAssembler(FORMAT.frames), PacketAssembler(FORMAT.frames)
     for n in range(10):
-        queue.add(image, due, sighting(0, n, said(n), light=50))
+        queue.add(image, due, sighting(0, n, said(n), light=70))
     assert queue.step() == []
     assert queue
     for n in range(10):
