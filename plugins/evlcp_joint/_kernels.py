@@ -387,16 +387,21 @@ def solve(
     factor, move = np.zeros((5, 5)), np.empty(5)
     cost = equations(codes, known, offset, when, profile, huber, prior, seen_values, fit, normal, right)
     damping = 1e-3
+    outside = False
     for _ in range(steps):
         if not _damped_step(normal, right, damping, factor, move):
             return False
         new_fit = fit + move
-        # A spacing below a pixel, or a boundary seven times as wide as a lens makes it, is none.
-        if not np.all(np.isfinite(new_fit)) or new_fit[0] < 1 or abs(new_fit[4]) > 2:
+        if not np.all(np.isfinite(new_fit)):
             return False
-        new_cost = equations(
-            codes, known, offset, when, profile, huber, prior, seen_values, new_fit, new_normal, new_right
-        )
+        # A spacing below a pixel, or a boundary seven times as wide as a lens makes it, is none; a long step
+        # may lead there where a shorter one does not.
+        outside = new_fit[0] < 1 or abs(new_fit[4]) > 2
+        new_cost = np.inf
+        if not outside:
+            new_cost = equations(
+                codes, known, offset, when, profile, huber, prior, seen_values, new_fit, new_normal, new_right
+            )
         if new_cost <= cost:
             fit[:] = new_fit
             normal[:] = new_normal
@@ -407,7 +412,7 @@ def solve(
                 return True
         else:
             damping *= 10
-    return True
+    return not outside
 
 
 @njit(cache=True, nogil=True)
