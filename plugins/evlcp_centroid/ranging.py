@@ -22,12 +22,12 @@ _NONE = Range(float("nan"), float("nan"), 0)
 class CentroidRanging(Ranging):
     """Similarity (shift, turn, scale) that brings the layout to the centres of gravity best.
 
-    Each cluster's centre is the mean of its map; clusters far from the fit, by more than three times the
-    median, are left out and the fit is made again. Sigma is that of the least squares.
+    Each cluster's centre is the mean of its map. From a start by medians, clusters far from the fit, by more
+    than three times the median, are left out. Sigma is that of the least squares.
     """
 
     skip_outer: Annotated[
-        int, Field(ge=0, description="Clusters left out at each end: an outer edge has no neighbour.")
+        int, Field(ge=0, description="Seen clusters left out at each end: an outer edge has no neighbour.")
     ] = 1
     min_clusters: Annotated[int, Field(ge=3, description="Clusters that must be seen.")] = 5
 
@@ -38,38 +38,52 @@ class CentroidRanging(Ranging):
             ConfigError: Fewer clusters are left than a distance needs.
         """
         centres = bar.cluster_centres_m()
-        used = np.arange(self.skip_outer, bar.clusters - self.skip_outer)
-        if len(used) < self.min_clusters:
+        left = bar.clusters - 2 * self.skip_outer
+        if left < self.min_clusters:
             raise ConfigError(
-                f"ranging 'centroid' uses {len(used)} of {bar.clusters} clusters (skip_outer ="
+                f"ranging 'centroid' uses {max(left, 0)} of {bar.clusters} clusters (skip_outer ="
                 f" {self.skip_outer}), expected at least min_clusters = {self.min_clusters}"
             )
-        layout = centres[used, 0] + 1j * centres[used, 1]
+        layout = centres[:, 0] + 1j * centres[:, 1]
+        i, j = np.triu_indices(bar.clusters, 1)
+        apart = layout[j] - layout[i]
 
         def measure(view: FrameView) -> Range:
-            maps = view.presence.pixels[used].astype(np.float64)
+            maps = view.presence.pixels.astype(np.float64)
             weight = maps.sum((1, 2))
-            seen = weight > 0
-            if seen.sum() < self.min_clusters:
+            # The outermost of what is seen may be cut off by what hides the others.
+            seen = np.flatnonzero(weight > 0)
+            seen = seen[self.skip_outer : len(seen) - self.skip_outer]
+            if len(seen) < self.min_clusters:
                 return _NONE
             down = maps.sum(2)[seen] @ np.arange(maps.shape[1]) / weight[seen]
             right = maps.sum(1)[seen] @ np.arange(maps.shape[2]) / weight[seen]
             image, place = right + 1j * down, layout[seen]
-            keep = np.ones(len(image), bool)
+            # The start is robust: medians of pairs half of what is seen apart, and of what they leave.
+            at = np.full(bar.clusters, np.nan, np.complex128)
+            at[seen] = image
+            step = (at[j] - at[i]) / apart
+            both = np.isfinite(step)
+            both &= np.abs(apart) >= 0.5 * np.abs(apart[both]).max()
+            scale = complex(np.median(step[both].real), np.median(step[both].imag))
+            rest = image - scale * place
+            shift = complex(np.median(rest.real), np.median(rest.imag))
             for _ in range(2):
-                middle = place[keep].mean()
-                spread = place - middle
-                power = float((np.abs(spread[keep]) ** 2).sum())
-                scale = (np.conj(spread[keep]) @ image[keep]) / power
-                off = np.abs(image - image[keep].mean() - scale * spread)
-                variance = float((off[keep] ** 2).sum()) / max(2 * int(keep.sum()) - 4, 1)
-                kept, keep = keep, off <= 3 * np.median(off) + 1e-9
+                off = np.abs(image - shift - scale * place)
+                keep = off <= 3 * np.median(off) + 1e-9
                 if keep.sum() < self.min_clusters:
-                    break
-            size = float(np.abs(scale))
+                    return _NONE
+                spread = place[keep] - place[keep].mean()
+                power = float((np.abs(spread) ** 2).sum())
+                scale = complex(np.conj(spread) @ image[keep]) / power
+                shift = complex(image[keep].mean() - scale * place[keep].mean())
+            off = np.abs(image[keep] - shift - scale * place[keep])
+            kept = int(keep.sum())
+            variance = float((off**2).sum()) / max(2 * kept - 4, 1)
+            size = abs(scale)
             if not size > 0:
                 return _NONE
             distance = camera.focal_px / size
-            return Range(distance, distance * float(np.sqrt(variance / power)) / size, int(kept.sum()))
+            return Range(distance, distance * float(np.sqrt(variance / power)) / size, kept)
 
         return measure

@@ -59,6 +59,7 @@ def phase_only_correlation(
 class PocRanging(Ranging):
     """Phase-only correlation between the maps of cluster pairs, L = f S / (l' a) (arXiv 2510.17203).
 
+    Of a bar with hidden ends, the clusters that are seen count as if they were all.
     A pair whose clusters lie a spacing off the scale that all clusters agree on is left out first.
     The shift of each pair comes from the Dirichlet kernel that fits the correlation's peak best. A shift
     has the same error whatever its length, so a pair's distance is the better the farther apart its clusters:
@@ -80,11 +81,14 @@ class PocRanging(Ranging):
     ] = ()
     skip_outer: Annotated[
         int,
-        Field(ge=0, description="Clusters left out at each end: an outer edge has no neighbour to bound it."),
+        Field(
+            ge=0,
+            description="Seen clusters left out at each end: an outer edge has no neighbour to bound it.",
+        ),
     ] = 1
     min_spacing: Annotated[
         float,
-        Field(ge=0, le=1, description="Least spacing of a pair, as a share of the longest."),
+        Field(ge=0, le=1, description="Least spacing of a pair, as a share of the longest that is seen."),
     ] = 0.5
     drop_extremes: Annotated[
         int, Field(ge=0, description="Pairs dropped at each end of the sorted distances.")
@@ -117,19 +121,21 @@ class PocRanging(Ranging):
             ConfigError: Fewer than two clusters are left to pair.
         """
         used = self._used(bar.clusters)
+        if not self.clusters:
+            # Which are outermost is told by what is seen.
+            used = np.arange(bar.clusters)
+        skip = 0 if self.clusters else self.skip_outer
         centres = bar.cluster_centres_m()
-        i, j = np.triu_indices(len(used), 1)
-        spacing = np.hypot(*(centres[used[j]] - centres[used[i]]).T)
-        far = spacing >= self.min_spacing * spacing.max() - 1e-12
-        first, second, spacing = used[i[far]], used[j[far]], spacing[far]
+        a, b = np.triu_indices(len(used), 1)
+        all_first, all_second = used[a], used[b]
+        all_spacing = np.hypot(*(centres[all_second] - centres[all_first]).T)
+        most_pairs = _far(all_spacing, self.min_spacing, *_inner(all_first, all_second, used, skip))
         neighbour = float(np.min(np.hypot(*(centres[1:] - centres[:-1]).T)))
 
         # The scale that all clusters agree on shows which ones are out of place.
         every = np.arange(bar.clusters)
         i, j = np.triu_indices(bar.clusters, 1)
         apart = np.hypot(*(centres[j] - centres[i]).T)
-        wide = apart >= 0.5 * apart.max()
-        wide_a, wide_b, wide_m = i[wide], j[wide], apart[wide]
 
         def measure(view: FrameView) -> Range:
             from evlcp_poc import _kernels
@@ -137,15 +143,20 @@ class PocRanging(Ranging):
             maps = view.presence.pixels
             middle = np.empty((len(every), 2), np.int64)
             _kernels.middles(maps, every, self.min_pixels, middle)
-            px_per_m = _kernels.median_scale(middle, wide_a, wide_b, wide_m)
+            lit = middle[:, 0] >= 0
+            wide = _far(apart, 0.5, lit[i], lit[j])
+            px_per_m = _kernels.median_scale(middle, i[wide], j[wide], apart[wide])
             if px_per_m <= 0:
                 return _NONE
             neighbour_px = px_per_m * neighbour
+            seen = used[lit[used]]
+            far = _far(all_spacing, self.min_spacing, *_inner(all_first, all_second, seen, skip))
+            first, second, spacing = all_first[far], all_second[far], all_spacing[far]
             pairs, apart_px = np.empty(len(first), np.int64), np.empty((len(first), 2))
             n = _kernels.pairs_in_place(
                 middle, first, second, spacing, px_per_m, neighbour_px, pairs, apart_px
             )
-            if n < min(self.min_pairs, len(first)):
+            if n < min(self.min_pairs, int(most_pairs.sum())):
                 return _NONE
             pairs, apart_px = pairs[:n], apart_px[:n]
             a, b, apart_m = first[pairs], second[pairs], spacing[pairs]
@@ -186,6 +197,24 @@ class PocRanging(Ranging):
                 f" expected two or more different clusters of 0 to {clusters - 1}"
             )
         return np.sort(used)
+
+
+def _inner(
+    first: NDArray[np.int64], second: NDArray[np.int64], seen: NDArray[np.int64], skip: int
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Whether the first, and the second, of each pair is seen and not among the outermost that are."""
+    inner = seen[skip : len(seen) - skip]
+    return np.isin(first, inner), np.isin(second, inner)
+
+
+def _far(
+    spacing: NDArray[np.float64], share: float, first: NDArray[np.bool_], second: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Pairs of which both count, with a share of the longest spacing of these, or more."""
+    both = first & second
+    if not both.any():
+        return both
+    return np.asarray(both & (spacing >= share * spacing[both].max() - 1e-12))
 
 
 def _full_band(height: int, width: int) -> tuple[int, int]:

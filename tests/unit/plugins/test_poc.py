@@ -383,11 +383,15 @@ def test_dark_clusters_cost_only_their_pairs(dark):
     maps[dark] = 0
     found = measured(maps, drop_extremes=0, outlier_iqr=1e6, min_pairs=1)
     lit = [k for k in range(1, 15) if k not in dark]
-    assert found.pairs == sum(j - i >= 6.5 for i in lit for j in lit)
+    longest = max(lit) - min(lit)
+    assert found.pairs == sum(j - i >= longest / 2 for i in lit for j in lit)
     assert found.distance_m == pytest.approx(50, rel=1e-3)
 
 
-@pytest.mark.parametrize(("dark", "pairs"), [((1, 2, 3), 10), ((1, 2, 3, 4), 6), (range(4, 12), 9)])
+@pytest.mark.parametrize(
+    ("dark", "pairs"),
+    [((1, 2, 3), 21), (range(4, 12), 9), (range(5, 13), 8), ((*range(4), *range(11, 16)), 6)],
+)
 def test_a_distance_needs_its_pairs(dark, pairs):
     maps = image_of(BAR, 50)
     maps[list(dark)] = 0
@@ -404,6 +408,18 @@ def test_a_cluster_out_of_place_is_dropped(cluster, down):
     assert found.distance_m == pytest.approx(50, rel=1.5e-3)
     assert abs(everything.distance_m / 50 - 1) > 2.5e-3
     assert everything.sigma_m > 2 * found.sigma_m
+
+
+@pytest.mark.parametrize("hidden", [range(4), range(11, 16), (0, 1, 14, 15)])
+def test_hidden_ends_leave_the_distance(hidden):
+    maps = image_of(BAR, 50)
+    maps[list(hidden)] = 0
+    found = measured(maps)
+    assert found.distance_m == pytest.approx(50, rel=1.5e-3)
+    lit = [k for k in range(16) if k not in hidden]
+    # The outermost of what is seen may be cut off by what hides the others.
+    maps[[lit[0], lit[-1]]] = np.roll(maps[[lit[0], lit[-1]]], 4, 1)
+    assert measured(maps).distance_m == pytest.approx(50, rel=1.5e-3)
 
 
 def test_outermost_clusters_do_not_matter():
