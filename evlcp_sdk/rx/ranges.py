@@ -25,6 +25,9 @@ _SCATTER_WORTH = 8.0
 _OUTLIER = 4.0
 """Sigmas from the others, 1 of 16000 by chance, beyond which how far off a distance is becomes its sigma."""
 
+_LEAST_SIGMA = 1e-6
+"""Of the distance: ideal images have less, which says nothing of anything."""
+
 _LEVEL_DEG, _LEANING_DEG, _LEANING_SHARE = 0.7, 6.0, 0.03
 """What is likely of a bar's lean before it is measured: none but for a mount's error and the car's springs
 (sigma), and of one camera in thirty, whose mount nobody levelled, anything up to the steepest."""
@@ -83,9 +86,10 @@ class RangeKeeper:
             measured: As the ranging gave it; without a distance, or a sigma, it is given back.
         """
         distance_m, sigma_m = measured.distance_m, measured.sigma_m
-        if not (math.isfinite(distance_m) and math.isfinite(sigma_m) and sigma_m > 0):
+        if not (0 < distance_m < math.inf and 0 <= sigma_m < math.inf):
             return state, measured
         t_s, late_s = t_us * 1e-6, measured.late_chips * chip_us * 1e-6
+        sigma_m = max(sigma_m, _LEAST_SIGMA * abs(distance_m))
         past = np.concatenate([state.past, [[t_s, distance_m, sigma_m**2]]])
         past = past[past[:, 0] > t_s - _MEMORY_S]
         speed_m_s, speed_variance, variance = _smooth(past)

@@ -167,7 +167,7 @@ class JointScaleRanging(Ranging):
                 distance * sigma_px / float(fit[0]),
                 int(np.count_nonzero(off[1])),
                 late_chips,
-                Bend(_places(clusters), off[0] / one_px, off[1] * one_px**2),
+                Bend(np.arange(1.0, clusters) - clusters / 2, off[0] / one_px, off[1] * one_px**2),
             )
 
         return measure
@@ -261,12 +261,6 @@ def _offsets(offset_px: Floats) -> Floats:
     second = offset_px[:, 1::2]
     step = second - offset_px[:, 0::2]
     return second - (step - np.rint(step)) / 2
-
-
-@cache
-def _places(clusters: int) -> Floats:
-    """Of the boundaries between neighbours, from the bar's middle, in spacings."""
-    return np.arange(1.0, clusters) - clusters / 2
 
 
 @cache

@@ -64,7 +64,7 @@ def nees(errors: np.ndarray) -> float:
 
 def test_without_a_distance_nothing_changes() -> None:
     keeper, state = RangeKeeper(), Ranges()
-    for measured in (Range(math.nan, math.nan, 0), Range(50.0, math.nan, 3), Range(50.0, 0.0, 3)):
+    for measured in (Range(math.nan, math.nan, 0), Range(50.0, math.nan, 3), Range(0.0, 0.0, 3)):
         assert keeper.step(state, 0.0, CHIP_US, measured) == (state, measured)
 
 
@@ -162,3 +162,12 @@ def test_another_layout_s_bend_starts_anew() -> None:
     assert state.bend.shape == (2, 4)
     # Four boundaries say nothing of a parabola beside scale, place and the pilots' pattern.
     assert math.isfinite(found.sigma_m)
+
+
+@pytest.mark.parametrize("sigma_m", [0.0, 1e-12])
+def test_ideal_distances_stay(sigma_m: float) -> None:
+    keeper, state = RangeKeeper(), Ranges()
+    for i in range(120):
+        state, found = keeper.step(state, i * FRAME_US, CHIP_US, Range(50.0, sigma_m, 15))
+        assert found.distance_m == pytest.approx(50.0, abs=0.01)
+        assert 0 < found.sigma_m < 0.03
