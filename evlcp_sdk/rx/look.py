@@ -149,7 +149,9 @@ class Looker:
     def _size(self, width_px: float, height_px: float) -> tuple[int, int]:
         """Of the image: a region's, its seam on both sides, made even."""
         seam_px = 2 * self._spec.margin_px
-        return _even(width_px + seam_px), _even(height_px + seam_px)
+        # Twice an odd number: a bar of one or two columns stands in the middle of a cell of 2 px, not on the
+        # edge of two, each of which would see half of it.
+        return 2 * (2 * math.ceil((width_px + seam_px - 2) / 4) + 1), _even(height_px + seam_px)
 
 
 def polarity_sums(

@@ -23,7 +23,7 @@ from evlcp_sdk.testing.recordings import (
     noise_events,
     random_symbols,
 )
-from evlcp_sdk.values import Events, Packet
+from evlcp_sdk.values import Events, Packet, PresenceMap
 
 LINK = load_link()
 
@@ -337,6 +337,28 @@ def test_probes_see_every_stage() -> None:
     assert probe.seen["synchronization"] == 2
     assert probe.seen["separation"] >= 20
     assert probe.seen["regions"] >= 40
+
+
+@pytest.mark.parametrize("width_px", [1, 2, 3, 4, 5, 6])
+def test_a_thin_bar_stands_in_the_middle_of_a_cell(width_px: int) -> None:
+    seen: list[PresenceMap] = []
+
+    class Probe:
+        @hookimpl
+        def evlcp_stage_finished(self, stage: str, value: object, elapsed_s: float) -> None:
+            if isinstance(value, PresenceMap):
+                seen.append(value)
+
+    receiver = Receiver(LINK, Registry.load(Probe()).hook)
+    receiver.feed(ideal_events(LINK, IdealBar(random_symbols(LINK, 2), width_px=width_px, x_px=400.0)))
+    receiver.close()
+    assert len(seen) >= 20
+    for presence in seen:
+        columns = presence.selected.shape[2]
+        # As many cells on its left as on its right.
+        assert columns % 2 == 1
+        if width_px <= 2:
+            assert presence.selected.any((0, 1)).sum() <= 3
 
 
 def test_other_codes_work() -> None:
