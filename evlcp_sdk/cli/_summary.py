@@ -51,7 +51,7 @@ def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
             style="yellow",
         )
     for warning in summary["warnings"]:
-        out.print(f"look: {escape(warning)}", style="yellow")
+        out.print(f"warning: {escape(warning)}", style="yellow")
     out.print(f"written: {escape(str(folder))}/frames.csv, packets.jsonl, summary.json", style="dim")
 
 

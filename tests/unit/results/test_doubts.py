@@ -51,11 +51,17 @@ def test_codewords_that_never_occur() -> None:
     assert "modulation.id" in line
 
 
-@pytest.mark.parametrize("ppm", [-5000.0, 300.0])
+@pytest.mark.parametrize("ppm", [-5000.0, 600.0])
 def test_a_clock_that_no_crystal_has(ppm: float) -> None:
     (line,) = told(tally_of(RANDOM, ppm=ppm))
     assert f"{ppm:+.0f} ppm off" in line
     assert f"air.chip_rate_hz = {10_000 + ppm / 100:.6g} would fit" in line
+
+
+def test_a_short_recording_says_little_of_a_clock() -> None:
+    # Two packets: 40 us that light took, in 34.6 ms, are no clock.
+    assert told(tally_of(RANDOM[:2], ppm=1150)) == []
+    assert len(told(tally_of(RANDOM[:2], ppm=1800))) == 1
 
 
 def test_clusters_that_are_never_seen() -> None:
