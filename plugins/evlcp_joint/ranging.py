@@ -241,12 +241,12 @@ def _own_motion(shift: Floats, information: Floats, when: Floats) -> Floats:
     Bayes).
     """
     weight = np.maximum(information, 1e-12)
-    mean, middle = np.average(shift, weights=weight), np.average(when, weights=weight)
-    lever = when - middle
-    rate = float((weight * lever * (shift - mean)).sum() / (weight * lever**2).sum())
-    beyond = shift - mean - rate * lever
     total = float(weight.sum())
-    variance = (float((weight * beyond**2).sum()) - (len(shift) - 2)) / total
+    off = shift - float(weight @ shift) / total
+    lever = when - float(weight @ when) / total
+    levered = weight * lever
+    beyond = off - lever * (float(levered @ off) / float(levered @ lever))
+    variance = (float(weight @ beyond**2) - (len(shift) - 2)) / total
     if variance <= 0:
         return np.zeros_like(shift)
     return np.asarray(beyond * variance / (variance + 1 / weight))
