@@ -218,6 +218,21 @@ def compare() -> None:
             )
 
 
+def compare_road() -> None:
+    paths = sorted((SHARED / "road").glob("*.raw"))
+    if not paths:
+        print("no ../shared/recordings/road: comparison left out")
+        return
+    print("| recording | Mev/s | here | share of ON events | here |\n|---|---|---|---|---|")
+    for path in paths:
+        told = read_truth(path.with_suffix(".truth.json"))
+        made = scene_of_truth(told)
+        theirs, ours = read_events(path), Events.concat(list(simulate(made)))
+        rates = (f"{len(events) / made.duration_s / 1e6:.2f}" for events in (theirs, ours))
+        shares = (f"{events.p.mean():.3f}" for events in (theirs, ours))
+        print(f"| {path.stem} | " + " | ".join((*rates, *shares)) + " |", flush=True)
+
+
 def draw_scene(figure: Figure) -> None:
     image, chips = figure.subplots(1, 2, width_ratios=[1, 2.2])
     scene = Scene(duration_s=0.02, background=BackgroundSpec(light_w_m2=0.05))
@@ -253,6 +268,7 @@ def main() -> None:
     draw_scene(figure)
     figure.savefig(args.out / "simulator-scene.png", dpi=110)
     compare()
+    compare_road()
 
 
 if __name__ == "__main__":

@@ -707,20 +707,22 @@ def read_out(
     cap: int,
     cap_window_us: int,
     memory: Array,
+    pending: Array,
     out_t: Array,
     out_x: Array,
     out_y: Array,
     out_p: Array,
-) -> tuple[int, int, int]:
+) -> tuple[int, int, int, int]:
     """Serve requests row by row until `safe_us`; what is not served yet moves to the front of `t` and `code`.
 
     One row is served at a time, which takes `row_us` and takes all its requests along; the next is the next
     one below with a request, and after the last row the first. More than `cap` events in a window of
     `cap_window_us` are dropped. `t` is sorted; `memory` holds (time when free, last row, number of the
-    window, events in it) and is updated.
+    window, events in it) and is updated. Where `pending`, bool (rows, columns), all False, has any room, a
+    pixel sends nothing while a request of its waits.
 
     Returns:
-        (events written, events dropped, requests left).
+        (events written, events over the cap, requests of waiting pixels, requests left).
     """
     head = np.full(height, -1, np.int64)
     tail = np.full(height, -1, np.int64)
@@ -732,6 +734,7 @@ def read_out(
     window_end = (window + 1) * cap_window_us
     n = 0
     dropped = 0
+    held = 0
     waiting = 0
     i = 0
     while True:
@@ -743,6 +746,14 @@ def read_out(
             break
         while i < t.size and t[i] <= free:
             y = code[i] >> (COLUMN_BITS + 1)
+            if pending.size:
+                x = (code[i] >> 1) & ((1 << COLUMN_BITS) - 1)
+                if pending[y, x]:
+                    served[i] = True
+                    held += 1
+                    i += 1
+                    continue
+                pending[y, x] = True
             if head[y] < 0:
                 head[y] = i
                 group[y >> 4] += 1
@@ -771,6 +782,8 @@ def read_out(
         while k >= 0:
             waiting -= 1
             served[k] = True
+            if pending.size:
+                pending[at_row, (code[k] >> 1) & ((1 << COLUMN_BITS) - 1)] = False
             if cap > 0 and used >= cap:
                 dropped += 1
             else:
@@ -786,8 +799,10 @@ def read_out(
     left = 0
     for k in range(t.size):
         if not served[k]:
+            if pending.size:
+                pending[code[k] >> (COLUMN_BITS + 1), (code[k] >> 1) & ((1 << COLUMN_BITS) - 1)] = False
             t[left] = t[k]
             code[left] = code[k]
             left += 1
     memory[0], memory[1], memory[2], memory[3] = free, at_row, window, used
-    return n, dropped, left
+    return n, dropped, held, left

@@ -330,6 +330,10 @@ class SensorSpec:
         float, Field(ge=0, lt=1, description="Share of OFF events that go missing; a guess.")
     ] = 0.2
     t_row_us: Annotated[float, Field(ge=0, le=10, description="Readout's time for a row.")] = 0.2
+    hold: Annotated[
+        bool,
+        Field(description="A pixel whose event waits for the readout sends no other; without: all wait."),
+    ] = False
     cap_mev_s: Annotated[
         float, Field(ge=0, description="Events a second, in millions, that pass at most; 0: no limit.")
     ] = 100.0

@@ -193,6 +193,9 @@ class Simulation:
         self._near_share = 1 - sum(halo.share for halo in self._halos)
         self._wide_reach = max(halo.reach_px for halo in self._halos)
         self._counts = dict.fromkeys(("events", "signal_events", "dropped_by_rate_cap", "dropped_blind"), 0)
+        self._pending = np.zeros(
+            (scene.camera.height, scene.camera.width) if scene.sensor.hold else (0, 0), bool
+        )
         self._done_us = 0.0
 
     def _check_ahead(self) -> None:
@@ -267,10 +270,11 @@ class Simulation:
         columns = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
         cap = round(sensor.cap_mev_s * sensor.cap_window_us)
         cap = max(cap, 1) if sensor.cap_mev_s > 0 else 0
-        written, dropped, left = _kernels.read_out(
+        written, dropped, held, left = _kernels.read_out(
             t, code, camera.height, sensor.t_row_us, safe_us, cap, sensor.cap_window_us, memory,
-            *columns,
+            self._pending, *columns,
         )  # fmt: skip
+        self._counts["dropped_blind"] += held
         self._counts["events"] += written
         self._counts["dropped_by_rate_cap"] += dropped
         columns[0][:written] += self.scene.t0_us

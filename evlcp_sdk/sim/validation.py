@@ -114,7 +114,9 @@ def latency_with_readout_us(sensor: SensorSpec, light_w_m2: float, side_px: int,
     n = len(first)
     out = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
     memory = np.array([-1e18, -1.0, -1.0, 0.0])
-    _kernels.read_out(t, order, side_px, sensor.t_row_us, np.inf, 0, 200, memory, *out)
+    _kernels.read_out(
+        t, order, side_px, sensor.t_row_us, np.inf, 0, 200, memory, np.zeros((0, 0), np.bool_), *out
+    )
     return float(out[0].mean() + 0.5)
 
 

@@ -190,8 +190,8 @@ def read_out(
     n = len(t)
     out = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
     memory = np.array([-1e18, -1.0, -1.0, 0.0])
-    written, dropped, left = _kernels.read_out(
-        t.astype(float), code, 720, row_us, math.inf, cap, window, memory, *out
+    written, dropped, _, left = _kernels.read_out(
+        t.astype(float), code, 720, row_us, math.inf, cap, window, memory, np.zeros((0, 0), bool), *out
     )
     assert left == 0
     return Events(*(c[:written] for c in out)), dropped

@@ -35,7 +35,7 @@ from evlcp_sdk.sim import (
     simulate,
     truth_of,
 )
-from evlcp_sdk.sim._kernels import texture_at
+from evlcp_sdk.sim._kernels import COLUMN_BITS, read_out, texture_at
 from evlcp_sdk.sim.light import BarLight, wiper_switches
 from evlcp_sdk.sim.motion import pothole_angle_rad
 from evlcp_sdk.sim.optics import blur_of
@@ -390,6 +390,51 @@ def test_all_that_a_road_adds_does_not_depend_on_threads_or_length() -> None:
     table = json.loads(json.dumps(truth_of(scene).to_table()))
     assert scene_of_truth(table) == scene
     assert resolve_scene(json.loads(json.dumps(scene_table(scene)))) == scene
+
+
+def held_by_hand(t: Floats, y: Floats, x: Floats, row_us: float) -> list[tuple[int, int, int]]:
+    """Row after row, a plain loop: a pixel's request that comes while one of it waits is not there."""
+    todo, waiting, found = list(zip(t.tolist(), y.tolist(), x.tolist(), strict=True)), {}, []
+    free, row = 0.0, -1
+    while todo or waiting:
+        if not waiting:
+            free = max(free, todo[0][0])
+        while todo and todo[0][0] <= free:
+            _, at, column = todo.pop(0)
+            waiting.setdefault((at, column), True)
+        row = next(r % 30 for r in range(row + 1, row + 31) if any(at == r % 30 for at, _ in waiting))
+        free += row_us
+        for key in sorted(key for key in waiting if key[0] == row):
+            found.append((math.floor(free), *key))
+            del waiting[key]
+    return found
+
+
+def test_a_pixel_that_waits_for_the_readout_sends_no_other() -> None:
+    rng = np.random.default_rng(4)
+    t = np.sort(rng.uniform(0, 400, 3000))
+    y, x = rng.integers(0, 30, 3000), rng.integers(0, 6, 3000)
+    want = held_by_hand(t, y, x, 1.3)
+    assert 500 < len(want) < 2500
+    for cuts in ([math.inf], [100.0, 101.5, 260.0, math.inf]):
+        memory, pending, found, blind = np.array([-1e18, -1.0, -1.0, 0.0]), np.zeros((30, 8), bool), [], 0
+        code = ((y << COLUMN_BITS | x) << 1).astype(np.int32)
+        rest_t, rest_code, before = np.empty(0), np.empty(0, np.int32), 0.0
+        for safe in cuts:
+            new = (t >= before) & (t < safe)
+            before = safe
+            now_t, now_code = np.concatenate([rest_t, t[new]]), np.concatenate([rest_code, code[new]])
+            out = [np.empty(len(now_t), kind) for kind in (np.int64, np.uint16, np.uint16, np.uint8)]
+            n, _, held, left = read_out(now_t, now_code, 30, 1.3, safe, 0, 200, memory, pending, *out)
+            rest_t, rest_code = now_t[:left].copy(), now_code[:left].copy()
+            blind += held
+            found += list(zip(*(out[i][:n].tolist() for i in (0, 2, 1)), strict=True))
+            assert not pending.any()
+        assert sorted(found) == sorted(want)
+        assert blind + len(found) == 3000
+    scene = Scene(duration_s=0.02, sensor=replace(SensorSpec(), t_row_us=1.0, hold=True))
+    events = every(scene)
+    assert len({row[:3] for row in rows(events)}) == len(events)
 
 
 @pytest.mark.parametrize(
