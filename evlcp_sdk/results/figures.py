@@ -100,6 +100,7 @@ class FigureProbe:
         self.regions: dict[int, Thinned[Region]] = {}
         self.frames: dict[int, Thinned[Frame]] = {}
         self.clearest: dict[int, _Shown] = {}
+        self.echo_of: dict[int, int | None] = {}
         self._points = points
         self._presence: PresenceMap | None = None
 
@@ -122,6 +123,8 @@ class FigureProbe:
             self._presence = value
         elif stage == "frame":
             self.frames.setdefault(value.transmitter, Thinned(self._points)).add(value)
+            # The newest frame knows most.
+            self.echo_of[value.transmitter] = value.echo_of
             best = self.clearest.get(value.transmitter)
             if self._presence is not None and (best is None or value.soft.quality > best.frame.soft.quality):
                 self.clearest[value.transmitter] = _Shown(value, self._presence)
@@ -320,12 +323,13 @@ def draw_presence(probe: FigureProbe, title: str) -> Figure:
     figure = Figure(figsize=(6 * len(shown), 6.4), layout="constrained")
     parts = figure.subfigures(1, len(shown), squeeze=False)[0]
     for part, best in zip(parts, shown, strict=True):
-        _draw_one_presence(part, best)
+        number = best.frame.transmitter
+        _draw_one_presence(part, best, _who(number, probe.echo_of[number]))
     figure.suptitle(f"{title}: presence of the clusters", fontsize=11, color=_INK)
     return figure
 
 
-def _draw_one_presence(part: SubFigure, best: _Shown) -> None:
+def _draw_one_presence(part: SubFigure, best: _Shown, who: str) -> None:
     cells, pixels, profile = part.subplots(1, 3, width_ratios=[1, 1, 1.8], sharey=True)
     presence, frame = best.presence, best.frame
     colours = cluster_colours(len(presence.probability))
@@ -367,7 +371,7 @@ def _draw_one_presence(part: SubFigure, best: _Shown) -> None:
             )
     profile.set(xlabel="pilot correlation of the row", xlim=(0, None))
     _plain(profile)
-    _title(profile, f"{_who(frame)}, packet {frame.packet}, frame {frame.frame}")
+    _title(profile, f"{who}, packet {frame.packet}, frame {frame.frame}")
 
 
 def draw_distance(probe: FigureProbe, title: str) -> Figure:
@@ -388,7 +392,7 @@ def draw_distance(probe: FigureProbe, title: str) -> Figure:
         near, far = (distance - sigma)[known], (distance + sigma)[known]
         axis.fill_between(t_s[known], near, far, color=colour, alpha=0.25, lw=0, label="one sigma")
         axis.set_ylabel("distance, m")
-        _title(axis, f"{_who(frames[-1])}, {known.sum()} distances")
+        _title(axis, f"{_who(number, probe.echo_of[number])}, {known.sum()} distances")
         axis.legend(frameon=False, fontsize=9)
         last.plot(t_s, [f.soft.quality for f in frames], "o", ms=2.5, color=colour)
     last.set(ylabel="quality", xlabel="time since the first event, s", ylim=(0, 1.05))
@@ -424,11 +428,9 @@ def _bounds(path: Iterable[Region]) -> tuple[float, float, float, float]:
     return min(left), min(upper), max(right), max(lower)
 
 
-def _who(frame: Frame) -> str:
-    """The transmitter of a frame, and of which it is a reflection."""
-    return f"transmitter {frame.transmitter}" + (
-        "" if frame.echo_of is None else f" (reflection of {frame.echo_of})"
-    )
+def _who(transmitter: int, echo_of: int | None) -> str:
+    """A transmitter, and of which it is a reflection."""
+    return f"transmitter {transmitter}" + ("" if echo_of is None else f" (reflection of {echo_of})")
 
 
 def _title(axis: Axes, text: str) -> None:

@@ -36,13 +36,17 @@ _MIRRORED = 5.0
 bar: one installation in 150 hangs upside down over a mirror."""
 
 _LIGHT = 0.3
-"""Logarithm of the events of the bar's image over those of its reflection, and how much it varies: a pixel
-answers a step with few events, however high it is, so that a fifth of the light takes a third of them."""
+"""Logarithm of the cells that show a cluster of the bar over those of its reflection, and how much it varies:
+a pixel answers a step with few events, however high it is, so a fifth of the light takes a third of them."""
 
 _MOST_LIGHT = 3.0
 """Log odds that light can give at the most: a reflection that is blurred wakes more pixels than the bar."""
 
-_STAYS = 0.5
+_WHOLE = 1.0
+"""Log odds for each e-fold of clusters that the one shows more of: a rail is lower than the bar, so that its
+image is cut more often than the bar is covered."""
+
+_STAYS = 1.0
 """Log odds for what was said to be the bar before: what wavers by less changes nothing."""
 
 _ROW_US = 0.35
@@ -61,19 +65,21 @@ class Sighting:
 
     Attributes:
         frame: The frame.
-        light: Events that follow the pilots, a cluster.
+        light: Grid cells that show a cluster, on average: what shines more shows in more of them.
+        seen: Clusters that are seen.
         mirrored: The order of the clusters is the opposite of the layout's.
     """
 
     frame: Frame
     light: float
+    seen: int
     mirrored: bool
 
     @classmethod
     def of(cls, frame: Frame, look: Look) -> "Sighting":
         """What a frame's image shows."""
-        light = float(look.presence.pixels.sum()) / int(look.placement.seen.sum())
-        return cls(frame, light, look.placement.mirrored)
+        placed, seen = look.placement, max(int(look.placement.seen.sum()), 1)
+        return cls(frame, placed.cells / seen, seen, placed.mirrored)
 
 
 def repeats(one: NDArray[np.int64], other: NDArray[np.int64], codewords: int) -> float:
@@ -144,6 +150,7 @@ class _Pair:
         frames: Frames in common.
         lit: Those of them that show light in both.
         light: Sum of the logarithms of the first one's light over the second's.
+        seen: The same of the clusters that are seen.
         mirrored: Frames in which only the second is mirrored less those in which only the first is.
         last_us: Time of the newest frame in common, us.
     """
@@ -153,6 +160,7 @@ class _Pair:
     frames: int = 0
     lit: int = 0
     light: float = 0.0
+    seen: float = 0.0
     mirrored: int = 0
     last_us: float = -math.inf
 
@@ -166,13 +174,15 @@ class _Pair:
         if one.light > 0 and other.light > 0:
             self.lit += 1
             self.light += math.log(one.light / other.light)
+            self.seen += math.log(one.seen / other.seen)
         self.mirrored += other.mirrored - one.mirrored
         self.last_us = max(one.frame.t_us, other.frame.t_us, self.last_us)
 
     def odds(self) -> float:
         """Log odds of the first being the bar and the second its reflection."""
         turned = _MIRRORED * self.mirrored / max(self.frames, 1)
-        return turned + brighter(self.light / max(self.lit, 1))
+        lit = max(self.lit, 1)
+        return turned + brighter(self.light / lit) + _WHOLE * self.seen / lit
 
 
 class Echoes:

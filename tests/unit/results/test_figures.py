@@ -1,6 +1,7 @@
 """Figures: drawn from whatever a recording gives, in bounded memory."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +91,20 @@ def test_nothing_to_show() -> None:
     draw_presence(dark, "dark").draw_without_rendering()
     dark.evlcp_stage_finished("frame", frame(1, 0, math.nan))
     draw_distance(dark, "no distance").draw_without_rendering()
+
+
+def test_a_reflection_is_named_as_one() -> None:
+    """By the newest frame, which knows most; the clearest may have been told before."""
+    probe = told(FigureProbe(CameraModel()), 2, 6)
+    probe.evlcp_stage_finished("frame", replace(frame(1, 6, 44.0), echo_of=0))
+    titles = [
+        [axis.get_title(loc="left") for axis in figure.get_axes()]
+        for figure in (draw_presence(probe, "REC.raw"), draw_distance(probe, "REC.raw"))
+    ]
+    for every in titles:
+        named = [title for title in every if title.startswith("transmitter")]
+        assert [title.startswith(f"transmitter {n}") for n, title in enumerate(named)] == [True, True]
+        assert ["(reflection of 0)" in title for title in named] == [False, True]
 
 
 def test_neighbouring_clusters_differ_in_colour() -> None:

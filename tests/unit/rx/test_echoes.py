@@ -41,7 +41,7 @@ def sighting(
     soft = SoftSymbols(symbols, np.zeros((len(symbols), 6), np.float32), 1.0)
     none = Range(math.nan, math.nan, 0)
     frame = Frame(transmitter, packet, index, t_us, soft, none, None, 400.0, y_px)
-    return Sighting(frame, light, mirrored)
+    return Sighting(frame, light, int((symbols >= 0).sum()), mirrored)
 
 
 def said(number: int, seed: int = 0) -> Symbols:
@@ -107,6 +107,10 @@ def test_a_partial_reflection(clusters: int) -> None:
     echoes = Echoes(FORMAT, CODEWORDS)
     echoes.judge([sighting(0, 0, said(0)), sighting(1, 0, part, light=70)])
     assert echoes.echo_of(1) == 0
+    # As bright as the bar, whichever is first.
+    echoes = Echoes(FORMAT, CODEWORDS)
+    echoes.judge([sighting(0, 0, part), sighting(1, 0, said(0))])
+    assert echoes.echo_of(0) == 1
     # What is hidden of the one is all that is seen of the other: nothing is known.
     rest = np.where(part < 0, said(0), -1)
     echoes = Echoes(FORMAT, CODEWORDS)
@@ -235,7 +239,7 @@ def test_originals_against_every_choice() -> None:
         matrix -= matrix.T
         before = {int(rng.integers(0, size))} if rng.random() < 0.5 else set()
         odds = {(i, j): float(matrix[i, j]) for i in range(size) for j in range(i + 1, size)}
-        score = [matrix[i].sum() / 2 + 0.5 * (i in before) for i in range(size)]
+        score = [matrix[i].sum() / 2 + 1.0 * (i in before) for i in range(size)]
         assert originals(range(size), odds, before) == int(np.argmax(score))
 
 
@@ -334,8 +338,8 @@ def test_a_reflection_that_comes_and_goes() -> None:
 
 
 def test_half_a_reflection() -> None:
-    """Eight of sixteen clusters are mirrored: it is a reflection, or nothing."""
-    image = reflected(OWN, right_px=80, down_px=0, missing=0.2, late_us=5)
+    """Eight of sixteen clusters are mirrored, weaker than the bar: it is a reflection, or nothing."""
+    image = ideal_events(LINK, replace(BAR, x_px=480.3, width_px=2), seed=2, missing=0.2)
     packets = received(merged(OWN, image[image.y > 350]))
     own = [p for p in packets if p.echo_of is None]
     assert {p.frames[0].x_px < 440 for p in own} == {True}
