@@ -11,6 +11,7 @@ Falls are not looked at: they come later or sooner than rises by the light, they
 missing, and some cameras send none. One pass, one number a pixel.
 """
 
+import math
 from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass, field, replace
@@ -48,6 +49,16 @@ _HEIGHTS = 9
 _STRAY_PX = 2.0
 """How much too long a region may be before what is too much must be strays: an edge is good to a pixel."""
 
+_RESHAPE_PX = 1.0
+"""How far a region may be off its bar, in place and in size, before it is set right: a fifth of its seam."""
+
+_LONGEST_US = 200_000
+"""How long events of the whole image are kept at the most, to gather those of a region anew: a packet that is
+longer than that starts with the frames in reach."""
+
+_END_PX = 5.0
+"""How far from where it is expected an end of a bar still counts as its end: the seam of a region."""
+
 _MIN_PIXELS = 4
 """Blinking pixels below which a region has no position: one cluster at 100 m has a dozen."""
 
@@ -73,7 +84,10 @@ class Followed:
         pieces: Its events, one entry a time step: (start of the step, us; events).
         first_us: Start of the first step of which it has events, us.
         filter: State of the filter of its centre, None without one.
-        heights: As measured lately, px.
+        heights: As measured lately, px; of a bar of known size, those of steps in which both ends were seen.
+        size_px: (width, height) of the whole bar, by what its frames show, px; None before the first.
+        outgrown: The region before that, which may have held other bars: (right, down) of its centre from
+            this one's, width and height, px, and until when that matters, us.
         released: True once it has faded or was merged into another; it gets no more events.
     """
 
@@ -84,6 +98,8 @@ class Followed:
     released: bool = False
     filter: Any = None
     heights: deque[float] = field(default_factory=lambda: deque(maxlen=_HEIGHTS))
+    size_px: tuple[float, float] | None = None
+    outgrown: tuple[float, float, float, float, float] | None = None
 
     @property
     def latest(self) -> Region:
@@ -122,6 +138,22 @@ class Followed:
             i -= 1
         return self.positions[i].width_px, self.positions[i].height_px
 
+    def covers(self, t_us: float, point_px: tuple[float, float]) -> bool:
+        """Whether a point on the sensor (column, row) is inside the region at a time."""
+        (x,), (y,) = self.at(np.array([t_us]))
+        width, height = self.size_at(t_us)
+        return abs(point_px[0] - float(x)) <= width / 2 and abs(point_px[1] - float(y)) <= height / 2
+
+    def holds(self, other: "Followed", same_px: float) -> bool:
+        """Whether another region is a part of this bar, or the same bar, its centre so near."""
+        (x,), (y,) = self.at(np.array([other.latest.t_us]))
+        mine, its = self.latest, other.latest
+        right, down = abs(its.x_px - float(x)), abs(its.y_px - float(y))
+        if other.size_px is not None:
+            return max(right, down) <= same_px
+        # Half of it, or more, in each direction.
+        return right <= mine.width_px / 2 + same_px and down <= mine.height_px / 2
+
     def forget_before(self, t_us: float, step_us: int) -> None:
         """Drop events and positions older than a time."""
         while self.pieces and self.pieces[0][0] + step_us <= t_us:
@@ -138,10 +170,17 @@ class RegionFollower:
         camera: For the size of the sensor.
         chip_us: Nominal length of a chip, us.
         position: Filter of the centres; None for centres as measured.
+        keep_us: How long events of the whole image are kept, so that a region may turn out to be larger than
+            it was taken for, us.
     """
 
     def __init__(
-        self, spec: RegionSpec, camera: CameraModel, chip_us: float, position: Filter | None = None
+        self,
+        spec: RegionSpec,
+        camera: CameraModel,
+        chip_us: float,
+        position: Filter | None = None,
+        keep_us: float = 0.0,
     ) -> None:
         self._spec = spec
         self._position = position
@@ -153,7 +192,9 @@ class RegionFollower:
         self._pixels = np.full(shape, _LONG_AGO_US << 12, np.int64)
         self._hits = np.zeros([(n - 1 >> _CELL_SHIFT) + 1 for n in shape], np.int32)
         self._fresh: list[Box] = []
-        self._recent: deque[Piece] = deque(maxlen=_BACKFILL_STEPS)
+        self._keep_us = keep_us
+        steps = math.ceil(min(keep_us, _LONGEST_US) / spec.step_us)
+        self._recent: deque[Piece] = deque(maxlen=max(steps, _BACKFILL_STEPS))
         self._next_id = 0
         self.alive: list[Followed] = []
 
@@ -192,6 +233,66 @@ class RegionFollower:
         self._fresh = []
         self._recent.clear()
 
+    def shape(
+        self, followed: Followed, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]
+    ) -> bool:
+        """Set a region right by what a frame showed of its bar; return whether its events changed.
+
+        Args:
+            followed: The region.
+            t_us: When the bar was seen, us.
+            centre_px: Centre (column, row) of the whole bar at that time.
+            size_px: Its (width, height).
+        """
+        (x,), (y,) = followed.at(np.array([t_us]))
+        off = centre_px[0] - float(x), centre_px[1] - float(y)
+        known = followed.size_px
+        if known is None:
+            followed.heights.clear()
+            last = followed.latest
+            until_us = t_us + self._keep_us
+            followed.outgrown = -off[0], -off[1], last.width_px, last.height_px, until_us
+        elif max(abs(v) for v in (*off, size_px[0] - known[0], size_px[1] - known[1])) < _RESHAPE_PX:
+            return False
+        followed.size_px = size_px
+        followed.positions = deque(
+            replace(p, x_px=p.x_px + off[0], y_px=p.y_px + off[1], width_px=size_px[0], height_px=size_px[1])
+            for p in followed.positions
+        )
+        followed.filter = self._position.init() if self._position else None
+        self._gather(followed)
+        return True
+
+    def beside(
+        self, like: Followed, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]
+    ) -> Followed:
+        """Open a region for another image of a bar: it moves as the one that showed it does."""
+        followed = Followed(
+            self._next_id, deque(like.positions), like.first_us, deque(like.pieces), filter=like.filter
+        )
+        followed.positions = deque(replace(p, id=followed.id) for p in followed.positions)
+        self._next_id += 1
+        self.alive.append(followed)
+        self.shape(followed, t_us, centre_px, size_px)
+        return followed
+
+    def drop(self, followed: Followed) -> None:
+        """Let a region go at once."""
+        followed.released = True
+        self.alive = [other for other in self.alive if other is not followed]
+
+    def _gather(self, followed: Followed) -> None:
+        """Take a region's events once more, from where it is now known to have been."""
+        oldest_us = followed.pieces[0][0] if followed.pieces else followed.first_us
+        half_us = self._spec.step_us / 2
+        kept = [piece for piece in self._recent if piece[0] >= oldest_us]
+        times = np.array([start + half_us for start, _ in kept])
+        gathered = {}
+        for (start, events), x, y in zip(kept, *followed.at(times), strict=True):
+            box = self._reach(replace(followed.latest, x_px=float(x), y_px=float(y)))
+            gathered[start] = _select(events, [box])[0]
+        followed.pieces = deque((start, gathered.get(start, events)) for start, events in followed.pieces)
+
     def _expected(self, followed: Followed, t_us: float) -> Region:
         """Where a region should be soon: by its filter, or else straight on."""
         expected = self._position.predict(followed.filter, t_us) if self._position else None
@@ -204,21 +305,33 @@ class RegionFollower:
 
         Where few pixels are awake, an end is dark; where noise wakes pixels that a fast bar has left, there
         is one too many. Of the places that the edges allow, or that hold the most pixels, the nearest to the
-        expected one is taken.
+        expected one is taken. Where more of a bar of known size is missing, an end is hidden: the one that is
+        nearer to its place counts alone.
         """
-        followed.heights.append(measured.height_px)
-        height_px = median(followed.heights)
-        excess_px = measured.height_px - height_px
+        known = followed.size_px
         expected_px = self._expected(followed, measured.t_us).y_px
+        height_px = median(followed.heights) if followed.heights else measured.height_px
+        if known is None or abs(measured.height_px - height_px) <= _STRAY_PX:
+            followed.heights.append(measured.height_px)
+            height_px = median(followed.heights)
+        excess_px = measured.height_px - height_px
         if excess_px > _STRAY_PX:
-            n = round(height_px)
+            n = min(round(height_px), len(rows))
             total = np.concatenate([[0], np.cumsum(rows)])
             inside = total[n:] - total[:-n]
             places_px = top + np.flatnonzero(inside == inside.max()) + (n - 1) / 2
             y_px = float(places_px[np.abs(places_px - expected_px).argmin()])
+        elif known is not None and excess_px < -2 * _END_PX:
+            # By its upper end, and by its lower one.
+            ends_px = measured.y_px - excess_px / 2, measured.y_px + excess_px / 2
+            y_px = min(ends_px, key=lambda end_px: abs(end_px - expected_px))
+            if abs(y_px - expected_px) > _END_PX:
+                y_px = expected_px
         else:
             slack_px = abs(excess_px) / 2
             y_px = measured.y_px + min(max(expected_px - measured.y_px, -slack_px), slack_px)
+        if known is not None:
+            return replace(measured, y_px=y_px, width_px=known[0], height_px=known[1])
         return replace(measured, y_px=y_px, height_px=height_px + min(max(excess_px, 0.0), _STRAY_PX))
 
     def _filtered(self, followed: Followed, measured: Region) -> Region:
@@ -296,7 +409,23 @@ class RegionFollower:
             return
         self._next_id += 1
         reach = self._reach(region)
-        pieces = deque((start, _select(events, [reach])[0]) for start, events in self._recent)
+        for like in self.alive:
+            if like.outgrown is not None and _left_by(like, region):
+                # It was seen as long as the one that it was taken to be a part of.
+                right, down = region.x_px - like.latest.x_px, region.y_px - like.latest.y_px
+                size = {"width_px": region.width_px, "height_px": region.height_px}
+                places = deque(
+                    replace(p, id=region.id, x_px=p.x_px + right, y_px=p.y_px + down, **size)
+                    for p in like.positions
+                )
+                pieces = deque((start, Events.empty()) for start, _ in self._recent)
+                followed = Followed(region.id, places, pieces[0][0], pieces)
+                followed.filter = self._position.init() if self._position else None
+                self._gather(followed)
+                self.alive.append(followed)
+                return
+        recent = list(self._recent)[-_BACKFILL_STEPS:]
+        pieces = deque((start, _select(events, [reach])[0]) for start, events in recent)
         state = self._position.init() if self._position else None
         self.alive.append(Followed(region.id, deque([region]), pieces[0][0], pieces, filter=state))
 
@@ -320,6 +449,15 @@ def _select(events: Events, boxes: list[Box]) -> list[Events]:
     p, taken = np.empty(shape, np.uint8), np.empty(len(boxes), np.int64)
     _kernels.select_boxes(events.t_us, events.x, events.y, events.p, np.array(boxes), t, x, y, p, taken)
     return [Events(t[i, :n], x[i, :n], y[i, :n], p[i, :n]) for i, n in enumerate(taken)]
+
+
+def _left_by(like: Followed, region: Region) -> bool:
+    """Whether a region lies in what another was taken for, before a frame showed its size."""
+    assert like.outgrown is not None
+    right, down, width, height, until_us = like.outgrown
+    x, y = like.latest.x_px + right, like.latest.y_px + down
+    near = abs(region.x_px - x) <= width / 2 and abs(region.y_px - y) <= height / 2
+    return near and region.t_us < until_us
 
 
 def _inside(hits: NDArray[np.int32], box: Box) -> NDArray[np.int32]:

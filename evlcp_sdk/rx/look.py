@@ -11,7 +11,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.detection import Followed
 from evlcp_sdk.rx.grid import DueFrame
-from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements
+from evlcp_sdk.rx.placement import Placement, direction, layout_of, lit, masked, placements
 from evlcp_sdk.values import Events, PresenceMap, SyncLock
 
 __all__ = ["Look", "Looker", "Pilot", "polarity_sums"]
@@ -145,6 +145,38 @@ class Looker:
         middle_us = float(middles[middle]) - lock.chip_us / 2
         look = Look(sums, offset_px, pilot.presence, pilot.placement, pilot.others, corner_px, middle_us)
         return look, pilot
+
+    def box(self, look: Look, placement: Placement) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Centre (column, row) on the sensor and (width, height) of a whole bar, hidden parts too, px.
+
+        Args:
+            look: A frame.
+            placement: The bar's own or that of another instance, taken to be as wide.
+        """
+        selected, grid = look.presence.selected.any(0), look.presence.grid_px
+        row, column = np.nonzero(selected)
+        cells = (column + 1j * row) * grid + (grid - 1) / 2 * (1 + 1j)
+        own, layout = look.placement, self._layout
+        if own.scale == 0:
+            corners = np.concatenate([cells - grid / 2 * (1 + 1j), cells + grid / 2 * (1 + 1j)])
+        else:
+            along_px = across_px = abs(own.scale) * layout.spacing_m / 2
+            way = placement.scale / abs(placement.scale)
+            if layout.line:
+                # A line's width is that of its cells; the layout says nothing of it.
+                turn = own.scale / abs(own.scale) * direction(layout)
+                off = np.abs(((cells - own.shift) * turn.conjugate()).imag)
+                across_px = float(off.max(initial=0.0)) + grid / 2
+                way *= direction(layout)
+            edges = np.array(
+                [way * (a + 1j * b) for a in (-along_px, along_px) for b in (-across_px, across_px)]
+            )
+            corners = (placement.places(layout)[:, None] + edges).ravel()
+        low = np.array([corners.real.min(), corners.imag.min()])
+        high = np.array([corners.real.max(), corners.imag.max()])
+        x, y = (low + high) / 2 + look.corner_px
+        width, height = high - low
+        return (float(x), float(y)), (float(width), float(height))
 
     def _size(self, width_px: float, height_px: float) -> tuple[int, int]:
         """Of the image: a region's, its seam on both sides, made even."""

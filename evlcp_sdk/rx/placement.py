@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.values import PresenceMap
 
-__all__ = ["Layout", "Placement", "layout_of", "lit", "masked", "placements"]
+__all__ = ["Layout", "Placement", "direction", "layout_of", "lit", "masked", "placements"]
 
 _LEAST_SPACING_PX = 1.0
 """A placement that puts neighbours into one pixel would fit anything."""
@@ -179,7 +179,7 @@ def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> Prese
         return presence
     unit = placement.scale / abs(placement.scale)
     if layout.line:
-        unit *= _direction(layout)
+        unit *= direction(layout)
     spacing_px = abs(placement.scale) * layout.spacing_m
     places = placement.places(layout)
     grid = presence.grid_px
@@ -190,7 +190,9 @@ def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> Prese
         hits, cells = np.zeros((2, math.ceil(spacing_px + _WIDEST_PX)))
         seen, probability = placement.seen, presence.probability
         _kernels.across_profile(probability, seen, places, unit, spacing_px, grid, hits, cells)
-        profile = _core(hits / np.maximum(cells, 1))
+        # Cells in rows with the axis leave distances out between them.
+        some = np.flatnonzero(cells)
+        profile = _core(np.interp(np.arange(len(hits)), some, hits[some] / cells[some], right=0.0))
         across_px = float(len(profile))
         _kernels.line_prior(places, unit, spacing_px, grid, profile, prior)
     else:
@@ -240,7 +242,7 @@ def _core(profile: NDArray[np.float64]) -> NDArray[np.float64]:
     return core
 
 
-def _direction(layout: Layout) -> complex:
+def direction(layout: Layout) -> complex:
     """From the first to the last cluster of a line."""
     way = complex(layout.at_m[-1] - layout.at_m[0])
     return way / abs(way)
@@ -322,7 +324,7 @@ def _judged(
     tries = math.comb(max(shown, proposed), proposed)
     chance = min(1.0, tries * _at_least(int(seen.sum()) - proposed, shown - proposed, odds))
     if layout.line:
-        way = scale * _direction(layout)
+        way = scale * direction(layout)
         mirrored = way.real + way.imag < 0
     return Placement(scale, shift, mirrored, seen, float(in_place[seen].sum()), chance)
 

@@ -13,7 +13,7 @@ from evlcp_sdk.rx.detection import Followed, RegionFollower
 from evlcp_sdk.rx.echoes import Echoes, EchoQueue, Sighting
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.inbox import MessageAssembler
-from evlcp_sdk.rx.look import Looker
+from evlcp_sdk.rx.look import Look, Looker
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.steps import Announcer, Steps
@@ -28,6 +28,17 @@ _NO_POINTS = (np.empty((0, 2)), np.empty(0))
 
 _TAIL_CHIPS = 2
 """A frame is whole if the stream goes on for this long after it: its last events come late."""
+
+_LOOKBACK_PACKETS = 2
+"""Packets of events kept of the whole image: a region's first frame, which may show that it is larger, is
+read up to a packet after its start."""
+
+_LOOKS = 3
+"""Looks at a region's first frame: at what was found of a bar, at the whole of it, and once more, as few
+clusters place it less well than all."""
+
+_SAME_PX = 3.0
+"""How far apart the centres of two regions of one bar may be."""
 
 _COUNTS = (
     "events_in_regions",
@@ -69,7 +80,13 @@ class Receiver:
         self._announcer = Announcer(hook)
         self._steps = Steps(link, self._announcer)
         self._timeline = Timeline(self._step_us, link.camera.width, link.camera.height)
-        self._regions = RegionFollower(link.regions, link.camera, link.packet.chip_us, self._steps.position)
+        self._regions = RegionFollower(
+            link.regions,
+            link.camera,
+            link.packet.chip_us,
+            self._steps.position,
+            _LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us,
+        )
         self._transmitters = Transmitters(link.packet, self._step_us)
         self._looker = Looker(
             link.packet, link.regions, centres_m, link.codebook.pilots, self._steps.separate
@@ -79,6 +96,7 @@ class Receiver:
         self._echoes = Echoes(link.packet, len(link.codebook.codewords))
         self._judged = EchoQueue(self._echoes)
         self._messages = MessageAssembler.of(link)
+        self._joined: set[int] = set()
         self._closed = False
         self._counts = dict.fromkeys(_COUNTS, 0)
 
@@ -122,7 +140,10 @@ class Receiver:
         regions = self._regions.step(step.start_us, step.events)
         for region in regions:
             self._announcer.lap("regions", region.latest)
+        self._joined.clear()
         for region in regions:
+            if region.id in self._joined:
+                continue
             transmitter = self._hear(region, step)
             self._decode_due(transmitter, step.end_us - self._tail_us)
             self._transmitters.forget(transmitter, step.end_us)
@@ -173,11 +194,11 @@ class Receiver:
 
     def _decode(self, transmitter: Transmitter, due: DueFrame) -> Sighting | None:
         """Read a frame; None if it does not show where the clusters are."""
-        assert transmitter.number is not None
         self._announcer.start()
-        look, transmitter.pilot = self._looker.look(transmitter.region, due, transmitter.pilot)
+        look = self._look(transmitter, due)
         if look is None:
             return None
+        number = self._transmitters.number(transmitter)
         soft = self._steps.decode(look.presence, look.sums)
         distance, points = _NO_RANGE, _NO_POINTS
         if due.has_pilot:
@@ -191,7 +212,7 @@ class Receiver:
         if transmitter.first is None:
             transmitter.first = due.packet
         frame = Frame(
-            transmitter=transmitter.number,
+            transmitter=number,
             packet=due.packet - transmitter.first,
             frame=due.index,
             t_us=due.start_us,
@@ -203,10 +224,42 @@ class Receiver:
             points_px=points[0],
             points_sigma_px=points[1],
             points_t_us=look.middle_us,
-            echo_of=self._echoes.echo_of(transmitter.number),
+            echo_of=self._echoes.echo_of(number),
         )
         self._announcer.total("frame", frame)
         return Sighting.of(frame, look)
+
+    def _look(self, transmitter: Transmitter, due: DueFrame) -> Look | None:
+        """Look at a frame; set its region right by it, join what is of the same bar, open what is another."""
+        region = transmitter.region
+        for _ in range(_LOOKS):
+            whole = region.size_px is not None
+            look, transmitter.pilot = self._looker.look(region, due, transmitter.pilot)
+            if look is None or not due.has_pilot:
+                return look
+            changed = self._regions.shape(region, look.middle_us, *self._looker.box(look, look.placement))
+            if changed:
+                self._join(region)
+            if whole or not changed:
+                break
+        assert look is not None
+        for other in look.others:
+            centre_px, size_px = self._looker.box(look, other)
+            if not any(r.covers(look.middle_us, centre_px) for r in self._regions.alive):
+                self._regions.beside(region, look.middle_us, centre_px, size_px)
+        return look
+
+    def _join(self, region: Followed) -> None:
+        """Let other regions go that are parts of the same bar."""
+        for other in list(self._regions.alive):
+            if other is region or not region.holds(other, _SAME_PX):
+                continue
+            self._regions.drop(other)
+            self._joined.add(other.id)
+            if other in self._transmitters:
+                self._counts["regions_released"] += 1
+                self._judged.end(self._transmitters[other].packets)
+                self._transmitters.release(self._transmitters[other])
 
     def _end(self, transmitter: Transmitter, now_us: float) -> None:
         """Decode what a region that has ended still shows; its last packet is over."""

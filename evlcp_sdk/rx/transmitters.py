@@ -1,4 +1,4 @@
-"""The transmitters that a receiver knows: numbered at their first lock, remembered when lost from sight."""
+"""The transmitters that a receiver knows: numbered at their first frame, remembered when lost from sight."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -33,7 +33,7 @@ class Transmitter:
         packets: Collects its frames.
         grid: Where its frames stand on the clock.
         distance: What is known of its distance.
-        number: Transmitter number, None before the first lock.
+        number: Transmitter number, None before the first frame.
         first: Number of the first packet on the grid that had a frame, None before.
         rows: How late the rows of its bar are read.
         pilot: The newest pilot, None where it showed no bar.
@@ -95,11 +95,15 @@ class Transmitters:
         if transmitter.grid.lock is None and self._inherit(transmitter, lock):
             transmitter.grid.skip_before(earliest_us)
             return True
+        transmitter.grid.restart(lock, earliest_us)
+        return True
+
+    def number(self, transmitter: Transmitter) -> int:
+        """Its number: the next one, if it has none."""
         if transmitter.number is None:
             transmitter.number = self._numbered
             self._numbered += 1
-        transmitter.grid.restart(lock, earliest_us)
-        return True
+        return transmitter.number
 
     def _inherit(self, transmitter: Transmitter, lock: SyncLock) -> bool:
         """Go on as a transmitter that was lost from sight, if the packets stand on its grid."""
