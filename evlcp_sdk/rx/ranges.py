@@ -28,9 +28,9 @@ _OUTLIER = 4.0
 _LEAST_SIGMA = 1e-6
 """Of the distance: ideal images have less, which says nothing of anything."""
 
-_LEVEL_DEG, _LEANING_DEG, _LEANING_SHARE = 0.7, 6.0, 0.03
+_LEVEL_DEG, _LEANING_DEG, _LEANING_SHARE = 0.7, 6.0, 0.02
 """What is likely of a bar's lean before it is measured: none but for a mount's error and the car's springs
-(sigma), and of one camera in thirty, whose mount nobody levelled, anything up to the steepest."""
+(sigma), and of one camera in fifty, whose mount nobody levelled, anything up to the steepest."""
 
 _TILT_MEMORY_S = 1.0
 """A car's pitch changes within a second when it brakes."""

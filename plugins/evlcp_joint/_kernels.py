@@ -1,6 +1,6 @@
 """Where a bar's clusters lie, the values of its rows, and the fit of its boundaries: compiled."""
 
-from math import erf, exp, pi, sqrt
+from math import exp, sqrt
 from typing import Any
 
 import numpy as np
@@ -136,109 +136,43 @@ def row_values(sums: Array, line: Array, weight: Array, full: float, out: Array)
             out[i, v] = total / max(mass, 1e-12)
 
 
-_PER_SIGMA = 256
-_NORMAL = np.array([0.5 * erf(i / _PER_SIGMA / sqrt(2.0)) for i in range(16 * _PER_SIGMA)])
-_DENSITY = np.array([exp(-0.5 * (i / _PER_SIGMA) ** 2) / sqrt(2 * pi) for i in range(16 * _PER_SIGMA)])
-"""The standard normal distribution above its middle, and its density; straight lines between are good to a
-millionth. Far more sigmas than `_REACH` of the wider of two normal ones are cut off."""
+_REACH = 12.0
+"""Widths of a boundary's core beyond which it is not felt: 6 of 100000 of tails thrice as wide are left."""
 
 
 @njit(cache=True, nogil=True)
-def _from_tables(z: float) -> tuple[float, float]:
-    """The standard normal distribution and its density."""
-    at = min(abs(z) * _PER_SIGMA, _NORMAL.size - 1.5)
-    i = int(at)
-    rest = at - i
-    half = _NORMAL[i] + rest * (_NORMAL[i + 1] - _NORMAL[i])
-    density = _DENSITY[i] + rest * (_DENSITY[i + 1] - _DENSITY[i])
-    return 0.5 + half if z > 0 else 0.5 - half, density
-
-
-@njit(cache=True, nogil=True)
-def _across(z: float, core: float, tail: float, share: float) -> tuple[float, float]:
-    """Profile of a boundary at `z` px from it, 0 to 1, and its slope: a mixture of two normal ones."""
-    first, first_slope = _from_tables(z / core)
-    second, second_slope = _from_tables(z / tail)
-    slope = share * first_slope / core + (1 - share) * second_slope / tail
-    return share * first + (1 - share) * second, slope
-
-
-_REACH = 4.0
-"""Sigmas of the tails beyond which a boundary is not felt: 6 of 100000 are left."""
-
-
-@njit(cache=True, nogil=True)
-def _rows_of(at: float, spacing: float, rows: int) -> tuple[int, int]:
-    """The rows that are nearer to a boundary at `at` than to the others, which are too far to be felt through
-    the blur: the first, and the one behind the last.
-    """
-    return max(int(np.ceil(at - spacing / 2)), 0), min(int(np.ceil(at + spacing / 2)), rows)
-
-
-@njit(cache=True, nogil=True)
-def model(
-    codes: Array,
-    known: Array,
-    offset: Array,
-    when: Array,
-    profile: tuple[float, float, float],
-    fit: Array,
-    value: Array,
-    slope: Array,
-    nearest: Array,
+def rows_felt(
+    known: Array, offset: Array, when: Array, reach: float, fit: Array, rows: int, first: Array, last: Array
 ) -> None:
-    """Expected values of all rows, their slopes, and which boundary each belongs to.
+    """Rows within `reach` px of a boundary in a value, and nearest to it: from `first` to `last` - 1.
 
     `fit` is (spacing, centre, drift, gain, width): boundary b between clusters b - 1 and b of K lies at
-    spacing * (b - K / 2) from a centre that moves by drift * when[i] in value i. Across a boundary the value
-    goes from one code to the next as a mixture of two normal distributions: `profile` holds both sigmas and
-    the share of the first, and exp(width) stretches them. `value` and `nearest` are (values, rows), `slope`
-    (5, values, rows) holds the derivatives by `fit`. A row does not count, and is NaN, 0 and -1, outside the
-    middles of the outer clusters, which have no neighbour to bound them, and where `known` (K + 1, values)
-    says that one of the two codes at a boundary is not known.
+    spacing * (b - K / 2) from a centre that is centre + drift * when[i] + offset[i] from the middle row in
+    value i. `first` and `last` are (K + 1, values), and there are none where `known`, the same, says that
+    one of the two codes is not known.
     """
-    clusters, values = codes.shape
-    rows = value.shape[1]
-    spacing, centre, drift, gain = fit[0], fit[1], fit[2], fit[3]
-    stretch = exp(fit[4])
-    core, tail, share = profile[0] * stretch, profile[1] * stretch, profile[2]
-    reach = _REACH * max(core, tail)
-    middle = (rows - 1) / 2
-    value[:] = np.nan
-    nearest[:] = -1
-    slope[:] = 0.0
+    boundaries, values = known.shape
+    spacing, centre, drift = fit[0], fit[1], fit[2]
+    half = min(reach, spacing / 2)
     for i in range(values):
-        moved = middle + offset[i] + centre + drift * when[i]
-        for b in range(1, clusters):
-            if not known[b, i]:
-                continue
-            place = b - clusters / 2
-            at = moved + spacing * place
-            top, bottom = _rows_of(at, spacing, rows)
-            above, below = float(codes[b - 1, i]), float(codes[b, i])
-            for v in range(top, bottom):
-                z = v - at
-                level = below if z > 0 else above
-                if above != below and abs(z) < reach:
-                    share_of, density = _across(z, core, tail, share)
-                    level = above + (below - above) * share_of
-                    steep = gain * (above - below) * density
-                    slope[0, i, v] = steep * place
-                    slope[1, i, v] = steep
-                    slope[2, i, v] = steep * when[i]
-                    slope[4, i, v] = steep * z
-                slope[3, i, v] = level
-                value[i, v] = gain * level
-                nearest[i, v] = b
+        middle = (rows - 1) / 2 + offset[i] + centre + drift * when[i]
+        for b in range(boundaries):
+            first[b, i] = last[b, i] = 0
+            if known[b, i]:
+                place = middle + spacing * (b - (boundaries - 1) / 2)
+                first[b, i] = min(max(int(np.ceil(place - half)), 0), rows)
+                last[b, i] = min(max(int(np.ceil(place + half)), 0), rows)
 
 
 @njit(cache=True, nogil=True)
 def equations(
     codes: Array,
-    known: Array,
+    first: Array,
+    last: Array,
     offset: Array,
     when: Array,
-    profile: tuple[float, float, float],
+    profile: Array,
+    blur: float,
     huber: float,
     prior: float,
     seen_values: Array,
@@ -246,87 +180,131 @@ def equations(
     normal: Array,
     right: Array,
 ) -> float:
-    """Normal equations of a robust least-squares step of `model`, `normal` (5, 5), `right` (5,); the cost.
+    """Normal equations of a robust least-squares step, `normal` (5, 5), `right` (5,); the cost.
 
+    Across a boundary where codes differ, a value goes from one code times the gain to the next as `profile`
+    has it: that and its slope, (2, n), at n steps from 0 to `_REACH` widths; a width is blur * exp(width) px.
     Residuals beyond `huber` weigh less, so that a cluster that was decoded wrong does not bend the fit.
     `prior` is the weight of a width of 0.
     """
     clusters, values = codes.shape
     rows = seen_values.shape[1]
     spacing, centre, drift, gain = fit[0], fit[1], fit[2], fit[3]
-    stretch = exp(fit[4])
-    core, tail, share = profile[0] * stretch, profile[1] * stretch, profile[2]
-    reach = _REACH * max(core, tail)
-    middle = (rows - 1) / 2
+    width = blur * exp(fit[4])
+    steps = profile.shape[1] - 1
+    slope = np.empty(5)
     normal[:] = 0.0
     right[:] = 0.0
     cost = 0.0
     for i in range(values):
-        moved = middle + offset[i] + centre + drift * when[i]
+        middle = (rows - 1) / 2 + offset[i] + centre + drift * when[i]
         for b in range(1, clusters):
-            if not known[b, i]:
+            step = codes[b, i] - codes[b - 1, i]
+            if step == 0:
                 continue
             place = b - clusters / 2
-            at = moved + spacing * place
-            top, bottom = _rows_of(at, spacing, rows)
-            above, below = float(codes[b - 1, i]), float(codes[b, i])
-            # Sums over these rows of weighted products: e of the slope by the centre, l of that by the gain,
-            # z of the place from the boundary, r of the residual.
-            ee = eez = eezz = el = elz = ll = er = erz = lr = 0.0
-            for v in range(top, bottom):
-                z = v - at
-                level = below if z > 0 else above
-                steep = 0.0
-                if above != below and abs(z) < reach:
-                    share_of, density = _across(z, core, tail, share)
-                    level = above + (below - above) * share_of
-                    steep = gain * (above - below) * density
+            for v in range(first[b, i], last[b, i]):
+                z = v - middle - spacing * place
+                # The profile by straight pieces.
+                at = min(abs(z) / width / _REACH * steps, steps - 1e-9)
+                n = int(at)
+                part = at - n
+                beyond = profile[0, n] + part * (profile[0, n + 1] - profile[0, n])
+                density = profile[1, n] + part * (profile[1, n + 1] - profile[1, n])
+                level = 0.5 * (codes[b, i] + codes[b - 1, i] + (step if z > 0 else -step) * beyond)
+                steep = 0.5 * gain * step * density / width
+                slope[0] = -steep * place
+                slope[1] = -steep
+                slope[2] = -steep * when[i]
+                slope[3] = level
+                slope[4] = -steep * z
                 residual = seen_values[i, v] - gain * level
                 size = abs(residual)
-                weight = 1.0
-                if size <= huber:
-                    cost += residual * residual / 2
-                else:
-                    weight = huber / size
-                    cost += huber * (size - huber / 2)
-                ll += weight * level * level
-                lr += weight * level * residual
-                pull = weight * steep
-                ee += pull * steep
-                eez += pull * steep * z
-                eezz += pull * steep * z * z
-                el += pull * level
-                elz += pull * level * z
-                er += pull * residual
-                erz += pull * residual * z
-            # All slopes but that by the gain are the one by the centre, times what is alike for these rows.
-            t = when[i]
-            normal[0, 0] += place * place * ee
-            normal[1, 0] += place * ee
-            normal[1, 1] += ee
-            normal[2, 0] += place * t * ee
-            normal[2, 1] += t * ee
-            normal[2, 2] += t * t * ee
-            normal[3, 0] += place * el
-            normal[3, 1] += el
-            normal[3, 2] += t * el
-            normal[3, 3] += ll
-            normal[4, 0] += place * eez
-            normal[4, 1] += eez
-            normal[4, 2] += t * eez
-            normal[4, 3] += elz
-            normal[4, 4] += eezz
-            right[0] += place * er
-            right[1] += er
-            right[2] += t * er
-            right[3] += lr
-            right[4] += erz
+                weight = 1.0 if size <= huber else huber / size
+                cost += residual * residual / 2 if size <= huber else huber * (size - huber / 2)
+                for a in range(5):
+                    pull = weight * slope[a]
+                    right[a] += pull * residual
+                    for c in range(a + 1):
+                        normal[a, c] += pull * slope[c]
     for a in range(5):
         for c in range(a):
             normal[c, a] = normal[a, c]
     normal[4, 4] += prior
     right[4] -= prior * fit[4]
     return float(cost + prior * fit[4] ** 2 / 2)
+
+
+@njit(cache=True, nogil=True)
+def leftovers(
+    codes: Array,
+    first: Array,
+    last: Array,
+    offset: Array,
+    when: Array,
+    profile: Array,
+    blur: float,
+    huber: float,
+    seen_values: Array,
+    fit: Array,
+    by_boundary: Array,
+    by_value: Array,
+    scores: Array,
+) -> tuple[float, float, float]:
+    """What a fit leaves: shifts of each boundary and of each value, and each row's score.
+
+    `by_boundary` (2, K + 1) and `by_value` (2, values) take the shift of the centre, px, and its information,
+    in units of the variance of one value; `scores` (rows, 5) the slopes times the residuals, clipped to
+    `huber`, over a row's values, which share one pixel phase and so one error.
+
+    Returns:
+        Mean square of the clipped residuals, sum of the squares of residuals, and of the values.
+    """
+    clusters, values = codes.shape
+    rows = seen_values.shape[1]
+    spacing, centre, drift, gain = fit[0], fit[1], fit[2], fit[3]
+    width = blur * exp(fit[4])
+    steps = profile.shape[1] - 1
+    by_boundary[:] = 0.0
+    by_value[:] = 0.0
+    scores[:] = 0.0
+    noise, spent, all_squares, count = 0.0, 0.0, 0.0, 0
+    for i in range(values):
+        middle = (rows - 1) / 2 + offset[i] + centre + drift * when[i]
+        for b in range(1, clusters):
+            step = codes[b, i] - codes[b - 1, i]
+            if step == 0:
+                continue
+            place = b - clusters / 2
+            for v in range(first[b, i], last[b, i]):
+                z = v - middle - spacing * place
+                at = min(abs(z) / width / _REACH * steps, steps - 1e-9)
+                n = int(at)
+                part = at - n
+                beyond = profile[0, n] + part * (profile[0, n + 1] - profile[0, n])
+                density = profile[1, n] + part * (profile[1, n + 1] - profile[1, n])
+                level = 0.5 * (codes[b, i] + codes[b - 1, i] + (step if z > 0 else -step) * beyond)
+                steep = 0.5 * gain * step * density / width
+                residual = seen_values[i, v] - gain * level
+                spent += residual * residual
+                all_squares += seen_values[i, v] * seen_values[i, v]
+                residual = min(max(residual, -huber), huber)
+                noise += residual * residual
+                count += 1
+                by_boundary[0, b] -= steep * residual
+                by_boundary[1, b] += steep * steep
+                by_value[0, i] -= steep * residual
+                by_value[1, i] += steep * steep
+                scores[v, 0] -= steep * place * residual
+                scores[v, 1] -= steep * residual
+                scores[v, 2] -= steep * when[i] * residual
+                scores[v, 3] += level * residual
+                scores[v, 4] -= steep * z * residual
+    for b in range(clusters + 1):
+        by_boundary[0, b] /= max(by_boundary[1, b], 1e-12)
+    for i in range(values):
+        by_value[0, i] /= max(by_value[1, i], 1e-12)
+    return noise / max(count, 1), spent, all_squares
 
 
 @njit(cache=True, nogil=True)
@@ -366,7 +344,8 @@ def solve(
     known: Array,
     offset: Array,
     when: Array,
-    profile: tuple[float, float, float],
+    profile: Array,
+    blur: float,
     huber: float,
     prior: float,
     seen_values: Array,
@@ -374,15 +353,22 @@ def solve(
     tolerance: float,
     fit: Array,
     normal: Array,
+    first: Array,
+    last: Array,
 ) -> bool:
     """Levenberg-Marquardt from `fit`, which is changed; False where there is no fit.
 
     It ends with a step of the spacing below `tolerance` of it, or after `steps`; `normal` (5, 5) are the
-    normal equations there.
+    normal equations there, and `first`, `last` (K + 1, values) the rows that count: those that the start's
+    boundaries are felt in.
     """
+    rows = seen_values.shape[1]
+    rows_felt(known, offset, when, _REACH * blur * exp(fit[4]), fit, rows, first, last)
     right, new_normal, new_right = np.empty(5), np.empty((5, 5)), np.empty(5)
     factor, move = np.zeros((5, 5)), np.empty(5)
-    cost = equations(codes, known, offset, when, profile, huber, prior, seen_values, fit, normal, right)
+    cost = equations(
+        codes, first, last, offset, when, profile, blur, huber, prior, seen_values, fit, normal, right
+    )
     damping = 1e-3
     outside = False
     for _ in range(steps):
@@ -397,7 +383,19 @@ def solve(
         new_cost = np.inf
         if not outside:
             new_cost = equations(
-                codes, known, offset, when, profile, huber, prior, seen_values, new_fit, new_normal, new_right
+                codes,
+                first,
+                last,
+                offset,
+                when,
+                profile,
+                blur,
+                huber,
+                prior,
+                seen_values,
+                new_fit,
+                new_normal,
+                new_right,
             )
         if new_cost <= cost:
             fit[:] = new_fit
@@ -410,71 +408,3 @@ def solve(
         else:
             damping *= 10
     return not outside
-
-
-@njit(cache=True, nogil=True)
-def row_scores(seen_values: Array, value: Array, slope: Array, huber: float, meat: Array) -> int:
-    """Sum over rows of the outer product of each row's score, `meat` (n, n); return the rows that count.
-
-    A row's values share one pixel phase and so one error: they are one observation, not many.
-    """
-    values, rows = value.shape
-    n = meat.shape[0]
-    meat[:] = 0.0
-    used = 0
-    score = np.empty(n)
-    for v in range(rows):
-        score[:] = 0.0
-        some = False
-        for i in range(values):
-            if np.isnan(value[i, v]):
-                continue
-            some = True
-            residual = seen_values[i, v] - value[i, v]
-            residual = min(max(residual, -huber), huber)
-            for a in range(n):
-                score[a] += slope[a, i, v] * residual
-        used += some
-        for a in range(n):
-            for b in range(n):
-                meat[a, b] += score[a] * score[b]
-    return used
-
-
-@njit(cache=True, nogil=True)
-def shifts(
-    seen_values: Array,
-    value: Array,
-    slope: Array,
-    nearest: Array,
-    huber: float,
-    by_boundary: Array,
-    by_value: Array,
-) -> float:
-    """What is left of the values, as shifts of the centre: of each boundary and of each value.
-
-    `by_boundary` (2, K + 1) and `by_value` (2, values) take the shift, px, and its information, in units of
-    the variance of one value, which is returned.
-    """
-    values, rows = value.shape
-    by_boundary[:] = 0.0
-    by_value[:] = 0.0
-    squares, n = 0.0, 0
-    for i in range(values):
-        for v in range(rows):
-            b = nearest[i, v]
-            if b < 0:
-                continue
-            residual = min(max(seen_values[i, v] - value[i, v], -huber), huber)
-            squares += residual * residual
-            n += 1
-            steep = slope[1, i, v]
-            by_boundary[0, b] += steep * residual
-            by_boundary[1, b] += steep * steep
-            by_value[0, i] += steep * residual
-            by_value[1, i] += steep * steep
-    for b in range(by_boundary.shape[1]):
-        by_boundary[0, b] /= max(by_boundary[1, b], 1e-12)
-    for i in range(values):
-        by_value[0, i] /= max(by_value[1, i], 1e-12)
-    return squares / max(n, 1)

@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy import special
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
@@ -187,25 +188,48 @@ class JointScaleRanging(Ranging):
         """
         from evlcp_joint import _kernels
 
-        when = _when(len(values))
-        profile = (self.blur_px, _TAIL * self.blur_px, self.core_share)
-        prior = _NOISE**2 / _WIDTH_SIGMA**2
-        value, slope, nearest = (
-            np.empty(values.shape),
-            np.empty((5, *values.shape)),
-            np.empty_like(values, int),
-        )
+        when, profile = _when(len(values)), _profile(self.core_share)
+        codes, prior = codes.astype(np.float64), _NOISE**2 / _WIDTH_SIGMA**2
         by_boundary, by_value = np.empty((2, len(known))), np.empty((2, len(values)))
-        normal, moved, fit = np.empty((5, 5)), offset, fit.copy()
+        scores, normal = np.empty((values.shape[1], 5)), np.empty((5, 5))
+        first, last = np.empty_like(known, int), np.empty_like(known, int)
+        moved, fit = offset, fit.copy()
         for left in range(_ROUNDS, -1, -1):
             # Only the last fit has to be exact.
             tolerance = _CLOSE if left else _EXACT
             if not _kernels.solve(
-                codes, known, moved, when, profile, self.huber, prior, values, _STEPS, tolerance, fit, normal
+                codes,
+                known,
+                moved,
+                when,
+                profile,
+                self.blur_px,
+                self.huber,
+                prior,
+                values,
+                _STEPS,
+                tolerance,
+                fit,
+                normal,
+                first,
+                last,
             ):
                 return None
-            _kernels.model(codes, known, moved, when, profile, fit, value, slope, nearest)
-            noise = _kernels.shifts(values, value, slope, nearest, self.huber, by_boundary, by_value)
+            noise, spent, squares = _kernels.leftovers(
+                codes,
+                first,
+                last,
+                moved,
+                when,
+                profile,
+                self.blur_px,
+                self.huber,
+                values,
+                fit,
+                by_boundary,
+                by_value,
+                scores,
+            )
             used = by_boundary[1] > 0
             off, weight = by_boundary[0, used], by_boundary[1, used]
             if len(off) < least:
@@ -215,13 +239,8 @@ class JointScaleRanging(Ranging):
             most_px = max(_OUTLIER * 1.4826 * median(np.abs(off).tolist()), _LEAST_OUTLIER_PX)
             known = known & (np.abs(by_boundary[0]) <= most_px)[:, None]
             moved = offset + _own_motion(by_value[0] + moved - offset, by_value[1] / max(noise, 1e-12), when)
-        counts = nearest >= 0
-        seen_values = values[counts]
-        spent = float(np.square(seen_values - value[counts]).sum())
-        if spent > (1 - _LEAST_EXPLAINED) * float(np.square(seen_values).sum()):
+        if spent > (1 - _LEAST_EXPLAINED) * squares:
             return None
-        meat = np.empty_like(normal)
-        rows = _kernels.row_scores(values, value, slope, self.huber, meat)
         place = np.flatnonzero(used) - (len(known) - 1) / 2
         try:
             inverse = np.linalg.inv(normal)
@@ -229,7 +248,8 @@ class JointScaleRanging(Ranging):
             spread = float(np.linalg.inv((scale * weight) @ scale.T)[0, 0])
         except np.linalg.LinAlgError:
             return None
-        by_row = (inverse @ meat @ inverse)[0, 0] * rows / max(rows - 5, 1)
+        rows = int(scores[:, 3].astype(bool).sum())
+        by_row = float(np.square(scores @ inverse[0]).sum()) * rows / max(rows - 5, 1)
         by_scatter = spread * float((weight * off**2).sum()) / max(len(off) - 2, 1)
         return fit, float(np.sqrt(max((by_row + by_scatter) / 2, 0.0))), by_boundary[:, 1:-1]
 
@@ -261,6 +281,23 @@ def _offsets(offset_px: Floats) -> Floats:
     second = offset_px[:, 1::2]
     step = second - offset_px[:, 0::2]
     return second - (step - np.rint(step)) / 2
+
+
+@cache
+def _profile(core_share: float) -> Floats:
+    """Of a boundary with a core of width 1: -1 to 1 across it, and the slope of that, float64 (2, n).
+
+    From its middle to `_kernels._REACH`; straight pieces between leave a hundred-thousandth.
+    """
+    from evlcp_joint._kernels import _REACH
+
+    z = np.linspace(0, _REACH, 2049)
+    parts = ((core_share, 1.0), (1 - core_share, _TAIL))
+    across = sum(share * special.erf(z / wide / np.sqrt(2)) for share, wide in parts)
+    slope = sum(share * 2 * np.exp(-0.5 * (z / wide) ** 2) / wide for share, wide in parts) / np.sqrt(
+        2 * np.pi
+    )
+    return np.stack([across, slope])
 
 
 @cache

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from evlcp_joint import _kernels
-from evlcp_joint.ranging import JointScaleRanging
+from evlcp_joint.ranging import JointScaleRanging, _profile
 from numpy.testing import assert_allclose
 from scipy.stats import norm, theilslopes
 
@@ -191,57 +191,117 @@ def test_panels_are_refused() -> None:
         JointScaleRanging().compile(CameraModel(), panel, LINK.codebook)
 
 
-PROFILE = (0.2, 0.6, 0.4)
+BLUR, SHARE = 0.2, 0.4
 
 
-def profile_of(z: np.ndarray, width: float) -> np.ndarray:
-    """The twin of a boundary's profile."""
-    core, tail, share = PROFILE[0] * np.exp(width), PROFILE[1] * np.exp(width), PROFILE[2]
-    return share * norm.cdf(z / core) + (1 - share) * norm.cdf(z / tail)
+def test_profile_is_a_mixture_of_normal_distributions() -> None:
+    table = _profile(SHARE)
+    z = np.linspace(0, _kernels._REACH, table.shape[1])
+    assert_allclose(table[0], 2 * (SHARE * norm.cdf(z) + (1 - SHARE) * norm.cdf(z / 3)) - 1, atol=1e-12)
+    assert_allclose(table[1], 2 * (SHARE * norm.pdf(z) + (1 - SHARE) * norm.pdf(z / 3) / 3), atol=1e-12)
 
 
-def model_of(
-    fit: np.ndarray, codes: np.ndarray, known: np.ndarray, offset: np.ndarray, when: np.ndarray, rows: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    values = codes.shape[1]
-    value, slope = np.empty((values, rows)), np.empty((5, values, rows))
-    nearest = np.empty((values, rows), np.int64)
-    _kernels.model(codes, known, offset, when, PROFILE, fit, value, slope, nearest)
-    return value, slope, nearest
+class Twin:
+    """Values about boundaries, fitted: each boundary by itself, with the profile from SciPy."""
+
+    def __init__(self, seed: int, rows: int = 90) -> None:
+        rng = np.random.default_rng(seed)
+        self.codes = rng.choice([-1.0, 1.0], (K, 6))
+        self.known = rng.random((K + 1, 6)) > 0.1
+        self.known[[0, K]] = False
+        self.offset, self.when = rng.uniform(-0.5, 0.5, 6), np.linspace(-0.5, 0.5, 6)
+        self.fit = np.array([5.3, 0.2, 0.1, 0.7, 0.2])
+        self.rows = rows
+        self.first, self.last = np.empty((2, K + 1, 6), np.int64)
+        reach = _kernels._REACH * BLUR * np.exp(0.2)
+        _kernels.rows_felt(self.known, self.offset, self.when, reach, self.fit, rows, self.first, self.last)
+        self.reach = min(reach, 5.3 / 2)
+        self.seen = 0.7 * rng.choice([-1.0, 1.0], (6, rows)) + rng.normal(0, 0.5, (6, rows))
+        self.args = (self.codes, self.first, self.last, self.offset, self.when, _profile(SHARE), BLUR)
+
+    def place(self, fit: np.ndarray, b: int, i: int) -> float:
+        middle = (self.rows - 1) / 2 + self.offset[i] + fit[1] + fit[2] * self.when[i]
+        return float(middle + fit[0] * (b - K / 2))
+
+    def cells(self, fit: np.ndarray) -> np.ndarray:
+        """Boundary, value, row and expected value of each cell."""
+        out = []
+        for b in range(1, K):
+            for i in range(6):
+                if self.known[b, i] and self.codes[b, i] != self.codes[b - 1, i]:
+                    # Rows stay those of the fit that they were found for.
+                    at = self.place(self.fit, b, i)
+                    for v in range(self.rows):
+                        if at - self.reach <= v < at + self.reach:
+                            z = (v - self.place(fit, b, i)) / (BLUR * np.exp(fit[4]))
+                            share = SHARE * norm.cdf(z) + (1 - SHARE) * norm.cdf(z / 3)
+                            value = self.codes[b - 1, i] * (1 - share) + self.codes[b, i] * share
+                            out.append((b, i, v, fit[3] * value))
+        return np.array(out)
+
+    def slopes(self) -> np.ndarray:
+        """By differences, float64 (5, cells)."""
+        step = 1e-5 * np.eye(5)
+        return np.array(
+            [(self.cells(self.fit + s)[:, 3] - self.cells(self.fit - s)[:, 3]) / 2e-5 for s in step]
+        )
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_model_is_the_profile_and_its_slopes_are_differences(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    codes = rng.choice([-1, 1], (K, 4))
-    known = rng.random((K + 1, 4)) > 0.1
-    offset, when = rng.uniform(-0.5, 0.5, 4), np.linspace(-0.5, 0.5, 4)
-    fit = np.array([7.3, 0.4, 0.3, 0.8, 0.1])
-    value, slope, nearest = model_of(fit, codes, known, offset, when, 130)
-    rows = np.arange(130) - 64.5
+def test_normal_equations_are_huber_s(seed: int) -> None:
+    twin = Twin(seed)
+    b, i, v = twin.cells(twin.fit)[:, :3].astype(int).T
+    assert len(b) > 100
+    r = twin.seen[i, v] - twin.cells(twin.fit)[:, 3]
+    j = twin.slopes()
+    w = np.minimum(1, 0.5 / np.abs(r))
+    normal, right = np.empty((5, 5)), np.empty(5)
+    cost = _kernels.equations(*twin.args, 0.5, 2.0, twin.seen, twin.fit, normal, right)
+    prior = np.diag([0, 0, 0, 0, 2.0])
+    # The profile is of straight pieces.
+    assert_allclose(normal, (j * w) @ j.T + prior, rtol=1e-3, atol=0.05)
+    assert_allclose(right, (j * w) @ r - prior @ twin.fit, rtol=1e-3, atol=0.02)
+    want = np.where(np.abs(r) <= 0.5, r**2 / 2, 0.5 * (np.abs(r) - 0.25)).sum()
+    assert cost == pytest.approx(want + twin.fit[4] ** 2, rel=1e-4)
 
-    def wanted(fit: np.ndarray) -> np.ndarray:
-        """Every boundary's profile at every row, (4, 130)."""
-        at = rows - offset[:, None] - fit[1] - fit[2] * when[:, None]
-        share = profile_of(at[..., None] - fit[0] * (np.arange(1, K) - K / 2), fit[4])
-        return fit[3] * (codes[0, :, None] + np.einsum("ivb,bi->iv", share, np.diff(codes, axis=0)))
 
-    want, counts = wanted(fit), ~np.isnan(value)
-    # The tails end at four of their sigmas.
-    assert_allclose(value[counts], want[counts], atol=2e-4)
-    assert np.array_equal(nearest >= 0, counts)
-    at = rows - offset[:, None] - fit[1] - fit[2] * when[:, None]
-    place = np.rint(at / fit[0] + K / 2).astype(int)
-    assert np.array_equal(nearest[counts], place[counts])
-    inside = (place >= 1) & (place <= K - 1)
-    assert np.array_equal(counts, inside & known[np.clip(place, 0, K), np.arange(4)[:, None]])
-    assert (counts.sum(1) > 60).all()
-    for a in range(5):
-        step = np.zeros(5)
-        step[a] = 1e-6
-        differences = (wanted(fit + step) - wanted(fit - step)) / 2e-6
-        # A tail that is cut off at four of its sigmas has this slope there, by the place of the outermost.
-        assert_allclose(slope[a][counts], differences[counts], atol=1e-2 if a == 0 else 2e-3)
+@pytest.mark.parametrize("seed", range(3))
+def test_leftovers_are_by_boundary_value_and_row(seed: int) -> None:
+    twin = Twin(seed)
+    b, i, v = twin.cells(twin.fit)[:, :3].astype(int).T
+    r = twin.seen[i, v] - twin.cells(twin.fit)[:, 3]
+    j, clipped = twin.slopes(), np.clip(r, -0.5, 0.5)
+    by_boundary, by_value, scores = np.empty((2, K + 1)), np.empty((2, 6)), np.empty((90, 5))
+    noise, spent, squares = _kernels.leftovers(
+        *twin.args, 0.5, twin.seen, twin.fit, by_boundary, by_value, scores
+    )
+    assert noise == pytest.approx((clipped**2).mean(), rel=1e-4)
+    assert spent == pytest.approx((r**2).sum(), rel=1e-4)
+    assert squares == pytest.approx((twin.seen[i, v] ** 2).sum())
+    for got, which in ((by_boundary, b), (by_value, i)):
+        for n in range(got.shape[1]):
+            own = which == n
+            information = (j[1, own] ** 2).sum()
+            assert got[1, n] == pytest.approx(information, rel=1e-3, abs=1e-9)
+            if information:
+                assert got[0, n] == pytest.approx((j[1, own] @ clipped[own]) / information, abs=1e-3)
+    want = np.array([(j[:, v == n] * clipped[v == n]).sum(1) for n in range(90)])
+    assert_allclose(scores, want, atol=5e-3)
+
+
+def test_rows_belong_to_the_nearest_boundary_only() -> None:
+    known, rows = np.ones((K + 1, 2), np.bool_), 60
+    known[5, 1] = False
+    first, last = np.empty((2, K + 1, 2), np.int64)
+    fit = np.array([2.6, 0.3, 0.0, 1.0, 0.0])
+    _kernels.rows_felt(known, np.array([0.2, -0.4]), np.array([-0.5, 0.5]), 2.4, fit, rows, first, last)
+    for i in (0, 1):
+        counts = np.zeros(rows, int)
+        for b in range(K + 1):
+            counts[first[b, i] : last[b, i]] += 1
+        assert counts.max() == 1
+        # All but the rows of the boundary that is not known, and those beyond the last.
+        assert counts.sum() in ((44, 45) if i == 0 else (41, 42))
 
 
 def test_column_light_is_the_mean_size_beside_the_line() -> None:
@@ -273,71 +333,40 @@ def test_row_values_are_clipped_weighted_means() -> None:
         assert_allclose(out[:, v], np.average(clipped, axis=1, weights=weight[inside]))
 
 
-def test_the_profile_from_tables_is_the_profile_to_a_millionth() -> None:
-    for z in np.linspace(-12, 12, 999):
-        share, slope = _kernels._across(z, 0.45, 1.35, 0.8)
-        assert share == pytest.approx(0.8 * norm.cdf(z / 0.45) + 0.2 * norm.cdf(z / 1.35), abs=2e-6)
-        assert slope == pytest.approx(
-            0.8 / 0.45 * norm.pdf(z / 0.45) + 0.2 / 1.35 * norm.pdf(z / 1.35), abs=2e-6
-        )
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_normal_equations_scores_and_shifts_are_huber_s(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    codes = rng.choice([-1, 1], (K, 6))
-    known = rng.random((K + 1, 6)) > 0.1
-    offset, when = rng.uniform(-0.5, 0.5, 6), np.linspace(-0.5, 0.5, 6)
-    fit = np.array([6.1, 0.2, 0.1, 0.7, 0.2])
-    value, slope, nearest = model_of(fit, codes, known, offset, when, 90)
-    seen = np.nan_to_num(value) + rng.normal(0, 0.5, value.shape)
-    normal, right, meat = np.empty((5, 5)), np.empty(5), np.empty((5, 5))
-    cost = _kernels.equations(codes, known, offset, when, PROFILE, 0.5, 2.0, seen, fit, normal, right)
-    good = ~np.isnan(value)
-    r = (seen - value)[good]
-    j = slope[:, good]
-    w = np.minimum(1, 0.5 / np.abs(r))
-    prior = np.diag([0, 0, 0, 0, 2.0])
-    # The profile comes from tables that are good to a millionth, and this is a sum over hundreds of rows.
-    assert_allclose(normal, (j * w) @ j.T + prior, rtol=1e-5, atol=2e-4)
-    assert_allclose(right, (j * w) @ r - prior @ fit, rtol=1e-5, atol=2e-4)
-    want = np.where(np.abs(r) <= 0.5, r**2 / 2, 0.5 * (np.abs(r) - 0.25)).sum()
-    assert cost == pytest.approx(want + 2.0 * fit[4] ** 2 / 2, rel=1e-5)
-    rows = _kernels.row_scores(seen, value, slope, 0.5, meat)
-    clipped = np.where(good, np.clip(seen - value, -0.5, 0.5), 0)
-    scores = (slope * clipped).sum(1)
-    assert_allclose(meat, scores @ scores.T)
-    assert rows == good.any(0).sum()
-    by_boundary, by_value = np.empty((2, K + 1)), np.empty((2, 6))
-    noise = _kernels.shifts(seen, value, slope, nearest, 0.5, by_boundary, by_value)
-    assert noise == pytest.approx(np.square(clipped[good]).mean())
-    for got, which in ((by_boundary, nearest), (by_value, np.indices(nearest.shape)[0])):
-        for n in range(got.shape[1]):
-            own = good & (which == n)
-            information = np.square(slope[1][own]).sum()
-            assert got[1, n] == pytest.approx(information)
-            if information:
-                assert got[0, n] == pytest.approx((slope[1] * clipped)[own].sum() / information)
-
-
 def test_solve_leaves_no_score() -> None:
+    twin = Twin(5)
     rng = np.random.default_rng(5)
-    codes = rng.choice([-1, 1], (K, 16))
-    known = np.ones((K + 1, 16), np.bool_)
-    offset, when = rng.uniform(-0.5, 0.5, 16), (np.arange(16) + 0.5) / 16 - 0.5
-    truth = np.array([7.31, 0.3, 0.4, 0.7, 0.1])
-    seen = np.nan_to_num(model_of(truth, codes, known, offset, when, 124)[0])
-    seen += rng.normal(0, 0.3, seen.shape)
-    fit, normal = truth * [1.004, 1, 1, 1, 0], np.empty((5, 5))
-    assert _kernels.solve(codes, known, offset, when, PROFILE, 0.5, 2.0, seen, 50, 1e-12, fit, normal)
-
-    value, slope, _ = model_of(fit, codes, known, offset, when, 124)
-    good = ~np.isnan(value)
-    left = np.clip(seen - value, -0.5, 0.5)[good]
-    score = slope[:, good] @ left - 2.0 * fit * [0, 0, 0, 0, 1]
+    truth = twin.fit.copy()
+    cells = twin.cells(truth)
+    b, i, v = cells[:, :3].astype(int).T
+    seen = np.zeros((6, twin.rows))
+    seen[i, v] = cells[:, 3] + rng.normal(0, 0.2, len(b))
+    fit, normal = truth * [1.004, 1, 1, 1, 1], np.empty((5, 5))
+    first, last = np.empty((2, K + 1, 6), np.int64)
+    assert _kernels.solve(
+        twin.codes, twin.known, twin.offset, twin.when, _profile(SHARE), BLUR, 0.5, 2.0, seen, 50, 1e-12,
+        fit, normal, first, last,
+    )  # fmt: skip
+    again, score = np.empty((5, 5)), np.empty(5)
+    _kernels.equations(
+        twin.codes,
+        first,
+        last,
+        twin.offset,
+        twin.when,
+        _profile(SHARE),
+        BLUR,
+        0.5,
+        2.0,
+        seen,
+        fit,
+        again,
+        score,
+    )
+    assert_allclose(normal, again)
     # No score is left: a thousandth of a standard deviation of each.
     assert (np.abs(score) < 1e-3 * np.sqrt(np.diag(normal))).all()
-    sigma = np.sqrt(np.diag(np.linalg.inv(normal))) * 0.3
+    sigma = np.sqrt(np.diag(np.linalg.inv(normal))) * 0.2
     assert (np.abs(fit - truth) < 4 * sigma).all()
 
 

@@ -72,7 +72,7 @@ def test_a_first_distance_stays_but_for_the_lean_that_is_likely() -> None:
     _, found = RangeKeeper().step(Ranges(), 0.0, CHIP_US, Range(50.0, 0.02, 15))
 
     def chance(a: float) -> float:
-        return 0.97 * norm.pdf(a, 0, math.radians(0.7)) + 0.03 / math.radians(12)
+        return 0.98 * norm.pdf(a, 0, math.radians(0.7)) + 0.02 / math.radians(12)
 
     most = math.radians(6)
     mean = quad(lambda a: chance(a) * math.cos(a), -most, most, points=[0])[0]
