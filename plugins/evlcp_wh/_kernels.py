@@ -129,25 +129,22 @@ def max_log(fit: Array, bits: int, zero: Array, one: Array) -> None:
 def count_pairs(sums: Array, codes: Array, probability: Array, grid: int, most: int, counts: Array) -> None:
     """Histograms of a value's two polarity sums where the value is known, `counts` (value, first, second).
 
-    Each pixel counts for its likeliest cluster by that cluster's probability.
+    A pixel that rather shows one cluster than any other, or none, counts for it by its probability.
     """
     clusters, length = codes.shape
     _, rows, columns = probability.shape
-    for r in range(rows):
-        for c in range(columns):
-            k = 0
-            for other in range(1, clusters):
-                if probability[other, r, c] > probability[k, r, c]:
-                    k = other
-            weight = probability[k, r, c]
-            if weight < 0.5:
-                continue
-            for v in range(r * grid, (r + 1) * grid):
-                for u in range(c * grid, (c + 1) * grid):
-                    for i in range(length):
-                        first = min(max(sums[2 * i, v, u], -most), most) + most
-                        second = min(max(sums[2 * i + 1, v, u], -most), most) + most
-                        counts[(codes[k, i] + 1) // 2, first, second] += weight
+    for k in range(clusters):
+        for r in range(rows):
+            for c in range(columns):
+                weight = probability[k, r, c]
+                if weight <= 0.5:
+                    continue
+                for v in range(r * grid, (r + 1) * grid):
+                    for u in range(c * grid, (c + 1) * grid):
+                        for i in range(length):
+                            first = min(max(sums[2 * i, v, u], -most), most) + most
+                            second = min(max(sums[2 * i + 1, v, u], -most), most) + most
+                            counts[(codes[k, i] + 1) // 2, first, second] += weight
 
 
 @njit(cache=True, nogil=True)
@@ -200,34 +197,62 @@ def worth_images(sums: Array, worth: Array, most: int, seam: int, out: Array) ->
 
 
 @njit(cache=True, nogil=True)
-def cluster_matches(maps: Array, images: Array, out: Array) -> None:
+def cluster_matches(maps: Array, prior: Array, grid: int, images: Array, out: Array) -> None:
     """What the pixels of each cluster say of each value if the bar is off its place, `out` (K, n, n, values).
 
-    Shifts (down, right) go from -(n // 2) to n // 2 px, the seam of the images.
+    Shifts (down, right) go from -(n // 2) to n // 2 px, the seam of the images. Pixels count where a cluster
+    may be, by the prior of their cell: those of its neighbours tell nothing.
     """
-    clusters, height, width = maps.shape
+    clusters, rows, columns = prior.shape
     _, side, _, values = out.shape
+    # Values lie side by side, and so do those of neighbouring pixels.
+    run = side * values
+    lines = images.reshape(images.shape[0], images.shape[1] * values)
+    sums = out.reshape(clusters, side, run)
     out[:] = 0.0
     for k in range(clusters):
-        for v in range(height):
-            for u in range(width):
-                weight = maps[k, v, u]
-                if weight > 0:
-                    for a in range(side):
-                        for b in range(side):
-                            # Values innermost: they lie side by side.
-                            for i in range(values):
-                                out[k, a, b, i] += weight * images[v + a, u + b, i]
+        for r in range(rows):
+            for c in range(columns):
+                if prior[k, r, c] <= 0:
+                    continue
+                for v in range(r * grid, (r + 1) * grid):
+                    for u in range(c * grid, (c + 1) * grid):
+                        weight = maps[k, v, u]
+                        if weight > 0:
+                            for a in range(side):
+                                line = lines[v + a, u * values : u * values + run]
+                                total = sums[k, a]
+                                for i in range(run):
+                                    total[i] += weight * line[i]
+
+
+@njit(cache=True, nogil=True)
+def path_scores(matches: Array, known: Array, out: Array) -> None:
+    """Twice what all clusters say of a shift in each value, `out` (n, n, values).
+
+    `known` are the codes of the first values, (K, m); of the others, each cluster's is what fits better.
+    """
+    clusters, side, _, values = matches.shape
+    first = known.shape[1]
+    out[:] = 0.0
+    for k in range(clusters):
+        for a in range(side):
+            for b in range(side):
+                for i in range(first):
+                    out[a, b, i] += known[k, i] * matches[k, a, b, i]
+                for i in range(first, values):
+                    out[a, b, i] += abs(matches[k, a, b, i])
 
 
 @njit(cache=True, nogil=True)
 def smooth_path(scores: Array, step_cost: float, place_cost: float, path: Array) -> None:
     """Shifts (down, right) of all values that score best together (Viterbi), `path` (values, 2), px.
 
-    A shift costs its square times `place_cost`, a change from value to value its square times `step_cost`.
-    Squares add, so the best predecessor is sought along one axis, then along the other.
+    `scores` are (n, n, values). A shift costs its square times `place_cost`, a change from value to value its
+    square times `step_cost`. Squares add, so the best predecessor is sought along one axis, then along the
+    other.
     """
-    values, side, _ = scores.shape
+    side, _, values = scores.shape
     reach = side // 2
     best = np.zeros((side, side))
     half = np.empty((side, side))
@@ -253,7 +278,7 @@ def smooth_path(scores: Array, step_cost: float, place_cost: float, path: Array)
                             come_b[i, a, b] = d
         for a in range(side):
             for b in range(side):
-                best[a, b] += scores[i, a, b] - place_cost * ((a - reach) ** 2 + (b - reach) ** 2)
+                best[a, b] += scores[a, b, i] - place_cost * ((a - reach) ** 2 + (b - reach) ** 2)
     a, b = reach, reach
     for c in range(side):
         for d in range(side):

@@ -106,14 +106,11 @@ class MotionFeedback(Decoding):
         values, seam, side = len(sums) // 2, self.reach_px, 2 * self.reach_px + 1
         images = np.empty((height + 2 * seam, width + 2 * seam, values), np.float32)
         _kernels.worth_images(sums, worth.astype(np.float32), len(worth) // 2, seam, images)
-        maps = presence.pixels
-        if presence.prior is not None:
-            # Pixels in a cluster's own cells; those in its neighbours' tell nothing.
-            own = (presence.prior > 0).repeat(presence.grid_px, 1).repeat(presence.grid_px, 2)
-            maps = np.where(own, maps[:, : own.shape[1], : own.shape[2]], np.float32(0))
-        out = np.empty((len(maps), side, side, values), np.float32)
-        _kernels.cluster_matches(maps, images, out)
-        return self.independent_pixels * out
+        prior = presence.probability if presence.prior is None else presence.prior
+        out = np.empty((len(prior), side, side, values), np.float32)
+        _kernels.cluster_matches(presence.pixels, prior, presence.grid_px, images, out)
+        out *= self.independent_pixels
+        return out
 
     def _path(self, matches: NDArray[np.float32], known: NDArray[np.int64]) -> NDArray[np.int64]:
         """Shift (down, right) of the bar from its place in each value, int64 (values, 2), px.
@@ -122,11 +119,12 @@ class MotionFeedback(Decoding):
         """
         from evlcp_wh import _kernels
 
-        n = known.shape[1]
-        fits = np.abs(matches[..., n:]).sum(0), np.einsum("kabi,ki->abi", matches[..., :n], known)
-        scores = np.moveaxis(np.concatenate(fits[::-1], axis=-1), -1, 0) / 2
-        path = np.empty((len(scores), 2), np.int64)
-        _kernels.smooth_path(scores, 0.5 / self.step_px**2, 0.5 / self.place_px**2 / len(scores), path)
+        values = matches.shape[3]
+        scores = np.empty(matches.shape[1:], np.float64)
+        _kernels.path_scores(matches, known, scores)
+        # What is scored is twice a log-likelihood, and so are the costs.
+        path = np.empty((values, 2), np.int64)
+        _kernels.smooth_path(scores, 1 / self.step_px**2, 1 / self.place_px**2 / values, path)
         return path
 
     def _separated(

@@ -116,7 +116,9 @@ def test_max_log(clusters, bits):
 def test_histograms_of_pairs_and_their_worth(seed, grid, most):
     rng = np.random.default_rng(seed)
     sums = random_sums(rng, (16, 13, 10))
-    probability = presence_of(rng, CLUSTERS, 13 // grid, 10 // grid, grid).probability
+    # One cluster or none shows in a cell, so that probabilities sum to one at the most.
+    probability = rng.dirichlet(np.full(CLUSTERS + 1, 0.1), (13 // grid, 10 // grid)).T[:-1].swapaxes(1, 2)
+    assert ((probability > 0.5).sum((1, 2)) > 0).any()
     counts = np.full((2, 2 * most + 1, 2 * most + 1), 0.5)
     _kernels.count_pairs(sums, CODES.astype(np.int64), probability, grid, most, counts)
     assert_allclose(counts, twins.count_pairs(sums, CODES, probability, grid, most, 0.5), rtol=1e-6)
@@ -140,9 +142,22 @@ def test_what_clusters_say_off_their_places(seed, reach):
     pixels = twins.worth_of(sums, worth) - worth[2, 2]
     want = np.pad(pixels, ((0, 0), (reach, reach), (reach, reach)))
     assert_allclose(images, np.moveaxis(want, 0, -1))
+    prior = (rng.random((4, 5, 3)) * (rng.random((4, 5, 3)) < 0.7)).astype(np.float32)
     out = np.empty((4, 2 * reach + 1, 2 * reach + 1, 6))
-    _kernels.cluster_matches(maps, images, out)
-    assert_allclose(out, twins.cluster_matches(pixels, maps, reach), atol=1e-6)
+    _kernels.cluster_matches(maps, prior, 2, images, out)
+    own = np.zeros(maps.shape, bool)
+    own[:, :10, :6] = (prior > 0).repeat(2, 1).repeat(2, 2)
+    assert_allclose(out, twins.cluster_matches(pixels, maps * own, reach), atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_scores_of_shifts_by_known_codes_and_by_what_fits(seed):
+    rng = np.random.default_rng(seed)
+    matches, known = rng.normal(size=(4, 3, 3, 7)), rng.choice([-1, 1], (4, 5))
+    out = np.empty((3, 3, 7))
+    _kernels.path_scores(matches, known, out)
+    assert_allclose(out[..., :5], np.einsum("kabi,ki->abi", matches[..., :5], known), atol=1e-12)
+    assert_allclose(out[..., 5:], np.abs(matches[..., 5:]).sum(0), atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -150,7 +165,7 @@ def test_what_clusters_say_off_their_places(seed, reach):
 def test_the_smooth_path_is_the_best_of_all(seed, step_cost, place_cost):
     scores = np.random.default_rng(seed).normal(0, 2, (4, 3, 3))
     path = np.empty((4, 2), np.int64)
-    _kernels.smooth_path(scores, step_cost, place_cost, path)
+    _kernels.smooth_path(np.moveaxis(scores, 0, -1), step_cost, place_cost, path)
     assert_array_equal(path, twins.best_path(scores, step_cost, place_cost))
 
 
