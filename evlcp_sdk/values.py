@@ -229,7 +229,7 @@ class PresenceMap:
         pixels: Pilot correlation of the pixels in and around each cluster's selected cells, float32
             (K, height, width), 0 elsewhere; the maps that ranging needs.
         prior: The same probability by the bar's place alone, float32 (K, rows, columns); None where it is not
-            known. `probability` has it in already.
+            known. `probability` is 0 where this is, and has no more of it in.
     """
 
     probability: NDArray[np.float32]
@@ -238,12 +238,15 @@ class PresenceMap:
     pixels: NDArray[np.float32]
     prior: NDArray[np.float32] | None = None
 
-    def informed(self, prior: NDArray[np.float32]) -> "PresenceMap":
-        """Take in what the bar's place says, by Bayes' rule; `probability` is for K equal chances, and none.
+    def informed(self) -> "PresenceMap":
+        """With what the bar's place says taken into `probability` by Bayes' rule; as it is without a prior.
 
-        Args:
-            prior: Probability by place alone, float32 (K, rows, columns); the rest, of showing no cluster.
+        What a cell shows tells how well it can be read, too; for a decoding that knows that by other means, a
+        dim cell in its place counts in full.
         """
+        prior = self.prior
+        if prior is None:
+            return self
         clusters = len(prior)
         inside = prior.any(0)
         share, place = self.probability[:, inside], prior[:, inside]
@@ -255,7 +258,7 @@ class PresenceMap:
         share /= share.sum(0) + np.maximum(1 - place.sum(0), np.float32(1e-6))
         probability = np.zeros_like(prior)
         probability[:, inside] = share
-        return replace(self, probability=probability, prior=prior)
+        return replace(self, probability=probability)
 
     def __repr__(self) -> str:
         clusters, rows, columns = self.selected.shape

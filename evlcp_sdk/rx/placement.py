@@ -198,8 +198,9 @@ def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> Prese
     else:
         _kernels.block_prior(places, unit, spacing_px, grid, prior)
     _kernels.copy_near(presence.pixels, places, unit, spacing_px, across_px, pixels)
-    placed = presence.informed(prior)
-    return replace(placed, selected=presence.selected & (prior > 0), pixels=pixels)
+    inside = prior > 0
+    probability = np.where(inside, presence.probability, np.float32(0))
+    return PresenceMap(probability, grid, presence.selected & inside, pixels, prior)
 
 
 def lit(

@@ -61,6 +61,7 @@ class MlSoft(Decoding):
         pilots = codebook.pilots.astype(np.int64)
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
+            presence = presence.informed()
             worth = learned_worth(presence, sums, pilots, self.max_events, self.prior_count)
             values = combined_values(presence, sums[2 * pilots.shape[1] :], worth, self.min_weight)
             return soft_symbols(values, words, self.independent_pixels)

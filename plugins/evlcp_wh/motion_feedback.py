@@ -65,6 +65,7 @@ class MotionFeedback(Decoding):
         pilots = codebook.pilots.astype(np.int64)
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
+            presence = presence.informed()
             worth = learned_worth(presence, sums, pilots, self.max_events, self.prior_count)
             matches = self._matches(presence, sums, worth)
             known, aligned = pilots, sums
@@ -137,8 +138,7 @@ class MotionFeedback(Decoding):
         probability = np.zeros_like(before.probability)
         pilot = sums[: 2 * pilots.shape[1]]
         _kernels.presence(pilot, pilots, before.grid_px, agree, disagree, self.min_values, probability)
-        after = replace(before, probability=probability)
-        return after if before.prior is None else after.informed(before.prior)
+        return replace(before, probability=probability).informed()
 
 
 def _taken_back(sums: NDArray[np.int16], path: NDArray[np.int64]) -> NDArray[np.int16]:

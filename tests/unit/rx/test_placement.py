@@ -117,8 +117,8 @@ def test_a_halo_is_not_in_the_footprints() -> None:
     selected = np.where(core, presence.selected, np.where(hit, any_row, halo.selected) & halo.selected.any(0))
     blurred = PresenceMap(selected.astype(np.float32), 2, selected, selected.repeat(2, 1).repeat(2, 2) * 1.0)
     only = masked(blurred, LINE, placements(blurred, LINE)[0])
-    assert (only.probability[presence.selected] > 0.5).all()
-    assert only.probability.sum() < 1.1 * presence.selected.sum()
+    assert (only.informed().probability[presence.selected] > 0.5).all()
+    assert only.informed().probability.sum() < 1.1 * presence.selected.sum()
 
 
 def test_where_the_place_is_known_presence_is_that_of_bayes() -> None:
@@ -126,7 +126,8 @@ def test_where_the_place_is_known_presence_is_that_of_bayes() -> None:
     probability = np.array([[[8 / 12, 0]], [[2 / 12, 0]]], np.float32)
     prior = np.array([[[0.3, 0.6]], [[0.5, 0.2]]], np.float32)
     nothing = np.zeros((2, 1, 2), bool)
-    placed = PresenceMap(probability, 2, nothing, np.zeros((2, 2, 4), np.float32)).informed(prior)
+    presence = PresenceMap(probability, 2, nothing, np.zeros((2, 2, 4), np.float32), prior)
+    placed = presence.informed()
     want = np.array([0.3 * 8, 0.5 * 2])
     # Of twelve parts two are for none: one for it, by as many chances as there are clusters.
     np.testing.assert_allclose(placed.probability[:, 0, 0], want / (want.sum() + 0.2), rtol=1e-5)
