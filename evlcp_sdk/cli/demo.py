@@ -124,8 +124,9 @@ def show_drive(summary: "Summary") -> None:
     """Print BER and RMSE of each segment of distance beside the paper's."""
     from rich.table import Table
 
-    from evlcp_sdk.study.campaign.summary import beside_paper, measure
-    from evlcp_sdk.study.tally import SEGMENT_M
+    from evlcp_sdk.study.campaign.summary import beside_paper
+    from evlcp_sdk.study.intervals import measure
+    from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
     (series,) = summary.series
     paper = {
@@ -136,13 +137,13 @@ def show_drive(summary: "Summary") -> None:
     table = Table(box=None, pad_edge=False, header_style="dim")
     for number, name in enumerate(("distance", "frames", "BER", "paper", "RMSE, m", "paper")):
         table.add_column(name, justify="right" if number else "left", no_wrap=True)
-    for begin, tally in reversed(series.statistics.segments):
-        ber, rmse = measure(tally, "ber"), measure(tally, "rmse_m")
-        none = ber.count and not ber.value
+    for begin, recordings in reversed(series.segments):
+        tally = Tally.together(recordings)
+        ber, rmse = measure(recordings, "ber"), measure(recordings, "rmse_m")
         table.add_row(
             f"{begin} to {begin + SEGMENT_M} m",
             f"{tally.frames_found} of {tally.frames_sent}",
-            f"below {ber.high:.1g}" if none else f"{ber.value:.2g}" if ber.count else "-",
+            f"below {ber.high:.1g}" if ber.none else f"{ber.value:.2g}" if ber.count else "-",
             paper.get(("ber", begin), "-"),
             f"{rmse.value:.3f}" if rmse.count else "-",
             paper.get(("rmse_m", begin), "-"),

@@ -102,26 +102,27 @@ def as_markdown(summary: "Summary") -> str:
 
 
 def _series_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
-    from evlcp_sdk.study.campaign.summary import measure
-    from evlcp_sdk.study.tally import SEGMENT_M
+    from evlcp_sdk.study.intervals import Figure, measure
+    from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
-    def shown(value: float, low: float, high: float, form: str) -> str:
-        return f"{value:{form}} [{low:{form}}, {high:{form}}]"
+    def shown(figure: Figure, form: str) -> str:
+        return f"{figure.value:{form}} {figure.interval(form)}".rstrip() if figure.count else "-"
 
     tallies = [t for one in summary.series for _, t in one.statistics.segments]
     messages = any(t.messages_sent for t in tallies)
     positions = any(t.fixes or t.fixes_refused for t in tallies)
     rows = []
     for one in summary.series:
-        for begin, tally in reversed(one.statistics.segments):
-            ber, rmse, gross = (measure(tally, kind) for kind in ("ber", "rmse_m", "gross_share"))
+        for begin, recordings in reversed(one.segments):
+            tally = Tally.together(recordings)
+            ber, rmse, gross = (measure(recordings, kind) for kind in ("ber", "rmse_m", "gross_share"))
             rows.append(
                 [
                     one.name,
                     f"{begin} to {begin + SEGMENT_M} m",
                     f"{tally.frames_found} of {tally.frames_sent}",
-                    shown(ber.value, ber.low, ber.high, ".1e") if ber.count else "-",
-                    shown(rmse.value, rmse.low, rmse.high, ".3f") if rmse.count else "-",
+                    shown(ber, ".1e"),
+                    shown(rmse, ".3f"),
                     f"{gross.value:.2%}" if gross.count else "-",
                     *([f"{tally.messages_found} of {tally.messages_sent}"] if messages else []),
                     *([f"{tally.messages_wrong}"] if messages else []),

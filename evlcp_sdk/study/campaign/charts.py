@@ -11,8 +11,9 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from evlcp_sdk.files import whole_file
 from evlcp_sdk.results.figures import TRANSMITTER_COLOURS
 from evlcp_sdk.study.campaign.paper import PAPER_NAME, Measure
-from evlcp_sdk.study.campaign.summary import Series, Summary, measure, reference_marks
-from evlcp_sdk.study.tally import BIN_M, SEGMENT_M
+from evlcp_sdk.study.campaign.summary import Series, Summary, reference_marks
+from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, INTERVALS, Figure, measure
+from evlcp_sdk.study.tally import BIN_M, SEGMENT_M, Tally
 
 __all__ = ["Chart", "Dot", "Line", "Mark", "charts_of", "decades", "draw", "save_charts"]
 
@@ -39,8 +40,8 @@ class Dot:
     Attributes:
         x: Where.
         y: The figure; where there was not one error on a logarithmic axis, the upper end of its interval.
-        low: Lower end of the interval.
-        high: Upper end.
+        low: Lower end of the interval, or the figure itself where there is none.
+        high: Upper end, the same.
         text: What a reader who points at it sees.
         limit: Only an upper limit is known.
     """
@@ -117,17 +118,14 @@ def charts_of(summary: Summary) -> list[Chart]:
             ]
         return Chart(id, title, distance, label, log, False, lines, tuple(marks), note)
 
-    independent = (
-        f"Segments of {SEGMENT_M} m. 95 % intervals take errors as independent; those of one frame or drive"
-        " are not quite, so true intervals are wider."
-    )
+    segments = f"Segments of {SEGMENT_M} m. {INTERVALS}"
     histogram = _lines(summary.series, lambda series, _: _bins(series))
     positions = over_distance(
         "position_rmse_m",
         "position",
         "Position error",
         "position RMSE in space, m",
-        f"{independent} Chi-square. The distance is that of the nearest bar.",
+        f"{segments} The distance is that of the nearest bar.",
         log=True,
     )
     return [
@@ -136,18 +134,16 @@ def charts_of(summary: Summary) -> list[Chart]:
             "ber",
             "Bit error rate",
             "bit error rate",
-            f"{independent} A triangle is an upper limit: not one error was seen. Clopper-Pearson.",
+            f"{segments} A triangle is an upper limit: not one error was seen.",
             log=True,
         ),
-        over_distance(
-            "rmse_m", "rmse", "Distance error", "distance RMSE, m", f"{independent} Chi-square.", log=True
-        ),
+        over_distance("rmse_m", "rmse", "Distance error", "distance RMSE, m", segments, log=True),
         over_distance(
             "gross_share",
             "gross",
             "Distance errors of 0.5 m or more",
             "share of distances",
-            f"{independent} Clopper-Pearson.",
+            segments,
             log=False,
         ),
         over_distance(
@@ -155,7 +151,7 @@ def charts_of(summary: Summary) -> list[Chart]:
             "found",
             "Frames found",
             "share of frames sent",
-            independent + " Clopper-Pearson.",
+            segments,
             log=False,
         ),
         Chart(
@@ -209,11 +205,12 @@ def _part(series: Series, prefix: str) -> str:
 
 def _dots(series: Series, kind: str, shift: float, *, log: bool) -> tuple[Dot, ...]:
     dots = []
-    for begin, tally in series.statistics.segments:
-        figure = measure(tally, kind)
+    for begin, recordings in series.segments:
+        figure = measure(recordings, kind)
         if not figure.count:
             continue
-        none = log and figure.value == 0
+        tally = Tally.together(recordings)
+        none = log and figure.none
         what = {
             "ber": f"{tally.bit_errors} of {tally.bits} bits wrong",
             "rmse_m": f"{tally.ranged} distances, bias {tally.bias_m:+.3f} m",
@@ -223,13 +220,20 @@ def _dots(series: Series, kind: str, shift: float, *, log: bool) -> tuple[Dot, .
             f" 95 % within {tally.position_quantile_m(0.95):.3f} m; {tally.fixes_refused} refused",
         }[kind]
         shown = f"below {figure.high:.2g}" if none else f"{figure.value:.4g}"
-        text = (
-            f"{series.name}<br>{begin} to {begin + SEGMENT_M} m: {shown}"
-            f"<br>95 %: {figure.low:.3g} to {figure.high:.3g}<br>{what}"
-        )
+        text = f"{series.name}<br>{begin} to {begin + SEGMENT_M} m: {shown}<br>{_interval(figure)}{what}"
         y = figure.high if none else figure.value
-        dots.append(Dot(begin + SEGMENT_M / 2 + shift, y, figure.low, figure.high, text, none))
+        low, high = (figure.value if math.isnan(v) else v for v in (figure.low, figure.high))
+        dots.append(Dot(begin + SEGMENT_M / 2 + shift, y, low, high, text, none))
     return tuple(dots)
+
+
+def _interval(figure: Figure) -> str:
+    """What the ends of an error bar are."""
+    if math.isnan(figure.high):
+        return "one recording: no interval<br>"
+    few = figure.recordings < FEWEST_RECORDINGS and not figure.none
+    kind = f"range of {figure.recordings} recordings" if few else "95 %"
+    return f"{kind}: {figure.low:.3g} to {figure.high:.3g}<br>"
 
 
 def _bins(series: Series) -> tuple[Dot, ...]:

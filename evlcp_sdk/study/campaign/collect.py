@@ -77,6 +77,11 @@ class Counted:
                 return
 
     @property
+    def recordings(self) -> tuple[Statistics, ...]:
+        """What counts of each seed, in order."""
+        return tuple(self.results[task] for task in self.tasks[: self.seeds])
+
+    @property
     def done(self) -> int:
         """Tasks that are finished, of those that count or may still."""
         return self.seeds if self.complete else sum(task in self.results for task in self.tasks)

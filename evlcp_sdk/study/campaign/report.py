@@ -16,7 +16,8 @@ from evlcp_sdk.files import write_text
 from evlcp_sdk.study.campaign.charts import Chart, charts_of, decades
 from evlcp_sdk.study.campaign.paper import PAPER_NAME
 from evlcp_sdk.study.campaign.plan import digest_of
-from evlcp_sdk.study.campaign.summary import Figure, PaperComparison, Summary, beside_paper, measure
+from evlcp_sdk.study.campaign.summary import PaperComparison, Summary, beside_paper
+from evlcp_sdk.study.intervals import INTERVALS, Figure, measure
 from evlcp_sdk.study.markup import details, document, table
 from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
@@ -184,7 +185,7 @@ def comparison_rows(comparisons: Iterable[PaperComparison]) -> list[tuple[str, .
                 one.series,
                 ("at most " if r.bound else "") + shown(r.value),
                 shown(one.ours.value) + (f" at {one.from_m} to {one.to_m} m" if wide else ""),
-                f"{shown(one.ours.low)} to {shown(one.ours.high)}",
+                one.ours.interval(".2%" if percent else ".3g") or "-",
                 "yes" if one.agrees else "no",
             )
         )
@@ -196,20 +197,21 @@ def _figures_table(summary: Summary) -> str:
     positions = any(t.fixes or t.fixes_refused for one in summary.series for _, t in one.statistics.segments)
     rows = []
     for one in summary.series:
-        for begin, tally in one.statistics.segments:
+        for begin, recordings in one.segments:
+            tally = Tally.together(recordings)
             rows.append(
                 (
                     html.escape(one.name),
                     f"{begin} to {begin + SEGMENT_M} m",
                     f"{tally.frames_found} of {tally.frames_sent}",
                     f"{tally.bit_errors} of {tally.bits}",
-                    _shown(measure(tally, "ber"), "{:.2g}"),
-                    _shown(measure(tally, "rmse_m"), "{:.3f}"),
+                    _shown(measure(recordings, "ber"), ".2g"),
+                    _shown(measure(recordings, "rmse_m"), ".3f"),
                     "-" if math.isnan(tally.bias_m) else f"{tally.bias_m:+.3f}",
-                    _shown(measure(tally, "gross_share"), "{:.2%}"),
+                    _shown(measure(recordings, "gross_share"), ".2%"),
                     *((f"{tally.messages_found} of {tally.messages_sent}",) if messages else ()),
                     *((f"{tally.messages_wrong}",) if messages else ()),
-                    *(_positions(tally) if positions else ()),
+                    *(_positions(recordings) if positions else ()),
                 )
             )
     head = (
@@ -217,19 +219,20 @@ def _figures_table(summary: Summary) -> str:
         *(("messages", "read wrong") if messages else ()),
         *(_POSITION_HEAD if positions else ()),
     )
-    return f"<h2>All figures</h2>{table(head, rows)}"
+    return f'<h2>All figures</h2><p class="note">{INTERVALS}</p>{table(head, rows)}'
 
 
 _POSITION_HEAD = ("positions", "RMSE in space, m", "half within, m", "95 % within, m", "NEES, ideally 3")
 
 
-def _positions(tally: Tally) -> tuple[str, ...]:
+def _positions(recordings: Sequence[Tally]) -> tuple[str, ...]:
     """Positions given of those due, and their errors, as text."""
+    tally = Tally.together(recordings)
     if not tally.fixes:
         return (f"0 of {tally.fixes_refused}", *4 * ("-",))
     return (
         f"{tally.fixes} of {tally.fixes + tally.fixes_refused}",
-        _shown(measure(tally, "position_rmse_m"), "{:.3f}"),
+        _shown(measure(recordings, "position_rmse_m"), ".3f"),
         f"{tally.position_quantile_m(0.5):.3f}",
         f"{tally.position_quantile_m(0.95):.3f}",
         f"{tally.position_nees:.2f}",
@@ -239,8 +242,7 @@ def _positions(tally: Tally) -> tuple[str, ...]:
 def _shown(figure: Figure, form: str) -> str:
     if not figure.count:
         return "-"
-    low, high = form.format(figure.low), form.format(figure.high)
-    return f'{form.format(figure.value)} <span class="note">[{low}, {high}]</span>'
+    return f'{figure.value:{form}} <span class="note">{figure.interval(form)}</span>'
 
 
 def _configuration(summary: Summary) -> str:

@@ -1,65 +1,24 @@
-"""What a campaign found: one series a combination of what it varies, one row a segment of distance."""
+"""What a campaign found: one series a combination of what it varies, one row a segment of distance.
+
+Recordings with the same seed shake alike, at whatever distance: a seed counts as one recording.
+"""
 
 import json
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from itertools import zip_longest
 from typing import Any
 
 from evlcp_sdk.study.campaign.collect import Counted
 from evlcp_sdk.study.campaign.paper import PAPER, Measure, Reference
 from evlcp_sdk.study.campaign.plan import StopRule
 from evlcp_sdk.study.campaign.store import Store
-from evlcp_sdk.study.intervals import proportion_interval, rms_interval
+from evlcp_sdk.study.intervals import Figure, measure
 from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
 
-__all__ = ["Figure", "PaperComparison", "Series", "Summary", "beside_paper", "measure", "summarize"]
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A measured figure with its 95 % interval; NaN where nothing was measured.
-
-    Attributes:
-        value: The figure.
-        low: Lower end of the interval.
-        high: Its upper end.
-        count: Bits, distances or frames it was measured on.
-    """
-
-    value: float
-    low: float
-    high: float
-    count: int
-
-
-def measure(tally: Tally, kind: str) -> Figure:
-    """A figure of a tally.
-
-    Args:
-        tally: What was counted.
-        kind: `ber`, `rmse_m`, `gross_share`, `found_share`, `lost_share` (messages that were not read),
-            `wrong_share` (messages that were read wrong, of those that were read) or `position_rmse_m`.
-
-    >>> round(measure(Tally(bits=1000), "ber").high, 4)
-    0.0037
-    """
-    if kind == "rmse_m":
-        return Figure(tally.rmse_m, *rms_interval(tally.rmse_m, tally.ranged), tally.ranged)
-    if kind == "position_rmse_m":
-        # An error in space has three parts.
-        interval = rms_interval(tally.position_rmse_m, 3 * tally.fixes)
-        return Figure(tally.position_rmse_m, *interval, tally.fixes)
-    hits, trials = {
-        "ber": (tally.bit_errors, tally.bits),
-        "gross_share": (tally.gross, tally.ranged),
-        "found_share": (tally.frames_found, tally.frames_sent),
-        "lost_share": (tally.messages_sent - tally.messages_found, tally.messages_sent),
-        "wrong_share": (tally.messages_wrong, tally.messages_found + tally.messages_wrong),
-    }[kind]
-    if not trials:
-        return Figure(math.nan, math.nan, math.nan, 0)
-    return Figure(hits / trials, *proportion_interval(hits, trials), trials)
+__all__ = ["PaperComparison", "Series", "Summary", "beside_paper", "summarize"]
 
 
 @dataclass(frozen=True)
@@ -70,13 +29,23 @@ class Series:
         labels: What sets it apart from the other series.
         scene: Identity of its first scene.
         link: Identity of its link.
-        statistics: What counts of its points, added up.
+        recordings: What counts of its points, added up seed by seed.
     """
 
     labels: Mapping[str, Any]
     scene: Any
     link: Any
-    statistics: Statistics
+    recordings: tuple[Statistics, ...]
+
+    @cached_property
+    def statistics(self) -> Statistics:
+        """All recordings together."""
+        return sum(self.recordings, Statistics())
+
+    @cached_property
+    def segments(self) -> tuple[tuple[int, tuple[Tally, ...]], ...]:
+        """(Start of the segment in m, the tally of each recording), in order."""
+        return tuple((at, self.between(at, at + SEGMENT_M)) for at, _ in self.statistics.segments)
 
     @property
     def name(self) -> str:
@@ -111,9 +80,11 @@ class Series:
         """Speed of the camera, km/h; None where the scene does not say."""
         return _speed_kmh(self.scene)
 
-    def between(self, from_m: int, to_m: int) -> Tally:
-        """The tally of the segments that lie between two distances."""
-        return Tally.together(t for at, t in self.statistics.segments if from_m <= at < to_m)
+    def between(self, from_m: int, to_m: int) -> tuple[Tally, ...]:
+        """The tally of each recording, of the segments that lie between two distances."""
+        return tuple(
+            Tally.together(t for at, t in one.segments if from_m <= at < to_m) for one in self.recordings
+        )
 
 
 _UNITS = {"kmh": "km/h", "mps": "m/s", "m": "m", "us": "us", "s": "s", "hz": "Hz", "mm": "mm", "px": "px"}
@@ -173,8 +144,8 @@ class Summary:
                     "echoes": s.statistics.echoes,
                     "sigma_m": s.statistics.sigma_m if s.statistics.stated else None,
                     "segments": [
-                        {"from_m": at, "to_m": at + SEGMENT_M} | _figures(tally)
-                        for at, tally in s.statistics.segments
+                        {"from_m": at, "to_m": at + SEGMENT_M} | _figures(tallies)
+                        for at, tallies in s.segments
                     ],
                 }
                 for s in self.series
@@ -188,7 +159,8 @@ class Summary:
         }
 
 
-def _figures(tally: Tally) -> dict[str, Any]:
+def _figures(recordings: Sequence[Tally]) -> dict[str, Any]:
+    tally = Tally.together(recordings)
     kinds = ("ber", "rmse_m", "gross_share", "found_share", "lost_share", "wrong_share", "position_rmse_m")
     names = (
         *("frames_sent", "frames_found", "bits", "bit_errors", "ranged", "gross"),
@@ -206,7 +178,7 @@ def _figures(tally: Tally) -> dict[str, Any]:
         "position_95_m": tally.position_quantile_m(0.95),
         "position_nees": tally.position_nees,
     }
-    return _plain(counts | others) | {kind: _plain(asdict(measure(tally, kind))) for kind in kinds}
+    return _plain(counts | others) | {kind: _plain(asdict(measure(recordings, kind))) for kind in kinds}
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -235,10 +207,10 @@ def summarize(store: Store) -> Summary:
         if before is None:
             scene = plan["scenes"][point["scene"]]["identity"]
             link = plan["links"][point["link"]]["identity"]
-            found[key] = Series(labels, scene, link, counted.total)
+            found[key] = Series(labels, scene, link, counted.recordings)
         else:
-            together = before.statistics + counted.total
-            found[key] = Series(before.labels, before.scene, before.link, together)
+            pairs = zip_longest(before.recordings, counted.recordings, fillvalue=Statistics())
+            found[key] = replace(before, recordings=tuple(a + b for a, b in pairs))
     return Summary(plan["name"], plan["digest"], tasks, done, tuple(found.values()), plan)
 
 
@@ -276,10 +248,10 @@ def beside_paper(series: Iterable[Series], references: Iterable[Reference] = PAP
                 continue
             if reference.speed_kmh is not None and one.speed_kmh != reference.speed_kmh:
                 continue
-            tally, at = one.between(reference.from_m, reference.to_m), (reference.from_m, reference.to_m)
+            ours = measure(one.between(reference.from_m, reference.to_m), reference.measure)
+            at = (reference.from_m, reference.to_m)
             if reference.bound:
-                tally, at = _worst(one, reference)
-            ours = measure(tally, reference.measure)
+                ours, at = _worst(one, reference)
             if ours.count:
                 ratio = ours.value / reference.value
                 agrees = ratio <= 1 if reference.bound else abs(ratio - 1) <= AGREEMENT
@@ -287,14 +259,13 @@ def beside_paper(series: Iterable[Series], references: Iterable[Reference] = PAP
     return found
 
 
-def _worst(series: Series, reference: Reference) -> tuple[Tally, tuple[int, int]]:
-    """The segment within a reference's distances whose figure is largest, and where it lies."""
-    worst, at = Tally(), (reference.from_m, reference.to_m)
+def _worst(series: Series, reference: Reference) -> tuple[Figure, tuple[int, int]]:
+    """The largest figure of a segment within a reference's distances, and where the segment lies."""
+    worst, at = measure((), reference.measure), (reference.from_m, reference.to_m)
     for begin in range(reference.from_m, reference.to_m, SEGMENT_M):
-        tally = series.between(begin, begin + SEGMENT_M)
-        value, most = (measure(t, reference.measure) for t in (tally, worst))
-        if value.count and (not most.count or value.value > most.value):
-            worst, at = tally, (begin, begin + SEGMENT_M)
+        ours = measure(series.between(begin, begin + SEGMENT_M), reference.measure)
+        if ours.count and (not worst.count or ours.value > worst.value):
+            worst, at = ours, (begin, begin + SEGMENT_M)
     return worst, at
 
 

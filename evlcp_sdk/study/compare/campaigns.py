@@ -29,7 +29,7 @@ def of_campaign(summary: Summary) -> Comparison:
             "digest": identity.get("digest", ""),
             "configuration": identity.get("table", {}),
         }
-        scenes.setdefault(scene, []).append(Row(link, Measured(series.statistics)))
+        scenes.setdefault(scene, []).append(Row(link, _measured(series)))
     tables = [Table(name, tuple(rows)) for name, rows in scenes.items()]
     if len(tables) > 1:
         tables.append(total_of(tables, "all scenes"))
@@ -37,6 +37,11 @@ def of_campaign(summary: Summary) -> Comparison:
     if summary.done < summary.tasks:
         notes.append(f"{summary.done} of {summary.tasks} tasks are done")
     return Comparison(links, tuple(tables), tuple(notes), summary.plan["environment"])
+
+
+def _measured(series: Series) -> Measured:
+    recordings = {f"seed {i}": one.total() for i, one in enumerate(series.recordings)}
+    return Measured(series.statistics, recordings=recordings)
 
 
 def _part(series: Series, prefix: str, otherwise: str) -> str:

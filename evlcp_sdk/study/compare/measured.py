@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.study.intervals import proportion_interval
+from evlcp_sdk.study.intervals import Figure, measure
 from evlcp_sdk.study.tally import Statistics, Tally
 
 __all__ = ["STAGES", "Measured", "Moments", "Times", "median"]
@@ -75,13 +75,18 @@ class Measured:
     Attributes:
         statistics: What was counted; without truth, nothing but rows and packets.
         times: What it took; nothing where nobody measured.
+        recordings: By name, the tally of what shares nothing with the others: a recording, or all of a
+            campaign's with one seed.
     """
 
     statistics: Statistics = field(default_factory=Statistics)
     times: Times = field(default_factory=Times)
+    recordings: Mapping[str, Tally] = field(default_factory=dict)
 
     def __add__(self, other: "Measured") -> "Measured":
-        return Measured(self.statistics + other.statistics, self.times + other.times)
+        ours, theirs = self.recordings, other.recordings
+        together = {name: ours.get(name, Tally()) + theirs.get(name, Tally()) for name in {**ours, **theirs}}
+        return Measured(self.statistics + other.statistics, self.times + other.times, together)
 
     @cached_property
     def tally(self) -> Tally:
@@ -93,11 +98,10 @@ class Measured:
         """Share of the sent frames that were decoded; NaN without truth."""
         return self.tally.frames_found / self.tally.frames_sent if self.tally.frames_sent else math.nan
 
-    @property
-    def ber_interval(self) -> tuple[float, float]:
-        """95 % interval of the bit error rate (Clopper-Pearson), errors taken as independent."""
-        tally = self.tally
-        return proportion_interval(tally.bit_errors, tally.bits) if tally.bits else (math.nan, math.nan)
+    @cached_property
+    def ber(self) -> Figure:
+        """The bit error rate with its interval over recordings."""
+        return measure(tuple(self.recordings.values()), "ber")
 
     @property
     def us_per_frame(self) -> float:

@@ -153,7 +153,7 @@ def measure_recording(
         bound.settle()
     recorded_s = 0.0 if first_us is None or last_us is None else (last_us - first_us) * 1e-6
     rows = tuple(
-        Row(variant.name, _measured(lane, truth, recorded_s, reading_s))
+        Row(variant.name, _measured(name, lane, truth, recorded_s, reading_s))
         for variant, lane in zip(variants, lanes, strict=True)
     )
     sigma_m = [] if bound is None else bound.sigma_m
@@ -184,7 +184,7 @@ def _bound_of(link: Link) -> _Bound | None:
         return None
 
 
-def _measured(lane: _Lane, truth: Truth | None, recorded_s: float, reading_s: float) -> Measured:
+def _measured(name: str, lane: _Lane, truth: Truth | None, recorded_s: float, reading_s: float) -> Measured:
     times = Times(
         frame_us=tuple(lane.watch.frame_us),
         stage_us={stage: tuple(lane.watch.stage_us[stage]) for stage in STAGES},
@@ -193,4 +193,5 @@ def _measured(lane: _Lane, truth: Truth | None, recorded_s: float, reading_s: fl
     )
     if truth is None:
         return Measured(without_truth(lane.frames, lane.packets), times)
-    return Measured(statistics_of(lane.frames, truth, packets=lane.packets), times)
+    counted = statistics_of(lane.frames, truth, packets=lane.packets)
+    return Measured(counted, times, {name: counted.total()})

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments, median
+from evlcp_sdk.study.intervals import FEWEST_RECORDINGS
 from evlcp_sdk.study.markup import details, document, table
 
 __all__ = ["BOUND_NAME", "COLUMNS", "LEGEND", "MARK", "Column", "Comparison", "Row", "Table", "total_of"]
@@ -21,10 +22,11 @@ MARK = "*"
 """Follows the best figure of a column, where bold type may be lost."""
 
 LEGEND = (
-    f"{MARK} best of its column. BER of the symbols that are given, with its 95 % interval; filtered is the"
-    " RMSE after tracking; sigma is what the ranging itself states, root mean square; us/frame is the median"
-    " processor time of separation, decoding and ranging; x real time is recorded time over the processor"
-    " time of reading and receiving."
+    f"{MARK} best of its column. BER of the symbols that are given; its 95 % interval is a bootstrap over"
+    f" recordings, from {FEWEST_RECORDINGS} on; < is an upper limit, as if frames were independent; filtered"
+    " is the RMSE after tracking; sigma is what the ranging itself states, root mean square; us/frame is the"
+    " median processor time of separation, decoding and ranging; x real time is recorded time over the"
+    " processor time of reading and receiving."
 )
 
 
@@ -59,10 +61,10 @@ def _ber(m: Measured) -> str:
 
 
 def _interval(m: Measured) -> str:
-    if not m.tally.bits:
-        return "-"
-    low, high = m.ber_interval
-    return f"{low:.1e} to {high:.1e}" if m.tally.bit_errors else f"< {high:.1e}"
+    ber = m.ber
+    if ber.none:
+        return f"< {ber.high:.1e}"
+    return ber.interval(".1e") if ber.recordings >= FEWEST_RECORDINGS else "-"
 
 
 def _some(count: int, of: int) -> str:
@@ -165,7 +167,7 @@ class Table:
         for row, keys in zip(self.rows, self.best(), strict=True):
             m = row.measured
             tally, known = m.tally, m.tally.frames_sent > 0
-            low, high = m.ber_interval
+            low, high = (m.ber.low, m.ber.high) if _interval(m) != "-" else (math.nan, math.nan)
             values: dict[str, Any] = {
                 "recording": self.name,
                 "variant": row.variant,

@@ -16,7 +16,8 @@ from evlcp_sdk.study.campaign.paper import PAPER
 from evlcp_sdk.study.campaign.plan import Case, Plan, make_plan
 from evlcp_sdk.study.campaign.report import page, save_page
 from evlcp_sdk.study.campaign.store import Store
-from evlcp_sdk.study.campaign.summary import Series, Summary, beside_paper, measure, summarize
+from evlcp_sdk.study.campaign.summary import Series, Summary, beside_paper, summarize
+from evlcp_sdk.study.intervals import measure
 from evlcp_sdk.study.tally import Statistics, Tally
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
 from tests.unit.study.campaign.fake import run_fake
@@ -75,7 +76,7 @@ def test_the_paper_is_held_beside_the_series_it_speaks_of(summary: Summary) -> N
     assert by_name["rmse_m", 30, 16].startswith("30 km/h, 16")
     assert by_name["rmse_m", 30, 2].startswith("30 km/h, two")
     assert sum(c.reference.measure == "ber" for c in found) == 2
-    ours = Series({}, {"speed_kmh": 30}, summary.series[0].link, Statistics())
+    ours = Series({}, {"speed_kmh": 30}, summary.series[0].link, ())
     assert beside_paper([ours]) == []
 
 
@@ -92,16 +93,17 @@ def test_agreement_is_a_kept_bound_or_a_figure_within_30_percent(summary: Summar
         ):
             tally = Tally.distance(reference.value * factor)
             at = Statistics.of([(reference.from_m, tally)], tasks=1)
-            (one,) = beside_paper([Series({}, {"speed_kmh": 30}, link, at)], [reference])
+            (one,) = beside_paper([Series({}, {"speed_kmh": 30}, link, (at,))], [reference])
             assert one.agrees is agrees, (reference, factor)
 
 
-def test_no_errors_and_no_data_have_figures() -> None:
-    none = measure(Tally(bits=10_000), "ber")
-    assert (none.value, none.low) == (0, 0)
-    assert 3e-4 < none.high < 4e-4
-    assert measure(Tally(), "rmse_m").count == 0
-    assert measure(Tally(), "gross_share").count == 0
+def test_a_seed_is_one_recording_over_all_distances(summary: Summary) -> None:
+    for series in summary.series:
+        assert len(series.recordings) == 2
+        assert sum(series.recordings, Statistics()) == series.statistics
+        for at, recordings in series.segments:
+            assert Tally.together(recordings) == dict(series.statistics.segments)[at]
+            assert measure(recordings, "rmse_m").recordings == 2
 
 
 def test_json_has_every_figure(summary: Summary) -> None:
