@@ -1,8 +1,8 @@
 """The link: what both ends agree on and how the receiver works, from `link.toml` to checked objects.
 
-One table a role (`[ranging]`: `id = "poc"`, its parameters flat beside it), and `[camera]`, `[bar]`, `[air]`,
-`[regions]`, `[messages]` and `[position]`. Every default is written out before anything runs, so that the
-resolved table alone reproduces a result. See `docs/configuration.md`.
+One table a role (`[ranging]`: `id = "joint-scale"`, its parameters flat beside it), and `[camera]`, `[bar]`,
+`[air]`, `[regions]`, `[messages]` and `[position]`. Every default is written out before anything runs, so
+that the resolved table alone reproduces a result. See `docs/configuration.md`.
 """
 
 import hashlib
@@ -249,7 +249,7 @@ def resolve(
         if section in _SPECS:
             cls = _SPECS[section]
         else:
-            head["id"] = name = keys.pop("id", ROLES[section].default)
+            head["id"] = name = keys.pop("id", ROLES[section].default_for(built.get("bar")))
             if not isinstance(name, str):
                 fault(section, "id", f" = {name!r}: expected a string")
                 continue

@@ -251,12 +251,25 @@ class Role:
         abstract: The class that its algorithms derive from.
         default: Id of the algorithm where the link names none.
         verb: What it does, in one line.
+        default_elsewhere: Id of it for a bar that is not one column of three clusters or more, which the
+            default refuses; None where that one takes every bar.
     """
 
     name: str
     abstract: type[ABC]
     default: str
     verb: str
+    default_elsewhere: str | None = None
+
+    def default_for(self, bar: BarLayout | None) -> str:
+        """Id of the algorithm where the link names none, for its bar; None for one that is not known.
+
+        >>> from evlcp_sdk.scene.bar import BarLayout
+        >>> ROLES["ranging"].default_for(BarLayout(rows=96, columns=2))
+        'poc'
+        """
+        column = bar is None or (bar.columns == bar.cluster_columns and bar.clusters >= 3)
+        return self.default if column or self.default_elsewhere is None else self.default_elsewhere
 
 
 ROLES: Mapping[str, Role] = MappingProxyType(
@@ -267,8 +280,8 @@ ROLES: Mapping[str, Role] = MappingProxyType(
             Role("modulation", Modulation, "wh4x2", "bits of a symbol <-> its codeword"),
             Role("synchronization", Synchronization, "barker", "a region's events -> packet timing"),
             Role("separation", Separation, "wh-correlation", "a pilot's image -> where each cluster is"),
-            Role("decoding", Decoding, "wh-transform", "a frame's image -> soft symbols"),
-            Role("ranging", Ranging, "poc", "a decoded frame's image -> distance"),
+            Role("decoding", Decoding, "ml-soft", "a frame's image -> soft symbols"),
+            Role("ranging", Ranging, "joint-scale", "a decoded frame's image -> distance", "poc"),
             Role("tracking", Tracking, "none", "distance and image position over time"),
             Role("error-correction", ErrorCorrection, "polar", "message bits <-> coded bits, soft input"),
         )

@@ -24,12 +24,12 @@ pytestmark = pytest.mark.skipif(
 
 # recording: for each bar, share of frames found, bit error rate, distance RMSE in m
 FIGURES = {
-    "night-50m-30kmh": [(0.90, 0.001, 0.12)],
-    "day-35m-20kmh": [(0.90, 0.001, 0.085)],
-    "tunnel-90m-30kmh": [(0.85, 0.01, 0.35)],
-    "two-bars-60m-75m": [(0.85, 0.005, 0.20), (0.85, 0.005, 0.40)],
-    "lamps-60m-40kmh-rollover": [(0.85, 0.005, 0.20)],
-    "wh8-100m-30kmh": [(0.85, 0.005, 0.60)],
+    "night-50m-30kmh": [(0.98, 0.0, 0.03)],
+    "day-35m-20kmh": [(0.98, 0.0, 0.012)],
+    "tunnel-90m-30kmh": [(0.98, 0.0, 0.06)],
+    "two-bars-60m-75m": [(0.98, 0.0, 0.03), (0.98, 0.0, 0.05)],
+    "lamps-60m-40kmh-rollover": [(0.98, 0.0, 0.025)],
+    "wh8-100m-30kmh": [(0.98, 0.0, 0.06)],
     "no-bar": [],
 }
 
@@ -86,10 +86,11 @@ def test_two_clusters_are_worse(tmp_path: Path, evlcp: Callable[..., Run]) -> No
     """The method that the paper compares with is one configuration, and loses, as in the paper."""
     name = "day-35m-20kmh"
     rmse_m = {}
-    two = ROOT / "examples" / "campaigns" / "two-clusters.toml"
-    for method, options in {"all": [], "two": ["-c", two]}.items():
+    links = {"all": "links/paper.toml", "two": "campaigns/two-clusters.toml"}
+    for method, link in links.items():
         out = tmp_path / method
-        assert evlcp("receive", RECORDINGS / f"{name}.raw", "-o", out, *options).code == 0
+        link_file = ROOT / "examples" / link
+        assert evlcp("receive", RECORDINGS / f"{name}.raw", "-o", out, "-c", link_file).code == 0
         rmse_m[method] = scored(out, name)["bars"][0]["rmse_m"]
     assert rmse_m["two"] > 1.5 * rmse_m["all"]
 
@@ -127,7 +128,7 @@ WITH_BARS = [name for name, bars in FIGURES.items() if bars]
 def test_one_fit_over_all_boundaries_is_better(name: str, tmp_path: Path, evlcp: Callable[..., Run]) -> None:
     """The best variant has at most 0.75 of the paper's error, filtered 0.4 of it."""
     raw, truth = RECORDINGS / f"{name}.raw", json.loads((RECORDINGS / f"{name}.truth.json").read_text())
-    paper = scored_with(tmp_path / "paper", name, raw, evlcp)
+    paper = scored_with(tmp_path / "paper", name, raw, evlcp, "decoding.id=wh-transform", "ranging.id=poc")
     joint = scored_with(tmp_path / "joint", name, raw, evlcp, "ranging.id=joint-scale", "tracking.id=kalman")
     filtered = filtered_errors_m(tmp_path / "joint", truth)
     for one, other, error_m in zip(paper, joint, filtered, strict=True):
@@ -167,7 +168,14 @@ def test_the_band_of_the_blobs_is_better(tmp_path: Path, evlcp: Callable[..., Ru
     ratios = []
     for name in WITH_BARS:
         full, blob = (
-            scored_with(tmp_path / band, name, RECORDINGS / f"{name}.raw", evlcp, f"ranging.band={band}")
+            scored_with(
+                tmp_path / band,
+                name,
+                RECORDINGS / f"{name}.raw",
+                evlcp,
+                "ranging.id=poc",
+                f"ranging.band={band}",
+            )
             for band in ("full", "blob")
         )
         ratios += [b["rmse_m"] / f["rmse_m"] for f, b in zip(full, blob, strict=True)]

@@ -91,7 +91,7 @@ def test_receive_writes_and_tells(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) 
     assert table["counts"]["events"] == table["recording"]["counts"]["events"] == 764_142
     assert len(table["digest"]) == 64
     assert {"evlcp-sdk", "numpy", "python"} <= set(table["versions"])
-    assert table["configuration"]["ranging"]["id"] == "poc"
+    assert table["configuration"]["ranging"]["id"] == "joint-scale"
 
 
 def test_receive_draws_figures_and_parquet(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ REC_WH8 = (
     ' modulation.id: sent with "wh4x2", received with "wh8"'
 )
 VARIANTS = {
-    "paper": (),
+    "paper": ("ranging.id=poc", "decoding.id=wh-transform"),
     "filtered": ("ranging.id=joint-scale", "tracking.id=kalman"),
     "coarse": ("ranging.id=centroid", "ranging.skip_outer=2"),
 }

@@ -138,7 +138,7 @@ def test_defaults_are_all_written_out(registry: Registry) -> None:
     ]
     assert link.table["air"] == {"chip_rate_hz": 10_000.0, "frames_per_packet": 10, "pilot_every": 1}
     assert link.table["ranging"] == {
-        "id": "poc",
+        "id": "joint-scale",
         "min_spacing": 8,
         "window_px": 2.0,
         "kernel": "sinc",
@@ -231,11 +231,12 @@ def test_every_fault_of_a_file_is_told(registry: Registry, tmp_path: Path) -> No
 
 def test_a_wrong_id_says_exactly_this(registry: Registry) -> None:
     with pytest.raises(UnknownAlgorithmError) as caught:
-        load_link(None, ["ranging.id=pco"], registry)
-    expected = "no ranging algorithm named 'pco'; did you mean 'poc'? (installed: centroid, poc)"
+        load_link(None, ["ranging.id=joint-scael"], registry)
+    installed = "(installed: centroid, joint-scale)"
+    expected = f"no ranging algorithm named 'joint-scael'; did you mean 'joint-scale'? {installed}"
     assert str(caught.value) == expected
     with pytest.raises(ConfigError) as both:
-        load_link(None, ["ranging.id=pco", "air.frames_per_packet=0"], registry)
+        load_link(None, ["ranging.id=joint-scael", "air.frames_per_packet=0"], registry)
     assert expected in str(both.value).splitlines()
     assert len(str(both.value).splitlines()) == 2
 
@@ -301,7 +302,7 @@ def test_the_text_tells_meaning_unit_bounds_and_default(registry: Registry) -> N
     assert lines[i - 1 : i + 6] == [
         "# Distance out of thin air.",
         "[ranging]",
-        'id = "poc"  # or centroid',
+        'id = "joint-scale"  # or centroid',
         "# Clusters between the two of a pair. [>= 1, <= 15, default 8]",
         "min_spacing = 8",
         "# Half width of the fit. [px, > 0, default 2.0]",

@@ -274,7 +274,7 @@ def test_broken_and_conflicting_plugins_are_listed(monkeypatch: pytest.MonkeyPat
     table = json.loads(evlcp("plugins", "--json").out)
     assert [a["conflict"] for a in table["algorithms"]] == [True, True]
     assert table["broken"][0]["plugin"] == "cam"
-    assert {"role": "ranging", "verb": ROLES["ranging"].verb, "default": "poc"} in table["roles"]
+    assert {"role": "ranging", "verb": ROLES["ranging"].verb, "default": "joint-scale"} in table["roles"]
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,15 @@ def link_with(layout: str, *overrides: str) -> Link:
     return load_link(overrides=[*LAYOUTS[layout], *overrides])
 
 
+@pytest.mark.parametrize(
+    "layout", [name for name in LAYOUTS if name not in ("1 clusters", "2 clusters", "one row of two")]
+)
+def test_a_link_that_names_no_ranging_measures_its_bar(layout: str) -> None:
+    link = link_with(layout)
+    assert link.table["ranging"]["id"] == ("joint-scale" if "clusters" in layout else "poc")
+    link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("name", RANGINGS)
 def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name: str, layout: str) -> None:

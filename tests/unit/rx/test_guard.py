@@ -109,11 +109,13 @@ def test_a_synchronization_that_gives_no_locks_is_named() -> None:
 def test_the_command_line_tells_it_in_one_line(
     evlcp: Callable[..., Any], demo_raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from evlcp_poc.ranging import PocRanging
+    from evlcp_joint.ranging import JointScaleRanging
 
-    monkeypatch.setattr(PocRanging, "compile", lambda *_: fails)
+    monkeypatch.setattr(JointScaleRanging, "compile", lambda *_: fails)
     done = evlcp("receive", demo_raw, "-o", tmp_path / "out")
     assert done.code == 2
-    assert done.err.startswith("evlcp: ranging algorithm 'poc': KeyError: 'boom' (test_guard.py, line ")
+    assert done.err.startswith(
+        "evlcp: ranging algorithm 'joint-scale': KeyError: 'boom' (test_guard.py, line "
+    )
     assert done.err.count("\n") == 1
     assert list((tmp_path / "out").iterdir()) == []

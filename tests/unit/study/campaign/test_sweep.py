@@ -34,7 +34,7 @@ motion.distance_m = [95.0, 85.0]
 
 [link.variants]
 "16 clusters" = {}
-"two clusters" = { ranging.clusters = [1, 14], ranging.drop_extremes = 0 }
+"two clusters" = { ranging.id = "poc", ranging.clusters = [1, 14], ranging.drop_extremes = 0 }
 """
 
 

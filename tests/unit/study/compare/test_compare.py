@@ -239,7 +239,7 @@ def test_variants_that_cannot_be(text: str, told: str) -> None:
 def test_variants_share_what_is_set_for_all() -> None:
     base, other = load_variants(
         ["base:", "other: decoding.min_weight=0.3,ranging.clusters=[1, 3, 14] , ranging.skip_outer=0"],
-        overrides=["decoding.min_weight=0.2", "ranging.min_pixels=7"],
+        overrides=["decoding.min_weight=0.2", "ranging.id=poc", "ranging.min_pixels=7"],
     )
     assert base.link.table["decoding"]["min_weight"] == 0.2
     assert other.link.table["decoding"]["min_weight"] == 0.3
