@@ -259,6 +259,9 @@ class RegionFollower:
             replace(p, x_px=p.x_px + off[0], y_px=p.y_px + off[1], width_px=size_px[0], height_px=size_px[1])
             for p in followed.positions
         )
+        if known is None:
+            # As more of a bar was seen, what was seen of it moved: that is no motion of the bar.
+            followed.positions = deque(replace(p, y_px=centre_px[1]) for p in followed.positions)
         followed.filter = self._position.init() if self._position else None
         self._gather(followed)
         return True
@@ -310,7 +313,9 @@ class RegionFollower:
         """
         known = followed.size_px
         expected_px = self._expected(followed, measured.t_us).y_px
-        height_px = median(followed.heights) if followed.heights else measured.height_px
+        # A part of the bar says nothing of its height, once that is known.
+        first_px = measured.height_px if known is None else known[1]
+        height_px = median(followed.heights) if followed.heights else first_px
         if known is None or abs(measured.height_px - height_px) <= _STRAY_PX:
             followed.heights.append(measured.height_px)
             height_px = median(followed.heights)
@@ -326,7 +331,7 @@ class RegionFollower:
             ends_px = measured.y_px - excess_px / 2, measured.y_px + excess_px / 2
             y_px = min(ends_px, key=lambda end_px: abs(end_px - expected_px))
             if abs(y_px - expected_px) > _END_PX:
-                y_px = expected_px
+                y_px = followed.latest.y_px
         else:
             slack_px = abs(excess_px) / 2
             y_px = measured.y_px + min(max(expected_px - measured.y_px, -slack_px), slack_px)

@@ -52,6 +52,9 @@ _STAYS = 1.0
 _ROW_US = 0.35
 """Longest time that a sensor takes to read a row, us: of two images, the lower one may come as much later."""
 
+_APART_PX = 5.0
+"""Centres nearer than that, a region's seam, are one image that two regions saw before they were joined."""
+
 _LOOKBACK_PACKETS = 3
 """Packets of frames remembered: a new transmitter begins with the last two packets before its lock."""
 
@@ -227,7 +230,7 @@ class Echoes:
         self._decide()
 
     def _beside(self, sighting: Sighting, known: Iterable[Sighting]) -> Sighting | None:
-        """The frame of another transmitter that began at the same time, to half a chip; None without one."""
+        """Another transmitter's frame elsewhere in the image, begun within half a chip; None without one."""
         frame = sighting.frame
 
         def apart_us(other: Sighting) -> float:
@@ -237,7 +240,8 @@ class Echoes:
         if nearest is None:
             return None
         within_us = self._chip_us / 2 + _ROW_US * abs(nearest.frame.y_px - frame.y_px)
-        return nearest if apart_us(nearest) < within_us else None
+        off_px = max(abs(nearest.frame.x_px - frame.x_px), abs(nearest.frame.y_px - frame.y_px))
+        return nearest if apart_us(nearest) < within_us and off_px > _APART_PX else None
 
     def _forget(self) -> None:
         for known in self._seen.values():

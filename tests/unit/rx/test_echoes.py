@@ -32,6 +32,7 @@ def sighting(
     *,
     late_us: float = 0.0,
     y_px: float = 300.0,
+    x_px: float | None = None,
     light: float = 100.0,
     mirrored: bool = False,
 ) -> Sighting:
@@ -40,7 +41,8 @@ def sighting(
     t_us = packet * PERIOD_US + FORMAT.frame_start_chip(index) * FORMAT.chip_us + late_us
     soft = SoftSymbols(symbols, np.zeros((len(symbols), 6), np.float32), 1.0)
     none = Range(math.nan, math.nan, 0)
-    frame = Frame(transmitter, packet, index, t_us, soft, none, None, 400.0, y_px)
+    x_px = 400.0 + 40 * transmitter if x_px is None else x_px
+    frame = Frame(transmitter, packet, index, t_us, soft, none, None, x_px, y_px)
     return Sighting(frame, light, int((symbols >= 0).sum()), mirrored)
 
 
@@ -151,6 +153,14 @@ def test_what_comes_late_is_judged_by_what_was_before() -> None:
         echoes.judge([sighting(0, n, said(n))])
     echoes.judge([sighting(1, n, said(n), light=70) for n in range(5, 25)])
     assert echoes.echo_of(1) == 0
+
+
+def test_one_image_seen_by_two_regions_is_no_reflection() -> None:
+    for off_px, echo_of in ((0.0, None), (4.0, None), (6.0, 0)):
+        echoes = Echoes(FORMAT, CODEWORDS)
+        for n in range(10):
+            echoes.judge([sighting(0, n, said(n), x_px=400.0), sighting(1, n, said(n), x_px=400.0 + off_px)])
+        assert echoes.echo_of(1) == echo_of
 
 
 def test_the_verdict_is_stable() -> None:
