@@ -79,7 +79,7 @@ def test_the_numbers_are_those_of_receive_and_score(evlcp: Evlcp, recording: Pat
             t_us = np.array([f.t_us for f in frames]) - truth.t0_us
             true_m = np.interp(t_us + 800, truth.t_us, truth.bars[0].distance_m)
             off = np.array([f.filtered_m for f in frames]) - true_m
-            # A frame says its time late by the camera's latency, in which the car drives a third of a millimetre.
+            # A frame says its time late by the camera's latency: the car drives a third of a millimetre.
             assert row["filtered_rmse_m"] == pytest.approx(np.sqrt(np.mean(off**2)), abs=3.5e-4)
         else:
             assert row["filtered_rmse_m"] is None
