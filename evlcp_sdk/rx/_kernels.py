@@ -100,28 +100,57 @@ def score_rises(
 
 @njit(cache=True, nogil=True)
 def measure_box(
-    pixels: Array, box: tuple[int, int, int, int], since_us: int, min_score: int, rows: Array
+    pixels: Array,
+    box: tuple[int, int, int, int],
+    since_us: int,
+    min_score: int,
+    seam: int,
+    reach: float,
+    rows: Array,
 ) -> tuple[int, float, int, int, float, float]:
     """Where in a box pixels blink in the rhythm of the chips and rose since `since_us`.
 
+    Columns count by what they have more than the `seam` outermost ones on the darker side: a halo, or lit
+    leaves; those that hold most within twice `reach` give the mean column, and rows count what they have
+    within `reach` of it. An edge row that holds fewer pixels than a full one counts by its share.
+
     Returns:
-        (pixels, mean column, first column, last column, upper edge, lower edge); an edge row that holds
-        fewer pixels than a full one counts by its share.
+        (pixels, mean column, first column, last column, upper edge, lower edge).
     """
     left, top, right, bottom = box
-    total = 0
-    weighted = 0
+    columns = np.zeros(right - left)
     first_column, last_column = right, left
-    lit = 0
+    for v in range(top, bottom):
+        for u in range(left, right):
+            state = pixels[v, u]
+            if (state >> 12) >= since_us and ((state >> 1) & 127) >= min_score:
+                columns[u - left] += 1
+                first_column = min(first_column, u)
+                last_column = max(last_column, u)
+    rows[:] = 0
+    if last_column < first_column:
+        return 0, 0.0, 0, 0, 0.0, 0.0
+    outside = min(columns[:seam].mean(), columns[-seam:].mean()) if columns.size > 2 * seam else 0.0
+    columns = np.maximum(columns - outside, 0.0)
+    wide = int(min(2 * reach, columns.size))
+    start, best, inside = 0, 0.0, 0.0
+    for i in range(columns.size):
+        inside += columns[i] - (columns[i - wide] if i >= wide else 0.0)
+        if i >= wide - 1 and inside > best + 1e-9:
+            start, best = i - wide + 1, inside
+    column = (first_column + last_column) / 2
+    if best > 0:
+        weighted = 0.0
+        for i in range(start, start + wide):
+            weighted += columns[i] * (left + i)
+        column = weighted / best
+    total, lit = 0, 0
     for v in range(top, bottom):
         n = 0
         for u in range(left, right):
             state = pixels[v, u]
-            if (state >> 12) >= since_us and ((state >> 1) & 127) >= min_score:
-                n += 1
-                weighted += u
-                first_column = min(first_column, u)
-                last_column = max(last_column, u)
+            lit_pixel = (state >> 12) >= since_us and ((state >> 1) & 127) >= min_score
+            n += lit_pixel and abs(u - column) <= reach
         rows[v - top] = n
         total += n
         lit += n > 0
@@ -136,7 +165,7 @@ def measure_box(
     while rows[v - top] == 0:
         v -= 1
     lower = v + min(rows[v - top] / full, 1.0)
-    return total, weighted / total, first_column, last_column, upper, lower
+    return total, column, first_column, last_column, upper, lower
 
 
 @njit(cache=True, nogil=True)

@@ -56,6 +56,16 @@ _LONGEST_US = 200_000
 """How long events of the whole image are kept at the most, to gather those of a region anew: a packet that is
 longer than that starts with the frames in reach."""
 
+_BLUR_PX = 2.0
+"""How much longer than a bar its blinking pixels are: blur of a pixel at either end."""
+
+_LEFT_STEPS = 6
+"""Steps in which what is left of a region that turned out to be smaller may become one: it blinks all the
+time. What wakes there later is a halo, or leaves that its light falls on."""
+
+_SEAM_PX = 2
+"""Columns at either side of a box that a bar should leave dark: some of the least seam of a region."""
+
 _END_PX = 5.0
 """How far from where it is expected an end of a bar still counts as its end: the seam of a region."""
 
@@ -192,7 +202,6 @@ class RegionFollower:
         self._pixels = np.full(shape, _LONG_AGO_US << 12, np.int64)
         self._hits = np.zeros([(n - 1 >> _CELL_SHIFT) + 1 for n in shape], np.int32)
         self._fresh: list[Box] = []
-        self._keep_us = keep_us
         steps = math.ceil(min(keep_us, _LONGEST_US) / spec.step_us)
         self._recent: deque[Piece] = deque(maxlen=max(steps, _BACKFILL_STEPS))
         self._next_id = 0
@@ -214,9 +223,10 @@ class RegionFollower:
             self._reach(self._expected(followed, start_us + spec.step_us / 2)) for followed in self.alive
         ]
         for followed, box, inside in zip(self.alive, boxes, _select(events, boxes), strict=True):
-            followed.pieces.append((start_us, inside))
+            followed.pieces.append((start_us, inside if followed.size_px else self._rhythmic(inside)))
             rows = np.empty(box[3] - box[1], np.int64)
-            measured = self._measure(followed.id, box, end_us, rows)
+            width_px = followed.size_px[0] if followed.size_px else math.inf
+            measured = self._measure(followed.id, box, end_us, rows, width_px)
             if measured is not None:
                 measured = self._whole(followed, measured, box[1], rows)
                 followed.positions.append(self._filtered(followed, measured))
@@ -249,8 +259,9 @@ class RegionFollower:
         known = followed.size_px
         if known is None:
             followed.heights.clear()
+            followed.heights.append(size_px[1] + _BLUR_PX)
             last = followed.latest
-            until_us = t_us + self._keep_us
+            until_us = last.t_us + _LEFT_STEPS * self._spec.step_us
             followed.outgrown = -off[0], -off[1], last.width_px, last.height_px, until_us
         elif max(abs(v) for v in (*off, size_px[0] - known[0], size_px[1] - known[1])) < _RESHAPE_PX:
             return False
@@ -283,6 +294,14 @@ class RegionFollower:
         """Let a region go at once."""
         followed.released = True
         self.alive = [other for other in self.alive if other is not followed]
+
+    def _rhythmic(self, events: Events) -> Events:
+        """Those of pixels that blink in rhythm.
+
+        Before a frame shows where in its box a bar is, panels and moving textures around it would drown it.
+        """
+        score = (self._pixels[events.y, events.x] >> 1) & 127
+        return events[score >= self._spec.min_score // 2]
 
     def _gather(self, followed: Followed) -> None:
         """Take a region's events once more, from where it is now known to have been."""
@@ -360,13 +379,19 @@ class RegionFollower:
             min(max(int(region.y_px + half_h) + 1, 0), height),
         )
 
-    def _measure(self, id: int, box: Box, end_us: int, rows: NDArray[np.int64]) -> Region | None:
-        """Centre and size of what blinks in a box at the end of a step; `rows`: its pixels in each row."""
+    def _measure(
+        self, id: int, box: Box, end_us: int, rows: NDArray[np.int64], width_px: float = math.inf
+    ) -> Region | None:
+        """Centre and size of what blinks in a box at the end of a step; `rows`: its pixels in each row.
+
+        Of a bar of known width, rows count no pixels beside it.
+        """
         from evlcp_sdk.rx import _kernels
 
         # Half the score suffices inside a region: its seam is new to the light as the bar moves.
+        since_us, score = end_us - self._measure_us, self._spec.min_score // 2
         total, column, left, right, upper, lower = _kernels.measure_box(
-            self._pixels, box, end_us - self._measure_us, self._spec.min_score // 2, rows
+            self._pixels, box, since_us, score, _SEAM_PX, width_px / 2 + 1, rows
         )
         if total < _MIN_PIXELS:
             return None
@@ -385,6 +410,8 @@ class RegionFollower:
         merge = self._spec.merge_px
         for followed in self.alive:
             _inside(hits, _grown(self._reach(followed.latest), merge))[:] = 0
+            if followed.outgrown is not None and end_us > followed.outgrown[4]:
+                _inside(hits, self._reach(_outgrown(followed)))[:] = 0
         if hits.max() == 0:
             self._fresh = []
             return
@@ -415,7 +442,7 @@ class RegionFollower:
         self._next_id += 1
         reach = self._reach(region)
         for like in self.alive:
-            if like.outgrown is not None and _left_by(like, region):
+            if _left_by(like, region):
                 # It was seen as long as the one that it was taken to be a part of.
                 right, down = region.x_px - like.latest.x_px, region.y_px - like.latest.y_px
                 size = {"width_px": region.width_px, "height_px": region.height_px}
@@ -430,7 +457,7 @@ class RegionFollower:
                 self.alive.append(followed)
                 return
         recent = list(self._recent)[-_BACKFILL_STEPS:]
-        pieces = deque((start, _select(events, [reach])[0]) for start, events in recent)
+        pieces = deque((start, self._rhythmic(_select(events, [reach])[0])) for start, events in recent)
         state = self._position.init() if self._position else None
         self.alive.append(Followed(region.id, deque([region]), pieces[0][0], pieces, filter=state))
 
@@ -456,13 +483,21 @@ def _select(events: Events, boxes: list[Box]) -> list[Events]:
     return [Events(t[i, :n], x[i, :n], y[i, :n], p[i, :n]) for i, n in enumerate(taken)]
 
 
+def _outgrown(followed: Followed) -> Region:
+    """Where a region would be now if no frame had shown its size."""
+    assert followed.outgrown is not None
+    right, down, width, height, _ = followed.outgrown
+    last = followed.latest
+    return Region(last.id, last.t_us, last.x_px + right, last.y_px + down, width, height)
+
+
 def _left_by(like: Followed, region: Region) -> bool:
     """Whether a region lies in what another was taken for, before a frame showed its size."""
-    assert like.outgrown is not None
-    right, down, width, height, until_us = like.outgrown
-    x, y = like.latest.x_px + right, like.latest.y_px + down
-    near = abs(region.x_px - x) <= width / 2 and abs(region.y_px - y) <= height / 2
-    return near and region.t_us < until_us
+    if like.outgrown is None or region.t_us > like.outgrown[4]:
+        return False
+    whole = _outgrown(like)
+    right, down = abs(region.x_px - whole.x_px), abs(region.y_px - whole.y_px)
+    return right <= whole.width_px / 2 and down <= whole.height_px / 2
 
 
 def _inside(hits: NDArray[np.int32], box: Box) -> NDArray[np.int32]:

@@ -146,6 +146,8 @@ class Receiver:
                 continue
             transmitter = self._hear(region, step)
             self._decode_due(transmitter, step.end_us - self._tail_us)
+            if region.id in self._joined:
+                continue
             self._transmitters.forget(transmitter, step.end_us)
             if region.released:
                 self._counts["regions_released"] += 1
@@ -188,6 +190,8 @@ class Receiver:
             transmitter.grid.frame += 1
             if sighting is None:
                 self._counts["frames_rejected"] += 1
+                if transmitter.region.id in self._joined:
+                    return
                 continue
             self._counts["frames"] += 1
             self._judged.add(transmitter.packets, due, sighting)
@@ -238,8 +242,8 @@ class Receiver:
             if look is None or not due.has_pilot:
                 return look
             changed = self._regions.shape(region, look.middle_us, *self._looker.box(look, look.placement))
-            if changed:
-                self._join(region)
+            if changed and not self._join(region):
+                return None
             if whole or not changed:
                 break
         assert look is not None
@@ -249,17 +253,21 @@ class Receiver:
                 self._regions.beside(region, look.middle_us, centre_px, size_px)
         return look
 
-    def _join(self, region: Followed) -> None:
-        """Let other regions go that are parts of the same bar."""
+    def _join(self, region: Followed) -> bool:
+        """Let other regions of the same bar go; False if this one goes, as the other is known."""
         for other in list(self._regions.alive):
             if other is region or not region.holds(other, _SAME_PX):
                 continue
-            self._regions.drop(other)
-            self._joined.add(other.id)
-            if other in self._transmitters:
+            gone = region if other.size_px is not None and other.id < region.id else other
+            self._regions.drop(gone)
+            self._joined.add(gone.id)
+            if gone in self._transmitters:
                 self._counts["regions_released"] += 1
-                self._judged.end(self._transmitters[other].packets)
-                self._transmitters.release(self._transmitters[other])
+                self._judged.end(self._transmitters[gone].packets)
+                self._transmitters.release(self._transmitters[gone])
+            if gone is region:
+                return False
+        return True
 
     def _end(self, transmitter: Transmitter, now_us: float) -> None:
         """Decode what a region that has ended still shows; its last packet is over."""

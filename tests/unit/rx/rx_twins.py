@@ -45,19 +45,28 @@ def score_rises(events, shape, start, chip_us, min_score, cell_shift):
     return (rose, chips, score), hits
 
 
-def measure_box(lit, box):
+def measure_box(lit, box, seam, reach):
     """What `measure_box` says of a mask of blinking pixels."""
     left, top, right, bottom = box
-    rows = np.zeros(len(lit), int)
-    rows[top:bottom] = lit[top:bottom, left:right].sum(1)
+    inside = lit[top:bottom, left:right]
+    counts = inside.sum(0)
+    if not counts.any():
+        return (0, 0.0, 0, 0, 0.0, 0.0), np.zeros(bottom - top, int)
+    outside = min(counts[:seam].mean(), counts[-seam:].mean()) if len(counts) > 2 * seam else 0
+    more = np.maximum(counts - outside, 0)
+    columns = left + np.arange(len(counts))
+    seen = columns[counts > 0]
+    wide = int(min(2 * reach, len(counts)))
+    sums = np.array([more[i : i + wide].sum() for i in range(len(more) - wide + 1)])
+    core = slice(int(sums.argmax()), int(sums.argmax()) + wide)
+    column = np.average(columns[core], weights=more[core]) if more.any() else (seen[0] + seen[-1]) / 2
+    rows = inside[:, np.abs(columns - column) <= reach].sum(1)
     if not rows.any():
-        return (0, 0.0, 0, 0, 0.0, 0.0), rows[top:bottom]
-    columns = left + np.nonzero(lit[top:bottom, left:right])[1]
+        return (0, 0.0, 0, 0, 0.0, 0.0), rows
     first, last = np.flatnonzero(rows)[[0, -1]]
     share = np.minimum(rows / rows[rows > 0].mean(), 1)
-    upper, lower = first + 1 - share[first], last + share[last]
-    found = (rows.sum(), columns.mean(), columns.min(), columns.max(), upper, lower)
-    return found, rows[top:bottom]
+    upper, lower = top + first + 1 - share[first], top + last + share[last]
+    return (rows.sum(), column, seen[0], seen[-1], upper, lower), rows
 
 
 def select_box(events, box):

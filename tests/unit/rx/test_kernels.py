@@ -129,17 +129,18 @@ def test_scores_do_not_care_how_the_stream_is_cut():
     assert_array_equal(got, want)
 
 
+@pytest.mark.parametrize("reach", [2.0, np.inf])
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 1.0])
 @pytest.mark.parametrize("box", [(0, 0, WIDTH, HEIGHT), (5, 3, 20, 12), (7, 7, 8, 8), (0, 15, 24, 16)])
-def test_what_blinks_in_a_box(box, share):
+def test_what_blinks_in_a_box(box, share, reach):
     rng = np.random.default_rng(round(100 * share))
     changed = rng.integers(900, 1100, (HEIGHT, WIDTH))
     score = np.where(rng.random(changed.shape) < share, 5, 3)
     pixels = changed << 12 | score << 1 | rng.integers(0, 2, changed.shape)
     since_us = 1000 if share < 1 else 900
     rows = np.empty(box[3] - box[1], np.int64)
-    got = _kernels.measure_box(pixels, box, since_us, 5, rows)
-    want, want_rows = twins.measure_box((changed >= since_us) & (score >= 5), box)
+    got = _kernels.measure_box(pixels, box, since_us, 5, 2, reach, rows)
+    want, want_rows = twins.measure_box((changed >= since_us) & (score >= 5), box, 2, reach)
     assert_allclose(got, want, rtol=1e-12)
     assert_array_equal(rows, want_rows)
 
@@ -148,7 +149,7 @@ def test_an_edge_row_counts_by_its_share():
     pixels = np.zeros((HEIGHT, WIDTH), np.int64)
     pixels[4:8, 2:10] = pixels[8, 2:4] = 1000 << 12 | 40 << 1
     *_, upper, lower = _kernels.measure_box(
-        pixels, (0, 0, WIDTH, HEIGHT), 1000, 5, np.empty(HEIGHT, np.int64)
+        pixels, (0, 0, WIDTH, HEIGHT), 1000, 5, 2, np.inf, np.empty(HEIGHT, np.int64)
     )
     # 34 pixels in five rows: a full row counts as 6.8.
     assert (upper, lower) == pytest.approx((4, 8 + 2 / 6.8))
