@@ -57,7 +57,7 @@ _LONGEST_US = 200_000
 longer than that starts with the frames in reach."""
 
 _BLUR_PX = 2.0
-"""How much longer than a bar its blinking pixels are: blur of a pixel at either end."""
+"""How much longer than a bar its blinking pixels are: blur of a pixel at either end; in motion twice that."""
 
 _LEFT_STEPS = 6
 """Steps in which what is left of a region that turned out to be smaller may become one: it blinks all the
@@ -259,20 +259,22 @@ class RegionFollower:
         known = followed.size_px
         if known is None:
             followed.heights.clear()
-            followed.heights.append(size_px[1] + _BLUR_PX)
             last = followed.latest
             until_us = last.t_us + _LEFT_STEPS * self._spec.step_us
             followed.outgrown = -off[0], -off[1], last.width_px, last.height_px, until_us
         elif max(abs(v) for v in (*off, size_px[0] - known[0], size_px[1] - known[1])) < _RESHAPE_PX:
             return False
-        followed.size_px = size_px
+        followed.size_px, before = size_px, followed.positions
         followed.positions = deque(
             replace(p, x_px=p.x_px + off[0], y_px=p.y_px + off[1], width_px=size_px[0], height_px=size_px[1])
             for p in followed.positions
         )
         if known is None:
-            # As more of a bar was seen, what was seen of it moved: that is no motion of the bar.
-            followed.positions = deque(replace(p, y_px=centre_px[1]) for p in followed.positions)
+            # Where less of the bar was seen, or more than it, its place is not that of what was seen.
+            followed.positions = deque(
+                p if abs(old.height_px - size_px[1]) <= 2 * _END_PX else replace(p, y_px=centre_px[1])
+                for p, old in zip(followed.positions, before, strict=True)
+            )
         followed.filter = self._position.init() if self._position else None
         self._gather(followed)
         return True
@@ -332,12 +334,10 @@ class RegionFollower:
         """
         known = followed.size_px
         expected_px = self._expected(followed, measured.t_us).y_px
-        # A part of the bar says nothing of its height, once that is known.
-        first_px = measured.height_px if known is None else known[1]
-        height_px = median(followed.heights) if followed.heights else first_px
-        if known is None or abs(measured.height_px - height_px) <= _STRAY_PX:
+        if known is None or -_STRAY_PX <= measured.height_px - known[1] <= 2 * _BLUR_PX:
             followed.heights.append(measured.height_px)
-            height_px = median(followed.heights)
+        # A part of the bar says nothing of its height, once that is known.
+        height_px = median(followed.heights) if followed.heights else (known or (0, measured.height_px))[1]
         excess_px = measured.height_px - height_px
         if excess_px > _STRAY_PX:
             n = min(round(height_px), len(rows))
