@@ -37,6 +37,7 @@ PAGES = (
     "position",
     "configuration",
     "simulator",
+    "road",
     "campaigns",
     "compare",
     "paper",
