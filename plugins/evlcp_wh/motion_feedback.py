@@ -58,6 +58,10 @@ class MotionFeedback(Decoding):
     independent_pixels: IndependentPixels = 0.25
     value_error: ErrorShare = 0.1
     min_values: MinValues = 4
+    sure_llr: Annotated[
+        float,
+        Field(ge=0, description="Log-likelihood ratio of every bit from which on a frame is read once only."),
+    ] = 20.0
 
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's pilots and codewords."""
@@ -67,6 +71,9 @@ class MotionFeedback(Decoding):
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             presence = presence.informed()
             worth = learned_worth(presence, sums, pilots, self.max_events, self.prior_count)
+            soft = self._decided(presence, sums, pilots, words, worth)
+            if np.abs(soft.llr).min() >= self.sure_llr:
+                return soft
             matches = self._matches(presence, sums, worth)
             known, aligned = pilots, sums
             done = np.zeros((len(sums) // 2, 2), np.int64)
