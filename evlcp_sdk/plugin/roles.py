@@ -280,7 +280,7 @@ ROLES: Mapping[str, Role] = MappingProxyType(
             Role("modulation", Modulation, "wh4x2", "bits of a symbol <-> its codeword"),
             Role("synchronization", Synchronization, "barker", "a region's events -> packet timing"),
             Role("separation", Separation, "wh-correlation", "a pilot's image -> where each cluster is"),
-            Role("decoding", Decoding, "ml-soft", "a frame's image -> soft symbols"),
+            Role("decoding", Decoding, "motion-feedback", "a frame's image -> soft symbols"),
             Role("ranging", Ranging, "joint-scale", "a decoded frame's image -> distance", "poc"),
             Role("tracking", Tracking, "none", "distance and image position over time"),
             Role("error-correction", ErrorCorrection, "polar", "message bits <-> coded bits, soft input"),
