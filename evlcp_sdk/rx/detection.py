@@ -219,8 +219,11 @@ class RegionFollower:
             t_us, x, y, p, self._pixels, self._hits, self._chip_us, spec.min_score, _CELL_SHIFT
         )
         end_us = start_us + spec.step_us
+        expected = [self._expected(followed, start_us + spec.step_us / 2) for followed in self.alive]
+        known = [_tight(e) for e, followed in zip(expected, self.alive, strict=True) if followed.size_px]
         boxes = [
-            self._reach(self._expected(followed, start_us + spec.step_us / 2)) for followed in self.alive
+            self._reach(e) if followed.size_px else _clear(self._reach(e), known)
+            for e, followed in zip(expected, self.alive, strict=True)
         ]
         for followed, box, inside in zip(self.alive, boxes, _select(events, boxes), strict=True):
             followed.pieces.append((start_us, inside if followed.size_px else self._rhythmic(inside)))
@@ -409,7 +412,9 @@ class RegionFollower:
         hits = self._hits
         merge = self._spec.merge_px
         for followed in self.alive:
-            _inside(hits, _grown(self._reach(followed.latest), merge))[:] = 0
+            # What is near a bar of known size is another one, or its outgrown box would hold it.
+            near = 0 if followed.size_px else merge
+            _inside(hits, _grown(self._reach(followed.latest), near))[:] = 0
             if followed.outgrown is not None and end_us > followed.outgrown[4]:
                 _inside(hits, self._reach(_outgrown(followed)))[:] = 0
         if hits.max() == 0:
@@ -481,6 +486,19 @@ def _select(events: Events, boxes: list[Box]) -> list[Events]:
     p, taken = np.empty(shape, np.uint8), np.empty(len(boxes), np.int64)
     _kernels.select_boxes(events.t_us, events.x, events.y, events.p, np.array(boxes), t, x, y, p, taken)
     return [Events(t[i, :n], x[i, :n], y[i, :n], p[i, :n]) for i, n in enumerate(taken)]
+
+
+def _clear(box: Box, others: list[Box]) -> Box:
+    """The largest part of a box, cut straight, that is clear of others."""
+    for left, top, right, bottom in others:
+        if _overlap(box, (left, top, right, bottom)):
+            u, v, w, z = box
+            parts = [(u, v, min(w, left), z), (max(u, right), v, w, z)]
+            parts += [(u, v, w, min(z, top)), (u, max(v, bottom), w, z)]
+            box = max(parts, key=lambda b: max(b[2] - b[0], 0) * max(b[3] - b[1], 0))
+            if box[0] >= box[2] or box[1] >= box[3]:
+                return u, v, u, v
+    return box
 
 
 def _outgrown(followed: Followed) -> Region:

@@ -1,6 +1,7 @@
 """The receiver: events in, packets out."""
 
 import math
+from collections import deque
 
 import numpy as np
 import pluggy
@@ -97,6 +98,7 @@ class Receiver:
         self._judged = EchoQueue(self._echoes)
         self._messages = MessageAssembler.of(link)
         self._joined: set[int] = set()
+        self._due: deque[Followed] = deque()
         self._closed = False
         self._counts = dict.fromkeys(_COUNTS, 0)
 
@@ -141,7 +143,10 @@ class Receiver:
         for region in regions:
             self._announcer.lap("regions", region.latest)
         self._joined.clear()
-        for region in regions:
+        # A frame may show another image of its bar: that is a region, too, and heard at once.
+        self._due = deque(regions)
+        while self._due:
+            region = self._due.popleft()
             if region.id in self._joined:
                 continue
             transmitter = self._hear(region, step)
@@ -236,21 +241,22 @@ class Receiver:
     def _look(self, transmitter: Transmitter, due: DueFrame) -> Look | None:
         """Look at a frame; set its region right by it, join what is of the same bar, open what is another."""
         region = transmitter.region
+        others: list[tuple[float, tuple[float, float], tuple[float, float]]] = []
         for _ in range(_LOOKS):
             whole = region.size_px is not None
             look, transmitter.pilot = self._looker.look(region, due, transmitter.pilot)
             if look is None or not due.has_pilot:
                 return look
+            # What the first look shows beside the bar is out of the second one's sight.
+            others += [(look.middle_us, *self._looker.box(look, other)) for other in look.others]
             changed = self._regions.shape(region, look.middle_us, *self._looker.box(look, look.placement))
             if changed and not self._join(region):
                 return None
             if whole or not changed:
                 break
-        assert look is not None
-        for other in look.others:
-            centre_px, size_px = self._looker.box(look, other)
-            if not any(r.covers(look.middle_us, centre_px) for r in self._regions.alive):
-                self._regions.beside(region, look.middle_us, centre_px, size_px)
+        for middle_us, centre_px, size_px in others:
+            if not any(known.covers(middle_us, centre_px) for known in self._regions.alive):
+                self._due.append(self._regions.beside(region, middle_us, centre_px, size_px))
         return look
 
     def _join(self, region: Followed) -> bool:
