@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.values import SoftSymbols
+from evlcp_sdk.values import PresenceMap, SoftSymbols
 
-__all__ = ["believed"]
+__all__ = ["believed", "still_lit"]
 
 _EXPECTED_SPREAD = 0.5
 """Standard deviation of the sizes of LLRs, in their mean, before any is seen: at the end of the range, 180 m
@@ -19,6 +19,32 @@ _EXPECTED_WORTH = 6.0
 _LEAST_SURE = 0.6
 """Probability of being right against its nearest rival below which a symbol is not given: it has others, too,
 and of those that are less sure, half or more are wrong in recordings."""
+
+
+_LEAST_EVENTS = 0.25
+"""Share of a pilot's chips with events that an info segment has at the least: a codeword has half as many
+edges as another, and as much again may be chance."""
+
+
+def still_lit(sums: NDArray[np.int16], presence: PresenceMap, pilot_chips: int) -> NDArray[np.bool_]:
+    """Which clusters have events in a frame's info segment as they have in its pilot, bool (K,).
+
+    Where a stream has a gap, or a pole passes, silence is not what a cluster says.
+
+    Args:
+        sums: Polarity sums of pilot and info segment, int16 (chips, height, width).
+        presence: Where the clusters are.
+        pilot_chips: Chips of the pilot.
+    """
+    weight, grid = presence.probability, presence.grid_px
+    _, rows, columns = weight.shape
+    active = (sums[:, : rows * grid, : columns * grid] != 0).astype(np.uint8)
+    pilot, info = (
+        part.mean(0, dtype=np.float32).reshape(rows, grid, columns, grid).sum((1, 3))
+        for part in (active[:pilot_chips], active[pilot_chips:])
+    )
+    lit: NDArray[np.bool_] = (weight * (info - _LEAST_EVENTS * pilot)).sum((1, 2)) > 0
+    return lit
 
 
 def believed(soft: SoftSymbols, seen: NDArray[np.bool_]) -> SoftSymbols:

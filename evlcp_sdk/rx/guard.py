@@ -27,7 +27,7 @@ class Guard:
     >>> with Guard(load_link(), "ranging"):
     ...     {}["boom"]
     Traceback (most recent call last):
-    evlcp_sdk.errors.PluginError: ranging algorithm 'poc': KeyError: 'boom' (...
+    evlcp_sdk.errors.PluginError: ranging algorithm 'joint-scale': KeyError: 'boom' (...
     """
 
     def __init__(self, link: Link, role: str) -> None:

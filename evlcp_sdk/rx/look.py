@@ -146,6 +146,18 @@ class Looker:
         look = Look(sums, offset_px, pilot.presence, pilot.placement, pilot.others, corner_px, middle_us)
         return look, pilot
 
+    def centre(self, look: Look, points_px: NDArray[np.float64]) -> tuple[float, float]:
+        """Column and row of the bar's centre on the sensor, px, by its clusters' points there, float64 (K, 2).
+
+        Points are finer than the cells that placed the layout; without any, those count.
+        """
+        off = points_px @ np.array([1, 1j]) - look.placement.places(self._layout)
+        seen = np.isfinite(off)
+        if not seen.any():
+            return look.centre_px
+        centre = look.placement.shift + complex(off[seen].mean())
+        return centre.real, centre.imag
+
     def box(self, look: Look, placement: Placement) -> tuple[tuple[float, float], tuple[float, float]]:
         """Centre (column, row) on the sensor and (width, height) of a whole bar, hidden parts too, px.
 

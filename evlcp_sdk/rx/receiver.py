@@ -8,7 +8,7 @@ import pluggy
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.rx.belief import believed
+from evlcp_sdk.rx.belief import believed, still_lit
 from evlcp_sdk.rx.delays import RowDelays
 from evlcp_sdk.rx.detection import Followed, RegionFollower
 from evlcp_sdk.rx.echoes import Echoes, EchoQueue, Sighting
@@ -209,12 +209,14 @@ class Receiver:
             return None
         number = self._transmitters.number(transmitter)
         soft = self._steps.decode(look.presence, look.sums)
-        distance, points = _NO_RANGE, _NO_POINTS
+        lit = still_lit(look.sums, look.presence, self._packet.pilot_chips)
+        distance, points, centre_px = _NO_RANGE, _NO_POINTS, look.centre_px
         if due.has_pilot:
             # Another distance of the same pilot, or other points, would say nothing new.
             distance = self._steps.measure(FrameView(look.sums, look.offset_px, look.presence, soft))
             points_px, sigma_px = self._find_points(look.presence, look.placement)
             points = points_px + look.corner_px, sigma_px
+            centre_px = self._looker.centre(look, points[0])
         transmitter.distance, distance, filtered = self._steps.follow(
             transmitter.distance, due.start_us, due.lock.chip_us, distance
         )
@@ -225,11 +227,11 @@ class Receiver:
             packet=due.packet - transmitter.first,
             frame=due.index,
             t_us=due.start_us,
-            soft=believed(soft, look.placement.seen),
+            soft=believed(soft, look.placement.seen & lit),
             range=distance,
             filtered=filtered,
-            x_px=look.centre_px[0],
-            y_px=look.centre_px[1],
+            x_px=centre_px[0],
+            y_px=centre_px[1],
             points_px=points[0],
             points_sigma_px=points[1],
             points_t_us=look.middle_us,

@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import hadamard
-from evlcp_sdk.rx.belief import believed
-from evlcp_sdk.values import SoftSymbols
+from evlcp_sdk.rx.belief import believed, still_lit
+from evlcp_sdk.values import PresenceMap, SoftSymbols
 
 ALL = np.ones(16, bool)
 ROWS = hadamard(8)
@@ -70,3 +70,16 @@ def test_of_what_is_not_seen_nothing_is_given() -> None:
         assert (none.symbols == -1).all()
         assert not none.llr.any()
         assert none.quality == 0
+
+
+def test_silence_is_not_what_a_cluster_says() -> None:
+    """Two clusters side by side; the second one's info segment has an event in one chip of eight."""
+    rng = np.random.default_rng(0)
+    sums = np.where(rng.random((32, 6, 8)) < 0.6, 1, 0).astype(np.int16)
+    sums[16:, :, 4:] = 0
+    sums[16:20:2, :, 4:] = -1
+    probability = np.zeros((3, 3, 4), np.float32)
+    probability[0, :, :2] = probability[1, :, 2:] = 0.9
+    nothing = np.zeros((3, 6, 8), np.float32)
+    presence = PresenceMap(probability, 2, probability > 0.5, nothing)
+    assert still_lit(sums, presence, 16).tolist() == [True, False, False]
