@@ -412,9 +412,7 @@ class RegionFollower:
         hits = self._hits
         merge = self._spec.merge_px
         for followed in self.alive:
-            # What is near a bar of known size is another one, or its outgrown box would hold it.
-            near = 0 if followed.size_px else merge
-            _inside(hits, _grown(self._reach(followed.latest), near))[:] = 0
+            _inside(hits, _grown(self._reach(followed.latest), merge))[:] = 0
             if followed.outgrown is not None and end_us > followed.outgrown[4]:
                 _inside(hits, self._reach(_outgrown(followed)))[:] = 0
         if hits.max() == 0:

@@ -147,7 +147,7 @@ class Looker:
         return look, pilot
 
     def centre(self, look: Look, points_px: NDArray[np.float64]) -> tuple[float, float]:
-        """Column and row of the bar's centre on the sensor, px, by its clusters' points there, float64 (K, 2).
+        """Column and row of the bar's centre on the sensor, px, by its clusters' points, float64 (K, 2).
 
         Points are finer than the cells that placed the layout; without any, those count.
         """

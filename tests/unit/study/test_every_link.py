@@ -118,8 +118,11 @@ def test_all_commands_agree(name: str, evlcp: Evlcp, tmp_path: Path) -> None:
     (swept,) = json.loads(run(evlcp, "compare", results, "--json"))["rows"]
     for one in (row, swept):
         assert (one["frames"], one["unmatched"], one["echoes"]) == (score["rows"], 0, 0)
-        for key in ("frames_sent", "frames_found", "bits", "bit_errors", "ranged"):
+        for key in ("frames_sent", "frames_found", "ranged"):
             assert one[key] == plain[key] == road[key], key
+        # To the plain score, a symbol that is not given is a wrong one.
+        for key in ("bits", "bit_errors"):
+            assert one[key] == road[key], key
         assert (one["erased_share"], one["claimed_share"]) == (road["erased"], road["claimed"])
         for key in ("rmse_m", "bias_m"):
             # frames.csv has tenths of millimetres.
