@@ -60,7 +60,9 @@ def score_rises(
     """Score each pixel by the rhythm of its rises; add the rises of candidates to their cell's `hits`.
 
     A pixel's state holds the time of its last rise, us (bits 12 up), the whole chips between that and the one
-    before (bits 8 to 11, 0: none), and its score (bits 1 to 7).
+    before (bits 8 to 11, 0: none), and its score (bits 1 to 7). In no code do rises come sooner than two
+    chips apart; jitter and latencies that differ from rise to rise put one off the chips by up to three
+    tenths; a time beyond twelve chips says nothing.
     """
     soon = int(1.5 * chip_us)
     late = 12.5 * chip_us

@@ -36,9 +36,9 @@ _MEASURE_CHIPS = 6
 """A blinking pixel rises at least once in four chips; half of that again allows for a late event."""
 
 _AGE_CHIPS = 5
-"""Age of a measured centre. A moving bar's leading end counts once its pixels have had two runs of one chip,
-some six chips late and more where events go missing; its trailing end stays for the four chips of the
-measurement. In recordings and simulated scenes the centre is 4 to 8 chips late."""
+"""Age of a measured centre. A moving bar's leading end counts once its pixels have risen in rhythm twice,
+some six chips late and more where events go missing; its trailing end stays for the six chips of the
+measurement. In recordings and simulated scenes the centre is 3 to 8 chips late."""
 
 _MOST_AHEAD_STEPS = 2
 """Steps beyond the measured centres for which a region goes straight on, before a shaking camera turns."""
@@ -65,9 +65,6 @@ time. What wakes there later is a halo, or leaves that its light falls on."""
 
 _SEAM_PX = 2
 """Columns at either side of a box that a bar should leave dark: some of the least seam of a region."""
-
-_END_PX = 5.0
-"""How far from where it is expected an end of a bar still counts as its end: the seam of a region."""
 
 _MIN_PIXELS = 4
 """Blinking pixels below which a region has no position: one cluster at 100 m has a dozen."""
@@ -275,7 +272,9 @@ class RegionFollower:
         if known is None:
             # Where less of the bar was seen, or more than it, its place is not that of what was seen.
             followed.positions = deque(
-                p if abs(old.height_px - size_px[1]) <= 2 * _END_PX else replace(p, y_px=centre_px[1])
+                p
+                if abs(old.height_px - size_px[1]) <= 2 * self._spec.margin_px
+                else replace(p, y_px=centre_px[1])
                 for p, old in zip(followed.positions, before, strict=True)
             )
         followed.filter = self._position.init() if self._position else None
@@ -348,11 +347,11 @@ class RegionFollower:
             inside = total[n:] - total[:-n]
             places_px = top + np.flatnonzero(inside == inside.max()) + (n - 1) / 2
             y_px = float(places_px[np.abs(places_px - expected_px).argmin()])
-        elif known is not None and excess_px < -2 * _END_PX:
+        elif known is not None and excess_px < -2 * self._spec.margin_px:
             # By its upper end, and by its lower one.
             ends_px = measured.y_px - excess_px / 2, measured.y_px + excess_px / 2
             y_px = min(ends_px, key=lambda end_px: abs(end_px - expected_px))
-            if abs(y_px - expected_px) > _END_PX:
+            if abs(y_px - expected_px) > self._spec.margin_px:
                 y_px = followed.latest.y_px
         else:
             slack_px = abs(excess_px) / 2

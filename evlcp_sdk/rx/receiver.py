@@ -19,7 +19,7 @@ from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.steps import Announcer, Steps
 from evlcp_sdk.rx.timeline import Timeline, TimeStep
-from evlcp_sdk.rx.transmitters import Transmitter, Transmitters
+from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Transmitter, Transmitters
 from evlcp_sdk.values import Events, Frame, FrameView, Packet, Range, SyncLock
 
 __all__ = ["Receiver"]
@@ -29,10 +29,6 @@ _NO_POINTS = (np.empty((0, 2)), np.empty(0))
 
 _TAIL_CHIPS = 2
 """A frame is whole if the stream goes on for this long after it: its last events come late."""
-
-_LOOKBACK_PACKETS = 2
-"""Packets of events kept of the whole image: a region's first frame, which may show that it is larger, is
-read up to a packet after its start."""
 
 _LOOKS = 3
 """Looks at a region's first frame: at what was found of a bar, at the whole of it, and once more, as few
@@ -86,7 +82,7 @@ class Receiver:
             link.camera,
             link.packet.chip_us,
             self._steps.position,
-            _LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us,
+            LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us,
         )
         self._transmitters = Transmitters(link.packet, self._step_us)
         self._looker = Looker(

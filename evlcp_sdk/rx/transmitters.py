@@ -11,9 +11,9 @@ from evlcp_sdk.rx.look import Pilot
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.values import SyncLock
 
-__all__ = ["Transmitter", "Transmitters"]
+__all__ = ["LOOKBACK_PACKETS", "Transmitter", "Transmitters"]
 
-_LOOKBACK_PACKETS = 2
+LOOKBACK_PACKETS = 2
 """Packets of events kept while there is no lock: one to hear a preamble in, one to look back on."""
 
 _REMEMBER_US = 1e6
@@ -125,7 +125,7 @@ class Transmitters:
         region, grid = transmitter.region, transmitter.grid
         if grid.lock is None:
             packet_us = self._packet.packet_chips * self._packet.chip_us
-            keep_us = now_us - _LOOKBACK_PACKETS * packet_us
+            keep_us = now_us - LOOKBACK_PACKETS * packet_us
             region.first_us = max(region.first_us, int(keep_us))
         else:
             # A later lock may move the next frame's start by a chip; the preamble before a packet's first

@@ -165,6 +165,18 @@ def rows_felt(
 
 
 @njit(cache=True, nogil=True)
+def _profile_at(profile: Array, z: float, width: float) -> tuple[float, float]:
+    """Share of a boundary's light beyond `z`, and its density there, by straight pieces."""
+    steps = profile.shape[1] - 1
+    at = min(abs(z) / width / _REACH * steps, steps - 1e-9)
+    n = int(at)
+    part = at - n
+    beyond = profile[0, n] + part * (profile[0, n + 1] - profile[0, n])
+    density = profile[1, n] + part * (profile[1, n + 1] - profile[1, n])
+    return beyond, density
+
+
+@njit(cache=True, nogil=True)
 def equations(
     codes: Array,
     first: Array,
@@ -191,7 +203,6 @@ def equations(
     rows = seen_values.shape[1]
     spacing, centre, drift, gain = fit[0], fit[1], fit[2], fit[3]
     width = blur * exp(fit[4])
-    steps = profile.shape[1] - 1
     slope = np.empty(5)
     normal[:] = 0.0
     right[:] = 0.0
@@ -205,12 +216,7 @@ def equations(
             place = b - clusters / 2
             for v in range(first[b, i], last[b, i]):
                 z = v - middle - spacing * place
-                # The profile by straight pieces.
-                at = min(abs(z) / width / _REACH * steps, steps - 1e-9)
-                n = int(at)
-                part = at - n
-                beyond = profile[0, n] + part * (profile[0, n + 1] - profile[0, n])
-                density = profile[1, n] + part * (profile[1, n + 1] - profile[1, n])
+                beyond, density = _profile_at(profile, z, width)
                 level = 0.5 * (codes[b, i] + codes[b - 1, i] + (step if z > 0 else -step) * beyond)
                 steep = 0.5 * gain * step * density / width
                 slope[0] = -steep * place
@@ -264,7 +270,6 @@ def leftovers(
     rows = seen_values.shape[1]
     spacing, centre, drift, gain = fit[0], fit[1], fit[2], fit[3]
     width = blur * exp(fit[4])
-    steps = profile.shape[1] - 1
     by_boundary[:] = 0.0
     by_value[:] = 0.0
     scores[:] = 0.0
@@ -278,11 +283,7 @@ def leftovers(
             place = b - clusters / 2
             for v in range(first[b, i], last[b, i]):
                 z = v - middle - spacing * place
-                at = min(abs(z) / width / _REACH * steps, steps - 1e-9)
-                n = int(at)
-                part = at - n
-                beyond = profile[0, n] + part * (profile[0, n + 1] - profile[0, n])
-                density = profile[1, n] + part * (profile[1, n + 1] - profile[1, n])
+                beyond, density = _profile_at(profile, z, width)
                 level = 0.5 * (codes[b, i] + codes[b - 1, i] + (step if z > 0 else -step) * beyond)
                 steep = 0.5 * gain * step * density / width
                 residual = seen_values[i, v] - gain * level

@@ -10,7 +10,7 @@ import pytest
 
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import RegionSpec
-from evlcp_sdk.rx.detection import Followed, RegionFollower
+from evlcp_sdk.rx.detection import Followed, RegionFollower, _clear
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing.recordings import (
     IdealBar,
@@ -163,7 +163,7 @@ def test_what_fades_is_released() -> None:
     assert alive[gone + STEP_US] == []
 
 
-@pytest.mark.parametrize("hz", [100, 300, 1000, 2000])
+@pytest.mark.parametrize("hz", [100, 300, 1000, 2000, 4000])
 @pytest.mark.parametrize("duty", [0.05, 0.2, 0.5])
 def test_lamps_and_noise_are_no_regions(hz: float, duty: float) -> None:
     by_step = followed(
@@ -195,3 +195,69 @@ def test_bars_farther_apart_than_the_gap_are_two_regions_for_every_gap(merge_px:
     for start, part in steps(events, 30_000):
         found = regions.step(start, part)
     assert sorted(round(t.latest.x_px) for t in found) == [400, 500]
+
+
+def test_a_bar_is_found_before_a_panel_of_4_khz() -> None:
+    """Its rises come two and a half chips apart: it belongs to no region, and does not widen the bar's."""
+    bar = IdealBar(random_symbols(LINK, 1), start_us=0)
+    panel = lamp_events(385, 340, 30, 4000.0, 30_000, duty=0.5)
+    beside = (panel.x < 396) | (panel.x > 406)
+    (region,) = followed(merged(ideal_events(LINK, bar), panel[beside]), 30_000)[29_000]
+    assert region.latest.width_px <= bar.width_px + 2
+    assert region.latest.height_px == pytest.approx(128, abs=1.5)
+
+
+def test_a_region_takes_its_bars_size_and_gathers_its_events() -> None:
+    """Only the upper half is lit at first; the events of the whole come back from the image's."""
+    bar = IdealBar(random_symbols(LINK, 2), start_us=0)
+    events = ideal_events(LINK, bar)
+    half = (events.y < 345) | (events.t_us >= 20_000)
+    regions = RegionFollower(SPEC, CameraModel(), LINK.packet.chip_us, keep_us=50_000)
+    for start, part in steps(events[half], 25_000):
+        regions.step(start, part)
+    region = regions.alive[0]
+    before = sum(len(e) for _, e in region.pieces)
+    assert regions.shape(region, 24_000.0, (bar.x_px - 0.5, bar.y_px - 0.5), (4.0, 128.0))
+    x, y = region.at(np.array([24_000.0]))
+    assert (x[0], y[0]) == pytest.approx((bar.x_px - 0.5, bar.y_px - 0.5))
+    since_us = region.pieces[0][0]
+    kept = events[half]
+    within = (kept.t_us >= since_us) & (kept.t_us < 25_000)
+    assert sum(len(e) for _, e in region.pieces) == int(within.sum())
+    assert sum(len(e) for _, e in region.pieces) >= before
+    assert not regions.shape(region, 24_000.0, (bar.x_px - 0.4, bar.y_px - 0.5), (4.0, 128.2))
+
+
+def test_another_image_moves_with_its_bar() -> None:
+    bar = IdealBar(random_symbols(LINK, 2), start_us=0, shake_px=4, shake_hz=20)
+    regions = RegionFollower(SPEC, CameraModel(), LINK.packet.chip_us, keep_us=50_000)
+    for start, part in steps(ideal_events(LINK, bar), 25_000):
+        regions.step(start, part)
+    (region,) = regions.alive
+    (x,), (y,) = region.at(np.array([24_000.0]))
+    other = regions.beside(region, 24_000.0, (float(x) + 60, float(y) + 10), (4.0, 128.0))
+    at = np.arange(5000.0, 24_000.0, 500.0)
+    assert np.ptp(np.array(other.at(at)) - np.array(region.at(at)), axis=1) == pytest.approx([0, 0], abs=1e-9)
+    assert other in regions.alive
+    assert other.covers(24_000.0, (float(x) + 60, float(y) + 10))
+    assert not other.covers(24_000.0, (float(x), float(y)))
+    assert not region.holds(other, 3.0)
+    regions.drop(other)
+    assert regions.alive == [region]
+
+
+@pytest.mark.parametrize(
+    ("others", "clear"),
+    [
+        ([], (0, 0, 20, 100)),
+        ([(30, 0, 40, 100)], (0, 0, 20, 100)),
+        ([(15, 0, 40, 100)], (0, 0, 15, 100)),
+        ([(0, -50, 20, 10)], (0, 10, 20, 100)),
+        ([(15, 0, 40, 100), (0, 90, 20, 200)], (0, 0, 15, 90)),
+        ([(-5, -5, 25, 105)], (0, 0, 0, 0)),
+    ],
+)
+def test_the_part_of_a_box_that_is_clear_of_others(
+    others: list[tuple[int, int, int, int]], clear: tuple[int, int, int, int]
+) -> None:
+    assert _clear((0, 0, 20, 100), others) == clear
