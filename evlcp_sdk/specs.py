@@ -146,11 +146,28 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
         ConfigError: It is not TOML.
     """
     try:
-        return tomllib.loads(text)
+        table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as fault:
         raise ConfigError(f"{source}: not TOML: {fault}") from fault
     except RecursionError as fault:
         raise ConfigError(f"{source}: not TOML: nested too deep") from fault
+    except ValueError as fault:
+        raise ConfigError(f"{source}: not TOML: {_LONG}") from fault
+    if _has_long(table):
+        raise ConfigError(f"{source}: not TOML: {_LONG}")
+    return table
+
+
+_LONG = "an integer beyond 64 bits"
+
+
+def _has_long(value: Any) -> bool:
+    """Whether an integer is in it that TOML does not know; one of thousands of digits cannot be shown."""
+    if isinstance(value, Mapping):
+        return any(map(_has_long, value.values()))
+    if isinstance(value, list):
+        return any(map(_has_long, value))
+    return isinstance(value, int) and not -(1 << 63) <= value < 1 << 63
 
 
 def parse_value(text: str) -> Any:
@@ -160,9 +177,10 @@ def parse_value(text: str) -> Any:
     ([1, 2.5], 'joint-scale')
     """
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (tomllib.TOMLDecodeError, RecursionError):
+        value = tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
         return text.strip()
+    return text.strip() if _has_long(value) else value
 
 
 _MODELS: dict[type[Any], type[BaseModel]] = {}
@@ -188,9 +206,13 @@ def spec_model(cls: type[Any]) -> type[BaseModel]:
     return _MODELS.setdefault(cls, model)
 
 
+_MOST_SHOWN = 120
+
+
 def shown(value: Any) -> str:
-    """A value as a message shows it."""
-    return toml_value(value) if isinstance(value, bool | int | float | str | list) else str(value)
+    """A value as a message shows it, its start only where it is long."""
+    text = toml_value(value) if isinstance(value, bool | int | float | str | list) else str(value)
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
 
 
 def toml_value(value: Any) -> str:

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evlcp_sdk.cli._complain import complain
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -53,12 +55,6 @@ Dask = Annotated[
         help="Run on the workers of a Dask scheduler, e.g. tcp://host:8786; needs the extra cluster.",
     ),
 ]
-
-
-def complain(text: str) -> None:
-    """Print one line per fault on stderr."""
-    for line in text.splitlines():
-        typer.echo(f"evlcp: {line}", err=True)
 
 
 def console() -> "Console":

@@ -1,142 +1,102 @@
-"""Entry point of the `evlcp` command line."""
+"""Entry point of the `evlcp` command line: whatever happens ends in lines on stderr and an exit code.
 
-import sys
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
-
-if TYPE_CHECKING:
-    from evlcp_sdk.plugin.registry import Registry
-
-__all__ = ["main", "make_app"]
-
-HELP = """Read data and distance from blinking LEDs with an event camera.
-
-[bold]evlcp demo[/] decodes a small recording that comes with the package;
-[bold]evlcp receive REC.raw -o out[/] decodes yours.
-
-Exit codes: [bold]0[/] done (also when no transmitter was there), [bold]1[/] failed,
-[bold]2[/] usage, configuration or an algorithm that cannot be used, [bold]3[/] input that cannot be read,
-[bold]130[/] interrupted. A broken plugin is left out with a warning.
+It imports nothing that takes time before it can be interrupted.
 """
 
+import sys
 
-def make_app() -> typer.Typer:
-    """The command line with its own commands; plugins add theirs by `evlcp_register_commands`."""
-    from evlcp_sdk.cli import (
-        calibrate,
-        check,
-        compare,
-        config,
-        demo,
-        info,
-        plugins,
-        receive,
-        report,
-        score,
-        simulate,
-        sweep,
-    )
+from evlcp_sdk.cli._complain import complain
 
-    app = typer.Typer(
-        name="evlcp", no_args_is_help=True, rich_markup_mode="rich", pretty_exceptions_enable=False, help=HELP
-    )
-    app.callback()(_root)
-    first = (receive, info, compare, simulate, score, sweep, report, demo)
-    for module in (*first, calibrate, config, plugins, check):
-        module.register(app)
-    return app
+__all__ = ["INTERNAL", "main"]
 
+INTERNAL = 70
+"""Exit code of a fault that is the SDK's own."""
 
-def add_plugin_commands(app: typer.Typer, registry: "Registry") -> None:
-    """Add the commands of plugins; a plugin whose commands cannot be built, or are there, is left out."""
-    known = _names(app)
-    for plugin in registry.plugins("evlcp_register_commands"):
-        added = typer.Typer()
-        for _ in registry.ask("evlcp_register_commands", only=plugin, app=added):
-            reason = None
-            if registry.owner(plugin)[0] != "evlcp-sdk":
-                # Ours are built in any case, and tested.
-                reason = _fault_of(added, known)
-            if reason is not None:
-                registry.leave_out(plugin, reason)
-                continue
-            known |= _names(added)
-            app.registered_commands += added.registered_commands
-            app.registered_groups += added.registered_groups
-
-
-def _names(app: typer.Typer) -> set[str]:
-    """Names of its commands and groups, as they are called."""
-    named = {command.name or _called(command.callback) for command in app.registered_commands}
-    return named | {group.name or "" for group in app.registered_groups}
-
-
-def _called(function: Any) -> str:
-    return str(function.__name__).replace("_", "-")
-
-
-def _fault_of(added: typer.Typer, known: set[str]) -> str | None:
-    """What is wrong with the commands of a plugin, in one line."""
-    if not (added.registered_commands or added.registered_groups):
-        return None
-    # With a callback, a single command is built as one of a group, too.
-    added.callback()(lambda: None)
-    try:
-        typer.main.get_command(added)
-    except Exception as fault:
-        return f"its commands cannot be built: {type(fault).__name__}: {' '.join(str(fault).split())}"
-    twice = sorted(known & _names(added))
-    return f"has the command '{twice[0]}', which is there already" if twice else None
-
-
-def _version(show: bool) -> None:
-    if show:
-        from importlib.metadata import version
-
-        typer.echo(f"evlcp-sdk {version('evlcp-sdk')}")
-        raise typer.Exit
-
-
-def _root(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
-    ] = False,
-) -> None:
-    del version
+_FAILED = 1
+_INTERRUPTED = 130
+_MOST_PLACES = 12
 
 
 def main() -> None:
-    """Run the command line; an SDK error becomes one line per fault on stderr and its exit code."""
-    import warnings
+    """Run the command line; whatever goes wrong becomes one line per fault on stderr and its exit code."""
+    code: object = 0
+    try:
+        from evlcp_sdk.cli._app import run
 
-    from evlcp_sdk.cli._common import complain
-    from evlcp_sdk.errors import EvlcpError, PluginWarning
-    from evlcp_sdk.plugin.registry import Registry
+        run()
+    except SystemExit as end:
+        code = end.code
+        if code == _INTERRUPTED:
+            complain("interrupted")
+    except KeyboardInterrupt:
+        code = _INTERRUPTED
+        complain("interrupted")
+    except BaseException as fault:
+        code = _told(fault)
+    if not _stdout_took_all() and not code:
+        code = _FAILED
+    sys.exit(code)  # type: ignore[arg-type]
 
-    others = warnings.showwarning
-    said = set()
 
-    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
-        if issubclass(category, PluginWarning):
-            # Every registry of the process finds it again.
-            if str(message) not in said:
-                complain(f"warning: {message}")
-            said.add(str(message))
-        else:
-            others(message, category, *place, **more)
+def _told(fault: BaseException) -> int:
+    """Say what went wrong; the exit code."""
+    from evlcp_sdk.errors import EvlcpError
+
+    if isinstance(fault, EvlcpError):
+        complain(str(fault))
+        return fault.exit_code
+    if isinstance(fault, MemoryError):
+        complain(f"not enough memory: {_first_line(fault)}")
+        return _FAILED
+    if isinstance(fault, OSError):
+        # Our own files are written where their names are known, so what has none is stdout.
+        complain(f"{fault.filename or 'standard output'}: {fault.strerror or _first_line(fault)}")
+        return _FAILED
+    complain(_report(fault))
+    return INTERNAL
+
+
+def _stdout_took_all() -> bool:
+    """Whether all that was printed has been written; says so if not, but for a reader who has left."""
+    import errno
+    import os
+    from contextlib import suppress
 
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("always", PluginWarning)
-            warnings.showwarning = show
-            app = make_app()
-            add_plugin_commands(app, Registry.load())
-            app()
-    except EvlcpError as fault:
-        complain(str(fault))
-        sys.exit(fault.exit_code)
-    except SystemExit as end:
-        if end.code == 130:
-            complain("interrupted")
-        raise
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError as fault:
+        if fault.errno != errno.EPIPE:
+            complain(f"standard output: {fault.strerror}")
+        # Or else the interpreter tries once more as it ends, and complains in its own words.
+        with suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return False
+    except ValueError:
+        # It is closed.
+        return True
+    return True
+
+
+def _first_line(fault: BaseException) -> str:
+    text = " ".join(str(fault).split())
+    return text if len(text) <= 200 else f"{text[:200]}..."
+
+
+def _report(fault: BaseException) -> str:
+    """What a fault of ours is told with: what happened, where, and with which versions."""
+    import platform
+    import traceback
+    from importlib.metadata import version
+    from pathlib import Path
+
+    def place(frame: traceback.FrameSummary) -> str:
+        return f"{'/'.join(Path(frame.filename).parts[-2:])}:{frame.lineno}"
+
+    frames = traceback.extract_tb(fault.__traceback__)[-_MOST_PLACES:]
+    return (
+        f"a fault of evlcp itself, not of what you gave: {type(fault).__name__}: {_first_line(fault)}\n"
+        "please report the command, what it was given, and this:"
+        f" evlcp-sdk {version('evlcp-sdk')}, Python {platform.python_version()}, {platform.platform()};"
+        f" at {' > '.join(map(place, frames))}"
+    )

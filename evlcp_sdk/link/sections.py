@@ -14,10 +14,10 @@ __all__ = ["AirSpec", "MessageSpec", "PositionSpec", "RegionSpec"]
 class AirSpec:
     """What is on air: the rate of the chips and the length of a packet."""
 
-    chip_rate_hz: Annotated[float, Field(gt=0, description="Chips sent a second.")] = (
+    chip_rate_hz: Annotated[float, Field(ge=1, le=1e7, description="Chips sent a second.")] = (
         PacketFormat.chip_rate_hz
     )
-    frames_per_packet: Annotated[int, Field(gt=0, description="Frames between two preambles.")] = (
+    frames_per_packet: Annotated[int, Field(gt=0, le=4096, description="Frames between two preambles.")] = (
         PacketFormat.frames
     )
     pilot_every: Annotated[

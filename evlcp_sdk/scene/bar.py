@@ -11,6 +11,8 @@ from evlcp_sdk.errors import ConfigError
 
 __all__ = ["BarLayout"]
 
+_MOST_LEDS = 1 << 16
+
 
 @dataclass(frozen=True)
 class BarLayout:
@@ -20,7 +22,7 @@ class BarLayout:
     `cluster_rows` x `cluster_columns` LEDs, numbered row by row from the top left.
 
     Raises:
-        ConfigError: The blocks do not tile the grid.
+        ConfigError: The blocks do not tile the grid, or it has more than 65536 LEDs.
 
     >>> BarLayout().clusters
     16
@@ -29,13 +31,17 @@ class BarLayout:
     [-0.02, -0.06]
     """
 
-    rows: Annotated[int, Field(gt=0, description="LEDs from top to bottom.")] = 96
-    columns: Annotated[int, Field(gt=0, description="LEDs from left to right.")] = 1
-    led_pitch_m: Annotated[float, Field(gt=0, description="Spacing of neighbouring LEDs.")] = 0.01
+    rows: Annotated[int, Field(gt=0, le=4096, description="LEDs from top to bottom.")] = 96
+    columns: Annotated[int, Field(gt=0, le=4096, description="LEDs from left to right.")] = 1
+    led_pitch_m: Annotated[float, Field(ge=1e-6, le=100, description="Spacing of neighbouring LEDs.")] = 0.01
     cluster_rows: Annotated[int, Field(gt=0, description="LED rows of a cluster.")] = 6
     cluster_columns: Annotated[int, Field(gt=0, description="LED columns of a cluster.")] = 1
 
     def __post_init__(self) -> None:
+        if self.rows * self.columns > _MOST_LEDS:
+            raise ConfigError(
+                f"bar.rows = {self.rows}, bar.columns = {self.columns}: expected at most {_MOST_LEDS} LEDs"
+            )
         for name in ("rows", "columns"):
             n, block = getattr(self, name), getattr(self, f"cluster_{name}")
             if n % block:

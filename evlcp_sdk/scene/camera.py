@@ -31,10 +31,10 @@ class CameraModel:
     [999.99, 360.0]
     """
 
-    width: Annotated[int, Field(gt=0, description="Columns of the sensor.")] = 1280
-    height: Annotated[int, Field(gt=0, description="Rows of the sensor.")] = 720
-    focal_mm: Annotated[float, Field(gt=0, description="Focal length of the lens.")] = 35.0
-    pitch_um: Annotated[float, Field(gt=0, description="Spacing of the sensor's pixels.")] = 4.86
+    width: Annotated[int, Field(gt=0, le=8192, description="Columns of the sensor.")] = 1280
+    height: Annotated[int, Field(gt=0, le=8192, description="Rows of the sensor.")] = 720
+    focal_mm: Annotated[float, Field(ge=0.01, le=1e5, description="Focal length of the lens.")] = 35.0
+    pitch_um: Annotated[float, Field(ge=0.01, le=1e4, description="Spacing of the sensor's pixels.")] = 4.86
     centre_x_px: Annotated[
         float | None, Field(description="Column of the principal point; none: half the columns.")
     ] = None

@@ -7,7 +7,7 @@ import pytest
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.specs import SpecError, build
+from evlcp_sdk.specs import SpecError, build, parse_toml, parse_value
 
 
 @dataclass(frozen=True)
@@ -84,3 +84,21 @@ def test_what_the_dataclass_refuses_passes_and_a_hint_stands_for_the_nearest() -
         build(Outer, {"count": 13})
     with pytest.raises(SpecError, match=r"^rows\.0\.wide = 3: unknown key; see width$"):
         build(Outer, {"count": 1, "rows": [{"wide": 3}]}, hint=lambda path: f"; see {path[-1][:3]}th")
+
+
+@pytest.mark.parametrize("digits", ["9" * 5000, "0x" + "f" * 5000, "9223372036854775808"])
+def test_an_integer_beyond_64_bits_is_a_line(digits: str) -> None:
+    for text in (f"a = {digits}", f"a = [[{{b = {digits}}}]]"):
+        with pytest.raises(ConfigError, match=r"^here: not TOML: an integer beyond 64 bits$"):
+            parse_toml(text, "here")
+    assert parse_value(digits) == digits
+    with pytest.raises(SpecError) as caught:
+        build(Outer, {"count": parse_value(digits)})
+    (line,) = caught.value.lines()
+    assert len(line) < 250
+    assert line.endswith(": expected a valid integer")
+
+
+def test_the_largest_integers_are_read() -> None:
+    assert parse_value("9223372036854775807") == 2**63 - 1
+    assert parse_toml("a = -9223372036854775808", "") == {"a": -(2**63)}

@@ -148,7 +148,10 @@ def test_of_several_recordings_the_others_are_decoded(
     ("args", "told"),
     [
         (["--set", "ranging.id=pco"], "evlcp: no ranging algorithm named 'pco'; did you mean 'poc'?"),
-        (["--set", "camera.focal_mm=-1"], "evlcp: --set: camera.focal_mm = -1: expected greater than 0"),
+        (
+            ["--set", "camera.focal_mm=-1"],
+            "evlcp: --set: camera.focal_mm = -1: expected greater than or equal to 0.01",
+        ),
         (["--set", "nonsense"], "evlcp: --set nonsense: expected table.key=value, e.g. modulation.id=wh8"),
         (["-c", "missing.toml"], "evlcp: missing.toml: cannot be read: No such file or directory"),
         (

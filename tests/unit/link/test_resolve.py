@@ -216,7 +216,7 @@ def test_every_fault_of_a_file_is_told(registry: Registry, tmp_path: Path) -> No
         " pilots, modulation, synchronization, separation, decoding, ranging, tracking, error-correction)",
         "link.toml: camera.width = 0: expected greater than 0",
         'link.toml: camera.focal_mm = "35": expected a valid number',
-        "--set: bar.led_pitch_m = -1: expected greater than 0",
+        "--set: bar.led_pitch_m = -1: expected greater than or equal to 0.000001",
         "link.toml: air.frames_per_packet = 2.5: expected a valid integer",
         'link.toml: regions.step_us = "slow": expected a valid integer',
         "link.toml: modulation.id = 8: expected a string",
@@ -280,7 +280,7 @@ def test_the_digest_holds_table_codebook_and_revisions(registry: Registry) -> No
 OVERRIDES: list[list[str]] = [
     [],
     ["ranging.limit_m=120", "ranging.drop=[]", 'ranging.kernel="gauss"', "ranging.window_px=1e-7"],
-    ["ranging.id=centroid", "camera.focal_mm=1e17", "air.chip_rate_hz=12500"],
+    ["ranging.id=centroid", "camera.k3=1e-17", "air.chip_rate_hz=12500"],
 ]
 
 
@@ -321,3 +321,22 @@ def test_a_link_travels_to_another_process(registry: Registry) -> None:
 def test_versions_name_every_distribution(registry: Registry) -> None:
     found = registry.versions()
     assert {"python", "evlcp-sdk", "numpy", "scipy", "numba"} <= set(found)
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ("bar.led_pitch_m=1e-308", "expected greater than or equal to 0.000001"),
+        ("bar.rows=600000000", "expected less than or equal to 4096"),
+        ("bar.columns=4096", "bar.rows = 96, bar.columns = 4096: expected at most 65536 LEDs"),
+        ("air.chip_rate_hz=1e-300", "expected greater than or equal to 1"),
+        ("air.frames_per_packet=100000000", "expected less than or equal to 4096"),
+        ("camera.width=1000000000", "expected less than or equal to 8192"),
+        ("camera.focal_mm=1e-300", "expected greater than or equal to 0.01"),
+        ("camera.pitch_um=1e-300", "expected greater than or equal to 0.01"),
+    ],
+)
+def test_sizes_that_no_memory_or_number_holds_are_refused(setting: str, says: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_link(overrides=[setting])
+    assert str(caught.value).endswith(says)

@@ -1,0 +1,138 @@
+"""What the `evlcp` command line consists of, plugins' commands included."""
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from evlcp_sdk.plugin.registry import Registry
+
+__all__ = ["make_app", "run"]
+
+HELP = """Read data and distance from blinking LEDs with an event camera.
+
+[bold]evlcp demo[/] decodes a small recording that comes with the package;
+[bold]evlcp receive REC.raw -o out[/] decodes yours.
+
+Exit codes: [bold]0[/] done (also when no transmitter was there), [bold]1[/] failed,
+[bold]2[/] usage, configuration or an algorithm that cannot be used, [bold]3[/] input that cannot be read,
+[bold]70[/] a fault of evlcp itself, [bold]130[/] interrupted. A broken plugin is left out with a warning.
+"""
+
+
+def make_app() -> typer.Typer:
+    """The command line with its own commands; plugins add theirs by `evlcp_register_commands`."""
+    from evlcp_sdk.cli import (
+        calibrate,
+        check,
+        compare,
+        config,
+        demo,
+        info,
+        plugins,
+        receive,
+        report,
+        score,
+        simulate,
+        sweep,
+    )
+
+    app = typer.Typer(
+        name="evlcp", no_args_is_help=True, rich_markup_mode="rich", pretty_exceptions_enable=False, help=HELP
+    )
+    app.callback()(_root)
+    first = (receive, info, compare, simulate, score, sweep, report, demo)
+    for module in (*first, calibrate, config, plugins, check):
+        module.register(app)
+    return app
+
+
+def add_plugin_commands(app: typer.Typer, registry: "Registry") -> None:
+    """Add the commands of plugins; a plugin whose commands cannot be built, or are there, is left out."""
+    known = _names(app)
+    for plugin in registry.plugins("evlcp_register_commands"):
+        added = typer.Typer()
+        for _ in registry.ask("evlcp_register_commands", only=plugin, app=added):
+            reason = None
+            if registry.owner(plugin)[0] != "evlcp-sdk":
+                # Ours are built in any case, and tested.
+                reason = _fault_of(added, known)
+            if reason is not None:
+                registry.leave_out(plugin, reason)
+                continue
+            known |= _names(added)
+            app.registered_commands += added.registered_commands
+            app.registered_groups += added.registered_groups
+
+
+def _names(app: typer.Typer) -> set[str]:
+    """Names of its commands and groups, as they are called."""
+    named = {command.name or _called(command.callback) for command in app.registered_commands}
+    return named | {group.name or "" for group in app.registered_groups}
+
+
+def _called(function: Any) -> str:
+    return str(function.__name__).replace("_", "-")
+
+
+def _fault_of(added: typer.Typer, known: set[str]) -> str | None:
+    """What is wrong with the commands of a plugin, in one line."""
+    if not (added.registered_commands or added.registered_groups):
+        return None
+    # With a callback, a single command is built as one of a group, too.
+    added.callback()(lambda: None)
+    try:
+        typer.main.get_command(added)
+    except Exception as fault:
+        return f"its commands cannot be built: {type(fault).__name__}: {' '.join(str(fault).split())}"
+    twice = sorted(known & _names(added))
+    return f"has the command '{twice[0]}', which is there already" if twice else None
+
+
+def _version(show: bool) -> None:
+    if show:
+        from importlib.metadata import version
+
+        typer.echo(f"evlcp-sdk {version('evlcp-sdk')}")
+        raise typer.Exit
+
+
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
+    ] = False,
+) -> None:
+    del version
+
+
+def run() -> None:
+    """Parse the command line and run its command; a `PluginWarning` becomes a line on stderr.
+
+    Raises:
+        EvlcpError: What the command raises.
+        SystemExit: The command has ended.
+    """
+    import warnings
+
+    from evlcp_sdk.cli._complain import complain
+    from evlcp_sdk.errors import PluginWarning
+    from evlcp_sdk.plugin.registry import Registry
+
+    others = warnings.showwarning
+    said = set()
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if issubclass(category, PluginWarning):
+            # Every registry of the process finds it again.
+            if str(message) not in said:
+                complain(f"warning: {message}")
+            said.add(str(message))
+        else:
+            others(message, category, *place, **more)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", PluginWarning)
+        warnings.showwarning = show
+        app = make_app()
+        add_plugin_commands(app, Registry.load())
+        app()

@@ -1,0 +1,126 @@
+"""How the command line ends when it is not the command that decides: stdout, Ctrl-C, faults of ours."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import evlcp_sdk.io.describe
+from evlcp_sdk.cli._complain import complain
+from evlcp_sdk.cli.main import INTERNAL
+
+Evlcp = Callable[..., Any]
+MAIN = "from evlcp_sdk.cli.main import main; main()"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("args", [("info",), ("info", "--json"), ("plugins",), ("--version",)])
+def test_a_full_stdout_is_one_line(demo_raw: Path, args: tuple[str, ...]) -> None:
+    given = [*args, str(demo_raw)] if args[0] == "info" else list(args)
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", MAIN, *given], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert done.stderr == "evlcp: standard output: No space left on device\n"
+    assert done.returncode == 1
+
+
+def test_a_reader_who_leaves_is_no_fault() -> None:
+    command = f"{sys.executable} -c '{MAIN}' plugins --json | true; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert done.stderr == ""
+    assert done.returncode in (0, 1)
+
+
+def test_ctrl_c_during_imports_is_one_line(tmp_path: Path) -> None:
+    code = MAIN.replace("; ", "; import sys; sys.stderr.write('ready'); sys.stderr.flush(); ")
+    for pause_s in (0.0, 0.02, 0.1, 0.3):
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, "info", tmp_path / "none.raw"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stderr is not None
+        assert process.stderr.read(5) == "ready"
+        time.sleep(0.01 + pause_s)
+        process.send_signal(signal.SIGINT)
+        said = process.stderr.read()
+        process.stderr.close()
+        code_ = process.wait()
+        assert said in ("evlcp: interrupted\n", f"evlcp: {tmp_path}/none.raw: No such file or directory\n")
+        assert code_ == (130 if "interrupted" in said else 3)
+
+
+def test_a_module_interrupted_while_it_is_imported(
+    evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    class Interrupt:
+        def find_spec(self, name: str, *_: object) -> None:
+            if name == "evlcp_sdk.cli._app":
+                raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "evlcp_sdk.cli._app", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Interrupt(), *sys.meta_path])
+    done = evlcp("info", tmp_path / "none.raw")
+    assert (done.code, done.err) == (130, "evlcp: interrupted\n")
+
+
+def test_the_entry_point_can_be_interrupted_from_the_start() -> None:
+    """What it imports before it can catch an interrupt is next to nothing."""
+    code = "import sys; import evlcp_sdk.cli.main; print(*sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert {name for name in said.split() if name.startswith("evlcp")} == {
+        *("evlcp_sdk", "evlcp_sdk.cli", "evlcp_sdk.cli.main", "evlcp_sdk.cli._complain"),
+    }
+    assert not {"typer", "rich", "typing", "pathlib", "logging"} & set(said.split())
+
+
+def test_a_fault_of_ours_says_so_and_what_to_report(
+    evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch, demo_raw: Path
+) -> None:
+    def broken(*_: object) -> None:
+        raise KeyError("no\nsuch key")
+
+    monkeypatch.setattr(evlcp_sdk.io.describe, "describe", broken)
+    done = evlcp("info", demo_raw)
+    assert done.code == INTERNAL == 70
+    first, second = done.err.splitlines()
+    assert first.startswith("evlcp: a fault of evlcp itself, not of what you gave: KeyError: ")
+    assert second.startswith("evlcp: please report the command")
+    assert "evlcp-sdk " in second
+    assert "cli/info.py:" in second
+    assert "test_ends.py:" in second
+
+
+def test_too_little_memory_is_no_fault_of_ours(
+    evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch, demo_raw: Path
+) -> None:
+    def broken(*_: object) -> None:
+        raise MemoryError("Unable to allocate 12.9 GiB")
+
+    monkeypatch.setattr(evlcp_sdk.io.describe, "describe", broken)
+    done = evlcp("info", demo_raw)
+    assert (done.code, done.err) == (1, "evlcp: not enough memory: Unable to allocate 12.9 GiB\n")
+
+
+def test_what_is_said_moves_no_cursor(capsys: pytest.CaptureFixture[str]) -> None:
+    complain("a\x1b]0;title\x07\x9b2J\r.raw: no\nb\udcff\t\n\n")
+    assert capsys.readouterr().err == ("evlcp: a\\x1b]0;title\\x07\\x9b2J\\x0d.raw: no\nevlcp: b\\udcff\t\n")
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_a_closed_stream_is_no_fault(stream: str) -> None:
+    closed = {"stdout": ">&-", "stderr": "2>&-"}[stream]
+    command = f"{sys.executable} -c '{MAIN}' config --set a=1 {closed}"
+    done = subprocess.run(
+        ["bash", "-c", command], capture_output=True, text=True, check=False, env=os.environ
+    )
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
