@@ -247,18 +247,10 @@ class PresenceMap:
         prior = self.prior
         if prior is None:
             return self
-        clusters = len(prior)
-        inside = np.flatnonzero(prior.any(0))
-        share = self.probability.reshape(clusters, -1).take(inside, 1)
-        place = prior.reshape(clusters, -1).take(inside, 1)
-        unheard = ~share.any(0)
-        # Not even a cell that fits a code in all its values is sure to show a cluster, nor a place.
-        share *= clusters / np.maximum(1 - share.sum(0), np.float32(1e-6))
-        share[:, unheard] = 1
-        share *= place
-        share /= share.sum(0) + np.maximum(1 - place.sum(0), np.float32(1e-6))
-        probability = np.zeros_like(prior)
-        probability.reshape(clusters, -1)[:, inside] = share
+        from evlcp_sdk import _kernels
+
+        probability = np.empty_like(self.probability)
+        _kernels.take_in(self.probability, prior, probability)
         return replace(self, probability=probability)
 
     def __repr__(self) -> str:

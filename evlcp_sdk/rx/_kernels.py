@@ -45,6 +45,21 @@ def keep_ordered(
     return off, backward, last_us
 
 
+CHIPS_AT = 6
+"""Bit of a pixel's state from which its chips are held; below is its score, and from `CLOCK_AT` its clock."""
+
+CLOCK_AT = 10
+
+CLOCK_ROUND = 1 << 32 - CLOCK_AT
+"""Ticks after which the clock of 22 bits goes round."""
+
+SCORES = (1 << CHIPS_AT) - 1
+
+_LOW = np.uint32((1 << CLOCK_AT) - 1)
+_CLOCK = np.uint32(CLOCK_AT)
+_ROUND = np.uint32(CLOCK_ROUND - 1)
+
+
 @njit(cache=True, nogil=True)
 def score_rises(
     t_us: Array,
@@ -53,64 +68,83 @@ def score_rises(
     p: Array,
     pixels: Array,
     hits: Array,
-    chip_us: float,
+    kinds: Array,
+    lows: Array,
+    soon: int,
+    tick_shift: int,
     min_score: int,
     cell_shift: int,
-) -> None:
-    """Score each pixel by the rhythm of its rises; add the rises of candidates to their cell's `hits`.
+) -> int:
+    """Score each pixel by the rhythm of its rises; add those of candidates to their cell's `hits`; how many.
 
-    A pixel's state holds the time of its last rise, us (bits 12 up), the whole chips between that and the one
-    before (bits 8 to 11, 0: none), and its score (bits 1 to 7). In no code do rises come sooner than two
-    chips apart; jitter and latencies that differ from rise to rise put one off the chips by up to three
-    tenths; a time beyond twelve chips says nothing.
+    `pixels` (height, width) are uint32, see `Rhythm`. A rise sooner than `soon` ticks after the one before is
+    the same; `kinds` says what a number of ticks is, the last for all beyond, and `lows` what becomes of
+    chips and score. A tick is 2^tick_shift us.
     """
-    soon = int(1.5 * chip_us)
-    late = 12.5 * chip_us
-    stray = 0.3 * chip_us
-    shift = np.uint64(cell_shift)
-    # Polarity is as good as random, so that rises are found without a branch.
+    width, columns = np.uint32(pixels.shape[1]), np.uint32(hits.shape[1])
+    states, cells = pixels.reshape(-1), hits.reshape(-1)
+    longest, least = np.uint32(kinds.size - 1), np.uint32(min_score)
+    first, shift = np.uint32(soon), np.uint32(cell_shift)
+    # What counts is as good as random at each stage, so that it is found without a branch.
     rises = np.empty(t_us.size + 1, np.int32)
     n = 0
     for i in range(t_us.size):
         rises[n] = i
-        n += p[i]
+        n += int(p[i])
+    where, runs = np.empty(n + 1, np.uint32), np.empty(n + 1, np.uint32)
+    new = 0
     for i in rises[:n]:
-        u, v = np.uint64(x[i]), np.uint64(y[i])
-        state = pixels[v, u]
-        run = t_us[i] - (state >> 12)
-        # More events of the same rise.
-        if run < soon:
-            continue
-        chips = 0
-        score = (state >> 1) & 127
-        if run > late:
-            score -= 1
-        else:
-            chips = int(run / chip_us + 0.5)
-            if abs(run - chips * chip_us) > stray:
-                score -= 3
-            elif chips <= 4:
-                score += 2
-            elif chips == (state >> 8) & 15:
-                score -= 2
-            else:
-                score += 1
-        score = min(max(score, 0), 40)
-        pixels[v, u] = (t_us[i] << 12) | (chips << 8) | (score << 1)
-        hits[v >> shift, u >> shift] += np.int32(score >= min_score)
+        at = np.uint32(y[i]) * width + np.uint32(x[i])
+        tick = np.uint32(t_us[i] >> tick_shift)
+        state = states[at]
+        run = (tick - (state >> _CLOCK)) & _ROUND
+        states[at] = (tick << _CLOCK) | (state & _LOW) if run >= first else state
+        where[new] = at
+        runs[new] = min(run, longest)
+        new += int(run >= first)
+    candidates = 0
+    for i in range(new):
+        at = where[i]
+        state = states[at]
+        low = np.uint32(lows[(np.uint32(kinds[runs[i]]) << _CLOCK) | (state & _LOW)])
+        states[at] = (state & ~_LOW) | low
+        if (low & np.uint32(SCORES)) >= least:
+            row = at // width
+            cells[(row >> shift) * columns + ((at - row * width) >> shift)] += 1
+            candidates += 1
+    return candidates
+
+
+@njit(cache=True, nogil=True)
+def grow_old(pixels: Array, now: int, least: int, age: int) -> None:
+    """Set the rises of pixels that are `least` ticks ago or more to `age` ticks ago."""
+    then = (np.uint32(now) - np.uint32(age)) << _CLOCK
+    for v in range(pixels.shape[0]):
+        for u in range(pixels.shape[1]):
+            state = pixels[v, u]
+            old = ((np.uint32(now) - (state >> _CLOCK)) & _ROUND) >= np.uint32(least)
+            pixels[v, u] = then | (state & _LOW) if old else state
+
+
+@njit(cache=True, nogil=True)
+def _blinks(state: int, now: int, span: int, least: int) -> bool:
+    """Whether a pixel rose in the last `span` ticks and has a score of `least` or more."""
+    age = (np.uint32(now) - (np.uint32(state) >> _CLOCK)) & _ROUND
+    return bool(age <= np.uint32(span)) and bool((np.uint32(state) & np.uint32(SCORES)) >= np.uint32(least))
 
 
 @njit(cache=True, nogil=True)
 def measure_box(
     pixels: Array,
     box: tuple[int, int, int, int],
-    since_us: int,
+    now: int,
+    span: int,
     min_score: int,
     seam: int,
     reach: float,
     rows: Array,
 ) -> tuple[int, float, int, int, float, float]:
-    """Where in a box pixels blink in the rhythm of the chips and rose since `since_us`.
+    """Where in a box pixels blink in the rhythm of the chips and rose in the last `span` ticks.
 
     Columns count by what they have more than the `seam` outermost ones on the darker side: a halo, or lit
     leaves; those that hold most within twice `reach` give the mean column, and rows count what they have
@@ -124,8 +158,7 @@ def measure_box(
     first_column, last_column = right, left
     for v in range(top, bottom):
         for u in range(left, right):
-            state = pixels[v, u]
-            if (state >> 12) >= since_us and ((state >> 1) & 127) >= min_score:
+            if _blinks(pixels[v, u], now, span, min_score):
                 columns[u - left] += 1
                 first_column = min(first_column, u)
                 last_column = max(last_column, u)
@@ -150,9 +183,7 @@ def measure_box(
     for v in range(top, bottom):
         n = 0
         for u in range(left, right):
-            state = pixels[v, u]
-            lit_pixel = (state >> 12) >= since_us and ((state >> 1) & 127) >= min_score
-            n += lit_pixel and abs(u - column) <= reach
+            n += _blinks(pixels[v, u], now, span, min_score) and abs(u - column) <= reach
         rows[v - top] = n
         total += n
         lit += n > 0
@@ -171,39 +202,30 @@ def measure_box(
 
 
 @njit(cache=True, nogil=True)
-def select_boxes(
+def select_box(
     t_us: Array,
     x: Array,
     y: Array,
     p: Array,
-    boxes: Array,
+    box: tuple[int, int, int, int],
     out_t: Array,
     out_x: Array,
     out_y: Array,
     out_p: Array,
-    taken: Array,
-) -> None:
-    """Copy the events inside each box (left, top, right, bottom) to that box's row; count them in `taken`."""
-    inside = np.empty(t_us.size, np.uint8)
-    which = np.empty(t_us.size + 1, np.int32)
-    for b in range(boxes.shape[0]):
-        left, top = np.uint16(boxes[b, 0]), np.uint16(boxes[b, 1])
-        width, height = np.uint16(boxes[b, 2] - boxes[b, 0]), np.uint16(boxes[b, 3] - boxes[b, 1])
-        # Without a branch, so that it runs on many events at once; unsigned, one comparison for both edges.
-        for i in range(t_us.size):
-            inside[i] = np.uint8(np.uint16(x[i] - left) < width) & np.uint8(np.uint16(y[i] - top) < height)
-        n = 0
-        for i in range(t_us.size):
-            # Written always, kept if inside: between two bars, a branch would be a coin toss.
-            which[n] = i
-            n += inside[i]
-        for j in range(n):
-            i = which[j]
-            out_t[b, j] = t_us[i]
-            out_x[b, j] = x[i]
-            out_y[b, j] = y[i]
-            out_p[b, j] = p[i]
-        taken[b] = n
+) -> int:
+    """Copy the events inside a box (left, top, right, bottom); how many. One more than all find room."""
+    left, top = np.uint16(box[0]), np.uint16(box[1])
+    width, height = np.uint16(box[2] - box[0]), np.uint16(box[3] - box[1])
+    n = 0
+    for i in range(t_us.size):
+        # Written always, kept if inside: between two bars, a branch would be a coin toss. Unsigned, one
+        # comparison does for both edges.
+        out_t[n] = t_us[i]
+        out_x[n] = x[i]
+        out_y[n] = y[i]
+        out_p[n] = p[i]
+        n += int(np.uint16(x[i] - left) < width) & int(np.uint16(y[i] - top) < height)
+    return n
 
 
 @njit(cache=True, nogil=True)
@@ -683,3 +705,256 @@ def place_clusters(
             off = abs(complex(points[k, 0], points[k, 1]) - image_mean - cross / power * c)
             squares += off * off
     return squares
+
+
+@njit(cache=True, nogil=True)
+def info_activity(sums: Array, weight: Array, grid: int, pilot_chips: int, least: float, out: Array) -> None:
+    """Share of info chips with events, less `least` of pilot chips': weighted sum of pixels, `out` (K,).
+
+    `weight` (K, rows, columns) is that of cells.
+    """
+    chips, height, width = sums.shape
+    clusters, rows, columns = weight.shape
+    events = np.zeros((2, height, width), np.int16)
+    for c in range(chips):
+        part = events[int(c >= pilot_chips)]
+        for v in range(height):
+            for u in range(width):
+                part[v, u] += sums[c, v, u] != 0
+    by_info, by_pilot = 1 / max(chips - pilot_chips, 1), least / pilot_chips
+    over = np.zeros((rows, columns))
+    for v in range(rows * grid):
+        for u in range(columns * grid):
+            over[v // grid, u // grid] += events[1, v, u] * by_info - events[0, v, u] * by_pilot
+    for k in range(clusters):
+        total = 0.0
+        for r in range(rows):
+            for c in range(columns):
+                total += weight[k, r, c] * over[r, c]
+        out[k] = total
+
+
+@njit(cache=True, nogil=True)
+def believe(
+    read: Array,
+    llr: Array,
+    seen: Array,
+    worth: float,
+    spread: float,
+    least: float,
+    symbols: Array,
+    scaled: Array,
+) -> float:
+    """Scale LLRs (K, bits) so that their sizes' variance is twice the mean, give the symbols that are sure.
+
+    The variance is pooled with an expected one, `spread` of the mean squared, worth `worth` sizes. Clusters
+    unseen, or with a symbol of -1, are given LLRs of 0 and a symbol of -1; so are those less sure than
+    `least`, but for their LLRs.
+
+    Returns:
+        Probability that all that are given are right; 0 if none is.
+    """
+    clusters, bits = llr.shape
+    symbols[:] = -1
+    scaled[:] = 0
+    n, total, squares = 0, 0.0, 0.0
+    for k in range(clusters):
+        if seen[k] and read[k] >= 0:
+            for b in range(bits):
+                n += 1
+                total += abs(np.float64(llr[k, b]))
+    if total == 0:
+        return 0.0
+    mean = total / n
+    for k in range(clusters):
+        if seen[k] and read[k] >= 0:
+            for b in range(bits):
+                squares += (abs(np.float64(llr[k, b])) - mean) ** 2
+    scale = 2 * mean * (n + worth) / (squares + worth * (spread * mean) ** 2)
+    given, right = 0, 1.0
+    for k in range(clusters):
+        if seen[k] and read[k] >= 0:
+            nearest = np.inf
+            for b in range(bits):
+                scaled[k, b] = llr[k, b] * scale
+                nearest = min(nearest, abs(llr[k, b] * scale))
+            sure = 1 / (1 + np.exp(-nearest))
+            if sure >= least:
+                symbols[k] = read[k]
+                right *= sure
+                given += 1
+    return right if given else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _inverse(matrix: Array, out: Array) -> bool:
+    """Inverse of a symmetric positive definite matrix by Cholesky; False where it is none."""
+    n = len(matrix)
+    factor = np.zeros((n, n))
+    for a in range(n):
+        for c in range(a + 1):
+            total = matrix[a, c]
+            for k in range(c):
+                total -= factor[a, k] * factor[c, k]
+            if a == c:
+                # What rounding leaves of nothing.
+                if not total > 1e-13 * matrix[a, a]:
+                    return False
+                factor[a, a] = np.sqrt(total)
+            else:
+                factor[a, c] = total / factor[c, c]
+    # The factor's own inverse, below its diagonal; its square is the inverse.
+    lower = np.zeros((n, n))
+    for c in range(n):
+        lower[c, c] = 1 / factor[c, c]
+        for a in range(c + 1, n):
+            total = 0.0
+            for k in range(c, a):
+                total -= factor[a, k] * lower[k, c]
+            lower[a, c] = total / factor[a, a]
+    for a in range(n):
+        for c in range(n):
+            total = 0.0
+            for k in range(max(a, c), n):
+                total += lower[k, a] * lower[k, c]
+            out[a, c] = total
+    return True
+
+
+@njit(cache=True, nogil=True)
+def newest_on_parabola(
+    past: Array, speed_weight: float, bend_weight: float, worth: float, outlier: float
+) -> tuple[float, float, float]:
+    """Rate of the newest of measurements and its variance, and the newest one's variance, by all of them.
+
+    `past` (n, 3) holds times, values and variances. Values follow a parabola whose rate and bend weigh as
+    much before any is measured. The squares of what is left, in those that the variances expect, `worth` of
+    them expected, scale the variances; squares beyond `outlier` count as that, and the newest for itself.
+    """
+    n = len(past)
+    terms, normal, right = np.empty(3), np.empty((3, 3)), np.empty(3)
+    likely, inverse, path = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    left = np.empty(n)
+    scale = 1.0
+    # The scale says how much the likely counts against the values, and hardly changes after the first.
+    for _ in range(2):
+        normal[:] = 0.0
+        right[:] = 0.0
+        for i in range(n):
+            t = past[i, 0] - past[n - 1, 0]
+            terms[0], terms[1], terms[2] = 1.0, t, t * t / 2
+            weight = 1 / (past[i, 2] * scale)
+            for a in range(3):
+                right[a] += weight * terms[a] * (past[i, 1] - past[n - 1, 1])
+                for b in range(3):
+                    normal[a, b] += weight * terms[a] * terms[b]
+        likely[:] = normal
+        likely[1, 1] += speed_weight
+        likely[2, 2] += bend_weight
+        _inverse(likely, inverse)
+        free, counted = float(n), 0.0
+        for a in range(3):
+            path[a] = 0.0
+            for b in range(3):
+                path[a] += inverse[a, b] * right[b]
+                free -= inverse[a, b] * normal[a, b]
+        for i in range(n):
+            t = past[i, 0] - past[n - 1, 0]
+            off = past[i, 1] - past[n - 1, 1] - path[0] - path[1] * t - path[2] * t * t / 2
+            left[i] = off * off / past[i, 2]
+            counted += min(left[i], outlier * scale)
+        scale = (worth + counted) / (worth + max(free, 0.0))
+    newest = max(scale, left[n - 1]) if left[n - 1] > outlier * scale else scale
+    return path[1], inverse[1, 1], newest * past[n - 1, 2]
+
+
+@njit(cache=True, nogil=True)
+def bend_of(place: Array, sums: Array, least: float) -> tuple[float, float]:
+    """Bend of a parabola through boundaries, and its variance by their scatter about it; NaN of too few.
+
+    `place` (n,) are whole or half numbers, `sums` (2, n) what lies off, weighted, and the weights; those of
+    less than `least` of the heaviest are passed over. Beside the parabola a shift is fitted that boundaries
+    of even and odd number have to both sides.
+    """
+    heaviest = sums[1].max()
+    normal, right, inverse = np.zeros((4, 4)), np.zeros(4), np.empty((4, 4))
+    terms, path = np.empty(4), np.empty(4)
+    n = 0
+    for i in range(place.size):
+        if sums[1, i] > least * heaviest:
+            n += 1
+            terms[0], terms[1], terms[2] = place[i] ** 2, 1.0, place[i]
+            terms[3] = -1.0 if np.floor(place[i]) % 2 else 1.0
+            for a in range(4):
+                right[a] += terms[a] * sums[0, i]
+                for b in range(4):
+                    normal[a, b] += sums[1, i] * terms[a] * terms[b]
+    # The variance of a normal variable over an estimated sigma is finite from three degrees of freedom on.
+    if n - 4 < 3 or not _inverse(normal, inverse):
+        return np.nan, np.nan
+    for a in range(4):
+        path[a] = 0.0
+        for b in range(4):
+            path[a] += inverse[a, b] * right[b]
+    left = 0.0
+    for i in range(place.size):
+        if sums[1, i] > least * heaviest:
+            side = -1.0 if np.floor(place[i]) % 2 else 1.0
+            off = sums[0, i] / sums[1, i]
+            off -= path[0] * place[i] ** 2 + path[1] + path[2] * place[i] + path[3] * side
+            left += sums[1, i] * off * off
+    return path[0], inverse[0, 0] * left / (n - 6)
+
+
+@njit(cache=True, nogil=True)
+def farthest_off(selected: Array, grid: int, on: complex, turn: complex) -> float:
+    """Farthest that the middle of a cell of any cluster lies off the line through `on` along `turn`, px."""
+    clusters, rows, columns = selected.shape
+    most = 0.0
+    for k in range(clusters):
+        for r in range(rows):
+            for c in range(columns):
+                if selected[k, r, c]:
+                    off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - on
+                    most = max(most, abs((off * turn.conjugate()).imag))
+    return most
+
+
+@njit(cache=True, nogil=True)
+def keep_inside(prior: Array, probability: Array, selected: Array, out: Array, chosen: Array) -> None:
+    """Probabilities, and the choice, of cells whose prior is not 0; 0 and False elsewhere."""
+    clusters, rows, columns = prior.shape
+    for k in range(clusters):
+        for r in range(rows):
+            for c in range(columns):
+                inside = prior[k, r, c] > 0
+                out[k, r, c] = probability[k, r, c] if inside else 0.0
+                chosen[k, r, c] = selected[k, r, c] and inside
+
+
+@njit(cache=True, nogil=True)
+def cells_by_place(
+    at: Array,
+    cluster: Array,
+    cells: Array,
+    places: Array,
+    reach: float,
+    half: float,
+    in_place: Array,
+    out_of_place: Array,
+) -> None:
+    """Cells of blobs within reach of their cluster's place, by cluster; of others, by the place they are in.
+
+    A blob that is not in its place counts where it is within `half` of the nearest one.
+    """
+    for i in range(at.size):
+        if abs(at[i] - places[cluster[i]]) <= reach:
+            in_place[cluster[i]] += cells[i]
+            continue
+        nearest, least = 0, np.inf
+        for k in range(places.size):
+            off = abs(at[i] - places[k])
+            if off < least:
+                nearest, least = k, off
+        if least <= half:
+            out_of_place[nearest] += cells[i]

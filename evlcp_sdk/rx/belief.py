@@ -1,7 +1,5 @@
 """How far a frame's symbols are believed: one measure for every decoding."""
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,15 +34,11 @@ def still_lit(sums: NDArray[np.int16], presence: PresenceMap, pilot_chips: int) 
         presence: Where the clusters are.
         pilot_chips: Chips of the pilot.
     """
-    weight, grid = presence.probability, presence.grid_px
-    _, rows, columns = weight.shape
-    active = (sums[:, : rows * grid, : columns * grid] != 0).astype(np.uint8)
-    pilot, info = (
-        part.mean(0, dtype=np.float32).reshape(rows, grid, columns, grid).sum((1, 3))
-        for part in (active[:pilot_chips], active[pilot_chips:])
-    )
-    lit: NDArray[np.bool_] = (weight * (info - _LEAST_EVENTS * pilot)).sum((1, 2)) > 0
-    return lit
+    from evlcp_sdk.rx import _kernels
+
+    over = np.empty(len(presence.probability))
+    _kernels.info_activity(sums, presence.probability, presence.grid_px, pilot_chips, _LEAST_EVENTS, over)
+    return over > 0
 
 
 def believed(soft: SoftSymbols, seen: NDArray[np.bool_]) -> SoftSymbols:
@@ -60,16 +54,10 @@ def believed(soft: SoftSymbols, seen: NDArray[np.bool_]) -> SoftSymbols:
         soft: What a decoding says.
         seen: Clusters that are in sight, bool (K,); nothing is given of the others, and their LLRs are 0.
     """
-    seen = seen & (soft.symbols >= 0)
-    llr = np.where(seen[:, None], soft.llr, np.float32(0))
-    size = np.abs(llr[seen]).astype(np.float64)
-    mean = float(size.mean()) if size.size else 0.0
-    if mean == 0:
-        return SoftSymbols(np.full_like(soft.symbols, -1), np.zeros_like(soft.llr), 0.0)
-    expected = _EXPECTED_WORTH * (_EXPECTED_SPREAD * mean) ** 2
-    variance = (float(((size - mean) ** 2).sum()) + expected) / (size.size + _EXPECTED_WORTH)
-    llr *= np.float32(2 * mean / variance)
-    sure = 1 / (1 + np.exp(-np.abs(llr.astype(np.float64)).min(1)))
-    given = seen & (sure >= _LEAST_SURE)
-    quality = float(sure[given].prod()) if given.any() else 0.0
-    return replace(soft, symbols=np.where(given, soft.symbols, -1), llr=llr, quality=quality)
+    from evlcp_sdk.rx import _kernels
+
+    symbols, llr = np.empty_like(soft.symbols), np.empty_like(soft.llr)
+    quality = _kernels.believe(
+        soft.symbols, soft.llr, seen, _EXPECTED_WORTH, _EXPECTED_SPREAD, _LEAST_SURE, symbols, llr
+    )
+    return SoftSymbols(symbols, llr, quality)

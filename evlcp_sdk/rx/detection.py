@@ -1,15 +1,4 @@
-"""Finds regions that blink in the rhythm of the chips and follows them while the camera moves.
-
-The rhythm is judged per pixel, from rise to rise: the times at which it starts to get brighter. In a code
-of the air interface rises come two, three or four chips apart, and where events go missing a few chips
-more, but whole chips always. So a rise two to four whole chips after the one before raises a pixel's score
-by two, one after five to twelve by one. A rise off the chips, as of a lamp with pulse width modulation of 4
-kHz (two and a half chips) or of a moving texture, lowers it by three: more than the two that chance, which
-is on the chips in six cases of ten, would bring. One after the very same number of chips as before lowers
-it by two from five chips on: a lamp of 1 or 2 kHz repeats its period, a code with missing events does not.
-Falls are not looked at: they come later or sooner than rises by the light, they are the first to go
-missing, and some cameras send none. One pass, one number a pixel.
-"""
+"""Finds regions that blink in the rhythm of the chips and follows them while the camera moves."""
 
 import math
 from bisect import bisect_left
@@ -24,6 +13,7 @@ from scipy import ndimage
 
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.plugin.roles import Filter
+from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
 
@@ -74,8 +64,6 @@ _CENTRE_SIGMA_PX = 0.25
 
 _BACKFILL_STEPS = 12
 """Steps kept from before a region was found: a pixel needs about 1 ms to score, a region two steps."""
-
-_LONG_AGO_US = -(10**12)
 
 Box = tuple[int, int, int, int]
 Piece = tuple[int, Events]
@@ -192,11 +180,10 @@ class RegionFollower:
         self._spec = spec
         self._position = position
         self._camera = camera
-        self._chip_us = chip_us
         self._measure_us = round(_MEASURE_CHIPS * chip_us)
         self._age_us = _AGE_CHIPS * chip_us
         shape = (camera.height, camera.width)
-        self._pixels = np.full(shape, _LONG_AGO_US << 12, np.int64)
+        self._rhythm = Rhythm(camera.width, camera.height, chip_us, spec.min_score)
         self._hits = np.zeros([(n - 1 >> _CELL_SHIFT) + 1 for n in shape], np.int32)
         self._fresh: list[Box] = []
         steps = math.ceil(min(keep_us, _LONGEST_US) / spec.step_us)
@@ -206,15 +193,9 @@ class RegionFollower:
 
     def step(self, start_us: int, events: Events) -> list[Followed]:
         """Take the events of one time step; return the regions that are alive or ended in it."""
-        from evlcp_sdk.rx import _kernels
-
         spec = self._spec
         self._recent.append((start_us, events))
-        self._hits[:] = 0
-        t_us, x, y, p = events.t_us, events.x, events.y, events.p
-        _kernels.score_rises(
-            t_us, x, y, p, self._pixels, self._hits, self._chip_us, spec.min_score, _CELL_SHIFT
-        )
+        rises = self._rhythm.step(start_us, events, self._hits, _CELL_SHIFT)
         end_us = start_us + spec.step_us
         expected = [self._expected(followed, start_us + spec.step_us / 2) for followed in self.alive]
         known = [_tight(e) for e, followed in zip(expected, self.alive, strict=True) if followed.size_px]
@@ -231,7 +212,7 @@ class RegionFollower:
                 measured = self._whole(followed, measured, box[1], rows)
                 followed.positions.append(self._filtered(followed, measured))
         self._merge()
-        self._open(end_us)
+        self._open(end_us, rises)
         seen = list(self.alive)
         for followed in self.alive:
             followed.released |= end_us - followed.latest.t_us > spec.fade_us
@@ -246,7 +227,9 @@ class RegionFollower:
     def shape(
         self, followed: Followed, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]
     ) -> bool:
-        """Set a region right by what a frame showed of its bar; return whether its events changed.
+        """Set a region right by what a frame showed of its bar; return whether it changed.
+
+        Its events are those of where it was taken to be, until they are gathered anew.
 
         Args:
             followed: The region.
@@ -278,8 +261,30 @@ class RegionFollower:
                 for p, old in zip(followed.positions, before, strict=True)
             )
         followed.filter = self._position.init() if self._position else None
-        self._gather(followed)
         return True
+
+    def gather(self, followed: Followed, from_us: float = -math.inf, until_us: float = math.inf) -> None:
+        """Take a region's events once more, from where it is now known to have been.
+
+        Args:
+            followed: The region.
+            from_us: From the step that holds this time, us.
+            until_us: To the step before this time, us.
+        """
+        oldest_us = followed.pieces[0][0] if followed.pieces else followed.first_us
+        step_us = self._spec.step_us
+        kept = [
+            piece
+            for piece in self._recent
+            if oldest_us <= piece[0] < until_us and piece[0] + step_us > from_us
+        ]
+        last = followed.latest
+        gathered = {}
+        x, y = followed.at(np.array([start + step_us / 2 for start, _ in kept]))
+        for (start, events), x_px, y_px in zip(kept, x.tolist(), y.tolist(), strict=True):
+            box = self._reach(Region(last.id, last.t_us, x_px, y_px, last.width_px, last.height_px))
+            gathered[start] = _select(events, [box])[0]
+        followed.pieces = deque((start, gathered.get(start, events)) for start, events in followed.pieces)
 
     def beside(
         self, like: Followed, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]
@@ -292,6 +297,7 @@ class RegionFollower:
         self._next_id += 1
         self.alive.append(followed)
         self.shape(followed, t_us, centre_px, size_px)
+        self.gather(followed)
         return followed
 
     def drop(self, followed: Followed) -> None:
@@ -304,20 +310,7 @@ class RegionFollower:
 
         Before a frame shows where in its box a bar is, panels and moving textures around it would drown it.
         """
-        score = (self._pixels[events.y, events.x] >> 1) & 127
-        return events[score >= self._spec.min_score // 2]
-
-    def _gather(self, followed: Followed) -> None:
-        """Take a region's events once more, from where it is now known to have been."""
-        oldest_us = followed.pieces[0][0] if followed.pieces else followed.first_us
-        half_us = self._spec.step_us / 2
-        kept = [piece for piece in self._recent if piece[0] >= oldest_us]
-        times = np.array([start + half_us for start, _ in kept])
-        gathered = {}
-        for (start, events), x, y in zip(kept, *followed.at(times), strict=True):
-            box = self._reach(replace(followed.latest, x_px=float(x), y_px=float(y)))
-            gathered[start] = _select(events, [box])[0]
-        followed.pieces = deque((start, gathered.get(start, events)) for start, events in followed.pieces)
+        return events[self._rhythm.inside(events)]
 
     def _expected(self, followed: Followed, t_us: float) -> Region:
         """Where a region should be soon: by its filter, or else straight on."""
@@ -388,12 +381,9 @@ class RegionFollower:
 
         Of a bar of known width, rows count no pixels beside it.
         """
-        from evlcp_sdk.rx import _kernels
-
         # Half the score suffices inside a region: its seam is new to the light as the bar moves.
-        since_us, score = end_us - self._measure_us, self._spec.min_score // 2
-        total, column, left, right, upper, lower = _kernels.measure_box(
-            self._pixels, box, since_us, score, _SEAM_PX, width_px / 2 + 1, rows
+        total, column, left, right, upper, lower = self._rhythm.measure(
+            box, end_us, self._measure_us, _SEAM_PX, width_px / 2 + 1, rows
         )
         if total < _MIN_PIXELS:
             return None
@@ -406,21 +396,29 @@ class RegionFollower:
             height_px=lower - upper,
         )
 
-    def _open(self, end_us: int) -> None:
-        """Open a region where something blinks in two steps on end outside those known."""
+    def _open(self, end_us: int, rises: int) -> None:
+        """Open a region where something blinks in two steps on end outside those known.
+
+        Args:
+            end_us: End of the step, us.
+            rises: How many hits there are.
+        """
         hits = self._hits
         merge = self._spec.merge_px
         for followed in self.alive:
-            _inside(hits, _grown(self._reach(followed.latest), merge))[:] = 0
+            rises -= _cleared(hits, _grown(self._reach(followed.latest), merge))
             if followed.outgrown is not None and end_us > followed.outgrown[4]:
-                _inside(hits, self._reach(_outgrown(followed)))[:] = 0
-        if hits.max() == 0:
+                rises -= _cleared(hits, self._reach(_outgrown(followed)))
+        if rises < self._spec.min_rises:
             self._fresh = []
+            if rises:
+                hits[:] = 0
             return
         areas, _ = ndimage.label(hits, np.ones((3, 3), bool))
         lit = [self._lit(where, end_us) for where in ndimage.find_objects(areas)]
         joined = _joined([box for box in lit if box is not None], merge)
         boxes = [box for box in joined if _inside(hits, box).sum() >= self._spec.min_rises]
+        hits[:] = 0
         fresh, self._fresh = self._fresh, []
         for box in boxes:
             if any(_overlap(_grown(box, merge), other) for other in fresh):
@@ -455,7 +453,7 @@ class RegionFollower:
                 pieces = deque((start, Events.empty()) for start, _ in self._recent)
                 followed = Followed(region.id, places, pieces[0][0], pieces)
                 followed.filter = self._position.init() if self._position else None
-                self._gather(followed)
+                self.gather(followed)
                 self.alive.append(followed)
                 return
         recent = list(self._recent)[-_BACKFILL_STEPS:]
@@ -476,13 +474,13 @@ def _select(events: Events, boxes: list[Box]) -> list[Events]:
     """The events inside each box."""
     from evlcp_sdk.rx import _kernels
 
-    if not boxes:
-        return []
-    shape = (len(boxes), len(events) + 1)
-    t, x, y = np.empty(shape, np.int64), np.empty(shape, np.uint16), np.empty(shape, np.uint16)
-    p, taken = np.empty(shape, np.uint8), np.empty(len(boxes), np.int64)
-    _kernels.select_boxes(events.t_us, events.x, events.y, events.p, np.array(boxes), t, x, y, p, taken)
-    return [Events(t[i, :n], x[i, :n], y[i, :n], p[i, :n]) for i, n in enumerate(taken)]
+    room = len(events) + 1
+    found = []
+    for box in boxes:
+        t, x, y, p = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
+        n = _kernels.select_box(events.t_us, events.x, events.y, events.p, box, t, x, y, p)
+        found.append(Events(t[:n], x[:n], y[:n], p[:n]))
+    return found
 
 
 def _clear(box: Box, others: list[Box]) -> Box:
@@ -522,6 +520,14 @@ def _inside(hits: NDArray[np.int32], box: Box) -> NDArray[np.int32]:
         top >> _CELL_SHIFT : (bottom - 1 >> _CELL_SHIFT) + 1,
         left >> _CELL_SHIFT : (right - 1 >> _CELL_SHIFT) + 1,
     ]
+
+
+def _cleared(hits: NDArray[np.int32], box: Box) -> int:
+    """Set the cells that a box touches to 0; return what they had."""
+    cells = _inside(hits, box)
+    had = int(cells.sum())
+    cells[:] = 0
+    return had
 
 
 def _joined(boxes: list[Box], gap: int) -> list[Box]:

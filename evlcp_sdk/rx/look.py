@@ -165,30 +165,29 @@ class Looker:
             look: A frame.
             placement: The bar's own or that of another instance, taken to be as wide.
         """
-        selected, grid = look.presence.selected.any(0), look.presence.grid_px
-        row, column = np.nonzero(selected)
-        cells = (column + 1j * row) * grid + (grid - 1) / 2 * (1 + 1j)
+        from evlcp_sdk.rx import _kernels
+
+        selected, grid = look.presence.selected, look.presence.grid_px
         own, layout = look.placement, self._layout
         if own.scale == 0:
-            corners = np.concatenate([cells - grid / 2 * (1 + 1j), cells + grid / 2 * (1 + 1j)])
+            row, column = np.nonzero(selected.any(0))
+            places = (column + 1j * row) * grid + (grid - 1) / 2 * (1 + 1j)
+            right_px = down_px = grid / 2
         else:
             along_px = across_px = abs(own.scale) * layout.spacing_m / 2
             way = placement.scale / abs(placement.scale)
             if layout.line:
                 # A line's width is that of its cells; the layout says nothing of it.
                 turn = own.scale / abs(own.scale) * direction(layout)
-                off = np.abs(((cells - own.shift) * turn.conjugate()).imag)
-                across_px = float(off.max(initial=0.0)) + grid / 2
+                across_px = _kernels.farthest_off(selected, grid, own.shift, turn) + grid / 2
                 way *= direction(layout)
-            edges = np.array(
-                [way * (a + 1j * b) for a in (-along_px, along_px) for b in (-across_px, across_px)]
-            )
-            corners = (placement.places(layout)[:, None] + edges).ravel()
-        low = np.array([corners.real.min(), corners.imag.min()])
-        high = np.array([corners.real.max(), corners.imag.max()])
-        x, y = (low + high) / 2 + look.corner_px
-        width, height = high - low
-        return (float(x), float(y)), (float(width), float(height))
+            places = placement.places(layout)
+            right_px = along_px * abs(way.real) + across_px * abs(way.imag)
+            down_px = along_px * abs(way.imag) + across_px * abs(way.real)
+        left, right = float(places.real.min()) - right_px, float(places.real.max()) + right_px
+        top, bottom = float(places.imag.min()) - down_px, float(places.imag.max()) + down_px
+        x, y = look.corner_px
+        return (x + (left + right) / 2, y + (top + bottom) / 2), (right - left, bottom - top)
 
     def _size(self, width_px: float, height_px: float) -> tuple[int, int]:
         """Of the image: a region's, its seam on both sides, made even."""

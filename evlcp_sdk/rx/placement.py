@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,9 +202,9 @@ def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> Prese
     else:
         _kernels.block_prior(places, unit, spacing_px, grid, prior)
     _kernels.copy_near(presence.pixels, places, unit, spacing_px, across_px, pixels)
-    inside = prior > 0
-    probability = np.where(inside, presence.probability, np.float32(0))
-    return PresenceMap(probability, grid, presence.selected & inside, pixels, prior)
+    probability, selected = np.empty_like(presence.probability), np.empty_like(presence.selected)
+    _kernels.keep_inside(prior, presence.probability, presence.selected, probability, selected)
+    return PresenceMap(probability, grid, selected, pixels, prior)
 
 
 def lit(
@@ -225,7 +226,7 @@ def lit(
         return presence, placement
     light = np.empty(len(pilots))
     _kernels.pilot_light(sums, pilots, presence.prior, presence.grid_px, light)
-    full = float(np.median(light[placement.seen])) if placement.seen.any() else 0.0
+    full = median(light[placement.seen].tolist()) if placement.seen.any() else 0.0
     seen = light >= max(_LEAST_LIGHT * full, 1e-9)
     dark = ~seen
     if not dark.any():
@@ -310,16 +311,16 @@ def _judged(
     proposed: int,
 ) -> Placement:
     """A similarity with what is in its place, and how likely that is by chance."""
+    from evlcp_sdk.rx import _kernels
+
     clusters = len(layout.at_m)
     places = scale * _turned(layout, mirrored) + shift
     spacing_px = abs(scale) * layout.spacing_m
     reach = spacing_px / 2 + slack_px
-    right = np.abs(blobs.at - places[blobs.cluster]) <= reach
-    off = np.abs(blobs.at[:, None] - places[None])
-    nearest = off.argmin(1)
-    wrong = ~right & (off.min(1) <= spacing_px / 2)
-    in_place = np.bincount(blobs.cluster[right], blobs.cells[right], clusters)
-    out_of_place = np.bincount(nearest[wrong], blobs.cells[wrong], clusters)
+    in_place, out_of_place = np.zeros((2, clusters))
+    _kernels.cells_by_place(
+        blobs.at, blobs.cluster, blobs.cells, places, reach, spacing_px / 2, in_place, out_of_place
+    )
     seen = in_place > out_of_place
     shown = int(np.count_nonzero(in_place + out_of_place))
     # Where clusters are small, a cell stands in the place of two.

@@ -127,22 +127,11 @@ def _smooth(past: Floats) -> tuple[float, float, float]:
     Distances follow a parabola whose speed and acceleration are likely as above; the squares of what is left,
     in those that the sigmas expect, scale the variances.
     """
-    t_s = past[:, 0] - past[-1, 0]
-    terms = np.stack([np.ones(len(t_s)), t_s, t_s**2 / 2])
-    weight, value = 1 / past[:, 2], past[:, 1] - past[-1, 1]
-    likely = np.diag([0.0, _SPEED_M_S**-2, _ACCELERATION_M_S2**-2])
-    scale = 1.0
-    # The scale says how much the likely counts against the distances, and hardly changes after the first.
-    for _ in range(2):
-        weighted = terms * (weight / scale)
-        inverse = np.linalg.inv(weighted @ terms.T + likely)
-        path = inverse @ (weighted @ value)
-        left = (value - path @ terms) ** 2 * weight
-        free = len(value) - float(np.einsum("an,ab,bn->", weighted, inverse, terms))
-        counted = np.minimum(left, _OUTLIER**2 * scale)
-        scale = (_SCATTER_WORTH + float(counted.sum())) / (_SCATTER_WORTH + max(free, 0.0))
-    newest = max(scale, float(left[-1])) if left[-1] > _OUTLIER**2 * scale else scale
-    return float(path[1]), float(inverse[1, 1]), newest / float(weight[-1])
+    from evlcp_sdk.rx import _kernels
+
+    return _kernels.newest_on_parabola(
+        past, _SPEED_M_S**-2, _ACCELERATION_M_S2**-2, _SCATTER_WORTH, _OUTLIER**2
+    )
 
 
 def _add(state: Ranges, t_s: float, bend: Bend) -> Floats:
@@ -159,22 +148,7 @@ def _parabola(place: Floats, sums: Floats) -> tuple[float, float] | None:
     What bends every frame alike is in the scatter, too. Pilots put boundaries of even and odd number
     off to both sides, by a hundredth of a pixel, which is fitted beside.
     """
-    weight = sums[1]
-    use = weight > _LEAST_WEIGHT * weight.max()
-    n = int(use.sum())
-    place, weight = place[use], weight[use]
-    # Boundaries lie at whole or half places.
-    even = np.where(np.floor(place) % 2, -1.0, 1.0)
-    terms = np.stack([place**2, np.ones(n), place, even])
-    free = n - len(terms)
-    # The variance of a normal variable over an estimated sigma is finite from three degrees of freedom on.
-    if free < 3:
-        return None
-    off = sums[0, use] / weight
-    try:
-        inverse = np.linalg.inv((terms * weight) @ terms.T)
-    except np.linalg.LinAlgError:
-        return None
-    path = inverse @ (terms @ (weight * off))
-    left = float((weight * (off - path @ terms) ** 2).sum()) / (free - 2)
-    return float(path[0]), math.sqrt(max(float(inverse[0, 0]) * left, 1e-12))
+    from evlcp_sdk.rx import _kernels
+
+    sine, variance = _kernels.bend_of(place, sums, _LEAST_WEIGHT)
+    return None if math.isnan(sine) else (sine, math.sqrt(max(variance, 1e-12)))

@@ -240,18 +240,25 @@ class Receiver:
         """Look at a frame; set its region right by it, join what is of the same bar, open what is another."""
         region = transmitter.region
         others: list[tuple[float, tuple[float, float], tuple[float, float]]] = []
+        shaped = False
         for _ in range(_LOOKS):
             whole = region.size_px is not None
             look, transmitter.pilot = self._looker.look(region, due, transmitter.pilot)
             if look is None or not due.has_pilot:
-                return look
+                break
             # What the first look shows beside the bar is out of the second one's sight.
             others += [(look.middle_us, *self._looker.box(look, other)) for other in look.others]
             changed = self._regions.shape(region, look.middle_us, *self._looker.box(look, look.placement))
+            shaped |= changed
             if changed and not self._join(region):
                 return None
             if whole or not changed:
                 break
+            self._regions.gather(region, due.start_us, due.end_us)
+        if shaped:
+            self._regions.gather(region)
+        if look is None:
+            return None
         for middle_us, centre_px, size_px in others:
             if not any(known.covers(middle_us, centre_px) for known in self._regions.alive):
                 self._due.append(self._regions.beside(region, middle_us, centre_px, size_px))

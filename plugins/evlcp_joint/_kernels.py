@@ -96,6 +96,53 @@ def straight(x: Array, y: Array) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True)
+def core_of(counts: Array) -> tuple[float, float]:
+    """Middle and half the extent of the cells about the fullest that have three tenths of it.
+
+    The middle is given from that of `counts`. Stray cells beside a bar, and the dimmer ones of its
+    reflection, are fewer or apart.
+    """
+    peak = np.argmax(counts)
+    low, high = peak, peak
+    while low > 0 and counts[low - 1] >= 0.3 * counts[peak]:
+        low -= 1
+    while high + 1 < counts.size and counts[high + 1] >= 0.3 * counts[peak]:
+        high += 1
+    return (low + high) / 2 - counts.size // 2, (high - low) / 2
+
+
+@njit(cache=True, nogil=True)
+def line_of_cells(selected: Array, middles: Array, line: Array, seen: Array) -> bool:
+    """Line of a bar's cells; False with fewer than three clusters in it.
+
+    `line` (5,) takes the row of the first cluster, the rows to the next, the column in row 0, columns a row,
+    and half the width, all in cells. `middles` (K, 2) are medians of each cluster's cells, NaN without any;
+    `seen` (K,) says which clusters have cells in their place.
+    """
+    clusters = len(selected)
+    known = np.flatnonzero(~np.isnan(middles[:, 0]))
+    spacing, first = straight(known, middles[known, 0])
+    tilt, left = straight(middles[known, 0], middles[known, 1])
+    # Cells as wide as the bar is long are looked at: it is narrower.
+    counts = np.zeros(2 * int(abs(spacing) * clusters / 2) + 3, np.int64)
+    found = np.empty((clusters, 2))
+    # A cluster is as long as the spacing; half of it and a cell of blur.
+    reach = abs(spacing) / 2 + 1
+    cells_in_place(selected, (first, spacing, left, tilt), reach, counts, found)
+    shift, half = core_of(counts)
+    counts = np.zeros(2 * int(half + 1) + 1, np.int64)
+    cells_in_place(selected, (first, spacing, left + shift, tilt), reach, counts, found)
+    seen[:] = ~np.isnan(found[:, 0])
+    known = np.flatnonzero(seen)
+    if known.size < 3:
+        return False
+    line[1], line[0] = straight(known, found[known, 0])
+    line[3], line[2] = straight(found[known, 0], found[known, 1])
+    line[4] = half
+    return True
+
+
+@njit(cache=True, nogil=True)
 def column_light(sums: Array, line: Array, top: int, bottom: int, full: float, out: Array) -> None:
     """Mean size of the clipped sums beside a bar's line, from rows `top` to `bottom`, by pixels from it.
 
@@ -409,3 +456,131 @@ def solve(
         else:
             damping *= 10
     return not outside
+
+
+@njit(cache=True, nogil=True)
+def own_motion(shift: Array, information: Array, when: Array, out: Array) -> None:
+    """What each value's shift says of motion that is not a steady drift, as far as it is more than noise.
+
+    The shifts' variance beyond that of noise weighs each against the expectation of no motion (empirical
+    Bayes).
+    """
+    weight = np.maximum(information, 1e-12)
+    total = weight.sum()
+    off = shift - (weight * shift).sum() / total
+    lever = when - (weight * when).sum() / total
+    beyond = off - lever * ((weight * lever * off).sum() / (weight * lever * lever).sum())
+    variance = ((weight * beyond * beyond).sum() - (shift.size - 2)) / total
+    for i in range(shift.size):
+        out[i] = beyond[i] * variance / (variance + 1 / weight[i]) if variance > 0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def fit_bar(
+    codes: Array,
+    known: Array,
+    offset: Array,
+    when: Array,
+    profile: Array,
+    blur: float,
+    huber: float,
+    prior: float,
+    seen_values: Array,
+    search: tuple[int, int, float, float],
+    limits: tuple[int, float, float, float],
+    fit: Array,
+    by_boundary: Array,
+) -> float:
+    """Fit again and again, each time with the motion and without the boundaries that the last one showed.
+
+    `search` are steps of a fit, fits after the first, and tolerances of these and of the last; `limits` are
+    the least number of boundaries, how far one may lie off in standard deviations and in any case, px, and
+    the share of the values' energy that a fit explains at the least. From `fit`, which is changed;
+    `by_boundary` (2, K + 1) takes what `leftovers` says of it.
+
+    Returns:
+        Variance of the spacing, px2: mean of that by rows as observations (sandwich estimator) and that by
+        the scatter of the boundaries. NaN where there is no fit.
+    """
+    steps, rounds, close, exact = search
+    least, outlier, least_outlier, least_explained = limits
+    boundaries, values = known.shape
+    known = known.copy()
+    first, last = np.empty((boundaries, values), np.int64), np.empty((boundaries, values), np.int64)
+    by_value, scores, normal = np.empty((2, values)), np.empty((seen_values.shape[1], 5)), np.empty((5, 5))
+    moved, own = offset.copy(), np.zeros(values)
+    spent, squares = 0.0, 0.0
+    for left in range(rounds, -1, -1):
+        tolerance = close if left else exact
+        if not solve(
+            codes,
+            known,
+            moved,
+            when,
+            profile,
+            blur,
+            huber,
+            prior,
+            seen_values,
+            steps,
+            tolerance,
+            fit,
+            normal,
+            first,
+            last,
+        ):
+            return np.nan
+        noise, spent, squares = leftovers(
+            codes,
+            first,
+            last,
+            moved,
+            when,
+            profile,
+            blur,
+            huber,
+            seen_values,
+            fit,
+            by_boundary,
+            by_value,
+            scores,
+        )
+        used = by_boundary[1] > 0
+        if used.sum() < least:
+            return np.nan
+        if left:
+            sizes = np.abs(by_boundary[0])
+            most = max(outlier * 1.4826 * np.median(sizes[used]), least_outlier)
+            for b in range(boundaries):
+                if sizes[b] > most:
+                    known[b] = False
+            own_motion(by_value[0] + own, by_value[1] / max(noise, 1e-12), when, own)
+            moved[:] = offset + own
+    if spent > (1 - least_explained) * squares:
+        return np.nan
+    # The spacing's row of the inverse: one column of it, as that is symmetric.
+    unit, inverse = np.zeros(5), np.empty(5)
+    unit[0] = 1.0
+    if not _damped_step(normal, unit, 0.0, np.zeros((5, 5)), inverse):
+        return np.nan
+    by_row, rows = 0.0, 0
+    for v in range(len(scores)):
+        part = 0.0
+        for a in range(5):
+            part += scores[v, a] * inverse[a]
+        by_row += part * part
+        rows += scores[v, 3] != 0
+    n, total, mean, spread, left_over = 0, 0.0, 0.0, 0.0, 0.0
+    for b in range(boundaries):
+        weight = by_boundary[1, b]
+        if weight > 0:
+            n += 1
+            total += weight
+            mean += weight * b
+            left_over += weight * by_boundary[0, b] ** 2
+    mean /= total
+    for b in range(boundaries):
+        spread += by_boundary[1, b] * (b - mean) ** 2
+    if spread <= 0:
+        return np.nan
+    return (by_row * rows / max(rows - 5, 1) + left_over / max(n - 2, 1) / spread) / 2

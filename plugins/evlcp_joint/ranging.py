@@ -1,8 +1,8 @@
 """Distance from all boundaries between neighbouring clusters at once."""
 
+import math
 from dataclasses import dataclass
 from functools import cache
-from statistics import median
 from typing import Annotated
 
 import numpy as np
@@ -188,88 +188,25 @@ class JointScaleRanging(Ranging):
         """
         from evlcp_joint import _kernels
 
-        when, profile = _when(len(values)), _profile(self.core_share)
-        codes, prior = codes.astype(np.float64), _NOISE**2 / _WIDTH_SIGMA**2
-        by_boundary, by_value = np.empty((2, len(known))), np.empty((2, len(values)))
-        scores, normal = np.empty((values.shape[1], 5)), np.empty((5, 5))
-        first, last = np.empty_like(known, int), np.empty_like(known, int)
-        moved, fit = offset, fit.copy()
-        for left in range(_ROUNDS, -1, -1):
-            # Only the last fit has to be exact.
-            tolerance = _CLOSE if left else _EXACT
-            if not _kernels.solve(
-                codes,
-                known,
-                moved,
-                when,
-                profile,
-                self.blur_px,
-                self.huber,
-                prior,
-                values,
-                _STEPS,
-                tolerance,
-                fit,
-                normal,
-                first,
-                last,
-            ):
-                return None
-            noise, spent, squares = _kernels.leftovers(
-                codes,
-                first,
-                last,
-                moved,
-                when,
-                profile,
-                self.blur_px,
-                self.huber,
-                values,
-                fit,
-                by_boundary,
-                by_value,
-                scores,
-            )
-            used = by_boundary[1] > 0
-            off, weight = by_boundary[0, used], by_boundary[1, used]
-            if len(off) < least:
-                return None
-            if not left:
-                break
-            most_px = max(_OUTLIER * 1.4826 * median(np.abs(off).tolist()), _LEAST_OUTLIER_PX)
-            known = known & (np.abs(by_boundary[0]) <= most_px)[:, None]
-            moved = offset + _own_motion(by_value[0] + moved - offset, by_value[1] / max(noise, 1e-12), when)
-        if spent > (1 - _LEAST_EXPLAINED) * squares:
+        fit, by_boundary = fit.copy(), np.empty((2, len(known)))
+        variance = _kernels.fit_bar(
+            codes.astype(np.float64),
+            known,
+            offset,
+            _when(len(values)),
+            _profile(self.core_share),
+            self.blur_px,
+            self.huber,
+            _NOISE**2 / _WIDTH_SIGMA**2,
+            values,
+            (_STEPS, _ROUNDS, _CLOSE, _EXACT),
+            (least, _OUTLIER, _LEAST_OUTLIER_PX, _LEAST_EXPLAINED),
+            fit,
+            by_boundary,
+        )
+        if math.isnan(variance):
             return None
-        place = np.flatnonzero(used) - (len(known) - 1) / 2
-        try:
-            inverse = np.linalg.inv(normal)
-            scale = np.stack([place, np.ones(len(place))])
-            spread = float(np.linalg.inv((scale * weight) @ scale.T)[0, 0])
-        except np.linalg.LinAlgError:
-            return None
-        rows = int(scores[:, 3].astype(bool).sum())
-        by_row = float(np.square(scores @ inverse[0]).sum()) * rows / max(rows - 5, 1)
-        by_scatter = spread * float((weight * off**2).sum()) / max(len(off) - 2, 1)
-        return fit, float(np.sqrt(max((by_row + by_scatter) / 2, 0.0))), by_boundary[:, 1:-1]
-
-
-def _own_motion(shift: Floats, information: Floats, when: Floats) -> Floats:
-    """What each value's shift says of motion that is not a steady drift, as far as it is more than noise.
-
-    The shifts' variance beyond that of noise weighs each against the expectation of no motion (empirical
-    Bayes).
-    """
-    weight = np.maximum(information, 1e-12)
-    total = float(weight.sum())
-    off = shift - float(weight @ shift) / total
-    lever = when - float(weight @ when) / total
-    levered = weight * lever
-    beyond = off - lever * (float(levered @ off) / float(levered @ lever))
-    variance = (float(weight @ beyond**2) - (len(shift) - 2)) / total
-    if variance <= 0:
-        return np.zeros_like(shift)
-    return np.asarray(beyond * variance / (variance + 1 / weight))
+        return fit, math.sqrt(max(variance, 0.0)), by_boundary[:, 1:-1]
 
 
 def _offsets(offset_px: Floats) -> Floats:
@@ -343,51 +280,16 @@ def _place(presence: PresenceMap) -> tuple[_Place, bool] | None:
     k = np.flatnonzero(~np.isnan(middles[:, 0]))
     if len(k) < 3:
         return None
-    spread = np.ptp(middles[k], axis=0)
-    across = bool(spread[1] > spread[0])
+    rows, columns = middles[k].T
+    across = bool(np.ptp(columns) > np.ptp(rows))
     if across:
-        selected, middles = np.ascontiguousarray(selected.transpose(0, 2, 1)), middles[:, ::-1]
-    rows, columns = middles[k, 0], middles[k, 1]
-    spacing, first = _kernels.straight(k, rows)
-    tilt, left = _kernels.straight(rows, columns)
-    # Cells as wide as the bar is long are looked at: it is narrower.
-    counts = np.zeros(2 * int(abs(spacing) * len(selected) / 2) + 3, np.int64)
-    found = np.empty((len(selected), 2))
-    # A cluster is as long as the spacing; half of it and a cell of blur.
-    reach = abs(spacing) / 2 + 1
-    _kernels.cells_in_place(selected, (first, spacing, left, tilt), reach, counts, found)
-    shift, half = _core(counts)
-    _kernels.cells_in_place(
-        selected,
-        (first, spacing, left + shift, tilt),
-        reach,
-        np.zeros(2 * int(half + 1) + 1, np.int64),
-        found,
-    )
-    seen = ~np.isnan(found[:, 0])
-    if seen.sum() < 3:
+        selected, middles = np.ascontiguousarray(selected.transpose(0, 2, 1)), middles[:, ::-1].copy()
+    line, seen = np.empty(5), np.empty(len(selected), np.bool_)
+    if not _kernels.line_of_cells(selected, middles, line, seen):
         return None
-    k = np.flatnonzero(seen)
-    spacing, first = _kernels.straight(k, found[k, 0])
-    tilt, left = _kernels.straight(found[k, 0], found[k, 1])
+    first, spacing, left, tilt, half = line.tolist()
     grid = presence.grid_px
     middle = (grid - 1) / 2
-    line = np.array([left * grid + middle - tilt * middle, tilt])
+    at = np.array([left * grid + middle - tilt * middle, tilt])
     # In whole cells, as many as the core has.
-    place = _Place(first * grid + middle, spacing * grid, line, (half + 0.5) * grid, seen)
-    return place, across
-
-
-def _core(counts: NDArray[np.int64]) -> tuple[float, float]:
-    """Middle and half the extent of the cells about the fullest that have three tenths of it, in cells.
-
-    Stray cells beside a bar, and the dimmer ones of its reflection, are fewer or apart.
-    """
-    peak = int(counts.argmax())
-    enough = counts >= 0.3 * counts[peak]
-    low = high = peak
-    while low > 0 and enough[low - 1]:
-        low -= 1
-    while high + 1 < len(counts) and enough[high + 1]:
-        high += 1
-    return (low + high) / 2 - len(counts) // 2, (high - low) / 2
+    return _Place(first * grid + middle, spacing * grid, at, (half + 0.5) * grid, seen), across

@@ -148,6 +148,54 @@ def count_pairs(sums: Array, codes: Array, probability: Array, grid: int, most: 
 
 
 @njit(cache=True, nogil=True)
+def log_ratio(counts: Array, prior: float, out: Array) -> None:
+    """Log ratio of the second histogram's shares over the first's, `counts` (2, n, m), `prior` in each more.
+
+    That is on average of the two: to each as it has counts, so that what comes with both alike is worth 0.
+    """
+    first, second = counts[0].sum(), counts[1].sum()
+    less, more = prior, prior
+    if first > 0 and second > 0:
+        less, more = prior * 2 * first / (first + second), prior * 2 * second / (first + second)
+    n, m = out.shape
+    first += less * n * m
+    second += more * n * m
+    for a in range(n):
+        for b in range(m):
+            out[a, b] = np.log((counts[1, a, b] + more) / second * first / (counts[0, a, b] + less))
+
+
+@njit(cache=True, nogil=True)
+def read_words(values: Array, words: Array, scale: float, symbols: Array, llr: Array) -> float:
+    """Likeliest codeword of each cluster's values (K, n), `symbols` (K,), and max-log LLRs, `llr` (K, bits).
+
+    `words` are (2^bits, n); `scale` is that of their product with the values.
+
+    Returns:
+        Share of the values' sizes that agrees with the codewords; 0 without any.
+    """
+    clusters, length = values.shape
+    bits = llr.shape[1]
+    fit = np.zeros((clusters, len(words)))
+    zero, one = np.empty((clusters, bits)), np.empty((clusters, bits))
+    for k in range(clusters):
+        for s in range(len(words)):
+            for i in range(length):
+                fit[k, s] += values[k, i] * words[s, i] * scale
+    max_log(fit, bits, zero, one)
+    size, agree = 0.0, 0.0
+    for k in range(clusters):
+        symbols[k] = np.argmax(fit[k])
+        for b in range(bits):
+            llr[k, b] = zero[k, b] - one[k, b]
+        for i in range(length):
+            size += abs(values[k, i])
+            if values[k, i] * words[symbols[k], i] > 0:
+                agree += abs(values[k, i])
+    return agree / size if size > 0 else 0.0
+
+
+@njit(cache=True, nogil=True)
 def sum_worth(
     sums: Array, probability: Array, grid: int, least: float, most: int, worth: Array, out: Array
 ) -> None:

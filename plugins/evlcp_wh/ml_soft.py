@@ -92,13 +92,10 @@ def learned_worth(
     from evlcp_wh import _kernels
 
     side = 2 * max_events + 1
-    counts = np.zeros((2, side, side))
+    counts, worth = np.zeros((2, side, side)), np.empty((side, side))
     pilot = sums[: 2 * pilots.shape[1]]
     _kernels.count_pairs(pilot, pilots, presence.probability, presence.grid_px, max_events, counts)
-    seen = counts.sum((1, 2), keepdims=True)
-    counts += prior_count * (seen / seen.mean() if seen.min() > 0 else 1.0)
-    share = counts / counts.sum((1, 2), keepdims=True)
-    worth: NDArray[np.float64] = np.log(share[1] / share[0])
+    _kernels.log_ratio(counts, prior_count, worth)
     return worth
 
 
@@ -133,13 +130,7 @@ def soft_symbols(
     """
     from evlcp_wh import _kernels
 
-    fit = values @ words.T / 2 * independent_pixels
-    bits = len(words).bit_length() - 1
-    zero, one = np.empty((2, len(values), bits))
-    _kernels.max_log(fit, bits, zero, one)
-    symbols = fit.argmax(1)
-    size = np.abs(values)
-    total = float(size.sum())
-    agrees = np.sign(values) * words[symbols] > 0
-    quality = float((size * agrees).sum()) / total if total else 0.0
-    return SoftSymbols(symbols, (zero - one).astype(np.float32), quality)
+    clusters, bits = len(values), len(words).bit_length() - 1
+    symbols, llr = np.empty(clusters, np.int64), np.empty((clusters, bits), np.float32)
+    quality = _kernels.read_words(values, words, independent_pixels / 2, symbols, llr)
+    return SoftSymbols(symbols, llr, quality)

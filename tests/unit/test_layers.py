@@ -11,7 +11,7 @@ SDK = Path(__file__).parents[2] / "evlcp_sdk"
 LAYERS = (
     {"errors", "files", "specs", "spelling"},
     {"air"},
-    {"values", "scene"},
+    {"values", "scene", "_kernels"},
     {"plugin"},
     {"link"},
     {"io", "rx", "place", "sim"},
@@ -86,6 +86,7 @@ def test_the_middle_packages_do_not_import_one_another(package: str) -> None:
 
 
 RX = (
+    {"rhythm"},
     {"belief", "delays", "detection", "grid", "guard", "inbox", "packets", "placement", "ranges", "timeline"},
     {"look", "points", "steps"},
     {"echoes", "transmitters"},

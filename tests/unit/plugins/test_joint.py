@@ -410,6 +410,104 @@ def test_straight_is_theil_sen() -> None:
     assert left == pytest.approx(np.median(y - slope * x))
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_the_core_is_what_hangs_together_about_the_fullest(seed: int) -> None:
+    counts = np.random.default_rng(seed).integers(0, 20, 11)
+    enough = "".join("x" if c >= 0.3 * counts.max() else " " for c in counts)
+    peak = int(counts.argmax())
+    low = enough.rfind(" ", 0, peak) + 1
+    high = len(enough[:peak] + enough[peak:].partition(" ")[0]) - 1
+    assert _kernels.core_of(counts) == ((low + high) / 2 - 5, (high - low) / 2)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.1])
+def test_the_line_of_a_bar_leaves_strays_out(tilt: float) -> None:
+    rng = np.random.default_rng(8)
+    selected = np.zeros((K, 60, 40), np.bool_)
+    for k in range(K):
+        for v in range(4 + 3 * k, 7 + 3 * k):
+            left = round(12 + tilt * v)
+            selected[k, v, left : left + 3] = True
+    selected |= rng.random(selected.shape) < 0.002
+    medians, line, seen = np.empty((K, 2)), np.empty(5), np.empty(K, np.bool_)
+    _kernels.cell_medians(selected, medians)
+    assert _kernels.line_of_cells(selected, medians, line, seen)
+    assert_allclose(line, [5, 3, 13, tilt, 1], atol=0.35)
+    assert seen.all()
+    selected[2:] = False
+    _kernels.cell_medians(selected, medians)
+    assert not _kernels.line_of_cells(selected, medians, line, seen)
+
+
+def own_motion(shift: np.ndarray, information: np.ndarray, when: np.ndarray) -> np.ndarray:
+    """What is left of a weighted straight line, shrunk by the share of its variance that is not noise."""
+    weight = np.maximum(information, 1e-12)
+    left = shift - np.polyval(np.polyfit(when, shift, 1, w=np.sqrt(weight)), when)
+    variance = (weight @ left**2 - (len(shift) - 2)) / weight.sum()
+    return left * variance / (variance + 1 / weight) if variance > 0 else 0 * left
+
+
+@pytest.mark.parametrize("size", [0.0, 0.1, 1.0])
+def test_motion_stands_out_of_the_noise_or_is_none(size: float) -> None:
+    rng = np.random.default_rng(9)
+    when, information = np.linspace(-0.5, 0.5, 16), rng.uniform(20, 200, 16)
+    shift = 0.3 * when + size * np.sin(9 * when) + rng.normal(0, 1, 16) / np.sqrt(information)
+    out = np.empty(16)
+    _kernels.own_motion(shift, information, when, out)
+    assert_allclose(out, own_motion(shift, information, when), rtol=1e-6, atol=1e-9)
+    assert size < 1 or np.abs(out).max() > 0.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rounds_of_fits(seed: int) -> None:
+    """Step by step in NumPy, by kernels with twins of their own."""
+    twin = Twin(seed, rows=110)
+    rng = np.random.default_rng(seed)
+    b, i, v = twin.cells(twin.fit)[:, :3].astype(int).T
+    seen = np.zeros((6, twin.rows))
+    seen[i, v] = twin.cells(twin.fit)[:, 3] + rng.normal(0, 0.1, len(b))
+    # One boundary is out of line, and the bar shakes.
+    seen[:, v[b == 5]] = rng.normal(0, 0.5, seen[:, v[b == 5]].shape)
+    profile, start = _profile(SHARE), twin.fit * [1.003, 1, 1, 1, 1]
+    fit, by_boundary = start.copy(), np.empty((2, K + 1))
+    variance = _kernels.fit_bar(
+        twin.codes, twin.known, twin.offset, twin.when, profile, BLUR, 0.5, 2.0, seen,
+        (12, 2, 1e-3, 1e-5), (6, 4.0, 0.25, 0.3), fit, by_boundary,
+    )  # fmt: skip
+    known, moved, want = twin.known, twin.offset, start.copy()
+    by, by_value, scores, normal = (
+        np.empty((2, K + 1)),
+        np.empty((2, 6)),
+        np.empty((110, 5)),
+        np.empty((5, 5)),
+    )
+    first, last = np.empty((2, K + 1, 6), np.int64)
+    for left in (2, 1, 0):
+        tolerance = 1e-3 if left else 1e-5
+        assert _kernels.solve(
+            twin.codes, known, moved, twin.when, profile, BLUR, 0.5, 2.0, seen, 12, tolerance,
+            want, normal, first, last,
+        )  # fmt: skip
+        noise, _, _ = _kernels.leftovers(
+            twin.codes, first, last, moved, twin.when, profile, BLUR, 0.5, seen, want, by, by_value, scores
+        )
+        used = by[1] > 0
+        if left:
+            most = max(4 * 1.4826 * np.median(np.abs(by[0, used])), 0.25)
+            known = known & (np.abs(by[0]) <= most)[:, None]
+            shift = by_value[0] + moved - twin.offset
+            moved = twin.offset + own_motion(shift, by_value[1] / noise, twin.when)
+    assert_allclose(fit, want, rtol=1e-6)
+    assert_allclose(by_boundary, by, rtol=1e-5, atol=1e-9)
+    rows = int(np.count_nonzero(scores[:, 3]))
+    by_row = ((scores @ np.linalg.inv(normal)[0]) ** 2).sum() * rows / (rows - 5)
+    place = np.flatnonzero(used)
+    terms = np.stack([place, np.ones(len(place))])
+    spread = np.linalg.inv((terms * by[1, used]) @ terms.T)[0, 0]
+    by_scatter = spread * (by[1, used] * by[0, used] ** 2).sum() / (len(place) - 2)
+    assert variance == pytest.approx((by_row + by_scatter) / 2, rel=1e-5)
+
+
 def noisy_fit(distance_m: float, noise: float, seed: int) -> tuple[float, np.ndarray]:
     """The fit's distance for a frame made of the model plus Gaussian noise, and the symbols."""
     rng = np.random.default_rng(seed)

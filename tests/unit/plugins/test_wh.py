@@ -111,6 +111,32 @@ def test_max_log(clusters, bits):
     assert_array_equal([zero, one], twins.max_log(fit, bits))
 
 
+@pytest.mark.parametrize(("clusters", "bits", "length"), [(16, 6, 8), (1, 1, 2), (3, 8, 16)])
+def test_words_are_read(clusters, bits, length):
+    rng = np.random.default_rng(bits)
+    words = rng.choice([-1.0, 1.0], (2**bits, length))
+    for values in (rng.normal(size=(clusters, length)), np.zeros((clusters, length))):
+        symbols, llr = np.empty(clusters, np.int64), np.empty((clusters, bits), np.float32)
+        quality = _kernels.read_words(values, words, 0.25, symbols, llr)
+        want_symbols, want, want_quality = twins.read_words(values, words, 0.25)
+        assert_array_equal(symbols, want_symbols)
+        assert_allclose(llr, want, rtol=1e-5, atol=1e-6)
+        assert quality == pytest.approx(want_quality)
+
+
+@pytest.mark.parametrize("prior", [0.5, 1.0])
+def test_worth_of_histograms(prior):
+    rng = np.random.default_rng(3)
+    for counts in (
+        rng.random((2, 5, 5)) * [[[100]], [[30]]],
+        np.zeros((2, 3, 3)),
+        np.eye(3) * [[[1]], [[0]]],
+    ):
+        out = np.empty(counts.shape[1:])
+        _kernels.log_ratio(counts, prior, out)
+        assert_allclose(out, twins.log_ratio(counts, prior), rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("grid", "most"), [(2, 1), (3, 2)])
 def test_histograms_of_pairs_and_their_worth(seed, grid, most):

@@ -141,3 +141,18 @@ def take_back(sums, path):
             for c in range(len(sums))
         ]
     )
+
+
+def log_ratio(counts, prior):
+    seen = counts.sum((1, 2), keepdims=True)
+    more = counts + prior * (seen / seen.mean() if seen.min() > 0 else 1.0)
+    share = more / more.sum((1, 2), keepdims=True)
+    return np.log(share[1] / share[0])
+
+
+def read_words(values, words, scale):
+    fit = values @ words.T * scale
+    symbols = fit.argmax(1)
+    zero, one = max_log(fit, len(words).bit_length() - 1)
+    agrees = np.sign(values) * words[symbols] > 0
+    return symbols, zero - one, np.abs(values)[agrees].sum() / max(np.abs(values).sum(), 1e-9)

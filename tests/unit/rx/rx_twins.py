@@ -201,3 +201,72 @@ def pilot_light(sums, codes, prior, grid):
     agree = np.einsum("khw,ihw,ki->k", weight, values, codes)
     place = weight.sum((1, 2))
     return np.where(place > 0, agree / (codes.shape[1] * np.maximum(place, 1e-9)), 0)
+
+
+def info_activity(sums, weight, grid, pilot_chips, least):
+    _, rows, columns = weight.shape
+    active = (sums[:, : rows * grid, : columns * grid] != 0).astype(float)
+    pilot, info = (
+        part.mean(0).reshape(rows, grid, columns, grid).sum((1, 3))
+        for part in (active[:pilot_chips], active[pilot_chips:])
+    )
+    return (weight * (info - least * pilot)).sum((1, 2))
+
+
+def believe(read, llr, seen, worth, spread, least):
+    seen = seen & (read >= 0)
+    size = np.abs(llr[seen].astype(float))
+    if not size.any():
+        return np.full_like(read, -1), np.zeros_like(llr), 0.0
+    mean = size.mean()
+    variance = np.average([((size - mean) ** 2).mean(), (spread * mean) ** 2], weights=[size.size, worth])
+    scaled = np.where(seen[:, None], llr * (2 * mean / variance), 0)
+    sure = 1 / (1 + np.exp(-np.abs(scaled).min(1)))
+    given = seen & (sure >= least)
+    return np.where(given, read, -1), scaled, sure[given].prod() if given.any() else 0.0
+
+
+def newest_on_parabola(past, speed_weight, bend_weight, worth, outlier):
+    t_s = past[:, 0] - past[-1, 0]
+    terms = np.stack([np.ones(len(t_s)), t_s, t_s**2 / 2])
+    weight, value = 1 / past[:, 2], past[:, 1] - past[-1, 1]
+    scale = 1.0
+    for _ in range(2):
+        weighted = terms * (weight / scale)
+        inverse = np.linalg.inv(weighted @ terms.T + np.diag([0.0, speed_weight, bend_weight]))
+        path = inverse @ (weighted @ value)
+        left = (value - path @ terms) ** 2 * weight
+        free = len(value) - np.trace(inverse @ weighted @ terms.T)
+        counted = np.minimum(left, outlier * scale)
+        scale = (worth + counted.sum()) / (worth + max(free, 0.0))
+    newest = max(scale, left[-1]) if left[-1] > outlier * scale else scale
+    return path[1], inverse[1, 1], newest / weight[-1]
+
+
+def bend_of(place, sums, least):
+    """By `lstsq`, weighted."""
+    use = sums[1] > least * sums[1].max()
+    place, weight = place[use], sums[1, use]
+    off = sums[0, use] / weight
+    side = np.where(np.floor(place) % 2, -1.0, 1.0)
+    terms = np.stack([place**2, np.ones(len(place)), place, side], 1)
+    root = np.sqrt(weight)
+    path = np.linalg.lstsq(terms * root[:, None], off * root)[0]
+    left = (weight * (off - terms @ path) ** 2).sum() / (len(place) - 6)
+    return path[0], np.linalg.inv((terms.T * weight) @ terms)[0, 0] * left
+
+
+def farthest_off(selected, grid, on, turn):
+    _, row, column = np.nonzero(selected)
+    cells = (column + 1j * row) * grid + (grid - 1) / 2 * (1 + 1j)
+    return np.abs(((cells - on) * np.conj(turn)).imag).max(initial=0.0)
+
+
+def cells_by_place(at, cluster, cells, places, reach, half):
+    right = np.abs(at - places[cluster]) <= reach
+    off = np.abs(at[:, None] - places)
+    wrong = ~right & (off.min(1) <= half)
+    return [
+        np.bincount(cluster[right], cells[right], len(places)),
+        np.bincount(off.argmin(1)[wrong], cells[wrong], len(places)),
+    ]

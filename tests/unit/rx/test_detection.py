@@ -220,6 +220,11 @@ def test_a_region_takes_its_bars_size_and_gathers_its_events() -> None:
     assert regions.shape(region, 24_000.0, (bar.x_px - 0.5, bar.y_px - 0.5), (4.0, 128.0))
     x, y = region.at(np.array([24_000.0]))
     assert (x[0], y[0]) == pytest.approx((bar.x_px - 0.5, bar.y_px - 0.5))
+    old = list(region.pieces)
+    regions.gather(region, 18_000.5, 21_000)
+    for (start, now), (_, then) in zip(region.pieces, old, strict=True):
+        assert (now is not then) == (start < 21_000 and start + 1_000 > 18_000.5)
+    regions.gather(region)
     since_us = region.pieces[0][0]
     kept = events[half]
     within = (kept.t_us >= since_us) & (kept.t_us < 25_000)

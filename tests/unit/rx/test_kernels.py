@@ -6,11 +6,11 @@ import rx_twins as twins
 from numpy.testing import assert_allclose, assert_array_equal
 
 from evlcp_sdk.rx import _kernels
+from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.values import Events
 
 WIDTH, HEIGHT = 24, 16
 SEEDS = range(8)
-LONG_AGO_US = -(10**12)
 CHIP_US = 100.0
 
 
@@ -54,11 +54,24 @@ def test_the_first_event_too_may_be_off_the_sensor(x, y):
     assert not _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT)
 
 
+LOW = (1 << _kernels.CLOCK_AT) - 1
+
+
+def states(rose_us, chips, score):
+    """Pixels of these last rises, us, chips and scores."""
+    clock = np.asarray(rose_us) % _kernels.CLOCK_ROUND << _kernels.CLOCK_AT
+    return (clock | np.asarray(chips) << _kernels.CHIPS_AT | score).astype(np.uint32)
+
+
+def rhythm_of(pixels, chip_us=CHIP_US, min_score=8):
+    rhythm = Rhythm(WIDTH, HEIGHT, chip_us, min_score)
+    rhythm._pixels, rhythm._seen = pixels, 0
+    return rhythm
+
+
 def scored(events, pixels, min_score=8, cell_shift=2):
     hits = np.zeros((HEIGHT >> cell_shift, WIDTH >> cell_shift), np.int32)
-    _kernels.score_rises(
-        events.t_us, events.x, events.y, events.p, pixels, hits, CHIP_US, min_score, cell_shift
-    )
+    assert rhythm_of(pixels, min_score=min_score).step(0, events, hits, cell_shift) == hits.sum()
     return hits
 
 
@@ -72,14 +85,13 @@ def test_scores_of_pixels(seed, freeze):
     t_us = np.where(rng.random(len(events)) < 0.75, (events.t_us / 100).round() * 100, events.t_us)
     order = np.argsort(t_us, kind="stable")
     events = Events.of(t_us[order], events.x[order], events.y[order], events.p[order])
-    pixels = np.full((HEIGHT, WIDTH), LONG_AGO_US << 12, np.int64)
-    start = (np.full(pixels.shape, LONG_AGO_US), np.zeros(pixels.shape, int), np.zeros(pixels.shape, int))
+    start_us = -(2**21)
+    pixels = states(np.full((HEIGHT, WIDTH), start_us), 0, 0)
+    start = (np.full(pixels.shape, start_us), np.zeros(pixels.shape, int), np.zeros(pixels.shape, int))
     hits = scored(frozen(events, freeze), pixels)
     rows = zip(*(c.tolist() for c in (events.t_us, events.x, events.y, events.p)), strict=True)
     (rose, chips, score), want = twins.score_rises(rows, pixels.shape, start, CHIP_US, 8, 2)
-    assert_array_equal(pixels >> 12, rose)
-    assert_array_equal(pixels >> 8 & 15, chips)
-    assert_array_equal(pixels >> 1 & 127, score)
+    assert_array_equal(pixels, states(rose, chips, score))
     assert {tuple(c): hits[tuple(c)] for c in np.argwhere(hits).tolist()} == want
     assert 0 <= score.min() < score.max() <= 40
 
@@ -99,22 +111,37 @@ def test_scores_of_pixels(seed, freeze):
         (700, -2),
         (1200, 1),
         (1251, -1),
-        (10**9, -1),
+        (10**6, -1),
     ],
 )
 def test_a_rise_counts_by_its_time_since_the_last(run_us, score):
     """Seven chips lay between the two before."""
-    before = (1000 << 12) | (7 << 8) | (10 << 1)
-    pixels = np.full((HEIGHT, WIDTH), before, np.int64)
+    before = int(states(1000, 7, 10))
+    pixels = np.full((HEIGHT, WIDTH), before, np.uint32)
     assert not scored(Events.of([1000 + run_us], [3], [2], [1]), pixels, min_score=13).any()
     if score is None:
         assert pixels[2, 3] == before
     else:
-        assert (pixels[2, 3] >> 12, pixels[2, 3] >> 1 & 127) == (1000 + run_us, 10 + score)
+        assert pixels[2, 3] & _kernels.SCORES == 10 + score
+        assert pixels[2, 3] >> _kernels.CLOCK_AT == (1000 + run_us) % _kernels.CLOCK_ROUND
+
+
+@pytest.mark.parametrize("chip_us", [50.0, 100.0, 333.3, 1e5, 2e6])
+def test_times_count_alike_at_every_chip_rate(chip_us):
+    """A clock of ticks longer than a microsecond serves slow chips."""
+    for chips, score in ((2, 2), (4.2, 2), (5, 1), (7, -2), (7.5, -3), (12, 1), (14, -1)):
+        pixels = np.zeros((HEIGHT, WIDTH), np.uint32)
+        rhythm = rhythm_of(pixels, chip_us)
+        start_us = 5_000_000_000_000
+        pixels[:] = states(start_us >> rhythm._shift, 7, 10)
+        rhythm._seen = start_us >> rhythm._shift
+        rise = Events.of([start_us + round(chips * chip_us)], [3], [2], [1])
+        rhythm.step(start_us, rise, np.zeros((4, 6), np.int32), 2)
+        assert pixels[2, 3] & _kernels.SCORES == 10 + score, chips
 
 
 def test_falls_are_not_looked_at():
-    pixels = np.full((HEIGHT, WIDTH), 1000 << 12, np.int64)
+    pixels = np.full((HEIGHT, WIDTH), states(1000, 0, 0), np.uint32)
     before = pixels.copy()
     assert not scored(Events.of([1200, 1400], [3, 3], [2, 2], [0, 0]), pixels).any()
     assert_array_equal(pixels, before)
@@ -122,11 +149,44 @@ def test_falls_are_not_looked_at():
 
 def test_scores_do_not_care_how_the_stream_is_cut():
     events = random_events(np.random.default_rng(0), 1000, step_us=8, width=4, height=4)
-    whole, parts = np.full((2, HEIGHT, WIDTH), LONG_AGO_US << 12, np.int64)
+    whole, parts = (states(np.full((HEIGHT, WIDTH), -(2**21)), 0, 0) for _ in range(2))
     want = scored(events, whole)
     got = sum(scored(events[a:b], parts) for a, b in [(0, 0), (0, 1), (1, 700), (700, 1000)])
     assert_array_equal(parts, whole)
     assert_array_equal(got, want)
+
+
+@pytest.mark.parametrize("gap_us", [1500, 400_000, 1_100_000, 4_194_304, 10**10])
+def test_no_rise_grows_young(gap_us):
+    """The clock goes round in 2^22 us, while a pixel's age never goes below half of that again."""
+    rng = np.random.default_rng(0)
+    rhythm = Rhythm(WIDTH, HEIGHT, CHIP_US, 8)
+    hits, events = np.zeros((4, 6), np.int32), random_events(rng, 500)
+    rhythm.step(1000, events, hits, 2)
+    low = rhythm._pixels & LOW
+    rose = np.full((HEIGHT, WIDTH), -(2**40))
+    for t, u, v, p in zip(*(c.tolist() for c in (events.t_us, events.x, events.y, events.p)), strict=True):
+        if p and t - rose[v, u] >= 150:
+            rose[v, u] = t
+    for now in range(3000, 3000 + max(6 * gap_us, 10**7), gap_us):
+        rhythm.step(now, Events.empty(), hits, 2)
+        age = (now - (rhythm._pixels >> _kernels.CLOCK_AT).astype(int)) % _kernels.CLOCK_ROUND
+        true = now - rose
+        assert_array_equal(age[true < 2**20], true[true < 2**20])
+        assert (age[true >= 2**20] >= 2**20).all()
+        assert_array_equal(rhythm._pixels & LOW, low)
+        if gap_us < 10**4 and now > 6000:
+            break
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_old_rises(seed):
+    rng = np.random.default_rng(seed)
+    now, rose = 5_000_000, 5_000_000 - rng.integers(0, 2**22, (HEIGHT, WIDTH))
+    chips, score = rng.integers(0, 14, rose.shape), rng.integers(0, 41, rose.shape)
+    pixels = states(rose, chips, score)
+    _kernels.grow_old(pixels, now, 3000, 4000)
+    assert_array_equal(pixels, states(np.where(now - rose >= 3000, now - 4000, rose), chips, score))
 
 
 @pytest.mark.parametrize("reach", [2.0, np.inf])
@@ -134,22 +194,22 @@ def test_scores_do_not_care_how_the_stream_is_cut():
 @pytest.mark.parametrize("box", [(0, 0, WIDTH, HEIGHT), (5, 3, 20, 12), (7, 7, 8, 8), (0, 15, 24, 16)])
 def test_what_blinks_in_a_box(box, share, reach):
     rng = np.random.default_rng(round(100 * share))
-    changed = rng.integers(900, 1100, (HEIGHT, WIDTH))
-    score = np.where(rng.random(changed.shape) < share, 5, 3)
-    pixels = changed << 12 | score << 1 | rng.integers(0, 2, changed.shape)
-    since_us = 1000 if share < 1 else 900
+    rose = rng.integers(900, 1100, (HEIGHT, WIDTH))
+    score = np.where(rng.random(rose.shape) < share, 5, 3)
+    pixels = states(rose, rng.integers(0, 14, rose.shape), score)
+    span_us = 100 if share < 1 else 200
     rows = np.empty(box[3] - box[1], np.int64)
-    got = _kernels.measure_box(pixels, box, since_us, 5, 2, reach, rows)
-    want, want_rows = twins.measure_box((changed >= since_us) & (score >= 5), box, 2, reach)
+    got = rhythm_of(pixels, min_score=10).measure(box, 1100, span_us, 2, reach, rows)
+    want, want_rows = twins.measure_box((rose >= 1100 - span_us) & (score >= 5), box, 2, reach)
     assert_allclose(got, want, rtol=1e-12)
     assert_array_equal(rows, want_rows)
 
 
 def test_an_edge_row_counts_by_its_share():
-    pixels = np.zeros((HEIGHT, WIDTH), np.int64)
-    pixels[4:8, 2:10] = pixels[8, 2:4] = 1000 << 12 | 40 << 1
+    pixels = np.zeros((HEIGHT, WIDTH), np.uint32)
+    pixels[4:8, 2:10] = pixels[8, 2:4] = states(1000, 0, 40)
     *_, upper, lower = _kernels.measure_box(
-        pixels, (0, 0, WIDTH, HEIGHT), 1000, 5, 2, np.inf, np.empty(HEIGHT, np.int64)
+        pixels, (0, 0, WIDTH, HEIGHT), 1000, 0, 5, 2, np.inf, np.empty(HEIGHT, np.int64)
     )
     # 34 pixels in five rows: a full row counts as 6.8.
     assert (upper, lower) == pytest.approx((4, 8 + 2 / 6.8))
@@ -159,16 +219,14 @@ def test_an_edge_row_counts_by_its_share():
 @pytest.mark.parametrize("freeze", [1, 2])
 def test_events_in_boxes(n, freeze):
     events = random_events(np.random.default_rng(n), n)
-    boxes = np.array([(0, 0, WIDTH, HEIGHT), (0, 0, 1, 1), (3, 2, 17, 9), (10, 5, 30, 20), (4, 4, 4, 9)])
-    columns = [np.empty((len(boxes), n + 1), c.dtype) for c in (events.t_us, events.x, events.y, events.p)]
-    taken = np.empty(len(boxes), np.int64)
     e = frozen(events, freeze)
-    _kernels.select_boxes(e.t_us, e.x, e.y, e.p, boxes, *columns, taken)
-    for i, box in enumerate(boxes.tolist()):
+    for box in [(0, 0, WIDTH, HEIGHT), (0, 0, 1, 1), (3, 2, 17, 9), (10, 5, 30, 20), (4, 4, 4, 9)]:
+        columns = [np.empty(n + 1, c.dtype) for c in (events.t_us, events.x, events.y, events.p)]
+        taken = _kernels.select_box(e.t_us, e.x, e.y, e.p, box, *columns)
         want = twins.select_box(events, box)
         for got, name in zip(columns, ("t_us", "x", "y", "p"), strict=True):
-            assert_array_equal(got[i, : taken[i]], getattr(want, name))
-    assert taken[0] == n
+            assert_array_equal(got[:taken], getattr(want, name))
+        assert taken == len(want)
 
 
 @pytest.mark.parametrize("freeze", [1, 2])
@@ -279,3 +337,92 @@ def test_centres_in_one_pixel_have_no_boundary(apart):
     pixels = np.ones((2, 9, 9), np.float32)
     assert np.isnan(_kernels._boundary(pixels, 0, 1, 4 + 4j, 4 + 4j + apart, 3.0))
     assert _kernels._boundary(pixels, 0, 1, 4 + 3j, 4 + 5j, 3.0) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("grid", [1, 2])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_events_in_pilot_and_info(seed, grid):
+    rng = np.random.default_rng(seed)
+    sums = (rng.integers(-2, 3, (20, 11, 9)) * (rng.random((20, 11, 9)) < 0.4)).astype(np.int16)
+    weight = rng.random((3, 11 // grid, 9 // grid)).astype(np.float32)
+    out = np.empty(3)
+    _kernels.info_activity(sums, weight, grid, 12, 0.25, out)
+    assert_allclose(out, twins.info_activity(sums, weight, grid, 12, 0.25), rtol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.3, 20.0])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_llrs_are_scaled_to_tell_the_truth(seed, scale):
+    rng = np.random.default_rng(seed)
+    llr = (scale * rng.normal(0.5, 1, (6, 4))).astype(np.float32)
+    read, seen = rng.integers(-1, 16, 6), rng.random(6) < 0.8
+    symbols, scaled = np.empty_like(read), np.empty_like(llr)
+    quality = _kernels.believe(read, llr, seen, 6.0, 0.5, 0.6, symbols, scaled)
+    want_symbols, want, want_quality = twins.believe(read, llr, seen, 6.0, 0.5, 0.6)
+    assert_array_equal(symbols, want_symbols)
+    assert_allclose(scaled, want, rtol=1e-5)
+    assert quality == pytest.approx(want_quality, rel=1e-5)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 60])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_newest_value_by_all(seed, n):
+    rng = np.random.default_rng(seed)
+    past = np.stack([np.sort(rng.uniform(0, 0.3, n)), rng.normal(50, 1, n), rng.uniform(1e-4, 1e-2, n)], 1)
+    past[:, 1] += rng.choice([0, 5], n, p=[0.9, 0.1])
+    got = _kernels.newest_on_parabola(past, 20.0**-2, 3.0**-2, 8.0, 16.0)
+    assert_allclose(got, twins.newest_on_parabola(past, 20.0**-2, 3.0**-2, 8.0, 16.0), rtol=1e-7)
+
+
+@pytest.mark.parametrize("n", [7, 15])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_bend_of_boundaries(seed, n):
+    rng = np.random.default_rng(seed)
+    place, weight = np.arange(n) - (n - 1) / 2, rng.uniform(50, 100, n)
+    off = 0.01 * place**2 + 0.3 - 0.02 * place + rng.normal(0, 0.1, n)
+    if n > 7:
+        weight[3] = 1.0
+    sums = np.stack([weight * off, weight])
+    assert_allclose(_kernels.bend_of(place, sums, 0.1), twins.bend_of(place, sums, 0.1), rtol=1e-6)
+    assert np.isnan(_kernels.bend_of(place[:6], sums[:, :6], 0.1)).all()
+
+
+@pytest.mark.parametrize("n", [1, 3, 4])
+def test_inverse(n):
+    rng = np.random.default_rng(n)
+    part = rng.normal(size=(n, n + 2))
+    matrix, out = part @ part.T, np.empty((n, n))
+    assert _kernels._inverse(matrix, out)
+    assert_allclose(out, np.linalg.inv(matrix), rtol=1e-9)
+    assert not _kernels._inverse(-matrix, out)
+    if n > 1:
+        assert not _kernels._inverse(np.ones((n, n)), out)
+
+
+@pytest.mark.parametrize("grid", [1, 2, 3])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_cells_beside_a_line_and_inside_a_prior(seed, grid):
+    rng = np.random.default_rng(seed)
+    selected = rng.random((4, 9, 7)) < 0.1
+    on, turn = complex(*rng.uniform(0, 9, 2)), np.exp(1j * rng.uniform(0, 6))
+    assert _kernels.farthest_off(selected, grid, on, turn) == pytest.approx(
+        twins.farthest_off(selected, grid, on, turn)
+    )
+    assert _kernels.farthest_off(np.zeros_like(selected), grid, on, turn) == 0
+    prior = np.where(rng.random(selected.shape) < 0.5, rng.random(), 0).astype(np.float32)
+    probability = rng.random(selected.shape).astype(np.float32)
+    out, chosen = np.empty_like(probability), np.empty_like(selected)
+    _kernels.keep_inside(prior, probability, selected, out, chosen)
+    assert_array_equal(out, np.where(prior > 0, probability, 0))
+    assert_array_equal(chosen, selected & (prior > 0))
+
+
+@pytest.mark.parametrize("clusters", [2, 8])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_cells_in_and_out_of_place(seed, clusters):
+    rng = np.random.default_rng(seed)
+    layout, s, shift, at, cluster, cells = some_blobs(rng, clusters)
+    places, gap = s * layout + shift, abs(s) * 0.06
+    got = np.zeros((2, clusters))
+    _kernels.cells_by_place(at, cluster, cells, places, gap / 2 + 1, gap / 2, *got)
+    assert_array_equal(got, twins.cells_by_place(at, cluster, cells, places, gap / 2 + 1, gap / 2))

@@ -134,6 +134,26 @@ def test_where_the_place_is_known_presence_is_that_of_bayes() -> None:
     np.testing.assert_allclose(placed.probability[:, 0, 1], prior[:, 0, 1], rtol=1e-5)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_bayes_cell_by_cell(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    probability, prior = (rng.dirichlet(np.full(6, 0.3), (7, 4)).T[:-1] for _ in range(2))
+    probability[:, :, 3] = prior[:, :2] = 0
+    presence = PresenceMap(
+        np.ascontiguousarray(probability, np.float32),
+        2,
+        probability > 0.5,
+        np.zeros((5, 8, 14), np.float32),
+        np.ascontiguousarray(prior, np.float32),
+    )
+    none = 1 - probability.sum(0)
+    # By as many chances as there are clusters, none has the likelihood that is left.
+    likely = np.where(probability.any(0), probability * 5 / np.maximum(none, 1e-6), 1)
+    both = likely * prior
+    want = both / (both.sum(0) + np.maximum(1 - prior.sum(0), 1e-6))
+    np.testing.assert_allclose(presence.informed().probability, want, rtol=2e-3, atol=1e-5)
+
+
 def test_a_hidden_cluster_is_not_lit_by_its_neighbours() -> None:
     """Clusters 5 and 6 are covered; blur carries a tenth of their neighbours' light into their places."""
     codes = np.concatenate([hadamard(8), -hadamard(8)]).astype(np.int64)

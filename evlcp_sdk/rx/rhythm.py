@@ -1,0 +1,165 @@
+"""Which pixels blink in the rhythm of the chips.
+
+The rhythm is judged per pixel, from rise to rise: the times at which it starts to get brighter. In a code
+of the air interface rises come two, three or four chips apart, and where events go missing a few chips
+more, but whole chips always. So a rise two to four whole chips after the one before raises a pixel's score
+by two, one after five to twelve by one. A rise off the chips, as of a lamp with pulse width modulation of 4
+kHz (two and a half chips) or of a moving texture, lowers it by three: more than the two that chance, which
+is on the chips in six cases of ten, would bring. One after the very same number of chips as before lowers
+it by two from five chips on: a lamp of 1 or 2 kHz repeats its period, a code with missing events does not.
+Falls are not looked at: they come later or sooner than rises by the light, they are the first to go
+missing, and some cameras send none. One pass, four bytes a pixel.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.values import Events
+
+__all__ = ["Rhythm"]
+
+_MOST_SCORE = 40
+"""Scores rise no further: what has blinked in rhythm for long is forgotten after so many rises off it."""
+
+_SOON_CHIPS = 1.5
+"""Rises come no sooner in any code; what does is more events of the same rise."""
+
+_LATE_CHIPS = 12.5
+"""A time beyond says nothing."""
+
+_STRAY_CHIPS = 0.3
+"""Jitter and latencies that differ from rise to rise put one off the chips by so much."""
+
+_LONGEST_TICKS = 2**19
+"""Of what is looked up by its length: a tick is 1 us but for chips slower than 24 a second."""
+
+_LATE, _OFF = 0, 16
+"""Kind of a time between rises: its number of whole chips, or 0 beyond; so much more where it is off them."""
+
+
+class Rhythm:
+    """Scores of a sensor's pixels.
+
+    A pixel's state holds the time of its last rise (22 bits of the clock's ticks), the whole chips between
+    that and the one before (4 bits), and its score (6 bits). The clock of 22 bits goes round in four seconds;
+    rows are looked at in turn, all in a quarter of that, and rises older than half of it are forgotten.
+
+    Args:
+        width: Columns of the sensor.
+        height: Its rows.
+        chip_us: Nominal length of a chip, us.
+        min_score: Score at which a pixel is a candidate; half of it is enough inside a region.
+    """
+
+    def __init__(self, width: int, height: int, chip_us: float, min_score: int) -> None:
+        from evlcp_sdk.rx import _kernels
+
+        late_us = _LATE_CHIPS * chip_us
+        self._shift = max(math.ceil(math.log2(late_us / _LONGEST_TICKS)), 0)
+        tick_us = 1 << self._shift
+        self._soon = int(_SOON_CHIPS * chip_us) >> self._shift
+        self._kinds = _kinds(chip_us, tick_us)
+        self._lows = _lows()
+        self._min_score = min_score
+        self._pixels = np.zeros((height, width), np.uint32)
+        self._turn = _kernels.CLOCK_ROUND // 4
+        self._row = 0
+        self._seen: int | None = None
+
+    def step(self, start_us: int, events: Events, hits: NDArray[np.int32], cell_shift: int) -> int:
+        """Take the events of a time step; add the rises of candidates to their cell's `hits`; how many.
+
+        Args:
+            start_us: Start of the step, us.
+            events: Those in it, in order.
+            hits: Of cells of 2^cell_shift px, int32 (rows, columns).
+            cell_shift: See there.
+        """
+        from evlcp_sdk.rx import _kernels
+
+        self._grow_old(start_us >> self._shift)
+        return _kernels.score_rises(
+            events.t_us,
+            events.x,
+            events.y,
+            events.p,
+            self._pixels,
+            hits,
+            self._kinds,
+            self._lows,
+            self._soon,
+            self._shift,
+            self._min_score,
+            cell_shift,
+        )
+
+    def inside(self, events: Events) -> NDArray[np.bool_]:
+        """Which events are of pixels that blink in rhythm, by what is enough inside a region."""
+        from evlcp_sdk.rx import _kernels
+
+        score = self._pixels[events.y, events.x] & _kernels.SCORES
+        return np.asarray(score >= self._min_score // 2)
+
+    def measure(
+        self,
+        box: tuple[int, int, int, int],
+        end_us: int,
+        span_us: int,
+        seam_px: int,
+        reach_px: float,
+        rows: NDArray[np.int64],
+    ) -> tuple[int, float, int, int, float, float]:
+        """Where in a box pixels blink that rose in a time up to now, by what is enough inside a region.
+
+        Args:
+            box: (left, top, right, bottom), px.
+            end_us: Now: the end of a step, us.
+            span_us: How long before that a rise may be, us.
+            seam_px: Columns at either side that should be dark.
+            reach_px: How far from the mean column rows are counted.
+            rows: Takes how many pixels count in each row, int64 (bottom - top,).
+
+        Returns:
+            (pixels, mean column, first column, last column, upper edge, lower edge).
+        """
+        from evlcp_sdk.rx import _kernels
+
+        score = max(self._min_score // 2, 1)
+        now, span = end_us >> self._shift, span_us >> self._shift
+        return _kernels.measure_box(self._pixels, box, now, span, score, seam_px, reach_px, rows)
+
+    def _grow_old(self, now: int) -> None:
+        """Look at as many rows as the time since the last step asks for, at all after a gap."""
+        from evlcp_sdk.rx import _kernels
+
+        height = len(self._pixels)
+        passed = self._turn if self._seen is None else now - self._seen
+        self._seen = now
+        if passed >= self._turn:
+            _kernels.grow_old(self._pixels, now, 0, 2 * self._turn)
+            return
+        many = -(-height * passed // self._turn)
+        for row in range(self._row, self._row + many):
+            one = row % height
+            _kernels.grow_old(self._pixels[one : one + 1], now, 2 * self._turn, 2 * self._turn)
+        self._row = (self._row + many) % height
+
+
+def _kinds(chip_us: float, tick_us: int) -> NDArray[np.uint8]:
+    """Kind of a time between rises by its ticks, the last for all beyond."""
+    run_us = np.arange(int(_LATE_CHIPS * chip_us) // tick_us + 2) * float(tick_us)
+    chips = np.floor(run_us / chip_us + 0.5)
+    kinds = chips + _OFF * (np.abs(run_us - chips * chip_us) > _STRAY_CHIPS * chip_us)
+    kinds[run_us > _LATE_CHIPS * chip_us] = _LATE
+    return np.asarray(kinds, np.uint8)
+
+
+def _lows() -> NDArray[np.uint16]:
+    """Chips and score of a pixel after a rise, by the kind of its time and by chips and score before it."""
+    kind, before, score = np.meshgrid(np.arange(2 * _OFF), np.arange(16), np.arange(64), indexing="ij")
+    change = np.where(kind <= 4, 2, np.where(kind == before, -2, 1))
+    change[kind >= _OFF] = -3
+    change[kind == _LATE] = -1
+    return np.asarray(kind % _OFF << 6 | np.clip(score + change, 0, _MOST_SCORE), np.uint16).ravel()
