@@ -1,6 +1,5 @@
 """What a recording holds, without decoding its light."""
 
-from collections import Counter
 from dataclasses import asdict
 from typing import Any
 
@@ -30,9 +29,10 @@ def describe(source: EventSource, name: str) -> dict[str, Any]:
     first_us = last_us = None
     positive = 0
     window, in_window, peak = -1, 0, 0
-    edges: Counter[tuple[int, int]] = Counter()
+    edges = np.zeros((256, 2), np.int64)
     for events, triggers in source.stream():
-        edges.update(zip(triggers.channel.tolist(), triggers.value.tolist(), strict=True))
+        kinds = triggers.channel.astype(np.int64) * 2 + (triggers.value != 0)
+        edges += np.bincount(kinds, minlength=edges.size).reshape(edges.shape)
         if not len(events):
             continue
         first_us = int(events.t_us[0]) if first_us is None else first_us
@@ -59,8 +59,12 @@ def describe(source: EventSource, name: str) -> dict[str, Any]:
         "positive_share": round(positive / total, 4) if total else None,
         "counts": dict(source.counts),
         "triggers": [
-            {"channel": channel, "edge": "rising" if value else "falling", "count": count}
-            for (channel, value), count in sorted(edges.items())
+            {
+                "channel": channel,
+                "edge": "rising" if value else "falling",
+                "count": int(edges[channel, value]),
+            }
+            for channel, value in np.argwhere(edges).tolist()
         ],
         "losses": {kind: asdict(loss) for kind, loss in source.losses.items()},
         "anomalies": [str(loss) for loss in source.losses.values()],

@@ -1,6 +1,7 @@
 """Tables of events: NPZ with one array a column, and CSV, plain or gzipped."""
 
 import gzip
+import lzma
 import shutil
 import tempfile
 import zipfile
@@ -49,6 +50,12 @@ BUFFER_BYTES = 1 << 20
 LEAST_ROWS = 1 << 12
 
 
+DAMAGE: Final = (
+    *(OSError, EOFError, ValueError, RuntimeError, zlib.error, lzma.LZMAError, zipfile.BadZipFile),
+)
+"""What reading a member of a ZIP file raises; RuntimeError: encrypted, or packed by an unknown method."""
+
+
 class _Column:
     """One array of an NPZ file, read from front to back.
 
@@ -65,15 +72,18 @@ class _Column:
         except KeyError:
             found = ", ".join(sorted(member.removesuffix(".npy") for member in archive.namelist()))
             raise InputError(f"{path}: found the arrays {found or 'none'}, expected {name} too") from None
+        except DAMAGE as error:
+            raise InputError(f"{path}: array {name}: {_said(error)}") from error
         try:
             version = np.lib.format.read_magic(self._file)
             read = np.lib.format.read_array_header_1_0
             if version != (1, 0):
                 read = np.lib.format.read_array_header_2_0
             shape, _, dtype = read(self._file)
-        except ValueError as error:
-            raise InputError(f"{path}: array {name}: {error}") from error
-        if dtype.kind not in "iub" or len(shape) > 1:
+        except Exception as error:
+            # NumPy evaluates the header as a piece of Python, which may fail in any way.
+            raise InputError(f"{path}: array {name}: {_said(error)}") from error
+        if dtype.kind not in "iub" or len(shape) > 1 or min(shape, default=0) < 0:
             raise InputError(f"{path}: array {name}: found {dtype} {shape}, expected integers (n,)")
         self.dtype = dtype
         self.is_scalar = not shape
@@ -102,12 +112,28 @@ class _Column:
         self.row += rows
         return values.astype(WIRE_TYPES.get(self.name, np.dtype(np.int64)))
 
+    def one(self) -> int:
+        """The only value.
+
+        Raises:
+            InputError: There are none or several, or it has no place in the column.
+        """
+        if self.rows != 1:
+            raise InputError(f"{self._path}: array {self.name}: found {self.rows} values, expected one")
+        return int(self.take(1)[0])
+
+
+def _said(error: Exception) -> str:
+    """What an error says, in one line."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 200 else f"{text[:200]}..."
+
 
 class NpzSource(EventSource):
     """An NPZ file: arrays `t_us`, `x`, `y`, `p`, and where known the numbers `width` and `height`.
 
-    External triggers are in `trigger_t_us`, `trigger_channel`, `trigger_value`, if there are any. The events
-    are read in pieces, compressed or not; the triggers at once.
+    External triggers are in `trigger_t_us`, `trigger_channel`, `trigger_value`, if there are any, by rising
+    time. Both are read in pieces, compressed or not.
 
     Args:
         path: The file.
@@ -133,10 +159,10 @@ class NpzSource(EventSource):
                     raise InputError(f"{path}: found arrays of the lengths {sizes}, expected one length")
                 names = archive.namelist()
                 width, height = (
-                    int(_Column(target, archive, name, stack).take(1)[0]) if f"{name}.npy" in names else None
+                    _Column(target, archive, name, stack).one() if f"{name}.npy" in names else None
                     for name in ("width", "height")
                 )
-                self._triggers = Triggers.empty()
+                self._trigger_columns: list[_Column] = []
                 if "trigger_t_us.npy" in names:
                     columns = [_Column(target, archive, name, stack) for name in TRIGGER_COLUMNS]
                     lengths = {column.name: column.rows for column in columns}
@@ -144,11 +170,12 @@ class NpzSource(EventSource):
                         raise InputError(
                             f"{path}: found arrays of the lengths {lengths}, expected one length"
                         )
-                    self._triggers = Triggers(*(column.take(column.rows) for column in columns))
-            except (OSError, EOFError, zlib.error, zipfile.BadZipFile) as error:
-                raise InputError(f"{path}: damaged NPZ file: {error}") from error
+                    self._trigger_columns = columns
+            except DAMAGE as error:
+                raise InputError(f"{path}: damaged NPZ file: {_said(error)}") from error
             super().__init__(target, "NPZ", width, height, None, target.stat().st_size)
             self._sieve = Sieve("row", width, height)
+            self._events, self._triggers = Events.empty(), Triggers.empty()
             self._stack = stack.pop_all()
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
@@ -159,18 +186,32 @@ class NpzSource(EventSource):
         """
         row = self._columns[0].row
         try:
-            events = Events(*(column.take(max_events) for column in self._columns))
-        except (OSError, EOFError, ValueError, zlib.error, zipfile.BadZipFile) as error:
-            raise InputError(f"{self.path}: damaged NPZ file at row {row + 1}: {error}") from error
-        triggers = self._triggers
-        if not len(events) and not len(triggers):
+            if not len(self._events):
+                taken = Events(*(column.take(max_events) for column in self._columns))
+                self._events = self._sieve.sift(taken, row + 1)
+            self._more_triggers(max(max_events, LEAST_ROWS))
+        except DAMAGE as error:
+            raise InputError(f"{self.path}: damaged NPZ file at row {row + 1}: {_said(error)}") from error
+        events, triggers = self._events, self._triggers
+        left = self._columns[0].rows - self._columns[0].row
+        if not len(events) and not len(triggers) and not left:
             return None
-        due = int(np.searchsorted(triggers.t_us, events.t_us[-1], "right")) if len(events) else len(triggers)
-        self._triggers = Triggers(triggers.t_us[due:], triggers.channel[due:], triggers.value[due:])
-        return (
-            self._sieve.sift(events, row + 1),
-            Triggers(triggers.t_us[:due], triggers.channel[:due], triggers.value[:due]),
-        )
+        n, due = len(events), 0 if left else len(triggers)
+        if n:
+            due = int(np.searchsorted(triggers.t_us, events.t_us[-1], "right"))
+        if due == len(triggers) and self._triggers_left():
+            # More of them may be due before the last of these events.
+            n = int(np.searchsorted(events.t_us, triggers.t_us[-1], "right"))
+        self._events, self._triggers = events[n:], triggers[due:]
+        return events[:n], triggers[:due]
+
+    def _more_triggers(self, rows: int) -> None:
+        """Have some triggers at hand, if any are left; never all of a long file's at once."""
+        if not len(self._triggers) and self._triggers_left():
+            self._triggers = Triggers(*(column.take(rows) for column in self._trigger_columns))
+
+    def _triggers_left(self) -> bool:
+        return any(column.row < column.rows for column in self._trigger_columns)
 
     @property
     def position_bytes(self) -> int:

@@ -2,6 +2,9 @@
 
 import gzip
 import io
+import itertools
+import subprocess
+import sys
 import zipfile
 
 import numpy as np
@@ -250,3 +253,129 @@ def test_closed_tables_are_errors(tmp_path):
         source.close()
         with pytest.raises(InputError, match=name):
             source.read()
+
+
+def test_triggers_of_a_long_file_come_in_pieces(tmp_path):
+    rng = np.random.default_rng(5)
+    n, m = 40_000, 90_000
+    t_us, trigger_us = (np.sort(rng.integers(0, 1_000_000, k)) for k in (n, m))
+    trigger_us[:30_000] = 5
+    triggers = Triggers.of(trigger_us, rng.integers(0, 8, m), rng.integers(0, 2, m))
+    events = Events.of(t_us, rng.integers(0, 640, n), rng.integers(0, 480, n), rng.integers(0, 2, n))
+    write_events(tmp_path / "a.npz", events, 640, 480, triggers)
+    for most in (1, 777, 1 << 16, 1 << 20):
+        with NpzSource(tmp_path / "a.npz") as source:
+            taken = []
+            while (piece := source.take(most)) is not None:
+                taken.append(piece)
+                assert len(piece[1]) <= max(most, 1 << 12)
+                if most == 1 and len(taken) > 500:
+                    break
+        if most == 1:
+            continue
+        for column in ("t_us", "x", "y", "p"):
+            got = np.concatenate([getattr(e, column) for e, _ in taken])
+            assert np.array_equal(got, getattr(events, column))
+        for column in ("t_us", "channel", "value"):
+            got = np.concatenate([getattr(g, column) for _, g in taken])
+            assert np.array_equal(got, getattr(triggers, column))
+        # A piece holds the triggers up to its last event, and no later piece one from before that.
+        for (e, g), (later, rest) in itertools.pairwise(taken):
+            if len(e) and len(rest):
+                assert rest.t_us[0] >= e.t_us[-1]
+            if len(g) and len(later):
+                assert later.t_us[0] >= g.t_us[-1] or not len(e)
+
+
+def test_many_triggers_in_a_small_file_take_little_memory(tmp_path):
+    """10^8 triggers are 1 GB; packed, they are a file of 1 MB."""
+    path, n = tmp_path / "a.npz", 100_000_000
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name in ("t_us", "x", "y", "p"):
+            with archive.open(f"{name}.npy", "w") as member:
+                np.lib.format.write_array(member, np.array([0, 1], np.int64))
+        zeros = bytes(1 << 24)
+        for name in ("trigger_t_us", "trigger_channel", "trigger_value"):
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                head = {"descr": "|u1", "fortran_order": False, "shape": (n,)}
+                np.lib.format.write_array_header_1_0(member, head)
+                for k in range(0, n, len(zeros)):
+                    member.write(zeros[: n - k])
+    assert path.stat().st_size < 3e6
+    code = (
+        "import resource, sys; from evlcp_sdk.io import open_source\n"
+        f"with open_source({str(path)!r}) as source:\n"
+        "    for _ in range(100):\n        next(source.stream())\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 300_000
+
+
+def member(name, method=zipfile.ZIP_STORED, data=None):
+    """An NPZ file of which one array is packed so; `data` is what it holds instead."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for column in ("t_us", "x", "y", "p", "width"):
+            held = io.BytesIO()
+            np.save(held, np.array([1, 0] if column != "width" else 640))
+            chosen = column == name
+            archive.writestr(
+                f"{column}.npy",
+                held.getvalue() if data is None or not chosen else data,
+                compress_type=method if chosen else zipfile.ZIP_STORED,
+            )
+    return file.getvalue()
+
+
+def patched(data, name, at, value):
+    """The same with two bytes of a member's local header and of its entry in the directory."""
+    spoilt = bytearray(data)
+    for magic, offset, named in ((b"PK\x03\x04", at, 30), (b"PK\x01\x02", at + 2, 46)):
+        start = -1
+        while (start := data.find(magic, start + 1)) >= 0:
+            if data[start + named :].startswith(f"{name}.npy".encode()):
+                spoilt[start + offset : start + offset + 2] = value.to_bytes(2, "little")
+    return bytes(spoilt)
+
+
+def spoilt_lzma():
+    data = bytearray(member("x", zipfile.ZIP_LZMA))
+    at = data.find(b"x.npy") + len("x.npy")
+    data[at + 12 : at + 40] = bytes(range(28))
+    return bytes(data)
+
+
+def header(text):
+    line = text.encode("latin-1") + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(line).to_bytes(2, "little") + line + bytes(16)
+
+
+ODD_NPZ = {
+    "encrypted": (patched(member("x"), "x", 6, 1), "array x: .*encrypted, password required"),
+    "method 93": (patched(member("x"), "x", 8, 93), "array x: .*not supported"),
+    "damaged LZMA": (spoilt_lzma(), "damaged|array x"),
+    "no width": (member("width", data=header("{'descr': '<i8', 'fortran_order': False, 'shape': (0,)}")),
+        "array width: found 0 values, expected one"),
+    "two widths": (member("width", data=header("{'descr': '<i8', 'fortran_order': False, 'shape': (2,)}")),
+        "array width: found 2 values, expected one"),
+    "fewer than none": (member("x", data=header("{'descr': '<i8', 'fortran_order': False, 'shape': (-3,)}")),
+        r"array x: found int64 \(-3,\), expected integers"),
+    "no header": (member("x", data=header("{'descr': '<i8', 'fort")), "array x: "),
+    "a list for a header": (member("x", data=header("[1]")), "array x: "),
+    "no type": (member("x", data=header("{'descr': [[]], 'fortran_order': False, 'shape': (2,)}")), "array x: "),
+    "brackets": (member("x", data=header("(" * 5000)), "array x: "),
+    "zeros": (member("x", data=header("\0" * 60)), "array x: "),
+    "a long header": (member("x", data=header(" " * 60_000)), "array x: "),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("data", "says"), ODD_NPZ.values(), ids=ODD_NPZ.keys())
+def test_odd_npz_is_one_line(data, says, tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=says) as caught:
+        read_events(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
