@@ -1,16 +1,21 @@
 """Files written whole, so that no reader ever sees half a result; small ones read whole."""
 
 import csv
+import errno
+import io
 import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from evlcp_sdk.errors import EvlcpError, InputError
 
-__all__ = ["hidden_path", "read_csv", "read_json", "whole_file", "write_text"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["hidden_path", "read_csv", "read_json", "read_numbers", "read_whole", "whole_file", "write_text"]
 
 
 def hidden_path(folder: Path, name: str) -> Path:
@@ -63,6 +68,44 @@ def read_csv(path: Path | str) -> tuple[tuple[str, ...], list[tuple[int, dict[st
         raise InputError(f"{path}: not a CSV file: {fault}") from fault
 
 
+MOST_BYTES = 1 << 28
+"""Files of more bytes are not read whole."""
+
+
+def read_whole(path: Path | str) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+        OSError: It cannot be read, or is too large to be read whole, as a device without end.
+    """
+    with Path(path).open("rb") as file:
+        data = file.read(MOST_BYTES + 1)
+    if len(data) > MOST_BYTES:
+        raise OSError(errno.EFBIG, f"larger than {MOST_BYTES >> 20} MiB")
+    return data
+
+
+def read_numbers(path: Path | str) -> "NDArray[Any]":
+    """The array of numbers that a `.npy` file holds.
+
+    Raises:
+        InputError: The file cannot be read, or holds something else.
+    """
+    import numpy as np
+
+    try:
+        array = np.load(io.BytesIO(read_whole(path)), allow_pickle=False)
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be read: {fault.strerror or fault}") from fault
+    except Exception as fault:
+        # NumPy evaluates the header as a piece of Python, which may fail in any way.
+        said = " ".join(str(fault).split())
+        raise InputError(f"{path}: not a .npy file of plain numbers: {said:.200}") from fault
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+        raise InputError(f"{path}: not a .npy file of plain numbers, but of another kind")
+    return array
+
+
 def read_json(path: Path | str) -> Any:
     """What a JSON file holds.
 
@@ -70,7 +113,7 @@ def read_json(path: Path | str) -> Any:
         InputError: The file cannot be read, or is not JSON.
     """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        return json.loads(read_whole(path))
     except OSError as fault:
         raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
     except (ValueError, RecursionError) as fault:

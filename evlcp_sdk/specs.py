@@ -11,6 +11,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import read_whole
 from evlcp_sdk.spelling import nearest
 
 __all__ = [
@@ -131,7 +132,7 @@ def read_toml(path: Path | str) -> dict[str, Any]:
         ConfigError: The file cannot be read, or is not TOML.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = read_whole(path).decode().replace("\r\n", "\n")
     except OSError as fault:
         raise ConfigError(f"{path}: cannot be read: {fault.strerror}") from fault
     except UnicodeDecodeError as fault:

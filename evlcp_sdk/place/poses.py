@@ -14,8 +14,13 @@ __all__ = ["KnownPose", "read_poses"]
 _RANGES = {
     "latitude_deg": (-90.0, 90.0),
     "longitude_deg": (-180.0, 180.0),
-    "position_sigma_m": (1e-6, math.inf),
-    "attitude_sigma_deg": (1e-6, math.inf),
+    "height_m": (-12_000.0, 20_000.0),
+    "position_sigma_m": (1e-6, 1e6),
+    "attitude_sigma_deg": (1e-6, 1e6),
+    "heading_deg": (-360.0, 360.0),
+    "pitch_deg": (-360.0, 360.0),
+    "roll_deg": (-360.0, 360.0),
+    "t_us": (-1e18, 1e18),
 }
 """What a pose's values may be, least and most; exact ones would outweigh all in double precision."""
 
@@ -71,10 +76,9 @@ def read_poses(path: Path | str) -> list[KnownPose]:
                 number = math.nan
             if not math.isfinite(number):
                 raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected a number")
-            low, high = _RANGES.get(name, (number, number))
+            low, high = _RANGES[name]
             if not low <= number <= high:
-                expected = f"{low:g} to {high:g}" if math.isfinite(high) else f"{low:g} or more"
-                raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected {expected}")
+                raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected {low:g} to {high:g}")
             return number
 
         angles = [name for name in ("heading_deg", "pitch_deg", "roll_deg") if row.get(name)]

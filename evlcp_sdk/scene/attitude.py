@@ -12,6 +12,9 @@ from evlcp_sdk.files import read_csv
 
 __all__ = ["Attitude", "AttitudeLog"]
 
+_MOST = 1e18
+"""Size of the largest number of a log: microseconds since 1970 are 1e15."""
+
 _NEEDED = ("t_us", "pitch_deg", "roll_deg")
 _OPTIONAL = ("heading_deg", "gravity_sigma_deg", "heading_sigma_deg")
 
@@ -164,6 +167,7 @@ def _number(path: Path | str, line: int, name: str, text: str | None) -> float:
         value = float(text if text is not None else "")
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
-        raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected a number")
+    if not abs(value) <= _MOST:
+        wanted = "a number" if not math.isfinite(value) else f"at most {_MOST:g}"
+        raise ConfigError(f"{path}: line {line}: {name} = {text!r:.40}: expected {wanted}")
     return value

@@ -19,6 +19,11 @@ Floats = NDArray[np.float64]
 
 _SINES = 128
 
+_MOST = 1e6
+"""Size of the largest number of a path: beyond, its splines lose the millimetres."""
+
+_SHORTEST_S = 1e-6
+
 
 @dataclass(frozen=True, eq=False)
 class Vibration:
@@ -143,8 +148,12 @@ def _read_path(path: Path, duration_s: float) -> CubicSpline:
                 raise ConfigError(
                     f"{path}: line {line}: no number in column {name} (columns: {', '.join(names)})"
                 ) from fault
-    if len(table) < 2 or not np.isfinite(table).all() or (np.diff(table[:, 0]) <= 0).any():
-        raise ConfigError(f"{path}: expected two or more lines of finite numbers with rising t_s")
+    for line, values in zip((line for line, _ in rows), table, strict=True):
+        for name, value in zip(names, values.tolist(), strict=True):
+            if not abs(value) <= _MOST:
+                raise ConfigError(f"{path}: line {line}: {name} = {value:g}: expected at most {_MOST:g}")
+    if len(table) < 2 or (np.diff(table[:, 0]) < _SHORTEST_S).any():
+        raise ConfigError(f"{path}: expected two lines or more with rising t_s, {_SHORTEST_S:g} s apart")
     if table[0, 0] > 0 or table[-1, 0] < duration_s:
         raise ConfigError(
             f"{path}: lasts from {table[0, 0]} to {table[-1, 0]} s, the scene to {duration_s} s"

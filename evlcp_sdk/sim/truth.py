@@ -1,6 +1,5 @@
 """The truth beside a recording: what each bar sent, with which link, and where it was in the image."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.errors import EvlcpError, InputError
+from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
 from evlcp_sdk.files import read_json
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.scene.sites import BarSite
+from evlcp_sdk.scene.sites import BarSite, resolve_sites
 
 __all__ = ["SentBar", "Truth", "read_truth", "truth_from_table", "truth_path"]
 
@@ -24,6 +23,11 @@ _DARK_W_M2 = 1e-6
 """Light up to which a bar counts as dark."""
 
 _PAYLOADS = ("symbols", "data", "messages")
+
+_MOST = 1e18
+"""Size of the largest number that a truth holds: microseconds since 1970 are 1e15."""
+
+_MOST_PPM = 1e5
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,9 +278,10 @@ class _Reader:
         self, row: Mapping[str, Any], where: str, links: Mapping[str, Link], centre: Floats, depth: Floats
     ) -> SentBar:
         link = self._link(row, where, links)
-        ppm = self._number(row, "ppm", f"{where}.")
+        ppm = self._number(row, "ppm", f"{where}.", -_MOST_PPM, _MOST_PPM)
         light = row.get("led_w_m2")
         lit = light is None or self._number(row, "led_w_m2", f"{where}.") > _DARK_W_M2
+        clusters = link.codebook.clusters
         payload = row.get("payload") or "symbols"
         if payload not in _PAYLOADS:
             raise self._fault(f"{where}.payload", payload, f"one of {', '.join(_PAYLOADS)}")
@@ -290,12 +295,12 @@ class _Reader:
             lit=lit,
             centre_px=centre,
             distance_m=depth,
-            covered=tuple(self._spans(row, "covered", where, 1)[:, 0].astype(int).tolist()),
+            covered=tuple(self._spans(row, "covered", where, 1, clusters)[:, 0].astype(int).tolist()),
             cover_s=tuple(
                 (a, b, int(first), int(last))
-                for a, b, first, last in self._spans(row, "cover_s", where, 4).tolist()
+                for a, b, first, last in self._spans(row, "cover_s", where, 4, clusters).tolist()
             ),
-            pole_s=tuple((a, b) for a, b in self._spans(row, "pole_s", where, 2).tolist()),
+            pole_s=tuple((a, b) for a, b in self._spans(row, "pole_s", where, 2, clusters).tolist()),
         )
 
     def _links(self, told: Any) -> dict[str, Link]:
@@ -378,12 +383,14 @@ class _Reader:
     def _sites(self, told: Any) -> tuple[BarSite, ...]:
         if not isinstance(told, list):
             raise self._fault("sites", told, "a list")
+        if not told:
+            return ()
         try:
-            return tuple(BarSite(**site) for site in told)
-        except TypeError as fault:
-            raise self._fault("sites", told, "tables with the keys of a site") from fault
+            return resolve_sites({"bar": told}, source=f"{self._source}: not a scene's truth: sites")
+        except ConfigError as refused:
+            raise InputError(str(refused).splitlines()[0]) from refused
 
-    def _spans(self, row: Mapping[str, Any], key: str, where: str, columns: int) -> Floats:
+    def _spans(self, row: Mapping[str, Any], key: str, where: str, columns: int, clusters: int) -> Floats:
         told = row.get(key) or []
         rows = [[v] for v in told] if columns == 1 and isinstance(told, list) else told
         found = self._numbers(rows, f"{where}.{key}", None)
@@ -391,6 +398,10 @@ class _Reader:
             return np.empty((0, columns))
         if found.ndim != 2 or found.shape[1] != columns:
             raise self._fault(f"{where}.{key}", told, f"a list of lists of {columns} numbers")
+        # Behind the times, or alone, stand numbers of clusters.
+        numbers = found[:, 2:] if columns > 1 else found
+        if ((numbers < 0) | (numbers >= clusters) | (numbers % 1 != 0)).any():
+            raise self._fault(f"{where}.{key}", told, f"clusters 0 to {clusters - 1}")
         return found
 
     def _table(self, table: Mapping[str, Any], key: str, before: str = "") -> Mapping[str, Any]:
@@ -408,15 +419,19 @@ class _Reader:
         return found
 
     def _number(
-        self, table: Mapping[str, Any], key: str, before: str = "", least: float = -math.inf
+        self,
+        table: Mapping[str, Any],
+        key: str,
+        before: str = "",
+        least: float = -_MOST,
+        most: float = _MOST,
     ) -> float:
         value = table.get(key)
-        wanted = "a number" if least == -math.inf else f"a number, at least {least:g}"
+        wanted = "a number" if least == -_MOST else f"a number, at least {least:g}"
         if key not in table:
             raise InputError(f"{self._source}: {before}{key}: missing; expected {wanted}")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise self._fault(before + key, value, wanted)
-        if value < least:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
+            wanted += "" if most == _MOST else f" and at most {most:g}"
             raise self._fault(before + key, value, wanted)
         return value
 
@@ -427,7 +442,7 @@ class _Reader:
         except (TypeError, ValueError, OverflowError) as fault:
             raise self._fault(where, told, wanted) from fault
         right = ndim is None or (found.ndim == ndim and (not shape or found.shape == shape))
-        if not right or not np.isfinite(found).all():
+        if not right or not (np.abs(found) <= _MOST).all():
             raise self._fault(where, told, wanted)
         return found
 

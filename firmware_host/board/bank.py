@@ -1,6 +1,5 @@
 """What a driver board is sent: symbols or chip masks, as the content of a bank."""
 
-import zipfile
 import zlib
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat, info_words, packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.files import read_numbers
 from evlcp_sdk.link.resolve import Link
 from firmware_host.protocol.requests import CLUSTERS, LEDS, ROW_BYTES, Format
 from firmware_host.protocol.rows import rows_of_chips
@@ -185,15 +185,7 @@ def read_masks(path: Path, codebook: Codebook, packet: PacketFormat) -> Bank:
         InputError: The file cannot be read, or holds something else.
     """
     _refuse(limits(codebook, packet))
-    try:
-        with path.open("rb") as file:
-            chips = np.load(file, allow_pickle=False)
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault}") from fault
-    except (ValueError, EOFError, MemoryError, zipfile.BadZipFile) as fault:
-        raise InputError(f"{path}: not a .npy file of plain numbers: {fault}") from fault
-    if not isinstance(chips, np.ndarray):
-        raise InputError(f"{path}: not a .npy file, but an archive of several")
+    chips = read_numbers(path)
     try:
         return Bank.of_masks(chips, codebook, packet)
     except ConfigError as fault:

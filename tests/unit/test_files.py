@@ -108,3 +108,11 @@ def test_what_is_no_json_is_one_line(content: bytes, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match=r"b\.json: cannot be read: No such file"):
         read_json(tmp_path / "b.json")
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs /dev/zero")
+def test_a_file_without_end_is_not_read_whole() -> None:
+    with pytest.raises(InputError, match=r"^/dev/zero: cannot be read: larger than 256 MiB$"):
+        read_json("/dev/zero")
+    with pytest.raises(ConfigError, match=r"^/dev/zero: cannot be read: larger than 256 MiB$"):
+        read_toml("/dev/zero")

@@ -145,7 +145,7 @@ def test_poses_are_read_and_their_faults_told(tmp_path: Path) -> None:
         (f"attitude_sigma_deg,{head}0,a.raw,1,35,137,5,1,1,1\n", r"line 2: attitude_sigma_deg = '0'"),
         (
             f"position_sigma_m,{head}-1,a.raw,1,35,137,5,1,1,1\n",
-            r"position_sigma_m = '-1': expected 1e-06 or more",
+            r"position_sigma_m = '-1': expected 1e-06 to 1e\+06",
         ),
     ):
         path.write_text(text)

@@ -148,7 +148,7 @@ def test_a_bar_sends_given_symbols_and_chips(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         BarLight(BarSpec(chips_file=str(tmp_path / "no.npy")), LINK, 1.0, seed=0)
     (tmp_path / "text.npy").write_text("chips")
-    with pytest.raises(InputError, match="not an array file"):
+    with pytest.raises(InputError, match="not a .npy file of plain numbers"):
         BarLight(BarSpec(chips_file=str(tmp_path / "text.npy")), LINK, 1.0, seed=0)
 
 
@@ -319,3 +319,43 @@ def test_the_simulator_sees_through_the_camera_model() -> None:
     place, depth = project(points, np.zeros((1, 3)), np.zeros((1, 3)), camera)
     np.testing.assert_allclose(place[0], camera.project(points))
     np.testing.assert_allclose(depth[0], [20, 60])
+
+
+@pytest.mark.parametrize(
+    ("row", "says"),
+    [
+        ("0.1,1e308,0,0,0,0,0", "line 3: x_m = 1e+308: expected at most 1e+06"),
+        ("0.1,0,0,0,0,0,nan", "line 3: roll_deg = nan: expected at most 1e+06"),
+        ("inf,0,0,0,0,0,0", "line 3: t_s = inf: expected at most 1e+06"),
+        ("1e-300,0,0,0,0,0,0", "two lines or more with rising t_s, 1e-06 s apart"),
+    ],
+)
+def test_a_path_beyond_its_numbers_is_one_line(row: str, says: str, tmp_path: Path) -> None:
+    head = "t_s,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg\n0,0,0,-40,0,0,0\n"
+    (tmp_path / "path.csv").write_text(f"{head}{row}\n9,0,0,-30,0,0,0\n")
+    (tmp_path / "scene.toml").write_text('[motion]\npath_file = "path.csv"\n')
+    with pytest.raises(ConfigError) as caught:
+        Simulation(load_scene(tmp_path / "scene.toml", ["duration_s=0.2"]))
+    assert (
+        str(caught.value) == f"{tmp_path}/path.csv: {says}"
+        if "line" in says[:5]
+        else says in str(caught.value)
+    )
+    assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("content", ["zip", "object", "text", "brackets", "huge"])
+def test_chips_of_another_kind_of_array_are_one_line(content: str, tmp_path: Path) -> None:
+    path = tmp_path / "chips.npy"
+    if content == "zip":
+        np.savez(tmp_path / "a.npz", np.eye(16))
+        (tmp_path / "a.npz").rename(path)
+    elif content in ("object", "text"):
+        np.save(path, np.array([{}] if content == "object" else ["a"]), allow_pickle=True)
+    else:
+        shape = "(" * 5000 if content == "brackets" else "(1000000000000, 16)"
+        head = f"{{'descr': '<i8', 'fortran_order': False, 'shape': {shape}, }}".encode()
+        path.write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(160))
+    with pytest.raises(InputError, match=r"chips\.npy: not a \.npy file of plain numbers") as caught:
+        BarLight(BarSpec(chips_file=str(path)), LINK, 1.0, seed=0)
+    assert len(str(caught.value).splitlines()) == 1

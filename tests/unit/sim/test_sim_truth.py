@@ -14,6 +14,8 @@ from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.sim import Truth, load_scene, read_truth, resolve_scene, truth_from_table, truth_of
+from evlcp_sdk.study.score import score_frames
+from tests.unit.mutants import mutants, refusal
 
 SHARED = Path(__file__).parents[4] / "shared" / "recordings"
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 136.9}
@@ -140,8 +142,19 @@ def test_files_of_another_generator_are_read(path: Path) -> None:
         ("bars.0.covered", ["all"], "bars.0.covered = [['all']]: expected"),
         ("links", 3, "links = 3: expected a table"),
         ("sites", 3, "sites = 3: expected a list"),
-        ("sites", [{"x": 1}], "sites = [{'x': 1}]: expected tables with the keys of a site"),
+        ("sites", [{"x": 1}], "sites: bar.0.transmitter_id: missing"),
         ("camera_path", 3, "camera_path = 3: expected a table"),
+        ("bars", [None], "bars.0 = None: expected a table"),
+        (
+            "bars.0.ppm",
+            -1e6,
+            "bars.0.ppm = -1000000.0: expected a number, at least -100000 and at most 100000",
+        ),
+        ("bars.0.covered", [16], "bars.0.covered = [16]: expected clusters 0 to 15"),
+        ("bars.0.cover_s", [[0, 1, -1, 3]], "cover_s = [[0, 1, -1, 3]]: expected clusters 0 to 15"),
+        ("t_s.1", 1e308, "expected a list of finite numbers"),
+        ("scene.t0_us", 10**400, "expected a number"),
+        ("sites", [{"transmitter_id": "<b>"}], "sites: bar.0.transmitter_id"),
     ],
 )
 def test_what_no_truth_says_is_refused_in_one_line(path: str, value: Any, says: str, tmp_path: Path) -> None:
@@ -165,6 +178,11 @@ def test_files_that_are_no_truth_are_refused(tmp_path: Path) -> None:
     (tmp_path / "t.json").write_text("{")
     with pytest.raises(InputError, match="not JSON"):
         read_truth(tmp_path / "t.json")
+    for text in ("[" * 200_000, "9" * 5000, '{"a": ' * 5000):
+        (tmp_path / "t.json").write_text(text)
+        with pytest.raises(InputError, match="not JSON") as caught:
+            read_truth(tmp_path / "t.json")
+        assert len(str(caught.value)) < 400
     (tmp_path / "t.json").write_text("[]")
     with pytest.raises(InputError, match="not a scene's truth: bar_centre_px, bars"):
         read_truth(tmp_path / "t.json")
@@ -199,3 +217,26 @@ def test_a_truth_is_read_without_the_kernels() -> None:
     says = "import sys, evlcp_sdk.sim.truth; print('numba' in sys.modules, 'scipy' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", says], capture_output=True, text=True, check=True)
     assert done.stdout == "False False\n"
+
+
+def test_a_truth_changed_at_any_place_is_a_truth_or_refused_in_one_line(tmp_path: Path) -> None:
+    settings = {"duration_s": 0.05, "bars.cover_s": [[0.0, 0.03, 1, 3]], "bars.pole_s": [[0.02, 0.03]]}
+    world = {f"world.{key}": value for key, value in WORLD.items()}
+    known = plain(truth_of(load_scene("two-bars", settings | world)))
+    registry = Registry.load()
+
+    def read() -> None:
+        truth = read_truth(tmp_path / "t.json", registry)
+        json.dumps(score_frames([], truth), allow_nan=False)
+        truth.to_table()
+
+    refused = 0
+    for mutant, what in mutants(known, 400, seed=12):
+        (tmp_path / "t.json").write_text(json.dumps(mutant))
+        line = refusal(read)
+        if line is not None:
+            refused += 1
+            assert line.startswith(f"{tmp_path}/t.json: "), what
+            assert len(line.splitlines()) == 1, what
+            assert len(line) < 600, what
+    assert 50 < refused < 350
