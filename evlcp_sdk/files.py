@@ -101,8 +101,10 @@ def read_numbers(path: Path | str) -> "NDArray[Any]":
         # NumPy evaluates the header as a piece of Python, which may fail in any way.
         said = " ".join(str(fault).split())
         raise InputError(f"{path}: not a .npy file of plain numbers: {said:.200}") from fault
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
-        raise InputError(f"{path}: not a .npy file of plain numbers, but of another kind")
+    if not isinstance(array, np.ndarray):
+        raise InputError(f"{path}: not a .npy file of plain numbers, but an archive of several")
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"{path}: not a .npy file of plain numbers, but of {array.dtype}")
     return array
 
 

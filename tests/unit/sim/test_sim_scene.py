@@ -148,7 +148,7 @@ def test_a_bar_sends_given_symbols_and_chips(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         BarLight(BarSpec(chips_file=str(tmp_path / "no.npy")), LINK, 1.0, seed=0)
     (tmp_path / "text.npy").write_text("chips")
-    with pytest.raises(InputError, match="not a .npy file of plain numbers"):
+    with pytest.raises(InputError, match=r"not a \.npy file of plain numbers"):
         BarLight(BarSpec(chips_file=str(tmp_path / "text.npy")), LINK, 1.0, seed=0)
 
 
