@@ -6,6 +6,7 @@ EvlcpError                     1   anything the SDK raises on purpose
 │   ├── UnknownAlgorithmError  2   no algorithm of that role and id; suggests the nearest
 │   └── CodebookMismatchError  2   two ends that do not share one codebook
 ├── PluginError                2   a plugin whose algorithm cannot be used or fails, or two of one (role, id)
+├── OutputError                1   a file or folder that cannot be written
 ├── InputError                 3   a file or stream that cannot be read
 │   └── RawFormatError         3   a RAW file's header or words; names byte offset, found, expected
 ├── InterruptedRunError      130   the user stopped the run; what was done until then is kept
@@ -24,6 +25,7 @@ __all__ = [
     "EvlcpError",
     "InputError",
     "InterruptedRunError",
+    "OutputError",
     "PluginError",
     "PluginWarning",
     "RawFormatError",
@@ -60,6 +62,10 @@ class PluginError(EvlcpError):
 
 class PluginWarning(UserWarning):
     """A plugin is broken and left out."""
+
+
+class OutputError(EvlcpError):
+    """A file or folder that cannot be written: no room, no permission, or something else in its place."""
 
 
 class InputError(EvlcpError):

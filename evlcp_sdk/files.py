@@ -1,53 +1,366 @@
-"""Files written whole, so that no reader ever sees half a result; small ones read whole."""
+"""Files written whole, so that no reader ever sees half a result; small ones read whole.
+
+Whatever the SDK leaves behind goes through `Outputs`, whose rules are these: files grow in a private folder
+of random name beside their places and come into place together; links are neither followed nor replaced,
+nor are devices replaced; and a run that dies while its files come into place leaves a mark that readers
+refuse.
+"""
 
 import csv
 import errno
+import hashlib
 import io
 import json
 import os
+import shutil
+import stat
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Any, BinaryIO, Self, TextIO
 
-from evlcp_sdk.errors import EvlcpError, InputError
+from evlcp_sdk.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["hidden_path", "read_csv", "read_json", "read_numbers", "read_whole", "whole_file", "write_text"]
+__all__ = [
+    "Outputs",
+    "check_output",
+    "check_sha256",
+    "defused",
+    "open_log",
+    "output_fault",
+    "read_csv",
+    "read_json",
+    "read_numbers",
+    "read_whole",
+    "write_new",
+]
+
+STAGE_PREFIX = ".evlcp-"
+"""How the name of a folder begins in which files grow; what a killed run leaves of it may be deleted."""
+
+_UNFINISHED = {
+    "status": "unfinished",
+    "error": "the run ended while its files came into place: those beside this one may belong to two runs",
+}
+"""What stands in place of the last file, if it is JSON, while others come into place."""
 
 
-def hidden_path(folder: Path, name: str) -> Path:
-    """Where a file is written until it is whole."""
-    return folder / f".{name}.{os.getpid()}.part"
+def output_fault(path: Path | str, fault: OSError) -> OutputError:
+    """What is told of an output that the system refuses."""
+    return OutputError(f"{path}: cannot be written: {fault.strerror or fault}")
 
 
-@contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """Give a hidden path to write to, which becomes `path` in the end; an earlier file stays until then.
+class Outputs:
+    """Files that come into place together, or not at all; a context manager that is ended by `commit`.
+
+    Until then, and after a crash, what was there before stays. The file that was asked for last is the seal:
+    while the others come into place it is away, or, if it is JSON, says that the files are unfinished,
+    which `read_json` refuses. So who finds it finds all of them. What is no regular file (a pipe,
+    `/dev/null`) is written directly.
+    """
+
+    def __init__(self) -> None:
+        self._stages: dict[Path, Path] = {}
+        self._staged: dict[Path, Path] = {}
+        self._direct: list[Path] = []
+        self._dropped: list[Path] = []
+        self._open: list[IO[Any]] = []
+
+    def path(self, target: Path) -> Path:
+        """Where a file is to be written, which becomes `target` in the end; nothing is there yet.
+
+        Raises:
+            OutputError: There is no such folder, it cannot be written, or a link or a folder is in the place.
+        """
+        if target in self._staged:
+            return self._staged[target]
+        if target in self._direct:
+            return target
+        try:
+            if _is_special(target):
+                self._direct.append(target)
+                return target
+            if target.parent not in self._stages:
+                stage = tempfile.mkdtemp(prefix=STAGE_PREFIX, dir=target.parent)
+                self._stages[target.parent] = Path(stage)
+        except OSError as fault:
+            raise output_fault(target, fault) from fault
+        self._staged[target] = self._stages[target.parent] / target.name
+        return self._staged[target]
+
+    def open(self, target: Path) -> TextIO:
+        """A text file, UTF-8, line ends as written; it is closed with the others.
+
+        Raises:
+            OutputError: As `path`.
+            OSError: It cannot be opened.
+        """
+        file = self.path(target).open(self._mode(target), encoding="utf-8", newline="")
+        self._open.append(file)
+        return file  # type: ignore[return-value]
+
+    def open_binary(self, target: Path) -> BinaryIO:
+        """A binary file; it is closed with the others.
+
+        Raises:
+            OutputError: As `path`.
+            OSError: It cannot be opened.
+        """
+        file = self.path(target).open(f"{self._mode(target)}b")
+        self._open.append(file)
+        return file  # type: ignore[return-value]
+
+    def _mode(self, target: Path) -> str:
+        return "w" if target in self._direct else "x"
+
+    def write_text(self, text: str, target: Path) -> None:
+        """Write a text file.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        with self.told(target), self.open(target) as file:
+            file.write(text)
+
+    @contextmanager
+    def told(self, target: Path) -> Iterator[None]:
+        """What the system refuses within becomes an `OutputError` that names the file."""
+        try:
+            yield
+        except OSError as fault:
+            raise output_fault(target, fault) from fault
+
+    def drop(self, target: Path) -> None:
+        """Remove what is left of an earlier run when the files come into place."""
+        self._dropped.append(target)
+
+    def close_files(self) -> None:
+        """Close what `open` gave.
+
+        Raises:
+            OSError: Something cannot be written any more, e.g. the disk is full.
+        """
+        for file in self._open:
+            file.close()
+
+    def digests(self) -> dict[str, dict[str, Any]]:
+        """Size and SHA-256 of each file that is written so far, by its name; closes those that `open` gave.
+
+        Raises:
+            OSError: Something cannot be written or read back.
+        """
+        self.close_files()
+        found = {}
+        for target, staged in self._staged.items():
+            if staged.exists():
+                with staged.open("rb") as file:
+                    digest = hashlib.file_digest(file, "sha256").hexdigest()
+                found[target.name] = {"bytes": staged.stat().st_size, "sha256": digest}
+        return found
+
+    def commit(self) -> None:
+        """Bring all files into place, the seal last, and drop what is to be dropped.
+
+        Raises:
+            OutputError: A file cannot be written; an earlier result stays, unless the fault came while files
+                came into place.
+        """
+        with self.told(next(iter((*self._staged, *self._direct)), Path())):
+            self.close_files()
+        written = {target: staged for target, staged in self._staged.items() if staged.exists()}
+        for target, staged in written.items():
+            with self.told(target):
+                # Somebody may have put a link there meanwhile.
+                _is_special(target)
+                _sync(staged)
+        gone = [*self._dropped, *(target for target in self._staged if target not in written)]
+        gone = [target for target in gone if os.path.lexists(target)]
+        others, seals = [*written][:-1], [*written][-1:]
+        for seal in seals if others or gone else ():
+            with self.told(seal):
+                self._unseal(seal)
+        for target in gone:
+            with self.told(target):
+                target.unlink()
+        for target in others:
+            with self.told(target):
+                written[target].replace(target)
+        for seal in seals:
+            with self.told(seal):
+                if others:
+                    self._sync_folders()
+                written[seal].replace(seal)
+                self._sync_folders()
+        self.discard()
+
+    def _unseal(self, seal: Path) -> None:
+        """Take the seal's place while the files are those of two runs."""
+        if seal.suffix == ".json":
+            mark = self._stages[seal.parent] / f"{seal.name}.unfinished"
+            with mark.open("x", encoding="utf-8") as file:
+                json.dump(_UNFINISHED, file)
+            _sync(mark)
+            mark.replace(seal)
+        else:
+            seal.unlink(missing_ok=True)
+        _sync(seal.parent)
+
+    def _sync_folders(self) -> None:
+        for folder in self._stages:
+            _sync(folder)
+
+    def discard(self) -> None:
+        """Remove what has not come into place."""
+        for file in self._open:
+            # A file that could not be written cannot be flushed either, and is dropped.
+            with suppress(OSError):
+                file.close()
+        for stage in self._stages.values():
+            shutil.rmtree(stage, ignore_errors=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Remove what `commit` has not brought into place."""
+        self.discard()
+
+
+def _is_special(path: Path) -> bool:
+    """Whether something is no regular file but can be written: a pipe, a terminal, `/dev/null`.
 
     Raises:
-        EvlcpError: The file cannot be written.
+        OutputError: It is a link to a file, a folder or a disk.
     """
-    part = hidden_path(path.parent, path.name)
     try:
-        yield part
-        part.replace(path)
-    except OSError as fault:
-        raise EvlcpError(f"{path}: cannot be written: {fault.strerror}") from fault
-    finally:
-        part.unlink(missing_ok=True)
+        mode = found = path.lstat().st_mode
+    except FileNotFoundError:
+        return False
+    if stat.S_ISLNK(found):
+        # Such as /dev/stdout, and what a shell gives for >(command).
+        with suppress(OSError):
+            mode = path.stat().st_mode
+    if stat.S_ISCHR(mode) or stat.S_ISFIFO(mode):
+        return True
+    if stat.S_ISLNK(found):
+        raise OutputError(
+            f"{path}: cannot be written: it is a link; name the file itself, or remove the link"
+        )
+    if not stat.S_ISREG(found):
+        what = "Is a directory" if stat.S_ISDIR(found) else "neither a file nor a pipe"
+        raise OutputError(f"{path}: cannot be written: {what}")
+    return False
 
 
-def write_text(text: str, path: Path) -> None:
-    """Write a text file that is never there by half.
+def check_output(path: Path, *, regular: bool = True) -> None:
+    """See that something can be written here, before the work is done.
+
+    Args:
+        path: The file; it need not be there.
+        regular: A pipe or a terminal will not do.
 
     Raises:
-        EvlcpError: The file cannot be written.
+        OutputError: A link, a folder or a device is in its place.
     """
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+    try:
+        special = _is_special(path)
+    except OSError as fault:
+        raise output_fault(path, fault) from fault
+    if special and regular:
+        raise OutputError(f"{path}: cannot be written: not a regular file")
+
+
+def _sync(path: Path) -> None:
+    """Have the disk hold what was written of a file, or the names in a folder."""
+    number = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(number)
+    except OSError as fault:
+        # Some file systems hold their folders without being asked, and cannot be.
+        if not (path.is_dir() and fault.errno in (errno.EINVAL, errno.ENOTSUP)):
+            raise
+    finally:
+        os.close(number)
+
+
+def write_new(data: bytes, path: Path, mode: int = 0o600) -> None:
+    """Write a file that is not there yet; one that cannot be written whole does not stay.
+
+    Raises:
+        FileExistsError: Something is there.
+        OutputError: It cannot be written.
+    """
+    try:
+        number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+        try:
+            with os.fdopen(number, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(number)
+            _sync(path.parent)
+        except BaseException:
+            path.unlink()
+            raise
+    except FileExistsError:
+        raise
+    except OSError as fault:
+        raise output_fault(path, fault) from fault
+
+
+def open_log(path: Path) -> TextIO:
+    """A text file that is there while it grows, for what must outlast a crash; links are not followed.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
+    try:
+        flags |= 0 if _is_special(path) else os.O_NOFOLLOW
+        return os.fdopen(os.open(path, flags, 0o666), "w", encoding="utf-8")
+    except OSError as fault:
+        raise output_fault(path, fault) from fault
+
+
+def defused(text: str) -> str:
+    """Text for a cell of a CSV file: what a spreadsheet would take for a formula begins with `'`.
+
+    >>> defused("=1+1"), defused("night.raw")
+    ("'=1+1", 'night.raw')
+    """
+    return f"'{text}" if text[:1] in _FORMULA else text
+
+
+_FORMULA = frozenset("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")
+
+
+def check_sha256(path: Path, expected: str, source: str) -> None:
+    """See that a file is the one that another file names.
+
+    Args:
+        path: The file.
+        expected: SHA-256, 64 hex digits.
+        source: Who says so, for the message.
+
+    Raises:
+        InputError: It cannot be read, or is another one.
+    """
+    try:
+        with path.open("rb") as file:
+            found = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+    if found != expected:
+        raise InputError(
+            f"{path}: not the file that {source} speaks of: SHA-256 {found[:16]}, expected {expected[:16]};"
+            " changed since, or of another run"
+        )
 
 
 def read_csv(path: Path | str) -> tuple[tuple[str, ...], list[tuple[int, dict[str, Any]]]]:
@@ -112,11 +425,15 @@ def read_json(path: Path | str) -> Any:
     """What a JSON file holds.
 
     Raises:
-        InputError: The file cannot be read, or is not JSON.
+        InputError: The file is what `Outputs` leaves of a run that died while its files came into place,
+            cannot be read, or is not JSON.
     """
     try:
-        return json.loads(read_whole(path))
+        value = json.loads(read_whole(path))
     except OSError as fault:
         raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
     except (ValueError, RecursionError) as fault:
         raise InputError(f"{path}: not JSON: {fault}") from fault
+    if value == _UNFINISHED:
+        raise InputError(f"{path}: unfinished: {value['error']}; write them again")
+    return value

@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from evlcp_sdk.errors import ConfigError, EvlcpError, StreamError
-from evlcp_sdk.files import write_text
+from evlcp_sdk.errors import ConfigError, StreamError
+from evlcp_sdk.files import Outputs, check_output
 from evlcp_sdk.io.open import open_writer
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.source import EventSource
@@ -59,7 +59,7 @@ class SimulatedSource(EventSource):
         """Render the scene into a recording with its truth beside it; return the files that were written.
 
         `NAME.raw` (EVT3) and `NAME.truth.json`; of a scene on earth also `NAME.site.toml`, where its bars
-        stand, and `NAME.attitude.csv`, what an IMU measures.
+        stand, and `NAME.attitude.csv`, what an IMU measures. They come into place together, the truth last.
 
         Args:
             path: `NAME.raw`.
@@ -68,26 +68,28 @@ class SimulatedSource(EventSource):
         Raises:
             StreamError: Events of the source have been taken already.
             ConfigError: The file's name does not end in `.raw`.
-            EvlcpError: A file cannot be written.
+            OutputError: A file cannot be written.
         """
         out, simulation = Path(path), self.simulation
         if out.suffix != ".raw":
             raise ConfigError(f"{out}: a recording is written as NAME.raw")
         if simulation.done_s:
             raise StreamError(f"{out}: the simulation has been read already; simulate it again to save it")
-        with open_writer(out, self.width, self.height, "EVT3") as writer:
-            for events in self._pieces:
-                writer.write(events)
-                if advance is not None:
-                    advance(simulation.done_s)
         truth_file = truth_path(out)
-        try:
-            write_text(json.dumps(self.truth.to_table() | {"bytes": out.stat().st_size}), truth_file)
-        except EvlcpError as fault:
-            # An older truth may lie there; the scores of another recording would look like this one's.
-            out.unlink(missing_ok=True)
-            raise type(fault)(f"{fault}; {out} is taken away, as it would be without its truth") from fault
-        return (out, truth_file, *_on_earth(simulation, out))
+        check_output(truth_file)
+        with Outputs() as outputs:
+            with open_writer(out, self.width, self.height, "EVT3", outputs) as writer:
+                for events in self._pieces:
+                    writer.write(events)
+                    if advance is not None:
+                        advance(simulation.done_s)
+            beside = _on_earth(simulation, out)
+            for path, text in beside.items():
+                outputs.write_text(text, path)
+            size = outputs.path(out).stat().st_size
+            outputs.write_text(json.dumps(self.truth.to_table() | {"bytes": size}), truth_file)
+            outputs.commit()
+        return (out, truth_file, *beside)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -103,18 +105,16 @@ class SimulatedSource(EventSource):
         return f"SimulatedSource({scene.name}, {bars}, {scene.duration_s:g} s, seed {scene.seed})"
 
 
-def _on_earth(simulation: Simulation, out: Path) -> list[Path]:
-    """Write where the bars stand and how the camera does, if the scene says so; return the files."""
+def _on_earth(simulation: Simulation, out: Path) -> dict[Path, str]:
+    """The files that say where the bars stand and how the camera does, if the scene says so."""
     scene = simulation.scene
     if scene.world is None:
-        return []
-    written = [out.with_suffix(".site.toml")]
-    write_text(to_toml(sites_of(scene)), written[0])
+        return {}
+    found = {out.with_suffix(".site.toml"): to_toml(sites_of(scene))}
     log = attitude_log(scene, scene.seed, simulation.path)
     if log is not None:
-        written.append(out.with_suffix(".attitude.csv"))
-        write_text(log.to_csv(), written[1])
-    return written
+        found[out.with_suffix(".attitude.csv")] = log.to_csv()
+    return found
 
 
 def simulate(

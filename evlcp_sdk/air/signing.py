@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.files import write_new
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -36,7 +37,8 @@ def make_key(path: Path) -> str:
 
     Raises:
         ConfigError: The extra is not installed.
-        InputError: The file exists, or cannot be written.
+        InputError: The file exists.
+        OutputError: It cannot be written.
     """
     _check_installed()
     from cryptography.hazmat.primitives import serialization
@@ -47,12 +49,9 @@ def make_key(path: Path) -> str:
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     try:
-        path.touch(mode=0o600, exist_ok=False)
-        path.write_bytes(text)
+        write_new(text, path)
     except FileExistsError as fault:
         raise InputError(f"{path}: exists; a key is not overwritten") from fault
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be written: {fault.strerror}") from fault
     return public_key(key)
 
 

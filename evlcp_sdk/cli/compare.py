@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, complain, console, make_executor
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
     from rich.table import Table as Grid
@@ -78,6 +78,8 @@ def compare(
     and --set hold for all variants. The best of each column has a *. The last row is the Cramer-Rao bound of
     the frames' distances: no unbiased ranging from one frame can do better.
     """
+    from evlcp_sdk.files import check_output
+
     names = [path for path in out or [] if path.suffix not in (".csv", ".html", ".json")]
     if names:
         raise typer.BadParameter(
@@ -85,7 +87,8 @@ def compare(
         )
     for path in out or []:
         if not path.parent.is_dir():
-            raise ConfigError(f"{path}: cannot be written: no folder {path.parent}")
+            raise OutputError(f"{path}: cannot be written: no folder {path.parent}")
+        check_output(path, regular=False)
     if any(map(_is_campaign, recordings)):
         if variants or link_file or overrides or len(recordings) > 1:
             raise typer.BadParameter(
@@ -182,11 +185,13 @@ def _bar(job: CompareJob) -> Iterator[Callable[[int, int | None], None]]:
 
 
 def _write(comparison: "Comparison", paths: Sequence[Path]) -> None:
-    from evlcp_sdk.files import write_text
+    from evlcp_sdk.files import Outputs
 
-    for path in paths:
-        texts = {".csv": comparison.to_csv, ".html": comparison.to_html, ".json": comparison.to_json}
-        write_text(texts[path.suffix](), path)
+    texts = {".csv": comparison.to_csv, ".html": comparison.to_html, ".json": comparison.to_json}
+    with Outputs() as outputs:
+        for path in paths:
+            outputs.write_text(texts[path.suffix](), path)
+        outputs.commit()
 
 
 def _show(comparison: "Comparison", paths: Sequence[Path]) -> None:

@@ -78,9 +78,10 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     from evlcp_sdk.cli._campaign import progress_bar, show_faults
     from evlcp_sdk.cli._common import make_executor
     from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.files import Outputs, output_fault
     from evlcp_sdk.study.campaign.charts import charts_of, save_charts
     from evlcp_sdk.study.campaign.collect import collect
-    from evlcp_sdk.study.campaign.report import save_page
+    from evlcp_sdk.study.campaign.report import page
     from evlcp_sdk.study.campaign.store import Store
     from evlcp_sdk.study.campaign.summary import summarize
     from evlcp_sdk.study.campaign.task import plan_of, run_job
@@ -95,7 +96,7 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as fault:
-        raise ConfigError(f"{out}: cannot be written: {fault.strerror}") from fault
+        raise output_fault(out, fault) from fault
     results = out / f"{CAMPAIGN_NAME}.sqlite"
     for name in (results, *(results.with_name(results.name + end) for end in ("-wal", "-shm"))):
         with suppress(FileNotFoundError):
@@ -107,12 +108,14 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     show_faults(progress)
     if progress.faults:
         raise typer.Exit(max(fault.exit_code for _, fault in progress.faults))
-    save_charts(charts_of(summary), summary.name, out)
-    try:
-        save_page(summary, out / "report.html")
-        written = f"{out}/report.html, ber.png, rmse.png and more, {results}"
-    except ConfigError as fault:
-        written = f"{out}/ber.png, rmse.png and more, {results}; {fault}"
+    with Outputs() as outputs:
+        save_charts(charts_of(summary), summary.name, out, outputs)
+        try:
+            outputs.write_text(page(summary), out / "report.html")
+            written = f"{out}/report.html, ber.png, rmse.png and more, {results}"
+        except ConfigError as fault:
+            written = f"{out}/ber.png, rmse.png and more, {results}; {fault}"
+        outputs.commit()
     if as_json:
         typer.echo(json.dumps(summary.to_dict()))
         return

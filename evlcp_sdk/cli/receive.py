@@ -244,6 +244,11 @@ def _until(stopped: Callable[[], bool], jobs: Sequence[ReceiveJob]) -> Iterator[
 def _jobs(recordings: Sequence[str], out: Path) -> list[ReceiveJob]:
     if len(recordings) == 1:
         return [ReceiveJob(recordings[0], out)]
+    for url in recordings:
+        if _stem(url) in ("", ".", ".."):
+            raise typer.BadParameter(
+                f"{url}: gives no name of a folder in {out}; receive it by itself", param_hint="REC..."
+            )
     jobs = [ReceiveJob(url, out / _stem(url)) for url in recordings]
     folders = [job.folder for job in jobs]
     for job in jobs:

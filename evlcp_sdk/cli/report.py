@@ -51,8 +51,9 @@ def report(
     """
     import json
 
+    from evlcp_sdk.files import Outputs
     from evlcp_sdk.study.campaign.charts import charts_of, save_charts
-    from evlcp_sdk.study.campaign.report import save_page
+    from evlcp_sdk.study.campaign.report import page
     from evlcp_sdk.study.campaign.store import Store
     from evlcp_sdk.study.campaign.summary import summarize
 
@@ -60,11 +61,13 @@ def report(
         raise typer.BadParameter("give one of --markdown and --json", param_hint="--json")
     with Store(results) as store:
         summary = summarize(store)
-    if out is not None:
-        save_page(summary, out)
     folder = figures or (out.parent / f"{out.stem}-figures" if out is not None else None)
-    if folder is not None:
-        save_charts(charts_of(summary), summary.name, folder)
+    with Outputs() as outputs:
+        if folder is not None:
+            save_charts(charts_of(summary), summary.name, folder, outputs)
+        if out is not None:
+            outputs.write_text(page(summary), out)
+        outputs.commit()
     if as_json:
         typer.echo(json.dumps(summary.to_dict(), indent=1))
     elif markdown:

@@ -40,9 +40,9 @@ def score(
     from evlcp_sdk.study.score import link_of_result, score_frames
 
     registry = Registry.load()
+    link = link_of_result(folder, registry)
     frames = read_frames(folder)
     truth = read_truth(truth_file, registry)
-    link = link_of_result(folder, registry)
     if link is None:
         complain(f"{folder}/summary.json: not there, so nothing says with which link it was received")
     else:

@@ -6,6 +6,7 @@ from typing import Final
 from urllib.parse import unquote
 
 from evlcp_sdk.errors import EvlcpError, InputError, StreamError
+from evlcp_sdk.files import Outputs
 from evlcp_sdk.io.faery import FORMATS, FaerySource
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
 from evlcp_sdk.io.tables import CSV_HEADER, CsvSource, CsvWriter, NpzSource, NpzWriter
@@ -114,6 +115,7 @@ def open_writer(
     width: int | None = None,
     height: int | None = None,
     format: str | None = None,
+    outputs: Outputs | None = None,
 ) -> EventWriter:
     """Create a recording to write piece by piece, a context manager.
 
@@ -122,22 +124,23 @@ def open_writer(
         width: Columns of the sensor; RAW needs it, the tables do not.
         height: Rows of the sensor, likewise.
         format: `EVT3` (the default for `.raw`), `EVT2`, `NPZ` or `CSV`, whatever the file's name.
+        outputs: The files that it comes into place with; None for alone, as soon as it is closed.
 
     Raises:
-        EvlcpError: The file cannot be written.
+        OutputError: The file cannot be written.
         StreamError: The format is unknown, or width and height are missing for RAW.
     """
     name = (format or WRITABLE.get(_suffix(Path(path)), "")).upper()
     if name == "NPZ":
-        return NpzWriter(path, width, height)
+        return NpzWriter(path, width, height, outputs)
     if name == "CSV":
-        return CsvWriter(path, width, height)
+        return CsvWriter(path, width, height, outputs)
     if name not in CODECS:
         found = f"format {format!r}" if format else f"suffix {_suffix(Path(path))!r}"
         raise StreamError(f"{path}: {found}, expected {', '.join(WRITABLE)} or format EVT2, EVT3, NPZ, CSV")
     if width is None or height is None:
         raise StreamError(f"{path}: sensor of {width}x{height}, expected a width and a height for {name}")
-    return RawWriter(path, width, height, CODECS[name])
+    return RawWriter(path, width, height, CODECS[name], outputs)
 
 
 def write_events(
@@ -151,7 +154,7 @@ def write_events(
     """Save events and triggers, sorted by time, as a recording; arguments as for `open_writer`.
 
     Raises:
-        EvlcpError: The file cannot be written.
+        OutputError: The file cannot be written.
         StreamError: The format is unknown or has no place for a value or for triggers, or times run backward.
     """
     with open_writer(path, width, height, format) as writer:

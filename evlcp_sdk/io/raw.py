@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from evlcp_sdk.errors import InputError, RawFormatError, StreamError
+from evlcp_sdk.files import Outputs
 from evlcp_sdk.io import _words
 from evlcp_sdk.io._codec import MAX_SIDE, Codec, Columns, Decoder
 from evlcp_sdk.io.evt2 import EVT2
@@ -334,9 +335,10 @@ class RawWriter(EventWriter):
         width: Columns of the sensor.
         height: Rows of the sensor.
         codec: `EVT3` or `EVT2`.
+        outputs: See `EventWriter`.
 
     Raises:
-        EvlcpError: The file cannot be written.
+        OutputError: The file cannot be written.
         StreamError: The sensor is larger than the words can address.
     """
 
@@ -344,10 +346,17 @@ class RawWriter(EventWriter):
     # 16.8 s) the writer lets it roll over that often; this keeps those words below 1 MB.
     times_us = (0, (1 << 40) - 1)
 
-    def __init__(self, path: Path | str, width: int, height: int, codec: Codec = EVT3) -> None:
+    def __init__(
+        self,
+        path: Path | str,
+        width: int,
+        height: int,
+        codec: Codec = EVT3,
+        outputs: Outputs | None = None,
+    ) -> None:
         if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
             raise StreamError(f"{path}: sensor of {width}x{height}, expected 1 to {MAX_SIDE} each")
-        super().__init__(path, width, height)
+        super().__init__(path, width, height, outputs)
         self.channels = codec.channels
         self._columns = width
         self._codec = codec

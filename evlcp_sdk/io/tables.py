@@ -14,7 +14,8 @@ from typing import IO, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import InputError, StreamError
+from evlcp_sdk.errors import InputError, OutputError, StreamError
+from evlcp_sdk.files import Outputs
 from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.io.writers import LAST_TIME_US, EventWriter
 from evlcp_sdk.plugin.source import EventSource, Loss
@@ -238,18 +239,30 @@ class NpzWriter(EventWriter):
         path: The file.
         width: Columns of the sensor, or None if unknown.
         height: Rows of the sensor, or None.
+        outputs: See `EventWriter`.
 
     Raises:
-        EvlcpError: The file cannot be written.
+        OutputError: The file cannot be written.
     """
 
-    def __init__(self, path: Path | str, width: int | None = None, height: int | None = None) -> None:
-        super().__init__(path, width, height)
+    def __init__(
+        self,
+        path: Path | str,
+        width: int | None = None,
+        height: int | None = None,
+        outputs: Outputs | None = None,
+    ) -> None:
+        super().__init__(path, width, height, outputs)
         self._stack = ExitStack()
-        self._spools: dict[str, IO[bytes]] = {
-            name: self._stack.enter_context(tempfile.TemporaryFile(dir=self._target.parent))  # noqa: SIM115
-            for name in WIRE_TYPES
-        }
+        try:
+            with self._outputs.told(self.path):
+                self._spools: dict[str, IO[bytes]] = {
+                    name: self._stack.enter_context(tempfile.TemporaryFile(dir=self.path.parent))  # noqa: SIM115
+                    for name in WIRE_TYPES
+                }
+        except OutputError:
+            self.discard()
+            raise
 
     def _write(self, events: Events, triggers: Triggers) -> None:
         event_columns = (events.t_us, events.x, events.y, events.p)
@@ -382,13 +395,20 @@ class CsvWriter(EventWriter):
         path: The file.
         width: Columns of the sensor, or None if unknown; only checked, the file does not say it.
         height: Rows of the sensor, or None.
+        outputs: See `EventWriter`.
 
     Raises:
-        EvlcpError: The file cannot be written.
+        OutputError: The file cannot be written.
     """
 
-    def __init__(self, path: Path | str, width: int | None = None, height: int | None = None) -> None:
-        super().__init__(path, width, height)
+    def __init__(
+        self,
+        path: Path | str,
+        width: int | None = None,
+        height: int | None = None,
+        outputs: Outputs | None = None,
+    ) -> None:
+        super().__init__(path, width, height, outputs)
         self._out: IO[bytes] | gzip.GzipFile = self._file
         if self.path.suffix == ".gz":
             self._out = gzip.GzipFile("", "wb", 6, self._file, 0)  # no name, no time: same events, same bytes

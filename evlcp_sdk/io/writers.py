@@ -1,6 +1,5 @@
 """What every file that events are written to has in common."""
 
-import os
 from abc import ABC, abstractmethod
 from pathlib import Path
 from types import TracebackType
@@ -9,7 +8,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import EvlcpError, StreamError
+from evlcp_sdk.errors import OutputError, StreamError
+from evlcp_sdk.files import Outputs
 from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["LAST_TIME_US", "EventWriter"]
@@ -21,16 +21,17 @@ LAST_TIME_US = 10**18 - 1
 class EventWriter(ABC):
     """A recording being written, piece by piece; a context manager.
 
-    The file appears under its name only when it is complete: it grows beside it, as `.NAME.PID.part`, and
-    an exception in the `with` block removes it. What is not a regular file (a pipe) is written directly.
+    The file appears under its name only when it is complete: it grows in a hidden place beside it, and an
+    exception in the `with` block removes it. What is not a regular file (a pipe) is written directly.
 
     Args:
         path: The file; an existing one is replaced.
         width: Columns of the sensor, or None if unknown; no event may lie outside.
         height: Rows of the sensor, or None.
+        outputs: The files that it comes into place with; None for alone, as soon as it is closed.
 
     Raises:
-        EvlcpError: The file cannot be written.
+        OutputError: The file cannot be written.
     """
 
     times_us = (-LAST_TIME_US, LAST_TIME_US)
@@ -38,25 +39,23 @@ class EventWriter(ABC):
     channels = 256
     """Trigger inputs that can be written."""
 
-    def __init__(self, path: Path | str, width: int | None, height: int | None) -> None:
+    def __init__(
+        self, path: Path | str, width: int | None, height: int | None, outputs: Outputs | None = None
+    ) -> None:
         self.path = Path(path)
         self.width = width
         self.height = height
         self._last_us: int | None = None
-        self._target = Path(os.path.realpath(path))
-        special = self._target.exists() and not self._target.is_file()
-        part = self._target.with_name(f".{self._target.name}.{os.getpid()}.part")
-        self._part = self._target if special else part
-        try:
-            self._file = self._part.open("wb")
-        except OSError as error:
-            raise EvlcpError(f"{path}: cannot be written: {error.strerror}") from error
+        self._alone = outputs is None
+        self._outputs = Outputs() if outputs is None else outputs
+        with self._outputs.told(self.path):
+            self._file = self._outputs.open_binary(self.path)
 
     def write(self, events: Events, triggers: Triggers | None = None) -> None:
         """Append events and triggers, each sorted by time and none before what was written before.
 
         Raises:
-            EvlcpError: The file cannot be written.
+            OutputError: The file cannot be written.
             StreamError: Times run backward, or a value has no place in the file; nothing is written then.
         """
         if triggers is None:
@@ -70,10 +69,8 @@ class EventWriter(ABC):
         self._check("event", "p", events.p, 2)
         self._check("trigger", "channel", triggers.channel, self.channels)
         self._check("trigger", "value", triggers.value, 2)
-        try:
+        with self._outputs.told(self.path):
             self._write(events, triggers)
-        except OSError as error:
-            raise EvlcpError(f"{self.path}: cannot be written: {error.strerror}") from error
         lasts = [int(column[-1]) for column in (events.t_us, triggers.t_us) if len(column)]
         if lasts:
             self._last_us = max(lasts)
@@ -90,24 +87,23 @@ class EventWriter(ABC):
         """Complete the file and give it its name; twice does no harm.
 
         Raises:
-            EvlcpError: The file cannot be written.
+            OutputError: The file cannot be written.
         """
         if self._file.closed:
             return
         try:
-            self._finish()
-            self._file.close()
-            if self._part != self._target:
-                self._part.replace(self._target)
-        except OSError as error:
+            with self._outputs.told(self.path):
+                self._finish()
+                self._file.close()
+            if self._alone:
+                self._outputs.commit()
+        except OutputError:
             self.discard()
-            raise EvlcpError(f"{self.path}: cannot be written: {error.strerror}") from error
+            raise
 
     def discard(self) -> None:
         """Remove what has been written; a file that had the name before stays as it was."""
-        self._file.close()
-        if self._part != self._target:
-            self._part.unlink(missing_ok=True)
+        self._outputs.discard()
 
     def _check_times(self, t_us: NDArray[np.int64], what: str) -> None:
         if not len(t_us):

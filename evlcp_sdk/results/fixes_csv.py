@@ -2,6 +2,7 @@
 
 import csv
 
+from evlcp_sdk.files import defused
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
@@ -53,7 +54,7 @@ class FixesCsv(Sink):
                 text_or_empty(fix.roll_deg, 4),
                 " ".join(map(str, fix.transmitters)),
                 str(int(fix.verified)),
-                fix.refusal,
-                fix.detail,
+                defused(fix.refusal),
+                defused(fix.detail),
             ]
         )

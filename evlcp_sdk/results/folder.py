@@ -1,20 +1,19 @@
 """The folder of a result: a run's files come into place together, or not at all."""
 
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, BinaryIO, Self, TextIO
+from typing import Any, BinaryIO, Self, TextIO
 
-from evlcp_sdk.errors import ConfigError, EvlcpError
-from evlcp_sdk.files import hidden_path
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.files import Outputs, check_output, check_sha256, output_fault, read_json
 from evlcp_sdk.plugin.records import SUMMARY
 
-__all__ = ["ResultFolder"]
+__all__ = ["ResultFolder", "check_result_file", "read_summary"]
 
 
 class ResultFolder:
-    """Files under hidden names beside the final ones, which `finish` moves into place; a context manager.
+    """Files in a hidden place of their own, which `finish` moves into the folder; a context manager.
 
     Until then, and after a crash, an earlier result stays as it was.
 
@@ -24,75 +23,75 @@ class ResultFolder:
             the end.
 
     Raises:
-        ConfigError: The folder cannot be written.
+        OutputError: The folder cannot be written, or something in it that is no regular file has such a name.
     """
 
     def __init__(self, folder: Path, files: Iterable[str]) -> None:
         self.folder = folder
         self._files = tuple(dict.fromkeys((*files, SUMMARY)))
-        self._used: list[str] = []
-        self._open: list[IO[Any]] = []
+        self._used: set[str] = set()
+        self._outputs = Outputs()
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as fault:
-            raise ConfigError(f"{folder}: cannot be written: {fault.strerror}") from fault
+            raise output_fault(folder, fault) from fault
+        for name in self._files:
+            check_output(folder / name)
 
     def path(self, name: str) -> Path:
-        """The hidden path of a file.
+        """Where a file is to be written until the run ends; nothing is there yet.
 
         Raises:
             ValueError: It is not among the files that a run may leave.
+            OutputError: It cannot be written.
         """
-        if name not in self._files:
-            raise ValueError(f"'{name}' is not among the files of its record")
-        if name not in self._used:
-            self._used.append(name)
-        return hidden_path(self.folder, name)
+        return self._outputs.path(self._place(name))
 
     def open(self, name: str) -> TextIO:
         """A text file, UTF-8, line ends as written; it is closed with the folder.
 
         Raises:
             ValueError: It is not among the files that a run may leave.
-            OSError: It cannot be written.
+            OutputError: It cannot be written.
+            OSError: Likewise.
         """
-        file = self.path(name).open("w", encoding="utf-8", newline="")
-        self._open.append(file)
-        return file
+        return self._outputs.open(self._place(name))
 
     def open_binary(self, name: str) -> BinaryIO:
         """A binary file; it is closed with the folder.
 
         Raises:
             ValueError: It is not among the files that a run may leave.
-            OSError: It cannot be written.
+            OutputError: It cannot be written.
+            OSError: Likewise.
         """
-        file = self.path(name).open("wb")
-        self._open.append(file)
-        return file
+        return self._outputs.open_binary(self._place(name))
 
-    def finish(self) -> None:
-        """Move all files into place and drop what an earlier run left.
+    def _place(self, name: str) -> Path:
+        if name not in self._files:
+            raise ValueError(f"'{name}' is not among the files of its record")
+        self._used.add(name)
+        return self.folder / name
 
-        The summary comes last: where it is, the result is complete.
+    def digests(self) -> dict[str, dict[str, Any]]:
+        """Size in bytes and SHA-256 of each file, by name; they are closed.
 
         Raises:
-            EvlcpError: A file cannot be written, e.g. the disk is full.
+            OutputError: A file cannot be written, e.g. the disk is full.
         """
-        try:
-            self._close()
-            for name in sorted(self._files, key=lambda name: name == SUMMARY):
-                hidden = hidden_path(self.folder, name)
-                if name in self._used and hidden.exists():
-                    hidden.replace(self.folder / name)
-                else:
-                    (self.folder / name).unlink(missing_ok=True)
-        except OSError as fault:
-            raise EvlcpError(f"{self.folder}: cannot be written: {fault.strerror}") from fault
+        with self._outputs.told(self.folder):
+            return self._outputs.digests()
 
-    def _close(self) -> None:
-        for file in self._open:
-            file.close()
+    def finish(self) -> None:
+        """Move all files into place, the one that was asked for last behind the others, and drop old ones.
+
+        Raises:
+            OutputError: A file cannot be written, e.g. the disk is full.
+        """
+        for name in self._files:
+            if name not in self._used:
+                self._outputs.drop(self.folder / name)
+        self._outputs.commit()
 
     def __enter__(self) -> Self:
         return self
@@ -101,9 +100,39 @@ class ResultFolder:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Drop what `finish` has not moved into place."""
-        for file in self._open:
-            # A file that could not be written cannot be flushed either, and is dropped.
-            with suppress(OSError):
-                file.close()
-        for name in self._used:
-            hidden_path(self.folder, name).unlink(missing_ok=True)
+        self._outputs.discard()
+
+
+def read_summary(folder: Path | str) -> dict[str, Any] | None:
+    """What a result's `summary.json` says; None where there is none.
+
+    Raises:
+        InputError: It cannot be read, is no object, or says that the files are unfinished.
+    """
+    path = Path(folder) / SUMMARY
+    if not path.exists():
+        return None
+    table = read_json(path)
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: expected an object")
+    return table
+
+
+def check_result_file(folder: Path | str, name: str, summary: Mapping[str, Any]) -> None:
+    """See that a file of a result is the one that its summary speaks of.
+
+    Args:
+        folder: The result.
+        name: Name of the file.
+        summary: What `read_summary` found.
+
+    Raises:
+        InputError: The summary does not name it, or it is another file.
+    """
+    path = Path(folder) / SUMMARY
+    files = summary.get("files")
+    entry = files.get(name) if isinstance(files, dict) else None
+    digest = entry.get("sha256") if isinstance(entry, dict) else None
+    if not isinstance(digest, str):
+        raise InputError(f"{path}: files.{name}.sha256 = {digest!r:.40}: expected the file's SHA-256")
+    check_sha256(Path(folder) / name, digest, SUMMARY)

@@ -7,7 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from evlcp_sdk.errors import ConfigError, EvlcpError, PluginError
+from evlcp_sdk.errors import EvlcpError, PluginError
+from evlcp_sdk.files import output_fault
 from evlcp_sdk.place.navigator import Placed, Settled
 from evlcp_sdk.plugin.records import InstalledSink
 from evlcp_sdk.results.folder import ResultFolder
@@ -36,7 +37,7 @@ def load_sinks(chosen: Sequence[InstalledSink]) -> list[tuple[InstalledSink, typ
 class Sinks:
     """Hands on what a run finds to each of its sinks.
 
-    What a sink raises becomes a `PluginError` that names it, or an `EvlcpError` where the disk refuses.
+    What a sink raises becomes a `PluginError` that names it, or an `OutputError` where the disk refuses.
 
     Args:
         classes: The sinks with their classes, in the order in which they are called.
@@ -44,7 +45,7 @@ class Sinks:
         run: What is written down.
 
     Raises:
-        ConfigError: A file cannot be opened.
+        OutputError: A file cannot be opened.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class Sinks:
         self._folder = folder
         self._sinks: list[tuple[InstalledSink, Sink]] = []
         for installed, cls in classes:
-            with self._blame(installed, ConfigError):
+            with self._blame(installed):
                 self._sinks.append((installed, cls(folder, run)))
 
     @property
@@ -99,14 +100,13 @@ class Sinks:
         return said
 
     @contextmanager
-    def _blame(self, installed: InstalledSink, refused: type[EvlcpError] = EvlcpError) -> Iterator[None]:
+    def _blame(self, installed: InstalledSink) -> Iterator[None]:
         try:
             yield
         except EvlcpError:
             raise
         except OSError as fault:
-            why = fault.strerror or fault
-            raise refused(f"{self._folder.folder}: cannot be written: {why}") from fault
+            raise output_fault(self._folder.folder, fault) from fault
         except Exception as fault:
             last = traceback.extract_tb(fault.__traceback__)[-1]
             what = f"{type(fault).__name__}: {fault}".splitlines()[0]

@@ -4,7 +4,8 @@ import json
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from evlcp_sdk.errors import ConfigError, EvlcpError
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import output_fault
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.records import SUMMARY
 from evlcp_sdk.results.doubts import warnings_of
@@ -71,12 +72,12 @@ def write_summary(table: Mapping[str, Any], folder: ResultFolder) -> None:
     """Write `summary.json`.
 
     Raises:
-        EvlcpError: It cannot be written.
+        OutputError: It cannot be written.
     """
     try:
         folder.open(SUMMARY).write(json.dumps(table, indent=2) + "\n")
     except OSError as fault:
-        raise EvlcpError(f"{folder.folder}: cannot be written: {fault.strerror}") from fault
+        raise output_fault(folder.folder, fault) from fault
 
 
 def _messages_off(link: Link) -> str | None:

@@ -34,7 +34,8 @@ class ResultWriter:
         sinks: Output formats beside the default ones, by name.
 
     Raises:
-        ConfigError: The folder cannot be written, or a sink cannot be used.
+        OutputError: The folder cannot be written.
+        ConfigError: A sink cannot be used.
         PluginError: A sink fails.
     """
 
@@ -68,7 +69,7 @@ class ResultWriter:
         """Take the receiver's next packets.
 
         Raises:
-            EvlcpError: A file cannot be written, e.g. the disk is full.
+            OutputError: A file cannot be written, e.g. the disk is full.
             PluginError: A sink fails.
         """
         for packet in packets:
@@ -100,7 +101,7 @@ class ResultWriter:
             The content of `summary.json`.
 
         Raises:
-            EvlcpError: A file cannot be written, e.g. the disk is full.
+            OutputError: A file cannot be written, e.g. the disk is full.
             PluginError: A sink fails.
         """
         positions = None
@@ -122,6 +123,7 @@ class ResultWriter:
             positions=positions,
             sinks=self._sinks.finish(),
         )
+        table["files"] = self._folder.digests()
         write_summary(table, self._folder)
         self._folder.finish()
         return table

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.files import read_csv
+from evlcp_sdk.results.folder import check_result_file, read_summary
 from evlcp_sdk.values import Frame, Packet
 
 __all__ = ["GivenFrame", "frames_of", "given", "read_frames"]
@@ -59,6 +60,8 @@ def frames_of(packets: Iterable[Packet]) -> list[GivenFrame]:
     return [given(frame) for packet in packets for frame in packet.frames]
 
 
+FRAMES = "frames.csv"
+
 _NEEDED = ("transmitter", "t_us", "symbols", "distance_m", "x_px", "y_px")
 
 
@@ -69,9 +72,13 @@ def read_frames(folder: Path | str) -> list[GivenFrame]:
     distance_filtered_m and echo_of are read where they are there.
 
     Raises:
-        InputError: It is not there, a column is missing, or a value is not a number; with file and line.
+        InputError: It is not there, it is not the file that `summary.json` beside it speaks of, a column is
+            missing, or a value is not a number; with file and line.
     """
-    path = Path(folder) / "frames.csv"
+    path = Path(folder) / FRAMES
+    summary = read_summary(folder)
+    if summary is not None:
+        check_result_file(folder, FRAMES, summary)
     names, rows = read_csv(path)
     missing = [name for name in _NEEDED if name not in names]
     if missing:

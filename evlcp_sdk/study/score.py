@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.files import read_json
 from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.plugin.records import SUMMARY
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.results.folder import read_summary
 from evlcp_sdk.sim.truth import Truth
 from evlcp_sdk.study.frames import GivenFrame
 from evlcp_sdk.study.match import match
@@ -146,11 +147,10 @@ def link_of_result(folder: Path | str, registry: Registry | None = None) -> Link
         InputError: The file cannot be read, or does not say a configuration.
         ConfigError: The configuration cannot be resolved here.
     """
-    path = Path(folder) / "summary.json"
-    if not path.exists():
+    summary = read_summary(folder)
+    if summary is None:
         return None
-    summary = read_json(path)
-    table = summary.get("configuration") if isinstance(summary, dict) else None
+    path, table = Path(folder) / SUMMARY, summary.get("configuration")
     if not isinstance(table, dict):
         raise InputError(f"{path}: configuration: expected a table")
     try:

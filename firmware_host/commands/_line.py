@@ -46,7 +46,7 @@ class BoardLine:
     @contextlib.contextmanager
     def open(self) -> "Iterator[Board]":
         """The board on the line, or the recorded one."""
-        from evlcp_sdk.errors import ConfigError, EvlcpError
+        from evlcp_sdk.errors import ConfigError, OutputError
         from firmware_host.board.board import Board
         from firmware_host.board.session import Session
         from firmware_host.board.survey import find
@@ -70,11 +70,10 @@ class BoardLine:
                 draw = random.SystemRandom()
                 first, nonce = draw.randrange(1 << 16), draw.randrange(1 << 32)
                 try:
-                    file = self.trace.open("w", encoding="utf-8")
-                except OSError as fault:
+                    transport = TraceTransport(transport, self.trace, baud, first, nonce)
+                except OutputError:
                     transport.close()
-                    raise EvlcpError(f"{self.trace}: cannot be written: {fault.strerror}") from fault
-                transport = TraceTransport(transport, file, baud, first, nonce)
+                    raise
         with Session(transport, Timing(baud), first, nonce) as session:
             yield Board(session)
 

@@ -1,4 +1,4 @@
-"""What commands write; a file is there whole or as it was before."""
+"""What commands write; files are there whole and together, or as they were before."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -7,18 +7,23 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from evlcp_sdk.files import Outputs
+
 __all__ = ["save_array"]
 
 
-def save_array(path: Path, array: "NDArray[np.generic]") -> None:
+def save_array(path: Path, array: "NDArray[np.generic]", outputs: "Outputs") -> None:
     """Write an array as `.npy` under exactly this name.
 
+    Args:
+        path: The file.
+        array: What it holds.
+        outputs: The files that it comes into place with.
+
     Raises:
-        EvlcpError: The file cannot be written.
+        OutputError: The file cannot be written.
     """
     import numpy as np
 
-    from evlcp_sdk.files import whole_file
-
-    with whole_file(path) as part, part.open("wb") as file:
-        np.save(file, array)
+    with outputs.told(path):
+        np.save(outputs.open_binary(path), array)

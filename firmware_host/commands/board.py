@@ -545,6 +545,7 @@ def leds(
     For example: [bold]evlcp board leds leds.bin --chips chips.npy[/]
     """
     from evlcp_sdk.errors import ConfigError, InputError
+    from evlcp_sdk.files import Outputs
     from firmware_host.commands._output import save_array
     from firmware_host.emulators.led_record import LedRecord
 
@@ -553,8 +554,10 @@ def leds(
         table = played.chips(96 if per_led else 16)
     except ConfigError as fault:
         raise InputError(f"{record}: {fault}") from fault
-    save_array(chips, table)
-    save_array(chips.with_suffix(".ticks.npy"), played.ticks)
+    with Outputs() as outputs:
+        save_array(chips, table, outputs)
+        save_array(chips.with_suffix(".ticks.npy"), played.ticks, outputs)
+        outputs.commit()
     typer.echo(f"{len(played)} chips")
     if played.cut_bytes:
         raise InputError(

@@ -76,6 +76,7 @@ def message(
     import json
 
     from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.files import Outputs
     from evlcp_sdk.link.compose import messages_of, packets_of, utf8
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
@@ -100,14 +101,14 @@ def message(
     )
     symbols = packets_of(messages, link.block_coder(), repeat)
     table = symbols_table(symbols, link, messages=True)
-    if out is not None:
-        from evlcp_sdk.files import write_text
+    with Outputs() as outputs:
+        if chips is not None:
+            from firmware_host.board.bank import symbol_chips
 
-        write_text(json.dumps(table) + "\n", out)
-    if chips is not None:
-        from firmware_host.board.bank import symbol_chips
-
-        save_array(chips, symbol_chips(symbols, link.codebook, link.packet.pilot_every))
+            save_array(chips, symbol_chips(symbols, link.codebook, link.packet.pilot_every), outputs)
+        if out is not None:
+            outputs.write_text(json.dumps(table) + "\n", out)
+        outputs.commit()
     programmed = None if port is None else _program(symbols, link, port, baud)
     packet_s = link.packet.packet_chips / link.air.chip_rate_hz
     summary: dict[str, Any] = {

@@ -57,9 +57,12 @@ def frames(
     """
     table, link = _source.symbols(symbols, random, seed, link_file, overrides)
     if chips is not None:
+        from evlcp_sdk.files import Outputs
         from firmware_host.board.bank import symbol_chips
 
-        save_array(chips, symbol_chips(table, link.codebook, link.packet.pilot_every))
+        with Outputs() as outputs:
+            save_array(chips, symbol_chips(table, link.codebook, link.packet.pilot_every), outputs)
+            outputs.commit()
     typer.echo(_FORMS[form](table, link))
 
 

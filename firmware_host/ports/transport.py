@@ -8,10 +8,12 @@ import json
 import select
 import socket
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any, Protocol
 
 from evlcp_sdk.errors import InputError
+from evlcp_sdk.files import open_log, output_fault
 from firmware_host.errors import LineError, NoBoardError
 from firmware_host.protocol.requests import DEFAULT_BAUD
 
@@ -175,20 +177,37 @@ class TraceTransport:
 
     The first line has port, line rate and what the client drew at random; each further one is
     `{"t": seconds, "dir": "tx" | "rx", "hex": bytes}`.
+
+    Args:
+        inner: The line.
+        path: The file.
+        baud: Line rate, bit/s.
+        first: First sequence number that the client drew.
+        nonce: Session number that it drew.
+
+    Raises:
+        OutputError: The file cannot be written; so do `read`, `write` and `close`.
     """
 
-    def __init__(self, inner: Transport, file: TextIO, baud: int, first: int, nonce: int) -> None:
+    def __init__(self, inner: Transport, path: Path, baud: int, first: int, nonce: int) -> None:
         self.name = inner.name
         self._inner = inner
-        self._file = file
+        self._path = path
+        self._file = open_log(path)
         self._start = inner.now()
         head = {"evlcp_trace": 1, "port": inner.name, "baud": baud, "first": first, "nonce": nonce}
-        file.write(json.dumps(head) + "\n")
+        self._put(head)
 
     def _note(self, direction: str, data: bytes) -> None:
         if data:
             line = {"t": round(self._inner.now() - self._start, 6), "dir": direction, "hex": data.hex()}
+            self._put(line)
+
+    def _put(self, line: Mapping[str, Any]) -> None:
+        try:
             self._file.write(json.dumps(line) + "\n")
+        except OSError as fault:
+            raise output_fault(self._path, fault) from fault
 
     def now(self) -> float:
         """The inner line's time, s."""
@@ -208,7 +227,10 @@ class TraceTransport:
     def close(self) -> None:
         """Close line and file."""
         self._inner.close()
-        self._file.close()
+        try:
+            self._file.close()
+        except OSError as fault:
+            raise output_fault(self._path, fault) from fault
 
 
 class ReplayTransport:

@@ -49,6 +49,7 @@ NAMES = [
     "Message",
     "MessageKind",
     "Modulation",
+    "OutputError",
     "Packet",
     "PacketFormat",
     "Pilots",

@@ -1,11 +1,25 @@
 """Files read and written whole."""
 
+import csv
+import io
+import json
+import os
+import re
+import stat
+import threading
 from pathlib import Path
 
 import pytest
 
-from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
-from evlcp_sdk.files import read_csv, read_json, whole_file, write_text
+from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, OutputError
+from evlcp_sdk.files import (
+    Outputs,
+    defused,
+    open_log,
+    read_csv,
+    read_json,
+    write_new,
+)
 from evlcp_sdk.specs import parse_value, read_toml
 
 
@@ -44,9 +58,15 @@ def test_values(text: str, value: object) -> None:
     assert parse_value(text) == value
 
 
+def write_text(text: str, path: Path) -> None:
+    with Outputs() as outputs:
+        outputs.write_text(text, path)
+        outputs.commit()
+
+
 def break_off(path: Path) -> None:
-    with whole_file(path) as part:
-        part.write_text("half")
+    with Outputs() as outputs:
+        outputs.path(path).write_text("half")
         raise KeyError
 
 
@@ -56,19 +76,19 @@ def test_an_earlier_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> Non
     with pytest.raises(KeyError):
         break_off(path)
     assert path.read_text() == "old"
-    with whole_file(path) as part:
-        part.write_text("new")
+    with Outputs() as outputs:
+        outputs.path(path).write_text("new")
         assert path.read_text() == "old"
+        outputs.commit()
     assert path.read_text() == "new"
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(self: Path, *_args: object, **_kwargs: object) -> None:
-        self.touch()
+    def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr("os.fsync", full)
     with pytest.raises(EvlcpError, match=r"a\.txt: cannot be written: No space left"):
         write_text("x", tmp_path / "a.txt")
     assert list(tmp_path.iterdir()) == []
@@ -77,6 +97,155 @@ def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, monkeypatch: py
 def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
     with pytest.raises(EvlcpError, match=r"a\.txt: cannot be written: No such file"):
         write_text("x", tmp_path / "none" / "a.txt")
+
+
+def test_hidden_places_cannot_be_known_before(tmp_path: Path) -> None:
+    """Who plants links under the names that a process would use reaches nothing."""
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    (tmp_path / f".a.txt.{os.getpid()}.part").symlink_to(victim)
+    write_text("x", tmp_path / "a.txt")
+    assert victim.read_text() == "mine"
+    stages = set()
+    for _ in range(20):
+        with Outputs() as outputs:
+            stage = outputs.path(tmp_path / "a.txt").parent
+            assert stat.S_IMODE(stage.stat().st_mode) == 0o700
+            assert stage.parent == tmp_path
+            stages.add(stage)
+    assert len(stages) == 20
+    assert not any(stage.exists() for stage in stages)
+
+
+@pytest.mark.parametrize("dangling", [False, True])
+def test_links_are_neither_followed_nor_replaced(tmp_path: Path, dangling: bool) -> None:
+    victim, link = tmp_path / "victim", tmp_path / "a.txt"
+    if not dangling:
+        victim.write_text("mine")
+    link.symlink_to(victim)
+    for write in (lambda: write_text("x", link), lambda: open_log(link)):
+        with pytest.raises(OutputError, match=r"a\.txt: cannot be written: it is a link; name the file"):
+            write()
+    assert link.is_symlink()
+    assert victim.exists() is not dangling
+    with pytest.raises(FileExistsError):
+        write_new(b"x", link)
+    with Outputs() as outputs:
+        outputs.write_text("x", tmp_path / "b.txt")
+        (tmp_path / "b.txt").symlink_to(victim)
+        with pytest.raises(OutputError, match=r"b\.txt: cannot be written: it is a link"):
+            outputs.commit()
+    assert (tmp_path / "b.txt").is_symlink()
+    assert dangling or victim.read_text() == "mine"
+
+
+def test_a_pipe_is_written_and_stays(tmp_path: Path) -> None:
+    pipe, said = tmp_path / "pipe", []
+    os.mkfifo(pipe)
+    reader = threading.Thread(target=lambda: said.append(pipe.read_text()))
+    reader.start()
+    write_text("through", pipe)
+    reader.join(10)
+    assert said == ["through"]
+    assert stat.S_ISFIFO(pipe.lstat().st_mode)
+    assert list(tmp_path.iterdir()) == [pipe]
+
+
+@pytest.mark.parametrize(("minor", "full"), [(3, False), (7, True)])
+def test_a_device_is_written_and_stays(tmp_path: Path, minor: int, full: bool) -> None:
+    device = tmp_path / "device"
+    try:
+        os.mknod(device, 0o666 | stat.S_IFCHR, os.makedev(1, minor))
+        device.read_bytes() if not full else None
+    except OSError:
+        pytest.skip("devices cannot be made here")
+    for write in (write_text, lambda text, path: open_log(path).close()):
+        if full and write is write_text:
+            with pytest.raises(OutputError, match="device: cannot be written: No space left"):
+                write("x" * 100_000, device)
+        else:
+            write("x", device)
+    assert stat.S_ISCHR(device.lstat().st_mode)
+    assert list(tmp_path.iterdir()) == [device]
+
+
+def put(folder: Path, text: str) -> None:
+    with Outputs() as outputs:
+        for name in ("a.csv", "b.csv", "seal.json"):
+            outputs.write_text(json.dumps(text), folder / name)
+        outputs.drop(folder / "old.csv")
+        outputs.commit()
+
+
+def test_files_come_into_place_together(tmp_path: Path) -> None:
+    (tmp_path / "old.csv").write_text("old")
+    (tmp_path / "mine.txt").write_text("mine")
+    put(tmp_path, "A")
+    assert {p.name for p in tmp_path.iterdir()} == {"a.csv", "b.csv", "seal.json", "mine.txt"}
+    assert {read_json(tmp_path / name) for name in ("a.csv", "b.csv", "seal.json")} == {"A"}
+
+
+@pytest.mark.parametrize("step", range(4))
+@pytest.mark.parametrize("seal", ["seal.json", "seal.npy"])
+def test_a_death_between_two_renames_leaves_a_mark(
+    tmp_path: Path, step: int, seal: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two runs' files side by side never have the seal of one of them."""
+    names = ("a.csv", "b.csv", seal)
+
+    def write(text: str) -> None:
+        with Outputs() as outputs:
+            for name in names:
+                outputs.write_text(json.dumps(text), tmp_path / name)
+            outputs.commit()
+
+    write("A")
+    replace, steps = Path.replace, iter(range(10))
+
+    def die(self: Path, target: Path) -> Path:
+        if next(steps) == step:
+            raise KeyboardInterrupt
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", die)
+    if step < 3 or seal == "seal.json":
+        with pytest.raises(KeyboardInterrupt):
+            write("B")
+    found = [json.loads((tmp_path / name).read_text()) for name in names[:2]]
+    if seal == "seal.npy":
+        assert (tmp_path / seal).exists() is (step == 3)
+        return
+    if step == 0:
+        assert [*found, read_json(tmp_path / seal)] == ["A", "A", "A"]
+        return
+    assert found == {1: ["A", "A"], 2: ["B", "A"], 3: ["B", "B"]}[step]
+    with pytest.raises(InputError, match=r"seal\.json: unfinished: .* two runs; write them again"):
+        read_json(tmp_path / seal)
+
+
+def test_a_new_file_is_never_an_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_new(b"key", tmp_path / "k")
+    assert stat.S_IMODE((tmp_path / "k").stat().st_mode) == 0o600
+    with pytest.raises(FileExistsError):
+        write_new(b"other", tmp_path / "k")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OutputError, match="cannot be written: No space left"):
+        write_new(b"key", tmp_path / "half")
+    assert [p.name for p in tmp_path.iterdir()] == ["k"]
+
+
+@pytest.mark.parametrize("text", ["=HYPERLINK(1)", "+1", "-1+2", "@SUM(A1)", "\t=1", "\r=1", "\uff1d1"])
+def test_a_spreadsheet_finds_no_formula(text: str) -> None:
+    assert defused(text) == f"'{text}"
+    for harmless in ("night.raw", "", "a=b", "1.5"):
+        assert defused(harmless) == harmless
+    out = io.StringIO()
+    csv.writer(out).writerow([defused(text)])
+    assert not re.match(r'"?\s*[=+\-@]', out.getvalue())
 
 
 def test_a_csv_file_is_read_by_line(tmp_path: Path) -> None:

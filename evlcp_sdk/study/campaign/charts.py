@@ -8,7 +8,7 @@ from pathlib import Path
 from matplotlib.figure import Figure as Drawing
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from evlcp_sdk.files import whole_file
+from evlcp_sdk.files import Outputs, output_fault
 from evlcp_sdk.results.figures import TRANSMITTER_COLOURS
 from evlcp_sdk.study.campaign.paper import PAPER_NAME, Measure
 from evlcp_sdk.study.campaign.summary import Series, Summary, reference_marks
@@ -330,19 +330,28 @@ def _quantile(dots: Iterable[Dot], share: float) -> float:
     return math.inf
 
 
-def save_charts(charts: Sequence[Chart], title: str, folder: Path) -> list[Path]:
+def save_charts(charts: Sequence[Chart], title: str, folder: Path, outputs: Outputs) -> list[Path]:
     """Draw charts as PNG and SVG, named by their id.
 
+    Args:
+        charts: What is drawn.
+        title: Above each.
+        folder: Where they go; made if need be.
+        outputs: The files that they come into place with.
+
     Raises:
-        EvlcpError: A file cannot be written.
+        OutputError: A file cannot be written.
     """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as fault:
+        raise output_fault(folder, fault) from fault
     written = []
     for chart in charts:
         figure = draw(chart, title)
         for kind in ("png", "svg"):
             path = folder / f"{chart.id}.{kind}"
-            with whole_file(path) as part:
-                folder.mkdir(parents=True, exist_ok=True)
-                figure.savefig(part, format=kind, dpi=150)
+            with outputs.told(path):
+                figure.savefig(outputs.path(path), format=kind, dpi=150)
             written.append(path)
     return written

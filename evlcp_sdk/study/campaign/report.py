@@ -8,11 +8,9 @@ import html
 import json
 import math
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import write_text
 from evlcp_sdk.study.campaign.charts import Chart, charts_of, decades
 from evlcp_sdk.study.campaign.paper import PAPER_NAME
 from evlcp_sdk.study.campaign.plan import digest_of
@@ -21,7 +19,7 @@ from evlcp_sdk.study.intervals import INTERVALS, Figure, measure
 from evlcp_sdk.study.markup import details, document, table
 from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
-__all__ = ["comparison_rows", "page", "save_page"]
+__all__ = ["comparison_rows", "page"]
 
 _INK = "#333333"
 
@@ -64,16 +62,6 @@ def page(summary: Summary) -> str:
     )
     body.append(f"<script>\n{script}\n</script>")
     return document(summary.name, body, f"<script>{get_plotlyjs()}</script>\n")
-
-
-def save_page(summary: Summary, path: Path) -> None:
-    """Write the page; an earlier one stays until the new one is complete.
-
-    Raises:
-        ConfigError: The extra is not installed.
-        EvlcpError: The file cannot be written.
-    """
-    write_text(page(summary), path)
 
 
 def _plotly(chart: Chart) -> dict[str, Any]:

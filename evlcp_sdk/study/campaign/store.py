@@ -14,7 +14,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
+from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, OutputError
+from evlcp_sdk.files import check_output
 from evlcp_sdk.study.campaign.plan import Plan
 from evlcp_sdk.study.tally import Statistics
 
@@ -41,13 +42,15 @@ class Store:
 
     Raises:
         InputError: It is missing, or no results file of this schema.
-        ConfigError: It cannot be written.
+        OutputError: It cannot be written.
     """
 
     def __init__(self, path: Path, *, create: bool = False) -> None:
         self.path = path
         if not create and not path.is_file():
             raise InputError(f"{path}: no results file there")
+        if create:
+            check_output(path)
         try:
             # Readers need write access to the WAL's index beside the file, but write no table.
             self._base = sqlite3.connect(path, timeout=30, isolation_level=None)
@@ -67,7 +70,9 @@ class Store:
             self._close()
             if not isinstance(fault, sqlite3.OperationalError):
                 raise _no_store(path, fault) from fault
-            raise (ConfigError if create else InputError)(f"{path}: {fault}") from fault
+            if create:
+                raise OutputError(f"{path}: cannot be written: {fault}") from fault
+            raise InputError(f"{path}: {fault}") from fault
         except EvlcpError:
             self._close()
             raise
@@ -89,7 +94,9 @@ class Store:
         try:
             yield
         except sqlite3.DatabaseError as fault:
-            raise EvlcpError(f"{self.path}: cannot be written: {fault}; what was finished is kept") from fault
+            raise OutputError(
+                f"{self.path}: cannot be written: {fault}; what was finished is kept"
+            ) from fault
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
@@ -104,7 +111,7 @@ class Store:
         Raises:
             ConfigError: The file holds another campaign.
             InputError: The file is damaged.
-            EvlcpError: The file cannot be written.
+            OutputError: The file cannot be written.
         """
         with self._reading():
             row = self._base.execute("SELECT name FROM plan").fetchone()
@@ -133,7 +140,7 @@ class Store:
         """Keep results of tasks, all or none; one that is there already stays.
 
         Raises:
-            EvlcpError: The file cannot be written, e.g. the disk is full; what was kept before stays.
+            OutputError: The file cannot be written, e.g. the disk is full; what was kept before stays.
         """
         rows = [(task, json.dumps(statistics.to_dict(), sort_keys=True)) for task, statistics in results]
         with self._writing():

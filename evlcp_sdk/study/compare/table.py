@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from evlcp_sdk.files import defused
 from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments, median
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS
 from evlcp_sdk.study.markup import details, document, table
@@ -243,7 +244,8 @@ class Comparison:
         writer = csv.DictWriter(out, list(records[0]) if records else [], lineterminator="\n")
         writer.writeheader()
         for record in records:
-            writer.writerow(record | {"best": " ".join(record["best"])})
+            row = record | {"best": " ".join(record["best"])}
+            writer.writerow({k: defused(v) if isinstance(v, str) else v for k, v in row.items()})
         return out.getvalue()
 
     def to_html(self) -> str:

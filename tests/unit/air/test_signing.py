@@ -9,7 +9,7 @@ import pytest
 
 from evlcp_sdk.air import signing
 from evlcp_sdk.air.blocks import Kind, Message
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError, InputError, OutputError
 
 ed25519 = pytest.importorskip(
     "cryptography.hazmat.primitives.asymmetric.ed25519", reason="the extra sign is not installed"
@@ -48,7 +48,7 @@ def test_a_key_is_its_owners_and_stays(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="exists; a key is not overwritten"):
         signing.make_key(path)
     assert path.read_bytes() == before
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(OutputError, match="cannot be written"):
         signing.make_key(tmp_path / "no" / "k.pem")
 
 

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -185,6 +186,20 @@ def test_two_recordings_of_one_name(evlcp: Evlcp, tmp_path: Path) -> None:
     done = evlcp("receive", "a/night.raw", "b/night.npz", "-o", tmp_path / "out")
     assert done.code == 2
     assert "two recordings would both be written" in done.err
+
+
+@pytest.mark.parametrize("name", ["...raw", "..raw", "...csv.gz", "..", "/"])
+def test_no_recording_is_written_outside(evlcp: Evlcp, demo_raw: Path, tmp_path: Path, name: str) -> None:
+    recording = tmp_path / "in" / name
+    recording.parent.mkdir(exist_ok=True)
+    if not recording.exists():
+        shutil.copy(demo_raw, recording)
+    out = tmp_path / "a" / "b"
+    done = evlcp("receive", recording, demo_raw, "-o", out)
+    assert done.code == 2
+    told = " ".join(done.err.replace("│", " ").split())
+    assert "gives no name of a folder in" in told
+    assert not (tmp_path / "a").exists()
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n" + bytes(40), b"no header at all"])

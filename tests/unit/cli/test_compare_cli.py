@@ -153,7 +153,7 @@ def test_no_figure_is_cut_on_a_narrow_screen(
         (("--variant", "a:", "--variant", "a:"), 2, "the name 'a' is taken"),
         (("--variant", "a:ranging.id=pco"), 2, "--variant a: no ranging algorithm named 'pco'"),
         (("--variant", "a:", "-o", "t.pdf"), 2, ".csv, .html"),
-        (("--variant", "a:", "-o", "none/t.csv"), 2, "none/t.csv: cannot be written: no folder none"),
+        (("--variant", "a:", "-o", "none/t.csv"), 1, "none/t.csv: cannot be written: no folder none"),
         (("REC.raw", "--variant", "a:"), 2, "REC.raw is named twice"),
         (("paper.toml",), 2, "evlcp sweep paper.toml -o R.sqlite, then evlcp compare R.sqlite"),
         (("none.sqlite",), 2, "stand alone"),

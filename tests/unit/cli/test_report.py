@@ -9,12 +9,13 @@ from typing import Any
 import pytest
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import Outputs
 from evlcp_sdk.jobs.inline import Inline
 from evlcp_sdk.study.campaign.charts import charts_of, save_charts
 from evlcp_sdk.study.campaign.collect import collect
 from evlcp_sdk.study.campaign.paper import PAPER
 from evlcp_sdk.study.campaign.plan import Case, Plan, make_plan
-from evlcp_sdk.study.campaign.report import page, save_page
+from evlcp_sdk.study.campaign.report import page
 from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.campaign.summary import Series, Summary, beside_paper, summarize
 from evlcp_sdk.study.intervals import measure
@@ -115,7 +116,10 @@ def test_json_has_every_figure(summary: Summary) -> None:
 
 
 def test_charts_are_saved_as_png_and_svg(summary: Summary, tmp_path: Path) -> None:
-    written = save_charts(charts_of(summary), summary.name, tmp_path / "figures")
+    with Outputs() as outputs:
+        written = save_charts(charts_of(summary), summary.name, tmp_path / "figures", outputs)
+        assert not any(path.exists() for path in written)
+        outputs.commit()
     assert [p.name for p in written] == [f"{c}.{kind}" for c in CHARTS for kind in ("png", "svg")]
     for path in written:
         assert path.read_bytes().startswith((b"\x89PNG", b"<?xml"))
@@ -127,7 +131,8 @@ def test_an_empty_campaign_has_a_page(tmp_path: Path) -> None:
         store.adopt(plan_of_two_methods())
         nothing = summarize(store)
     assert "0 of 40 tasks" in page(nothing)
-    assert len(save_charts(charts_of(nothing), "nothing", tmp_path)) == 10
+    with Outputs() as outputs:
+        assert len(save_charts(charts_of(nothing), "nothing", tmp_path, outputs)) == 10
 
 
 def test_without_plotly(summary: Summary, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,7 +157,7 @@ def test_the_page_tells_everything(summary: Summary) -> None:
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
 def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) -> None:
     pytest.importorskip("plotly", reason="the extra report is not installed")
-    save_page(summary, tmp_path / "report.html")
+    (tmp_path / "report.html").write_text(page(summary), encoding="utf-8")
     with Browser(tmp_path / "profile") as browser:
         browser.open(tmp_path / "report.html")
         drawn = browser.value(

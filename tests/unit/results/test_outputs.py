@@ -1,9 +1,9 @@
 """The three files of a result: columns, values, streaming, and what is left after a stop or a crash."""
 
 import csv
+import hashlib
 import json
 import math
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat, symbols_of_bits
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS
-from evlcp_sdk.errors import ConfigError, EvlcpError
+from evlcp_sdk.errors import ConfigError, InputError, OutputError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
 from evlcp_sdk.results.columns import FRAME_COLUMNS
@@ -266,22 +266,90 @@ def test_a_failed_run_says_so_and_keeps_what_was_decoded(tmp_path: Path) -> None
 
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="file: cannot be written"):
+    with pytest.raises(OutputError, match="file: cannot be written"):
         ResultWriter(tmp_path / "file", LINK)
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_the_summary_names_every_file_by_its_digest(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, LINK, sinks=["figures"]) as writer:
+        writer.write([packet(0, (frame(0, 0),))])
+        table = finish(writer)
+    names = {p.name for p in tmp_path.iterdir()} - {"summary.json"}
+    assert set(table["files"]) == names > {"frames.csv", "packets.jsonl"}
+    for name, told in table["files"].items():
+        data = (tmp_path / name).read_bytes()
+        assert told == {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    assert len(read_frames(tmp_path)) == 1
+    (tmp_path / "frames.csv").write_text(
+        (tmp_path / "frames.csv").read_text().replace(",50.0000", ",51.0000")
+    )
+    with pytest.raises(InputError, match=r"frames\.csv: not the file that summary\.json speaks of: SHA-256"):
+        read_frames(tmp_path)
+    (tmp_path / "frames.csv").unlink()
+    with pytest.raises(InputError, match=r"frames\.csv: cannot be read"):
+        read_frames(tmp_path)
+
+
+@pytest.mark.parametrize("step", range(4))
+def test_a_death_between_two_renames_is_seen(
+    tmp_path: Path, step: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No summary of one run stands beside a file of another and says `complete`."""
+
+    def run(frames: int) -> None:
+        with ResultWriter(tmp_path, LINK) as writer:
+            writer.write([packet(0, tuple(frame(0, i) for i in range(frames)))])
+            finish(writer)
+
+    replace, steps = Path.replace, iter(range(10))
+
+    def die(self: Path, target: Path) -> Path:
+        if next(steps) == step:
+            raise SystemExit
+        return replace(self, target)
+
+    run(1)
+    monkeypatch.setattr(Path, "replace", die)
+    with pytest.raises(SystemExit):
+        run(2)
+    status = json.loads((tmp_path / "summary.json").read_text())["status"]
+    assert (status, len(rows_of(tmp_path))) == (("unfinished", 1 + (step > 1)) if step else ("complete", 1))
+    if step:
+        with pytest.raises(InputError, match=r"summary\.json: unfinished: "):
+            read_frames(tmp_path)
+    else:
+        assert len(read_frames(tmp_path)) == 1
+
+
+def test_a_link_in_a_result_is_refused_before_the_work(tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "regions.png").symlink_to(victim)
+    with pytest.raises(OutputError, match=r"regions\.png: cannot be written: it is a link"):
+        ResultWriter(tmp_path / "out", LINK)
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["regions.png"]
+    assert victim.read_text() == "mine"
+
+
+def no_room(*_: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
 @pytest.mark.parametrize("packets", [1, 100])
-def test_a_full_disk_is_told_and_leaves_the_old_result(tmp_path: Path, packets: int) -> None:
+def test_a_full_disk_is_told_and_leaves_the_old_result(
+    tmp_path: Path, packets: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "frames.csv").write_text("old")
-    (tmp_path / f".packets.jsonl.{os.getpid()}.part").symlink_to("/dev/full")
 
     def fill() -> None:
         with ResultWriter(tmp_path, LINK) as writer:
             writer.write([packet(i, (frame(i, 0), frame(i, 1))) for i in range(packets)])
             finish(writer)
 
-    with pytest.raises(EvlcpError, match="cannot be written: No space left on device") as caught:
+    # A file system may find only here that it has no room.
+    monkeypatch.setattr("os.fsync", no_room)
+    with pytest.raises(OutputError, match="cannot be written: No space left on device") as caught:
         fill()
     assert caught.value.exit_code == 1
     assert [p.name for p in tmp_path.iterdir()] == ["frames.csv"]

@@ -15,7 +15,7 @@ import pynmea2
 import pytest
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import hidden_path
+from evlcp_sdk.files import STAGE_PREFIX
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place import navigator
 from evlcp_sdk.place.navigator import Navigator, PositionPlan
@@ -176,7 +176,7 @@ def test_a_run_that_breaks_off_leaves_nothing(tmp_path: Path) -> None:
     plan = PositionPlan((SITE,), ATTITUDE)
     with ResultWriter(tmp_path, LINK, plan=plan) as results:
         results.write(packets(5))
-        assert list(tmp_path.glob(".fixes.csv.*"))
+        assert list(tmp_path.glob(f"{STAGE_PREFIX}*/fixes.csv"))
     assert not list(tmp_path.iterdir())
 
 
@@ -226,4 +226,4 @@ def test_beacons_that_are_not_believed_give_no_positions(tmp_path: Path) -> None
     stranger = dataclasses.replace(SITE, transmitter=3)
     told = write(tmp_path, packets(5), PositionPlan((stranger,), ATTITUDE))
     assert told["refused"] == {"no-site": 4}
-    assert not hidden_path(tmp_path, "fixes.csv").exists()
+    assert not list(tmp_path.glob(f"{STAGE_PREFIX}*"))

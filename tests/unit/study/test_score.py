@@ -1,5 +1,6 @@
 """Scores against the independent scorers, against plain loops for other links, and by hand."""
 
+import hashlib
 import importlib.util
 import json
 import subprocess
@@ -285,6 +286,8 @@ def test_a_result_of_another_link_is_refused(
     truth = plain(truth_of(Scene(duration_s=0.05)).to_table())
     folder, path = write(tmp_path, GOOD, truth)
     summary = {"configuration": {section: dict(keys) for section, keys in link.table.items()}}
+    digest = hashlib.sha256(GOOD.encode()).hexdigest()
+    summary["files"] = {"frames.csv": {"bytes": len(GOOD), "sha256": digest}}
     (folder / "summary.json").write_text(json.dumps(summary))
     done = evlcp("score", folder, path, "--json")
     assert done.code == (2 if says else 0)
@@ -296,7 +299,9 @@ def test_a_result_of_another_link_is_refused(
     ("summary", "code", "says"),
     [
         ("{", 3, "summary.json: not JSON"),
-        ("[]", 3, "summary.json: configuration: expected a table"),
+        ("[]", 3, "summary.json: expected an object"),
+        ('{"status": "complete"}', 3, "summary.json: configuration: expected a table"),
+        ('{"configuration": {}}', 3, "summary.json: files.frames.csv.sha256 = None: expected"),
         ('{"configuration": {"modulation": {"id": "gone"}}}', 2, "no modulation algorithm named 'gone'"),
         ('{"configuration": {"air": {"frames": 3}}}', 2, "summary.json: air.frames = 3: unknown key"),
     ],

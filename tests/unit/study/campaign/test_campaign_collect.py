@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
+from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, OutputError
 from evlcp_sdk.jobs.executor import Executor
 from evlcp_sdk.jobs.inline import Inline
 from evlcp_sdk.jobs.processes import Processes
@@ -246,7 +246,7 @@ def test_a_damaged_store_is_named(tmp_path: Path, damage: str) -> None:
 def test_stores_that_cannot_be_opened(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no results file there"):
         Store(tmp_path / "none.sqlite")
-    with pytest.raises(ConfigError, match="unable to open"):
+    with pytest.raises(OutputError, match=r"a\.sqlite: cannot be written: unable to open"):
         Store(tmp_path / "no" / "such" / "a.sqlite", create=True)
     with Store(tmp_path / "a.sqlite", create=True) as store:
         with pytest.raises(InputError, match="no campaign has started"):

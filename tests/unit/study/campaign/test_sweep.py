@@ -116,8 +116,8 @@ def test_a_bar_that_the_link_does_not_speak_to(evlcp: Evlcp, campaign: Path, tmp
 
 def test_results_that_cannot_be_written(evlcp: Evlcp, campaign: Path, tmp_path: Path) -> None:
     done = evlcp("sweep", campaign, "-o", tmp_path / "no" / "r.sqlite")
-    assert done.code == 2
-    assert done.err == f"evlcp: {tmp_path}/no/r.sqlite: unable to open database file\n"
+    assert done.code == 1
+    assert done.err == f"evlcp: {tmp_path}/no/r.sqlite: cannot be written: unable to open database file\n"
     assert evlcp("report", tmp_path / "none.sqlite").code == 3
 
 
