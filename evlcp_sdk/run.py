@@ -1,6 +1,5 @@
 """The use cases: what a program does with a recording, and what the commands parse and print."""
 
-import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -29,6 +28,7 @@ from evlcp_sdk.results.tables import frames_table
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
+from evlcp_sdk.signals import ENDING, heard_by
 from evlcp_sdk.values import Frame, Packet
 
 if TYPE_CHECKING:
@@ -277,23 +277,24 @@ def _run(
 
 
 @contextmanager
-def stop_on_request() -> Iterator[Stopped]:
-    """Let Ctrl-C end a run after the piece in hand; a second one ends it at once.
+def stop_on_request(pass_on: Callable[[], None] = lambda: None) -> Iterator[Stopped]:
+    """Let Ctrl-C, SIGTERM or SIGHUP end a run after the piece in hand; a second one ends it at once.
 
     Gives what `receive_to_folder` takes as `stopped`. Only a main thread can listen.
+
+    Args:
+        pass_on: Called at the first one, to tell others.
     """
     asked = False
 
     def ask(_number: int, _frame: FrameType | None) -> None:
         nonlocal asked
         asked = True
-        signal.signal(signal.SIGINT, before)
+        restore()
+        pass_on()
 
-    before = signal.signal(signal.SIGINT, ask)
-    try:
+    with heard_by(ask, *ENDING) as restore:
         yield lambda: asked
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def calibrate(

@@ -21,9 +21,15 @@ def main() -> None:
     """Run the command line; whatever goes wrong becomes one line per fault on stderr and its exit code."""
     code: object = 0
     try:
-        from evlcp_sdk.cli._app import run
+        from signal import SIGHUP, SIGTERM
 
-        run()
+        from evlcp_sdk.signals import heard_by, interrupt
+
+        # Python itself hears Ctrl-C.
+        with heard_by(interrupt, SIGTERM, SIGHUP):
+            from evlcp_sdk.cli._app import run
+
+            run()
     except SystemExit as end:
         code = end.code
         if code == _INTERRUPTED:

@@ -1,8 +1,7 @@
 """`evlcp receive`."""
 
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -109,6 +108,7 @@ def receive(
     """
     import json
 
+    from evlcp_sdk.jobs.processes import stop_workers
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.records import choose_sinks
     from evlcp_sdk.plugin.registry import Registry
@@ -127,7 +127,8 @@ def receive(
     executor = make_executor(0 if here else workers or None, dask)
     worst = 0
     interrupted: list[Path] = []
-    with stop_on_request() as stopped, _recordings_bar(0 if here else len(jobs)) as count:
+    pass_on = (lambda: None) if here else stop_workers
+    with stop_on_request(pass_on) as stopped, _recordings_bar(0 if here else len(jobs)) as count:
         run = partial(
             _decode_job,
             link=link,
@@ -228,9 +229,8 @@ def _decode_job(
     if stopped is not None:
         with bytes_bar(Path(job.url).name) as advance:
             return decode(advance=advance, stopped=stopped)
-    # A terminal sends Ctrl-C to workers, too; only a main thread can listen to it.
-    main = threading.current_thread() is threading.main_thread()
-    with stop_on_request() if main else nullcontext(lambda: False) as asked:
+    # A terminal sends Ctrl-C to workers, too.
+    with stop_on_request() as asked:
         return decode(stopped=asked)
 
 

@@ -18,8 +18,9 @@ from typing import Generic, TypeVar
 
 from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.jobs.executor import ATTEMPTS, Fault, Outcome, attempt
+from evlcp_sdk.signals import ENDING
 
-__all__ = ["Processes"]
+__all__ = ["Processes", "stop_workers"]
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -143,9 +144,19 @@ class _Worker(Generic[J]):
         return code
 
 
+def stop_workers() -> None:
+    """Ask the jobs that run in processes of this one to stop, as a terminal's Ctrl-C does."""
+    for process in multiprocessing.active_children():
+        # It may have ended just now.
+        with suppress(ProcessLookupError):
+            if process.pid is not None:
+                os.kill(process.pid, signal.SIGINT)
+
+
 def _serve(pipe: Connection, function: bytes) -> None:
     """What a worker process does until its pipe closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in ENDING:
+        signal.signal(number, signal.SIG_IGN)
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
     run = pickle.loads(function)
     with suppress(EOFError, OSError):

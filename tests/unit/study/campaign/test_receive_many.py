@@ -16,6 +16,12 @@ import pytest
 Evlcp = Callable[..., Any]
 
 
+def hear_all() -> None:
+    """Whoever runs the tests may have set some to be ignored."""
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
+
+
 @pytest.fixture
 def three(tmp_path: Path, demo_raw: Path) -> list[Path]:
     return [Path(shutil.copy(demo_raw, tmp_path / f"{name}.raw")) for name in "abc"]
@@ -38,7 +44,12 @@ def test_processes_give_what_this_one_gives(
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
-def test_ctrl_c_ends_all_of_them(three: list[Path], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("number", "tell"), [(signal.SIGINT, os.killpg), (signal.SIGHUP, os.killpg), (signal.SIGTERM, os.kill)]
+)
+def test_ctrl_c_and_its_like_end_all_of_them(
+    three: list[Path], tmp_path: Path, number: int, tell: Callable[[int, int], None]
+) -> None:
     """A terminal's Ctrl-C reaches workers, too: what they decoded is written, and nothing is begun."""
     many = [Path(shutil.copy(three[0], tmp_path / f"r{n}.raw")) for n in range(40)]
     out = tmp_path / "out"
@@ -50,11 +61,12 @@ def test_ctrl_c_ends_all_of_them(three: list[Path], tmp_path: Path) -> None:
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        preexec_fn=hear_all,
     )
     until = time.monotonic() + 60
     while len(list(out.glob("*/summary.json"))) < 2 and time.monotonic() < until:
         time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGINT)
+    tell(process.pid, number)
     _, err = process.communicate(timeout=30)
     assert process.returncode == 130
     assert err.startswith("evlcp: interrupted; what was decoded until then is in ")

@@ -1,0 +1,91 @@
+"""SIGTERM and SIGHUP end a run as Ctrl-C does."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from evlcp_sdk.signals import ENDING, heard_by, interrupt
+
+MAIN = "from evlcp_sdk.cli.main import main; main()"
+
+
+def hear_all() -> None:
+    """Whoever runs the tests may have set some to be ignored."""
+    for number in ENDING:
+        signal.signal(number, signal.SIG_DFL)
+
+
+def start(*arguments: str | Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", MAIN, *map(str, arguments)]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hear_all
+    )
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_a_run_that_is_told_to_end_keeps_what_it_has(
+    number: signal.Signals, demo_raw: Path, tmp_path: Path
+) -> None:
+    pipe, out = tmp_path / "live.raw", tmp_path / "out"
+    os.mkfifo(pipe)
+    process = start("receive", pipe, "-o", out)
+    data = demo_raw.read_bytes()
+    with pipe.open("wb", buffering=0) as file:
+        # A pipe holds less than this: the receiver has begun.
+        file.write(data[: len(data) // 2])
+        process.send_signal(number)
+        time.sleep(0.2)
+        file.write(data[len(data) // 2 :])
+        _, said = process.communicate(timeout=60)
+    assert said == f"evlcp: interrupted; what was decoded until then is in {out}\n"
+    assert process.returncode == 130
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["status"] == "interrupted"
+    assert summary["transmitters"][0]["frames_found"] > 0
+    assert {p.name for p in out.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_a_simulation_that_is_told_to_end_leaves_nothing(number: signal.Signals, tmp_path: Path) -> None:
+    process = start("simulate", "--preset", "night", "-o", tmp_path / "a.raw", "--set", "duration_s=60")
+    until = time.monotonic() + 60
+    while not list(tmp_path.glob(".evlcp-*/a.raw")) and time.monotonic() < until:
+        time.sleep(0.02)
+    process.send_signal(number)
+    out, said = process.communicate(timeout=60)
+    assert (process.returncode, out, said.splitlines()[-1:]) == (130, "", ["evlcp: interrupted"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_ignored_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with heard_by(interrupt, signal.SIGHUP, signal.SIGTERM):
+            signal.raise_signal(signal.SIGHUP)
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGTERM)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_who_heard_before_hears_again() -> None:
+    def mine(_number: int, _frame: object) -> None:
+        heard.append("mine")
+
+    heard: list[str] = []
+    before = signal.signal(signal.SIGTERM, mine)
+    try:
+        with heard_by(lambda *_: (heard.append("inner"), restore()), signal.SIGTERM) as restore:  # type: ignore[func-returns-value]
+            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
+        assert heard == ["inner", "mine"]
+        assert signal.getsignal(signal.SIGTERM) is mine
+    finally:
+        signal.signal(signal.SIGTERM, before)
