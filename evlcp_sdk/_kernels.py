@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
@@ -16,19 +17,21 @@ def take_in(heard: Array, prior: Array, out: Array) -> None:
     not even a cell that fits a code in all its values is sure to show a cluster, nor a place.
     """
     clusters, rows, columns = prior.shape
-    out[:] = 0
+    place, share = np.zeros((rows, columns)), np.zeros((rows, columns))
+    for k in range(clusters):
+        for r in range(rows):
+            for c in range(columns):
+                out[k, r, c] = 0
+                place[r, c] += prior[k, r, c]
+                share[r, c] += heard[k, r, c]
     for r in range(rows):
         for c in range(columns):
-            place, share = 0.0, 0.0
-            for k in range(clusters):
-                place += prior[k, r, c]
-                share += heard[k, r, c]
-            if place == 0:
+            if place[r, c] == 0:
                 continue
-            odds = clusters / max(1 - share, 1e-6)
-            total = max(1 - place, 1e-6)
+            odds = clusters / max(1 - share[r, c], 1e-6)
+            unheard = 0.0 if share[r, c] > 0 else 1.0
+            total = max(1 - place[r, c], 1e-6)
             for k in range(clusters):
-                total += prior[k, r, c] * (heard[k, r, c] * odds if share > 0 else 1.0)
+                total += prior[k, r, c] * (heard[k, r, c] * odds + unheard)
             for k in range(clusters):
-                likely = heard[k, r, c] * odds if share > 0 else 1.0
-                out[k, r, c] = prior[k, r, c] * likely / total
+                out[k, r, c] = prior[k, r, c] * (heard[k, r, c] * odds + unheard) / total

@@ -116,14 +116,23 @@ def score_rises(
 
 
 @njit(cache=True, nogil=True)
-def grow_old(pixels: Array, now: int, least: int, age: int) -> None:
-    """Set the rises of pixels that are `least` ticks ago or more to `age` ticks ago."""
+def grow_old(pixels: Array, first: int, many: int, now: int, least: int, age: int) -> None:
+    """In so many rows from the first on, round and round, set rises of `least` ticks ago or more to `age`."""
     then = (np.uint32(now) - np.uint32(age)) << _CLOCK
-    for v in range(pixels.shape[0]):
-        for u in range(pixels.shape[1]):
+    height, width = pixels.shape
+    for row in range(first, first + many):
+        v = row % height
+        for u in range(width):
             state = pixels[v, u]
             old = ((np.uint32(now) - (state >> _CLOCK)) & _ROUND) >= np.uint32(least)
             pixels[v, u] = then | (state & _LOW) if old else state
+
+
+@njit(cache=True, nogil=True)
+def in_rhythm(x: Array, y: Array, pixels: Array, least: int, keep: Array) -> None:
+    """Mark events of pixels with a score of `least` or more."""
+    for i in range(x.size):
+        keep[i] = (pixels[y[i], x[i]] & np.uint32(SCORES)) >= np.uint32(least)
 
 
 @njit(cache=True, nogil=True)
@@ -472,10 +481,15 @@ def across_profile(
     middle lies; its two neighbours may show in it, too.
     """
     _, rows, columns = probability.shape
-    far = np.zeros((places.size, places.size), np.bool_)
+    near = np.zeros((places.size, places.size), np.bool_)
     for k in range(places.size):
         for other in range(places.size):
-            far[k, other] = abs(places[other] - places[k]) > 1.5 * spacing
+            near[k, other] = abs(places[other] - places[k]) <= 1.5 * spacing
+    every = np.zeros((rows, columns))
+    for k in range(places.size):
+        for r in range(rows):
+            for c in range(columns):
+                every[r, c] += probability[k, r, c]
     half = spacing / 2 + grid
     # Of the box that holds the strip about a place, whatever its turn.
     reach = np.hypot(half, hits.size)
@@ -491,10 +505,11 @@ def across_profile(
                 if share > 0 and abs(off.imag) < hits.size:
                     i = int(abs(off.imag))
                     cells[i] += share * share
-                    hits[i] += share * probability[k, r, c]
+                    far = every[r, c]
                     for other in range(places.size):
-                        if far[k, other]:
-                            hits[i] -= share * share * probability[other, r, c]
+                        if near[k, other]:
+                            far -= probability[other, r, c]
+                    hits[i] += share * probability[k, r, c] - share * share * far
 
 
 @njit(cache=True, nogil=True)
@@ -534,6 +549,13 @@ def pilot_light(sums: Array, codes: Array, prior: Array, grid: int, out: Array) 
     """
     clusters, rows, columns = prior.shape
     length = codes.shape[1]
+    height, width = rows * grid, columns * grid
+    values = np.empty((length, height, width), np.int8)
+    for i in range(length):
+        for v in range(height):
+            for u in range(width):
+                first, second = sums[2 * i, v, u], sums[2 * i + 1, v, u]
+                values[i, v, u] = (second > 0) - (second < 0) + (second == 0) * ((first < 0) - (first > 0))
     for k in range(clusters):
         total, place = 0.0, 0.0
         for r in range(rows):
@@ -546,10 +568,7 @@ def pilot_light(sums: Array, codes: Array, prior: Array, grid: int, out: Array) 
                 for v in range(r * grid, (r + 1) * grid):
                     for u in range(c * grid, (c + 1) * grid):
                         for i in range(length):
-                            value = np.sign(sums[2 * i + 1, v, u])
-                            if value == 0:
-                                value = -np.sign(sums[2 * i, v, u])
-                            agree += codes[k, i] * value
+                            agree += codes[k, i] * values[i, v, u]
                 total += weight * agree
         out[k] = total / (length * place) if place > 0 else 0.0
 
@@ -720,7 +739,7 @@ def info_activity(sums: Array, weight: Array, grid: int, pilot_chips: int, least
         part = events[int(c >= pilot_chips)]
         for v in range(height):
             for u in range(width):
-                part[v, u] += sums[c, v, u] != 0
+                part[v, u] += np.int16(sums[c, v, u] != 0)
     by_info, by_pilot = 1 / max(chips - pilot_chips, 1), least / pilot_chips
     over = np.zeros((rows, columns))
     for v in range(rows * grid):

@@ -310,7 +310,7 @@ class RegionFollower:
 
         Before a frame shows where in its box a bar is, panels and moving textures around it would drown it.
         """
-        return events[self._rhythm.inside(events)]
+        return self._rhythm.of(events)
 
     def _expected(self, followed: Followed, t_us: float) -> Region:
         """Where a region should be soon: by its filter, or else straight on."""

@@ -315,5 +315,7 @@ class EchoQueue:
         if waiting.sighting is None or waiting.due is None:
             return waiting.packets.flush()
         frame = waiting.sighting.frame
-        frame = replace(frame, echo_of=self.echoes.echo_of(frame.transmitter))
+        echo_of = self.echoes.echo_of(frame.transmitter)
+        if echo_of != frame.echo_of:
+            frame = replace(frame, echo_of=echo_of)
         return waiting.packets.add(frame, waiting.due.packet_us, waiting.due.lock.chip_us)

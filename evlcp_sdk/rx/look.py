@@ -11,7 +11,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.detection import Followed
 from evlcp_sdk.rx.grid import DueFrame
-from evlcp_sdk.rx.placement import Placement, direction, layout_of, lit, masked, placements
+from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements
 from evlcp_sdk.values import Events, PresenceMap, SyncLock
 
 __all__ = ["Look", "Looker", "Pilot", "polarity_sums"]
@@ -178,9 +178,9 @@ class Looker:
             way = placement.scale / abs(placement.scale)
             if layout.line:
                 # A line's width is that of its cells; the layout says nothing of it.
-                turn = own.scale / abs(own.scale) * direction(layout)
+                turn = own.scale / abs(own.scale) * layout.way
                 across_px = _kernels.farthest_off(selected, grid, own.shift, turn) + grid / 2
-                way *= direction(layout)
+                way *= layout.way
             places = placement.places(layout)
             right_px = along_px * abs(way.real) + across_px * abs(way.imag)
             down_px = along_px * abs(way.imag) + across_px * abs(way.real)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.values import PresenceMap
 
-__all__ = ["Layout", "Placement", "direction", "layout_of", "lit", "masked", "placements"]
+__all__ = ["Layout", "Placement", "layout_of", "lit", "masked", "placements"]
 
 _LEAST_SPACING_PX = 1.0
 """A placement that puts neighbours into one pixel would fit anything."""
@@ -51,11 +51,13 @@ class Layout:
         at_m: Cluster centres, m, complex128 (K,).
         spacing_m: From one cluster to its nearest neighbour, m; 0 for a single cluster.
         line: Whether the clusters stand in one line, which looks the same from behind.
+        way: Direction from the first cluster to the last, of size 1; 1 for a single cluster.
     """
 
     at_m: NDArray[np.complex128]
     spacing_m: float
     line: bool
+    way: complex
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +112,13 @@ def layout_of(centres_m: NDArray[np.float64]) -> Layout:
     at = centres_m @ np.array([1, 1j])
     gaps = np.abs(at[:, None] - at[None])
     apart = gaps[gaps > 1e-9]
-    return Layout(at, float(apart.min()) if len(apart) else 0.0, bool((np.ptp(centres_m, 0) < 1e-9).any()))
+    way = complex(at[-1] - at[0])
+    return Layout(
+        at,
+        float(apart.min()) if len(apart) else 0.0,
+        bool((np.ptp(centres_m, 0) < 1e-9).any()),
+        way / abs(way) if way else 1 + 0j,
+    )
 
 
 def placements(
@@ -183,7 +191,7 @@ def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> Prese
         return presence
     unit = placement.scale / abs(placement.scale)
     if layout.line:
-        unit *= direction(layout)
+        unit *= layout.way
     spacing_px = abs(placement.scale) * layout.spacing_m
     places = placement.places(layout)
     grid = presence.grid_px
@@ -245,12 +253,6 @@ def _core(profile: NDArray[np.float64]) -> NDArray[np.float64]:
     low = np.flatnonzero(profile[peak:] < _EDGE * profile[peak])
     core: NDArray[np.float64] = np.clip(profile[: peak + low[0] if len(low) else None], 0, 1)
     return core
-
-
-def direction(layout: Layout) -> complex:
-    """From the first to the last cluster of a line."""
-    way = complex(layout.at_m[-1] - layout.at_m[0])
-    return way / abs(way)
 
 
 def _turned(layout: Layout, mirrored: bool) -> NDArray[np.complex128]:
@@ -329,7 +331,7 @@ def _judged(
     tries = math.comb(max(shown, proposed), proposed)
     chance = min(1.0, tries * _at_least(int(seen.sum()) - proposed, shown - proposed, odds))
     if layout.line:
-        way = scale * direction(layout)
+        way = scale * layout.way
         mirrored = way.real + way.imag < 0
     return Placement(scale, shift, mirrored, seen, float(in_place[seen].sum()), chance)
 

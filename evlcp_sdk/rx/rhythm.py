@@ -95,12 +95,13 @@ class Rhythm:
             cell_shift,
         )
 
-    def inside(self, events: Events) -> NDArray[np.bool_]:
-        """Which events are of pixels that blink in rhythm, by what is enough inside a region."""
+    def of(self, events: Events) -> Events:
+        """Those of pixels that blink in rhythm, by what is enough inside a region."""
         from evlcp_sdk.rx import _kernels
 
-        score = self._pixels[events.y, events.x] & _kernels.SCORES
-        return np.asarray(score >= self._min_score // 2)
+        keep = np.empty(len(events), np.bool_)
+        _kernels.in_rhythm(events.x, events.y, self._pixels, self._min_score // 2, keep)
+        return events[keep]
 
     def measure(
         self,
@@ -138,12 +139,10 @@ class Rhythm:
         passed = self._turn if self._seen is None else now - self._seen
         self._seen = now
         if passed >= self._turn:
-            _kernels.grow_old(self._pixels, now, 0, 2 * self._turn)
+            _kernels.grow_old(self._pixels, 0, height, now, 0, 2 * self._turn)
             return
         many = -(-height * passed // self._turn)
-        for row in range(self._row, self._row + many):
-            one = row % height
-            _kernels.grow_old(self._pixels[one : one + 1], now, 2 * self._turn, 2 * self._turn)
+        _kernels.grow_old(self._pixels, self._row, many, now, 2 * self._turn, 2 * self._turn)
         self._row = (self._row + many) % height
 
 

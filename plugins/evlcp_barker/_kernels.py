@@ -19,12 +19,13 @@ def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, known: Arra
     i = np.searchsorted(t_us, first_bin * bin_us)
     # Time never runs backward, so each bin goes on where the last one ended.
     for b in range(bins):
-        upper = (first_bin + b + 1) * bin_us
+        if i == t_us.size:
+            break
         begin = i
+        i += np.searchsorted(t_us[i:], (first_bin + b + 1) * bin_us)
         on = 0
-        while i < t_us.size and t_us[i] < upper:
-            on += p[i]
-            i += 1
+        for j in range(begin, i):
+            on += p[j]
         counts[0, b] += i - begin - on
         counts[1, b] += on
 

@@ -143,6 +143,22 @@ def line_of_cells(selected: Array, middles: Array, line: Array, seen: Array) -> 
 
 
 @njit(cache=True, nogil=True)
+def codes_said(pilots: Array, words: Array, symbols: Array, seen: Array, codes: Array, known: Array) -> None:
+    """What each cluster says in a frame, `codes` (K, values), and between which it is known, (K + 1, values).
+
+    A boundary lies between clusters that are seen; in info values, those whose symbol is known, too.
+    """
+    clusters, first = pilots.shape
+    known[:] = False
+    for k in range(clusters):
+        codes[k, :first] = pilots[k]
+        codes[k, first:] = words[max(symbols[k], 0)]
+        if k > 0 and seen[k] and seen[k - 1]:
+            known[k, :first] = True
+            known[k, first:] = symbols[k] >= 0 and symbols[k - 1] >= 0
+
+
+@njit(cache=True, nogil=True)
 def column_light(sums: Array, line: Array, top: int, bottom: int, full: float, out: Array) -> None:
     """Mean size of the clipped sums beside a bar's line, from rows `top` to `bottom`, by pixels from it.
 
@@ -150,13 +166,13 @@ def column_light(sums: Array, line: Array, top: int, bottom: int, full: float, o
     and a sum of `full` events or more counts as 1.
     """
     chips, _, width = sums.shape
-    half = out.size // 2
+    half, share = out.size // 2, 1 / full
     out[:] = 0.0
     for i in range(1, chips, 2):
         for v in range(top, bottom + 1):
             centre = int(np.rint(line[0] + line[1] * v))
             for u in range(max(centre - half, 0), min(centre + half, width - 1) + 1):
-                out[half + u - centre] += min(abs(sums[i, v, u]) / full, 1.0)
+                out[half + u - centre] += min(abs(sums[i, v, u]) * share, 1.0)
     out /= max((bottom - top + 1) * (chips // 2), 1)
 
 
@@ -169,7 +185,7 @@ def row_values(sums: Array, line: Array, weight: Array, full: float, out: Array)
     """
     values, rows = out.shape
     width = sums.shape[2]
-    half = weight.size // 2
+    half, share = weight.size // 2, 1 / full
     for v in range(rows):
         centre = int(np.rint(line[0] + line[1] * v))
         first, last = max(centre - half, 0), min(centre + half, width - 1)
@@ -179,7 +195,7 @@ def row_values(sums: Array, line: Array, weight: Array, full: float, out: Array)
         for i in range(values):
             total = 0.0
             for u in range(first, last + 1):
-                total += weight[half + u - centre] * min(max(sums[2 * i + 1, v, u] / full, -1.0), 1.0)
+                total += weight[half + u - centre] * min(max(sums[2 * i + 1, v, u] * share, -1.0), 1.0)
             out[i, v] = total / max(mass, 1e-12)
 
 

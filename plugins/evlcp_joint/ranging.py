@@ -115,7 +115,7 @@ class JointScaleRanging(Ranging):
         clusters = len(centres)
         least = min(self.min_boundaries, clusters - 1)
         spacing_m = float(centres[1, 1] - centres[0, 1])
-        pilots, words = codebook.pilots.astype(np.int64), codebook.codewords.astype(np.int64)
+        pilots, words = codebook.pilots.astype(np.float64), codebook.codewords.astype(np.float64)
 
         def measure(view: FrameView) -> Range:
             placed = _place(view.presence)
@@ -126,16 +126,12 @@ class JointScaleRanging(Ranging):
             if across:
                 # A bar that lies across the image: exchange rows and columns.
                 sums, offset = np.ascontiguousarray(sums.transpose(0, 2, 1)), offset[::-1]
-            symbols = view.soft.symbols
-            codes = np.concatenate([pilots, words[np.maximum(symbols, 0)]], axis=1)
-            known = np.zeros((clusters + 1, codes.shape[1]), np.bool_)
-            known[1:-1] = (place.seen[1:] & place.seen[:-1])[:, None]
-            unread = symbols < 0
-            known[1:-1, pilots.shape[1] :] &= ~(unread[1:] | unread[:-1])[:, None]
             from evlcp_joint import _kernels
 
-            height = sums.shape[1]
-            values = np.empty((codes.shape[1], height))
+            height, n = sums.shape[1], pilots.shape[1] + words.shape[1]
+            codes, known = np.empty((clusters, n)), np.empty((clusters + 1, n), np.bool_)
+            _kernels.codes_said(pilots, words, view.soft.symbols, place.seen, codes, known)
+            values = np.empty((n, height))
             ends = place.first + place.spacing * np.array([-0.5, clusters - 0.5])
             top, bottom = max(int(ends.min()), 0), min(int(ends.max()), height - 1)
             light = np.empty(2 * int(place.half_width) + 3)
@@ -175,7 +171,7 @@ class JointScaleRanging(Ranging):
 
     def _fit(
         self,
-        codes: NDArray[np.int64],
+        codes: Floats,
         known: NDArray[np.bool_],
         offset: Floats,
         values: Floats,
@@ -190,7 +186,7 @@ class JointScaleRanging(Ranging):
 
         fit, by_boundary = fit.copy(), np.empty((2, len(known)))
         variance = _kernels.fit_bar(
-            codes.astype(np.float64),
+            codes,
             known,
             offset,
             _when(len(values)),

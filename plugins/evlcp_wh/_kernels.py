@@ -20,6 +20,28 @@ def _value(first: int, second: int) -> int:
 
 
 @njit(cache=True, nogil=True)
+def _cell_values(sums: Array, grid: int, out: Array) -> None:
+    """Values of the cells' polarity sums, `out` int32 (rows, columns, values)."""
+    rows, columns, length = out.shape
+    width = columns * grid
+    first, second = np.empty(width, np.int32), np.empty(width, np.int32)
+    for i in range(length):
+        for r in range(rows):
+            first[:] = 0
+            second[:] = 0
+            for v in range(r * grid, (r + 1) * grid):
+                for u in range(width):
+                    first[u] += sums[2 * i, v, u]
+                    second[u] += sums[2 * i + 1, v, u]
+            for c in range(columns):
+                a, b = 0, 0
+                for u in range(c * grid, (c + 1) * grid):
+                    a += first[u]
+                    b += second[u]
+                out[r, c, i] = _value(a, b)
+
+
+@njit(cache=True, nogil=True)
 def presence(
     sums: Array, codes: Array, grid: int, agree: float, disagree: float, min_seen: int, out: Array
 ) -> None:
@@ -29,29 +51,25 @@ def presence(
     """
     clusters, length = codes.shape
     _, rows, columns = out.shape
-    values = np.empty(length, np.int64)
-    fits = np.empty(clusters, np.int64)
+    values = np.empty((rows, columns, length), np.int32)
+    _cell_values(sums, grid, values)
+    by_value = np.ascontiguousarray(codes.T.astype(np.int32))
+    fits = np.empty(clusters, np.int32)
     # A cluster whose fit is d below the best is `beside[d]` times as likely.
     beside = np.exp(np.arange(2 * length + 1) * (disagree - agree) / 2)
     for r in range(rows):
         for c in range(columns):
             seen = 0
             for i in range(length):
-                first = 0
-                second = 0
-                for v in range(r * grid, (r + 1) * grid):
-                    for u in range(c * grid, (c + 1) * grid):
-                        first += sums[2 * i, v, u]
-                        second += sums[2 * i + 1, v, u]
-                values[i] = _value(first, second)
-                seen += values[i] != 0
+                seen += abs(values[r, c, i])
             if seen < min_seen:
                 continue
+            fits[:] = 0
+            for i in range(length):
+                for k in range(clusters):
+                    fits[k] += by_value[i, k] * values[r, c, i]
             most = -length
             for k in range(clusters):
-                fits[k] = 0
-                for i in range(length):
-                    fits[k] += codes[k, i] * values[i]
                 most = max(most, fits[k])
             norm = clusters * np.exp(-(agree * (seen + most) + disagree * (seen - most)) / 2)
             for k in range(clusters):
@@ -61,26 +79,40 @@ def presence(
 
 
 @njit(cache=True, nogil=True)
+def _pixel_values(sums: Array, out: Array) -> None:
+    """Values of the pixels' polarity sums, `out` int8 (values, height, width)."""
+    length, height, width = out.shape
+    for i in range(length):
+        for v in range(height):
+            for u in range(width):
+                first, second = sums[2 * i, v, u], sums[2 * i + 1, v, u]
+                out[i, v, u] = (second > 0) - (second < 0) + (second == 0) * ((first < 0) - (first > 0))
+
+
+@njit(cache=True, nogil=True)
 def pixel_maps(sums: Array, codes: Array, grid: int, selected: Array, out: Array) -> None:
     """Pilot correlation of the pixels in each cluster's selected cells and their neighbours, 0 to 1."""
     clusters, length = codes.shape
     _, rows, columns = selected.shape
-    done = np.zeros(selected.shape, np.bool_)
+    values = np.empty((length, sums.shape[1], sums.shape[2]), np.int8)
+    _pixel_values(sums, values)
+    done = np.zeros((rows, columns), np.bool_)
     for k in range(clusters):
+        done[:] = False
         for row in range(rows):
             for column in range(columns):
                 if not selected[k, row, column]:
                     continue
                 for r in range(max(row - 1, 0), min(row + 2, rows)):
                     for c in range(max(column - 1, 0), min(column + 2, columns)):
-                        if done[k, r, c]:
+                        if done[r, c]:
                             continue
-                        done[k, r, c] = True
+                        done[r, c] = True
                         for v in range(r * grid, (r + 1) * grid):
                             for u in range(c * grid, (c + 1) * grid):
                                 fit = 0
                                 for i in range(length):
-                                    fit += codes[k, i] * _value(sums[2 * i, v, u], sums[2 * i + 1, v, u])
+                                    fit += codes[k, i] * values[i, v, u]
                                 out[k, v, u] = max(fit, 0) / length
 
 

@@ -410,6 +410,19 @@ def test_straight_is_theil_sen() -> None:
     assert left == pytest.approx(np.median(y - slope * x))
 
 
+def test_codes_are_known_between_clusters_that_are_seen_and_read() -> None:
+    rng = np.random.default_rng(4)
+    symbols, seen = rng.integers(-1, 64, K), rng.random(K) < 0.8
+    symbols[[3, 9]] = -1
+    codes, known = np.empty((K, 16)), np.empty((K + 1, 16), np.bool_)
+    _kernels.codes_said(PILOTS, WORDS, symbols, seen, codes, known)
+    np.testing.assert_array_equal(codes, np.concatenate([PILOTS, WORDS[np.maximum(symbols, 0)]], axis=1))
+    both, read = seen[1:] & seen[:-1], (symbols[1:] >= 0) & (symbols[:-1] >= 0)
+    want = np.zeros((K + 1, 16), bool)
+    want[1:-1, :8], want[1:-1, 8:] = both[:, None], (both & read)[:, None]
+    np.testing.assert_array_equal(known, want)
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_the_core_is_what_hangs_together_about_the_fullest(seed: int) -> None:
     counts = np.random.default_rng(seed).integers(0, 20, 11)
@@ -512,7 +525,7 @@ def noisy_fit(distance_m: float, noise: float, seed: int) -> tuple[float, np.nda
     """The fit's distance for a frame made of the model plus Gaussian noise, and the symbols."""
     rng = np.random.default_rng(seed)
     symbols = rng.integers(0, 64, K)
-    codes = np.concatenate([PILOTS, WORDS[symbols]], axis=1).astype(np.int64)
+    codes = np.concatenate([PILOTS, WORDS[symbols]], axis=1)
     spacing = LINK.camera.focal_px * 0.06 / distance_m
     rows = 2 * int(spacing * 8 + 4)
     at = np.arange(rows) - (rows - 1) / 2

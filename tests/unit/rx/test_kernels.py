@@ -185,8 +185,14 @@ def test_old_rises(seed):
     now, rose = 5_000_000, 5_000_000 - rng.integers(0, 2**22, (HEIGHT, WIDTH))
     chips, score = rng.integers(0, 14, rose.shape), rng.integers(0, 41, rose.shape)
     pixels = states(rose, chips, score)
-    _kernels.grow_old(pixels, now, 3000, 4000)
-    assert_array_equal(pixels, states(np.where(now - rose >= 3000, now - 4000, rose), chips, score))
+    # Rows 10 to 15, and 0 to 4.
+    _kernels.grow_old(pixels, 10, 11, now, 3000, 4000)
+    looked_at = np.isin(np.arange(HEIGHT), [*range(10, 16), *range(5)])
+    old = (now - rose >= 3000) & looked_at[:, None]
+    assert_array_equal(pixels, states(np.where(old, now - 4000, rose), chips, score))
+    events, keep = random_events(rng, 300), np.empty(300, np.bool_)
+    _kernels.in_rhythm(events.x, events.y, pixels, 20, keep)
+    assert_array_equal(keep, score[events.y, events.x] >= 20)
 
 
 @pytest.mark.parametrize("reach", [2.0, np.inf])
