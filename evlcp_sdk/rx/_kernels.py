@@ -513,6 +513,32 @@ def across_profile(
 
 
 @njit(cache=True, nogil=True)
+def core_profile(hits: Array, cells: Array, edge: float, out: Array) -> int:
+    """Hits per cell by distance from an axis, 0 to 1; how many.
+
+    They reach to where, beyond their peak, they first fall below `edge` of it. Cells in rows with the axis leave distances out between them: straight lines lead over those, and to the
+    first from 0 it stays the same.
+    """
+    before = -1
+    out[:] = 0.0
+    for i in range(cells.size):
+        if cells[i] > 0:
+            value = hits[i] / cells[i]
+            for j in range(before + 1, i):
+                part = (j - before) / (i - before)
+                out[j] = out[before] + part * (value - out[before]) if before >= 0 else value
+            out[i] = value
+            before = i
+    n = int(np.argmax(out))
+    highest = out[n]
+    while n < out.size and not out[n] < edge * highest:
+        n += 1
+    for i in range(n):
+        out[i] = min(max(out[i], 0.0), 1.0)
+    return n
+
+
+@njit(cache=True, nogil=True)
 def line_prior(places: Array, unit: complex, spacing: float, grid: int, profile: Array, out: Array) -> None:
     """Probability of each cluster of a line in each cell, by its share of the cell and its distance off."""
     _, rows, columns = out.shape
@@ -977,3 +1003,52 @@ def cells_by_place(
                 nearest, least = k, off
         if least <= half:
             out_of_place[nearest] += cells[i]
+
+
+@njit(cache=True, nogil=True)
+def out_of_reach(at: Array, places: Array, reach: float, left: Array) -> None:
+    """Mark blobs that are farther than `reach` from every place."""
+    for i in range(at.size):
+        left[i] = True
+        for place in places:
+            if abs(at[i] - place) <= reach:
+                left[i] = False
+                break
+
+
+@njit(cache=True, nogil=True)
+def mean_off(points: Array, places: Array) -> complex | None:
+    """How far points (K, 2) are off their places on average, without those that are NaN; None without any."""
+    total, n = complex(0.0, 0.0), 0
+    for k in range(places.size):
+        if np.isfinite(points[k, 0]) and np.isfinite(points[k, 1]):
+            total += complex(points[k, 0], points[k, 1]) - places[k]
+            n += 1
+    return total / n if n else None
+
+
+@njit(cache=True, nogil=True)
+def hold_still(x: Array, y: Array, width: int, height: int, shift: Array, rest: Array) -> float:
+    """Sensor pixel of an image's (0, 0) that holds a centre (chips,) in its middle, and what is left of it.
+
+    `shift` and `rest` are (2, chips); the mean row of the centre is given back.
+    """
+    total = 0.0
+    for c in range(x.size):
+        left, top = x[c] - (width - 1) / 2, y[c] - (height - 1) / 2
+        shift[0, c], shift[1, c] = int(np.rint(left)), int(np.rint(top))
+        rest[0, c], rest[1, c] = left - shift[0, c], top - shift[1, c]
+        total += y[c]
+    return total / x.size
+
+
+@njit(cache=True, nogil=True)
+def clear_cells(hits: Array, box: tuple[int, int, int, int], cell_shift: int) -> int:
+    """Set the cells that a box (left, top, right, bottom) of pixels touches to 0; what they had."""
+    left, top, right, bottom = box
+    had = 0
+    for v in range(top >> cell_shift, min((bottom - 1 >> cell_shift) + 1, hits.shape[0])):
+        for u in range(left >> cell_shift, min((right - 1 >> cell_shift) + 1, hits.shape[1])):
+            had += hits[v, u]
+            hits[v, u] = 0
+    return had

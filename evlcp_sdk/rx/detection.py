@@ -524,10 +524,9 @@ def _inside(hits: NDArray[np.int32], box: Box) -> NDArray[np.int32]:
 
 def _cleared(hits: NDArray[np.int32], box: Box) -> int:
     """Set the cells that a box touches to 0; return what they had."""
-    cells = _inside(hits, box)
-    had = int(cells.sum())
-    cells[:] = 0
-    return had
+    from evlcp_sdk.rx import _kernels
+
+    return _kernels.clear_cells(hits, box, _CELL_SHIFT)
 
 
 def _joined(boxes: list[Box], gap: int) -> list[Box]:

@@ -151,11 +151,13 @@ class Looker:
 
         Points are finer than the cells that placed the layout; without any, those count.
         """
-        off = points_px @ np.array([1, 1j]) - look.placement.places(self._layout)
-        seen = np.isfinite(off)
-        if not seen.any():
+        from evlcp_sdk.rx import _kernels
+
+        placed = look.placement
+        off = _kernels.mean_off(points_px, placed.places(self._layout))
+        if off is None:
             return look.centre_px
-        centre = look.placement.shift + complex(off[seen].mean())
+        centre = placed.shift + off
         return centre.real, centre.imag
 
     def box(self, look: Look, placement: Placement) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -220,14 +222,11 @@ def polarity_sums(
     from evlcp_sdk.rx import _kernels
 
     width, height = size_px
-    corner_px = np.array(centre_px)
-    corner_px[0] -= (width - 1) / 2
-    corner_px[1] -= (height - 1) / 2
-    whole_px = np.rint(corner_px)
-    shift_x, shift_y = whole_px.astype(np.int64)
-    sums = np.zeros((len(shift_x), height, width), np.int16)
+    chips = len(centre_px[0])
+    shift, rest_px = np.empty((2, chips), np.int64), np.empty((2, chips))
     # Rows wait for the bar's own, wherever they are.
-    row_px = float(np.mean(centre_px[1]))
+    row_px = _kernels.hold_still(*centre_px, width, height, shift, rest_px)
+    sums = np.zeros((chips, height, width), np.int16)
     for e in events:
         _kernels.add_polarity(
             e.t_us,
@@ -239,11 +238,11 @@ def polarity_sums(
             lock.chip_us,
             lock.row_us,
             row_px,
-            shift_x,
-            shift_y,
+            shift[0],
+            shift[1],
             sums,
         )
-    return sums, corner_px - whole_px
+    return sums, rest_px
 
 
 def _even(size: float) -> int:

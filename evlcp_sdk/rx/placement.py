@@ -170,7 +170,7 @@ def placements(
         if found and best.cells < _OTHER_CELLS * found[0].cells:
             break
         found.append(best)
-        blobs = blobs[~_covered(blobs, layout, best, slack_px)]
+        blobs = _left(blobs, layout, best, slack_px)
         # Most images show one bar; what is left of them needs no vote.
         if blobs.cells.sum() < _OTHER_CELLS * found[0].cells:
             break
@@ -202,9 +202,8 @@ def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> Prese
         hits, cells = np.zeros((2, math.ceil(spacing_px + _WIDEST_PX)))
         seen, probability = placement.seen, presence.probability
         _kernels.across_profile(probability, seen, places, unit, spacing_px, grid, hits, cells)
-        # Cells in rows with the axis leave distances out between them.
-        some = np.flatnonzero(cells)
-        profile = _core(np.interp(np.arange(len(hits)), some, hits[some] / cells[some], right=0.0))
+        profile = np.empty(len(hits))
+        profile = profile[: _kernels.core_profile(hits, cells, _EDGE, profile)]
         across_px = float(len(profile))
         _kernels.line_prior(places, unit, spacing_px, grid, profile, prior)
     else:
@@ -234,25 +233,18 @@ def lit(
         return presence, placement
     light = np.empty(len(pilots))
     _kernels.pilot_light(sums, pilots, presence.prior, presence.grid_px, light)
-    full = median(light[placement.seen].tolist()) if placement.seen.any() else 0.0
-    seen = light >= max(_LEAST_LIGHT * full, 1e-9)
+    others = [v for v, in_place in zip(light.tolist(), placement.seen.tolist(), strict=True) if in_place]
+    seen = light >= max(_LEAST_LIGHT * median(others) if others else 0.0, 1e-9)
+    placement = replace(placement, seen=seen)
+    if seen.all():
+        return presence, placement
     dark = ~seen
-    if not dark.any():
-        return presence, replace(placement, seen=seen)
     probability, prior = presence.probability.copy(), presence.prior.copy()
     pixels, selected = presence.pixels.copy(), presence.selected.copy()
     for image in (probability, prior, pixels, selected):
         image[dark] = 0
     only = replace(presence, probability=probability, prior=prior, pixels=pixels, selected=selected)
-    return only, replace(placement, seen=seen)
-
-
-def _core(profile: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A profile from its axis to where, beyond its peak, it first falls below `_EDGE` of it."""
-    peak = int(profile.argmax())
-    low = np.flatnonzero(profile[peak:] < _EDGE * profile[peak])
-    core: NDArray[np.float64] = np.clip(profile[: peak + low[0] if len(low) else None], 0, 1)
-    return core
+    return only, placement
 
 
 def _turned(layout: Layout, mirrored: bool) -> NDArray[np.complex128]:
@@ -343,10 +335,11 @@ def _at_least(hits: int, of: int, odds: float) -> float:
     return float(sum(math.comb(of, n) * odds**n * (1 - odds) ** (of - n) for n in range(hits, of + 1)))
 
 
-def _covered(blobs: _Blobs, layout: Layout, placement: Placement, slack_px: float) -> NDArray[np.bool_]:
-    """Blobs that a placement has used up: those in the clusters' places, and what lies in the bar."""
-    places = placement.places(layout)
+def _left(blobs: _Blobs, layout: Layout, placement: Placement, slack_px: float) -> _Blobs:
+    """Blobs that a placement has not used up: neither in the clusters' places, nor elsewhere in the bar."""
+    from evlcp_sdk.rx import _kernels
+
     reach = abs(placement.scale) * layout.spacing_m / 2 + slack_px
-    off = np.abs(blobs.at[:, None] - places[None])
-    covered: NDArray[np.bool_] = off.min(1) <= reach
-    return covered
+    left = np.empty(len(blobs.at), np.bool_)
+    _kernels.out_of_reach(blobs.at, placement.places(layout), reach, left)
+    return blobs[left]

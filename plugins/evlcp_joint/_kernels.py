@@ -112,6 +112,18 @@ def core_of(counts: Array) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True)
+def lies_across(middles: Array) -> bool:
+    """Whether middles (row, column) spread over more columns than rows; NaN are passed over."""
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for k in range(len(middles)):
+        for a in range(2):
+            if not np.isnan(middles[k, a]):
+                low[a] = min(low[a], middles[k, a])
+                high[a] = max(high[a], middles[k, a])
+    return bool(high[1] - low[1] > high[0] - low[0])
+
+
+@njit(cache=True, nogil=True)
 def line_of_cells(selected: Array, middles: Array, line: Array, seen: Array) -> bool:
     """Line of a bar's cells; False with fewer than three clusters in it.
 
@@ -121,6 +133,8 @@ def line_of_cells(selected: Array, middles: Array, line: Array, seen: Array) -> 
     """
     clusters = len(selected)
     known = np.flatnonzero(~np.isnan(middles[:, 0]))
+    if known.size < 3:
+        return False
     spacing, first = straight(known, middles[known, 0])
     tilt, left = straight(middles[known, 0], middles[known, 1])
     # Cells as wide as the bar is long are looked at: it is narrower.
@@ -197,6 +211,28 @@ def row_values(sums: Array, line: Array, weight: Array, full: float, out: Array)
             for u in range(first, last + 1):
                 total += weight[half + u - centre] * min(max(sums[2 * i + 1, v, u] * share, -1.0), 1.0)
             out[i, v] = total / max(mass, 1e-12)
+
+
+@njit(cache=True, nogil=True)
+def bar_values(
+    sums: Array,
+    line: Array,
+    half_width: float,
+    one_end: float,
+    other_end: float,
+    full: float,
+    veil: float,
+    out: Array,
+) -> None:
+    """Values of the rows of a bar, `out` (values, rows), columns weighed by their light between its ends.
+
+    What has less than `veil` of the brightest column's light is its veil, or beside it.
+    """
+    rows = out.shape[1]
+    top, bottom = max(int(min(one_end, other_end)), 0), min(int(max(one_end, other_end)), rows - 1)
+    light = np.empty(2 * int(half_width) + 3)
+    column_light(sums, line, top, bottom, full, light)
+    row_values(sums, line, np.maximum(light - veil * light.max(), 0), full, out)
 
 
 _REACH = 12.0

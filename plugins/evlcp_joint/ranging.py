@@ -132,13 +132,16 @@ class JointScaleRanging(Ranging):
             codes, known = np.empty((clusters, n)), np.empty((clusters + 1, n), np.bool_)
             _kernels.codes_said(pilots, words, view.soft.symbols, place.seen, codes, known)
             values = np.empty((n, height))
-            ends = place.first + place.spacing * np.array([-0.5, clusters - 0.5])
-            top, bottom = max(int(ends.min()), 0), min(int(ends.max()), height - 1)
-            light = np.empty(2 * int(place.half_width) + 3)
-            _kernels.column_light(sums, place.line, top, bottom, self.full_events, light)
-            # What has less than that much of the brightest column's light is its veil, or beside it.
-            light = np.maximum(light - _VEIL * light.max(), 0)
-            _kernels.row_values(sums, place.line, light, self.full_events, values)
+            _kernels.bar_values(
+                sums,
+                place.line,
+                place.half_width,
+                place.first - 0.5 * place.spacing,
+                place.first + (clusters - 0.5) * place.spacing,
+                self.full_events,
+                _VEIL,
+                values,
+            )
             spacing, first, moved = place.spacing, place.first, np.ascontiguousarray(offset[1])
             if spacing < 0:
                 # A bar upside down: mirror it.
@@ -155,7 +158,7 @@ class JointScaleRanging(Ranging):
             if abs(fit[0] - spacing) * (clusters - 1) / 2 + abs(fit[1] - centre) > most_px:
                 return _NONE
             # Rows measure the bar along one axis; a tilted bar is longer by its slope.
-            stretch = float(np.hypot(1.0, place.line[1]))
+            stretch = math.hypot(1.0, place.line[1])
             distance = camera.distance_m(spacing_m, float(fit[0]) * stretch)
             late_chips = (len(sums) - 2 * pilots.shape[1]) / 2
             one_px = spacing_m * float(fit[0]) * stretch / distance
@@ -273,11 +276,7 @@ def _place(presence: PresenceMap) -> tuple[_Place, bool] | None:
     selected = presence.selected
     middles = np.empty((len(selected), 2))
     _kernels.cell_medians(selected, middles)
-    k = np.flatnonzero(~np.isnan(middles[:, 0]))
-    if len(k) < 3:
-        return None
-    rows, columns = middles[k].T
-    across = bool(np.ptp(columns) > np.ptp(rows))
+    across = _kernels.lies_across(middles)
     if across:
         selected, middles = np.ascontiguousarray(selected.transpose(0, 2, 1)), middles[:, ::-1].copy()
     line, seen = np.empty(5), np.empty(len(selected), np.bool_)

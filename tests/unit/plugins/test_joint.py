@@ -333,6 +333,25 @@ def test_row_values_are_clipped_weighted_means() -> None:
         assert_allclose(out[:, v], np.average(clipped, axis=1, weights=weight[inside]))
 
 
+def test_rows_are_weighed_by_the_light_between_a_bars_ends() -> None:
+    rng = np.random.default_rng(3)
+    sums = rng.integers(-5, 6, (8, 20, 15)).astype(np.int16)
+    line, out, want = np.array([5.0, 0.2]), np.empty((4, 20)), np.empty((4, 20))
+    for ends in ((3.2, 16.9), (16.9, 3.2)):
+        _kernels.bar_values(sums, line, 1.7, *ends, 3.0, 0.3, out)
+        light = np.empty(5)
+        _kernels.column_light(sums, line, 3, 16, 3.0, light)
+        _kernels.row_values(sums, line, np.maximum(light - 0.3 * light.max(), 0), 3.0, want)
+        assert_allclose(out, want)
+
+
+def test_a_bar_lies_along_what_it_spreads_over() -> None:
+    upright = np.array([[1.0, 5.0], [np.nan, np.nan], [9.0, 6.0]])
+    assert not _kernels.lies_across(upright)
+    assert _kernels.lies_across(upright[:, ::-1].copy())
+    assert not _kernels.lies_across(np.full((4, 2), np.nan))
+
+
 def test_solve_leaves_no_score() -> None:
     twin = Twin(5)
     rng = np.random.default_rng(5)

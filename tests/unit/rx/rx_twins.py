@@ -270,3 +270,11 @@ def cells_by_place(at, cluster, cells, places, reach, half):
         np.bincount(cluster[right], cells[right], len(places)),
         np.bincount(off.argmin(1)[wrong], cells[wrong], len(places)),
     ]
+
+
+def core_profile(hits, cells, edge):
+    some = np.flatnonzero(cells)
+    profile = np.interp(np.arange(len(hits)), some, hits[some] / cells[some], right=0.0)
+    peak = int(profile.argmax())
+    low = np.flatnonzero(profile[peak:] < edge * profile[peak])
+    return np.clip(profile[: peak + low[0] if len(low) else None], 0, 1)

@@ -432,3 +432,48 @@ def test_cells_in_and_out_of_place(seed, clusters):
     got = np.zeros((2, clusters))
     _kernels.cells_by_place(at, cluster, cells, places, gap / 2 + 1, gap / 2, *got)
     assert_array_equal(got, twins.cells_by_place(at, cluster, cells, places, gap / 2 + 1, gap / 2))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_core_of_a_profile(seed):
+    rng = np.random.default_rng(seed)
+    cells = np.where(rng.random(12) < 0.6, rng.random(12), 0)
+    cells[rng.integers(12)] = 0.5
+    hits, out = cells * rng.uniform(-0.5, 1.5, 12), np.empty(12)
+    n = _kernels.core_profile(hits, cells, 0.5, out)
+    assert_allclose(out[:n], twins.core_profile(hits, cells, 0.5), atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_blobs_that_are_left_and_points_off_their_places(seed):
+    rng = np.random.default_rng(seed)
+    at, places = (rng.normal(0, 9, (n, 2)) @ [1, 1j] for n in (30, 5))
+    left = np.empty(30, np.bool_)
+    _kernels.out_of_reach(at, places, 4.0, left)
+    assert_array_equal(left, np.abs(at[:, None] - places).min(1) > 4)
+    points = rng.normal(0, 9, (5, 2))
+    points[[1, 3]] = np.nan
+    off = points @ [1, 1j] - places
+    assert _kernels.mean_off(points, places) == pytest.approx(off[[0, 2, 4]].mean())
+    assert _kernels.mean_off(np.full((5, 2), np.nan), places) is None
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_centre_is_held_in_the_middle(seed):
+    x, y = np.random.default_rng(seed).uniform(-3, 1300, (2, 20))
+    shift, rest = np.empty((2, 20), np.int64), np.empty((2, 20))
+    assert _kernels.hold_still(x, y, 18, 101, shift, rest) == pytest.approx(y.mean())
+    corner = np.stack([x - 8.5, y - 50])
+    assert_array_equal(shift, np.rint(corner))
+    assert_allclose(rest, corner - np.rint(corner), atol=1e-12)
+
+
+@pytest.mark.parametrize("box", [(0, 0, 24, 16), (3, 5, 9, 6), (4, 4, 8, 8), (20, 8, 40, 30)])
+def test_cells_that_a_box_touches_are_cleared(box):
+    hits = np.random.default_rng(0).integers(1, 9, (4, 6)).astype(np.int32)
+    left, top, right, bottom = box
+    v, u = np.mgrid[:4, :6]
+    inside = (4 * v < bottom) & (4 * v + 4 > top) & (4 * u < right) & (4 * u + 4 > left)
+    had, want = int(hits[inside].sum()), np.where(inside, 0, hits)
+    assert _kernels.clear_cells(hits, box, 2) == had
+    assert_array_equal(hits, want)
