@@ -516,8 +516,9 @@ def across_profile(
 def core_profile(hits: Array, cells: Array, edge: float, out: Array) -> int:
     """Hits per cell by distance from an axis, 0 to 1; how many.
 
-    They reach to where, beyond their peak, they first fall below `edge` of it. Cells in rows with the axis leave distances out between them: straight lines lead over those, and to the
-    first from 0 it stays the same.
+    They reach to where, beyond their peak, they first fall below `edge` of it. Cells in rows with the axis
+    leave distances out between them: straight lines lead over those, and up to the first it
+    stays the same.
     """
     before = -1
     out[:] = 0.0
@@ -1052,3 +1053,47 @@ def clear_cells(hits: Array, box: tuple[int, int, int, int], cell_shift: int) ->
             had += hits[v, u]
             hits[v, u] = 0
     return had
+
+
+@njit(cache=True, nogil=True)
+def slope_of_rows(
+    rows: Array, fit: Array, seen: Array, fewest: int, chance: float, least: float
+) -> tuple[float, float]:
+    """Lag from row to row at which blocks of rows fit best, and its sigma, lags; NaN of too few.
+
+    `rows` (blocks,) are their middles, `fit` (blocks, lags) how well each fits, `seen` its events. A block
+    beside the light, or hidden, has next to none of the events, or fits no better than by chance: less than a
+    quarter of the median, or than `chance` sigmas of its events. `least` is the least error of a place.
+    """
+    blocks, lags = fit.shape
+    top = np.empty(blocks)
+    for b in range(blocks):
+        top[b] = fit[b].max()
+    middle = np.median(top)
+    at, place = np.empty(blocks), np.empty(blocks)
+    n = 0
+    for b in range(blocks):
+        if top[b] > max(middle / 4, chance * np.sqrt(seen[b])):
+            # The top is flat where a window holds all events of an edge: its middle is the best window.
+            weight, total = 0.0, 0.0
+            for lag in range(lags):
+                over = max(fit[b, lag] - 0.9 * top[b], 0.0)
+                weight += over
+                total += over * lag
+            at[n], place[n] = rows[b], total / weight
+            n += 1
+    if n < fewest:
+        return np.nan, np.nan
+    # A median of pairs: blocks with a part of the bar hidden, or another's light, are outliers.
+    slopes = np.empty(n * n)
+    pairs = 0
+    for i in range(n):
+        for j in range(i + 1, n):
+            if at[j] - at[i] > (at[n - 1] - at[0]) / 3:
+                slopes[pairs] = (place[j] - place[i]) / (at[j] - at[i])
+                pairs += 1
+    slope = np.median(slopes[:pairs])
+    rest = place[:n] - slope * at[:n]
+    spread = max(1.48 * np.median(np.abs(rest - np.median(rest))), least)
+    mean = at[:n].mean()
+    return slope, spread / np.sqrt(((at[:n] - mean) ** 2).sum())

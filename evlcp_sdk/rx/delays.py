@@ -114,31 +114,10 @@ class RowDelays:
         rows_px = (np.arange(blocks) + 0.5) * height_px / blocks
         total, weight = 0.0, 0.0
         for part, seen in zip(fit, counts.sum(2), strict=True):
-            row_us, sigma_us = _slope(rows_px, part, seen, step_us)
-            if math.isfinite(row_us):
-                total += row_us / sigma_us**2
-                weight += 1 / sigma_us**2
+            lag, sigma = _kernels.slope_of_rows(
+                rows_px, part, seen, _FEWEST_BLOCKS, _CHANCE_SIGMAS, _PLACE_SIGMA_US / step_us
+            )
+            if math.isfinite(lag):
+                total += lag * step_us / (sigma * step_us) ** 2
+                weight += 1 / (sigma * step_us) ** 2
         return (total / weight, 1 / math.sqrt(weight)) if weight else (math.nan, math.nan)
-
-
-def _slope(
-    rows_px: NDArray[np.float64], fit: NDArray[np.float64], seen: NDArray[np.float64], step_us: float
-) -> tuple[float, float]:
-    """Delay a row, and its sigma, from how each block's events fit the preamble (blocks, lags)."""
-    top = fit.max(1)
-    # A block beside the light, or hidden, has next to none of the events, or fits no better than by chance.
-    lit = top > np.maximum(np.median(top) / 4, _CHANCE_SIGMAS * np.sqrt(seen))
-    if lit.sum() < _FEWEST_BLOCKS:
-        return math.nan, math.nan
-    rows_px, fit, top = rows_px[lit], fit[lit], top[lit]
-    # The top is flat where a window holds all events of an edge: its middle is the best window.
-    weight = np.maximum(fit - 0.9 * top[:, None], 0)
-    places_us = step_us * (weight @ np.arange(fit.shape[1])) / weight.sum(1)
-    i, j = np.triu_indices(len(rows_px), 1)
-    far = rows_px[j] - rows_px[i] > (rows_px[-1] - rows_px[0]) / 3
-    i, j = i[far], j[far]
-    # A median of pairs: blocks with a part of the bar hidden, or another's light, are outliers.
-    row_us = float(np.median((places_us[j] - places_us[i]) / (rows_px[j] - rows_px[i])))
-    rest_us = places_us - row_us * rows_px
-    spread_us = max(1.48 * float(np.median(np.abs(rest_us - np.median(rest_us)))), _PLACE_SIGMA_US)
-    return row_us, spread_us / math.sqrt(float(((rows_px - rows_px.mean()) ** 2).sum()))

@@ -116,9 +116,12 @@ class Followed:
 
     def at(self, t_us: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Centre (column, row) at times, interpolated; straight on for a little before and after, px."""
-        t = [r.t_us for r in self.positions]
-        x = [r.x_px for r in self.positions]
-        y = [r.y_px for r in self.positions]
+        # Those about the times asked for, which are few of many.
+        first, last = float(t_us.min(initial=math.inf)), float(t_us.max(initial=-math.inf))
+        times = [r.t_us for r in self.positions]
+        start, stop = max(bisect_left(times, first) - 2, 0), bisect_left(times, last) + 2
+        near = list(self.positions)[start:stop]
+        t, x, y = times[start:stop], [r.x_px for r in near], [r.y_px for r in near]
         if len(t) > 1:
             # A place more at each end, on the straight line through the outermost two.
             n = _MOST_AHEAD_STEPS

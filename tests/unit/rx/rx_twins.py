@@ -278,3 +278,20 @@ def core_profile(hits, cells, edge):
     peak = int(profile.argmax())
     low = np.flatnonzero(profile[peak:] < edge * profile[peak])
     return np.clip(profile[: peak + low[0] if len(low) else None], 0, 1)
+
+
+def slope_of_rows(rows, fit, seen, fewest, chance, least):
+    top = fit.max(1)
+    lit = top > np.maximum(np.median(top) / 4, chance * np.sqrt(seen))
+    if lit.sum() < fewest:
+        return np.nan, np.nan
+    rows, fit, top = rows[lit], fit[lit], top[lit]
+    weight = np.maximum(fit - 0.9 * top[:, None], 0)
+    places = (weight @ np.arange(fit.shape[1])) / weight.sum(1)
+    i, j = np.triu_indices(len(rows), 1)
+    far = rows[j] - rows[i] > (rows[-1] - rows[0]) / 3
+    i, j = i[far], j[far]
+    slope = np.median((places[j] - places[i]) / (rows[j] - rows[i]))
+    rest = places - slope * rows
+    spread = max(1.48 * np.median(np.abs(rest - np.median(rest))), least)
+    return slope, spread / np.sqrt(((rows - rows.mean()) ** 2).sum())
