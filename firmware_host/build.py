@@ -24,7 +24,10 @@ def build_folder() -> Path:
         p for p in FIRMWARE.rglob("*") if p.suffix in (".c", ".h", ".ld") or p.name == "Makefile"
     ):
         digest.update(path.relative_to(FIRMWARE).as_posix().encode() + b"\0" + path.read_bytes())
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    try:
+        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError as fault:
+        raise ToolchainError(f"{fault} Set XDG_CACHE_HOME to a folder that can be written") from fault
     return root / "evlcp" / f"firmware-{digest.hexdigest()[:16]}"
 
 

@@ -44,7 +44,7 @@ def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
             f" {processing['events_per_s'] / 1e6:.1f} Mev/s, {processing['times_real_time']:.2f} x real time"
         )
         if processing["compiled_s"] > 1:
-            out.print(f"kernels compiled, once for all, in {processing['compiled_s']:.0f} s", style="dim")
+            out.print(f"kernels compiled in {processing['compiled_s']:.0f} s", style="dim")
     for loss in summary["losses"].values():
         out.print(
             f"lost: {loss['count']} {loss['meaning']} (first at {loss['unit']} {loss['first']})",

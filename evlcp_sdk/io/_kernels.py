@@ -6,7 +6,6 @@ Indices that advance in a loop are `uintp`: numba then leaves out its test for n
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from evlcp_sdk.io._words import (
@@ -53,6 +52,7 @@ from evlcp_sdk.io._words import (
     VECTOR_CUT,
     VECTOR_LEFT,
 )
+from evlcp_sdk.kernels import njit
 
 __all__ = ["decode_evt2", "decode_evt3", "encode_evt2", "encode_evt3", "format_csv", "parse_csv"]
 

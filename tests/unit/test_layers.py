@@ -9,7 +9,7 @@ import pytest
 SDK = Path(__file__).parents[2] / "evlcp_sdk"
 
 LAYERS = (
-    {"errors", "files", "signals", "specs", "spelling"},
+    {"errors", "files", "kernels", "signals", "specs", "spelling"},
     {"air"},
     {"values", "scene", "_kernels"},
     {"plugin"},
