@@ -27,6 +27,7 @@ from evlcp_sdk.results.summary import Status
 from evlcp_sdk.results.tables import frames_table
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.signals import ENDING, heard_by
 from evlcp_sdk.values import Frame, Packet
@@ -57,6 +58,7 @@ def receive(
     link: Link | Path | str | None = None,
     *,
     registry: Registry | None = None,
+    attitude: Attitude | AttitudeLog | None = None,
 ) -> "Reception":
     """Receive a recording or a camera: an iterator over its packets, in constant memory.
 
@@ -66,6 +68,8 @@ def receive(
         source: What to open, plugins asked first; or a source that is open, which is read on and closed.
         link: The configuration, or a `link.toml`; None for all defaults.
         registry: Plugins whose hooks are called; None for all that are installed.
+        attitude: What is known of the camera's attitude, the same always or over time: how plumb bars lean
+            against the sensor. None for nothing.
 
     Raises:
         InputError: The source cannot be opened.
@@ -76,7 +80,7 @@ def receive(
     opened = source if isinstance(source, EventSource) else open_source(source, registry)
     try:
         check_sensor(opened, opened.path if isinstance(source, EventSource) else source, link.camera)
-        return Reception(opened, Receiver(link, registry.hook), link)
+        return Reception(opened, Receiver(link, registry.hook, attitude=attitude), link)
     except BaseException:
         opened.close()
         raise
@@ -183,6 +187,7 @@ def receive_to_folder(
     *,
     registry: Registry | None = None,
     plan: PositionPlan | None = None,
+    attitude: Attitude | AttitudeLog | None = None,
     sinks: Sequence[str] = (),
     advance: Advance = lambda _done, _of: None,
     stopped: Stopped = lambda: False,
@@ -196,6 +201,8 @@ def receive_to_folder(
         link: The configuration, or a `link.toml`; None for all defaults.
         registry: The plugins; None for all that are installed.
         plan: What positions are computed from; None for none.
+        attitude: What is known of the camera's attitude, the same always or over time, for distances and
+            positions; None for nothing.
         sinks: Output formats beside the default ones, by name, e.g. `parquet`.
         advance: Says how far the reading is.
         stopped: Ends the run early; what was decoded until then is written.
@@ -214,8 +221,12 @@ def receive_to_folder(
     url = str(source.path if isinstance(source, EventSource) else source)
     with source if isinstance(source, EventSource) else open_source(source, registry) as opened:
         check_sensor(opened, url, link.camera)
-        with ResultWriter(folder, link, registry, name=Path(url).name, plan=plan, sinks=sinks) as writer:
-            return _run(opened, url, Receiver(link, registry.hook), writer, advance, stopped)
+        name = Path(url).name
+        with ResultWriter(
+            folder, link, registry, name=name, plan=plan, attitude=attitude, sinks=sinks
+        ) as writer:
+            receiver = Receiver(link, registry.hook, attitude=attitude)
+            return _run(opened, url, receiver, writer, advance, stopped)
 
 
 def _run(

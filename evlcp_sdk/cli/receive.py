@@ -16,6 +16,7 @@ from evlcp_sdk.errors import InputError, InterruptedRunError
 if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
     from evlcp_sdk.place.navigator import PositionPlan
+    from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 
 __all__ = ["register"]
 
@@ -55,8 +56,13 @@ def receive(
         Path | None,
         typer.Option("--sites", metavar="site.toml", help="Where the bars stand: compute positions."),
     ] = None,
-    attitude: Annotated[
-        Path | None, typer.Option("--attitude", metavar="FILE.csv", help="The camera's attitude over time.")
+    attitude_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--attitude",
+            metavar="FILE.csv",
+            help="The camera's attitude over time, for distances and positions.",
+        ),
     ] = None,
     heading_deg: Annotated[
         float | None, typer.Option("--heading-deg", help="Its heading, clockwise from north, if known.")
@@ -99,6 +105,8 @@ def receive(
     Positions, with the camera level and looking north: [bold]evlcp receive REC.raw -o out --sites site.toml
     --heading-deg 0 --pitch-deg 0 --roll-deg 0[/]
 
+    Distances, with the camera pitched up: [bold]evlcp receive REC.raw -o out --pitch-deg 4 --roll-deg 0[/]
+
     Positions, with an IMU's log: [bold]evlcp receive REC.raw -o out --sites site.toml --attitude imu.csv[/]
 
     OUT gets frames.csv (a row per frame), packets.jsonl (a line per packet or message) and summary.json.
@@ -119,7 +127,8 @@ def receive(
     registry = Registry.load()
     link = load_link(link_file, overrides or [], registry)
     angles = (heading_deg, pitch_deg, roll_deg)
-    plan = _position_plan(sites, attitude, angles, (gravity_sigma_deg, heading_sigma_deg), clock_zero, mcap)
+    attitude = _attitude(attitude_file, angles, (gravity_sigma_deg, heading_sigma_deg))
+    plan = _position_plan(sites, clock_zero, mcap)
     short = {"figures": figures, "parquet": parquet, "mcap": mcap}
     asked = tuple(dict.fromkeys([*(name for name, given in short.items() if given), *(sinks or [])]))
     load_sinks(choose_sinks(registry, asked, positions=plan is not None))
@@ -133,6 +142,7 @@ def receive(
             _decode_job,
             link=link,
             plan=plan,
+            attitude=attitude,
             sinks=asked,
             stopped=stopped if here else None,
         )
@@ -162,29 +172,17 @@ def receive(
     raise typer.Exit(worst)
 
 
-def _position_plan(
-    sites: Path | None,
+def _attitude(
     file: Path | None,
     angles: tuple[float | None, float | None, float | None],
     sigmas: tuple[float, float],
-    clock_zero: str | None,
-    mcap: bool,
-) -> "PositionPlan | None":
-    """What the options say of positions; None without sites."""
-    heading, pitch, roll = angles
-    if sites is None:
-        given = {"--attitude": file, "--heading-deg": heading, "--pitch-deg": pitch, "--roll-deg": roll}
-        for name, value in (given | {"--clock-zero": clock_zero, "--mcap": mcap or None}).items():
-            if value is not None:
-                raise typer.BadParameter("needs --sites", param_hint=name)
-        return None
+) -> "Attitude | AttitudeLog | None":
+    """What the options say of the camera's attitude; None for nothing."""
     import math
-    from datetime import UTC, datetime
 
-    from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
-    from evlcp_sdk.scene.sites import load_sites
 
+    heading, pitch, roll = angles
     if file is not None and angles != (None, None, None):
         raise typer.BadParameter("give a file or angles, not both", param_hint="--attitude")
     if (pitch is None) != (roll is None) or (heading is not None and pitch is None):
@@ -195,11 +193,23 @@ def _position_plan(
     for name, given_deg in zip(names, (*angles, *sigmas), strict=True):
         if given_deg is not None and not math.isfinite(given_deg):
             raise typer.BadParameter(f"{given_deg}: expected a finite number", param_hint=name)
-    attitude: AttitudeLog | Attitude | None = None
     if file is not None:
-        attitude = AttitudeLog.read(file, Attitude(0.0, 0.0, None, *sigmas))
-    elif pitch is not None and roll is not None:
-        attitude = Attitude(pitch, roll, heading, *sigmas)
+        return AttitudeLog.read(file, Attitude(0.0, 0.0, None, *sigmas))
+    return Attitude(pitch, roll, heading, *sigmas) if pitch is not None and roll is not None else None
+
+
+def _position_plan(sites: Path | None, clock_zero: str | None, mcap: bool) -> "PositionPlan | None":
+    """What the options say of positions; None without sites."""
+    if sites is None:
+        for name, value in {"--clock-zero": clock_zero, "--mcap": mcap or None}.items():
+            if value is not None:
+                raise typer.BadParameter("needs --sites", param_hint=name)
+        return None
+    from datetime import UTC, datetime
+
+    from evlcp_sdk.place.navigator import PositionPlan
+    from evlcp_sdk.scene.sites import load_sites
+
     zero = None
     if clock_zero is not None:
         try:
@@ -211,7 +221,7 @@ def _position_plan(
         # MCAP counts from 1970 on, and NMEA has two digits of the year.
         if not datetime(1970, 1, 1, tzinfo=UTC) <= zero < datetime(2200, 1, 1, tzinfo=UTC):
             raise typer.BadParameter(f"{clock_zero!r}: expected 1970 to 2199", param_hint="--clock-zero")
-    return PositionPlan(load_sites(sites), attitude, zero)
+    return PositionPlan(load_sites(sites), zero)
 
 
 def _decode_job(
@@ -219,13 +229,14 @@ def _decode_job(
     *,
     link: "Link",
     plan: "PositionPlan | None",
+    attitude: "Attitude | AttitudeLog | None",
     sinks: tuple[str, ...],
     stopped: Callable[[], bool] | None,
 ) -> dict[str, Any]:
     """Decode a recording here, with a bar; or, without `stopped`, quietly in a worker."""
     from evlcp_sdk.run import receive_to_folder, stop_on_request
 
-    decode = partial(receive_to_folder, job.url, job.folder, link, plan=plan, sinks=sinks)
+    decode = partial(receive_to_folder, job.url, job.folder, link, plan=plan, attitude=attitude, sinks=sinks)
     if stopped is not None:
         with bytes_bar(Path(job.url).name) as advance:
             return decode(advance=advance, stopped=stopped)

@@ -1,7 +1,7 @@
 """Packets to the camera's trajectory: fixes as they are known, filtered at once, smoothed a window later."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.positioner import Positioner
 from evlcp_sdk.place.trajectory import TrajectoryPoint, smooth_trajectory, trajectory_step
-from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
+from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.values import Fix, Packet
 
-__all__ = ["Navigator", "Place", "Placed", "PositionPlan", "Settled", "attitude_source"]
+__all__ = ["Navigator", "Place", "Placed", "PositionPlan", "Settled"]
 
 Floats = NDArray[np.float64]
 
@@ -26,16 +26,14 @@ acceleration of 1 m/s2 lasts against fixes of centimetres."""
 
 @dataclass(frozen=True)
 class PositionPlan:
-    """What positions are computed from.
+    """What positions are computed from beside what the camera sees and how it is turned.
 
     Attributes:
         sites: Where the bars stand.
-        attitude: What is known of the camera's attitude, the same always or over time; None for nothing.
         clock_zero: UTC of the camera clock's 0, where known.
     """
 
     sites: tuple[BarSite, ...]
-    attitude: Attitude | AttitudeLog | None = None
     clock_zero: datetime | None = None
 
 
@@ -103,17 +101,20 @@ class Navigator:
 
     Args:
         link: The configuration that the receiver ran with.
-        plan: Sites and attitude.
+        plan: Where the bars stand.
+        attitude: What is known of the camera's attitude, the same always or over time; None for nothing.
     """
 
-    def __init__(self, link: Link, plan: PositionPlan) -> None:
+    def __init__(
+        self, link: Link, plan: PositionPlan, attitude: Attitude | AttitudeLog | None = None
+    ) -> None:
         self._spec = link.position
         self.positioner = Positioner(
             link.camera,
             link.bar.clusters,
             link.packet.packet_chips * link.packet.chip_us,
             plan.sites,
-            attitude_source(plan.attitude),
+            attitude_source(attitude),
             link.position,
         )
         self._state: TrajectoryPoint | None = None
@@ -173,8 +174,3 @@ class Navigator:
             left_out=point.misses > 0,
             starts=point.starts,
         )
-
-
-def attitude_source(attitude: Attitude | AttitudeLog | None) -> Callable[[float], Attitude | None]:
-    """The attitude at a time, us."""
-    return attitude.at if isinstance(attitude, AttitudeLog) else lambda _t_us: attitude

@@ -14,6 +14,9 @@ _FEW_FRAMES = 10
 _REJECTED_SHARE = 0.1
 """Rejected frames of which more is said: a bar that comes into view, or leaves it, loses a frame or two."""
 
+_ASKEW_SHARE = 0.5
+"""Of frames that contradict the attitude: fewer are one bar of several that is mounted askew."""
+
 _CRYSTALS_PPM = 200.0
 """Two crystals are this far apart at most, 100 ppm each."""
 
@@ -47,6 +50,13 @@ def _frames(counts: Mapping[str, int]) -> Iterator[str]:
         yield (
             f"{rejected} of {frames + rejected} frames rejected, as their clusters do not stand where the bar"
             " has them: compare the link's [bar] and [pilots] with the transmitter's, and see --figures"
+        )
+
+    askew = counts.get("frames_askew", 0)
+    if askew >= _FEW_FRAMES and askew > _ASKEW_SHARE * frames:
+        yield (
+            f"{askew} of {frames} frames show bars that do not stand plumb by the camera's attitude: it does"
+            " not correct their distances; check pitch and roll, their signs and their sigma"
         )
 
 

@@ -15,6 +15,7 @@ from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.sinks import Sinks, load_sinks
 from evlcp_sdk.results.summary import Status, summary_of, write_summary
 from evlcp_sdk.results.tallies import PositionTally, RunTally
+from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 from evlcp_sdk.values import Events, Packet
 
 __all__ = ["ResultWriter"]
@@ -31,6 +32,7 @@ class ResultWriter:
         registry: Where sinks are found; None for all that are installed.
         name: Name of the recording, for titles.
         plan: What positions are computed from; None for none.
+        attitude: What is known of the camera's attitude, for positions; None for nothing.
         sinks: Output formats beside the default ones, by name.
 
     Raises:
@@ -47,12 +49,13 @@ class ResultWriter:
         *,
         name: str = "",
         plan: PositionPlan | None = None,
+        attitude: Attitude | AttitudeLog | None = None,
         sinks: Sequence[str] = (),
     ) -> None:
         self._registry = Registry.load() if registry is None else registry
         self._link = link
         self._tally, self._positions = RunTally(link.packet), PositionTally()
-        self._navigator = Navigator(link, plan) if plan is not None else None
+        self._navigator = Navigator(link, plan, attitude) if plan is not None else None
         classes = load_sinks(choose_sinks(self._registry, sinks, positions=plan is not None))
         files = [file for s in installed_sinks(self._registry).values() for file in s.record.files]
         with ExitStack() as stack:

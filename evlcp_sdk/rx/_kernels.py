@@ -916,41 +916,49 @@ def newest_on_parabola(
 
 
 @njit(cache=True, nogil=True)
-def bend_of(place: Array, sums: Array, least: float) -> tuple[float, float]:
+def bend_of(place: Array, uneven: Array, sums: Array, least: float) -> tuple[float, float]:
     """Bend of a parabola through boundaries, and its variance by their scatter about it; NaN of too few.
 
     `place` (n,) are whole or half numbers, `sums` (2, n) what lies off, weighted, and the weights; those of
     less than `least` of the heaviest are passed over. Beside the parabola a shift is fitted that boundaries
-    of even and odd number have to both sides.
+    of even and odd number have to both sides, and a multiple of `uneven` (n,), unless that is 0 throughout.
     """
     heaviest = sums[1].max()
-    normal, right, inverse = np.zeros((4, 4)), np.zeros(4), np.empty((4, 4))
-    terms, path = np.empty(4), np.empty(4)
-    n = 0
-    for i in range(place.size):
-        if sums[1, i] > least * heaviest:
-            n += 1
-            terms[0], terms[1], terms[2] = place[i] ** 2, 1.0, place[i]
-            terms[3] = -1.0 if np.floor(place[i]) % 2 else 1.0
-            for a in range(4):
-                right[a] += terms[a] * sums[0, i]
-                for b in range(4):
-                    normal[a, b] += sums[1, i] * terms[a] * terms[b]
+    use = sums[1] > least * heaviest
+    n = int(use.sum())
+    count = 5 if np.any(uneven[use] != 0) else 4
     # The variance of a normal variable over an estimated sigma is finite from three degrees of freedom on.
-    if n - 4 < 3 or not _inverse(normal, inverse):
+    if n - count < 3:
         return np.nan, np.nan
-    for a in range(4):
-        path[a] = 0.0
-        for b in range(4):
+    normal, right, inverse = np.zeros((count, count)), np.zeros(count), np.empty((count, count))
+    terms = np.empty((n, 5))
+    k = 0
+    for i in range(place.size):
+        if use[i]:
+            terms[k, 0], terms[k, 1], terms[k, 2] = place[i] ** 2, 1.0, place[i]
+            terms[k, 3] = -1.0 if np.floor(place[i]) % 2 else 1.0
+            terms[k, 4] = uneven[i]
+            for a in range(count):
+                right[a] += terms[k, a] * sums[0, i]
+                for b in range(count):
+                    normal[a, b] += sums[1, i] * terms[k, a] * terms[k, b]
+            k += 1
+    if not _inverse(normal, inverse):
+        return np.nan, np.nan
+    path = np.zeros(count)
+    for a in range(count):
+        for b in range(count):
             path[a] += inverse[a, b] * right[b]
     left = 0.0
+    k = 0
     for i in range(place.size):
-        if sums[1, i] > least * heaviest:
-            side = -1.0 if np.floor(place[i]) % 2 else 1.0
+        if use[i]:
             off = sums[0, i] / sums[1, i]
-            off -= path[0] * place[i] ** 2 + path[1] + path[2] * place[i] + path[3] * side
+            for a in range(count):
+                off -= path[a] * terms[k, a]
             left += sums[1, i] * off * off
-    return path[0], inverse[0, 0] * left / (n - 6)
+            k += 1
+    return path[0], inverse[0, 0] * left / (n - count - 2)
 
 
 @njit(cache=True, nogil=True)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.scene.lean import BarSight, foreshortening
 from evlcp_sdk.values import Bend, Range
 
 __all__ = ["RangeKeeper", "Ranges"]
@@ -30,13 +31,19 @@ _LEAST_SIGMA = 1e-6
 
 _LEVEL_DEG, _LEANING_DEG, _LEANING_SHARE = 0.7, 6.0, 0.02
 """What is likely of a bar's lean before it is measured: none but for a mount's error and the car's springs
-(sigma), and of one camera in fifty, whose mount nobody levelled, anything up to the steepest."""
+(sigma), and of one camera in fifty, whose mount nobody levelled, anything up to the steepest. With more of
+these, sigmas of level bars far away are too large; with fewer, those of leaning ones too small for longer."""
 
 _TILT_MEMORY_S = 1.0
 """A car's pitch changes within a second when it brakes."""
 
 _STEP_DEG = 0.1
 """Grid of leans that are weighed: a third of the sigma that the bends of a second have at 30 m."""
+
+_SLANTED_SHARE = 6e-5
+"""Of the bars that a camera with a known attitude sees: not plumb all the same, or the attitude is wrong;
+then anything up to the steepest, more or less. As seldom as an outlier, so that it costs the others no sigma,
+and enough that a bend which contradicts is believed."""
 
 _LEAST_WEIGHT = 0.1
 """Of the heaviest boundary: below, one is not seen."""
@@ -50,13 +57,16 @@ class Ranges:
 
     Attributes:
         past: Time (s), distance (m) and variance (m2) of each, oldest first, float64 (n, 3).
-        bend: Sum of the boundaries' bends and of their weights, float64 (2, n); empty without any.
+        bend: Sum of the boundaries' bends, beyond what the attitude explains, and of their weights, float64
+            (2, n); empty without any.
         bend_s: When that was, s.
+        told: The attitude said how the bar leans then.
     """
 
     past: Floats = field(default_factory=lambda: np.empty((0, 3)))
     bend: Floats = field(default_factory=lambda: np.empty((2, 0)))
     bend_s: float = math.nan
+    told: bool = False
 
 
 class RangeKeeper:
@@ -64,19 +74,22 @@ class RangeKeeper:
 
     A distance itself stays that of its frame: the others say three things about it only. A ranging that reads
     all of a frame measures at the frame's middle; how fast distances change takes that to the pilot's. A bar
-    that leans towards or from the camera by an angle a looks shorter by cos(a); its boundaries then
-    lie on a parabola, whose bend is far below a frame's noise and adds up over frames. And distances of a
-    moving car lie on a smooth line: their scatter about it, against the sigmas that the ranging gave,
-    says what these are worth.
+    that leans towards or from the camera looks shorter, or beside the image's middle longer; its boundaries
+    then lie on a parabola, whose bend is far below a frame's noise and adds up over frames. Where the
+    camera's attitude is known, a plumb bar's lean is, too, to its sigma, and the bend tells the rest.
+    And distances of a moving car lie on a smooth line: their scatter about it, against the sigmas that the
+    ranging gave, says what these are worth.
     """
 
     def __init__(self) -> None:
-        lean_deg = np.arange(-_LEANING_DEG, _LEANING_DEG + _STEP_DEG / 2, _STEP_DEG)
-        self._sine, self._cosine = np.sin(np.radians(lean_deg)), np.cos(np.radians(lean_deg))
-        level = _bell(lean_deg, _LEVEL_DEG) / math.sqrt(2 * math.pi)
-        self._prior = (1 - _LEANING_SHARE) * level + _LEANING_SHARE / (2 * _LEANING_DEG)
+        # The middles of the grid's cells.
+        self._lean_deg = np.arange(-_LEANING_DEG + _STEP_DEG / 2, _LEANING_DEG, _STEP_DEG)
+        self._sine = np.sin(np.radians(self._lean_deg))
+        self._likely = self._mixture(_LEVEL_DEG, _LEANING_SHARE)
 
-    def step(self, state: Ranges, t_us: float, chip_us: float, measured: Range) -> tuple[Ranges, Range]:
+    def step(
+        self, state: Ranges, t_us: float, chip_us: float, measured: Range, sight: BarSight
+    ) -> tuple[Ranges, Range]:
         """Take a frame's distance; give the new state and the distance as it should be.
 
         Args:
@@ -84,6 +97,7 @@ class RangeKeeper:
             t_us: Start of the frame, us.
             chip_us: Length of a chip, us.
             measured: As the ranging gave it; without a distance, or a sigma, it is given back.
+            sight: Where the bar is seen, and what the attitude says of its lean.
         """
         distance_m, sigma_m = measured.distance_m, measured.sigma_m
         if not (0 < distance_m < math.inf and 0 <= sigma_m < math.inf):
@@ -95,26 +109,39 @@ class RangeKeeper:
         speed_m_s, speed_variance, variance = _smooth(past)
         distance_m -= speed_m_s * late_s
         variance += speed_variance * late_s**2
-        bend, bend_s = state.bend, state.bend_s
+        bend, bend_s, told = state.bend, state.bend_s, state.told
         if measured.bend is not None:
-            bend, bend_s = _add(state, t_s, measured.bend), t_s
-        cosine, cosine_variance = self._leaning(bend, measured.bend)
-        variance = variance * cosine**2 + distance_m**2 * cosine_variance
-        found = Range(distance_m * cosine, math.sqrt(variance), measured.pairs)
-        return Ranges(past, bend, bend_s), found
+            bend, bend_s, told = _add(state, t_s, measured.bend, sight.sine), t_s, sight.sine is not None
+        length, length_variance = self._leaning(bend, measured.bend, sight)
+        variance = variance * length**2 + distance_m**2 * length_variance
+        found = Range(distance_m * length, math.sqrt(variance), measured.pairs)
+        return Ranges(past, bend, bend_s, told), found
 
-    def _leaning(self, sums: Floats, newest: Bend | None) -> tuple[float, float]:
-        """Mean and variance of the cosine of the lean, by what is likely and by what was seen."""
-        chance = self._prior
-        seen = None if newest is None else _parabola(newest.place, sums)
+    def _leaning(self, sums: Floats, newest: Bend | None, sight: BarSight) -> tuple[float, float]:
+        """Mean and variance of the foreshortening, by what is likely and by what was seen."""
+        likely, sine, told = self._likely, self._sine, 0.0
+        if sight.sine is not None:
+            told = sight.sine
+            sine = np.sin(math.asin(told) + np.radians(self._lean_deg))
+            sigma_deg = math.degrees(sight.sigma / math.sqrt(max(1 - told**2, sight.sigma**2)))
+            likely = self._mixture(sigma_deg, _SLANTED_SHARE)
+        chance = likely
+        seen = None if newest is None else _parabola(newest, sums)
         if seen is not None:
-            chance = chance * _bell(self._sine - seen[0], seen[1])
+            chance = chance * _bell(sine - told - seen[0], seen[1])
         total = float(chance.sum())
         if not total > 0:
             # A bend that no lean makes says nothing of one.
-            chance, total = self._prior, float(self._prior.sum())
-        mean = float(chance @ self._cosine) / total
-        return mean, max(float(chance @ self._cosine**2) / total - mean**2, 0.0)
+            chance, total = likely, float(likely.sum())
+        length = foreshortening(sine, sight)
+        mean = float(chance @ length) / total
+        return mean, max(float(chance @ length**2) / total - mean**2, 0.0)
+
+    def _mixture(self, sigma_deg: float, share: float) -> Floats:
+        """Chances of the leans of the grid: as surely as said, but for a share of which nothing is known."""
+        # Half a step is as narrow as a grid shows it.
+        sure = _bell(self._lean_deg, max(sigma_deg, _STEP_DEG / 2)) / math.sqrt(2 * math.pi)
+        return np.asarray((1 - share) * sure + share / (2 * _LEANING_DEG))
 
 
 def _bell(off: Floats, sigma: float) -> Floats:
@@ -134,21 +161,23 @@ def _smooth(past: Floats) -> tuple[float, float, float]:
     )
 
 
-def _add(state: Ranges, t_s: float, bend: Bend) -> Floats:
-    """Sums with a frame's bend; older ones fade."""
-    new = np.stack([bend.weight * bend.off, bend.weight])
-    if state.bend.shape != new.shape:
+def _add(state: Ranges, t_s: float, bend: Bend, sine: float | None) -> Floats:
+    """Sums with a frame's bend, without that of the lean that is told; older ones fade."""
+    off = bend.off if sine is None else bend.off - sine * bend.place**2
+    new = np.stack([bend.weight * off, bend.weight])
+    if state.bend.shape != new.shape or state.told != (sine is not None):
         return new
     return np.asarray(new + state.bend * math.exp(-max(t_s - state.bend_s, 0.0) / _TILT_MEMORY_S))
 
 
-def _parabola(place: Floats, sums: Floats) -> tuple[float, float] | None:
+def _parabola(bend: Bend, sums: Floats) -> tuple[float, float] | None:
     """Sine of the lean and its sigma, from the scatter of the boundaries about a parabola; None of too few.
 
-    What bends every frame alike is in the scatter, too. Pilots put boundaries of even and odd number
-    off to both sides, by a hundredth of a pixel, which is fitted beside.
+    What bends every frame alike is in the scatter, too. Pilots put boundaries off, by a hundredth of a pixel,
+    which is fitted beside: those of even and odd number to both sides, as one of them has values that repeat,
+    and those with more steps up than down, or fewer, as negative events are missed more often.
     """
     from evlcp_sdk.rx import _kernels
 
-    sine, variance = _kernels.bend_of(place, sums, _LEAST_WEIGHT)
+    sine, variance = _kernels.bend_of(bend.place, bend.uneven, sums, _LEAST_WEIGHT)
     return None if math.isnan(sine) else (sine, math.sqrt(max(variance, 1e-12)))

@@ -5,6 +5,7 @@ from collections import deque
 
 import numpy as np
 import pluggy
+from numpy.typing import NDArray
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
@@ -20,6 +21,8 @@ from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.steps import Announcer, Steps
 from evlcp_sdk.rx.timeline import Timeline, TimeStep
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Transmitter, Transmitters
+from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
+from evlcp_sdk.scene.lean import BarSight, sight_of
 from evlcp_sdk.values import Events, Frame, FrameView, Packet, Range, SyncLock
 
 __all__ = ["Receiver"]
@@ -46,6 +49,7 @@ _COUNTS = (
     "frames",
     "frames_rejected",
     "frames_reflected",
+    "frames_askew",
     "packets",
 )
 
@@ -58,6 +62,8 @@ class Receiver:
     Args:
         link: The resolved configuration.
         hook: Where finished stages are announced (`Registry.hook`); None for nowhere.
+        attitude: What is known of the camera's attitude, the same always or over time: how plumb bars lean
+            against the sensor. None for nothing.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> receiver = Receiver(load_link())
@@ -69,8 +75,17 @@ class Receiver:
     2
     """
 
-    def __init__(self, link: Link, hook: pluggy.HookRelay | None = None) -> None:
+    def __init__(
+        self,
+        link: Link,
+        hook: pluggy.HookRelay | None = None,
+        *,
+        attitude: Attitude | AttitudeLog | None = None,
+    ) -> None:
         centres_m = link.bar.cluster_centres_m()
+        self._camera = link.camera
+        self._is_column = float(np.ptp(centres_m[:, 0])) < 1e-9
+        self._attitude_at = attitude_source(attitude)
         self._packet = link.packet
         self._step_us = link.regions.step_us
         self._tail_us = _TAIL_CHIPS * link.packet.chip_us
@@ -206,15 +221,16 @@ class Receiver:
         number = self._transmitters.number(transmitter)
         soft = self._steps.decode(look.presence, look.sums)
         lit = still_lit(look.sums, look.presence, self._packet.pilot_chips)
-        distance, points, centre_px = _NO_RANGE, _NO_POINTS, look.centre_px
+        distance, points, centre_px, sight = _NO_RANGE, _NO_POINTS, look.centre_px, BarSight()
         if due.has_pilot:
             # Another distance of the same pilot, or other points, would say nothing new.
             distance = self._steps.measure(FrameView(look.sums, look.offset_px, look.presence, soft))
             points_px, sigma_px = self._find_points(look.presence, look.placement)
             points = points_px + look.corner_px, sigma_px
             centre_px = self._looker.centre(look, points[0])
+            sight = self._sight(points, look.middle_us)
         transmitter.distance, distance, filtered = self._steps.follow(
-            transmitter.distance, due.start_us, due.lock.chip_us, distance
+            transmitter.distance, due.start_us, due.lock.chip_us, distance, sight
         )
         if transmitter.first is None:
             transmitter.first = due.packet
@@ -235,6 +251,14 @@ class Receiver:
         )
         self._announcer.total("frame", frame)
         return Sighting.of(frame, look)
+
+    def _sight(self, points: tuple[NDArray[np.float64], NDArray[np.float64]], t_us: float) -> BarSight:
+        """Where a bar is seen, and how it leans; a panel has no direction, and counts as level."""
+        if not self._is_column:
+            return BarSight()
+        sight = sight_of(self._camera, *points, self._attitude_at(t_us))
+        self._counts["frames_askew"] += sight.askew
+        return sight
 
     def _look(self, transmitter: Transmitter, due: DueFrame) -> Look | None:
         """Look at a frame; set its region right by it, join what is of the same bar, open what is another."""

@@ -15,6 +15,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import ROLES, Filter, Synchronizer, Tracker
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
+from evlcp_sdk.scene.lean import BarSight
 from evlcp_sdk.values import Events, FrameView, PresenceMap, Range, SoftSymbols, SyncLock
 
 __all__ = ["Announcer", "Steps"]
@@ -141,13 +142,14 @@ class Steps:
         return distance
 
     def follow(
-        self, state: tuple[Ranges, Any], t_us: float, chip_us: float, measured: Range
+        self, state: tuple[Ranges, Any], t_us: float, chip_us: float, measured: Range, sight: BarSight
     ) -> tuple[tuple[Ranges, Any], Range, Range | None]:
         """Take a frame's distance as the ranging gave it; the new state, the distance, and that filtered.
 
-        The filtered one is the prediction where a frame allows no distance, None without tracking.
+        The sight says where its bar is seen, and what the attitude tells of its lean. The filtered one is
+        the prediction where a frame allows no distance, None without tracking.
         """
-        ranges, distance = self._keeper.step(state[0], t_us, chip_us, measured)
+        ranges, distance = self._keeper.step(state[0], t_us, chip_us, measured, sight)
         filter_state, filtered = self._filter(state[1], t_us, distance)
         return (ranges, filter_state), distance, filtered
 

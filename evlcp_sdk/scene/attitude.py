@@ -1,6 +1,7 @@
 """The camera's attitude: at one time, and over time from a file such as an IMU's log."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import read_csv
 
-__all__ = ["Attitude", "AttitudeLog"]
+__all__ = ["Attitude", "AttitudeLog", "attitude_source"]
 
 _MOST = 1e18
 """Size of the largest number of a log: microseconds since 1970 are 1e15."""
@@ -160,6 +161,11 @@ class AttitudeLog:
             value(self.gravity_sigma_deg),
             value(self.heading_sigma_deg),
         )
+
+
+def attitude_source(attitude: Attitude | AttitudeLog | None) -> Callable[[float], Attitude | None]:
+    """The attitude at a time, us; None where nothing is known."""
+    return attitude.at if isinstance(attitude, AttitudeLog) else lambda _t_us: attitude
 
 
 def _number(path: Path | str, line: int, name: str, text: str | None) -> float:

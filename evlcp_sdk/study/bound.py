@@ -1,4 +1,4 @@
-"""The least error that a frame's distance can have: the Cramer-Rao bound of the boundaries between clusters.
+"""The least error that a frame's distance and lean can have: Cramer-Rao bounds of the boundaries of clusters.
 
 It belongs to the geometry of the problem and to no algorithm, so it stands here and not beside one: how
 sharply a boundary of the bar shows in the image, how noisy its pixels are, and how far boundaries lie apart
@@ -19,7 +19,7 @@ from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, PresenceMap, Range
 
-__all__ = ["cramer_rao_sigma_m", "frame_bound"]
+__all__ = ["cramer_rao_sigma_m", "frame_bound", "lean_sigma_deg"]
 
 _NONE = Range(float("nan"), float("nan"), 0)
 
@@ -79,6 +79,77 @@ def cramer_rao_sigma_m(
     >>> round(cramer_rao_sigma_m(*scene, blur_px=0.45, noise=0.3), 4)
     0.0145
     """
+    slopes, spacing = _frame_slopes(
+        camera, bar, codebook, distance_m, symbols, blur_px=blur_px, noise=noise, gain=gain, shift_px=shift_px
+    )
+    information = columns / noise**2 * (slopes[:4] @ slopes[:4].T)
+    return float(distance_m * np.sqrt(np.linalg.inv(information)[0, 0]) / spacing)
+
+
+def lean_sigma_deg(
+    camera: CameraModel,
+    bar: BarLayout,
+    codebook: Codebook,
+    distance_m: float,
+    symbols: ArrayLike,
+    *,
+    blur_px: float,
+    noise: float,
+    columns: float = 5.0,
+    gain: float = 0.8,
+    shift_px: float = 0.0,
+) -> float:
+    """Smallest standard deviation of the lean that one frame tells, degrees, of a bar that hardly leans.
+
+    A lean of sine s moves the boundary at place b, in spacings from the bar's middle, by b^2 s times
+    spacing_px * spacing_m / distance_m pixels: a parabola, which spacing, position, drift and gain, unknown
+    beside it, do not make. So the bound grows with the distance squared.
+
+    Args:
+        camera: For the spacing in the image.
+        bar: One column of clusters.
+        codebook: Pilots and codewords.
+        distance_m: Distance of the bar, m.
+        symbols: What the frame says, integers (K,).
+        blur_px: Width (sigma) of a boundary in the image, px.
+        noise: Standard deviation of one pixel's value, in full values.
+        columns: Pixels across the bar.
+        gain: Share of a full value that is seen.
+        shift_px: Where the bar lies on the pixel grid, px.
+
+    Raises:
+        ConfigError: A quantity that must be positive is not.
+
+    >>> from evlcp_sdk.link.resolve import load_link
+    >>> link = load_link()
+    >>> scene = link.camera, link.bar, link.codebook, 50.0, range(16)
+    >>> round(lean_sigma_deg(*scene, blur_px=0.45, noise=0.3), 2)
+    3.52
+    """
+    slopes, spacing = _frame_slopes(
+        camera, bar, codebook, distance_m, symbols, blur_px=blur_px, noise=noise, gain=gain, shift_px=shift_px
+    )
+    slopes = np.stack([*slopes[:4], slopes[4] * spacing * _spacing_m(bar) / distance_m])
+    information = columns / noise**2 * (slopes @ slopes.T)
+    return float(np.degrees(np.sqrt(np.linalg.inv(information)[4, 4])))
+
+
+def _frame_slopes(
+    camera: CameraModel,
+    bar: BarLayout,
+    codebook: Codebook,
+    distance_m: float,
+    symbols: ArrayLike,
+    *,
+    blur_px: float,
+    noise: float,
+    gain: float,
+    shift_px: float,
+) -> tuple[Array, float]:
+    """Slopes of a frame's values by spacing, centre, drift, gain and bend, (5, n), and the spacing, px.
+
+    The bend is how far, in px, a boundary moves one spacing from the bar's middle, and b^2 times that at b.
+    """
     for name, quantity in (("distance_m", distance_m), ("blur_px", blur_px), ("noise", noise)):
         if not quantity > 0:
             raise ConfigError(f"{name} = {quantity}: expected a positive number")
@@ -90,9 +161,9 @@ def cramer_rao_sigma_m(
     offset, when = np.zeros(values), _when(values)
     nearest = _nearest(fit, clusters, rows, offset, when)
     _, slopes = _model(fit, codes, nearest, rows, offset, when)
-    flat = slopes[:4, _counts(nearest, np.ones(clusters, np.bool_))]
-    information = columns / noise**2 * (flat @ flat.T)
-    return float(distance_m * np.sqrt(np.linalg.inv(information)[0, 0]) / spacing)
+    bend = slopes[1] * (np.clip(nearest, 1, clusters - 1) - clusters / 2) ** 2
+    flat = np.concatenate([slopes[:4], bend[None]])[:, _counts(nearest, np.ones(clusters, np.bool_))]
+    return flat, spacing
 
 
 def frame_bound(

@@ -9,7 +9,7 @@ import numpy as np
 from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.positioner import Positioner
-from evlcp_sdk.scene.attitude import AttitudeLog
+from evlcp_sdk.scene.attitude import AttitudeLog, attitude_source
 from evlcp_sdk.sim.truth import Truth
 from evlcp_sdk.study.frames import GivenFrame
 from evlcp_sdk.study.match import NEAREST_PX, BarFrames, BarPackets, match, nearest_bar
@@ -171,7 +171,7 @@ def position_tallies(
         link.bar.clusters,
         link.packet.packet_chips * link.packet.chip_us,
         sites,
-        (lambda _: None) if attitude is None else attitude.at,
+        attitude_source(attitude),
         link.position,
     )
     axes = positioner.axes

@@ -116,6 +116,8 @@ class JointScaleRanging(Ranging):
         least = min(self.min_boundaries, clusters - 1)
         spacing_m = float(centres[1, 1] - centres[0, 1])
         pilots, words = codebook.pilots.astype(np.float64), codebook.codewords.astype(np.float64)
+        boundaries = np.arange(1.0, clusters) - clusters / 2
+        uneven = np.sign(np.diff(pilots, axis=0)).sum(1)
 
         def measure(view: FrameView) -> Range:
             placed = _place(view.presence)
@@ -167,7 +169,7 @@ class JointScaleRanging(Ranging):
                 distance * sigma_px / float(fit[0]),
                 int(np.count_nonzero(off[1])),
                 late_chips,
-                Bend(np.arange(1.0, clusters) - clusters / 2, off[0] / one_px, off[1] * one_px**2),
+                Bend(boundaries, off[0] / one_px, off[1] * one_px**2, uneven),
             )
 
         return measure

@@ -135,7 +135,7 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
             raise ConfigError(f"link {digest[:12]} resolves to {link.digest[:12]} here")
         check_link(truth, link, "the scene", messages=True)
         links.append(link)
-        receivers.append(Receiver(link))
+        receivers.append(Receiver(link, attitude=attitude))
     packets: list[list[Packet]] = [[] for _ in receivers]
     number = 0
     for events in simulation.stream():

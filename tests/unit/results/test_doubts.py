@@ -82,5 +82,12 @@ def test_frames_rejected_and_blocks_that_cannot_be_read() -> None:
     assert line.startswith("2 packets were sent with another codebook")
 
 
+def test_an_attitude_that_the_image_contradicts() -> None:
+    (line,) = told(tally_of(RANDOM), frames=60, frames_askew=40)
+    assert line.startswith("40 of 60 frames show bars that do not stand plumb")
+    # One bar of three that is mounted so.
+    assert told(tally_of(RANDOM), frames=60, frames_askew=20) == []
+
+
 def test_a_reflection_is_not_doubted() -> None:
     assert told(tally_of(RANDOM % 16, ppm=5000, echo_of=3), blocks_tried=0) == []

@@ -55,9 +55,13 @@ def packets(count: int, seed: int = 1, transmitter: int = 0) -> list[Packet]:
 
 
 def write(
-    folder: Path, stream: Iterable[Packet], plan: PositionPlan, sinks: Sequence[str] = ()
+    folder: Path,
+    stream: Iterable[Packet],
+    plan: PositionPlan,
+    sinks: Sequence[str] = (),
+    attitude: Attitude = ATTITUDE,
 ) -> dict[str, Any]:
-    with ResultWriter(folder, LINK, plan=plan, sinks=sinks) as results:
+    with ResultWriter(folder, LINK, plan=plan, attitude=attitude, sinks=sinks) as results:
         results.write(stream)
         told: dict[str, Any] = results.finish("complete", {}, {}, {}, {})["positions"]
     return told
@@ -69,7 +73,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 def test_files_of_a_drive(tmp_path: Path) -> None:
-    told = write(tmp_path, packets(13), PositionPlan((SITE,), ATTITUDE, ZERO), ["figures"])
+    told = write(tmp_path, packets(13), PositionPlan((SITE,), ZERO), ["figures"])
     fixes = rows(tmp_path / "fixes.csv")
     assert told["fixes"] == len(fixes) == 12
     assert told["bars"] == {"0": 7}
@@ -103,7 +107,7 @@ def test_files_of_a_drive(tmp_path: Path) -> None:
 
 def test_the_figure_of_a_track(tmp_path: Path) -> None:
     probe = TrackProbe()
-    way = Navigator(LINK, PositionPlan((SITE,), ATTITUDE))
+    way = Navigator(LINK, PositionPlan((SITE,)), ATTITUDE)
     way.feed(packets(13))
     for settled in way.close()[1]:
         probe.add(settled)
@@ -118,7 +122,7 @@ def test_the_figure_of_a_track(tmp_path: Path) -> None:
 def test_a_track_across_the_180th_meridian_is_cut(tmp_path: Path) -> None:
     metre = 1 / (111_319.5 * math.cos(math.radians(35)))
     site = dataclasses.replace(SITE, longitude_deg=180 - metre)
-    write(tmp_path, packets(4), PositionPlan((site,), ATTITUDE, ZERO))
+    write(tmp_path, packets(4), PositionPlan((site,), ZERO))
     shapes = json.loads((tmp_path / "fixes.geojson").read_text())["features"]
     (line,) = (s["geometry"]["coordinates"] for s in shapes if s["geometry"]["type"] == "LineString")
     assert all(-180 <= point[0] < -179.9999 for point in line)
@@ -135,7 +139,7 @@ def test_a_track_across_the_180th_meridian_is_cut(tmp_path: Path) -> None:
 
 
 def test_refused_fixes_are_listed_and_counted(tmp_path: Path) -> None:
-    told = write(tmp_path, packets(7), PositionPlan((SITE,), Attitude(5.0, 0.0)))
+    told = write(tmp_path, packets(7), PositionPlan((SITE,)), attitude=Attitude(5.0, 0.0))
     assert told["fixes"] == 0
     assert told["refused"] == {"heading-unknown": 6}
     found = rows(tmp_path / "fixes.csv")
@@ -149,7 +153,7 @@ def test_refused_fixes_are_listed_and_counted(tmp_path: Path) -> None:
 
 
 def test_a_long_track_is_smoothed_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan, stream = PositionPlan((SITE,), ATTITUDE), packets(60)
+    plan, stream = PositionPlan((SITE,)), packets(60)
     write(tmp_path / "whole", stream, plan)
     monkeypatch.setattr(navigator, "_BLOCK", 16)
     write(tmp_path / "blocks", stream, plan)
@@ -165,7 +169,7 @@ def test_a_long_track_is_smoothed_in_blocks(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_a_run_without_sites_drops_an_earlier_ones_positions(tmp_path: Path) -> None:
-    write(tmp_path, packets(3), PositionPlan((SITE,), ATTITUDE))
+    write(tmp_path, packets(3), PositionPlan((SITE,)))
     assert (tmp_path / "fixes.csv").exists()
     with ResultWriter(tmp_path, LINK) as results:
         results.finish("complete", {}, {}, {}, {})
@@ -173,7 +177,7 @@ def test_a_run_without_sites_drops_an_earlier_ones_positions(tmp_path: Path) -> 
 
 
 def test_a_run_that_breaks_off_leaves_nothing(tmp_path: Path) -> None:
-    plan = PositionPlan((SITE,), ATTITUDE)
+    plan = PositionPlan((SITE,))
     with ResultWriter(tmp_path, LINK, plan=plan) as results:
         results.write(packets(5))
         assert list(tmp_path.glob(f"{STAGE_PREFIX}*/fixes.csv"))
@@ -185,7 +189,7 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
     from mcap_protobuf.decoder import DecoderFactory
     from scipy.spatial.transform import Rotation
 
-    write(tmp_path, packets(6), PositionPlan((SITE,), ATTITUDE, ZERO), ["mcap"])
+    write(tmp_path, packets(6), PositionPlan((SITE,), ZERO), ["mcap"])
     fixes = rows(tmp_path / "fixes.csv")
     found: dict[str, list[tuple[str, int, object]]] = {}
     with (tmp_path / "fixes.mcap").open("rb") as file:
@@ -212,7 +216,7 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
 def test_mcap_without_the_extra_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("evlcp_sdk.plugin.records.find_spec", lambda _name: None)
     with pytest.raises(ConfigError, match=r"sink 'mcap' of evlcp-sdk needs the extra: .*evlcp-sdk\[mcap\]"):
-        ResultWriter(tmp_path / "out", LINK, plan=PositionPlan((SITE,), ATTITUDE), sinks=["mcap"])
+        ResultWriter(tmp_path / "out", LINK, plan=PositionPlan((SITE,)), sinks=["mcap"])
     assert not (tmp_path / "out").exists()
 
 
@@ -224,6 +228,6 @@ def test_what_writes_positions_needs_them(tmp_path: Path) -> None:
 
 def test_beacons_that_are_not_believed_give_no_positions(tmp_path: Path) -> None:
     stranger = dataclasses.replace(SITE, transmitter=3)
-    told = write(tmp_path, packets(5), PositionPlan((stranger,), ATTITUDE))
+    told = write(tmp_path, packets(5), PositionPlan((stranger,)))
     assert told["refused"] == {"no-site": 4}
     assert not list(tmp_path.glob(f"{STAGE_PREFIX}*"))

@@ -243,16 +243,16 @@ def newest_on_parabola(past, speed_weight, bend_weight, worth, outlier):
     return path[1], inverse[1, 1], newest / weight[-1]
 
 
-def bend_of(place, sums, least):
+def bend_of(place, uneven, sums, least):
     """By `lstsq`, weighted."""
     use = sums[1] > least * sums[1].max()
-    place, weight = place[use], sums[1, use]
+    place, uneven, weight = place[use], uneven[use], sums[1, use]
     off = sums[0, use] / weight
     side = np.where(np.floor(place) % 2, -1.0, 1.0)
-    terms = np.stack([place**2, np.ones(len(place)), place, side], 1)
+    terms = np.stack([place**2, np.ones(len(place)), place, side, *([uneven] if uneven.any() else [])], 1)
     root = np.sqrt(weight)
     path = np.linalg.lstsq(terms * root[:, None], off * root)[0]
-    left = (weight * (off - terms @ path) ** 2).sum() / (len(place) - 6)
+    left = (weight * (off - terms @ path) ** 2).sum() / (len(place) - terms.shape[1] - 2)
     return path[0], np.linalg.inv((terms.T * weight) @ terms)[0, 0] * left
 
 

@@ -1,6 +1,7 @@
 """Distances together: drives whose truth is known, with errors drawn as the sigmas say, or not so."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
+from evlcp_sdk.scene.lean import BarSight
 from evlcp_sdk.values import Bend, Range
 
 CHIP_US = 100.0
@@ -15,6 +17,7 @@ FRAME_US = 3200.0
 PLACES = np.arange(1.0, 16) - 8
 SPACING_M = 0.06
 FOCAL_PX = 7200.0
+AHEAD = BarSight()
 
 
 def bend_of(lean_deg: float, distance_m: float, noise_px: float, rng: np.random.Generator) -> Bend:
@@ -25,7 +28,7 @@ def bend_of(lean_deg: float, distance_m: float, noise_px: float, rng: np.random.
     spacing_px = FOCAL_PX * SPACING_M * cosine / distance_m
     off_px = seen_px - spacing_px * PLACES + noise_px * rng.standard_normal(len(PLACES))
     one_px = spacing_px * SPACING_M / distance_m
-    return Bend(PLACES, off_px / one_px, np.full(len(PLACES), one_px**2))
+    return Bend(PLACES, off_px / one_px, np.full(len(PLACES), one_px**2), np.zeros(len(PLACES)))
 
 
 def drive(
@@ -52,7 +55,7 @@ def drive(
         seen_m += 0.5 * (i in outliers)
         bend = None if bend_px is None else bend_of(lean_deg, true_m, bend_px, rng)
         measured = Range(seen_m, said_m or sigma_m, 15, late_chips, bend)
-        state, found = keeper.step(state, t_us, CHIP_US, measured)
+        state, found = keeper.step(state, t_us, CHIP_US, measured, AHEAD)
         assert found.pairs == 15
         out.append((found.distance_m - true_m, found.sigma_m))
     return np.array(out)
@@ -65,20 +68,43 @@ def nees(errors: np.ndarray) -> float:
 def test_without_a_distance_nothing_changes() -> None:
     keeper, state = RangeKeeper(), Ranges()
     for measured in (Range(math.nan, math.nan, 0), Range(50.0, math.nan, 3), Range(0.0, 0.0, 3)):
-        assert keeper.step(state, 0.0, CHIP_US, measured) == (state, measured)
+        assert keeper.step(state, 0.0, CHIP_US, measured, AHEAD) == (state, measured)
 
 
-def test_a_first_distance_stays_but_for_the_lean_that_is_likely() -> None:
-    _, found = RangeKeeper().step(Ranges(), 0.0, CHIP_US, Range(50.0, 0.02, 15))
+def foreshortened(
+    along: float = 0.0, about_deg: float = 0.0, sigma_deg: float = 0.7, share: float = 0.02
+) -> tuple[float, float]:
+    """Mean and standard deviation of the foreshortening over what is likely of a lean, by quadrature."""
+    sigma, most, about = math.radians(sigma_deg), math.radians(6), math.radians(about_deg)
 
-    def chance(a: float) -> float:
-        return 0.98 * norm.pdf(a, 0, math.radians(0.7)) + 0.02 / math.radians(12)
+    def mean_of(value: Callable[[float], float]) -> float:
+        def weighed(a: float) -> float:
+            chance = (1 - share) * norm.pdf(a, 0, sigma) + share / (2 * most)
+            return chance * value(math.cos(about + a) + along * math.sin(about + a))
 
-    most = math.radians(6)
-    mean = quad(lambda a: chance(a) * math.cos(a), -most, most, points=[0])[0]
-    square = quad(lambda a: chance(a) * (math.cos(a) - mean) ** 2, -most, most, points=[0])[0]
+        return float(quad(weighed, -most, most, points=[-3 * sigma, 0, 3 * sigma], epsabs=1e-13)[0])
+
+    mean = mean_of(lambda length: length)
+    return mean, math.sqrt(mean_of(lambda length: (length - mean) ** 2))
+
+
+@pytest.mark.parametrize("along", [0.0, 0.05, -0.05])
+def test_a_first_distance_stays_but_for_the_lean_that_is_likely(along: float) -> None:
+    """A bar 360 px off the middle looks shorter or longer by a twentieth of its lean, which is not known."""
+    _, found = RangeKeeper().step(Ranges(), 0.0, CHIP_US, Range(50.0, 0.02, 15), BarSight(along))
+    mean, spread = foreshortened(along)
     assert found.distance_m == pytest.approx(50 * mean, abs=2e-4)
-    assert found.sigma_m == pytest.approx(math.hypot(0.02 * mean, 50 * math.sqrt(square)), rel=0.02)
+    assert found.sigma_m == pytest.approx(math.hypot(0.02 * mean, 50 * spread), rel=0.02)
+
+
+@pytest.mark.parametrize("along", [0.0, -0.04])
+@pytest.mark.parametrize("lean_deg", [-4.0, 0.0, 12.0])
+def test_an_attitude_tells_the_lean(lean_deg: float, along: float) -> None:
+    sight = BarSight(along, sine=math.sin(math.radians(lean_deg)), sigma=math.radians(0.3))
+    _, found = RangeKeeper().step(Ranges(), 0.0, CHIP_US, Range(50.0, 0.02, 15), sight)
+    mean, spread = foreshortened(along, lean_deg, 0.3, 6e-5)
+    assert found.distance_m == pytest.approx(50 * mean, abs=1e-3)
+    assert found.sigma_m == pytest.approx(math.hypot(0.02 * mean, 50 * spread), rel=0.03)
 
 
 def test_distances_are_brought_to_the_pilot() -> None:
@@ -107,7 +133,7 @@ def test_braking_is_no_scatter() -> None:
         t_s = i * FRAME_US * 1e-6
         true_m = 40 - 15 * t_s + 8 * t_s**2 / 2
         measured = Range(true_m + 0.01 * rng.standard_normal(), 0.01, 15)
-        state, found = keeper.step(state, t_s * 1e6, CHIP_US, measured)
+        state, found = keeper.step(state, t_s * 1e6, CHIP_US, measured, AHEAD)
         sigmas.append(found.sigma_m)
     plain = drive(frames=150, sigma_m=0.01, start_m=40.0, late_chips=0.0, seed=3)
     assert np.mean(sigmas[60:]) < 1.15 * np.mean(plain[60:, 1])
@@ -145,10 +171,10 @@ def test_a_distance_keeps_nothing_of_old_bends_and_distances() -> None:
     rng = np.random.default_rng(5)
     for i in range(400):
         bend = bend_of(4.0, 45.0, 0.04, rng)
-        state, _ = keeper.step(state, i * FRAME_US, CHIP_US, Range(45.1, 0.01, 15, 8.0, bend))
+        state, _ = keeper.step(state, i * FRAME_US, CHIP_US, Range(45.1, 0.01, 15, 8.0, bend), AHEAD)
     assert len(state.past) <= 0.3 / (FRAME_US * 1e-6) + 1
     assert state.bend[1].max() < 1.01 * bend.weight.max() / (1 - math.exp(-FRAME_US * 1e-6))
-    new, _ = keeper.step(state, 400 * FRAME_US + 20e6, CHIP_US, Range(45.1, 0.01, 15, 8.0, bend))
+    new, _ = keeper.step(state, 400 * FRAME_US + 20e6, CHIP_US, Range(45.1, 0.01, 15, 8.0, bend), AHEAD)
     assert len(new.past) == 1
     assert new.bend[1] == pytest.approx(bend.weight)
 
@@ -156,9 +182,9 @@ def test_a_distance_keeps_nothing_of_old_bends_and_distances() -> None:
 def test_another_layout_s_bend_starts_anew() -> None:
     keeper, rng = RangeKeeper(), np.random.default_rng(6)
     bend = bend_of(0.0, 45.0, 0.04, rng)
-    state, _ = keeper.step(Ranges(), 0.0, CHIP_US, Range(45.0, 0.01, 15, 8.0, bend))
-    few = Bend(bend.place[:4], bend.off[:4], bend.weight[:4])
-    state, found = keeper.step(state, FRAME_US, CHIP_US, Range(45.0, 0.01, 4, 8.0, few))
+    state, _ = keeper.step(Ranges(), 0.0, CHIP_US, Range(45.0, 0.01, 15, 8.0, bend), AHEAD)
+    few = Bend(bend.place[:4], bend.off[:4], bend.weight[:4], bend.uneven[:4])
+    state, found = keeper.step(state, FRAME_US, CHIP_US, Range(45.0, 0.01, 4, 8.0, few), AHEAD)
     assert state.bend.shape == (2, 4)
     # Four boundaries say nothing of a parabola beside scale, place and the pilots' pattern.
     assert math.isfinite(found.sigma_m)
@@ -168,6 +194,7 @@ def test_another_layout_s_bend_starts_anew() -> None:
 def test_ideal_distances_stay(sigma_m: float) -> None:
     keeper, state = RangeKeeper(), Ranges()
     for i in range(120):
-        state, found = keeper.step(state, i * FRAME_US, CHIP_US, Range(50.0, sigma_m, 15))
-        assert found.distance_m == pytest.approx(50.0, abs=0.01)
-        assert 0 < found.sigma_m < 0.03
+        state, found = keeper.step(state, i * FRAME_US, CHIP_US, Range(50.0, sigma_m, 15), AHEAD)
+        mean, spread = foreshortened()
+        assert found.distance_m == pytest.approx(50 * mean, abs=2e-4)
+        assert found.sigma_m == pytest.approx(50 * spread, rel=0.02)

@@ -15,6 +15,7 @@ from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 from evlcp_sdk.testing.recordings import (
     IdealBar,
     ideal_events,
@@ -23,7 +24,7 @@ from evlcp_sdk.testing.recordings import (
     noise_events,
     random_symbols,
 )
-from evlcp_sdk.values import Events, Packet, PresenceMap
+from evlcp_sdk.values import Events, Frame, Packet, PresenceMap
 
 LINK = load_link()
 
@@ -277,6 +278,48 @@ def test_even_pieces_give_the_same(size: int) -> None:
     pieces = (slice(a, a + size) for a in range(0, len(STREAM), size))
     assert rows(received(LINK, STREAM, pieces)) == WHOLE
     assert len(WHOLE) == 60
+
+
+def turned(
+    attitude: Attitude | AttitudeLog | None, size: int | None = None, link: Link = LINK
+) -> tuple[list[Frame], dict[str, int]]:
+    """Frames of the stream by a camera that is turned so, in pieces of a size, and the receiver's counts."""
+    receiver, size = Receiver(link, attitude=attitude), size or len(STREAM)
+    packets = [p for a in range(0, len(STREAM), size) for p in receiver.feed(STREAM[a : a + size])]
+    return [f for p in packets + receiver.close() for f in p.frames], receiver.counts
+
+
+def test_an_attitude_makes_distances_shorter_by_what_the_bar_leans() -> None:
+    # These images have no bend, which `joint-scale` would see.
+    poc = load_link(overrides=["ranging.id=poc"])
+    pitched, counts = turned(Attitude(6.0, 0.0), link=poc)
+    level, _ = turned(Attitude(0.0, 0.0), link=poc)
+    assert counts["frames_askew"] == 0
+    assert len(pitched) == len(level) == 60
+    for a, b in zip(pitched, level, strict=True):
+        # A pinhole's, of a bar that is seen some rows below the middle of the image.
+        below = (a.y_px - LINK.camera.height / 2) / LINK.camera.focal_px
+        length = np.cos(np.radians(6)) + below * np.sin(np.radians(6))
+        assert a.range.distance_m / b.range.distance_m == pytest.approx(length, abs=1e-4)
+        assert a.range.sigma_m > b.range.sigma_m
+
+
+def test_an_attitude_that_the_image_contradicts_counts_as_none() -> None:
+    rolled, counts = turned(Attitude(6.0, 5.0))
+    assert counts["frames_askew"] == len(rolled)
+    assert [f.range for f in rolled] == [f.range for f in turned(None)[0]]
+
+
+def test_any_split_gives_the_same_with_an_attitude_that_changes() -> None:
+    """A log that ends in the middle of the stream."""
+    t_us = np.linspace(0, 50_000, 50)
+    pitch_deg = 3 * np.sin(t_us / 15_000)
+    log = AttitudeLog(t_us, pitch_deg, 0 * t_us, None, np.full(50, 0.2), np.full(50, 0.5))
+    whole = [(f.t_us, f.range) for f in turned(log)[0]]
+    for size in (700, 9000):
+        assert [(f.t_us, f.range) for f in turned(log, size)[0]] == whole
+    assert sum(t > 50_000 for t, _ in whole) > 20
+    assert [r for _, r in whole] != [f.range for f in turned(None)[0]]
 
 
 def test_the_clock_may_begin_anywhere() -> None:

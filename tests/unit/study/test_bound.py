@@ -8,7 +8,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.study.bound import cramer_rao_sigma_m, frame_bound
+from evlcp_sdk.study.bound import cramer_rao_sigma_m, frame_bound, lean_sigma_deg
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
 LINK = load_link()
@@ -44,6 +44,40 @@ def test_the_bound_is_that_of_boundaries_by_themselves(blur_px: float) -> None:
     spacing_px = LINK.camera.focal_px * 0.06 / 50
     want = 50 / spacing_px * np.sqrt(np.linalg.inv(information)[0, 0])
     assert bound(blur_px=blur_px) == pytest.approx(want, rel=0.02)
+
+
+def lean_bound(**how: float) -> float:
+    given = {"distance_m": 50.0, "blur_px": 0.45, "noise": 0.3} | how
+    return lean_sigma_deg(LINK.camera, LINK.bar, LINK.codebook, symbols=np.arange(K), **given)
+
+
+def test_the_bound_of_the_lean_follows_noise_and_distance() -> None:
+    assert lean_bound(noise=0.6) == pytest.approx(2 * lean_bound())
+    assert lean_bound(distance_m=100.0) == pytest.approx(4 * lean_bound(), rel=0.2)
+    with pytest.raises(ConfigError, match="distance_m = -1"):
+        lean_bound(distance_m=-1)
+
+
+@pytest.mark.parametrize("distance_m", [15.0, 50.0, 90.0])
+def test_the_bound_of_the_lean_is_that_of_boundaries_by_themselves(distance_m: float) -> None:
+    """Boundaries of a leaning bar where a pinhole sees them, derived numerically; each as sure as above."""
+    codes = np.concatenate([LINK.codebook.pilots, LINK.codebook.codewords[np.arange(K)]], axis=1)
+    steps = np.diff(codes.astype(float), axis=0)
+    each = 0.8**2 * steps**2 / (2 * np.sqrt(np.pi) * 0.9) * 5 / 0.3**2
+    along_m = 0.06 * (np.arange(1, K) - K / 2)
+
+    def rows(sine: float, scale: float) -> np.ndarray:
+        cosine = np.sqrt(1 - sine**2)
+        return LINK.camera.focal_px * scale * along_m * cosine / (distance_m - along_m * sine)
+
+    lean = (rows(1e-4, 1.0) - rows(-1e-4, 1.0)) / 2e-4
+    scale = (rows(0.0, 1 + 1e-4) - rows(0.0, 1 - 1e-4)) / 2e-4
+    when = np.arange(codes.shape[1]) / codes.shape[1] - 0.5
+    by_boundary = [np.repeat(column[:, None], len(when), 1) for column in (lean, scale, np.ones(K - 1))]
+    slopes = np.stack([*by_boundary, np.tile(when, (K - 1, 1))])
+    information = np.einsum("aki,bki,ki->ab", slopes, slopes, each)
+    want = np.degrees(np.sqrt(np.linalg.inv(information)[0, 0]))
+    assert lean_bound(distance_m=distance_m, blur_px=0.9) == pytest.approx(want, rel=0.03)
 
 
 def view_of(

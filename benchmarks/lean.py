@@ -1,0 +1,124 @@
+"""What a bar's lean against the sensor does to distances: bounds, and what the receiver makes of it.
+
+    python benchmarks/lean.py [--seeds 4] [--duration 0.5] [--bounds]
+
+The first table is of closed forms and bounds (`evlcp_sdk.study.bound`), which take no receiver; with
+`--bounds` it is all. The second has drives of the simulator by a camera that is level or pitched up by 4
+degrees, the bar in the middle of its image or 200 px above it at first, vibration and all, received by the
+default link without an attitude and with what an IMU says, whose sigma is 0.1 degrees, and which is off from
+the bar by one sigma of both, to either side by turns. Five minutes of processor time.
+"""
+
+import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.scene.lean import BarSight, foreshortening
+from evlcp_sdk.sim import Simulation, Truth, resolve_scene, truth_of
+from evlcp_sdk.sim.world import attitude_log
+from evlcp_sdk.study.bound import cramer_rao_sigma_m, lean_sigma_deg
+from evlcp_sdk.values import Packet
+
+LINK = load_link()
+DISTANCES_M = (15, 30, 45, 60, 80, 90)
+SCENES = ((0.0, 0.0), (4.0, 0.0), (4.0, -200.0))
+BLUR_PX, NOISE = 0.45, 0.3
+SIGMA_DEG = 0.1
+EARLY_S = 0.1
+
+
+def bounds() -> None:
+    print("| m | a frame's distance, m | its lean, deg | 4 deg in the middle, m | 200 px above, m | frames |")
+    print("|---|---|---|---|---|---|")
+    sine = math.sin(math.radians(4))
+    middle, above = (BarSight(row / LINK.camera.focal_px) for row in (0.0, -200.0))
+    for distance_m in DISTANCES_M:
+        scene = LINK.camera, LINK.bar, LINK.codebook, float(distance_m), range(LINK.bar.clusters)
+        distance = cramer_rao_sigma_m(*scene, blur_px=BLUR_PX, noise=NOISE)
+        lean = lean_sigma_deg(*scene, blur_px=BLUR_PX, noise=NOISE)
+        off = [distance_m * (1 / foreshortening(np.array([sine]), s)[0] - 1) for s in (middle, above)]
+        # What the lean, told by n frames, adds at 4 degrees is then no more than the frame's own sigma.
+        frames = (distance_m * sine * math.radians(lean) / distance) ** 2
+        print(f"| {distance_m} | {distance:.4f} | {lean:.1f} | {off[0]:.3f} | {off[1]:.3f} | {frames:.0f} |")
+
+
+def drive(
+    distance_m: float, pitch_deg: float, row_px: float, seed: int, duration_s: float
+) -> dict[str, NDArray[np.float64]]:
+    """Time, error and sigma of each distance, float64 (n, 3): without an attitude, and with one."""
+    # Attitude and bar are off to opposite sides: by one sigma of both together.
+    off_deg = math.copysign(SIGMA_DEG / math.sqrt(2), seed % 2 - 0.5)
+    up = math.radians(pitch_deg) - math.atan(row_px / LINK.camera.focal_px)
+    scene = resolve_scene(
+        {
+            "duration_s": duration_s,
+            "motion": {"distance_m": float(distance_m), "pitch_deg": pitch_deg},
+            "background": {"light_w_m2": 0.3},
+            "world": {"latitude_deg": 35.0, "gravity_sigma_deg": 0.0, "attitude": "gravity"},
+            "bars": [{"x_m": -0.8, "y_m": -distance_m * math.tan(up), "tilt_deg": off_deg}],
+        }
+    )
+    simulation = Simulation(scene, seed)
+    truth, true = truth_of(simulation), attitude_log(scene, seed, simulation.path)
+    assert true is not None
+    log = replace(
+        true, pitch_deg=true.pitch_deg - off_deg, gravity_sigma_deg=np.full(len(true.t_us), SIGMA_DEG)
+    )
+    receivers = {"without": Receiver(LINK), "with": Receiver(LINK, attitude=log)}
+    packets: dict[str, list[Packet]] = {name: [] for name in receivers}
+    for events in simulation.stream():
+        for name, receiver in receivers.items():
+            packets[name] += receiver.feed(events)
+    return {name: errors(packets[name] + receiver.close(), truth) for name, receiver in receivers.items()}
+
+
+def errors(packets: Sequence[Packet], truth: Truth) -> NDArray[np.float64]:
+    found = []
+    for packet in packets:
+        for frame in packet.frames if packet.echo_of is None else ():
+            if math.isfinite(frame.range.distance_m):
+                true_m = np.interp(frame.points_t_us - truth.t0_us, truth.t_us, truth.bars[0].distance_m)
+                error_m = frame.range.distance_m - float(true_m)
+                found.append((frame.t_us - truth.t0_us, error_m, frame.range.sigma_m))
+    return np.array(found)
+
+
+def nees(found: NDArray[np.float64]) -> str:
+    return f"{np.mean((found[:, 1] / found[:, 2]) ** 2):.2f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--duration", type=float, default=0.5)
+    parser.add_argument("--bounds", action="store_true")
+    args = parser.parse_args()
+    bounds()
+    if args.bounds:
+        return
+    print("\n| pitch | row | m | without: RMSE m | NEES: first 0.1 s | then | with: RMSE m | NEES | frames |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for pitch_deg, row_px in SCENES:
+        for distance_m in (30, 45, 60, 80):
+            drives: list[dict[str, Any]] = [
+                drive(distance_m, pitch_deg, row_px, seed, args.duration) for seed in range(1, args.seeds + 1)
+            ]
+            plain, told = (np.concatenate([d[name] for d in drives]) for name in ("without", "with"))
+            early = plain[:, 0] < EARLY_S * 1e6
+            rmse = [math.sqrt(float(np.mean(x[:, 1] ** 2))) for x in (plain, told)]
+            print(
+                f"| {pitch_deg:g} | {row_px:+g} | {distance_m} | {rmse[0]:.3f} | {nees(plain[early])}"
+                f" | {nees(plain[~early])} | {rmse[1]:.3f} | {nees(told)} | {len(told)} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

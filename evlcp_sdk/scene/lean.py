@@ -1,0 +1,107 @@
+"""A bar that leans against the sensor: how much shorter it looks, and how a plumb one must lean."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.camera import CameraModel
+
+__all__ = ["BarSight", "foreshortening", "sight_of"]
+
+Floats = NDArray[np.float64]
+
+_PLUMB_DEG = 0.1
+"""How far bars stand off the vertical (sigma), each way: 1.7 mm in a metre, as by a spirit level."""
+
+_ASKEW = 4.0
+"""Sigmas off the vertical in the image, 1 of 16000 by chance, beyond which a bar is not meant to be plumb."""
+
+
+@dataclass(frozen=True)
+class BarSight:
+    """Where a bar is seen, and how it leans as far as the camera's attitude says so.
+
+    Attributes:
+        along: Tangent of the angle between the optical axis and the sight of the bar's middle, in the bar's
+            direction in the image, from its first cluster to its last.
+        across: The same at a right angle to it.
+        sine: Of the lean that a plumb bar has; positive: its last cluster is nearer than its first. None
+            where no attitude tells.
+        sigma: Standard deviation of that sine.
+        askew: The attitude is known, but the image shows that the bar does not stand plumb.
+
+    A default one is in the middle of the image, and nothing is known of its lean.
+    """
+
+    along: float = 0.0
+    across: float = 0.0
+    sine: float | None = None
+    sigma: float = 0.0
+    askew: bool = False
+
+
+def foreshortening(sine: Floats, sight: BarSight) -> Floats:
+    """How long a bar looks, in what one parallel to the sensor does at the same depth: exact, of a pinhole.
+
+    A bar whose direction has the part -sine along the optical axis, and whose middle is seen at tangents
+    (along, across) of the axis, looks sqrt(1 - sine^2 (1 + across^2)) + along sine times as long: in the
+    middle of the image cos(lean), elsewhere by `along` times the lean more or less, which is of first order.
+
+    Args:
+        sine: Sines of leans, float64 (n,).
+        sight: Where the bar is seen.
+
+    >>> lean = np.sin(np.radians([4.0]))
+    >>> foreshortening(lean, BarSight()).round(5).tolist()
+    [0.99756]
+    >>> foreshortening(lean, BarSight(along=-0.03)).round(5).tolist()
+    [0.99547]
+    """
+    flat = np.maximum(1 - sine**2 * (1 + sight.across**2), 0.0)
+    return np.asarray(np.sqrt(flat) + sight.along * sine)
+
+
+def sight_of(
+    camera: CameraModel, points_px: Floats, sigma_px: Floats, attitude: Attitude | None = None
+) -> BarSight:
+    """Where a bar of one column is seen; with an attitude, how it leans if it is plumb, upright or not.
+
+    A plumb bar's direction in the image follows from pitch, roll and place. Where the bar shows another, by
+    more than the sigmas explain, the attitude says nothing of its lean.
+
+    Args:
+        camera: The camera.
+        points_px: Where the clusters' centres are seen, first cluster first, px, float64 (K, 2); NaN where
+            unseen. With fewer than two, the sight is the default one.
+        sigma_px: Their standard deviations, px, float64 (K,).
+        attitude: What is known of the camera's attitude; None for nothing.
+    """
+    seen = np.flatnonzero(np.isfinite(points_px).all(1))
+    if len(seen) < 2:
+        return BarSight()
+    first, last = int(seen[0]), int(seen[-1])
+    ends = camera.undistort(points_px[[first, last]])
+    direction, (u, v) = ends[1] - ends[0], ends.mean(0)
+    length = float(np.hypot(*direction))
+    if not length > 0:
+        return BarSight()
+    x, y = (float(part) / length for part in direction)
+    along, across = float(x * u + y * v), float(x * v - y * u)
+    if attitude is None:
+        return BarSight(along, across)
+    up = attitude.rotation()[2]
+    # What a small step downward does to the sight, by the rule of the quotient.
+    down_x, down_y = up[2] * u - up[0], up[2] * v - up[1]
+    off_rad = math.atan2(down_x * y - down_y * x, down_x * x + down_y * y)
+    # A bar may hang with its first cluster at the bottom.
+    upside_down = abs(off_rad) > math.pi / 2
+    off_rad = math.pi - abs(off_rad) if upside_down else abs(off_rad)
+    lean_rad = math.radians(math.hypot(attitude.gravity_sigma_deg, _PLUMB_DEG))
+    image_rad = math.hypot(sigma_px[first], sigma_px[last]) / (length * camera.focal_px)
+    if off_rad > _ASKEW * math.hypot(lean_rad, image_rad):
+        return BarSight(along, across, askew=True)
+    sine = float(-up[2] if upside_down else up[2])
+    return BarSight(along, across, sine, lean_rad * math.sqrt(max(1 - sine**2, 0.0)))

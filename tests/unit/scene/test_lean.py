@@ -1,0 +1,92 @@
+"""Leaning bars, against a pinhole that sees their LEDs, and against the simulator's geometry."""
+
+import math
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.scene.lean import BarSight, foreshortening, sight_of
+
+CAMERA = CameraModel()
+SIGMA_PX = np.full(16, 0.1)
+
+
+def seen(
+    attitude: Attitude, east: float, up: float, axis: tuple[float, float, float], camera: CameraModel = CAMERA
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """Where 16 clusters of a bar are seen 50 m to the north, its depth, and its direction (camera's axes)."""
+    down = np.array(axis) / np.linalg.norm(axis)
+    along = 0.06 * (np.arange(16) - 7.5)
+    turned = (np.array([east, 50.0, up]) + along[:, None] * down) @ attitude.rotation()
+    return camera.project(turned), float(turned.mean(0)[2]), down @ attitude.rotation()
+
+
+PLUMB = (0.0, 0.0, -1.0)
+
+
+@pytest.mark.parametrize(("east", "up"), [(0.0, 0.0), (4.0, 2.0), (-4.0, -2.0), (0.0, -2.4)])
+@pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(0.0, 0.0), (4.0, 0.0), (-3.0, 10.0), (2.0, -90.0)])
+@pytest.mark.parametrize("axis", [PLUMB, (0.0, 0.0, 1.0)], ids=["upright", "upside-down"])
+def test_a_plumb_bar(
+    pitch_deg: float, roll_deg: float, east: float, up: float, axis: tuple[float, float, float]
+) -> None:
+    attitude = Attitude(pitch_deg, roll_deg, 0.0)
+    points, depth_m, direction = seen(attitude, east, up, axis)
+    sight = sight_of(CAMERA, points, SIGMA_PX, attitude)
+    assert not sight.askew
+    assert sight.sine == pytest.approx(-direction[2], abs=1e-12)
+    # The length in the image says the depth, once it is known how much of it the lean takes.
+    spacing_px = np.hypot(*(points[-1] - points[0])) / 15
+    length = foreshortening(np.array([sight.sine]), sight)[0]
+    assert CAMERA.distance_m(0.06, spacing_px) * length == pytest.approx(depth_m, abs=1e-3)
+
+
+def test_a_lean_beside_the_middle_counts_at_once() -> None:
+    """200 px above the middle 4 degrees make 0.44 % of the distance, below it 0.05 %."""
+    lean = np.array([math.sin(math.radians(4))])
+    above, middle, below = (
+        1 - foreshortening(lean, BarSight(px / CAMERA.focal_px))[0] for px in (-200, 0, 200)
+    )
+    assert (above, middle, below) == pytest.approx((0.00437, 0.00244, 0.00050), abs=1e-5)
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.05, 0.0, -1.0), (-0.02, 0.0, 1.0)])
+def test_a_bar_that_stands_otherwise_is_askew(axis: tuple[float, float, float]) -> None:
+    attitude = Attitude(4.0, 0.0)
+    points, _, _ = seen(attitude, 1.0, 0.5, axis)
+    sight = sight_of(CAMERA, points, SIGMA_PX, attitude)
+    assert sight.askew
+    assert sight.sine is None
+    # An attitude that is not sure to that extent does not tell it from a plumb one.
+    if abs(axis[0]) < 0.1:
+        assert sight_of(CAMERA, points, SIGMA_PX, Attitude(4.0, 0.0, gravity_sigma_deg=1.5)).sine is not None
+
+
+def test_the_sigma_is_that_of_gravity_and_of_plumb_bars() -> None:
+    points, _, _ = seen(Attitude(30.0, 0.0, 0.0), 0.0, 29.0, PLUMB)
+    sight = sight_of(CAMERA, points, SIGMA_PX, Attitude(30.0, 0.0, gravity_sigma_deg=0.2))
+    assert sight.sine == pytest.approx(0.5)
+    assert sight.sigma == pytest.approx(math.radians(math.hypot(0.2, 0.1)) * math.cos(math.radians(30)))
+
+
+def test_a_lens_does_not_change_the_sight() -> None:
+    attitude, bent = Attitude(4.0, 3.0), CameraModel(k1=-0.4, p1=0.002)
+    plain = sight_of(CAMERA, seen(attitude, 3.0, 3.0, PLUMB)[0], SIGMA_PX, attitude)
+    lens = sight_of(bent, seen(attitude, 3.0, 3.0, PLUMB, bent)[0], SIGMA_PX, attitude)
+    assert (lens.along, lens.across, lens.sine) == pytest.approx((plain.along, plain.across, plain.sine))
+
+
+def test_a_part_of_a_bar_has_a_sight_and_a_point_has_none() -> None:
+    attitude = Attitude(4.0, 0.0)
+    points, _, direction = seen(attitude, 1.0, 3.0, PLUMB)
+    points[[0, 1, 2, 9]] = np.nan
+    assert sight_of(CAMERA, points, SIGMA_PX, attitude).sine == pytest.approx(-direction[2])
+    unknown = sight_of(CAMERA, points, SIGMA_PX)
+    # 3 m above and 4 degrees up: below the middle, a metre to the right.
+    assert unknown.along == pytest.approx(math.tan(math.radians(4)) - 3 / 50, abs=2e-3)
+    assert abs(unknown.across) == pytest.approx(1 / 50, abs=1e-3)
+    assert (unknown.sine, unknown.askew) == (None, False)
+    points[4:] = np.nan
+    assert sight_of(CAMERA, points, SIGMA_PX, attitude) == BarSight()
