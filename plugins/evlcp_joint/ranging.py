@@ -169,7 +169,7 @@ class JointScaleRanging(Ranging):
                 distance * sigma_px / float(fit[0]),
                 int(np.count_nonzero(off[1])),
                 late_chips,
-                Bend(boundaries, off[0] / one_px, off[1] * one_px**2, uneven),
+                Bend(boundaries.copy(), off[0] / one_px, off[1] * one_px**2, uneven.copy()),
             )
 
         return measure
