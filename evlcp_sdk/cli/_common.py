@@ -58,10 +58,13 @@ Dask = Annotated[
 
 
 def console() -> "Console":
-    """Where tables go: stdout, without colour where it is not a terminal or NO_COLOR is set."""
+    """Where tables go: stdout, without colour where it is not a terminal or NO_COLOR is set.
+
+    Texts are printed as they are: no brackets of a name or a plugin are taken for Rich's markup.
+    """
     from rich.console import Console
 
-    return Console(highlight=False, soft_wrap=True)
+    return Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 
 def make_executor(workers: int | None, dask: str | None) -> "Executor":

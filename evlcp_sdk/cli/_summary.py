@@ -11,12 +11,12 @@ __all__ = ["show"]
 
 def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
     """Print what was found, what was lost, where the result is, and how fast it went."""
-    from rich.markup import escape
     from rich.table import Table
+    from rich.text import Text
 
     out = console()
     recording, processing = summary["recording"], summary["processing"]
-    out.print(f"[bold]{escape(Path(recording['path']).name)}[/]: {summary['result']}")
+    out.print(Text.assemble((Path(recording["path"]).name, "bold"), f": {summary['result']}"))
     if summary["transmitters"]:
         table = Table(box=None, pad_edge=False, header_style="dim")
         for name in ("transmitter", "frames", "not seen", "quality", "clock", "distance"):
@@ -51,8 +51,8 @@ def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
             style="yellow",
         )
     for warning in summary["warnings"]:
-        out.print(f"warning: {escape(warning)}", style="yellow")
-    out.print(f"written: {escape(str(folder))}/frames.csv, packets.jsonl, summary.json", style="dim")
+        out.print(f"warning: {warning}", style="yellow")
+    out.print(f"written: {folder}/frames.csv, packets.jsonl, summary.json", style="dim")
 
 
 def _who(told: Mapping[str, Any]) -> str:

@@ -62,7 +62,7 @@ def calibrate(
     if as_json:
         typer.echo(json.dumps(_table(found) | {"poses": len(known)}))
     else:
-        console().print(_toml(found, len(known)), markup=False)
+        console().print(_toml(found, len(known)))
 
 
 def _table(found: "Calibrated") -> dict[str, Any]:

@@ -132,10 +132,10 @@ def _link(
 
 
 def _show(outcomes: "list[Verdict]") -> None:
-    from rich.markup import escape
+    from rich.text import Text
 
     out = console()
     width = max(len(o.law.name) for o in outcomes)
     for o in outcomes:
         text = o.law.says if o.status == "ok" else " ".join(o.detail.split())
-        out.print(f"[{_STYLES[o.status]}]{o.status:<7}[/]  {o.law.name:<{width}}  {escape(text)}")
+        out.print(Text.assemble((f"{o.status:<7}", _STYLES[o.status]), f"  {o.law.name:<{width}}  {text}"))

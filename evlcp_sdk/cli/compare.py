@@ -195,8 +195,6 @@ def _write(comparison: "Comparison", paths: Sequence[Path]) -> None:
 
 
 def _show(comparison: "Comparison", paths: Sequence[Path]) -> None:
-    from rich.markup import escape
-
     from evlcp_sdk.study.compare.table import LEGEND
 
     out = console()
@@ -204,7 +202,7 @@ def _show(comparison: "Comparison", paths: Sequence[Path]) -> None:
         # A pipe has no width that a table should be cut to.
         out.width = _PIPE_WIDTH
     for one in comparison.tables:
-        out.print(f"[bold]{escape(one.name)}[/]")
+        out.print(one.name, style="bold")
         head, lines = one.cells()
         columns = [[(title, False) for title in head], *lines]
         if _width(zip(*columns, strict=True)) <= out.width:
@@ -213,10 +211,10 @@ def _show(comparison: "Comparison", paths: Sequence[Path]) -> None:
         out.print(_grid(columns))
         out.print()
     for note in comparison.notes:
-        out.print(escape(note), style="yellow")
+        out.print(note, style="yellow")
     out.print(LEGEND, style="dim")
     if paths:
-        out.print(f"written: {escape(', '.join(map(str, paths)))}", style="dim")
+        out.print(f"written: {', '.join(map(str, paths))}", style="dim")
 
 
 def _width(columns: Iterable[Sequence[tuple[str, bool]]]) -> int:
@@ -225,12 +223,12 @@ def _width(columns: Iterable[Sequence[tuple[str, bool]]]) -> int:
 
 def _grid(columns: Sequence[Sequence[tuple[str, bool]]]) -> "Grid":
     """A table of columns, each with its heading first; the best in bold type."""
-    from rich.markup import escape
     from rich.table import Table as Grid
+    from rich.text import Text
 
     grid = Grid(box=None, pad_edge=False, header_style="dim")
     for number, column in enumerate(columns):
-        grid.add_column(escape(column[0][0]), justify="right" if number else "left", no_wrap=True)
+        grid.add_column(column[0][0], justify="right" if number else "left", no_wrap=True)
     for row in zip(*(column[1:] for column in columns), strict=True):
-        grid.add_row(*(f"[bold]{escape(text)}[/]" if best else escape(text) + " " for text, best in row))
+        grid.add_row(*(Text(text, "bold") if best else f"{text} " for text, best in row))
     return grid

@@ -99,7 +99,8 @@ def as_markdown(summary: "Summary") -> str:
     parts = []
     for head, rows in (_paper_table(summary), _series_table(summary)):
         if rows:
-            lines = [head, ["---"] * len(head), *rows]
+            cells = [[cell.replace("\\", "\\\\").replace("|", "\\|") for cell in row] for row in rows]
+            lines = [head, ["---"] * len(head), *cells]
             parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
     return "\n\n".join(parts)
 

@@ -1,11 +1,19 @@
-"""Self-contained pages: their look, tables, and how they are written; nothing in them asks the network."""
+"""Self-contained pages: their look, tables, and how they are written; nothing in them asks the network.
 
-import html
+What is not `Markup` is plain text and is escaped where it enters a page, whatever wrote it; and a page lets
+no script run but those that it was written with.
+"""
+
+import base64
+import hashlib
 import json
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-__all__ = ["details", "document", "table"]
+from markupsafe import Markup, escape
+
+__all__ = ["Markup", "details", "document", "escape", "table"]
 
 _CSS = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #333; max-width: 70rem; margin: 2rem auto;
@@ -20,39 +28,82 @@ th { color: #666; font-weight: 600 } td:first-child, th:first-child { text-align
 pre { background: #f6f6f6; padding: 0.7rem; overflow-x: auto; font-size: 0.8rem } summary { cursor: pointer }
 """
 
+_PAGE = Markup(
+    """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{policy}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<link rel="icon" href="data:,">
+<title>{title}</title>
+<style>{css}</style>
+</head>
+<body>
+{body}
+</body>
+</html>
+"""
+)
 
-def document(title: str, body: Iterable[str], head: str = "") -> str:
+
+def document(
+    title: str, body: Iterable[str], scripts: Sequence[str] = (), data: Mapping[str, Any] | None = None
+) -> str:
     """A whole page.
 
     Args:
         title: Plain text.
-        body: HTML.
-        head: HTML that the body needs, e.g. a script.
+        body: `Markup`; any other text is escaped.
+        scripts: JavaScript, run in this order once the body is there; written by us, nothing of it by others.
+        data: What the scripts read, as JSON: name to values. The text of the script element with the id
+            `name` is the JSON of its values.
+
+    Raises:
+        ValueError: A script holds what would end its element.
     """
-    return "\n".join(
-        [
-            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            '<link rel="icon" href="data:,">',
-            f"<title>{html.escape(title)}</title>\n<style>{_CSS}</style>",
-            f"{head}</head>\n<body>",
-            *body,
-            "</body>\n</html>\n",
-        ]
+    parts = [Markup("{}").format(part) for part in body]
+    for name, values in (data or {}).items():
+        held = Markup('<script type="application/json" id="{}">{}</script>')
+        parts.append(held.format(name, Markup(_json(values))))
+    sources = []
+    for script in scripts:
+        if re.search("</script", script, re.IGNORECASE):
+            raise ValueError("a script that would end its own element")
+        # As a browser reads it.
+        script = script.replace("\r\n", "\n").replace("\r", "\n")
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        sources.append(f"'sha256-{digest}'")
+        parts.append(Markup("<script>{}</script>").format(Markup(script)))
+    policy = (
+        "default-src 'none'; img-src data: blob:; base-uri 'none'; form-action 'none';"
+        # Charts style themselves.
+        " style-src 'unsafe-inline'; script-src " + (" ".join(sources) or "'none'")
+    )
+    # The quotes of a policy are those that it is known by.
+    return str(
+        _PAGE.format(policy=Markup(policy), title=title, css=Markup(_CSS), body=Markup("\n").join(parts))
     )
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; its cells are HTML."""
-
-    def cells(tag: str, values: Sequence[str]) -> str:
-        return "".join(f"<{tag}>{v}</{tag}>" for v in values)
-
-    lines = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    return f'<div class="wide"><table><tr>{cells("th", head)}</tr>\n{lines}</table></div>'
+def _json(values: Any) -> str:
+    """JSON that ends no script element, whatever texts are in it: none of its characters is markup."""
+    text = json.dumps(values, allow_nan=False)
+    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
-def details(title: str, values: Any) -> str:
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Markup:
+    """A table; cells that are no `Markup` are escaped."""
+
+    def line(tag: str, values: Sequence[str]) -> Markup:
+        cell = Markup(f"<{tag}>{{}}</{tag}>")
+        return Markup("<tr>{}</tr>").format(Markup("").join(cell.format(v) for v in values))
+
+    lines = Markup("\n").join([line("th", head), *(line("td", row) for row in rows)])
+    return Markup('<div class="wide"><table>{}</table></div>').format(lines)
+
+
+def details(title: str, values: Any) -> Markup:
     """JSON values that show when their title is clicked."""
-    text = html.escape(json.dumps(values, indent=1, sort_keys=True))
-    return f'<details><summary class="digest">{html.escape(title)}</summary><pre>{text}</pre></details>'
+    held = Markup('<details><summary class="digest">{}</summary><pre>{}</pre></details>')
+    return held.format(title, json.dumps(values, indent=1, sort_keys=True))

@@ -1,10 +1,16 @@
 """Statistics that add: what was counted of decoded frames, exact in any order of summation."""
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Annotated, Any, Self
+
+from pydantic import Field
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.specs import build
 
 __all__ = [
     "BIN_M",
@@ -32,6 +38,12 @@ HALF_METRE_M = 0.5
 _FARTHEST_BIN = 150
 _FARTHEST_POSITION_BIN = 1000
 _HISTOGRAMS = ("histogram", "position_histogram")
+_MOST = 10**40
+"""What is counted is less: all nanometres squared of all frames of a year are 1e30."""
+
+Count = Annotated[int, Field(ge=0, lt=2**53)]
+Sum = Annotated[int, Field(ge=0, le=_MOST)]
+Bin = tuple[Annotated[int, Field(ge=-_FARTHEST_POSITION_BIN, le=_FARTHEST_POSITION_BIN)], Count]
 _LARGEST = ("worst_nm",)
 _MOST_SIGMAS = 1e6
 """So many sigmas are wrong beyond all measure; an error in sigmas of 0 has no number."""
@@ -94,33 +106,33 @@ class Tally:
         position_histogram: The same of the positions' errors, in bins of `POSITION_BIN_M` from 0.
     """
 
-    frames_sent: int = 0
-    frames_found: int = 0
-    bits: int = 0
-    bit_errors: int = 0
-    visible: int = 0
-    erased: int = 0
-    erased_bits: int = 0
-    hidden: int = 0
-    claimed: int = 0
-    ranged: int = 0
-    sum_nm: int = 0
-    squares_nm2: int = 0
-    gross: int = 0
-    worst_nm: int = 0
-    with_sigma: int = 0
-    nees_micro: int = 0
-    filtered: int = 0
-    filtered_squares_nm2: int = 0
-    messages_sent: int = 0
-    messages_found: int = 0
-    messages_wrong: int = 0
-    fixes: int = 0
-    fixes_refused: int = 0
-    position_squares_nm2: int = 0
-    position_nees_micro: int = 0
-    histogram: tuple[tuple[int, int], ...] = ()
-    position_histogram: tuple[tuple[int, int], ...] = ()
+    frames_sent: Count = 0
+    frames_found: Count = 0
+    bits: Count = 0
+    bit_errors: Count = 0
+    visible: Count = 0
+    erased: Count = 0
+    erased_bits: Count = 0
+    hidden: Count = 0
+    claimed: Count = 0
+    ranged: Count = 0
+    sum_nm: Annotated[int, Field(ge=-_MOST, le=_MOST)] = 0
+    squares_nm2: Sum = 0
+    gross: Count = 0
+    worst_nm: Sum = 0
+    with_sigma: Count = 0
+    nees_micro: Sum = 0
+    filtered: Count = 0
+    filtered_squares_nm2: Sum = 0
+    messages_sent: Count = 0
+    messages_found: Count = 0
+    messages_wrong: Count = 0
+    fixes: Count = 0
+    fixes_refused: Count = 0
+    position_squares_nm2: Sum = 0
+    position_nees_micro: Sum = 0
+    histogram: tuple[Bin, ...] = ()
+    position_histogram: tuple[Bin, ...] = ()
 
     @classmethod
     def distance(cls, error_m: float, sigma_m: float = math.nan) -> Self:
@@ -289,15 +301,15 @@ class Statistics:
     4
     """
 
-    tasks: int = 0
-    events: int = 0
-    duration_us: int = 0
-    packets: int = 0
-    rows: int = 0
-    echoes: int = 0
-    unmatched: int = 0
-    stated: int = 0
-    sigma_squares_nm2: int = 0
+    tasks: Count = 0
+    events: Count = 0
+    duration_us: Count = 0
+    packets: Count = 0
+    rows: Count = 0
+    echoes: Count = 0
+    unmatched: Count = 0
+    stated: Count = 0
+    sigma_squares_nm2: Sum = 0
     segments: tuple[tuple[int, Tally], ...] = ()
 
     @classmethod
@@ -334,12 +346,54 @@ class Statistics:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
-        """What `to_dict` gave."""
+        """What `to_dict` gave.
+
+        Raises:
+            ConfigError: It is something else.
+        """
+        kept = build(_Kept, table)
         tallies = []
-        for start, values in table["segments"].items():
-            bins = {name: tuple(sorted((int(b), n) for b, n in values[name].items())) for name in _HISTOGRAMS}
-            tallies.append((int(start), Tally(**{**values, **bins})))
-        return cls.of(tallies, **{name: table[name] for name in _COUNTS})
+        for start, values in kept.segments.items():
+            if values.keys() != _TALLIED:
+                raise ConfigError(f"segments.{start:.20}: expected the keys of a tally")
+            bins = {name: _pairs(values[name]) for name in _HISTOGRAMS}
+            tally = build(Tally, {**values, **bins})
+            for part, whole in (("bit_errors", "bits"), ("erased", "visible"), ("gross", "ranged")):
+                if getattr(tally, part) > getattr(tally, whole):
+                    raise ConfigError(f"segments.{start}.{part}: more than {whole}")
+            tallies.append((_whole(start), tally))
+        return cls.of(tallies, **{name: getattr(kept, name) for name in _COUNTS})
+
+
+_TALLIED = {f.name for f in fields(Tally)}
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """Statistics as JSON values have them."""
+
+    tasks: Count
+    events: Count
+    duration_us: Count
+    packets: Count
+    rows: Count
+    echoes: Count
+    unmatched: Count
+    stated: Count
+    sigma_squares_nm2: Sum
+    segments: dict[str, dict[str, Any]]
+
+
+def _pairs(bins: Any) -> list[list[Any]]:
+    if not isinstance(bins, dict):
+        raise ConfigError("expected a table of bins")
+    return sorted([_whole(bin), number] for bin, number in bins.items())
+
+
+def _whole(text: str) -> int:
+    if not re.fullmatch(r"-?[0-9]{1,6}", text):
+        raise ConfigError(f"{text[:20]!r}: expected a whole number")
+    return int(text)
 
 
 _COUNTS = tuple(f.name for f in fields(Statistics) if f.name != "segments")

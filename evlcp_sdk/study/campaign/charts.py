@@ -13,6 +13,7 @@ from evlcp_sdk.results.figures import TRANSMITTER_COLOURS
 from evlcp_sdk.study.campaign.paper import PAPER_NAME, Measure
 from evlcp_sdk.study.campaign.summary import Series, Summary, reference_marks
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, INTERVALS, Figure, measure
+from evlcp_sdk.study.markup import escape
 from evlcp_sdk.study.tally import BIN_M, SEGMENT_M, Tally
 
 __all__ = ["Chart", "Dot", "Line", "Mark", "charts_of", "decades", "draw", "save_charts"]
@@ -42,7 +43,7 @@ class Dot:
         y: The figure; where there was not one error on a logarithmic axis, the upper end of its interval.
         low: Lower end of the interval, or the figure itself where there is none.
         high: Upper end, the same.
-        text: What a reader who points at it sees.
+        text: What a reader who points at it sees; HTML.
         limit: Only an upper limit is known.
     """
 
@@ -220,7 +221,9 @@ def _dots(series: Series, kind: str, shift: float, *, log: bool) -> tuple[Dot, .
             f" 95 % within {tally.position_quantile_m(0.95):.3f} m; {tally.fixes_refused} refused",
         }[kind]
         shown = f"below {figure.high:.2g}" if none else f"{figure.value:.4g}"
-        text = f"{series.name}<br>{begin} to {begin + SEGMENT_M} m: {shown}<br>{_interval(figure)}{what}"
+        text = (
+            f"{escape(series.name)}<br>{begin} to {begin + SEGMENT_M} m: {shown}<br>{_interval(figure)}{what}"
+        )
         y = figure.high if none else figure.value
         low, high = (figure.value if math.isnan(v) else v for v in (figure.low, figure.high))
         dots.append(Dot(begin + SEGMENT_M / 2 + shift, y, low, high, text, none))
@@ -244,7 +247,8 @@ def _bins(series: Series) -> tuple[Dot, ...]:
     dots = []
     for bin in range(min(counts) - 1, max(counts) + 2):
         low, share = bin * BIN_M, counts.get(bin, 0) / tally.ranged
-        text = f"{series.name}<br>{low:+.2f} to {low + BIN_M:+.2f} m: {counts.get(bin, 0)} of {tally.ranged}"
+        some = f"{counts.get(bin, 0)} of {tally.ranged}"
+        text = f"{escape(series.name)}<br>{low:+.2f} to {low + BIN_M:+.2f} m: {some}"
         dots.append(Dot(low + BIN_M / 2, share, share, share, text))
     return tuple(dots)
 
@@ -296,13 +300,14 @@ def draw(chart: Chart, title: str) -> Drawing:
     axis.set(xlabel=chart.x_label, ylabel=chart.y_label)
     if chart.steps:
         axis.set_xlim(*_core(chart))
-    axis.set_title(f"{title}: {chart.title}", loc="left", fontsize=11, color=_INK)
+    axis.set_title(f"{title}: {chart.title}", loc="left", fontsize=11, color=_INK, parse_math=False)
     axis.grid(color="#e6e6e6", lw=0.8)
     axis.set_axisbelow(True)
     for side in ("top", "right"):
         axis.spines[side].set_visible(False)
     if axis.get_legend_handles_labels()[1]:
-        axis.legend(frameon=False, fontsize=8)
+        for entry in axis.legend(frameon=False, fontsize=8).get_texts():
+            entry.set_parse_math(False)
     return figure
 
 

@@ -8,6 +8,7 @@ once: a scene, rendered once, and all links that receive this rendering.
 import hashlib
 import itertools
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,7 +20,21 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.specs import SpecError, build, parse_value, read_toml
 from evlcp_sdk.study.tally import Statistics
 
-__all__ = ["Case", "Job", "Plan", "Point", "StopRule", "Task", "digest_of", "load_plan", "make_plan"]
+__all__ = [
+    "Case",
+    "Job",
+    "KeptCase",
+    "KeptPlan",
+    "KeptPoint",
+    "Plan",
+    "Point",
+    "StopRule",
+    "Task",
+    "digest_of",
+    "kept_plan",
+    "load_plan",
+    "make_plan",
+]
 
 Labels = tuple[tuple[str, Any], ...]
 """What sets a case apart: (key, value) of everything that the campaign varies."""
@@ -34,8 +49,8 @@ class StopRule:
         max_errors: Wrong bits received.
     """
 
-    max_bits: int | None = None
-    max_errors: int | None = None
+    max_bits: Annotated[int | None, Field(ge=0, lt=2**63)] = None
+    max_errors: Annotated[int | None, Field(ge=0, lt=2**63)] = None
 
     def reached(self, statistics: Statistics) -> bool:
         """Whether these statistics are enough.
@@ -156,6 +171,109 @@ class Plan:
         }
 
 
+_SHA256 = r"^[0-9a-f]{64}$"
+_NAME = r"^[\w.-]+$"
+
+
+@dataclass(frozen=True)
+class KeptCase:
+    """A scene or a link of a plan that was kept.
+
+    Attributes:
+        labels: What sets it apart from the others.
+        identity: Everything about it that determines a result, as JSON values.
+    """
+
+    labels: dict[str, Any]
+    identity: Any
+
+
+@dataclass(frozen=True)
+class KeptPoint:
+    """A point of a plan that was kept; see `Point`."""
+
+    labels: dict[str, Any]
+    scene: Annotated[int, Field(ge=0)]
+    link: Annotated[int, Field(ge=0)]
+    tasks: tuple[Annotated[str, Field(pattern=_SHA256)], ...]
+
+
+@dataclass(frozen=True)
+class KeptPlan:
+    """A plan that was kept: what `Plan.to_dict` gives, checked; see `Plan`.
+
+    Attributes:
+        digest: SHA-256 of all its tasks.
+
+    Raises:
+        ConfigError: Its parts do not fit each other.
+    """
+
+    name: Annotated[str, Field(max_length=200)]
+    rule: StopRule
+    merge: tuple[str, ...]
+    seeds: Annotated[tuple[Annotated[int, Field(ge=0, lt=2**63)], ...], Field(min_length=1)]
+    scenes: tuple[KeptCase, ...]
+    links: tuple[KeptCase, ...]
+    points: tuple[KeptPoint, ...]
+    environment: dict[str, Any]
+    digest: Annotated[str, Field(pattern=_SHA256)]
+
+    def __post_init__(self) -> None:
+        for i, point in enumerate(self.points):
+            for key, cases in (("scene", self.scenes), ("link", self.links)):
+                if getattr(point, key) >= len(cases):
+                    raise ConfigError(
+                        f"points.{i}.{key} = {getattr(point, key)}: there are {len(cases)}, counted from 0"
+                    )
+            if len(point.tasks) != len(self.seeds):
+                raise ConfigError(
+                    f"points.{i}.tasks: {len(point.tasks)} of them, expected one a seed, {len(self.seeds)}"
+                )
+        labelled = [part.labels for part in (*self.scenes, *self.links)]
+        for labels in (*labelled, *(point.labels for point in self.points)):
+            for key, value in labels.items():
+                if not all(isinstance(v, _PLAIN) for v in (value if isinstance(value, list) else [value])):
+                    raise ConfigError(f"labels.{key:.40}: expected a text, a number, or a list of these")
+        if self.digest != digest_of([point.tasks for point in self.points]):
+            raise ConfigError(f"digest = {self.digest}: not that of its tasks")
+
+
+_PLAIN = (str, int, float)
+_DEEPEST = 32
+
+
+def kept_plan(table: Any) -> KeptPlan:
+    """Check what `Plan.to_dict` gave.
+
+    Raises:
+        ConfigError: It is something else.
+    """
+    if not isinstance(table, dict):
+        raise ConfigError("expected a table")
+    _check_plain(table)
+    return build(KeptPlan, table)
+
+
+def _check_plain(table: Any) -> None:
+    """What is shown and hashed as it is, is of finite numbers and not too deep."""
+    below: list[Any] = [table]
+    for _ in range(_DEEPEST):
+        values, below = below, []
+        for value in values:
+            if isinstance(value, dict):
+                below += value.values()
+            elif isinstance(value, list):
+                below += value
+            elif isinstance(value, int | float) and not abs(value) <= _MOST:
+                raise ConfigError(f"a number that is not finite, or beyond {_MOST:g}")
+    if below:
+        raise ConfigError(f"tables nested more than {_DEEPEST} deep")
+
+
+_MOST = 1e300
+
+
 def digest_of(value: Any) -> str:
     """SHA-256 of JSON values, whatever the order of keys, 64 hex digits.
 
@@ -228,7 +346,7 @@ def make_plan(
 
 @dataclass(frozen=True)
 class _Campaign:
-    name: Annotated[str, Field(pattern=r"^[\w.-]+$")]
+    name: Annotated[str, Field(pattern=_NAME, max_length=200)]
     seeds: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     first_seed: Annotated[int, Field(ge=0)] = 0
     max_bits: Annotated[int | None, Field(ge=1)] = None
@@ -250,6 +368,10 @@ class _File:
     scene: _Grid = _Grid()
     link: _Grid = _Grid()
 
+
+_MOST_CASES = 10_000
+_MOST_TASKS = 1_000_000
+"""A task simulates for a second or more; a campaign of more would end in weeks."""
 
 SceneCases = Callable[[str | None, Sequence[str]], tuple[Any, Any]]
 """From base and overrides to (value, identity)."""
@@ -299,6 +421,12 @@ def load_plan(
     if faults:
         raise ConfigError("\n".join(dict.fromkeys(faults)))
     head = file.campaign
+    tasks = len(scenes) * len(links) * head.seeds
+    if tasks > _MOST_TASKS:
+        raise ConfigError(
+            f"{path}: {len(scenes)} scenes x {len(links)} links x {head.seeds} seeds: {tasks} tasks,"
+            f" expected at most {_MOST_TASKS}"
+        )
     return make_plan(
         head.name,
         scenes,
@@ -337,6 +465,10 @@ def _cases(
             faults.append(f"{path}: {kind}.grid.{key} = {values!r}: expected a list of values")
         elif len({repr(v) for v in values}) < len(values):
             faults.append(f"{path}: {kind}.grid.{key}: a value stands there twice")
+    number = math.prod(len(values) for values in axes.values() if isinstance(values, list))
+    number *= max(len(grid.variants), 1)
+    if number > _MOST_CASES:
+        faults.append(f"{path}: {kind}: {number} cases of grid and variants, expected at most {_MOST_CASES}")
     if faults:
         return []
     base = grid.base

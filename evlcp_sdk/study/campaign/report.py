@@ -4,8 +4,6 @@ Needs the extra `report`. The page holds everything it shows, the charting libra
 network for anything.
 """
 
-import html
-import json
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -16,7 +14,7 @@ from evlcp_sdk.study.campaign.paper import PAPER_NAME
 from evlcp_sdk.study.campaign.plan import digest_of
 from evlcp_sdk.study.campaign.summary import PaperComparison, Summary, beside_paper
 from evlcp_sdk.study.intervals import INTERVALS, Figure, measure
-from evlcp_sdk.study.markup import details, document, table
+from evlcp_sdk.study.markup import Markup, details, document, escape, table
 from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
 __all__ = ["comparison_rows", "page"]
@@ -43,33 +41,35 @@ def page(summary: Summary) -> str:
         else f"{summary.done} tasks"
     )
     body = [
-        f"<h1>{html.escape(summary.name)}</h1>",
-        f"<p>{part}, {seconds:,.1f} s received, {events / 1e6:,.1f} million events.</p>",
+        Markup("<h1>{}</h1>").format(summary.name),
+        Markup("<p>{}, {} s received, {} million events.</p>").format(
+            part, f"{seconds:,.1f}", f"{events / 1e6:,.1f}"
+        ),
     ]
     for chart in charts:
-        body.append(f'<h2>{html.escape(chart.title)}</h2><div class="chart" id="{chart.id}"></div>')
-        body.append(f'<p class="note">{html.escape(chart.note)}</p>')
+        body.append(Markup('<h2>{}</h2><div class="chart" id="{}"></div>').format(chart.title, chart.id))
+        body.append(Markup('<p class="note">{}</p>').format(chart.note))
     body += [_paper_table(beside_paper(summary.series)), _figures_table(summary), _configuration(summary)]
     drawn = {chart.id: _plotly(chart) for chart in charts}
-    # "</script>" in a name would end the script element, "<!--<script>" keep it from ending.
-    data = json.dumps(drawn, allow_nan=False).replace("<", "\\u003c")
-    script = (
-        f"const charts = {data};\n"
-        # The library would offer to upload a chart.
-        "const config = {displaylogo: false, responsive: true,"
-        " showSendToCloud: false, plotlyServerURL: ''};\n"
-        "for (const [id, c] of Object.entries(charts)) Plotly.newPlot(id, c.data, c.layout, config);"
-    )
-    body.append(f"<script>\n{script}\n</script>")
-    return document(summary.name, body, f"<script>{get_plotlyjs()}</script>\n")
+    return document(summary.name, body, (get_plotlyjs(), _SCRIPT), {_DATA: drawn})
+
+
+_DATA = "charts"
+_SCRIPT = f"""
+const charts = JSON.parse(document.getElementById("{_DATA}").textContent);
+// The library would offer to upload a chart.
+const config = {{displaylogo: false, responsive: true, showSendToCloud: false, plotlyServerURL: ""}};
+for (const [id, c] of Object.entries(charts)) Plotly.newPlot(id, c.data, c.layout, config);
+"""
 
 
 def _plotly(chart: Chart) -> dict[str, Any]:
+    """What the library draws; it takes texts for HTML of its own kind, so ours are escaped."""
     data: list[dict[str, Any]] = []
     for line in chart.lines:
         trace: dict[str, Any] = {
             "type": "scatter",
-            "name": line.name,
+            "name": str(escape(line.name)),
             "x": [round(d.x, 6) for d in line.dots],
             "y": [d.y for d in line.dots],
             "text": [d.text for d in line.dots],
@@ -138,18 +138,20 @@ def _plotly(chart: Chart) -> dict[str, Any]:
     return {"data": data, "layout": layout}
 
 
-def _paper_table(comparisons: Sequence[PaperComparison]) -> str:
+def _paper_table(comparisons: Sequence[PaperComparison]) -> Markup:
     if not comparisons:
-        return ""
+        return Markup("")
     rows = []
     for cells, one in zip(comparison_rows(comparisons), comparisons, strict=True):
-        kind = "yes" if one.agrees else "no"
-        rows.append([*map(html.escape, cells[:-1]), f'<span class="{kind}">{html.escape(cells[-1])}</span>'])
-    return (
-        f"<h2>Beside {PAPER_NAME}</h2>"
-        + table(("figure", "distance", "series", "paper", "here", "95 %", "agrees"), rows)
-        + '<p class="note">A bound agrees when the worst segment of 10 m keeps it, a figure when ours lies'
-        " within 30 % of it.</p>"
+        agrees = Markup('<span class="{}">{}</span>').format("yes" if one.agrees else "no", cells[-1])
+        rows.append([*cells[:-1], agrees])
+    note = (
+        "A bound agrees when the worst segment of 10 m keeps it, a figure when ours lies within 30 % of it."
+    )
+    return Markup('<h2>{}</h2>{}<p class="note">{}</p>').format(
+        f"Beside {PAPER_NAME}",
+        table(("figure", "distance", "series", "paper", "here", "95 %", "agrees"), rows),
+        note,
     )
 
 
@@ -180,7 +182,7 @@ def comparison_rows(comparisons: Iterable[PaperComparison]) -> list[tuple[str, .
     return rows
 
 
-def _figures_table(summary: Summary) -> str:
+def _figures_table(summary: Summary) -> Markup:
     messages = any(t.messages_sent for one in summary.series for _, t in one.statistics.segments)
     positions = any(t.fixes or t.fixes_refused for one in summary.series for _, t in one.statistics.segments)
     rows = []
@@ -189,7 +191,7 @@ def _figures_table(summary: Summary) -> str:
             tally = Tally.together(recordings)
             rows.append(
                 (
-                    html.escape(one.name),
+                    one.name,
                     f"{begin} to {begin + SEGMENT_M} m",
                     f"{tally.frames_found} of {tally.frames_sent}",
                     f"{tally.bit_errors} of {tally.bits}",
@@ -207,7 +209,7 @@ def _figures_table(summary: Summary) -> str:
         *(("messages", "read wrong") if messages else ()),
         *(_POSITION_HEAD if positions else ()),
     )
-    return f'<h2>All figures</h2><p class="note">{INTERVALS}</p>{table(head, rows)}'
+    return Markup('<h2>All figures</h2><p class="note">{}</p>{}').format(INTERVALS, table(head, rows))
 
 
 _POSITION_HEAD = ("positions", "RMSE in space, m", "half within, m", "95 % within, m", "NEES, ideally 3")
@@ -230,29 +232,31 @@ def _positions(recordings: Sequence[Tally]) -> tuple[str, ...]:
 def _shown(figure: Figure, form: str) -> str:
     if not figure.count:
         return "-"
-    return f'{figure.value:{form}} <span class="note">{figure.interval(form)}</span>'
+    return Markup('{} <span class="note">{}</span>').format(f"{figure.value:{form}}", figure.interval(form))
 
 
-def _configuration(summary: Summary) -> str:
-    plan, rule = summary.plan, summary.plan["rule"]
+def _configuration(summary: Summary) -> Markup:
+    plan, rule = summary.plan, summary.plan.rule
+    head = Markup(
+        '<h2>Configuration and digests</h2>\n<p class="digest">campaign {}</p>\n'
+        "<p>Seeds {} to {}; a point ends at {} or {}.</p>"
+    )
+    ends = (_limit(rule.max_bits, "bits"), _limit(rule.max_errors, "wrong bits"))
     parts = [
-        "<h2>Configuration and digests</h2>",
-        f'<p class="digest">campaign {summary.digest}</p>',
-        f"<p>Seeds {plan['seeds'][0]} to {plan['seeds'][-1]}; a point ends at"
-        f" {_limit(rule['max_bits'], 'bits')} or {_limit(rule['max_errors'], 'wrong bits')}.</p>",
-        details("code and versions", plan["environment"]),
+        head.format(summary.digest, plan.seeds[0], plan.seeds[-1], *ends),
+        details("code and versions", plan.environment),
     ]
-    for kind, cases in (("scene", plan["scenes"]), ("link", plan["links"])):
+    for kind, cases in (("scene", plan.scenes), ("link", plan.links)):
         for case in cases:
-            labels = ", ".join(f"{k} {v}" for k, v in case["labels"].items()) or "the only one"
-            identity = case["identity"]
+            labels = ", ".join(f"{k} {v}" for k, v in case.labels.items()) or "the only one"
+            identity = case.identity
             digest = (
                 identity["digest"]
                 if isinstance(identity, dict) and "digest" in identity
                 else digest_of(identity)
             )
             parts.append(details(f"{kind}: {labels}; SHA-256 {digest}", identity))
-    return "\n".join(parts)
+    return Markup("\n").join(parts)
 
 
 def _limit(value: int | None, what: str) -> str:

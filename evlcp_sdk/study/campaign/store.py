@@ -9,14 +9,15 @@ former self.
 import json
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
+from urllib.parse import quote
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, OutputError
 from evlcp_sdk.files import check_output
-from evlcp_sdk.study.campaign.plan import Plan
+from evlcp_sdk.study.campaign.plan import KeptPlan, Plan, kept_plan
 from evlcp_sdk.study.tally import Statistics
 
 __all__ = ["Store"]
@@ -31,6 +32,48 @@ CREATE TABLE IF NOT EXISTS result (
     task TEXT PRIMARY KEY, statistics TEXT NOT NULL, finished_at TEXT NOT NULL DEFAULT CURRENT_TIMESTAMP
 ) WITHOUT ROWID;
 """
+
+
+def _connect(path: Path, *, create: bool) -> sqlite3.Connection:
+    """A connection that believes nothing of what a file says but its rows."""
+    if create:
+        base = sqlite3.connect(path, timeout=30, isolation_level=None)
+    else:
+        wal = path.with_name(f"{path.name}-wal")
+        # Where nobody writes, no file beside it is needed, so that the folder may be read-only, too.
+        mode = "mode=ro" if wal.exists() and wal.stat().st_size else "mode=ro&immutable=1"
+        url = f"file:{quote(str(path.absolute()))}?{mode}"
+        base = sqlite3.connect(url, timeout=30, isolation_level=None, uri=True)
+    try:
+        base.execute("PRAGMA trusted_schema = OFF")
+        base.execute("PRAGMA cell_size_check = ON")
+        if not create:
+            base.execute("PRAGMA query_only = ON")
+    except sqlite3.DatabaseError:
+        base.close()
+        raise
+    base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_BYTES)
+    base.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
+    return base
+
+
+_MOST_BYTES = 1 << 28
+"""Length of the longest text that is read or written: the plan of a million tasks has 70 MB."""
+
+
+def _schema_of(base: sqlite3.Connection) -> set[tuple[str, ...]]:
+    """Everything that a base consists of: (type, name, SQL) of each part, however it is spaced."""
+    parts = base.execute("SELECT type, name, sql FROM sqlite_master")
+    return {tuple(" ".join(str(text).split()) for text in part) for part in parts}
+
+
+def _own_schema() -> set[tuple[str, ...]]:
+    with closing(sqlite3.connect(":memory:")) as base:
+        base.executescript(_TABLES)
+        return _schema_of(base)
+
+
+_SCHEMA = _own_schema()
 
 
 class Store:
@@ -52,13 +95,16 @@ class Store:
         if create:
             check_output(path)
         try:
-            # Readers need write access to the WAL's index beside the file, but write no table.
-            self._base = sqlite3.connect(path, timeout=30, isolation_level=None)
+            self._base = _connect(path, create=create)
             (version,) = self._base.execute("PRAGMA user_version").fetchone()
-            tables = {name for (name,) in self._base.execute("SELECT name FROM sqlite_master")}
-            if version not in (0, SCHEMA) or (version == 0 and (tables or not create)):
+            found = _schema_of(self._base)
+            if version not in (0, SCHEMA) or (version == 0 and (found or not create)):
                 raise InputError(
                     f"{path}: not a results file of this SDK (schema {version}, expected {SCHEMA})"
+                )
+            if version and found != _SCHEMA:
+                raise InputError(
+                    f"{path}: not a results file of this SDK: other tables than evlcp sweep makes"
                 )
             if create:
                 self._base.execute("PRAGMA journal_mode = WAL")
@@ -66,6 +112,11 @@ class Store:
                 with self._writing():
                     self._base.executescript(_TABLES)
                     self._base.execute(f"PRAGMA user_version = {SCHEMA}")
+            else:
+                # A page that is its own child would be read for ever.
+                (state,) = self._base.execute("PRAGMA quick_check(1)").fetchone()
+                if state != "ok":
+                    raise InputError(f"{path}: damaged results file: {' '.join(state.split())}")
         except sqlite3.DatabaseError as fault:
             self._close()
             if not isinstance(fault, sqlite3.OperationalError):
@@ -102,7 +153,7 @@ class Store:
     def _reading(self) -> Iterator[None]:
         try:
             yield
-        except (sqlite3.DatabaseError, ValueError, TypeError, KeyError, AttributeError) as fault:
+        except (sqlite3.DatabaseError, ValueError, TypeError, RecursionError, ConfigError) as fault:
             raise _no_store(self.path, fault) from fault
 
     def adopt(self, plan: Plan) -> None:
@@ -123,18 +174,17 @@ class Store:
             body = json.dumps(plan.to_dict())
             self._base.execute("INSERT OR REPLACE INTO plan VALUES (1, ?, ?)", (plan.name, body))
 
-    def plan(self) -> dict[str, Any]:
-        """The plan as `Plan.to_dict` gave it.
+    def plan(self) -> KeptPlan:
+        """The plan.
 
         Raises:
             InputError: There is none, or the file is damaged.
         """
         with self._reading():
             row = self._base.execute("SELECT body FROM plan").fetchone()
-            table: dict[str, Any] | None = None if row is None else json.loads(row[0])
-        if table is None:
-            raise InputError(f"{self.path}: no campaign has started in it")
-        return table
+            if row is not None:
+                return kept_plan(json.loads(row[0]))
+        raise InputError(f"{self.path}: no campaign has started in it")
 
     def put(self, results: list[tuple[str, Statistics]]) -> None:
         """Keep results of tasks, all or none; one that is there already stays.
@@ -165,4 +215,7 @@ class Store:
 
 
 def _no_store(path: Path, fault: Exception) -> InputError:
-    return InputError(f"{path}: damaged, or no results file of evlcp sweep ({type(fault).__name__}: {fault})")
+    said = (str(fault).splitlines() or [""])[0]
+    return InputError(
+        f"{path}: damaged, or no results file of evlcp sweep ({type(fault).__name__}: {said:.200})"
+    )

@@ -13,7 +13,7 @@ from typing import Any
 
 from evlcp_sdk.study.campaign.collect import Counted
 from evlcp_sdk.study.campaign.paper import PAPER, Measure, Reference
-from evlcp_sdk.study.campaign.plan import StopRule
+from evlcp_sdk.study.campaign.plan import KeptPlan
 from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.intervals import Figure, measure
 from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
@@ -56,13 +56,14 @@ class Series:
             stem, _, unit = word.rpartition("_")
             if word in ("variant", "base", "id"):
                 parts.append(str(value))
-            elif unit in _UNITS:
+            elif unit in _UNITS and isinstance(value, int | float):
                 parts.append(
                     f"{value:g} {_UNITS[unit]}" if stem == "speed" else f"{stem} {value:g} {_UNITS[unit]}"
                 )
             else:
                 parts.append(f"{word} {value}")
-        return ", ".join(parts) or "simulated"
+        name = ", ".join(parts) or "simulated"
+        return "".join(c if c.isprintable() else "\ufffd" for c in name)
 
     @property
     def clusters(self) -> int | None:
@@ -72,7 +73,8 @@ class Series:
             chosen, bar = table["ranging"].get("clusters"), table["bar"]
             rows = bar["rows"] // bar["cluster_rows"]
             return len(chosen) if chosen else int(rows * (bar["columns"] // bar["cluster_columns"]))
-        except (TypeError, KeyError):
+        except (TypeError, KeyError, AttributeError, ArithmeticError, ValueError):
+            # An identity is whatever its link was when it was kept.
             return None
 
     @property
@@ -93,10 +95,8 @@ _UNITS = {"kmh": "km/h", "mps": "m/s", "m": "m", "us": "us", "s": "s", "hz": "Hz
 def _speed_kmh(scene: Any) -> float | None:
     if isinstance(scene, Mapping):
         for key, value in scene.items():
-            if key == "speed_kmh" and isinstance(value, int | float):
-                return float(value)
-            if key == "speed_mps" and isinstance(value, int | float):
-                return round(value * 3.6, 1)
+            if key in ("speed_kmh", "speed_mps") and isinstance(value, int | float):
+                return float(value) if key == "speed_kmh" else round(float(value) * 3.6, 1)
         for value in scene.values():
             if (found := _speed_kmh(value)) is not None:
                 return found
@@ -113,7 +113,7 @@ class Summary:
         tasks: Tasks that count or would.
         done: Those that are finished.
         series: In the order of the campaign.
-        plan: The plan as the store keeps it.
+        plan: The plan that the store keeps.
     """
 
     name: str
@@ -121,14 +121,14 @@ class Summary:
     tasks: int
     done: int
     series: tuple[Series, ...]
-    plan: Mapping[str, Any]
+    plan: KeptPlan
 
     def to_dict(self) -> dict[str, Any]:
         """Every figure as JSON values; what was not measured is null."""
         return {
             "campaign": self.name,
             "digest": self.digest,
-            "environment": self.plan["environment"],
+            "environment": self.plan.environment,
             "tasks": self.tasks,
             "done": self.done,
             "series": [
@@ -193,25 +193,23 @@ def summarize(store: Store) -> Summary:
     """
     plan = store.plan()
     results = store.results()
-    rule = StopRule(**plan["rule"])
-    merged = set(plan["merge"])
+    merged = set(plan.merge)
     found: dict[str, Series] = {}
     tasks = done = 0
-    for point in plan["points"]:
-        counted = Counted(point["tasks"], rule, results)
+    for point in plan.points:
+        counted = Counted(point.tasks, plan.rule, results)
         tasks += counted.seeds if counted.complete else len(counted.tasks)
         done += counted.done
-        labels = {k: v for k, v in point["labels"].items() if k not in merged}
+        labels = {k: v for k, v in point.labels.items() if k not in merged}
         key = json.dumps(labels)
         before = found.get(key)
         if before is None:
-            scene = plan["scenes"][point["scene"]]["identity"]
-            link = plan["links"][point["link"]]["identity"]
+            scene, link = plan.scenes[point.scene].identity, plan.links[point.link].identity
             found[key] = Series(labels, scene, link, counted.recordings)
         else:
             pairs = zip_longest(before.recordings, counted.recordings, fillvalue=Statistics())
             found[key] = replace(before, recordings=tuple(a + b for a, b in pairs))
-    return Summary(plan["name"], plan["digest"], tasks, done, tuple(found.values()), plan)
+    return Summary(plan.name, plan.digest, tasks, done, tuple(found.values()), plan)
 
 
 @dataclass(frozen=True)

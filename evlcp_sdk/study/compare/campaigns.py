@@ -31,12 +31,14 @@ def of_campaign(summary: Summary) -> Comparison:
         }
         scenes.setdefault(scene, []).append(Row(link, _measured(series)))
     tables = [Table(name, tuple(rows)) for name, rows in scenes.items()]
-    if len(tables) > 1:
-        tables.append(total_of(tables, "all scenes"))
     notes = [f"campaign {summary.name}, {summary.digest}"]
+    if len({tuple(row.variant for row in table.rows) for table in tables}) > 1:
+        notes.append("not every link receives every scene, so that there is no table of all scenes")
+    elif len(tables) > 1:
+        tables.append(total_of(tables, "all scenes"))
     if summary.done < summary.tasks:
         notes.append(f"{summary.done} of {summary.tasks} tasks are done")
-    return Comparison(links, tuple(tables), tuple(notes), summary.plan["environment"])
+    return Comparison(links, tuple(tables), tuple(notes), summary.plan.environment)
 
 
 def _measured(series: Series) -> Measured:

@@ -1,7 +1,6 @@
 """The table of a comparison: columns, who is best in them, and how it is written down."""
 
 import csv
-import html
 import io
 import json
 import math
@@ -12,7 +11,7 @@ from typing import Any
 from evlcp_sdk.files import defused
 from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments, median
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS
-from evlcp_sdk.study.markup import details, document, table
+from evlcp_sdk.study.markup import Markup, details, document, table
 
 __all__ = ["BOUND_NAME", "COLUMNS", "LEGEND", "MARK", "Column", "Comparison", "Row", "Table", "total_of"]
 
@@ -250,15 +249,15 @@ class Comparison:
 
     def to_html(self) -> str:
         """One self-contained page."""
-        body = ["<h1>Variants compared</h1>"]
+        body = [Markup("<h1>Variants compared</h1>")]
         for one in self.tables:
             head, lines = one.cells()
             rows = [
-                [f"<b>{html.escape(t)}</b>" if best else html.escape(t) for t, best in row] for row in lines
+                [Markup("<b>{}</b>").format(text) if best else text for text, best in row] for row in lines
             ]
-            body += [f"<h2>{html.escape(one.name)}</h2>", table([html.escape(h) for h in head], rows)]
-        body += [f'<p class="note">{html.escape(text)}</p>' for text in (LEGEND, *self.notes)]
-        body.append("<h2>Configuration and digests</h2>")
+            body += [Markup("<h2>{}</h2>").format(one.name), table(head, rows)]
+        body += [Markup('<p class="note">{}</p>').format(text) for text in (LEGEND, *self.notes)]
+        body.append(Markup("<h2>Configuration and digests</h2>"))
         for name, values in self.variants.items():
             about = ", ".join(values["settings"]) or "the link as it is"
             body.append(details(f"{name}: {about}; SHA-256 {values['digest']}", values))

@@ -22,6 +22,7 @@ from evlcp_sdk.study.intervals import measure
 from evlcp_sdk.study.tally import Statistics, Tally
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
 from tests.unit.study.campaign.fake import run_fake
+from tests.unit.study.test_markup import HOSTILE
 
 TWO = "two clusters <!--<script>"
 """In a script element, such a name would keep its end tag from ending it."""
@@ -182,6 +183,38 @@ def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) ->
         assert {url.split(":")[0] for url in asked} <= {"file", "data", "blob"}
         wrong = [m for m in browser.heard if m.get("method") == "Runtime.exceptionThrown"]
         assert wrong == []
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_no_script_but_the_page_s_own_runs_in_a_browser(tmp_path: Path) -> None:
+    pytest.importorskip("plotly", reason="the extra report is not installed")
+    identity = {"n": 0, HOSTILE: HOSTILE, "digest": HOSTILE, "table": {HOSTILE: HOSTILE}}
+    plan = make_plan(
+        HOSTILE,
+        [Case(((HOSTILE, HOSTILE),), {"n": n}, identity | {"n": n}) for n in range(2)],
+        [Case((("variant", HOSTILE),), 0, identity)],
+        range(2),
+        environment={HOSTILE: HOSTILE},
+    )
+    with Store(tmp_path / "a.sqlite", create=True) as store:
+        collect(plan, store, Inline(), run_fake)
+        text = page(summarize(store))
+    # What gets past the escaping all the same does not run, either.
+    assert text.count("<h2>All figures</h2>") == 1
+    injected = "<script>document.title='caught'</script><img src=x onerror=\"document.title='caught'\">"
+    injected += "<a id=trap href=\"javascript:document.title='caught'\">x</a>"
+    pages = {"a": text, "b": text.replace("<h2>All figures</h2>", f"{injected}<h2>All figures</h2>")}
+    with Browser(tmp_path / "profile") as browser:
+        for name, content in pages.items():
+            (tmp_path / f"{name}.html").write_text(content, encoding="utf-8")
+            browser.open(tmp_path / f"{name}.html")
+            assert browser.value("document.querySelectorAll('.scatterlayer .trace').length") > 4
+            browser.value("document.getElementById('trap')?.click()")
+            told = hovered(browser, "histogram")
+            assert "<img src=x" in told
+            browser.value("new Promise(done => setTimeout(done, 200))")
+            assert browser.value("document.title") == HOSTILE
+            assert browser.value("document.querySelectorAll('img').length") == (name == "b")
 
 
 def hovered(browser: Browser, chart: str) -> str:

@@ -1,5 +1,6 @@
 """From campaign.toml to points, tasks and jobs."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.study.campaign.plan import Case, Plan, StopRule, digest_of, load_plan, make_plan
+from evlcp_sdk.study.campaign.plan import (
+    Case,
+    Plan,
+    StopRule,
+    digest_of,
+    kept_plan,
+    load_plan,
+    make_plan,
+)
 
 TEXT = """
 [campaign]
@@ -138,3 +147,38 @@ def test_overrides_that_name_nothing(tmp_path: Path) -> None:
         plan_of(tmp_path, overrides=["seeds=3"])
     with pytest.raises(ConfigError, match=r"none\.toml: cannot be read"):
         load_plan(tmp_path / "none.toml", made, made, {})
+
+
+def test_a_grid_of_too_many_points_is_refused_at_once(tmp_path: Path) -> None:
+    values = list(range(59))
+    axes = "\n".join(f"{axis} = {values}" for axis in "abcde")
+    with pytest.raises(ConfigError) as caught:
+        plan_of(tmp_path, f'[campaign]\nname = "x"\n[scene.grid]\n{axes}\n')
+    assert str(caught.value) == (
+        f"{tmp_path}/c.toml: scene: 714924299 cases of grid and variants, expected at most 10000"
+    )
+    two = f"[scene.grid]\na = {values}\n[link.grid]\nb = {values}\n"
+    with pytest.raises(
+        ConfigError, match=r"59 scenes x 59 links x 1000 seeds: 3481000 tasks, expected at most"
+    ):
+        plan_of(tmp_path, f'[campaign]\nname = "x"\nseeds = 1000\n{two}')
+
+
+def test_a_kept_plan_is_the_plan(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path)
+    kept = kept_plan(json.loads(json.dumps(plan.to_dict())))
+    assert (kept.name, kept.rule, kept.merge, kept.seeds) == (plan.name, plan.rule, plan.merge, plan.seeds)
+    assert [(p.scene, p.link, p.tasks) for p in kept.points] == [
+        (p.scene, p.link, p.tasks) for p in plan.points
+    ]
+    for one, other in zip((*kept.scenes, *kept.links), (*plan.scenes, *plan.links), strict=True):
+        assert one.labels == dict(other.labels)
+        assert [type(v) for v in one.labels.values()] == [type(v) for _, v in other.labels]
+        assert one.identity == other.identity
+    assert kept.digest == digest_of([p.tasks for p in plan.points])
+    deep: Any = 1
+    for _ in range(40):
+        deep = [deep]
+    for change in ({"environment": {"a": deep}}, {"environment": {"a": float("inf")}}):
+        with pytest.raises(ConfigError, match="nested more than 32 deep|not finite"):
+            kept_plan(plan.to_dict() | change)

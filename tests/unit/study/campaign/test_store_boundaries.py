@@ -1,0 +1,288 @@
+"""Results files that somebody else wrote: views, damaged pages, mutants; a report changes nothing."""
+
+import json
+import os
+import random
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.jobs.inline import Inline
+from evlcp_sdk.study.campaign.charts import charts_of
+from evlcp_sdk.study.campaign.collect import collect
+from evlcp_sdk.study.campaign.plan import Case, make_plan
+from evlcp_sdk.study.campaign.report import page
+from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.campaign.summary import Summary, summarize
+from evlcp_sdk.study.compare.campaigns import of_campaign
+from evlcp_sdk.study.compare.table import Comparison
+from tests.unit.mutants import mutants, refusal
+from tests.unit.study.campaign.fake import fake_plan, run_fake
+from tests.unit.study.test_markup import HOSTILE, Elements
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    """A finished campaign, nothing of it left in a log."""
+    path = tmp_path / "a.sqlite"
+    with Store(path, create=True) as store:
+        collect(fake_plan(scenes=2, seeds=2), store, Inline(), run_fake)
+    return path
+
+
+def change(path: Path, *statements: str) -> None:
+    base = sqlite3.connect(path)
+    for statement in statements:
+        base.execute(statement)
+    base.commit()
+    base.execute("PRAGMA journal_mode = DELETE")
+    base.close()
+
+
+def read(path: Path) -> Summary:
+    with Store(path) as store:
+        return summarize(store)
+
+
+ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
+
+
+@pytest.mark.parametrize(
+    "statements",
+    [
+        ("DROP TABLE plan", f"CREATE VIEW plan AS {ENDLESS} SELECT 'a' AS name, max(i) AS body FROM n"),
+        ("DROP TABLE result", f"CREATE VIEW result AS {ENDLESS} SELECT i AS task, 'x' AS statistics FROM n"),
+        ("CREATE TRIGGER t AFTER INSERT ON result BEGIN DELETE FROM plan; END",),
+        ("CREATE INDEX i ON result (statistics)",),
+        ("CREATE TABLE more (x)",),
+        ("DROP TABLE plan",),
+        ("DROP TABLE plan", "CREATE TABLE plan (id, name, body AS (hex(zeroblob(100000000))))"),
+    ],
+)
+def test_a_file_of_other_tables_is_refused_at_once(results: Path, statements: tuple[str, ...]) -> None:
+    change(results, *statements)
+    began = time.monotonic()
+    for create in (False, True):
+        with pytest.raises(InputError, match=r"a\.sqlite: not a results file of this SDK: other tables"):
+            Store(results, create=create)
+    assert time.monotonic() - began < 2
+
+
+def test_a_page_that_is_its_own_child_is_damage(results: Path) -> None:
+    base = sqlite3.connect(results)
+    rng = random.Random(1)
+    rows = [(f"{rng.randrange(16**64):064x}", "{}" * 300) for _ in range(3000)]
+    base.executemany("INSERT INTO result (task, statistics) VALUES (?, ?)", rows)
+    base.commit()
+    (root,) = base.execute("SELECT rootpage FROM sqlite_master WHERE name = 'result'").fetchone()
+    (size,) = base.execute("PRAGMA page_size").fetchone()
+    base.execute("PRAGMA journal_mode = DELETE")
+    base.close()
+    data = bytearray(results.read_bytes())
+    at = (root - 1) * size
+    assert data[at] == 2, "no page with children"
+    data[at + 8 : at + 12] = root.to_bytes(4, "big")
+    results.write_bytes(data)
+    with pytest.raises(InputError, match=r"a\.sqlite: damaged"):
+        read(results)
+
+
+def test_a_report_changes_nothing(results: Path) -> None:
+    before = results.read_bytes()
+    with Store(results) as store:
+        assert sorted(results.parent.iterdir()) == [results]
+        summarize(store)
+        for pragma, value in (("trusted_schema", 0), ("query_only", 1), ("cell_size_check", 1)):
+            assert store._base.execute(f"PRAGMA {pragma}").fetchone() == (value,)
+        with pytest.raises(sqlite3.OperationalError, match="readonly"):
+            store._base.execute("DELETE FROM result")
+    assert sorted(results.parent.iterdir()) == [results]
+    assert results.read_bytes() == before
+
+
+def test_what_still_runs_is_read_from_its_log(results: Path) -> None:
+    with Store(results, create=True) as writer:
+        collect(fake_plan(scenes=3, seeds=3), writer, Inline(), run_fake)
+        assert Path(f"{results}-wal").stat().st_size
+        assert read(results).done == 18
+    assert read(results).done == 18
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_cannot_be_written_is_read(results: Path) -> None:
+    results.parent.chmod(0o500)
+    try:
+        assert read(results).done == 8
+    finally:
+        results.parent.chmod(0o700)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="becomes another user")
+def test_somebody_elses_folder_is_read(results: Path) -> None:
+    folder = Path("/dev/shm") if Path("/dev/shm").is_dir() else results.parent
+    copied = folder / f"evlcp-{os.getpid()}"
+    copied.mkdir(mode=0o755)
+    try:
+        (copied / "a.sqlite").write_bytes(results.read_bytes())
+        (copied / "a.sqlite").chmod(0o444)
+        code = (
+            "import sys\nfrom pathlib import Path\n"
+            "from evlcp_sdk.study.campaign.store import Store\nimport os\n"
+            "def read():\n    with Store(Path(sys.argv[1])) as store: return len(store.results())\n"
+            # Whoever it becomes may not import anything more.
+            "read(); os.setuid(65534); print(read())\n"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", code, copied / "a.sqlite"], capture_output=True, text=True, check=False
+        )
+        assert done.stdout == "8\n", done.stderr
+    finally:
+        (copied / "a.sqlite").unlink()
+        copied.rmdir()
+
+
+@pytest.fixture
+def quick_page(monkeypatch: pytest.MonkeyPatch) -> Callable[[Summary], str]:
+    """The page without the charting library, which takes longer than all the rest."""
+    offline = pytest.importorskip("plotly.offline", reason="the extra report is not installed")
+    monkeypatch.setattr(offline, "get_plotlyjs", lambda: "")
+    return page
+
+
+def told(summary: Summary, page_of: Callable[[Summary], str]) -> Elements:
+    """Everything that is told of a summary; its page."""
+    from evlcp_sdk.cli.report import as_markdown, show_paper, show_series
+
+    json.dumps(summary.to_dict(), allow_nan=False)
+    show_series(summary)
+    show_paper(summary)
+    as_markdown(summary)
+    charts_of(summary)
+    compared: Comparison = of_campaign(summary)
+    compared.to_json()
+    compared.to_csv()
+    assert_plain(Elements(compared.to_html()))
+    return assert_plain(Elements(page_of(summary)))
+
+
+def assert_plain(found: Elements) -> Elements:
+    assert not {tag for tag, _ in found.tags} & {"img", "iframe", "object", "embed", "base", "form"}
+    assert not [a for _, attrs in found.tags for a in attrs if a.startswith("on") or a == "src"]
+    assert not [s for s in found.scripts if s.startswith("document.title")]
+    assert "'unsafe-inline'" not in found.policy["script-src"]
+    return found
+
+
+def kept(path: Path) -> tuple[Any, dict[str, Any]]:
+    base = sqlite3.connect(path)
+    ((body,),) = base.execute("SELECT body FROM plan").fetchall()
+    rows = base.execute("SELECT task, statistics FROM result").fetchall()
+    base.close()
+    return json.loads(body), {task: json.loads(text) for task, text in rows}
+
+
+def keep(path: Path, plan: Any, rows: dict[str, Any]) -> None:
+    base = sqlite3.connect(path)
+    base.execute("UPDATE plan SET body = ?", (json.dumps(plan),))
+    base.executemany(
+        "UPDATE result SET statistics = ? WHERE task = ?", [(json.dumps(v), t) for t, v in rows.items()]
+    )
+    base.commit()
+    base.close()
+
+
+def test_a_changed_plan_is_a_plan_or_refused_in_one_line(
+    results: Path, quick_page: Callable[[Summary], str]
+) -> None:
+    plan, _ = kept(results)
+    link = {"table": {"bar": {"rows": 96, "cluster_rows": 6, "columns": 1, "cluster_columns": 1}}}
+    plan["links"][0]["identity"] = link["table"] | {
+        "digest": "d" * 64,
+        "table": {"ranging": {}, **link["table"]},
+    }
+    plan["scenes"][0]["identity"] = {"motion": {"speed_mps": 8.0}}
+    refused = 0
+    for mutant, what in mutants(plan, 300, seed=3):
+        keep(results, mutant, {})
+        line = refusal(lambda: told(read(results), quick_page))
+        if line is not None:
+            refused += 1
+            assert line.startswith(f"{results}: "), what
+            assert len(line.splitlines()) == 1, what
+    assert 150 < refused < 290
+
+
+def test_changed_statistics_are_statistics_or_refused_in_one_line(
+    results: Path, quick_page: Callable[[Summary], str]
+) -> None:
+    plan, rows = kept(results)
+    task = next(iter(rows))
+    refused = 0
+    for mutant, what in mutants(rows[task], 300, seed=4):
+        keep(results, plan, {task: mutant})
+        line = refusal(lambda: told(read(results), quick_page))
+        if line is not None:
+            refused += 1
+            assert line.startswith(f"{results}: "), what
+            assert len(line.splitlines()) == 1, what
+    assert 100 < refused < 290
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("digest", HOSTILE, "digest = "),
+        ("digest", "0" * 64, "digest = 0000"),
+        ("seeds", [HOSTILE], "seeds.0 = "),
+        ("seeds", [], "seeds"),
+        ("points", {}, "points"),
+        ("rule", None, "rule"),
+    ],
+)
+def test_what_a_plan_cannot_hold_is_named(results: Path, key: str, value: Any, says: str) -> None:
+    plan, _ = kept(results)
+    keep(results, plan | {key: value}, {})
+    with pytest.raises(InputError, match=r"a\.sqlite: damaged, or no results file of evlcp sweep") as caught:
+        read(results)
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("body", ["{}", "[]", "null", "3", "[" * 200_000, "9" * 5000, '{"a": NaN}'])
+def test_what_is_no_plan_is_one_line(results: Path, body: str) -> None:
+    base = sqlite3.connect(results)
+    base.execute("UPDATE plan SET body = ?", (body,))
+    base.commit()
+    base.close()
+    with pytest.raises(InputError, match=r"a\.sqlite: damaged, or no results file") as caught:
+        read(results)
+    assert len(str(caught.value).splitlines()) == 1
+    assert len(str(caught.value)) < 500
+
+
+def test_hostile_names_are_shown_as_they_are(
+    tmp_path: Path, quick_page: Callable[[Summary], str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    identity = {"n": 0, HOSTILE: [HOSTILE], "digest": HOSTILE, "table": {HOSTILE: HOSTILE}}
+    plan = make_plan(
+        HOSTILE,
+        [Case(((HOSTILE, HOSTILE), ("variant", "[/]$\\frac$")), {"n": 0}, identity)],
+        [Case((("variant", HOSTILE),), 0, identity)],
+        range(2),
+        environment={HOSTILE: HOSTILE},
+    )
+    with Store(tmp_path / "a.sqlite", create=True) as store:
+        collect(plan, store, Inline(), run_fake)
+    found = told(read(tmp_path / "a.sqlite"), quick_page)
+    assert found.text.count(HOSTILE) > 8
+    # The charting library takes texts for HTML of its own kind.
+    drawn = json.dumps(json.loads(found.scripts[0]))
+    assert "&lt;img src" in drawn
+    assert "<img" not in drawn
+    assert HOSTILE in capsys.readouterr().out
