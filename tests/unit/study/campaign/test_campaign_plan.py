@@ -180,5 +180,5 @@ def test_a_kept_plan_is_the_plan(tmp_path: Path) -> None:
     for _ in range(40):
         deep = [deep]
     for change in ({"environment": {"a": deep}}, {"environment": {"a": float("inf")}}):
-        with pytest.raises(ConfigError, match="nested more than 32 deep|not finite"):
+        with pytest.raises(ConfigError, match=r"nested more than 32 deep|not finite"):
             kept_plan(plan.to_dict() | change)
