@@ -23,7 +23,12 @@ def save_array(path: Path, array: "NDArray[np.generic]", outputs: "Outputs") -> 
     Raises:
         OutputError: The file cannot be written.
     """
+    import io
+
     import numpy as np
 
+    # To a file itself NumPy writes past Python, which a pipe cannot take.
+    whole = io.BytesIO()
+    np.save(whole, array)
     with outputs.told(path):
-        np.save(outputs.open_binary(path), array)
+        outputs.open_binary(path).write(whole.getbuffer())

@@ -109,9 +109,11 @@ class Store:
             if create:
                 self._base.execute("PRAGMA journal_mode = WAL")
                 self._base.execute("PRAGMA synchronous = FULL")
-                with self._writing():
-                    self._base.executescript(_TABLES)
-                    self._base.execute(f"PRAGMA user_version = {SCHEMA}")
+                if version == 0:
+                    with self._writing():
+                        # All or nothing: tables of no version are somebody else's.
+                        script = f"BEGIN IMMEDIATE; {_TABLES} PRAGMA user_version = {SCHEMA}; COMMIT"
+                        self._base.executescript(script)
             else:
                 # A page that is its own child would be read for ever.
                 (state,) = self._base.execute("PRAGMA quick_check(1)").fetchone()

@@ -1,0 +1,291 @@
+"""Runs a command again and again, in forks, each with a fault of the disk; what `test_faults.py` starts."""
+
+import ctypes
+import io
+import json
+import os
+import shutil
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import evlcp_sdk.run
+import evlcp_sdk.study.campaign.task as task
+from evlcp_sdk.cli.main import main
+from evlcp_sdk.errors import EvlcpError, InputError
+from evlcp_sdk.files import STAGE_PREFIX, read_json
+from evlcp_sdk.io.open import write_events
+from evlcp_sdk.jobs.inline import Inline
+from evlcp_sdk.results.folder import check_result_file, read_summary
+from evlcp_sdk.study.campaign.collect import collect
+from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.values import Events, Packet
+from tests.unit.study.campaign.fake import fake_plan, run_fake
+
+HOW = ("fails", "dies", "stays full")
+
+SHIM: Any = ctypes.CDLL(os.environ.get("LD_PRELOAD"))
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended: `code` is None where it was killed."""
+
+    code: int | None
+    err: str = ""
+    calls: tuple[str, ...] = ()
+
+
+def warm(*arguments: str) -> None:
+    """Run a command in this process, so that forks have all imports."""
+    sys.argv = ["evlcp", *arguments]
+    with redirect_stdout(io.StringIO()), suppress(SystemExit):
+        main()
+
+
+def run(arguments: tuple[str, ...], folder: Path, at: int = -1, how: str = "fails") -> Ended:
+    """Run a command in a fork; its call number `at` below the folder fails."""
+    inlet, outlet = os.pipe()
+    pid = os.fork()
+    if not pid:
+        code: Any = 70
+        try:
+            sys.argv = ["evlcp", *arguments]
+            sys.stdout, sys.stderr = io.StringIO(), io.StringIO()
+            SHIM.faults_arm(os.fsencode(folder), ctypes.c_long(at), HOW.index(how))
+            try:
+                main()
+            except SystemExit as end:
+                code = end.code
+            SHIM.faults_calls.restype = ctypes.c_char_p
+            calls = SHIM.faults_calls().decode().split()
+            os.write(outlet, json.dumps([code or 0, sys.stderr.getvalue(), calls]).encode())
+        finally:
+            os._exit(0)
+    os.close(outlet)
+    with os.fdopen(inlet, "rb") as file:
+        said = file.read()
+    _, status = os.waitpid(pid, 0)
+    if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL:
+        return Ended(None)
+    code, err, calls = json.loads(said)
+    return Ended(code, err, tuple(calls))
+
+
+def held(folder: Path) -> dict[str, bytes]:
+    """What a folder holds, by name, without what differs from run to run."""
+    found = {}
+    for path in sorted(folder.iterdir()):
+        if path.is_dir():
+            continue
+        found[path.name] = path.read_bytes()
+        if path.name == "summary.json":
+            table = json.loads(found[path.name])
+            table.pop("processing", None)
+            found[path.name] = json.dumps(table).encode()
+    return found
+
+
+@dataclass
+class Trial:
+    """A command over what an earlier one left.
+
+    Attributes:
+        old: Arguments of the earlier one, `OUT` for the folder.
+        new: Those of the one that meets faults.
+        seal: The file that is there only with all the others.
+        check: Raises where the folder is not what a reader takes.
+    """
+
+    old: tuple[str, ...]
+    new: tuple[str, ...]
+    seal: str
+    check: Callable[[Path], None] = lambda _: None
+    stale: tuple[str, ...] = ()
+    calls: tuple[str, ...] = field(default=())
+
+    def faults(self, work: Path) -> Iterator[str]:
+        """What is wrong after each fault; nothing where each result is complete and true, or flagged."""
+        before, after, out = work / "before", work / "after", work / "out"
+        for folder in (before, after):
+            folder.mkdir()
+        # Names in results say where they were written.
+        warm(*self._put(self.old, before))
+        states = []
+        for arguments in (self.old, self.new):
+            shutil.rmtree(out, ignore_errors=True)
+            if states:
+                shutil.copytree(before, out)
+            else:
+                out.mkdir()
+            ended = run(self._put(arguments, out), out)
+            assert ended.code == 0, ended
+            if not states:
+                for name in self.stale:
+                    (out / name).write_text("of an earlier run")
+                shutil.rmtree(before)
+                shutil.copytree(out, before)
+            states.append(held(out))
+        self.calls = ended.calls
+        old, new = states
+        for how in HOW:
+            for at, call in enumerate(self.calls):
+                shutil.rmtree(out)
+                shutil.copytree(before, out)
+                ended = run(self._put(self.new, out), out, at, how)
+                for text in self._wrong(ended, out, old, new, call, how):
+                    yield f"{how} at {at} ({call}), {ended}: {text}"
+
+    def _put(self, arguments: tuple[str, ...], out: Path) -> tuple[str, ...]:
+        return tuple(a.replace("OUT", str(out)) for a in arguments)
+
+    def _wrong(
+        self, ended: Ended, out: Path, old: dict[str, bytes], new: dict[str, bytes], call: str, how: str
+    ) -> Iterator[str]:
+        found = held(out)
+        if ended.code == 0 and found != new:
+            yield "says that it is done, and is not"
+        if ended.code not in (None, 0):
+            if ended.code != 1 or ended.err.count("\n") != 1 or ": cannot be written: " not in ended.err:
+                yield "expected one line and exit code 1"
+            if any(p.name.startswith(STAGE_PREFIX) for p in out.iterdir()):
+                yield "leaves hidden files"
+        if found in (old, new):
+            try:
+                self.check(out)
+            except InputError as fault:
+                yield f"a whole result is refused: {fault}"
+        elif self.seal in found:
+            if self.seal.endswith(".json"):
+                try:
+                    read_json(out / self.seal)
+                except InputError as fault:
+                    if "unfinished" in str(fault):
+                        return
+            yield f"torn: {sorted(found)}"
+
+
+def check_result(folder: Path) -> None:
+    summary = read_summary(folder)
+    assert summary is not None
+    for name in summary["files"]:
+        check_result_file(folder, name, summary)
+
+
+class StandIn:
+    """A receiver that has decoded already."""
+
+    packets: tuple[Packet, ...] = ()
+
+    def __init__(self, *_: object) -> None:
+        self.counts: dict[str, int] = {}
+
+    def feed(self, _events: Events) -> list[Packet]:
+        return []
+
+    def close(self) -> list[Packet]:
+        return list(self.packets)
+
+
+def receive(work: Path, demo: Path) -> Trial:
+    """Two recordings, one after the other, into one folder."""
+    with evlcp_sdk.run.receive(demo) as packets:
+        StandIn.packets = (next(packets),)
+        StandIn.counts = packets.counts  # type: ignore[attr-defined]
+    counts = packets.counts
+
+    def stand_in(*_: object, **_more: object) -> StandIn:
+        made = StandIn()
+        made.counts = counts
+        if "two.raw" not in sys.argv[2]:
+            made.packets = ()
+        return made
+
+    evlcp_sdk.run.Receiver = stand_in  # type: ignore[assignment,misc]
+    events = Events.of(np.arange(50, dtype=np.int64), *(np.zeros((3, 50), np.int64)))
+    for name in ("one.raw", "two.raw"):
+        write_events(work / name, events, 1280, 720)
+    arguments = [("receive", str(work / name), "-o", "OUT") for name in ("one.raw", "two.raw")]
+    return Trial(*arguments, "summary.json", check_result, ("frames.parquet",))
+
+
+def simulate(_work: Path, _demo: Path) -> Trial:
+    """A recording and its truth over another one's."""
+    short = ("--set", "duration_s=0.001", "--set", "camera.width=200", "--set", "camera.height=100")
+    arguments = [("simulate", "--preset", "night", "-o", "OUT/a.raw", *short, "--seed", n) for n in "12"]
+    return Trial(*arguments, "a.truth.json")
+
+
+def tx(_work: Path, _demo: Path) -> Trial:
+    """Symbols and chips over those of another message."""
+    files = ("-o", "OUT/m.json", "--chips", "OUT/c.npy", "--sequence", "1")
+    return Trial(*(("tx", "message", "--text", text, *files) for text in ("a", "b")), "m.json")
+
+
+def sweep(work: Path) -> tuple[list[str], tuple[str, ...]]:
+    """A campaign that meets a fault is whole after the same command once more; what was kept is true."""
+    plan = fake_plan(2, 1, 1)
+    task.plan_of = lambda *_: plan  # type: ignore[assignment]
+    task.run_job = run_fake
+    out = work / "out"
+    arguments = ("sweep", "campaign.toml", "-o", str(out / "r.sqlite"), "--workers", "0")
+
+    def results() -> Any:
+        with Store(out / "r.sqlite") as store:
+            return store.results()
+
+    out.mkdir()
+    with Store(work / "whole.sqlite", create=True) as store:
+        collect(plan, store, Inline(), run_fake)
+        whole = store.results()
+    warm(*arguments)
+    shutil.rmtree(out)
+    out.mkdir()
+    calls = run(arguments, out).calls
+    assert results() == whole
+    faults = []
+    for how in HOW:
+        for at, call in enumerate(calls):
+            shutil.rmtree(out)
+            out.mkdir()
+            ended = run(arguments, out, at, how)
+            where = f"{how} at {at} ({call}), {ended}: "
+            if ended.code not in (None, 0) and (
+                ended.code != 1 or ended.err.count("\n") != 1 or ": cannot be written: " not in ended.err
+            ):
+                faults.append(where + "expected one line and exit code 1")
+            try:
+                kept = results()
+            except InputError:
+                kept = {}  # nothing was kept yet, which is said
+            if not kept.items() <= whole.items() or (ended.code == 0 and kept != whole):
+                faults.append(where + "what is kept is not true")
+            try:
+                with Store(out / "r.sqlite", create=True) as store:
+                    collect(plan, store, Inline(), run_fake)
+            except EvlcpError as fault:
+                faults.append(where + f"the same command does not go on: {fault}")
+            else:
+                if results() != whole:
+                    faults.append(where + "the same command does not give the same")
+    return faults, calls
+
+
+def tell(name: str, work: Path, demo: Path) -> None:
+    if name == "sweep":
+        faults, calls = sweep(work)
+    else:
+        trial = {"receive": receive, "simulate": simulate, "tx": tx}[name](work, demo)
+        faults = list(trial.faults(work))
+        calls = trial.calls
+    print(json.dumps({"faults": faults, "calls": calls}))
+
+
+if __name__ == "__main__":
+    tell(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]))

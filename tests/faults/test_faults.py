@@ -1,0 +1,42 @@
+"""Each write, rename and fsync fails once, and is died in once: results are whole and true, or flagged."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+
+needs_compiler = pytest.mark.skipif(
+    not sys.platform.startswith("linux") or shutil.which("cc") is None, reason="needs Linux and a C compiler"
+)
+
+
+@pytest.fixture(scope="module")
+def shim(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("shim") / "shim.so"
+    command = ["cc", "-O1", "-Wall", "-Werror", "-shared", "-fPIC", "-o", path, HERE / "shim.c", "-ldl"]
+    subprocess.run(command, check=True)
+    return path
+
+
+@needs_compiler
+@pytest.mark.parametrize("command", ["receive", "simulate", "tx", "sweep"])
+def test_a_disk_that_fails_once(command: str, shim: Path, tmp_path: Path, demo_raw: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.faults.commands", command, tmp_path, demo_raw],
+        cwd=HERE.parents[1],
+        env=os.environ | {"LD_PRELOAD": str(shim)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["faults"] == []
+    assert {"write", "fsync", "unlink" if command == "sweep" else "rename"} <= set(told["calls"])
+    assert len(told["calls"]) > 10
