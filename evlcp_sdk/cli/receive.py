@@ -11,7 +11,7 @@ import typer
 
 from evlcp_sdk.cli._common import Dask, LinkFile, Overrides, bytes_bar, complain, make_executor
 from evlcp_sdk.cli._summary import show
-from evlcp_sdk.errors import InputError, InterruptedRunError
+from evlcp_sdk.errors import InputError, InterruptedRunError, OutputError
 
 if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
@@ -261,6 +261,10 @@ def _jobs(recordings: Sequence[str], out: Path) -> list[ReceiveJob]:
                 f"{url}: gives no name of a folder in {out}; receive it by itself", param_hint="REC..."
             )
     jobs = [ReceiveJob(url, out / _stem(url)) for url in recordings]
+    for job in jobs:
+        # The user named OUT, and nobody what is in it.
+        if job.folder.is_symlink():
+            raise OutputError(f"{job.folder}: cannot be written: it is a link, which may lead out of {out}")
     folders = [job.folder for job in jobs]
     for job in jobs:
         if folders.count(job.folder) > 1:

@@ -496,6 +496,7 @@ def emulate(
     import subprocess
 
     from evlcp_sdk.errors import ConfigError, InputError
+    from evlcp_sdk.files import check_output
     from firmware_host.emulators.processes import native_command, qemu_command, wait_for
     from firmware_host.errors import ToolchainError
 
@@ -507,6 +508,8 @@ def emulate(
         host, _, number = place.rpartition(":")
         if not host or not re.fullmatch("[0-9]{1,5}", number) or not 1 <= int(number) <= 65535:
             raise ConfigError(f"--listen {listen}: expected tcp:HOST:PORT with a port from 1 to 65535")
+    if leds is not None:
+        check_output(leds, regular=False)
     if emulator is Emulator.QEMU:
         command = qemu_command(listen, leds)
     else:

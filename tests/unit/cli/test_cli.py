@@ -214,6 +214,16 @@ def test_what_cannot_be_read_ends_with_3(evlcp: Evlcp, tmp_path: Path, content: 
     assert not (tmp_path / "out").exists()
 
 
+def test_no_planted_folder_leads_outside(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / demo_raw.stem).symlink_to(tmp_path / "elsewhere")
+    done = evlcp("receive", demo_raw, tmp_path / "other.raw", "-o", tmp_path / "out")
+    assert done.code == 1
+    assert f"{demo_raw.stem}: cannot be written: it is a link" in done.err
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
 class FailingSource(RawSource):
     """A recording whose bytes cannot be read after the first piece."""
 

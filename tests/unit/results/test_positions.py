@@ -21,11 +21,14 @@ from evlcp_sdk.place import navigator
 from evlcp_sdk.place.navigator import Navigator, PositionPlan
 from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.results.figures import TrackProbe, draw_track
+from evlcp_sdk.results.fixes_csv import FixesCsv
+from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.geojson import cut
+from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
+from evlcp_sdk.values import Fix, Frame, Packet, Range, SoftSymbols
 
 LINK = load_link()
 ZERO = datetime(2026, 3, 1, 10, 15, tzinfo=UTC)
@@ -136,6 +139,15 @@ def test_a_track_across_the_180th_meridian_is_cut(tmp_path: Path) -> None:
         one, two = cut(way)
         assert one == [way[0], pytest.approx([sign * 180, 35.1, 2.0])]
         assert two == [pytest.approx([sign * -180, 35.1, 2.0]), way[1], way[2]]
+
+
+def test_a_refusal_that_is_a_formula_is_none_in_the_csv(tmp_path: Path) -> None:
+    with ResultFolder(tmp_path, ["fixes.csv"]) as folder:
+        sink = FixesCsv(folder, Run("", LINK))
+        sink.fix(Fix.refused(1.0, (0,), "+a", "=1+1"), None)
+        folder.finish()
+    (row,) = rows(tmp_path / "fixes.csv")
+    assert (row["refusal"], row["detail"]) == ("'+a", "'=1+1")
 
 
 def test_refused_fixes_are_listed_and_counted(tmp_path: Path) -> None:

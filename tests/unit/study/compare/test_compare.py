@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -188,6 +189,13 @@ def test_total_adds_recordings() -> None:
     mixed = total_of([one, table(BLIND, BLIND)])
     assert mixed.rows[0].measured.tally.ber == measured().tally.ber
     assert mixed.rows[0].measured.statistics.rows == 95
+
+
+def test_a_recording_whose_name_is_a_formula_is_none_in_the_csv() -> None:
+    name = '=HYPERLINK("http://192.0.2.1/","a.raw")'
+    rows = list(csv.DictReader(io.StringIO(comparison(replace(table(measured()), name=name)).to_csv())))
+    assert f"'{name}" in rows[0].values()
+    assert not any(text.startswith(("=", "@", "+")) for row in rows for text in row.values())
 
 
 def test_json_csv_and_html_parse_back() -> None:
