@@ -47,8 +47,6 @@ def test_a_trace_follows_no_link(tmp_path: Path) -> None:
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_ends_a_trace_in_one_line() -> None:
     trace = TraceTransport(Line(), Path("/dev/full"), 9600, 1, 2)
-    with pytest.raises(OutputError, match="/dev/full: cannot be written: No space left"):
-        trace.read(0.1)
-    trace = TraceTransport(Line(), Path("/dev/full"), 9600, 1, 2)
-    with pytest.raises(OutputError, match="/dev/full: cannot be written: No space left"):
-        trace.close()
+    for end in (lambda: trace.read(0.1), trace.close):
+        with pytest.raises(OutputError, match="/dev/full: cannot be written: No space left"):
+            end()
