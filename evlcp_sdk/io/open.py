@@ -60,7 +60,7 @@ def _ask_plugins(url: str, registry: Registry) -> EventSource | None:
             source: object = impl.function(*(url for _ in impl.argnames))
         except EvlcpError:
             raise
-        except Exception as fault:
+        except (Exception, SystemExit) as fault:
             what = " ".join(f"{type(fault).__name__}: {fault}".split())
             registry.leave_out(impl.plugin_name, f"evlcp_open_events({url!r}) fails: {what}")
             continue

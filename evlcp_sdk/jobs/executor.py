@@ -62,6 +62,6 @@ def attempt(function: Callable[[J], R], job: J) -> Outcome[J, R]:
         return Outcome(job, function(job))
     except EvlcpError as fault:
         return Outcome(job, fault=Fault(str(fault), fault.exit_code))
-    except Exception as fault:
+    except (Exception, SystemExit) as fault:
         text = f"{type(fault).__name__}: {fault}".splitlines()[0]
         return Outcome(job, fault=Fault(text, trace=traceback.format_exc()))

@@ -96,6 +96,8 @@ class BlockCoder:
         if np.count_nonzero(llr) < self._code.message_bits:
             return None
         found = self._code.decode(np.ascontiguousarray(llr[self._order], np.float32))
+        if np.shape(found.bits) != (self._code.message_bits,):
+            raise ValueError(f"gave bits of shape {np.shape(found.bits)}, expected {self._code.message_bits}")
         if not found.ok or found.bits[8 * self.block_bytes :].any():
             return None
         return np.packbits(found.bits[: 8 * self.block_bytes]).tobytes()

@@ -44,7 +44,7 @@ class InstalledSink:
         module, _, name = record.target.partition(":")
         try:
             found = getattr(importlib.import_module(module), name)
-        except Exception as fault:
+        except (Exception, SystemExit) as fault:
             raise PluginError(f"{self}: cannot import {record.target}: {fault}") from fault
         if not isinstance(found, type):
             raise PluginError(f"{self}: {record.target} is not a class")

@@ -123,7 +123,7 @@ class Registry:
                 answer = impl.function(*(given[name] for name in impl.argnames))
                 if isinstance(answer, Iterator):
                     answer = list(answer)
-            except Exception as fault:
+            except (Exception, SystemExit) as fault:
                 self.leave_out(impl.plugin_name, f"{hook}() fails: {_line(fault)}")
                 continue
             answers.append((impl.plugin_name, answer))

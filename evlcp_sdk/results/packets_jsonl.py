@@ -75,7 +75,7 @@ def message_line(received: ReceivedMessage) -> str:
     try:
         shown = dict(kind.to_dict(received.value))
         text = json.dumps(line | shown, ensure_ascii=False)
-    except Exception as fault:
+    except (Exception, SystemExit) as fault:
         raise PluginError(f"{who}: to_dict() fails: {type(fault).__name__}: {fault}") from fault
     if twice := line.keys() & shown.keys():
         raise PluginError(f"{who}: to_dict() shows '{min(twice)}', which every message has")

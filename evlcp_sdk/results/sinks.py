@@ -107,7 +107,7 @@ class Sinks:
             raise
         except OSError as fault:
             raise output_fault(self._folder.folder, fault) from fault
-        except Exception as fault:
+        except (Exception, SystemExit) as fault:
             last = traceback.extract_tb(fault.__traceback__)[-1]
             what = f"{type(fault).__name__}: {fault}".splitlines()[0]
             where = f"{Path(last.filename).name}, line {last.lineno}"

@@ -1,17 +1,29 @@
-"""Whose fault it is when a stage of the receiver fails."""
+"""Whose fault it is when a stage of the receiver fails, or gives what the next one cannot work with.
 
+Kernels read and write where what they are given says, so all of it is checked before they see it.
+"""
+
+import math
 import traceback
 from pathlib import Path
 from types import TracebackType
+from typing import NoReturn
 
 import numpy as np
 
 from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import EvlcpError, PluginError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.values import SoftSymbols
+from evlcp_sdk.values import Bend, PresenceMap, Range, SoftSymbols, SyncLock
 
 __all__ = ["Guard"]
+
+_FAR_PACKETS = 64
+"""Packets between a lock and the time when it is heard; the grid of its packets is counted from it."""
+
+_FARTHEST_M = 1e15
+"""Distance that a pixel's fraction of a billionth shows; beyond is no number of a measurement."""
 
 
 class Guard:
@@ -41,11 +53,20 @@ class Guard:
     def __exit__(
         self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if isinstance(fault, Exception) and not isinstance(fault, EvlcpError):
+        # To exit is not an algorithm's to decide; to interrupt is the user's.
+        if isinstance(fault, (Exception, SystemExit)) and not isinstance(fault, EvlcpError):
             last = traceback.extract_tb(trace)[-1]
             what = f"{type(fault).__name__}: {fault}".splitlines()[0]
             where = f"{Path(last.filename).name}, line {last.lineno}"
             raise PluginError(f"{self._who}: {what} ({where}); {self._hint}") from fault
+
+    def refuse(self, gave: str, expected: str) -> NoReturn:
+        """Say what an algorithm gave, and what was expected.
+
+        Raises:
+            PluginError: With both.
+        """
+        raise PluginError(f"{self._who}: gave {gave}, expected {expected}; {self._hint}")
 
     def expect(self, found: object, kind: type) -> None:
         """Check what an algorithm gave.
@@ -54,21 +75,134 @@ class Guard:
             PluginError: It is of another type.
         """
         if not isinstance(found, kind):
-            name = type(found).__name__
-            raise PluginError(f"{self._who}: gave {name}, expected {kind.__name__}; {self._hint}")
+            self.refuse(type(found).__name__, kind.__name__)
+
+    def expect_array(self, found: object, name: str, shape: tuple[int, ...], kinds: str) -> None:
+        """Check an array's shape, and its type by NumPy's letters for kinds, e.g. `"iu"`.
+
+        Raises:
+            PluginError: It is none, or of another shape or type.
+        """
+        if not isinstance(found, np.ndarray):
+            self.refuse(f"{name} of type {type(found).__name__}", f"an array {shape}")
+        if found.shape != shape:
+            self.refuse(f"{name} of shape {found.shape}", f"{shape}")
+        if found.dtype.kind not in kinds:
+            self.refuse(f"{name} of {found.dtype}", " or ".join(_KINDS[kind] for kind in kinds))
+
+    def expect_number(self, found: object, name: str, least: float, most: float) -> None:
+        """Check a number.
+
+        Raises:
+            PluginError: It is none, or out of range.
+        """
+        try:
+            fine = bool(least <= found <= most)  # type: ignore[operator]
+        except (TypeError, ValueError):
+            fine = False
+        if not fine:
+            self.refuse(f"{name} = {found!r:.40}", f"a number from {least:g} to {most:g}")
+
+    def expect_lock(self, lock: SyncLock, until_us: float, packet: PacketFormat) -> None:
+        """Check what a synchronization heard until a time, us.
+
+        Raises:
+            PluginError: It is no `SyncLock`, or its times are not those of such packets.
+        """
+        self.expect(lock, SyncLock)
+        chip_us, whole_us = packet.chip_us, packet.packet_chips * packet.chip_us
+        far_us = _FAR_PACKETS * whole_us
+        self.expect_number(lock.chip_us, "chip_us", chip_us / 2, chip_us * 2)
+        self.expect_number(lock.packet_t_us, "packet_t_us", until_us - far_us, until_us + far_us)
+        self.expect_number(lock.delay_on_us, "delay_on_us", -whole_us, whole_us)
+        self.expect_number(lock.delay_off_us, "delay_off_us", -whole_us, whole_us)
+        self.expect_number(lock.quality, "quality", 0.0, _ONE)
+        self.expect_number(lock.row_us, "row_us", -chip_us, chip_us)
+        self.expect_number(lock.last_row_us, "last_row_us", -whole_us, whole_us)
+
+    def expect_presence(self, found: PresenceMap, clusters: int, height: int, width: int) -> None:
+        """Check what a separation gave of an image.
+
+        Raises:
+            PluginError: It is no `PresenceMap` of this image.
+        """
+        self.expect(found, PresenceMap)
+        grid = found.grid_px
+        if not isinstance(grid, int | np.integer) or grid < 1:
+            self.refuse(f"grid_px = {grid!r:.40}", "a whole number of pixels")
+        cells = (clusters, height // grid, width // grid)
+        self.expect_array(found.probability, "probability", cells, "f")
+        self.expect_array(found.selected, "selected", cells, "b")
+        self.expect_array(found.pixels, "pixels", (clusters, height, width), "f")
+        if found.prior is not None:
+            self.expect_array(found.prior, "prior", cells, "f")
+        if found.probability.size and not (found.probability.min() >= 0 and found.probability.max() <= _ONE):
+            self.refuse("probability of other values", "0 to 1")
+        # One that is not finite makes the sum so.
+        if not math.isfinite(found.pixels.sum()):
+            self.refuse("pixels of other values", "finite ones")
 
     def expect_symbols(self, soft: SoftSymbols, codebook: Codebook) -> None:
         """Check what a decoding gave.
 
         Raises:
-            PluginError: It is not a `SoftSymbols`, or of other shapes than the codebook's.
+            PluginError: It is not a `SoftSymbols`, or of other shapes or symbols than the codebook's.
         """
         self.expect(soft, SoftSymbols)
-        for name, found, expected in (
-            ("symbols", soft.symbols, (codebook.clusters,)),
-            ("llr", soft.llr, (codebook.clusters, codebook.bits_per_symbol)),
+        self.expect_array(soft.symbols, "symbols", (codebook.clusters,), "iu")
+        self.expect_array(soft.llr, "llr", (codebook.clusters, codebook.bits_per_symbol), "f")
+        top = len(codebook.codewords) - 1
+        least, most = soft.symbols.min(), soft.symbols.max()
+        if least < -1 or most > top:
+            self.refuse(f"symbol {least if least < -1 else most}", f"0 to {top}, or -1 for one not given")
+        if not math.isfinite(soft.llr.sum()):
+            self.refuse("llr of other values", "finite ones")
+
+    def expect_range(self, found: Range) -> None:
+        """Check what a ranging gave.
+
+        Raises:
+            PluginError: It is no `Range`, or its numbers are not those of a distance.
+        """
+        self.expect(found, Range)
+        for name, value, least in (
+            ("distance_m", found.distance_m, math.ulp(0.0)),
+            ("sigma_m", found.sigma_m, 0.0),
         ):
-            if np.shape(found) != expected:
-                raise PluginError(
-                    f"{self._who}: gave {name} of shape {np.shape(found)}, expected {expected}; {self._hint}"
-                )
+            if not _unknown(value):
+                self.expect_number(value, name, least, _FARTHEST_M if name == "distance_m" else math.inf)
+        self.expect_number(found.pairs, "pairs", 0, 1 << 32)
+        self.expect_number(found.late_chips, "late_chips", -_LATEST_CHIPS, _LATEST_CHIPS)
+        if found.bend is not None:
+            self.expect(found.bend, Bend)
+            shape = np.shape(found.bend.place)
+            for name in ("place", "off", "weight", "uneven"):
+                self.expect_array(getattr(found.bend, name), f"bend.{name}", shape, "f")
+            if len(shape) != 1:
+                self.refuse(f"bend.place of shape {shape}", "one number a boundary")
+
+    def expect_filtered(self, values: object, sigma: object, shape: tuple[int, ...]) -> None:
+        """Check what a filter of tracking gave.
+
+        Raises:
+            PluginError: Other than finite values of this shape, and a sigma.
+        """
+        self.expect_array(values, "values", shape, "f")
+        assert isinstance(values, np.ndarray)
+        if not math.isfinite(values.sum()):
+            self.refuse(f"values {values.tolist()!r:.40}", "finite ones")
+        if not _unknown(sigma):
+            self.expect_number(sigma, "sigma", 0.0, math.inf)
+
+
+def _unknown(value: object) -> bool:
+    try:
+        return math.isnan(value)  # type: ignore[arg-type]
+    except TypeError:
+        return False
+
+
+_KINDS = {"f": "floats", "b": "booleans", "i": "integers", "u": "unsigned ones"}
+_ONE = 1 + 1e-5
+"""Rounding of 32 bits is no fault."""
+_LATEST_CHIPS = 1e6

@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Self, TypeVar
 
@@ -16,6 +17,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.sections import MessageSpec
+from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.values import Packet, ReceivedMessage, Trust
 
 __all__ = ["MessageAssembler"]
@@ -94,15 +96,21 @@ class MessageAssembler:
         coder: How packets carry blocks.
         spec: The configuration.
         kinds: The kinds of messages that are understood, by number; blocks of others count as malformed.
+        guard: Names the error correction where it fails.
 
     Raises:
         ConfigError: A trusted key is not valid, or there are keys and the extra `sign` is not installed.
     """
 
     def __init__(
-        self, coder: BlockCoder, spec: MessageSpec, kinds: Mapping[int, MessageKind] = BUILT_IN_KINDS
+        self,
+        coder: BlockCoder,
+        spec: MessageSpec,
+        kinds: Mapping[int, MessageKind] = BUILT_IN_KINDS,
+        guard: Guard | None = None,
     ) -> None:
         self._coder = coder
+        self._guard: AbstractContextManager[None] = guard or nullcontext()
         self._kinds = kinds
         self._spec = spec
         self._room = coder.block_bytes - HEADER_BYTES
@@ -139,11 +147,13 @@ class MessageAssembler:
         """
         if not link.messages.decode:
             return None
+        guard = Guard(link, "error-correction")
         try:
-            coder = link.block_coder()
+            with guard:
+                coder = link.block_coder()
         except ConfigError:
             return None
-        return cls(coder, link.messages, link.kinds)
+        return cls(coder, link.messages, link.kinds, guard)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -195,7 +205,8 @@ class MessageAssembler:
 
     def _content(self, inbox: _Inbox, llr: NDArray[np.float32]) -> tuple[bytes | None, int]:
         """The bytes of a packet's block and the packets it took; None if that is not known yet."""
-        found = self._coder.block(llr)
+        with self._guard:
+            found = self._coder.block(llr)
         if found is not None or not self._spec.combine_packets:
             return found, 1
         alike = [_agreement(llr, earlier.llr) for earlier in inbox.sums]
@@ -205,7 +216,8 @@ class MessageAssembler:
             return None, 0
         one = inbox.sums.pop(best)
         total = _Sum(one.llr + llr, one.packets + 1)
-        found = self._coder.block(total.llr)
+        with self._guard:
+            found = self._coder.block(total.llr)
         if found is None:
             inbox.sums.append(total)
         return found, total.packets
@@ -246,7 +258,7 @@ class MessageAssembler:
         kind = self._kinds[message.kind]
         try:
             value = kind.unpack(message.payload)
-        except Exception:
+        except (Exception, SystemExit):
             # Whatever a lamp says, and whatever a plugin makes of it, the receiver goes on.
             return self._undecodable(parts)
         beacon = value if message.kind == Kind.BEACON else None

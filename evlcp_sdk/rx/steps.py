@@ -1,5 +1,6 @@
 """A link's algorithms as the receiver calls them: compiled once, guarded, checked, announced."""
 
+import math
 import time
 import traceback
 from collections.abc import Callable
@@ -54,7 +55,7 @@ class Announcer:
                 self._hook(stage=stage, value=value, elapsed_s=elapsed_s)
             except EvlcpError:
                 raise
-            except Exception as fault:
+            except (Exception, SystemExit) as fault:
                 last = traceback.extract_tb(fault.__traceback__)[-1]
                 what = f"{type(fault).__name__}: {fault}".splitlines()[0]
                 where = f"{Path(last.filename).name}, line {last.lineno}"
@@ -74,6 +75,7 @@ class Steps:
 
     def __init__(self, link: Link, announcer: Announcer) -> None:
         self._codebook = link.codebook
+        self._packet = link.packet
         self._keeper = RangeKeeper()
         self._announcer = announcer
         self._guards = guards = {role: Guard(link, role) for role in ROLES}
@@ -108,8 +110,9 @@ class Steps:
         self._announcer.start()
         with guard:
             state, locks = self._synchronizer.step(state, events.t_us, events.p, until_us)
+        guard.expect(locks, list)
         for lock in locks:
-            guard.expect(lock, SyncLock)
+            guard.expect_lock(lock, until_us, self._packet)
             self._announcer.lap("synchronization", lock)
         return state, locks
 
@@ -118,7 +121,7 @@ class Steps:
         guard = self._guards["separation"]
         with guard:
             presence: PresenceMap = self._separate(sums)
-        guard.expect(presence, PresenceMap)
+        guard.expect_presence(presence, self._codebook.clusters, *sums.shape[1:])
         self._announcer.lap("separation", presence)
         return presence
 
@@ -137,7 +140,7 @@ class Steps:
         self._announcer.lap("view", view)
         with guard:
             distance: Range = self._measure(view)
-        guard.expect(distance, Range)
+        guard.expect_range(distance)
         self._announcer.lap("ranging", distance)
         return distance
 
@@ -156,7 +159,7 @@ class Steps:
     def _filter(self, state: Any, t_us: float, measured: Range) -> tuple[Any, Range | None]:
         if self._distance is None:
             return state, None
-        if np.isnan(measured.distance_m) or np.isnan(measured.sigma_m):
+        if not (math.isfinite(measured.distance_m) and math.isfinite(measured.sigma_m)):
             expected = self._distance.predict(state, t_us)
             return state, None if expected is None else Range(float(expected[0][0]), expected[1], 0)
         value = np.array([measured.distance_m])
@@ -177,13 +180,19 @@ class _GuardedFilter(Filter):
 
     def predict(self, state: Any, t_us: float) -> tuple[NDArray[np.float64], float] | None:
         with self._guard:
-            return self._filter.predict(state, t_us)
+            found = self._filter.predict(state, t_us)
+            if found is not None:
+                values, sigma = found
+                self._guard.expect_filtered(values, sigma, np.shape(values)[:1])
+        return found
 
     def step(
         self, state: Any, t_us: float, value: NDArray[np.float64], sigma: float
     ) -> tuple[Any, NDArray[np.float64], float]:
         with self._guard:
-            return self._filter.step(state, t_us, value, sigma)
+            state, values, sigma = self._filter.step(state, t_us, value, sigma)
+            self._guard.expect_filtered(values, sigma, value.shape)
+        return state, values, sigma
 
 
 def _guarded(filter_: Filter | None, guard: Guard) -> Filter | None:

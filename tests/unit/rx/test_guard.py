@@ -1,6 +1,9 @@
 """An algorithm that fails is told by name, in one line."""
 
+import math
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -8,9 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evlcp_sdk.errors import ConfigError, PluginError
+from evlcp_sdk.errors import ConfigError, PluginError, PluginWarning
+from evlcp_sdk.io import open_source
 from evlcp_sdk.link.resolve import Link, load_link
-from evlcp_sdk.plugin.roles import Filter, Tracker
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.roles import Corrected, Filter, Tracker
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.values import SoftSymbols
@@ -104,6 +110,193 @@ def test_a_synchronization_that_gives_no_locks_is_named() -> None:
         PluginError, match=r"^synchronization algorithm 'mine': gave tuple, expected SyncLock"
     ):
         received(link_with("synchronization", lambda *_: gives))
+
+
+def exits(*_args: object) -> Any:
+    raise SystemExit(0)
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_an_algorithm_that_exits_is_named(role: str) -> None:
+    filter_ = FailingFilter()
+    filter_.step = exits  # type: ignore[assignment]
+    gives: dict[str, Any] = {
+        "synchronization": SimpleNamespace(init=lambda: None, step=exits),
+        "tracking": Tracker(None, filter_),
+    }
+    gives["tracking"].distance.predict = lambda *_: None
+    with pytest.raises(PluginError, match=rf"^{role} algorithm 'mine': SystemExit: 0"):
+        received(link_with(role, lambda *_: gives.get(role, exits)))
+
+
+def test_an_interrupt_in_an_algorithm_is_the_user_s() -> None:
+    def interrupted(*_args: object) -> Any:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        received(link_with("ranging", lambda *_: interrupted))
+
+
+def changed(role: str, change: Callable[[Any], Any]) -> Link:
+    """The link with an algorithm that gives something else than the built-in one."""
+    compiled = LINK.algorithm(role).compile
+    if role == "synchronization":
+
+        def step(state: Any, *given: Any, sync: Any) -> tuple[Any, Any]:
+            state, locks = sync.step(state, *given)
+            return state, [change(lock) for lock in locks]
+
+        def compile_sync(*given: Any) -> Any:
+            sync = compiled(*given)
+            return SimpleNamespace(init=sync.init, step=partial(step, sync=sync))
+
+        return link_with(role, compile_sync)
+    if role == "tracking":
+
+        def compile_tracker() -> Tracker:
+            tracker = compiled()
+            return Tracker(*(Changed(one, change) for one in (tracker.position, tracker.distance)))
+
+        return link_with(role, compile_tracker)
+    return link_with(role, lambda *given: lambda *data: change(compiled(*given)(*data)))
+
+
+class Changed(Filter):
+    """A filter whose values are changed."""
+
+    def __init__(self, filter_: Filter, change: Callable[[Any], Any]) -> None:
+        self._filter, self._change = filter_, change
+
+    def init(self) -> Any:
+        return self._filter.init()
+
+    def predict(self, state: Any, t_us: float) -> Any:
+        return self._filter.predict(state, t_us)
+
+    def step(self, state: Any, t_us: float, value: Any, sigma: float) -> Any:
+        state, values, sigma = self._filter.step(state, t_us, value, sigma)
+        return state, *self._change((values, sigma))
+
+
+def but(**changes: Any) -> Callable[[Any], Any]:
+    return lambda found: replace(found, **changes)
+
+
+def spoilt(name: str, value: float, kind: Any = None) -> Callable[[Any], Any]:
+    """One value of an array is another."""
+
+    def change(found: Any) -> Any:
+        array = getattr(found, name).astype(kind or getattr(found, name).dtype, copy=True)
+        array.flat[0] = value
+        return replace(found, **{name: array})
+
+    return change
+
+
+ODD: list[tuple[str, Callable[[Any], Any], str]] = [
+    ("synchronization", but(chip_us=-100.0), r"chip_us = -100\.0, expected a number from 50 to 200"),
+    ("synchronization", but(chip_us=1e-9), "chip_us = 1e-09, expected"),
+    ("synchronization", but(chip_us=math.nan), "chip_us = nan, expected"),
+    ("synchronization", but(packet_t_us=-1e15), r"packet_t_us = -1000000000000000\.0, expected"),
+    ("synchronization", but(packet_t_us=math.nan), "packet_t_us = nan, expected"),
+    ("synchronization", but(packet_t_us="soon"), "packet_t_us = 'soon', expected"),
+    ("synchronization", but(delay_on_us=math.inf), "delay_on_us = inf, expected"),
+    ("synchronization", but(delay_off_us=np.zeros(2)), "delay_off_us = array"),
+    ("synchronization", but(quality=2.0), r"quality = 2\.0, expected a number from 0 to 1"),
+    ("synchronization", but(row_us=math.nan), "row_us = nan"),
+    ("separation", but(grid_px=10**6), r"probability of shape \(16, \d+, \d+\), expected \(16, 0, 0\)"),
+    ("separation", but(grid_px=0), "grid_px = 0, expected a whole number of pixels"),
+    ("separation", but(grid_px=2.0), r"grid_px = 2\.0, expected a whole number"),
+    ("separation", but(grid_px="2"), "grid_px = '2', expected a whole number"),
+    ("separation", but(probability=[0.5]), "probability of type list, expected an array"),
+    ("separation", spoilt("probability", math.nan), "probability of other values, expected 0 to 1"),
+    ("separation", spoilt("probability", -3), "probability of other values, expected 0 to 1"),
+    ("separation", spoilt("pixels", math.inf), "pixels of other values, expected finite ones"),
+    ("separation", spoilt("selected", 1, np.int64), "selected of int64, expected booleans"),
+    ("separation", lambda p: replace(p, pixels=p.pixels[:, 1:]), r"pixels of shape"),
+    ("decoding", but(symbols=[0] * 16), r"symbols of type list, expected an array \(16,\)"),
+    ("decoding", spoilt("symbols", -2), "symbol -2, expected 0 to 63, or -1 for one not given"),
+    ("decoding", spoilt("symbols", 10**12), "symbol 1000000000000, expected 0 to 63"),
+    ("decoding", spoilt("symbols", 1, np.float64), "symbols of float64, expected integers or unsigned"),
+    ("decoding", spoilt("llr", math.nan), "llr of other values, expected finite ones"),
+    ("ranging", but(distance_m=-5.0), r"distance_m = -5\.0, expected a number from"),
+    ("ranging", but(distance_m="50 m"), "distance_m = '50 m', expected a number from"),
+    ("ranging", but(distance_m=math.inf), "distance_m = inf, expected a number from"),
+    ("ranging", but(distance_m=None), "distance_m = None, expected a number from"),
+    ("ranging", but(sigma_m=-1.0), r"sigma_m = -1\.0, expected a number from 0"),
+    ("ranging", but(pairs="many"), "pairs = 'many', expected a number"),
+    ("ranging", but(late_chips=math.nan), "late_chips = nan, expected a number"),
+    ("ranging", but(bend=3), "int, expected Bend"),
+    ("tracking", lambda found: (found[0] * math.nan, found[1]), r"values \[nan"),
+    ("tracking", lambda found: (found[0][:0], found[1]), r"values of shape \(0,\), expected"),
+    ("tracking", lambda found: (found[0].tolist(), found[1]), "values of type list"),
+    ("tracking", lambda found: (found[0], "a lot"), "sigma = 'a lot', expected a number"),
+]
+
+
+@pytest.mark.parametrize(
+    ("role", "change", "says"), ODD, ids=[f"{role}-{says[:30]}" for role, _, says in ODD]
+)
+def test_what_no_next_stage_can_work_with_is_named(
+    role: str, change: Callable[[Any], Any], says: str
+) -> None:
+    with pytest.raises(
+        PluginError, match=rf"^{role} algorithm 'mine': gave {says}.*; try: evlcp check"
+    ) as told:
+        received(changed(role, change))
+    assert len(str(told.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("role", "change"),
+    [
+        ("synchronization", but(chip_us=np.float32(100.0))),
+        ("separation", but(grid_px=np.int64(2))),
+        ("decoding", lambda soft: replace(soft, symbols=soft.symbols.astype(np.int16))),
+        ("ranging", but(distance_m=math.nan, sigma_m=math.nan, pairs=0)),
+        ("ranging", but(distance_m=np.float64(50.0), sigma_m=math.inf)),
+        ("ranging", but(bend=None)),
+    ],
+)
+def test_other_types_of_right_values_pass(role: str, change: Callable[[Any], Any]) -> None:
+    received(changed(role, change))
+
+
+@pytest.mark.parametrize(
+    ("gives", "says"),
+    [
+        (None, "AttributeError: "),
+        (Corrected(np.zeros(3, np.uint8), True, 0), r"ValueError: gave bits of shape \(3,\), expected"),
+    ],
+)
+def test_an_error_correction_that_gives_another_thing_is_named(gives: object, says: str) -> None:
+    built_in = LINK.algorithm("error-correction").compile
+    code = SimpleNamespace(decode=lambda *_: gives)
+
+    def compile_code(length: int) -> Any:
+        code.message_bits = built_in(length).message_bits
+        return code
+
+    with pytest.raises(PluginError, match=f"^error-correction algorithm 'mine': {says}"):
+        received(link_with("error-correction", compile_code))
+
+
+def test_hooks_that_exit_end_nothing(demo_raw: Path) -> None:
+    class Exits:
+        @hookimpl
+        def evlcp_open_events(self, url: str) -> None:
+            raise SystemExit(0)
+
+        @hookimpl
+        def evlcp_stage_finished(self, stage: str) -> None:
+            raise SystemExit(0)
+
+    registry = Registry.load(Exits())
+    receiver = Receiver(LINK, registry.hook)
+    with pytest.raises(PluginError, match=r"^evlcp_stage_finished\(\) of a plugin: SystemExit: 0"):
+        receiver.feed(EVENTS)
+    with pytest.warns(PluginWarning, match="evlcp_open_events.* fails: SystemExit: 0"):
+        open_source(demo_raw, registry).close()
 
 
 def test_the_command_line_tells_it_in_one_line(
