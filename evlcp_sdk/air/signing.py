@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evlcp_sdk.air.blocks import Kind, Message
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError, InputError, OutputError
 from evlcp_sdk.files import write_new
 
 if TYPE_CHECKING:
@@ -37,8 +37,7 @@ def make_key(path: Path) -> str:
 
     Raises:
         ConfigError: The extra is not installed.
-        InputError: The file exists.
-        OutputError: It cannot be written.
+        OutputError: The file exists, or cannot be written.
     """
     _check_installed()
     from cryptography.hazmat.primitives import serialization
@@ -51,7 +50,7 @@ def make_key(path: Path) -> str:
     try:
         write_new(text, path)
     except FileExistsError as fault:
-        raise InputError(f"{path}: exists; a key is not overwritten") from fault
+        raise OutputError(f"{path}: exists; a key is not overwritten") from fault
     return public_key(key)
 
 

@@ -1,7 +1,7 @@
 """`evlcp receive`."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -137,7 +137,11 @@ def receive(
     worst = 0
     interrupted: list[Path] = []
     pass_on = (lambda: None) if here else stop_workers
-    with stop_on_request(pass_on) as stopped, _recordings_bar(0 if here else len(jobs)) as count:
+    with (
+        stop_on_request(pass_on) as stopped,
+        _recordings_bar(0 if here else len(jobs)) as count,
+        ExitStack() as stack,
+    ):
         run = partial(
             _decode_job,
             link=link,
@@ -146,7 +150,8 @@ def receive(
             sinks=asked,
             stopped=stopped if here else None,
         )
-        for outcome in executor.run(run, _until(stopped, jobs)):
+        outcomes = stack.enter_context(closing(executor.run(run, _until(stopped, jobs))))
+        for outcome in outcomes:
             count()
             job, summary, fault = outcome.job, outcome.value, outcome.fault
             if summary is None:

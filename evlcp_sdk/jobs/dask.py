@@ -1,6 +1,6 @@
 """Jobs on a Dask cluster; needs the extra `cluster`."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import suppress
 from typing import Any, TypeVar
 
@@ -47,7 +47,7 @@ class DaskCluster:
         except (OSError, TimeoutError, ValueError, ImportError) as fault:
             raise ConfigError(f"--dask {address}: no Dask scheduler answers there") from fault
 
-    def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Iterator[Outcome[J, R]]:
+    def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Generator[Outcome[J, R], None, None]:
         """See `Executor.run`."""
         client, dask = self._client, self._dask
         source = iter(jobs)

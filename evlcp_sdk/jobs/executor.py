@@ -5,7 +5,7 @@ are ready, in any order.
 """
 
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
@@ -47,8 +47,10 @@ class Outcome(Generic[J, R]):
 class Executor(Protocol):
     """Runs a function over jobs; function, jobs and values can be pickled."""
 
-    def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Iterator[Outcome[J, R]]:
+    def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Generator[Outcome[J, R], None, None]:
         """Run the function over the jobs; `jobs` is drawn from only when there is room for one.
+
+        Who leaves before the end closes it, which ends what runs.
 
         Raises:
             EvlcpError: The executor itself cannot go on.

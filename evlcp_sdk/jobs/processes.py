@@ -9,7 +9,7 @@ import os
 import pickle
 import signal
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
@@ -18,7 +18,6 @@ from typing import Generic, TypeVar
 
 from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.jobs.executor import ATTEMPTS, Fault, Outcome, attempt
-from evlcp_sdk.signals import ENDING
 
 __all__ = ["Processes", "stop_workers"]
 
@@ -42,7 +41,7 @@ class Processes:
     def __init__(self, workers: int) -> None:
         self._workers = workers
 
-    def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Iterator[Outcome[J, R]]:
+    def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Generator[Outcome[J, R], None, None]:
         """See `Executor.run`."""
         source = iter(jobs)
         again: deque[_Begun[J]] = deque()
@@ -155,7 +154,8 @@ def stop_workers() -> None:
 
 def _serve(pipe: Connection, function: bytes) -> None:
     """What a worker process does until its pipe closes."""
-    for number in ENDING:
+    # What a terminal sends is the parent's business; by SIGTERM it ends its processes.
+    for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
     run = pickle.loads(function)

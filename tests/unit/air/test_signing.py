@@ -45,7 +45,7 @@ def test_a_key_is_its_owners_and_stays(tmp_path: Path) -> None:
     signing.make_key(path)
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     before = path.read_bytes()
-    with pytest.raises(InputError, match="exists; a key is not overwritten"):
+    with pytest.raises(OutputError, match="exists; a key is not overwritten"):
         signing.make_key(path)
     assert path.read_bytes() == before
     with pytest.raises(OutputError, match="cannot be written"):

@@ -77,6 +77,19 @@ def test_ctrl_c_and_its_like_end_all_of_them(
         assert {p.name for p in folder.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
 
 
+@pytest.mark.parametrize("how", ["", "raise SystemExit(0)"])
+def test_a_program_that_leaves_its_processes_ends(how: str) -> None:
+    """Its workers hear the SIGTERM by which Python ends them."""
+    code = f"""import time
+from evlcp_sdk.jobs.processes import Processes
+if __name__ == "__main__":
+    outcomes = Processes(2).run(time.sleep, [0.01, 100, 100])
+    next(outcomes)
+    {how}
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=30)
+
+
 def test_dask_that_is_not_there(evlcp: Evlcp, three: list[Path], tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="the extra cluster is not installed")
     done = evlcp("receive", *three, "-o", tmp_path / "out", "--dask", "nonsense://x")
