@@ -142,21 +142,22 @@ class Followed:
         width, height = self.size_at(t_us)
         return abs(point_px[0] - float(x)) <= width / 2 and abs(point_px[1] - float(y)) <= height / 2
 
-    def holds(self, other: "Followed", same_px: float) -> bool:
-        """Whether another region is a part of this bar, or the same bar, its centre so near."""
-        (x,), (y,) = self.at(np.array([other.latest.t_us]))
+    def holds(self, other: "Followed", t_us: float, same_px: float) -> bool:
+        """Whether another region is a part of this bar, or the same bar, its centre so near at a time."""
         mine, its = self.latest, other.latest
-        right, down = abs(its.x_px - float(x)), abs(its.y_px - float(y))
+        when = t_us if other.size_px is not None else its.t_us
+        (x, y), (u, v) = self.at(np.array([when])), other.at(np.array([when]))
+        right, down = abs(float(u[0] - x[0])), abs(float(v[0] - y[0]))
         if other.size_px is not None:
             return max(right, down) <= same_px
         # Half of it, or more, in each direction.
         return right <= mine.width_px / 2 + same_px and down <= mine.height_px / 2
 
-    def forget_before(self, t_us: float, step_us: int) -> None:
-        """Drop events and positions older than a time."""
+    def forget_before(self, t_us: float, step_us: int, places_us: float) -> None:
+        """Drop events older than a time, and positions older than another: others ask where it was."""
         while self.pieces and self.pieces[0][0] + step_us <= t_us:
             self.pieces.popleft()
-        while len(self.positions) > 2 and self.positions[1].t_us < t_us:
+        while len(self.positions) > 2 and self.positions[1].t_us < places_us:
             self.positions.popleft()
 
 
@@ -288,6 +289,25 @@ class RegionFollower:
             box = self._reach(Region(last.id, last.t_us, x_px, y_px, last.width_px, last.height_px))
             gathered[start] = _select(events, [box])[0]
         followed.pieces = deque((start, gathered.get(start, events)) for start, events in followed.pieces)
+
+    def unite(self, followed: Followed, other: Followed) -> None:
+        """Take another region into one: both are parts of what is not known yet, and the other one goes."""
+        one, two = followed.latest, other.latest
+        parts = np.array([_tight(one), _tight(two)])
+        left, top, right, bottom = (*parts[:, :2].min(0).tolist(), *parts[:, 2:].max(0).tolist())
+        off_x, off_y = (left + right - 1) / 2 - one.x_px, (top + bottom - 1) / 2 - one.y_px
+        size = {"width_px": float(right - left - 1), "height_px": float(bottom - top - 1)}
+        followed.positions = deque(
+            replace(p, x_px=p.x_px + off_x, y_px=p.y_px + off_y, **size) for p in followed.positions
+        )
+        followed.heights.clear()
+        followed.filter = self._position.init() if self._position else None
+        since_us = min(part.pieces[0][0] for part in (followed, other) if part.pieces)
+        followed.first_us = min(followed.first_us, other.first_us)
+        followed.pieces = deque((start, events) for start, events in self._recent if start >= since_us)
+        self.gather(followed)
+        followed.pieces = deque((start, self._rhythmic(events)) for start, events in followed.pieces)
+        self.drop(other)
 
     def beside(
         self, like: Followed, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]

@@ -185,7 +185,11 @@ class Receiver:
             for heard in locks:
                 self._counts["preambles"] += 1
                 lock = self._late_rows(transmitter, heard)
-                self._counts["locks"] += self._transmitters.adopt(transmitter, lock, self._timeline.first_us)
+                if self._transmitters.adopt(transmitter, lock, self._timeline.first_us):
+                    self._counts["locks"] += 1
+                    for part in self._transmitters.in_step(transmitter):
+                        self._regions.unite(region, part.region)
+                        self._let_go(part.region)
         return transmitter
 
     def _late_rows(self, transmitter: Transmitter, lock: SyncLock) -> SyncLock:
@@ -274,7 +278,7 @@ class Receiver:
             others += [(look.middle_us, *self._looker.box(look, other)) for other in look.others]
             changed = self._regions.shape(region, look.middle_us, *self._looker.box(look, look.placement))
             shaped |= changed
-            if changed and not self._join(region):
+            if changed and not self._join(region, look.middle_us):
                 return None
             if whole or not changed:
                 break
@@ -288,21 +292,25 @@ class Receiver:
                 self._due.append(self._regions.beside(region, middle_us, centre_px, size_px))
         return look
 
-    def _join(self, region: Followed) -> bool:
-        """Let other regions of the same bar go; False if this one goes, as the other is known."""
+    def _join(self, region: Followed, t_us: float) -> bool:
+        """Let other regions of the bar seen at a time go; False if this one goes, as the other is known."""
         for other in list(self._regions.alive):
-            if other is region or not region.holds(other, _SAME_PX):
+            if other is region or not region.holds(other, t_us, _SAME_PX):
                 continue
             gone = region if other.size_px is not None and other.id < region.id else other
             self._regions.drop(gone)
-            self._joined.add(gone.id)
-            if gone in self._transmitters:
-                self._counts["regions_released"] += 1
-                self._judged.end(self._transmitters[gone].packets)
-                self._transmitters.release(self._transmitters[gone])
+            self._let_go(gone)
             if gone is region:
                 return False
         return True
+
+    def _let_go(self, region: Followed) -> None:
+        """Forget a region that has become a part of another."""
+        self._joined.add(region.id)
+        if region in self._transmitters:
+            self._counts["regions_released"] += 1
+            self._judged.end(self._transmitters[region].packets)
+            self._transmitters.release(self._transmitters[region])
 
     def _end(self, transmitter: Transmitter, now_us: float) -> None:
         """Decode what a region that has ended still shows; its last packet is over."""

@@ -100,7 +100,7 @@ class Rhythm:
         from evlcp_sdk.rx import _kernels
 
         keep = np.empty(len(events), np.bool_)
-        _kernels.in_rhythm(events.x, events.y, self._pixels, self._min_score // 2, keep)
+        _kernels.in_rhythm(events.x, events.y, self._pixels, self._min_score, keep)
         return events[keep]
 
     def measure(

@@ -19,6 +19,9 @@ LOOKBACK_PACKETS = 2
 _REMEMBER_US = 1e6
 """How long a transmitter lost from sight is remembered: clocks 100 ppm apart drift by a chip in it."""
 
+_ROW_US = 0.35
+"""The longest that a row takes to be read: so much later are those below."""
+
 _UNSEEN_STEPS = 5
 """Steps without a position after which a region counts as lost: it blinks in every chip otherwise."""
 
@@ -120,12 +123,32 @@ class Transmitters:
             return True
         return False
 
+    def in_step(self, transmitter: Transmitter) -> list[Transmitter]:
+        """Others that have shown no frame yet either, whose packets stand on the same times.
+
+        They are parts of one bar, or a bar and its image: of two bars, three in a hundred pairs would.
+        """
+        lock = transmitter.grid.lock
+        if lock is None or transmitter.region.size_px is not None:
+            return []
+        period_us, same = self._packet.packet_chips * lock.chip_us, []
+        for other in self._alive.values():
+            heard = other.grid.lock
+            if other is transmitter or heard is None or other.region.size_px is not None:
+                continue
+            apart = (heard.packet_t_us - lock.packet_t_us) / period_us
+            rows_px = abs(other.region.latest.y_px - transmitter.region.latest.y_px)
+            within_us = lock.chip_us / 4 + _ROW_US * rows_px
+            if abs(apart - round(apart)) * period_us <= within_us:
+                same.append(other)
+        return same
+
     def forget(self, transmitter: Transmitter, now_us: float) -> None:
         """Drop the events that no frame can need any more."""
         region, grid = transmitter.region, transmitter.grid
+        oldest_us = now_us - LOOKBACK_PACKETS * self._packet.packet_chips * self._packet.chip_us
         if grid.lock is None:
-            packet_us = self._packet.packet_chips * self._packet.chip_us
-            keep_us = now_us - LOOKBACK_PACKETS * packet_us
+            keep_us = oldest_us
             region.first_us = max(region.first_us, int(keep_us))
         else:
             # A later lock may move the next frame's start by a chip; the preamble before a packet's first
@@ -133,7 +156,7 @@ class Transmitters:
             keep_us = grid.start_us(grid.frame) - grid.lock.chip_us
             if grid.frame % self._packet.frames == 0:
                 keep_us -= self._packet.preamble_chips * grid.lock.chip_us
-        region.forget_before(keep_us, self._step_us)
+        region.forget_before(keep_us, self._step_us, min(keep_us, oldest_us))
 
     def release(self, transmitter: Transmitter) -> None:
         """Remember a transmitter whose region has ended, without its events."""

@@ -1,0 +1,91 @@
+"""Is `quality` true? Of frames with quality q, about 1 - q should have a wrong bit, whatever the decoding.
+
+    python benchmarks/quality.py [--seeds 1] [--jobs 2] [--campaign examples/campaigns/road.toml]
+
+Every scene of a campaign is simulated and received with each decoding. Frames of all of them together are put
+into bins by their quality; a bin shows how many of its frames should be wrong by it (the mean of 1 - q) and
+how many are, with an interval of 95 % that is bootstrapped over recordings. The last column is their ratio.
+"""
+
+import argparse
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.sim import Scene, Simulation, truth_of
+from evlcp_sdk.study.campaign.task import plan_of
+from evlcp_sdk.study.frames import given
+from evlcp_sdk.study.match import match
+from evlcp_sdk.values import Events
+
+CAMPAIGN = Path(__file__).parents[1] / "examples" / "campaigns" / "road.toml"
+DECODINGS = ("motion-feedback", "ml-soft", "wh-transform")
+EDGES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
+ROUNDS = 1000
+
+Judged = dict[str, list[tuple[float, bool]]]
+
+
+def judged(scene: Scene, seed: int) -> Judged:
+    """Quality of each frame of a simulated scene, and whether it has a wrong bit, by decoding."""
+    simulation = Simulation(scene, seed)
+    events, truth = Events.concat(simulation.stream()), truth_of(simulation)
+    found: Judged = {}
+    for decoding in DECODINGS:
+        link = load_link(overrides=[f"decoding.id={decoding}"])
+        receiver = Receiver(link)
+        packets = receiver.feed(events) + receiver.close()
+        frames = [frame for packet in packets for frame in packet.frames]
+        rows = [given(frame) for frame in frames]
+        quality = {id(row): frame.soft.quality for row, frame in zip(rows, frames, strict=True)}
+        matched, own = match(rows, truth), found.setdefault(decoding, [])
+        for sent, pairs in zip(matched.bars, matched.pairs, strict=True):
+            for row, number in pairs:
+                said = np.array(row.symbols)
+                counts = (said >= 0) & ~(sent.cut[number] & ~sent.hidden[number])
+                own.append((quality[id(row)], bool((said != sent.symbols[number])[counts].any())))
+    return found
+
+
+def table(recordings: list[list[tuple[float, bool]]]) -> Iterator[str]:
+    """A line a bin, and one of all."""
+    rng = np.random.default_rng(0)
+    parts = [np.array(part, float).reshape(-1, 2) for part in recordings]
+    for low, high in [*pairwise(EDGES), (0.0, 1.0)]:
+        kept = [p[(p[:, 0] >= low) & ((p[:, 0] < high) | (high == 1))] for p in parts]
+        n = np.array([len(p) for p in kept])
+        if not n.sum():
+            continue
+        doubt, wrong = np.array([[(1 - p[:, 0]).sum(), p[:, 1].sum()] for p in kept]).T
+        drawn = rng.integers(0, len(kept), (ROUNDS, len(kept)))
+        share = wrong[drawn].sum(1) / np.maximum(n[drawn].sum(1), 1)
+        least, most = np.quantile(share, [0.025, 0.975])
+        said, true = doubt.sum() / n.sum(), wrong.sum() / n.sum()
+        name = "all" if (low, high) == (0.0, 1.0) else f"{low:g} to {high:g}"
+        ratio = f"{true / said:.2f}" if said > 0 else "-"
+        yield f"| {name} | {n.sum()} | {said:.4f} | {true:.4f} ({least:.4f} to {most:.4f}) | {ratio} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--campaign", type=Path, default=CAMPAIGN)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=2)
+    args = parser.parse_args()
+    scenes = [case.value for case in plan_of(args.campaign).scenes]
+    work = [(scene, seed) for scene in scenes for seed in range(1, args.seeds + 1)]
+    with ProcessPoolExecutor(args.jobs) as pool:
+        found = list(pool.map(judged, *zip(*work, strict=True)))
+    for decoding in DECODINGS:
+        print(f"\n{decoding}, {len(work)} recordings\n")
+        print("| quality | frames | wrong by it | wrong (95 %) | ratio |\n|---|---|---|---|---|")
+        print("\n".join(table([part[decoding] for part in found])))
+
+
+if __name__ == "__main__":
+    main()
