@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.values import Events, SyncLock
 
-__all__ = ["RowDelay", "RowDelays"]
+__all__ = ["LONGEST_ROW_US", "RowDelay", "RowDelays"]
 
 _STEPS = 10
 """Steps of a chip in which the response of a block of rows is placed."""
@@ -28,6 +28,9 @@ _FEWEST_BLOCKS = 4
 
 _TYPICAL_US = 0.2
 """Time a row takes (sigma) before one has been measured."""
+
+LONGEST_ROW_US = 0.35
+"""The longest that a sensor takes to read a row, us: of two parts, the lower one may come as much later."""
 
 _WALK_US = 0.01
 """Change of it from packet to packet: with the number of events in a row, as the bar grows."""

@@ -293,12 +293,12 @@ class RegionFollower:
     def unite(self, followed: Followed, other: Followed) -> None:
         """Take another region into one: both are parts of what is not known yet, and the other one goes."""
         one, two = followed.latest, other.latest
-        parts = np.array([_tight(one), _tight(two)])
-        left, top, right, bottom = (*parts[:, :2].min(0).tolist(), *parts[:, 2:].max(0).tolist())
+        left, top, right, bottom = _around([_tight(one), _tight(two)])
         off_x, off_y = (left + right - 1) / 2 - one.x_px, (top + bottom - 1) / 2 - one.y_px
-        size = {"width_px": float(right - left - 1), "height_px": float(bottom - top - 1)}
+        width_px, height_px = float(right - left - 1), float(bottom - top - 1)
         followed.positions = deque(
-            replace(p, x_px=p.x_px + off_x, y_px=p.y_px + off_y, **size) for p in followed.positions
+            Region(p.id, p.t_us, p.x_px + off_x, p.y_px + off_y, width_px, height_px)
+            for p in followed.positions
         )
         followed.heights.clear()
         followed.filter = self._position.init() if self._position else None
@@ -558,10 +558,14 @@ def _joined(boxes: list[Box], gap: int) -> list[Box]:
     for box in boxes:
         while near := [b for b in done if _overlap(_grown(box, gap), b)]:
             done = [b for b in done if b not in near]
-            parts = np.array([box, *near])
-            box = (*parts[:, :2].min(0).tolist(), *parts[:, 2:].max(0).tolist())
+            box = _around([box, *near])
         done.append(box)
     return done
+
+
+def _around(boxes: list[Box]) -> Box:
+    lefts, tops, rights, bottoms = zip(*boxes, strict=True)
+    return min(lefts), min(tops), max(rights), max(bottoms)
 
 
 def _tight(region: Region) -> Box:

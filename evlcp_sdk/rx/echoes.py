@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.rx.delays import LONGEST_ROW_US
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.look import Look
 from evlcp_sdk.rx.packets import PacketAssembler
@@ -48,9 +49,6 @@ image is cut more often than the bar is covered."""
 
 _STAYS = 1.0
 """Log odds for what was said to be the bar before: what wavers by less changes nothing."""
-
-_ROW_US = 0.35
-"""Longest time that a sensor takes to read a row, us: of two images, the lower one may come as much later."""
 
 _APART_PX = 5.0
 """Centres nearer than that, a region's seam, are one image that two regions saw before they were joined."""
@@ -239,7 +237,7 @@ class Echoes:
         nearest = min(known, key=apart_us, default=None)
         if nearest is None:
             return None
-        within_us = self._chip_us / 2 + _ROW_US * abs(nearest.frame.y_px - frame.y_px)
+        within_us = self._chip_us / 2 + LONGEST_ROW_US * abs(nearest.frame.y_px - frame.y_px)
         off_px = max(abs(nearest.frame.x_px - frame.x_px), abs(nearest.frame.y_px - frame.y_px))
         return nearest if apart_us(nearest) < within_us and off_px > _APART_PX else None
 

@@ -37,8 +37,8 @@ _LOOKS = 3
 """Looks at a region's first frame: at what was found of a bar, at the whole of it, and once more, as few
 clusters place it less well than all."""
 
-_SAME_PX = 3.0
-"""How far apart the centres of two regions of one bar may be."""
+_SAME_PX = 5.0
+"""How far apart the centres of two regions of one bar may be: before lit leaves an end is good to some px."""
 
 _COUNTS = (
     "events_in_regions",
@@ -185,11 +185,7 @@ class Receiver:
             for heard in locks:
                 self._counts["preambles"] += 1
                 lock = self._late_rows(transmitter, heard)
-                if self._transmitters.adopt(transmitter, lock, self._timeline.first_us):
-                    self._counts["locks"] += 1
-                    for part in self._transmitters.in_step(transmitter):
-                        self._regions.unite(region, part.region)
-                        self._let_go(part.region)
+                self._counts["locks"] += self._transmitters.adopt(transmitter, lock, self._timeline.first_us)
         return transmitter
 
     def _late_rows(self, transmitter: Transmitter, lock: SyncLock) -> SyncLock:
@@ -207,6 +203,8 @@ class Receiver:
         """Decode the frames that lie before a time, with the events after their last edge."""
         while (due := transmitter.grid.due(until_us)) is not None:
             sighting = self._decode(transmitter, due)
+            if sighting is None and self._put_together(transmitter):
+                continue
             transmitter.grid.frame += 1
             if sighting is None:
                 self._counts["frames_rejected"] += 1
@@ -302,6 +300,16 @@ class Receiver:
             self._let_go(gone)
             if gone is region:
                 return False
+        return True
+
+    def _put_together(self, transmitter: Transmitter) -> bool:
+        """Unite a region that shows too little of a bar with others that hear the same, if there are any."""
+        parts = self._transmitters.in_step(transmitter)
+        if transmitter.region.id in self._joined or not parts:
+            return False
+        for part in parts:
+            self._regions.unite(transmitter.region, part.region)
+            self._let_go(part.region)
         return True
 
     def _let_go(self, region: Followed) -> None:

@@ -96,7 +96,11 @@ class Rhythm:
         )
 
     def of(self, events: Events) -> Events:
-        """Those of pixels that blink in rhythm, by what is enough inside a region."""
+        """Those of candidates.
+
+        Where leaves move, chance takes a third of their pixels to half of a candidate's score, and a tenth to
+        all of it.
+        """
         from evlcp_sdk.rx import _kernels
 
         keep = np.empty(len(events), np.bool_)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.rx.delays import RowDelay
+from evlcp_sdk.rx.delays import LONGEST_ROW_US, RowDelay
 from evlcp_sdk.rx.detection import Followed
 from evlcp_sdk.rx.grid import PacketGrid
 from evlcp_sdk.rx.look import Pilot
@@ -18,9 +18,6 @@ LOOKBACK_PACKETS = 2
 
 _REMEMBER_US = 1e6
 """How long a transmitter lost from sight is remembered: clocks 100 ppm apart drift by a chip in it."""
-
-_ROW_US = 0.35
-"""The longest that a row takes to be read: so much later are those below."""
 
 _UNSEEN_STEPS = 5
 """Steps without a position after which a region counts as lost: it blinks in every chip otherwise."""
@@ -138,7 +135,7 @@ class Transmitters:
                 continue
             apart = (heard.packet_t_us - lock.packet_t_us) / period_us
             rows_px = abs(other.region.latest.y_px - transmitter.region.latest.y_px)
-            within_us = lock.chip_us / 4 + _ROW_US * rows_px
+            within_us = lock.chip_us / 4 + LONGEST_ROW_US * rows_px
             if abs(apart - round(apart)) * period_us <= within_us:
                 same.append(other)
         return same

@@ -246,9 +246,32 @@ def test_another_image_moves_with_its_bar() -> None:
     assert other in regions.alive
     assert other.covers(24_000.0, (float(x) + 60, float(y) + 10))
     assert not other.covers(24_000.0, (float(x), float(y)))
-    assert not region.holds(other, 3.0)
+    assert not region.holds(other, 24_000.0, 3.0)
+    assert not region.holds(other, 24_000.0, 59.0)
+    assert region.holds(other, 24_000.0, 61.0)
     regions.drop(other)
     assert regions.alive == [region]
+
+
+def test_parts_of_a_bar_that_hear_the_same_become_one_region() -> None:
+    """The middle is dark for longer than parts are joined over."""
+    bar = IdealBar(random_symbols(LINK, 2), start_us=0)
+    events = ideal_events(LINK, bar)
+    events = events[np.abs(events.y - bar.y_px) > 12]
+    regions = RegionFollower(SPEC, CameraModel(), LINK.packet.chip_us, keep_us=50_000)
+    for start, part in steps(events, 25_000):
+        regions.step(start, part)
+    upper, lower = sorted(regions.alive, key=lambda r: r.latest.y_px)
+    regions.unite(lower, upper)
+    assert regions.alive == [lower]
+    assert upper.released
+    (x,), (y,) = lower.at(np.array([24_000.0]))
+    assert (x, y) == pytest.approx((bar.x_px - 0.5, bar.y_px - 0.5), abs=1.5)
+    assert lower.latest.height_px == pytest.approx(128, abs=4)
+    since_us = lower.pieces[0][0]
+    within = (events.t_us >= since_us + 6000) & (events.t_us < 25_000)
+    kept = sum(int((e.t_us >= since_us + 6000).sum()) for _, e in lower.pieces)
+    assert kept > 0.97 * within.sum()
 
 
 @pytest.mark.parametrize(
