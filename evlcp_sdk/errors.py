@@ -100,3 +100,46 @@ class InterruptedRunError(EvlcpError):
     """The user stopped the run; what was done until then is kept, or the message says that nothing is."""
 
     exit_code = 130
+
+
+OWN_FAULT = 70
+"""Exit code of a fault that is the SDK's own."""
+
+_FAILED = 1
+_MOST_PLACES = 12
+
+
+def explained(fault: BaseException) -> tuple[str, int]:
+    """What is told of anything that was raised, and the exit code: a line a fault of what was given, one line
+    that says what to report where it is our own.
+    """
+    if isinstance(fault, EvlcpError):
+        return str(fault), fault.exit_code
+    if isinstance(fault, MemoryError):
+        return f"not enough memory: {_first_line(fault)}", _FAILED
+    if isinstance(fault, OSError) and fault.filename is not None:
+        return f"{fault.filename}: {fault.strerror}", _FAILED
+    return _report(fault), OWN_FAULT
+
+
+def _first_line(fault: BaseException) -> str:
+    text = " ".join(str(fault).split())
+    return text if len(text) <= 200 else f"{text[:200]}..."
+
+
+def _report(fault: BaseException) -> str:
+    """What happened, where, and with which versions."""
+    import platform
+    import traceback
+    from importlib.metadata import version
+
+    def place(frame: traceback.FrameSummary) -> str:
+        return f"{'/'.join(Path(frame.filename).parts[-2:])}:{frame.lineno}"
+
+    frames = traceback.extract_tb(fault.__traceback__)[-_MOST_PLACES:]
+    return (
+        f"a fault of evlcp itself, not of what you gave: {type(fault).__name__}: {_first_line(fault)};"
+        " please report the command, what it was given, and this line:"
+        f" evlcp-sdk {version('evlcp-sdk')}, Python {platform.python_version()}, {platform.platform()},"
+        f" at {' > '.join(map(place, frames))}"
+    )

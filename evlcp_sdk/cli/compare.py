@@ -157,7 +157,7 @@ def _of_recordings(
             if outcome.value is not None:
                 tables[outcome.job.url] = outcome.value
             elif outcome.fault is not None:
-                complain(f"{outcome.fault.trace}{outcome.fault.message}")
+                complain(outcome.fault.message)
                 code = max(code, outcome.fault.exit_code)
     except KeyboardInterrupt:
         raise InterruptedRunError("interrupted; nothing is written") from None

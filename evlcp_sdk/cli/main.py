@@ -7,14 +7,10 @@ import sys
 
 from evlcp_sdk.cli._complain import complain
 
-__all__ = ["INTERNAL", "main"]
-
-INTERNAL = 70
-"""Exit code of a fault that is the SDK's own."""
+__all__ = ["main"]
 
 _FAILED = 1
 _INTERRUPTED = 130
-_MOST_PLACES = 12
 
 
 def main() -> None:
@@ -46,20 +42,15 @@ def main() -> None:
 
 def _told(fault: BaseException) -> int:
     """Say what went wrong; the exit code."""
-    from evlcp_sdk.errors import EvlcpError
+    from evlcp_sdk.errors import explained
 
-    if isinstance(fault, EvlcpError):
-        complain(str(fault))
-        return fault.exit_code
-    if isinstance(fault, MemoryError):
-        complain(f"not enough memory: {_first_line(fault)}")
+    # Our own files are written where their names are known, so what has none is stdout.
+    if isinstance(fault, OSError) and fault.filename is None:
+        complain(f"standard output: {fault.strerror or fault}")
         return _FAILED
-    if isinstance(fault, OSError):
-        # Our own files are written where their names are known, so what has none is stdout.
-        complain(f"{fault.filename or 'standard output'}: {fault.strerror or _first_line(fault)}")
-        return _FAILED
-    complain(_report(fault))
-    return INTERNAL
+    message, code = explained(fault)
+    complain(message)
+    return code
 
 
 def _stdout_took_all() -> bool:
@@ -82,27 +73,3 @@ def _stdout_took_all() -> bool:
         # It is closed.
         return True
     return True
-
-
-def _first_line(fault: BaseException) -> str:
-    text = " ".join(str(fault).split())
-    return text if len(text) <= 200 else f"{text[:200]}..."
-
-
-def _report(fault: BaseException) -> str:
-    """What a fault of ours is told with: what happened, where, and with which versions."""
-    import platform
-    import traceback
-    from importlib.metadata import version
-    from pathlib import Path
-
-    def place(frame: traceback.FrameSummary) -> str:
-        return f"{'/'.join(Path(frame.filename).parts[-2:])}:{frame.lineno}"
-
-    frames = traceback.extract_tb(fault.__traceback__)[-_MOST_PLACES:]
-    return (
-        f"a fault of evlcp itself, not of what you gave: {type(fault).__name__}: {_first_line(fault)}\n"
-        "please report the command, what it was given, and this:"
-        f" evlcp-sdk {version('evlcp-sdk')}, Python {platform.python_version()}, {platform.platform()};"
-        f" at {' > '.join(map(place, frames))}"
-    )

@@ -156,7 +156,7 @@ def receive(
             job, summary, fault = outcome.job, outcome.value, outcome.fault
             if summary is None:
                 message = fault.message if fault else "no result"
-                complain(f"{fault.trace}{message}" if fault else message)
+                complain(message)
                 worst = max(worst, fault.exit_code if fault else 1)
                 if as_json:
                     failed = {"status": "failed", "error": message, "recording": {"path": job.url}}

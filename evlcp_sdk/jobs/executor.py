@@ -4,12 +4,11 @@ An executor draws jobs only when it has room for one, so the drawer may decide l
 are ready, in any order.
 """
 
-import traceback
 from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-from evlcp_sdk.errors import EvlcpError
+from evlcp_sdk.errors import explained
 
 __all__ = ["ATTEMPTS", "Executor", "Fault", "Outcome", "attempt"]
 
@@ -25,14 +24,12 @@ class Fault:
     """Why a job has no value.
 
     Attributes:
-        message: One line.
+        message: A line a fault.
         exit_code: What the command line would end with.
-        trace: Where an unexpected fault was raised; empty for the SDK's own.
     """
 
     message: str
     exit_code: int = 1
-    trace: str = ""
 
 
 @dataclass(frozen=True)
@@ -62,8 +59,5 @@ def attempt(function: Callable[[J], R], job: J) -> Outcome[J, R]:
     """Run one job; whatever it raises becomes a fault."""
     try:
         return Outcome(job, function(job))
-    except EvlcpError as fault:
-        return Outcome(job, fault=Fault(str(fault), fault.exit_code))
     except (Exception, SystemExit) as fault:
-        text = f"{type(fault).__name__}: {fault}".splitlines()[0]
-        return Outcome(job, fault=Fault(text, trace=traceback.format_exc()))
+        return Outcome(job, fault=Fault(*explained(fault)))
