@@ -251,19 +251,19 @@ class RegionFollower:
             followed.outgrown = -off[0], -off[1], last.width_px, last.height_px, until_us
         elif max(abs(v) for v in (*off, size_px[0] - known[0], size_px[1] - known[1])) < _RESHAPE_PX:
             return False
-        followed.size_px, before = size_px, followed.positions
+        followed.size_px = size_px
+        # Where less of the bar was seen, or more than it, its place is not that of what was seen.
+        most_px = 2 * self._spec.margin_px if known is None else math.inf
         followed.positions = deque(
-            replace(p, x_px=p.x_px + off[0], y_px=p.y_px + off[1], width_px=size_px[0], height_px=size_px[1])
+            Region(
+                p.id,
+                p.t_us,
+                p.x_px + off[0],
+                p.y_px + off[1] if abs(p.height_px - size_px[1]) <= most_px else centre_px[1],
+                *size_px,
+            )
             for p in followed.positions
         )
-        if known is None:
-            # Where less of the bar was seen, or more than it, its place is not that of what was seen.
-            followed.positions = deque(
-                p
-                if abs(old.height_px - size_px[1]) <= 2 * self._spec.margin_px
-                else replace(p, y_px=centre_px[1])
-                for p, old in zip(followed.positions, before, strict=True)
-            )
         followed.filter = self._position.init() if self._position else None
         return True
 
