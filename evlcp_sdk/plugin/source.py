@@ -1,5 +1,6 @@
 """What every recording, camera and replay is to a receiver: a stream of events, with what it lost."""
 
+import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -7,7 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from evlcp_sdk.errors import StreamError
+from evlcp_sdk.errors import EvlcpError, PluginError, StreamError
 from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["DEFAULT_MAX_EVENTS", "EventSource", "Loss"]
@@ -112,6 +113,7 @@ class EventSource(ABC):
 
         Raises:
             InputError: The file cannot be read on.
+            PluginError: A plugin's source fails, or gives something else than `take` says.
             StreamError: `max_events` is not positive.
         """
         if max_events < 1:
@@ -120,7 +122,7 @@ class EventSource(ABC):
         while True:
             events, triggers = self._rest
             if not len(events) and not len(triggers):
-                piece = self.take(max_events)
+                piece = self._taken(max_events)
                 if piece is None:
                     return
                 self._rest = piece
@@ -133,6 +135,31 @@ class EventSource(ABC):
             self._given["events"] += len(events)
             self._given["triggers"] += len(triggers)
             yield events, triggers
+
+    def _taken(self, max_events: int) -> tuple[Events, Triggers] | None:
+        """What `take` gives, checked: kernels trust it."""
+        try:
+            piece: object = self.take(max_events)
+        except EvlcpError:
+            raise
+        except (Exception, SystemExit) as fault:
+            if type(self).__module__.startswith("evlcp_sdk."):
+                raise
+            last = traceback.extract_tb(fault.__traceback__)[-1]
+            what = f"{type(fault).__name__}: {fault}".splitlines()[0]
+            raise self._refused(f"{what} ({Path(last.filename).name}, line {last.lineno})") from fault
+        if piece is None:
+            return None
+        if not isinstance(piece, tuple) or tuple(map(type, piece)) != (Events, Triggers):
+            gave = ", ".join(type(one).__name__ for one in piece) if isinstance(piece, tuple) else None
+            raise self._refused(f"gave ({gave or type(piece).__name__}), expected (Events, Triggers)")
+        events, triggers = piece
+        if len(events) and events.p.max() > 1:
+            raise self._refused(f"gave polarity {events.p.max()}, expected 0 or 1")
+        return events, triggers
+
+    def _refused(self, what: str) -> PluginError:
+        return PluginError(f"{self.path}: source {type(self).__name__}: {what}")
 
     def chunks(self, max_events: int = DEFAULT_MAX_EVENTS) -> Iterator[Events]:
         """Yield the events of `stream`; its triggers only count in `counts`.

@@ -125,10 +125,12 @@ class Receiver:
         Events before their predecessor in time, or off the sensor, are dropped and counted.
 
         Raises:
-            StreamError: The stream was closed.
+            StreamError: The stream was closed, or a polarity is neither 0 nor 1.
         """
         if self._closed:
             raise StreamError("the receiver is closed: make a new one for a new stream")
+        if len(events) and events.p.max() > 1:
+            raise StreamError(f"events with polarity {events.p.max()}, expected 0 or 1")
         steps = self._timeline.feed(events, lambda: bool(self._regions.alive or self._judged))
         return self._read([packet for step in steps for packet in self._run(step)])
 

@@ -1,0 +1,69 @@
+"""What a source of a plugin gives is checked before any kernel sees it, and the source is named."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.errors import InputError, PluginError, StreamError
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.plugin.source import EventSource
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.values import Events, Triggers
+
+
+class Strange(EventSource):
+    """A source whose one piece is what a function gives."""
+
+    def __init__(self, gives: Callable[[], Any]) -> None:
+        super().__init__(Path("strange:0"), "STRANGE", 1280, 720)
+        self._gives: list[Callable[[], Any]] = [gives]
+
+    def take(self, max_events: int) -> Any:
+        return self._gives.pop()() if self._gives else None
+
+    def close(self) -> None:
+        pass
+
+
+def raises(fault: BaseException) -> Any:
+    raise fault
+
+
+EVENTS = Events.of([1, 2], [3, 4], [5, 6], [1, 7])
+
+
+@pytest.mark.parametrize(
+    ("gives", "says"),
+    [
+        (lambda: 5, r"gave \(int\), expected \(Events, Triggers\)"),
+        (lambda: (EVENTS,), r"gave \(Events\), expected .*"),
+        (lambda: (EVENTS, None), r"gave \(Events, NoneType\), expected .*"),
+        (lambda: (EVENTS, Triggers.empty()), "gave polarity 7, expected 0 or 1"),
+        (lambda: raises(KeyError("boom")), r"KeyError: 'boom' \(test_source.py, line \d+\)"),
+        (lambda: raises(SystemExit(0)), r"SystemExit: 0 \(test_source.py, line \d+\)"),
+    ],
+)
+def test_what_no_receiver_can_take_is_named(gives: Callable[[], Any], says: str) -> None:
+    with pytest.raises(PluginError, match=f"^strange:0: source Strange: {says}$"):
+        Strange(gives).read()
+
+
+def test_what_a_source_says_itself_is_left_as_it_is() -> None:
+    with pytest.raises(InputError, match=r"^the lens cap is on$"):
+        Strange(lambda: raises(InputError("the lens cap is on"))).read()
+    with pytest.raises(KeyboardInterrupt):
+        Strange(lambda: raises(KeyboardInterrupt())).read()
+
+
+def test_a_receiver_is_fed_polarities_only() -> None:
+    receiver = Receiver(load_link())
+    n = 5000
+    rng = np.random.default_rng(0)
+    columns = np.arange(n) * 10, rng.integers(0, 1280, n), rng.integers(0, 720, n)
+    with pytest.raises(StreamError, match="events with polarity 7, expected 0 or 1"):
+        receiver.feed(Events.of(*columns, np.full(n, 7)))
+    receiver.feed(Events.of(*columns, rng.integers(0, 2, n)))
+    receiver.feed(Events.empty())
