@@ -88,7 +88,11 @@ class Codebook:
 
     def __post_init__(self) -> None:
         for name, ndim in (("preamble", 1), ("pilots", 2), ("codewords", 2)):
-            code = np.array(getattr(self, name), np.int8)
+            try:
+                code = np.array(getattr(self, name), np.int8)
+            except (TypeError, ValueError, OverflowError):
+                # Of no shape that is expected below.
+                code = np.empty(0, np.int8)
             if code.ndim != ndim or code.size == 0 or not np.isin(code, (-1, 1)).all():
                 raise ConfigError(f"codebook {name}: expected a {ndim}-D array of -1 and +1")
             if ndim == 2 and len(np.unique(code, axis=0)) != len(code):
@@ -156,7 +160,7 @@ class Codebook:
                 np.array(table["codewords"], np.int8),
             )
             digest = table["digest"]
-        except (ValueError, TypeError, OverflowError) as fault:
+        except (ValueError, TypeError, OverflowError, RecursionError) as fault:
             raise ConfigError(f"{source}: not a codebook: {fault}") from fault
         except KeyError as fault:
             raise ConfigError(f"{source}: not a codebook: key {fault} is missing") from fault

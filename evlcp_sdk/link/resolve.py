@@ -7,7 +7,8 @@ that the resolved table alone reproduces a result. See `docs/configuration.md`.
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, overload
@@ -15,7 +16,7 @@ from typing import Any, Literal, overload
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
-from evlcp_sdk.errors import ConfigError, UnknownAlgorithmError
+from evlcp_sdk.errors import ConfigError, EvlcpError, PluginError, UnknownAlgorithmError
 from evlcp_sdk.link.blocks import BlockCoder, packet_bits
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
 from evlcp_sdk.plugin.records import message_kinds
@@ -284,9 +285,13 @@ def _assembled(
     """The link of checked parts, and the table that describes them."""
     bar, air = parts["bar"], parts["air"]
     pilots, modulation = parts["pilots"], parts["modulation"]
-    codebook = Codebook(
-        table["modulation"]["id"], pilots.preamble(), pilots.codes(bar.clusters), modulation.codewords()
-    )
+    with _named("pilots", table):
+        preamble, codes = pilots.preamble(), pilots.codes(bar.clusters)
+        if len(codes) != bar.clusters:
+            raise ValueError(f"gave {len(codes)} codes, expected {bar.clusters}")
+    with _named("modulation", table):
+        codewords = modulation.codewords()
+    codebook = Codebook(table["modulation"]["id"], preamble, codes, codewords)
     return Link(
         **{section: parts[section] for section in _SPECS},
         algorithms={role: parts[role] for role in ROLES},
@@ -297,6 +302,18 @@ def _assembled(
         digest=_digest(table, codebook, revisions),
         kinds=kinds,
     )
+
+
+@contextmanager
+def _named(role: str, table: Mapping[str, Mapping[str, Any]]) -> Iterator[None]:
+    """What an algorithm raises within becomes a `PluginError` that names it."""
+    try:
+        yield
+    except EvlcpError:
+        raise
+    except (Exception, SystemExit) as fault:
+        id, what = table[role]["id"], f"{type(fault).__name__}: {fault}".splitlines()[0]
+        raise PluginError(f"{role} algorithm '{id}': {what}; try: evlcp check {role} {id}") from fault
 
 
 def _parse_override(text: str) -> tuple[str, str, Any]:

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from evlcp_sdk.air.codebook import BARKER13, Codebook, hadamard
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.errors import ConfigError, UnknownAlgorithmError
+from evlcp_sdk.errors import ConfigError, PluginError, UnknownAlgorithmError
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.link.text import to_toml
 from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
@@ -340,3 +340,49 @@ def test_sizes_that_no_memory_or_number_holds_are_refused(setting: str, says: st
     with pytest.raises(ConfigError) as caught:
         load_link(overrides=[setting])
     assert str(caught.value).endswith(says)
+
+
+class Odd:
+    """Pilots or a modulation that give something else."""
+
+    def __init__(self, codes: Any, preamble: Any = BARKER13) -> None:
+        self._codes, self._preamble = codes, preamble
+
+    def preamble(self) -> Any:
+        return self._preamble
+
+    def codes(self, clusters: int) -> Any:
+        return self._codes(clusters)
+
+    def codewords(self) -> Any:
+        return self._codes(0)
+
+
+def exits(_: int) -> Any:
+    raise SystemExit(0)
+
+
+@pytest.mark.parametrize(
+    ("role", "gives", "says"),
+    [
+        (
+            "pilots",
+            lambda _: {}["boom"],
+            r"^pilots algorithm 'odd': KeyError: 'boom'; try: evlcp check pilots odd",
+        ),
+        ("pilots", exits, r"^pilots algorithm 'odd': SystemExit: 0; try"),
+        ("pilots", lambda _: None, r"^pilots algorithm 'odd': TypeError: "),
+        (
+            "pilots",
+            lambda k: hadamard(8)[: k - 15],
+            r"^pilots algorithm 'odd': ValueError: gave 1 codes, expected 16",
+        ),
+        ("pilots", lambda k: ["a"] * k, r"^codebook pilots: expected a 2-D array of -1 and \+1"),
+        ("modulation", exits, r"^modulation algorithm 'odd': SystemExit: 0; try"),
+        ("modulation", lambda _: None, r"^codebook codewords: expected a 2-D array of -1 and \+1"),
+        ("modulation", lambda _: [[1, -1], [1]], r"^codebook codewords: expected a 2-D array of -1 and \+1"),
+    ],
+)
+def test_codes_that_are_none_are_named(role: str, gives: Any, says: str) -> None:
+    with pytest.raises((PluginError, ConfigError), match=says):
+        load_link().with_algorithm(role, Odd(gives), id="odd")
