@@ -62,6 +62,9 @@ def frames_of(packets: Iterable[Packet]) -> list[GivenFrame]:
 
 FRAMES = "frames.csv"
 
+_MOST = 1e18
+"""Size of the largest number: microseconds since 1970 are 1e15."""
+
 _NEEDED = ("transmitter", "t_us", "symbols", "distance_m", "x_px", "y_px")
 
 
@@ -95,7 +98,7 @@ def _row(row: Mapping[str, str | None], place: str) -> GivenFrame:
             value = float(text)
         except ValueError:
             value = math.inf
-        if not math.isfinite(value):
+        if not abs(value) <= _MOST:
             raise InputError(f"{place}: {name} = {text!r:.40}: expected a number")
         return value
 

@@ -248,6 +248,7 @@ TRUE = '{"scene": {}, "bars": 3, "t_s": [], "distance_m": [], "bar_centre_px": [
         (GOOD + "0,soon,1,,0,0\n", "{}", "frames.csv:2: t_us = 'soon': expected a number"),
         (GOOD + "0,1,1,,0,0\n0,1,1 x,,0,0\n", "{}", "frames.csv:3: symbols = 'x': expected a whole number"),
         (GOOD + "0,1,1,inf,0,0\n", "{}", "frames.csv:2: distance_m = 'inf': expected a number"),
+        (GOOD + "0,1,1,-1e308,0,0\n", "{}", "frames.csv:2: distance_m = '-1e308': expected a number"),
         (GOOD, "{}", "not a scene's truth: bar_centre_px, bars, distance_m, scene, t_s"),
         (GOOD, "[]", "not a scene's truth"),
         (GOOD, TRUE, "t.json: not a scene's truth: bars = 3: expected a list"),
