@@ -429,7 +429,8 @@ class RegionFollower:
         hits = self._hits
         merge = self._spec.merge_px
         for followed in self.alive:
-            rises -= _cleared(hits, _grown(self._reach(followed.latest), merge))
+            reach = self._reach(followed.latest)
+            rises -= _cleared(hits, reach if followed.size_px else _grown(reach, merge))
             if followed.outgrown is not None and end_us > followed.outgrown[4]:
                 rises -= _cleared(hits, self._reach(_outgrown(followed)))
         if rises < self._spec.min_rises:

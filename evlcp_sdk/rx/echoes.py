@@ -207,6 +207,16 @@ class Echoes:
         """Of which transmitter one is a reflection, by all frames so far; None if of none."""
         return self._echo_of.get(transmitter)
 
+    def shown(self, t_us: float, centre_px: tuple[float, float]) -> bool:
+        """Whether a transmitter has shown a frame that began at this time in this place."""
+        for known in self._seen.values():
+            for sighting in known:
+                frame = sighting.frame
+                off_px = max(abs(frame.x_px - centre_px[0]), abs(frame.y_px - centre_px[1]))
+                if off_px <= _APART_PX and abs(frame.t_us - t_us) < self._chip_us / 2:
+                    return True
+        return False
+
     def judge(self, seen: Iterable[Sighting]) -> None:
         """Take the frames of a time step, in any order.
 

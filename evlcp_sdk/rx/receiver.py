@@ -222,6 +222,11 @@ class Receiver:
         look = self._look(transmitter, due)
         if look is None:
             return None
+        if transmitter.number is None and self._echoes.shown(due.start_us, look.centre_px):
+            # The same bar once more: where the first region was then is not known as well as what it showed.
+            self._regions.drop(transmitter.region)
+            self._let_go(transmitter.region)
+            return None
         number = self._transmitters.number(transmitter)
         soft = self._steps.decode(look.presence, look.sums)
         lit = still_lit(look.sums, look.presence, self._packet.pilot_chips)

@@ -361,3 +361,13 @@ def test_two_bars_on_one_clock_are_two() -> None:
     packets = received(merged(OWN, ideal_events(LINK, other, seed=2)))
     assert len({p.transmitter for p in packets}) == 2
     assert {p.echo_of for p in packets} == {None}
+
+
+def test_what_was_shown_then_and_there_is_known() -> None:
+    echoes = Echoes(FORMAT, CODEWORDS)
+    one = sighting(0, 3, said(3), x_px=300.0, y_px=350.0)
+    echoes.judge([one])
+    t_us = one.frame.t_us
+    assert echoes.shown(t_us + 40, (304.0, 350.0))
+    assert not echoes.shown(t_us + 60, (304.0, 350.0))
+    assert not echoes.shown(t_us + 40, (306.0, 350.0))

@@ -436,3 +436,18 @@ def test_a_bar_in_pieces_too_small_to_place_is_put_together() -> None:
     for frame in frames:
         assert any(frame.soft.symbols[seen].tolist() == row[seen].tolist() for row in sent)
         assert (frame.soft.symbols[[4, 5, 10, 11]] == -1).all()
+
+
+@pytest.mark.parametrize("apart_px", [10, 14])
+def test_two_bars_a_few_pixels_apart_are_two(apart_px: int) -> None:
+    """Each with a clock and a payload of its own."""
+    one = IdealBar(random_symbols(LINK, 3, seed=1), start_us=0)
+    two = IdealBar(random_symbols(LINK, 3, seed=2), start_us=12_345, x_px=one.x_px + apart_px, ppm=40)
+    receiver = Receiver(LINK)
+    packets = receiver.feed(merged(ideal_events(LINK, one), ideal_events(LINK, two))) + receiver.close()
+    by_bar = {packet.transmitter: [] for packet in packets}
+    for packet in packets:
+        by_bar[packet.transmitter] += packet.frames
+    places = sorted((frames[0].x_px, len(frames)) for frames in by_bar.values())
+    assert [x for x, _ in places] == pytest.approx([one.x_px - 0.5, two.x_px - 0.5], abs=1)
+    assert min(n for _, n in places) >= 28
