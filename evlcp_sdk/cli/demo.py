@@ -176,7 +176,7 @@ def _decode_recording(out: Path, as_json: bool) -> None:
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import receive_to_folder
     from evlcp_sdk.sim.truth import read_truth
-    from evlcp_sdk.study.frames import given
+    from evlcp_sdk.study.frames import read_frames
     from evlcp_sdk.study.score import score_frames
 
     recording, truth_file = demo_files()
@@ -188,7 +188,8 @@ def _decode_recording(out: Path, as_json: bool) -> None:
             f"decoding {recording.name} (the first run also compiles the kernels) ...", style="dim"
         )
     summary = receive_to_folder(recording, out, link, registry=registry, sinks=["figures"])
-    found = score_frames([given(frame) for frame in frames.found], read_truth(truth_file))
+    # The rows as they are written, which `evlcp score` reads, too.
+    found = score_frames(read_frames(out), read_truth(truth_file))
     if as_json:
         typer.echo(json.dumps(summary | {"score": found}))
         return
