@@ -230,10 +230,11 @@ class RegionFollower:
 
     def shape(
         self, followed: Followed, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]
-    ) -> bool:
-        """Set a region right by what a frame showed of its bar; return whether it changed.
+    ) -> float:
+        """Set a region right by what a frame showed of its bar; return by how much, px, 0 for nothing.
 
-        Its events are those of where it was taken to be, until they are gathered anew.
+        It is infinite at the first time. Its events are those of where it was taken to be, until they are
+        gathered anew; within half of the seam, they are all there.
 
         Args:
             followed: The region.
@@ -244,13 +245,16 @@ class RegionFollower:
         (x,), (y,) = followed.at(np.array([t_us]))
         off = centre_px[0] - float(x), centre_px[1] - float(y)
         known = followed.size_px
+        off_px = math.inf
         if known is None:
             followed.heights.clear()
             last = followed.latest
             until_us = last.t_us + _LEFT_STEPS * self._spec.step_us
             followed.outgrown = -off[0], -off[1], last.width_px, last.height_px, until_us
-        elif max(abs(v) for v in (*off, size_px[0] - known[0], size_px[1] - known[1])) < _RESHAPE_PX:
-            return False
+        else:
+            off_px = max(abs(v) for v in (*off, size_px[0] - known[0], size_px[1] - known[1]))
+            if off_px < _RESHAPE_PX:
+                return 0.0
         followed.size_px = size_px
         # Where less of the bar was seen, or more than it, its place is not that of what was seen.
         most_px = 2 * self._spec.margin_px if known is None else math.inf
@@ -265,7 +269,7 @@ class RegionFollower:
             for p in followed.positions
         )
         followed.filter = self._position.init() if self._position else None
-        return True
+        return off_px
 
     def gather(self, followed: Followed, from_us: float = -math.inf, until_us: float = math.inf) -> None:
         """Take a region's events once more, from where it is now known to have been.

@@ -88,6 +88,7 @@ class Receiver:
         self._attitude_at = attitude_source(attitude)
         self._packet = link.packet
         self._step_us = link.regions.step_us
+        self._seam_px = link.regions.margin_px
         self._tail_us = _TAIL_CHIPS * link.packet.chip_us
         self._announcer = Announcer(hook)
         self._steps = Steps(link, self._announcer)
@@ -273,7 +274,7 @@ class Receiver:
         """Look at a frame; set its region right by it, join what is of the same bar, open what is another."""
         region = transmitter.region
         others: list[tuple[float, tuple[float, float], tuple[float, float]]] = []
-        shaped = False
+        most_px = 0.0
         for _ in range(_LOOKS):
             whole = region.size_px is not None
             look, transmitter.pilot = self._looker.look(region, due, transmitter.pilot)
@@ -281,14 +282,14 @@ class Receiver:
                 break
             # What the first look shows beside the bar is out of the second one's sight.
             others += [(look.middle_us, *self._looker.box(look, other)) for other in look.others]
-            changed = self._regions.shape(region, look.middle_us, *self._looker.box(look, look.placement))
-            shaped |= changed
-            if changed and not self._join(region, look.middle_us):
+            off_px = self._regions.shape(region, look.middle_us, *self._looker.box(look, look.placement))
+            most_px = max(most_px, off_px)
+            if off_px > 0 and not self._join(region, look.middle_us):
                 return None
-            if whole or not changed:
+            if whole or off_px == 0:
                 break
             self._regions.gather(region, due.start_us, due.end_us)
-        if shaped:
+        if most_px > self._seam_px / 2:
             self._regions.gather(region)
         if look is None:
             return None

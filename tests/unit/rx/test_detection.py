@@ -217,7 +217,7 @@ def test_a_region_takes_its_bars_size_and_gathers_its_events() -> None:
         regions.step(start, part)
     region = regions.alive[0]
     before = sum(len(e) for _, e in region.pieces)
-    assert regions.shape(region, 24_000.0, (bar.x_px - 0.5, bar.y_px - 0.5), (4.0, 128.0))
+    assert regions.shape(region, 24_000.0, (bar.x_px - 0.5, bar.y_px - 0.5), (4.0, 128.0)) == np.inf
     x, y = region.at(np.array([24_000.0]))
     assert (x[0], y[0]) == pytest.approx((bar.x_px - 0.5, bar.y_px - 0.5))
     old = list(region.pieces)
@@ -230,7 +230,9 @@ def test_a_region_takes_its_bars_size_and_gathers_its_events() -> None:
     within = (kept.t_us >= since_us) & (kept.t_us < 25_000)
     assert sum(len(e) for _, e in region.pieces) == int(within.sum())
     assert sum(len(e) for _, e in region.pieces) >= before
-    assert not regions.shape(region, 24_000.0, (bar.x_px - 0.4, bar.y_px - 0.5), (4.0, 128.2))
+    assert regions.shape(region, 24_000.0, (bar.x_px - 0.4, bar.y_px - 0.5), (4.0, 128.2)) == 0
+    off_px = regions.shape(region, 24_000.0, (bar.x_px + 0.5, bar.y_px - 0.5), (4.0, 131.0))
+    assert off_px == pytest.approx(3)
 
 
 def test_another_image_moves_with_its_bar() -> None:
