@@ -3,8 +3,9 @@
     python benchmarks/quality.py [--seeds 1] [--jobs 2] [--campaign examples/campaigns/road.toml]
 
 Every scene of a campaign is simulated and received with each decoding. Frames of all of them together are put
-into bins by their quality; a bin shows how many of its frames should be wrong by it (the mean of 1 - q) and
-how many are, with an interval of 95 % that is bootstrapped over recordings. The last column is their ratio.
+into bins by their quality; a bin shows how many frames it has, what share of them should be wrong by it (the
+mean of 1 - q), and what share is, with an interval of 95 % that is bootstrapped over recordings. Where the
+latter is more than twice the former, or less than half of it, there is a star.
 """
 
 import argparse
@@ -26,6 +27,7 @@ from evlcp_sdk.values import Events
 CAMPAIGN = Path(__file__).parents[1] / "examples" / "campaigns" / "road.toml"
 DECODINGS = ("motion-feedback", "ml-soft", "wh-transform")
 EDGES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
+BINS = (*pairwise(EDGES), (0.0, 1.0))
 ROUNDS = 1000
 
 Judged = dict[str, list[tuple[float, bool]]]
@@ -52,23 +54,23 @@ def judged(scene: Scene, seed: int) -> Judged:
     return found
 
 
-def table(recordings: list[list[tuple[float, bool]]]) -> Iterator[str]:
-    """A line a bin, and one of all."""
+def rows(recordings: list[list[tuple[float, bool]]]) -> Iterator[list[str]]:
+    """Three cells a bin, and those of all."""
     rng = np.random.default_rng(0)
     parts = [np.array(part, float).reshape(-1, 2) for part in recordings]
-    for low, high in [*pairwise(EDGES), (0.0, 1.0)]:
+    for low, high in BINS:
         kept = [p[(p[:, 0] >= low) & ((p[:, 0] < high) | (high == 1))] for p in parts]
         n = np.array([len(p) for p in kept])
         if not n.sum():
+            yield ["0", "-", "-"]
             continue
         doubt, wrong = np.array([[(1 - p[:, 0]).sum(), p[:, 1].sum()] for p in kept]).T
         drawn = rng.integers(0, len(kept), (ROUNDS, len(kept)))
         share = wrong[drawn].sum(1) / np.maximum(n[drawn].sum(1), 1)
         least, most = np.quantile(share, [0.025, 0.975])
         said, true = doubt.sum() / n.sum(), wrong.sum() / n.sum()
-        name = "all" if (low, high) == (0.0, 1.0) else f"{low:g} to {high:g}"
-        ratio = f"{true / said:.2f}" if said > 0 else "-"
-        yield f"| {name} | {n.sum()} | {said:.4f} | {true:.4f} ({least:.4f} to {most:.4f}) | {ratio} |"
+        star = "" if said / 2 <= true <= said * 2 else "*"
+        yield [str(n.sum()), f"{said:.2g}", f"{true:.2g}{star} ({least:.2g} to {most:.2g})"]
 
 
 def main() -> None:
@@ -81,10 +83,12 @@ def main() -> None:
     work = [(scene, seed) for scene in scenes for seed in range(1, args.seeds + 1)]
     with ProcessPoolExecutor(args.jobs) as pool:
         found = list(pool.map(judged, *zip(*work, strict=True)))
-    for decoding in DECODINGS:
-        print(f"\n{decoding}, {len(work)} recordings\n")
-        print("| quality | frames | wrong by it | wrong (95 %) | ratio |\n|---|---|---|---|---|")
-        print("\n".join(table([part[decoding] for part in found])))
+    print("| quality |" + "".join(f" {decoding}: frames | by it | wrong |" for decoding in DECODINGS))
+    print("|---|" + "---|---|---|" * len(DECODINGS))
+    tables = zip(*(rows([part[decoding] for part in found]) for decoding in DECODINGS), strict=True)
+    for (low, high), cells in zip(BINS, tables, strict=True):
+        name = "all" if (low, high) == (0.0, 1.0) else f"{low:g} to {high:g}"
+        print(f"| {name} | " + " | ".join(cell for part in cells for cell in part) + " |")
 
 
 if __name__ == "__main__":
