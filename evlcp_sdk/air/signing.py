@@ -4,6 +4,8 @@ Needs the extra `sign` (package `cryptography`) to make keys, to sign, and to ch
 """
 
 import hashlib
+import os
+import stat
 import struct
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,6 +25,8 @@ KEY_NAME_BYTES = 8
 
 _SIGNATURE_BYTES = 64
 _KEY_BYTES = 32
+_MOST_PEM_BYTES = 1 << 16
+_OTHERS = 0o077
 _DOMAIN = b"EVLCP beacon 1\0"
 _SIGNED_HEAD = struct.Struct("<II4s")
 
@@ -59,7 +63,8 @@ def read_key(path: Path) -> "Ed25519PrivateKey":
 
     Raises:
         ConfigError: The extra is not installed.
-        InputError: The file cannot be read, or holds no Ed25519 key without a password.
+        InputError: The file cannot be read, others than its owner may use it, or it holds no Ed25519 key
+            without a password.
     """
     _check_installed()
     from cryptography.exceptions import UnsupportedAlgorithm
@@ -67,7 +72,14 @@ def read_key(path: Path) -> "Ed25519PrivateKey":
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
     try:
-        key = serialization.load_pem_private_key(path.read_bytes(), password=None)
+        with path.open("rb") as file:
+            mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
+            if mode & _OTHERS:
+                raise InputError(
+                    f"{path}: mode {mode:04o}, expected a private key that its owner alone can use: chmod 600"
+                )
+            text = file.read(_MOST_PEM_BYTES)
+        key = serialization.load_pem_private_key(text, password=None)
     except OSError as fault:
         raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
     except (ValueError, TypeError, UnsupportedAlgorithm) as fault:

@@ -52,11 +52,23 @@ def test_a_key_is_its_owners_and_stays(tmp_path: Path) -> None:
         signing.make_key(tmp_path / "no" / "k.pem")
 
 
+@pytest.mark.parametrize("mode", [0o644, 0o640, 0o604, 0o620, 0o601])
+def test_a_key_that_others_can_use_is_refused(mode: int, tmp_path: Path) -> None:
+    path = tmp_path / "k.pem"
+    signing.make_key(path)
+    path.chmod(mode)
+    with pytest.raises(InputError, match=rf"k.pem: mode {mode:04o}, expected .*its owner alone.*chmod 600"):
+        signing.read_key(path)
+    path.chmod(0o400)
+    signing.read_key(path)
+
+
 def test_what_is_no_key_is_told(tmp_path: Path) -> None:
     path = tmp_path / "k.pem"
     with pytest.raises(InputError, match="cannot be read"):
         signing.read_key(path)
     path.write_text("no key")
+    path.chmod(0o600)
     with pytest.raises(InputError, match="expected an Ed25519 private key, PEM"):
         signing.read_key(path)
     for text in ("abc", "zz" * 32, "00" * 31):

@@ -1,0 +1,54 @@
+"""The lock of development holds what `pyproject.toml` asks for, each file by its hash."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[2]
+LOCK = (ROOT / "requirements-dev.lock").read_text()
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+ASKED = [
+    *PROJECT["build-system"]["requires"],
+    *PROJECT["project"]["dependencies"],
+    *(one for extra in PROJECT["project"]["optional-dependencies"].values() for one in extra),
+    *(one for group in PROJECT["dependency-groups"].values() for one in group),
+]
+
+
+def entries() -> list[str]:
+    """One text a package: `name==version ; marker --hash=...`."""
+    lines = "\n".join(line for line in LOCK.splitlines() if not line.startswith("#"))
+    return lines.replace("\\\n", " ").splitlines()
+
+
+def requirement(entry: str) -> Requirement:
+    return Requirement(entry.partition(" --hash=")[0])
+
+
+@pytest.mark.parametrize("asked", ASKED)
+def test_what_the_project_asks_for_is_locked(asked: str) -> None:
+    wanted = Requirement(asked)
+    versions = [
+        str(r.specifier).removeprefix("==")
+        for r in map(requirement, entries())
+        if canonicalize_name(r.name) == canonicalize_name(wanted.name)
+    ]
+    assert versions, f"requirements-dev.lock lacks {wanted.name}"
+    assert all(wanted.specifier.contains(version) for version in versions), (asked, versions)
+
+
+def test_every_package_is_pinned_by_version_and_hash() -> None:
+    for entry in entries():
+        (one,) = requirement(entry).specifier
+        assert one.operator == "==", entry
+        assert not one.version.endswith("*"), entry
+        hashes = entry.partition(" --hash=")[2].split("--hash=")
+        assert all(re.fullmatch(r"sha256:[0-9a-f]{64}", h.strip()) for h in hashes), entry
+
+
+def test_the_lock_names_no_registry_and_no_machine() -> None:
+    assert not re.search(r"://|index-url|find-links|^\s*-[a-z]|/[a-z]+/", LOCK)
