@@ -31,6 +31,7 @@ __all__ = [
     "check_output",
     "check_sha256",
     "defused",
+    "is_there",
     "open_log",
     "output_fault",
     "read_csv",
@@ -379,6 +380,14 @@ def read_csv(path: Path | str) -> tuple[tuple[str, ...], list[tuple[int, dict[st
         raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
     except (UnicodeDecodeError, csv.Error) as fault:
         raise InputError(f"{path}: not a CSV file: {fault}") from fault
+
+
+def is_there(path: Path | str) -> bool:
+    """Whether there is a file or a folder of that name; what cannot be a name is not there."""
+    try:
+        return Path(path).exists()
+    except OSError:
+        return False
 
 
 MOST_BYTES = 1 << 28

@@ -6,7 +6,7 @@ from typing import Final
 from urllib.parse import unquote
 
 from evlcp_sdk.errors import EvlcpError, InputError, StreamError
-from evlcp_sdk.files import Outputs
+from evlcp_sdk.files import Outputs, is_there
 from evlcp_sdk.io.faery import FORMATS, FaerySource
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
 from evlcp_sdk.io.tables import CSV_HEADER, CsvSource, CsvWriter, NpzSource, NpzWriter
@@ -41,7 +41,7 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
     if source is not None:
         return source
     scheme = _SCHEME.match(str(url))
-    if scheme is None or Path(url).exists():
+    if scheme is None or is_there(url):
         return _open_file(url)
     if scheme[1].lower() == "file":
         return _open_file(unquote(str(url)[len(scheme[0]) :].removeprefix("//")))

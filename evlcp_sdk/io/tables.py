@@ -151,7 +151,7 @@ class NpzSource(EventSource):
                 archive = stack.enter_context(zipfile.ZipFile(self._file))
             except OSError as error:
                 raise InputError(f"{path}: {error.strerror}") from error
-            except zipfile.BadZipFile as error:
+            except (zipfile.BadZipFile, UnicodeDecodeError, NotImplementedError) as error:
                 raise InputError(f"{path}: found no NPZ file, expected one ({error})") from error
             try:
                 self._columns = [_Column(target, archive, name, stack) for name in COLUMNS]

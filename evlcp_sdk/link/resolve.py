@@ -257,7 +257,8 @@ def resolve(
             try:
                 revisions[section] = registry.find(section, name).algorithm.revision
             except UnknownAlgorithmError as unknown:
-                faults.append(unknown)
+                told = bool(source) and (section, "id") not in overridden
+                faults.append(UnknownAlgorithmError(f"{source}: {unknown}") if told else unknown)
                 continue
             cls = registry.load_class(section, name)
         try:

@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import is_there
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
@@ -460,7 +461,7 @@ def load_scene(
         path = Path(source)
         folder = path.parent
         where = name
-        if not path.exists() and not path.suffix:
+        if not is_there(path) and not path.suffix:
             raise ConfigError(
                 f"{name}: no such file, and no preset of that name{nearest(name, preset_names())}"
             )

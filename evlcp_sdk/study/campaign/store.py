@@ -126,6 +126,9 @@ class Store:
             if create:
                 raise OutputError(f"{path}: cannot be written: {fault}") from fault
             raise InputError(f"{path}: {fault}") from fault
+        except UnicodeDecodeError as fault:
+            self._close()
+            raise _no_store(path, fault) from fault
         except EvlcpError:
             self._close()
             raise

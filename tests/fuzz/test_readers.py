@@ -1,0 +1,116 @@
+"""Every reader, with damaged files: it reads them or says in lines what is wrong, and nothing else.
+
+`make test` draws the same files every time, `make fuzz` new ones, as many as it is told.
+"""
+
+import os
+import random
+import subprocess
+import sys
+import warnings
+import zlib
+from pathlib import Path
+
+import pytest
+
+from evlcp_sdk.errors import EvlcpError
+from evlcp_sdk.jobs.inline import Inline
+from evlcp_sdk.study.campaign.collect import collect
+from evlcp_sdk.study.campaign.store import Store
+from tests.fuzz.corpus import Kind, kinds
+from tests.fuzz.mutate import damaged
+from tests.unit.study.campaign.fake import fake_plan, run_fake
+
+NAMES = (
+    *(
+        "EVT3",
+        "EVT2",
+        "NPZ",
+        "CSV",
+        "CSV in gzip",
+        "truth",
+        "frames.csv",
+        "summary.json",
+        "poses",
+        "attitude",
+    ),
+    *("sites", "link", "scene", "campaign", "results", "symbols", "masks", "inventory"),
+)
+
+ROUNDS = {"campaign": 40, "results": 100, "EVT3": 600, "EVT2": 600}
+"""Damaged files of a kind; 300 of others. A second or two each."""
+
+
+def store_of(folder: Path) -> bytes:
+    """A finished campaign's results file."""
+    path = folder / "results.sqlite"
+    with Store(path, create=True) as store:
+        collect(fake_plan(scenes=2, seeds=2), store, Inline(), run_fake)
+    return path.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def corpus(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Kind]:
+    folder = tmp_path_factory.mktemp("corpus")
+    return {kind.name: kind for kind in kinds(folder, store_of(folder))}
+
+
+def refused(kind: Kind, data: bytes, folder: Path) -> bool:
+    """Read a file with these bytes; whether it was refused, in lines that name it."""
+    path = folder / kind.file
+    path.write_bytes(data)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            kind.read(path)
+    except EvlcpError as fault:
+        lines = str(fault).splitlines()
+        assert lines, "an empty message"
+        assert path.name in lines[0] or str(folder) in lines[0], f"does not name the file: {lines[0]}"
+        assert max(map(len, lines)) < 2000, f"a line of {max(map(len, lines))} characters"
+        return True
+    return False
+
+
+def test_the_corpus_is_good(corpus: dict[str, Kind], tmp_path: Path) -> None:
+    assert tuple(corpus) == NAMES
+    for kind in corpus.values():
+        assert not refused(kind, kind.data, tmp_path), kind.name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_damaged_files(corpus: dict[str, Kind], name: str, tmp_path: Path) -> None:
+    kind = corpus[name]
+    rng = random.Random(zlib.crc32(name.encode()))
+    rounds = ROUNDS.get(name, 300)
+    faults = sum(refused(kind, damaged(kind.data, rng), tmp_path) for _ in range(rounds))
+    # Accidents that change nothing that matters are read, and others must be seen.
+    assert faults > 0
+
+
+@pytest.mark.parametrize("name", ["EVT3", "EVT2"])
+def test_no_kernel_reads_or_writes_beside_its_arrays(
+    corpus: dict[str, Kind], name: str, tmp_path: Path
+) -> None:
+    """The same files in a process whose kernels check every index."""
+    code = (
+        "import pathlib, random, sys; from tests.fuzz.corpus import read_recording\n"
+        "from tests.fuzz.mutate import damaged; from evlcp_sdk.errors import EvlcpError\n"
+        "good, path = (pathlib.Path(a) for a in sys.argv[1:])\n"
+        "rng = random.Random(5)\n"
+        "for _ in range(150):\n"
+        "    path.write_bytes(damaged(good.read_bytes(), rng))\n"
+        "    try: read_recording(path)\n"
+        "    except EvlcpError: pass\n"
+    )
+    good = tmp_path / "good.raw"
+    good.write_bytes(corpus[name].data)
+    environment = os.environ | {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    done = subprocess.run(
+        [sys.executable, "-c", code, good, tmp_path / "a.raw"],
+        env=environment,
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
