@@ -2,7 +2,7 @@
 
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -17,6 +17,8 @@ __all__ = [
     "BlockError",
     "Kind",
     "Message",
+    "carried_bytes",
+    "joined",
     "split",
 ]
 
@@ -30,6 +32,7 @@ MOST_MESSAGE_BYTES = 0xFFFF
 """Longest message: what the header's length can express."""
 
 _HEADER = struct.Struct("<BIIHH4s")
+_CHECK = struct.Struct("<I")
 
 HEADER_BYTES = _HEADER.size
 """Bytes of a block's header."""
@@ -38,6 +41,7 @@ _WHITE_SEED = 2463534242
 """Start of the whitening where the header's CRC is 0: xorshift32 would stay there."""
 
 _MOST_NUMBER = 0xFFFFFFFF
+_MOST_PARTS = 0x10000
 
 
 class Kind(IntEnum):
@@ -113,7 +117,8 @@ class Block:
         transmitter_id: As in `Message`.
         sequence: As in `Message`.
         index: Number of the part, from 0.
-        length: Bytes of the whole message; with the size of a block it gives the number of parts.
+        length: Bytes of the whole message, without its check; with the size of a block it gives the number of
+            parts.
         codebook: First `DIGEST_BYTES` bytes of the codebook's digest.
         part: The part's bytes; all parts but the last fill their block.
 
@@ -161,10 +166,11 @@ class Block:
         if kind not in kinds:
             raise BlockError(f"block of kind {kind}, expected one of {', '.join(map(str, sorted(kinds)))}")
         room = len(block) - HEADER_BYTES
-        if not index * room < length:
+        carried = carried_bytes(length, room)
+        if not index * room < carried:
             raise BlockError(f"part {index} of a message of {length} bytes, {room} in a part")
         rest = _whitened(block[:HEADER_BYTES], block[HEADER_BYTES:])
-        end = min(room, length - index * room)
+        end = min(room, carried - index * room)
         if any(rest[end:]):
             raise BlockError(f"bytes {HEADER_BYTES + end} to {len(block) - 1} of the block: expected zeros")
         return cls(
@@ -196,25 +202,71 @@ def _whitened(head: bytes, rest: bytes) -> bytes:
     return bytes(a ^ b for a, b in zip(rest, stream, strict=False))
 
 
+def carried_bytes(length: int, room: int) -> int:
+    """Bytes that the parts of a message carry: its own and, where one part does not hold them, its check.
+
+    Args:
+        length: Bytes of the message.
+        room: Bytes of a part.
+
+    >>> carried_bytes(40, 40), carried_bytes(41, 40)
+    (40, 45)
+    """
+    return length if length <= room else length + _CHECK.size
+
+
 def split(message: Message, codebook: bytes, size: int) -> Iterator[Block]:
     """The blocks of `size` bytes each that carry a message.
+
+    A message of several blocks is followed by its CRC-32 (that of zlib): each block is sure by itself, but
+    two messages under one number would pass for one.
 
     Args:
         message: The message.
         codebook: First `DIGEST_BYTES` bytes of the codebook's digest.
         size: Bytes of a block.
 
-    >>> [b.part for b in split(Message(Kind.DATA, 1, 0, b"abcde"), bytes(4), HEADER_BYTES + 2)]
-    [b'ab', b'cd', b'e']
+    Raises:
+        ConfigError: Its parts are more than a header can number.
+
+    >>> [b.part.hex() for b in split(Message(Kind.DATA, 1, 0, b"abcde"), bytes(4), HEADER_BYTES + 3)]
+    ['616263', '646565', 'd88785']
     """
-    room = size - HEADER_BYTES
-    for index, begin in enumerate(range(0, len(message.payload), room)):
+    room, length = size - HEADER_BYTES, len(message.payload)
+    carried = message.payload if length <= room else message.payload + _check(message.payload)
+    if len(carried) > room * _MOST_PARTS:
+        raise ConfigError(f"message: {length} bytes in parts of {room}, expected at most {_MOST_PARTS} parts")
+    for index, begin in enumerate(range(0, len(carried), room)):
         yield Block(
             message.kind,
             message.transmitter_id,
             message.sequence,
             index,
-            len(message.payload),
+            length,
             codebook,
-            message.payload[begin : begin + room],
+            carried[begin : begin + room],
         )
+
+
+def joined(parts: Sequence[bytes], length: int) -> bytes:
+    """The payload that the parts of a message carry, all of them and in order.
+
+    Args:
+        parts: What `split` made of it.
+        length: Bytes of the message.
+
+    Raises:
+        BlockError: The parts are not those of one message.
+
+    >>> joined([bytes.fromhex(part) for part in ("616263", "646565", "d88785")], 5)
+    b'abcde'
+    """
+    carried = b"".join(parts)
+    payload, check = carried[:length], carried[length:]
+    if check != (_check(payload) if len(parts) > 1 else b""):
+        raise BlockError(f"{len(parts)} parts that are not those of one message of {length} bytes")
+    return payload
+
+
+def _check(payload: bytes) -> bytes:
+    return _CHECK.pack(zlib.crc32(payload))

@@ -93,6 +93,7 @@ def _messages(counts: Mapping[str, int]) -> str:
         ("blocks_other_codebook", "packets of another codebook"),
         ("blocks_malformed", "packets with no block of this format"),
         ("parts_missing", "parts missing"),
+        ("messages_mixed", "messages put together from parts of two, left out"),
         ("messages_undecodable", "messages without meaning"),
     ):
         if counts[key]:

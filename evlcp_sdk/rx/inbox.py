@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.beacons import Beacon
-from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message
+from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message, carried_bytes, joined
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.air.signing import TrustedKeys
 from evlcp_sdk.errors import ConfigError
@@ -53,19 +53,23 @@ class _Parts:
 
     Attributes:
         length: Its bytes.
+        carried: Bytes that all its parts carry.
         parts: Known parts by number.
+        payload: Its bytes, once all are known.
         given: The trust and reason last handed on; None before.
     """
 
     length: int
+    carried: int
     parts: dict[int, bytes] = field(default_factory=dict)
+    payload: bytes = b""
     given: tuple[Trust, str] | None = None
 
     def complete(self) -> bool:
-        return sum(map(len, self.parts.values())) == self.length
+        return sum(map(len, self.parts.values())) == self.carried
 
-    def payload(self) -> bytes:
-        return b"".join(self.parts[i] for i in sorted(self.parts))
+    def join(self) -> None:
+        self.payload = joined([self.parts[i] for i in sorted(self.parts)], self.length)
 
 
 @dataclass
@@ -130,6 +134,7 @@ class MessageAssembler:
                 "parts_conflicting",
                 "parts_missing",
                 "messages",
+                "messages_mixed",
                 "messages_undecodable",
                 "beacons_verified",
                 "beacons_unverified",
@@ -234,11 +239,19 @@ class MessageAssembler:
             self._counts["parts_conflicting"] += 1
             inbox.done.pop(key, None)
             self._missing(inbox.open.pop(key, None))
-        parts = _kept(inbox.open, key, lambda: _Parts(block.length))
+        carried = carried_bytes(block.length, self._room)
+        parts = _kept(inbox.open, key, lambda: _Parts(block.length, carried))
         parts.parts[block.index] = block.part
         while len(inbox.open) > _MOST_MESSAGES:
             self._missing(inbox.open.popitem(last=False)[1])
         if not parts.complete():
+            return []
+        try:
+            parts.join()
+        except BlockError:
+            # Two messages under one number, mixed: the newest part is surely of the newest.
+            self._counts["messages_mixed"] += 1
+            parts.parts = {block.index: block.part}
             return []
         inbox.done[key] = inbox.open.pop(key)
         while len(inbox.done) > _MOST_MESSAGES:
@@ -254,7 +267,7 @@ class MessageAssembler:
         if parts is None:
             return []
         inbox.done.move_to_end(key)
-        message = Message(key[1], transmitter_id, sequence, parts.payload())
+        message = Message(key[1], transmitter_id, sequence, parts.payload)
         kind = self._kinds[message.kind]
         try:
             value = kind.unpack(message.payload)
@@ -299,7 +312,7 @@ class MessageAssembler:
             else self._keys.check(
                 message,
                 digest,
-                Message(Kind.SIGNATURE, message.transmitter_id, message.sequence, signed.payload()),
+                Message(Kind.SIGNATURE, message.transmitter_id, message.sequence, signed.payload),
             )
         )
         if good is False:
@@ -328,7 +341,7 @@ class MessageAssembler:
 
     def _missing(self, parts: _Parts | None) -> None:
         if parts is not None:
-            self._counts["parts_missing"] += -(-parts.length // self._room) - len(parts.parts)
+            self._counts["parts_missing"] += -(-parts.carried // self._room) - len(parts.parts)
 
     def _give_up(self, inbox: _Inbox) -> None:
         for parts in inbox.open.values():

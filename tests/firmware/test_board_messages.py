@@ -11,7 +11,7 @@ import pytest
 from test_board_cli import Emulated
 
 from evlcp_sdk.air.beacons import Beacon
-from evlcp_sdk.air.blocks import Block, Kind, Message
+from evlcp_sdk.air.blocks import Block, Kind, Message, joined
 from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.air.signing import TrustedKeys
@@ -64,8 +64,7 @@ def messages_of(symbols: np.ndarray, link: Link) -> dict[Kind, Message]:
         parts.setdefault(block.kind, {})[block.index] = block
     found = {}
     for kind, blocks in parts.items():
-        payload = b"".join(blocks[i].part for i in range(len(blocks)))
-        assert len(payload) == blocks[0].length
+        payload = joined([blocks[i].part for i in range(len(blocks))], blocks[0].length)
         found[kind] = Message(kind, blocks[0].transmitter_id, blocks[0].sequence, payload)
     return found
 

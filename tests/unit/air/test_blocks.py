@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evlcp_sdk.air.beacons import BEACON_BYTES, Beacon
-from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message, split
+from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message, joined, split
 from evlcp_sdk.errors import ConfigError
 
 DIGEST = bytes.fromhex("00112233")
@@ -40,16 +40,21 @@ def test_a_message_is_the_sum_of_its_blocks(
 ) -> None:
     message = Message(kind, transmitter_id, sequence, payload)
     blocks = list(split(message, DIGEST, size))
-    assert len(blocks) == -(-len(payload) // (size - HEADER_BYTES))
+    # Independent of the module: a message of several blocks is followed by its CRC-32.
+    carried = payload
+    if len(payload) > size - 17:
+        carried += struct.pack("<I", binascii.crc32(payload))
+    assert len(blocks) == -(-len(carried) // (size - HEADER_BYTES))
     packed = [b.pack(size) for b in blocks]
     assert {len(p) for p in packed} == {size}
     assert [Block.unpack(p) for p in packed] == blocks
-    assert b"".join(b.part for b in blocks) == payload
+    assert b"".join(b.part for b in blocks) == carried
+    assert joined([b.part for b in blocks], len(payload)) == payload
     for i, p in enumerate(packed):
         # Independent of the module: the table of docs/messages.md.
         head = struct.pack("<BIIHH", 0x10 + kind, transmitter_id, sequence, i, len(payload)) + DIGEST
         assert p[:17] == head
-        part = payload[i * (size - 17) : (i + 1) * (size - 17)]
+        part = carried[i * (size - 17) : (i + 1) * (size - 17)]
         assert plain(p)[17:] == part + bytes(size - 17 - len(part))
 
 
@@ -72,6 +77,24 @@ def test_what_is_no_block_is_told(change: dict[int, int], told: str) -> None:
         block[at] = value if at < 17 else block[at] ^ value
     with pytest.raises(BlockError, match=told):
         Block.unpack(bytes(block))
+
+
+@given(st.binary(min_size=21, max_size=99), st.data())
+def test_parts_of_two_messages_are_not_joined(payload: bytes, data: st.DataObject) -> None:
+    other = data.draw(st.binary(min_size=len(payload), max_size=len(payload)))
+    one, two = ([b.part for b in split(Message(Kind.DATA, 1, 2, m), DIGEST, 37)] for m in (payload, other))
+    mixed = [data.draw(st.sampled_from(pair)) for pair in zip(one, two, strict=True)]
+    if mixed in (one, two):
+        assert joined(mixed, len(payload)) in (payload, other)
+        return
+    with pytest.raises(BlockError, match="not those of one message"):
+        joined(mixed, len(payload))
+
+
+def test_a_message_of_more_parts_than_there_are_numbers_is_refused() -> None:
+    message = Message(Kind.DATA, 1, 2, bytes(65535))
+    with pytest.raises(ConfigError, match="65535 bytes in parts of 1, expected at most 65536 parts"):
+        next(split(message, DIGEST, HEADER_BYTES + 1))
 
 
 @pytest.mark.parametrize(

@@ -132,6 +132,20 @@ def test_another_message_under_the_same_number_replaces_it() -> None:
     assert feed(longer)[0].message.payload == bytes(100)
 
 
+@pytest.mark.parametrize("length", [80, 100])
+def test_parts_of_two_messages_under_one_number_are_not_one_message(length: int) -> None:
+    """A transmitter that starts anew with another message, and the first part of the new one is lost."""
+    feed = Feed()
+    one, two = (blocks_of(Message(Kind.DATA, 7, 3, bytes([v]) * length)) for v in (1, 2))
+    assert len(one) == 3
+    assert not feed(one[:1] + two[1:])
+    assert feed.counts["messages_mixed"] == 1
+    assert "messages" not in feed.counts
+    # What comes again is of the new one.
+    found = feed(two)
+    assert [m.message.payload for m in found] == [bytes([2]) * length]
+
+
 def test_repetitions_are_added_until_they_decode() -> None:
     # At this bit error rate no packet decodes by itself: half the bits are message, capacity is 0.53 (soft).
     blocks = blocks_of(Message(Kind.DATA, 7, 3, bytes(range(100))))
