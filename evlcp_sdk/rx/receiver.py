@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 import pluggy
@@ -18,7 +19,7 @@ from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.look import Look, Looker
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
-from evlcp_sdk.rx.steps import Announcer, Steps
+from evlcp_sdk.rx.steps import Announcer, Steps, on_camera
 from evlcp_sdk.rx.timeline import Timeline, TimeStep
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Transmitter, Transmitters
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
@@ -90,9 +91,10 @@ class Receiver:
         self._step_us = link.regions.step_us
         self._seam_px = link.regions.margin_px
         self._tail_us = _TAIL_CHIPS * link.packet.chip_us
-        self._announcer = Announcer(hook)
-        self._steps = Steps(link, self._announcer)
         self._timeline = Timeline(self._step_us, link.camera.width, link.camera.height)
+        self._clock = self._timeline.clock
+        self._announcer = Announcer(hook, self._clock.camera_us)
+        self._steps = Steps(link, self._announcer)
         self._regions = RegionFollower(
             link.regions,
             link.camera,
@@ -118,12 +120,13 @@ class Receiver:
     def counts(self) -> dict[str, int]:
         """What was taken, found and dropped so far."""
         messages = self._messages.counts if self._messages is not None else {}
-        return self._timeline.counts | self._counts | messages
+        return self._clock.counts | self._counts | messages
 
     def feed(self, events: Events) -> list[Packet]:
         """Take the next events of the stream; return the packets that are complete.
 
-        Events before their predecessor in time, or off the sensor, are dropped and counted.
+        Events before their predecessor in time, off the sensor, or on a clock that no others agree on, are
+        dropped and counted.
 
         Raises:
             StreamError: The stream was closed, or a polarity is neither 0 nor 1.
@@ -142,7 +145,7 @@ class Receiver:
         self._closed = True
         packets = [packet for step in self._timeline.close() for packet in self._run(step)]
         for transmitter in self._transmitters.close():
-            self._end(transmitter, self._timeline.last_us)
+            self._end(transmitter, self._clock.last_us)
         packets = self._read(packets + self._judged.close())
         if self._messages is not None:
             self._messages.close()
@@ -188,7 +191,7 @@ class Receiver:
             for heard in locks:
                 self._counts["preambles"] += 1
                 lock = self._late_rows(transmitter, heard)
-                self._counts["locks"] += self._transmitters.adopt(transmitter, lock, self._timeline.first_us)
+                self._counts["locks"] += self._transmitters.adopt(transmitter, lock)
         return transmitter
 
     def _late_rows(self, transmitter: Transmitter, lock: SyncLock) -> SyncLock:
@@ -266,7 +269,7 @@ class Receiver:
         """Where a bar is seen, and how it leans; a panel has no direction, and counts as level."""
         if not self._is_column:
             return BarSight()
-        sight = sight_of(self._camera, *points, self._attitude_at(t_us))
+        sight = sight_of(self._camera, *points, self._attitude_at(self._clock.camera_us(t_us)))
         self._counts["frames_askew"] += sight.askew
         return sight
 
@@ -338,6 +341,7 @@ class Receiver:
         """Read the messages that packets carry."""
         self._counts["packets"] += len(packets)
         self._counts["frames_reflected"] += sum(len(p.frames) for p in packets if p.echo_of is not None)
+        packets = [self._on_camera(packet) for packet in packets]
         if self._messages is None:
             return packets
         read = []
@@ -347,3 +351,8 @@ class Receiver:
             for message in read[-1].messages:
                 self._announcer.lap("message", message)
         return read
+
+    def _on_camera(self, packet: Packet) -> Packet:
+        """A packet with the times of the camera's clock."""
+        frames = tuple(on_camera(frame, self._clock.camera_us) for frame in packet.frames)
+        return replace(packet, t_us=self._clock.camera_us(packet.t_us), frames=frames)

@@ -4,6 +4,7 @@ import math
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,22 @@ from evlcp_sdk.plugin.roles import ROLES, Filter, Synchronizer, Tracker
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
 from evlcp_sdk.scene.lean import BarSight
-from evlcp_sdk.values import Events, FrameView, PresenceMap, Range, SoftSymbols, SyncLock
+from evlcp_sdk.values import Events, Frame, FrameView, PresenceMap, Range, Region, SoftSymbols, SyncLock
 
-__all__ = ["Announcer", "Steps"]
+__all__ = ["Announcer", "Steps", "on_camera"]
+
+
+def on_camera(value: Any, camera_us: Callable[[float], float]) -> Any:
+    """What a stage gives, with the times of the camera's clock."""
+    match value:
+        case Region():
+            return replace(value, t_us=camera_us(value.t_us))
+        case SyncLock():
+            return replace(value, packet_t_us=camera_us(value.packet_t_us))
+        case Frame():
+            points_t_us = camera_us(value.points_t_us)
+            return replace(value, t_us=camera_us(value.t_us), points_t_us=points_t_us)
+    return value
 
 
 class Announcer:
@@ -27,9 +41,13 @@ class Announcer:
 
     Args:
         hook: Where that is heard (`Registry.hook`); None for nowhere.
+        camera_us: Gives the camera clock's time of a time inside.
     """
 
-    def __init__(self, hook: pluggy.HookRelay | None = None) -> None:
+    def __init__(
+        self, hook: pluggy.HookRelay | None = None, camera_us: Callable[[float], float] = lambda t_us: t_us
+    ) -> None:
+        self._camera_us = camera_us
         self._hook: Callable[..., Any] | None = None
         if hook is not None and hook.evlcp_stage_finished.get_hookimpls():
             self._hook = hook.evlcp_stage_finished
@@ -52,7 +70,7 @@ class Announcer:
     def _say(self, stage: str, value: object, elapsed_s: float) -> None:
         if self._hook is not None:
             try:
-                self._hook(stage=stage, value=value, elapsed_s=elapsed_s)
+                self._hook(stage=stage, value=on_camera(value, self._camera_us), elapsed_s=elapsed_s)
             except EvlcpError:
                 raise
             except (Exception, SystemExit) as fault:

@@ -1,10 +1,11 @@
-"""The clock's side of a stream: its order, its grid of time steps, its gaps."""
+"""The clock's side of a stream: its grid of time steps, its gaps."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from evlcp_sdk.rx.clock import CameraClock
 from evlcp_sdk.values import Events
 
 __all__ = ["TimeStep", "Timeline"]
@@ -15,7 +16,7 @@ class TimeStep:
     """The events of one time step.
 
     Attributes:
-        start_us: A multiple of the step's length, camera clock, us.
+        start_us: A multiple of the step's length after the stream's first event, us.
         end_us: Start of the next step, or the last event of a stream that ends in this one, us.
         events: Those in it, in order.
         after_gap: Steps in which nothing could happen were left out before it.
@@ -31,7 +32,7 @@ class Timeline:
     """Cuts a stream into time steps on a fixed grid, whatever pieces it comes in.
 
     A step is given once an event after it has been seen. Empty steps are given as long as somebody waits for
-    them, and left out in a gap.
+    them, and left out in a gap. Times are those inside: see `CameraClock`.
 
     Args:
         step_us: Length of a step, us.
@@ -39,45 +40,37 @@ class Timeline:
         height: Its rows.
 
     Attributes:
-        first_us: Time of the first event, us; 0 before it.
-        last_us: Time of the newest event, us; long ago before the first.
+        clock: What time it is, and which events are dropped.
 
     >>> timeline = Timeline(1000, 1280, 720)
     >>> events = Events.of([100, 2500, 2600], x=[5, 5, 5], y=[7, 7, 7], p=[1, 0, 1])
     >>> [(s.start_us, len(s.events)) for s in timeline.feed(events, lambda: True)]
     [(0, 1), (1000, 0)]
     >>> [(s.start_us, s.end_us, len(s.events)) for s in timeline.close()]
-    [(2000, 2600, 2)]
+    [(2000, 2500, 2)]
     """
 
     def __init__(self, step_us: int, width: int, height: int) -> None:
-        self.first_us = 0
-        self.last_us = -(2**62)
+        self.clock = CameraClock(width, height)
         self._step_us = step_us
-        self._size = width, height
         self._start_us: int | None = None
         self._pending: list[Events] = []
         self._after_gap = False
-        self._counts = {"events": 0, "dropped_time_backward": 0, "dropped_off_sensor": 0}
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Events taken, and dropped as they lie before their predecessor in time or off the sensor."""
-        return dict(self._counts)
 
     def feed(self, events: Events, waiting: Callable[[], bool]) -> Iterator[TimeStep]:
         """Take the next events of the stream; give the steps that they complete.
 
         Args:
-            events: Those in disorder or off the sensor are dropped and counted.
+            events: Those that the clock drops are in no step.
             waiting: Says after a step whether the next one matters even if it is empty.
         """
-        events = self._ordered(events)
-        if not len(events):
-            return
+        for kept in self.clock.take(events):
+            yield from self._cut(kept, waiting)
+
+    def _cut(self, events: Events, waiting: Callable[[], bool]) -> Iterator[TimeStep]:
+        """Cut events that are in order and not none."""
         if self._start_us is None:
-            self.first_us = int(events.t_us[0])
-            self._start_us = self._grid_us(self.first_us)
+            self._start_us = 0
         done = 0
         for end in self._bounds(events, self._start_us):
             self._pending.append(events[done:end])
@@ -93,8 +86,9 @@ class Timeline:
 
     def close(self) -> Iterator[TimeStep]:
         """End the stream; give the step that it ends in, if there is one."""
+        self.clock.close()
         if self._pending:
-            yield self._next(self.last_us)
+            yield self._next(self.clock.last_us)
 
     def _grid_us(self, t_us: int) -> int:
         return t_us // self._step_us * self._step_us
@@ -108,22 +102,6 @@ class Timeline:
         self._start_us += self._step_us
         return TimeStep(start_us, self._start_us if end_us is None else end_us, events, after_gap)
 
-    def _ordered(self, events: Events) -> Events:
-        from evlcp_sdk.rx import _kernels
-
-        t_us, x, y = events.t_us, events.x, events.y
-        self._counts["events"] += len(events)
-        if not len(events):
-            return events
-        if t_us[0] >= self.last_us and _kernels.all_ordered(t_us, x, y, *self._size):
-            self.last_us = int(t_us[-1])
-            return events
-        keep = np.empty(len(events), np.bool_)
-        off, backward, self.last_us = _kernels.keep_ordered(t_us, x, y, *self._size, self.last_us, keep)
-        self._counts["dropped_off_sensor"] += off
-        self._counts["dropped_time_backward"] += backward
-        return events[keep]
-
     def _bounds(self, events: Events, start_us: int) -> list[int]:
         """Where each new time step starts among the events."""
         t_us, step_us = events.t_us, self._step_us
@@ -133,5 +111,6 @@ class Timeline:
             step = t_us // step_us
             before = np.concatenate([[start_us // step_us], step[:-1]])
             return [int(i) for i in np.flatnonzero(step > before)]
-        starts_us = np.arange(start_us + step_us, int(t_us[-1]) + 1, step_us)
+        # Steps before the first event of these are not looked at, however many there are.
+        starts_us = np.arange(first_us + step_us * (first_us == start_us), int(t_us[-1]) + 1, step_us)
         return sorted(set(np.searchsorted(t_us, starts_us).tolist()))

@@ -76,13 +76,12 @@ class Transmitters:
         packets, grid = PacketAssembler(self._packet.frames), PacketGrid(self._packet)
         self._alive[region.id] = Transmitter(region, sync, packets, grid, distance)
 
-    def adopt(self, transmitter: Transmitter, lock: SyncLock, first_us: int) -> bool:
+    def adopt(self, transmitter: Transmitter, lock: SyncLock) -> bool:
         """Take a new lock; frames go on where they were, or start with the first whole one of the region.
 
         Args:
             transmitter: Whose preamble was heard.
             lock: How.
-            first_us: The stream's first event, us.
 
         Returns:
             Whether it is another packet grid than before.
@@ -90,8 +89,8 @@ class Transmitters:
         if transmitter.grid.follow(lock):
             return False
         transmitter.pilot = None
-        # Half a chip before the first event is still within the first edge's delay.
-        earliest_us = max(transmitter.region.first_us, first_us - lock.chip_us / 2)
+        # Half a chip before the first event, at 0, is still within the first edge's delay.
+        earliest_us = max(transmitter.region.first_us, -lock.chip_us / 2)
         if transmitter.grid.lock is None and self._inherit(transmitter, lock):
             transmitter.grid.skip_before(earliest_us)
             return True

@@ -41,11 +41,6 @@ def test_order_is_checked_event_by_event(seed, n):
     for e in (clock_faults(rng, n), random_events(rng, n)):
         want = twins.ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT)
         assert _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT) == want
-        keep = np.empty(n, np.bool_)
-        got = _kernels.keep_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, 1, keep)
-        kept, counts = twins.keep_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, 1)
-        assert (keep.tolist(), got) == (kept, counts)
-        assert twins.ordered(e.t_us[keep], e.x[keep], e.y[keep], WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize(("x", "y"), [(WIDTH, 0), (0, HEIGHT), (65_535, 65_535)])

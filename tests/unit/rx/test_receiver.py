@@ -1,5 +1,6 @@
 """The whole receiver on ideal recordings: what it must decode, and the laws it keeps."""
 
+import tracemalloc
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
@@ -348,6 +349,50 @@ def test_a_long_gap_costs_nothing() -> None:
     packets = received(LINK, Events.concat([first, ideal_events(LINK, bar, t0_us=hour)]))
     assert [f.transmitter for p in packets for f in p.frames] == [0] * 20 + [1] * 20
     assert check_symbols(packets[2:], bar, LINK, t0_us=hour) == 20
+
+
+def test_a_leap_of_a_month_in_one_piece_takes_no_memory() -> None:
+    bar = IdealBar(random_symbols(LINK, 2))
+    one = ideal_events(LINK, bar)
+    month = 30 * 86_400_000_000
+    whole = Events.concat([one, ideal_events(LINK, bar, t0_us=month)])
+    tracemalloc.start()
+    packets = received(LINK, whole)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert check_symbols(packets[2:], bar, LINK, t0_us=month) == 20
+    assert peak < 100e6
+
+
+@pytest.mark.parametrize("back_us", [100_000, 3_000_000, 10**15])
+def test_a_camera_that_restarts_its_clock_is_heard_again(back_us: int) -> None:
+    bar = IdealBar(random_symbols(LINK, 2))
+    late_us = 10**12
+    receiver = Receiver(LINK)
+    packets = receiver.feed(ideal_events(LINK, bar, t0_us=late_us))
+    packets += receiver.feed(ideal_events(LINK, bar, t0_us=late_us - back_us)) + receiver.close()
+    assert receiver.counts["clock_restarts"] == 1
+    assert receiver.counts["dropped_time_backward"] == receiver.counts["dropped_time_doubtful"] == 0
+    assert [f.transmitter for p in packets for f in p.frames] == [0] * 20 + [1] * 20
+    assert check_symbols(packets[:2], bar, LINK, t0_us=late_us) == 20
+    assert check_symbols(packets[2:], bar, LINK, t0_us=late_us - back_us) == 20
+
+
+@pytest.mark.parametrize("t0_us", [-123_457, 16_777_001, 1_700_000_000_123_457])
+def test_a_frame_says_the_same_at_any_time_of_the_clock(t0_us: int) -> None:
+    later = received(LINK, Events(STREAM.t_us + t0_us, STREAM.x, STREAM.y, STREAM.p))
+    for one, other in zip(received(LINK, STREAM), later, strict=True):
+        assert abs(other.t_us - t0_us - one.t_us) <= 0.25
+        for a, b in zip(one.frames, other.frames, strict=True):
+            assert (a.transmitter, a.range, a.filtered, a.x_px) == (
+                b.transmitter,
+                b.range,
+                b.filtered,
+                b.x_px,
+            )
+            assert_allclose(b.points_px, a.points_px, rtol=0)
+            assert abs(b.t_us - t0_us - a.t_us) <= 0.25
+            assert abs(b.points_t_us - t0_us - a.points_t_us) <= 0.25
 
 
 def test_memory_does_not_grow() -> None:

@@ -1,5 +1,6 @@
 """Time steps of a stream: the laws of the grid, against a loop over single events."""
 
+import tracemalloc
 from itertools import pairwise
 
 import numpy as np
@@ -22,14 +23,14 @@ def stream(seed: int, n: int = 300) -> Events:
 
 
 def kept(events: Events) -> tuple[list[tuple[int, ...]], int, int]:
-    """The events that are taken, one by one; and how many lie before one of those, or else off the sensor."""
+    """The events that are taken, one by one; and how many lie off the sensor, or else before one of those."""
     found: list[tuple[int, ...]] = []
     backward = off = 0
     for row in rows(events):
-        if found and row[0] < found[-1][0]:
-            backward += 1
-        elif row[1] >= WIDTH or row[2] >= HEIGHT:
+        if row[1] >= WIDTH or row[2] >= HEIGHT:
             off += 1
+        elif found and row[0] < found[-1][0]:
+            backward += 1
         else:
             found.append(row)
     return found, backward, off
@@ -63,19 +64,17 @@ def test_every_event_is_in_its_step_once(seed: int, waits: int) -> None:
     events = stream(seed)
     want, backward, off = kept(events)
     steps, timeline = steps_of(events, [], waits=waits)
-    assert [row for s in steps for row in rows(s.events)] == want
+    first = want[0][0]
+    assert [(first + t, *row) for s in steps for t, *row in rows(s.events)] == want
     assert all(s.start_us % STEP_US == 0 for s in steps)
     assert all(s.start_us <= t < s.start_us + STEP_US for s in steps for t in s.events.t_us)
     assert [s.end_us for s in steps[:-1]] == [s.start_us + STEP_US for s in steps[:-1]]
-    assert steps[-1].end_us == timeline.last_us == want[-1][0]
-    assert timeline.first_us == want[0][0]
+    assert steps[-1].end_us == timeline.clock.last_us == want[-1][0] - first
     assert backward
     assert off
-    assert timeline.counts == {
-        "events": len(events),
-        "dropped_time_backward": backward,
-        "dropped_off_sensor": off,
-    }
+    counts = timeline.clock.counts
+    assert counts["events"] == len(events)
+    assert (counts["dropped_time_backward"], counts["dropped_off_sensor"]) == (backward, off)
 
 
 @pytest.mark.parametrize("waits", [0, 1, 3])
@@ -100,11 +99,28 @@ def test_any_split_of_the_stream_gives_the_same_steps(seed: int, cuts: list[int]
     whole, timeline = steps_of(events, [], waits=waits)
     pieces, other = steps_of(events, sorted(cuts), waits=waits)
     assert plain(pieces) == plain(whole)
-    assert other.counts == timeline.counts
+    assert other.clock.counts == timeline.clock.counts
 
 
 def test_a_stream_without_events_has_no_steps() -> None:
     off = Events.of([5, 6], [WIDTH, 0], [0, HEIGHT], [1, 1])
     steps, timeline = steps_of(Events.concat([Events.empty(), off]), [0, 1], waits=1)
     assert steps == []
-    assert timeline.counts == {"events": 2, "dropped_time_backward": 0, "dropped_off_sensor": 2}
+    assert timeline.clock.counts["events"] == timeline.clock.counts["dropped_off_sensor"] == 2
+
+
+def test_a_leap_of_a_month_between_two_pieces_costs_nothing() -> None:
+    timeline = Timeline(STEP_US, WIDTH, HEIGHT)
+    t_us = np.arange(0, 20_000, 10)
+    one = Events.of(t_us, t_us * 0, t_us * 0, t_us * 0)
+    month_us = 30 * 86_400 * 10**6
+    other = Events.of(t_us + month_us, one.x, one.y, one.p)
+    tracemalloc.start()
+    steps = [s for e in (one, other) for s in timeline.feed(e, lambda: False)] + list(timeline.close())
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert sum(len(s.events) for s in steps) == 2 * len(t_us)
+    assert len(steps) <= 401
+    assert peak < 2e6
+    assert timeline.clock.counts["clock_leaps"] == 1
+    assert timeline.clock.camera_us(timeline.clock.last_us) == month_us + t_us[-1]
