@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from datetime import datetime
 from html import escape
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -59,6 +60,7 @@ def receive(
     *,
     registry: Registry | None = None,
     attitude: Attitude | AttitudeLog | None = None,
+    clock_zero: datetime | None = None,
 ) -> "Reception":
     """Receive a recording or a camera: an iterator over its packets, in constant memory.
 
@@ -70,6 +72,7 @@ def receive(
         registry: Plugins whose hooks are called; None for all that are installed.
         attitude: What is known of the camera's attitude, the same always or over time: how plumb bars lean
             against the sensor. None for nothing.
+        clock_zero: UTC of the camera clock's 0, for the age of signed beacons; None if it is not known.
 
     Raises:
         InputError: The source cannot be opened.
@@ -80,7 +83,8 @@ def receive(
     opened = source if isinstance(source, EventSource) else open_source(source, registry)
     try:
         check_sensor(opened, opened.path if isinstance(source, EventSource) else source, link.camera)
-        return Reception(opened, Receiver(link, registry.hook, attitude=attitude), link)
+        receiver = Receiver(link, registry.hook, attitude=attitude, clock_zero=clock_zero)
+        return Reception(opened, receiver, link)
     except BaseException:
         opened.close()
         raise
@@ -188,6 +192,7 @@ def receive_to_folder(
     registry: Registry | None = None,
     plan: PositionPlan | None = None,
     attitude: Attitude | AttitudeLog | None = None,
+    clock_zero: datetime | None = None,
     sinks: Sequence[str] = (),
     advance: Advance = lambda _done, _of: None,
     stopped: Stopped = lambda: False,
@@ -203,6 +208,8 @@ def receive_to_folder(
         plan: What positions are computed from; None for none.
         attitude: What is known of the camera's attitude, the same always or over time, for distances and
             positions; None for nothing.
+        clock_zero: UTC of the camera clock's 0, for the age of signed beacons, and for formats with UTC; None
+            if it is not known.
         sinks: Output formats beside the default ones, by name, e.g. `parquet`.
         advance: Says how far the reading is.
         stopped: Ends the run early; what was decoded until then is written.
@@ -223,9 +230,16 @@ def receive_to_folder(
         check_sensor(opened, url, link.camera)
         name = Path(url).name
         with ResultWriter(
-            folder, link, registry, name=name, plan=plan, attitude=attitude, sinks=sinks
+            folder,
+            link,
+            registry,
+            name=name,
+            plan=plan,
+            attitude=attitude,
+            clock_zero=clock_zero,
+            sinks=sinks,
         ) as writer:
-            receiver = Receiver(link, registry.hook, attitude=attitude)
+            receiver = Receiver(link, registry.hook, attitude=attitude, clock_zero=clock_zero)
             return _run(opened, url, receiver, writer, advance, stopped)
 
 

@@ -217,11 +217,14 @@ def shown(value: Any) -> str:
 
 
 def toml_value(value: Any) -> str:
-    """A value as TOML."""
+    """A value as TOML, on one line; what is None in a table is left out."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, Mapping):
+        pairs = (f"{key} = {toml_value(inner)}" for key, inner in value.items() if inner is not None)
+        return f"{{{', '.join(pairs)}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(toml_value, value))}]"
     return repr(value)

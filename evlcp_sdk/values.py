@@ -401,7 +401,9 @@ class ReceivedMessage:
         kind: What it is.
         value: What it says: a `Beacon`, a text, bytes, or what a plugin's kind makes of its payload.
         trust: How far it may be believed. Texts and data are not signed, so they are `unverified`.
-        reason: Why it is not `verified`; empty where it is.
+        reason: Why it is not `verified`; where it is, when it was signed, and how long before
+            it was received.
+        age_s: Time from a verified beacon's signature to its reception, s; None where that is not known.
     """
 
     transmitter: int
@@ -412,6 +414,7 @@ class ReceivedMessage:
     value: Any
     trust: Trust
     reason: str
+    age_s: float | None = None
 
     @property
     def beacon(self) -> Beacon | None:

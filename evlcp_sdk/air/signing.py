@@ -4,12 +4,18 @@ Needs the extra `sign` (package `cryptography`) to make keys, to sign, and to ch
 """
 
 import hashlib
+import math
 import os
 import stat
 import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import Field
 
 from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.errors import ConfigError, InputError, OutputError
@@ -18,7 +24,16 @@ from evlcp_sdk.files import write_new
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-__all__ = ["KEY_NAME_BYTES", "TrustedKeys", "make_key", "public_key", "read_key", "sign", "signed_bytes"]
+__all__ = [
+    "KEY_NAME_BYTES",
+    "TrustedKey",
+    "TrustedKeys",
+    "make_key",
+    "public_key",
+    "read_key",
+    "sign",
+    "signed_bytes",
+]
 
 KEY_NAME_BYTES = 8
 """Bytes that name a public key in a signature: the first of its SHA-256."""
@@ -117,34 +132,133 @@ def sign(beacon: Message, codebook: bytes, key: "Ed25519PrivateKey") -> Message:
     return Message(Kind.SIGNATURE, beacon.transmitter_id, beacon.sequence, payload)
 
 
+@dataclass(frozen=True)
+class TrustedKey:
+    """A public key that a receiver trusts, and what it may sign: a `[[messages.trusted_keys]]` of a link.
+
+    A key with several of these may sign what any of them allows.
+
+    Raises:
+        ConfigError: The key or a time is not one, the area is not whole, or a range is empty.
+
+    >>> TrustedKey("00" * 32, first_id=7, last_id=9, valid_to="2030-01-01").for_id(8)
+    True
+    """
+
+    key: Annotated[str, Field(description="The public key, 64 hex digits.")]
+    first_id: Annotated[int, Field(ge=0, lt=2**32, description="First transmitter id that it is for.")] = 0
+    last_id: Annotated[int, Field(ge=0, lt=2**32, description="Last transmitter id that it is for.")] = (
+        2**32 - 1
+    )
+    latitude_deg: Annotated[
+        float | None, Field(ge=-90, le=90, description="Centre of the area that it is for, WGS-84.")
+    ] = None
+    longitude_deg: Annotated[float | None, Field(ge=-180, le=180, description="The same.")] = None
+    radius_m: Annotated[
+        float | None, Field(gt=0, le=2e7, description="Radius of the area; without the three, anywhere.")
+    ] = None
+    valid_from: Annotated[
+        str, Field(description="Time from which on it is valid, UTC unless it says; empty: always.")
+    ] = ""
+    valid_to: Annotated[str, Field(description="Time until which it is valid, likewise.")] = ""
+
+    def __post_init__(self) -> None:
+        _key_bytes(self.key, "messages.trusted_keys: key")
+        begin, end = self._validity
+        for name, low, high, shown in (
+            ("last_id", self.first_id, self.last_id, f"first_id, {self.first_id}"),
+            ("valid_to", begin, end, f"valid_from, {self.valid_from}"),
+        ):
+            if high < low:
+                value = getattr(self, name)
+                raise ConfigError(f"messages.trusted_keys: {name} = {value!r}: expected not before {shown}")
+        if (self.latitude_deg, self.longitude_deg, self.radius_m).count(None) not in (0, 3):
+            raise ConfigError(
+                "messages.trusted_keys: latitude_deg, longitude_deg, radius_m of an area: give all or none"
+            )
+
+    @property
+    def area(self) -> tuple[float, float, float] | None:
+        """Latitude and longitude of the centre, degrees, and the radius, m; None: anywhere."""
+        if self.latitude_deg is None or self.longitude_deg is None or self.radius_m is None:
+            return None
+        return self.latitude_deg, self.longitude_deg, self.radius_m
+
+    def for_id(self, transmitter_id: int) -> bool:
+        """Whether it may sign for a transmitter."""
+        return self.first_id <= transmitter_id <= self.last_id
+
+    def holds_at(self, time_s: float) -> bool:
+        """Whether it is valid at a time, seconds since 1970."""
+        begin, end = self._validity
+        return begin <= time_s <= end
+
+    @property
+    def _validity(self) -> tuple[float, float]:
+        return (
+            _time_s(self.valid_from, "valid_from", -math.inf),
+            _time_s(self.valid_to, "valid_to", math.inf),
+        )
+
+
+def _time_s(text: str, name: str, without: float) -> float:
+    if not text:
+        return without
+    try:
+        time = datetime.fromisoformat(text)
+        return (time if time.tzinfo is not None else time.replace(tzinfo=UTC)).timestamp()
+    except (ValueError, OverflowError) as fault:
+        raise ConfigError(
+            f"messages.trusted_keys: {name} = {text!r}: expected a time such as 2027-01-01T00:00:00Z"
+        ) from fault
+
+
+def _key_bytes(text: str, name: str) -> bytes:
+    try:
+        key = bytes.fromhex(text)
+    except ValueError:
+        key = b""
+    if len(key) != _KEY_BYTES or len(text) != 2 * _KEY_BYTES:
+        raise ConfigError(
+            f"{name} = {text!r}: expected a public key of 64 hex digits, as 'evlcp tx keygen' prints it"
+        )
+    return key
+
+
 class TrustedKeys:
-    """The public keys that a receiver trusts.
+    """The public keys that a receiver trusts, and those that it does not trust any more.
 
     Args:
-        keys: Public keys, 64 hex digits each.
+        trusted: Public keys, and what each may sign.
+        revoked: Public keys whose beacons are forged, whenever they were signed; 64 hex digits each.
 
     Raises:
         ConfigError: A key is not valid, or there are keys and the extra is not installed.
     """
 
-    def __init__(self, keys: tuple[str, ...]) -> None:
-        self._keys: dict[bytes, bytes] = {}
-        for i, text in enumerate(keys):
-            try:
-                key = bytes.fromhex(text)
-            except ValueError:
-                key = b""
-            if len(key) != _KEY_BYTES:
-                raise ConfigError(
-                    f"messages.trusted_keys[{i}] = {text!r}: expected a public key of 64 hex digits,"
-                    " as 'evlcp tx keygen' prints it"
-                )
-            self._keys[_key_name(key)] = key
-        if keys:
+    def __init__(self, trusted: Sequence[TrustedKey], revoked: Sequence[str] = ()) -> None:
+        gone = [_key_bytes(text, f"messages.revoked_keys[{i}]") for i, text in enumerate(revoked)]
+        self._revoked = frozenset(map(_key_name, gone))
+        self._keys = {_key_name(key): key for key in gone}
+        self._grants: dict[bytes, tuple[TrustedKey, ...]] = {}
+        for grant in trusted:
+            key = bytes.fromhex(grant.key)
+            name = _key_name(key)
+            self._keys[name] = key
+            self._grants[name] = (*self._grants.get(name, ()), grant)
+        if self._keys:
             _check_installed()
 
+    def revoked(self, signature: Message) -> bool:
+        """Whether a signature names a key that is revoked."""
+        return signature.payload[:KEY_NAME_BYTES] in self._revoked
+
+    def grants(self, signature: Message) -> tuple[TrustedKey, ...]:
+        """What the key that a signature names may sign; empty if it is not trusted."""
+        return self._grants.get(signature.payload[:KEY_NAME_BYTES], ())
+
     def check(self, beacon: Message, codebook: bytes, signature: Message) -> bool | None:
-        """Whether a signature is that of a beacon; None if it names no trusted key.
+        """Whether a signature is that of a beacon; None if it names no known key.
 
         Args:
             beacon: The beacon.

@@ -88,6 +88,8 @@ def _messages(counts: Mapping[str, int]) -> str:
     trusts = {t: counts[f"beacons_{t}"] for t in ("verified", "unverified", "forged")}
     if any(trusts.values()):
         text += f"; beacons {', '.join(f'{n} times {t}' for t, n in trusts.items() if n)}"
+    if counts["beacons_undated"]:
+        text += "; how old verified ones are is not known without --clock-zero"
     for key, lost in (
         ("blocks_failed", "packets not readable"),
         ("blocks_other_codebook", "packets of another codebook"),

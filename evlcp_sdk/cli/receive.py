@@ -14,6 +14,8 @@ from evlcp_sdk.cli._summary import show
 from evlcp_sdk.errors import InputError, InterruptedRunError, OutputError
 
 if TYPE_CHECKING:
+    from datetime import datetime
+
     from evlcp_sdk.link.resolve import Link
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
@@ -80,7 +82,11 @@ def receive(
     ] = 0.1,
     clock_zero: Annotated[
         str | None,
-        typer.Option("--clock-zero", metavar="UTC", help="UTC of the camera clock's 0, for NMEA and MCAP."),
+        typer.Option(
+            "--clock-zero",
+            metavar="UTC",
+            help="UTC of the camera clock's 0, for the age of signed beacons, NMEA and MCAP.",
+        ),
     ] = None,
     mcap: Annotated[bool, typer.Option("--mcap", help="Also write fixes.mcap, for Foxglove.")] = False,
     sinks: Annotated[
@@ -128,7 +134,7 @@ def receive(
     link = load_link(link_file, overrides or [], registry)
     angles = (heading_deg, pitch_deg, roll_deg)
     attitude = _attitude(attitude_file, angles, (gravity_sigma_deg, heading_sigma_deg))
-    plan = _position_plan(sites, clock_zero, mcap)
+    plan, zero = _position_plan(sites, mcap), _clock_zero(clock_zero)
     short = {"figures": figures, "parquet": parquet, "mcap": mcap}
     asked = tuple(dict.fromkeys([*(name for name, given in short.items() if given), *(sinks or [])]))
     load_sinks(choose_sinks(registry, asked, positions=plan is not None))
@@ -147,6 +153,7 @@ def receive(
             link=link,
             plan=plan,
             attitude=attitude,
+            clock_zero=zero,
             sinks=asked,
             stopped=stopped if here else None,
         )
@@ -203,30 +210,34 @@ def _attitude(
     return Attitude(pitch, roll, heading, *sigmas) if pitch is not None and roll is not None else None
 
 
-def _position_plan(sites: Path | None, clock_zero: str | None, mcap: bool) -> "PositionPlan | None":
+def _position_plan(sites: Path | None, mcap: bool) -> "PositionPlan | None":
     """What the options say of positions; None without sites."""
     if sites is None:
-        for name, value in {"--clock-zero": clock_zero, "--mcap": mcap or None}.items():
-            if value is not None:
-                raise typer.BadParameter("needs --sites", param_hint=name)
+        if mcap:
+            raise typer.BadParameter("needs --sites", param_hint="--mcap")
         return None
-    from datetime import UTC, datetime
-
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.scene.sites import load_sites
 
-    zero = None
-    if clock_zero is not None:
-        try:
-            zero = datetime.fromisoformat(clock_zero)
-        except ValueError as fault:
-            text = f"{clock_zero!r}: expected a time such as 2026-03-01T10:15:00Z"
-            raise typer.BadParameter(text, param_hint="--clock-zero") from fault
-        zero = zero if zero.tzinfo is not None else zero.replace(tzinfo=UTC)
-        # MCAP counts from 1970 on, and NMEA has two digits of the year.
-        if not datetime(1970, 1, 1, tzinfo=UTC) <= zero < datetime(2200, 1, 1, tzinfo=UTC):
-            raise typer.BadParameter(f"{clock_zero!r}: expected 1970 to 2199", param_hint="--clock-zero")
-    return PositionPlan(load_sites(sites), zero)
+    return PositionPlan(load_sites(sites))
+
+
+def _clock_zero(text: str | None) -> "datetime | None":
+    """UTC of the camera clock's 0; None if it is not given."""
+    from datetime import UTC, datetime
+
+    if text is None:
+        return None
+    try:
+        zero = datetime.fromisoformat(text)
+    except ValueError as fault:
+        said = f"{text!r}: expected a time such as 2026-03-01T10:15:00Z"
+        raise typer.BadParameter(said, param_hint="--clock-zero") from fault
+    zero = zero if zero.tzinfo is not None else zero.replace(tzinfo=UTC)
+    # MCAP counts from 1970 on, and NMEA has two digits of the year.
+    if not datetime(1970, 1, 1, tzinfo=UTC) <= zero < datetime(2200, 1, 1, tzinfo=UTC):
+        raise typer.BadParameter(f"{text!r}: expected 1970 to 2199", param_hint="--clock-zero")
+    return zero
 
 
 def _decode_job(
@@ -235,13 +246,15 @@ def _decode_job(
     link: "Link",
     plan: "PositionPlan | None",
     attitude: "Attitude | AttitudeLog | None",
+    clock_zero: "datetime | None",
     sinks: tuple[str, ...],
     stopped: Callable[[], bool] | None,
 ) -> dict[str, Any]:
     """Decode a recording here, with a bar; or, without `stopped`, quietly in a worker."""
     from evlcp_sdk.run import receive_to_folder, stop_on_request
 
-    decode = partial(receive_to_folder, job.url, job.folder, link, plan=plan, attitude=attitude, sinks=sinks)
+    known: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock_zero}
+    decode = partial(receive_to_folder, job.url, job.folder, link, **known, sinks=sinks)
     if stopped is not None:
         with bytes_bar(Path(job.url).name) as advance:
             return decode(advance=advance, stopped=stopped)

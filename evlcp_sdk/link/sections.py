@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.air.signing import TrustedKey
 
 __all__ = ["AirSpec", "MessageSpec", "PositionSpec", "RegionSpec"]
 
@@ -47,9 +48,17 @@ class MessageSpec:
         Field(gt=0, le=100, description="Largest LLR after that; no bit is surer than the sync it hangs on."),
     ] = 7.0
     trusted_keys: Annotated[
-        tuple[str, ...],
-        Field(description="Public Ed25519 keys, 64 hex digits each, whose beacons are verified."),
+        tuple[TrustedKey, ...],
+        Field(description="Public Ed25519 keys whose beacons are verified, and what each may sign."),
     ] = ()
+    revoked_keys: Annotated[
+        tuple[str, ...],
+        Field(description="Public keys whose beacons are forged, whenever they were signed."),
+    ] = ()
+    max_age_s: Annotated[
+        float,
+        Field(ge=0, description="Time from signature to reception up to which a beacon is verified; 0: any."),
+    ] = 0.0
     oldest_sequence: Annotated[
         int, Field(ge=0, lt=2**32, description="Sequence below which a signed beacon counts as replayed.")
     ] = 0

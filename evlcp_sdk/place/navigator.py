@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import datetime
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +29,9 @@ class PositionPlan:
 
     Attributes:
         sites: Where the bars stand.
-        clock_zero: UTC of the camera clock's 0, where known.
     """
 
     sites: tuple[BarSite, ...]
-    clock_zero: datetime | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ class Mcap(Sink):
         from mcap_protobuf.writer import Writer
 
         super().__init__(folder, run)
-        zero = run.plan.clock_zero if run.plan is not None else None
+        zero = run.clock_zero
         self._zero_us = round(zero.timestamp() * 1e6) if zero is not None else 0
         self._writer: Any = Writer(folder.open_binary("fixes.mcap"))
 

@@ -26,7 +26,7 @@ class Nmea(Sink):
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
         self._file = folder.open("fixes.nmea")
-        self._zero = run.plan.clock_zero if run.plan is not None else None
+        self._zero = run.clock_zero
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write two sentences; those of a refused fix have no place."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
 
 from evlcp_sdk.link.resolve import Link
@@ -21,12 +22,14 @@ class Run:
         link: The configuration that the receiver runs with.
         plan: What positions are computed from; None where none are computed.
         navigator: Computes them; at the end it says where the bars stand. None where none are computed.
+        clock_zero: UTC of the camera clock's 0; None where it is not known.
     """
 
     name: str
     link: Link
     plan: PositionPlan | None = None
     navigator: Navigator | None = None
+    clock_zero: datetime | None = None
 
 
 class Sink:

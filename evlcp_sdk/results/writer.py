@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -33,6 +34,7 @@ class ResultWriter:
         name: Name of the recording, for titles.
         plan: What positions are computed from; None for none.
         attitude: What is known of the camera's attitude, for positions; None for nothing.
+        clock_zero: UTC of the camera clock's 0; None if it is not known.
         sinks: Output formats beside the default ones, by name.
 
     Raises:
@@ -50,6 +52,7 @@ class ResultWriter:
         name: str = "",
         plan: PositionPlan | None = None,
         attitude: Attitude | AttitudeLog | None = None,
+        clock_zero: datetime | None = None,
         sinks: Sequence[str] = (),
     ) -> None:
         self._registry = Registry.load() if registry is None else registry
@@ -60,7 +63,8 @@ class ResultWriter:
         files = [file for s in installed_sinks(self._registry).values() for file in s.record.files]
         with ExitStack() as stack:
             self._folder = stack.enter_context(ResultFolder(folder, files))
-            self._sinks = Sinks(classes, self._folder, Run(name, link, plan, self._navigator))
+            run = Run(name, link, plan, self._navigator, clock_zero)
+            self._sinks = Sinks(classes, self._folder, run)
             stack.enter_context(self._registry.joined(*self._sinks.all))
             self._stack = stack.pop_all()
 

@@ -4,21 +4,21 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message, carried_bytes, joined
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
-from evlcp_sdk.air.signing import TrustedKeys
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.sections import MessageSpec
 from evlcp_sdk.rx.guard import Guard
-from evlcp_sdk.values import Packet, ReceivedMessage, Trust
+from evlcp_sdk.rx.trust import BeaconJudge, Standing, signed_text
+from evlcp_sdk.values import Packet, ReceivedMessage
 
 __all__ = ["MessageAssembler"]
 
@@ -30,9 +30,6 @@ _MOST_TRANSMITTERS = 16
 
 _MOST_MESSAGES = 8
 """Messages of a transmitter that are collected at a time, and that are remembered when complete."""
-
-_MOST_VERIFIED = 4096
-"""Transmitter ids whose last verified beacon is remembered; the one not heard for longest makes way."""
 
 _Key = tuple[int, int, int]
 _K = TypeVar("_K")
@@ -56,14 +53,14 @@ class _Parts:
         carried: Bytes that all its parts carry.
         parts: Known parts by number.
         payload: Its bytes, once all are known.
-        given: The trust and reason last handed on; None before.
+        given: The trust last handed on, and why not more; None before.
     """
 
     length: int
     carried: int
     parts: dict[int, bytes] = field(default_factory=dict)
     payload: bytes = b""
-    given: tuple[Trust, str] | None = None
+    given: Standing | None = None
 
     def complete(self) -> bool:
         return sum(map(len, self.parts.values())) == self.carried
@@ -81,12 +78,6 @@ class _Inbox:
     done: OrderedDict[_Key, _Parts] = field(default_factory=OrderedDict)
 
 
-@dataclass(frozen=True)
-class _Verified:
-    sequence: int
-    payload: bytes
-
-
 class MessageAssembler:
     """Reads the blocks of packets and puts messages together, transmitter by transmitter.
 
@@ -101,6 +92,7 @@ class MessageAssembler:
         spec: The configuration.
         kinds: The kinds of messages that are understood, by number; blocks of others count as malformed.
         guard: Names the error correction where it fails.
+        clock_zero: UTC of the camera clock's 0; None if it is not known.
 
     Raises:
         ConfigError: A trusted key is not valid, or there are keys and the extra `sign` is not installed.
@@ -112,15 +104,16 @@ class MessageAssembler:
         spec: MessageSpec,
         kinds: Mapping[int, MessageKind] = BUILT_IN_KINDS,
         guard: Guard | None = None,
+        clock_zero: datetime | None = None,
     ) -> None:
         self._coder = coder
         self._guard: AbstractContextManager[None] = guard or nullcontext()
         self._kinds = kinds
         self._spec = spec
         self._room = coder.block_bytes - HEADER_BYTES
-        self._keys = TrustedKeys(spec.trusted_keys)
+        self._beacons = BeaconJudge(spec, coder.digest)
+        self._zero_s = None if clock_zero is None else clock_zero.timestamp()
         self._inboxes: OrderedDict[int, _Inbox] = OrderedDict()
-        self._verified: OrderedDict[int, _Verified] = OrderedDict()
         self._counts = dict.fromkeys(
             (
                 "blocks_reflected",
@@ -139,13 +132,18 @@ class MessageAssembler:
                 "beacons_verified",
                 "beacons_unverified",
                 "beacons_forged",
+                "beacons_undated",
             ),
             0,
         )
 
     @classmethod
-    def of(cls, link: Link) -> Self | None:
+    def of(cls, link: Link, clock_zero: datetime | None = None) -> Self | None:
         """What reads a link's messages; None where that is turned off, or packets are too short for them.
+
+        Args:
+            link: The link.
+            clock_zero: UTC of the camera clock's 0; None if it is not known.
 
         Raises:
             ConfigError: As above.
@@ -158,7 +156,7 @@ class MessageAssembler:
                 coder = link.block_coder()
         except ConfigError:
             return None
-        return cls(coder, link.messages, link.kinds, guard)
+        return cls(coder, link.messages, link.kinds, guard, clock_zero)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -275,69 +273,33 @@ class MessageAssembler:
             # Whatever a lamp says, and whatever a plugin makes of it, the receiver goes on.
             return self._undecodable(parts)
         beacon = value if message.kind == Kind.BEACON else None
-        verdict: tuple[Trust, str] = ("unverified", "not signed")
+        verdict, now_s = Standing("unverified", "not signed"), None
         if beacon is not None:
-            verdict = self._judge(inbox, message, beacon)
+            now_s = None if self._zero_s is None else self._zero_s + packet.t_us * 1e-6
+            signed = inbox.done.get((transmitter_id, Kind.SIGNATURE, sequence))
+            signature = None
+            if signed is not None:
+                signature = Message(Kind.SIGNATURE, transmitter_id, sequence, signed.payload)
+            verdict = self._beacons.judge(message, beacon, signature, now_s)
         if verdict == parts.given:
             return []
         self._counts["messages"] += parts.given is None
-        if beacon is not None and (parts.given is None or parts.given[0] != verdict[0]):
-            self._counts[f"beacons_{verdict[0]}"] += 1
+        if beacon is not None and (parts.given is None or parts.given.trust != verdict.trust):
+            self._counts[f"beacons_{verdict.trust}"] += 1
+            self._counts["beacons_undated"] += verdict.trust == "verified" and now_s is None
         parts.given = verdict
         where = (packet.transmitter, packet.packet, packet.t_us)
-        return [ReceivedMessage(*where, message, kind, value, *verdict)]
+        reason, age_s = verdict.why, None
+        if verdict.trust == "verified":
+            reason, age_s = signed_text(message, now_s)
+        return [ReceivedMessage(*where, message, kind, value, verdict.trust, reason, age_s)]
 
     def _undecodable(self, parts: _Parts) -> list[ReceivedMessage]:
         """Count a message whose bytes mean nothing, once."""
         if parts.given is None:
-            parts.given = ("unverified", "undecodable")
+            parts.given = Standing("unverified", "undecodable")
             self._counts["messages_undecodable"] += 1
         return []
-
-    def _judge(self, inbox: _Inbox, message: Message, beacon: Beacon) -> tuple[Trust, str]:
-        """How far a beacon may be believed; remembers it if it is verified."""
-        last = self._verified.get(message.transmitter_id)
-        if last is not None and last.sequence == message.sequence and last.payload == message.payload:
-            self._verified.move_to_end(message.transmitter_id)
-            return "verified", ""
-        if last is not None and message.sequence < last.sequence:
-            return "forged", f"replayed: sequence {message.sequence} is older than verified {last.sequence}"
-        if last is not None and message.sequence == last.sequence:
-            return "forged", f"differs from the verified beacon of sequence {last.sequence}"
-        signed = inbox.done.get((message.transmitter_id, Kind.SIGNATURE, message.sequence))
-        digest = self._coder.digest
-        good = (
-            None
-            if signed is None
-            else self._keys.check(
-                message,
-                digest,
-                Message(Kind.SIGNATURE, message.transmitter_id, message.sequence, signed.payload),
-            )
-        )
-        if good is False:
-            return "forged", "the signature is not that of this beacon"
-        if good is None:
-            if last is not None and Beacon.unpack(last.payload).place != beacon.place:
-                return (
-                    "forged",
-                    f"another place than the verified beacon of sequence {last.sequence}, unsigned",
-                )
-            return (
-                "unverified",
-                "no signature yet" if signed is None else "signed by a key that is not trusted",
-            )
-        if message.sequence < self._spec.oldest_sequence:
-            oldest = self._spec.oldest_sequence
-            return (
-                "forged",
-                f"replayed: sequence {message.sequence} is older than messages.oldest_sequence {oldest}",
-            )
-        self._verified[message.transmitter_id] = _Verified(message.sequence, message.payload)
-        self._verified.move_to_end(message.transmitter_id)
-        while len(self._verified) > _MOST_VERIFIED:
-            self._verified.popitem(last=False)
-        return "verified", ""
 
     def _missing(self, parts: _Parts | None) -> None:
         if parts is not None:

@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from dataclasses import replace
+from datetime import datetime
 
 import numpy as np
 import pluggy
@@ -65,6 +66,7 @@ class Receiver:
         hook: Where finished stages are announced (`Registry.hook`); None for nowhere.
         attitude: What is known of the camera's attitude, the same always or over time: how plumb bars lean
             against the sensor. None for nothing.
+        clock_zero: UTC of the camera clock's 0, for the age of signed beacons; None if it is not known.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> receiver = Receiver(load_link())
@@ -82,6 +84,7 @@ class Receiver:
         hook: pluggy.HookRelay | None = None,
         *,
         attitude: Attitude | AttitudeLog | None = None,
+        clock_zero: datetime | None = None,
     ) -> None:
         centres_m = link.bar.cluster_centres_m()
         self._camera = link.camera
@@ -110,7 +113,7 @@ class Receiver:
         self._find_points = points_finder(layout_of(centres_m))
         self._echoes = Echoes(link.packet, len(link.codebook.codewords))
         self._judged = EchoQueue(self._echoes)
-        self._messages = MessageAssembler.of(link)
+        self._messages = MessageAssembler.of(link, clock_zero)
         self._joined: set[int] = set()
         self._due: deque[Followed] = deque()
         self._closed = False

@@ -450,7 +450,7 @@ def test_an_attitude_alone_corrects_distances(evlcp: Evlcp, street: Path, tmp_pa
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--clock-zero", "2026-03-01"], "needs --sites"),
+        (["--clock-zero", "noon"], "expected a time such as"),
         (["--heading-deg", "3"], "a heading needs gravity"),
         (["--attitude", "none.csv"], "none.csv: cannot be read"),
         (["--sites", "S", "--heading-deg", "3"], "a heading needs gravity"),

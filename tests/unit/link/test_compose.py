@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.air.blocks import Kind
-from evlcp_sdk.air.signing import TrustedKeys, make_key
+from evlcp_sdk.air.signing import TrustedKey, TrustedKeys, make_key
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.compose import compose, messages_of, packets_of
 from evlcp_sdk.link.resolve import load_link
@@ -25,9 +25,9 @@ def test_a_beacon_is_signed_with_the_key(tmp_path: Path) -> None:
     )
     assert (beacon.kind, signature.kind, beacon.transmitter_id) == (Kind.BEACON, Kind.SIGNATURE, 7)
     digest = link.block_coder().digest
-    assert TrustedKeys((public,)).check(beacon, digest, signature) is True
+    assert TrustedKeys([TrustedKey(public)]).check(beacon, digest, signature) is True
     other = messages_of(link, beacon=SITE, user=b"lane 3", sequence=3)[0]
-    assert TrustedKeys((public,)).check(other, digest, signature) is False
+    assert TrustedKeys([TrustedKey(public)]).check(other, digest, signature) is False
     symbols = compose(link, beacon=SITE, user=b"lane 2", key=tmp_path / "private.pem", sequence=3, repeat=2)
     np.testing.assert_array_equal(symbols, packets_of([beacon, signature], link.block_coder(), 2))
 

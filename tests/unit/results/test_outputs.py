@@ -149,7 +149,7 @@ def test_a_message_is_a_line_after_its_packet(tmp_path: Path) -> None:
     messages = (
         received(Kind.TEXT, "Tempo 30 für \n 2 km".encode()),
         received(Kind.DATA, b"\x00\xff"),
-        received(Kind.BEACON, beacon.pack(), trust="verified", reason=""),
+        received(Kind.BEACON, beacon.pack(), trust="verified", reason="signed then", age_s=2.5),
         received(Kind.BEACON, beacon.pack(), trust="forged", reason="replayed"),
     )
     with ResultWriter(tmp_path, LINK) as writer:
@@ -158,14 +158,13 @@ def test_a_message_is_a_line_after_its_packet(tmp_path: Path) -> None:
     lines = [json.loads(line) for line in (tmp_path / "packets.jsonl").read_text().splitlines()]
     assert [line["kind"] for line in lines] == ["packet", "text", "data", "beacon", "beacon", "packet"]
     shared = {"transmitter": 1, "packet": 4, "t_us": 12.35, "transmitter_id": 7, "sequence": 9}
-    unsigned = shared | {"verified": False, "trust": "unverified", "reason": "not signed"}
+    unsigned = shared | {"verified": False, "trust": "unverified", "reason": "not signed", "age_s": None}
     assert lines[1] == {"kind": "text"} | unsigned | {"text": "Tempo 30 für \n 2 km"}
     assert lines[2] == {"kind": "data"} | unsigned | {"data": "00ff"}
     place = {"latitude_deg": 35.1, "longitude_deg": 136.9, "height_m": 52.0, "user": "0102"}
     place |= {"heading_deg": 90.0, "tilt_deg": 1.0, "length_m": 0.96}
-    assert (
-        lines[3] == {"kind": "beacon", "verified": True, "trust": "verified", "reason": ""} | shared | place
-    )
+    believed = {"verified": True, "trust": "verified", "reason": "signed then", "age_s": 2.5}
+    assert lines[3] == {"kind": "beacon"} | believed | shared | place
     assert (lines[4]["verified"], lines[4]["trust"], lines[4]["reason"]) == (False, "forged", "replayed")
 
 

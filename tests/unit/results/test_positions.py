@@ -63,8 +63,10 @@ def write(
     plan: PositionPlan,
     sinks: Sequence[str] = (),
     attitude: Attitude = ATTITUDE,
+    zero: datetime | None = None,
 ) -> dict[str, Any]:
-    with ResultWriter(folder, LINK, plan=plan, attitude=attitude, sinks=sinks) as results:
+    known = {"plan": plan, "attitude": attitude, "clock_zero": zero}
+    with ResultWriter(folder, LINK, sinks=sinks, **known) as results:  # type: ignore[arg-type]
         results.write(stream)
         told: dict[str, Any] = results.finish("complete", {}, {}, {}, {})["positions"]
     return told
@@ -76,7 +78,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 def test_files_of_a_drive(tmp_path: Path) -> None:
-    told = write(tmp_path, packets(13), PositionPlan((SITE,), ZERO), ["figures"])
+    told = write(tmp_path, packets(13), PositionPlan((SITE,)), ["figures"], zero=ZERO)
     fixes = rows(tmp_path / "fixes.csv")
     assert told["fixes"] == len(fixes) == 12
     assert told["bars"] == {"0": 7}
@@ -125,7 +127,7 @@ def test_the_figure_of_a_track(tmp_path: Path) -> None:
 def test_a_track_across_the_180th_meridian_is_cut(tmp_path: Path) -> None:
     metre = 1 / (111_319.5 * math.cos(math.radians(35)))
     site = dataclasses.replace(SITE, longitude_deg=180 - metre)
-    write(tmp_path, packets(4), PositionPlan((site,), ZERO))
+    write(tmp_path, packets(4), PositionPlan((site,)), zero=ZERO)
     shapes = json.loads((tmp_path / "fixes.geojson").read_text())["features"]
     (line,) = (s["geometry"]["coordinates"] for s in shapes if s["geometry"]["type"] == "LineString")
     assert all(-180 <= point[0] < -179.9999 for point in line)
@@ -201,7 +203,7 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
     from mcap_protobuf.decoder import DecoderFactory
     from scipy.spatial.transform import Rotation
 
-    write(tmp_path, packets(6), PositionPlan((SITE,), ZERO), ["mcap"])
+    write(tmp_path, packets(6), PositionPlan((SITE,)), ["mcap"], zero=ZERO)
     fixes = rows(tmp_path / "fixes.csv")
     found: dict[str, list[tuple[str, int, object]]] = {}
     with (tmp_path / "fixes.mcap").open("rb") as file:

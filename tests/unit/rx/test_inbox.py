@@ -224,6 +224,7 @@ class Signed:
     def __init__(self, folder: Path) -> None:
         pytest.importorskip("cryptography", reason="the extra sign is not installed")
         self.public = signing.make_key(folder / "k.pem")
+        self.trusted = (signing.TrustedKey(self.public),)
         self.key = signing.read_key(folder / "k.pem")
 
     def __call__(self, sequence: int, beacon: Beacon = PLACE, transmitter_id: int = 7) -> list[Message]:
@@ -241,15 +242,16 @@ def trusts(found: list[ReceivedMessage]) -> list[str]:
 
 
 def test_a_signed_beacon_is_verified_once_its_signature_is_there(signed: Signed) -> None:
-    feed = Feed(trusted_keys=(signed.public,))
+    feed = Feed(trusted_keys=signed.trusted)
     blocks = blocks_of(*signed(5))
     assert len(blocks) == 3
     found = feed(blocks * 3)
     assert trusts(found) == ["unverified", "verified"]
-    assert (found[0].reason, found[1].reason) == ("no signature yet", "")
+    unknown = "signed 1970-01-01 00:00:05 UTC; when it was received is not known"
+    assert (found[0].reason, found[1].reason) == ("no signature yet", unknown)
     assert found[1].beacon == PLACE
     # The signature may come first.
-    assert trusts(Feed(trusted_keys=(signed.public,))(blocks[1:] + blocks[:1])) == ["verified"]
+    assert trusts(Feed(trusted_keys=signed.trusted)(blocks[1:] + blocks[:1])) == ["verified"]
     # A newer beacon of another place is believed with its signature only.
     moved = replace(PLACE, latitude_deg=35.2)
     found = feed(blocks_of(*signed(6, moved)))
@@ -266,9 +268,9 @@ def test_without_a_trusted_key_nothing_is_verified(signed: Signed) -> None:
 
 
 def test_an_old_beacon_is_replayed(signed: Signed) -> None:
-    feed = Feed(trusted_keys=(signed.public,), oldest_sequence=3)
+    feed = Feed(trusted_keys=signed.trusted, oldest_sequence=3)
     assert trusts(feed(blocks_of(*signed(2)))) == ["unverified", "forged"]
-    feed = Feed(trusted_keys=(signed.public,))
+    feed = Feed(trusted_keys=signed.trusted)
     assert trusts(feed(blocks_of(*signed(9)))) == ["unverified", "verified"]
     found = feed(blocks_of(*signed(8, replace(PLACE, latitude_deg=35.3))), transmitter=1)
     assert trusts(found) == ["forged"]
@@ -277,14 +279,15 @@ def test_an_old_beacon_is_replayed(signed: Signed) -> None:
     assert trusts(found) == ["forged"]
     assert found[0].reason == "differs from the verified beacon of sequence 9"
     # Another transmitter's number is its own.
-    assert trusts(feed(blocks_of(*signed(1, transmitter_id=8)))) == ["unverified", "verified"]
+    other = signed(1, replace(PLACE, latitude_deg=35.4), transmitter_id=8)
+    assert trusts(feed(blocks_of(*other))) == ["unverified", "verified"]
 
 
 def test_every_forgery_of_ten_thousand_is_found_out(signed: Signed, tmp_path: Path) -> None:
     """A lamp beside the honest one shows tampered, unsigned, replayed or wrongly signed beacons."""
     rng = np.random.default_rng(11)
     other = Signed(tmp_path)
-    assembler = MessageAssembler(CODER, replace(MessageSpec(), trusted_keys=(signed.public,)))
+    assembler = MessageAssembler(CODER, replace(MessageSpec(), trusted_keys=signed.trusted))
 
     def show(messages: list[Message], transmitter: int) -> list[ReceivedMessage]:
         """Hand blocks over as if decoded: forgery is of bytes, not of light."""
@@ -331,4 +334,4 @@ def test_every_forgery_of_ten_thousand_is_found_out(signed: Signed, tmp_path: Pa
     # Some tampered bytes are a place that cannot be: counted, and never handed on.
     assert flagged + assembler.counts["messages_undecodable"] == 10_000
     assert flagged > 9_000
-    assert assembler._verified[7].sequence == 1000
+    assert assembler._beacons._verified[7].message.sequence == 1000

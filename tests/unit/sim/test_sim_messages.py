@@ -135,7 +135,7 @@ def test_from_a_scene_to_the_lines_of_a_result(evlcp: Any, tmp_path: Path) -> No
         f"--preset drive-30kmh --set duration_s=0.2 --set bars.start_chip=1380 --set bars.chips_file={chips}"
     )
     assert evlcp("simulate", *scene.split(), "-o", rec).code == 0
-    told = evlcp("receive", rec, "-o", out, "--set", f'messages.trusted_keys=["{public}"]')
+    told = evlcp("receive", rec, "-o", out, "--set", f'messages.trusted_keys=[{{key="{public}"}}]')
     assert told.code == 0, told.err
     lines = [json.loads(line) for line in (out / "packets.jsonl").read_text().splitlines()]
     messages = [line for line in lines if line["kind"] != "packet"]
@@ -148,7 +148,9 @@ def test_from_a_scene_to_the_lines_of_a_result(evlcp: Any, tmp_path: Path) -> No
     assert (text["text"], text["transmitter_id"], text["sequence"]) == ("Tempo_30", 7, 5)
     (beacon,) = (m for m in messages if m["verified"])
     assert (beacon["latitude_deg"], beacon["longitude_deg"], beacon["height_m"]) == (35.1, 136.9, 52.4)
-    assert "2 messages; beacons 1 times verified, 1 times unverified" in told.out
+    assert "2 messages; beacons 1 times verified, 1 times unverified; how old verified ones are" in told.out
+    assert beacon["reason"] == "signed 1970-01-01 00:00:05 UTC; when it was received is not known"
+    assert beacon["age_s"] is None
     counts = json.loads((out / "summary.json").read_text())["counts"]
     assert counts["blocks_decoded"] == counts["blocks_tried"] - counts["blocks_failed"] >= 4
 
