@@ -30,7 +30,7 @@ class Codec:
         types: The word types that exist; the top 4 bits of a word.
         channels: Trigger inputs that a word can name.
         time_bits: Bits of TIME_HIGH, and of the time below it.
-        rollover: Words with which the clock rolls over once and stands at 0.
+        rollover: Words with which the clock rolls over once and stands at 0, in steps that are believed.
         decoder: Name of its decoding kernel in `evlcp_sdk.io._kernels`.
         encoder: Name of its encoding kernel there.
     """
@@ -54,8 +54,11 @@ class Codec:
     def prelude(self, first_us: int) -> tuple[NDArray[Any], int]:
         """Return the words before a first time, and the number of the TIME_HIGH that they end with."""
         high, low = self.time_bits
-        rollovers = first_us >> (high + low)
-        return np.array(self.rollover * rollovers, self.word), (first_us >> low) - 1
+        rollovers, step = divmod(first_us >> low, 1 << high)
+        # A third of the range at a time: a longer step would look like one back.
+        third = len(self.rollover) // 5
+        way = self.rollover[: third * (3 * step >> high)] if rollovers else ()
+        return np.array(self.rollover * rollovers + way, self.word), (first_us >> low) - 1
 
     def reserved(self, words: NDArray[Any]) -> NDArray[np.bool_]:
         """Return which of `words` are of a type that does not exist."""
@@ -109,10 +112,11 @@ class Decoder:
         """Whether a TIME_HIGH has come by."""
         return bool(self._state[_words.BASE] != _words.UNKNOWN_TIME)
 
-    def decode(self, words: NDArray[Any], at: int, out: Columns) -> int:
+    def decode(self, words: NDArray[Any], at: int, out: Columns, final: bool) -> int:
         """Decode `words`, whose first is at byte `at`, behind what is in `out`; return how many were used.
 
-        It stops early when `out` has no room for another word's events (`codec.burst`) or trigger.
+        It stops early when `out` has no room for another word's events (`codec.burst`) or trigger; and where
+        it takes more words, up to `LOOK_BYTES`, to believe the time, unless these are the `final` ones.
         """
         used, out.events, out.triggers = self._kernel(
             words,
@@ -129,6 +133,7 @@ class Decoder:
             out.channel,
             out.value,
             out.triggers,
+            final,
         )
         return int(used)
 

@@ -13,6 +13,7 @@ from evlcp_sdk.io._words import (
     BEFORE_TIME,
     COLUMN,
     COLUMN_UNKNOWN,
+    DOUBT,
     EVT2_CD_ON,
     EVT2_CONTINUED,
     EVT2_EXT_TRIGGER,
@@ -29,7 +30,10 @@ from evlcp_sdk.io._words import (
     EVT3_VECT_8,
     EVT3_VECT_12,
     EVT3_VECT_BASE_X,
+    FOLLOWERS,
     LAST,
+    LOOK_BYTES,
+    NEAR_US,
     OTHER_WORDS,
     OUTSIDE_SENSOR,
     PACKED,
@@ -44,6 +48,7 @@ from evlcp_sdk.io._words import (
     ROLLOVERS,
     ROW_UNKNOWN,
     TIME_BACKWARD,
+    TIME_DOUBTFUL,
     TIME_GAPS,
     TIME_GLITCH,
     UNKNOWN_COLUMN,
@@ -85,13 +90,48 @@ def _note(tally: Column, row: Integer, at: Integer) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _rolls_over(before: Integer, high: Integer, bits: Integer, at: Integer, tally: Column) -> Any:
-    """Whether a TIME_HIGH below the one before is a rollover, noted as that or as a glitch."""
-    if before - high < 1 << (bits - 1):
-        _note(tally, TIME_GLITCH, at)
-        return False
-    _note(tally, ROLLOVERS, at)
-    return True
+def _judge_time(
+    words: Column, i: Integer, size: Integer, before: Integer, low_bits: Integer, final: Any
+) -> Integer:
+    """Whether words[i], a TIME_HIGH, is believed after the one before, by those that follow it.
+
+    Args:
+        words: All that is known of what follows.
+        i: Which one.
+        size: Bytes of a word; its top 4 bits are its type, TIME_HIGH is 8 in every encoding.
+        before: The value believed so far.
+        low_bits: Bits of the time below it.
+        final: Nothing comes behind `words`.
+
+    Returns:
+        2 early by little, 1 believed, 0 not, -1 more words are needed to tell.
+    """
+    shift = 8 * size - 4
+    ring = (int64(1) << shift) - 1
+    high = int64(words[i]) & ring
+    ahead = (high - before) & ring
+    if ahead <= 1:
+        return int64(1)
+    if (ring + 1 - ahead) << low_bits <= NEAR_US:
+        return int64(2)
+    # The next but one is past a short step, believed or not.
+    most = FOLLOWERS if ahead > FOLLOWERS else 1
+    agree = against = 0
+    stop = min(i + 1 + LOOK_BYTES // size, len(words))
+    for k in range(i + 1, stop):
+        w = int64(words[k])
+        if w >> shift != 8:
+            continue
+        if ((w & ring) - before) & ring < ahead:
+            against += 1
+        else:
+            agree += 1
+        if 2 * max(agree, against) > most:
+            break
+    else:
+        if not final and i + 1 + LOOK_BYTES // size > len(words):
+            return int64(-1)
+    return int64(agree >= against)
 
 
 @njit(cache=True, nogil=True)
@@ -100,7 +140,8 @@ def _pack_evt3(
 ) -> tuple[Integer, Integer]:
     """Decode words start..stop to packed events, unchecked, up to the first that is not of the sensor's.
 
-    Those are all but events and times that do not step back. Returns where it stopped and how many events.
+    Those are all but events and times that go on by one at the most. Returns where it stopped and how many
+    events there are.
     """
     event, column, polarity = state[PACKED], state[COLUMN], state[POLARITY]
     left, vector_at = state[VECTOR_LEFT], state[VECTOR_AT]
@@ -133,11 +174,8 @@ def _pack_evt3(
             polarity = (w >> 11) & 1
             left = 3
             vector_at = at + 2 * int64(i)
-        elif kind == EVT3_TIME_HIGH and w & 0xFFF >= event >> PACKED_HIGH:
-            step = (w & 0xFFF) - (event >> PACKED_HIGH)
-            if step > 1:
-                _note(tally, TIME_GAPS, at + 2 * int64(i))
-            if step:
+        elif kind == EVT3_TIME_HIGH and uintp((w & 0xFFF) - (event >> PACKED_HIGH)) <= ONE:
+            if w & 0xFFF != event >> PACKED_HIGH:
                 event = (event & 0xFFFFFFFF) | (w & 0xFFF) << PACKED_HIGH
         else:
             break
@@ -243,6 +281,15 @@ def _word_of_event(words: Column, word: Integer, event: Integer) -> Integer:
 
 
 @njit(cache=True, nogil=True)
+def _note_other(kind: Integer, at: Integer, tally: Column) -> None:
+    """Take note of an EVT3 word that brings neither event nor time."""
+    if kind in (EVT3_OTHERS, EVT3_CONTINUED_4, EVT3_CONTINUED_12):
+        _note(tally, OTHER_WORDS, at)
+    else:
+        _note(tally, RESERVED, at)
+
+
+@njit(cache=True, nogil=True)
 def decode_evt3(
     words: Column,
     at: Integer,
@@ -259,6 +306,7 @@ def decode_evt3(
     channel: Column,
     value: Column,
     m: Integer,
+    final: Any,
 ) -> tuple[Integer, Integer, Integer]:
     """Decode EVT3 words until they run out, or the columns' room for 12 events or for a trigger does.
 
@@ -278,6 +326,8 @@ def decode_evt3(
         channel: See trigger_t.
         value: See trigger_t.
         m: Triggers already in the columns.
+        final: Nothing comes behind these words. Else it may stop before a TIME_HIGH that what follows has to
+            confirm, within `LOOK_BYTES`.
 
     Returns:
         Words used, events and triggers now in the columns.
@@ -293,6 +343,19 @@ def decode_evt3(
             state[PACKED] |= (int64(words[i]) & 0xFFF) << PACKED_HIGH
             i += 1
     while i < len(words) and n <= len(t) - BURST and m < len(trigger_t):
+        while state[DOUBT] and i < len(words) and words[i] >> 12 != EVT3_TIME_HIGH:
+            start = i
+            i, count = _pack_evt3(words, i, i + 1, at, state, tally, packed)
+            for _ in range(count):
+                _note(tally, TIME_DOUBTFUL, at + 2 * start)
+            if i == start:
+                if words[i] >> 12 == EVT3_EXT_TRIGGER:
+                    _note(tally, TIME_DOUBTFUL, at + 2 * i)
+                else:
+                    _note_other(words[i] >> 12, at + 2 * i, tally)
+                i += 1
+        if i == len(words):
+            break
         start, first = i, n
         stop = i + min(len(words) - i, (len(t) - n) // BURST, BLOCK_WORDS)
         i, count = _pack_evt3(words, start, stop, at, state, tally, packed)
@@ -309,11 +372,22 @@ def decode_evt3(
         if kind == EVT3_TIME_HIGH:
             high = w & 0xFFF
             before = state[PACKED] >> PACKED_HIGH
-            if _rolls_over(before, high, 12, here, tally):
-                state[BASE] += 1 << 24
-                if high + 4096 - before > 1:
+            verdict = _judge_time(words, i, 2, before, 12, final)
+            if verdict < 0:
+                break
+            state[DOUBT] = int64(verdict == 0)
+            if verdict != 1:
+                _note(tally, TIME_GLITCH, here)
+            if verdict:
+                if verdict == 1 and high < before:
+                    _note(tally, ROLLOVERS, here)
+                    state[BASE] += 1 << 24
+                if verdict == 1 and (high - before) & 0xFFF > 1:
                     _note(tally, TIME_GAPS, here)
-            state[PACKED] = (state[PACKED] & 0xFFFFFFFF) | high << PACKED_HIGH
+                if verdict == 2 and high > before:
+                    state[BASE] -= 1 << 24
+                if high != before:
+                    state[PACKED] = (state[PACKED] & 0xFFFFFFFF) | high << PACKED_HIGH
         elif kind == EVT3_EXT_TRIGGER:
             clock = state[BASE] + (state[PACKED] >> PACKED_LOW)
             if clock < state[LAST]:
@@ -322,10 +396,8 @@ def decode_evt3(
                 trigger_t[m], channel[m], value[m] = clock, (w >> 8) & 0xF, w & 1
                 state[LAST] = clock
                 m += 1
-        elif kind in (EVT3_OTHERS, EVT3_CONTINUED_4, EVT3_CONTINUED_12):
-            _note(tally, OTHER_WORDS, here)
         else:
-            _note(tally, RESERVED, here)
+            _note_other(kind, here, tally)
         i += 1
     return i, n, m
 
@@ -347,9 +419,10 @@ def decode_evt2(
     channel: Column,
     value: Column,
     m: Integer,
+    final: Any,
 ) -> tuple[Integer, Integer, Integer]:
     """Decode EVT2 words (uint32) until they or the columns' room run out; as `decode_evt3`."""
-    base, last = state[BASE], state[LAST]
+    base, last, doubt = state[BASE], state[LAST], state[DOUBT]
     i = 0
     while i < len(words) and n < len(t) and m < len(trigger_t):
         w = int64(words[i])
@@ -365,11 +438,24 @@ def decode_evt2(
                 base = high << 6
                 continue
             before = (base >> 6) & 0xFFFFFFF
-            if high < before and _rolls_over(before, high, 28, here, tally):
-                base += 1 << 34
-            base += (high - before) << 6
+            verdict = _judge_time(words, i - 1, 4, before, 6, final)
+            if verdict < 0:
+                i -= 1
+                break
+            doubt = int64(verdict == 0)
+            if verdict != 1:
+                _note(tally, TIME_GLITCH, here)
+            if verdict:
+                if verdict == 1 and high < before:
+                    _note(tally, ROLLOVERS, here)
+                    base += 1 << 34
+                if verdict == 2 and high > before:
+                    base -= 1 << 34
+                base += (high - before) << 6
         elif base < 0:
             _note(tally, BEFORE_TIME, here)
+        elif doubt and (kind <= EVT2_CD_ON or kind == EVT2_EXT_TRIGGER):
+            _note(tally, TIME_DOUBTFUL, here)
         elif kind <= EVT2_CD_ON:
             if column >= width or row >= height:
                 _note(tally, OUTSIDE_SENSOR, here)
@@ -390,7 +476,7 @@ def decode_evt2(
             _note(tally, OTHER_WORDS, here)
         else:
             _note(tally, RESERVED, here)
-    state[BASE], state[LAST] = base, last
+    state[BASE], state[LAST], state[DOUBT] = base, last, doubt
     return i, n, m
 
 

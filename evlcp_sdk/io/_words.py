@@ -35,7 +35,14 @@ COLUMN: Final = 3  # where the next vector word starts, or UNKNOWN_COLUMN or mor
 POLARITY: Final = 4  # of the last VECT_BASE_X
 VECTOR_LEFT: Final = 5  # vector words still to come after the last VECT_BASE_X
 VECTOR_AT: Final = 6  # byte offset of that VECT_BASE_X
-STATE_SLOTS: Final = 7
+DOUBT: Final = 7  # both: 1 behind a TIME_HIGH that is not believed
+STATE_SLOTS: Final = 8
+
+# A step of TIME_HIGH by more than one is believed unless most of the next `FOLLOWERS` in so many bytes are
+# still on the clock before it. One back by up to `NEAR_US` is an early word, not another clock.
+FOLLOWERS: Final = 3
+LOOK_BYTES: Final = 1 << 18
+NEAR_US: Final = 10_000
 
 UNKNOWN_TIME: Final = -1
 UNKNOWN_ROW: Final = 0x8000
@@ -63,11 +70,16 @@ HEADER_OPEN: Final = 9
 ROLLOVERS: Final = 10
 TIME_GAPS: Final = 11
 OTHER_WORDS: Final = 12
-TALLY_ROWS: Final = 13
+TIME_DOUBTFUL: Final = 13
+TALLY_ROWS: Final = 14
 
 LOSSES: Final = {
     "words_before_time": (BEFORE_TIME, "words before the first TIME_HIGH, which have no time; skipped"),
-    "time_glitches": (TIME_GLITCH, "TIME_HIGH words that step back by less than half its range"),
+    "time_glitches": (TIME_GLITCH, "TIME_HIGH words that no others agree with, or that are early"),
+    "time_doubtful": (
+        TIME_DOUBTFUL,
+        "events and triggers behind a TIME_HIGH that no others agree with; dropped",
+    ),
     "time_backward": (TIME_BACKWARD, "events and triggers earlier than the one before; dropped"),
     "outside_sensor": (OUTSIDE_SENSOR, "events outside the sensor; dropped"),
     "row_unknown": (ROW_UNKNOWN, "events before the first ADDR_Y, which have no row; dropped"),

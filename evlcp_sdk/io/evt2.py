@@ -26,7 +26,7 @@ EVT2: Final = Codec(
     ),
     channels=32,
     time_bits=(28, 6),
-    rollover=(0x8FFFFFFF, 0x80000000),
+    rollover=(0x85555555, 0x8AAAAAAA, 0x8FFFFFFF, 0x80000000, 0x80000000),
     decoder="decode_evt2",
     encoder="encode_evt2",
 )

@@ -31,7 +31,7 @@ EVT3: Final = Codec(
     ),
     channels=16,
     time_bits=(12, 12),
-    rollover=(0x8FFF, 0x6000, 0x8000, 0x6000),
+    rollover=(0x8555, 0x6000, 0x8AAA, 0x6000, 0x8FFF, 0x6000, 0x8000, 0x6000, 0x8000, 0x6000),
     decoder="decode_evt3",
     encoder="encode_evt3",
 )

@@ -184,7 +184,7 @@ class RawSource(EventSource):
 
     Args:
         path: The file.
-        buffer_bytes: Size of the buffer.
+        buffer_bytes: Size of the buffer; half a megabyte at the least.
 
     Raises:
         InputError: The file cannot be opened.
@@ -193,7 +193,7 @@ class RawSource(EventSource):
 
     def __init__(self, path: Path | str, buffer_bytes: int = BUFFER_BYTES) -> None:
         self._path = Path(path)
-        self._buffer = np.empty(max(buffer_bytes, MAX_HEADER_BYTES), np.uint8)
+        self._buffer = np.empty(max(buffer_bytes, 2 * _words.LOOK_BYTES), np.uint8)
         self._position = 0  # byte offset in the file of the first byte not decoded
         self._start = self._end = 0  # the bytes of the buffer not decoded
         self._exhausted = False
@@ -285,7 +285,9 @@ class RawSource(EventSource):
                     return True
                 self._fill()
                 continue
-            used = self._decoder.decode(words, self._position, out) * words.itemsize
+            used = self._decoder.decode(words, self._position, out, self._exhausted) * words.itemsize
+            if not used:
+                self._fill()
             self._start += used
             self._position += used
             if not self._decoder.has_time and self._position - self._data_start > TIMELESS_BYTES:
@@ -343,7 +345,7 @@ class RawWriter(EventWriter):
     """
 
     # A word does not say how often the clock has rolled over. Before a first time beyond its range (EVT3:
-    # 16.8 s) the writer lets it roll over that often; this keeps those words below 1 MB.
+    # 16.8 s) the writer lets it roll over that often; this keeps those words below 2 MB.
     times_us = (0, (1 << 40) - 1)
 
     def __init__(

@@ -14,6 +14,7 @@ class Decoded:
         default_factory=dict
     )  # kind -> count, byte offset of the first
     rollovers: int = 0
+    early: int = 0  # steps back over a rollover
     last: int = 0
 
     def lose(self, kind: str, at: int, count: int = 1) -> None:
@@ -37,12 +38,28 @@ class Decoded:
             self.triggers.append((t, channel, value))
 
 
+def judged(words: list[int], k: int, bits: int, low_bits: int, before: int) -> str:
+    """Whether TIME_HIGH words[k] is believed after `before`, `early` by little, or not believed."""
+    ring, size = 1 << bits, (bits + 4) // 8
+    ahead = (words[k] - before) % ring
+    if ahead <= 1:
+        return "believed"
+    if (ring - ahead) << low_bits <= 10_000:
+        return "early"
+    near = words[k + 1 : k + 1 + (1 << 18) // size]
+    following = [w % ring for w in near if w >> bits == 8][: 3 if ahead > 3 else 1]
+    against = sum((n - before) % ring < ahead for n in following)
+    return "doubtful" if against > len(following) - against else "believed"
+
+
 def decode_evt3(data: bytes, width: int, height: int, start: int = 0) -> Decoded:
     out = Decoded()
     high = row = base = None
     low = polarity = 0
     vector_at, vector_left = 0, 0
-    for k, (word,) in enumerate(struct.iter_unpack("<H", data[: len(data) // 2 * 2])):
+    doubt = False
+    words = [word for (word,) in struct.iter_unpack("<H", data[: len(data) // 2 * 2])]
+    for k, word in enumerate(words):
         at = start + 2 * k
         kind, value = word >> 12, word & 0xFFF
         if high is None:
@@ -51,11 +68,13 @@ def decode_evt3(data: bytes, width: int, height: int, start: int = 0) -> Decoded
             else:
                 out.lose("words_before_time", at)
             continue
-        t = out.rollovers * 2**24 + high * 2**12 + low
+        t = (out.rollovers - out.early) * 2**24 + high * 2**12 + low
         if kind == 0x0:
             row = value & 0x7FF
         elif kind == 0x2:
-            if row is None:
+            if doubt:
+                out.lose("time_doubtful", at)
+            elif row is None:
                 out.lose("row_unknown", at)
             else:
                 out.add_event(t, value & 0x7FF, row, value >> 11, at, width, height)
@@ -70,7 +89,9 @@ def decode_evt3(data: bytes, width: int, height: int, start: int = 0) -> Decoded
             for bit in range(size):
                 if not value >> bit & 1:
                     continue
-                if row is None:
+                if doubt:
+                    out.lose("time_doubtful", at)
+                elif row is None:
                     out.lose("row_unknown", at)
                 elif base is None:
                     out.lose("column_unknown", at)
@@ -81,12 +102,18 @@ def decode_evt3(data: bytes, width: int, height: int, start: int = 0) -> Decoded
         elif kind == 0x6:
             low = value
         elif kind == 0x8:
+            verdict = judged(words, k, 12, 12, high)
+            doubt = verdict == "doubtful"
+            if verdict != "believed":
+                out.lose("time_glitches", at)
+            if doubt:
+                continue
+            out.rollovers += verdict == "believed" and value < high
+            out.early += verdict == "early" and value > high
             if value != high:
-                if high - value >= 2048:
-                    out.rollovers += 1
-                elif value < high:
-                    out.lose("time_glitches", at)
                 high, low = value, 0
+        elif kind == 0xA and doubt:
+            out.lose("time_doubtful", at)
         elif kind == 0xA:
             out.add_trigger(t, value >> 8 & 0xF, value & 1, at)
         elif kind in (0x1, 0x9, 0xB, 0xC, 0xD):
@@ -99,22 +126,31 @@ def decode_evt3(data: bytes, width: int, height: int, start: int = 0) -> Decoded
 def decode_evt2(data: bytes, width: int, height: int, start: int = 0) -> Decoded:
     out = Decoded()
     high = None
-    for k, (word,) in enumerate(struct.iter_unpack("<I", data[: len(data) // 4 * 4])):
+    doubt = False
+    words = [word for (word,) in struct.iter_unpack("<I", data[: len(data) // 4 * 4])]
+    for k, word in enumerate(words):
         at = start + 4 * k
         kind = word >> 28
         if kind == 0x8:
             value = word & 0xFFFFFFF
-            if high is not None and high - value >= 2**27:
-                out.rollovers += 1
-            elif high is not None and value < high:
-                out.lose("time_glitches", at)
+            if high is not None:
+                verdict = judged(words, k, 28, 6, high)
+                doubt = verdict == "doubtful"
+                if verdict != "believed":
+                    out.lose("time_glitches", at)
+                if doubt:
+                    continue
+                out.rollovers += verdict == "believed" and value < high
+                out.early += verdict == "early" and value > high
             high = value
             continue
         if high is None:
             out.lose("words_before_time", at)
             continue
-        t = out.rollovers * 2**34 + high * 64 + (word >> 22 & 0x3F)
-        if kind in (0x0, 0x1):
+        t = (out.rollovers - out.early) * 2**34 + high * 64 + (word >> 22 & 0x3F)
+        if doubt and kind in (0x0, 0x1, 0xA):
+            out.lose("time_doubtful", at)
+        elif kind in (0x0, 0x1):
             out.add_event(t, word >> 11 & 0x7FF, word & 0x7FF, kind, at, width, height)
         elif kind == 0xA:
             out.add_trigger(t, word >> 8 & 0x1F, word & 1, at)
