@@ -14,7 +14,7 @@ from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Block, Kind, Message, joined
 from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.air.frames import bits_of_symbols
-from evlcp_sdk.air.signing import TrustedKeys
+from evlcp_sdk.air.signing import TrustedKey, TrustedKeys
 from evlcp_sdk.link.resolve import Link, load_link
 
 SITE = """
@@ -141,7 +141,7 @@ def test_a_signed_beacon(evlcp: Evlcp, site: Path, tmp_path: Path) -> None:
     assert evlcp("tx", "message", "--beacon", site, "--key", key, "-o", out).code == 0
     link = load_link()
     found = messages_of(np.array(json.loads(out.read_text())["symbols"]), link)
-    keys = TrustedKeys((made.out.strip(),))
+    keys = TrustedKeys([TrustedKey(made.out.strip())])
     assert keys.check(found[Kind.BEACON], link.block_coder().digest, found[Kind.SIGNATURE]) is True
     again = evlcp("tx", "keygen", key)
     assert (again.code, again.err) == (1, f"evlcp: {key}: exists; a key is not overwritten\n")
