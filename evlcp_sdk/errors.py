@@ -13,6 +13,8 @@ EvlcpError                     1   anything the SDK raises on purpose
 └── StreamError                1   events fed in an order or shape the receiver cannot take
 ```
 
+A recording of which much was dropped is no error, but ends a command with `DEGRADED`, 4.
+
 `PluginWarning` is a warning: a plugin is broken and left out, and all others go on.
 """
 
@@ -101,6 +103,9 @@ class InterruptedRunError(EvlcpError):
 
     exit_code = 130
 
+
+DEGRADED = 4
+"""Exit code where a recording was decoded and much of it dropped."""
 
 OWN_FAULT = 70
 """Exit code of a fault that is the SDK's own."""

@@ -50,6 +50,9 @@ __all__ = [
 Advance = Callable[[int, int | None], None]
 """Called after each piece with the bytes that are done, and of how many if that is known."""
 
+DEGRADED_SHARE, DEGRADED_LEAST = 0.01, 100
+"""Share, and number, of events and words dropped from which on a result is `degraded`."""
+
 Stopped = Callable[[], bool]
 """Asked after each piece whether to end early."""
 
@@ -215,7 +218,8 @@ def receive_to_folder(
         stopped: Ends the run early; what was decoded until then is written.
 
     Returns:
-        The summary; its `status` is `failed` when the recording cannot be read on.
+        The summary; its `status` is `failed` when the recording cannot be read on, `degraded` when more
+        than a hundredth of it was dropped.
 
     Raises:
         InputError: The recording cannot be opened; nothing is written.
@@ -271,6 +275,8 @@ def _run(
         except InputError as fault:
             status, error = "failed", str(fault)
         writer.write(receiver.close())
+    if status == "complete" and (told := _much_dropped(source, receiver)):
+        status, error = "degraded", f"{url}: {told}"
     # Kernels are compiled once on a machine, which says nothing of the receiver's speed.
     elapsed_s = time.perf_counter() - began - sum(compiled_s)
     read = source.counts["events"]
@@ -299,6 +305,16 @@ def _run(
         losses={kind: asdict(loss) for kind, loss in source.losses.items()},
         error=error,
     )
+
+
+def _much_dropped(source: EventSource, receiver: Receiver) -> str | None:
+    """How much of a recording was dropped, where that is too much to call the result whole."""
+    lost = sum(loss.count for loss in source.losses.values())
+    dropped = lost + sum(n for name, n in receiver.counts.items() if name.startswith("dropped_"))
+    share = dropped / max(source.counts["events"] + lost, 1)
+    if dropped < DEGRADED_LEAST or share <= DEGRADED_SHARE:
+        return None
+    return f"{dropped} events or words, {share:.1%}, were dropped: losses and counts in summary.json say why"
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import typer
 
 from evlcp_sdk.cli._common import Dask, LinkFile, Overrides, bytes_bar, complain, make_executor
 from evlcp_sdk.cli._summary import show
-from evlcp_sdk.errors import InputError, InterruptedRunError, OutputError
+from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -140,7 +140,7 @@ def receive(
     load_sinks(choose_sinks(registry, asked, positions=plan is not None))
     here = dask is None and (not workers or len(jobs) == 1)
     executor = make_executor(0 if here else workers or None, dask)
-    worst = 0
+    worst, degraded = 0, False
     interrupted: list[Path] = []
     pass_on = (lambda: None) if here else stop_workers
     with (
@@ -173,15 +173,17 @@ def receive(
                 typer.echo(json.dumps(summary))
             else:
                 show(summary, job.folder)
-            if summary["status"] == "failed":
+            if summary["status"] in ("failed", "degraded"):
                 complain(summary["error"])
+            if summary["status"] == "failed":
                 worst = max(worst, InputError.exit_code)
+            degraded |= summary["status"] == "degraded"
             if summary["status"] == "interrupted":
                 interrupted.append(job.folder)
         if stopped():
             folder = interrupted[0] if len(interrupted) == 1 else out
             raise InterruptedRunError(f"interrupted; what was decoded until then is in {folder}")
-    raise typer.Exit(worst)
+    raise typer.Exit(worst or DEGRADED * degraded)
 
 
 def _attitude(

@@ -14,8 +14,9 @@ from evlcp_sdk.results.tallies import RunTally
 
 __all__ = ["Status", "summary_of", "write_summary"]
 
-Status = Literal["complete", "interrupted", "failed"]
-"""How a run ended: read to the end, stopped by the user, or stopped by input that cannot be read."""
+Status = Literal["complete", "degraded", "interrupted", "failed"]
+"""How a run ended: read to the end, the same with much of it dropped, stopped by the user, or stopped by
+input that cannot be read."""
 
 
 def summary_of(
@@ -43,7 +44,7 @@ def summary_of(
         counts: The receiver's counts.
         losses: What the reader skipped, by kind, with byte offsets.
         versions: Installed versions.
-        error: The message, when `status` is `failed`.
+        error: The message, when `status` is `failed` or `degraded`.
         positions: Figures of the positions, where they were computed.
         sinks: What sinks say, by name; those that say nothing are left out.
     """

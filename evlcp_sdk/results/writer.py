@@ -102,7 +102,7 @@ class ResultWriter:
             processing: How long it took.
             counts: The receiver's counts.
             losses: What the reader skipped, by kind, with byte offsets.
-            error: The message, when `status` is `failed`.
+            error: The message, when `status` is `failed` or `degraded`.
 
         Returns:
             The content of `summary.json`.

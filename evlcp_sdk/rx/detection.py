@@ -499,15 +499,17 @@ class RegionFollower:
 
 
 def _select(events: Events, boxes: list[Box]) -> list[Events]:
-    """The events inside each box."""
+    """The events inside each box, in no more memory than they need."""
     from evlcp_sdk.rx import _kernels
 
+    if not boxes:
+        return []
     room = len(events) + 1
+    t, x, y, p = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
     found = []
     for box in boxes:
-        t, x, y, p = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
         n = _kernels.select_box(events.t_us, events.x, events.y, events.p, box, t, x, y, p)
-        found.append(Events(t[:n], x[:n], y[:n], p[:n]))
+        found.append(Events(t[:n].copy(), x[:n].copy(), y[:n].copy(), p[:n].copy()))
     return found
 
 

@@ -122,6 +122,22 @@ def test_no_transmitter_is_no_failure(evlcp: Evlcp, noise_raw: Path, tmp_path: P
     assert names_in(tmp_path / "out") == FILES | {"regions.png"}
 
 
+def test_a_recording_of_which_much_is_dropped_is_degraded(
+    evlcp: Evlcp, noise_raw: Path, tmp_path: Path
+) -> None:
+    data = noise_raw.read_bytes()
+    middle = data.index(b"% end\n") + 6 + len(data) // 4 * 2
+    path = tmp_path / "torn.raw"
+    path.write_bytes(data[:middle] + b"\x00\x90" * (len(data) // 10) + data[middle:])
+    done = evlcp("receive", path, "-o", tmp_path / "out")
+    assert done.code == 4
+    told = summary_of(tmp_path / "out")
+    assert told["status"] == "degraded"
+    assert told["losses"]["reserved_words"]["count"] == len(data) // 10
+    assert done.err.startswith(f"evlcp: {path}: ")
+    assert "were dropped" in done.err
+
+
 def test_receive_json_is_one_line_a_recording(
     evlcp: Evlcp, noise_raw: Path, demo_raw: Path, tmp_path: Path
 ) -> None:
