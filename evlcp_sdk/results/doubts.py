@@ -20,6 +20,12 @@ _ASKEW_SHARE = 0.5
 _CRYSTALS_PPM = 200.0
 """Two crystals are this far apart at most, 100 ppm each."""
 
+_MANY_EVENTS = 100_000
+"""In regions without a preamble, of which more is said: a bar sends so many in 20 ms, a lamp in a second."""
+
+_RANGED_SHARE = 0.25
+"""Frames with a distance of which fewer is said."""
+
 _BY_CHANCE = 1e-6
 """Probability of a finding by chance below which it is told."""
 
@@ -45,6 +51,13 @@ def warnings_of(
 
 
 def _frames(counts: Mapping[str, int]) -> Iterator[str]:
+    blinking = counts.get("events_in_regions", 0)
+    if blinking >= _MANY_EVENTS and not counts.get("locks", 0):
+        yield (
+            f"something blinks, {blinking} events in {counts.get('regions_opened', 0)} regions, but no"
+            " preamble is heard: compare air.chip_rate_hz and the preamble with the transmitter's; a panel or leaves"
+            " behind a bar may drown it, see `evlcp info` and --figures"
+        )
     rejected, frames = counts.get("frames_rejected", 0), counts.get("frames", 0)
     if rejected >= _FEW_FRAMES and rejected > _REJECTED_SHARE * (frames + rejected):
         yield (
@@ -78,6 +91,12 @@ def _transmitter(one: TransmitterTally, link: Link) -> Iterator[str]:
         yield (
             f"{never} of {codewords} codewords never occur in {one.given} symbols: data that repeats,"
             " or another modulation than modulation.id"
+        )
+    own = (one.frames - one.echoes) / link.packet.pilot_every
+    if one.ranged < _RANGED_SHARE * own:
+        yield (
+            f"{one.ranged} of {own:.0f} frames have a distance: too few boundaries between clusters are seen,"
+            " or their values do not fit the layout; another ranging.id may bear it"
         )
     hidden = [k for k in range(link.codebook.clusters) if one.unseen[k] == one.frames]
     if hidden:

@@ -12,14 +12,19 @@ from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
 
 LINK = load_link()
 NONE = Range(float("nan"), float("nan"), 0)
+NEAR = Range(50.0, 0.1, 15)
 
 
-def tally_of(symbols: np.ndarray, *, ppm: float = 0.0, echo_of: int | None = None) -> RunTally:
+def tally_of(
+    symbols: np.ndarray, *, ppm: float = 0.0, echo_of: int | None = None, distance: Range = NEAR
+) -> RunTally:
     """Packets of ten frames with these symbols, (packets, 10, 16)."""
     tally = RunTally(LINK.packet)
     for n, packet in enumerate(symbols):
         frames = tuple(
-            Frame(0, n, f, 0.0, SoftSymbols(said, np.zeros((16, 6), np.float32), 1.0), NONE, None, 0.0, 0.0)
+            Frame(
+                0, n, f, 0.0, SoftSymbols(said, np.zeros((16, 6), np.float32), 1.0), distance, None, 0.0, 0.0
+            )
             for f, said in enumerate(packet)
         )
         frames = tuple(replace(frame, echo_of=echo_of) for frame in frames)
@@ -91,3 +96,16 @@ def test_an_attitude_that_the_image_contradicts() -> None:
 
 def test_a_reflection_is_not_doubted() -> None:
     assert told(tally_of(RANDOM % 16, ppm=5000, echo_of=3), blocks_tried=0) == []
+
+
+def test_what_blinks_without_a_preamble() -> None:
+    nothing = RunTally(LINK.packet)
+    (line,) = told(nothing, events_in_regions=5_000_000, regions_opened=1)
+    assert line.startswith("something blinks, 5000000 events in 1 regions, but no preamble is heard")
+    assert told(nothing, events_in_regions=5_000_000, regions_opened=2, locks=1) == []
+    assert told(nothing, events_in_regions=20_000, regions_opened=3) == []
+
+
+def test_frames_without_a_distance() -> None:
+    (line,) = told(tally_of(RANDOM, distance=NONE))
+    assert line.startswith("transmitter 0: 0 of 60 frames have a distance")
