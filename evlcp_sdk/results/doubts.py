@@ -53,10 +53,11 @@ def warnings_of(
 def _frames(counts: Mapping[str, int]) -> Iterator[str]:
     blinking = counts.get("events_in_regions", 0)
     if blinking >= _MANY_EVENTS and not counts.get("locks", 0):
+        regions = counts.get("regions_opened", 0)
         yield (
-            f"something blinks, {blinking} events in {counts.get('regions_opened', 0)} regions, but no"
-            " preamble is heard: compare air.chip_rate_hz and the preamble with the transmitter's; a panel or leaves"
-            " behind a bar may drown it, see `evlcp info` and --figures"
+            f"something blinks, {blinking} events in {regions} regions, but no preamble is heard: compare"
+            " air.chip_rate_hz and the preamble with the transmitter's; a panel or leaves behind a bar may"
+            " drown it, see `evlcp info` and --figures"
         )
     rejected, frames = counts.get("frames_rejected", 0), counts.get("frames", 0)
     if rejected >= _FEW_FRAMES and rejected > _REJECTED_SHARE * (frames + rejected):
