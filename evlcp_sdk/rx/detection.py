@@ -499,17 +499,22 @@ class RegionFollower:
 
 
 def _select(events: Events, boxes: list[Box]) -> list[Events]:
-    """The events inside each box, in no more memory than they need."""
+    """The events inside each box, in no more memory than twice what they need."""
     from evlcp_sdk.rx import _kernels
 
-    if not boxes:
-        return []
     room = len(events) + 1
-    t, x, y, p = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
     found = []
+    into: tuple[NDArray[Any], ...] = ()
     for box in boxes:
-        n = _kernels.select_box(events.t_us, events.x, events.y, events.p, box, t, x, y, p)
-        found.append(Events(t[:n].copy(), x[:n].copy(), y[:n].copy(), p[:n].copy()))
+        if not into:
+            into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
+        n = _kernels.select_box(events.t_us, events.x, events.y, events.p, box, *into)
+        part = [column[:n] for column in into]
+        if 2 * n < room:
+            part = [column.copy() for column in part]
+        else:
+            into = ()
+        found.append(Events(*part))
     return found
 
 
