@@ -136,7 +136,7 @@ GOOD = 'id = "a"\nport = "native:"\nposition_m = [0, 0, 0]\nrandom = 1\n'
         ("[[board]]\n" + GOOD + 'profile = "wh8"', 'board[0].profile = "wh8": unknown key'),
         (
             '[[board]]\nlink = {modulation = {id = "wh9"}}\n' + GOOD,
-            "board[0]: no modulation algorithm named 'wh9'",
+            "board[0]: link: no modulation algorithm named 'wh9'",
         ),
         ('[[board]]\nlink = "no.toml"\n' + GOOD, "no.toml: cannot be read"),
         (
