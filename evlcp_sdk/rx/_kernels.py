@@ -92,14 +92,20 @@ def sort_out(
 CHIPS_AT = 6
 """Bit of a pixel's state from which its chips are held; below is its score, and from `CLOCK_AT` its clock."""
 
-CLOCK_AT = 10
+SAME_AT = 10
+"""Bit from which is held how often lately the same number of chips came again, 0 to `MOST_SAME`."""
+
+MOST_SAME = 7
+
+CLOCK_AT = 13
 
 CLOCK_ROUND = 1 << 32 - CLOCK_AT
-"""Ticks after which the clock of 22 bits goes round."""
+"""Ticks after which the clock of 19 bits goes round."""
 
 SCORES = (1 << CHIPS_AT) - 1
 
 _LOW = np.uint32((1 << CLOCK_AT) - 1)
+_PART = np.uint32((1 << SAME_AT) - 1)
 _CLOCK = np.uint32(CLOCK_AT)
 _ROUND = np.uint32(CLOCK_ROUND - 1)
 
@@ -150,8 +156,12 @@ def score_rises(
     for i in range(new):
         at = where[i]
         state = states[at]
-        low = np.uint32(lows[(np.uint32(kinds[runs[i]]) << _CLOCK) | (state & _LOW)])
-        states[at] = (state & ~_LOW) | low
+        kind = np.uint32(kinds[runs[i]])
+        low = np.uint32(lows[(kind << np.uint32(SAME_AT)) | (state & _PART)])
+        same = np.int32((state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME))
+        again = kind == ((state >> np.uint32(CHIPS_AT)) & np.uint32(15))
+        same = min(same + 1, MOST_SAME) if again else max(same - 2, 0)
+        states[at] = (state & ~_LOW) | (np.uint32(same) << np.uint32(SAME_AT)) | low
         if (low & np.uint32(SCORES)) >= least:
             row = at // width
             cells[(row >> shift) * columns + ((at - row * width) >> shift)] += 1
@@ -173,10 +183,12 @@ def grow_old(pixels: Array, first: int, many: int, now: int, least: int, age: in
 
 
 @njit(cache=True, nogil=True)
-def in_rhythm(x: Array, y: Array, pixels: Array, least: int, keep: Array) -> None:
-    """Mark events of pixels with a score of `least` or more."""
+def in_rhythm(x: Array, y: Array, pixels: Array, least: int, same: int, keep: Array) -> None:
+    """Mark events of pixels with a score of `least` or more whose rises are not `same` time after time."""
     for i in range(x.size):
-        keep[i] = (pixels[y[i], x[i]] & np.uint32(SCORES)) >= np.uint32(least)
+        state = pixels[y[i], x[i]]
+        again = (state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME)
+        keep[i] = (state & np.uint32(SCORES)) >= np.uint32(least) and again < np.uint32(same)
 
 
 @njit(cache=True, nogil=True)

@@ -7,8 +7,10 @@ by two, one after five to twelve by one. A rise off the chips, as of a lamp with
 kHz (two and a half chips) or of a moving texture, lowers it by three: more than the two that chance, which
 is on the chips in six cases of ten, would bring. One after the very same number of chips as before lowers
 it by two from five chips on: a lamp of 1 or 2 kHz repeats its period, a code with missing events does not.
-Falls are not looked at: they come later or sooner than rises by the light, they are the first to go
-missing, and some cameras send none. One pass, four bytes a pixel.
+A lamp whose period is two, three or four whole chips is in rhythm, too, as far as a score tells; but there the
+same time comes again and again, which in a code it does not for long: before a frame shows where the bar is,
+such pixels are not listened to. Falls are not looked at: they come later or sooner than rises by the light,
+they are the first to go missing, and some cameras send none. One pass, four bytes a pixel.
 """
 
 import math
@@ -32,8 +34,13 @@ _LATE_CHIPS = 12.5
 _STRAY_CHIPS = 0.3
 """Jitter and latencies that differ from rise to rise put one off the chips by so much."""
 
-_LONGEST_TICKS = 2**19
-"""Of what is looked up by its length: a tick is 1 us but for chips slower than 24 a second."""
+_LONGEST_TICKS = 2**16
+"""Of what is looked up by its length: a tick is 1 us but for chips slower than 190 a second."""
+
+_SAME = 5
+"""Rises after the same time as before, less two for each other one, from which on a pixel is a lamp: of the
+times of a code half are of two chips, so that one of thirty pixels is taken for one, and a lamp that misses
+one rise in six is not."""
 
 _LATE, _OFF = 0, 16
 """Kind of a time between rises: its number of whole chips, or 0 beyond; so much more where it is off them."""
@@ -42,9 +49,10 @@ _LATE, _OFF = 0, 16
 class Rhythm:
     """Scores of a sensor's pixels.
 
-    A pixel's state holds the time of its last rise (22 bits of the clock's ticks), the whole chips between
-    that and the one before (4 bits), and its score (6 bits). The clock of 22 bits goes round in four seconds;
-    rows are looked at in turn, all in a quarter of that, and rises older than half of it are forgotten.
+    A pixel's state holds the time of its last rise (19 bits of the clock's ticks), how often the same time
+    came again (3 bits), the whole chips between that and the rise before (4 bits), and its score (6 bits). The
+    clock of 19 bits goes round in half a second; rows are looked at in turn, all in a quarter of that, so
+    that no old rise looks young.
 
     Args:
         width: Columns of the sensor.
@@ -96,7 +104,7 @@ class Rhythm:
         )
 
     def of(self, events: Events) -> Events:
-        """Those of candidates.
+        """Those of candidates that are no lamps.
 
         Where leaves move, chance takes a third of their pixels to half of a candidate's score, and a tenth to
         all of it.
@@ -104,7 +112,7 @@ class Rhythm:
         from evlcp_sdk.rx import _kernels
 
         keep = np.empty(len(events), np.bool_)
-        _kernels.in_rhythm(events.x, events.y, self._pixels, self._min_score, keep)
+        _kernels.in_rhythm(events.x, events.y, self._pixels, self._min_score, _SAME, keep)
         return events[keep]
 
     def measure(

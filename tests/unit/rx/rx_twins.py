@@ -44,29 +44,33 @@ def clock(rows, width, height):
 
 
 def score_rises(events, shape, start, chip_us, min_score, cell_shift):
-    """Last rise, chips before it and score of each pixel, and hits; `start` is the same three before."""
-    (rose, chips, score), hits = (a.copy() for a in start), {}
+    """Last rise, chips before it, how often these again, score of each pixel; and hits. `start`: before."""
+    (rose, chips, same, score), hits = (a.copy() for a in start), {}
     for t, u, v, p in events:
         run = t - rose[v, u]
         if not p or run < int(1.5 * chip_us):
             continue
-        whole = 0
+        whole = again = 0
         if run > 12.5 * chip_us:
             score[v, u] -= 1
+            again = chips[v, u] == 0
         else:
             whole = int(np.floor(run / chip_us + 0.5))
+            again = whole == chips[v, u]
             if abs(run - whole * chip_us) > 0.3 * chip_us:
+                again = False
                 score[v, u] -= 3
             elif whole <= 4:
                 score[v, u] += 2
             else:
                 score[v, u] += -2 if whole == chips[v, u] else 1
         score[v, u] = sorted((0, score[v, u], 40))[1]
+        same[v, u] = min(same[v, u] + 1, 7) if again else max(same[v, u] - 2, 0)
         rose[v, u], chips[v, u] = t, whole
         if score[v, u] >= min_score:
             cell = v >> cell_shift, u >> cell_shift
             hits[cell] = hits.get(cell, 0) + 1
-    return (rose, chips, score), hits
+    return (rose, chips, same, score), hits
 
 
 def measure_box(lit, box, seam, reach):

@@ -52,10 +52,11 @@ def test_the_first_event_too_may_be_off_the_sensor(x, y):
 LOW = (1 << _kernels.CLOCK_AT) - 1
 
 
-def states(rose_us, chips, score):
-    """Pixels of these last rises, us, chips and scores."""
+def states(rose_us, chips, score, same=0):
+    """Pixels of these last rises, us, chips, scores, and how often the same again."""
     clock = np.asarray(rose_us) % _kernels.CLOCK_ROUND << _kernels.CLOCK_AT
-    return (clock | np.asarray(chips) << _kernels.CHIPS_AT | score).astype(np.uint32)
+    again = np.asarray(same) << _kernels.SAME_AT
+    return (clock | again | np.asarray(chips) << _kernels.CHIPS_AT | score).astype(np.uint32)
 
 
 def rhythm_of(pixels, chip_us=CHIP_US, min_score=8):
@@ -80,13 +81,13 @@ def test_scores_of_pixels(seed, freeze):
     t_us = np.where(rng.random(len(events)) < 0.75, (events.t_us / 100).round() * 100, events.t_us)
     order = np.argsort(t_us, kind="stable")
     events = Events.of(t_us[order], events.x[order], events.y[order], events.p[order])
-    start_us = -(2**21)
+    start_us = -(2**18)
     pixels = states(np.full((HEIGHT, WIDTH), start_us), 0, 0)
-    start = (np.full(pixels.shape, start_us), np.zeros(pixels.shape, int), np.zeros(pixels.shape, int))
+    start = (np.full(pixels.shape, start_us), *np.zeros((3, *pixels.shape), int))
     hits = scored(frozen(events, freeze), pixels)
     rows = zip(*(c.tolist() for c in (events.t_us, events.x, events.y, events.p)), strict=True)
-    (rose, chips, score), want = twins.score_rises(rows, pixels.shape, start, CHIP_US, 8, 2)
-    assert_array_equal(pixels, states(rose, chips, score))
+    (rose, chips, same, score), want = twins.score_rises(rows, pixels.shape, start, CHIP_US, 8, 2)
+    assert_array_equal(pixels, states(rose, chips, score, same))
     assert {tuple(c): hits[tuple(c)] for c in np.argwhere(hits).tolist()} == want
     assert 0 <= score.min() < score.max() <= 40
 
@@ -106,7 +107,7 @@ def test_scores_of_pixels(seed, freeze):
         (700, -2),
         (1200, 1),
         (1251, -1),
-        (10**6, -1),
+        (10**5, -1),
     ],
 )
 def test_a_rise_counts_by_its_time_since_the_last(run_us, score):
@@ -144,16 +145,16 @@ def test_falls_are_not_looked_at():
 
 def test_scores_do_not_care_how_the_stream_is_cut():
     events = random_events(np.random.default_rng(0), 1000, step_us=8, width=4, height=4)
-    whole, parts = (states(np.full((HEIGHT, WIDTH), -(2**21)), 0, 0) for _ in range(2))
+    whole, parts = (states(np.full((HEIGHT, WIDTH), -(2**18)), 0, 0) for _ in range(2))
     want = scored(events, whole)
     got = sum(scored(events[a:b], parts) for a, b in [(0, 0), (0, 1), (1, 700), (700, 1000)])
     assert_array_equal(parts, whole)
     assert_array_equal(got, want)
 
 
-@pytest.mark.parametrize("gap_us", [1500, 400_000, 1_100_000, 4_194_304, 10**10])
+@pytest.mark.parametrize("gap_us", [1500, 50_000, 140_000, 524_288, 10**10])
 def test_no_rise_grows_young(gap_us):
-    """The clock goes round in 2^22 us, while a pixel's age never goes below half of that again."""
+    """The clock goes round in 2^19 us, while a pixel's age never goes below a quarter of that again."""
     rng = np.random.default_rng(0)
     rhythm = Rhythm(WIDTH, HEIGHT, CHIP_US, 8)
     hits, events = np.zeros((4, 6), np.int32), random_events(rng, 500)
@@ -163,31 +164,30 @@ def test_no_rise_grows_young(gap_us):
     for t, u, v, p in zip(*(c.tolist() for c in (events.t_us, events.x, events.y, events.p)), strict=True):
         if p and t - rose[v, u] >= 150:
             rose[v, u] = t
-    for now in range(3000, 3000 + max(6 * gap_us, 10**7), gap_us):
+    for now in range(3000, 3000 + max(6 * gap_us, 10**6), gap_us):
         rhythm.step(now, Events.empty(), hits, 2)
         age = (now - (rhythm._pixels >> _kernels.CLOCK_AT).astype(int)) % _kernels.CLOCK_ROUND
         true = now - rose
-        assert_array_equal(age[true < 2**20], true[true < 2**20])
-        assert (age[true >= 2**20] >= 2**20).all()
+        assert_array_equal(age[true < 2**17], true[true < 2**17])
+        assert (age[true >= 2**17] >= 2**17).all()
         assert_array_equal(rhythm._pixels & LOW, low)
-        if gap_us < 10**4 and now > 6000:
-            break
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_old_rises(seed):
     rng = np.random.default_rng(seed)
-    now, rose = 5_000_000, 5_000_000 - rng.integers(0, 2**22, (HEIGHT, WIDTH))
+    now, rose = 5_000_000, 5_000_000 - rng.integers(0, 2**19, (HEIGHT, WIDTH))
     chips, score = rng.integers(0, 14, rose.shape), rng.integers(0, 41, rose.shape)
-    pixels = states(rose, chips, score)
+    same = rng.integers(0, 8, rose.shape)
+    pixels = states(rose, chips, score, same)
     # Rows 10 to 15, and 0 to 4.
     _kernels.grow_old(pixels, 10, 11, now, 3000, 4000)
     looked_at = np.isin(np.arange(HEIGHT), [*range(10, 16), *range(5)])
     old = (now - rose >= 3000) & looked_at[:, None]
-    assert_array_equal(pixels, states(np.where(old, now - 4000, rose), chips, score))
+    assert_array_equal(pixels, states(np.where(old, now - 4000, rose), chips, score, same))
     events, keep = random_events(rng, 300), np.empty(300, np.bool_)
-    _kernels.in_rhythm(events.x, events.y, pixels, 20, keep)
-    assert_array_equal(keep, score[events.y, events.x] >= 20)
+    _kernels.in_rhythm(events.x, events.y, pixels, 20, 5, keep)
+    assert_array_equal(keep, ((score >= 20) & (same < 5))[events.y, events.x])
 
 
 @pytest.mark.parametrize("reach", [2.0, np.inf])
@@ -491,3 +491,20 @@ def test_rows_are_read_one_after_another(seed, blocks):
     seen = np.full(blocks, 100.0)
     got = _kernels.slope_of_rows(rows, fit, seen, 4, 4.0, 0.2)
     assert_allclose(got, twins.slope_of_rows(rows, fit, seen, 4, 4.0, 0.2), rtol=1e-9)
+
+
+@pytest.mark.parametrize("period_us", [200, 222, 300, 400, 500])
+def test_a_lamp_of_whole_chips_is_no_candidate(period_us):
+    """Its rises are on the chips; but in a code the same time does not come again and again."""
+    rng = np.random.default_rng(0)
+    rhythm = Rhythm(WIDTH, HEIGHT, CHIP_US, 8)
+    lamp = np.arange(0, 20_000, period_us)
+    lamp = lamp[rng.random(len(lamp)) > 0.05]
+    code = 100 * np.cumsum(rng.choice([2, 3, 4], 80, p=[0.5, 0.37, 0.13]))
+    code = code[code < 20_000]
+    t = np.concatenate([lamp, code])
+    order = np.argsort(t, kind="stable")
+    x = np.repeat([3, 9], [len(lamp), len(code)])
+    events = Events.of(t[order], x[order], np.full(len(t), 5), np.ones(len(t)))
+    rhythm.step(0, events, np.zeros((4, 6), np.int32), 2)
+    assert set(rhythm.of(events).x.tolist()) == {9}
