@@ -1,4 +1,4 @@
-"""Runs a command again and again, in forks, each with a fault of the disk; what `test_faults.py` starts."""
+"""Runs a command again and again, in forks, each with a fault of the disk; what `test_fault_injection.py` starts."""
 
 import ctypes
 import io
