@@ -158,7 +158,7 @@ def score_rises(
         state = states[at]
         kind = np.uint32(kinds[runs[i]])
         low = np.uint32(lows[(kind << np.uint32(SAME_AT)) | (state & _PART)])
-        same = np.int32((state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME))
+        same = int((state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME))
         again = kind == ((state >> np.uint32(CHIPS_AT)) & np.uint32(15))
         same = min(same + 1, MOST_SAME) if again else max(same - 2, 0)
         states[at] = (state & ~_LOW) | (np.uint32(same) << np.uint32(SAME_AT)) | low

@@ -7,9 +7,9 @@ by two, one after five to twelve by one. A rise off the chips, as of a lamp with
 kHz (two and a half chips) or of a moving texture, lowers it by three: more than the two that chance, which
 is on the chips in six cases of ten, would bring. One after the very same number of chips as before lowers
 it by two from five chips on: a lamp of 1 or 2 kHz repeats its period, a code with missing events does not.
-A lamp whose period is two, three or four whole chips is in rhythm, too, as far as a score tells; but there the
-same time comes again and again, which in a code it does not for long: before a frame shows where the bar is,
-such pixels are not listened to. Falls are not looked at: they come later or sooner than rises by the light,
+A lamp whose period is two, three or four whole chips is in rhythm, too, as far as a score tells; but its time
+comes again and again, which one of a code does not for long: before a frame shows where the bar is, such
+pixels are not listened to. Falls are not looked at: they come later or sooner than rises by the light,
 they are the first to go missing, and some cameras send none. One pass, four bytes a pixel.
 """
 
@@ -50,9 +50,9 @@ class Rhythm:
     """Scores of a sensor's pixels.
 
     A pixel's state holds the time of its last rise (19 bits of the clock's ticks), how often the same time
-    came again (3 bits), the whole chips between that and the rise before (4 bits), and its score (6 bits). The
-    clock of 19 bits goes round in half a second; rows are looked at in turn, all in a quarter of that, so
-    that no old rise looks young.
+    came again (3 bits), the whole chips between that and the rise before (4 bits), and its score (6 bits).
+    The clock of 19 bits goes round in half a second; rows are looked at in turn, all in a quarter of that,
+    so that no old rise looks young.
 
     Args:
         width: Columns of the sensor.

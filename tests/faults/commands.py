@@ -1,4 +1,4 @@
-"""Runs a command again and again, in forks, each with a fault of the disk; what `test_fault_injection.py` starts."""
+"""Runs a command again and again, in forks, each with a fault of the disk: for `test_fault_injection.py`."""
 
 import ctypes
 import io
