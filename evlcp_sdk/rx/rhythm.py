@@ -39,8 +39,8 @@ _LONGEST_TICKS = 2**16
 
 _SAME = 5
 """Rises after the same time as before, less two for each other one, from which on a pixel is a lamp: of the
-times of a code half are of two chips, so that one of thirty pixels is taken for one, and a lamp that misses
-one rise in six is not."""
+times of a code half are of two chips, so that a tenth of its pixels, and more in some pilots, are taken for
+one now and then; a lamp that misses one rise in six is not."""
 
 _LATE, _OFF = 0, 16
 """Kind of a time between rises: its number of whole chips, or 0 beyond; so much more where it is off them."""
