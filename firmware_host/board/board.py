@@ -375,12 +375,17 @@ class Board:
         end = self.session.transport.now() + timeout_s + _packet_s(status)
         while status.state not in (State.DARK, State.FAULT):
             if self.session.transport.now() > end:
-                raise LineError(
-                    f"{self.session.name}: still {State(status.state).name}; try 'evlcp board blank'"
-                )
+                raise LineError(f"{self.session.name}: still {_state(status.state)}; try 'evlcp board blank'")
             self.session.transport.read(0.005)
             status = self.status()
         return status
+
+
+def _state(value: int) -> str:
+    try:
+        return State(value).name
+    except ValueError:
+        return f"state {value}"
 
 
 def provision(

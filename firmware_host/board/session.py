@@ -15,7 +15,15 @@ from firmware_host.errors import (
 )
 from firmware_host.ports.transport import Transport
 from firmware_host.protocol.client import TRIES, Client, RequestOutcome, Timing
-from firmware_host.protocol.requests import NO_SESSION, SCHEMA, HelloReply, HelloRequest, Status, Type
+from firmware_host.protocol.requests import (
+    MAJOR,
+    MINOR,
+    NO_SESSION,
+    HelloReply,
+    HelloRequest,
+    Status,
+    Type,
+)
 from firmware_host.protocol.wire import WireMessage
 
 __all__ = ["Session", "refusal"]
@@ -33,7 +41,7 @@ _ADVICE = {
     " it goes on where it was",
     Status.STALE: "the board has done a later request already; run the command again",
     Status.NOTHING_COMMITTED: "nothing is programmed; 'evlcp board program' first",
-    Status.INCOMPATIBLE: "its protocol is another one than this host's; update firmware or host",
+    Status.INCOMPATIBLE: f"it speaks protocol {{protocol}}, this host {MAJOR}.{MINOR}; update the {{older}}",
     Status.FLASH_FAULT: "its flash does not hold the data; try again, then replace the board",
     Status.NOT_SUPPORTED: "this board cannot do that; 'evlcp board hello' shows what it can",
     Status.EMPTY_SLOT: "no settings are saved; 'evlcp board save' first",
@@ -53,7 +61,13 @@ def refusal(name: str, type_: int, status: Status | int, detail: int) -> BoardEr
     request = Type(type_).name
     word = status.name if isinstance(status, Status) else f"status {status}"
     advice = _ADVICE.get(status, "update the host") if isinstance(status, Status) else "update the host"
-    message = f"{name}: {request} refused ({word}): {advice.format(detail=detail)}"
+    major, minor = detail & 0xFF, detail >> 8 & 0xFF
+    values = {
+        "detail": detail,
+        "protocol": f"{major}.{minor}",
+        "older": "firmware" if major < MAJOR else "host",
+    }
+    message = f"{name}: {request} refused ({word}): {advice.format(**values)}"
     kind = _KINDS.get(status)
     return kind(message) if kind else RefusedError(message, int(status), detail)
 
@@ -110,10 +124,11 @@ class Session:
         """
         self.client.session = NO_SESSION
         self.client.window = 1
+        self.client.minor = MINOR
         # Ends what a host before this one may have left half sent.
         self.transport.write(b"\0")
         found: list[RequestOutcome] = []
-        self.run([HelloRequest(SCHEMA, self._nonce)], lambda _, outcome: found.append(outcome))
+        self.run([HelloRequest(MAJOR, MINOR, self._nonce)], lambda _, outcome: found.append(outcome))
         outcome = found[0]
         if outcome.status is None:
             raise NoBoardError(
@@ -124,6 +139,7 @@ class Session:
             raise refusal(self.name, Type.HELLO, outcome.status, outcome.detail)
         self.client.session = outcome.reply.session
         self.client.window = max(1, outcome.reply.window)
+        self.client.minor = min(MINOR, outcome.reply.minor)
         return outcome.reply
 
     def call(self, request: WireMessage, reply: type[Reply]) -> Reply:
@@ -139,6 +155,17 @@ class Session:
         if not isinstance(answer, reply):
             raise LineError(f"{self.name}: {type(answer).__name__} came, expected {reply.__name__}")
         return answer
+
+    def _check_known(self, request: WireMessage) -> None:
+        """Raise IncompatibleError if the board's protocol is too old for a request."""
+        later = request.later(self.client.minor)
+        if later is None:
+            return
+        what = Type(request.TYPE).name + ("" if later == "it" else f" with {later}")
+        raise IncompatibleError(
+            f"{self.name}: {what} is not in its protocol {MAJOR}.{self.client.minor}, this host has"
+            f" {MAJOR}.{MINOR}; update the firmware"
+        )
 
     def checked(self, request: WireMessage, outcome: RequestOutcome) -> WireMessage:
         """The answer of an outcome.
@@ -175,6 +202,7 @@ class Session:
                     if request is None:
                         more = False
                         break
+                    self._check_known(request)
                     sent[self.client.submit(request)] = request
                 data, deadline = self.client.poll(self.transport.now())
                 if data:

@@ -70,7 +70,7 @@ def _about(about: "HelloReply") -> dict[str, Any]:
         "hal": about.hal.rstrip(b"\0").decode("ascii", "replace"),
         "unique_id": about.unique_id.hex(),
         "firmware": f"{about.version_major}.{about.version_minor}.{about.version_patch}",
-        "schema": about.schema.hex(),
+        "protocol": f"{about.major}.{about.minor}",
         "clusters": about.clusters,
         "leds": about.leds,
         "banks": about.banks,
@@ -80,7 +80,7 @@ def _about(about: "HelloReply") -> dict[str, Any]:
         "tick_hz": about.tick_hz,
         "chip_rate_max_hz": about.chip_rate_max_hz,
         "level_max_ma": about.level_max_ma,
-        "capabilities": [c.name.lower() for c in Capability if c & about.capabilities and c.name],
+        "capabilities": _bits(Capability, about.capabilities),
         "uptime_ms": about.uptime_ms,
     }
 
@@ -92,6 +92,12 @@ def _name(enum: Any, value: int) -> str:
         return str(value)
 
 
+def _bits(flags: Any, value: int) -> list[str]:
+    """Names of the bits that are set; of those that a later firmware has, the number."""
+    names = [_name(flags, 1 << n) for n in range(value.bit_length()) if value >> n & 1]
+    return [f"bit {int(name):#x}" if name.isdigit() else name for name in names]
+
+
 def _status(status: "StatusReply") -> dict[str, Any]:
     from firmware_host.protocol.requests import NO_BANK, BoardFault, Format, Profile, State, Watchdog
 
@@ -101,7 +107,7 @@ def _status(status: "StatusReply") -> dict[str, Any]:
     open_leds = int.from_bytes(status.open_leds, "big")
     table: dict[str, Any] = {
         "state": _name(State, status.state),
-        "faults": [f.name.lower() for f in BoardFault if f & status.faults and f.name],
+        "faults": _bits(BoardFault, status.faults),
         "active_bank": bank(status.active_bank),
         "pending_bank": bank(status.pending_bank),
     }

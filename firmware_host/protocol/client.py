@@ -14,6 +14,7 @@ from firmware_host.protocol.requests import (
     CRC_BYTES,
     HEADER_BYTES,
     MAX_PAYLOAD,
+    MINOR,
     NO_SESSION,
     REPLIES,
     REPLY_BIT,
@@ -96,6 +97,7 @@ class Client:
         timing: How long an answer may take.
         window: Requests under way at once; HELLO says how many the board takes.
         session: Session that HELLO gave.
+        minor: Minor version of the protocol in which requests are sent: the board's, that HELLO gave.
         first: First sequence number, by default drawn at random.
         tries: How often a request is sent before it is given up.
         retries: Counts the requests sent again.
@@ -111,6 +113,7 @@ class Client:
     timing: Timing
     window: int = 1
     session: int = NO_SESSION
+    minor: int = MINOR
     first: int = field(default_factory=lambda: random.SystemRandom().randrange(1 << 16))
     tries: int = TRIES
     retries: int = 0
@@ -124,7 +127,7 @@ class Client:
         """Queue a request; returns the token its outcome will carry."""
         sequence = (self.first + self._tokens) & 0xFFFF
         chosen = self.session if session is None else session
-        wire = Datagram(request.TYPE, 0, sequence, chosen, request.pack()).encode()
+        wire = Datagram(request.TYPE, 0, sequence, chosen, request.pack(self.minor)).encode()
         reply = REPLIES[request.TYPE]
         longest = MAX_PAYLOAD if reply.LAYOUT[-1:] == (("*", 1),) else max(4, reply.fixed_bytes())
         token = self._tokens

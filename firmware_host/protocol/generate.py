@@ -4,8 +4,6 @@
 """
 
 import argparse
-import hashlib
-import json
 import sys
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -16,7 +14,7 @@ from typing import Any
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.link.resolve import resolve
 
-__all__ = ["Field", "codebook_of", "generated_files", "main", "schema_hash"]
+__all__ = ["Field", "codebook_of", "generated_files", "main"]
 
 HERE = Path(__file__).parents[1]
 
@@ -34,6 +32,7 @@ class Field:
         base: Type of an element: u8, u16, u32, u64, i16 or bytes.
         count: Elements; 0 for the rest of the payload.
         doc: Meaning.
+        since: Minor version that brought it.
 
     >>> Field.parse({"name": "pilots", "type": "u16[16]", "doc": "Pilot words."}).size
     32
@@ -43,15 +42,16 @@ class Field:
     base: str
     count: int
     doc: str
+    since: int = 0
 
     @classmethod
-    def parse(cls, table: dict[str, str]) -> "Field":
+    def parse(cls, table: dict[str, Any]) -> "Field":
         """Read one field of the definition."""
         base, bracket, count = table["type"].partition("[")
         if base not in _SIZES and base != "bytes":
             raise ValueError(f"field {table['name']}: type {table['type']} is unknown")
         n = int(count[:-1]) if bracket else (0 if base == "bytes" else 1)
-        return cls(table["name"], base, n, table["doc"])
+        return cls(table["name"], base, n, table["doc"], table.get("since", 0))
 
     @property
     def size(self) -> int:
@@ -72,17 +72,14 @@ class Field:
             return "bytes"
         return "int" if self.count == 1 else "tuple[int, ...]"
 
-
-def schema_hash(definition: dict[str, Any]) -> str:
-    """SHA-256 over everything of the definition but its prose, 64 hex digits."""
-
-    def bare(node: Any) -> Any:
-        if isinstance(node, dict):
-            return {k: bare(v) for k, v in node.items() if k != "doc"}
-        return [bare(v) for v in node] if isinstance(node, list) else node
-
-    text = json.dumps(bare(definition), sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
+    @property
+    def python_default(self) -> str:
+        """What stands for it where it is not known; empty if it always is."""
+        if not self.since:
+            return ""
+        if self.base == "bytes":
+            return f" = bytes({self.count})"
+        return " = 0" if self.count == 1 else f" = (0,) * {self.count}"
 
 
 def profiles_of(definition: dict[str, Any]) -> list[str]:
@@ -101,11 +98,14 @@ def codebook_of(profile: str) -> Codebook:
 
 def _messages(definition: dict[str, Any]) -> Iterator[tuple[dict[str, Any], list[Field], list[Field]]]:
     for message in definition["message"]:
-        yield (
-            message,
-            [Field.parse(f) for f in message["request"]],
-            [Field.parse(f) for f in message["reply"]],
-        )
+        request = [Field.parse(f) for f in message["request"]]
+        reply = [Field.parse(f) for f in message["reply"]]
+        for fields in (request, reply):
+            if [f.since for f in fields] != sorted(f.since for f in fields):
+                raise ValueError(f"message {message['name']}: a field with `since` stands before one without")
+            if any(f.since and not f.size for f in fields):
+                raise ValueError(f"message {message['name']}: a field of any length cannot come later")
+        yield message, request, reply
 
 
 _CLASSES = {"fault": "BoardFault"}
@@ -119,9 +119,8 @@ def _camel(name: str) -> str:
 def python_module(definition: dict[str, Any]) -> str:
     """The Python module of the messages."""
     protocol, geometry = definition["protocol"], definition["geometry"]
-    digest = schema_hash(definition)
-    names = ["HEADER_BYTES", "CRC_BYTES", "MAX_PAYLOAD", "WINDOW", "DEFAULT_BAUD", "PROTOCOL_VERSION"]
-    names += ["CLUSTERS", "LEDS", "ROW_BYTES", "SCHEMA", "SCHEMA_HEX", "REPLIES", "Type"]
+    names = ["HEADER_BYTES", "CRC_BYTES", "MAX_PAYLOAD", "WINDOW", "DEFAULT_BAUD", "MAJOR", "MINOR"]
+    names += ["CLUSTERS", "LEDS", "ROW_BYTES", "REPLIES", "Type"]
     names += [name.upper() for name in definition["constants"]]
     out = [
         '"""Messages of the driver board; `python -m firmware_host.protocol.generate` writes this file."""',
@@ -134,12 +133,10 @@ def python_module(definition: dict[str, Any]) -> str:
         "",
         "@ALL@",
         "",
-        f"PROTOCOL_VERSION = {protocol['version']}",
-        '"""Version of the protocol."""',
-        f'SCHEMA_HEX = "{digest}"',
-        '"""SHA-256 of the definition."""',
-        "SCHEMA = bytes.fromhex(SCHEMA_HEX)[:8]",
-        '"""What HELLO carries of it."""',
+        f"MAJOR = {protocol['major']}",
+        '"""Version of the protocol: of another major one no message is understood."""',
+        f"MINOR = {protocol['minor']}",
+        '"""Version of the protocol: what it has beyond the major version\'s first."""',
         f"HEADER_BYTES = {protocol['header_bytes']}",
         f"CRC_BYTES = {protocol['crc_bytes']}",
         f"MAX_PAYLOAD = {protocol['max_payload']}",
@@ -185,9 +182,13 @@ def python_module(definition: dict[str, Any]) -> str:
                 out.append("    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (")
                 out += [f'        ("{code}", {count}),' for code, count in (f.layout for f in fields)]
                 out.append("    )")
+            if message.get("since", 0):
+                out.append(f"    SINCE: ClassVar[int] = {message['since']}")
+            if any(f.since for f in fields):
+                out.append(f"    FIELD_SINCE: ClassVar[tuple[int, ...]] = {tuple(f.since for f in fields)}")
             if fields:
                 out.append("")
-            out += [f"    {f.name}: {f.python_type}" for f in fields]
+            out += [f"    {f.name}: {f.python_type}{f.python_default}" for f in fields]
     out += ["", "", "REPLIES: dict[int, type[WireMessage]] = {"]
     out += [f"    0x{m['type']:02X}: {_camel(m['name'])}Reply," for m, _, _ in _messages(definition)]
     out += ["}", '"""The reply of each request type."""', ""]
@@ -267,14 +268,14 @@ static inline uint32_t evlcp_get32(const uint8_t *p)
 def c_header(definition: dict[str, Any]) -> str:
     """The C header of the messages: numbers, and for each message a struct, its size, put and get."""
     protocol, geometry = definition["protocol"], definition["geometry"]
-    schema = ", ".join(f"0x{b:02x}" for b in bytes.fromhex(schema_hash(definition))[:8])
     out = [
         "/* Messages of the driver board; generated from protocol.toml, do not edit. */",
         "#ifndef EVLCP_PROTOCOL_H",
         "#define EVLCP_PROTOCOL_H",
         "#include <stdint.h>",
         "",
-        f"#define EVLCP_PROTOCOL_VERSION {protocol['version']}u",
+        f"#define EVLCP_PROTOCOL_MAJOR {protocol['major']}u",
+        f"#define EVLCP_PROTOCOL_MINOR {protocol['minor']}u",
         f"#define EVLCP_HEADER_BYTES {protocol['header_bytes']}u",
         f"#define EVLCP_CRC_BYTES {protocol['crc_bytes']}u",
         f"#define EVLCP_MAX_PAYLOAD {protocol['max_payload']}u",
@@ -283,7 +284,6 @@ def c_header(definition: dict[str, Any]) -> str:
         f"#define EVLCP_BOARD_CLUSTERS {geometry['clusters']}u",
         f"#define EVLCP_LEDS {geometry['leds']}u",
         f"#define EVLCP_ROW_BYTES {geometry['row_bytes']}u",
-        f"#define EVLCP_SCHEMA {{{schema}}}",
     ]
     for name, entry in definition["constants"].items():
         out.append(f"#define EVLCP_{name.upper()} 0x{entry['value']:x}u /* {entry['doc']} */")
@@ -322,7 +322,25 @@ def c_header(definition: dict[str, Any]) -> str:
                     out += step(f, at)
                     at += f.size
                 out.append("}")
-    out += ["", "#endif", ""]
+    sizes = {m["name"]: sum(f.size for f in request) for m, request, _ in _messages(definition)}
+    out += [
+        "",
+        f"#define EVLCP_REQUEST_MOST {max(sizes.values())}u /* longest request, data left out */",
+        "",
+        "/* Requests: type, whether control, whether any length may follow, and the length, that of the",
+        "   first minor version and today's; a shorter one goes on with zeros. */",
+        "#define EVLCP_SHAPES \\",
+    ]
+    rows = []
+    for message, request, _ in _messages(definition):
+        least = sum(f.size for f in request if not f.since)
+        control = "true" if message["kind"] == "control" else "false"
+        # what a later host adds to HELLO is for the board to leave alone
+        more = "true" if message["kind"] == "session" or any(not f.size for f in request) else "false"
+        rows.append(
+            f"    {{0x{message['type']:02x}u, {control}, {more}, {least}u, {sizes[message['name']]}u}}"
+        )
+    out += [", \\\n".join(rows), "", "#endif", ""]
     return "\n".join(out)
 
 
@@ -382,7 +400,8 @@ def markdown(definition: dict[str, Any]) -> str:
             for f in fields:
                 many = f"[{f.count}]" if f.count > 1 else ""
                 rest = ", the rest" if f.base == "bytes" and not f.count else ""
-                out.append(f"| {kind} | `{f.name}` | {f.base}{many}{rest} | {f.doc} |")
+                later = f" Since {definition['protocol']['major']}.{f.since}." if f.since else ""
+                out.append(f"| {kind} | `{f.name}` | {f.base}{many}{rest} | {f.doc}{later} |")
     for name, table in definition["enums"].items():
         out += [
             "",

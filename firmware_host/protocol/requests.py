@@ -14,15 +14,14 @@ __all__ = [
     "DEFAULT_BAUD",
     "HEADER_BYTES",
     "LEDS",
+    "MAJOR",
     "MAX_PAYLOAD",
+    "MINOR",
     "NO_BANK",
     "NO_SESSION",
-    "PROTOCOL_VERSION",
     "REPLIES",
     "REPLY_BIT",
     "ROW_BYTES",
-    "SCHEMA",
-    "SCHEMA_HEX",
     "WINDOW",
     "BlankReply",
     "BlankRequest",
@@ -66,12 +65,10 @@ __all__ = [
     "WriteRequest",
 ]
 
-PROTOCOL_VERSION = 1
-"""Version of the protocol."""
-SCHEMA_HEX = "85507b45425b847c4a0f0706672a60bf961ec81b082026425238d00d03dac3dd"
-"""SHA-256 of the definition."""
-SCHEMA = bytes.fromhex(SCHEMA_HEX)[:8]
-"""What HELLO carries of it."""
+MAJOR = 2
+"""Version of the protocol: of another major one no message is understood."""
+MINOR = 0
+"""Version of the protocol: what it has beyond the major version's first."""
 HEADER_BYTES = 6
 CRC_BYTES = 4
 MAX_PAYLOAD = 512
@@ -137,7 +134,7 @@ class Status(IntEnum):
     NOTHING_COMMITTED = 9
     """No bank has been committed."""
     INCOMPATIBLE = 10
-    """The host's schema is another one."""
+    """The host's major version is another one."""
     FLASH_FAULT = 11
     """The flash did not take or give the data."""
     NOT_SUPPORTED = 12
@@ -225,7 +222,7 @@ class BoardFault(IntFlag):
     CHIP_LOST = 8
     """A chip interrupt came a whole chip late, or chips stopped: LEDs dark."""
     WATCHDOG = 16
-    """The host fell silent and the watchdog acted; cleared by the next request."""
+    """The host fell silent and the watchdog acted; cleared by the next control request."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,17 +230,20 @@ class HelloRequest(WireMessage):
     """Open a session and learn the board. Its first two fields never change between versions.
 
     Attributes:
-        schema: First bytes of the SHA-256 of the host's protocol definition.
+        major: The host's protocol; another major version is INCOMPATIBLE.
+        minor: The host's protocol.
         nonce: Random; the same nonce keeps the session.
     """
 
     TYPE: ClassVar[int] = 0x01
     LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("8s", 1),
+        ("B", 1),
+        ("B", 1),
         ("I", 1),
     )
 
-    schema: bytes
+    major: int
+    minor: int
     nonce: int
 
 
@@ -252,7 +252,8 @@ class HelloReply(WireMessage):
     """What the board answers to HELLO.
 
     Attributes:
-        schema: The board's schema.
+        major: The board's protocol.
+        minor: The board's protocol: what came later it does not know.
         session: Goes into the header of every further request.
         version_major: Firmware version.
         version_minor: Firmware version.
@@ -274,7 +275,8 @@ class HelloReply(WireMessage):
 
     TYPE: ClassVar[int] = 0x01
     LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("8s", 1),
+        ("B", 1),
+        ("B", 1),
         ("H", 1),
         ("B", 1),
         ("B", 1),
@@ -294,7 +296,8 @@ class HelloReply(WireMessage):
         ("12s", 1),
     )
 
-    schema: bytes
+    major: int
+    minor: int
     session: int
     version_major: int
     version_minor: int
@@ -669,7 +672,7 @@ class StatusReply(WireMessage):
         open_leds: A bit a LED: open.
         watchdog: Watchdog action.
         watchdog_ms: Watchdog time-out.
-        silence_ms: Time since the request before this one.
+        silence_ms: Time since the request before this one, HELLO left out.
         uptime_ms: Time since reset.
         digest: Digest of the active bank's codebook, or of the one set.
     """
@@ -677,7 +680,7 @@ class StatusReply(WireMessage):
     TYPE: ClassVar[int] = 0x0C
     LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
         ("B", 1),
-        ("B", 1),
+        ("H", 1),
         ("B", 1),
         ("B", 1),
         ("B", 1),

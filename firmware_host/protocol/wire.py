@@ -21,25 +21,51 @@ class WireMessage:
     Attributes:
         TYPE: Type byte of the request the payload belongs to.
         LAYOUT: Per field its `struct` code and how many values it takes; the code `*` is the rest.
+        SINCE: Minor version of the protocol that brought the message.
+        FIELD_SINCE: The same per field; empty if all came with the message.
     """
 
     TYPE: ClassVar[int]
     LAYOUT: ClassVar[tuple[tuple[str, int], ...]]
+    SINCE: ClassVar[int] = 0
+    FIELD_SINCE: ClassVar[tuple[int, ...]] = ()
 
     @classmethod
     def fixed_bytes(cls) -> int:
         """Length without a trailing field of any length, bytes."""
         return _packer("".join(code for code, _ in cls.LAYOUT if code != "*")).size
 
-    def pack(self) -> bytes:
-        """The payload as bytes.
+    @classmethod
+    def _lengths(cls) -> list[int]:
+        """Lengths of the payload in each minor version that changed it, bytes."""
+        codes = [code for code, _ in cls.LAYOUT if code != "*"]
+        since = cls.FIELD_SINCE or (0,) * len(codes)
+        return [
+            _packer("".join(c for c, m in zip(codes, since, strict=False) if m <= minor)).size
+            for minor in sorted({0, *since})
+        ]
+
+    def later(self, minor: int) -> str | None:
+        """What of this message a board of an earlier minor version could not know; None if nothing."""
+        if minor < self.SINCE:
+            return "it"
+        fields = dataclasses.fields(self)  # type: ignore[arg-type]
+        for field, since in zip(fields, self.FIELD_SINCE, strict=False):
+            if since > minor and getattr(self, field.name) != field.default:
+                return field.name
+        return None
+
+    def pack(self, minor: int | None = None) -> bytes:
+        """The payload as bytes, for a board of a minor version, or as long as it is.
 
         Raises:
             DatagramError: A value does not fit its field.
         """
         values: list[Any] = []
         rest = b""
-        for (code, count), field in zip(self.LAYOUT, dataclasses.fields(self), strict=True):  # type: ignore[arg-type]
+        since = self.FIELD_SINCE if minor is not None else ()
+        known = len(self.LAYOUT) - sum(m > (minor or 0) for m in since)
+        for (code, count), field in zip(self.LAYOUT[:known], dataclasses.fields(self), strict=False):  # type: ignore[arg-type]
             value = getattr(self, field.name)
             if code == "*":
                 rest = value
@@ -50,22 +76,23 @@ class WireMessage:
                     raise DatagramError(f"{type(self).__name__}.{field.name}: {len(value)} bytes")
                 values.append(value)
         try:
-            head = _packer("".join(code for code, _ in self.LAYOUT if code != "*")).pack(*values)
+            head = _packer("".join(code for code, _ in self.LAYOUT[:known] if code != "*")).pack(*values)
         except struct.error as fault:
             raise DatagramError(f"{type(self).__name__}: {fault}") from fault
         return head + rest
 
     @classmethod
     def unpack(cls, data: bytes) -> Self:
-        """Read a payload.
+        """Read a payload; what a later minor version has added is left out, what this one has is 0.
 
         Raises:
-            DatagramError: The length is not the message's.
+            DatagramError: The length is no minor version's.
         """
         size = cls.fixed_bytes()
-        open_ended = bool(cls.LAYOUT) and cls.LAYOUT[-1][0] == "*"
-        if len(data) < size or (len(data) > size and not open_ended):
-            raise DatagramError(f"{cls.__name__}: {len(data)} bytes, expected {size}")
+        if len(data) < size:
+            if len(data) not in cls._lengths():
+                raise DatagramError(f"{cls.__name__}: {len(data)} bytes, expected {size}")
+            data += bytes(size - len(data))
         flat = iter(_packer("".join(code for code, _ in cls.LAYOUT if code != "*")).unpack(data[:size]))
         values: list[Any] = []
         for code, count in cls.LAYOUT:

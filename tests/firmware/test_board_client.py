@@ -12,7 +12,6 @@ from firmware_host.protocol.requests import (
     CrcRequest,
     Status,
     StatusRequest,
-    StopReply,
     StopRequest,
     WriteRequest,
 )
@@ -73,17 +72,18 @@ def test_time_out_follows_the_line_rate() -> None:
 
 def test_late_doubled_and_foreign_answers_are_ignored() -> None:
     client = Client(Timing(), first=0xFFFF)
-    client.submit(StopRequest())
+    client.submit(CrcRequest(0, 0, 1))
     request = sent(client.poll(0.0)[0])[0]
     assert request.sequence == 0xFFFF
+    answer = CrcReply(9).pack()
     other = Datagram(request.type, 0, 5, 0, b"")
     assert client.receive(reply(other)) == []
     wrong_type = Datagram(0x01, 0, request.sequence, 0, b"")
     assert client.receive(reply(wrong_type)) == []
-    assert client.receive(reply(request, b"too long")) == []
+    assert client.receive(reply(request, b"cut")) == []
     assert client.receive(request.encode()) == []  # an echo
-    assert client.receive(reply(request))[0].reply == StopReply()
-    assert client.receive(reply(request)) == []
+    assert client.receive(reply(request, answer))[0].reply == CrcReply(9)
+    assert client.receive(reply(request, answer)) == []
     client.submit(StatusRequest())
     assert sent(client.poll(1.0)[0])[0].sequence == 0
 

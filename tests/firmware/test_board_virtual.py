@@ -32,6 +32,8 @@ from firmware_host.errors import (
 )
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.requests import (
+    MAJOR,
+    MINOR,
     NO_BANK,
     BoardFault,
     CodebookReply,
@@ -356,10 +358,30 @@ def test_silence_is_told(device: SimulatedBoard, board: Board) -> None:
     assert LineError.exit_code == 6
 
 
-def test_another_schema_is_incompatible(device: SimulatedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("firmware_host.board.session.SCHEMA", b"12345678")
-    with pytest.raises(IncompatibleError, match="update firmware or host"):
+@pytest.mark.parametrize(("major", "older"), [(MAJOR - 1, "host"), (MAJOR + 1, "firmware")])
+def test_another_major_version_is_incompatible(
+    device: SimulatedBoard, monkeypatch: pytest.MonkeyPatch, major: int, older: str
+) -> None:
+    monkeypatch.setattr("firmware_host.board.session.MAJOR", major)
+    words = rf"it speaks protocol {MAJOR}\.{MINOR}, this host .*; update the {older}"
+    with pytest.raises(IncompatibleError, match=words):
         Board(Session(SimulatedLine(device), Timing()))
+
+
+def test_what_a_watchdog_did_is_told_to_the_host_that_comes_back(
+    device: SimulatedBoard, board: Board, book: Codebook
+) -> None:
+    provision(board, Bank.of_symbols(symbols_of(2, 0, book), book), Settings())
+    board.watchdog(Watchdog.DARK, 200)
+    device.run(1_000_000)
+    again = board_on(SimulatedLine(device))
+    for _ in range(2):
+        status = again.status()
+        assert (status.state, status.faults) == (State.DARK, BoardFault.WATCHDOG)
+    assert Board(Session(SimulatedLine(device), Timing())).status().faults == BoardFault.WATCHDOG
+    again = board_on(SimulatedLine(device))
+    again.start()
+    assert again.status().faults == 0
 
 
 def test_too_much_is_told_before_anything_is_sent(board: Board, book: Codebook) -> None:

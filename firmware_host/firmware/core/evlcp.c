@@ -6,7 +6,6 @@
 #define WATCHDOG_MIN_MS 100u
 #define HOLDS_DARK (EVLCP_FAULT_OVER_TEMPERATURE | EVLCP_FAULT_CLOCK)
 
-static const uint8_t schema[8] = EVLCP_SCHEMA;
 static const uint8_t dark[EVLCP_ROW_BYTES];
 
 /* A request on its way through its handler. */
@@ -23,14 +22,14 @@ static bool running(struct evlcp *e)
     return atomic_load(&e->player.running);
 }
 
-static uint8_t faults(struct evlcp *e)
+static uint16_t faults(struct evlcp *e)
 {
     uint32_t bits = e->health.faults | e->latched;
     if (atomic_load(&e->player.chip_lost))
         bits |= EVLCP_FAULT_CHIP_LOST;
-    if (e->watch.fired)
+    if (e->watch.acted)
         bits |= EVLCP_FAULT_WATCHDOG;
-    return (uint8_t)bits;
+    return (uint16_t)bits;
 }
 
 static void test_end(struct evlcp *e)
@@ -63,12 +62,10 @@ static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x, uint16_t 
     struct evlcp_hello_request request;
     struct evlcp_hello_reply reply = {0};
     evlcp_hello_request_get(x->in, &request);
-    for (uint32_t i = 0; i < sizeof schema; i++) {
-        if (request.schema[i] != schema[i]) {
-            evlcp_copy(x->out, schema, sizeof schema);
-            x->out_length = sizeof schema;
-            return EVLCP_STATUS_INCOMPATIBLE;
-        }
+    if (request.major != EVLCP_PROTOCOL_MAJOR) {
+        static const uint8_t version[4] = {EVLCP_PROTOCOL_MAJOR, EVLCP_PROTOCOL_MINOR};
+        x->detail = evlcp_get32(version);
+        return EVLCP_STATUS_INCOMPATIBLE;
     }
     if (e->session == EVLCP_NO_SESSION || request.nonce != e->nonce) {
         uint16_t session = (uint16_t)(request.nonce ^ request.nonce >> 16);
@@ -80,7 +77,8 @@ static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x, uint16_t 
         e->control.newest = sequence;
         e->control.sequence = sequence;
     }
-    evlcp_copy(reply.schema, schema, sizeof schema);
+    reply.major = EVLCP_PROTOCOL_MAJOR;
+    reply.minor = EVLCP_PROTOCOL_MINOR;
     reply.session = e->session;
     reply.version_major = EVLCP_VERSION_MAJOR;
     reply.version_minor = EVLCP_VERSION_MINOR;
@@ -346,7 +344,7 @@ static enum evlcp_status on_status(struct evlcp *e, struct exchange *x)
     evlcp_copy(reply.open_leds, e->health.open_leds, sizeof reply.open_leds);
     reply.watchdog = e->watch.action;
     reply.watchdog_ms = e->watch.timeout_ms;
-    reply.silence_ms = hal_millis() - e->watch.heard_ms;
+    reply.silence_ms = hal_millis() - e->watch.asked_ms;
     reply.uptime_ms = hal_millis();
     evlcp_status_reply_put(x->out, &reply);
     x->out_length = EVLCP_STATUS_REPLY_BYTES;
@@ -462,27 +460,11 @@ struct shape {
     uint8_t type;
     bool control;
     bool open_ended;
+    uint16_t least;
     uint16_t bytes;
 };
 
-static const struct shape shapes[] = {
-    {EVLCP_TYPE_HELLO, false, false, EVLCP_HELLO_REQUEST_BYTES},
-    {EVLCP_TYPE_CONFIGURE, true, false, EVLCP_CONFIGURE_REQUEST_BYTES},
-    {EVLCP_TYPE_CODEBOOK, true, false, EVLCP_CODEBOOK_REQUEST_BYTES},
-    {EVLCP_TYPE_WRITE, false, true, EVLCP_WRITE_REQUEST_BYTES},
-    {EVLCP_TYPE_READ, false, false, EVLCP_READ_REQUEST_BYTES},
-    {EVLCP_TYPE_CRC, false, false, EVLCP_CRC_REQUEST_BYTES},
-    {EVLCP_TYPE_COMMIT, true, false, EVLCP_COMMIT_REQUEST_BYTES},
-    {EVLCP_TYPE_START, true, false, EVLCP_START_REQUEST_BYTES},
-    {EVLCP_TYPE_STOP, true, false, EVLCP_STOP_REQUEST_BYTES},
-    {EVLCP_TYPE_BLANK, true, false, EVLCP_BLANK_REQUEST_BYTES},
-    {EVLCP_TYPE_LEVEL, true, false, EVLCP_LEVEL_REQUEST_BYTES},
-    {EVLCP_TYPE_STATUS, false, false, EVLCP_STATUS_REQUEST_BYTES},
-    {EVLCP_TYPE_WATCHDOG, true, false, EVLCP_WATCHDOG_REQUEST_BYTES},
-    {EVLCP_TYPE_SAVE, true, false, EVLCP_SAVE_REQUEST_BYTES},
-    {EVLCP_TYPE_RECALL, true, false, EVLCP_RECALL_REQUEST_BYTES},
-    {EVLCP_TYPE_LED_TEST, true, false, EVLCP_LED_TEST_REQUEST_BYTES},
-};
+static const struct shape shapes[] = {EVLCP_SHAPES};
 
 static const struct shape *shape_of(uint8_t type)
 {
@@ -522,6 +504,7 @@ static enum evlcp_status controlled(struct evlcp *e, const struct evlcp_datagram
     return status;
 }
 
+/* What the watchdog did is told until a control request: a host that comes back says HELLO first. */
 static void heard(struct evlcp *e)
 {
     e->watch.heard_ms = hal_millis();
@@ -534,9 +517,16 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
     const struct shape *shape = shape_of(d->type);
     if (shape == 0)
         return EVLCP_STATUS_UNKNOWN_TYPE;
-    if (d->length < shape->bytes || (d->length > shape->bytes && !shape->open_ended)) {
+    if (d->length < shape->least || (d->length > shape->bytes && !shape->open_ended)) {
         x->detail = shape->bytes;
         return EVLCP_STATUS_BAD_LENGTH;
+    }
+    /* Of an earlier minor version: what it does not have is zero. */
+    uint8_t whole[EVLCP_REQUEST_MOST] = {0};
+    if (d->length < shape->bytes) {
+        evlcp_copy(whole, d->payload, d->length);
+        x->in = whole;
+        x->in_length = shape->bytes;
     }
     if (d->type == EVLCP_TYPE_HELLO) {
         enum evlcp_status status = on_hello(e, x, d->sequence);
@@ -546,8 +536,9 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
     }
     if (d->session != e->session || e->session == EVLCP_NO_SESSION)
         return EVLCP_STATUS_NO_SESSION;
+    heard(e);
     if (d->type != EVLCP_TYPE_STATUS)
-        heard(e);
+        e->watch.asked_ms = e->watch.heard_ms;
     struct evlcp_control *c = &e->control;
     if (after(d->sequence, c->newest)) {
         c->newest = d->sequence;
@@ -557,8 +548,10 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
             c->known = false;
         }
     }
-    if (shape->control)
+    if (shape->control) {
+        e->watch.acted = false;
         return controlled(e, d, x);
+    }
     switch (d->type) {
     case EVLCP_TYPE_WRITE:
         return after(d->sequence, c->sequence) ? on_write(e, x) : EVLCP_STATUS_STALE;
@@ -568,7 +561,7 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
         return on_crc(e, x);
     default: {
         enum evlcp_status status = on_status(e, x);
-        heard(e); /* after, so that the status still tells of a watchdog that fired */
+        e->watch.asked_ms = e->watch.heard_ms; /* after, for the status tells how long it was */
         return status;
     }
     }
@@ -582,7 +575,7 @@ static void answer(struct evlcp *e, const struct evlcp_datagram *d)
         return;
     e->requests++;
     enum evlcp_status status = dispatch(e, d, &x);
-    if (status != EVLCP_STATUS_OK && status != EVLCP_STATUS_INCOMPATIBLE) {
+    if (status != EVLCP_STATUS_OK) {
         evlcp_put32(e->payload, x.detail);
         x.out_length = 4u;
     }
@@ -603,6 +596,7 @@ static void watch(struct evlcp *e, uint32_t now)
         now - e->watch.heard_ms < e->watch.timeout_ms || !atomic_load(&e->player.want_play))
         return;
     e->watch.fired = true;
+    e->watch.acted = true;
     if (e->watch.action == EVLCP_WATCHDOG_IDLE)
         atomic_store(&e->player.want_idle, true);
     else
@@ -658,7 +652,8 @@ void evlcp_init(struct evlcp *e)
     e->link.wire_sent = 0u;
     evlcp_banks_init(&e->banks);
     evlcp_setup_init(&e->setup, e->info.tick_hz);
-    e->watch = (struct evlcp_watch){.action = EVLCP_WATCHDOG_KEEP, .heard_ms = hal_millis()};
+    e->watch = (struct evlcp_watch){
+        .action = EVLCP_WATCHDOG_KEEP, .heard_ms = hal_millis(), .asked_ms = hal_millis()};
     e->test.on = false;
     e->control = (struct evlcp_control){.known = false};
     e->session = EVLCP_NO_SESSION;

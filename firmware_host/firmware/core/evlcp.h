@@ -19,8 +19,10 @@
 struct evlcp_watch {
     uint8_t action;
     uint32_t timeout_ms;
-    uint32_t heard_ms;
-    bool fired;
+    uint32_t heard_ms; /* the latest request */
+    uint32_t asked_ms; /* the same, HELLO left out */
+    bool fired;        /* it acts, until the next request */
+    bool acted;        /* it did, until the next control request */
 };
 
 struct evlcp_test {

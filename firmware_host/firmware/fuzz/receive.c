@@ -31,7 +31,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     if (size == 0u)
         return 0;
     uint8_t hello[EVLCP_HELLO_REQUEST_BYTES];
-    const struct evlcp_hello_request request = {.schema = EVLCP_SCHEMA, .nonce = 1u};
+    const struct evlcp_hello_request request = {.major = EVLCP_PROTOCOL_MAJOR, .minor = EVLCP_PROTOCOL_MINOR, .nonce = 1u};
     evlcp_hello_request_put(hello, &request);
     send_datagram(&board, 0u, EVLCP_NO_SESSION, EVLCP_TYPE_HELLO, hello, sizeof hello);
     if ((data[0] & 1u) == 0u) {

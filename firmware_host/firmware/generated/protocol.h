@@ -3,7 +3,8 @@
 #define EVLCP_PROTOCOL_H
 #include <stdint.h>
 
-#define EVLCP_PROTOCOL_VERSION 1u
+#define EVLCP_PROTOCOL_MAJOR 2u
+#define EVLCP_PROTOCOL_MINOR 0u
 #define EVLCP_HEADER_BYTES 6u
 #define EVLCP_CRC_BYTES 4u
 #define EVLCP_MAX_PAYLOAD 512u
@@ -12,7 +13,6 @@
 #define EVLCP_BOARD_CLUSTERS 16u
 #define EVLCP_LEDS 96u
 #define EVLCP_ROW_BYTES 12u
-#define EVLCP_SCHEMA {0x85, 0x50, 0x7b, 0x45, 0x42, 0x5b, 0x84, 0x7c}
 #define EVLCP_REPLY_BIT 0x80u /* Set in the type of a reply. */
 #define EVLCP_NO_BANK 0xffu /* No bank. */
 #define EVLCP_NO_SESSION 0x0u /* Session of a HELLO request, and of a board that knows no host. */
@@ -50,7 +50,7 @@ enum evlcp_status {
     EVLCP_STATUS_NO_SESSION = 7, /* The board was reset, or another host has said HELLO. */
     EVLCP_STATUS_STALE = 8, /* Older than a request already done; not done. */
     EVLCP_STATUS_NOTHING_COMMITTED = 9, /* No bank has been committed. */
-    EVLCP_STATUS_INCOMPATIBLE = 10, /* The host's schema is another one. */
+    EVLCP_STATUS_INCOMPATIBLE = 10, /* The host's major version is another one. */
     EVLCP_STATUS_FLASH_FAULT = 11, /* The flash did not take or give the data. */
     EVLCP_STATUS_NOT_SUPPORTED = 12, /* This board cannot do that. */
     EVLCP_STATUS_EMPTY_SLOT = 13, /* No flash slot holds a valid setting. */
@@ -103,7 +103,7 @@ enum evlcp_fault {
     EVLCP_FAULT_OPEN_LED = 2, /* A LED or its wire is open; playing goes on. */
     EVLCP_FAULT_CLOCK = 4, /* The crystal did not start, or stopped: LEDs dark, timing would be wrong. */
     EVLCP_FAULT_CHIP_LOST = 8, /* A chip interrupt came a whole chip late, or chips stopped: LEDs dark. */
-    EVLCP_FAULT_WATCHDOG = 16, /* The host fell silent and the watchdog acted; cleared by the next request. */
+    EVLCP_FAULT_WATCHDOG = 16, /* The host fell silent and the watchdog acted; cleared by the next control request. */
 };
 
 static inline void evlcp_copy(uint8_t *to, const uint8_t *from, uint32_t n)
@@ -144,29 +144,33 @@ static inline uint32_t evlcp_get32(const uint8_t *p)
     return evlcp_get16(p) | (uint32_t)evlcp_get16(p + 2) << 16;
 }
 
-#define EVLCP_HELLO_REQUEST_BYTES 12u
+#define EVLCP_HELLO_REQUEST_BYTES 6u
 /* Open a session and learn the board. Its first two fields never change between versions. */
 struct evlcp_hello_request {
-    uint8_t schema[8]; /* First bytes of the SHA-256 of the host's protocol definition. */
+    uint8_t major; /* The host's protocol; another major version is INCOMPATIBLE. */
+    uint8_t minor; /* The host's protocol. */
     uint32_t nonce; /* Random; the same nonce keeps the session. */
 };
 
 static inline void evlcp_hello_request_put(uint8_t *p, const struct evlcp_hello_request *m)
 {
-    evlcp_copy(p + 0, m->schema, 8u);
-    evlcp_put32(p + 8, m->nonce);
+    evlcp_put8(p + 0, m->major);
+    evlcp_put8(p + 1, m->minor);
+    evlcp_put32(p + 2, m->nonce);
 }
 
 static inline void evlcp_hello_request_get(const uint8_t *p, struct evlcp_hello_request *m)
 {
-    evlcp_copy(m->schema, p + 0, 8u);
-    m->nonce = evlcp_get32(p + 8);
+    m->major = evlcp_get8(p + 0);
+    m->minor = evlcp_get8(p + 1);
+    m->nonce = evlcp_get32(p + 2);
 }
 
-#define EVLCP_HELLO_REPLY_BYTES 66u
+#define EVLCP_HELLO_REPLY_BYTES 60u
 /* Answer to hello. */
 struct evlcp_hello_reply {
-    uint8_t schema[8]; /* The board's schema. */
+    uint8_t major; /* The board's protocol. */
+    uint8_t minor; /* The board's protocol: what came later it does not know. */
     uint16_t session; /* Goes into the header of every further request. */
     uint8_t version_major; /* Firmware version. */
     uint8_t version_minor; /* Firmware version. */
@@ -188,46 +192,48 @@ struct evlcp_hello_reply {
 
 static inline void evlcp_hello_reply_put(uint8_t *p, const struct evlcp_hello_reply *m)
 {
-    evlcp_copy(p + 0, m->schema, 8u);
-    evlcp_put16(p + 8, m->session);
-    evlcp_put8(p + 10, m->version_major);
-    evlcp_put8(p + 11, m->version_minor);
-    evlcp_put8(p + 12, m->version_patch);
-    evlcp_put8(p + 13, m->window);
-    evlcp_put16(p + 14, m->max_payload);
-    evlcp_put8(p + 16, m->banks);
-    evlcp_put32(p + 17, m->bank_bytes);
-    evlcp_put8(p + 21, m->clusters);
-    evlcp_put16(p + 22, m->leds);
-    evlcp_put32(p + 24, m->tick_hz);
-    evlcp_put32(p + 28, m->chip_rate_max_hz);
-    evlcp_put16(p + 32, m->level_max_ma);
-    evlcp_put32(p + 34, m->capabilities);
-    evlcp_copy(p + 38, m->unique_id, 12u);
-    evlcp_put32(p + 50, m->uptime_ms);
-    evlcp_copy(p + 54, m->hal, 12u);
+    evlcp_put8(p + 0, m->major);
+    evlcp_put8(p + 1, m->minor);
+    evlcp_put16(p + 2, m->session);
+    evlcp_put8(p + 4, m->version_major);
+    evlcp_put8(p + 5, m->version_minor);
+    evlcp_put8(p + 6, m->version_patch);
+    evlcp_put8(p + 7, m->window);
+    evlcp_put16(p + 8, m->max_payload);
+    evlcp_put8(p + 10, m->banks);
+    evlcp_put32(p + 11, m->bank_bytes);
+    evlcp_put8(p + 15, m->clusters);
+    evlcp_put16(p + 16, m->leds);
+    evlcp_put32(p + 18, m->tick_hz);
+    evlcp_put32(p + 22, m->chip_rate_max_hz);
+    evlcp_put16(p + 26, m->level_max_ma);
+    evlcp_put32(p + 28, m->capabilities);
+    evlcp_copy(p + 32, m->unique_id, 12u);
+    evlcp_put32(p + 44, m->uptime_ms);
+    evlcp_copy(p + 48, m->hal, 12u);
 }
 
 static inline void evlcp_hello_reply_get(const uint8_t *p, struct evlcp_hello_reply *m)
 {
-    evlcp_copy(m->schema, p + 0, 8u);
-    m->session = evlcp_get16(p + 8);
-    m->version_major = evlcp_get8(p + 10);
-    m->version_minor = evlcp_get8(p + 11);
-    m->version_patch = evlcp_get8(p + 12);
-    m->window = evlcp_get8(p + 13);
-    m->max_payload = evlcp_get16(p + 14);
-    m->banks = evlcp_get8(p + 16);
-    m->bank_bytes = evlcp_get32(p + 17);
-    m->clusters = evlcp_get8(p + 21);
-    m->leds = evlcp_get16(p + 22);
-    m->tick_hz = evlcp_get32(p + 24);
-    m->chip_rate_max_hz = evlcp_get32(p + 28);
-    m->level_max_ma = evlcp_get16(p + 32);
-    m->capabilities = evlcp_get32(p + 34);
-    evlcp_copy(m->unique_id, p + 38, 12u);
-    m->uptime_ms = evlcp_get32(p + 50);
-    evlcp_copy(m->hal, p + 54, 12u);
+    m->major = evlcp_get8(p + 0);
+    m->minor = evlcp_get8(p + 1);
+    m->session = evlcp_get16(p + 2);
+    m->version_major = evlcp_get8(p + 4);
+    m->version_minor = evlcp_get8(p + 5);
+    m->version_patch = evlcp_get8(p + 6);
+    m->window = evlcp_get8(p + 7);
+    m->max_payload = evlcp_get16(p + 8);
+    m->banks = evlcp_get8(p + 10);
+    m->bank_bytes = evlcp_get32(p + 11);
+    m->clusters = evlcp_get8(p + 15);
+    m->leds = evlcp_get16(p + 16);
+    m->tick_hz = evlcp_get32(p + 18);
+    m->chip_rate_max_hz = evlcp_get32(p + 22);
+    m->level_max_ma = evlcp_get16(p + 26);
+    m->capabilities = evlcp_get32(p + 28);
+    evlcp_copy(m->unique_id, p + 32, 12u);
+    m->uptime_ms = evlcp_get32(p + 44);
+    evlcp_copy(m->hal, p + 48, 12u);
 }
 
 #define EVLCP_CONFIGURE_REQUEST_BYTES 8u
@@ -502,11 +508,11 @@ static inline void evlcp_level_request_get(const uint8_t *p, struct evlcp_level_
 
 #define EVLCP_STATUS_REQUEST_BYTES 0u
 
-#define EVLCP_STATUS_REPLY_BYTES 120u
+#define EVLCP_STATUS_REPLY_BYTES 121u
 /* Answer to status. */
 struct evlcp_status_reply {
     uint8_t state; /* State. */
-    uint8_t faults; /* Fault bits. */
+    uint16_t faults; /* Fault bits. */
     uint8_t active_bank; /* Bank that plays or would play, or no_bank. */
     uint8_t pending_bank; /* Bank waiting for the packet boundary, or no_bank. */
     uint8_t format; /* Format of the active bank. */
@@ -531,7 +537,7 @@ struct evlcp_status_reply {
     uint8_t open_leds[12]; /* A bit a LED: open. */
     uint8_t watchdog; /* Watchdog action. */
     uint32_t watchdog_ms; /* Watchdog time-out. */
-    uint32_t silence_ms; /* Time since the request before this one. */
+    uint32_t silence_ms; /* Time since the request before this one, HELLO left out. */
     uint32_t uptime_ms; /* Time since reset. */
     uint8_t digest[32]; /* Digest of the active bank's codebook, or of the one set. */
 };
@@ -539,67 +545,67 @@ struct evlcp_status_reply {
 static inline void evlcp_status_reply_put(uint8_t *p, const struct evlcp_status_reply *m)
 {
     evlcp_put8(p + 0, m->state);
-    evlcp_put8(p + 1, m->faults);
-    evlcp_put8(p + 2, m->active_bank);
-    evlcp_put8(p + 3, m->pending_bank);
-    evlcp_put8(p + 4, m->format);
-    evlcp_put8(p + 5, m->profile);
-    evlcp_put16(p + 6, m->frames);
-    evlcp_put8(p + 8, m->pilot_every);
-    evlcp_put16(p + 9, m->packets);
-    evlcp_put32(p + 11, m->length);
-    evlcp_put32(p + 15, m->crc);
-    evlcp_put32(p + 19, m->chip_rate_hz);
-    evlcp_put32(p + 23, m->commits);
-    evlcp_put32(p + 27, m->packets_sent);
-    evlcp_put32(p + 31, m->chips_sent);
-    evlcp_put32(p + 35, m->lateness_ticks);
-    evlcp_put32(p + 39, m->lateness_max_ticks);
-    evlcp_put32(p + 43, m->crc_errors);
-    evlcp_put32(p + 47, m->framing_errors);
-    evlcp_put32(p + 51, m->overflow_errors);
-    evlcp_put32(p + 55, m->requests);
-    evlcp_put16(p + 59, m->level_ma);
-    evlcp_put16(p + 61, (uint16_t)m->temperature_dc);
-    evlcp_copy(p + 63, m->open_leds, 12u);
-    evlcp_put8(p + 75, m->watchdog);
-    evlcp_put32(p + 76, m->watchdog_ms);
-    evlcp_put32(p + 80, m->silence_ms);
-    evlcp_put32(p + 84, m->uptime_ms);
-    evlcp_copy(p + 88, m->digest, 32u);
+    evlcp_put16(p + 1, m->faults);
+    evlcp_put8(p + 3, m->active_bank);
+    evlcp_put8(p + 4, m->pending_bank);
+    evlcp_put8(p + 5, m->format);
+    evlcp_put8(p + 6, m->profile);
+    evlcp_put16(p + 7, m->frames);
+    evlcp_put8(p + 9, m->pilot_every);
+    evlcp_put16(p + 10, m->packets);
+    evlcp_put32(p + 12, m->length);
+    evlcp_put32(p + 16, m->crc);
+    evlcp_put32(p + 20, m->chip_rate_hz);
+    evlcp_put32(p + 24, m->commits);
+    evlcp_put32(p + 28, m->packets_sent);
+    evlcp_put32(p + 32, m->chips_sent);
+    evlcp_put32(p + 36, m->lateness_ticks);
+    evlcp_put32(p + 40, m->lateness_max_ticks);
+    evlcp_put32(p + 44, m->crc_errors);
+    evlcp_put32(p + 48, m->framing_errors);
+    evlcp_put32(p + 52, m->overflow_errors);
+    evlcp_put32(p + 56, m->requests);
+    evlcp_put16(p + 60, m->level_ma);
+    evlcp_put16(p + 62, (uint16_t)m->temperature_dc);
+    evlcp_copy(p + 64, m->open_leds, 12u);
+    evlcp_put8(p + 76, m->watchdog);
+    evlcp_put32(p + 77, m->watchdog_ms);
+    evlcp_put32(p + 81, m->silence_ms);
+    evlcp_put32(p + 85, m->uptime_ms);
+    evlcp_copy(p + 89, m->digest, 32u);
 }
 
 static inline void evlcp_status_reply_get(const uint8_t *p, struct evlcp_status_reply *m)
 {
     m->state = evlcp_get8(p + 0);
-    m->faults = evlcp_get8(p + 1);
-    m->active_bank = evlcp_get8(p + 2);
-    m->pending_bank = evlcp_get8(p + 3);
-    m->format = evlcp_get8(p + 4);
-    m->profile = evlcp_get8(p + 5);
-    m->frames = evlcp_get16(p + 6);
-    m->pilot_every = evlcp_get8(p + 8);
-    m->packets = evlcp_get16(p + 9);
-    m->length = evlcp_get32(p + 11);
-    m->crc = evlcp_get32(p + 15);
-    m->chip_rate_hz = evlcp_get32(p + 19);
-    m->commits = evlcp_get32(p + 23);
-    m->packets_sent = evlcp_get32(p + 27);
-    m->chips_sent = evlcp_get32(p + 31);
-    m->lateness_ticks = evlcp_get32(p + 35);
-    m->lateness_max_ticks = evlcp_get32(p + 39);
-    m->crc_errors = evlcp_get32(p + 43);
-    m->framing_errors = evlcp_get32(p + 47);
-    m->overflow_errors = evlcp_get32(p + 51);
-    m->requests = evlcp_get32(p + 55);
-    m->level_ma = evlcp_get16(p + 59);
-    m->temperature_dc = (int16_t)evlcp_get16(p + 61);
-    evlcp_copy(m->open_leds, p + 63, 12u);
-    m->watchdog = evlcp_get8(p + 75);
-    m->watchdog_ms = evlcp_get32(p + 76);
-    m->silence_ms = evlcp_get32(p + 80);
-    m->uptime_ms = evlcp_get32(p + 84);
-    evlcp_copy(m->digest, p + 88, 32u);
+    m->faults = evlcp_get16(p + 1);
+    m->active_bank = evlcp_get8(p + 3);
+    m->pending_bank = evlcp_get8(p + 4);
+    m->format = evlcp_get8(p + 5);
+    m->profile = evlcp_get8(p + 6);
+    m->frames = evlcp_get16(p + 7);
+    m->pilot_every = evlcp_get8(p + 9);
+    m->packets = evlcp_get16(p + 10);
+    m->length = evlcp_get32(p + 12);
+    m->crc = evlcp_get32(p + 16);
+    m->chip_rate_hz = evlcp_get32(p + 20);
+    m->commits = evlcp_get32(p + 24);
+    m->packets_sent = evlcp_get32(p + 28);
+    m->chips_sent = evlcp_get32(p + 32);
+    m->lateness_ticks = evlcp_get32(p + 36);
+    m->lateness_max_ticks = evlcp_get32(p + 40);
+    m->crc_errors = evlcp_get32(p + 44);
+    m->framing_errors = evlcp_get32(p + 48);
+    m->overflow_errors = evlcp_get32(p + 52);
+    m->requests = evlcp_get32(p + 56);
+    m->level_ma = evlcp_get16(p + 60);
+    m->temperature_dc = (int16_t)evlcp_get16(p + 62);
+    evlcp_copy(m->open_leds, p + 64, 12u);
+    m->watchdog = evlcp_get8(p + 76);
+    m->watchdog_ms = evlcp_get32(p + 77);
+    m->silence_ms = evlcp_get32(p + 81);
+    m->uptime_ms = evlcp_get32(p + 85);
+    evlcp_copy(m->digest, p + 89, 32u);
 }
 
 #define EVLCP_WATCHDOG_REQUEST_BYTES 5u
@@ -702,5 +708,27 @@ static inline void evlcp_led_test_request_get(const uint8_t *p, struct evlcp_led
 }
 
 #define EVLCP_LED_TEST_REPLY_BYTES 0u
+
+#define EVLCP_REQUEST_MOST 69u /* longest request, data left out */
+
+/* Requests: type, whether control, whether any length may follow, and the length, that of the
+   first minor version and today's; a shorter one goes on with zeros. */
+#define EVLCP_SHAPES \
+    {0x01u, false, true, 6u, 6u}, \
+    {0x02u, true, false, 8u, 8u}, \
+    {0x03u, true, false, 69u, 69u}, \
+    {0x04u, false, true, 5u, 5u}, \
+    {0x05u, false, false, 7u, 7u}, \
+    {0x06u, false, false, 9u, 9u}, \
+    {0x07u, true, false, 44u, 44u}, \
+    {0x08u, true, false, 0u, 0u}, \
+    {0x09u, true, false, 0u, 0u}, \
+    {0x0au, true, false, 0u, 0u}, \
+    {0x0bu, true, false, 2u, 2u}, \
+    {0x0cu, false, false, 0u, 0u}, \
+    {0x0du, true, false, 5u, 5u}, \
+    {0x0eu, true, false, 1u, 1u}, \
+    {0x0fu, true, false, 0u, 0u}, \
+    {0x10u, true, false, 4u, 4u}
 
 #endif

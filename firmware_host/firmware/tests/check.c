@@ -85,7 +85,7 @@ static uint8_t ask(struct host *h, uint8_t type, const uint8_t *payload, uint32_
 static void say_hello(struct host *h, uint32_t nonce)
 {
     uint8_t payload[EVLCP_HELLO_REQUEST_BYTES];
-    const struct evlcp_hello_request request = {.schema = EVLCP_SCHEMA, .nonce = nonce};
+    const struct evlcp_hello_request request = {.major = EVLCP_PROTOCOL_MAJOR, .minor = EVLCP_PROTOCOL_MINOR, .nonce = nonce};
     struct evlcp_hello_reply reply;
     evlcp_hello_request_put(payload, &request);
     EXPECT(exchange(h, EVLCP_TYPE_HELLO, ++h->sequence, EVLCP_NO_SESSION, payload, sizeof payload));
@@ -266,6 +266,10 @@ static void test_sessions(void)
     EXPECT(ask(&h, EVLCP_TYPE_STATUS, NULL, 0) == EVLCP_STATUS_NO_SESSION);
     uint8_t payload[EVLCP_HELLO_REQUEST_BYTES] = {1, 2, 3};
     EXPECT(ask(&h, EVLCP_TYPE_HELLO, payload, sizeof payload) == EVLCP_STATUS_INCOMPATIBLE);
+    EXPECT(h.payload[0] == EVLCP_PROTOCOL_MAJOR && h.payload[1] == EVLCP_PROTOCOL_MINOR);
+    /* A host of a later minor version may say more. */
+    uint8_t more[EVLCP_HELLO_REQUEST_BYTES + 9u] = {EVLCP_PROTOCOL_MAJOR, 200u, 7u};
+    EXPECT(ask(&h, EVLCP_TYPE_HELLO, more, sizeof more) == EVLCP_STATUS_OK);
     EXPECT(ask(&h, EVLCP_TYPE_HELLO, payload, 3) == EVLCP_STATUS_BAD_LENGTH);
     EXPECT(ask(&h, 0x7f, NULL, 0) == EVLCP_STATUS_UNKNOWN_TYPE);
 }
@@ -527,14 +531,21 @@ static void test_watchdog(void)
     EXPECT(s.silence_ms >= 90u);
     run_chips(board, 400u);
     s = ask_status(&h);
-    EXPECT(s.faults == 0u && s.state == EVLCP_STATE_PLAYING);
+    EXPECT(s.faults == EVLCP_FAULT_WATCHDOG && s.state == EVLCP_STATE_PLAYING);
 
     r.action = EVLCP_WATCHDOG_DARK;
     evlcp_watchdog_request_put(payload, &r);
     EXPECT(ask(&h, EVLCP_TYPE_WATCHDOG, payload, sizeof payload) == EVLCP_STATUS_OK);
+    EXPECT(ask_status(&h).faults == 0u);
     run_chips(board, 3000u);
+    /* A host that comes back says HELLO first. */
+    say_hello(&h, 0x5a5a5a5au);
+    run_chips(board, 100u);
     s = ask_status(&h);
     EXPECT(s.state == EVLCP_STATE_DARK && s.faults == EVLCP_FAULT_WATCHDOG);
+    EXPECT(s.silence_ms >= 310u && s.silence_ms < 320u);
+    s = ask_status(&h);
+    EXPECT(s.faults == EVLCP_FAULT_WATCHDOG && s.silence_ms == 0u);
     run_chips(board, 500u);
     EXPECT(ask_status(&h).state == EVLCP_STATE_DARK);
     EXPECT(ask(&h, EVLCP_TYPE_START, NULL, 0) == EVLCP_STATUS_OK);
