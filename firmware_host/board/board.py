@@ -77,6 +77,8 @@ class Programmed:
         swapped: Whether another bank became active.
         bank: The active bank.
         retries: Requests that had to be sent again.
+        watchdog: What the board does when this host falls silent: keep, idle or dark.
+        watchdog_ms: After which silence, ms.
     """
 
     written: int
@@ -84,6 +86,8 @@ class Programmed:
     swapped: bool
     bank: int
     retries: int
+    watchdog: str
+    watchdog_ms: int
 
 
 @dataclass(frozen=True)
@@ -245,7 +249,7 @@ class Board:
 
         Raises:
             ConfigError: The content is larger than a bank, or of other clusters than the board.
-            RefusedError: The board refuses a value.
+            RefusedError: The board refuses a value, or plays at another chip rate; then nothing is sent.
             VerifyError: The bank does not hold what was sent.
             LineError: The line fails; what was active stays so.
         """
@@ -256,14 +260,22 @@ class Board:
         if self.holds(content, status):
             if progress:
                 progress(total, total)
-            return Programmed(0, total, False, status.active_bank, self.session.client.retries - before)
+            return self._programmed(0, total, False, status, before)
+        if _rate_held(status) and status.chip_rate_hz != content.chip_rate_hz:
+            raise RefusedError(
+                f"{self.session.name}: plays {status.chip_rate_hz} chips per second, this payload has"
+                f" {content.chip_rate_hz}: a board that plays keeps its rate; 'evlcp board stop' first;"
+                " nothing was sent",
+                Status.BUSY,
+                status.chip_rate_hz,
+            )
         self.prepare(content)
         bank = 1 if status.active_bank == 0 else 0
         written = self.fill(bank, content.content, progress)
         if verify and written and self.crc(bank, 0, total) != content.crc:
             raise VerifyError(
                 f"{self.session.name}: bank {bank} does not hold what was sent; the old one goes on;"
-                " program it again, or with --baud of a lower rate"
+                " program it again, and if that does not help have the board looked at"
             )
         digest = bytes.fromhex(content.codebook.digest)
         commit = CommitRequest(bank, content.format, content.packets, total, content.crc, digest)
@@ -273,7 +285,14 @@ class Board:
             raise VerifyError(
                 f"{self.session.name}: bank {status.active_bank} is active, expected {bank}; program it again"
             )
-        return Programmed(written, total, True, bank, self.session.client.retries - before)
+        return self._programmed(written, total, True, status, before)
+
+    def _programmed(
+        self, written: int, length: int, swapped: bool, status: StatusReply, retries: int
+    ) -> Programmed:
+        again = self.session.client.retries - retries
+        watchdog = Watchdog(status.watchdog).name.lower()
+        return Programmed(written, length, swapped, status.active_bank, again, watchdog, status.watchdog_ms)
 
     def check_fits(self, bank: Bank) -> None:
         """Raise ConfigError unless the content fits the board's clusters and bank."""
@@ -365,6 +384,21 @@ class Board:
             status = self.status()
         return status
 
+    def stay(self, seconds: float, status: StatusReply) -> None:
+        """Wait, and let the board hear of this host so often that its watchdog does not act.
+
+        Args:
+            seconds: How long, s.
+            status: What the board said last: its watchdog counts.
+        """
+        line = self.session.transport
+        end = line.now() + seconds
+        pulse = seconds if status.watchdog == Watchdog.KEEP else status.watchdog_ms / 3e3
+        while (left := end - line.now()) > 0.0:
+            line.read(min(left, pulse))
+            if line.now() < end:
+                self.status()
+
     def wait_dark(self, timeout_s: float = 10.0) -> StatusReply:
         """Status once the LEDs are dark after a stop.
 
@@ -410,6 +444,11 @@ def provision(
     if settings.start and status.state != State.PLAYING:
         board.start()
     return done
+
+
+def _rate_held(status: StatusReply) -> bool:
+    """Whether chips run, so that their rate cannot be changed."""
+    return status.state in (State.PLAYING, State.STOPPING, State.IDLE_PATTERN)
 
 
 def _packet_s(status: StatusReply) -> float:

@@ -13,7 +13,7 @@ from firmware_host.errors import (
     RefusedError,
     VerifyError,
 )
-from firmware_host.ports.transport import Transport
+from firmware_host.ports.transport import Transport, on_network
 from firmware_host.protocol.client import TRIES, Client, RequestOutcome, Timing
 from firmware_host.protocol.requests import (
     MAJOR,
@@ -27,6 +27,14 @@ from firmware_host.protocol.requests import (
 from firmware_host.protocol.wire import WireMessage
 
 __all__ = ["Session", "refusal"]
+
+
+def _if_silent(port: str) -> str:
+    """What to do where nobody answers on a port that could be opened."""
+    if on_network(port):
+        return "another host may be connected to it: end that one; or the board behind it is off"
+    return "check power, cable and --baud, or find it with 'evlcp board ports'"
+
 
 Reply = TypeVar("Reply", bound=WireMessage)
 
@@ -125,16 +133,21 @@ class Session:
         self.client.session = NO_SESSION
         self.client.window = 1
         self.client.minor = MINOR
-        # Ends what a host before this one may have left half sent.
-        self.transport.write(b"\0")
         found: list[RequestOutcome] = []
-        self.run([HelloRequest(MAJOR, MINOR, self._nonce)], lambda _, outcome: found.append(outcome))
+        try:
+            # Ends what a host before this one may have left half sent.
+            self.transport.write(b"\0")
+            self.run([HelloRequest(MAJOR, MINOR, self._nonce)], lambda _, outcome: found.append(outcome))
+        except LineError as fault:
+            if not on_network(self.name):
+                raise
+            raise NoBoardError(
+                f"{self.name}: hangs up before it answers: another host is connected to it, or the board"
+                " has ended; end that host, or start the board again"
+            ) from fault
         outcome = found[0]
         if outcome.status is None:
-            raise NoBoardError(
-                f"{self.name}: no board answers; check power, cable and --baud, or find it with"
-                " 'evlcp board ports'"
-            )
+            raise NoBoardError(f"{self.name}: no board answers; {_if_silent(self.name)}")
         if not isinstance(outcome.reply, HelloReply):
             raise refusal(self.name, Type.HELLO, outcome.status, outcome.detail)
         self.client.session = outcome.reply.session

@@ -15,13 +15,16 @@ if TYPE_CHECKING:
 __all__ = [
     "LINE",
     "BoardLine",
+    "KeepAlive",
     "LineCommand",
     "SurveyCommand",
     "from_command_line",
+    "keep_alive",
     "line_options",
     "open_board",
     "progress_bar",
     "say_done",
+    "say_watchdog",
 ]
 
 _BAUD = 1_000_000
@@ -156,6 +159,39 @@ def progress_bar(what: str) -> "Iterator[Any]":
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
+def say_watchdog(action: str, timeout_ms: int) -> None:
+    """Say what happens once this command has ended, unless the board goes on playing."""
+    if action != "keep":
+        what = "shows its idle pattern" if action == "idle" else "goes dark"
+        typer.echo(
+            f"watchdog: the board {what} once no host has spoken for {timeout_ms / 1e3:g} s;"
+            " 'evlcp board monitor' or --keep-alive keeps it playing"
+        )
+
+
+KeepAlive = Annotated[
+    bool,
+    typer.Option("--keep-alive", help="Stay, so that the board's watchdog does not act; end with Ctrl-C."),
+]
+
+
+def keep_alive(board: "Board") -> None:
+    """Stay with a board until Ctrl-C; a line on stderr where its state or its faults change."""
+    from evlcp_sdk.cli._complain import complain
+    from firmware_host.board.tables import name_of, names_of_bits
+    from firmware_host.protocol.requests import BoardFault, State
+
+    status = board.status()
+    with contextlib.suppress(KeyboardInterrupt):
+        while True:
+            before = (status.state, status.faults)
+            board.stay(1.0, status)
+            status = board.status()
+            if (status.state, status.faults) != before:
+                faults = ", ".join(names_of_bits(BoardFault, status.faults)) or "none"
+                complain(f"{board.session.name}: state {name_of(State, status.state)}, faults {faults}")
+
+
 def say_done(done: Any, as_json: bool) -> None:
     """Say what programming did."""
     if as_json:
@@ -167,3 +203,5 @@ def say_done(done: Any, as_json: bool) -> None:
         typer.echo(f"was there already: {done.length} bytes in bank {done.bank}")
     else:
         typer.echo(f"sent {done.written} of {done.length} bytes; bank {done.bank} is active")
+    if not as_json:
+        say_watchdog(done.watchdog, done.watchdog_ms)

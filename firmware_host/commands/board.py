@@ -12,20 +12,23 @@ from firmware_host.commands import _source
 from firmware_host.commands._line import (
     LINE,
     BoardLine,
+    KeepAlive,
     LineCommand,
     SurveyCommand,
     from_command_line,
+    keep_alive,
     line_options,
     open_board,
     progress_bar,
     say_done,
+    say_watchdog,
 )
 from firmware_host.commands._source import RandomPackets, Seed, SymbolsFile
 
 if TYPE_CHECKING:
     from firmware_host.board.bank import Bank
     from firmware_host.board.board import Board
-    from firmware_host.protocol.requests import HelloReply, StatusReply
+    from firmware_host.protocol.requests import StatusReply
 
 __all__ = ["app"]
 
@@ -63,86 +66,6 @@ class Emulator(StrEnum):
     QEMU = "qemu"
 
 
-def _about(about: "HelloReply") -> dict[str, Any]:
-    from firmware_host.protocol.requests import Capability
-
-    return {
-        "hal": about.hal.rstrip(b"\0").decode("ascii", "replace"),
-        "unique_id": about.unique_id.hex(),
-        "firmware": f"{about.version_major}.{about.version_minor}.{about.version_patch}",
-        "protocol": f"{about.major}.{about.minor}",
-        "clusters": about.clusters,
-        "leds": about.leds,
-        "banks": about.banks,
-        "bank_bytes": about.bank_bytes,
-        "window": about.window,
-        "max_payload": about.max_payload,
-        "tick_hz": about.tick_hz,
-        "chip_rate_max_hz": about.chip_rate_max_hz,
-        "level_max_ma": about.level_max_ma,
-        "capabilities": _bits(Capability, about.capabilities),
-        "uptime_ms": about.uptime_ms,
-    }
-
-
-def _name(enum: Any, value: int) -> str:
-    try:
-        return str(enum(value).name).lower()
-    except ValueError:
-        return str(value)
-
-
-def _bits(flags: Any, value: int) -> list[str]:
-    """Names of the bits that are set; of those that a later firmware has, the number."""
-    names = [_name(flags, 1 << n) for n in range(value.bit_length()) if value >> n & 1]
-    return [f"bit {int(name):#x}" if name.isdigit() else name for name in names]
-
-
-def _status(status: "StatusReply") -> dict[str, Any]:
-    from firmware_host.protocol.requests import NO_BANK, BoardFault, Format, Profile, State, Watchdog
-
-    def bank(number: int) -> int | None:
-        return None if number == NO_BANK else number
-
-    open_leds = int.from_bytes(status.open_leds, "big")
-    table: dict[str, Any] = {
-        "state": _name(State, status.state),
-        "faults": _bits(BoardFault, status.faults),
-        "active_bank": bank(status.active_bank),
-        "pending_bank": bank(status.pending_bank),
-    }
-    if status.active_bank != NO_BANK:
-        table |= {
-            "format": _name(Format, status.format),
-            "profile": _name(Profile, status.profile),
-            "frames": status.frames,
-            "pilot_every": status.pilot_every,
-            "packets": status.packets,
-            "length": status.length,
-            "crc": f"{status.crc:08x}",
-        }
-    return table | {
-        "codebook": status.digest.hex(),
-        "chip_rate_hz": status.chip_rate_hz,
-        "commits": status.commits,
-        "packets_sent": status.packets_sent,
-        "chips_sent": status.chips_sent,
-        "lateness_ticks": status.lateness_ticks,
-        "lateness_max_ticks": status.lateness_max_ticks,
-        "crc_errors": status.crc_errors,
-        "framing_errors": status.framing_errors,
-        "overflow_errors": status.overflow_errors,
-        "requests": status.requests,
-        "level_ma": status.level_ma,
-        "temperature_c": None if status.temperature_dc == -(1 << 15) else status.temperature_dc / 10,
-        "open_leds": [led for led in range(96) if open_leds >> (95 - led) & 1],
-        "watchdog": _name(Watchdog, status.watchdog),
-        "watchdog_ms": status.watchdog_ms,
-        "silence_ms": status.silence_ms,
-        "uptime_ms": status.uptime_ms,
-    }
-
-
 def _show(table: dict[str, Any], as_json: bool) -> None:
     if as_json:
         import json
@@ -161,6 +84,7 @@ def ports(context: typer.Context, as_json: AsJson = False) -> None:
     For example: [bold]evlcp board ports[/]
     """
     from firmware_host.board.survey import survey
+    from firmware_host.board.tables import about_table
 
     line: BoardLine = context.obj
     found = survey(line.baud)
@@ -168,7 +92,7 @@ def ports(context: typer.Context, as_json: AsJson = False) -> None:
         import json
 
         rows = [
-            {"port": f.port, "description": f.description, "board": _about(f.about) if f.about else None}
+            {"port": f.port, "description": f.description, "board": about_table(f.about) if f.about else None}
             for f in found
         ]
         typer.echo(json.dumps(rows))
@@ -176,7 +100,7 @@ def ports(context: typer.Context, as_json: AsJson = False) -> None:
     for f in found:
         what = "no board answers"
         if f.about:
-            about = _about(f.about)
+            about = about_table(f.about)
             what = f"{about['hal']} {about['unique_id']}, firmware {about['firmware']}"
         typer.echo(f"{f.port}  {f.description}  {what}")
     if not found:
@@ -192,8 +116,10 @@ def hello(
 
     For example: [bold]evlcp board --port native: hello[/]
     """
+    from firmware_host.board.tables import about_table
+
     with open_board(context) as board:
-        _show(_about(board.about), as_json)
+        _show(about_table(board.about), as_json)
 
 
 @app.command(cls=LineCommand)
@@ -213,6 +139,7 @@ def program(
     watchdog_ms: Annotated[int, typer.Option(help="After which silence, ms.", min=100, max=2**32 - 1)] = 5000,
     verify: Annotated[bool, typer.Option(help="Compare what the board holds.")] = True,
     start: Annotated[bool, typer.Option(help="Play when done.")] = True,
+    stay: KeepAlive = False,
     as_json: AsJson = False,
 ) -> None:
     """Program a board, or all boards of an inventory: codebook, settings and payload.
@@ -246,9 +173,12 @@ def program(
     action = None if watchdog is None else Watchdog[watchdog.name]
     bank = _source.bank(symbols, random, masks, seed, link_file, overrides)
     settings = Settings(level, action, watchdog_ms, start)
-    with open_board(context) as board, progress_bar("programming") as progress:
-        done = provision(board, bank, settings, verify, progress)
-    say_done(done, as_json)
+    with open_board(context) as board:
+        with progress_bar("programming") as progress:
+            done = provision(board, bank, settings, verify, progress)
+        say_done(done, as_json)
+        if stay:
+            keep_alive(board)
 
 
 def _program_fleet(path: Path, verify: bool, as_json: bool) -> None:
@@ -357,6 +287,7 @@ def watchdog(
 
     with open_board(context) as board:
         board.watchdog(Watchdog[action.name], after_ms)
+    say_watchdog(action, after_ms)
 
 
 @app.command(cls=LineCommand)
@@ -365,8 +296,10 @@ def status(
     as_json: AsJson = False,
 ) -> None:
     """Show what a board does, and what went wrong since its reset."""
+    from firmware_host.board.tables import status_table
+
     with open_board(context) as board:
-        _show(_status(board.status()), as_json)
+        _show(status_table(board.status()), as_json)
 
 
 @app.command(cls=LineCommand)
@@ -376,27 +309,28 @@ def monitor(
     count: Annotated[int | None, typer.Option(help="End after so many lines.", min=1)] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show a line of status again and again; end with Ctrl-C."""
+    """Show a line of status again and again, and keep the board's watchdog from acting; end with Ctrl-C."""
     import itertools
     import json
 
+    from firmware_host.board.tables import name_of, status_table
     from firmware_host.protocol.requests import State
 
     with open_board(context) as board, contextlib.suppress(KeyboardInterrupt):
         for n in itertools.count(1):
             s = board.status()
             if as_json:
-                typer.echo(json.dumps(_status(s)))
+                typer.echo(json.dumps(status_table(s)))
             else:
                 typer.echo(
-                    f"{s.uptime_ms / 1e3:10.1f} s  {_name(State, s.state):12} packets {s.packets_sent:8}"
+                    f"{s.uptime_ms / 1e3:10.1f} s  {name_of(State, s.state):12} packets {s.packets_sent:8}"
                     f"  late {s.lateness_ticks:5} (max {s.lateness_max_ticks}) ticks"
                     f"  errors crc {s.crc_errors} framing {s.framing_errors} overflow {s.overflow_errors}"
                     f"  faults {s.faults:#04x}"
                 )
             if n == count:
                 return
-            board.session.transport.read(interval)
+            board.stay(interval, s)
 
 
 @app.command(cls=LineCommand)

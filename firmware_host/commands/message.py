@@ -6,14 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evlcp_sdk.cli._common import LinkFile, Overrides
-from firmware_host.commands._line import BoardLine, progress_bar, say_done
+from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, progress_bar, say_done
 from firmware_host.commands._output import save_array
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from evlcp_sdk.link.resolve import Link
     from evlcp_sdk.scene.sites import BarSite
 
 __all__ = ["keygen", "message"]
@@ -55,10 +51,11 @@ def message(
         str | None,
         typer.Option(
             help="Program a board and play: device, pyserial URL, native:, as for 'evlcp board';"
-            " EVLCP_PORT does not count here."
+            " EVLCP_PORT without it, unless -o or --chips is given."
         ),
     ] = None,
     baud: Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)] = 1_000_000,
+    stay: KeepAlive = False,
     link_file: LinkFile = None,
     overrides: Overrides = None,
     as_json: Annotated[
@@ -73,13 +70,17 @@ def message(
 
     Onto a board:    [bold]evlcp tx message --text "Tempo 30" --port /dev/ttyUSB0[/]
     """
+    import dataclasses
     import json
+    import os
 
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.files import Outputs
     from evlcp_sdk.link.compose import messages_of, packets_of, utf8
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
+    from firmware_host.board.bank import bank_of
+    from firmware_host.board.board import Settings, provision
     from firmware_host.board.symbols import symbols_table
 
     link = load_link(link_file, overrides or [], Registry.load())
@@ -109,7 +110,8 @@ def message(
         if out is not None:
             outputs.write_text(json.dumps(table) + "\n", out)
         outputs.commit()
-    programmed = None if port is None else _program(symbols, link, port, baud)
+    written = [str(path) for path in (out, chips) if path is not None]
+    port = port or (None if written else os.environ.get("EVLCP_PORT") or None)
     packet_s = link.packet.packet_chips / link.air.chip_rate_hz
     summary: dict[str, Any] = {
         "messages": [
@@ -124,28 +126,38 @@ def message(
         "packets": len(symbols),
         "duration_s": round(len(symbols) * packet_s, 6),
     }
-    if as_json:
-        import dataclasses
-
-        board = None if programmed is None else dataclasses.asdict(programmed)
-        typer.echo(json.dumps(summary | {"board": board} | table))
+    if port is None:
+        if as_json:
+            typer.echo(json.dumps(summary | {"board": None} | table))
+            return
+        _tell(summary, written, plays=False)
+        if not written:
+            raise ConfigError("nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips")
         return
+    bank = bank_of(symbols, link)
+    with BoardLine(port, baud).open() as board:
+        with progress_bar("programming") as progress:
+            programmed = provision(board, bank, Settings(), True, progress)
+        if as_json:
+            typer.echo(json.dumps(summary | {"board": dataclasses.asdict(programmed)} | table))
+        else:
+            _tell(summary, written, plays=True)
+            say_done(programmed, as_json=False)
+        if stay:
+            keep_alive(board)
+
+
+def _tell(summary: dict[str, Any], written: list[str], plays: bool) -> None:
+    """Say what was put on packets, and where they are."""
     for m in summary["messages"]:
         typer.echo(
             f"{m['kind']:9} {m['bytes']:5} bytes, transmitter {m['transmitter_id']}, sequence {m['sequence']}"
         )
     number = summary["packets"]
     said = f"{number} packet{'s' * (number != 1)}, {summary['duration_s']:.4g} s"
-    written = [str(path) for path in (out, chips) if path is not None]
     if written:
         said += f", in {' and '.join(written)}"
-    if programmed is not None:
-        said += ", again and again"
-    elif not written:
-        said += "; nothing is sent or written: give --port, -o or --chips"
-    typer.echo(said)
-    if programmed is not None:
-        say_done(programmed, as_json=False)
+    typer.echo(said + ", again and again" * plays)
 
 
 def keygen(
@@ -182,12 +194,3 @@ def _read(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as fault:
         raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
-
-
-def _program(symbols: "NDArray[np.int64]", link: "Link", port: str, baud: int) -> Any:
-    from firmware_host.board.bank import bank_of
-    from firmware_host.board.board import Settings, provision
-
-    bank = bank_of(symbols, link)
-    with BoardLine(port, baud).open() as board, progress_bar("programming") as progress:
-        return provision(board, bank, Settings(), True, progress)

@@ -17,7 +17,25 @@ from evlcp_sdk.files import open_log, output_fault
 from firmware_host.errors import LineError, NoBoardError
 from firmware_host.protocol.requests import DEFAULT_BAUD
 
-__all__ = ["ReplayTransport", "SocketTransport", "TraceTransport", "Transport", "open_transport"]
+__all__ = [
+    "ReplayTransport",
+    "SocketTransport",
+    "TraceTransport",
+    "Transport",
+    "on_network",
+    "open_transport",
+]
+
+_NETWORK = ("unix:", "tcp:", "socket://", "rfc2217://")
+
+
+def on_network(port: str) -> bool:
+    """Whether a port is a socket, which has no line rate and may have another host at its other end.
+
+    >>> on_network("unix:/tmp/board"), on_network("/dev/ttyUSB0")
+    (True, False)
+    """
+    return port.startswith(_NETWORK)
 
 
 class Transport(Protocol):

@@ -167,7 +167,7 @@ def test_faults_are_one_line(evlcp: Evlcp, site: Path, tmp_path: Path) -> None:
         assert done.code == code, done.err
         assert told in done.err
         assert done.err.count("\n") == 1
-    assert evlcp("tx", "message", "--beacon", two, "--id", 8).code == 0
+    assert evlcp("tx", "message", "--beacon", two, "--id", 8, "--json").code == 0
 
 
 def test_what_tx_wrote_tx_shows(evlcp: Evlcp, tmp_path: Path) -> None:
@@ -238,11 +238,25 @@ def test_a_link_that_no_board_can_play_is_one_line(
 
 
 def test_without_an_output_nothing_is_said_to_be_sent(evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("EVLCP_PORT", "unix:/nowhere")
+    monkeypatch.delenv("EVLCP_PORT", raising=False)
     done = evlcp("tx", "message", "--text", "hi")
-    assert done.code == 0
-    last = "1 packet, 0.0346 s; nothing is sent or written: give --port, -o or --chips"
-    assert done.out.splitlines()[-1] == last
+    assert done.code == 2
+    assert done.out.splitlines()[-1] == "1 packet, 0.0346 s"
+    wanted = "evlcp: nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips\n"
+    assert done.err == wanted
+    assert evlcp("tx", "message", "--text", "hi", "--json").code == 0
+
+
+@pytest.mark.usefixtures("compiler")
+def test_the_port_may_come_from_the_environment(
+    evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("EVLCP_PORT", "native:")
+    assert "bank 0 is active" in evlcp("tx", "message", "--text", "hi").out
+    monkeypatch.setenv("EVLCP_PORT", "unix:/nowhere")
+    assert evlcp("tx", "message", "--text", "hi").code == 4
+    # who asks for a file gets that, not lamps that blink
+    assert evlcp("tx", "message", "--text", "hi", "-o", tmp_path / "m.json").code == 0
 
 
 @pytest.mark.usefixtures("compiler")

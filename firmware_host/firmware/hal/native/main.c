@@ -347,6 +347,30 @@ static void write_line(struct native *board, struct line *line, struct throttle 
     }
 }
 
+/* A host that finds another one connected is hung up on; one whose forerunner has left takes its place. */
+static bool has_left(const struct line *line)
+{
+    struct pollfd left = {.fd = line->fd, .events = POLLRDHUP};
+    return poll(&left, 1, 0) > 0;
+}
+
+static void take_host(struct line *line)
+{
+    if (line->fd >= 0 && has_left(line))
+        return; /* first all that it has sent is read */
+    int fd = accept(line->listener, NULL, NULL);
+    if (fd < 0)
+        return;
+    if (line->fd >= 0 && !has_left(line)) {
+        close(fd);
+        return;
+    }
+    if (line->fd >= 0)
+        hang_up(line);
+    nonblocking(fd);
+    line->fd = fd;
+}
+
 int main(int argc, char **argv)
 {
     static struct native board;
@@ -398,13 +422,10 @@ int main(int argc, char **argv)
         if (ready < 0 && errno != EINTR)
             die("poll");
         uint64_t ns = now_ns();
-        if (line.fd < 0 && ready > 0) {
-            line.fd = accept(line.listener, NULL, NULL);
-            if (line.fd >= 0)
-                nonblocking(line.fd);
-        } else if (line.fd >= 0 && (ready > 0 || throttled)) {
+        if (line.fd >= 0 && (ready > 0 || throttled))
             read_line(&board, &line, &in, ns);
-        }
+        if (line.listener >= 0)
+            take_host(&line);
         native_run(&board, (ns - began) / (1000000000u / NATIVE_TICK_HZ));
         /* Before the answer to a SAVE goes out, the slots are in the file. */
         uint32_t flash = headers(&board);

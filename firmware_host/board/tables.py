@@ -1,0 +1,98 @@
+"""What a board says of itself, as plain values with names: for people, and for JSON."""
+
+from enum import Enum
+from typing import Any
+
+from firmware_host.protocol.requests import (
+    NO_BANK,
+    BoardFault,
+    Capability,
+    Format,
+    HelloReply,
+    Profile,
+    State,
+    StatusReply,
+    Watchdog,
+)
+
+__all__ = ["about_table", "name_of", "names_of_bits", "status_table"]
+
+
+def about_table(about: HelloReply) -> dict[str, Any]:
+    """What a board is and what it can, from its HELLO."""
+    return {
+        "hal": about.hal.rstrip(b"\0").decode("ascii", "replace"),
+        "unique_id": about.unique_id.hex(),
+        "firmware": f"{about.version_major}.{about.version_minor}.{about.version_patch}",
+        "protocol": f"{about.major}.{about.minor}",
+        "clusters": about.clusters,
+        "leds": about.leds,
+        "banks": about.banks,
+        "bank_bytes": about.bank_bytes,
+        "window": about.window,
+        "max_payload": about.max_payload,
+        "tick_hz": about.tick_hz,
+        "chip_rate_max_hz": about.chip_rate_max_hz,
+        "level_max_ma": about.level_max_ma,
+        "capabilities": names_of_bits(Capability, about.capabilities),
+        "uptime_ms": about.uptime_ms,
+    }
+
+
+def name_of(enum: type[Enum], value: int) -> str:
+    """The name of a number of the protocol; of one that this host does not know, the number."""
+    try:
+        return str(enum(value).name).lower()
+    except ValueError:
+        return str(value)
+
+
+def names_of_bits(flags: type[Enum], value: int) -> list[str]:
+    """Names of the bits that are set; of those that a later firmware has, the number."""
+    names = [name_of(flags, 1 << n) for n in range(value.bit_length()) if value >> n & 1]
+    return [f"bit {int(name):#x}" if name.isdigit() else name for name in names]
+
+
+def status_table(status: StatusReply) -> dict[str, Any]:
+    """What a board does, from its STATUS."""
+
+    def bank(number: int) -> int | None:
+        return None if number == NO_BANK else number
+
+    open_leds = int.from_bytes(status.open_leds, "big")
+    table: dict[str, Any] = {
+        "state": name_of(State, status.state),
+        "faults": names_of_bits(BoardFault, status.faults),
+        "active_bank": bank(status.active_bank),
+        "pending_bank": bank(status.pending_bank),
+    }
+    if status.active_bank != NO_BANK:
+        table |= {
+            "format": name_of(Format, status.format),
+            "profile": name_of(Profile, status.profile),
+            "frames": status.frames,
+            "pilot_every": status.pilot_every,
+            "packets": status.packets,
+            "length": status.length,
+            "crc": f"{status.crc:08x}",
+        }
+    return table | {
+        "codebook": status.digest.hex(),
+        "chip_rate_hz": status.chip_rate_hz,
+        "commits": status.commits,
+        "packets_sent": status.packets_sent,
+        "chips_sent": status.chips_sent,
+        "lateness_ticks": status.lateness_ticks,
+        "lateness_max_ticks": status.lateness_max_ticks,
+        "crc_errors": status.crc_errors,
+        "framing_errors": status.framing_errors,
+        "overflow_errors": status.overflow_errors,
+        "requests": status.requests,
+        "level_ma": status.level_ma,
+        "temperature_c": None if status.temperature_dc == -(1 << 15) else status.temperature_dc / 10,
+        "open_leds": [led for led in range(96) if open_leds >> (95 - led) & 1],
+        "watchdog": name_of(Watchdog, status.watchdog),
+        "watchdog_ms": status.watchdog_ms,
+        "silence_ms": status.silence_ms,
+        "uptime_ms": status.uptime_ms,
+    }
