@@ -11,7 +11,7 @@ from evlcp_sdk.air.frames import pilot_words
 from evlcp_sdk.errors import ConfigError
 from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank
 from firmware_host.board.session import Session
-from firmware_host.errors import LineError, RefusedError, VerifyError
+from firmware_host.errors import IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.protocol.client import RequestOutcome
 from firmware_host.protocol.profiles import DIGESTS
 from firmware_host.protocol.requests import (
@@ -294,6 +294,50 @@ class Board:
         watchdog = Watchdog(status.watchdog).name.lower()
         return Programmed(written, length, swapped, status.active_bank, again, watchdog, status.watchdog_ms)
 
+    def check_same_air(self, bank: Bank, status: StatusReply) -> None:
+        """Raise IncompatibleError unless what plays and what comes are of one codebook and one chip rate."""
+        plays, comes = f"codebook {status.digest.hex()[:16]}", f"codebook {bank.codebook.digest[:16]}"
+        if status.digest.hex() == bank.codebook.digest:
+            if status.chip_rate_hz == bank.chip_rate_hz:
+                return
+            plays, comes = (
+                f"{status.chip_rate_hz} chips per second",
+                f"air.chip_rate_hz = {bank.chip_rate_hz}",
+            )
+        raise IncompatibleError(
+            f"{self.session.name}: plays {plays}, this payload's link has {comes} ({bank.codebook.profile});"
+            " give its link with -c or --set, or 'evlcp board program' to change it"
+        )
+
+    def verify(self, bank: Bank) -> int:
+        """Read the active bank back and compare it; its number.
+
+        Raises:
+            IncompatibleError: It is of another codebook or chip rate.
+            VerifyError: It holds something else.
+        """
+        s, name = self.status(), self.session.name
+        again = "'evlcp board program' brings it there"
+        if s.active_bank == NO_BANK:
+            raise VerifyError(f"{name}: nothing is programmed; {again}")
+        self.check_same_air(bank, s)
+        packet = bank.packet
+        shape = (s.format, s.packets, s.frames, s.pilot_every, s.length)
+        if shape != (bank.format, bank.packets, packet.frames, packet.pilot_every, len(bank.content)):
+            raise VerifyError(
+                f"{name}: holds {s.packets} packets of {s.frames} frames, pilot in every"
+                f" {s.pilot_every}, {s.length} bytes; expected {bank.packets} of {packet.frames},"
+                f" pilot in every {packet.pilot_every}, {len(bank.content)} bytes; {again}"
+            )
+        held = self.read(s.active_bank, 0, s.length)
+        differ = next((i for i, (a, b) in enumerate(zip(held, bank.content, strict=True)) if a != b), None)
+        if differ is not None:
+            raise VerifyError(
+                f"{name}: byte {differ} of bank {s.active_bank} is {held[differ]:#04x},"
+                f" expected {bank.content[differ]:#04x}; {again}"
+            )
+        return s.active_bank
+
     def check_fits(self, bank: Bank) -> None:
         """Raise ConfigError unless the content fits the board's clusters and bank."""
         if bank.codebook.clusters != self.about.clusters:
@@ -393,10 +437,11 @@ class Board:
         """
         line = self.session.transport
         end = line.now() + seconds
-        pulse = seconds if status.watchdog == Watchdog.KEEP else status.watchdog_ms / 3e3
+        acts = status.watchdog != Watchdog.KEEP
+        pulse = status.watchdog_ms / 3e3 if acts else seconds
         while (left := end - line.now()) > 0.0:
             line.read(min(left, pulse))
-            if line.now() < end:
+            if acts and line.now() < end:
                 self.status()
 
     def wait_dark(self, timeout_s: float = 10.0) -> StatusReply:

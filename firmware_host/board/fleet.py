@@ -1,30 +1,45 @@
 """Many boards at once, from one inventory."""
 
+import contextlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
+from evlcp_sdk.link.compose import messages_of, packets_of, utf8
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.specs import SpecError, build, read_toml, shown
 from firmware_host.board.bank import MOST_RANDOM_FRAMES, Bank, bank_of, check_link, random_symbols, read_masks
-from firmware_host.board.board import Board, Programmed, Settings, provision
+from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
+from firmware_host.board.sites import site_that_sends
 from firmware_host.board.symbols import read_symbols
 from firmware_host.emulators.opening import open_port
 from firmware_host.errors import FleetError, IncompatibleError
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.requests import DEFAULT_BAUD, Watchdog
 
-__all__ = ["Entry", "Inventory", "Result", "program_fleet", "raise_failures", "read_inventory"]
+__all__ = [
+    "Entry",
+    "Inventory",
+    "Result",
+    "board_of",
+    "program_fleet",
+    "raise_failures",
+    "read_entries",
+    "read_inventory",
+    "run_fleet",
+    "verify_fleet",
+]
 
 
 @dataclass(frozen=True)
@@ -38,6 +53,14 @@ class Entry:
         payload: Symbols `[packet][frame][cluster]` in a JSON file, or chip masks in a `.npy` file.
         random: Instead of `payload`: that many packets of random symbols.
         seed: Seed of `random`.
+        text: Instead of `payload`: a message, a text.
+        beacon: Instead of `payload`, or beside `text`: the file of sites whose bar's beacon it sends,
+            its path relative to the inventory's.
+        user: The beacon's own bytes, as text.
+        key: File of the private key that signs the beacon, its path relative to the inventory's.
+        transmitter_id: Number of the transmitter in its messages; without it the site's, or 0.
+        sequence: Number of its messages: raise it when they change.
+        repeat: How many times in a row each packet is sent.
         link: The link: a file, its path relative to the inventory's, or its tables. Without it a payload's
             own, or all defaults.
         unique_id: The part's own number in hex, as `evlcp board hello` shows it; another board is refused.
@@ -48,7 +71,7 @@ class Entry:
         baud: Line rate, bit/s.
 
     Raises:
-        ConfigError: Not exactly one of payload and random is given.
+        ConfigError: Not exactly one of payload, random and a message is given.
     """
 
     id: Annotated[str, Field(min_length=1)]
@@ -57,6 +80,13 @@ class Entry:
     payload: str | None = None
     random: Annotated[int, Field(ge=1, le=65535)] | None = None
     seed: Annotated[int, Field(ge=0)] = 0
+    text: Annotated[str, Field(min_length=1)] | None = None
+    beacon: str | None = None
+    user: str = ""
+    key: str | None = None
+    transmitter_id: Annotated[int, Field(ge=0, lt=2**32)] | None = None
+    sequence: Annotated[int, Field(ge=0, lt=2**32)] | None = None
+    repeat: Annotated[int, Field(ge=1, le=1000)] = 1
     link: str | dict[str, Any] | None = None
     unique_id: Annotated[str, Field(pattern="^[0-9a-f]{24}$")] | None = None
     level_ma: Annotated[int, Field(ge=0, le=65535)] | None = None
@@ -66,8 +96,18 @@ class Entry:
     baud: Annotated[int, Field(ge=1200)] = DEFAULT_BAUD
 
     def __post_init__(self) -> None:
-        if (self.payload is None) == (self.random is None):
-            raise ConfigError("give payload or random, one of the two")
+        given = (self.payload is not None, self.random is not None, self.has_message)
+        if sum(given) != 1:
+            raise ConfigError("give payload or random or a message (text, beacon), one of them")
+        if self.has_message and self.sequence is None:
+            raise ConfigError("a message needs sequence: raise it when the message changes")
+        if self.beacon is None and (self.key is not None or self.user):
+            raise ConfigError("key and user belong to a beacon: give beacon, too")
+
+    @property
+    def has_message(self) -> bool:
+        """Whether it sends a message."""
+        return self.text is not None or self.beacon is not None
 
     @property
     def settings(self) -> Settings:
@@ -95,13 +135,15 @@ class Result:
 
     Attributes:
         entry: The board.
-        done: What was done, or None if it failed.
+        said: What was done, for a person.
+        table: The same as plain values.
         fault: Why it failed.
         elapsed_s: How long it took, s.
     """
 
     entry: Entry
-    done: Programmed | None
+    said: str
+    table: dict[str, Any]
     fault: EvlcpError | None
     elapsed_s: float
 
@@ -109,12 +151,9 @@ class Result:
     def line(self) -> str:
         """One line for a person."""
         head = f"{self.entry.id}  {self.entry.port}"
-        if self.done is None:
-            code = self.fault.exit_code if self.fault else 1
-            return f"{head}  FAILED ({code}): {self.fault}"
-        if not self.done.swapped:
-            return f"{head}  was there already ({self.done.length} bytes)"
-        return f"{head}  programmed {self.done.written} of {self.done.length} bytes in {self.elapsed_s:.2f} s"
+        if self.fault is not None:
+            return f"{head}  FAILED ({self.fault.exit_code}): {self.fault}"
+        return f"{head}  {self.said}"
 
     def to_dict(self) -> dict[str, Any]:
         """As plain values."""
@@ -122,9 +161,8 @@ class Result:
             "id": self.entry.id,
             "port": self.entry.port,
             "position_m": list(self.entry.position_m),
-            "ok": self.done is not None,
-            "written_bytes": self.done.written if self.done else 0,
-            "swapped": self.done.swapped if self.done else False,
+            "ok": self.fault is None,
+            **self.table,
             "exit_code": self.fault.exit_code if self.fault else 0,
             "fault": str(self.fault) if self.fault else None,
             "elapsed_s": round(self.elapsed_s, 3),
@@ -132,13 +170,23 @@ class Result:
 
 
 def read_inventory(path: Path) -> Inventory:
-    """Read an inventory: `[[board]]` tables, and `[defaults]` with any key of a board.
+    """Read an inventory, with what each board plays.
 
     Raises:
-        ConfigError: The inventory cannot be read, a value or a link is wrong, or a board cannot play a link;
-            the message names the place, the value and what was expected.
-        InputError: A payload cannot be read.
+        ConfigError: See `read_entries`; or a link or a message is wrong, or a board cannot play it.
+        InputError: A payload or a key cannot be read.
         IncompatibleError: A payload was made with another link.
+    """
+    links = _Links(path)
+    return Inventory(path, tuple((e, _bank(path, i, e, links)) for i, e in enumerate(read_entries(path))))
+
+
+def read_entries(path: Path) -> tuple[Entry, ...]:
+    """Read the boards of an inventory: `[[board]]` tables, and `[defaults]` with any key of a board.
+
+    Raises:
+        ConfigError: The inventory cannot be read, or a value is wrong; the message names the place, the value
+            and what was expected.
     """
     table = read_toml(path)
     unknown = sorted(set(table) - {"defaults", "board"})
@@ -160,8 +208,7 @@ def read_inventory(path: Path) -> Inventory:
                     f" expected another than board[{first[value]}]'s"
                 )
             first[value] = i
-    links = _Links(path)
-    return Inventory(path, tuple((e, _bank(path, i, e, links)) for i, e in enumerate(entries)))
+    return tuple(entries)
 
 
 def _entry(path: Path, index: int, row: dict[str, Any]) -> Entry:
@@ -202,6 +249,8 @@ def _bank(path: Path, index: int, entry: Entry, links: _Links) -> Bank:
             return bank_of(symbols, link)
         link = given or links.of({})
         check_link(link)
+        if entry.has_message:
+            return bank_of(_message(path.parent, entry, link), link)
         if entry.payload is not None:
             return read_masks(path.parent / entry.payload, link.codebook, link.packet)
         packets, frames = entry.random or 0, link.packet.frames
@@ -218,27 +267,78 @@ def _bank(path: Path, index: int, entry: Entry, links: _Links) -> Bank:
         raise kind("\n".join(f"{place}: {line}" for line in str(fault).splitlines())) from fault
 
 
-def _program(entry: Entry, bank: Bank, verify: bool) -> Result:
-    start = time.monotonic()
-    try:
-        with Session(open_port(entry.port, entry.baud), Timing(entry.baud)) as session:
-            board = Board(session)
-            found = board.about.unique_id.hex()
-            if entry.unique_id not in (None, found):
-                raise IncompatibleError(
-                    f"{entry.port}: unique_id {found}, the inventory expects {entry.unique_id};"
-                    " plug in that board or correct the inventory"
-                )
-            done = provision(board, bank, entry.settings, verify)
-        return Result(entry, done, None, time.monotonic() - start)
-    except EvlcpError as fault:
-        return Result(entry, None, fault, time.monotonic() - start)
+def _message(folder: Path, entry: Entry, link: Link) -> NDArray[np.int64]:
+    """The packets of a board's message, int64 (packets, frames, clusters)."""
+    site = None
+    if entry.beacon is not None:
+        site = site_that_sends(folder / entry.beacon, entry.transmitter_id, "transmitter_id")
+    messages = messages_of(
+        link,
+        text=entry.text,
+        beacon=site,
+        user=utf8(entry.user, "user"),
+        key=None if entry.key is None else folder / entry.key,
+        transmitter_id=entry.transmitter_id,
+        sequence=entry.sequence,
+    )
+    return packets_of(messages, link.block_coder(), entry.repeat)
 
 
-def program_fleet(
-    inventory: Inventory, verify: bool = True, report: Callable[[Result], None] | None = None
-) -> list[Result]:
-    """Program all boards at once; one that fails does not hold up the others.
+@contextlib.contextmanager
+def board_of(entry: Entry) -> Iterator[Board]:
+    """The board of an entry.
+
+    Raises:
+        IncompatibleError: Another board is on its port.
+        NoBoardError: None answers there.
+    """
+    with Session(open_port(entry.port, entry.baud), Timing(entry.baud)) as session:
+        board = Board(session)
+        found = board.about.unique_id.hex()
+        if entry.unique_id not in (None, found):
+            raise IncompatibleError(
+                f"{entry.port}: unique_id {found}, the inventory expects {entry.unique_id};"
+                " plug in that board or correct the inventory"
+            )
+        yield board
+
+
+Report = Callable[[Result], None]
+"""Called with each result as it comes."""
+
+Work = Callable[[Entry, Board], tuple[str, dict[str, Any]]]
+"""What is done with a board; what it did, for a person and as plain values."""
+
+
+def run_fleet(entries: Sequence[Entry], work: Work, report: Report | None = None) -> list[Result]:
+    """Do something with all boards at once; one that fails does not hold up the others.
+
+    Returns:
+        The results in the order of the entries.
+    """
+
+    def one(entry: Entry) -> Result:
+        start = time.monotonic()
+        said, table, failed = "", dict[str, Any](), None
+        try:
+            with board_of(entry) as board:
+                said, table = work(entry, board)
+        except EvlcpError as fault:
+            failed = fault
+        return Result(entry, said, table, failed, time.monotonic() - start)
+
+    results: dict[str, Result] = {}
+    with ThreadPoolExecutor(min(64, len(entries))) as pool:
+        for future in as_completed([pool.submit(one, entry) for entry in entries]):
+            result = future.result()
+            results[result.entry.id] = result
+            if report:
+                report(result)
+    return [results[entry.id] for entry in entries]
+
+
+def program_fleet(inventory: Inventory, verify: bool = True, report: Report | None = None) -> list[Result]:
+    """Program all boards at once.
 
     Args:
         inventory: The boards.
@@ -248,23 +348,40 @@ def program_fleet(
     Returns:
         The results in the inventory's order.
     """
-    results: dict[str, Result] = {}
-    with ThreadPoolExecutor(min(64, len(inventory.boards))) as pool:
-        for future in as_completed([pool.submit(_program, e, p, verify) for e, p in inventory.boards]):
-            result = future.result()
-            results[result.entry.id] = result
-            if report:
-                report(result)
-    return [results[entry.id] for entry, _ in inventory.boards]
+    banks = {entry.id: bank for entry, bank in inventory.boards}
+
+    def work(entry: Entry, board: Board) -> tuple[str, dict[str, Any]]:
+        start = time.monotonic()
+        done = provision(board, banks[entry.id], entry.settings, verify)
+        table = {"written_bytes": done.written, "swapped": done.swapped}
+        if not done.swapped:
+            return f"was there already ({done.length} bytes)", table
+        elapsed = time.monotonic() - start
+        return f"programmed {done.written} of {done.length} bytes in {elapsed:.2f} s", table
+
+    return run_fleet([entry for entry, _ in inventory.boards], work, report)
 
 
-def raise_failures(inventory: Inventory, results: list[Result]) -> None:
+def verify_fleet(inventory: Inventory, report: Report | None = None) -> list[Result]:
+    """Compare what all boards hold with what the inventory says; results in its order."""
+    banks = {entry.id: bank for entry, bank in inventory.boards}
+
+    def work(entry: Entry, board: Board) -> tuple[str, dict[str, Any]]:
+        bank = banks[entry.id]
+        number = board.verify(bank)
+        table = {"bytes": len(bank.content), "bank": number, "crc": f"{bank.crc:08x}"}
+        return f"same: {len(bank.content)} bytes in bank {number}, CRC {bank.crc:08x}", table
+
+    return run_fleet([entry for entry, _ in inventory.boards], work, report)
+
+
+def raise_failures(path: Path, results: list[Result]) -> None:
     """Raise FleetError, with the exit code of the first failure, if any board failed."""
     failed = [r for r in results if r.fault is not None]
     if failed and failed[0].fault is not None:
         raise FleetError(
-            f"{inventory.path}: {len(failed)} of {len(results)} boards failed"
-            f" ({', '.join(r.entry.id for r in failed)}); the others are programmed;"
+            f"{path}: {len(failed)} of {len(results)} boards failed"
+            f" ({', '.join(r.entry.id for r in failed)}); the others are done;"
             " run it again for the rest",
             failed[0].fault.exit_code,
         )

@@ -1,4 +1,4 @@
-"""Finds boards: lists the serial ports, and asks HELLO of each."""
+"""Finds boards: lists the serial ports, and asks HELLO of those that may have one."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from firmware_host.board.session import Session
 from firmware_host.errors import BoardError, NoBoardError
 from firmware_host.ports.transport import open_transport
+from firmware_host.ports.usb import SerialPort, UsbFilter, serial_ports
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.requests import HelloReply
 
-__all__ = ["Found", "ask", "find", "serial_ports", "survey"]
+__all__ = ["Found", "ask", "find", "survey"]
 
 _PROBE_TRIES = 2
 
@@ -19,50 +20,57 @@ class Found:
     """A port and what answered there.
 
     Attributes:
-        port: Name to give to `--port`.
-        description: What the operating system says of it.
+        port: The port.
+        asked: Whether anything was written to it.
         about: The board's HELLO, or None.
         fault: Why there is none.
     """
 
-    port: str
-    description: str
+    port: SerialPort
+    asked: bool
     about: HelloReply | None
     fault: str
 
 
-def serial_ports() -> list[tuple[str, str]]:
-    """Serial ports of this machine, as (device, description)."""
-    from serial.tools.list_ports import comports
-
-    return sorted((p.device, p.description) for p in comports())
-
-
-def ask(port: str, baud: int, description: str = "") -> Found:
+def ask(port: SerialPort, baud: int) -> Found:
     """Say HELLO on a port, briefly."""
     try:
-        with Session(open_transport(port, baud), Timing(baud, latency_s=0.15), tries=_PROBE_TRIES) as session:
-            return Found(port, description, session.hello(), "")
+        line = open_transport(port.device, baud)
+        with Session(line, Timing(baud, latency_s=0.15), tries=_PROBE_TRIES) as session:
+            return Found(port, True, session.hello(), "")
     except BoardError as fault:
-        return Found(port, description, None, str(fault))
+        return Found(port, True, None, str(fault))
 
 
-def survey(baud: int, ports: list[tuple[str, str]] | None = None) -> list[Found]:
-    """Ask every serial port at once.
+def survey(
+    baud: int, ports: list[SerialPort] | None = None, usb: UsbFilter | None = None, every: bool = False
+) -> list[Found]:
+    """List serial ports, and ask those at once that may have a board.
+
+    A port is left alone unless its USB id is a bridge's that boards usually have: who knows what hangs
+    on another.
 
     Args:
         baud: Line rate, bit/s.
-        ports: (device, description) of those to ask; by default all of this machine.
+        ports: The ports; by default all of this machine.
+        usb: List and ask only ports with this USB id.
+        every: Ask all that are listed.
     """
-    listed = serial_ports() if ports is None else ports
+    listed = [p for p in (serial_ports() if ports is None else ports) if usb is None or usb.takes(p)]
     if not listed:
         return []
+
+    def look(port: SerialPort) -> Found:
+        if every or usb is not None or port.likely:
+            return ask(port, baud)
+        return Found(port, False, None, "no USB id of a board's bridge: not asked")
+
     with ThreadPoolExecutor(len(listed)) as pool:
-        return list(pool.map(lambda p: ask(p[0], baud, p[1]), listed))
+        return list(pool.map(look, listed))
 
 
-def find(baud: int, ports: list[tuple[str, str]] | None = None) -> str:
-    """The port of the one board that answers.
+def find(baud: int, ports: list[SerialPort] | None = None) -> str:
+    """The port of the one board that answers, of those that may have one.
 
     Raises:
         NoBoardError: None answers, or several do.
@@ -70,12 +78,15 @@ def find(baud: int, ports: list[tuple[str, str]] | None = None) -> str:
     found = survey(baud, ports)
     boards = [f for f in found if f.about is not None]
     if len(boards) == 1:
-        return boards[0].port
+        return boards[0].port.device
     if boards:
-        names = ", ".join(f.port for f in boards)
+        names = ", ".join(f.port.device for f in boards)
         raise NoBoardError(f"{len(boards)} boards answer ({names}); choose one with --port or EVLCP_PORT")
-    tried = ", ".join(f.port for f in found) or "there is none"
+    silent = (
+        ", ".join(f.port.device for f in found if f.asked) or "there is none with a USB id that boards have"
+    )
+    left = ", ".join(f.port.device for f in found if not f.asked)
     raise NoBoardError(
-        f"no board answers on any serial port ({tried}); check power and cable, name its port with --port,"
-        " or use --port native: for an emulated one"
+        f"no board answers on any serial port ({silent}){f'; not asked: {left}' if left else ''};"
+        " check power and cable, name its port with --port, or use --port native: for an emulated one"
     )

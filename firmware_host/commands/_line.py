@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
-from typer.core import TyperCommand
+
+from firmware_host.commands._json import JsonCommand, print_json
 
 if TYPE_CHECKING:
     from firmware_host.board.board import Board
@@ -46,13 +47,18 @@ class BoardLine:
     trace: Path | None = None
     replay: Path | None = None
 
+    def found(self) -> str:
+        """The port: the one that is named, or the one of those that are asked that has a board."""
+        from firmware_host.board.survey import find
+
+        return self.port or find(self.baud)
+
     @contextlib.contextmanager
     def open(self) -> "Iterator[Board]":
         """The board on the line, or the recorded one."""
         from evlcp_sdk.errors import ConfigError, OutputError
         from firmware_host.board.board import Board
         from firmware_host.board.session import Session
-        from firmware_host.board.survey import find
         from firmware_host.emulators.opening import open_port
         from firmware_host.ports.transport import ReplayTransport, TraceTransport, Transport
         from firmware_host.protocol.client import Timing
@@ -66,7 +72,7 @@ class BoardLine:
             transport = played = ReplayTransport(self.replay)
             first, nonce, baud = played.first, played.nonce, played.baud
         else:
-            transport = open_port(self.port or find(baud), baud)
+            transport = open_port(self.found(), baud)
             if self.trace is not None:
                 import random
 
@@ -91,8 +97,8 @@ def line_options(
         str | None,
         typer.Option(
             envvar="EVLCP_PORT",
-            help="Device, pyserial URL, unix:PATH, tcp:HOST:PORT, native: or qemu:;"
-            " by default all are asked.",
+            help="Device, pyserial URL, usb:VID:PID, unix:PATH, tcp:HOST:PORT, native: or qemu:;"
+            " by default those are asked whose USB id boards usually have.",
         ),
     ] = None,
     baud: Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)] = _BAUD,
@@ -110,7 +116,7 @@ def line_options(
     context.obj = BoardLine(port, baud, trace, replay)
 
 
-class LineCommand(TyperCommand):
+class LineCommand(JsonCommand):
     """A command on a board: the group's options of the line may stand behind its name, too."""
 
     line: ClassVar[tuple[str, ...]] = LINE
@@ -196,9 +202,8 @@ def say_done(done: Any, as_json: bool) -> None:
     """Say what programming did."""
     if as_json:
         import dataclasses
-        import json
 
-        typer.echo(json.dumps(dataclasses.asdict(done)))
+        print_json(dataclasses.asdict(done))
     elif not done.swapped:
         typer.echo(f"was there already: {done.length} bytes in bank {done.bank}")
     else:

@@ -1,6 +1,7 @@
 """`evlcp board`: program and watch driver boards."""
 
 import contextlib
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,6 +10,7 @@ import typer
 
 from evlcp_sdk.cli._common import LinkFile, Overrides
 from firmware_host.commands import _source
+from firmware_host.commands._json import AsJson, JsonCommand, fault_table, print_json, say
 from firmware_host.commands._line import (
     LINE,
     BoardLine,
@@ -26,8 +28,11 @@ from firmware_host.commands._line import (
 from firmware_host.commands._source import RandomPackets, Seed, SymbolsFile
 
 if TYPE_CHECKING:
-    from firmware_host.board.bank import Bank
+    from collections.abc import Callable
+
     from firmware_host.board.board import Board
+    from firmware_host.board.fleet import Entry, Result, Work
+    from firmware_host.board.monitor import Back, Gone
     from firmware_host.protocol.requests import StatusReply
 
 __all__ = ["app"]
@@ -44,10 +49,14 @@ app = typer.Typer(
 
 app.callback()(line_options)
 
-AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
 Masks = Annotated[
     Path | None,
     typer.Option(metavar="FILE.npy", help="Chips instead: uint8, a column per LED or cluster."),
+]
+
+
+InventoryFile = Annotated[
+    Path | None, typer.Option("--inventory", metavar="FILE.toml", help="All boards of an inventory at once.")
 ]
 
 
@@ -68,9 +77,7 @@ class Emulator(StrEnum):
 
 def _show(table: dict[str, Any], as_json: bool) -> None:
     if as_json:
-        import json
-
-        typer.echo(json.dumps(table))
+        print_json(table)
         return
     for key, value in table.items():
         text = ", ".join(map(str, value)) if isinstance(value, list) else value
@@ -78,33 +85,60 @@ def _show(table: dict[str, Any], as_json: bool) -> None:
 
 
 @app.command(cls=SurveyCommand)
-def ports(context: typer.Context, as_json: AsJson = False) -> None:
-    """List the serial ports, and which have a board.
+def ports(
+    context: typer.Context,
+    usb: Annotated[
+        str | None,
+        typer.Option(metavar="VID:PID", help="Only ports with this USB id; VID, VID:PID or VID:PID:SERIAL."),
+    ] = None,
+    ask: Annotated[bool, typer.Option(help="Say HELLO on ports whose USB id boards usually have.")] = True,
+    every: Annotated[bool, typer.Option("--all", help="Say HELLO on every port.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """List the serial ports with their USB ids, and which have a board.
 
-    For example: [bold]evlcp board ports[/]
+    Nothing is written to a port whose USB id is not that of a bridge that boards usually have,
+    unless --usb or --all asks for it.
+
+    For example: [bold]evlcp board ports --usb 0403[/]
     """
-    from firmware_host.board.survey import survey
+    from firmware_host.board.survey import Found, survey
     from firmware_host.board.tables import about_table
+    from firmware_host.ports.usb import UsbFilter, serial_ports
 
     line: BoardLine = context.obj
-    found = survey(line.baud)
+    wanted = None if usb is None else UsbFilter.parse(usb)
+    if ask:
+        found = survey(line.baud, None, wanted, every)
+    else:
+        listed = [p for p in serial_ports() if wanted is None or wanted.takes(p)]
+        found = [Found(p, False, None, "not asked") for p in listed]
     if as_json:
-        import json
-
-        rows = [
-            {"port": f.port, "description": f.description, "board": about_table(f.about) if f.about else None}
-            for f in found
-        ]
-        typer.echo(json.dumps(rows))
+        print_json(
+            [
+                {
+                    "port": f.port.device,
+                    "description": f.port.description,
+                    "usb": f.port.usb,
+                    "serial_number": f.port.serial_number,
+                    "asked": f.asked,
+                    "board": about_table(f.about) if f.about else None,
+                    "fault": f.fault or None,
+                }
+                for f in found
+            ]
+        )
         return
     for f in found:
-        what = "no board answers"
+        what = f.fault
         if f.about:
             about = about_table(f.about)
             what = f"{about['hal']} {about['unique_id']}, firmware {about['firmware']}"
-        typer.echo(f"{f.port}  {f.description}  {what}")
+        serial = f" {f.port.serial_number}" if f.port.serial_number else ""
+        typer.echo(f"{f.port.device}  {f.port.usb or '-'}{serial}  {f.port.description}  {what}")
     if not found:
-        typer.echo("no serial ports; emulated boards: --port native: or --port qemu:")
+        which = "no serial ports" if usb is None else f"no serial port with USB id {usb}"
+        typer.echo(f"{which}; emulated boards: --port native: or --port qemu:")
 
 
 @app.command(cls=LineCommand)
@@ -150,22 +184,8 @@ def program(
     For example: [bold]evlcp board --port /dev/ttyUSB0 program SYMBOLS.json[/]
     """
     if inventory is not None:
-        from evlcp_sdk.errors import ConfigError
-
-        given = [
-            "/".join([*parameter.opts, *parameter.secondary_opts])
-            for parameter in context.command.get_params(context)
-            if parameter.name not in ("inventory", "verify", "as_json")
-            and from_command_line(context, parameter.name or "")
-        ]
-        group = context.parent
-        given += [f"--{name}" for name in LINE if group is not None and from_command_line(group, name)]
-        if given:
-            raise ConfigError(
-                f"--inventory names ports, payloads and settings itself: write {given[0]} there,"
-                " not on the command line"
-            )
-        _program_fleet(inventory, verify, as_json)
+        _beside_inventory(context, "verify", "stay")
+        _program_fleet(inventory, verify, stay, as_json)
         return
     from firmware_host.board.board import Settings, provision
     from firmware_host.protocol.requests import Watchdog
@@ -181,17 +201,49 @@ def program(
             keep_alive(board)
 
 
-def _program_fleet(path: Path, verify: bool, as_json: bool) -> None:
-    import json
+def _beside_inventory(context: typer.Context, *allowed: str) -> None:
+    """Raise ConfigError if an option was given that stands in the inventory."""
+    from evlcp_sdk.errors import ConfigError
 
-    from firmware_host.board.fleet import Result, program_fleet, raise_failures, read_inventory
+    given = [
+        "/".join([*parameter.opts, *parameter.secondary_opts])
+        for parameter in context.command.get_params(context)
+        if parameter.name not in ("inventory", "as_json", *allowed)
+        and from_command_line(context, parameter.name or "")
+    ]
+    group = context.parent
+    given += [f"--{name}" for name in LINE if group is not None and from_command_line(group, name)]
+    if given:
+        raise ConfigError(
+            f"--inventory names ports, payloads and settings itself: write {given[0]} there,"
+            " not on the command line"
+        )
+
+
+def _report(as_json: bool) -> "Callable[[Result], None]":
+    """Prints the result of each board of an inventory."""
+
+    def report(result: "Result") -> None:
+        say(result.line, result.to_dict(), as_json)
+
+    return report
+
+
+def _on_fleet(context: typer.Context, path: Path, as_json: bool, work: "Work", *allowed: str) -> None:
+    """Do something with all boards of an inventory; ends with the exit code of the first that fails."""
+    from firmware_host.board.fleet import raise_failures, read_entries, run_fleet
+
+    _beside_inventory(context, *allowed)
+    raise_failures(path, run_fleet(read_entries(path), work, _report(as_json)))
+
+
+def _program_fleet(path: Path, verify: bool, stay: bool, as_json: bool) -> None:
+    from firmware_host.board.fleet import program_fleet, raise_failures, read_inventory
 
     inventory = read_inventory(path)
-
-    def report(result: Result) -> None:
-        typer.echo(json.dumps(result.to_dict()) if as_json else result.line)
-
-    raise_failures(inventory, program_fleet(inventory, verify, report))
+    raise_failures(path, program_fleet(inventory, verify, _report(as_json)))
+    if stay:
+        _watch_fleet([entry for entry, _ in inventory.boards], 1.0, None, True, as_json, quiet=True)
 
 
 @app.command(cls=LineCommand)
@@ -221,52 +273,56 @@ def send(
                 f"{board.session.name}: nothing is programmed; 'evlcp board program' first",
                 Status.NOTHING_COMMITTED,
             )
-        _check_same_air(board, bank, status)
+        board.check_same_air(bank, status)
         done = board.program(bank, verify, progress)
     say_done(done, as_json)
 
 
-def _check_same_air(board: "Board", bank: "Bank", status: "StatusReply") -> None:
-    """What plays and what comes must be of one codebook and one chip rate."""
-    from firmware_host.errors import IncompatibleError
-
-    plays, comes = f"codebook {status.digest.hex()[:16]}", f"codebook {bank.codebook.digest[:16]}"
-    if status.digest.hex() == bank.codebook.digest:
-        if status.chip_rate_hz == bank.chip_rate_hz:
-            return
-        plays, comes = f"{status.chip_rate_hz} chips per second", f"air.chip_rate_hz = {bank.chip_rate_hz}"
-    raise IncompatibleError(
-        f"{board.session.name}: plays {plays}, this payload's link has {comes} ({bank.codebook.profile});"
-        " give its link with -c or --set, or 'evlcp board program' to change it"
-    )
-
-
 @app.command(cls=LineCommand)
-def start(context: typer.Context) -> None:
+def start(context: typer.Context, inventory: InventoryFile = None, as_json: AsJson = False) -> None:
     """Play what is programmed."""
-    with open_board(context) as board:
-        board.start()
+    _simple(context, inventory, as_json, lambda board: board.start(), "playing")
 
 
 @app.command(cls=LineCommand)
-def stop(context: typer.Context) -> None:
+def stop(context: typer.Context, inventory: InventoryFile = None, as_json: AsJson = False) -> None:
     """Finish the packet, then dark."""
-    with open_board(context) as board:
+
+    def work(board: "Board") -> None:
         board.stop()
         board.wait_dark()
 
+    _simple(context, inventory, as_json, work, "dark")
+
 
 @app.command(cls=LineCommand)
-def blank(context: typer.Context) -> None:
+def blank(context: typer.Context, inventory: InventoryFile = None, as_json: AsJson = False) -> None:
     """Dark at once."""
-    with open_board(context) as board:
-        board.blank()
+    _simple(context, inventory, as_json, lambda board: board.blank(), "dark")
+
+
+def _simple(
+    context: typer.Context, inventory: Path | None, as_json: bool, work: "Callable[[Board], Any]", state: str
+) -> None:
+    """A request or two, after which a board, or all of an inventory, is in a state."""
+    if inventory is None:
+        with open_board(context) as board:
+            work(board)
+        say("", {"state": state}, as_json)
+        return
+
+    def on_board(_: "Entry", board: "Board") -> tuple[str, dict[str, Any]]:
+        work(board)
+        return state, {"state": state}
+
+    _on_fleet(context, inventory, as_json, on_board)
 
 
 @app.command(cls=LineCommand)
 def level(
     context: typer.Context,
     level_ma: Annotated[int, typer.Argument(metavar="MA", help="LED current, mA.", min=0, max=65535)],
+    as_json: AsJson = False,
 ) -> None:
     """Set the LED current; above the board's maximum it is refused.
 
@@ -274,6 +330,7 @@ def level(
     """
     with open_board(context) as board:
         board.level(level_ma)
+    say("", {"level_ma": level_ma}, as_json)
 
 
 @app.command(cls=LineCommand)
@@ -281,25 +338,39 @@ def watchdog(
     context: typer.Context,
     action: Annotated[Silence, typer.Argument(help="What to do when the host is silent.")],
     after_ms: Annotated[int, typer.Option(help="After which silence, ms.", min=100, max=2**32 - 1)] = 5000,
+    as_json: AsJson = False,
 ) -> None:
     """Choose what the board does when the host falls silent: keep playing, idle pattern, or dark."""
     from firmware_host.protocol.requests import Watchdog
 
     with open_board(context) as board:
         board.watchdog(Watchdog[action.name], after_ms)
-    say_watchdog(action, after_ms)
+    if as_json:
+        print_json({"watchdog": action, "watchdog_ms": after_ms})
+    else:
+        say_watchdog(action, after_ms)
 
 
 @app.command(cls=LineCommand)
 def status(
     context: typer.Context,
+    inventory: InventoryFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Show what a board does, and what went wrong since its reset."""
     from firmware_host.board.tables import status_table
 
-    with open_board(context) as board:
-        _show(status_table(board.status()), as_json)
+    if inventory is None:
+        with open_board(context) as board:
+            _show(status_table(board.status()), as_json)
+        return
+
+    def work(_: "Entry", board: "Board") -> tuple[str, dict[str, Any]]:
+        found = status_table(board.status())
+        faults = f", faults {', '.join(found['faults'])}" if found["faults"] else ""
+        return f"{found['state']}, {found['packets_sent']} packets sent{faults}", {"status": found}
+
+    _on_fleet(context, inventory, as_json, work)
 
 
 @app.command(cls=LineCommand)
@@ -307,30 +378,103 @@ def monitor(
     context: typer.Context,
     interval: Annotated[float, typer.Option(help="Seconds between lines.", min=0.01)] = 1.0,
     count: Annotated[int | None, typer.Option(help="End after so many lines.", min=1)] = None,
+    reconnect: Annotated[bool, typer.Option(help="Look for a board that is gone until it answers.")] = True,
+    inventory: InventoryFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show a line of status again and again, and keep the board's watchdog from acting; end with Ctrl-C."""
-    import itertools
-    import json
+    """Show a line of status again and again, and keep the board's watchdog from acting; end with Ctrl-C.
 
+    A board that is gone is looked for until it answers again.
+    """
+    from firmware_host.board.monitor import watch
+
+    if inventory is not None:
+        from firmware_host.board.fleet import read_entries
+
+        _beside_inventory(context, "interval", "count", "reconnect")
+        _watch_fleet(list(read_entries(inventory)), interval, count, reconnect, as_json)
+        return
+    line: BoardLine = context.obj
+    # Where no port is named the one that is found now is meant, whatever comes later.
+    named = line if line.port or line.replay else replace(line, port=line.found())
+    with contextlib.suppress(KeyboardInterrupt):
+        for seen in watch(named.open, interval, count, reconnect):
+            _print_seen(seen, {"port": named.port}, as_json)
+
+
+def _watch_fleet(
+    entries: "list[Entry]",
+    interval: float,
+    count: int | None,
+    reconnect: bool,
+    as_json: bool,
+    quiet: bool = False,
+) -> None:
+    """Watch all boards of an inventory until Ctrl-C, or until each has been seen `count` times.
+
+    Args:
+        entries: The boards.
+        interval: Seconds between two looks.
+        count: Looks at each board.
+        reconnect: Whether to look for a board that is gone.
+        as_json: Whether to print JSON.
+        quiet: Print only boards that go and come.
+    """
+    import threading
+    from concurrent.futures import ThreadPoolExecutor
+    from functools import partial
+
+    from firmware_host.board.fleet import board_of
+    from firmware_host.board.monitor import watch
+    from firmware_host.protocol.requests import StatusReply
+
+    ended, printing = threading.Event(), threading.Lock()
+
+    def one(entry: "Entry") -> None:
+        for seen in watch(partial(board_of, entry), interval, count, reconnect, reconnect, ended):
+            if quiet and isinstance(seen, StatusReply):
+                continue
+            with printing:
+                _print_seen(seen, {"id": entry.id, "port": entry.port}, as_json)
+
+    with ThreadPoolExecutor(len(entries)) as pool:
+        looks = [pool.submit(one, entry) for entry in entries]
+        try:
+            for look in looks:
+                look.result()
+        except KeyboardInterrupt:
+            return
+        finally:
+            ended.set()
+
+
+def _print_seen(seen: "StatusReply | Gone | Back", which: dict[str, Any], as_json: bool) -> None:
+    """A line of `monitor`: of a board that is there on stdout, of one that goes and comes on stderr."""
+    from evlcp_sdk.cli._complain import complain
+    from firmware_host.board.monitor import Back, Gone
     from firmware_host.board.tables import name_of, status_table
     from firmware_host.protocol.requests import State
 
-    with open_board(context) as board, contextlib.suppress(KeyboardInterrupt):
-        for n in itertools.count(1):
-            s = board.status()
-            if as_json:
-                typer.echo(json.dumps(status_table(s)))
-            else:
-                typer.echo(
-                    f"{s.uptime_ms / 1e3:10.1f} s  {name_of(State, s.state):12} packets {s.packets_sent:8}"
-                    f"  late {s.lateness_ticks:5} (max {s.lateness_max_ticks}) ticks"
-                    f"  errors crc {s.crc_errors} framing {s.framing_errors} overflow {s.overflow_errors}"
-                    f"  faults {s.faults:#04x}"
-                )
-            if n == count:
-                return
-            board.stay(interval, s)
+    name = which.get("id") or which["port"]
+    if isinstance(seen, Gone):
+        if as_json:
+            print_json(which | fault_table(seen.fault))
+        complain(f"{seen.fault}; it is looked for, end with Ctrl-C")
+    elif isinstance(seen, Back):
+        if as_json:
+            print_json(which | {"back_after_s": round(seen.after_s, 3)})
+        complain(f"{name}: answers again after {seen.after_s:.1f} s")
+    elif as_json:
+        print_json(which | status_table(seen))
+    else:
+        head = f"{name}  " if "id" in which else ""
+        typer.echo(
+            f"{head}{seen.uptime_ms / 1e3:10.1f} s  {name_of(State, seen.state):12}"
+            f" packets {seen.packets_sent:8}"
+            f"  late {seen.lateness_ticks:5} (max {seen.lateness_max_ticks}) ticks"
+            f"  errors crc {seen.crc_errors} framing {seen.framing_errors} overflow {seen.overflow_errors}"
+            f"  faults {seen.faults:#04x}"
+        )
 
 
 @app.command(cls=LineCommand)
@@ -342,37 +486,24 @@ def verify(
     seed: Seed = 0,
     link_file: LinkFile = None,
     overrides: Overrides = None,
+    inventory: InventoryFile = None,
+    as_json: AsJson = False,
 ) -> None:
     """Read the active bank back and compare it with a payload; ends with 7 if it differs.
 
     For example: [bold]evlcp board --port /dev/ttyUSB0 verify SYMBOLS.json[/]
     """
-    from firmware_host.errors import VerifyError
-    from firmware_host.protocol.requests import NO_BANK
+    if inventory is not None:
+        from firmware_host.board.fleet import raise_failures, read_inventory, verify_fleet
 
+        _beside_inventory(context)
+        raise_failures(inventory, verify_fleet(read_inventory(inventory), _report(as_json)))
+        return
     bank = _source.bank(symbols, random, masks, seed, link_file, overrides)
     with open_board(context) as board:
-        s = board.status()
-        again = "'evlcp board program' brings it there"
-        if s.active_bank == NO_BANK:
-            raise VerifyError(f"{board.session.name}: nothing is programmed; {again}")
-        _check_same_air(board, bank, s)
-        packet = bank.packet
-        shape = (s.format, s.packets, s.frames, s.pilot_every, s.length)
-        if shape != (bank.format, bank.packets, packet.frames, packet.pilot_every, len(bank.content)):
-            raise VerifyError(
-                f"{board.session.name}: holds {s.packets} packets of {s.frames} frames, pilot in every"
-                f" {s.pilot_every}, {s.length} bytes; expected {bank.packets} of {packet.frames},"
-                f" pilot in every {packet.pilot_every}, {len(bank.content)} bytes; {again}"
-            )
-        held = board.read(s.active_bank, 0, s.length)
-        differ = next((i for i, (a, b) in enumerate(zip(held, bank.content, strict=True)) if a != b), None)
-        if differ is not None:
-            raise VerifyError(
-                f"{board.session.name}: byte {differ} of bank {s.active_bank} is {held[differ]:#04x},"
-                f" expected {bank.content[differ]:#04x}; {again}"
-            )
-    typer.echo(f"same: {len(held)} bytes in bank {s.active_bank}, CRC {bank.crc:08x}")
+        number = board.verify(bank)
+    table = {"bytes": len(bank.content), "bank": number, "crc": f"{bank.crc:08x}"}
+    say(f"same: {len(bank.content)} bytes in bank {number}, CRC {bank.crc:08x}", table, as_json)
 
 
 @app.command("test-leds", cls=LineCommand)
@@ -382,6 +513,7 @@ def walk_leds(
     last: Annotated[int, typer.Option(help="Last LED.", min=0, max=95)] = 95,
     dwell_ms: Annotated[int, typer.Option(help="Time each LED is on, ms.", min=1, max=65535)] = 100,
     wait: Annotated[bool, typer.Option(help="Wait until the walk has ended.")] = True,
+    as_json: AsJson = False,
 ) -> None:
     """Light the LEDs one by one.
 
@@ -391,28 +523,41 @@ def walk_leds(
         board.test_leds(first, last, dwell_ms)
         if wait:
             board.wait_dark(10.0 + (last - first + 1) * dwell_ms * 2e-3)
+    say("", {"first": first, "last": last, "dwell_ms": dwell_ms}, as_json)
 
 
 @app.command(cls=LineCommand)
 def save(
     context: typer.Context,
     autostart: Annotated[bool, typer.Option(help="Recall and play after a reset.")] = False,
+    inventory: InventoryFile = None,
+    as_json: AsJson = False,
 ) -> None:
     """Save payload and settings to the board's flash; stop it first.
 
     For example: [bold]evlcp board --port /dev/ttyUSB0 save --autostart[/]
     """
-    with open_board(context) as board:
+
+    def work(_: "Entry | None", board: "Board") -> tuple[str, dict[str, Any]]:
         reply = board.save(autostart)
-    typer.echo(f"saved in slot {reply.slot}, number {reply.save_sequence}")
+        table = {"slot": reply.slot, "save_sequence": reply.save_sequence, "autostart": autostart}
+        return f"saved in slot {reply.slot}, number {reply.save_sequence}", table
+
+    if inventory is not None:
+        _on_fleet(context, inventory, as_json, work, "autostart")
+        return
+    with open_board(context) as board:
+        said, table = work(None, board)
+    say(said, table, as_json)
 
 
 @app.command(cls=LineCommand)
-def recall(context: typer.Context) -> None:
+def recall(context: typer.Context, as_json: AsJson = False) -> None:
     """Take payload and settings from the board's flash."""
     with open_board(context) as board:
         reply = board.recall()
-    typer.echo(f"recalled slot {reply.slot}, number {reply.save_sequence}")
+    table = {"slot": reply.slot, "save_sequence": reply.save_sequence}
+    say(f"recalled slot {reply.slot}, number {reply.save_sequence}", table, as_json)
 
 
 @app.command()
@@ -472,13 +617,14 @@ def emulate(
         raise ToolchainError(f"the {emulator} board ended with {code}; see its message above")
 
 
-@app.command()
+@app.command(cls=JsonCommand)
 def leds(
     record: Annotated[Path, typer.Argument(metavar="FILE", help="LED record of an emulator.")],
     chips: Annotated[
         Path, typer.Option(metavar="OUT.npy", help="Chips: uint8, one row per chip, one column per cluster.")
     ],
     per_led: Annotated[bool, typer.Option("--per-led", help="One column an LED instead.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Turn an LED record into a chip table; the ticks go into OUT.ticks.npy.
 
@@ -501,7 +647,7 @@ def leds(
         save_array(chips, table, outputs)
         save_array(chips.with_suffix(".ticks.npy"), played.ticks, outputs)
         outputs.commit()
-    typer.echo(f"{len(played)} chips")
+    say(f"{len(played)} chips", {"chips": len(played), "cut_bytes": played.cut_bytes}, as_json)
     if played.cut_bytes:
         raise InputError(
             f"{record}: the last record is cut off ({played.cut_bytes} bytes) and left out;"

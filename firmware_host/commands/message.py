@@ -1,16 +1,14 @@
 """`evlcp tx message` and `evlcp tx keygen`: messages to packets, chips and boards."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from evlcp_sdk.cli._common import LinkFile, Overrides
+from firmware_host.commands._json import AsJson, print_json, say
 from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, progress_bar, say_done
 from firmware_host.commands._output import save_array
-
-if TYPE_CHECKING:
-    from evlcp_sdk.scene.sites import BarSite
 
 __all__ = ["keygen", "message"]
 
@@ -81,6 +79,7 @@ def message(
     from evlcp_sdk.plugin.registry import Registry
     from firmware_host.board.bank import bank_of
     from firmware_host.board.board import Settings, provision
+    from firmware_host.board.sites import site_that_sends
     from firmware_host.board.symbols import symbols_table
 
     link = load_link(link_file, overrides or [], Registry.load())
@@ -94,7 +93,7 @@ def message(
         link,
         text=text,
         data=None if file is None else _read(file),
-        beacon=None if beacon is None else _site(beacon, transmitter_id),
+        beacon=None if beacon is None else site_that_sends(beacon, transmitter_id, "--id"),
         user=user.encode(),
         key=key,
         transmitter_id=transmitter_id,
@@ -128,7 +127,7 @@ def message(
     }
     if port is None:
         if as_json:
-            typer.echo(json.dumps(summary | {"board": None} | table))
+            print_json(summary | {"board": None} | table)
             return
         _tell(summary, written, plays=False)
         if not written:
@@ -139,7 +138,7 @@ def message(
         with progress_bar("programming") as progress:
             programmed = provision(board, bank, Settings(), True, progress)
         if as_json:
-            typer.echo(json.dumps(summary | {"board": dataclasses.asdict(programmed)} | table))
+            print_json(summary | {"board": dataclasses.asdict(programmed)} | table)
         else:
             _tell(summary, written, plays=True)
             say_done(programmed, as_json=False)
@@ -162,6 +161,7 @@ def _tell(summary: dict[str, Any], written: list[str], plays: bool) -> None:
 
 def keygen(
     private: Annotated[Path, typer.Argument(metavar="private.pem", help="Where the private key goes.")],
+    as_json: AsJson = False,
 ) -> None:
     """Make an Ed25519 key that signs beacons; print the public key, for messages.trusted_keys.
 
@@ -169,22 +169,8 @@ def keygen(
     """
     from evlcp_sdk.air.signing import make_key
 
-    typer.echo(make_key(private))
-
-
-def _site(path: Path, transmitter_id: int | None) -> "BarSite":
-    """The bar of a file of sites that sends."""
-    from evlcp_sdk.errors import ConfigError
-    from evlcp_sdk.scene.sites import load_sites
-
-    sites = load_sites(path)
-    ids = ", ".join(str(s.transmitter_id) for s in sites)
-    if transmitter_id is None and len(sites) > 1:
-        raise ConfigError(f"{path}: {len(sites)} bars: choose one with --id, of {ids}")
-    chosen = [s for s in sites if transmitter_id in (None, s.transmitter_id)]
-    if not chosen:
-        raise ConfigError(f"{path}: no bar has transmitter_id {transmitter_id}, but {ids}")
-    return chosen[0]
+    public = make_key(private)
+    say(public, {"public_key": public}, as_json)
 
 
 def _read(path: Path) -> bytes:

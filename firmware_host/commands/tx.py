@@ -8,6 +8,7 @@ import typer
 
 from evlcp_sdk.cli._common import LinkFile, Overrides
 from firmware_host.commands import _source
+from firmware_host.commands._json import AsJson, JsonCommand, print_json
 from firmware_host.commands._output import save_array
 from firmware_host.commands._source import RandomPackets, Seed, SymbolsFile
 from firmware_host.commands.message import keygen, message
@@ -23,8 +24,8 @@ __all__ = ["app"]
 app = typer.Typer(
     no_args_is_help=True, rich_markup_mode="rich", help="Make, show and check what goes on air."
 )
-app.command()(message)
-app.command()(keygen)
+app.command(cls=JsonCommand)(message)
+app.command(cls=JsonCommand)(keygen)
 
 
 class Form(StrEnum):
@@ -137,14 +138,14 @@ def _json(symbols: "NDArray[np.int64]", link: "Link") -> str:
 _FORMS = {Form.TABLE: _table, Form.HEX: _hex, Form.C: _c, Form.JSON: _json}
 
 
-@app.command()
+@app.command(cls=JsonCommand)
 def check(
     symbols: SymbolsFile = None,
     random: RandomPackets = None,
     seed: Seed = 0,
     link_file: LinkFile = None,
     overrides: Overrides = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Check balance and flicker: on-share, longest run, lines below 3 kHz against IEEE Std 1789-2015.
 
@@ -159,9 +160,7 @@ def check(
     chip_rate = link.packet.chip_rate_hz
     rows = measure(symbol_chips(sent, link.codebook, link.packet.pilot_every), chip_rate)
     if as_json:
-        import json
-
-        typer.echo(json.dumps({"chip_rate_hz": chip_rate, "clusters": [r.to_dict() for r in rows]}))
+        print_json({"chip_rate_hz": chip_rate, "clusters": [r.to_dict() for r in rows]})
     else:
         typer.echo("cluster  on-share  longest-run  worst-line  modulation  no-effect bound  verdict")
         for r in rows:

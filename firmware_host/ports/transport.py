@@ -1,6 +1,7 @@
 """Byte lines to a board: serial ports, sockets, traces.
 
-A port is named by a device or any pyserial URL, or by `unix:PATH` or `tcp:HOST:PORT`.
+A port is named by a device or any pyserial URL, by `usb:VID:PID` or `usb:VID:PID:SERIAL`, by `unix:PATH` or
+`tcp:HOST:PORT`.
 """
 
 import contextlib
@@ -15,6 +16,8 @@ from typing import Any, Protocol
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.files import open_log, output_fault
 from firmware_host.errors import LineError, NoBoardError
+from firmware_host.ports.serial_port import SerialTransport
+from firmware_host.ports.usb import device_of
 from firmware_host.protocol.requests import DEFAULT_BAUD
 
 __all__ = [
@@ -86,6 +89,8 @@ class SocketTransport:
         scheme, _, place = spec.partition(":")
         try:
             if scheme == "unix":
+                if not hasattr(socket, "AF_UNIX"):
+                    raise ValueError("this system has no unix sockets")
                 connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
                 connected.settimeout(5.0)
                 try:
@@ -137,57 +142,6 @@ class SocketTransport:
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
-
-
-class SerialTransport:
-    """Anything that pyserial opens: a device, `socket://`, `rfc2217://`, `loop://` and so on."""
-
-    _SLICE_S = 0.005
-
-    def __init__(self, url: str, baud: int) -> None:
-        import serial
-
-        self.name = url
-        try:
-            options: dict[str, Any] = {} if "://" in url else {"exclusive": True}
-            self._port = serial.serial_for_url(
-                url, baudrate=baud, timeout=self._SLICE_S, write_timeout=5.0, **options
-            )
-        except (OSError, ValueError) as fault:
-            raise NoBoardError(
-                f"{url}: cannot be opened: {fault}; 'evlcp board ports' lists the ports"
-            ) from fault
-
-    def now(self) -> float:
-        """Monotonic time, s."""
-        return time.monotonic()
-
-    def read(self, timeout_s: float) -> bytes:
-        """See `Transport.read`."""
-        end = time.monotonic() + timeout_s
-        try:
-            while True:
-                data = bytes(self._port.read(max(1, self._port.in_waiting)))
-                if data or time.monotonic() >= end:
-                    return data
-        except (OSError, TypeError) as fault:
-            # pyserial raises TypeError when another thread closes the port under a read
-            raise LineError(
-                f"{self.name}: the line broke: {fault}; plug it in and run the command again"
-            ) from fault
-
-    def write(self, data: bytes) -> None:
-        """See `Transport.write`."""
-        try:
-            self._port.write(data)
-        except OSError as fault:
-            raise LineError(
-                f"{self.name}: the line broke: {fault}; plug it in and run the command again"
-            ) from fault
-
-    def close(self) -> None:
-        """Close the port."""
-        self._port.close()
 
 
 class TraceTransport:
@@ -336,6 +290,7 @@ def open_transport(spec: str, baud: int = DEFAULT_BAUD) -> Transport:
     Raises:
         NoBoardError: It cannot be opened.
     """
-    if spec.partition(":")[0] in ("unix", "tcp"):
+    scheme, _, rest = spec.partition(":")
+    if scheme in ("unix", "tcp"):
         return SocketTransport.connect(spec)
-    return SerialTransport(spec, baud)
+    return SerialTransport(device_of(rest) if scheme == "usb" else spec, baud)

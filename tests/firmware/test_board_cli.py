@@ -269,10 +269,11 @@ def test_pty_and_tcp(cli, tmp_path: Path) -> None:
 def test_ports_are_asked(native: str, tmp_path: Path) -> None:
     from firmware_host.board.survey import find, survey
     from firmware_host.errors import NoBoardError
+    from firmware_host.ports.usb import SerialPort
 
     silent, other = pty.openpty()
     tty.setraw(other)
-    listed = [(os.ttyname(other), "silent"), (native, "a board"), ("/dev/nowhere", "gone")]
+    listed = [SerialPort(p, usb="0403:6015") for p in (os.ttyname(other), native, "/dev/nowhere")]
     found = survey(1_000_000, listed)
     assert [f.about is not None for f in found] == [False, True, False]
     assert find(1_000_000, listed) == native
@@ -280,7 +281,7 @@ def test_ports_are_asked(native: str, tmp_path: Path) -> None:
         find(1_000_000, [listed[0], listed[2]])
     second = Emulated("native", "--listen", f"unix:{tmp_path / 'second'}")
     with pytest.raises(NoBoardError, match="2 boards answer"):
-        find(1_000_000, [listed[1], (f"unix:{tmp_path / 'second'}", "another")])
+        find(1_000_000, [listed[1], SerialPort(f"unix:{tmp_path / 'second'}", usb="0403:6015")])
     second.end()
     os.close(silent)
     os.close(other)
@@ -310,7 +311,8 @@ def test_host_processes_killed(native: str, tmp_path: Path, book: Codebook, cli)
 
 def test_board_that_hangs_up_is_told(cli, tmp_path: Path) -> None:
     emulated = Emulated("native", "--listen", f"unix:{tmp_path / 'b'}")
-    command = [*EVLCP, "board", "monitor", "--interval", "0.05", "--port", f"unix:{tmp_path / 'b'}"]
+    options = ("--interval", "0.05", "--no-reconnect", "--port", f"unix:{tmp_path / 'b'}")
+    command = [*EVLCP, "board", "monitor", *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     process.stdout.readline()

@@ -25,12 +25,24 @@ def test_commands_run(cli, block: str, tmp_path: Path) -> None:
 
 
 def test_inventory_is_valid(tmp_path: Path) -> None:
+    pytest.importorskip("cryptography", reason="the extra sign is not installed")
+    from evlcp_sdk.air.signing import make_key
+
     (tmp_path / "t01.json").write_text(str([[[0] * 16] * 10]))
     (tmp_path / "link.toml").write_text("[air]\npilot_every = 4\n")
+    (tmp_path / "site.toml").write_text(
+        "[[bar]]\ntransmitter_id = 3\nlatitude_deg = 35.0\nlongitude_deg = 137.0\nheight_m = 50.0\n"
+    )
+    make_key(tmp_path / "private.pem")
     (tmp_path / "tunnel.toml").write_text(blocks("toml")[0])
     boards = read_inventory(tmp_path / "tunnel.toml").boards
-    assert [(e.id, e.level_ma, b.packets) for e, b in boards] == [("T01", 20, 1), ("T02", 20, 16)]
-    assert [bank.packet.pilot_every for _, bank in boards] == [1, 4]
+    # beacon, signature (two packets) and text
+    assert [(e.id, e.level_ma, b.packets) for e, b in boards] == [
+        ("T01", 20, 1),
+        ("T02", 20, 16),
+        ("T03", 20, 4),
+    ]
+    assert [bank.packet.pilot_every for _, bank in boards] == [1, 4, 4]
 
 
 def test_file_of_symbols_is_one(evlcp, tmp_path: Path) -> None:

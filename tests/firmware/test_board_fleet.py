@@ -127,7 +127,7 @@ GOOD = 'id = "a"\nport = "native:"\nposition_m = [0, 0, 0]\nrandom = 1\n'
         ("", "expected at least one [[board]]"),
         ("[other]\n", "other: unknown table"),
         ("defaults = 3\n[[board]]\n" + GOOD, "defaults = 3"),
-        ("[[board]]\n" + GOOD.replace("random = 1", ""), "give payload or random"),
+        ("[[board]]\n" + GOOD.replace("random = 1", ""), "give payload or random or a message"),
         ("[[board]]\n" + GOOD + 'colour = "red"', 'board[0].colour = "red": unknown key'),
         ("[[board]]\n" + GOOD.replace("[0, 0, 0]", "[0, 0]"), "board[0].position_m = [0, 0]"),
         ("[[board]]\n" + GOOD.replace("[0, 0, 0]", "[0, 0, nan]"), "board[0].position_m.2"),

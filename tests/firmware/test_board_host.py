@@ -121,7 +121,7 @@ def test_a_bank_that_does_not_hold_is_not_blamed_on_the_rate(book: Codebook) -> 
 def test_a_url_without_a_port_is_one_line(evlcp: Callable[..., object], url: str) -> None:
     done = evlcp("board", "hello", "--port", url)
     assert done.code == 4
-    assert "cannot be opened" in done.err
+    assert f"cannot be opened: expected {url.split(':')[0]}://HOST:PORT" in done.err
     assert done.err.count("\n") == 1
 
 

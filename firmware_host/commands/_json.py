@@ -1,0 +1,58 @@
+"""Commands with `--json`: what goes wrong is JSON on stdout, too, beside the line on stderr."""
+
+import json
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+__all__ = ["AsJson", "JsonCommand", "fault_table", "print_json", "say"]
+
+AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, also of what goes wrong.")]
+
+
+def print_json(value: Any) -> None:
+    """Print a value as one line of JSON."""
+    typer.echo(json.dumps(value))
+
+
+def say(text: str, table: dict[str, Any], as_json: bool) -> None:
+    """What a command has done: a line for a person, or JSON."""
+    if as_json:
+        print_json(table)
+    elif text:
+        typer.echo(text)
+
+
+def fault_table(fault: BaseException) -> dict[str, Any]:
+    """What went wrong, as plain values: kind, exit code, message."""
+    from evlcp_sdk.errors import explained
+
+    message, code = explained(fault)
+    return {"error": {"kind": type(fault).__name__, "exit_code": code, "message": message}}
+
+
+class JsonCommand(TyperCommand):
+    """A command that prints `{"error": ...}` on stdout where it fails and was asked for JSON."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> Any:
+        """Parse; a fault of usage is JSON, too."""
+        wanted = "--json" in args
+        try:
+            return super().parse_args(ctx, args)
+        except Exception as fault:
+            if wanted and hasattr(fault, "format_message"):
+                said = fault.format_message()
+                print_json({"error": {"kind": "UsageError", "exit_code": 2, "message": said}})
+            raise
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run; a fault is JSON, too, unless stdout itself failed."""
+        try:
+            return super().invoke(ctx)
+        except (typer.Exit, typer.Abort):
+            raise
+        except Exception as fault:
+            if ctx.params.get("as_json") and not (isinstance(fault, OSError) and fault.filename is None):
+                print_json(fault_table(fault))
+            raise

@@ -1,0 +1,125 @@
+"""Serial ports of this machine with their USB ids, and which of them may have a board."""
+
+import re
+from dataclasses import dataclass
+
+from evlcp_sdk.errors import ConfigError
+from firmware_host.errors import NoBoardError
+
+__all__ = ["BRIDGES", "SerialPort", "UsbFilter", "device_of", "serial_ports"]
+
+BRIDGES = {
+    "0403:6001": "FTDI FT232R",
+    "0403:6010": "FTDI FT2232",
+    "0403:6011": "FTDI FT4232",
+    "0403:6014": "FTDI FT232H",
+    "0403:6015": "FTDI FT-X",
+    "0483:374b": "ST-LINK/V2-1",
+    "0483:374e": "ST-LINK/V3",
+    "0483:374f": "ST-LINK/V3",
+    "0483:3753": "ST-LINK/V3",
+    "10c4:ea60": "Silicon Labs CP210x",
+    "1a86:55d4": "WCH CH9102",
+    "1a86:7523": "WCH CH340",
+    "2e8a:000c": "Raspberry Pi Debug Probe",
+}
+"""USB ids of the bridges that boards usually have: unless told otherwise, only these ports are written to."""
+
+
+@dataclass(frozen=True)
+class SerialPort:
+    """A serial port.
+
+    Attributes:
+        device: Name to give to `--port`.
+        description: What the operating system says of it.
+        usb: USB id `vvvv:pppp` in hex, or None.
+        serial_number: The USB device's serial number, or None.
+    """
+
+    device: str
+    description: str = ""
+    usb: str | None = None
+    serial_number: str | None = None
+
+    @property
+    def likely(self) -> bool:
+        """Whether it is a bridge that boards usually have."""
+        return self.usb in BRIDGES
+
+
+@dataclass(frozen=True)
+class UsbFilter:
+    """USB devices by id and serial number.
+
+    Attributes:
+        vendor: Vendor id, four hex digits.
+        product: Product id, four hex digits; None for any.
+        serial_number: Serial number; None for any.
+
+    >>> UsbFilter.parse("0403:6015:D30A1").takes(SerialPort("COM7", "", "0403:6015", "D30A1"))
+    True
+    """
+
+    vendor: str
+    product: str | None = None
+    serial_number: str | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> "UsbFilter":
+        """Read `VID`, `VID:PID` or `VID:PID:SERIAL`.
+
+        Raises:
+            ConfigError: It is none of these.
+        """
+        found = re.fullmatch(r"([0-9a-fA-F]{4})(?::([0-9a-fA-F]{4})(?::(.+))?)?", text)
+        if found is None:
+            raise ConfigError(f"USB id {text!r}: expected VID, VID:PID or VID:PID:SERIAL, such as 0403:6015")
+        vendor, product, serial = found.groups()
+        return cls(vendor.lower(), product.lower() if product else None, serial)
+
+    def takes(self, port: SerialPort) -> bool:
+        """Whether a port is one of these."""
+        if port.usb is None:
+            return False
+        vendor, _, product = port.usb.partition(":")
+        return (
+            vendor == self.vendor
+            and self.product in (None, product)
+            and self.serial_number in (None, port.serial_number)
+        )
+
+
+def serial_ports() -> list[SerialPort]:
+    """Serial ports of this machine, by name; nothing is opened or written."""
+    from serial.tools.list_ports import comports
+
+    return sorted(
+        (
+            SerialPort(
+                p.device,
+                p.description or "",
+                None if p.vid is None or p.pid is None else f"{p.vid:04x}:{p.pid:04x}",
+                p.serial_number or None,
+            )
+            for p in comports()
+        ),
+        key=lambda port: port.device,
+    )
+
+
+def device_of(text: str) -> str:
+    """The device of the one serial port with a USB id, `VID`, `VID:PID` or `VID:PID:SERIAL`.
+
+    Raises:
+        ConfigError: It is no USB id.
+        NoBoardError: There is none, or there are several.
+    """
+    wanted = UsbFilter.parse(text)
+    found = [port for port in serial_ports() if wanted.takes(port)]
+    if len(found) == 1:
+        return found[0].device
+    if not found:
+        raise NoBoardError(f"usb:{text}: no serial port has this USB id; 'evlcp board ports' lists them")
+    names = ", ".join(f"{p.device} (serial number {p.serial_number})" for p in found)
+    raise NoBoardError(f"usb:{text}: {len(found)} ports have it: {names}; give VID:PID:SERIAL")
