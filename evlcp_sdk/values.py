@@ -125,6 +125,11 @@ class Events:
 
     def __getitem__(self, rows: Any) -> "Events":
         """The events of a slice or a mask (a view for a slice)."""
+        if isinstance(rows, slice):
+            # Columns of one type and length stay so.
+            part = object.__new__(Events)
+            vars(part).update(t_us=self.t_us[rows], x=self.x[rows], y=self.y[rows], p=self.p[rows])
+            return part
         return Events(self.t_us[rows], self.x[rows], self.y[rows], self.p[rows])
 
 

@@ -1,5 +1,6 @@
 """Loops over events, compiled."""
 
+from math import exp, sqrt
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,17 @@ Array = NDArray[Any]
 
 
 @njit(cache=True, nogil=True)
-def all_ordered(t_us: Array, x: Array, y: Array, width: int, height: int) -> bool:
-    """Whether no event is off the sensor or before its predecessor; without a branch, so that it is quick."""
+def all_ordered(t_us: Array, x: Array, y: Array, width: int, height: int, origin: int, since: Array) -> bool:
+    """Whether no event is off the sensor or before its predecessor; times since an origin.
+
+    Without a branch, so that it is quick.
+    """
     bad = 0
     for i in range(1, t_us.size):
         bad += int(t_us[i] < t_us[i - 1])
     for i in range(t_us.size):
         bad += int(x[i] >= width) | int(y[i] >= height)
+        since[i] = t_us[i] - origin
     return bad == 0
 
 
@@ -376,8 +381,13 @@ def fit_rows(counts: Array, chips: Array, chip_steps: int, fit: Array) -> None:
 
 @njit(cache=True, nogil=True)
 def blobs(selected: Array, at: Array, cluster: Array, cells: Array) -> int:
-    """Connected cells (8 neighbours) of each cluster: mean column + row * 1j, cluster, number; how many."""
+    """Connected cells (8 neighbours) of each cluster, most first: mean column + row * 1j, cluster, number.
+
+    Of as many cells, in the order of clusters, rows and columns. It returns how many there are.
+    """
     clusters, rows, columns = selected.shape
+    some = np.empty(at.size, np.complex128)
+    of = np.empty((2, at.size), np.int64)
     done = np.zeros((rows, columns), np.bool_)
     stack = np.empty((rows * columns, 2), np.int64)
     n = 0
@@ -402,10 +412,20 @@ def blobs(selected: Array, at: Array, cluster: Array, cells: Array) -> int:
                                 done[v, u] = True
                                 stack[top, 0], stack[top, 1] = v, u
                                 top += 1
-                at[n] = complex(right / count, down / count)
-                cluster[n] = k
-                cells[n] = count
+                some[n] = complex(right / count, down / count)
+                of[0, n], of[1, n] = k, count
                 n += 1
+    # Where those of a number of cells begin, behind those with more.
+    most = of[1, :n].max() if n else 0
+    begin = np.zeros(most + 2, np.int64)
+    for i in range(n):
+        begin[most - of[1, i] + 1] += 1
+    for size in range(most):
+        begin[size + 1] += begin[size]
+    for i in range(n):
+        place = begin[most - of[1, i]]
+        begin[most - of[1, i]] += 1
+        at[place], cluster[place], cells[place] = some[i], of[0, i], of[1, i]
     return n
 
 
@@ -1017,6 +1037,40 @@ def bend_of(place: Array, uneven: Array, sums: Array, least: float) -> tuple[flo
 
 
 @njit(cache=True, nogil=True)
+def mean_length(
+    sine: Array, likely: Array, seen: float, sigma: float, along: float, across: float
+) -> tuple[float, float]:
+    """Mean and variance of a leaning bar's foreshortening, by what is likely of its sines and what was seen.
+
+    Args:
+        sine: Sines of leans, float64 (n,).
+        likely: How likely each is before, float64 (n,).
+        seen: The sine that was measured, NaN for none.
+        sigma: Its standard deviation.
+        along: Of the sight.
+        across: Of the sight.
+    """
+    chance = likely
+    if not np.isnan(seen):
+        chance = np.empty(sine.size)
+        for i in range(sine.size):
+            off = (sine[i] - seen) / sigma
+            chance[i] = likely[i] * exp(-0.5 * min(off * off, 1400.0))
+        if not chance.sum() > 0:
+            # A bend that no lean makes says nothing of one.
+            chance = likely
+    total, mean, square = 0.0, 0.0, 0.0
+    for i in range(sine.size):
+        flat = max(1 - sine[i] * sine[i] * (1 + across * across), 0.0)
+        length = sqrt(flat) + along * sine[i]
+        total += chance[i]
+        mean += chance[i] * length
+        square += chance[i] * length * length
+    mean /= total
+    return mean, max(square / total - mean * mean, 0.0)
+
+
+@njit(cache=True, nogil=True)
 def farthest_off(selected: Array, grid: int, on: complex, turn: complex) -> float:
     """Farthest that the middle of a cell of any cluster lies off the line through `on` along `turn`, px."""
     clusters, rows, columns = selected.shape
@@ -1040,6 +1094,41 @@ def keep_inside(prior: Array, probability: Array, selected: Array, out: Array, c
                 inside = prior[k, r, c] > 0
                 out[k, r, c] = probability[k, r, c] if inside else 0.0
                 chosen[k, r, c] = selected[k, r, c] and inside
+
+
+@njit(cache=True, nogil=True)
+def mask(
+    probability: Array,
+    selected: Array,
+    pixels: Array,
+    seen: Array,
+    places: Array,
+    unit: complex,
+    spacing: float,
+    grid: int,
+    bins: int,
+    edge: float,
+    prior: Array,
+    out: Array,
+    chosen: Array,
+    near: Array,
+) -> None:
+    """Presence with a layout's place taken in: `prior`, probability `out`, choice, pixels `near` a place.
+
+    Of a line, whose width shows within `bins` px from its axis and is that at `edge` of its peak; of a
+    layout of squares where there are none.
+    """
+    across = spacing
+    if bins:
+        hits, cells, profile = np.zeros(bins), np.zeros(bins), np.empty(bins)
+        across_profile(probability, seen, places, unit, spacing, grid, hits, cells)
+        wide = core_profile(hits, cells, edge, profile)
+        across = float(wide)
+        line_prior(places, unit, spacing, grid, profile[:wide], prior)
+    else:
+        block_prior(places, unit, spacing, grid, prior)
+    copy_near(pixels, places, unit, spacing, across, near)
+    keep_inside(prior, probability, selected, out, chosen)
 
 
 @njit(cache=True, nogil=True)

@@ -101,10 +101,12 @@ class CameraClock:
             and not self._state[3]
             and int(t_us[0]) - int(self._state[0]) >= 0
             and int(t_us[-1]) - int(self._state[0]) <= LEAP_US
-            and _kernels.all_ordered(t_us, x, y, *self._size)
         ):
-            self._state[0] = t_us[-1]
-            return [self._inside(events)]
+            inside_us = np.empty(len(t_us), np.int64)
+            if _kernels.all_ordered(t_us, x, y, *self._size, self._offset_us, inside_us):
+                self._state[0] = t_us[-1]
+                self.last_us = int(inside_us[-1])
+                return [Events(inside_us, x, y, events.p)]
         return self._sorted(events)
 
     def close(self) -> None:

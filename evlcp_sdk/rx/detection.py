@@ -118,10 +118,21 @@ class Followed:
         """Centre (column, row) at times, interpolated; straight on for a little before and after, px."""
         # Those about the times asked for, which are few of many.
         first, last = float(t_us.min(initial=math.inf)), float(t_us.max(initial=-math.inf))
-        times = [r.t_us for r in self.positions]
-        start, stop = max(bisect_left(times, first) - 2, 0), bisect_left(times, last) + 2
-        near = list(self.positions)[start:stop]
-        t, x, y = times[start:stop], [r.x_px for r in near], [r.y_px for r in near]
+        t: list[float] = []
+        x: list[float] = []
+        y: list[float] = []
+        before = 0
+        for place in reversed(self.positions):
+            if len(t) == 2 and place.t_us >= last:
+                # Two before the newest are at or after the last time asked for.
+                del t[0], x[0], y[0]
+            t.append(place.t_us)
+            x.append(place.x_px)
+            y.append(place.y_px)
+            before += place.t_us < first
+            if before == 2:
+                break
+        t, x, y = t[::-1], x[::-1], y[::-1]
         if len(t) > 1:
             # A place more at each end, on the straight line through the outermost two.
             n = _MOST_AHEAD_STEPS
@@ -344,7 +355,9 @@ class RegionFollower:
         expected = self._position.predict(followed.filter, t_us) if self._position else None
         if expected is None:
             return followed.expected(t_us)
-        return replace(followed.latest, x_px=float(expected[0][0]), y_px=float(expected[0][1]))
+        last = followed.latest
+        x_px, y_px = float(expected[0][0]), float(expected[0][1])
+        return Region(last.id, last.t_us, x_px, y_px, last.width_px, last.height_px)
 
     def _whole(self, followed: Followed, measured: Region, top: int, rows: NDArray[np.int64]) -> Region:
         """A region of the height that it lately had; `rows`: its pixels in each row from `top` on.
@@ -376,9 +389,8 @@ class RegionFollower:
         else:
             slack_px = abs(excess_px) / 2
             y_px = measured.y_px + min(max(expected_px - measured.y_px, -slack_px), slack_px)
-        if known is not None:
-            return replace(measured, y_px=y_px, width_px=known[0], height_px=known[1])
-        return replace(measured, y_px=y_px, height_px=height_px + min(max(excess_px, 0.0), _STRAY_PX))
+        size_px = known or (measured.width_px, height_px + min(max(excess_px, 0.0), _STRAY_PX))
+        return Region(measured.id, measured.t_us, measured.x_px, y_px, *size_px)
 
     def _filtered(self, followed: Followed, measured: Region) -> Region:
         if self._position is None:
@@ -387,7 +399,8 @@ class RegionFollower:
         followed.filter, centre, _ = self._position.step(
             followed.filter, measured.t_us, centre, _CENTRE_SIGMA_PX
         )
-        return replace(measured, x_px=float(centre[0]), y_px=float(centre[1]))
+        x_px, y_px = float(centre[0]), float(centre[1])
+        return Region(measured.id, measured.t_us, x_px, y_px, measured.width_px, measured.height_px)
 
     def _reach(self, region: Region) -> Box:
         """The box in which a region's events lie within the next step; an empty one off the sensor."""

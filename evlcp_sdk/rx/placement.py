@@ -170,10 +170,11 @@ def placements(
         if found and best.cells < _OTHER_CELLS * found[0].cells:
             break
         found.append(best)
-        blobs = _left(blobs, layout, best, slack_px)
+        left = _left(blobs, layout, best, slack_px)
         # Most images show one bar; what is left of them needs no vote.
-        if blobs.cells.sum() < _OTHER_CELLS * found[0].cells:
+        if blobs.cells @ left < _OTHER_CELLS * found[0].cells:
             break
+        blobs = blobs[left]
     return found
 
 
@@ -195,22 +196,24 @@ def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> Prese
     spacing_px = abs(placement.scale) * layout.spacing_m
     places = placement.places(layout)
     grid = presence.grid_px
-    prior = np.zeros_like(presence.probability)
-    pixels = np.zeros_like(presence.pixels)
-    across_px = spacing_px
-    if layout.line:
-        hits, cells = np.zeros((2, math.ceil(spacing_px + _WIDEST_PX)))
-        seen, probability = placement.seen, presence.probability
-        _kernels.across_profile(probability, seen, places, unit, spacing_px, grid, hits, cells)
-        profile = np.empty(len(hits))
-        profile = profile[: _kernels.core_profile(hits, cells, _EDGE, profile)]
-        across_px = float(len(profile))
-        _kernels.line_prior(places, unit, spacing_px, grid, profile, prior)
-    else:
-        _kernels.block_prior(places, unit, spacing_px, grid, prior)
-    _kernels.copy_near(presence.pixels, places, unit, spacing_px, across_px, pixels)
+    pixels, prior = np.zeros_like(presence.pixels), np.zeros_like(presence.probability)
     probability, selected = np.empty_like(presence.probability), np.empty_like(presence.selected)
-    _kernels.keep_inside(prior, presence.probability, presence.selected, probability, selected)
+    _kernels.mask(
+        presence.probability,
+        presence.selected,
+        presence.pixels,
+        placement.seen,
+        places,
+        unit,
+        spacing_px,
+        grid,
+        math.ceil(spacing_px + _WIDEST_PX) if layout.line else 0,
+        _EDGE,
+        prior,
+        probability,
+        selected,
+        pixels,
+    )
     return PresenceMap(probability, grid, selected, pixels, prior)
 
 
@@ -235,7 +238,8 @@ def lit(
     _kernels.pilot_light(sums, pilots, presence.prior, presence.grid_px, light)
     others = [v for v, in_place in zip(light.tolist(), placement.seen.tolist(), strict=True) if in_place]
     seen = light >= max(_LEAST_LIGHT * median(others) if others else 0.0, 1e-9)
-    placement = replace(placement, seen=seen)
+    placed = placement
+    placement = Placement(placed.scale, placed.shift, placed.mirrored, seen, placed.cells, placed.chance)
     if seen.all():
         return presence, placement
     dark = ~seen
@@ -259,9 +263,8 @@ def _blobs_of(presence: PresenceMap) -> _Blobs:
     most = int(np.count_nonzero(selected))
     at, cluster, cells = np.empty(most, np.complex128), np.empty(most, np.int64), np.empty(most, np.int64)
     n = _kernels.blobs(selected, at, cluster, cells)
-    order = np.argsort(-cells[:n], kind="stable")
     grid = presence.grid_px
-    return _Blobs(at[order] * grid + (grid - 1) / 2 * (1 + 1j), cluster[order], cells[order])
+    return _Blobs(at[:n] * grid + (grid - 1) / 2 * (1 + 1j), cluster[:n], cells[:n])
 
 
 def _voted(blobs: _Blobs, layout: Layout, slack_px: float, before: Placement | None) -> Placement | None:
@@ -335,11 +338,11 @@ def _at_least(hits: int, of: int, odds: float) -> float:
     return float(sum(math.comb(of, n) * odds**n * (1 - odds) ** (of - n) for n in range(hits, of + 1)))
 
 
-def _left(blobs: _Blobs, layout: Layout, placement: Placement, slack_px: float) -> _Blobs:
-    """Blobs that a placement has not used up: neither in the clusters' places, nor elsewhere in the bar."""
+def _left(blobs: _Blobs, layout: Layout, placement: Placement, slack_px: float) -> NDArray[np.bool_]:
+    """Which blobs a placement has not used up: neither in the clusters' places, nor elsewhere in the bar."""
     from evlcp_sdk.rx import _kernels
 
     reach = abs(placement.scale) * layout.spacing_m / 2 + slack_px
     left = np.empty(len(blobs.at), np.bool_)
     _kernels.out_of_reach(blobs.at, placement.places(layout), reach, left)
-    return blobs[left]
+    return left

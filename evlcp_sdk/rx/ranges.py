@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.scene.lean import BarSight, foreshortening
+from evlcp_sdk.scene.lean import BarSight
 from evlcp_sdk.values import Bend, Range
 
 __all__ = ["RangeKeeper", "Ranges"]
@@ -29,9 +29,9 @@ _OUTLIER = 4.0
 _LEAST_SIGMA = 1e-6
 """Of the distance: ideal images have less, which says nothing of anything."""
 
-_LEVEL_DEG, _LEANING_DEG, _LEANING_SHARE = 0.7, 6.0, 0.02
+_LEVEL_DEG, _LEANING_DEG, _LEANING_SHARE = 0.7, 5.0, 0.05
 """What is likely of a bar's lean before it is measured: none but for a mount's error and the car's springs
-(sigma), and of one camera in fifty, whose mount nobody levelled, anything up to the steepest. With more of
+(sigma), and of one camera in twenty, whose mount nobody levelled, anything up to the steepest. With more of
 these, sigmas of level bars far away are too large; with fewer, those of leaning ones too small for longer."""
 
 _TILT_MEMORY_S = 1.0
@@ -119,23 +119,17 @@ class RangeKeeper:
 
     def _leaning(self, sums: Floats, newest: Bend | None, sight: BarSight) -> tuple[float, float]:
         """Mean and variance of the foreshortening, by what is likely and by what was seen."""
+        from evlcp_sdk.rx import _kernels
+
         likely, sine, told = self._likely, self._sine, 0.0
         if sight.sine is not None:
             told = sight.sine
             sine = np.sin(math.asin(told) + np.radians(self._lean_deg))
             sigma_deg = math.degrees(sight.sigma / math.sqrt(max(1 - told**2, sight.sigma**2)))
             likely = self._mixture(sigma_deg, _SLANTED_SHARE)
-        chance = likely
         seen = None if newest is None else _parabola(newest, sums)
-        if seen is not None:
-            chance = chance * _bell(sine - told - seen[0], seen[1])
-        total = float(chance.sum())
-        if not total > 0:
-            # A bend that no lean makes says nothing of one.
-            chance, total = likely, float(likely.sum())
-        length = foreshortening(sine, sight)
-        mean = float(chance @ length) / total
-        return mean, max(float(chance @ length**2) / total - mean**2, 0.0)
+        off, sigma = seen or (math.nan, 1.0)
+        return _kernels.mean_length(sine, likely, told + off, sigma, sight.along, sight.across)
 
     def _mixture(self, sigma_deg: float, share: float) -> Floats:
         """Chances of the leans of the grid: as surely as said, but for a share of which nothing is known."""

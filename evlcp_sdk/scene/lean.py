@@ -79,17 +79,16 @@ def sight_of(
         sigma_px: Their standard deviations, px, float64 (K,).
         attitude: What is known of the camera's attitude; None for nothing.
     """
-    seen = np.flatnonzero(np.isfinite(points_px).all(1))
+    seen = [k for k, (x, y) in enumerate(points_px.tolist()) if math.isfinite(x) and math.isfinite(y)]
     if len(seen) < 2:
         return BarSight()
-    first, last = int(seen[0]), int(seen[-1])
-    ends = camera.undistort(points_px[[first, last]])
-    direction, (u, v) = ends[1] - ends[0], ends.mean(0)
-    length = float(np.hypot(*direction))
+    first, last = seen[0], seen[-1]
+    (u0, v0), (u1, v1) = camera.undistort(points_px[[first, last]]).tolist()
+    length = math.hypot(u1 - u0, v1 - v0)
     if not length > 0:
         return BarSight()
-    x, y = (float(part) / length for part in direction)
-    along, across = float(x * u + y * v), float(x * v - y * u)
+    u, v, x, y = (u0 + u1) / 2, (v0 + v1) / 2, (u1 - u0) / length, (v1 - v0) / length
+    along, across = x * u + y * v, x * v - y * u
     if attitude is None:
         return BarSight(along, across)
     up = attitude.rotation()[2]
