@@ -333,7 +333,7 @@ def add_polarity(
         late = t_us[i] - origin - row_us * row - apart * on
         if late < 0:
             continue
-        c = np.uint64(late * rate)
+        c = np.uint64(np.int64(late * rate))
         if c >= np.uint64(chips):
             continue
         # Unsigned, a pixel to the left of the image is far to its right: one comparison for both edges.
@@ -1139,13 +1139,17 @@ def cells_by_place(
     places: Array,
     reach: float,
     half: float,
-    in_place: Array,
-    out_of_place: Array,
-) -> None:
-    """Cells of blobs within reach of their cluster's place, by cluster; of others, by the place they are in.
+    seen: Array,
+) -> tuple[int, int, float]:
+    """Which clusters are `seen` in their place (K,): by more cells than others are in it.
 
-    A blob that is not in its place counts where it is within `half` of the nearest one.
+    A blob's cells are in place within `reach` of their cluster's; others stand in the nearest place, if that
+    is within `half`.
+
+    Returns:
+        How many places show cells, in how many their cluster is seen, and the cells of these.
     """
+    in_place, out_of_place = np.zeros(places.size), np.zeros(places.size)
     for i in range(at.size):
         if abs(at[i] - places[cluster[i]]) <= reach:
             in_place[cluster[i]] += cells[i]
@@ -1157,17 +1161,29 @@ def cells_by_place(
                 nearest, least = k, off
         if least <= half:
             out_of_place[nearest] += cells[i]
+    shown, many, total = 0, 0, 0.0
+    for k in range(places.size):
+        seen[k] = in_place[k] > out_of_place[k]
+        shown += in_place[k] + out_of_place[k] > 0
+        if seen[k]:
+            many += 1
+            total += in_place[k]
+    return shown, many, total
 
 
 @njit(cache=True, nogil=True)
-def out_of_reach(at: Array, places: Array, reach: float, left: Array) -> None:
-    """Mark blobs that are farther than `reach` from every place."""
+def out_of_reach(at: Array, cells: Array, places: Array, reach: float, left: Array) -> int:
+    """Mark blobs that are farther than `reach` from every place; how many cells they have."""
+    total = 0
     for i in range(at.size):
         left[i] = True
         for place in places:
             if abs(at[i] - place) <= reach:
                 left[i] = False
                 break
+        if left[i]:
+            total += cells[i]
+    return total
 
 
 @njit(cache=True, nogil=True)

@@ -142,6 +142,8 @@ def placements(
         before: In a frame shortly before: its scale still holds.
         min_share: Least share of the clusters in place that counts without a doubt.
     """
+    from evlcp_sdk.rx import _kernels
+
     blobs = _blobs_of(presence)
     clusters = len(layout.at_m)
     if not len(blobs.at):
@@ -170,9 +172,12 @@ def placements(
         if found and best.cells < _OTHER_CELLS * found[0].cells:
             break
         found.append(best)
-        left = _left(blobs, layout, best, slack_px)
+        # What a placement has not used up, neither in its clusters' places nor elsewhere in the bar.
+        left = np.empty(len(blobs.at), np.bool_)
+        reach = abs(best.scale) * layout.spacing_m / 2 + slack_px
+        cells = _kernels.out_of_reach(blobs.at, blobs.cells, best.places(layout), reach, left)
         # Most images show one bar; what is left of them needs no vote.
-        if blobs.cells @ left < _OTHER_CELLS * found[0].cells:
+        if cells < _OTHER_CELLS * found[0].cells:
             break
         blobs = blobs[left]
     return found
@@ -314,21 +319,19 @@ def _judged(
     places = scale * _turned(layout, mirrored) + shift
     spacing_px = abs(scale) * layout.spacing_m
     reach = spacing_px / 2 + slack_px
-    in_place, out_of_place = np.zeros((2, clusters))
-    _kernels.cells_by_place(
-        blobs.at, blobs.cluster, blobs.cells, places, reach, spacing_px / 2, in_place, out_of_place
+    seen = np.empty(clusters, np.bool_)
+    shown, many, cells = _kernels.cells_by_place(
+        blobs.at, blobs.cluster, blobs.cells, places, reach, spacing_px / 2, seen
     )
-    seen = in_place > out_of_place
-    shown = int(np.count_nonzero(in_place + out_of_place))
     # Where clusters are small, a cell stands in the place of two.
     odds = min(1.0, (2 * reach / spacing_px) ** (1 if layout.line else 2) / clusters)
     # As many similarities could have been proposed as there are choices of the clusters that fix one.
     tries = math.comb(max(shown, proposed), proposed)
-    chance = min(1.0, tries * _at_least(int(seen.sum()) - proposed, shown - proposed, odds))
+    chance = min(1.0, tries * _at_least(many - proposed, shown - proposed, odds))
     if layout.line:
         way = scale * layout.way
         mirrored = way.real + way.imag < 0
-    return Placement(scale, shift, mirrored, seen, float(in_place[seen].sum()), chance)
+    return Placement(scale, shift, mirrored, seen, cells, chance)
 
 
 def _at_least(hits: int, of: int, odds: float) -> float:
@@ -336,13 +339,3 @@ def _at_least(hits: int, of: int, odds: float) -> float:
     if hits <= 0:
         return 1.0
     return float(sum(math.comb(of, n) * odds**n * (1 - odds) ** (of - n) for n in range(hits, of + 1)))
-
-
-def _left(blobs: _Blobs, layout: Layout, placement: Placement, slack_px: float) -> NDArray[np.bool_]:
-    """Which blobs a placement has not used up: neither in the clusters' places, nor elsewhere in the bar."""
-    from evlcp_sdk.rx import _kernels
-
-    reach = abs(placement.scale) * layout.spacing_m / 2 + slack_px
-    left = np.empty(len(blobs.at), np.bool_)
-    _kernels.out_of_reach(blobs.at, placement.places(layout), reach, left)
-    return left

@@ -183,11 +183,17 @@ def column_light(sums: Array, line: Array, top: int, bottom: int, full: float, o
     chips, _, width = sums.shape
     half, share = out.size // 2, 1 / full
     out[:] = 0.0
-    for i in range(1, chips, 2):
-        for v in range(top, bottom + 1):
-            centre = int(np.rint(line[0] + line[1] * v))
-            for u in range(max(centre - half, 0), min(centre + half, width - 1) + 1):
-                out[half + u - centre] += min(abs(sums[i, v, u]) * share, 1.0)
+    for v in range(top, bottom + 1):
+        centre = int(np.rint(line[0] + line[1] * v))
+        first, last = max(centre - half, 0), min(centre + half, width - 1)
+        if first > last:
+            continue
+        light = out[half + first - centre :]
+        for i in range(1, chips, 2):
+            # One index, so that columns go side by side.
+            row = sums[i, v, first : last + 1]
+            for u in range(row.size):
+                light[u] += min(abs(row[u]) * share, 1.0)
     out /= max((bottom - top + 1) * (chips // 2), 1)
 
 
@@ -204,14 +210,20 @@ def row_values(sums: Array, line: Array, weight: Array, full: float, out: Array)
     for v in range(rows):
         centre = int(np.rint(line[0] + line[1] * v))
         first, last = max(centre - half, 0), min(centre + half, width - 1)
+        # The columns whose weight is not 0, which are few of a bar's seam.
+        while first <= last and weight[half + first - centre] == 0:
+            first += 1
+        while first <= last and weight[half + last - centre] == 0:
+            last -= 1
         mass = 0.0
         for u in range(first, last + 1):
             mass += weight[half + u - centre]
+        one = 1 / max(mass, 1e-12)
         for i in range(values):
             total = 0.0
             for u in range(first, last + 1):
                 total += weight[half + u - centre] * min(max(sums[2 * i + 1, v, u] * share, -1.0), 1.0)
-            out[i, v] = total / max(mass, 1e-12)
+            out[i, v] = total * one
 
 
 @njit(cache=True, nogil=True)
@@ -265,10 +277,9 @@ def rows_felt(
 
 
 @njit(cache=True, nogil=True)
-def _profile_at(profile: Array, z: float, width: float) -> tuple[float, float]:
-    """Share of a boundary's light beyond `z`, and its density there, by straight pieces."""
-    steps = profile.shape[1] - 1
-    at = min(abs(z) / width / _REACH * steps, steps - 1e-9)
+def _profile_at(profile: Array, z: float, scale: float) -> tuple[float, float]:
+    """Share of a boundary's light beyond `z`, and its density there, by straight pieces, `scale` a px."""
+    at = min(abs(z) * scale, profile.shape[1] - 1 - 1e-9)
     n = int(at)
     part = at - n
     beyond = profile[0, n] + part * (profile[0, n + 1] - profile[0, n])
@@ -303,7 +314,7 @@ def equations(
     rows = seen_values.shape[1]
     spacing, centre, drift, gain = fit[0], fit[1], fit[2], fit[3]
     width = blur * exp(fit[4])
-    slope = np.empty(5)
+    scale, steepest = (profile.shape[1] - 1) / (_REACH * width), 0.5 * gain / width
     normal[:] = 0.0
     right[:] = 0.0
     cost = 0.0
@@ -313,26 +324,41 @@ def equations(
             step = codes[b, i] - codes[b - 1, i]
             if step == 0:
                 continue
-            place = b - clusters / 2
+            place, both = b - clusters / 2, codes[b, i] + codes[b - 1, i]
+            # In a boundary's rows of one value, three of the slopes go together: sums of what they share.
+            ss, sl, sz, ll, lz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            s, by_level, by_z = 0.0, 0.0, 0.0
             for v in range(first[b, i], last[b, i]):
                 z = v - middle - spacing * place
-                beyond, density = _profile_at(profile, z, width)
-                level = 0.5 * (codes[b, i] + codes[b - 1, i] + (step if z > 0 else -step) * beyond)
-                steep = 0.5 * gain * step * density / width
-                slope[0] = -steep * place
-                slope[1] = -steep
-                slope[2] = -steep * when[i]
-                slope[3] = level
-                slope[4] = -steep * z
+                beyond, density = _profile_at(profile, z, scale)
+                level = 0.5 * (both + (step if z > 0 else -step) * beyond)
+                steep = -steepest * step * density
                 residual = seen_values[i, v] - gain * level
                 size = abs(residual)
                 weight = 1.0 if size <= huber else huber / size
                 cost += residual * residual / 2 if size <= huber else huber * (size - huber / 2)
-                for a in range(5):
-                    pull = weight * slope[a]
-                    right[a] += pull * residual
-                    for c in range(a + 1):
-                        normal[a, c] += pull * slope[c]
+                pull = weight * steep
+                ss += pull * steep
+                sl += pull * level
+                sz += pull * steep * z
+                ll += weight * level * level
+                lz += pull * z * level
+                zz += pull * z * steep * z
+                s += pull * residual
+                by_level += weight * level * residual
+                by_z += pull * z * residual
+            slope = place, 1.0, when[i]
+            for a in range(3):
+                right[a] += slope[a] * s
+                normal[3, a] += slope[a] * sl
+                normal[4, a] += slope[a] * sz
+                for c in range(a + 1):
+                    normal[a, c] += slope[a] * slope[c] * ss
+            right[3] += by_level
+            right[4] += by_z
+            normal[3, 3] += ll
+            normal[4, 3] += lz
+            normal[4, 4] += zz
     for a in range(5):
         for c in range(a):
             normal[c, a] = normal[a, c]
@@ -370,6 +396,7 @@ def leftovers(
     rows = seen_values.shape[1]
     spacing, centre, drift, gain = fit[0], fit[1], fit[2], fit[3]
     width = blur * exp(fit[4])
+    scale = (profile.shape[1] - 1) / (_REACH * width)
     by_boundary[:] = 0.0
     by_value[:] = 0.0
     scores[:] = 0.0
@@ -383,7 +410,7 @@ def leftovers(
             place = b - clusters / 2
             for v in range(first[b, i], last[b, i]):
                 z = v - middle - spacing * place
-                beyond, density = _profile_at(profile, z, width)
+                beyond, density = _profile_at(profile, z, scale)
                 level = 0.5 * (codes[b, i] + codes[b - 1, i] + (step if z > 0 else -step) * beyond)
                 steep = 0.5 * gain * step * density / width
                 residual = seen_values[i, v] - gain * level

@@ -1,12 +1,16 @@
 """The receiver's compiled loops against their twins."""
 
+import math
+
 import numpy as np
 import pytest
 import rx_twins as twins
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy import stats
 
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.rhythm import Rhythm
+from evlcp_sdk.scene.lean import BarSight, foreshortening
 from evlcp_sdk.values import Events
 
 WIDTH, HEIGHT = 24, 16
@@ -40,13 +44,15 @@ def test_order_is_checked_event_by_event(seed, n):
     rng = np.random.default_rng(seed)
     for e in (clock_faults(rng, n), random_events(rng, n)):
         want = twins.ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT)
-        assert _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT) == want
+        since = np.empty(n, np.int64)
+        assert _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, -7, since) == want
+        assert_array_equal(since, e.t_us + 7)
 
 
 @pytest.mark.parametrize(("x", "y"), [(WIDTH, 0), (0, HEIGHT), (65_535, 65_535)])
 def test_the_first_event_too_may_be_off_the_sensor(x, y):
     e = Events.of([5], [x], [y], [1])
-    assert not _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT)
+    assert not _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, 0, np.empty(1, np.int64))
 
 
 LOW = (1 << _kernels.CLOCK_AT) - 1
@@ -260,7 +266,7 @@ def test_connected_cells_of_each_cluster(seed, clusters):
     most = int(selected.sum())
     at, cluster, cells = np.empty(most, complex), np.empty(most, np.int64), np.empty(most, np.int64)
     n = _kernels.blobs(selected, at, cluster, cells)
-    want = twins.blobs(selected)
+    want = sorted(twins.blobs(selected), key=lambda blob: -blob[2])
     assert n == len(want)
     assert_allclose(at[:n], [w[0] for w in want], rtol=1e-12)
     assert cluster[:n].tolist() == [w[1] for w in want]
@@ -316,6 +322,50 @@ def test_footprints(seed, grid):
     near = np.zeros(shape, np.float32)
     _kernels.copy_near(probability, places, unit, spacing, 3.0, near)
     assert_allclose(near, twins.copy_near(probability, places, unit, spacing, 3.0))
+
+
+@pytest.mark.parametrize("bins", [0, 7])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_mask_is_the_layout_s_footprint(seed, bins):
+    rng = np.random.default_rng(seed)
+    unit, spacing, shape = np.exp(1j * rng.uniform(0, 2 * np.pi)), rng.uniform(1.5, 9), (5, 40, 30)
+    places = 15.3 + 20.2j + unit * spacing * (np.arange(5) - rng.uniform(1, 3))
+    probability, pixels = rng.random((2, *shape)).astype(np.float32)
+    selected, seen = rng.random(shape) < 0.5, np.ones(5, np.bool_)
+    prior, out, near, chosen = *np.zeros((3, *shape), np.float32), np.zeros(shape, np.bool_)
+    _kernels.mask(
+        probability, selected, pixels, seen, places, unit, spacing, 1, bins, 0.5, prior, out, chosen, near
+    )
+    across = spacing
+    if bins:
+        hits, cells = twins.across_profile(probability, seen, places, unit, spacing, 1, bins)
+        profile = twins.core_profile(hits, cells, 0.5)
+        across = len(profile)
+        want = twins.line_prior(shape, places, unit, spacing, 1, profile)
+    else:
+        want = twins.block_prior(shape, places, unit, spacing, 1)
+    assert_allclose(prior, want, rtol=1e-4, atol=1e-5)
+    assert_array_equal(out, np.where(prior > 0, probability, 0))
+    assert_array_equal(chosen, selected & (prior > 0))
+    assert_allclose(near, twins.copy_near(pixels, places, unit, spacing, across))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_mean_length_of_a_leaning_bar(seed):
+    rng = np.random.default_rng(seed)
+    sine, likely, along, across = np.sin(rng.uniform(-0.1, 0.1, 50)), rng.random(50), -0.04, 0.05
+    sight = BarSight(along, across)
+    for seen, chance in (
+        (0.03, likely * stats.norm.pdf(sine, 0.03, 0.02)),
+        (math.nan, likely),
+        # What no lean explains says nothing.
+        (9.0, likely),
+    ):
+        length = foreshortening(sine, sight)
+        mean = np.average(length, weights=chance)
+        spread = np.average((length - mean) ** 2, weights=chance)
+        found = _kernels.mean_length(sine, likely, seen, 0.02 if seen != 9 else 0.01, along, across)
+        assert found == pytest.approx((mean, spread), rel=1e-6)
 
 
 @pytest.mark.parametrize("grid", [1, 2])
@@ -430,9 +480,11 @@ def test_cells_in_and_out_of_place(seed, clusters):
     rng = np.random.default_rng(seed)
     layout, s, shift, at, cluster, cells = some_blobs(rng, clusters)
     places, gap = s * layout + shift, abs(s) * 0.06
-    got = np.zeros((2, clusters))
-    _kernels.cells_by_place(at, cluster, cells, places, gap / 2 + 1, gap / 2, *got)
-    assert_array_equal(got, twins.cells_by_place(at, cluster, cells, places, gap / 2 + 1, gap / 2))
+    seen = np.empty(clusters, np.bool_)
+    found = _kernels.cells_by_place(at, cluster, cells, places, gap / 2 + 1, gap / 2, seen)
+    right, wrong = twins.cells_by_place(at, cluster, cells, places, gap / 2 + 1, gap / 2)
+    assert_array_equal(seen, right > wrong)
+    assert found == (np.count_nonzero(right + wrong), seen.sum(), right[seen].sum())
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -450,8 +502,10 @@ def test_blobs_that_are_left_and_points_off_their_places(seed):
     rng = np.random.default_rng(seed)
     at, places = (rng.normal(0, 9, (n, 2)) @ [1, 1j] for n in (30, 5))
     left = np.empty(30, np.bool_)
-    _kernels.out_of_reach(at, places, 4.0, left)
+    cells = rng.integers(1, 9, 30)
+    total = _kernels.out_of_reach(at, cells, places, 4.0, left)
     assert_array_equal(left, np.abs(at[:, None] - places).min(1) > 4)
+    assert total == cells[left].sum()
     points = rng.normal(0, 9, (5, 2))
     points[[1, 3]] = np.nan
     off = points @ [1, 1j] - places

@@ -72,10 +72,10 @@ def test_without_a_distance_nothing_changes() -> None:
 
 
 def foreshortened(
-    along: float = 0.0, about_deg: float = 0.0, sigma_deg: float = 0.7, share: float = 0.02
+    along: float = 0.0, about_deg: float = 0.0, sigma_deg: float = 0.7, share: float = 0.05
 ) -> tuple[float, float]:
     """Mean and standard deviation of the foreshortening over what is likely of a lean, by quadrature."""
-    sigma, most, about = math.radians(sigma_deg), math.radians(6), math.radians(about_deg)
+    sigma, most, about = math.radians(sigma_deg), math.radians(5), math.radians(about_deg)
 
     def mean_of(value: Callable[[float], float]) -> float:
         def weighed(a: float) -> float:
