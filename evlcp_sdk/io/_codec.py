@@ -80,12 +80,12 @@ class Columns:
         self.value = np.empty(triggers, np.uint8)
 
     def taken(self) -> tuple[Events, Triggers]:
-        """Return what is filled, as views."""
+        """Return what is filled, as views; as copies where it is little, so as not to hold all the room."""
         n, m = self.events, self.triggers
-        return (
-            Events(self.t_us[:n], self.x[:n], self.y[:n], self.p[:n]),
-            Triggers(self.trigger_t_us[:m], self.channel[:m], self.value[:m]),
-        )
+        events = Events(self.t_us[:n], self.x[:n], self.y[:n], self.p[:n])
+        if 2 * n < len(self.t_us):
+            events = Events(events.t_us.copy(), events.x.copy(), events.y.copy(), events.p.copy())
+        return events, Triggers(self.trigger_t_us[:m], self.channel[:m], self.value[:m])
 
 
 class Decoder:

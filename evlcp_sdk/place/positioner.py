@@ -86,7 +86,6 @@ class Positioner:
         return fixes
 
     def _take(self, packet: Packet) -> None:
-        kept = self._frames.setdefault(packet.transmitter, [])
         for frame in packet.frames:
             if len(frame.points_px) == self._clusters and np.isfinite(frame.points_t_us):
                 number = math.ceil(frame.points_t_us / self._packet_us - 0.5)
@@ -94,7 +93,7 @@ class Positioner:
                     self._next = number
                 # What is late for its own grid time may still serve the next as a neighbour.
                 self._counts["frames_late"] += number < self._next
-                kept.append(frame)
+                self._frames.setdefault(packet.transmitter, []).append(frame)
 
     def close(self) -> list[Fix]:
         """End the stream; return the rest of the fixes."""
@@ -112,8 +111,8 @@ class Positioner:
                 fixes.append(fix)
             self._next += 1
             oldest = (self._next - 1) * self._packet_us
-            for kept in self._frames.values():
-                kept[:] = [f for f in kept if f.points_t_us > oldest]
+            later = {n: [f for f in kept if f.points_t_us > oldest] for n, kept in self._frames.items()}
+            self._frames = {number: kept for number, kept in later.items() if kept}
             coming = [f.points_t_us for kept in self._frames.values() for f in kept]
             # Where nothing is in view, the grid goes on with the next frame.
             first = math.ceil(min(coming) / self._packet_us - 0.5) if coming else None

@@ -14,6 +14,9 @@ __all__ = ["Whereabouts"]
 _LENGTH_SHARE = 0.01
 """Share by which a beacon's length may differ from its site's: a lone bar's distance is wrong by as much."""
 
+_MOST_TRANSMITTERS = 1024
+"""Transmitters whose beacons are remembered; the one not heard for longest makes way."""
+
 _BELIEVED = {"none": (), "verified": ("verified",), "any": ("verified", "unverified")}
 """Trust that `position.beacons` asks for."""
 
@@ -67,7 +70,9 @@ class Whereabouts:
         if packet.echo_of is not None:
             self._said.pop(packet.transmitter, None)
             return
-        said = self._said.setdefault(packet.transmitter, _Said())
+        said = self._said[packet.transmitter] = self._said.pop(packet.transmitter, _Said())
+        if len(self._said) > _MOST_TRANSMITTERS:
+            del self._said[next(iter(self._said))]
         for heard in packet.messages:
             if heard.trust == "forged":
                 self.forged += 1

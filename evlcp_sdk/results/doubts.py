@@ -26,6 +26,15 @@ _MANY_EVENTS = 100_000
 _RANGED_SHARE = 0.25
 """Frames with a distance of which fewer is said."""
 
+_NO_ROOM = (
+    ("dropped_crowded", "{} events of crowded time steps dropped"),
+    ("dropped_no_room", "{} events of regions forgotten early"),
+    ("frames_cut", "{} frames passed over for it"),
+    ("regions_left_out", "{} times a region more was not followed"),
+    ("regions_gave_way", "{} regions without a bar let go for others"),
+)
+"""Counts of what there was no room for, and how they are told."""
+
 _BY_CHANCE = 1e-6
 """Probability of a finding by chance below which it is told."""
 
@@ -41,7 +50,7 @@ def warnings_of(
         link: The configuration that it ran with.
         reads_messages: Whether messages were looked for.
     """
-    found = [*_frames(counts)]
+    found = [*_frames(counts), *_room(counts)]
     for number, one in sorted(tally.transmitters.items()):
         if one.frames - one.echoes >= _FEW_FRAMES:
             found += [f"transmitter {number}: {text}" for text in _transmitter(one, link)]
@@ -72,6 +81,13 @@ def _frames(counts: Mapping[str, int]) -> Iterator[str]:
             f"{askew} of {frames} frames show bars that do not stand plumb by the camera's attitude: it does"
             " not correct their distances; check pitch and roll, their signs and their sigma"
         )
+
+
+def _room(counts: Mapping[str, int]) -> Iterator[str]:
+    """What the receiver had no room for."""
+    found = [text for name, text in _NO_ROOM if (n := counts.get(name, 0)) for text in [text.format(n)]]
+    if found:
+        yield f"more than the receiver holds at a time: {'; '.join(found)}; frames may be missing"
 
 
 def _transmitter(one: TransmitterTally, link: Link) -> Iterator[str]:

@@ -92,12 +92,18 @@ class FigureProbe:
     Args:
         camera: Has the size of the image.
         points: How many frames of a transmitter, and places of a region, to keep.
+        most_regions: How many regions to keep: of more, those with the fewest places are left out.
+
+    Attributes:
+        many_regions: How many there were.
     """
 
-    def __init__(self, camera: CameraModel, points: int = 4096) -> None:
+    def __init__(self, camera: CameraModel, points: int = 1024, most_regions: int = 64) -> None:
         self.image: NDArray[np.int64] = np.zeros((camera.height, camera.width), np.int64)
         self.first_us: int | None = None
         self.regions: dict[int, Thinned[Region]] = {}
+        self.many_regions = 0
+        self._most_regions = most_regions
         self.frames: dict[int, Thinned[Frame]] = {}
         self.clearest: dict[int, _Shown] = {}
         self.echo_of: dict[int, int | None] = {}
@@ -118,16 +124,25 @@ class FigureProbe:
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
         """Keep regions, presence maps and frames."""
         if stage == "regions":
-            self.regions.setdefault(value.id, Thinned(self._points)).add(value)
+            self._place(value)
         elif stage == "separation":
             self._presence = value
-        elif stage == "frame":
+        elif stage == "frame" and (value.transmitter in self.frames or len(self.frames) < _MOST_ZOOMS):
             self.frames.setdefault(value.transmitter, Thinned(self._points)).add(value)
             # The newest frame knows most.
             self.echo_of[value.transmitter] = value.echo_of
             best = self.clearest.get(value.transmitter)
             if self._presence is not None and (best is None or value.soft.quality > best.frame.soft.quality):
                 self.clearest[value.transmitter] = _Shown(value, self._presence)
+
+    def _place(self, region: Region) -> None:
+        """Keep a place of a region, and the regions with the most of them."""
+        if region.id not in self.regions:
+            self.many_regions += 1
+            if len(self.regions) == self._most_regions:
+                del self.regions[min(self.regions, key=lambda number: len(self.regions[number]))]
+            self.regions[region.id] = Thinned(self._points)
+        self.regions[region.id].add(region)
 
 
 class Figures(Sink):
@@ -274,7 +289,9 @@ def draw_regions(probe: FigureProbe, title: str) -> Figure:
         axis.set_xlabel("column, px")
     whole = axes[0]
     whole.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), ylabel="row, px")
-    many = f"{len(probe.regions)} region{'s' * (len(probe.regions) != 1)}"
+    many = f"{probe.many_regions} region{'s' * (probe.many_regions != 1)}"
+    if probe.many_regions > len(probe.regions):
+        many += f", {len(probe.regions)} shown"
     if zooms:
         many += " (beside: dotted at first, solid at last)"
     _title(whole, f"{title}: {probe.image.sum():,} events, {many}")

@@ -1,7 +1,7 @@
 """The figures of a summary, counted as packets and positions come, in constant memory."""
 
 import math
-from collections import Counter
+from collections import Counter, OrderedDict
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -15,7 +15,12 @@ from evlcp_sdk.values import Packet
 __all__ = ["PositionTally", "RunTally", "TransmitterTally"]
 
 _CELL_M = 0.01
-_FARTHEST_M = 10_000.0
+_FARTHEST_M = 1_000.0
+"""Medians know no distance beyond: a hundred thousand cells are enough."""
+
+_MOST_TRANSMITTERS = 1024
+"""Transmitters with figures of their own; of more, those not heard for longest are only counted."""
+
 _MOST_CLOCK_ERROR = 0.01
 
 
@@ -130,10 +135,16 @@ class RunTally:
 
     Args:
         form: Lengths of a packet's parts.
+
+    Attributes:
+        transmitters: Figures by number.
+        others: Transmitters whose figures were dropped, as there are too many; a number may come twice.
+        others_frames: Their frames.
     """
 
     def __init__(self, form: PacketFormat) -> None:
-        self.transmitters: dict[int, TransmitterTally] = {}
+        self.transmitters: OrderedDict[int, TransmitterTally] = OrderedDict()
+        self.others = self.others_frames = 0
         self._packet_us = form.packet_chips * form.chip_us
 
     def add(self, packet: Packet) -> None:
@@ -142,6 +153,10 @@ class RunTally:
         if tally is None:
             tally = self.transmitters[packet.transmitter] = TransmitterTally(packet.sent, self._packet_us)
         tally.add(packet)
+        self.transmitters.move_to_end(packet.transmitter)
+        if len(self.transmitters) > _MOST_TRANSMITTERS:
+            self.others += 1
+            self.others_frames += self.transmitters.popitem(last=False)[1].frames
 
     def headline(self) -> str:
         """What was found, in one sentence."""
@@ -150,7 +165,8 @@ class RunTally:
         tallies = self.transmitters.values()
         own = [t.frames - t.echoes for t in tallies if t.frames > t.echoes or not t.echoes]
         echoes = [t.echoes for t in tallies if t.echoes]
-        parts = ((own, "transmitter"), (echoes, "reflection"))
+        others = [self.others_frames] + [0] * (self.others - 1) if self.others else []
+        parts = ((own, "transmitter"), (echoes, "reflection"), (others, "earlier one"))
         return "; ".join(
             f"{len(frames)} {what}{'s' * (len(frames) > 1)}, {sum(frames)} frame{'s' * (sum(frames) != 1)}"
             for frames, what in parts

@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.plugin.roles import Filter
+from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
@@ -65,6 +66,8 @@ _CENTRE_SIGMA_PX = 0.25
 _BACKFILL_STEPS = 12
 """Steps kept from before a region was found: a pixel needs about 1 ms to score, a region two steps."""
 
+_COUNTS = ("steps_forgotten", "dropped_no_room", "regions_left_out", "regions_gave_way", "areas_left_out")
+
 Box = tuple[int, int, int, int]
 Piece = tuple[int, Events]
 
@@ -84,6 +87,9 @@ class Followed:
         outgrown: The region before that, which may have held other bars: (right, down) of its centre from
             this one's, width and height, px, and until when that matters, us.
         released: True once it has faded or was merged into another; it gets no more events.
+        opened_us: End of the step in which it was found, us.
+        cut_us: Until when its events were forgotten for want of room, us; None where none were.
+        held_bytes: What its pieces take.
     """
 
     id: int
@@ -95,6 +101,28 @@ class Followed:
     heights: deque[float] = field(default_factory=lambda: deque(maxlen=_HEIGHTS))
     size_px: tuple[float, float] | None = None
     outgrown: tuple[float, float, float, float, float] | None = None
+    opened_us: int = 0
+    cut_us: int | None = None
+    held_bytes: int = 0
+
+    def __post_init__(self) -> None:
+        self.hold(self.pieces)
+
+    def hold(self, pieces: deque[Piece]) -> None:
+        """Take other events instead of those held."""
+        self.pieces = pieces
+        self.held_bytes = sum(held_bytes(events) for _, events in pieces)
+
+    def add(self, start_us: int, events: Events) -> None:
+        """Take the events of the next step."""
+        self.pieces.append((start_us, events))
+        self.held_bytes += held_bytes(events)
+
+    def forget(self) -> tuple[int, int]:
+        """Drop the events of the oldest step; its start, us, and how many they were."""
+        start_us, events = self.pieces.popleft()
+        self.held_bytes -= held_bytes(events)
+        return start_us, len(events)
 
     @property
     def latest(self) -> Region:
@@ -167,7 +195,7 @@ class Followed:
     def forget_before(self, t_us: float, step_us: int, places_us: float) -> None:
         """Drop events older than a time, and positions older than another: others ask where it was."""
         while self.pieces and self.pieces[0][0] + step_us <= t_us:
-            self.pieces.popleft()
+            self.forget()
         while len(self.positions) > 2 and self.positions[1].t_us < places_us:
             self.positions.popleft()
 
@@ -182,6 +210,11 @@ class RegionFollower:
         position: Filter of the centres; None for centres as measured.
         keep_us: How long events of the whole image are kept, so that a region may turn out to be larger than
             it was taken for, us.
+        limits: How much is held.
+
+    Attributes:
+        alive: The regions that are followed.
+        counts: What was left out for want of room.
     """
 
     def __init__(
@@ -191,8 +224,11 @@ class RegionFollower:
         chip_us: float,
         position: Filter | None = None,
         keep_us: float = 0.0,
+        limits: Limits = LIMITS,
     ) -> None:
         self._spec = spec
+        self._limits = limits
+        self._keep_us = keep_us
         self._position = position
         self._camera = camera
         self._measure_us = round(_MEASURE_CHIPS * chip_us)
@@ -202,14 +238,17 @@ class RegionFollower:
         self._hits = np.zeros([(n - 1 >> _CELL_SHIFT) + 1 for n in shape], np.int32)
         self._fresh: list[Box] = []
         steps = math.ceil(min(keep_us, _LONGEST_US) / spec.step_us)
-        self._recent: deque[Piece] = deque(maxlen=max(steps, _BACKFILL_STEPS))
+        self._recent: deque[Piece] = deque()
+        self._most_recent = max(steps, _BACKFILL_STEPS)
+        self._recent_bytes = 0
         self._next_id = 0
         self.alive: list[Followed] = []
+        self.counts = dict.fromkeys(_COUNTS, 0)
 
     def step(self, start_us: int, events: Events) -> list[Followed]:
         """Take the events of one time step; return the regions that are alive or ended in it."""
         spec = self._spec
-        self._recent.append((start_us, events))
+        self._remember(start_us, events)
         rises = self._rhythm.step(start_us, events, self._hits, _CELL_SHIFT)
         end_us = start_us + spec.step_us
         expected = [self._expected(followed, start_us + spec.step_us / 2) for followed in self.alive]
@@ -219,7 +258,7 @@ class RegionFollower:
             for e, followed in zip(expected, self.alive, strict=True)
         ]
         for followed, box, inside in zip(self.alive, boxes, _select(events, boxes), strict=True):
-            followed.pieces.append((start_us, inside if followed.size_px else self._rhythmic(inside)))
+            followed.add(start_us, inside if followed.size_px else self._rhythmic(inside))
             rows = np.empty(box[3] - box[1], np.int64)
             width_px = followed.size_px[0] if followed.size_px else math.inf
             measured = self._measure(followed.id, box, end_us, rows, width_px)
@@ -227,6 +266,7 @@ class RegionFollower:
                 measured = self._whole(followed, measured, box[1], rows)
                 followed.positions.append(self._filtered(followed, measured))
         self._merge()
+        self._make_room()
         self._open(end_us, rises)
         seen = list(self.alive)
         for followed in self.alive:
@@ -234,10 +274,38 @@ class RegionFollower:
         self.alive = [followed for followed in self.alive if not followed.released]
         return seen
 
+    def _remember(self, start_us: int, events: Events) -> None:
+        """Keep a step's events of the whole image, and as many before it as there is room for."""
+        self._recent.append((start_us, events))
+        self._recent_bytes += held_bytes(events)
+        while len(self._recent) > self._most_recent or (
+            self._recent_bytes > self._limits.recent_bytes and len(self._recent) > 1
+        ):
+            self.counts["steps_forgotten"] += len(self._recent) <= self._most_recent
+            _, forgotten = self._recent.popleft()
+            self._recent_bytes -= held_bytes(forgotten)
+
+    def _make_room(self) -> None:
+        """Forget the oldest events of regions where all together take too much."""
+        spare = self._limits.region_bytes - sum(followed.held_bytes for followed in self.alive)
+        while spare < 0:
+            held = [followed for followed in self.alive if len(followed.pieces) > 1]
+            if not held:
+                return
+            oldest_us = min(followed.pieces[0][0] for followed in held)
+            for followed in held:
+                if spare < 0 and followed.pieces[0][0] == oldest_us:
+                    before = followed.held_bytes
+                    _, many = followed.forget()
+                    spare += before - followed.held_bytes
+                    self.counts["dropped_no_room"] += many
+                    followed.cut_us = followed.first_us = oldest_us + self._spec.step_us
+
     def skip(self) -> None:
         """Pass over a gap in time, with no region alive."""
         self._fresh = []
         self._recent.clear()
+        self._recent_bytes = 0
 
     def shape(
         self, followed: Followed, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]
@@ -303,7 +371,8 @@ class RegionFollower:
         for (start, events), x_px, y_px in zip(kept, x.tolist(), y.tolist(), strict=True):
             box = self._reach(Region(last.id, last.t_us, x_px, y_px, last.width_px, last.height_px))
             gathered[start] = _select(events, [box])[0]
-        followed.pieces = deque((start, gathered.get(start, events)) for start, events in followed.pieces)
+        followed.hold(deque((start, gathered.get(start, events)) for start, events in followed.pieces))
+        self._make_room()
 
     def unite(self, followed: Followed, other: Followed) -> None:
         """Take another region into one: both are parts of what is not known yet, and the other one goes."""
@@ -319,9 +388,11 @@ class RegionFollower:
         followed.filter = self._position.init() if self._position else None
         since_us = min(part.pieces[0][0] for part in (followed, other) if part.pieces)
         followed.first_us = min(followed.first_us, other.first_us)
+        if self._recent[0][0] > since_us:
+            followed.cut_us = followed.first_us = self._recent[0][0]
         followed.pieces = deque((start, events) for start, events in self._recent if start >= since_us)
         self.gather(followed)
-        followed.pieces = deque((start, self._rhythmic(events)) for start, events in followed.pieces)
+        followed.hold(deque((start, self._rhythmic(events)) for start, events in followed.pieces))
         self.drop(other)
 
     def beside(
@@ -329,7 +400,12 @@ class RegionFollower:
     ) -> Followed:
         """Open a region for another image of a bar: it moves as the one that showed it does."""
         followed = Followed(
-            self._next_id, deque(like.positions), like.first_us, deque(like.pieces), filter=like.filter
+            self._next_id,
+            deque(like.positions),
+            like.first_us,
+            deque(like.pieces),
+            filter=like.filter,
+            opened_us=like.opened_us,
         )
         followed.positions = deque(replace(p, id=followed.id) for p in followed.positions)
         self._next_id += 1
@@ -337,6 +413,12 @@ class RegionFollower:
         self.shape(followed, t_us, centre_px, size_px)
         self.gather(followed)
         return followed
+
+    def has_room(self) -> bool:
+        """Whether another region may be followed; counts one that may not."""
+        room = len(self.alive) < self._limits.regions
+        self.counts["regions_left_out"] += not room
+        return room
 
     def drop(self, followed: Followed) -> None:
         """Let a region go at once."""
@@ -455,8 +537,14 @@ class RegionFollower:
             if rises:
                 hits[:] = 0
             return
-        areas, _ = ndimage.label(hits, np.ones((3, 3), bool))
-        lit = [self._lit(where, end_us) for where in ndimage.find_objects(areas)]
+        areas, many = ndimage.label(hits, np.ones((3, 3), bool))
+        found = ndimage.find_objects(areas)
+        if many > self._limits.areas:
+            self.counts["areas_left_out"] += many - self._limits.areas
+            of_area = np.bincount(areas.ravel(), hits.ravel(), many + 1)[1:]
+            best = np.sort(np.argsort(-of_area, kind="stable")[: self._limits.areas])
+            found = [found[k] for k in best]
+        lit = [self._lit(where, end_us) for where in found]
         joined = _joined([box for box in lit if box is not None], merge)
         boxes = [box for box in joined if _inside(hits, box).sum() >= self._spec.min_rises]
         hits[:] = 0
@@ -478,7 +566,7 @@ class RegionFollower:
 
     def _start(self, box: Box, end_us: int) -> None:
         region = self._measure(self._next_id, box, end_us, np.empty(box[3] - box[1], np.int64))
-        if region is None:
+        if region is None or not self._place_for_one(end_us):
             return
         self._next_id += 1
         reach = self._reach(region)
@@ -492,7 +580,7 @@ class RegionFollower:
                     for p in like.positions
                 )
                 pieces = deque((start, Events.empty()) for start, _ in self._recent)
-                followed = Followed(region.id, places, pieces[0][0], pieces)
+                followed = Followed(region.id, places, pieces[0][0], pieces, opened_us=end_us)
                 followed.filter = self._position.init() if self._position else None
                 self.gather(followed)
                 self.alive.append(followed)
@@ -500,7 +588,22 @@ class RegionFollower:
         recent = list(self._recent)[-_BACKFILL_STEPS:]
         pieces = deque((start, self._rhythmic(_select(events, [reach])[0])) for start, events in recent)
         state = self._position.init() if self._position else None
-        self.alive.append(Followed(region.id, deque([region]), pieces[0][0], pieces, filter=state))
+        self.alive.append(
+            Followed(region.id, deque([region]), pieces[0][0], pieces, filter=state, opened_us=end_us)
+        )
+
+    def _place_for_one(self, now_us: int) -> bool:
+        """Whether a new region may be followed, maybe in place of one that had its time and shows no bar."""
+        followed = [one for one in self.alive if not one.released]
+        if len(followed) < self._limits.regions:
+            return True
+        idle = [one for one in followed if one.size_px is None and one.opened_us + self._keep_us < now_us]
+        if not idle:
+            self.counts["regions_left_out"] += 1
+            return False
+        min(idle, key=lambda one: (one.opened_us, one.id)).released = True
+        self.counts["regions_gave_way"] += 1
+        return True
 
     def _merge(self) -> None:
         """Keep the older of two regions that have grown together."""

@@ -74,10 +74,12 @@ class PacketGrid:
         self.frame = (self.packet - back) * self.format.frames
         self.skip_before(earliest_us)
 
-    def skip_before(self, earliest_us: float) -> None:
-        """Pass over the frames that start before a time."""
+    def skip_before(self, earliest_us: float) -> int:
+        """Pass over the frames that start before a time; how many."""
+        first = self.frame
         while self.start_us(self.frame) < earliest_us:
             self.frame += 1
+        return self.frame - first
 
     def start_us(self, frame: int) -> float:
         """Start of a frame's first chip, us."""

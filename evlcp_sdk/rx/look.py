@@ -80,6 +80,7 @@ class Looker:
         centres_m: Cluster centres of the layout, m, float64 (K, 2).
         pilots: The clusters' pilot codes, (K, values), +1 and -1.
         separate: From a pilot's polarity sums to where the clusters are.
+        sensor_px: Columns and rows of the sensor: no image is larger, but for the seam.
     """
 
     def __init__(
@@ -89,12 +90,14 @@ class Looker:
         centres_m: NDArray[np.float64],
         pilots: NDArray[np.int8],
         separate: Callable[[NDArray[np.int16]], PresenceMap],
+        sensor_px: tuple[int, int],
     ) -> None:
         self._packet = packet
         self._spec = spec
         self._layout = layout_of(centres_m)
         self._pilots = pilots.astype(np.int64)
         self._separate = separate
+        self._sensor_px = sensor_px
 
     def look(self, region: Followed, due: DueFrame, pilot: Pilot | None) -> tuple[Look | None, Pilot | None]:
         """Look at a frame.
@@ -194,6 +197,7 @@ class Looker:
     def _size(self, width_px: float, height_px: float) -> tuple[int, int]:
         """Of the image: a region's, its seam on both sides, made even."""
         seam_px = 2 * self._spec.margin_px
+        width_px, height_px = min(width_px, self._sensor_px[0]), min(height_px, self._sensor_px[1])
         # Twice an odd number: a bar of one or two columns stands in the middle of a cell of 2 px, not on the
         # edge of two, each of which would see half of it.
         return 2 * (2 * math.ceil((width_px + seam_px - 2) / 4) + 1), _even(height_px + seam_px)

@@ -17,6 +17,7 @@ from evlcp_sdk.rx.detection import Followed, RegionFollower
 from evlcp_sdk.rx.echoes import Echoes, EchoQueue, Sighting
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.inbox import MessageAssembler
+from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.look import Look, Looker
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
@@ -52,6 +53,7 @@ _COUNTS = (
     "frames_rejected",
     "frames_reflected",
     "frames_askew",
+    "frames_cut",
     "packets",
 )
 
@@ -67,6 +69,7 @@ class Receiver:
         attitude: What is known of the camera's attitude, the same always or over time: how plumb bars lean
             against the sensor. None for nothing.
         clock_zero: UTC of the camera clock's 0, for the age of signed beacons; None if it is not known.
+        limits: How much it holds at the most.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> receiver = Receiver(load_link())
@@ -85,6 +88,7 @@ class Receiver:
         *,
         attitude: Attitude | AttitudeLog | None = None,
         clock_zero: datetime | None = None,
+        limits: Limits = LIMITS,
     ) -> None:
         centres_m = link.bar.cluster_centres_m()
         self._camera = link.camera
@@ -94,7 +98,7 @@ class Receiver:
         self._step_us = link.regions.step_us
         self._seam_px = link.regions.margin_px
         self._tail_us = _TAIL_CHIPS * link.packet.chip_us
-        self._timeline = Timeline(self._step_us, link.camera.width, link.camera.height)
+        self._timeline = Timeline(self._step_us, link.camera.width, link.camera.height, limits)
         self._clock = self._timeline.clock
         self._announcer = Announcer(hook, self._clock.camera_us)
         self._steps = Steps(link, self._announcer)
@@ -104,10 +108,16 @@ class Receiver:
             link.packet.chip_us,
             self._steps.position,
             LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us,
+            limits,
         )
-        self._transmitters = Transmitters(link.packet, self._step_us)
+        self._transmitters = Transmitters(link.packet, self._step_us, limits)
         self._looker = Looker(
-            link.packet, link.regions, centres_m, link.codebook.pilots, self._steps.separate
+            link.packet,
+            link.regions,
+            centres_m,
+            link.codebook.pilots,
+            self._steps.separate,
+            (link.camera.width, link.camera.height),
         )
         self._rows = RowDelays(link.codebook.preamble)
         self._find_points = points_finder(layout_of(centres_m))
@@ -123,7 +133,8 @@ class Receiver:
     def counts(self) -> dict[str, int]:
         """What was taken, found and dropped so far."""
         messages = self._messages.counts if self._messages is not None else {}
-        return self._clock.counts | self._counts | messages
+        dropped = {"dropped_crowded": self._timeline.dropped}
+        return self._clock.counts | dropped | self._regions.counts | self._counts | messages
 
     def feed(self, events: Events) -> list[Packet]:
         """Take the next events of the stream; return the packets that are complete.
@@ -210,6 +221,9 @@ class Receiver:
 
     def _decode_due(self, transmitter: Transmitter, until_us: float) -> None:
         """Decode the frames that lie before a time, with the events after their last edge."""
+        cut_us = transmitter.region.cut_us
+        if cut_us is not None and transmitter.grid.lock is not None:
+            self._counts["frames_cut"] += transmitter.grid.skip_before(cut_us)
         while (due := transmitter.grid.due(until_us)) is not None:
             sighting = self._decode(transmitter, due)
             if sighting is None and self._put_together(transmitter):
@@ -300,7 +314,8 @@ class Receiver:
         if look is None:
             return None
         for middle_us, centre_px, size_px in others:
-            if not any(known.covers(middle_us, centre_px) for known in self._regions.alive):
+            known = any(one.covers(middle_us, centre_px) for one in self._regions.alive)
+            if not known and self._regions.has_room():
                 self._due.append(self._regions.beside(region, middle_us, centre_px, size_px))
         return look
 

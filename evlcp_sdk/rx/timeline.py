@@ -6,9 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from evlcp_sdk.rx.clock import CameraClock
+from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.values import Events
 
 __all__ = ["TimeStep", "Timeline"]
+
+
+_MOST_PIECES = 64
+"""Pieces of a time step that wait to be put together, but for one more in `_WHOLE_EVENTS`: small ones take
+more memory than their events."""
+
+_WHOLE_EVENTS = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +46,10 @@ class Timeline:
         step_us: Length of a step, us.
         width: Columns of the sensor.
         height: Its rows.
+        limits: How many events a step may have.
 
     Attributes:
+        dropped: Events beyond that, of all steps so far.
         clock: What time it is, and which events are dropped.
 
     >>> timeline = Timeline(1000, 1280, 720)
@@ -50,8 +60,11 @@ class Timeline:
     [(2000, 2500, 2)]
     """
 
-    def __init__(self, step_us: int, width: int, height: int) -> None:
+    def __init__(self, step_us: int, width: int, height: int, limits: Limits = LIMITS) -> None:
         self.clock = CameraClock(width, height)
+        self.dropped = 0
+        self._most = limits.step_events
+        self._waiting = 0
         self._step_us = step_us
         self._start_us: int | None = None
         self._pending: list[Events] = []
@@ -73,7 +86,7 @@ class Timeline:
             self._start_us = 0
         done = 0
         for end in self._bounds(events, self._start_us):
-            self._pending.append(events[done:end])
+            self._keep(events[done:end])
             done = end
             yield self._next()
             next_us = self._grid_us(int(events.t_us[end]))
@@ -82,7 +95,18 @@ class Timeline:
             if self._start_us < next_us:
                 self._start_us, self._after_gap = next_us, True
         if done < len(events):
-            self._pending.append(events[done:])
+            self._keep(events[done:])
+
+    def _keep(self, events: Events) -> None:
+        """Add events to the step that is open, as far as it has room."""
+        taken = events[: self._most - self._waiting]
+        self.dropped += len(events) - len(taken)
+        if not len(taken):
+            return
+        self._waiting += len(taken)
+        self._pending.append(taken)
+        if len(self._pending) > _MOST_PIECES + self._waiting // _WHOLE_EVENTS:
+            self._pending = [Events.concat(self._pending)]
 
     def close(self) -> Iterator[TimeStep]:
         """End the stream; give the step that it ends in, if there is one."""
@@ -98,7 +122,7 @@ class Timeline:
         assert self._start_us is not None
         events = self._pending[0] if len(self._pending) == 1 else Events.concat(self._pending)
         start_us, after_gap = self._start_us, self._after_gap
-        self._pending, self._after_gap = [], False
+        self._pending, self._waiting, self._after_gap = [], 0, False
         self._start_us += self._step_us
         return TimeStep(start_us, self._start_us if end_us is None else end_us, events, after_gap)
 

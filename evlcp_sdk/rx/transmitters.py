@@ -1,5 +1,6 @@
 """The transmitters that a receiver knows: numbered at their first frame, remembered when lost from sight."""
 
+from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -7,6 +8,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.delays import LONGEST_ROW_US, RowDelay
 from evlcp_sdk.rx.detection import Followed
 from evlcp_sdk.rx.grid import PacketGrid
+from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.look import Pilot
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.values import SyncLock
@@ -56,10 +58,12 @@ class Transmitters:
     Args:
         packet: What is on air.
         step_us: Length of a time step, us.
+        limits: How many are remembered.
     """
 
-    def __init__(self, packet: PacketFormat, step_us: int) -> None:
+    def __init__(self, packet: PacketFormat, step_us: int, limits: Limits = LIMITS) -> None:
         self._packet = packet
+        self._remembered = limits.remembered
         self._step_us = step_us
         self._alive: dict[int, Transmitter] = {}
         self._released: list[Transmitter] = []
@@ -158,9 +162,12 @@ class Transmitters:
         """Remember a transmitter whose region has ended, without its events."""
         region = transmitter.region
         del self._alive[region.id]
-        region.pieces.clear()
+        region.hold(deque())
+        region.positions = deque([region.latest])
+        transmitter.sync = transmitter.pilot = None
         oldest_us = region.latest.t_us - _REMEMBER_US
-        self._released = [r for r in self._released if r.region.latest.t_us > oldest_us] + [transmitter]
+        kept = [r for r in self._released if r.region.latest.t_us > oldest_us]
+        self._released = [*kept, transmitter][-self._remembered :]
 
     def close(self) -> list[Transmitter]:
         """Give those that are alive, and forget all."""

@@ -109,3 +109,9 @@ def test_what_blinks_without_a_preamble() -> None:
 def test_frames_without_a_distance() -> None:
     (line,) = told(tally_of(RANDOM, distance=NONE))
     assert line.startswith("transmitter 0: 0 of 60 frames have a distance")
+
+
+def test_what_there_was_no_room_for_is_told() -> None:
+    (line,) = told(tally_of(RANDOM), frames=60, dropped_crowded=7, frames_cut=3, steps_forgotten=50)
+    assert "7 events of crowded time steps dropped; 3 frames passed over" in line
+    assert told(tally_of(RANDOM), frames=60, steps_forgotten=50, areas_left_out=9) == []

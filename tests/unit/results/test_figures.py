@@ -112,3 +112,18 @@ def test_neighbouring_clusters_differ_in_colour() -> None:
     apart = np.abs(colours[1:] - colours[:-1]).max(1)
     assert apart.min() > 0.2
     assert len(np.unique(colours, axis=0)) == 16
+
+
+def test_many_regions_and_transmitters_keep_a_bounded_share() -> None:
+    """Regions with the most places stay; transmitters that no figure shows are not kept."""
+    probe = FigureProbe(CameraModel(), points=8, most_regions=5)
+    for number in range(300):
+        for i in range(6 if number < 4 else 1):
+            probe.evlcp_stage_finished("regions", Region(number, 1000.0 * i, 100.0, 200.0, 6.0, 80.0))
+    assert set(probe.regions) >= {0, 1, 2, 3}
+    assert len(probe.regions) == 5
+    assert probe.many_regions == 300
+    told(probe, 40, 2)
+    assert sorted(probe.frames) == sorted(probe.clearest) == list(range(len(probe.frames)))
+    assert len(probe.frames) < 10
+    assert f"{probe.many_regions} regions, 5 shown" in draw_regions(probe, "many").axes[0].get_title("left")

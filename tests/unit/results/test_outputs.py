@@ -23,7 +23,7 @@ from evlcp_sdk.errors import ConfigError, InputError, OutputError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
 from evlcp_sdk.results.columns import FRAME_COLUMNS
-from evlcp_sdk.results.tallies import TransmitterTally
+from evlcp_sdk.results.tallies import RunTally, TransmitterTally
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
@@ -380,7 +380,7 @@ def test_the_median_needs_no_memory_of_every_frame() -> None:
         tally.add(packet(i // 3, tuple(frame(i // 3, k, float(distances[i + k])) for k in range(3))))
     assert tally.median_m() == pytest.approx(np.median(distances), abs=0.006)
     tally.add(packet(333, (frame(333, 0, 1e300),)))
-    assert max(tally.cells) == 1_000_000
+    assert max(tally.cells) == 100_000
 
 
 def test_a_jump_in_time_is_no_clock_error() -> None:
@@ -407,3 +407,14 @@ def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path, parquet: boo
 
         table = pyarrow.parquet.read_table(tmp_path / "frames.parquet").to_pylist()
         assert [row["distance_filtered_m"] for row in table] == [51.0, None]
+
+
+def test_figures_of_the_newest_transmitters_are_kept() -> None:
+    tally = RunTally(LINK.packet)
+    for number in range(1030):
+        tally.add(Packet(number, 0, 1000.0 * number, 100.0, (frame(0, 0), frame(0, 1)), sent=3))
+    tally.add(Packet(6, 1, 1e7, 100.0, (frame(1, 0),), sent=3))
+    assert len(tally.transmitters) == 1024
+    assert set(range(1030)) - set(tally.transmitters) == set(range(6))
+    assert (tally.others, tally.others_frames) == (6, 12)
+    assert tally.headline() == "1024 transmitters, 2049 frames; 6 earlier ones, 12 frames"

@@ -1,0 +1,51 @@
+"""What the receiver holds at the most, whatever it is fed.
+
+Above a limit something is left out and counted; what and when depends on the events alone, not on the pieces
+in which they come. The defaults keep `evlcp receive` below 500 MB, of which the interpreter with its compiled
+kernels takes 200; `benchmarks/memory.py` measures it. A camera of 60 million events a second stays below all
+of them.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+from evlcp_sdk.values import Events
+
+__all__ = ["EVENT_BYTES", "LIMITS", "PIECE_BYTES", "Limits", "held_bytes"]
+
+EVENT_BYTES: Final = 13
+"""Of an event: its time, column, row and polarity."""
+
+PIECE_BYTES: Final = 768
+"""Of four arrays and what holds them, however few events there are."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How much is held at a time.
+
+    Attributes:
+        step_events: Events of a time step; the first ones count, the others are dropped.
+        recent_bytes: Of events of the whole image, from which a region's are gathered anew; the oldest steps
+            are forgotten.
+        region_bytes: Of events of all regions together; the oldest steps are forgotten.
+        regions: Regions that are followed; one that has shown no frame for long gives way to a new one, or
+            else there is none.
+        areas: Blinking areas that are looked at in a time step; those with the most rises count.
+        remembered: Transmitters lost from sight that may come back; the newest ones.
+    """
+
+    step_events: int = 1 << 21
+    recent_bytes: int = 64 << 20
+    region_bytes: int = 48 << 20
+    regions: int = 256
+    areas: int = 256
+    remembered: int = 256
+
+
+LIMITS: Final = Limits()
+
+
+def held_bytes(events: Events) -> int:
+    """Bytes that some events take."""
+    return PIECE_BYTES + EVENT_BYTES * len(events)
