@@ -99,12 +99,25 @@ class Settings:
         watchdog: What to do when the host falls silent; None leaves it.
         watchdog_ms: After which silence, ms.
         start: Whether to play when all is done.
+        level_limit_ma: Largest LED current from now on, mA; None leaves it.
+        duty_limit: Largest share of time that a LED is on from now on, 0.001 to 1; None leaves it.
+
+    Raises:
+        ConfigError: A limit is out of its range.
     """
 
     level_ma: int | None = None
     watchdog: Watchdog | None = None
     watchdog_ms: int = 5_000
     start: bool = True
+    level_limit_ma: int | None = None
+    duty_limit: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.level_limit_ma is not None and not 0 < self.level_limit_ma < 1 << 16:
+            raise ConfigError(f"level_limit_ma = {self.level_limit_ma}: expected 1 to 65535")
+        if self.duty_limit is not None and not 0.001 <= self.duty_limit <= 1:
+            raise ConfigError(f"duty_limit = {self.duty_limit}: expected 0.001 to 1")
 
 
 class Board:
@@ -188,6 +201,20 @@ class Board:
 
     # -- programming
 
+    def limit(self, bank: Bank, level_ma: int | None = None, duty: float | None = None) -> None:
+        """Set limits of light, which hold at once; and chip rate and profile for the next commit.
+
+        Args:
+            bank: What comes next.
+            level_ma: Largest LED current, mA; None leaves it.
+            duty: Largest share of time that a LED is on, 0.001 to 1; None leaves it.
+
+        Raises:
+            RefusedError: The board cannot take a value.
+        """
+        permille = 0 if duty is None else round(1000 * duty)
+        self._configure(bank, level_ma or 0, permille)
+
     def prepare(self, bank: Bank) -> None:
         """Set chip rate, profile and codebook for the next commit.
 
@@ -195,8 +222,19 @@ class Board:
             IncompatibleError: The firmware was built with another codebook.
             RefusedError: The board cannot take a value.
         """
-        book, packet, chip_rate_hz = bank.codebook, bank.packet, bank.chip_rate_hz
-        configure = ConfigureRequest(chip_rate_hz, profile_number(book), packet.frames, packet.pilot_every)
+        self._configure(bank)
+        book = bank.codebook
+        pilots = tuple(int(w) for w in pilot_words(book))
+        request = CodebookRequest(
+            bank.packet.preamble_chips, word_of_values(book.preamble), pilots, bytes.fromhex(book.digest)
+        )
+        self.session.call(request, CodebookReply)
+
+    def _configure(self, bank: Bank, level_limit_ma: int = 0, duty_limit: int = 0) -> None:
+        packet, chip_rate_hz, profile = bank.packet, bank.chip_rate_hz, profile_number(bank.codebook)
+        configure = ConfigureRequest(
+            chip_rate_hz, profile, packet.frames, packet.pilot_every, level_limit_ma, duty_limit
+        )
         try:
             self.session.call(configure, ConfigureReply)
         except RefusedError as fault:
@@ -211,11 +249,6 @@ class Board:
                 fault.status,
                 fault.detail,
             ) from fault
-        pilots = tuple(int(w) for w in pilot_words(book))
-        request = CodebookRequest(
-            packet.preamble_chips, word_of_values(book.preamble), pilots, bytes.fromhex(book.digest)
-        )
-        self.session.call(request, CodebookReply)
 
     def holds(self, bank: Bank, status: StatusReply) -> bool:
         """Whether the active bank is this one."""
@@ -480,12 +513,24 @@ def provision(
     """
     board.check_fits(bank)
     status = board.status()
-    if settings.level_ma is not None and status.level_ma != settings.level_ma:
-        board.level(settings.level_ma)
+    if settings.level_limit_ma is not None or settings.duty_limit is not None:
+        board.limit(bank, settings.level_limit_ma, settings.duty_limit)
+        status = board.status()
+    level, later = settings.level_ma, False
+    if level is not None and status.level_ma != level:
+        try:
+            board.level(level)
+        except RefusedError as fault:
+            # too much for what plays, but perhaps not for what comes
+            later = fault.status == Status.TOO_BRIGHT
+            if not later:
+                raise
     wanted = (settings.watchdog, settings.watchdog_ms)
     if settings.watchdog is not None and (status.watchdog, status.watchdog_ms) != wanted:
         board.watchdog(settings.watchdog, settings.watchdog_ms)
     done = board.program(bank, verify, progress)
+    if level is not None and later:
+        board.level(level)
     if settings.start and status.state != State.PLAYING:
         board.start()
     return done

@@ -69,6 +69,8 @@ class Entry:
         watchdog_ms: After which silence, ms.
         start: Whether to play when done.
         baud: Line rate, bit/s.
+        level_limit_ma: Largest LED current from now on, mA.
+        duty_limit: Largest share of time that a LED is on from now on.
 
     Raises:
         ConfigError: Not exactly one of payload, random and a message is given.
@@ -94,6 +96,8 @@ class Entry:
     watchdog_ms: Annotated[int, Field(ge=100, le=2**32 - 1)] = 5_000
     start: bool = True
     baud: Annotated[int, Field(ge=1200)] = DEFAULT_BAUD
+    level_limit_ma: Annotated[int, Field(ge=1, le=65535)] | None = None
+    duty_limit: Annotated[float, Field(ge=0.001, le=1)] | None = None
 
     def __post_init__(self) -> None:
         given = (self.payload is not None, self.random is not None, self.has_message)
@@ -113,7 +117,9 @@ class Entry:
     def settings(self) -> Settings:
         """What the board is set to."""
         watchdog = None if self.watchdog is None else Watchdog[self.watchdog.upper()]
-        return Settings(self.level_ma, watchdog, self.watchdog_ms, self.start)
+        return Settings(
+            self.level_ma, watchdog, self.watchdog_ms, self.start, self.level_limit_ma, self.duty_limit
+        )
 
 
 @dataclass(frozen=True)

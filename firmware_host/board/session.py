@@ -53,6 +53,8 @@ _ADVICE = {
     Status.FLASH_FAULT: "its flash does not hold the data; try again, then replace the board",
     Status.NOT_SUPPORTED: "this board cannot do that; 'evlcp board hello' shows what it can",
     Status.EMPTY_SLOT: "no settings are saved; 'evlcp board save' first",
+    Status.TOO_BRIGHT: "a LED would be on for longer than the limits allow ({detail} of 1000 chips at this"
+    " current); lower the level, or program chips that are dark more often",
     Status.HARDWARE_FAULT: "a fault holds the LEDs dark (bits {detail:#x}); see 'evlcp board status'",
 }
 

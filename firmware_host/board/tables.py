@@ -34,6 +34,8 @@ def about_table(about: HelloReply) -> dict[str, Any]:
         "tick_hz": about.tick_hz,
         "chip_rate_max_hz": about.chip_rate_max_hz,
         "level_max_ma": about.level_max_ma,
+        "mean_max_ma": about.mean_max_ma,
+        "burst_chips": about.burst_chips,
         "capabilities": names_of_bits(Capability, about.capabilities),
         "uptime_ms": about.uptime_ms,
     }
@@ -89,6 +91,9 @@ def status_table(status: StatusReply) -> dict[str, Any]:
         "overflow_errors": status.overflow_errors,
         "requests": status.requests,
         "level_ma": status.level_ma,
+        "level_limit_ma": status.level_limit_ma,
+        "duty_limit": status.duty_limit / 1000,
+        "duty": status.duty / 1000,
         "temperature_c": None if status.temperature_dc == -(1 << 15) else status.temperature_dc / 10,
         "open_leds": [led for led in range(96) if open_leds >> (95 - led) & 1],
         "watchdog": name_of(Watchdog, status.watchdog),

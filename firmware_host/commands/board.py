@@ -169,6 +169,12 @@ def program(
         Path | None, typer.Option(metavar="FILE.toml", help="Program all boards of an inventory at once.")
     ] = None,
     level: Annotated[int | None, typer.Option(help="LED current, mA.", min=0, max=65535)] = None,
+    level_limit: Annotated[
+        int | None, typer.Option(help="Largest LED current from now on, mA.", min=1, max=65535)
+    ] = None,
+    duty_limit: Annotated[
+        float | None, typer.Option(help="Largest share of time that a LED is on.", min=0.001, max=1.0)
+    ] = None,
     watchdog: Annotated[Silence | None, typer.Option(help="What to do when the host is silent.")] = None,
     watchdog_ms: Annotated[int, typer.Option(help="After which silence, ms.", min=100, max=2**32 - 1)] = 5000,
     verify: Annotated[bool, typer.Option(help="Compare what the board holds.")] = True,
@@ -192,7 +198,7 @@ def program(
 
     action = None if watchdog is None else Watchdog[watchdog.name]
     bank = _source.bank(symbols, random, masks, seed, link_file, overrides)
-    settings = Settings(level, action, watchdog_ms, start)
+    settings = Settings(level, action, watchdog_ms, start, level_limit, duty_limit)
     with open_board(context) as board:
         with progress_bar("programming") as progress:
             done = provision(board, bank, settings, verify, progress)

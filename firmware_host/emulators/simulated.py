@@ -31,6 +31,7 @@ def _library() -> ctypes.CDLL:
         ("set_failures", None, [handle, ctypes.c_uint8, ctypes.c_uint8]),
         ("flip_flash", None, [handle, ctypes.c_uint8, ctypes.c_uint32]),
         ("shown", None, [handle, ctypes.c_char_p]),
+        ("level", ctypes.c_uint16, [handle]),
     ):
         function = getattr(library, f"board_{name}")
         function.restype, function.argtypes = result, arguments
@@ -89,6 +90,10 @@ class SimulatedBoard:
         row = ctypes.create_string_buffer(ROW_BYTES)
         self._c.board_shown(self._board, row)
         return np.unpackbits(np.frombuffer(row.raw, np.uint8))[:LEDS]
+
+    def level_ma(self) -> int:
+        """The LED current that the hardware is set to, mA."""
+        return int(self._c.board_level(self._board))
 
     def set_health(self, temperature_c: float = 25.0, faults: int = 0, open_led: int = 255) -> None:
         """What the sensors report from now on; an `open_led` of 255 is none."""

@@ -143,6 +143,8 @@ class Status(IntEnum):
     """No flash slot holds a valid setting."""
     HARDWARE_FAULT = 14
     """A fault holds the LEDs dark; detail: fault bits."""
+    TOO_BRIGHT = 15
+    """LEDs would be on for longer than the limits allow; detail: the share that they allow, permille."""
 
 
 class Format(IntEnum):
@@ -214,7 +216,7 @@ class BoardFault(IntFlag):
     """Bits of STATUS.faults."""
 
     OVER_TEMPERATURE = 1
-    """The drivers are too hot: LEDs dark until they cool and START."""
+    """The drivers are too hot, or the sensor's wire is broken: LEDs dark until they cool and START."""
     OPEN_LED = 2
     """A LED or its wire is open; playing goes on."""
     CLOCK = 4
@@ -223,6 +225,8 @@ class BoardFault(IntFlag):
     """A chip interrupt came a whole chip late, or chips stopped: LEDs dark."""
     WATCHDOG = 16
     """The host fell silent and the watchdog acted; cleared by the next control request."""
+    OVER_LIMIT = 32
+    """What came next was beyond the limits of light: not shown, LEDs dark until START."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,6 +271,8 @@ class HelloReply(WireMessage):
         tick_hz: Rate of the tick counter that times the chips.
         chip_rate_max_hz: Fastest chip rate.
         level_max_ma: Largest LED current, mA.
+        mean_max_ma: Largest mean of a LED's current, mA.
+        burst_chips: Chips that a LED may be on beyond its share of any stretch of chips.
         capabilities: Capability bits.
         unique_id: The part's own number.
         uptime_ms: Time since reset; smaller than before means a reset.
@@ -290,6 +296,8 @@ class HelloReply(WireMessage):
         ("I", 1),
         ("I", 1),
         ("H", 1),
+        ("H", 1),
+        ("H", 1),
         ("I", 1),
         ("12s", 1),
         ("I", 1),
@@ -311,6 +319,8 @@ class HelloReply(WireMessage):
     tick_hz: int
     chip_rate_max_hz: int
     level_max_ma: int
+    mean_max_ma: int
+    burst_chips: int
     capabilities: int
     unique_id: bytes
     uptime_ms: int
@@ -319,13 +329,15 @@ class HelloReply(WireMessage):
 
 @dataclass(frozen=True, slots=True)
 class ConfigureRequest(WireMessage):
-    """Set what the next COMMIT plays with; playing goes on as it was.
+    """Set what the next COMMIT plays with, playing goes on as it was; and limits of light, that hold at once.
 
     Attributes:
         chip_rate_hz: Chips per second; must divide the tick rate; not changed while playing.
         profile: Info-segment profile.
         frames: Frames per packet.
         pilot_every: Frames from one pilot to the next; 1: every frame has one.
+        level_limit_ma: Largest LED current from now on, mA; 0: as it is.
+        duty_limit: Largest share of time that a LED is on from now on, permille; 0: as it is.
     """
 
     TYPE: ClassVar[int] = 0x02
@@ -334,12 +346,16 @@ class ConfigureRequest(WireMessage):
         ("B", 1),
         ("H", 1),
         ("B", 1),
+        ("H", 1),
+        ("H", 1),
     )
 
     chip_rate_hz: int
     profile: int
     frames: int
     pilot_every: int
+    level_limit_ma: int
+    duty_limit: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -613,7 +629,7 @@ class BlankReply(WireMessage):
 
 @dataclass(frozen=True, slots=True)
 class LevelRequest(WireMessage):
-    """Set the LED current; above the board's maximum it is refused.
+    """Set the LED current; refused above its limit, or if what is committed were too bright.
 
     Attributes:
         level_ma: LED current, mA.
@@ -668,6 +684,9 @@ class StatusReply(WireMessage):
         overflow_errors: Bytes lost because the receive buffer was full.
         requests: Good datagrams received.
         level_ma: LED current, mA.
+        level_limit_ma: Largest LED current that LEVEL takes, mA.
+        duty_limit: Largest share of time that a LED may be on, permille; with a large LED current less.
+        duty: Share of time that the active bank has a LED on, that of the brightest, permille.
         temperature_dc: Driver temperature, 0.1 degree C.
         open_leds: A bit a LED: open.
         watchdog: Watchdog action.
@@ -701,6 +720,9 @@ class StatusReply(WireMessage):
         ("I", 1),
         ("I", 1),
         ("H", 1),
+        ("H", 1),
+        ("H", 1),
+        ("H", 1),
         ("h", 1),
         ("12s", 1),
         ("B", 1),
@@ -732,6 +754,9 @@ class StatusReply(WireMessage):
     overflow_errors: int
     requests: int
     level_ma: int
+    level_limit_ma: int
+    duty_limit: int
+    duty: int
     temperature_dc: int
     open_leds: bytes
     watchdog: int
@@ -830,7 +855,7 @@ class RecallReply(WireMessage):
 
 @dataclass(frozen=True, slots=True)
 class LedTestRequest(WireMessage):
-    """Walk over LEDs one by one; not while playing. STOP or BLANK ends it early.
+    """Walk over LEDs one by one, at their mean current at most; not while playing. STOP or BLANK ends it.
 
     Attributes:
         first: First LED.

@@ -5,7 +5,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from stm32_model import RESET_BY_IWDG, RESET_BY_PIN, US, Dma, ModelLine, Shown, Stm32
 
 from evlcp_sdk.air.codebook import Codebook
 from firmware_host import build
@@ -15,6 +14,17 @@ from firmware_host.board.session import Session
 from firmware_host.errors import RefusedError
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.requests import BoardFault, State
+
+pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
+from firmware_host.emulators.stm32 import (
+    RESET_BY_IWDG,
+    RESET_BY_PIN,
+    US,
+    Dma,
+    ModelLine,
+    Shown,
+    Stm32,
+)
 
 CHIP = 100 * US
 BOOT_US = 15_000
@@ -255,3 +265,43 @@ def test_a_core_that_stops_is_reset_and_stays_dark(bar: Bar, what: str) -> None:
     status = bar.connect().status()
     assert (status.state, status.faults) == (State.FAULT, BoardFault.CHIP_LOST)
     assert bar.dark
+
+
+def test_a_broken_thermal_wire_is_too_hot(bar: Bar) -> None:
+    bar.board.start()
+    bar.chip.run(5_000)
+    assert not bar.dark
+    bar.chip.thermal_open = True
+    bar.chip.run(101_000)
+    assert bar.dark
+    status = bar.board.status()
+    assert (status.state, status.faults) == (State.FAULT, BoardFault.OVER_TEMPERATURE)
+    with pytest.raises(RefusedError, match="HARDWARE_FAULT"):
+        bar.board.start()
+    bar.chip.thermal_open = False
+    bar.board.start()
+    bar.chip.run(5_000)
+    assert not bar.dark
+
+
+def test_led_test_and_save_wait_until_the_last_rows_have_left(bar: Bar) -> None:
+    for then in ("test", "save"):
+        bar.board.start()
+        bar.chip.run(5_000)
+        bar.board.stop()
+        begin = len(bar.log)
+        while bar.board.status().state != State.DARK:  # the core has ended, the chain has not
+            pass
+        if then == "save":
+            bar.board.save()
+        else:
+            bar.board.test_leds(7, 7, 2)
+        rows, _ = played(bar.log[begin:])
+        lit = np.flatnonzero(rows.any(1))
+        single = [s.row for s in bar.log[begin:] if s.row.bit_count() == 1]
+        assert single == ([1 << 95 - 7] * len(single) if then == "test" else [])
+        whole = bar.expected(len(bar.chips) * 3)
+        last = lit[rows[lit].sum(1) > 1][-1]
+        assert (rows[last] == whole[np.flatnonzero(whole[: len(bar.chips)].any(1))[-1]]).all()
+        assert bar.board.status().faults == 0
+        bar.board.blank()

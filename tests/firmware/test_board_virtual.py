@@ -213,7 +213,7 @@ def test_wrong_crc_or_codebook_never_plays(device: SimulatedBoard, board: Board,
     pilots = tuple(range(16))
     with pytest.raises(IncompatibleError, match="built with another codebook"):
         board.session.call(CodebookRequest(26, 0, pilots, digest), CodebookReply)
-    board.session.call(ConfigureRequest(10_000, Profile.WH8, 10, 1), ConfigureReply)
+    board.session.call(ConfigureRequest(10_000, Profile.WH8, 10, 1, 0, 0), ConfigureReply)
     with pytest.raises(IncompatibleError):
         board.session.call(CommitRequest(1, 0, 2, length, payload.crc, digest), CommitReply)
     device.run(500_000)

@@ -2,6 +2,7 @@
 
 #include "codebook.h"
 #include "crc32.h"
+#include "guard.h"
 #include "profiles.h"
 
 _Static_assert(EVLCP_CLUSTERS == EVLCP_BOARD_CLUSTERS, "codebook and board have other clusters");
@@ -116,6 +117,7 @@ enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlc
     for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
         plan->pilots[k] = setup->pilots[k];
     evlcp_copy(plan->digest, setup->digest, 32u);
+    plan->duty = evlcp_guard_duty(plan, banks->content[request->bank]);
     plan->valid = true;
     return EVLCP_STATUS_OK;
 }

@@ -26,6 +26,7 @@ struct evlcp_plan {
     uint32_t chip_rate_hz;
     uint32_t ticks_per_chip;
     uint32_t packet_chips;
+    uint16_t duty; /* share of time that the brightest LED is on, permille */
     uint16_t pilots[EVLCP_BOARD_CLUSTERS];
     uint8_t digest[32];
 };

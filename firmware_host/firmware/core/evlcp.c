@@ -27,6 +27,8 @@ static uint16_t faults(struct evlcp *e)
     uint32_t bits = e->health.faults | e->latched;
     if (atomic_load(&e->player.chip_lost))
         bits |= EVLCP_FAULT_CHIP_LOST;
+    if (atomic_load(&e->player.over_limit))
+        bits |= EVLCP_FAULT_OVER_LIMIT;
     if (e->watch.acted)
         bits |= EVLCP_FAULT_WATCHDOG;
     return (uint16_t)bits;
@@ -34,8 +36,10 @@ static uint16_t faults(struct evlcp *e)
 
 static void test_end(struct evlcp *e)
 {
-    if (e->test.on)
-        hal_leds(dark, EVLCP_CHIP_DARK);
+    if (!e->test.on)
+        return;
+    hal_leds(dark, EVLCP_CHIP_DARK);
+    (void)hal_level(e->level_ma);
     e->test.on = false;
 }
 
@@ -53,6 +57,34 @@ void evlcp_activate(struct evlcp *e, uint8_t bank)
     /* While chips run the chip interrupt swaps; if it has just ended, evlcp_poll does. */
     if (!running(e))
         (void)evlcp_banks_swap(&e->banks);
+}
+
+uint32_t evlcp_allowed(const struct evlcp *e, uint32_t level_ma)
+{
+    uint32_t most = level_ma > e->info.mean_max_ma ? 1000u * e->info.mean_max_ma / level_ma : 1000u;
+    return most < e->duty_limit ? most : e->duty_limit;
+}
+
+bool evlcp_light(struct evlcp *e, uint16_t level_ma, uint16_t level_limit_ma, uint16_t duty_limit)
+{
+    e->level_limit_ma = level_limit_ma;
+    e->duty_limit = duty_limit;
+    uint32_t duty = evlcp_allowed(e, level_ma);
+    uint32_t old = atomic_load(&e->player.guard.duty);
+    /* What plays meanwhile keeps to the lower of both. */
+    if (duty < old)
+        atomic_store(&e->player.guard.duty, duty);
+    if (!hal_level(level_ma))
+        return false;
+    e->level_ma = level_ma;
+    atomic_store(&e->player.guard.duty, duty);
+    return true;
+}
+
+/* Whether a bank that plays or would play allows for so large a share. */
+static bool bright_enough(const struct evlcp *e, uint8_t bank, uint32_t allowed)
+{
+    return bank == EVLCP_NO_BANK || e->banks.plan[bank].duty <= allowed;
 }
 
 /* ---- requests ---- */
@@ -92,6 +124,8 @@ static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x, uint16_t 
     reply.tick_hz = e->info.tick_hz;
     reply.chip_rate_max_hz = e->info.chip_rate_max_hz;
     reply.level_max_ma = e->info.level_max_ma;
+    reply.mean_max_ma = e->info.mean_max_ma;
+    reply.burst_chips = e->info.burst_chips;
     reply.capabilities = e->info.capabilities;
     evlcp_copy(reply.unique_id, e->info.unique_id, sizeof reply.unique_id);
     evlcp_copy(reply.hal, e->info.name, sizeof reply.hal);
@@ -141,6 +175,14 @@ static enum evlcp_status on_configure(struct evlcp *e, struct exchange *x)
         x->detail = EVLCP_PROFILE_CUSTOM;
         return EVLCP_STATUS_OUT_OF_RANGE;
     }
+    if (request.level_limit_ma > e->info.level_max_ma || request.duty_limit > 1000u) {
+        x->detail = request.duty_limit > 1000u ? 1000u : e->info.level_max_ma;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    uint16_t limit = request.level_limit_ma != 0u ? request.level_limit_ma : e->level_limit_ma;
+    uint16_t share = request.duty_limit != 0u ? request.duty_limit : e->duty_limit;
+    if (!evlcp_light(e, e->level_ma < limit ? e->level_ma : limit, limit, share))
+        return EVLCP_STATUS_HARDWARE_FAULT;
     e->setup.chip_rate_hz = request.chip_rate_hz;
     e->setup.ticks_per_chip = e->info.tick_hz / request.chip_rate_hz;
     e->setup.profile = request.profile;
@@ -249,6 +291,11 @@ static enum evlcp_status on_commit(struct evlcp *e, struct exchange *x)
     enum evlcp_status status = evlcp_banks_check(&e->banks, &e->setup, &request, &x->detail);
     if (status != EVLCP_STATUS_OK)
         return status;
+    uint32_t allowed = evlcp_allowed(e, e->level_ma);
+    if (!bright_enough(e, request.bank, allowed)) {
+        x->detail = allowed;
+        return EVLCP_STATUS_TOO_BRIGHT;
+    }
     if (!held)
         evlcp_activate(e, request.bank);
     const struct evlcp_commit_reply reply = {.commits = e->banks.commits};
@@ -268,6 +315,7 @@ static enum evlcp_status start(struct evlcp *e, uint32_t *detail)
     }
     e->latched = 0u;
     atomic_store(&e->player.chip_lost, false);
+    atomic_store(&e->player.over_limit, false);
     test_end(e);
     /* evlcp_poll begins; so a START that meets the end of a STOP is not lost. */
     atomic_store(&e->player.want_play, true);
@@ -280,14 +328,19 @@ static enum evlcp_status on_level(struct evlcp *e, struct exchange *x)
     evlcp_level_request_get(x->in, &request);
     if ((e->info.capabilities & EVLCP_CAPABILITY_LEVEL) == 0u)
         return EVLCP_STATUS_NOT_SUPPORTED;
-    if (request.level_ma > e->info.level_max_ma) {
-        x->detail = e->info.level_max_ma;
+    if (request.level_ma > e->level_limit_ma) {
+        x->detail = e->level_limit_ma;
         return EVLCP_STATUS_OUT_OF_RANGE;
     }
-    if (!hal_level(request.level_ma))
-        return EVLCP_STATUS_HARDWARE_FAULT;
-    e->level_ma = request.level_ma;
-    return EVLCP_STATUS_OK;
+    uint32_t allowed = evlcp_allowed(e, request.level_ma);
+    if (!bright_enough(e, atomic_load(&e->banks.pending), allowed) ||
+        !bright_enough(e, atomic_load(&e->banks.active), allowed)) {
+        x->detail = allowed;
+        return EVLCP_STATUS_TOO_BRIGHT;
+    }
+    test_end(e);
+    return evlcp_light(e, request.level_ma, e->level_limit_ma, e->duty_limit) ? EVLCP_STATUS_OK
+                                                                               : EVLCP_STATUS_HARDWARE_FAULT;
 }
 
 static uint8_t state(struct evlcp *e)
@@ -299,7 +352,7 @@ static uint8_t state(struct evlcp *e)
     }
     if (e->test.on)
         return EVLCP_STATE_TESTING;
-    if ((faults(e) & (HOLDS_DARK | EVLCP_FAULT_CHIP_LOST)) != 0u)
+    if ((faults(e) & (HOLDS_DARK | EVLCP_FAULT_CHIP_LOST | EVLCP_FAULT_OVER_LIMIT)) != 0u)
         return EVLCP_STATE_FAULT;
     /* Between START and its first chip. */
     return atomic_load(&e->player.want_play) ? EVLCP_STATE_PLAYING : EVLCP_STATE_DARK;
@@ -326,6 +379,7 @@ static enum evlcp_status on_status(struct evlcp *e, struct exchange *x)
         reply.pilot_every = plan->pilot_every;
         reply.packets = plan->packets;
         reply.length = plan->length;
+        reply.duty = plan->duty;
         reply.crc = plan->crc;
         reply.chip_rate_hz = plan->chip_rate_hz;
         evlcp_copy(reply.digest, plan->digest, sizeof reply.digest);
@@ -340,6 +394,8 @@ static enum evlcp_status on_status(struct evlcp *e, struct exchange *x)
     reply.overflow_errors = atomic_load(&e->link.overflow_errors);
     reply.requests = e->requests;
     reply.level_ma = e->level_ma;
+    reply.level_limit_ma = e->level_limit_ma;
+    reply.duty_limit = e->duty_limit;
     reply.temperature_dc = e->health.temperature_dc;
     evlcp_copy(reply.open_leds, e->health.open_leds, sizeof reply.open_leds);
     reply.watchdog = e->watch.action;
@@ -414,6 +470,12 @@ static enum evlcp_status on_led_test(struct evlcp *e, struct exchange *x)
         x->detail = e->health.faults;
         return EVLCP_STATUS_HARDWARE_FAULT;
     }
+    /* A LED is on for as long as the host likes: with no more than the mean that it may have. */
+    uint32_t most = (uint32_t)e->level_ma * evlcp_allowed(e, e->level_ma) / 1000u;
+    if (!hal_level((uint16_t)most)) {
+        x->detail = 0u;
+        return EVLCP_STATUS_HARDWARE_FAULT;
+    }
     e->test.on = true;
     e->test.led = request.first;
     e->test.last = request.last;
@@ -441,7 +503,7 @@ static enum evlcp_status on_control(struct evlcp *e, uint8_t type, struct exchan
     case EVLCP_TYPE_BLANK:
         atomic_store(&e->player.want_play, false);
         evlcp_player_blank(&e->player);
-        e->test.on = false;
+        test_end(e);
         return EVLCP_STATUS_OK;
     case EVLCP_TYPE_LEVEL:
         return on_level(e, x);
@@ -615,8 +677,8 @@ static void check_health(struct evlcp *e, uint32_t now)
     /* Whatever lights the LEDs, even if an earlier fault is still latched. */
     if (running(e) || atomic_load(&e->player.want_play) || e->test.on) {
         atomic_store(&e->player.want_play, false);
-        e->test.on = false;
         evlcp_player_blank(&e->player);
+        test_end(e);
     }
 }
 
@@ -660,7 +722,11 @@ void evlcp_init(struct evlcp *e)
     e->nonce = 0u;
     e->requests = 0u;
     e->latched = 0u;
-    e->level_ma = hal_level(e->info.level_default_ma) ? e->info.level_default_ma : 0u;
+    if (e->info.burst_chips > EVLCP_BURST_MOST)
+        e->info.burst_chips = EVLCP_BURST_MOST;
+    e->player.guard.burst = 1000u * e->info.burst_chips;
+    e->level_ma = 0u;
+    (void)evlcp_light(e, e->info.level_default_ma, e->info.level_max_ma, 1000u);
     hal_health(&e->health);
     e->health_ms = hal_millis();
     struct evlcp_recall_reply recalled;
@@ -683,7 +749,7 @@ void evlcp_failed(struct evlcp *e)
 {
     atomic_store(&e->player.want_play, false);
     evlcp_player_blank(&e->player);
-    e->test.on = false;
+    test_end(e);
     hal_health(&e->health);
     e->latched |= e->health.faults & HOLDS_DARK;
     if ((e->health.faults & HOLDS_DARK) == 0u)
@@ -703,7 +769,7 @@ void evlcp_poll(struct evlcp *e)
         atomic_fetch_add(&e->link.overflow_errors, lost);
     if (!running(e)) {
         (void)evlcp_banks_swap(&e->banks);
-        if (atomic_load(&e->player.chip_lost))
+        if (atomic_load(&e->player.chip_lost) || atomic_load(&e->player.over_limit))
             atomic_store(&e->player.want_play, false);
         if (atomic_load(&e->player.want_play) && atomic_load(&e->banks.active) != EVLCP_NO_BANK)
             evlcp_player_begin(&e->player, &e->banks);

@@ -58,6 +58,8 @@ struct evlcp {
     uint32_t nonce;
     uint16_t session;
     uint16_t level_ma;
+    uint16_t level_limit_ma;
+    uint16_t duty_limit; /* permille */
     uint8_t latched; /* faults that hold the LEDs dark until START finds them gone */
     uint32_t requests;
     uint8_t payload[EVLCP_MAX_PAYLOAD];
@@ -82,6 +84,12 @@ void evlcp_poll(struct evlcp *e);
 /* Storing settings; see settings.c. */
 enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct evlcp_save_reply *reply);
 enum evlcp_status evlcp_settings_recall(struct evlcp *e, bool only_autostart, struct evlcp_recall_reply *reply);
+
+/* Share of time that a LED may be on with a current, permille. */
+uint32_t evlcp_allowed(const struct evlcp *e, uint32_t level_ma);
+
+/* Set current and limits, as they are allowed together; false if the hardware does not follow. */
+bool evlcp_light(struct evlcp *e, uint16_t level_ma, uint16_t level_limit_ma, uint16_t duty_limit);
 
 /* Make a checked bank active: now if nothing plays, else at the packet boundary. */
 void evlcp_activate(struct evlcp *e, uint8_t bank);

@@ -14,6 +14,8 @@ struct evlcp_hal_info {
     uint32_t chip_rate_max_hz;   /* fastest chip rate */
     uint16_t level_max_ma;       /* largest LED current */
     uint16_t level_default_ma;   /* LED current after reset */
+    uint16_t mean_max_ma;        /* largest mean of a LED's current */
+    uint16_t burst_chips;        /* that a LED may be on beyond its share */
     uint32_t capabilities;       /* enum evlcp_capability */
     uint8_t unique_id[12];
     uint8_t name[12]; /* of the hardware layer, ASCII, zero-padded */

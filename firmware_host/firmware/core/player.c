@@ -10,12 +10,15 @@ void evlcp_player_init(struct evlcp_player *player)
     atomic_store(&player->want_idle, false);
     atomic_store(&player->running, false);
     atomic_store(&player->chip_lost, false);
+    atomic_store(&player->over_limit, false);
     atomic_store(&player->packets_sent, 0u);
     atomic_store(&player->chips_sent, 0u);
     atomic_store(&player->lateness, 0u);
     atomic_store(&player->lateness_max, 0u);
     player->idle = false;
     player->halt = false;
+    player->dark_ms = 0u;
+    player->guard = (struct evlcp_guard){.burst = 0u};
     hal_leds(dark, EVLCP_CHIP_DARK);
 }
 
@@ -33,6 +36,11 @@ static void compose(struct evlcp_player *player)
         player->packet_done = --player->idle_left == 0u;
     } else {
         player->packet_done = evlcp_cursor_row(&player->cursor, player->row);
+    }
+    /* The last thing between what is played and the LEDs. */
+    if (!evlcp_guard_take(&player->guard, player->row)) {
+        atomic_store(&player->over_limit, true);
+        player->halt = true;
     }
 }
 
@@ -61,8 +69,13 @@ void evlcp_player_begin(struct evlcp_player *player, struct evlcp_banks *banks)
     player->idle = false;
     player->ticks_per_chip = plan->ticks_per_chip;
     atomic_store(&player->chip_lost, false);
+    atomic_store(&player->over_limit, false);
     atomic_store(&player->lateness, 0u);
     atomic_store(&player->lateness_max, 0u);
+    uint32_t rested_ms = hal_millis() - player->dark_ms;
+    if (rested_ms > 1000u)
+        rested_ms = 1000u; /* longer than any burst */
+    evlcp_guard_rest(&player->guard, rested_ms * plan->chip_rate_hz / 1000u);
     seek(player, banks, 0u);
     compose(player);
     atomic_store(&player->running, true);
@@ -73,7 +86,8 @@ void evlcp_player_blank(struct evlcp_player *player)
 {
     hal_chips(0u);
     hal_leds(dark, EVLCP_CHIP_DARK);
-    atomic_store(&player->running, false);
+    if (atomic_exchange(&player->running, false))
+        player->dark_ms = hal_millis();
 }
 
 void evlcp_player_chip(struct evlcp_player *player, struct evlcp_banks *banks)

@@ -7,6 +7,7 @@
 #include <stdint.h>
 
 #include "banks.h"
+#include "guard.h"
 
 /* The main loop writes `want_play` and `want_idle`; the chip interrupt writes the rest while `running`, the main
    loop while not. */
@@ -15,6 +16,7 @@ struct evlcp_player {
     atomic_bool want_idle; /* idle pattern from the next packet boundary on */
     atomic_bool running;
     atomic_bool chip_lost; /* stopped because a chip came a whole chip late */
+    atomic_bool over_limit; /* stopped because the guard refused a row */
     bool idle;             /* this packet is the idle pattern */
     bool packet_done;      /* `row` is the packet's last */
     bool halt;             /* the row on show is the last */
@@ -22,6 +24,8 @@ struct evlcp_player {
     uint32_t idle_left;
     uint32_t chip;
     uint32_t ticks_per_chip;
+    uint32_t dark_ms; /* since when it does not run */
+    struct evlcp_guard guard;
     uint8_t row[EVLCP_ROW_BYTES];
     atomic_uint_least32_t packets_sent;
     atomic_uint_least32_t chips_sent;

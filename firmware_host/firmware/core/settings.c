@@ -2,7 +2,7 @@
 #include "crc32.h"
 #include "evlcp.h"
 
-#define MAGIC 0x45564c32u
+#define MAGIC 0x45564c33u
 #define CHUNK 256u
 
 /* A slot's header as it stands in the flash. */
@@ -12,6 +12,8 @@ struct slot {
     uint8_t watchdog;
     uint16_t level_ma;
     uint32_t watchdog_ms;
+    uint16_t level_limit_ma;
+    uint16_t duty_limit;
     struct evlcp_plan plan;
 };
 
@@ -38,6 +40,8 @@ static void put_header(const struct slot *s, uint8_t b[EVLCP_SLOT_HEADER_BYTES])
     for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
         evlcp_put16(b + 40 + 2u * k, s->plan.pilots[k]);
     evlcp_copy(b + 72, s->plan.digest, 32u);
+    evlcp_put16(b + 104, s->level_limit_ma);
+    evlcp_put16(b + 106, s->duty_limit);
     evlcp_put32(b + EVLCP_SLOT_HEADER_BYTES - 4u, evlcp_crc32(0u, b, EVLCP_SLOT_HEADER_BYTES - 4u));
 }
 
@@ -67,6 +71,8 @@ static bool get_header(struct evlcp *e, uint8_t index, struct slot *s)
     for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
         s->plan.pilots[k] = evlcp_get16(b + 40 + 2u * k);
     evlcp_copy(s->plan.digest, b + 72, 32u);
+    s->level_limit_ma = evlcp_get16(b + 104);
+    s->duty_limit = evlcp_get16(b + 106);
     return s->plan.chip_rate_hz != 0u && e->info.tick_hz % s->plan.chip_rate_hz == 0u &&
            s->plan.length <= EVLCP_BANK_BYTES;
 }
@@ -105,6 +111,8 @@ enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct ev
                               .watchdog = e->watch.action,
                               .level_ma = e->level_ma,
                               .watchdog_ms = e->watch.timeout_ms,
+                              .level_limit_ma = e->level_limit_ma,
+                              .duty_limit = e->duty_limit,
                               .plan = e->banks.plan[active]};
     put_header(&slot, header);
     /* The header goes last: until it is complete the slot is empty. */
@@ -156,11 +164,14 @@ static enum evlcp_status load(struct evlcp *e, uint8_t index, const struct slot 
     enum evlcp_status status = evlcp_banks_check(&e->banks, &setup, &request, &detail);
     if (status != EVLCP_STATUS_OK)
         return status;
+    if (s->level_limit_ma > e->info.level_max_ma || s->level_ma > s->level_limit_ma || s->duty_limit > 1000u ||
+        !evlcp_light(e, s->level_ma, s->level_limit_ma, s->duty_limit))
+        return EVLCP_STATUS_HARDWARE_FAULT;
+    if (e->banks.plan[bank].duty > evlcp_allowed(e, s->level_ma))
+        return EVLCP_STATUS_TOO_BRIGHT;
     e->setup = setup;
     e->watch.action = s->watchdog <= EVLCP_WATCHDOG_DARK ? s->watchdog : EVLCP_WATCHDOG_KEEP;
     e->watch.timeout_ms = s->watchdog_ms;
-    if (s->level_ma <= e->info.level_max_ma && hal_level(s->level_ma))
-        e->level_ma = s->level_ma;
     evlcp_activate(e, bank);
     return EVLCP_STATUS_OK;
 }

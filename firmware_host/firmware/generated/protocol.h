@@ -55,6 +55,7 @@ enum evlcp_status {
     EVLCP_STATUS_NOT_SUPPORTED = 12, /* This board cannot do that. */
     EVLCP_STATUS_EMPTY_SLOT = 13, /* No flash slot holds a valid setting. */
     EVLCP_STATUS_HARDWARE_FAULT = 14, /* A fault holds the LEDs dark; detail: fault bits. */
+    EVLCP_STATUS_TOO_BRIGHT = 15, /* LEDs would be on for longer than the limits allow; detail: the share that they allow, permille. */
 };
 
 /* What a bank holds. */
@@ -99,11 +100,12 @@ enum evlcp_capability {
 
 /* Bits of STATUS.faults. */
 enum evlcp_fault {
-    EVLCP_FAULT_OVER_TEMPERATURE = 1, /* The drivers are too hot: LEDs dark until they cool and START. */
+    EVLCP_FAULT_OVER_TEMPERATURE = 1, /* The drivers are too hot, or the sensor's wire is broken: LEDs dark until they cool and START. */
     EVLCP_FAULT_OPEN_LED = 2, /* A LED or its wire is open; playing goes on. */
     EVLCP_FAULT_CLOCK = 4, /* The crystal did not start, or stopped: LEDs dark, timing would be wrong. */
     EVLCP_FAULT_CHIP_LOST = 8, /* A chip interrupt came a whole chip late, or chips stopped: LEDs dark. */
     EVLCP_FAULT_WATCHDOG = 16, /* The host fell silent and the watchdog acted; cleared by the next control request. */
+    EVLCP_FAULT_OVER_LIMIT = 32, /* What came next was beyond the limits of light: not shown, LEDs dark until START. */
 };
 
 static inline void evlcp_copy(uint8_t *to, const uint8_t *from, uint32_t n)
@@ -166,7 +168,7 @@ static inline void evlcp_hello_request_get(const uint8_t *p, struct evlcp_hello_
     m->nonce = evlcp_get32(p + 2);
 }
 
-#define EVLCP_HELLO_REPLY_BYTES 60u
+#define EVLCP_HELLO_REPLY_BYTES 64u
 /* Answer to hello. */
 struct evlcp_hello_reply {
     uint8_t major; /* The board's protocol. */
@@ -184,6 +186,8 @@ struct evlcp_hello_reply {
     uint32_t tick_hz; /* Rate of the tick counter that times the chips. */
     uint32_t chip_rate_max_hz; /* Fastest chip rate. */
     uint16_t level_max_ma; /* Largest LED current, mA. */
+    uint16_t mean_max_ma; /* Largest mean of a LED's current, mA. */
+    uint16_t burst_chips; /* Chips that a LED may be on beyond its share of any stretch of chips. */
     uint32_t capabilities; /* Capability bits. */
     uint8_t unique_id[12]; /* The part's own number. */
     uint32_t uptime_ms; /* Time since reset; smaller than before means a reset. */
@@ -207,10 +211,12 @@ static inline void evlcp_hello_reply_put(uint8_t *p, const struct evlcp_hello_re
     evlcp_put32(p + 18, m->tick_hz);
     evlcp_put32(p + 22, m->chip_rate_max_hz);
     evlcp_put16(p + 26, m->level_max_ma);
-    evlcp_put32(p + 28, m->capabilities);
-    evlcp_copy(p + 32, m->unique_id, 12u);
-    evlcp_put32(p + 44, m->uptime_ms);
-    evlcp_copy(p + 48, m->hal, 12u);
+    evlcp_put16(p + 28, m->mean_max_ma);
+    evlcp_put16(p + 30, m->burst_chips);
+    evlcp_put32(p + 32, m->capabilities);
+    evlcp_copy(p + 36, m->unique_id, 12u);
+    evlcp_put32(p + 48, m->uptime_ms);
+    evlcp_copy(p + 52, m->hal, 12u);
 }
 
 static inline void evlcp_hello_reply_get(const uint8_t *p, struct evlcp_hello_reply *m)
@@ -230,19 +236,23 @@ static inline void evlcp_hello_reply_get(const uint8_t *p, struct evlcp_hello_re
     m->tick_hz = evlcp_get32(p + 18);
     m->chip_rate_max_hz = evlcp_get32(p + 22);
     m->level_max_ma = evlcp_get16(p + 26);
-    m->capabilities = evlcp_get32(p + 28);
-    evlcp_copy(m->unique_id, p + 32, 12u);
-    m->uptime_ms = evlcp_get32(p + 44);
-    evlcp_copy(m->hal, p + 48, 12u);
+    m->mean_max_ma = evlcp_get16(p + 28);
+    m->burst_chips = evlcp_get16(p + 30);
+    m->capabilities = evlcp_get32(p + 32);
+    evlcp_copy(m->unique_id, p + 36, 12u);
+    m->uptime_ms = evlcp_get32(p + 48);
+    evlcp_copy(m->hal, p + 52, 12u);
 }
 
-#define EVLCP_CONFIGURE_REQUEST_BYTES 8u
-/* Set what the next COMMIT plays with; playing goes on as it was. */
+#define EVLCP_CONFIGURE_REQUEST_BYTES 12u
+/* Set what the next COMMIT plays with, playing goes on as it was; and limits of light, that hold at once. */
 struct evlcp_configure_request {
     uint32_t chip_rate_hz; /* Chips per second; must divide the tick rate; not changed while playing. */
     uint8_t profile; /* Info-segment profile. */
     uint16_t frames; /* Frames per packet. */
     uint8_t pilot_every; /* Frames from one pilot to the next; 1: every frame has one. */
+    uint16_t level_limit_ma; /* Largest LED current from now on, mA; 0: as it is. */
+    uint16_t duty_limit; /* Largest share of time that a LED is on from now on, permille; 0: as it is. */
 };
 
 static inline void evlcp_configure_request_put(uint8_t *p, const struct evlcp_configure_request *m)
@@ -251,6 +261,8 @@ static inline void evlcp_configure_request_put(uint8_t *p, const struct evlcp_co
     evlcp_put8(p + 4, m->profile);
     evlcp_put16(p + 5, m->frames);
     evlcp_put8(p + 7, m->pilot_every);
+    evlcp_put16(p + 8, m->level_limit_ma);
+    evlcp_put16(p + 10, m->duty_limit);
 }
 
 static inline void evlcp_configure_request_get(const uint8_t *p, struct evlcp_configure_request *m)
@@ -259,6 +271,8 @@ static inline void evlcp_configure_request_get(const uint8_t *p, struct evlcp_co
     m->profile = evlcp_get8(p + 4);
     m->frames = evlcp_get16(p + 5);
     m->pilot_every = evlcp_get8(p + 7);
+    m->level_limit_ma = evlcp_get16(p + 8);
+    m->duty_limit = evlcp_get16(p + 10);
 }
 
 #define EVLCP_CONFIGURE_REPLY_BYTES 8u
@@ -489,7 +503,7 @@ static inline void evlcp_commit_reply_get(const uint8_t *p, struct evlcp_commit_
 #define EVLCP_BLANK_REPLY_BYTES 0u
 
 #define EVLCP_LEVEL_REQUEST_BYTES 2u
-/* Set the LED current; above the board's maximum it is refused. */
+/* Set the LED current; refused above its limit, or if what is committed were too bright. */
 struct evlcp_level_request {
     uint16_t level_ma; /* LED current, mA. */
 };
@@ -508,7 +522,7 @@ static inline void evlcp_level_request_get(const uint8_t *p, struct evlcp_level_
 
 #define EVLCP_STATUS_REQUEST_BYTES 0u
 
-#define EVLCP_STATUS_REPLY_BYTES 121u
+#define EVLCP_STATUS_REPLY_BYTES 127u
 /* Answer to status. */
 struct evlcp_status_reply {
     uint8_t state; /* State. */
@@ -533,6 +547,9 @@ struct evlcp_status_reply {
     uint32_t overflow_errors; /* Bytes lost because the receive buffer was full. */
     uint32_t requests; /* Good datagrams received. */
     uint16_t level_ma; /* LED current, mA. */
+    uint16_t level_limit_ma; /* Largest LED current that LEVEL takes, mA. */
+    uint16_t duty_limit; /* Largest share of time that a LED may be on, permille; with a large LED current less. */
+    uint16_t duty; /* Share of time that the active bank has a LED on, that of the brightest, permille. */
     int16_t temperature_dc; /* Driver temperature, 0.1 degree C. */
     uint8_t open_leds[12]; /* A bit a LED: open. */
     uint8_t watchdog; /* Watchdog action. */
@@ -566,13 +583,16 @@ static inline void evlcp_status_reply_put(uint8_t *p, const struct evlcp_status_
     evlcp_put32(p + 52, m->overflow_errors);
     evlcp_put32(p + 56, m->requests);
     evlcp_put16(p + 60, m->level_ma);
-    evlcp_put16(p + 62, (uint16_t)m->temperature_dc);
-    evlcp_copy(p + 64, m->open_leds, 12u);
-    evlcp_put8(p + 76, m->watchdog);
-    evlcp_put32(p + 77, m->watchdog_ms);
-    evlcp_put32(p + 81, m->silence_ms);
-    evlcp_put32(p + 85, m->uptime_ms);
-    evlcp_copy(p + 89, m->digest, 32u);
+    evlcp_put16(p + 62, m->level_limit_ma);
+    evlcp_put16(p + 64, m->duty_limit);
+    evlcp_put16(p + 66, m->duty);
+    evlcp_put16(p + 68, (uint16_t)m->temperature_dc);
+    evlcp_copy(p + 70, m->open_leds, 12u);
+    evlcp_put8(p + 82, m->watchdog);
+    evlcp_put32(p + 83, m->watchdog_ms);
+    evlcp_put32(p + 87, m->silence_ms);
+    evlcp_put32(p + 91, m->uptime_ms);
+    evlcp_copy(p + 95, m->digest, 32u);
 }
 
 static inline void evlcp_status_reply_get(const uint8_t *p, struct evlcp_status_reply *m)
@@ -599,13 +619,16 @@ static inline void evlcp_status_reply_get(const uint8_t *p, struct evlcp_status_
     m->overflow_errors = evlcp_get32(p + 52);
     m->requests = evlcp_get32(p + 56);
     m->level_ma = evlcp_get16(p + 60);
-    m->temperature_dc = (int16_t)evlcp_get16(p + 62);
-    evlcp_copy(m->open_leds, p + 64, 12u);
-    m->watchdog = evlcp_get8(p + 76);
-    m->watchdog_ms = evlcp_get32(p + 77);
-    m->silence_ms = evlcp_get32(p + 81);
-    m->uptime_ms = evlcp_get32(p + 85);
-    evlcp_copy(m->digest, p + 89, 32u);
+    m->level_limit_ma = evlcp_get16(p + 62);
+    m->duty_limit = evlcp_get16(p + 64);
+    m->duty = evlcp_get16(p + 66);
+    m->temperature_dc = (int16_t)evlcp_get16(p + 68);
+    evlcp_copy(m->open_leds, p + 70, 12u);
+    m->watchdog = evlcp_get8(p + 82);
+    m->watchdog_ms = evlcp_get32(p + 83);
+    m->silence_ms = evlcp_get32(p + 87);
+    m->uptime_ms = evlcp_get32(p + 91);
+    evlcp_copy(m->digest, p + 95, 32u);
 }
 
 #define EVLCP_WATCHDOG_REQUEST_BYTES 5u
@@ -686,7 +709,7 @@ static inline void evlcp_recall_reply_get(const uint8_t *p, struct evlcp_recall_
 }
 
 #define EVLCP_LED_TEST_REQUEST_BYTES 4u
-/* Walk over LEDs one by one; not while playing. STOP or BLANK ends it early. */
+/* Walk over LEDs one by one, at their mean current at most; not while playing. STOP or BLANK ends it. */
 struct evlcp_led_test_request {
     uint8_t first; /* First LED. */
     uint8_t last; /* Last LED. */
@@ -715,7 +738,7 @@ static inline void evlcp_led_test_request_get(const uint8_t *p, struct evlcp_led
    first minor version and today's; a shorter one goes on with zeros. */
 #define EVLCP_SHAPES \
     {0x01u, false, true, 6u, 6u}, \
-    {0x02u, true, false, 8u, 8u}, \
+    {0x02u, true, false, 12u, 12u}, \
     {0x03u, true, false, 69u, 69u}, \
     {0x04u, false, true, 5u, 5u}, \
     {0x05u, false, false, 7u, 7u}, \

@@ -58,6 +58,8 @@ void hal_info(struct evlcp_hal_info *info)
         .chip_rate_max_hz = 20000u,
         .level_max_ma = 60u,
         .level_default_ma = 20u,
+        .mean_max_ma = 30u,
+        .burst_chips = 64u,
         .capabilities = EVLCP_CAPABILITY_FLASH | EVLCP_CAPABILITY_LEVEL | EVLCP_CAPABILITY_RECORDS,
         .unique_id = "QEMU-AN385",
         .name = "mps2-an385"};

@@ -13,6 +13,8 @@ void hal_info(struct evlcp_hal_info *info)
         .chip_rate_max_hz = 20000u,
         .level_max_ma = 60u,
         .level_default_ma = 20u,
+        .mean_max_ma = 30u,
+        .burst_chips = 64u,
         .capabilities = EVLCP_CAPABILITY_FLASH | EVLCP_CAPABILITY_LEVEL | EVLCP_CAPABILITY_RECORDS,
         .name = "native"};
     memcpy(info->unique_id, self->unique_id, sizeof info->unique_id);
@@ -63,7 +65,8 @@ uint32_t hal_lost(void)
 
 bool hal_level(uint16_t level_ma)
 {
-    (void)level_ma;
+    if (!self->level_fails)
+        self->level_ma = level_ma;
     return !self->level_fails;
 }
 

@@ -21,6 +21,7 @@ struct native {
     uint32_t late;      /* what hal_lateness says, to test a chip that comes late */
     uint8_t unique_id[12];
     struct evlcp_health health;
+    uint16_t level_ma;
     bool level_fails;
     bool flash_fails;
     uint8_t flash[EVLCP_SLOTS][EVLCP_SLOT_BYTES];

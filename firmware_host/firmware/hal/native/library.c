@@ -24,6 +24,7 @@ void board_set_late(struct library *l, uint32_t ticks);
 void board_set_failures(struct library *l, uint8_t level, uint8_t flash);
 void board_flip_flash(struct library *l, uint8_t slot, uint32_t offset);
 void board_shown(const struct library *l, uint8_t row[EVLCP_ROW_BYTES]);
+uint16_t board_level(const struct library *l);
 
 static void keep(void *context, const uint8_t record[NATIVE_RECORD_BYTES])
 {
@@ -118,4 +119,9 @@ void board_flip_flash(struct library *l, uint8_t slot, uint32_t offset)
 void board_shown(const struct library *l, uint8_t row[EVLCP_ROW_BYTES])
 {
     memcpy(row, l->board.shown, EVLCP_ROW_BYTES);
+}
+
+uint16_t board_level(const struct library *l)
+{
+    return l->board.level_ma;
 }

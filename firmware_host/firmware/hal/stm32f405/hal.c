@@ -1,4 +1,4 @@
-/* HAL of the driver board: STM32F405 at 168 MHz, six 16-channel constant-current shift registers in a chain.
+/* HAL of the driver board: STM32F405 at 168 MHz from a crystal of EVLCP_HSE_HZ, six 16-channel constant-current shift registers in a chain.
 
    | pin      | function                                             |
    |----------|------------------------------------------------------|
@@ -7,7 +7,8 @@
    | PA6      | latch (LE), TIM3 channel 1                           |
    | PA4      | DAC 1: reference of the LED current                  |
    | PB0      | output enable of the drivers, high is dark; pulled up on the board, so dark through reset |
-   | PB1      | thermal flag of the drivers, high is too hot         |
+   | PB1      | thermal switch to ground, open when too hot; pulled  |
+   |          | up inside, so a broken wire is too hot as well       |
 
    A chip of t ticks (a tick is 12 cycles) has six slots of 2 t cycles. At the end of each slot TIM1's update
    makes DMA2 stream 5 move one 16-bit word of the row to SPI1, which shifts it out in 1.5 us. TIM3 runs on the
@@ -35,6 +36,10 @@
    watchdog's reset stays dark, with CHIP_LOST, until START, even if a slot says autostart. */
 #include "evlcp.h"
 #include "startup.h"
+
+#ifndef EVLCP_HSE_HZ
+#define EVLCP_HSE_HZ 8000000u
+#endif
 
 #define CORE_HZ 168000000u
 #define HSI_HZ 16000000u
@@ -94,6 +99,10 @@
 #define FLASH_KEYR REGISTER(FLASH + 0x04u)
 #define FLASH_SR REGISTER(FLASH + 0x0cu)
 #define FLASH_CR REGISTER(FLASH + 0x10u)
+#define FLASH_LATENCY_5 0x005u
+#define FLASH_PREFETCH 0x100u
+#define FLASH_CACHES 0x600u /* instructions and data */
+#define FLASH_CACHES_RESET 0x1800u
 #define FLASH_BUSY 0x00010000u
 #define FLASH_ERRORS 0x000000f2u
 #define FLASH_PROGRAM 0x00000001u
@@ -180,6 +189,7 @@
 #define IRQ_DMA2_STREAM5 68u
 
 #define LEVEL_MAX_MA 60u
+#define MEAN_MAX_MA 30u
 #define DAC_FULL 4095u
 #define WAIT_LOOPS 1000000u
 #define WORD_WAIT_LOOPS 1000u /* a word is on its way for 1.5 us; a stream ends with the one under way */
@@ -212,6 +222,8 @@ void hal_info(struct evlcp_hal_info *info)
                                     .chip_rate_max_hz = 20000u,
                                     .level_max_ma = LEVEL_MAX_MA,
                                     .level_default_ma = 20u,
+                                    .mean_max_ma = MEAN_MAX_MA,
+                                    .burst_chips = 64u,
                                     .capabilities = EVLCP_CAPABILITY_FLASH | EVLCP_CAPABILITY_LEVEL,
                                     .name = "stm32f405"};
 #ifndef EVLCP_NETDUINOPLUS2
@@ -281,21 +293,6 @@ static bool shift_now(void)
     return true;
 }
 
-void hal_leds(const uint8_t *row, uint32_t chip)
-{
-    if (chip == EVLCP_CHIP_DARK && !in_chip) {
-        outputs_off();
-        return;
-    }
-    load(row);
-    if (chip == EVLCP_CHIP_TEST) {
-        if (shift_now())
-            outputs_on();
-        else
-            fail();
-    }
-}
-
 /* Something that should go on all the time, as the main loop sees it. */
 struct look {
     uint32_t good_at;
@@ -334,6 +331,30 @@ static void watch_chips(void)
     latch_count = count;
     if (bad && streaming) /* it may have ended meanwhile */
         fail();
+}
+
+/* Wait until the rows that the core has ended with have left the chain: at most three chips. */
+static void rest(void)
+{
+    while (draining != 0u)
+        watch_chips();
+}
+
+void hal_leds(const uint8_t *row, uint32_t chip)
+{
+    if (chip == EVLCP_CHIP_TEST)
+        rest();
+    if (chip == EVLCP_CHIP_DARK && !in_chip) {
+        outputs_off();
+        return;
+    }
+    load(row);
+    if (chip == EVLCP_CHIP_TEST) {
+        if (shift_now())
+            outputs_on();
+        else
+            fail();
+    }
 }
 
 static void chips_start(uint32_t ticks)
@@ -402,8 +423,7 @@ void hal_chips(uint32_t ticks)
         chips_stop();
         return;
     }
-    while (draining != 0u) /* at most three chips */
-        watch_chips();
+    rest();
     if (!failed)
         chips_start(ticks);
 }
@@ -484,14 +504,26 @@ static void iwdg_reload(uint32_t counts)
     IWDG_KR = IWDG_FEED;
 }
 
+/* What the caches hold of an erased sector is stale. */
+static void flash_forget(void)
+{
+    uint32_t acr = FLASH_ACR;
+    FLASH_ACR = acr & ~FLASH_CACHES; /* they are reset while they are off */
+    FLASH_ACR = (acr & ~FLASH_CACHES) | FLASH_CACHES_RESET;
+    FLASH_ACR = acr & ~FLASH_CACHES;
+    FLASH_ACR = acr;
+}
+
 bool hal_flash_erase(uint8_t slot)
 {
-    iwdg_reload(IWDG_LONG); /* the core stands while a sector is erased */
+    rest(); /* the core stands while a sector is erased, and no chip may come then */
+    iwdg_reload(IWDG_LONG);
     flash_unlock();
     FLASH_CR = FLASH_WORDS | FLASH_SECTOR_ERASE | SLOT_SECTOR(slot) << 3;
     FLASH_CR |= FLASH_START;
     bool done = flash_done();
     FLASH_CR = FLASH_LOCK;
+    flash_forget();
     iwdg_reload(clock_failed ? IWDG_LONG : IWDG_SHORT);
     return done;
 }
@@ -611,14 +643,14 @@ static bool ready(const volatile uint32_t *where, uint32_t mask, uint32_t value)
 #endif
 }
 
-/* 8 MHz crystal -> PLL -> 168 MHz; buses at 42 and 84 MHz. False: still on the 16 MHz RC oscillator. */
+/* Crystal -> 1 MHz -> PLL -> 168 MHz; buses at 42 and 84 MHz. False: still on the 16 MHz RC oscillator. */
 static bool clock_start(void)
 {
     RCC_CR |= HSE_ON;
     if (!ready(&RCC_CR, HSE_READY, HSE_READY))
         return false;
-    FLASH_ACR = 0x705u; /* five wait states, caches and prefetch on */
-    RCC_PLLCFGR = 7u << 24 | 1u << 22 | 336u << 6 | 8u;
+    FLASH_ACR = FLASH_CACHES | FLASH_PREFETCH | FLASH_LATENCY_5;
+    RCC_PLLCFGR = 7u << 24 | 1u << 22 | 336u << 6 | EVLCP_HSE_HZ / 1000000u;
     RCC_CR |= PLL_ON;
     if (!ready(&RCC_CR, PLL_READY, PLL_READY))
         return false;
@@ -637,7 +669,7 @@ static void pins_start(void)
     RCC_APB2ENR |= 1u << 12 | 1u << 4 | 1u << 0;             /* SPI1, USART1, TIM1 */
     GPIO_BSRR(GPIOB) = PIN(0);                               /* dark before the pin drives */
     GPIO_MODER(GPIOB) |= MODE(0, MODE_OUTPUT);
-    GPIO_PUPDR(GPIOB) |= 2u << 2;                            /* PB1 down */
+    GPIO_PUPDR(GPIOB) |= 1u << 2;                            /* PB1 up */
     GPIO_AFRL(GPIOA) = 5u << 20 | 2u << 24 | 5u << 28;       /* SPI1, TIM3, SPI1 */
     GPIO_AFRH(GPIOA) = 7u << 4 | 7u << 8;                    /* USART1 */
     GPIO_OSPEEDR(GPIOA) |= MODE(5, 2) | MODE(6, 2) | MODE(7, 2);
@@ -671,10 +703,11 @@ int main(void)
         evlcp_failed(&board);
     EXTI_PR = EXTI_PVD;
     EXTI_IMR = EXTI_PVD;
-    /* SysTick and PVD are the highest, to get through a chip interrupt that hangs; nothing else delays a row. */
+    /* SysTick and PVD are the highest, to get through a chip interrupt that hangs. A byte waits for 10 us, a row
+       for a whole chip: the receive interrupt, which takes less than a microsecond, goes before. */
     irq_enable(IRQ_PVD, 0x00u);
-    irq_enable(IRQ_DMA2_STREAM5, 0x10u);
-    irq_enable(IRQ_USART1, 0x80u);
+    irq_enable(IRQ_USART1, 0x10u);
+    irq_enable(IRQ_DMA2_STREAM5, 0x20u);
     USART_BRR = (clock_failed ? HSI_HZ : CORE_HZ / 2u) / EVLCP_BAUD;
     USART_CR1 = 1u << 13 | 1u << 5 | 1u << 3 | 1u << 2; /* on, receive interrupt, transmitter, receiver */
     for (;;) {

@@ -11,13 +11,15 @@ import heapq
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import count
 from pathlib import Path
+from typing import Any
 
-import pytest
+import unicorn
+from unicorn import arm_const
 
-unicorn = pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
-arm_const = pytest.importorskip("unicorn.arm_const")
+engine: Any = unicorn  # it has no types
 
 UNIT_HZ = 336_000_000
 HSI_HZ, HSE_HZ, LSI_HZ = 16_000_000, 8_000_000, 32_000
@@ -49,25 +51,30 @@ class Timer:
         self.stands = False  # broken: the counter does not move
         self.request = False  # of the update, for DMA
         self.generation = 0
-        self.on_edge: Callable[[bool], None] = lambda high: None
+        self.on_edge: Callable[[bool], None] = lambda _: None
         self.slave: Timer | None = None
 
     @property
     def running(self) -> bool:
+        """Whether the counter moves."""
         return bool(self.r[self.CR1] & 1) and not self.stands
 
     def counter(self) -> int:
+        """The counter now."""
         period = self.r[self.ARR] + 1
         moved = (self.chip.now - self.since) // self.unit if self.running else 0
         return (self.held + moved) % period
 
     def hold(self, value: int) -> None:
+        """Let the counter go on from a value."""
         self.held, self.since = value, self.chip.now
 
     def read(self, offset: int) -> int:
+        """What the core reads of a register."""
         return self.counter() if offset == self.CNT else self.r[offset]
 
     def write(self, offset: int, value: int) -> None:
+        """What a write of the core does."""
         self.hold(self.counter())
         if offset == self.EGR:
             assert value == 1, value
@@ -151,6 +158,7 @@ class Dma:
         self.dead = False
 
     def read(self, offset: int) -> int:
+        """What the core reads of a register."""
         return {
             0x04: self.flags,
             0x0C: 0,
@@ -162,6 +170,7 @@ class Dma:
         }[offset]
 
     def write(self, offset: int, value: int) -> None:
+        """What a write of the core does."""
         on = self.cr & 1
         if offset == 0x0C:
             self.flags &= ~value
@@ -188,6 +197,7 @@ class Dma:
         self.line()
 
     def start(self) -> None:
+        """The stream is enabled."""
         # channel 6, 16 bits both sides, memory counts up, circular, to the peripheral: all the model knows
         assert self.cr & ~0x1E == 6 << 25 | 3 << 16 | 1 << 13 | 1 << 11 | 1 << 10 | 1 << 8 | 1 << 6 | 1
         assert not self.fcr & 4  # direct mode
@@ -197,6 +207,7 @@ class Dma:
         self.serve()
 
     def fetch(self) -> None:
+        """Fetch the next word ahead."""
         at = self.memory + 2 * (self.count - self.left)
         self.ahead = struct.unpack("<H", self.chip.uc.mem_read(at, 2))[0]
 
@@ -224,6 +235,7 @@ class Dma:
         self.line()
 
     def line(self) -> None:
+        """Raise or drop the interrupt."""
         cr = self.cr
         enabled = (cr >> 4 & 1) * self.ALL | (cr >> 3 & 1) * self.HALF | (cr >> 2 & 1) * self.TRANSFER_ERROR
         enabled |= (cr >> 1 & 1) * self.DIRECT_ERROR | (self.fcr >> 7 & 1) * self.FIFO_ERROR
@@ -243,12 +255,14 @@ class Spi:
         self.dead = False
 
     def bits_done(self) -> int:
+        """Bits of the word under way that have left."""
         if self.word is None or self.dead:
             return 0
         return min(16, (self.chip.now - self.began) // self.bit)
 
     @property
     def bit(self) -> int:
+        """Time of a bit."""
         return UNIT_HZ // self.chip.pclk2 * (2 << (self.cr1 >> 3 & 7))
 
     def outputs(self) -> int:
@@ -257,11 +271,13 @@ class Spi:
         return (self.chain << done | (self.word or 0) >> (16 - done)) & (1 << LEDS) - 1
 
     def read(self, offset: int) -> int:
+        """What the core reads of a register."""
         if offset == 0x08:
             return (self.buffer is None) << 1 | (self.word is not None) << 7
         return {0x00: self.cr1, 0x04: self.cr2, 0x0C: 0}[offset]
 
     def write(self, offset: int, value: int) -> None:
+        """What a write of the core does."""
         if offset == 0x0C:
             self.send(value)
         elif offset == 0x00:
@@ -272,6 +288,7 @@ class Spi:
             self.cr2 = value
 
     def send(self, word: int) -> None:
+        """A word is written."""
         if not self.cr1 & 0x40:
             return
         if self.word is None and not self.dead:
@@ -280,10 +297,12 @@ class Spi:
             self.buffer = word
 
     def shift(self, word: int) -> None:
+        """A word begins to leave."""
         self.word, self.began = word, self.chip.now
         self.chip.at(self.chip.now + 16 * self.bit, self.done)
 
     def done(self) -> None:
+        """A word has left."""
         if self.dead or self.word is None:
             return
         self.chain = (self.chain << 16 | self.word) & (1 << LEDS) - 1
@@ -322,6 +341,7 @@ class Drivers:
 
     @property
     def row(self) -> int:
+        """What the LEDs show."""
         return 0 if self.dark else self.held
 
     def look(self) -> None:
@@ -358,9 +378,10 @@ class Usart:
         self.line_free = max(self.line_free, self.chip.now)
         for byte in data:
             self.line_free += self.BYTE
-            self.chip.at(self.line_free, lambda byte=byte: self.received(byte))
+            self.chip.at(self.line_free, partial(self.received, byte))
 
     def received(self, byte: int) -> None:
+        """A byte of the host has come."""
         if self.cr1 & 0x2004 != 0x2004 or not self.right_rate():
             return
         if self.sr & 0x20:
@@ -370,6 +391,7 @@ class Usart:
         self.line()
 
     def read(self, offset: int) -> int:
+        """What the core reads of a register."""
         if offset == 0x00:
             return self.sr & ~0x80 | (self.chip.now >= self.free_at) << 7
         if offset == 0x04:
@@ -379,6 +401,7 @@ class Usart:
         return {0x08: self.brr, 0x0C: self.cr1}[offset]
 
     def write(self, offset: int, value: int) -> None:
+        """What a write of the core does."""
         if offset == 0x04:
             if self.cr1 & 0x2008 == 0x2008:
                 leaves = max(self.chip.now, self.free_at) + self.BYTE
@@ -394,6 +417,7 @@ class Usart:
         self.line()
 
     def line(self) -> None:
+        """Raise or drop the interrupt."""
         self.chip.set_line(16 + self.IRQ, bool(self.cr1 & 0x20 and self.sr & 0x28))
 
 
@@ -406,9 +430,11 @@ class SysTick:
         self.generation = 0
 
     def read(self, offset: int) -> int:
+        """What the core reads of a register."""
         return {0x10: self.csr, 0x14: self.rvr, 0x18: 0}[offset]
 
     def write(self, offset: int, value: int) -> None:
+        """What a write of the core does."""
         if offset == 0x10:
             assert not value & ~7
             assert value in (0, 5, 7), "on the core's clock"
@@ -418,6 +444,7 @@ class SysTick:
         self.plan()  # a write to the counter clears it: it begins again with the reload value
 
     def plan(self) -> None:
+        """Look ahead to the end."""
         self.generation += 1
         generation = self.generation
 
@@ -443,13 +470,16 @@ class Iwdg:
 
     @property
     def timeout(self) -> int:
+        """How long it waits."""
         return (self.rlr + 1) * (4 << self.pr) * UNIT_HZ // LSI_HZ
 
     def read(self, offset: int) -> int:
+        """What the core reads of a register."""
         busy = 3 if self.chip.now < self.busy_until else 0
         return {0x0: 0, 0x4: self.pr, 0x8: self.rlr, 0xC: busy}[offset]
 
     def write(self, offset: int, value: int) -> None:
+        """What a write of the core does."""
         if offset == 0x0:
             self.open = value == 0x5555
             self.on |= value == 0xCCCC
@@ -463,6 +493,7 @@ class Iwdg:
                 self.rlr = value
 
     def feed(self) -> None:
+        """Begin anew."""
         self.generation += 1
         generation = self.generation
 
@@ -478,13 +509,21 @@ class Flash:
 
     def __init__(self, chip: "Stm32") -> None:
         self.chip = chip
-        self.acr, self.cr, self.keys = 0, 0x80000000, []
+        self.acr, self.cr = 0, 0x80000000
+        self.keys: list[int] = []
+        self.stale = False  # the caches may hold what was erased
 
     def read(self, offset: int) -> int:
+        """What the core reads of a register."""
         return {0x00: self.acr, 0x0C: 0, 0x10: self.cr}[offset]
 
     def write(self, offset: int, value: int) -> None:
+        """What a write of the core does."""
         if offset == 0x00:
+            # a cache is reset only while it is off
+            assert not (value & 0x1800 and value & 0x600), hex(value)
+            if value & 0x1800 == 0x1800:
+                self.stale = False
             self.acr = value
         elif offset == 0x04:
             self.keys = [*self.keys, value][-2:]
@@ -497,6 +536,7 @@ class Flash:
                 assert 8 <= sector < 12, "the last four, of 128 KiB each"
                 self.chip.uc.mem_write(0x08080000 + 0x20000 * (sector - 8), b"\xff" * 0x20000)
                 self.chip.now += UNIT_HZ
+                self.stale = bool(self.acr & 0x600)
                 self.cr &= ~0x10000
 
 
@@ -507,8 +547,13 @@ class Stm32:
         elf: The image.
     """
 
+    iwdg: Iwdg
+    drivers: Drivers
+    spi: Spi
+
     def __init__(self, elf: Path) -> None:
-        self.uc = uc = unicorn.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB | unicorn.UC_MODE_MCLASS)
+        uc: Any = engine.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB | unicorn.UC_MODE_MCLASS)
+        self.uc = uc
         uc.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
         uc.mem_map(0x08000000, 1 << 20)
         uc.mem_write(0x08000000, b"\xff" * (1 << 20))
@@ -523,6 +568,7 @@ class Stm32:
             kind, offset, _, at, size = struct.unpack_from("<5I", data, start + 32 * n)
             if kind == 1 and size:
                 uc.mem_write(at, data[offset : offset + size])
+        uc.hook_add(unicorn.UC_HOOK_MEM_READ, self._slot_read, begin=0x08080000, end=0x080FFFFF)
         self.now = 0
         self.events: list[tuple[int, int, Callable[[], None]]] = []
         self.order = count()
@@ -548,14 +594,16 @@ class Stm32:
         self.lines: set[int] = set()
         self.priorities: dict[int, int] = {}
         self.active: list[int] = []
+        self.entered: list[tuple[int, int]] = []
+        self.longest: dict[int, int] = {}
         self.tim1, self.tim2, self.tim3 = Timer(self, "TIM1"), Timer(self, "TIM2"), Timer(self, "TIM3")
         self.tim1.slave = self.tim3
-        self.tim3.on_edge = lambda high: self.drivers.look()
+        self.tim3.on_edge = lambda _: self.drivers.look()
         self.dma, self.spi, self.usart = Dma(self), Spi(self), Usart(self)
         self.systick, self.iwdg, self.flash = SysTick(self), Iwdg(self), Flash(self)
         self.drivers = Drivers(self)
         self.drivers.log, self.drivers.held, self.spi.chain = log, held, chain
-        self.places = {
+        self.places: dict[int, Any] = {
             0x40000000: self.tim2,
             0x40000400: self.tim3,
             0x40003000: self.iwdg,
@@ -572,6 +620,7 @@ class Stm32:
 
     @property
     def pclk2(self) -> int:
+        """Clock of APB2, Hz."""
         divider = self.plain.get(0x40023808, 0) >> 13 & 7
         return UNIT_HZ // self.cycle >> (divider - 3 if divider & 4 else 0)
 
@@ -630,6 +679,8 @@ class Stm32:
             self.core_stands = True
 
     core_stands = False
+    thermal_open = False
+    """Too hot, or the wire to the switch is broken."""
 
     # -- pins
 
@@ -645,17 +696,21 @@ class Stm32:
 
     # -- registers
 
+    def _slot_read(self, uc: object, access: int, at: int, size: int, value: int, data: object) -> None:
+        assert not self.flash.stale, f"{at:#x} is read through caches that were not flushed"
+
     def _read(self, uc: object, offset: int, size: int, base: int) -> int:
         at = base + offset
         if size != 4:
             raise AssertionError(hex(at))
         place = self.places.get(at & ~0x3FF)
         if place is not None:
-            return place.read(at & 0x3FF)
+            return int(place.read(at & 0x3FF))
         if 0xE000E010 <= at < 0xE000E020:
             return self.systick.read(at & 0xFF)
-        if at == 0x40020410:  # thermal flag: cool
-            return 0
+        if at == 0x40020410:  # the thermal switch: closed to ground while it is cool
+            pulled_up = self.plain.get(0x4002040C, 0) >> 2 & 3 == 1
+            return int(self.thermal_open and pulled_up) << 1
         if at == 0x40020000:
             return self.plain.get(at, 0xA8000000)
         return self.plain.get(at, 0)
@@ -693,6 +748,7 @@ class Stm32:
     # -- exceptions
 
     def set_line(self, number: int, high: bool) -> None:
+        """Raise or drop an interrupt line."""
         if high:
             self.lines.add(number)
             self.pending.add(number)
@@ -711,6 +767,7 @@ class Stm32:
             return
         self.pending.discard(number)
         self.exception(number)
+        self.entered.append((number, self.now))
 
     def exception(self, number: int) -> None:
         """Enter an exception: eight words go onto the stack."""
@@ -742,6 +799,9 @@ class Stm32:
         uc.reg_write(c.UC_ARM_REG_XPSR, status & ~(1 << 9) & 0xFF000000)
         uc.reg_write(c.UC_ARM_REG_SP, stack + 32 + 4 * (status >> 9 & 1))
         ended = self.active.pop()
+        if self.entered:
+            number, at = self.entered.pop()
+            self.longest[number] = max(self.longest.get(number, 0), self.now - at)
         if ended in self.lines:
             self.pending.add(ended)
         self.now += 12 * self.cycle
@@ -788,10 +848,12 @@ class ModelLine:
         self.chip = chip
 
     def now(self) -> float:
+        """Time of the model, s."""
         return self.chip.now / UNIT_HZ
 
     def read(self, timeout_s: float) -> bytes:
-        end = self.chip.now + int(timeout_s * UNIT_HZ)
+        """Bytes from the board; time passes until some come, or `timeout_s` is over."""
+        end = self.chip.now + max(50 * US, int(timeout_s * UNIT_HZ))
         while not self.chip.usart.to_host and self.chip.now < end:
             self.chip.run(50)
         data = bytes(self.chip.usart.to_host)
@@ -799,7 +861,8 @@ class ModelLine:
         return data
 
     def write(self, data: bytes) -> None:
+        """Bytes to the board."""
         self.chip.usart.arrive(data)
 
     def close(self) -> None:
-        pass
+        """Nothing to let go."""

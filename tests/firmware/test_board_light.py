@@ -1,0 +1,189 @@
+"""Limits of light on what is sent: refused before, dark in time; against a count of all stretches."""
+
+import numpy as np
+import pytest
+from board_lines import board_on
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import load_link
+from firmware_host.board.bank import Bank, random_symbols
+from firmware_host.board.board import Board, Settings, provision
+from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.errors import RefusedError
+from firmware_host.protocol.requests import BoardFault, State, Status
+
+pytestmark = pytest.mark.usefixtures("compiler")
+
+BURST = 64
+FRAMES = 4
+CHIPS = 26 + 32 * FRAMES
+
+
+def bank_of_rows(rows: NDArray[np.uint8]) -> Bank:
+    book = load_link().codebook
+    return Bank.of_masks(rows, book, PacketFormat.of(book, FRAMES))
+
+
+def excess(rows: NDArray[np.uint8], duty: float) -> NDArray[np.float64]:
+    """The chips that a LED is on beyond its share, the worst LED's and stretch's that ends with each chip."""
+    sums = np.vstack([np.zeros((1, 96)), np.cumsum(rows - duty, axis=0)])
+    lowest = np.minimum.accumulate(sums, axis=0)
+    return (sums - lowest).max(1)[1:]
+
+
+def device_and_board() -> tuple[SimulatedBoard, Board]:
+    device = SimulatedBoard()
+    return device, board_on(SimulatedLine(device))
+
+
+def shown(device: SimulatedBoard) -> NDArray[np.uint8]:
+    return device.records().played().chips(96)
+
+
+def test_the_oracle_counts_every_stretch() -> None:
+    rows = np.random.default_rng(1).integers(0, 2, (40, 96), dtype=np.uint8)
+    every = max(float((rows[a:b].sum(0) - 0.4 * (b - a)).max()) for a in range(40) for b in range(a, 41))
+    assert excess(rows, 0.4).max() == pytest.approx(every)
+
+
+def test_all_ones_at_full_current_are_refused_and_the_old_bank_plays_on(book: Codebook) -> None:
+    device, board = device_and_board()
+    assert (board.about.level_max_ma, board.about.mean_max_ma, board.about.burst_chips) == (60, 30, BURST)
+    good = Bank.of_symbols(random_symbols(2, 10, book, np.random.default_rng(0)), book)
+    provision(board, good, Settings(level_ma=60))
+    assert board.status().duty == 500
+    ones = bank_of_rows(np.ones((CHIPS, 96), np.uint8))
+    with pytest.raises(RefusedError, match=r"TOO_BRIGHT.*500 of 1000 chips.*lower the level") as refused:
+        board.program(ones)
+    assert (refused.value.status, refused.value.detail) == (Status.TOO_BRIGHT, 500)
+    device.run(100_000)
+    assert board.holds(good, board.status())
+    assert board.status().state == State.PLAYING
+    # what is too bright for 60 mA is not for 30, and the current stays below that then
+    provision(board, ones, Settings(level_ma=30))
+    with pytest.raises(RefusedError, match="TOO_BRIGHT"):
+        board.level(31)
+    device.run(100_000)
+    status = board.status()
+    assert (status.state, status.level_ma, status.duty, status.faults) == (State.PLAYING, 30, 1000, 0)
+    # and back in one go, although 60 mA are too much for what plays
+    provision(board, good, Settings(level_ma=60))
+    assert board.status().level_ma == 60
+
+
+def test_limits_hold_at_once_and_outlive_a_reset_by_save(book: Codebook) -> None:
+    device, board = device_and_board()
+    good = Bank.of_symbols(random_symbols(2, 10, book, np.random.default_rng(0)), book)
+    provision(board, good, Settings(level_ma=40, start=False))
+    board.limit(good, level_ma=25, duty=0.5)
+    status = board.status()
+    assert (status.level_ma, status.level_limit_ma, status.duty_limit) == (25, 25, 500)
+    with pytest.raises(RefusedError, match="nearest value the board can take is 25"):
+        board.level(26)
+    board.limit(good)  # nothing said, nothing changed
+    board.save(autostart=True)
+    device.reset()
+    board = board_on(SimulatedLine(device))
+    status = board.status()
+    assert (status.level_ma, status.level_limit_ma, status.duty_limit) == (25, 25, 500)
+    # a limit below what plays: dark, named, until START is allowed again
+    board.limit(good, duty=0.4)
+    device.run(200_000)
+    status = board.status()
+    assert (status.state, status.faults) == (State.FAULT, BoardFault.OVER_LIMIT)
+    assert not device.shown().any()
+    with pytest.raises(RefusedError, match="nearest value the board can take is 60"):
+        board.limit(good, level_ma=61)
+    with pytest.raises(ConfigError, match="duty_limit = 0: expected"):
+        Settings(duty_limit=0)
+
+
+@st.composite
+def streams(draw: st.DrawFn) -> tuple[NDArray[np.uint8], int, float]:
+    """Chips of which some LEDs are on in runs, a current, and a limit of duty."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    share = draw(st.floats(0.05, 1.0))
+    run = draw(st.integers(1, 2 * CHIPS))
+    packets = draw(st.integers(1, 3))
+    n = packets * CHIPS
+    steps = rng.random((n // run + 2, 96)) < share
+    rows = np.repeat(steps, run, axis=0)[:n].astype(np.uint8)
+    return rows, draw(st.integers(10, 60)), draw(st.sampled_from([0.1, 0.25, 0.4, 0.5, 0.75, 1.0]))
+
+
+@settings(max_examples=60, deadline=None)
+@given(streams(), st.lists(st.integers(1, 2000), max_size=4))
+def test_no_stretch_of_what_is_sent_is_beyond_the_limits(
+    stream: tuple[NDArray[np.uint8], int, float], stops: list[int]
+) -> None:
+    rows, level_ma, limit = stream
+    device, board = device_and_board()
+    bank = bank_of_rows(rows)
+    board.level(level_ma)
+    board.limit(bank, duty=limit)
+    duty = min(limit, (30_000 // level_ma) / 1000) if level_ma > 30 else limit
+    mean = rows.mean(0).max()
+    if mean > duty + 1e-9:
+        with pytest.raises(RefusedError, match="TOO_BRIGHT"):
+            board.program(bank)
+        return
+    board.program(bank)
+    assert board.status().duty == np.ceil(1000 * mean - 1e-9)
+
+    device.records()
+    sent, ended = [np.zeros((0, 96), np.uint8)], 0
+    for n, chips in enumerate([*stops, 3000]):
+        board.start()
+        device.run(100 * chips)
+        faults = board.status().faults
+        board.blank()
+        record = device.records().played()
+        part = record.chips(96)
+        # the first row beyond the limits is the one that was not shown
+        endless = np.resize(rows, (len(part) + 1, 96))
+        assert (part == endless[:-1]).all()
+        assert faults in (0, BoardFault.OVER_LIMIT)
+        if n == 0 and faults:
+            assert excess(endless, duty)[-1] > BURST - 1e-6
+        if len(part):
+            dark = (int(record.ticks[0]) - ended) // 1000 if ended else 0
+            sent += [np.zeros((dark, 96), np.uint8), part]
+            ended = int(record.ticks[-1])
+    # over BLANK and START as well; dark time is counted to the millisecond
+    everything = np.vstack(sent)
+    assert not len(everything) or excess(everything, duty).max() <= BURST + 10 * (len(stops) > 0)
+
+
+def test_a_burst_beyond_the_limits_goes_dark_before_it_is_shown() -> None:
+    rows = np.zeros((3 * CHIPS, 96), np.uint8)
+    rows[20:160, 5] = 1  # 0.3 of the time, but at once
+    device, board = device_and_board()
+    provision(board, bank_of_rows(rows), Settings(level_ma=20, duty_limit=0.54))
+    device.run(100_000)
+    # 140 * (1 - 0.54) chips are just beyond 64: the last of them is not shown
+    assert (shown(device) == rows[:159]).all()
+    status = board.status()
+    assert (status.state, status.faults) == (State.FAULT, BoardFault.OVER_LIMIT)
+    board.limit(bank_of_rows(rows), duty=0.55)
+    board.start()
+    device.run(100_000)
+    assert (board.status().state, board.status().faults) == (State.PLAYING, 0)
+    assert (shown(device)[:900] == np.resize(rows, (900, 96))).all()
+
+
+def test_the_led_test_keeps_to_the_mean_current() -> None:
+    device, board = device_and_board()
+    board.level(60)
+    board.test_leds(3, 4, 50)
+    assert device.level_ma() == 30
+    assert board.status().level_ma == 60
+    device.run(60_000)
+    assert device.level_ma() == 30
+    device.run(60_000)
+    assert board.status().state == State.DARK
+    assert device.level_ma() == 60
