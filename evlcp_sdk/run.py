@@ -421,8 +421,9 @@ def _views(
         for number, seen in frames.items():
             points = points_at(seen, pose.t_us, period_us, clusters, spec)
             if points is not None and number in stands_at:
-                enu = stands_at[number].cluster_positions_m(clusters, axes)
-                bars.append(BarView(number, enu, *points))
+                site = stands_at[number]
+                enu = site.cluster_positions_m(clusters, axes)
+                bars.append(BarView(site.transmitter_id, enu, *points, site.survey))
         place = (pose.latitude_deg, pose.longitude_deg, pose.height_m)
         rotation = None
         if pose.attitude is not None:

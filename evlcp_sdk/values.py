@@ -494,8 +494,8 @@ class Fix:
         height_m: Above the ellipsoid, m.
         enu_m: The same place in the local axes, m, float64 (3,).
         covariance_m2: Of `enu_m`, float64 (3, 3).
-        noise_m2: The part of it that is new with every fix; the rest comes from what was said about the
-            attitude, and stays, float64 (3, 3).
+        noise_m2: The part of it that is new with every fix, float64 (3, 3).
+        slow_m2: The part that changes as the image moves over the pixels, float64 (3, 3).
         heading_deg: Where the optical axis points to, clockwise from north.
         pitch_deg: How far it points above the horizon.
         roll_deg: How far the camera's top leans to its right.
@@ -505,6 +505,15 @@ class Fix:
             that a verified beacon sent.
         refusal: Kind of refusal, empty for a fix that is given.
         detail: The refusal in words.
+        standing: What is left of the covariance by its causes, as the position's moves by one sigma of each
+            error that stays, m, float64 (3, k): `camera`, `attitude` and `bar N`, as a `Pose` has them.
+        misfit: Mean square of the misses in sigmas, over the degrees of freedom.
+        freedom: Degrees of freedom; 0 where the fix is refused.
+        hpl_m: Horizontal protection level: beyond it the error is with the probability `position.risk`, even
+            where one part is wrong; infinite where the geometry does not protect.
+        vpl_m: The vertical one.
+        excluded: What was left out as the rest contradicts it: `bar N`, `heading`, `attitude`, `focal
+            length`.
     """
 
     t_us: float
@@ -522,6 +531,25 @@ class Fix:
     verified: bool
     refusal: str = ""
     detail: str = ""
+    slow_m2: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 3)))
+    standing: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    misfit: float = math.nan
+    freedom: int = 0
+    hpl_m: float = math.inf
+    vpl_m: float = math.inf
+    excluded: tuple[str, ...] = ()
+
+    @property
+    def alarms(self) -> tuple[str, ...]:
+        """What a user must know before this fix is used.
+
+        `excluded`: a part was left out; `unavailable`: there is no protection level; and the refusals
+        `misfit` and `site-contradicted`, by which parts contradict one another.
+        """
+        if self.refusal:
+            return (self.refusal,) if self.refusal in ("misfit", "site-contradicted") else ()
+        out = ("excluded",) if self.excluded else ()
+        return out if math.isfinite(self.hpl_m) and math.isfinite(self.vpl_m) else (*out, "unavailable")
 
     def __repr__(self) -> str:
         time = f"{self.t_us / 1e3:.1f} ms"

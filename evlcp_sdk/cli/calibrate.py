@@ -1,5 +1,6 @@
 """`evlcp calibrate`."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -34,7 +35,7 @@ def calibrate(
     ] = 2.0,
     as_json: Json = False,
 ) -> None:
-    """Estimate focal length, principal point and distortion; print a [camera] table for link.toml.
+    """Estimate focal length, principal point and distortion; print them, with covariance, as a link.toml.
 
     One recording:  [bold]evlcp calibrate REC.raw --sites site.toml --poses poses.csv[/]
 
@@ -69,6 +70,7 @@ def _table(found: "Calibrated") -> dict[str, Any]:
     return {
         "camera": {name: getattr(found.camera, name) for name in found.sigma},
         "sigma": dict(found.sigma),
+        "camera_sigma": asdict(found.camera_sigma),
         "not_determined_corner_px": dict(found.refused),
         "views": found.views,
         "points": found.points,
@@ -77,7 +79,7 @@ def _table(found: "Calibrated") -> dict[str, Any]:
 
 
 def _toml(found: "Calibrated", poses: int) -> str:
-    """The `[camera]` table, each value with its sigma; what was not determined as a comment."""
+    """The tables `[camera]` and `[camera_sigma]`; as comments what was not determined."""
     lines = [
         f"# {found.views} views, {found.points} points, misses of {found.misfit**0.5:.2f} sigmas (rms)",
         *([f"# {poses - found.views} of {poses} poses show no bar"] if poses > found.views else []),
@@ -89,4 +91,9 @@ def _toml(found: "Calibrated", poses: int) -> str:
         lines.append(
             f"# {name}: not determined (the image's corners move by {corner:.1f} px within its sigma)"
         )
+    lines += ["", "[camera_sigma]"]
+    for name in found.camera_sigma.__dataclass_fields__:
+        if name != "correlation":
+            lines.append(f"{name} = {getattr(found.camera_sigma, name):.6g}")
+    lines += ["correlation = [", *(f"  {list(row)}," for row in found.camera_sigma.correlation), "]"]
     return "\n".join(lines)

@@ -78,8 +78,23 @@ def receive(
         ),
     ] = 0.5,
     gravity_sigma_deg: Annotated[
-        float, typer.Option("--gravity-sigma-deg", min=0, help="The same of pitch and roll.")
-    ] = 0.1,
+        float | None,
+        typer.Option(
+            "--gravity-sigma-deg",
+            min=0,
+            help="The same of pitch and roll.  [default: 0.1 with a file, 0.5 with angles]",
+        ),
+    ] = None,
+    white_sigma_deg: Annotated[
+        float,
+        typer.Option(
+            "--white-sigma-deg", min=0, help="Of what is new in each angle with every line of the file."
+        ),
+    ] = 0.0,
+    time_sigma_us: Annotated[
+        float,
+        typer.Option("--time-sigma-us", min=0, help="Of the offset of the file's times from the camera's."),
+    ] = 0.0,
     clock_zero: Annotated[
         str | None,
         typer.Option(
@@ -133,7 +148,11 @@ def receive(
     registry = Registry.load()
     link = load_link(link_file, overrides or [], registry)
     angles = (heading_deg, pitch_deg, roll_deg)
-    attitude = _attitude(attitude_file, angles, (gravity_sigma_deg, heading_sigma_deg))
+    if gravity_sigma_deg is None:
+        # An IMU's samples follow a camera that sways; angles by hand hold for a whole drive.
+        gravity_sigma_deg = 0.5 if attitude_file is None else 0.1
+    sigmas = (gravity_sigma_deg, heading_sigma_deg, white_sigma_deg, time_sigma_us)
+    attitude = _attitude(attitude_file, angles, sigmas)
     plan, zero = _position_plan(sites, mcap), _clock_zero(clock_zero)
     short = {"figures": figures, "parquet": parquet, "mcap": mcap}
     asked = tuple(dict.fromkeys([*(name for name, given in short.items() if given), *(sinks or [])]))
@@ -189,7 +208,7 @@ def receive(
 def _attitude(
     file: Path | None,
     angles: tuple[float | None, float | None, float | None],
-    sigmas: tuple[float, float],
+    sigmas: tuple[float, float, float, float],
 ) -> "Attitude | AttitudeLog | None":
     """What the options say of the camera's attitude; None for nothing."""
     import math
@@ -203,10 +222,13 @@ def _attitude(
         raise typer.BadParameter(
             "gravity needs --pitch-deg and --roll-deg; a heading needs gravity", param_hint="--pitch-deg"
         )
-    names = ("--heading-deg", "--pitch-deg", "--roll-deg", "--gravity-sigma-deg", "--heading-sigma-deg")
-    for name, given_deg in zip(names, (*angles, *sigmas), strict=True):
-        if given_deg is not None and not math.isfinite(given_deg):
-            raise typer.BadParameter(f"{given_deg}: expected a finite number", param_hint=name)
+    names = (
+        *("--heading-deg", "--pitch-deg", "--roll-deg"),
+        *("--gravity-sigma-deg", "--heading-sigma-deg", "--white-sigma-deg", "--time-sigma-us"),
+    )
+    for name, said in zip(names, (*angles, *sigmas), strict=True):
+        if said is not None and not math.isfinite(said):
+            raise typer.BadParameter(f"{said}: expected a finite number", param_hint=name)
     if file is not None:
         return AttitudeLog.read(file, Attitude(0.0, 0.0, None, *sigmas))
     return Attitude(pitch, roll, heading, *sigmas) if pitch is not None and roll is not None else None

@@ -1,8 +1,8 @@
 """The link: what both ends agree on and how the receiver works, from `link.toml` to checked objects.
 
-One table a role (`[ranging]`: `id = "joint-scale"`, its parameters flat beside it), and `[camera]`, `[bar]`,
-`[air]`, `[regions]`, `[messages]` and `[position]`. Every default is written out before anything runs, so
-that the resolved table alone reproduces a result. See `docs/configuration.md`.
+One table a role (`[ranging]`: `id = "joint-scale"`, its parameters flat beside it), and `[camera]`,
+`[camera_sigma]`, `[bar]`, `[air]`, `[regions]`, `[messages]` and `[position]`. Every default is written out
+before anything runs, so that the resolved table alone reproduces a result. See `docs/configuration.md`.
 """
 
 import hashlib
@@ -33,7 +33,7 @@ from evlcp_sdk.plugin.roles import (
     Tracking,
 )
 from evlcp_sdk.scene.bar import BarLayout
-from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.specs import SpecError, build, parse_value, read_toml
 from evlcp_sdk.spelling import nearest
 
@@ -41,6 +41,7 @@ __all__ = ["Link", "load_link", "resolve"]
 
 _SPECS: dict[str, type[Any]] = {
     "camera": CameraModel,
+    "camera_sigma": CameraSigma,
     "bar": BarLayout,
     "air": AirSpec,
     "regions": RegionSpec,
@@ -55,6 +56,7 @@ class Link:
 
     Attributes:
         camera: The receiving camera.
+        camera_sigma: How precisely it is known.
         bar: The transmitter's LEDs and clusters.
         air: Chip rate and packet length.
         regions: Parameters of the region detector.
@@ -72,6 +74,7 @@ class Link:
     """
 
     camera: CameraModel
+    camera_sigma: CameraSigma
     bar: BarLayout
     air: AirSpec
     regions: RegionSpec

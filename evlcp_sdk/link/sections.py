@@ -123,12 +123,17 @@ class PositionSpec:
     max_sigma_m: Annotated[
         float, Field(gt=0, description="Largest sigma of a position, in any direction, that is given.")
     ] = 3.0
-    max_misfit: Annotated[
+    false_alarm: Annotated[
         float,
-        Field(
-            gt=1, description="Mean square of the misses, in sigmas, above which sites and image disagree."
-        ),
-    ] = 4.0
+        Field(ge=1e-12, le=0.1, description="Chance that the tests of a fix find fault where there is none."),
+    ] = 1e-4
+    risk: Annotated[
+        float,
+        Field(ge=1e-12, le=0.1, description="Chance of an error beyond a protection level, with a fault."),
+    ] = 1e-4
+    max_protection_m: Annotated[
+        float, Field(gt=0, description="Protection level above which there is none.")
+    ] = 50.0
     beacons: Annotated[
         Literal["none", "verified", "any"],
         Field(
@@ -136,6 +141,10 @@ class PositionSpec:
             " with none, they do not contradict sites, either."
         ),
     ] = "verified"
+    beacon_sigma_m: Annotated[
+        float,
+        Field(ge=0, description="How precisely a beacon says its place (sigma, to the east, north and up)."),
+    ] = 0.1
     acceleration_m2_s3: Annotated[
         float,
         Field(gt=0, description="Power density of the change of speed: 1 m/s2 that lasts for a second."),

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.observations import BarView, project_bars
-from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
 __all__ = ["PARAMETERS", "Calibrated", "CalibrationView", "calibrate"]
 
 Floats = NDArray[np.float64]
 
-PARAMETERS = ("focal_mm", "centre_x_px", "centre_y_px", "k1", "k2", "p1", "p2")
+PARAMETERS = CAMERA_PARAMETERS
 """What can be estimated, in the order of the fit's columns."""
 
 _USUAL = {
@@ -77,6 +77,8 @@ class Calibrated:
         views: Number of views.
         points: Number of image points.
         misfit: Mean square of the misses in sigmas, over the degrees of freedom.
+        camera_sigma: How precisely the camera is known by this, with what was not determined; as a link has
+            it.
     """
 
     camera: CameraModel
@@ -85,6 +87,7 @@ class Calibrated:
     views: int
     points: int
     misfit: float
+    camera_sigma: CameraSigma
 
 
 def calibrate(
@@ -98,7 +101,8 @@ def calibrate(
 
     All parameters are fitted together, within what lenses usually have. One is determined where the views say
     more than that, and leave the image's corners uncertain by no more than a limit; the sigmas of these
-    contain what is not known of the others. An error that a bar's points share is `spec.shared_sigma_px`.
+    contain what is not known of the others. An error that a bar's points share is `spec.shared_sigma_px`;
+    errors of a bar's site are the same in all views.
 
     Args:
         views: Bars seen from known places.
@@ -115,7 +119,8 @@ def calibrate(
     if not seen:
         raise ConfigError("no view shows a bar at a known site: nothing to calibrate from")
     start = replace(camera, centre_x_px=camera.centre_px[0], centre_y_px=camera.centre_px[1])
-    found, sigma, misfit = _fit(seen, start)
+    found, covariance, misfit = _fit(seen, start)
+    sigma = dict(zip(PARAMETERS, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     corner = {name: _at_corner(start, name) * sigma[name] for name in PARAMETERS}
     usual = _usual_sigma(start)
     sure = [n for n in PARAMETERS if corner[n] <= limit_px and sigma[n] <= _LEARNT * usual[n]]
@@ -129,6 +134,9 @@ def calibrate(
             f"the views miss their places by {math.sqrt(misfit):.1f} sigmas (rms):"
             " a site or pose is not as was said"
         )
+    kept = replace(start, **{name: getattr(found, name) for name in sure})
+    # What keeps its configured value is off by as much as the fit has it elsewhere, too.
+    off = np.array([getattr(kept, name) - getattr(found, name) for name in PARAMETERS])
     return Calibrated(
         replace(camera, **{name: getattr(found, name) for name in sure}),
         {name: sigma[name] for name in sure},
@@ -136,7 +144,17 @@ def calibrate(
         len(seen),
         sum(len(v.points_px) for v in seen),
         misfit,
+        _camera_sigma(covariance + np.outer(off, off)),
     )
+
+
+def _camera_sigma(covariance: Floats) -> CameraSigma:
+    """As a link has it; sigmas and correlations with the digits that they are written with."""
+    sigma = np.sqrt(np.diag(covariance))
+    rows = np.round(covariance / sigma / sigma[:, None], 6)
+    np.fill_diagonal(rows, 1.0)
+    values = {name: float(f"{value:.6g}") for name, value in zip(PARAMETERS, sigma, strict=True)}
+    return CameraSigma(**values, correlation=tuple(tuple(row) for row in rows.tolist()))
 
 
 def _usual_sigma(camera: CameraModel) -> dict[str, float]:
@@ -151,6 +169,9 @@ class _Seen:
     enu_m: Floats
     points_px: Floats
     whiten: Floats
+    bar: NDArray[np.int64]
+    arm_m: Floats
+    survey: Mapping[int, tuple[float, float, float]]
     place_m: Floats
     place_sigma_m: float
     rotation: Floats
@@ -158,13 +179,17 @@ class _Seen:
 
     @classmethod
     def of(cls, view: CalibrationView, camera: CameraModel, spec: PositionSpec) -> "_Seen":
-        enu, points, whiten = [], [], []
+        enu, points, whiten, number, arm = [], [], [], [], []
+        survey: dict[int, tuple[float, float, float]] = {}
         for bar in view.bars:
             good = np.isfinite(bar.points_px).all(1) & (bar.sigma_px > 0)
             if good.sum() < spec.min_points:
                 continue
             enu.append(bar.enu_m[good])
             points.append(bar.points_px[good])
+            number.append(np.full(int(good.sum()), bar.transmitter))
+            arm.append(bar.enu_m[good] - bar.enu_m.mean(0))
+            survey[bar.transmitter] = bar.survey
             covariance = np.diag(bar.sigma_px[good] ** 2) + spec.shared_sigma_px**2
             whiten.append(np.linalg.inv(np.linalg.cholesky(covariance)))
         size = sum(map(len, points))
@@ -178,7 +203,9 @@ class _Seen:
         sigma = math.radians(view.attitude_sigma_deg)
         if rotation is None:
             rotation, sigma = _turned(flat - view.enu_m, seen, camera), _FREE_SIGMA_RAD
-        return cls(flat, seen, joined, view.enu_m, view.position_sigma_m, rotation, sigma)
+        bars = np.concatenate([np.empty(0, np.int64), *number])
+        arms = np.concatenate([np.empty((0, 3)), *arm])
+        return cls(flat, seen, joined, bars, arms, survey, view.enu_m, view.position_sigma_m, rotation, sigma)
 
 
 def _turned(offset_m: Floats, points_px: Floats, camera: CameraModel) -> Floats:
@@ -218,13 +245,17 @@ def _at_corner(camera: CameraModel, name: str) -> float:
     return float(np.linalg.norm(moved, axis=1).max())
 
 
-def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, dict[str, float], float]:
-    """Least squares over everything; the camera, its parameters' sigmas, and the misfit."""
+def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, Floats, float]:
+    """Least squares over everything; the camera, its parameters' covariance, and the misfit."""
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
     names, shared = PARAMETERS, len(PARAMETERS)
-    start = np.array([float(getattr(camera, name)) for name in names] + [0.0] * (6 * len(views)))
+    # Errors of sites, in sigmas, behind the views: place, turn and length of each bar that has any.
+    surveys = {number: sigma for view in views for number, sigma in view.survey.items() if any(sigma)}
+    bars = {number: shared + 6 * len(views) + 7 * i for i, number in enumerate(sorted(surveys))}
+    first = np.array([float(getattr(camera, name)) for name in names])
+    start = np.concatenate([first, np.zeros(6 * len(views) + 7 * len(bars))])
     usual = _usual_sigma(camera)
     loose = np.array([1 / usual[name] for name in names])
 
@@ -241,12 +272,20 @@ def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, dict
             turn = x[at + 3 : at + 6]
             rotation = Rotation.from_rotvec(turn).as_matrix() @ view.rotation
             position = view.place_m + x[at : at + 3]
-            place, slope = project_bars(view.enu_m, position, rotation, now)
-            seen = (view.enu_m - position) @ rotation
+            stands, moves = view.enu_m.copy(), {}
+            for number, column in bars.items():
+                mine = view.bar == number
+                if mine.any():
+                    moves[column] = mine, _site_slope(view.arm_m[mine], surveys[number])
+                    stands[mine] += moves[column][1] @ x[column : column + 7]
+            place, slope = project_bars(stands, position, rotation, now)
+            seen = (stands - position) @ rotation
             block = np.zeros((len(place), 2, len(x)))
             block[:, :, :shared] = _slopes(now, seen[:, :2] / seen[:, 2:], place, names)
             block[:, :, at : at + 3] = slope[:, :, :3]
             block[:, :, at + 3 : at + 6] = slope[:, :, 3:] @ _turn_slope(turn)
+            for column, (mine, by_site) in moves.items():
+                block[mine, :, column : column + 7] = -slope[mine][:, :, :3] @ by_site
             for axis in (0, 1):
                 # A step that turns a point behind the camera is not to be taken.
                 off = np.nan_to_num(place[:, axis] - view.points_px[:, axis], nan=1e6)
@@ -257,6 +296,9 @@ def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, dict
             prior = np.zeros((6, len(x)))
             prior[:, at : at + 6] = np.diag(scale)
             rows.append(prior)
+        at = shared + 6 * len(views)
+        misses.append(x[at:])
+        rows.append(np.eye(len(x))[at:])
         return np.concatenate(misses), np.concatenate(rows)
 
     def miss(x: Floats) -> Floats:
@@ -272,8 +314,17 @@ def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, dict
     covariance = (half @ half.T) * scale * scale[:, None]
     points = 2 * sum(len(v.points_px) for v in views)
     freedom = max(points - shared - 3 * len(views), 1)
-    sigma = dict(zip(names, np.sqrt(np.diag(covariance)[:shared]).tolist(), strict=True))
-    return camera_of(fit.x), sigma, float(misses @ misses) / freedom
+    return camera_of(fit.x), covariance[:shared, :shared], float(misses @ misses) / freedom
+
+
+def _site_slope(arm_m: Floats, survey: tuple[float, float, float]) -> Floats:
+    """How points of a bar move by one sigma of its site's place, turn and length: m, float64 (n, 3, 7)."""
+    place, turn, length = survey
+    moves = np.zeros((len(arm_m), 3, 7))
+    moves[:, :, :3] = place * np.eye(3)
+    moves[:, :, 3:6] = turn * np.cross(np.eye(3)[None], arm_m[:, None]).transpose(0, 2, 1)
+    moves[:, :, 6] = length * arm_m
+    return moves
 
 
 def _turn_slope(turn: Floats) -> Floats:

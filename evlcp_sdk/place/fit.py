@@ -1,19 +1,24 @@
-"""The weighted least-squares fit of position, attitude and shared shifts to all observations."""
+"""The weighted least-squares fit of a pose, and of every error that is shared, to all observations."""
 
-import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.place.observations import Problem, cross_matrix, observe
+from evlcp_sdk.place import _kernels
+from evlcp_sdk.place.observations import Problem
 
-__all__ = ["Fit", "fit_pose", "moved", "normal_equations"]
+__all__ = ["Fit", "Normal", "fit_pose", "moved", "normal_equations"]
 
 Floats = NDArray[np.float64]
 
 _STEPS = 50
 """Levenberg-Marquardt steps; from a closed-form start, five to ten arrive."""
+
+FOCAL_FAULT = 0.005
+"""Share by which a focal length may be other than said without anybody's knowledge (sigma): the fault that
+protection levels cover."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,77 +28,88 @@ class Fit:
     Attributes:
         position: m, float64 (3,).
         rotation: Camera axes as columns in ENU, float64 (3, 3).
-        shared: Shift of each bar's image, px, float64 (bars, 2).
+        local: Each bar's own errors in their sigmas: shift of the image, place, turn, length, float64 (bars,
+            9).
+        lens: The camera's errors, by the root of their covariance, float64 (7,).
         cost: Twice the robust cost.
     """
 
     position: Floats
     rotation: Floats
-    shared: Floats
+    local: Floats
+    lens: Floats
     cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Normal equations at a point: see `_kernels.normal` for its arrays.
+
+    Attributes:
+        cost: Twice the robust cost; NaN where a point is behind the camera.
+        bar_cost: Of each bar, least over its own unknowns, float64 (bars,).
+        whole: The sum over everything, float64 (14, 14).
+        side: Its right-hand side, float64 (14,).
+    """
+
+    cost: float
+    info: Floats
+    right: Floats
+    gain: Floats
+    step: Floats
+    bar_cost: Floats
+    rows: Floats
+    miss: Floats
+    pixel: Floats
+    whole: Floats
+    side: Floats
 
 
 def fit_pose(problem: Problem, position: Floats, rotation: Floats) -> Fit | None:
     """Levenberg-Marquardt with Huber's weights; None where it leaves the view or does not settle."""
     bars = len(problem.transmitters)
-    here = Fit(position, rotation, np.zeros((bars, 2)), np.inf)
-    found = normal_equations(problem, here)
-    if found is None:
-        return None
-    normal, right, cost = found
-    here = Fit(position, rotation, here.shared, cost)
-    damping = 1e-4
-    for _ in range(_STEPS):
-        try:
-            move = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), right)
-        except np.linalg.LinAlgError:
-            return None
-        there = moved(problem, here, np.asarray(move, np.float64))
-        found = normal_equations(problem, there)
-        if found is not None and found[2] <= here.cost:
-            gain = here.cost - found[2]
-            normal, right, cost = found
-            here = Fit(there.position, there.rotation, there.shared, cost)
-            damping = max(damping / 10, 1e-12)
-            if gain <= 1e-9 * (1 + cost) and float(np.abs(right @ move)) < 1e-6:
-                return here
-        else:
-            damping *= 10
-            if damping > 1e12:
-                # No step is an improvement any more: rounding decides.
-                return here if float(right @ move) < 1e-3 else None
-    return None
+    here = (np.ascontiguousarray(position), np.ascontiguousarray(rotation))
+    still = (np.zeros((bars, _kernels.LOCAL)), np.zeros(7))
+    free = problem.free
+    found: tuple[Any, ...] = _kernels.fitted(*_data(problem), free, _STEPS, *here, *still)  # type: ignore[call-arg]
+    settled, cost, place, turned, local, lens = found
+    return Fit(place, turned, local, lens, cost) if settled else None
 
 
-def normal_equations(problem: Problem, at: Fit) -> tuple[Floats, Floats, float] | None:
-    """Normal equations and twice the robust cost; None where a point is behind the camera."""
-    seen = observe(problem, at.position, at.rotation, at.shared)
-    if seen is None:
-        return None
-    known, rows = seen.known_miss, seen.known_slope
-    size = np.linalg.norm(seen.miss, axis=1)
-    bound = problem.spec.huber_sigmas
-    far = size > bound
-    weight = np.where(far, bound / np.maximum(size, 1e-300), 1.0)
-    cost = float(np.where(far, bound * (2 * size - bound), size**2).sum() + (known**2).sum())
-    flat, flat_miss = seen.slope.reshape(-1, seen.slope.shape[2]), seen.miss.ravel()
-    weighted = flat * np.repeat(weight, 2)[:, None]
-    return flat.T @ weighted + rows.T @ rows, weighted.T @ flat_miss + rows.T @ known, cost
+def normal_equations(problem: Problem, at: Fit) -> Normal:
+    """Normal equations at a point."""
+    bars, wide, own = len(problem.transmitters), _kernels.GLOBAL, _kernels.LOCAL
+    info, right, cost = np.zeros((bars, wide, wide)), np.zeros((bars, wide)), np.zeros(bars)
+    gain, step, pixel = np.zeros((bars, own, wide)), np.zeros((bars, own)), np.zeros((bars, wide, wide))
+    rows, miss = np.zeros((3, wide)), np.zeros(3)
+    point = (at.position, at.rotation, at.local, at.lens)
+    found = (info, right, gain, step, cost, rows, miss, pixel)
+    total = _kernels.normal(*_data(problem), *point, *found)  # type: ignore[call-arg]
+    whole, side = np.zeros((wide, wide)), np.zeros(wide)
+    if not np.isnan(total):
+        _kernels.summed(info, right, rows, miss, at.lens, problem.free, whole, side)
+    return Normal(total, info, right, gain, step, cost, rows, miss, pixel, whole, side)
 
 
-def moved(problem: Problem, fit: Fit, move: Floats) -> Fit:
-    """The fit with its unknowns moved."""
-    n = len(problem.turns)
-    turns = np.zeros(3)
-    turns[list(problem.turns)] = move[3 : 3 + n]
-    shared = fit.shared + move[3 + n :].reshape(-1, 2) if len(move) > 3 + n else fit.shared
-    return Fit(fit.position + move[:3], _turn(turns) @ fit.rotation, shared, np.inf)
+def moved(problem: Problem, at: Fit, normal: Normal, move: Floats) -> Fit:
+    """A point with its unknowns moved by (14,), about the bars; what is a bar's own follows."""
+    point = (at.position, at.rotation, at.local, at.lens)
+    centre = problem.points[:, :3].mean(0)
+    return Fit(*_kernels.stepped(move, normal.gain, normal.step, centre, *point), np.nan)
 
 
-def _turn(vector: Floats) -> Floats:
-    """Rotation matrix of a rotation vector (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3) + cross_matrix(vector)
-    k = cross_matrix(vector / angle)
-    return np.asarray(np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k))
+def _data(problem: Problem) -> tuple[Any, ...]:
+    share = np.minimum((problem.spec.pixel_sigma_px * problem.points[:, 8:9]) ** 2, 1.0)
+    return (
+        np.concatenate([problem.points, share], 1),
+        problem.bar,
+        problem.bar_sigma,
+        problem.lens,
+        problem.lens_root,
+        FOCAL_FAULT,
+        problem.felt,
+        problem.heading_rad,
+        problem.angles,
+        problem.white,
+        problem.spec.huber_sigmas,
+    )

@@ -113,6 +113,7 @@ class Navigator:
             plan.sites,
             attitude_source(attitude),
             link.position,
+            link.camera_sigma,
         )
         self._state: TrajectoryPoint | None = None
         self._window: list[tuple[Fix, TrajectoryPoint, Place]] = []

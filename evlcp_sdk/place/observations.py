@@ -1,4 +1,4 @@
-"""What a camera sees of bars at known places, and how that moves with it: misses and slopes in sigmas."""
+"""What a camera sees of bars at known places, with everything that is known of its errors, in arrays."""
 
 import math
 from collections.abc import Sequence
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
-__all__ = ["BarView", "Observations", "Problem", "cross_matrix", "observe", "project_bars"]
+__all__ = ["EXACT_RAD", "BarView", "Problem", "project_bars"]
 
 Floats = NDArray[np.float64]
 
@@ -20,7 +20,7 @@ _INLINE = 0.02
 """Bars whose centres lie within this share of their extent from a line stand in line: beyond, the shape of a
 triangle of 10 m at 50 m is seen to better than a pixel of 7000 px."""
 
-_EXACT_RAD = 1e-7
+EXACT_RAD = 1e-7
 """Least sigma of an angle, so that exact knowledge stays solvable: 5 um at 50 m."""
 
 
@@ -33,12 +33,15 @@ class BarView:
         enu_m: Centres of its clusters in the local axes, m, float64 (K, 3).
         points_px: Where they are seen, px, float64 (K, 2); NaN where unseen.
         sigma_px: Their standard deviations, px, float64 (K,).
+        survey: Sigmas of the bar's place, m, of a turn of it about each axis, radians, and of its length, as
+            a share; 0: exact.
     """
 
     transmitter: int
     enu_m: Floats
     points_px: Floats
     sigma_px: Floats
+    survey: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def project_bars(
@@ -66,81 +69,134 @@ def project_bars(
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """All points in one array, and which unknowns there are.
+    """All points in one array, all sigmas, and which unknowns there are.
 
     Attributes:
         camera: The camera.
         attitude: What is known of its attitude; None for nothing.
         spec: Bounds and weights.
-        enu_m: The clusters that are seen, in the local axes, m, float64 (n, 3).
-        points_px: Where they are seen, px, float64 (n, 2).
-        sigma_px: Their standard deviations, px, float64 (n,).
-        bar: Number of each point's bar, int64 (n,).
-        centres_m: Mean of each bar's clusters, m, float64 (bars, 3).
+        points: A row a cluster that is seen: its place in the local axes and from its bar's centre, m, where
+            it is seen, px, 1 / sigma, and the share of its variance that stands for a while, float64 (n, 9).
+        bar: Number of each point's bar, rising, int64 (n,).
+        bar_sigma: Of each bar: its image's shift, px, and its survey, float64 (bars, 4).
         transmitters: Number of each bar.
-        turns: Which turns of the camera are unknown: all, about the vertical only, or none.
-        compass: The heading is known, with or without a sigma.
+        lens: Focal length, px, principal point, px, k1, k2, p1, p2, k3, float64 (8,).
+        lens_root: A lower root of the covariance of the first seven, float64 (7, 7).
+        felt: Up in the camera's axes by the attitude, float64 (3,).
+        heading_rad: By the attitude; 0 where it is not known.
+        angles: How many of pitch, roll and heading are known: 0, 2 or 3.
+        white: What whitens the errors of these, float64 (3, 3).
+        free: Which unknowns of the fit there are, bool (14,): see `_kernels`.
     """
 
     camera: CameraModel
     attitude: Attitude | None
     spec: PositionSpec
-    enu_m: Floats
-    points_px: Floats
-    sigma_px: Floats
+    points: Floats
     bar: NDArray[np.int64]
-    centres_m: Floats
+    bar_sigma: Floats
     transmitters: tuple[int, ...]
-    turns: tuple[int, ...]
-    compass: bool
+    lens: Floats
+    lens_root: Floats
+    felt: Floats
+    heading_rad: float
+    angles: int
+    white: Floats
+    free: NDArray[np.bool_]
 
     @classmethod
     def of(
-        cls, views: Sequence[BarView], camera: CameraModel, attitude: Attitude | None, spec: PositionSpec
+        cls,
+        views: Sequence[BarView],
+        camera: CameraModel,
+        attitude: Attitude | None,
+        spec: PositionSpec,
+        sigma: CameraSigma,
     ) -> "Problem | Refusal":
         """What the views give, or why that is too little for a position."""
         kept, most = [], 0
         for view in views:
-            seen = np.isfinite(view.points_px).all(1) & np.isfinite(view.sigma_px) & (view.sigma_px > 0)
+            with np.errstate(invalid="ignore"):
+                seen = np.isfinite(view.points_px).all(1) & (view.sigma_px > 0) & (view.sigma_px < np.inf)
             seen &= _whole(view.points_px, camera)
-            most = max(most, int(seen.sum()))
-            if seen.sum() >= spec.min_points:
+            number = int(seen.sum())
+            most = max(most, number)
+            if number >= spec.min_points:
                 kept.append((view, seen))
         if not kept:
             return Refusal(
                 "too-few-clusters", f"{most} whole clusters of a bar seen, {spec.min_points} needed"
             )
         compass = attitude is not None and attitude.heading_deg is not None
-        centres = np.array([v.enu_m[s].mean(0) for v, s in kept])
         if not compass and len(kept) == 1:
             return Refusal("heading-unknown", "one bar gives a position only with the camera's heading known")
         if attitude is None:
+            centres = np.array([v.enu_m[s].mean(0) for v, s in kept])
             extent = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
             if len(kept) < 3 or extent[1] < _INLINE * extent[0]:
                 many = "two bars give" if len(kept) == 2 else "bars in line give"
                 return Refusal("gravity-unknown", f"{many} a position only with gravity known")
-        turns: tuple[int, ...] = (0, 1, 2)
-        if attitude is not None and attitude.gravity_sigma_deg == 0:
-            turns = () if compass and attitude.heading_sigma_deg == 0 else (2,)
+        points = np.empty((sum(int(s.sum()) for _, s in kept), 9))
+        bar = np.empty(len(points), np.int64)
+        at = 0
+        for i, (view, seen) in enumerate(kept):
+            rows = slice(at, at + int(seen.sum()))
+            points[rows, :3] = view.enu_m[seen]
+            # The whole bar's centre: errors of its attitude turn it about that, whatever is seen of it.
+            points[rows, 3:6] = points[rows, :3] - view.enu_m.mean(0)
+            points[rows, 6:8] = view.points_px[seen]
+            points[rows, 8] = 1 / view.sigma_px[seen]
+            bar[rows] = i
+            at = rows.stop
+        felt, angles, white = np.zeros(3), 0, np.eye(3)
+        free = np.ones(14, np.bool_)
+        free[6] = False
+        free[7:] = sigma.known
+        heading = 0.0
+        if attitude is not None:
+            felt, angles = attitude.rotation()[2].copy(), 3 if compass else 2
+            heading = math.radians(attitude.heading_deg or 0.0)
+            white[:angles, :angles] = _whitening(attitude)[:angles, :angles]
+            if attitude.gravity_sigma_deg == attitude.white_sigma_deg == attitude.time_sigma_us == 0:
+                free[3:5] = False
+                free[5] = not compass or attitude.heading_sigma_deg > 0
         return cls(
             camera,
             attitude,
             spec,
-            np.concatenate([v.enu_m[s] for v, s in kept]),
-            np.concatenate([v.points_px[s] for v, s in kept]),
-            np.concatenate([v.sigma_px[s] for v, s in kept]),
-            np.repeat(np.arange(len(kept)), [int(s.sum()) for _, s in kept]),
-            centres,
+            points,
+            bar,
+            np.array([(spec.shared_sigma_px, *v.survey) for v, _ in kept]),
             tuple(v.transmitter for v, _ in kept),
-            turns,
-            compass,
+            np.array(
+                [camera.focal_px, *camera.centre_px, camera.k1, camera.k2, camera.p1, camera.p2, camera.k3]
+            ),
+            sigma.root(camera) if sigma.known else np.zeros((7, 7)),
+            felt,
+            heading,
+            angles,
+            white,
+            free,
         )
+
+    def centres_m(self) -> Floats:
+        """Mean of each bar's clusters that are seen, m, float64 (bars, 3)."""
+        count = np.bincount(self.bar)
+        return np.stack([np.bincount(self.bar, self.points[:, i]) / count for i in range(3)], 1)
 
     def sights(self) -> Floats:
         """Unit vectors towards the points in the camera's axes, float64 (n, 3); NaN beyond the lens."""
-        flat = self.camera.undistort(self.points_px)
-        ray = np.concatenate([flat, np.ones((len(flat), 1))], 1)
-        return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+        flat = self.camera.undistort(self.points[:, 6:8])
+        ray = np.ones((len(flat), 3))
+        ray[:, :2] = flat
+        return np.asarray(ray / np.sqrt((ray * ray).sum(1))[:, None])
+
+
+def _whitening(attitude: Attitude) -> Floats:
+    """What makes errors of pitch, roll and heading independent and of sigma 1, float64 (3, 3)."""
+    causes = attitude.standing()
+    least = math.radians(attitude.white_sigma_deg) ** 2 + EXACT_RAD**2
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(causes @ causes.T + least * np.eye(3))))
 
 
 def _whole(points_px: Floats, camera: CameraModel) -> NDArray[np.bool_]:
@@ -154,96 +210,3 @@ def _whole(points_px: Floats, camera: CameraModel) -> NDArray[np.bool_]:
     low = points_px - margin >= -0.5
     high = points_px + margin <= np.array([camera.width, camera.height]) - 0.5
     return np.asarray((low & high).all(1))
-
-
-@dataclass(frozen=True, eq=False)
-class Observations:
-    """Misses, and their slopes by the unknowns, in sigmas.
-
-    The unknowns are the position, the turns, and a shift of each bar's image that its points share.
-
-    Attributes:
-        miss: Of the image, float64 (n, 2).
-        slope: Of where the points are seen, float64 (n, 2, u).
-        known_miss: Of what is known beforehand, float64 (m,): the shared shifts, then the attitude.
-        known_slope: Of the same, float64 (m, u).
-        attitude: Rows of these two that speak of the attitude.
-    """
-
-    miss: Floats
-    slope: Floats
-    known_miss: Floats
-    known_slope: Floats
-    attitude: slice
-
-
-def observe(problem: Problem, position: Floats, rotation: Floats, shared: Floats) -> Observations | None:
-    """What is observed, against a position (3,), a rotation (3, 3) and shared shifts (bars, 2), px.
-
-    None where a point is behind the camera.
-    """
-    spec, turns = problem.spec, list(problem.turns)
-    place, slope = project_bars(problem.enu_m, position, rotation, problem.camera)
-    if not np.isfinite(place).all():
-        return None
-    weight = 1 / problem.sigma_px
-    bars = len(problem.transmitters) if spec.shared_sigma_px else 0
-    n, unknowns = len(place), 3 + len(turns) + 2 * bars
-    image = np.zeros((n, 2, unknowns))
-    image[:, :, :3] = slope[:, :, :3]
-    image[:, :, 3 : 3 + len(turns)] = slope[:, :, [3 + t for t in turns]]
-    known: list[float] = []
-    rows: list[Floats] = []
-    row: Floats
-    if bars:
-        at = 3 + len(turns) + 2 * problem.bar
-        for axis in (0, 1):
-            image[np.arange(n), axis, at + axis] = 1
-        place = place + shared[problem.bar]
-        for i, value in enumerate(shared.ravel().tolist()):
-            row = np.zeros(unknowns)
-            row[3 + len(turns) + i] = 1 / spec.shared_sigma_px
-            known.append(-value / spec.shared_sigma_px)
-            rows.append(row)
-    shifts = len(rows)
-    if problem.attitude is not None:
-        misses, turned = _attitude_misses(problem.attitude, rotation)
-        exact = problem.attitude.gravity_sigma_deg == 0
-        for i, (value, by_turn) in enumerate(zip(misses, turned, strict=True)):
-            if turns and not (exact and i < 2):
-                row = np.zeros(unknowns)
-                row[3 : 3 + len(turns)] = by_turn[turns]
-                known.append(value)
-                rows.append(row)
-    miss = (problem.points_px - place) * weight[:, None]
-    return Observations(
-        miss,
-        image * weight[:, None, None],
-        np.array(known),
-        np.array(rows).reshape(-1, unknowns),
-        slice(shifts, None),
-    )
-
-
-def _attitude_misses(attitude: Attitude, rotation: Floats) -> tuple[list[float], list[Floats]]:
-    """Gravity to the east and north, then the heading, minus what the rotation says, in sigmas; slopes."""
-    gravity_sigma = max(math.radians(attitude.gravity_sigma_deg), _EXACT_RAD)
-    # Up as the sensor felt it, turned as the camera is: level if the rotation is right.
-    felt = rotation @ attitude.rotation()[2]
-    leans = -cross_matrix(felt)
-    misses = [-float(felt[i]) / gravity_sigma for i in (0, 1)]
-    slopes = [leans[i] / gravity_sigma for i in (0, 1)]
-    if attitude.heading_deg is not None:
-        sigma = max(math.radians(attitude.heading_sigma_deg), _EXACT_RAD)
-        east, north, up = rotation[:, 2]
-        level = max(east * east + north * north, 1e-12)
-        off = math.radians(attitude.heading_deg) - math.atan2(east, north)
-        misses.append(math.remainder(off, 2 * math.pi) / sigma)
-        # d(forward) = turn x forward.
-        slopes.append(np.array([east * up, north * up, -level]) / level / sigma)
-    return misses, slopes
-
-
-def cross_matrix(v: Floats) -> Floats:
-    """The matrix, float64 (3, 3), that multiplies as the cross product with a vector (3,) does."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

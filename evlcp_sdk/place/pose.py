@@ -2,22 +2,24 @@
 
 One bar needs the camera's attitude; two or more need gravity and give the heading, too; three or more that do
 not stand in line give the full attitude. All are one weighted least-squares problem over the image points of
-all clusters, with what is known of the attitude as further observations. What the geometry does not determine
-is refused, with the reason. Frames and signs: `docs/position.md`.
+all clusters, with what is known of the attitude as further observations, and with every error that many
+points share as a further unknown. What the geometry does not determine is refused, with the reason; a part
+that the rest contradicts is left out, and named. Frames and signs: `docs/position.md`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.fit import fit_pose
-from evlcp_sdk.place.judgement import Pose, judged
+from evlcp_sdk.place.judgement import FOCAL, Judged, Pose, judged
 from evlcp_sdk.place.observations import BarView, Problem
 from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.place.starts import closed_form_starts
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
 __all__ = ["solve_pose"]
 
@@ -27,30 +29,93 @@ _ODDS = 18.4
 _APART_SIGMAS = 6.0
 """Solutions nearer to each other, in sigmas of the position, are one."""
 
+_FREE_FOCAL = 0.02
+"""Sigma of a focal length that is other than said, as a share: what is left to be known of it."""
+
 
 def solve_pose(
     views: Sequence[BarView],
     camera: CameraModel,
     attitude: Attitude | None = None,
     spec: PositionSpec | None = None,
+    sigma: CameraSigma | None = None,
 ) -> Pose | Refusal:
     """Fit position and attitude to all image points.
 
     Huber's loss over the miss of each point in its sigmas; Levenberg-Marquardt from closed-form starts: with
     the heading known, the point nearest to all lines of sight; with gravity known, the best of these over the
-    headings; else the three-point solutions (Grunert) of the widest triangle of bars.
+    headings; else the three-point solutions (Grunert) of the widest triangle of bars. Where the tests fail,
+    each part is left out in turn: if one alone explains it, the fix is the one without it.
 
     Args:
         views: The bars seen at one time.
         camera: The camera.
         attitude: What is known of its attitude; its heading may be None; None for nothing.
         spec: Bounds and weights; None for the defaults.
+        sigma: How precisely the camera is known; None: exactly.
 
     Returns:
-        The pose, or why the geometry does not determine one.
+        The pose, or why the geometry does not determine one, or the parts contradict one another.
     """
     spec = PositionSpec() if spec is None else spec
-    problem = Problem.of(views, camera, attitude, spec)
+    sigma = CameraSigma() if sigma is None else sigma
+    found = _plain(views, camera, attitude, spec, sigma)
+    if isinstance(found, Judged):
+        if not found.doubt:
+            return found.pose
+        doubt, tests = found.doubt, found.tests
+    else:
+        if found.kind != "not-determined":
+            return found
+        doubt, tests = found.detail, {}
+    fits: list[tuple[str, Pose]] = []
+    unsure = []
+    for name, fewer, other, looser in _without(views, camera, attitude, sigma):
+        again = _plain(fewer, camera, other, spec, looser)
+        if isinstance(again, Judged) and not again.doubt:
+            fits.append((name, again.pose))
+        elif isinstance(again, Refusal):
+            # It may be this part; without it there is no position that would tell.
+            unsure.append(name)
+    names = [name for name, _ in fits]
+    if "heading" in names:
+        fits = [fit for fit in fits if fit[0] != "attitude"]
+    if len(fits) == 1:
+        name, pose = fits[0]
+        rivals = [n for n in unsure if tests.get(name, 0.0) - tests.get(n, 0.0) < _ODDS and n in tests]
+        if not rivals and tests:
+            return replace(pose, excluded=(name,))
+        names = [name, *rivals]
+    if isinstance(found, Refusal) and not names:
+        return found
+    could = f"; it may be {' or '.join(names)}" if names else ""
+    return Refusal("misfit", doubt + could)
+
+
+def _without(
+    views: Sequence[BarView], camera: CameraModel, attitude: Attitude | None, sigma: CameraSigma
+) -> Iterator[tuple[str, Sequence[BarView], Attitude | None, CameraSigma]]:
+    """The same without each part that may be at fault, and its name."""
+    for i, view in enumerate(views):
+        if len(views) > 1:
+            yield f"bar {view.transmitter}", [*views[:i], *views[i + 1 :]], attitude, sigma
+    if attitude is not None and attitude.heading_deg is not None and len(views) > 1:
+        yield "heading", views, replace(attitude, heading_deg=None), sigma
+    if attitude is not None and len(views) > 2:
+        yield "attitude", views, None, sigma
+    focal_mm = float(np.hypot(sigma.focal_mm, _FREE_FOCAL * camera.focal_mm))
+    yield FOCAL, views, attitude, replace(sigma, focal_mm=focal_mm, correlation=())
+
+
+def _plain(
+    views: Sequence[BarView],
+    camera: CameraModel,
+    attitude: Attitude | None,
+    spec: PositionSpec,
+    sigma: CameraSigma,
+) -> Judged | Refusal:
+    """The pose by all that is given, whether it is to be believed or not."""
+    problem = Problem.of(views, camera, attitude, spec, sigma)
     if isinstance(problem, Refusal):
         return problem
     starts = closed_form_starts(problem)
@@ -60,14 +125,15 @@ def solve_pose(
     if not fits:
         return Refusal("not-determined", "the fit does not settle: the bars do not determine a position")
     best = min(fits, key=lambda fit: fit.cost)
-    pose = judged(problem, best)
-    if isinstance(pose, Refusal):
-        return pose
+    found = judged(problem, best)
+    if isinstance(found, Refusal):
+        return found
     for other in fits:
+        if other is best or other.cost - best.cost >= _ODDS:
+            continue
         apart = other.position - best.position
-        far = apart @ np.linalg.pinv(pose.covariance[:3, :3]) @ apart > _APART_SIGMAS**2
-        if far and other.cost - best.cost < _ODDS:
+        if apart @ np.linalg.pinv(found.pose.covariance[:3, :3]) @ apart > _APART_SIGMAS**2:
             return Refusal(
                 "two-solutions", f"two positions {np.linalg.norm(apart):.2f} m apart fit the image alike"
             )
-    return pose
+    return found

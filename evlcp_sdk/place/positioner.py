@@ -12,7 +12,7 @@ from evlcp_sdk.place.pose import solve_pose
 from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.place.whereabouts import Whereabouts
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Fix, Frame, Packet
 
@@ -34,6 +34,7 @@ class Positioner:
         sites: Where the bars stand; may be empty where beacons are believed.
         attitude_at: What is known of the camera's attitude at a time, us; None for nothing.
         spec: Bounds and weights; None for the defaults.
+        camera_sigma: How precisely the camera is known; None: exactly.
     """
 
     def __init__(
@@ -44,9 +45,11 @@ class Positioner:
         sites: Sequence[BarSite],
         attitude_at: Callable[[float], Attitude | None],
         spec: PositionSpec | None = None,
+        camera_sigma: CameraSigma | None = None,
     ) -> None:
         self.axes: LocalAxes | None = LocalAxes.of(sites) if sites else None
         self._camera = camera
+        self._camera_sigma = camera_sigma
         self._clusters = clusters
         self._packet_us = packet_us
         self._attitude_at = attitude_at
@@ -135,7 +138,7 @@ class Positioner:
             # Gravity and north are those of here, which may be far from the origin of the trajectory.
             here = LocalAxes.of([site]) if here is None else here
             enu = site.cluster_positions_m(self._clusters, here)
-            sited.append(BarView(number, enu, *points))
+            sited.append(BarView(number, enu, *points, site.survey))
         if not views:
             return None
         if here is None or self.axes is None:
@@ -144,7 +147,7 @@ class Positioner:
                 return Fix.refused(t_us, tuple(views), "site-contradicted", "; ".join(how))
             which = ", ".join(map(str, views))
             return Fix.refused(t_us, tuple(views), "no-site", f"no site is known of transmitter {which}")
-        pose = solve_pose(sited, self._camera, self._attitude_at(t_us), self._spec)
+        pose = solve_pose(sited, self._camera, self._attitude_at(t_us), self._spec, self._camera_sigma)
         if isinstance(pose, Refusal):
             return Fix.refused(t_us, tuple(views), pose.kind, pose.detail)
         verified = all(self._bars.verified(n) for n in pose.transmitters)
@@ -159,11 +162,18 @@ class Positioner:
             height_m=height,
             enu_m=self.axes.to_enu(latitude, longitude, height),
             covariance_m2=turn @ pose.covariance[:3, :3] @ turn.T,
-            noise_m2=turn @ pose.noise[:3, :3] @ turn.T,
+            noise_m2=turn @ pose.noise @ turn.T,
             heading_deg=attitude.heading_deg,
             pitch_deg=attitude.pitch_deg,
             roll_deg=attitude.roll_deg,
             heading_sigma_deg=math.degrees(math.sqrt(pose.covariance[5, 5])),
             transmitters=pose.transmitters,
             verified=verified,
+            slow_m2=turn @ pose.slow @ turn.T,
+            standing={name: turn @ moves for name, moves in pose.standing.items()},
+            misfit=pose.misfit,
+            freedom=pose.freedom,
+            hpl_m=pose.hpl_m,
+            vpl_m=pose.vpl_m,
+            excluded=pose.excluded,
         )

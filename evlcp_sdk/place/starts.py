@@ -6,71 +6,69 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.place import _kernels
 from evlcp_sdk.place.observations import Problem
 
 __all__ = ["closed_form_starts", "three_point_poses"]
 
 Floats = NDArray[np.float64]
 
-_HEADINGS = 72
+_ANGLES = np.arange(72) * (2 * math.pi / 72)
 """Headings tried at first where none is known: 5 degrees apart, a fraction of the basin of the fit."""
+
+_HEADINGS = np.zeros((72, 3, 3))
+_HEADINGS[:, 0, 0] = _HEADINGS[:, 1, 1] = np.cos(_ANGLES)
+_HEADINGS[:, 1, 0], _HEADINGS[:, 0, 1] = np.sin(_ANGLES), -np.sin(_ANGLES)
+_HEADINGS[:, 2, 2] = 1
 
 
 def closed_form_starts(problem: Problem) -> list[tuple[Floats, Floats]]:
     """Pairs of position, m, float64 (3,), and camera axes as columns in ENU, float64 (3, 3), to fit from."""
     sights = problem.sights()
-    good = np.isfinite(sights).all(1)
+    good = np.isfinite(sights[:, 0])
     if good.sum() < 3:
         return []
-    sights, enu = sights[good], problem.enu_m[good]
     if problem.attitude is None:
-        return _three_point_starts(problem)
+        return _three_point_starts(problem, sights)
+    enu, mean = _halves(problem, sights, good)
     known = problem.attitude.rotation()
-    if problem.compass:
-        position, cost = _nearest_to_sights(enu, sights @ known.T)
-        return [(position, known)] if np.isfinite(cost) else []
-    angle = np.arange(_HEADINGS) * (2 * math.pi / _HEADINGS)
-    turned = np.zeros((_HEADINGS, 3, 3))
-    turned[:, 0, 0] = turned[:, 1, 1] = np.cos(angle)
-    turned[:, 1, 0], turned[:, 0, 1] = np.sin(angle), -np.sin(angle)
-    turned[:, 2, 2] = 1
-    rotations = turned @ known
-    positions, costs = _nearest_to_sights(enu, sights @ rotations.transpose(0, 2, 1))
+    if problem.angles == 3:
+        positions, costs = _nearest_to_sights(enu, mean, known[None])
+        return [(positions[0], known)] if costs[0] < np.inf else []
+    rotations = _HEADINGS @ known
+    positions, costs = _nearest_to_sights(enu, mean, rotations)
     # A start from each valley, so that a second solution is found where there is one.
-    low = (costs <= np.roll(costs, 1)) & (costs <= np.roll(costs, -1)) & np.isfinite(costs)
+    low = (costs <= np.roll(costs, 1)) & (costs <= np.roll(costs, -1)) & (costs < np.inf)
     order = [int(i) for i in np.argsort(costs) if low[i]][:4]
     return [(positions[i], rotations[i]) for i in order]
 
 
-def _nearest_to_sights(enu_m: Floats, sights: Floats) -> tuple[Floats, Floats]:
-    """The point nearest to all lines through `enu_m` along `sights`, and how far it is from them.
-
-    Args:
-        enu_m: Points, m, float64 (n, 3).
-        sights: Unit vectors, float64 (..., n, 3).
-
-    Returns:
-        Points, m, float64 (..., 3), and the sum of 1 - cosine of the angles by which the lines miss them,
-        float64 (...,): large where lines lead there from behind, infinite where it is not determined.
-    """
-    normal = len(enu_m) * np.eye(3) - np.swapaxes(sights, -1, -2) @ sights
-    # What the lines leave open, as when all are parallel, is a direction of no curvature.
-    determined = np.linalg.eigvalsh(normal)[..., 0] > 1e-12 * len(enu_m)
-    normal = np.where(determined[..., None, None], normal, np.eye(3))
-    along = (sights * enu_m).sum(-1, keepdims=True)
-    position = np.linalg.solve(normal, (enu_m - sights * along).sum(-2)[..., None])[..., 0]
-    offset = enu_m - position[..., None, :]
-    distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-9)
-    cost = (1 - (offset * sights).sum(-1) / distance).sum(-1)
-    return position, np.where(determined, cost, np.inf)
+def _halves(problem: Problem, sights: Floats, good: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """Mean places and sights of the halves of each bar: what a start needs of its points."""
+    enu, mean = [], []
+    for b in range(len(problem.transmitters)):
+        rows = np.flatnonzero((problem.bar == b) & good)
+        half = len(rows) // 2
+        for part in (rows[:half], rows[half:]):
+            if len(part):
+                enu.append(problem.points[part, :3].mean(0))
+                mean.append(sights[part].mean(0))
+    found = np.array(mean)
+    return np.array(enu), found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
-def _three_point_starts(problem: Problem) -> list[tuple[Floats, Floats]]:
+def _nearest_to_sights(enu_m: Floats, sights: Floats, rotations: Floats) -> tuple[Floats, Floats]:
+    """The points nearest to all lines along `sights`, for each rotation, and how far these miss them."""
+    positions, costs = np.zeros((len(rotations), 3)), np.zeros(len(rotations))
+    _kernels.nearest_to_sights(enu_m, sights, np.ascontiguousarray(rotations), positions, costs)
+    return positions, costs
+
+
+def _three_point_starts(problem: Problem, sights: Floats) -> list[tuple[Floats, Floats]]:
     """Grunert's solutions for the three bars that span the largest triangle."""
-    sights = problem.sights()
-    centres, seen = problem.centres_m, []
+    centres, seen = problem.centres_m(), []
     for i in range(len(centres)):
-        mean = sights[problem.bar == i].mean(0)
+        mean = np.nanmean(sights[problem.bar == i], 0)
         seen.append(mean / np.linalg.norm(mean))
 
     def area(three: list[int]) -> float:

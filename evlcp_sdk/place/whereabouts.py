@@ -1,11 +1,13 @@
 """Which bar a transmitter is, and where it stands: by the user's sites, and by what beacons say."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.chances import chi_square
 from evlcp_sdk.scene.sites import BarSite, LocalAxes, site_of_transmitter
 from evlcp_sdk.values import Packet
 
@@ -86,7 +88,7 @@ class Whereabouts:
             said.transmitter_id, said.trust = heard.message.transmitter_id, heard.trust
             said.beacon = BarSite(
                 heard.message.transmitter_id, b.latitude_deg, b.longitude_deg, b.height_m,
-                b.heading_deg % 360, b.tilt_deg, b.length_m,
+                b.heading_deg % 360, b.tilt_deg, b.length_m, position_sigma_m=self._spec.beacon_sigma_m,
             )  # fmt: skip
 
     def verified(self, number: int) -> bool:
@@ -107,16 +109,17 @@ class Whereabouts:
         """How a transmitter's own beacon contradicts its site; empty where it does not.
 
         A lamp that is not where its site is would move the camera by as much, and so would two bars that are
-        mixed up. Nearer than a bar's length, two places are taken for one.
+        mixed up. Beyond what the sigmas of both explain, with the chance of a false alarm, they disagree.
         """
         site, beacon = self._listed(number), self._said[number].beacon
         if site is None or beacon is None or self._spec.beacons == "none":
             return ""
         place = (beacon.latitude_deg, beacon.longitude_deg, beacon.height_m)
         apart = float(np.linalg.norm(LocalAxes.of([site]).to_enu(*place)))
-        if apart > site.length_m:
-            return f"transmitter {number} says that it is {apart:.1f} m from the site of its id"
-        if abs(beacon.length_m - site.length_m) > _LENGTH_SHARE * site.length_m:
+        sigma = math.hypot(site.position_sigma_m or 0.0, self._spec.beacon_sigma_m)
+        if apart > max(sigma, 1e-3) * math.sqrt(chi_square(self._spec.false_alarm, 3)):
+            return f"transmitter {number} says that it is {apart:.2g} m from the site of its id"
+        if abs(beacon.length_m - site.length_m) > _LENGTH_SHARE * site.length_m + 4 * site.length_sigma_m:
             long = f"{beacon.length_m:g} m long, its site {site.length_m:g} m"
             return f"transmitter {number} says that it is {long}"
         return ""

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.results.tallies import RunTally, TransmitterTally
@@ -40,7 +41,12 @@ _BY_CHANCE = 1e-6
 
 
 def warnings_of(
-    tally: RunTally, counts: Mapping[str, int], link: Link, *, reads_messages: bool = True
+    tally: RunTally,
+    counts: Mapping[str, int],
+    link: Link,
+    *,
+    reads_messages: bool = True,
+    positions: Mapping[str, Any] | None = None,
 ) -> list[str]:
     """What looks wrong in a result, a line each.
 
@@ -49,6 +55,7 @@ def warnings_of(
         counts: The receiver's counts.
         link: The configuration that it ran with.
         reads_messages: Whether messages were looked for.
+        positions: Figures of the positions, where they were computed.
     """
     found = [*_frames(counts), *_room(counts)]
     for number, one in sorted(tally.transmitters.items()):
@@ -56,7 +63,33 @@ def warnings_of(
             found += [f"transmitter {number}: {text}" for text in _transmitter(one, link)]
     if reads_messages:
         found += _blocks(counts, tally)
+    if positions is not None:
+        found += _positions(positions, link)
     return found
+
+
+def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[str]:
+    if not positions["fixes"] + sum(positions["refused"].values()):
+        return
+    exact = positions["bars_exact"]
+    unsaid = [f"bars {', '.join(map(str, exact))} (position_sigma_m in site.toml)"] if exact else []
+    if not link.camera_sigma.known:
+        unsaid.append("the camera ([camera_sigma], which evlcp calibrate prints)")
+    if unsaid:
+        yield (
+            f"positions take as exact what has no sigma: {' and '.join(unsaid)}; their sigmas and protection"
+            " levels hold only if it is"
+        )
+    for name, number in positions["excluded"].items():
+        yield (
+            f"{number} positions are without {name}, which the rest contradicts: compare its place or angles"
+            " and their sigmas with what is there"
+        )
+    if number := positions["refused"].get("misfit", 0):
+        yield (
+            f"{number} positions refused, as bars, attitude and camera contradict one another: compare sites,"
+            " angles and [camera] with what is there, and their sigmas"
+        )
 
 
 def _frames(counts: Mapping[str, int]) -> Iterator[str]:

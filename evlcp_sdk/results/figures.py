@@ -201,19 +201,24 @@ class TrackProbe:
         self.points.add(settled)
 
 
+_LEVELS = {"hpl_m": "horizontal level", "vpl_m": "vertical level"}
+
+
 def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]], title: str) -> Figure:
-    """A map of fixes with their 95 % ellipses, the track and the bars; height and sigma over time.
+    """A map of fixes with their 95 % ellipses, the track and the bars; height, sigma, protection over time.
 
     Args:
         probe: Has the whole trajectory.
         bars_enu_m: Centre of each bar in the local axes, m, float64 (3,), by transmitter.
         title: What the figure is of.
     """
-    figure = Figure(figsize=(11, 7.6), layout="constrained")
+    figure = Figure(figsize=(11, 8.8), layout="constrained")
     parts = figure.subplot_mosaic(
-        [["plan", "close"], ["height", "height"], ["spread", "spread"]], height_ratios=[4, 1, 1]
+        [["plan", "close"], ["height", "height"], ["spread", "spread"], ["protected", "protected"]],
+        height_ratios=[4, 1, 1, 1],
     )
-    plan, close, height, spread = (parts[name] for name in ("plan", "close", "height", "spread"))
+    plan, close, height = (parts[name] for name in ("plan", "close", "height"))
+    spread, protected = parts["spread"], parts["protected"]
     points = list(probe.points)
     for number, enu in sorted(bars_enu_m.items()):
         plan.plot(enu[0], enu[1], "s", ms=7, color=transmitter_colour(number))
@@ -237,6 +242,14 @@ def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]],
         for i, name in enumerate(("east", "north", "up")):
             sigma = [math.sqrt(point.fix.covariance_m2[i, i]) for point in points]
             spread.plot(t_s, sigma, lw=1.2, color=TRANSMITTER_COLOURS[i], label=name)
+        for name, style in (("hpl_m", "-"), ("vpl_m", ":")):
+            # A gap where there is none.
+            level = np.array([getattr(point.fix, name) for point in points])
+            shown = np.where(np.isfinite(level), level, np.nan)
+            protected.plot(t_s, shown, style, lw=1.4, color=_INK, label=_LEVELS[name])
+        alarmed = [t for t, point in zip(t_s, points, strict=True) if point.fix.excluded]
+        protected.plot(alarmed, np.zeros(len(alarmed)), "x", ms=5, color="#d55e00", label="a part left out")
+        protected.legend(frameon=False, fontsize=9, ncols=3)
         close.legend(frameon=False, fontsize=9)
         spread.legend(frameon=False, fontsize=9, ncols=3)
     for axis in (plan, close):
@@ -245,8 +258,9 @@ def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]],
     _title(plan, "bars and track")
     _title(close, "the track alone")
     height.set(ylabel="up, m")
-    spread.set(ylabel="sigma, m", xlabel="camera clock, s", ylim=(0, None))
-    for axis in (plan, close, height, spread):
+    spread.set(ylabel="sigma, m", ylim=(0, None))
+    protected.set(ylabel="protection, m", xlabel="camera clock, s", ylim=(0, None))
+    for axis in (plan, close, height, spread, protected):
         _plain(axis)
         axis.grid(color="#e6e6e6", lw=0.8)
         axis.set_axisbelow(True)

@@ -1,12 +1,13 @@
 """`fixes.csv`: a row per fix, given or refused."""
 
 import csv
+from math import isfinite
 
 from evlcp_sdk.files import defused
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.results.text import sigmas, text_or_empty
+from evlcp_sdk.results.text import covariances, sigmas, text_or_empty
 from evlcp_sdk.values import Fix
 
 __all__ = ["FIX_COLUMNS", "FixesCsv"]
@@ -19,12 +20,21 @@ FIX_COLUMNS = (
     "sigma_east_m",
     "sigma_north_m",
     "sigma_up_m",
+    "cov_east_north_m2",
+    "cov_east_up_m2",
+    "cov_north_up_m2",
     "heading_deg",
     "heading_sigma_deg",
     "pitch_deg",
     "roll_deg",
     "bars",
     "verified",
+    "misfit",
+    "freedom",
+    "hpl_m",
+    "vpl_m",
+    "excluded",
+    "alarms",
     "refusal",
     "detail",
 )
@@ -48,12 +58,19 @@ class FixesCsv(Sink):
                 text_or_empty(fix.longitude_deg, 10),
                 text_or_empty(fix.height_m, 4),
                 *(text_or_empty(value, 4) for value in sigmas(fix.covariance_m2)),
+                *(f"{value:.6g}" if isfinite(value) else "" for value in covariances(fix.covariance_m2)),
                 text_or_empty(fix.heading_deg, 4),
                 text_or_empty(fix.heading_sigma_deg, 4),
                 text_or_empty(fix.pitch_deg, 4),
                 text_or_empty(fix.roll_deg, 4),
                 " ".join(map(str, fix.transmitters)),
                 str(int(fix.verified)),
+                text_or_empty(fix.misfit, 4),
+                str(fix.freedom),
+                text_or_empty(fix.hpl_m, 3),
+                text_or_empty(fix.vpl_m, 3),
+                "; ".join(fix.excluded),
+                " ".join(fix.alarms),
                 defused(fix.refusal),
                 defused(fix.detail),
             ]

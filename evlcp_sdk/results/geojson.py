@@ -9,7 +9,7 @@ from typing import Any
 from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.results.text import sigmas
+from evlcp_sdk.results.text import integrity, sigmas
 from evlcp_sdk.values import Fix
 
 __all__ = ["GeoJson", "cut"]
@@ -26,8 +26,11 @@ class GeoJson(Sink):
         self._line_end: list[list[float]] = []
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
-        """Write a fix that is given as a point."""
+        """Write a fix that is given as a point; one that is refused with an alarm has no place."""
         if filtered is None:
+            if fix.alarms:
+                why = {"t_us": round(fix.t_us, 1), "bars": list(fix.transmitters), "detail": fix.detail}
+                self._feature(None, [], why | integrity(fix))
             return
         self._feature(
             "Point",
@@ -36,8 +39,10 @@ class GeoJson(Sink):
                 "t_us": round(fix.t_us, 1),
                 "heading_deg": round(fix.heading_deg, 3),
                 "sigma_m": [round(value, 4) for value in sigmas(fix.covariance_m2)],
+                "covariance_m2": [[float(f"{v:.6g}") for v in row] for row in fix.covariance_m2.tolist()],
                 "bars": list(fix.transmitters),
                 "verified": fix.verified,
+                **integrity(fix),
             },
         )
 
@@ -74,8 +79,8 @@ class GeoJson(Sink):
             if len(piece) > 1:
                 self._feature("LineString", piece, {"track": "smoothed"})
 
-    def _feature(self, kind: str, coordinates: list[Any], properties: dict[str, Any]) -> None:
-        shape = {"type": kind, "coordinates": coordinates}
+    def _feature(self, kind: str | None, coordinates: list[Any], properties: dict[str, Any]) -> None:
+        shape = None if kind is None else {"type": kind, "coordinates": coordinates}
         feature = {"type": "Feature", "geometry": shape, "properties": properties}
         self._file.write(("," if self._features else "") + "\n" + json.dumps(feature))
         self._features += 1

@@ -1,4 +1,4 @@
-"""`fixes.mcap`: positions as MCAP with Foxglove's well-known schemas: `/fix`, `/pose`, `/track`."""
+"""`fixes.mcap`: positions as MCAP with well-known schemas: `/fix`, `/pose`, `/track`, `/integrity`."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
+from evlcp_sdk.results.text import integrity
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.values import Fix
 
@@ -22,7 +23,8 @@ class Mcap(Sink):
     """Writes `fixes.mcap`, message by message.
 
     `/fix` (foxglove.LocationFix) and `/pose` (foxglove.PoseInFrame, camera axes in ENU) hold each fix as it
-    was measured; `/track` (foxglove.LocationFix) the filtered position at its time.
+    was measured; `/track` (foxglove.LocationFix) the filtered position at its time; `/integrity`
+    (google.protobuf.Struct) protection levels, what was left out and alarms, of refused fixes, too.
     """
 
     def __init__(self, folder: ResultFolder, run: Run) -> None:
@@ -38,6 +40,7 @@ class Mcap(Sink):
         from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
         from scipy.spatial.transform import Rotation
 
+        self._integrity(fix)
         if filtered is None:
             return
         measured = (fix.latitude_deg, fix.longitude_deg, fix.height_m)
@@ -74,6 +77,13 @@ class Mcap(Sink):
         )
         message.timestamp.FromNanoseconds(self._at_ns(t_us))
         self._write(topic, t_us, message)
+
+    def _integrity(self, fix: Fix) -> None:
+        from google.protobuf.struct_pb2 import Struct
+
+        message = Struct()
+        message.update({"bars": list(fix.transmitters), "refusal": fix.refusal} | integrity(fix))
+        self._write("/integrity", fix.t_us, message)
 
     def _write(self, topic: str, t_us: float, message: Any) -> None:
         at_ns = self._at_ns(t_us)

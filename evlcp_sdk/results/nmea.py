@@ -1,13 +1,17 @@
-"""`fixes.nmea`: NMEA-0183 sentences of a fix, GGA and RMC.
+"""`fixes.nmea`: NMEA-0183 sentences of a fix, GGA, RMC and GST, and TXT for alarms.
 
 Talker `IN`, integrated navigation; quality 6 and mode E, estimated, as nothing here is a satellite's. The
 altitude is that above the WGS-84 ellipsoid; the geoid's height is not known and left empty. The number of
-satellites is that of bars, the dilution of precision the horizontal sigma in metres.
+satellites is that of bars, the dilution of precision the horizontal sigma in metres. The first value of a
+GST is the root of the misfit, in sigmas, as bars give no ranges; its ellipse and sigmas are in metres.
 """
 
 import math
 from datetime import UTC, datetime, timedelta
 from functools import reduce
+
+import numpy as np
+from numpy.typing import NDArray
 
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.results.folder import ResultFolder
@@ -15,7 +19,7 @@ from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.text import sigmas
 from evlcp_sdk.values import Fix
 
-__all__ = ["Nmea", "checksum", "gga", "rmc"]
+__all__ = ["Nmea", "checksum", "gga", "gst", "rmc", "txt"]
 
 _KNOTS_PER_M_S = 3600 / 1852
 
@@ -29,8 +33,10 @@ class Nmea(Sink):
         self._zero = run.clock_zero
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
-        """Write two sentences; those of a refused fix have no place."""
+        """Write its sentences; those of a refused fix have no place."""
         zero = self._zero
+        for number, alarm in enumerate(fix.alarms, 1):
+            self._file.write(txt(len(fix.alarms), number, _in_words(fix, alarm)))
         if filtered is None:
             self._file.write(gga(fix.t_us, zero, None, 0, 0.0) + rmc(fix.t_us, zero, None, None))
             return
@@ -40,6 +46,13 @@ class Nmea(Sink):
         bars = len(fix.transmitters)
         self._file.write(gga(fix.t_us, zero, place, bars, math.hypot(east, north)))
         self._file.write(rmc(fix.t_us, zero, place, way))
+        self._file.write(gst(fix.t_us, zero, math.sqrt(fix.misfit), filtered.covariance_m2))
+
+
+def _in_words(fix: Fix, alarm: str) -> str:
+    if alarm == "excluded":
+        return f"EXCLUDED {' '.join(fix.excluded)}"
+    return "NO PROTECTION LEVEL" if alarm == "unavailable" else alarm.upper()
 
 
 def checksum(body: str) -> str:
@@ -98,6 +111,34 @@ def rmc(
         ("", "") if way is None else (f"{way[0] * _KNOTS_PER_M_S:.3f}", f"{round(way[1], 2) % 360:.2f}")
     )
     return _sentence(f"INRMC,{clock},A,{where},{knots},{course},{date},,,E")
+
+
+def gst(t_us: float, zero: datetime | None, misfit: float, covariance_m2: NDArray[np.float64]) -> str:
+    """A GST sentence, with its line end: the error's ellipse and sigmas.
+
+    Args:
+        t_us: Camera clock, us.
+        zero: UTC of the camera clock's 0; None: the clock itself is written as time of day.
+        misfit: Root mean square of the misses, in sigmas.
+        covariance_m2: Of east, north and up, m2, float64 (3, 3).
+    """
+    clock, _ = _time(t_us, zero)
+    values, axes = np.linalg.eigh(covariance_m2[:2, :2])
+    minor, major = np.sqrt(np.maximum(values, 0)).tolist()
+    turned = math.degrees(math.atan2(axes[0, 1], axes[1, 1])) % 180
+    east, north, up = sigmas(covariance_m2)
+    return _sentence(
+        f"INGST,{clock},{misfit:.2f},{major:.3f},{minor:.3f},{turned:.1f},{north:.3f},{east:.3f},{up:.3f}"
+    )
+
+
+def txt(count: int, number: int, text: str) -> str:
+    """A TXT sentence, with its line end: a text that is one of so many; 01 says that it is a warning.
+
+    >>> txt(1, 1, "EXCLUDED bar 2").strip()
+    '$INTXT,01,01,01,EXCLUDED bar 2*1F'
+    """
+    return _sentence(f"INTXT,{count:02d},{number:02d},01,{text}")
 
 
 def _sentence(body: str) -> str:

@@ -57,7 +57,7 @@ def summary_of(
         "processing": dict(processing),
         "counts": dict(counts),
         "messages_off": (off := _messages_off(link)),
-        "warnings": warnings_of(tally, counts, link, reads_messages=off is None),
+        "warnings": warnings_of(tally, counts, link, reads_messages=off is None, positions=positions),
         "losses": {kind: dict(loss) for kind, loss in losses.items()},
         "digest": link.digest,
         "codebook": {"digest": link.codebook.digest, "profile": link.codebook.profile},

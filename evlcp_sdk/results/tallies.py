@@ -186,9 +186,13 @@ class PositionTally:
     verified: int = 0
     left_out: int = 0
     refused: Counter[str] = field(default_factory=Counter)
+    alarms: Counter[str] = field(default_factory=Counter)
+    excluded: Counter[str] = field(default_factory=Counter)
 
     def add(self, placed: Placed) -> None:
         """Count a fix."""
+        self.alarms.update(placed.fix.alarms)
+        self.excluded.update(placed.fix.excluded)
         if placed.filtered is None:
             self.refused[placed.fix.refusal] += 1
             return
@@ -203,10 +207,13 @@ class PositionTally:
             "fixes": self.given,
             "fixes_verified": self.verified,
             "refused": {kind: self.refused[kind] for kind in REFUSALS if self.refused[kind]},
+            "alarms": dict(sorted(self.alarms.items())),
+            "excluded": dict(sorted(self.excluded.items())),
             "left_out_of_track": self.left_out,
             "frames_late": positioner.counts["frames_late"],
             "beacons_forged": positioner.counts["beacons_forged"],
             "sites_contradicted": {str(n): how for n, how in positioner.contradicted.items()},
             "origin": asdict(axes) if axes is not None else None,
+            "bars_exact": [n for n, s in positioner.stands_at.items() if s.position_sigma_m is None],
             "bars": {str(n): s.transmitter_id for n, s in positioner.stands_at.items()},
         }

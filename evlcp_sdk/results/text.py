@@ -1,11 +1,14 @@
 """Numbers as the result's files write them."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["number_or_none", "sigmas", "symbol_list", "text_or_empty"]
+from evlcp_sdk.values import Fix
+
+__all__ = ["covariances", "integrity", "number_or_none", "sigmas", "symbol_list", "text_or_empty"]
 
 
 def text_or_empty(value: float, digits: int) -> str:
@@ -27,3 +30,20 @@ def sigmas(covariance: NDArray[np.float64]) -> list[float]:
     """Standard deviations of a covariance, the roots of its diagonal."""
     found: list[float] = np.sqrt(np.diag(covariance)).tolist()
     return found
+
+
+def covariances(covariance: NDArray[np.float64]) -> list[float]:
+    """What a covariance of east, north and up has beside its diagonal: east-north, east-up, north-up."""
+    return [float(covariance[i, j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+
+
+def integrity(fix: Fix) -> dict[str, Any]:
+    """How far a fix may be trusted, as values of JSON: misfit, levels, what was left out, alarms."""
+    return {
+        "misfit": number_or_none(fix.misfit, 4),
+        "freedom": fix.freedom,
+        "hpl_m": number_or_none(fix.hpl_m, 3),
+        "vpl_m": number_or_none(fix.vpl_m, 3),
+        "excluded": list(fix.excluded),
+        "alarms": list(fix.alarms),
+    }

@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.results.text import sigmas
+from evlcp_sdk.results.text import covariances, sigmas
 
 __all__ = ["TRACK_COLUMNS", "TrackCsv"]
 
-_PLACE_COLUMNS = ("latitude_deg", "longitude_deg", "height_m", "sigma_east_m", "sigma_north_m", "sigma_up_m")
+_PLACE_COLUMNS = (
+    *("latitude_deg", "longitude_deg", "height_m", "sigma_east_m", "sigma_north_m", "sigma_up_m"),
+    *("cov_east_north_m2", "cov_east_up_m2", "cov_north_up_m2"),
+)
 
 TRACK_COLUMNS = (
     "t_us",
@@ -48,4 +51,5 @@ class TrackCsv(Sink):
 
 def _place_row(place: Place) -> list[str]:
     where = [f"{place.latitude_deg:.10f}", f"{place.longitude_deg:.10f}", f"{place.height_m:.4f}"]
-    return where + [f"{value:.4f}" for value in sigmas(place.covariance_m2)]
+    spread = [f"{value:.4f}" for value in sigmas(place.covariance_m2)]
+    return where + spread + [f"{value:.6g}" for value in covariances(place.covariance_m2)]

@@ -30,8 +30,12 @@ class Attitude:
         pitch_deg: How far the optical axis points above the horizon.
         roll_deg: How far the camera's top leans to its right.
         heading_deg: Where the optical axis points to, clockwise from north; None when unknown.
-        gravity_sigma_deg: Standard deviation of pitch and roll each; 0: exact.
-        heading_sigma_deg: Of the heading; 0: exact.
+        gravity_sigma_deg: Standard deviation of what stays wrong with pitch and roll each; 0: exact.
+        heading_sigma_deg: The same of the heading; 0: exact.
+        white_sigma_deg: Of what is new with every time, of each angle.
+        time_sigma_us: Of the offset of its clock from the camera's, us.
+        rate_deg_s: How fast pitch, roll and heading change, degrees / s: what an offset in time moves them
+            by.
 
     >>> Attitude(heading_deg=90.0).rotation()[:, 2].round(6).tolist()
     [1.0, 0.0, 0.0]
@@ -42,6 +46,20 @@ class Attitude:
     heading_deg: float | None = None
     gravity_sigma_deg: float = 0.1
     heading_sigma_deg: float = 0.5
+    white_sigma_deg: float = 0.0
+    time_sigma_us: float = 0.0
+    rate_deg_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def standing(self) -> NDArray[np.float64]:
+        """What stays wrong with pitch, roll and heading, radians: float64 (3, 4), one column a cause.
+
+        The causes are the bias of each, and the offset in time; all in their own sigmas.
+        """
+        causes = np.zeros((3, 4))
+        bias = (self.gravity_sigma_deg, self.gravity_sigma_deg, self.heading_sigma_deg)
+        causes[:, :3] = np.diag(np.radians(bias))
+        causes[:, 3] = np.radians(self.rate_deg_s) * self.time_sigma_us * 1e-6
+        return causes
 
     def rotation(self) -> NDArray[np.float64]:
         """Camera axes (x right, y down, z forward) as columns in ENU, float64 (3, 3); north if unknown."""
@@ -78,6 +96,8 @@ class AttitudeLog:
         heading_deg: float64 (n,); None where the heading is not known.
         gravity_sigma_deg: float64 (n,).
         heading_sigma_deg: float64 (n,).
+        white_sigma_deg: As an `Attitude` has it.
+        time_sigma_us: The same.
     """
 
     t_us: NDArray[np.float64]
@@ -86,6 +106,8 @@ class AttitudeLog:
     heading_deg: NDArray[np.float64] | None
     gravity_sigma_deg: NDArray[np.float64]
     heading_sigma_deg: NDArray[np.float64]
+    white_sigma_deg: float = 0.0
+    time_sigma_us: float = 0.0
 
     @classmethod
     def read(cls, path: Path | str, usual: Attitude | None = None) -> "AttitudeLog":
@@ -130,6 +152,8 @@ class AttitudeLog:
             np.degrees(np.unwrap(np.radians(table["heading_deg"]))) if "heading_deg" in table else None,
             table.get("gravity_sigma_deg", np.full(len(t_us), usual.gravity_sigma_deg)),
             table.get("heading_sigma_deg", np.full(len(t_us), usual.heading_sigma_deg)),
+            usual.white_sigma_deg,
+            usual.time_sigma_us,
         )
 
     def to_csv(self) -> str:
@@ -160,7 +184,20 @@ class AttitudeLog:
             None if self.heading_deg is None else value(self.heading_deg) % 360,
             value(self.gravity_sigma_deg),
             value(self.heading_sigma_deg),
+            self.white_sigma_deg,
+            self.time_sigma_us,
+            self._rate_deg_s(t_us),
         )
+
+    def _rate_deg_s(self, t_us: float) -> tuple[float, float, float]:
+        """How fast the angles change between the lines about a time."""
+        after = min(max(int(np.searchsorted(self.t_us, t_us, "right")), 1), len(self.t_us) - 1)
+        dt_s = float(self.t_us[after] - self.t_us[after - 1]) * 1e-6
+
+        def rate(column: NDArray[np.float64] | None) -> float:
+            return 0.0 if column is None else float(column[after] - column[after - 1]) / dt_s
+
+        return rate(self.pitch_deg), rate(self.roll_deg), rate(self.heading_deg)
 
 
 def attitude_source(attitude: Attitude | AttitudeLog | None) -> Callable[[float], Attitude | None]:

@@ -7,7 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-__all__ = ["CameraModel"]
+from evlcp_sdk.errors import ConfigError
+
+__all__ = ["CAMERA_PARAMETERS", "CameraModel", "CameraSigma"]
+
+CAMERA_PARAMETERS = ("focal_mm", "centre_x_px", "centre_y_px", "k1", "k2", "p1", "p2")
+"""What a calibration estimates of a camera, in the order of covariances."""
 
 _NEWTON_STEPS = 12
 """Each doubles the digits; four suffice for what lenses do."""
@@ -134,3 +139,59 @@ class CameraModel:
             spacing_px: The same in the image, l', px.
         """
         return self.focal_px * spacing_m / spacing_px
+
+
+@dataclass(frozen=True)
+class CameraSigma:
+    """How precisely the camera is known, as a calibration says: standard deviations, and how they correlate.
+
+    Raises:
+        ConfigError: The correlation is not one of seven parameters: of another shape, with a diagonal other
+            than 1, not symmetric, or of negative variance in some direction.
+
+    >>> CameraSigma(focal_mm=0.035).root(CameraModel())[0, 0].round(2)
+    np.float64(7.2)
+    """
+
+    focal_mm: Annotated[
+        float, Field(ge=0, le=1e4, description="Standard deviation of the focal length; 0: exact.")
+    ] = 0.0
+    centre_x_px: Annotated[
+        float, Field(ge=0, le=1e4, description="Of the principal point's column; 0: exact.")
+    ] = 0.0
+    centre_y_px: Annotated[float, Field(ge=0, le=1e4, description="Of its row.")] = 0.0
+    k1: Annotated[float, Field(ge=0, le=10, description="Of the radial distortion, likewise.")] = 0.0
+    k2: Annotated[float, Field(ge=0, le=100, description="The same.")] = 0.0
+    p1: Annotated[float, Field(ge=0, le=1, description="Of the distortion of a tilted lens.")] = 0.0
+    p2: Annotated[float, Field(ge=0, le=1, description="The same.")] = 0.0
+    correlation: Annotated[
+        tuple[tuple[float, ...], ...],
+        Field(description="Correlations of these seven in this order, row by row; empty: none."),
+    ] = ()
+
+    def __post_init__(self) -> None:
+        if not self.correlation:
+            return
+        n = len(CAMERA_PARAMETERS)
+        if len(self.correlation) != n or any(len(row) != n for row in self.correlation):
+            raise ConfigError(f"camera_sigma.correlation: expected {n} rows of {n}")
+        matrix = np.array(self.correlation)
+        if not np.allclose(np.diag(matrix), 1, atol=1e-6) or not np.allclose(matrix, matrix.T, atol=1e-6):
+            raise ConfigError("camera_sigma.correlation: expected 1 on the diagonal, the same on both sides")
+        if float(np.linalg.eigvalsh(matrix)[0]) < -1e-6:
+            raise ConfigError("camera_sigma.correlation: expected no direction of negative variance")
+
+    @property
+    def known(self) -> bool:
+        """Whether anything is said."""
+        return any(getattr(self, name) > 0 for name in CAMERA_PARAMETERS)
+
+    def root(self, camera: CameraModel) -> NDArray[np.float64]:
+        """A lower root of the covariance of these seven, the focal length in px: float64 (7, 7)."""
+        sigma = np.array([getattr(self, name) for name in CAMERA_PARAMETERS])
+        sigma[0] *= camera.focal_px / camera.focal_mm
+        if not self.correlation:
+            return np.diag(sigma)
+        # What is written with few digits may be singular by rounding.
+        matrix = np.array(self.correlation) + 1e-9 * np.eye(len(sigma))
+        return np.asarray(sigma[:, None] * np.linalg.cholesky((matrix + matrix.T) / 2))

@@ -53,6 +53,20 @@ class BarSite:
         int | None,
         Field(ge=0, description="Number that the receiver gives it, where no beacon sends its id."),
     ] = None
+    position_sigma_m: Annotated[
+        float | None,
+        Field(ge=0, le=1000, description="Of its place, to the east, north and up each; none: exact."),
+    ] = None
+    attitude_sigma_deg: Annotated[
+        float, Field(ge=0, le=180, description="Of a turn of the bar about each axis; 0: exact.")
+    ] = 0.0
+    length_sigma_m: Annotated[float, Field(ge=0, le=10, description="Of its length; 0: exact.")] = 0.0
+
+    @property
+    def survey(self) -> tuple[float, float, float]:
+        """Sigmas of its place, m, of a turn about each axis, radians, and of its length, as a share."""
+        place, turn = self.position_sigma_m or 0.0, math.radians(self.attitude_sigma_deg)
+        return place, turn, self.length_sigma_m / self.length_m
 
     def axis_enu(self) -> NDArray[np.float64]:
         """Unit vector from its bottom to its top, in east, north and up at its own centre, float64 (3,)."""

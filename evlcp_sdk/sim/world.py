@@ -76,6 +76,7 @@ def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, .
                 heading_deg=heading,
                 tilt_deg=math.degrees(math.atan2(lean, up)),
                 length_m=link.bar.length_m,
+                position_sigma_m=0.0,
             )
         )
     return tuple(sites)

@@ -132,7 +132,7 @@ def faults_of(registry: Registry, text: str, tmp_path: Path, *overrides: str) ->
 def test_defaults_are_all_written_out(registry: Registry) -> None:
     link = load_link(None, (), registry)
     assert list(link.table) == [
-        *("camera", "bar", "air", "regions", "messages", "position"),
+        *("camera", "camera_sigma", "bar", "air", "regions", "messages", "position"),
         *("pilots", "modulation", "synchronization", "separation", "decoding", "ranging", "tracking"),
         "error-correction",
     ]
@@ -208,11 +208,11 @@ def test_every_fault_of_a_file_is_told(registry: Registry, tmp_path: Path) -> No
     window_px = nan
     """
     assert faults_of(registry, text, tmp_path, "bar.led_pitch_m=-1", "lamp.on=1") == [
-        "link.toml: camra: unknown table; did you mean 'camera'? (known: camera, bar, air, regions, messages,"
-        " position, pilots, modulation, synchronization, separation, decoding, ranging, tracking,"
-        " error-correction)",
+        "link.toml: camra: unknown table; did you mean 'camera'? (known: camera, camera_sigma, bar, air,"
+        " regions, messages, position, pilots, modulation, synchronization, separation, decoding, ranging,"
+        " tracking, error-correction)",
         "link.toml: decoding = 4: expected a table",
-        "--set: lamp.on: unknown table (known: camera, bar, air, regions, messages, position,"
+        "--set: lamp.on: unknown table (known: camera, camera_sigma, bar, air, regions, messages, position,"
         " pilots, modulation, synchronization, separation, decoding, ranging, tracking, error-correction)",
         "link.toml: camera.width = 0: expected greater than 0",
         'link.toml: camera.focal_mm = "35": expected a valid number',

@@ -75,6 +75,40 @@ def test_the_camera_comes_back_within_its_sigmas(known: bool) -> None:
     assert max(squares) < 5**2
 
 
+def test_sites_that_are_not_exact_are_in_the_covariance() -> None:
+    """Every bar is off by the same in all views: more views do not average it away."""
+    rng = np.random.default_rng(9)
+    survey, squares, spreads = (0.03, 0.002, 0.003), [], []
+    for _ in range(6):
+        seen = views(rng, 10, True)
+        off = {bar.transmitter: rng.normal(size=7) for view in seen for bar in view.bars}
+        told = []
+        for view in seen:
+            bars = []
+            for bar in view.bars:
+                z, arm = off[bar.transmitter], bar.enu_m - bar.enu_m.mean(0)
+                said = (
+                    bar.enu_m + survey[0] * z[:3] + np.cross(survey[1] * z[3:6], arm) + survey[2] * z[6] * arm
+                )
+                bars.append(dataclasses.replace(bar, enu_m=said, survey=survey))
+            told.append(dataclasses.replace(view, bars=tuple(bars)))
+        found = calibrate(told, NOMINAL, SPEC)
+        exact = calibrate(seen, NOMINAL, SPEC)
+        spreads.append(found.sigma["focal_mm"] / exact.sigma["focal_mm"])
+        squares += [(getattr(found.camera, n) - getattr(TRUE, n)) ** 2 / s**2 for n, s in found.sigma.items()]
+        # The whole covariance, as a link has it.
+        sigma = found.camera_sigma
+        assert sigma.focal_mm == pytest.approx(found.sigma["focal_mm"], rel=1e-3)
+        off_now = np.array([getattr(found.camera, n) or 0 for n in PARAMETERS]) - [
+            getattr(TRUE, n) for n in PARAMETERS
+        ]
+        assert (np.abs(off_now[3:]) < 5 * np.array([getattr(sigma, n) for n in PARAMETERS[3:]])).all()
+        root = sigma.root(found.camera)
+        assert root[0, 0] == pytest.approx(sigma.focal_mm * 1e3 / TRUE.pitch_um, rel=1e-3)
+    assert min(spreads) > 1.2
+    assert 0.2 < np.mean(squares) < stats.chi2.isf(1e-4, 8) / 8
+
+
 def test_what_one_bar_does_not_determine_is_refused() -> None:
     rng = np.random.default_rng(2)
     pole = np.array([0.5, 12.0, 0.2]) + ALONG[:, None] * [0, 0, 1]

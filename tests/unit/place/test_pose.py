@@ -1,5 +1,6 @@
 """Positions: slopes against differences, known poses, honest sigmas, refusals."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -18,7 +19,7 @@ from evlcp_sdk.place.pose import solve_pose
 from evlcp_sdk.place.refusals import REFUSALS, Refusal
 from evlcp_sdk.place.starts import three_point_poses
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
 CAMERA = CameraModel()
 BENT = CameraModel(k1=-0.3, k2=0.1, p1=1e-3, p2=-1e-3, centre_x_px=655.0, centre_y_px=350.0)
@@ -192,10 +193,166 @@ def test_noise_and_what_was_said_make_up_the_covariance() -> None:
     told = Attitude(5.0, 0.0, 0.0, 0.1, 0.1)
     pose = solved(solve_pose(seen, CAMERA, told, POINT_ONLY))
     exact = solved(solve_pose(seen, CAMERA, Attitude(5.0, 0.0, 0.0, 0.0, 0.0), POINT_ONLY))
-    np.testing.assert_allclose(pose.noise[:3, :3], exact.covariance[:3, :3], atol=2e-4)
+    np.testing.assert_allclose(pose.noise + pose.slow, exact.covariance[:3, :3], atol=2e-4)
     # 0.1 degrees at 50 m, across.
-    aside = math.sqrt((pose.covariance - pose.noise)[0, 0])
+    aside = float(np.linalg.norm(pose.standing["attitude"][0]))
     assert aside == pytest.approx(50 * math.radians(0.1), rel=0.02)
+
+
+SURVEY = (0.05, math.radians(0.3), 0.002)
+"""A survey of 5 cm, 0.3 degrees and 2 mm in a metre."""
+
+
+def drawn(
+    rng: np.random.Generator, places: list[tuple[float, float, float]], known: Attitude | None,
+    survey: tuple[float, float, float], focal: float,
+) -> tuple[list[BarView], Attitude | None, CameraSigma]:  # fmt: skip
+    """A camera at the origin that looks up, with every error drawn from its stated sigma."""
+    true = dataclasses.replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + focal * rng.normal()))
+    spec, seen = PositionSpec(), []
+    for view in views([bar(p) for p in places], np.zeros(3), UP.rotation(), rng, 0.1, true):
+        arm = view.enu_m - view.enu_m.mean(0)
+        said = view.enu_m + rng.normal(0, survey[0], 3) + np.cross(rng.normal(0, survey[1], 3), arm)
+        said = said + rng.normal(0, survey[2]) * arm
+        points = view.points_px + rng.normal(0, spec.shared_sigma_px, 2)
+        seen.append(BarView(view.transmitter, said, points, view.sigma_px, survey))
+    told = None
+    if known is not None:
+        # A bias of each angle, an offset in time that moves all of them, and noise.
+        off = np.degrees(known.standing()) @ rng.normal(size=4) + rng.normal(0, known.white_sigma_deg, 3)
+        heading = None if known.heading_deg is None else known.heading_deg + off[2]
+        told = dataclasses.replace(
+            known, pitch_deg=known.pitch_deg + off[0], roll_deg=known.roll_deg + off[1], heading_deg=heading
+        )
+    return seen, told, CameraSigma(focal_mm=focal * CAMERA.focal_mm)
+
+
+@pytest.mark.parametrize(
+    ("places", "known"),
+    [
+        (POLES[:1], Attitude(5.0, 0.0, 0.0, 0.1, 0.1)),
+        (POLES[:1], Attitude(5.0, 0.0, 0.0, 0.02, 0.02, 0.05, 5000.0, (10.0, -5.0, 45.0))),
+        (POLES, Attitude(5.0, 0.0, 0.0, 0.1, 0.1)),
+        (POLES, Attitude(5.0, 0.0, None, 0.1)),
+        (THREE, Attitude(5.0, 0.0, None, 0.1)),
+        (THREE, None),
+    ],
+)
+@pytest.mark.parametrize(("survey", "focal"), [(SURVEY, 0.0), ((0.0, 0.0, 0.0), 0.005), (SURVEY, 0.005)])
+def test_every_error_that_is_stated_is_in_the_covariance(
+    places: list[tuple[float, float, float]], known: Attitude | None,
+    survey: tuple[float, float, float], focal: float,
+) -> None:  # fmt: skip
+    rng = np.random.default_rng(11)
+    squares, parts = [], np.zeros((3, 3))
+    while len(squares) < 120:
+        seen, told, sigma = drawn(rng, places, known, survey, focal)
+        found = solve_pose(seen, CAMERA, told, None, sigma)
+        if isinstance(found, Refusal):
+            # Two bars on gravity and a survey of 5 cm leave metres along an arc.
+            assert found.kind in ("uncertain", "two-solutions"), found
+            assert survey[0] > 0
+            squares.append(3.0)
+            continue
+        squares.append(found.enu_m @ np.linalg.solve(found.covariance[:3, :3], found.enu_m))
+        parts = found.noise + found.slow + sum(s @ s.T for s in found.standing.values())
+        # What Huber's weights take from a few points is the difference.
+        np.testing.assert_allclose(parts, found.covariance[:3, :3], rtol=0.05, atol=1e-4)
+    assert squares.count(3.0) < 12
+    low, high = stats.chi2.interval(0.999, 3 * len(squares)) / np.array(len(squares))
+    assert low / 1.03 < np.mean(squares) < high * 1.03
+
+
+@pytest.mark.parametrize("way", [(1, 0, 0), (0, 1, 0), (0, 0, 1)])
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_a_bar_that_disagrees_is_left_out_by_name(which: int, way: tuple[int, int, int]) -> None:
+    rng = np.random.default_rng(13)
+    for known in (Attitude(5.0, 0.0, 0.0, 0.1, 0.1), Attitude(5.0, 0.0, None, 0.1)):
+        seen, told, _ = drawn(rng, THREE, known, (0.0, 0.0, 0.0), 0.0)
+        seen[which] = dataclasses.replace(seen[which], enu_m=seen[which].enu_m + 0.5 * np.array(way))
+        found = solve_pose(seen, CAMERA, told)
+        if isinstance(found, Refusal):
+            # A pair that stays cannot always tell which of three is wrong; it never says a place.
+            assert found.kind == "misfit", found
+            assert f"bar {which}" in found.detail or "not" in found.detail
+            continue
+        assert found.excluded == (f"bar {which}",)
+        assert which not in found.transmitters
+        assert found.enu_m @ np.linalg.solve(found.covariance[:3, :3], found.enu_m) < stats.chi2.isf(1e-5, 3)
+
+
+def test_an_attitude_that_disagrees_is_left_out_by_name() -> None:
+    rng = np.random.default_rng(14)
+    seen, told, _ = drawn(rng, THREE, Attitude(5.0, 0.0, 0.0, 0.1, 0.1), (0.0, 0.0, 0.0), 0.0)
+    assert told is not None
+    turned = solved(solve_pose(seen, CAMERA, dataclasses.replace(told, heading_deg=3.0)))
+    assert turned.excluded == ("heading",)
+    assert abs(math.remainder(Attitude.of_rotation(turned.rotation).heading_deg or 0, 360)) < 0.3
+    leaning = solved(solve_pose(seen, CAMERA, dataclasses.replace(told, roll_deg=2.0)))
+    assert leaning.excluded == ("attitude",)
+    for found in (turned, leaning):
+        assert np.linalg.norm(found.enu_m) < 0.3
+
+
+def test_two_bars_that_disagree_are_refused() -> None:
+    """Either may be the wrong one; so may the heading."""
+    rng = np.random.default_rng(15)
+    seen, told, _ = drawn(rng, POLES, Attitude(5.0, 0.0, 0.0, 0.1, 0.1), (0.0, 0.0, 0.0), 0.0)
+    seen[0] = dataclasses.replace(seen[0], enu_m=seen[0].enu_m + np.array([0.0, 0.0, 0.5]))
+    found = solve_pose(seen, CAMERA, told)
+    assert refused(found) == "misfit"
+    assert isinstance(found, Refusal)
+    assert "bar 0" in found.detail
+    assert "bar 1" in found.detail
+
+
+def test_protection_levels_cover_what_no_test_finds() -> None:
+    """Faults of every size, most of them too small to be found: none of these few is beyond a level."""
+    rng = np.random.default_rng(16)
+    hidden = 0
+    for trial in range(150):
+        three = trial % 2
+        seen, told, _ = drawn(
+            rng, THREE if three else POLES, Attitude(5.0, 0.0, 0.0, 0.1, 0.1), (0.0, 0.0, 0.0), 0.0
+        )
+        assert told is not None
+        camera, size = CAMERA, 10 ** rng.uniform(-2, 0)
+        which = trial % 3
+        if which == 0:
+            seen[0] = dataclasses.replace(seen[0], enu_m=seen[0].enu_m + size * rng.normal(size=3))
+        elif which == 1:
+            told = dataclasses.replace(told, pitch_deg=told.pitch_deg + size)
+        else:
+            camera = dataclasses.replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + 0.01 * size))
+        found = solve_pose(seen, camera, told)
+        if isinstance(found, Refusal) or math.isinf(found.hpl_m):
+            continue
+        assert math.hypot(*found.enu_m[:2]) < found.hpl_m
+        assert abs(found.enu_m[2]) < found.vpl_m
+        square = found.enu_m @ np.linalg.solve(found.covariance[:3, :3], found.enu_m)
+        hidden += square > stats.chi2.isf(0.0027, 3)
+    assert hidden > 20
+
+
+def test_a_lone_bar_has_no_protection() -> None:
+    seen, told, _ = drawn(
+        np.random.default_rng(17), POLES[:1], Attitude(5.0, 0.0, 0.0, 0.1, 0.1), (0.0, 0.0, 0.0), 0.0
+    )
+    pose = solved(solve_pose(seen, CAMERA, told))
+    assert math.isinf(pose.hpl_m)
+    assert math.isinf(pose.vpl_m)
+
+
+def test_false_alarms_are_as_rare_as_said() -> None:
+    """At a chance that can be counted: one of fifty."""
+    rng, spec = np.random.default_rng(18), PositionSpec(false_alarm=0.02)
+    alarms = 0
+    for _ in range(500):
+        seen, told, sigma = drawn(rng, THREE, Attitude(5.0, 0.0, 0.0, 0.1, 0.1), SURVEY, 0.002)
+        found = solve_pose(seen, CAMERA, told, spec, sigma)
+        alarms += isinstance(found, Refusal) or bool(found.excluded)
+    # Tests of overlapping parts share alarms, and the total is counted by Huber: never more, and not none.
+    assert 1 <= alarms <= stats.binom.isf(1e-3, 500, 0.02)
 
 
 def test_a_point_out_of_place_does_not_matter() -> None:
@@ -281,7 +438,10 @@ def test_what_is_not_determined_is_refused() -> None:
         *three[:2],
         BarView(2, three[2].enu_m + np.array([1.0, 0, 0]), three[2].points_px, three[2].sigma_px),
     ]
-    assert refused(solve_pose(moved, CAMERA, gravity)) in ("misfit", "not-determined")
+    found = solved(solve_pose(moved, CAMERA, gravity))
+    assert found.excluded == ("bar 2",)
+    assert found.transmitters == (0, 1)
+    assert np.linalg.norm(found.enu_m) < 0.1
 
 
 def test_a_mirrored_solution_is_refused_not_chosen() -> None:

@@ -253,7 +253,9 @@ def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
         ({"length_m": 1.92}, "0.96 m long, its site 1.92 m"),
         ({"length_m": 0.965}, None),
         ({"height_m": LEFT.height_m + 1.5}, "1.5 m from the site"),
-        ({"height_m": LEFT.height_m + 0.005}, None),
+        ({"height_m": LEFT.height_m + 0.9}, "0.9 m from the site"),
+        ({"height_m": LEFT.height_m + 0.9, "position_sigma_m": 0.3}, None),
+        ({"height_m": LEFT.height_m + 0.3}, None),
     ],
 )
 def test_a_bar_that_is_not_its_site(change: dict[str, float], told: str | None) -> None:

@@ -26,13 +26,14 @@ from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.tallies import RunTally, TransmitterTally
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.bar import BarLayout
-from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.values import Frame, Packet, Range, ReceivedMessage, SoftSymbols
 
 BOOK = Codebook("wh8", WhPilots().preamble(), WhPilots().codes(16), Wh8().codewords())
 LINK = Link(
     camera=CameraModel(),
+    camera_sigma=CameraSigma(),
     bar=BarLayout(),
     air=AirSpec(frames_per_packet=3),
     regions=RegionSpec(),

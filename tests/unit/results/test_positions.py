@@ -18,12 +18,14 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import STAGE_PREFIX
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place import navigator
-from evlcp_sdk.place.navigator import Navigator, PositionPlan
+from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan
 from evlcp_sdk.place.observations import project_bars
+from evlcp_sdk.place.trajectory import trajectory_step
 from evlcp_sdk.results.figures import TrackProbe, draw_track
 from evlcp_sdk.results.fixes_csv import FixesCsv
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.geojson import cut
+from evlcp_sdk.results.geojson import GeoJson, cut
+from evlcp_sdk.results.nmea import Nmea
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.attitude import Attitude
@@ -100,14 +102,71 @@ def test_files_of_a_drive(tmp_path: Path) -> None:
     _, latitude, _ = shapes[3]["geometry"]["coordinates"]
     assert latitude == pytest.approx(float(fixes[3]["latitude_deg"]), abs=2e-9)
     sentences = (tmp_path / "fixes.nmea").read_text().split("\n")[:-1]
-    assert len(sentences) == 24
-    last = pynmea2.parse(sentences[-1].strip(), check=True)
+    # Of a lone bar nothing is protected, and each fix says so.
+    kinds = [pynmea2.parse(s.strip(), check=True).sentence_type for s in sentences]
+    assert kinds == ["TXT", "GGA", "RMC", "GST"] * 12
+    assert pynmea2.parse(sentences[-4].strip()).text == "NO PROTECTION LEVEL"
+    spread = pynmea2.parse(sentences[-1].strip(), check=True)
+    assert spread.std_dev_altitude == pytest.approx(
+        float(rows(tmp_path / "track.csv")[-1]["filtered_sigma_up_m"]), abs=6e-4
+    )
+    last = pynmea2.parse(sentences[-2].strip(), check=True)
     assert last.spd_over_grnd * 1852 / 3600 == pytest.approx(10, abs=0.5)
     assert last.datestamp.isoformat() == "2026-03-01"
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["positions"] == json.loads(json.dumps(told))
     assert not list(tmp_path.glob(".*"))
     assert (tmp_path / "track.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_covariance_and_integrity_are_in_every_file(tmp_path: Path) -> None:
+    """Of a fix with everything to tell, and of one that is refused as its parts contradict one another."""
+    root = np.array([[0.3, 0.0, 0.0], [0.1, 0.2, 0.0], [-0.05, 0.02, 0.1]])
+    spread = root @ root.T
+    fix = dataclasses.replace(
+        Fix.refused(2e6, (0, 1), "", ""),
+        latitude_deg=35.0, longitude_deg=137.0, height_m=5.0, enu_m=np.zeros(3), covariance_m2=spread,
+        noise_m2=spread, heading_deg=1.0, pitch_deg=2.0, roll_deg=3.0, heading_sigma_deg=0.1,
+        misfit=0.64, freedom=60, hpl_m=1.25, vpl_m=math.inf, excluded=("bar 2", "heading"),
+    )  # fmt: skip
+    wrong = Fix.refused(3e6, (0, 1), "misfit", "heading does not fit the rest")
+    assert fix.alarms == ("excluded", "unavailable")
+    assert wrong.alarms == ("misfit",)
+    assert Fix.refused(3e6, (0,), "heading-unknown", "").alarms == ()
+    point = trajectory_step(None, fix, LINK.position)
+    place = Place(2e6, 35.0, 137.0, 5.0, point.mean[:3], point.covariance_m2, 0.0, 0.0, False, True)
+    with ResultFolder(tmp_path, ["fixes.csv", "fixes.nmea", "fixes.geojson"]) as folder:
+        run = Run("", LINK, PositionPlan((SITE,)), Navigator(LINK, PositionPlan((SITE,))), None)
+        for sink in (FixesCsv(folder, run), Nmea(folder, run), GeoJson(folder, run)):
+            sink.fix(fix, place)
+            sink.fix(wrong, None)
+            sink.finish()
+        folder.finish()
+    given, refused = rows(tmp_path / "fixes.csv")
+    for axis, i in (("east", 0), ("north", 1), ("up", 2)):
+        assert float(given[f"sigma_{axis}_m"]) == pytest.approx(math.sqrt(spread[i, i]), abs=1e-4)
+    for pair, (i, j) in (("east_north", (0, 1)), ("east_up", (0, 2)), ("north_up", (1, 2))):
+        assert float(given[f"cov_{pair}_m2"]) == pytest.approx(spread[i, j], rel=1e-5)
+    assert [given[k] for k in ("misfit", "freedom", "hpl_m", "vpl_m")] == ["0.6400", "60", "1.250", ""]
+    assert (given["excluded"], given["alarms"]) == ("bar 2; heading", "excluded unavailable")
+    assert (refused["alarms"], refused["hpl_m"], refused["cov_east_up_m2"]) == ("misfit", "", "")
+    point_, lost = json.loads((tmp_path / "fixes.geojson").read_text())["features"]
+    assert np.allclose(point_["properties"]["covariance_m2"], spread, rtol=1e-5)
+    assert (point_["properties"]["hpl_m"], point_["properties"]["vpl_m"]) == (1.25, None)
+    assert lost["geometry"] is None
+    assert lost["properties"]["alarms"] == ["misfit"]
+    texts = [pynmea2.parse(s, check=True) for s in (tmp_path / "fixes.nmea").read_text().splitlines()]
+    assert [t.sentence_type for t in texts] == ["TXT", "TXT", "GGA", "RMC", "GST", "TXT", "GGA", "RMC"]
+    assert texts[0].text == "EXCLUDED bar 2 heading"
+    assert texts[5].text == "MISFIT"
+    gst = texts[4]
+    major, minor = np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[::-1])
+    assert (gst.rms, gst.std_dev_major, gst.std_dev_minor) == pytest.approx((0.8, major, minor), abs=1e-3)
+    # Along the major axis, clockwise from north, the variance is the largest.
+    way = math.radians(gst.orientation)
+    along = np.array([math.sin(way), math.cos(way)])
+    assert along @ spread[:2, :2] @ along == pytest.approx(major**2, rel=1e-4)
+    assert gst.std_dev_latitude == pytest.approx(math.sqrt(spread[1, 1]), abs=1e-3)
 
 
 def test_the_figure_of_a_track(tmp_path: Path) -> None:
@@ -214,7 +273,12 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
         "/fix": {"foxglove.LocationFix"},
         "/track": {"foxglove.LocationFix"},
         "/pose": {"foxglove.PoseInFrame"},
+        "/integrity": {"google.protobuf.Struct"},
     }
+    for row, (_, _, told) in zip(fixes, found["/integrity"], strict=True):
+        assert told["misfit"] == pytest.approx(float(row["misfit"]), abs=1e-4)  # type: ignore[index]
+        assert list(told["alarms"]) == ["unavailable"]  # type: ignore[index]
+        assert told["hpl_m"] is None  # type: ignore[index]
     for row, (_, at_ns, fix), (_, _, pose) in zip(fixes, found["/fix"], found["/pose"], strict=True):
         assert at_ns == int(ZERO.timestamp()) * 10**9 + round(float(row["t_us"]) * 1000)
         assert fix.timestamp.ToNanoseconds() == at_ns  # type: ignore[attr-defined]

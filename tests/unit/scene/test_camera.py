@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import approx_fprime, root
 
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import resolve
-from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
 BENT = CameraModel(
     focal_mm=4.0, centre_x_px=650.5, centre_y_px=340.25, k1=-0.21, k2=0.06, p1=1.1e-3, p2=-7e-4, k3=-0.004
@@ -83,3 +84,36 @@ def test_the_configuration_has_the_keys() -> None:
     assert camera == CameraModel(k1=-0.1, centre_x_px=641.5)
     assert camera.centre_px == (641.5, 360.0)
     assert camera.distance_m(0.06, 6.0) == pytest.approx(72.016, abs=1e-3)
+
+
+def test_sigmas_and_correlations_make_the_covariance() -> None:
+    rng = np.random.default_rng(4)
+    half = rng.normal(size=(7, 7))
+    covariance = half @ half.T
+    sigma = np.sqrt(np.diag(covariance)) * [1e-2, 1, 1, 1e-2, 1e-2, 1e-4, 1e-4]
+    rows = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    found = CameraSigma(*sigma.tolist(), correlation=tuple(tuple(r) for r in rows.tolist()))
+    root = found.root(BENT)
+    assert not np.triu(root, 1).any()
+    sigma[0] *= BENT.focal_px / BENT.focal_mm
+    np.testing.assert_allclose(root @ root.T, rows * np.outer(sigma, sigma), rtol=1e-6)
+    assert found.known
+    assert not CameraSigma().known
+
+
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        (((1.0,),), "expected 7 rows of 7"),
+        (tuple((1.0,) * 7 for _ in range(6)), "expected 7 rows of 7"),
+        (tuple((2.0,) * 7 for _ in range(7)), "expected 1 on the diagonal"),
+        (tuple(tuple(1.0 if i <= j else 0.5 for j in range(7)) for i in range(7)), "the same on both sides"),
+        (
+            tuple(tuple(1.0 if i == j else -0.9 for j in range(7)) for i in range(7)),
+            "no direction of negative variance",
+        ),
+    ],
+)
+def test_correlations_that_are_none_are_refused(rows: tuple[tuple[float, ...], ...], says: str) -> None:
+    with pytest.raises(ConfigError, match=f"camera_sigma.correlation: .*{says}"):
+        CameraSigma(focal_mm=1.0, correlation=rows)

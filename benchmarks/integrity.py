@@ -1,0 +1,253 @@
+"""What positions promise, by Monte Carlo: covariances, fixes kept, faults found, protection levels.
+
+    python benchmarks/integrity.py                 # 2000 fixes a row, a few minutes
+    python benchmarks/integrity.py --fixes 100000  # the figures of docs/position.md
+
+Bars stand 30 to 90 m ahead, anywhere in view. Every error is drawn from its stated sigma: of points, of what
+a bar's points share, of survey, camera and attitude; then one part is made wrong without anybody's
+knowledge. A row:
+
+- NEES: mean of e' P^-1 e, 3 where covariances are right; its 99.73 % bound is 14.2
+- kept: fixes given, of those that the geometry allows
+- silent: fixes given whose error is beyond the 99.73 % bound of their own covariance
+- left out: fixes given without a part that is named
+- protected: fixes with both protection levels; their medians; and the share beyond one of them
+"""
+
+import argparse
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.judgement import Pose
+from evlcp_sdk.place.observations import BarView, project_bars
+from evlcp_sdk.place.pose import solve_pose
+from evlcp_sdk.place.refusals import Refusal
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.camera import CameraModel, CameraSigma
+
+Floats = NDArray[np.float64]
+
+CAMERA = CameraModel()
+SPEC = PositionSpec()
+POINT_PX = math.hypot(0.05, SPEC.pixel_sigma_px)
+ALONG = (0.5 - (np.arange(16) + 0.5) / 16) * 0.96
+BOUND = 14.156
+"""99.73 % of chi squared with 3 degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class World:
+    """What is seen, and how precisely everything is known.
+
+    Attributes:
+        bars: How many.
+        told: What is known of the attitude: "none", "gravity" or "heading".
+        survey: Sigmas of each bar's place, m, turn, radians, and length, a share.
+        focal: Of the focal length, as a share.
+        attitude_deg: Of pitch, roll and heading each.
+    """
+
+    bars: int
+    told: str
+    survey: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    focal: float = 0.0
+    attitude_deg: float = 0.1
+
+
+@dataclass
+class Scene:
+    """What the solver is given, which a fault changes, and where the camera is (the origin)."""
+
+    views: list[BarView]
+    attitude: Attitude | None
+    camera: CameraModel
+    sigma: CameraSigma
+
+
+def scene(world: World, rng: np.random.Generator) -> Scene:
+    """A scene with errors of the sigmas that are stated."""
+    pitch, roll, heading = rng.uniform(0, 6), rng.normal(0, 1), rng.uniform(0, 360)
+    rotation = Attitude(pitch, roll, heading).rotation()
+    focal_mm = CAMERA.focal_mm * (1 + world.focal * rng.normal())
+    true = replace(CAMERA, focal_mm=focal_mm)
+    depth = rng.uniform(30, 90)
+    views = []
+    # Thirds of the image's width, so that no two bars cover each other.
+    slots = rng.permutation(3)[: world.bars]
+    for number, slot in enumerate(slots):
+        far = depth * rng.uniform(0.8, 1.0)
+        sight = np.array([(slot - 1) * 0.055 + rng.uniform(-0.02, 0.02), rng.uniform(-0.025, 0.025), 1.0])
+        lean = rng.normal(0, 0.02, 2)
+        axis = np.array([*lean, 1.0]) / math.sqrt(1 + lean @ lean)
+        stands = rotation @ (sight * far) + ALONG[:, None] * axis
+        points, _ = project_bars(stands, np.zeros(3), rotation, true)
+        points = points + rng.normal(0, POINT_PX, points.shape) + rng.normal(0, SPEC.shared_sigma_px, 2)
+        place, turn, length = world.survey
+        arm = stands - stands.mean(0)
+        said = stands + rng.normal(0, place, 3) + np.cross(rng.normal(0, turn, 3), arm)
+        said = said + rng.normal(0, length) * arm
+        views.append(BarView(number, said, points, np.full(16, POINT_PX), world.survey))
+    off = rng.normal(0, world.attitude_deg, 3)
+    known = world.attitude_deg
+    told = {
+        "none": None,
+        "gravity": Attitude(pitch + off[0], roll + off[1], None, known, known),
+        "heading": Attitude(pitch + off[0], roll + off[1], (heading + off[2]) % 360, known, known),
+    }[world.told]
+    sigma = CameraSigma(focal_mm=world.focal * CAMERA.focal_mm)
+    return Scene(views, told, CAMERA, sigma)
+
+
+Fault = Callable[[Scene, np.random.Generator], None]
+
+
+def moved(bar: Scene, rng: np.random.Generator) -> None:
+    """A bar stands half a metre from where it is said to, in any direction."""
+    i = int(rng.integers(len(bar.views)))
+    way = rng.normal(size=3)
+    view = bar.views[i]
+    bar.views[i] = replace(view, enu_m=view.enu_m + 0.5 * way / np.linalg.norm(way))
+
+
+def swapped(bars: Scene, _rng: np.random.Generator) -> None:
+    """The first two sites are exchanged."""
+    one, two = bars.views[:2]
+    bars.views[:2] = [replace(one, enu_m=two.enu_m), replace(two, enu_m=one.enu_m)]
+
+
+def refocused(lens: Scene, rng: np.random.Generator) -> None:
+    """The focal length is half a percent off."""
+    share = 1 + 0.005 * rng.choice([-1, 1])
+    lens.camera = replace(lens.camera, focal_mm=lens.camera.focal_mm * share)
+
+
+def turned(angle_deg: float) -> Fault:
+    """One of the attitude's angles is off by so much."""
+
+    def turn(imu: Scene, rng: np.random.Generator) -> None:
+        if (told := imu.attitude) is None:
+            return
+        which = int(rng.integers(2 if told.heading_deg is None else 3))
+        off = angle_deg * rng.choice([-1, 1])
+        if which == 0:
+            imu.attitude = replace(told, pitch_deg=told.pitch_deg + off)
+        elif which == 1:
+            imu.attitude = replace(told, roll_deg=told.roll_deg + off)
+        else:
+            imu.attitude = replace(told, heading_deg=((told.heading_deg or 0) + off) % 360)
+
+    return turn
+
+
+def late(imu: Scene, rng: np.random.Generator) -> None:
+    """The attitude is 10 ms old: a car's pitch and heading change by up to 20 and 45 degrees a second."""
+    if (told := imu.attitude) is None:
+        return
+    off = rng.uniform(-1, 1, 3) * [0.2, 0.2, 0.45]
+    heading = None if told.heading_deg is None else (told.heading_deg + off[2]) % 360
+    imu.attitude = replace(
+        told, pitch_deg=told.pitch_deg + off[0], roll_deg=told.roll_deg + off[1], heading_deg=heading
+    )
+
+
+def row(world: World, fault: Fault | None, fixes: int, seed: int) -> dict[str, float]:
+    """The figures of a row of the table."""
+    rng = np.random.default_rng(seed)
+    squares, hpl, vpl = [], [], []
+    allowed = left_out = protected = beyond = 0
+    took_s = 0.0
+    while allowed < fixes:
+        here = scene(world, rng)
+        if fault is not None:
+            fault(here, rng)
+        began = time.perf_counter()
+        found = solve_pose(here.views, here.camera, here.attitude, SPEC, here.sigma)
+        took_s += time.perf_counter() - began
+        if isinstance(found, Refusal):
+            # What the geometry does not allow has nothing to do with faults.
+            allowed += found.kind in ("misfit", "not-determined")
+            if found.kind not in ("misfit", "not-determined"):
+                fixes -= 1
+            continue
+        allowed += 1
+        left_out += bool(found.excluded)
+        squares.append(square(found))
+        if math.isfinite(found.hpl_m) and math.isfinite(found.vpl_m):
+            protected += 1
+            hpl.append(found.hpl_m)
+            vpl.append(found.vpl_m)
+            flat, high = math.hypot(*found.enu_m[:2]), abs(found.enu_m[2])
+            beyond += flat > found.hpl_m or high > found.vpl_m
+    given = max(len(squares), 1)
+    return {
+        "NEES": float(np.mean(squares)) if squares else math.nan,
+        "kept": len(squares) / max(allowed, 1),
+        "silent": float(np.mean(np.array(squares) > BOUND)) if squares else 0.0,
+        "left out": left_out / given,
+        "protected": protected / given,
+        "HPL": float(np.median(hpl)) if hpl else math.nan,
+        "VPL": float(np.median(vpl)) if vpl else math.nan,
+        "beyond": beyond / max(protected, 1),
+        "ms": took_s / max(allowed, 1) * 1e3,
+    }
+
+
+def square(pose: Pose) -> float:
+    """The error squared in its own sigmas."""
+    return float(pose.enu_m @ np.linalg.solve(pose.covariance[:3, :3], pose.enu_m))
+
+
+SURVEYED = {"survey": (0.05, math.radians(0.3), 0.002), "focal": 0.005}
+WORLDS = {
+    "1 bar, heading": World(1, "heading"),
+    "2 bars, gravity": World(2, "gravity"),
+    "2 bars, heading": World(2, "heading"),
+    "3 bars, none": World(3, "none"),
+    "3 bars, gravity": World(3, "gravity"),
+    "3 bars, heading": World(3, "heading"),
+}
+FAULTS: dict[str, Fault] = {
+    "bar .5 m off": moved,
+    "sites swapped": swapped,
+    "focal length .5 % off": refocused,
+    "attitude 1 degree off": turned(1.0),
+    "attitude 10 ms late": late,
+}
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--fixes", type=int, default=2000, help="of a row")
+    parser.add_argument("--only", default="", help="rows whose name contains this")
+    given = parser.parse_args()
+    rows: list[tuple[str, World, Fault | None]] = []
+    for name, world in WORLDS.items():
+        stated = replace(world, survey=SURVEYED["survey"], focal=SURVEYED["focal"])  # type: ignore[arg-type]
+        rows += [(name, world, None), (f"{name}; survey 5 cm, focal .5 %", stated, None)]
+    for what, fault in FAULTS.items():
+        for name, world in WORLDS.items():
+            if (what == "sites swapped" and world.bars < 2) or ("attitude" in what and world.told == "none"):
+                continue
+            rows.append((f"{name}; {what}", world, fault))
+    head = ("NEES", "kept", "silent", "left out", "protected", "HPL", "VPL", "beyond", "ms")
+    print("| what | " + " | ".join(head) + " |")
+    print("|---" * (len(head) + 1) + "|")
+    row(World(2, "gravity"), None, 5, 0)
+    for i, (name, world, fault) in enumerate(rows):
+        if given.only in name:
+            found = row(world, fault, given.fixes, i)
+            texts = (
+                f"{found[key]:.4f}" if key in ("silent", "beyond") else f"{found[key]:.3g}" for key in head
+            )
+            print(f"| {name} | " + " | ".join(texts) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

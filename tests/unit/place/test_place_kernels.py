@@ -1,0 +1,249 @@
+"""The compiled fit against plain NumPy: numerical slopes, dense equations, SciPy's least squares."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import approx_fprime, least_squares
+from scipy.spatial.transform import Rotation
+
+from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place import _kernels
+from evlcp_sdk.place.fit import FOCAL_FAULT, Fit, fit_pose, moved, normal_equations
+from evlcp_sdk.place.observations import BarView, Problem, project_bars
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
+
+Floats = NDArray[np.float64]
+
+BENT = CameraModel(k1=-0.3, k2=0.1, p1=1e-3, p2=-1e-3, centre_x_px=655.0, centre_y_px=350.0)
+CORRELATED = tuple(tuple(0.4 if i != j else 1.0 for j in range(7)) for i in range(7))
+LENS = CameraSigma(0.1, 3.0, 2.0, 0.05, 0.05, 1e-4, 1e-4, correlation=CORRELATED)
+SURVEY = (0.05, 0.01, 0.01)
+SPEC = PositionSpec(huber_sigmas=3.0)
+ALONG = (0.5 - (np.arange(16) + 0.5) / 16) * 0.96
+
+
+def problem(rng: np.random.Generator, bars: int = 2, noise: float = 3.0) -> tuple[Problem, Floats, Floats]:
+    """Bars seen with errors, and the place and axes near which they are."""
+    attitude = Attitude(4.0, -2.0, 30.0, 0.2, 0.4, 0.1, 2000.0, (10.0, -20.0, 30.0))
+    rotation, position = attitude.rotation(), np.array([5.0, -3.0, 1.0])
+    views = []
+    for number in range(bars):
+        sight = np.array([0.05 * (number - 0.5), 0.02 * number, 1.0]) * (40 + 8 * number)
+        stands = position + rotation @ sight + ALONG[:, None] * np.array([0.1, 0.05, 0.99])
+        points, _ = project_bars(stands, position, rotation, BENT)
+        points = points + noise * rng.normal(0, 0.1, points.shape)
+        views.append(BarView(number, stands, points, rng.uniform(0.08, 0.15, 16), SURVEY))
+    found = Problem.of(views, BENT, attitude, SPEC, LENS)
+    assert isinstance(found, Problem)
+    return found, position, rotation
+
+
+def misses(p: Problem, at: Fit, change: Floats) -> Floats:
+    """All misses in sigmas, of points and of what is known, at a point that is moved: written out anew.
+
+    `change`: 6 of the pose, 1 of the focal length's fault, 7 of the lens, 9 of each bar.
+    """
+    z = at.lens + change[7:14]
+    off = LENS.root(BENT) @ z
+    f = BENT.focal_px + off[0]
+    camera = dataclasses.replace(
+        BENT,
+        focal_mm=BENT.focal_mm * f / BENT.focal_px,
+        **{name: BENT.centre_px[i] + off[1 + i] for i, name in enumerate(CAMERA_PARAMETERS[1:3])},
+        **{name: getattr(BENT, name) + off[3 + i] for i, name in enumerate(CAMERA_PARAMETERS[3:])},
+    )
+    turn = Rotation.from_rotvec(change[3:6]).as_matrix()
+    position, rotation = at.position + change[:3], turn @ at.rotation
+    found = []
+    for b in range(len(p.transmitters)):
+        own = at.local[b] + change[14 + 9 * b : 23 + 9 * b]
+        rows = p.points[p.bar == b]
+        arm = rows[:, 3:6]
+        place, lean, length = p.bar_sigma[b, 1:]
+        stands = rows[:, :3] + place * own[2:5] + np.cross(lean * own[5:8], arm) + length * own[8] * arm
+        points, _ = project_bars(stands, position, rotation, camera)
+        centre = np.array(camera.centre_px)
+        points = centre + (points - centre) * (1 + FOCAL_FAULT * change[6]) + p.bar_sigma[b, 0] * own[:2]
+        found.append(((rows[:, 6:8] - points) * rows[:, 8:9]).ravel())
+        found.append(-own)
+    found.append(-z)
+    assert p.attitude is not None
+    seen = Attitude.of_rotation(rotation)
+    off_deg = np.array(
+        [
+            p.attitude.pitch_deg - seen.pitch_deg,
+            p.attitude.roll_deg - seen.roll_deg,
+            (p.attitude.heading_deg or 0) - (seen.heading_deg or 0),
+        ]
+    )
+    causes = p.attitude.standing()
+    spread = causes @ causes.T + np.radians(p.attitude.white_sigma_deg) ** 2 * np.eye(3)
+    found.append(np.linalg.solve(np.linalg.cholesky(spread), np.radians(off_deg)))
+    return np.concatenate(found)
+
+
+def test_normal_equations_are_those_of_numerical_slopes() -> None:
+    rng = np.random.default_rng(1)
+    p, position, rotation = problem(rng, noise=0.8)
+    p = dataclasses.replace(p, spec=dataclasses.replace(SPEC, huber_sigmas=100.0))
+    at = Fit(position, rotation, rng.normal(0, 0.3, (2, 9)), rng.normal(0, 0.3, 7), 0.0)
+    found = normal_equations(p, at)
+    at_rest = misses(p, at, np.zeros(32))
+    slope = -approx_fprime(np.zeros(32), lambda x: misses(p, at, x), 1e-6)
+    whole, side = slope.T @ slope, slope.T @ at_rest
+    # The local unknowns eliminated; the fault's column is masked in the sum.
+    own = np.arange(14, 32)
+    gain = np.linalg.solve(whole[np.ix_(own, own)], np.column_stack([whole[own][:, :14], side[own]]))
+    want = whole[:14, :14] - whole[:14, own] @ gain[:, :14]
+    want_side = side[:14] - whole[:14, own] @ gain[:, 14]
+    keep = np.array([i for i in range(14) if i != 6])
+    scale = np.sqrt(np.diag(want))
+    np.testing.assert_allclose(
+        (found.whole / np.outer(scale, scale))[np.ix_(keep, keep)],
+        (want / np.outer(scale, scale))[np.ix_(keep, keep)],
+        # The roll is about the level forward axis, not the pitched one.
+        atol=1e-3,
+    )
+    np.testing.assert_allclose(found.side[keep] / scale[keep], want_side[keep] / scale[keep], atol=2e-3)
+    np.testing.assert_allclose(found.gain.reshape(18, 14)[:, keep], gain[:, keep], rtol=2e-3, atol=2e-3)
+    np.testing.assert_allclose(found.step.ravel(), gain[:, 14], atol=1e-3)
+    assert found.info.sum(0)[6, 6] == pytest.approx(want[6, 6], rel=1e-3)
+    np.testing.assert_allclose(
+        found.info.sum(0)[6, keep] / scale[keep], want[6, keep] / scale[keep], atol=0.05 * scale[6]
+    )
+    assert found.cost == pytest.approx(at_rest @ at_rest, rel=1e-6)
+    assert found.bar_cost.sum() == pytest.approx(
+        at_rest[: 2 * (32 + 9)] @ at_rest[: 2 * (32 + 9)]
+        - sum(side[i] @ np.linalg.solve(whole[np.ix_(i, i)], side[i]) for i in (own[:9], own[9:])),
+        rel=1e-5,
+    )
+
+
+def test_what_the_pixels_say_is_counted() -> None:
+    """Of points whose sigma is that of pixels alone, it is all but what the prior sigmas say."""
+    p, position, rotation = problem(np.random.default_rng(2), noise=0.5)
+    sharp = p.points.copy()
+    sharp[:, 8] = 1 / SPEC.pixel_sigma_px
+    p = dataclasses.replace(p, points=sharp, spec=dataclasses.replace(SPEC, huber_sigmas=100.0))
+    found = normal_equations(p, Fit(position, rotation, np.zeros((2, 9)), np.zeros(7), 0.0))
+    priors = np.einsum("bij,bik->bjk", found.gain, found.gain)
+    np.testing.assert_allclose(found.pixel + priors, found.info, rtol=1e-6, atol=1e-6 * found.info.max())
+
+
+def test_the_fit_is_that_of_scipy() -> None:
+    rng = np.random.default_rng(3)
+    p, position, rotation = problem(rng, noise=1.0)
+    # A point far out, for Huber's loss.
+    far = p.points.copy()
+    far[4, 6] += 4.0
+    p = dataclasses.replace(p, points=far)
+    fit = fit_pose(p, position + np.array([0.5, -0.4, 0.2]), rotation)
+    assert fit is not None
+    start = Fit(position, rotation, np.zeros((2, 9)), np.zeros(7), 0.0)
+
+    def cost(x: Floats) -> Floats:
+        all_ = misses(p, start, np.concatenate([x[:6], [0.0], x[6:]]))
+        for b in range(2):
+            rows = slice(41 * b, 41 * b + 32)
+            pairs = all_[rows].reshape(-1, 2)
+            size = np.linalg.norm(pairs, axis=1)
+            most = SPEC.huber_sigmas
+            less = np.where(
+                size > most, np.sqrt(np.abs(most * (2 * size - most))) / np.maximum(size, 1e-9), 1.0
+            )
+            all_[rows] = (pairs * less[:, None]).ravel()
+        return all_
+
+    scipy = least_squares(cost, np.zeros(31), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    # The roll is about the level forward axis, not the pitched one.
+    assert fit.cost == pytest.approx(2 * scipy.cost, rel=5e-5)
+    sigma = np.sqrt(np.diag(np.linalg.inv(normal_equations(p, fit).whole))[:3])
+    np.testing.assert_allclose(fit.position / sigma, (position + scipy.x[:3]) / sigma, atol=0.02)
+    np.testing.assert_allclose(fit.lens, scipy.x[6:13], atol=0.02)
+    np.testing.assert_allclose(fit.local.ravel(), scipy.x[13:], atol=0.02)
+
+
+def test_a_step_turns_about_the_bars() -> None:
+    """To first order along the straight line; a turn alone keeps the camera as far from the bars."""
+    p, position, rotation = problem(np.random.default_rng(4))
+    at = Fit(position, rotation, np.zeros((2, 9)), np.zeros(7), 0.0)
+    normal = dataclasses.replace(normal_equations(p, at), gain=np.zeros((2, 9, 14)), step=np.zeros((2, 9)))
+    centre = p.points[:, :3].mean(0)
+    turn = np.array([0.0, 0.0, 0.3])
+    move = np.zeros(14)
+    move[:3], move[3:6] = np.cross(turn, position - centre), turn
+    there = moved(p, at, normal, move)
+    assert np.linalg.norm(there.position - centre) == pytest.approx(np.linalg.norm(position - centre))
+    np.testing.assert_allclose(there.rotation, Rotation.from_rotvec(turn).as_matrix() @ rotation, atol=1e-12)
+    small = moved(p, at, normal, 1e-6 * move)
+    np.testing.assert_allclose(small.position - position, 1e-6 * move[:3], atol=1e-10)
+
+
+@pytest.mark.parametrize("bound", [0.0, 0.3])
+def test_a_mean_shift_test_is_the_larger_fit(bound: float) -> None:
+    """A linear problem with the fault's parameters as unknowns beside the others, solved whole."""
+    rng = np.random.default_rng(5)
+    rows, wrong = rng.normal(size=(40, 14)), np.zeros((40, 3))
+    wrong[:12] = rng.normal(size=(12, 3))
+    seen = rng.normal(size=40) + wrong @ [1.0, -2.0, 0.5]
+    spread = np.linalg.inv(rows.T @ rows)
+    left = seen - rows @ (spread @ (rows.T @ seen))
+    value, freedom, added, unseen = _kernels.tested(
+        wrong.T @ wrong, rows.T @ wrong, wrong.T @ left, spread, bound * np.eye(3), 1e-6
+    )
+    both = np.concatenate([rows, wrong], 1)
+    better = seen - both @ np.linalg.lstsq(both, seen, rcond=None)[0]
+    assert freedom == 3
+    assert value == pytest.approx(left @ left - better @ better)
+    prior = np.zeros((17, 17))
+    prior[14:, 14:] = bound * np.eye(3)
+    free = np.linalg.inv(both.T @ both + prior)
+    np.testing.assert_allclose(spread[:3, :3] + added, free[:3, :3], atol=1e-9)
+    # What the position moves by when the fault is free, as a linear map of the observations' noise.
+    move = free[:3] @ both.T - spread[:3] @ rows.T
+    noise = np.eye(40) - rows @ spread @ rows.T
+    np.testing.assert_allclose(unseen, move @ noise @ move.T, atol=1e-9)
+
+
+def test_a_part_that_says_nothing_has_no_test() -> None:
+    empty = _kernels.tested(
+        np.zeros((2, 2)), np.zeros((14, 2)), np.zeros(2), np.eye(14), np.zeros((2, 2)), 1e-3
+    )
+    assert empty[:2] == (0.0, 0)
+    assert not empty[2].any()
+    assert not empty[3].any()
+
+
+def test_the_nearest_point_to_sights() -> None:
+    rng = np.random.default_rng(6)
+    enu, here = rng.uniform(-10, 10, (6, 3)) + np.array([0, 50, 0]), np.array([1.0, 2.0, 3.0])
+    sights = (enu - here) / np.linalg.norm(enu - here, axis=1, keepdims=True) + rng.normal(0, 1e-3, (6, 3))
+    sights /= np.linalg.norm(sights, axis=1, keepdims=True)
+    turns = Rotation.from_rotvec([[0, 0, 0], [0, 0, 0.3], [0, 0, math.pi]]).as_matrix()
+    places, costs = np.zeros((3, 3)), np.zeros(3)
+    _kernels.nearest_to_sights(enu, sights, turns, places, costs)
+    for turn, place, cost in zip(turns, places, costs, strict=True):
+        lines = sights @ turn.T
+        flat = np.eye(3) - lines[:, :, None] * lines[:, None]
+        want = np.linalg.lstsq(flat.reshape(-1, 3), (flat @ enu[:, :, None]).ravel(), rcond=None)[0]
+        np.testing.assert_allclose(place, want, atol=1e-6)
+        away = enu - want
+        cosine = (away * lines).sum(1) / np.linalg.norm(away, axis=1)
+        assert cost == pytest.approx((1 - cosine).sum())
+    parallel = np.tile([[0.0, 1.0, 0.0]], (6, 1))
+    _kernels.nearest_to_sights(enu, parallel, turns, places, costs)
+    assert np.isinf(costs).all()
+
+
+def test_equations_that_are_singular_are_not_solved() -> None:
+    whole, move = np.diag(np.arange(1.0, 15.0)), np.zeros(14)
+    assert _kernels.solved(whole, np.ones(14), 0.0, move)
+    np.testing.assert_allclose(move, 1 / np.arange(1.0, 15.0))
+    whole[0, 0] = 0
+    assert not _kernels.solved(whole, np.ones(14), 0.0, move)
+    whole[:2, :2] = 1
+    assert not _kernels.solved(whole, np.ones(14), 0.0, move)
