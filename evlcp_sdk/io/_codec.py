@@ -113,10 +113,11 @@ class Decoder:
         return bool(self._state[_words.BASE] != _words.UNKNOWN_TIME)
 
     def decode(self, words: NDArray[Any], at: int, out: Columns, final: bool) -> int:
-        """Decode `words`, whose first is at byte `at`, behind what is in `out`; return how many were used.
+        """Decode `words`, whose first is at byte `at`, behind what is in `out`; return the bytes used.
 
         It stops early when `out` has no room for another word's events (`codec.burst`) or trigger; and where
-        it takes more words, up to `LOOK_BYTES`, to believe the time, unless these are the `final` ones.
+        it takes more words, up to `LOOK_BYTES`, to believe the time, unless these are the `final` ones; and
+        where words do not go on behind the last one, but some bytes later, which are used, too.
         """
         used, out.events, out.triggers = self._kernel(
             words,
@@ -135,7 +136,9 @@ class Decoder:
             out.triggers,
             final,
         )
-        return int(used)
+        askew = int(self._state[_words.ASKEW])
+        self._state[_words.ASKEW] = 0
+        return int(used) * self.codec.word.itemsize + askew
 
     def finish(self, at: int, odd_bytes: int) -> None:
         """Take note of how the stream ends: at byte `at`, with `odd_bytes` that make no word."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.io._words import (
+    ASKEW,
     BASE,
     BEFORE_TIME,
     COLUMN,
@@ -19,6 +20,7 @@ from evlcp_sdk.io._words import (
     EVT2_EXT_TRIGGER,
     EVT2_OTHERS,
     EVT2_TIME_HIGH,
+    EVT2_TYPES,
     EVT3_ADDR_X,
     EVT3_ADDR_Y,
     EVT3_CONTINUED_4,
@@ -27,11 +29,14 @@ from evlcp_sdk.io._words import (
     EVT3_OTHERS,
     EVT3_TIME_HIGH,
     EVT3_TIME_LOW,
+    EVT3_TYPES,
     EVT3_VECT_8,
     EVT3_VECT_12,
     EVT3_VECT_BASE_X,
     FOLLOWERS,
     LAST,
+    LEVEL,
+    LEVEL_WORDS,
     LOOK_BYTES,
     NEAR_US,
     OTHER_WORDS,
@@ -44,9 +49,14 @@ from evlcp_sdk.io._words import (
     PACKED_POLARITY,
     PACKED_ROW,
     POLARITY,
+    REALIGNED,
     RESERVED,
     ROLLOVERS,
     ROW_UNKNOWN,
+    SOON_WORDS,
+    STRIDE_US,
+    TELLING_RESERVED,
+    TELLING_WORDS,
     TIME_BACKWARD,
     TIME_DOUBTFUL,
     TIME_GAPS,
@@ -132,6 +142,87 @@ def _judge_time(
         if not final and i + 1 + LOOK_BYTES // size > len(words):
             return int64(-1)
     return int64(agree >= against)
+
+
+@njit(cache=True, nogil=True)
+def _shifted(words: Column, i: Integer, size: Integer, shift: Integer) -> Integer:
+    """The word that starts `shift` bytes behind the start of words[i]."""
+    word = int64(words[i]) >> (8 * shift)
+    if shift:
+        word |= (int64(words[i + 1]) << (8 * (size - shift))) & ((int64(1) << (8 * size)) - 1)
+    return word
+
+
+@njit(cache=True, nogil=True)
+def _unlevel(
+    words: Column,
+    i: Integer,
+    at: Integer,
+    size: Integer,
+    types: Integer,
+    low_bits: Integer,
+    state: Column,
+    final: Any,
+) -> Integer:
+    """How many bytes behind words[i] words start that agree with one another, where these do not.
+
+    Args:
+        words: All that is known.
+        i: A word that is odd.
+        at: Byte offset of words[0].
+        size: Bytes of a word; its top 4 bits are its type, TIME_HIGH is 8 in every encoding.
+        types: Those that exist, a bit each.
+        low_bits: Bits of the time below TIME_HIGH.
+        state: As of the decoder.
+        final: Nothing comes behind `words`.
+
+    Returns:
+        0 where these words stand as they should, or nothing tells; -1 more words are needed to tell.
+    """
+    if at + size * i < state[LEVEL] and int64(words[i]) >> (8 * size - 4) != 8:
+        return int64(0)
+    if i + TELLING_WORDS >= len(words):
+        return int64(0) if final else int64(-1)
+    top = 8 * size - 4
+    shift, fewest, here = int64(0), int64(TELLING_WORDS), int64(0)
+    for s in range(size):
+        reserved = int64(0)
+        for k in range(i, i + TELLING_WORDS):
+            reserved += 1 - ((types >> (_shifted(words, k, size, s) >> top)) & 1)
+        if s == 0:
+            here = reserved
+        elif reserved < fewest:
+            shift, fewest = int64(s), reserved
+    if here >= TELLING_RESERVED and 8 * fewest < here:
+        ring = (int64(1) << top) - 1
+        before = int64(-1)
+        stop = i + LOOK_BYTES // size
+        for k in range(i, min(stop, len(words) - 1)):
+            word = _shifted(words, k, size, shift)
+            if word >> top != 8:
+                continue
+            if before >= 0:
+                if ((word - before) & ring) << low_bits <= STRIDE_US:
+                    return shift
+                break
+            before = word & ring
+        else:
+            if stop <= len(words) - 1 or final:
+                return shift
+            return int64(-1)
+    # The first of them may be level, and bytes be missing soon.
+    state[LEVEL] = at + size * (i + (SOON_WORDS if here >= TELLING_RESERVED else LEVEL_WORDS))
+    return int64(0)
+
+
+@njit(cache=True, nogil=True)
+def _realign(shift: Integer, here: Integer, state: Column, tally: Column) -> None:
+    """Pass over bytes; what follows has no time before the next TIME_HIGH."""
+    _note(tally, REALIGNED, here)
+    tally[REALIGNED, 0] += shift - 1
+    state[ASKEW] = shift
+    state[DOUBT] = 1
+    state[LEVEL] = here + shift
 
 
 @njit(cache=True, nogil=True)
@@ -330,7 +421,8 @@ def decode_evt3(
             confirm, within `LOOK_BYTES`.
 
     Returns:
-        Words used, events and triggers now in the columns.
+        Words used, events and triggers now in the columns. Where `state[ASKEW]` is not 0, the next word
+        starts so many bytes behind them.
     """
     packed = np.empty(BLOCK_WORDS * BURST, int64)
     i = 0
@@ -342,6 +434,7 @@ def decode_evt3(
             state[BASE] = 0
             state[PACKED] |= (int64(words[i]) & 0xFFF) << PACKED_HIGH
             i += 1
+    askew = int64(0)
     while i < len(words) and n <= len(t) - BURST and m < len(trigger_t):
         while state[DOUBT] and i < len(words) and words[i] >> 12 != EVT3_TIME_HIGH:
             start = i
@@ -349,13 +442,20 @@ def decode_evt3(
             for _ in range(count):
                 _note(tally, TIME_DOUBTFUL, at + 2 * start)
             if i == start:
-                if words[i] >> 12 == EVT3_EXT_TRIGGER:
+                kind = words[i] >> 12
+                if not (EVT3_TYPES >> kind) & 1:
+                    askew = _unlevel(words, i, at, 2, EVT3_TYPES, 12, state, final)
+                    if askew:
+                        break
+                if kind == EVT3_EXT_TRIGGER:
                     _note(tally, TIME_DOUBTFUL, at + 2 * i)
                 else:
-                    _note_other(words[i] >> 12, at + 2 * i, tally)
+                    _note_other(kind, at + 2 * i, tally)
                 i += 1
-        if i == len(words):
+        if askew or i == len(words):
             break
+        if state[DOUBT] and uintp((int64(words[i]) & 0xFFF) - (state[PACKED] >> PACKED_HIGH)) <= ONE:
+            state[DOUBT] = 0
         start, first = i, n
         stop = i + min(len(words) - i, (len(t) - n) // BURST, BLOCK_WORDS)
         i, count = _pack_evt3(words, start, stop, at, state, tally, packed)
@@ -372,6 +472,10 @@ def decode_evt3(
         if kind == EVT3_TIME_HIGH:
             high = w & 0xFFF
             before = state[PACKED] >> PACKED_HIGH
+            if (high - before) & 0xFFF > 1:
+                askew = _unlevel(words, i, at, 2, EVT3_TYPES, 12, state, final)
+                if askew:
+                    break
             verdict = _judge_time(words, i, 2, before, 12, final)
             if verdict < 0:
                 break
@@ -397,8 +501,16 @@ def decode_evt3(
                 state[LAST] = clock
                 m += 1
         else:
+            if not (EVT3_TYPES >> kind) & 1:
+                askew = _unlevel(words, i, at, 2, EVT3_TYPES, 12, state, final)
+                if askew:
+                    break
             _note_other(kind, here, tally)
         i += 1
+    if askew > 0:
+        _realign(askew, at + 2 * i, state, tally)
+        state[PACKED] = (state[PACKED] & KEEP[EVT3_ADDR_Y]) | UNKNOWN_ROW << PACKED_ROW
+        state[COLUMN], state[VECTOR_LEFT] = UNKNOWN_COLUMN, 0
     return i, n, m
 
 
@@ -423,6 +535,7 @@ def decode_evt2(
 ) -> tuple[Integer, Integer, Integer]:
     """Decode EVT2 words (uint32) until they or the columns' room run out; as `decode_evt3`."""
     base, last, doubt = state[BASE], state[LAST], state[DOUBT]
+    askew = int64(0)
     i = 0
     while i < len(words) and n < len(t) and m < len(trigger_t):
         w = int64(words[i])
@@ -438,6 +551,11 @@ def decode_evt2(
                 base = high << 6
                 continue
             before = (base >> 6) & 0xFFFFFFF
+            if (high - before) & 0xFFFFFFF > 1:
+                askew = _unlevel(words, i - 1, at, 4, EVT2_TYPES, 6, state, final)
+                if askew:
+                    i -= 1
+                    break
             verdict = _judge_time(words, i - 1, 4, before, 6, final)
             if verdict < 0:
                 i -= 1
@@ -475,8 +593,14 @@ def decode_evt2(
         elif kind in (EVT2_OTHERS, EVT2_CONTINUED):
             _note(tally, OTHER_WORDS, here)
         else:
+            askew = _unlevel(words, i - 1, at, 4, EVT2_TYPES, 6, state, final)
+            if askew:
+                i -= 1
+                break
             _note(tally, RESERVED, here)
     state[BASE], state[LAST], state[DOUBT] = base, last, doubt
+    if askew > 0:
+        _realign(askew, at + 4 * i, state, tally)
     return i, n, m
 
 

@@ -18,6 +18,7 @@ EVT3_TIME_HIGH: Final = 0x8
 EVT3_EXT_TRIGGER: Final = 0xA
 EVT3_OTHERS: Final = 0xE
 EVT3_CONTINUED_12: Final = 0xF
+EVT3_TYPES: Final = 0b1100_0101_1111_1101  # bit by bit, from type 0
 
 # Word types of EVT2, the top 4 bits of 32. All others are reserved.
 EVT2_CD_OFF: Final = 0x0
@@ -26,6 +27,7 @@ EVT2_TIME_HIGH: Final = 0x8
 EVT2_EXT_TRIGGER: Final = 0xA
 EVT2_OTHERS: Final = 0xE
 EVT2_CONTINUED: Final = 0xF
+EVT2_TYPES: Final = 0b1100_0101_0000_0011
 
 # Slots of a decoder's state, int64. All of it; nothing else passes from one call to the next.
 BASE: Final = 0  # EVT3: 2^24 a rollover; EVT2: time of the last TIME_HIGH; UNKNOWN_TIME before the first, us
@@ -36,13 +38,26 @@ POLARITY: Final = 4  # of the last VECT_BASE_X
 VECTOR_LEFT: Final = 5  # vector words still to come after the last VECT_BASE_X
 VECTOR_AT: Final = 6  # byte offset of that VECT_BASE_X
 DOUBT: Final = 7  # both: 1 behind a TIME_HIGH that is not believed
-STATE_SLOTS: Final = 8
+ASKEW: Final = 8  # both: bytes to pass over before the next word
+LEVEL: Final = 9  # both: words before this byte offset are known not to stand askew
+STATE_SLOTS: Final = 10
 
 # A step of TIME_HIGH by more than one is believed unless most of the next `FOLLOWERS` in so many bytes are
 # still on the clock before it. One back by up to `NEAR_US` is an early word, not another clock.
 FOLLOWERS: Final = 3
 LOOK_BYTES: Final = 1 << 18
 NEAR_US: Final = 10_000
+
+# Where bytes are missing, all words behind stand askew. Of words as they were sent none is of a reserved
+# type, of others a third: so many words tell, if so many of them are reserved, and an eighth as many where
+# others are taken for their starts; and if times then follow one another by less than `STRIDE_US`. What is
+# found level is not looked at again for `LEVEL_WORDS`, where there is doubt for `SOON_WORDS`; but at any
+# TIME_HIGH that does not go on by one.
+TELLING_WORDS: Final = 256
+TELLING_RESERVED: Final = 8
+STRIDE_US: Final = 1_000_000
+LEVEL_WORDS: Final = 64
+SOON_WORDS: Final = 8
 
 UNKNOWN_TIME: Final = -1
 UNKNOWN_ROW: Final = 0x8000
@@ -71,14 +86,16 @@ ROLLOVERS: Final = 10
 TIME_GAPS: Final = 11
 OTHER_WORDS: Final = 12
 TIME_DOUBTFUL: Final = 13
-TALLY_ROWS: Final = 14
+REALIGNED: Final = 14
+TALLY_ROWS: Final = 15
 
 LOSSES: Final = {
     "words_before_time": (BEFORE_TIME, "words before the first TIME_HIGH, which have no time; skipped"),
     "time_glitches": (TIME_GLITCH, "TIME_HIGH words that no others agree with, or that are early"),
     "time_doubtful": (
         TIME_DOUBTFUL,
-        "events and triggers behind a TIME_HIGH that no others agree with; dropped",
+        "events and triggers behind a TIME_HIGH that no others agree with, or before the first one"
+        " where words stood askew; dropped",
     ),
     "time_backward": (TIME_BACKWARD, "events and triggers earlier than the one before; dropped"),
     "outside_sensor": (OUTSIDE_SENSOR, "events outside the sensor; dropped"),
@@ -89,6 +106,10 @@ LOSSES: Final = {
     ),
     "vectors_cut": (VECTOR_CUT, "vectors that are not whole (12 + 12 + 8 columns): words are missing"),
     "reserved_words": (RESERVED, "words of a reserved type; skipped"),
+    "bytes_askew": (
+        REALIGNED,
+        "bytes passed over where words stood askew, as bytes are missing there or too many",
+    ),
     "odd_bytes": (ODD_BYTES, "bytes at the end of the file that make no whole word; skipped"),
     "header_without_end": (
         HEADER_OPEN,

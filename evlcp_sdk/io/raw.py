@@ -31,6 +31,7 @@ MIN_READ, MAX_READ = 1 << 20, 1 << 27
 # Another encoding read as the declared one has a reserved type in a third of its words or more, and a camera
 # never sends one. An eighth is far from both; and fewer than 16 words are not enough to say.
 RESERVED_PROBE_WORDS = 1 << 15
+RESERVED_FIRST_WORDS = 1 << 8
 RESERVED_SHARE = 1 / 8
 RESERVED_LEAST = 16
 
@@ -224,7 +225,9 @@ class RawSource(EventSource):
         words = self._words()[:RESERVED_PROBE_WORDS]
         reserved = self._codec.reserved(words)
         share = np.count_nonzero(reserved) / max(len(words), 1)
-        if share > RESERVED_SHARE and share * len(words) >= RESERVED_LEAST:
+        # Where the first ones are as they should be, and later ones are not, bytes are missing: not here.
+        first = reserved[:RESERVED_FIRST_WORDS].mean() if len(words) else 0.0
+        if min(share, first) > RESERVED_SHARE and share * len(words) >= RESERVED_LEAST:
             raise RawFormatError(
                 self.path,
                 self._position + int(reserved.argmax()) * words.itemsize,
@@ -285,11 +288,11 @@ class RawSource(EventSource):
                     return True
                 self._fill()
                 continue
-            used = self._decoder.decode(words, self._position, out, self._exhausted) * words.itemsize
-            if not used:
-                self._fill()
+            used = self._decoder.decode(words, self._position, out, self._exhausted)
             self._start += used
             self._position += used
+            if not used or self._start % words.itemsize:
+                self._fill()
             if not self._decoder.has_time and self._position - self._data_start > TIMELESS_BYTES:
                 self._raise_timeless()
         return False
