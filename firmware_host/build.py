@@ -10,10 +10,13 @@ from pathlib import Path
 
 from firmware_host.errors import ToolchainError
 
-__all__ = ["FIRMWARE", "arm_image", "build_folder", "make", "native_library", "native_program"]
+__all__ = ["FIRMWARE", "TARGETS", "arm_image", "build_folder", "make", "native_library", "native_program"]
 
 FIRMWARE = Path(__file__).parent / "firmware"
 """The firmware's source tree."""
+
+TARGETS = {"stm32f405-8mhz": "stm32f405", "stm32f405-12mhz": "stm32f405-12mhz"}
+"""Boards that an image is built for, by part and crystal, and the names of their images."""
 
 
 @cache
@@ -91,7 +94,7 @@ def native_library() -> Path:
 
 
 def arm_image(board: str) -> Path:
-    """The ARM image of a board: `mps2-an385`, `stm32f405` or `stm32f405-netduinoplus2`.
+    """The ARM image of a board: `mps2-an385`, `stm32f405`, `stm32f405-12mhz` or `stm32f405-netduinoplus2`.
 
     Raises:
         ToolchainError: The cross compiler is missing, or fails.

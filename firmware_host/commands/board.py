@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evlcp_sdk.cli._common import LinkFile, Overrides
-from firmware_host.commands import _source
+from firmware_host.commands import _firmware, _source
 from firmware_host.commands._json import AsJson, JsonCommand, fault_table, print_json, say
 from firmware_host.commands._line import (
     LINE,
@@ -48,6 +48,8 @@ app = typer.Typer(
 )
 
 app.callback()(line_options)
+app.command("build", cls=JsonCommand)(_firmware.build_images)
+app.command(cls=_firmware.FlashCommand)(_firmware.flash)
 
 Masks = Annotated[
     Path | None,
@@ -73,6 +75,7 @@ class Emulator(StrEnum):
 
     NATIVE = "native"
     QEMU = "qemu"
+    STM32 = "stm32"
 
 
 def _show(table: dict[str, Any], as_json: bool) -> None:
@@ -568,7 +571,9 @@ def recall(context: typer.Context, as_json: AsJson = False) -> None:
 
 @app.command()
 def emulate(
-    emulator: Annotated[Emulator, typer.Argument(help="native: a program; qemu: the ARM image.")],
+    emulator: Annotated[
+        Emulator, typer.Argument(help="native: a program; qemu: an ARM image; stm32: the image as flashed.")
+    ],
     listen: Annotated[
         str, typer.Option(metavar="WHERE", help="unix:PATH, tcp:HOST:PORT, or (native) pty.")
     ] = "pty",
@@ -588,11 +593,11 @@ def emulate(
 
     from evlcp_sdk.errors import ConfigError, InputError
     from evlcp_sdk.files import check_output
-    from firmware_host.emulators.processes import native_command, qemu_command, wait_for
+    from firmware_host.emulators.processes import native_command, qemu_command, stm32_command, wait_for
     from firmware_host.errors import ToolchainError
 
     scheme, _, place = listen.partition(":")
-    known = ("unix", "tcp") if emulator is Emulator.QEMU else ("unix", "tcp", "pty")
+    known = ("unix", "tcp", "pty") if emulator is Emulator.NATIVE else ("unix", "tcp")
     if scheme not in known:
         raise ConfigError(f"--listen {listen}: expected {' or '.join(known)} for {emulator}")
     if scheme == "tcp":
@@ -603,13 +608,15 @@ def emulate(
         check_output(leds, regular=False)
     if emulator is Emulator.QEMU:
         command = qemu_command(listen, leds)
+    elif emulator is Emulator.STM32:
+        command = stm32_command(listen, leds)
     else:
         command = native_command(listen, leds, flash, link, baud, unique_id)
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     # The emulator ends with this command, however that comes.
     signal.signal(signal.SIGTERM, lambda *_: process.terminate())
     try:
-        if emulator is Emulator.QEMU and (line := wait_for(listen, process)) is not None:
+        if emulator is not Emulator.NATIVE and (line := wait_for(listen, process)) is not None:
             line.close()
             typer.echo(f"listening on {listen}")
         code = process.wait()

@@ -1,9 +1,11 @@
 """The board without a board: the native program, and the ARM image in QEMU."""
 
 import contextlib
+import importlib.util
 import shutil
 import socket
 import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -13,7 +15,15 @@ from firmware_host import build
 from firmware_host.errors import LineError, NoBoardError, ToolchainError
 from firmware_host.ports.transport import SocketTransport
 
-__all__ = ["ProcessTransport", "native_command", "qemu_command", "start_native", "start_qemu", "wait_for"]
+__all__ = [
+    "ProcessTransport",
+    "native_command",
+    "qemu_command",
+    "start_native",
+    "start_qemu",
+    "stm32_command",
+    "wait_for",
+]
 
 
 class ProcessTransport(SocketTransport):
@@ -116,6 +126,23 @@ def qemu_command(listen: str, leds: Path | None = None, wait: bool = False) -> l
         *("-icount", "shift=3,sleep=off", "-display", "none", "-monitor", "none", "-nodefaults"),
         *("-serial", serial, "-serial", record),
     ]
+
+
+def stm32_command(listen: str, leds: Path | None = None) -> list[str]:
+    """Command line of the model of an STM32F405 with the image as it is flashed.
+
+    Args:
+        listen: `unix:PATH` or `tcp:HOST:PORT`.
+        leds: File for the LED records.
+
+    Raises:
+        ToolchainError: Unicorn is missing, or the image cannot be built.
+    """
+    if importlib.util.find_spec("unicorn") is None:
+        raise ToolchainError("unicorn, the model's core, is missing: pip install unicorn")
+    image = build.arm_image("stm32f405")
+    command = [sys.executable, "-m", "firmware_host.emulators.stm32_server", str(image), "--listen", listen]
+    return command if leds is None else [*command, "--leds", str(leds)]
 
 
 def wait_for(

@@ -19,6 +19,8 @@ from typing import Any
 import unicorn
 from unicorn import arm_const
 
+from firmware_host.images import FlashImage
+
 engine: Any = unicorn  # it has no types
 
 UNIT_HZ = 336_000_000
@@ -544,14 +546,16 @@ class Stm32:
     """The part, from power-up on.
 
     Args:
-        elf: The image.
+        image: What is flashed.
+        hse_hz: The crystal.
     """
 
     iwdg: Iwdg
     drivers: Drivers
     spi: Spi
 
-    def __init__(self, elf: Path) -> None:
+    def __init__(self, image: Path | FlashImage, hse_hz: int = HSE_HZ) -> None:
+        self.hse_hz = hse_hz
         uc: Any = engine.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB | unicorn.UC_MODE_MCLASS)
         self.uc = uc
         uc.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
@@ -562,12 +566,8 @@ class Stm32:
         uc.mem_map(RETURN, 0x1000)
         for base, size in ((0x40000000, 0x80000), (0xE0000000, 0x100000)):
             uc.mmio_map(base, size, self._read, base, self._write, base)
-        data = elf.read_bytes()
-        start, number = struct.unpack_from("<I", data, 28)[0], struct.unpack_from("<H", data, 44)[0]
-        for n in range(number):
-            kind, offset, _, at, size = struct.unpack_from("<5I", data, start + 32 * n)
-            if kind == 1 and size:
-                uc.mem_write(at, data[offset : offset + size])
+        whole = FlashImage.read(image) if isinstance(image, Path) else image
+        uc.mem_write(whole.address, whole.data)
         uc.hook_add(unicorn.UC_HOOK_MEM_READ, self._slot_read, begin=0x08080000, end=0x080FFFFF)
         self.now = 0
         self.events: list[tuple[int, int, Callable[[], None]]] = []
@@ -639,7 +639,10 @@ class Stm32:
         elif offset == 0x08:
             assert value & 3 in (0, 2), value
             if value & 3 == 2:
-                assert self.plain[0x40023804] == 7 << 24 | 1 << 22 | 336 << 6 | 8  # 8 MHz to 168 MHz
+                m = self.hse_hz // 1_000_000
+                assert self.plain[0x40023804] == 7 << 24 | 1 << 22 | 336 << 6 | m, (
+                    "not 168 MHz by this crystal"
+                )
                 assert self.flash.acr & 7 == 5
             self._core_cycle(UNIT_HZ // (168_000_000 if value & 3 == 2 else HSI_HZ), value)
             value |= (value & 3) << 2

@@ -33,11 +33,13 @@ class SerialTransport:
 
     _SLICE_S = 0.005
 
-    def __init__(self, url: str, baud: int) -> None:
+    def __init__(self, url: str, baud: int, even_parity: bool = False) -> None:
         import serial
 
         self.name = url
         options: dict[str, Any] = {} if "://" in url else {"exclusive": True}
+        if even_parity:
+            options["parity"] = serial.PARITY_EVEN
         try:
             self._port = serial.serial_for_url(
                 url, baudrate=baud, timeout=self._SLICE_S, write_timeout=5.0, **options

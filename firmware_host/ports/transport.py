@@ -284,7 +284,7 @@ class ReplayTransport:
         """Nothing to let go."""
 
 
-def open_transport(spec: str, baud: int = DEFAULT_BAUD) -> Transport:
+def open_transport(spec: str, baud: int = DEFAULT_BAUD, even_parity: bool = False) -> Transport:
     """Open a port by its name; see the module. `firmware_host.emulators.opening` opens emulators, too.
 
     Raises:
@@ -293,4 +293,4 @@ def open_transport(spec: str, baud: int = DEFAULT_BAUD) -> Transport:
     scheme, _, rest = spec.partition(":")
     if scheme in ("unix", "tcp"):
         return SocketTransport.connect(spec)
-    return SerialTransport(device_of(rest) if scheme == "usb" else spec, baud)
+    return SerialTransport(device_of(rest) if scheme == "usb" else spec, baud, even_parity)

@@ -1,12 +1,16 @@
 """The STM32F405 image as it is flashed, on a model of the part: every LED, chip by chip, and what fails."""
 
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.link.resolve import load_link
 from firmware_host import build
 from firmware_host.board.bank import Bank, random_symbols, symbol_chips
 from firmware_host.board.board import Board, Settings, provision
@@ -305,3 +309,34 @@ def test_led_test_and_save_wait_until_the_last_rows_have_left(bar: Bar) -> None:
         assert (rows[last] == whole[np.flatnonzero(whole[: len(bar.chips)].any(1))[-1]]).all()
         assert bar.board.status().faults == 0
         bar.board.blank()
+
+
+def test_emulate_serves_the_model(cli, needs: Callable[..., None], book: Codebook, tmp_path: Path) -> None:
+    needs("cc", "make", "arm-none-eabi-gcc")
+    listen, record = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin"
+    command = "from evlcp_sdk.cli.main import main; main()"
+    arguments = ["board", "emulate", "stm32", "--listen", listen, "--leds", str(record)]
+    process = subprocess.Popen([sys.executable, "-c", command, *arguments], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == f"listening on {listen}\n"
+        random = ("--random", 1, "--seed", 4, "--set", "air.frames_per_packet=2")
+        done = cli("board", "program", *random, "--port", listen)
+        assert done.returncode == 0, done.stderr
+        done = cli("board", "stop", "--port", listen)
+        assert done.returncode == 0, done.stderr
+    finally:
+        process.terminate()
+        assert process.wait(10) == 0
+        assert process.stdout is not None
+        process.stdout.close()
+    done = cli("board", "leds", record, "--chips", tmp_path / "chips.npy")
+    assert done.returncode == 0, done.stderr
+    chips = np.load(tmp_path / "chips.npy")
+    packet = load_link(overrides=["air.frames_per_packet=2"]).packet
+    once = symbol_chips(random_symbols(1, 2, book, np.random.default_rng(4)), book, packet.pilot_every)
+    start = int(chips.any(1).argmax()) - int(once.any(1).argmax())
+    whole = (len(chips) - start) // len(once) * len(once)
+    assert whole >= len(once)
+    assert (chips[start : start + whole] == np.tile(once, (whole // len(once), 1))).all()
+    assert not chips[start + whole :].any()

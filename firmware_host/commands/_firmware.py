@@ -1,0 +1,117 @@
+"""`evlcp board build` and `flash`: the firmware as files, and into a part."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from firmware_host.commands._json import AsJson, say
+from firmware_host.commands._line import BoardLine, LineCommand, from_command_line, progress_bar
+
+__all__ = ["FlashCommand", "Target", "build_images", "flash"]
+
+
+class Target(StrEnum):
+    """Boards that an image is built for."""
+
+    STM32F405_8MHZ = "stm32f405-8mhz"
+    STM32F405_12MHZ = "stm32f405-12mhz"
+
+
+class FlashCommand(LineCommand):
+    """A command on a part that waits in its ROM."""
+
+    line = ("port", "baud")
+
+
+TargetOption = Annotated[Target, typer.Option(help="Part and crystal.")]
+
+
+def build_images(
+    target: TargetOption,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where to.")] = Path(),
+    as_json: AsJson = False,
+) -> None:
+    """Build the firmware: TARGET.elf, .hex and .bin.
+
+    For example: [bold]evlcp board build --target stm32f405-8mhz -o build[/]
+    """
+    from evlcp_sdk.files import Outputs, output_fault
+    from firmware_host.build import TARGETS, arm_image
+    from firmware_host.images import FlashImage
+
+    elf = arm_image(TARGETS[target])
+    image = FlashImage.read(elf)
+    contents = {".elf": elf.read_bytes(), ".hex": image.hex_text().encode(), ".bin": image.data}
+    paths = [output / f"{target}{suffix}" for suffix in contents]
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as fault:
+        raise output_fault(output, fault) from fault
+    with Outputs() as outputs:
+        for path, content in zip(paths, contents.values(), strict=True):
+            outputs.open_binary(path).write(content)
+        outputs.commit()
+    table = {
+        "target": str(target),
+        "address": image.address,
+        "bytes": len(image.data),
+        "files": [str(path) for path in paths],
+    }
+    say(f"{paths[0]}, .hex, .bin: {len(image.data)} bytes at {image.address:#x}", table, as_json)
+
+
+def flash(
+    context: typer.Context,
+    file: Annotated[Path | None, typer.Argument(metavar="FILE", help="Image: .elf, .hex or .bin.")] = None,
+    target: Annotated[Target | None, typer.Option(help="Or build it for a part and crystal.")] = None,
+    verify: Annotated[bool, typer.Option(help="Read it back.")] = True,
+    start: Annotated[bool, typer.Option(help="Run it when done.")] = True,
+    brown_out: Annotated[
+        bool, typer.Option("--brown-out", help="Set the option bytes, too: reset below 2.7 V.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Put an image into a part by the boot loader in its ROM (AN3155), over the board's own line.
+
+    Set BOOT0 high and press reset before; low again, and reset, after. What SAVE keeps stays.
+
+    For example: [bold]evlcp board flash --target stm32f405-8mhz --port /dev/ttyUSB0[/]
+    """
+    from evlcp_sdk.errors import ConfigError
+    from firmware_host.build import TARGETS, arm_image
+    from firmware_host.images import FlashImage
+    from firmware_host.ports.rom import BAUD, RomLoader, flash_image
+    from firmware_host.ports.transport import open_transport
+
+    if (file is None) == (target is None):
+        raise ConfigError("give an image, or --target to build one, one of the two")
+    line: BoardLine = context.obj
+    if line.port is None:
+        raise ConfigError("--port: expected the part's serial port; a part in its ROM is not asked for")
+    image = FlashImage.read(file) if file is not None else FlashImage.read(arm_image(TARGETS[target or ""]))
+    given = from_command_line(context, "baud") or (
+        context.parent is not None and from_command_line(context.parent, "baud")
+    )
+    transport = open_transport(line.port, line.baud if given else BAUD, even_parity=True)
+    try:
+        loader = RomLoader(transport)
+        with progress_bar("flashing") as progress:
+            sectors = flash_image(loader, image, verify, start and not brown_out, progress)
+        if brown_out:
+            loader.set_brown_out()
+    finally:
+        transport.close()
+    table = {
+        "port": line.port,
+        "address": image.address,
+        "bytes": len(image.data),
+        "sectors": sectors,
+        "verified": verify,
+        "started": start and not brown_out,
+        "brown_out": brown_out,
+    }
+    words = [f"{line.port}: {len(image.data)} bytes in sectors {sectors[0]} to {sectors[-1]}"]
+    words += ["read back"] * verify + ["brown-out reset set"] * brown_out
+    say("; ".join([*words, "BOOT0 low and reset starts it"]), table, as_json)

@@ -1,0 +1,119 @@
+"""Images of a part's flash: from ELF, Intel HEX and binary files, and back."""
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from evlcp_sdk.errors import InputError
+
+__all__ = ["FLASH_BYTES", "FLASH_START", "FlashImage"]
+
+FLASH_START = 0x0800_0000
+"""Where an STM32's flash begins."""
+FLASH_BYTES = 1 << 20
+"""What an STM32F405 has of it."""
+
+
+@dataclass(frozen=True)
+class FlashImage:
+    """Bytes of a flash; gaps are 0xff, as erased.
+
+    Attributes:
+        address: Where they stand.
+        data: The bytes.
+    """
+
+    address: int
+    data: bytes
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read an `.elf`, `.hex` or `.bin` file; the last one stands at the start of the flash.
+
+        Raises:
+            InputError: It cannot be read, is damaged, or does not fit the flash.
+        """
+        try:
+            data = path.read_bytes()
+        except OSError as fault:
+            raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+        if data[:4] == b"\x7fELF":
+            pieces = list(_elf_pieces(path, data))
+        elif path.suffix.lower() in (".hex", ".ihex", ".ihx"):
+            pieces = list(_hex_pieces(path, data))
+        else:
+            pieces = [(FLASH_START, data)]
+        pieces = [(at, piece) for at, piece in pieces if piece]
+        if not pieces:
+            raise InputError(f"{path}: holds no bytes of a flash; expected a firmware image")
+        first = min(at for at, _ in pieces)
+        end = max(at + len(piece) for at, piece in pieces)
+        if first < FLASH_START or end > FLASH_START + FLASH_BYTES:
+            raise InputError(
+                f"{path}: bytes from {first:#x} to {end - 1:#x}, expected within the flash,"
+                f" {FLASH_START:#x} to {FLASH_START + FLASH_BYTES - 1:#x}"
+            )
+        content = bytearray(b"\xff" * (end - first))
+        for at, piece in pieces:
+            content[at - first : at - first + len(piece)] = piece
+        return cls(first, bytes(content))
+
+    def hex_text(self) -> str:
+        """As Intel HEX, 16 bytes a record."""
+        out, high = [], -1
+        for at in range(0, len(self.data), 16):
+            address = self.address + at
+            if address >> 16 != high:
+                high = address >> 16
+                out.append(_record(0, 4, high.to_bytes(2, "big")))
+            out.append(_record(address & 0xFFFF, 0, self.data[at : at + 16]))
+        return "\n".join([*out, _record(0, 1, b""), ""])
+
+
+def _record(address: int, kind: int, data: bytes) -> str:
+    body = bytes([len(data), address >> 8, address & 0xFF, kind]) + data
+    return f":{(body + bytes([-sum(body) & 0xFF])).hex().upper()}"
+
+
+def _hex_pieces(path: Path, data: bytes) -> Iterator[tuple[int, bytes]]:
+    base, ended = 0, False
+    for number, line in enumerate(data.decode("latin-1").splitlines(), 1):
+        if not line.strip() or ended:
+            continue
+        try:
+            body = bytes.fromhex(line.strip().removeprefix(":"))
+            if not line.startswith(":") or len(body) != body[0] + 5 or sum(body) & 0xFF:
+                raise ValueError
+        except (ValueError, IndexError) as fault:
+            raise InputError(
+                f"{path}: line {number}: not a record of Intel HEX, or its check sum is wrong"
+            ) from fault
+        content, kind, address = body[4:-1], body[3], int.from_bytes(body[1:3], "big")
+        if kind == 0:
+            yield base + address, content
+        elif kind == 1:
+            ended = True
+        elif kind in (2, 4) and len(content) == 2:
+            base = int.from_bytes(content, "big") << (16 if kind == 4 else 4)
+        elif kind not in (3, 5):
+            raise InputError(f"{path}: line {number}: record type {kind}, expected 0 to 5")
+    if not ended:
+        raise InputError(f"{path}: has no end record; the file is cut off")
+
+
+def _elf_pieces(path: Path, data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Segments at their load addresses."""
+    try:
+        if data[4:6] != b"\x01\x01":
+            raise InputError(f"{path}: an ELF file, but not one of 32 bits, little-endian")
+        start, number = struct.unpack_from("<I", data, 28)[0], struct.unpack_from("<H", data, 44)[0]
+        for n in range(number):
+            kind, offset, _, at, size = struct.unpack_from("<5I", data, start + 32 * n)
+            if kind == 1 and size:
+                if offset + size > len(data):
+                    raise InputError(f"{path}: {len(data)} bytes, a segment ends at {offset + size}: cut off")
+                yield at, data[offset : offset + size]
+    except struct.error as fault:
+        raise InputError(f"{path}: {len(data)} bytes: an ELF file that is cut off") from fault

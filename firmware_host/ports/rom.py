@@ -1,0 +1,276 @@
+"""The boot loader in an STM32's ROM, over its USART: application note AN3155.
+
+The part runs it when BOOT0 is high at reset. Bytes have even parity, the rate is taken from the first byte.
+"""
+
+from collections.abc import Callable, Sequence
+
+from firmware_host.errors import LineError, NoBoardError, RefusedError, VerifyError
+from firmware_host.images import FLASH_START, FlashImage
+from firmware_host.ports.transport import Transport
+
+__all__ = ["BAUD", "PRODUCT", "SECTORS", "RomLoader", "flash_image"]
+
+BAUD = 115_200
+"""The fastest rate that the ROM takes for sure, bit/s."""
+PRODUCT = 0x413
+"""What the ROM of an STM32F405 says it is."""
+SECTORS = (*[16 << 10] * 4, 64 << 10, *[128 << 10] * 7)
+"""Sizes of the flash's sectors, bytes."""
+
+_ACK, _NACK, _SYNC = 0x79, 0x1F, 0x7F
+_GET, _GET_ID, _READ, _GO, _WRITE, _ERASE = 0x00, 0x02, 0x11, 0x21, 0x31, 0x44
+_PIECE = 256
+_OPTIONS = 0x1FFF_C000
+_BROWN_OUT = 0x0C
+
+Progress = Callable[[int, int], None]
+
+
+class RomLoader:
+    """A part that waits in its ROM.
+
+    Args:
+        transport: The line, with even parity.
+        tries: How often a command is sent before it is given up.
+        answer_s: How long an answer may take, s; an erase takes up to 2 s a sector more.
+
+    Raises:
+        NoBoardError: Nobody answers.
+    """
+
+    def __init__(self, transport: Transport, tries: int = 3, answer_s: float = 1.0) -> None:
+        self.line = transport
+        self.tries = tries
+        self.answer_s = answer_s
+        self._got = bytearray()
+        for _ in range(tries):
+            self.line.write(bytes([_SYNC]))
+            if self._byte(answer_s) in (_ACK, _NACK):  # NACK: it was in step already
+                break
+            if self._in_step():  # it waited for the rest of another run's command
+                break
+        else:
+            raise NoBoardError(
+                f"{self.line.name}: no boot loader answers; set BOOT0 high, press reset, and run it again;"
+                " PA9 and PA10 must lead to this port"
+            )
+        self._drop()
+
+    # -- bytes
+
+    def _byte(self, timeout_s: float) -> int | None:
+        end = self.line.now() + timeout_s
+        while not self._got:
+            left = end - self.line.now()
+            if left <= 0:
+                return None
+            self._got += self.line.read(left)
+        return self._got.pop(0)
+
+    def _bytes(self, count: int) -> bytes:
+        found = bytearray()
+        while len(found) < count:
+            byte = self._byte(self.answer_s)
+            if byte is None:
+                raise _SilenceError
+            found.append(byte)
+        return bytes(found)
+
+    def _drop(self) -> None:
+        """Forget what comes until the line is quiet."""
+        self._got.clear()
+        while self.line.read(0.02):
+            pass
+
+    def _acknowledged(self, timeout_s: float | None = None) -> None:
+        byte = self._byte(self.answer_s if timeout_s is None else timeout_s)
+        if byte is None:
+            raise _SilenceError
+        if byte != _ACK:
+            raise _RefusalError
+
+    def _in_step(self) -> bool:
+        """After a byte was lost: fill up what it waits for, until it refuses that; whether it did."""
+        self._drop()
+        answered = False
+        for _ in range(_PIECE + 8):
+            self.line.write(b"\xff")
+            if self._byte(0.005) is not None:
+                answered = True
+                break
+        self._drop()
+        return answered
+
+    def _command(self, code: int, work: Callable[[], bytes], what: str) -> bytes:
+        silent = False
+        for _ in range(self.tries):
+            try:
+                self.line.write(bytes([code, code ^ 0xFF]))
+                self._acknowledged()
+                return work()
+            except _SilenceError:
+                silent = True
+            except _RefusalError:
+                silent = False
+            self._in_step()
+        if silent:
+            raise LineError(f"{self.line.name}: no answer to {what} after {self.tries} tries; check the line")
+        raise RefusedError(
+            f"{self.line.name}: the boot loader refuses {what}; a part whose read-out is protected takes no"
+            " image by this way",
+            _NACK,
+        )
+
+    def _address(self, address: int) -> None:
+        place = address.to_bytes(4, "big")
+        self.line.write(place + bytes([_xor(place)]))
+        self._acknowledged()
+
+    # -- commands
+
+    def product(self) -> int:
+        """Number of the part."""
+
+        def work() -> bytes:
+            count = self._bytes(1)[0] + 1
+            found = self._bytes(count)
+            self._acknowledged()
+            return found
+
+        return int.from_bytes(self._command(_GET_ID, work, "GET ID"), "big")
+
+    def version(self) -> int:
+        """Version of the protocol, two hex digits."""
+
+        def work() -> bytes:
+            count = self._bytes(1)[0] + 1
+            found = self._bytes(count)
+            self._acknowledged()
+            return found
+
+        return self._command(_GET, work, "GET")[0]
+
+    def read(self, address: int, count: int) -> bytes:
+        """Up to 256 bytes."""
+
+        def work() -> bytes:
+            self._address(address)
+            self.line.write(bytes([count - 1, (count - 1) ^ 0xFF]))
+            self._acknowledged()
+            return self._bytes(count)
+
+        return self._command(_READ, work, f"READ at {address:#x}")
+
+    def write(self, address: int, data: bytes) -> None:
+        """Up to 256 bytes, a multiple of four, into erased flash."""
+        body = bytes([len(data) - 1]) + data
+
+        def work() -> bytes:
+            self._address(address)
+            self.line.write(body + bytes([_xor(body)]))
+            self._acknowledged()
+            return b""
+
+        self._command(_WRITE, work, f"WRITE at {address:#x}")
+
+    def erase(self, sectors: Sequence[int]) -> None:
+        """Erase sectors."""
+        body = (len(sectors) - 1).to_bytes(2, "big") + b"".join(s.to_bytes(2, "big") for s in sectors)
+
+        def work() -> bytes:
+            self.line.write(body + bytes([_xor(body)]))
+            self._acknowledged(self.answer_s + 2.0 * len(sectors))
+            return b""
+
+        self._command(_ERASE, work, f"ERASE of sectors {', '.join(map(str, sectors))}")
+
+    def go(self, address: int) -> None:
+        """Run what stands there."""
+
+        def work() -> bytes:
+            self._address(address)
+            return b""
+
+        self._command(_GO, work, f"GO to {address:#x}")
+
+    def brown_out(self) -> int:
+        """Level of the brown-out reset in the option bytes: 0 resets below 2.7 V, 3 is off but for 1.7 V."""
+        return (self.read(_OPTIONS, 4)[0] & _BROWN_OUT) >> 2
+
+    def set_brown_out(self) -> None:
+        """Have the part reset below 2.7 V; it resets now, to take that."""
+        options = bytearray(self.read(_OPTIONS, 16))
+        options[0] &= ~_BROWN_OUT & 0xFF
+        self.write(_OPTIONS, bytes(options))
+
+
+class _SilenceError(Exception):
+    pass
+
+
+class _RefusalError(Exception):
+    pass
+
+
+def _xor(data: bytes) -> int:
+    value = 0
+    for byte in data:
+        value ^= byte
+    return value
+
+
+def flash_image(
+    loader: RomLoader,
+    image: FlashImage,
+    verify: bool = True,
+    start: bool = True,
+    progress: Progress | None = None,
+) -> list[int]:
+    """Erase the sectors of an image, write it, read it back, and run it; gives the sectors.
+
+    Other sectors, such as those of SAVE, stay as they are.
+
+    Raises:
+        RefusedError: The part is another one, or refuses.
+        VerifyError: The flash does not hold what was sent.
+        LineError: The line fails.
+    """
+    product = loader.product()
+    if product != PRODUCT:
+        raise RefusedError(
+            f"{loader.line.name}: the part says {product:#x}, expected {PRODUCT:#x}, an STM32F405", _NACK
+        )
+    sectors, at = [], FLASH_START
+    end = image.address + len(image.data)
+    for number, size in enumerate(SECTORS):
+        if at < end and at + size > image.address:
+            sectors.append(number)
+        at += size
+    data = image.data + b"\xff" * (-len(image.data) % 4)
+    total, done = len(data) * (2 if verify else 1), 0
+    advance = progress or (lambda _done, _total: None)
+    advance(0, total)
+    loader.erase(sectors)
+    pieces = range(0, len(data), _PIECE)
+    for at in pieces:
+        loader.write(image.address + at, data[at : at + _PIECE])
+        done += len(data[at : at + _PIECE])
+        advance(done, total)
+    for at in pieces if verify else ():
+        piece = data[at : at + _PIECE]
+        for _ in range(loader.tries):  # what is read has no check sum
+            found = loader.read(image.address + at, len(piece))
+            if found == piece:
+                break
+        else:
+            wrong = next(i for i, (a, b) in enumerate(zip(found, piece, strict=True)) if a != b)
+            raise VerifyError(
+                f"{loader.line.name}: the flash holds {found[wrong]:#04x} at {image.address + at + wrong:#x},"
+                f" expected {piece[wrong]:#04x}; flash it again, then replace the part"
+            )
+        done += len(piece)
+        advance(done, total)
+    if start:
+        loader.go(image.address)
+    return sectors

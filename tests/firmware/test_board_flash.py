@@ -1,0 +1,243 @@
+"""The firmware as files, and into a part by its ROM; what is in there then boots on the model."""
+
+import json
+import socket
+import subprocess
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.errors import InputError
+from firmware_host import build
+from firmware_host.board.board import Board
+from firmware_host.board.session import Session
+from firmware_host.emulators.rom import RomEmulator, RomLine
+from firmware_host.errors import LineError, NoBoardError, RefusedError, VerifyError
+from firmware_host.images import FLASH_START, FlashImage
+from firmware_host.ports.rom import SECTORS, RomLoader, flash_image
+from firmware_host.protocol.client import Timing
+
+
+@pytest.fixture(scope="module")
+def image(needs: Callable[..., None]) -> FlashImage:
+    needs("make", "arm-none-eabi-gcc")
+    return FlashImage.read(build.arm_image("stm32f405"))
+
+
+def some(count: int, seed: int = 0, address: int = FLASH_START) -> FlashImage:
+    return FlashImage(address, np.random.default_rng(seed).integers(0, 256, count, np.uint8).tobytes())
+
+
+def test_files_are_those_of_objcopy(cli, needs: Callable[..., None], tmp_path: Path) -> None:
+    needs("make", "arm-none-eabi-gcc", "arm-none-eabi-objcopy")
+    for target in build.TARGETS:
+        done = cli("board", "build", "--target", target, "-o", tmp_path / "new", "--json")
+        assert done.returncode == 0, done.stderr
+        table = json.loads(done.stdout)
+        elf, hexed, binary = (Path(file) for file in table["files"])
+        for suffix, ours in (("binary", binary), ("ihex", hexed)):
+            theirs = tmp_path / f"theirs.{suffix}"
+            subprocess.run(["arm-none-eabi-objcopy", "-O", suffix, elf, theirs], check=True)
+            if suffix == "binary":
+                assert theirs.read_bytes() == ours.read_bytes()
+            else:
+                found = FlashImage.read(theirs.rename(tmp_path / "theirs.hex"))
+                assert found.data[: table["bytes"]] == binary.read_bytes()
+        images = [FlashImage.read(path) for path in (elf, hexed, binary)]
+        assert images[0] == images[1] == images[2]
+        assert (images[0].address, len(images[0].data)) == (FLASH_START, table["bytes"])
+
+
+def test_the_crystals_differ(image: FlashImage) -> None:
+    other = FlashImage.read(build.arm_image("stm32f405-12mhz"))
+    assert len(other.data) == len(image.data)
+    assert 0 < sum(a != b for a, b in zip(other.data, image.data, strict=True)) < 40
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.hex", b":0100000001FF\n", "line 1: not a record of Intel HEX, or its check sum is wrong"),
+        ("a.hex", b":0100000001FE\n", "has no end record"),
+        ("a.hex", b":0000000900\n", "line 1: not a record"),
+        ("a.hex", b":00000009F7\n", "record type 9, expected 0 to 5"),
+        ("a.hex", b":0100000001FE\n:00000001FF\n", "expected within the flash"),
+        ("a.bin", b"", "holds no bytes"),
+        ("a.bin", bytes((1 << 20) + 1), "expected within the flash"),
+        ("a.elf", b"\x7fELF\x01\x01", "cut off"),
+        ("a.elf", b"\x7fELF\x02\x01" + bytes(60), "not one of 32 bits"),
+    ],
+)
+def test_damaged_images_are_told(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        FlashImage.read(tmp_path / name)
+
+
+def test_flashed_read_back_started_and_the_rest_left_alone() -> None:
+    old = some(1 << 20, 1).data
+    rom = RomEmulator(old)
+    told: list[tuple[int, int]] = []
+    loader = RomLoader(RomLine(rom))
+    assert (loader.product(), loader.version()) == (0x413, 0x31)
+    new = some(70_001, 2)
+    assert flash_image(loader, new, progress=lambda done, total: told.append((done, total))) == [
+        0,
+        1,
+        2,
+        3,
+        4,
+    ]
+    assert rom.erased == [0, 1, 2, 3, 4]
+    assert rom.flash[:70_001] == new.data
+    assert rom.flash[70_001 : sum(SECTORS[:5])] == b"\xff" * (sum(SECTORS[:5]) - 70_001)
+    assert rom.flash[sum(SECTORS[:5]) :] == old[sum(SECTORS[:5]) :]
+    assert rom.started == FLASH_START
+    assert told[0] == (0, 140_008)
+    assert told[-1] == (140_008, 140_008)
+    assert [d for d, _ in told] == sorted(d for d, _ in told)
+
+
+def test_an_image_elsewhere_takes_its_own_sectors() -> None:
+    rom = RomEmulator(bytes(1 << 20))
+    flash_image(RomLoader(RomLine(rom)), some(10, 3, FLASH_START + (128 << 10) - 4), start=False)
+    assert rom.erased == [4, 5]
+    assert rom.started is None
+
+
+class BadLine(RomLine):
+    """Loses a byte or turns a bit, now and then."""
+
+    def __init__(self, rom: RomEmulator, seed: int, one_in: int) -> None:
+        super().__init__(rom)
+        self._rng, self._one_in = np.random.default_rng(seed), one_in
+
+    def harm(self, data: bytes) -> bytes:
+        out = bytearray()
+        for byte in data:
+            dice = self._rng.integers(0, 2 * self._one_in)
+            if dice == 0:
+                continue
+            out.append(byte ^ 0x10 if dice == 1 else byte)
+        return bytes(out)
+
+    def to_part(self, data: bytes) -> bytes:
+        return self.harm(data)
+
+    def to_host(self, data: bytes) -> bytes:
+        return self.harm(data)
+
+
+def test_a_bad_line_gets_through_or_is_told() -> None:
+    through = 0
+    for seed in range(20):
+        rom = RomEmulator()
+        new = some(6_000, seed)
+        try:
+            flash_image(RomLoader(BadLine(rom, seed, 3_000)), new)
+        except (LineError, RefusedError, VerifyError, NoBoardError):
+            continue
+        through += 1
+        assert rom.flash[:6_000] == new.data
+        assert rom.started == FLASH_START
+    assert through >= 15
+
+
+def test_what_cannot_be_flashed_is_told() -> None:
+    class Deaf(RomLine):
+        def to_part(self, data: bytes) -> bytes:
+            del data
+            return b""
+
+    with pytest.raises(NoBoardError, match="set BOOT0 high, press reset"):
+        RomLoader(Deaf(RomEmulator()))
+    with pytest.raises(RefusedError, match="read-out is protected"):
+        flash_image(RomLoader(RomLine(RomEmulator(protected=True))), some(100))
+    with pytest.raises(RefusedError, match="0x419, expected 0x413"):
+        flash_image(RomLoader(RomLine(RomEmulator(product=0x419))), some(100))
+
+    class Worn(RomEmulator):
+        def _write(self, address: int):
+            good = yield from super()._write(address)
+            self.flash[77] |= 1
+            return good
+
+    rom = Worn()
+    with pytest.raises(VerifyError, match="at 0x800004d, expected"):
+        flash_image(RomLoader(RomLine(rom)), FlashImage(FLASH_START, bytes(100)))
+    assert rom.started is None
+    # a line that ends in the middle is told, and the next run goes through
+    rom = RomEmulator()
+
+    class Cut(RomLine):
+        left = 3_000
+
+        def to_part(self, data: bytes) -> bytes:
+            self.left -= len(data)
+            return data if self.left > 0 else b""
+
+    with pytest.raises(LineError, match="no answer to WRITE at 0x8000"):
+        flash_image(RomLoader(Cut(rom)), some(6_000))
+    flash_image(RomLoader(RomLine(rom)), some(6_000))
+    assert rom.flash[:6_000] == some(6_000).data
+
+
+def test_brown_out_is_set_and_nothing_else() -> None:
+    rom = RomEmulator()
+    before = bytes(rom.options)
+    loader = RomLoader(RomLine(rom))
+    assert loader.brown_out() == 3
+    loader.set_brown_out()
+    assert rom.resets == 1
+    assert RomLoader(RomLine(rom)).brown_out() == 0
+    assert rom.options[0] == before[0] & 0xF3
+    assert rom.options[1:] == before[1:]
+
+
+@pytest.mark.parametrize(
+    ("target", "hse_hz"), [("stm32f405-8mhz", 8_000_000), ("stm32f405-12mhz", 12_000_000)]
+)
+def test_what_the_command_flashes_boots(cli, image: FlashImage, target: str, hse_hz: int) -> None:
+    del image  # built
+    pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
+    from firmware_host.emulators.stm32 import ModelLine, Stm32
+
+    rom = RomEmulator(some(1 << 20, 5).data)
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def serve() -> None:
+        line, _ = server.accept()
+        with line:
+            while data := line.recv(4096):
+                line.sendall(rom.receive(data))
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    port = f"tcp:127.0.0.1:{server.getsockname()[1]}"
+    done = cli("board", "flash", "--target", target, "--port", port, "--json")
+    thread.join()
+    server.close()
+    assert done.returncode == 0, done.stderr
+    table = json.loads(done.stdout)
+    assert (table["verified"], table["started"], table["sectors"][0]) == (True, True, 0)
+    chip = Stm32(FlashImage(FLASH_START, bytes(rom.flash)), hse_hz)
+    chip.run(15_000)
+    about = Board(Session(ModelLine(chip), Timing(latency_s=0.02))).about
+    assert about.hal.rstrip(b"\0") == b"stm32f405"
+    with pytest.raises(AssertionError, match="not 168 MHz by this crystal"):
+        Stm32(FlashImage(FLASH_START, bytes(rom.flash)), 20_000_000 - hse_hz).run(15_000)
+
+
+def test_options_of_flash_are_checked(cli, tmp_path: Path) -> None:
+    for arguments, words in (
+        (("--port", "tcp:127.0.0.1:1"), "give an image, or --target"),
+        (("--target", "stm32f405-8mhz"), "--port: expected"),
+    ):
+        done = cli("board", "flash", *arguments)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert words in done.stderr
+    done = cli("board", "flash", tmp_path / "no.bin", "--port", "tcp:127.0.0.1:1")
+    assert done.returncode == 3
