@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from evlcp_sdk.air.codebook import Codebook, word_of_values
 from evlcp_sdk.air.frames import pilot_words
 from evlcp_sdk.errors import ConfigError
-from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank
+from evlcp_sdk.link.resolve import Link
+from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank, check_link
 from firmware_host.board.session import Session
+from firmware_host.board.stream import AHEAD, Stream
 from firmware_host.errors import IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.protocol.client import RequestOutcome
 from firmware_host.protocol.profiles import DIGESTS
@@ -18,6 +20,7 @@ from firmware_host.protocol.requests import (
     NO_BANK,
     BlankReply,
     BlankRequest,
+    Capability,
     CodebookReply,
     CodebookRequest,
     CommitReply,
@@ -26,6 +29,7 @@ from firmware_host.protocol.requests import (
     ConfigureRequest,
     CrcReply,
     CrcRequest,
+    Format,
     HelloReply,
     LedTestReply,
     LedTestRequest,
@@ -46,6 +50,8 @@ from firmware_host.protocol.requests import (
     StatusRequest,
     StopReply,
     StopRequest,
+    StreamReply,
+    StreamRequest,
     Watchdog,
     WatchdogReply,
     WatchdogRequest,
@@ -294,14 +300,7 @@ class Board:
             if progress:
                 progress(total, total)
             return self._programmed(0, total, False, status, before)
-        if _rate_held(status) and status.chip_rate_hz != content.chip_rate_hz:
-            raise RefusedError(
-                f"{self.session.name}: plays {status.chip_rate_hz} chips per second, this payload has"
-                f" {content.chip_rate_hz}: a board that plays keeps its rate; 'evlcp board stop' first;"
-                " nothing was sent",
-                Status.BUSY,
-                status.chip_rate_hz,
-            )
+        self._check_rate(content, status)
         self.prepare(content)
         bank = 1 if status.active_bank == 0 else 0
         written = self.fill(bank, content.content, progress)
@@ -326,6 +325,53 @@ class Board:
         again = self.session.client.retries - retries
         watchdog = Watchdog(status.watchdog).name.lower()
         return Programmed(written, length, swapped, status.active_bank, again, watchdog, status.watchdog_ms)
+
+    def stream(self, link: Link, ahead: int = AHEAD) -> Stream:
+        """Make the spare bank a queue of packets, and play from it: packets as they come.
+
+        The board changes to it between two packets, and shows its idle pattern while the queue is empty.
+
+        Args:
+            link: What the packets are sent with.
+            ahead: Packets that wait on the board, the one that plays among them: the delay of a packet behind
+                others, and how long the host may be held up.
+
+        Raises:
+            ConfigError: A board cannot play the link, or `ahead` is less than 2.
+            IncompatibleError: The firmware has no streams, or another codebook.
+            RefusedError: The board refuses a value, or plays at another chip rate.
+        """
+        if ahead < 2:
+            raise ConfigError(f"ahead = {ahead}, expected 2 or more packets: one plays, the next waits")
+        check_link(link)
+        if not self.about.capabilities & Capability.STREAM:
+            raise IncompatibleError(f"{self.session.name}: its firmware has no streams; update the firmware")
+        like = Bank(Format.WORDS, 0, b"", link.codebook, link.packet)
+        status = self._settled()
+        self._check_rate(like, status)
+        self.prepare(like)
+        bank = 1 if status.active_bank == 0 else 0
+        request = StreamRequest(bank, Format.WORDS, bytes.fromhex(link.codebook.digest))
+        slots = self.session.call(request, StreamReply).slots
+        if ahead >= slots:
+            raise ConfigError(
+                f"ahead = {ahead}, {self.session.name} holds {slots - 1} packets of this length"
+            )
+        if status.state != State.PLAYING:
+            self.start()
+        acts = status.watchdog != Watchdog.KEEP
+        return Stream(self.session, bank, like, ahead, min(0.5, status.watchdog_ms / 3e3) if acts else 0.5)
+
+    def _check_rate(self, content: Bank, status: StatusReply) -> None:
+        """Raise RefusedError if chips run at another rate, which a board that plays keeps."""
+        if _rate_held(status) and status.chip_rate_hz != content.chip_rate_hz:
+            raise RefusedError(
+                f"{self.session.name}: plays {status.chip_rate_hz} chips per second, this payload has"
+                f" {content.chip_rate_hz}: a board that plays keeps its rate; 'evlcp board stop' first;"
+                " nothing was sent",
+                Status.BUSY,
+                status.chip_rate_hz,
+            )
 
     def check_same_air(self, bank: Bank, status: StatusReply) -> None:
         """Raise IncompatibleError unless what plays and what comes are of one codebook and one chip rate."""

@@ -17,6 +17,7 @@ from firmware_host.ports.transport import Transport, on_network
 from firmware_host.protocol.client import TRIES, Client, RequestOutcome, Timing
 from firmware_host.protocol.requests import (
     MAJOR,
+    MAX_PAYLOAD,
     MINOR,
     NO_SESSION,
     HelloReply,
@@ -91,6 +92,9 @@ class Session:
         first: First sequence number, by default drawn at random.
         nonce: Number of the session, by default drawn at random.
         tries: How often a request is sent before it is given up.
+
+    Attributes:
+        max_payload: Largest payload that the board takes, bytes; HELLO says it.
     """
 
     def __init__(
@@ -104,6 +108,7 @@ class Session:
         draw = random.SystemRandom()
         self.transport = transport
         self._nonce = draw.randrange(1 << 32) if nonce is None else nonce
+        self.max_payload = MAX_PAYLOAD
         self.client = Client(
             timing or Timing(),
             first=draw.randrange(1 << 16) if first is None else first,
@@ -154,6 +159,7 @@ class Session:
             raise refusal(self.name, Type.HELLO, outcome.status, outcome.detail)
         self.client.session = outcome.reply.session
         self.client.window = max(1, outcome.reply.window)
+        self.max_payload = outcome.reply.max_payload
         self.client.minor = min(MINOR, outcome.reply.minor)
         return outcome.reply
 

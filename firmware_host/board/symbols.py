@@ -18,7 +18,7 @@ from evlcp_sdk.link.shared import differences
 from evlcp_sdk.plugin.registry import Registry
 from firmware_host.errors import IncompatibleError
 
-__all__ = ["read_symbols", "symbols_table"]
+__all__ = ["read_symbols", "symbols_of", "symbols_table"]
 
 ON_AIR = ("air", "bar", "pilots", "modulation")
 """Tables of a link that symbols and chips follow from; blocks follow from the error correction, too."""
@@ -66,7 +66,7 @@ def read_symbols(path: Path, link: Link | None, registry: Registry | None = None
         table = table["symbols"]
     if link is None:
         link = resolve({}, registry)
-    return _symbols(path, table, link), link
+    return symbols_of(path, table, link), link
 
 
 def _own_link(path: Path, table: dict[str, Any], given: Link | None, registry: Registry | None) -> Link:
@@ -92,7 +92,12 @@ def _own_link(path: Path, table: dict[str, Any], given: Link | None, registry: R
     return own
 
 
-def _symbols(path: Path, packets: Any, link: Link) -> Symbols:
+def symbols_of(path: Path, packets: Any, link: Link) -> Symbols:
+    """Symbols of a list `[packet][frame][cluster]`, int64; `path` is what faults name.
+
+    Raises:
+        InputError: An element is missing, out of range or not an integer; the message names the place.
+    """
     book, frames = link.codebook, link.packet.frames
     place, top = "symbols", len(book.codewords) - 1
     _list(path, place, packets, "packets")

@@ -26,6 +26,7 @@ from firmware_host.commands._line import (
     say_watchdog,
 )
 from firmware_host.commands._source import RandomPackets, Seed, SymbolsFile
+from firmware_host.commands.stream import stream
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -285,6 +286,9 @@ def send(
         board.check_same_air(bank, status)
         done = board.program(bank, verify, progress)
     say_done(done, as_json)
+
+
+app.command(cls=LineCommand)(stream)
 
 
 @app.command(cls=LineCommand)

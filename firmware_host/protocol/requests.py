@@ -43,6 +43,8 @@ __all__ = [
     "LevelReply",
     "LevelRequest",
     "Profile",
+    "PushReply",
+    "PushRequest",
     "ReadReply",
     "ReadRequest",
     "RecallReply",
@@ -57,6 +59,8 @@ __all__ = [
     "StatusRequest",
     "StopReply",
     "StopRequest",
+    "StreamReply",
+    "StreamRequest",
     "Type",
     "Watchdog",
     "WatchdogReply",
@@ -108,6 +112,8 @@ class Type(IntEnum):
     SAVE = 0x0E
     RECALL = 0x0F
     LED_TEST = 0x10
+    STREAM = 0x18
+    PUSH = 0x19
 
 
 class Status(IntEnum):
@@ -210,6 +216,8 @@ class Capability(IntFlag):
     """STATUS.open_leds is measured."""
     RECORDS = 16
     """LED outputs are recorded (emulators)."""
+    STREAM = 32
+    """STREAM and PUSH: packets as they come."""
 
 
 class BoardFault(IntFlag):
@@ -227,6 +235,8 @@ class BoardFault(IntFlag):
     """The host fell silent and the watchdog acted; cleared by the next control request."""
     OVER_LIMIT = 32
     """What came next was beyond the limits of light: not shown, LEDs dark until START."""
+    UNDERRUN = 64
+    """The stream is empty though its end was not told: idle pattern until the next packet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -694,6 +704,7 @@ class StatusReply(WireMessage):
         silence_ms: Time since the request before this one, HELLO left out.
         uptime_ms: Time since reset.
         digest: Digest of the active bank's codebook, or of the one set.
+        underruns: How often the active bank's stream was empty before its end was told.
     """
 
     TYPE: ClassVar[int] = 0x0C
@@ -730,6 +741,7 @@ class StatusReply(WireMessage):
         ("I", 1),
         ("I", 1),
         ("32s", 1),
+        ("I", 1),
     )
 
     state: int
@@ -764,6 +776,7 @@ class StatusReply(WireMessage):
     silence_ms: int
     uptime_ms: int
     digest: bytes
+    underruns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -883,6 +896,95 @@ class LedTestReply(WireMessage):
     LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class StreamRequest(WireMessage):
+    """Make a spare bank an empty queue of packets and play from it; idle pattern while it is empty.
+
+    Attributes:
+        bank: Bank.
+        format: What a packet holds.
+        digest: Digest of the codebook that packets are made with.
+    """
+
+    TYPE: ClassVar[int] = 0x18
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("B", 1),
+        ("32s", 1),
+    )
+
+    bank: int
+    format: int
+    digest: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class StreamReply(WireMessage):
+    """What the board answers to STREAM.
+
+    Attributes:
+        slots: Packets that the queue holds, the one that plays among them.
+    """
+
+    TYPE: ClassVar[int] = 0x18
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (("H", 1),)
+
+    slots: int
+
+
+@dataclass(frozen=True, slots=True)
+class PushRequest(WireMessage):
+    """Put a piece of a packet into the queue, if it is the next and there is room; the reply says what is.
+
+    Attributes:
+        bank: Bank.
+        number: Number of the packet, from 0 on.
+        offset: First byte.
+        last: 1: no further packet comes, dark after what is there; 0: playing goes on.
+        data: Content.
+    """
+
+    TYPE: ClassVar[int] = 0x19
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("I", 1),
+        ("H", 1),
+        ("B", 1),
+        ("*", 1),
+    )
+
+    bank: int
+    number: int
+    offset: int
+    last: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class PushReply(WireMessage):
+    """What the board answers to PUSH.
+
+    Attributes:
+        number: Number of the packet that is next: those before it are there.
+        offset: Bytes of it that are there.
+        begun: Packets that have begun to play.
+        underruns: How often the queue was empty before its end was told.
+    """
+
+    TYPE: ClassVar[int] = 0x19
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("I", 1),
+        ("H", 1),
+        ("I", 1),
+        ("I", 1),
+    )
+
+    number: int
+    offset: int
+    begun: int
+    underruns: int
+
+
 REPLIES: dict[int, type[WireMessage]] = {
     0x01: HelloReply,
     0x02: ConfigureReply,
@@ -900,5 +1002,7 @@ REPLIES: dict[int, type[WireMessage]] = {
     0x0E: SaveReply,
     0x0F: RecallReply,
     0x10: LedTestReply,
+    0x18: StreamReply,
+    0x19: PushReply,
 }
 """The reply of each request type."""

@@ -4,6 +4,7 @@ import re
 from dataclasses import fields
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from firmware_host.board.fleet import read_inventory
@@ -43,6 +44,21 @@ def test_inventory_is_valid(tmp_path: Path) -> None:
         ("T03", 20, 4),
     ]
     assert [bank.packet.pilot_every for _, bank in boards] == [1, 4, 4]
+
+
+@pytest.mark.parametrize("block", blocks("python"))
+def test_code_runs(block: str) -> None:
+    exec(compile(block, "docs/transmitter.md", "exec"), {})
+
+
+def test_the_delays_of_streams_are_the_benchmarks() -> None:
+    """One row of the table measured again; the others are of the same function."""
+    from benchmarks.board_stream import measure
+
+    m = measure(0.016, 4, 0.1, packets=5)
+    (row,) = re.findall(r"^\| 16 ms \| alone \| ([0-9.]+) \| ([0-9.]+) \|", PAGE, re.MULTILINE)
+    assert float(row[0]) == pytest.approx(np.median(m.delays_ms), abs=0.2)
+    assert float(row[1]) == pytest.approx(m.delays_ms.max(), abs=0.2)
 
 
 def test_file_of_symbols_is_one(evlcp, tmp_path: Path) -> None:

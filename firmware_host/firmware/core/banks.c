@@ -10,7 +10,7 @@ _Static_assert(EVLCP_CLUSTERS == EVLCP_BOARD_CLUSTERS, "codebook and board have 
 void evlcp_banks_init(struct evlcp_banks *banks)
 {
     for (uint32_t i = 0; i < EVLCP_BANKS; i++)
-        banks->plan[i].valid = false;
+        banks->plan[i].valid = banks->stream[i].on = false;
     atomic_store(&banks->active, EVLCP_NO_BANK);
     atomic_store(&banks->pending, EVLCP_NO_BANK);
     banks->commits = 0u;
@@ -70,6 +70,59 @@ static bool already(const struct evlcp_plan *plan, const struct evlcp_setup *set
            plan->pilot_every == setup->pilot_every && plan->ticks_per_chip == setup->ticks_per_chip;
 }
 
+static uint32_t packet_bytes_of(const struct evlcp_setup *setup, uint8_t format, uint32_t chips)
+{
+    return format == EVLCP_FORMAT_WORDS ? setup->frames * EVLCP_FRAME_BYTES : chips * EVLCP_ROW_BYTES;
+}
+
+static void plan_of(struct evlcp_plan *plan, const struct evlcp_setup *setup, uint8_t format, uint32_t chips)
+{
+    plan->format = format;
+    plan->profile = setup->profile;
+    plan->preamble_chips = setup->preamble_chips;
+    plan->preamble = setup->preamble;
+    plan->frames = setup->frames;
+    plan->pilot_every = setup->pilot_every;
+    plan->chip_rate_hz = setup->chip_rate_hz;
+    plan->ticks_per_chip = setup->ticks_per_chip;
+    plan->packet_chips = chips;
+    for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
+        plan->pilots[k] = setup->pilots[k];
+    evlcp_copy(plan->digest, setup->digest, 32u);
+}
+
+enum evlcp_status evlcp_banks_stream(struct evlcp_banks *banks, const struct evlcp_setup *setup,
+                                     const struct evlcp_stream_request *request, uint32_t *detail)
+{
+    if (request->bank >= EVLCP_BANKS) {
+        *detail = EVLCP_BANKS - 1u;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    if (evlcp_banks_held(banks, request->bank))
+        return EVLCP_STATUS_BUSY;
+    struct evlcp_plan *plan = &banks->plan[request->bank];
+    plan->valid = banks->stream[request->bank].on = false;
+    if (request->format > EVLCP_FORMAT_MASKS || setup->frames == 0u || setup->pilot_every == 0u)
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    if (!equal(request->digest, setup->digest, 32u) || !evlcp_profile_digest_ok(setup->profile, setup->digest))
+        return EVLCP_STATUS_FOREIGN_CODEBOOK;
+    uint32_t chips = evlcp_packet_chips(setup->preamble_chips, setup->frames, setup->pilot_every);
+    uint32_t packet_bytes = packet_bytes_of(setup, request->format, chips);
+    /* One that plays, one that is put in meanwhile. */
+    if (packet_bytes > EVLCP_BANK_BYTES / 2u) {
+        *detail = 0u;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    evlcp_stream_begin(&banks->stream[request->bank], packet_bytes, EVLCP_BANK_BYTES);
+    plan_of(plan, setup, request->format, chips);
+    plan->packets = (uint16_t)banks->stream[request->bank].slots;
+    plan->duty = 0u; /* not known before: the guard looks at what is sent */
+    plan->length = 0u;
+    plan->crc = 0u;
+    plan->valid = true;
+    return EVLCP_STATUS_OK;
+}
+
 enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlcp_setup *setup,
                                     const struct evlcp_commit_request *request, uint32_t *detail)
 {
@@ -80,13 +133,12 @@ enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlc
     struct evlcp_plan *plan = &banks->plan[request->bank];
     if (evlcp_banks_held(banks, request->bank))
         return already(plan, setup, request) ? EVLCP_STATUS_OK : EVLCP_STATUS_BUSY;
-    plan->valid = false;
+    plan->valid = banks->stream[request->bank].on = false;
     if (request->format > EVLCP_FORMAT_MASKS || request->packets == 0u || setup->frames == 0u ||
         setup->pilot_every == 0u)
         return EVLCP_STATUS_OUT_OF_RANGE;
     uint32_t chips = evlcp_packet_chips(setup->preamble_chips, setup->frames, setup->pilot_every);
-    uint32_t packet_bytes = request->format == EVLCP_FORMAT_WORDS ? setup->frames * EVLCP_FRAME_BYTES
-                                                                  : chips * EVLCP_ROW_BYTES;
+    uint32_t packet_bytes = packet_bytes_of(setup, request->format, chips);
     if (packet_bytes > EVLCP_BANK_BYTES || request->packets > EVLCP_BANK_BYTES / packet_bytes) {
         *detail = EVLCP_BANK_BYTES / packet_bytes;
         return EVLCP_STATUS_OUT_OF_RANGE;
@@ -102,21 +154,10 @@ enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlc
         *detail = crc;
         return EVLCP_STATUS_BAD_CRC;
     }
-    plan->format = request->format;
-    plan->profile = setup->profile;
-    plan->preamble_chips = setup->preamble_chips;
-    plan->preamble = setup->preamble;
-    plan->frames = setup->frames;
-    plan->pilot_every = setup->pilot_every;
+    plan_of(plan, setup, request->format, chips);
     plan->packets = request->packets;
     plan->length = request->length;
     plan->crc = crc;
-    plan->chip_rate_hz = setup->chip_rate_hz;
-    plan->ticks_per_chip = setup->ticks_per_chip;
-    plan->packet_chips = chips;
-    for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
-        plan->pilots[k] = setup->pilots[k];
-    evlcp_copy(plan->digest, setup->digest, 32u);
     plan->duty = evlcp_guard_duty(plan, banks->content[request->bank]);
     plan->valid = true;
     return EVLCP_STATUS_OK;

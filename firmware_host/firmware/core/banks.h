@@ -7,6 +7,7 @@
 #include <stdint.h>
 
 #include "composer.h"
+#include "stream.h"
 
 #define EVLCP_BANKS 2u
 #ifndef EVLCP_BANK_BYTES
@@ -29,6 +30,7 @@ struct evlcp_setup {
 struct evlcp_banks {
     uint8_t content[EVLCP_BANKS][EVLCP_BANK_BYTES];
     struct evlcp_plan plan[EVLCP_BANKS];
+    struct evlcp_stream stream[EVLCP_BANKS];
     /* `active` is changed by the chip interrupt while chips run, else by the main loop; `pending` is set by the
        main loop and cleared by whoever makes it active. */
     atomic_uchar active;
@@ -54,6 +56,10 @@ bool evlcp_banks_held(const struct evlcp_banks *banks, uint8_t bank);
 /* Check a bank's content against setup and request, and fill its plan; the plan is valid only on OK. */
 enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlcp_setup *setup,
                                     const struct evlcp_commit_request *request, uint32_t *detail);
+
+/* Make a spare bank an empty stream against the setup, and fill its plan; the plan is valid only on OK. */
+enum evlcp_status evlcp_banks_stream(struct evlcp_banks *banks, const struct evlcp_setup *setup,
+                                     const struct evlcp_stream_request *request, uint32_t *detail);
 
 /* Make the pending bank active, if there is one. True if it changed. */
 bool evlcp_banks_swap(struct evlcp_banks *banks);

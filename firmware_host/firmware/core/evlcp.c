@@ -31,6 +31,9 @@ static uint16_t faults(struct evlcp *e)
         bits |= EVLCP_FAULT_OVER_LIMIT;
     if (e->watch.acted)
         bits |= EVLCP_FAULT_WATCHDOG;
+    uint8_t bank = atomic_load(&e->banks.active);
+    if (bank != EVLCP_NO_BANK && e->banks.stream[bank].on && atomic_load(&e->banks.stream[bank].starved))
+        bits |= EVLCP_FAULT_UNDERRUN;
     return (uint16_t)bits;
 }
 
@@ -126,7 +129,7 @@ static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x, uint16_t 
     reply.level_max_ma = e->info.level_max_ma;
     reply.mean_max_ma = e->info.mean_max_ma;
     reply.burst_chips = e->info.burst_chips;
-    reply.capabilities = e->info.capabilities;
+    reply.capabilities = e->info.capabilities | EVLCP_CAPABILITY_STREAM;
     evlcp_copy(reply.unique_id, e->info.unique_id, sizeof reply.unique_id);
     evlcp_copy(reply.hal, e->info.name, sizeof reply.hal);
     reply.uptime_ms = hal_millis();
@@ -304,6 +307,54 @@ static enum evlcp_status on_commit(struct evlcp *e, struct exchange *x)
     return EVLCP_STATUS_OK;
 }
 
+static enum evlcp_status on_stream(struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_stream_request request;
+    evlcp_stream_request_get(x->in, &request);
+    uint8_t active = atomic_load(&e->banks.active);
+    if (atomic_load(&e->banks.pending) != EVLCP_NO_BANK)
+        return EVLCP_STATUS_BUSY;
+    if (running(e) && e->setup.ticks_per_chip != e->banks.plan[active].ticks_per_chip) {
+        x->detail = e->banks.plan[active].chip_rate_hz;
+        return EVLCP_STATUS_BUSY;
+    }
+    enum evlcp_status status = evlcp_banks_stream(&e->banks, &e->setup, &request, &x->detail);
+    if (status != EVLCP_STATUS_OK)
+        return status;
+    evlcp_activate(e, request.bank);
+    const struct evlcp_stream_reply reply = {.slots = (uint16_t)e->banks.stream[request.bank].slots};
+    evlcp_stream_reply_put(x->out, &reply);
+    x->out_length = EVLCP_STREAM_REPLY_BYTES;
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_push(struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_push_request request;
+    evlcp_push_request_get(x->in, &request);
+    if (request.bank >= EVLCP_BANKS) {
+        x->detail = EVLCP_BANKS - 1u;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    struct evlcp_stream *stream = &e->banks.stream[request.bank];
+    if (!stream->on)
+        return EVLCP_STATUS_NOTHING_COMMITTED;
+    uint32_t count = x->in_length - EVLCP_PUSH_REQUEST_BYTES;
+    if (count != 0u)
+        evlcp_stream_push(stream, e->banks.content[request.bank], request.number, request.offset,
+                          x->in + EVLCP_PUSH_REQUEST_BYTES, count);
+    const struct evlcp_push_reply reply = {.number = atomic_load(&stream->pushed),
+                                           .offset = (uint16_t)stream->filled,
+                                           .begun = atomic_load(&stream->begun),
+                                           .underruns = atomic_load(&stream->underruns)};
+    /* The end holds once everything before it is there. */
+    if (request.last == 1u && reply.offset == 0u && reply.number == request.number + (count != 0u ? 1u : 0u))
+        atomic_store(&stream->ended, true);
+    evlcp_push_reply_put(x->out, &reply);
+    x->out_length = EVLCP_PUSH_REPLY_BYTES;
+    return EVLCP_STATUS_OK;
+}
+
 static enum evlcp_status start(struct evlcp *e, uint32_t *detail)
 {
     if (atomic_load(&e->banks.active) == EVLCP_NO_BANK && atomic_load(&e->banks.pending) == EVLCP_NO_BANK)
@@ -383,6 +434,8 @@ static enum evlcp_status on_status(struct evlcp *e, struct exchange *x)
         reply.crc = plan->crc;
         reply.chip_rate_hz = plan->chip_rate_hz;
         evlcp_copy(reply.digest, plan->digest, sizeof reply.digest);
+        if (e->banks.stream[reply.active_bank].on)
+            reply.underruns = atomic_load(&e->banks.stream[reply.active_bank].underruns);
     }
     reply.commits = e->banks.commits;
     reply.packets_sent = atomic_load(&e->player.packets_sent);
@@ -494,6 +547,8 @@ static enum evlcp_status on_control(struct evlcp *e, uint8_t type, struct exchan
         return on_codebook(e, x);
     case EVLCP_TYPE_COMMIT:
         return on_commit(e, x);
+    case EVLCP_TYPE_STREAM:
+        return on_stream(e, x);
     case EVLCP_TYPE_START:
         return start(e, &x->detail);
     case EVLCP_TYPE_STOP:
@@ -617,6 +672,8 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
     switch (d->type) {
     case EVLCP_TYPE_WRITE:
         return after(d->sequence, c->sequence) ? on_write(e, x) : EVLCP_STATUS_STALE;
+    case EVLCP_TYPE_PUSH:
+        return after(d->sequence, c->sequence) ? on_push(e, x) : EVLCP_STATUS_STALE;
     case EVLCP_TYPE_READ:
         return on_read(e, x);
     case EVLCP_TYPE_CRC:

@@ -22,10 +22,30 @@ void evlcp_player_init(struct evlcp_player *player)
     hal_leds(dark, EVLCP_CHIP_DARK);
 }
 
-static void seek(struct evlcp_player *player, const struct evlcp_banks *banks, uint32_t packet)
+/* Go to packet `next` of the active bank, or to what its stream has next. */
+static void seek(struct evlcp_player *player, struct evlcp_banks *banks, uint32_t next)
 {
     uint8_t bank = atomic_load(&banks->active);
-    evlcp_cursor_seek(&player->cursor, &banks->plan[bank], banks->content[bank], packet);
+    const struct evlcp_plan *plan = &banks->plan[bank];
+    player->idle = atomic_load(&player->want_idle);
+    player->idle_left = plan->packet_chips;
+    if (next >= plan->packets)
+        next = 0u;
+    if (banks->stream[bank].on) {
+        player->idle_left = EVLCP_STREAM_IDLE_CHIPS;
+        switch (evlcp_stream_take(&banks->stream[bank], player->idle, &next)) {
+        case EVLCP_STREAM_END:
+            atomic_store(&player->want_play, false);
+            player->halt = true;
+            return;
+        case EVLCP_STREAM_IDLE:
+            player->idle = true;
+            return;
+        default:
+            break;
+        }
+    }
+    evlcp_cursor_seek(&player->cursor, plan, banks->content[bank], next);
 }
 
 /* Row of the next chip. */
@@ -55,10 +75,7 @@ static void next_packet(struct evlcp_player *player, struct evlcp_banks *banks)
         player->halt = true;
         return;
     }
-    const struct evlcp_plan *plan = &banks->plan[atomic_load(&banks->active)];
-    seek(player, banks, next < plan->packets ? next : 0u);
-    player->idle = atomic_load(&player->want_idle);
-    player->idle_left = plan->packet_chips;
+    seek(player, banks, next);
 }
 
 void evlcp_player_begin(struct evlcp_player *player, struct evlcp_banks *banks)
@@ -66,7 +83,6 @@ void evlcp_player_begin(struct evlcp_player *player, struct evlcp_banks *banks)
     const struct evlcp_plan *plan = &banks->plan[atomic_load(&banks->active)];
     player->chip = 0u;
     player->halt = false;
-    player->idle = false;
     player->ticks_per_chip = plan->ticks_per_chip;
     atomic_store(&player->chip_lost, false);
     atomic_store(&player->over_limit, false);
@@ -77,6 +93,8 @@ void evlcp_player_begin(struct evlcp_player *player, struct evlcp_banks *banks)
         rested_ms = 1000u; /* longer than any burst */
     evlcp_guard_rest(&player->guard, rested_ms * plan->chip_rate_hz / 1000u);
     seek(player, banks, 0u);
+    if (player->halt)
+        return; /* the end of a stream that has played */
     compose(player);
     atomic_store(&player->running, true);
     hal_chips(plan->ticks_per_chip);

@@ -93,7 +93,7 @@ enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct ev
     /* Erasing stops the processor on single-bank parts: chips would come late, a LED test would stand still. */
     if (atomic_load(&e->player.running) || atomic_load(&e->player.want_play) || e->test.on)
         return EVLCP_STATUS_BUSY;
-    if (active == EVLCP_NO_BANK)
+    if (active == EVLCP_NO_BANK || e->banks.stream[active].on)
         return EVLCP_STATUS_NOTHING_COMMITTED;
     for (uint8_t i = 0; i < EVLCP_SLOTS; i++)
         valid[i] = get_header(e, i, &found[i]);

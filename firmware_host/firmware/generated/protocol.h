@@ -36,6 +36,8 @@ enum evlcp_type {
     EVLCP_TYPE_SAVE = 0x0e,
     EVLCP_TYPE_RECALL = 0x0f,
     EVLCP_TYPE_LED_TEST = 0x10,
+    EVLCP_TYPE_STREAM = 0x18,
+    EVLCP_TYPE_PUSH = 0x19,
 };
 
 /* How a request ended. */
@@ -96,6 +98,7 @@ enum evlcp_capability {
     EVLCP_CAPABILITY_TEMPERATURE = 4, /* STATUS.temperature_dc is measured. */
     EVLCP_CAPABILITY_OPEN_LED = 8, /* STATUS.open_leds is measured. */
     EVLCP_CAPABILITY_RECORDS = 16, /* LED outputs are recorded (emulators). */
+    EVLCP_CAPABILITY_STREAM = 32, /* STREAM and PUSH: packets as they come. */
 };
 
 /* Bits of STATUS.faults. */
@@ -106,6 +109,7 @@ enum evlcp_fault {
     EVLCP_FAULT_CHIP_LOST = 8, /* A chip interrupt came a whole chip late, or chips stopped: LEDs dark. */
     EVLCP_FAULT_WATCHDOG = 16, /* The host fell silent and the watchdog acted; cleared by the next control request. */
     EVLCP_FAULT_OVER_LIMIT = 32, /* What came next was beyond the limits of light: not shown, LEDs dark until START. */
+    EVLCP_FAULT_UNDERRUN = 64, /* The stream is empty though its end was not told: idle pattern until the next packet. */
 };
 
 static inline void evlcp_copy(uint8_t *to, const uint8_t *from, uint32_t n)
@@ -522,7 +526,7 @@ static inline void evlcp_level_request_get(const uint8_t *p, struct evlcp_level_
 
 #define EVLCP_STATUS_REQUEST_BYTES 0u
 
-#define EVLCP_STATUS_REPLY_BYTES 127u
+#define EVLCP_STATUS_REPLY_BYTES 131u
 /* Answer to status. */
 struct evlcp_status_reply {
     uint8_t state; /* State. */
@@ -557,6 +561,7 @@ struct evlcp_status_reply {
     uint32_t silence_ms; /* Time since the request before this one, HELLO left out. */
     uint32_t uptime_ms; /* Time since reset. */
     uint8_t digest[32]; /* Digest of the active bank's codebook, or of the one set. */
+    uint32_t underruns; /* How often the active bank's stream was empty before its end was told. */
 };
 
 static inline void evlcp_status_reply_put(uint8_t *p, const struct evlcp_status_reply *m)
@@ -593,6 +598,7 @@ static inline void evlcp_status_reply_put(uint8_t *p, const struct evlcp_status_
     evlcp_put32(p + 87, m->silence_ms);
     evlcp_put32(p + 91, m->uptime_ms);
     evlcp_copy(p + 95, m->digest, 32u);
+    evlcp_put32(p + 127, m->underruns);
 }
 
 static inline void evlcp_status_reply_get(const uint8_t *p, struct evlcp_status_reply *m)
@@ -629,6 +635,7 @@ static inline void evlcp_status_reply_get(const uint8_t *p, struct evlcp_status_
     m->silence_ms = evlcp_get32(p + 87);
     m->uptime_ms = evlcp_get32(p + 91);
     evlcp_copy(m->digest, p + 95, 32u);
+    m->underruns = evlcp_get32(p + 127);
 }
 
 #define EVLCP_WATCHDOG_REQUEST_BYTES 5u
@@ -732,6 +739,94 @@ static inline void evlcp_led_test_request_get(const uint8_t *p, struct evlcp_led
 
 #define EVLCP_LED_TEST_REPLY_BYTES 0u
 
+#define EVLCP_STREAM_REQUEST_BYTES 34u
+/* Make a spare bank an empty queue of packets and play from it; idle pattern while it is empty. */
+struct evlcp_stream_request {
+    uint8_t bank; /* Bank. */
+    uint8_t format; /* What a packet holds. */
+    uint8_t digest[32]; /* Digest of the codebook that packets are made with. */
+};
+
+static inline void evlcp_stream_request_put(uint8_t *p, const struct evlcp_stream_request *m)
+{
+    evlcp_put8(p + 0, m->bank);
+    evlcp_put8(p + 1, m->format);
+    evlcp_copy(p + 2, m->digest, 32u);
+}
+
+static inline void evlcp_stream_request_get(const uint8_t *p, struct evlcp_stream_request *m)
+{
+    m->bank = evlcp_get8(p + 0);
+    m->format = evlcp_get8(p + 1);
+    evlcp_copy(m->digest, p + 2, 32u);
+}
+
+#define EVLCP_STREAM_REPLY_BYTES 2u
+/* Answer to stream. */
+struct evlcp_stream_reply {
+    uint16_t slots; /* Packets that the queue holds, the one that plays among them. */
+};
+
+static inline void evlcp_stream_reply_put(uint8_t *p, const struct evlcp_stream_reply *m)
+{
+    evlcp_put16(p + 0, m->slots);
+}
+
+static inline void evlcp_stream_reply_get(const uint8_t *p, struct evlcp_stream_reply *m)
+{
+    m->slots = evlcp_get16(p + 0);
+}
+
+#define EVLCP_PUSH_REQUEST_BYTES 8u
+/* Put a piece of a packet into the queue, if it is the next and there is room; the reply says what is. */
+struct evlcp_push_request {
+    uint8_t bank; /* Bank. */
+    uint32_t number; /* Number of the packet, from 0 on. */
+    uint16_t offset; /* First byte. */
+    uint8_t last; /* 1: no further packet comes, dark after what is there; 0: playing goes on. */
+};
+
+static inline void evlcp_push_request_put(uint8_t *p, const struct evlcp_push_request *m)
+{
+    evlcp_put8(p + 0, m->bank);
+    evlcp_put32(p + 1, m->number);
+    evlcp_put16(p + 5, m->offset);
+    evlcp_put8(p + 7, m->last);
+}
+
+static inline void evlcp_push_request_get(const uint8_t *p, struct evlcp_push_request *m)
+{
+    m->bank = evlcp_get8(p + 0);
+    m->number = evlcp_get32(p + 1);
+    m->offset = evlcp_get16(p + 5);
+    m->last = evlcp_get8(p + 7);
+}
+
+#define EVLCP_PUSH_REPLY_BYTES 14u
+/* Answer to push. */
+struct evlcp_push_reply {
+    uint32_t number; /* Number of the packet that is next: those before it are there. */
+    uint16_t offset; /* Bytes of it that are there. */
+    uint32_t begun; /* Packets that have begun to play. */
+    uint32_t underruns; /* How often the queue was empty before its end was told. */
+};
+
+static inline void evlcp_push_reply_put(uint8_t *p, const struct evlcp_push_reply *m)
+{
+    evlcp_put32(p + 0, m->number);
+    evlcp_put16(p + 4, m->offset);
+    evlcp_put32(p + 6, m->begun);
+    evlcp_put32(p + 10, m->underruns);
+}
+
+static inline void evlcp_push_reply_get(const uint8_t *p, struct evlcp_push_reply *m)
+{
+    m->number = evlcp_get32(p + 0);
+    m->offset = evlcp_get16(p + 4);
+    m->begun = evlcp_get32(p + 6);
+    m->underruns = evlcp_get32(p + 10);
+}
+
 #define EVLCP_REQUEST_MOST 69u /* longest request, data left out */
 
 /* Requests: type, whether control, whether any length may follow, and the length, that of the
@@ -752,6 +847,8 @@ static inline void evlcp_led_test_request_get(const uint8_t *p, struct evlcp_led
     {0x0du, true, false, 5u, 5u}, \
     {0x0eu, true, false, 1u, 1u}, \
     {0x0fu, true, false, 0u, 0u}, \
-    {0x10u, true, false, 4u, 4u}
+    {0x10u, true, false, 4u, 4u}, \
+    {0x18u, true, false, 34u, 34u}, \
+    {0x19u, false, true, 8u, 8u}
 
 #endif

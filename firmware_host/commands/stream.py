@@ -1,0 +1,183 @@
+"""`evlcp board stream`: packets onto a board as they come."""
+
+import contextlib
+from collections.abc import Iterator
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from evlcp_sdk.cli._common import LinkFile, Overrides
+from firmware_host.commands._json import AsJson, say
+from firmware_host.commands._line import open_board
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from evlcp_sdk.link.blocks import BlockCoder
+    from evlcp_sdk.link.resolve import Link
+    from firmware_host.board.stream import Stream
+
+__all__ = ["Ahead", "said_of", "stream", "table_of"]
+
+_LOOK_S = 0.005
+_MOST_LINES = 64
+
+Ahead = Annotated[
+    int,
+    typer.Option(
+        min=2, help="Packets on the board: few for a short delay, many for a host that may be held up."
+    ),
+]
+
+
+class Lines(StrEnum):
+    """What a line of the input is."""
+
+    TEXT = "text"
+    SYMBOLS = "symbols"
+
+
+def stream(
+    context: typer.Context,
+    file: Annotated[Path, typer.Argument(metavar="[FILE]", help="A line a message; - is stdin.")] = Path("-"),
+    lines: Annotated[
+        Lines, typer.Option(help="text: a message; symbols: JSON, \\[frame]\\[cluster], or a list of these.")
+    ] = Lines.TEXT,
+    ahead: Ahead = 4,
+    transmitter_id: Annotated[
+        int, typer.Option("--id", min=0, max=2**32 - 1, help="Transmitter id of texts.")
+    ] = 0,
+    repeat: Annotated[int, typer.Option(min=1, max=1000, help="Send each packet so often in a row.")] = 1,
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Send what comes line by line, each as soon as it comes; end with the input, or with Ctrl-C.
+
+    The board queues the packets, and shows its idle pattern while it has none (an underrun). At the end
+    it is dark.
+
+    For example: [bold]date +%T | evlcp board --port native: stream[/]
+    """
+    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.plugin.registry import Registry
+
+    link = load_link(link_file, overrides or [], Registry.load())
+    # before the board waits for packets
+    coder = link.block_coder() if lines is Lines.TEXT else None
+    if coder is not None:
+        coder.symbols(bytes(coder.block_bytes))
+    packets = _packets(file, link, coder, transmitter_id, repeat)
+    with open_board(context) as board:
+        started = board.stream(link, ahead)
+        with contextlib.suppress(KeyboardInterrupt), started:
+            for some in packets:
+                if some is None:
+                    started.wait(_LOOK_S)
+                    continue
+                for packet in some:
+                    started.send(packet)
+    say(said_of(started), table_of(started), as_json)
+
+
+def said_of(stream: "Stream") -> str:
+    """What a stream did, for a person."""
+    table = table_of(stream)
+    said = f"{table['packets']} packets, {table['round_trips']:.2f} round trips a packet"
+    if stream.underruns:
+        return f"{said}; the board had none to play {stream.underruns} times and showed its idle pattern"
+    return f"{said}, no underrun"
+
+
+def table_of(stream: "Stream") -> dict[str, Any]:
+    """The same as plain values."""
+    return {
+        "packets": stream.sent,
+        "underruns": stream.underruns,
+        "round_trips": round(stream.requests / max(1, stream.sent), 3),
+    }
+
+
+def _packets(
+    file: Path, link: "Link", coder: "BlockCoder | None", transmitter_id: int, repeat: int
+) -> "Iterator[NDArray[np.int64] | None]":
+    """Packets (packets, frames, clusters) of each line as it comes; None while none does."""
+    import json
+    import time
+
+    import numpy as np
+
+    from evlcp_sdk.errors import ConfigError, InputError
+    from evlcp_sdk.link.compose import messages_of, packets_of
+    from firmware_host.board.symbols import symbols_of
+
+    sequence = 0
+    for number, line in _lines(file):
+        if line is None:
+            yield None
+            continue
+        if not line.strip():
+            continue
+        try:
+            if coder is None:
+                table = json.loads(line)
+                while _depth(table) < 3:
+                    table = [table]
+                place = Path(f"{file}: line {number}")
+                yield np.repeat(symbols_of(place, table, link), repeat, axis=0)
+            else:
+                # a later message has a higher number, also within a second
+                sequence = max(sequence + 1, int(time.time()))
+                said = messages_of(link, text=line, transmitter_id=transmitter_id, sequence=sequence)
+                yield packets_of(said, coder, repeat)
+        except (ValueError, RecursionError) as fault:
+            raise InputError(f"{file}: line {number}: not JSON: {fault}") from fault
+        except ConfigError as fault:
+            raise InputError(f"{file}: line {number}: {fault}") from fault
+
+
+def _depth(table: Any) -> int:
+    depth = 0
+    while isinstance(table, list) and table and depth < 3:
+        depth, table = depth + 1, table[0]
+    return max(1, depth) if depth else 3
+
+
+def _lines(file: Path) -> Iterator[tuple[int, str | None]]:
+    """Number and text of each line as it comes; None as its text while none does."""
+    import queue
+    import sys
+    import threading
+
+    from evlcp_sdk.errors import InputError
+
+    came: queue.Queue[str | Exception | None] = queue.Queue(_MOST_LINES)
+
+    def read() -> None:
+        try:
+            with contextlib.ExitStack() as stack:
+                opened = sys.stdin if str(file) == "-" else stack.enter_context(file.open(encoding="utf-8"))
+                for line in opened:
+                    came.put(line.rstrip("\r\n"))
+            came.put(None)
+        except (OSError, ValueError) as fault:
+            came.put(fault)
+
+    # it may be waiting for input when the command ends
+    threading.Thread(target=read, daemon=True).start()
+    number = 0
+    while True:
+        try:
+            line = came.get_nowait()
+        except queue.Empty:
+            yield number, None
+            continue
+        if line is None:
+            return
+        if isinstance(line, Exception):
+            raise InputError(f"{file}: cannot be read: {line}") from line
+        number += 1
+        yield number, line

@@ -1,0 +1,335 @@
+"""Streams: every packet once and in order over any line, underruns named, dark at the end."""
+
+import numpy as np
+import pytest
+from board_lines import NoisyLine
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evlcp_sdk.air.codebook import chips_of_values
+from evlcp_sdk.air.frames import packet_chips
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import Link, load_link
+from firmware_host.board.bank import Bank, bank_of, random_symbols
+from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.session import Session
+from firmware_host.board.stream import Stream
+from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine, UsbLine
+from firmware_host.errors import BoardResetError, IncompatibleError, RefusedError
+from firmware_host.protocol.client import Timing
+from firmware_host.protocol.requests import (
+    BoardFault,
+    Capability,
+    Format,
+    PushReply,
+    PushRequest,
+    State,
+    Status,
+    StreamReply,
+    StreamRequest,
+    Watchdog,
+)
+
+pytestmark = pytest.mark.usefixtures("compiler")
+
+LINK = load_link()
+LONG = load_link(overrides=["air.frames_per_packet=40", "air.pilot_every=4"])
+
+
+def symbols(link: Link, packets: int, seed: int = 0) -> np.ndarray:
+    return random_symbols(packets, link.packet.frames, link.codebook, np.random.default_rng(seed))
+
+
+def board_on(line: SimulatedLine) -> Board:
+    return Board(Session(line, Timing(latency_s=0.02), first=1, nonce=1))
+
+
+def played(device: SimulatedBoard, link: Link) -> tuple[list[bytes], int]:
+    """The packets that were shown, as chips, and how many chips of the idle pattern stood between them."""
+    chips = device.records().played().chips()
+    preamble = chips_of_values(link.codebook.preamble)
+    length = link.packet.packet_chips
+    found, at, idle = [], 0, 0
+    while at + length <= len(chips):
+        if (chips[at : at + len(preamble)] == preamble[:, None]).all():
+            found.append(chips[at : at + length].tobytes())
+            at += length
+        else:
+            assert (chips[at] == idle % 2).all(), f"chip {at} is neither of a packet nor of the idle pattern"
+            at += 1
+            idle += 1
+    return found, idle
+
+
+def expected(packets: np.ndarray, link: Link) -> list[bytes]:
+    every = link.packet.pilot_every
+    return [packet_chips(p, link.codebook, every).tobytes() for p in packets]
+
+
+@pytest.mark.parametrize("link", [LINK, LONG], ids=["one piece a packet", "three pieces a packet"])
+@pytest.mark.parametrize("latency_s", [0.0, 0.016])
+@pytest.mark.parametrize("ahead", [2, 5])
+def test_packets_follow_each_other_without_a_gap(link: Link, latency_s: float, ahead: int) -> None:
+    device = SimulatedBoard()
+    packets = symbols(link, 30)
+    with board_on(UsbLine(device, latency_s)).stream(link, ahead) as stream:
+        for n, packet in enumerate(packets):
+            assert stream.send(packet) == n
+    chips = device.records().played()
+    assert (np.diff(chips.ticks) == 1000).all()
+    length = link.packet.packet_chips
+    at = len(chips) - 30 * length
+    # the idle pattern until the first has come, then packet after packet
+    assert chips.chips()[at:].tobytes() == b"".join(expected(packets, link))
+    assert (chips.chips()[:at] == np.arange(at)[:, None] % 2).all()
+    assert at % 2 == 0
+    assert (stream.underruns, stream.sent) == (0, 30)
+    pieces = -(-link.packet.frames * 32 // (512 - PushRequest.fixed_bytes()))
+    assert stream.requests <= 30 * pieces + 3
+    assert not device.shown().any()
+
+
+def test_two_round_trips_a_packet_at_most_and_no_more_on_the_board_than_asked() -> None:
+    device = SimulatedBoard()
+    board = board_on(UsbLine(device, 0.016))
+    with board.stream(LINK, 3) as stream:
+        for packet in symbols(LINK, 50):
+            stream.send(packet)
+            assert stream.sent - stream.begun <= 4
+    assert stream.requests <= 100
+
+
+def test_an_empty_queue_is_named_and_shows_the_idle_pattern() -> None:
+    device = SimulatedBoard()
+    board = board_on(UsbLine(device, 0.001))
+    packets = symbols(LINK, 4)
+    with board.stream(LINK) as stream:
+        stream.wait(0.2)
+        assert stream.underruns == 0, "a stream that has not begun is not late"
+        for packet in packets[:2]:
+            stream.send(packet)
+        stream.wait(0.3)
+        probe = board_of_status(stream)
+        assert probe.state == State.IDLE_PATTERN
+        assert probe.faults & BoardFault.UNDERRUN
+        assert probe.underruns == 1
+        for packet in packets[2:]:
+            stream.send(packet)
+        stream.wait(0.01)
+        assert not board_of_status(stream).faults & BoardFault.UNDERRUN
+    found, idle = played(device, LINK)
+    assert found == expected(packets, LINK)
+    assert idle > 2000
+    assert stream.underruns == 1
+    after = board.status()
+    assert (after.state, after.faults, after.underruns) == (State.DARK, 0, 1)
+
+
+def board_of_status(stream: Stream) -> object:
+    """STATUS in between; nothing of the stream is under way then."""
+    from firmware_host.protocol.requests import StatusReply, StatusRequest
+
+    assert not stream._flight
+    return stream._session.call(StatusRequest(), StatusReply)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_noisy_line_loses_and_doubles_nothing(seed: int) -> None:
+    device = SimulatedBoard()
+    line = NoisyLine(device, 0.0, 0.0, 0.0, seed)
+    board = Board(Session(line, Timing(latency_s=0.004), tries=12, first=1, nonce=1))
+    link = LONG if seed % 2 else LINK
+    packets = symbols(link, 25, seed)
+    with board.stream(link, 6) as stream:
+        line.rates = (2e-4, 0.05, 0.05)
+        for packet in packets:
+            stream.send(packet)
+    line.rates = (0.0, 0.0, 0.0)
+    assert line.counts["dropped"]
+    assert line.counts["doubled"]
+    found, _ = played(device, link)
+    assert found == expected(packets, link)
+
+
+def test_from_a_bank_to_a_stream_and_back_without_a_torn_packet() -> None:
+    device = SimulatedBoard()
+    board = board_on(SimulatedLine(device))
+    first, second, last = symbols(LINK, 2, 1), symbols(LINK, 5, 2), symbols(LINK, 1, 3)
+    provision(board, bank_of(first, LINK), Settings())
+    device.run(100_000)
+    stream = board.stream(LINK)
+    for packet in second:
+        stream.send(packet)
+    while stream._flight:
+        stream.wait(0.01)
+    stream.wait(0.3)
+    provision(board, bank_of(last, LINK), Settings())
+    device.run(200_000)
+    found, _ = played(device, LINK)
+    names = [
+        next(i for i, p in enumerate((first, second, last)) if chips in expected(p, LINK)) for chips in found
+    ]
+    assert names == sorted(names)
+    assert names.count(1) == 5
+    assert names[-1] == 2
+    status = board.status()
+    assert (status.state, status.underruns, status.packets) == (State.PLAYING, 0, 1)
+
+
+def test_the_watchdog_acts_on_a_stream_whose_host_is_gone() -> None:
+    device = SimulatedBoard()
+    board = board_on(SimulatedLine(device))
+    board.watchdog(Watchdog.DARK, 200)
+    stream = board.stream(LINK)
+    stream.send(symbols(LINK, 1)[0])
+    stream.wait(1.0)
+    assert board_of_status(stream).state == State.IDLE_PATTERN
+    device.run(500_000)
+    assert not device.shown().any()
+
+
+def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_told() -> None:
+    device = SimulatedBoard()
+    board = board_on(SimulatedLine(device))
+
+    def fails() -> None:
+        with board.stream(LINK, 8) as stream:
+            for packet in symbols(LINK, 4):
+                stream.send(packet)
+            raise KeyError("x")
+
+    with pytest.raises(KeyError):
+        fails()
+    assert not device.shown().any()
+    assert board.status().packets_sent < 4
+    stream = board.stream(LINK)
+    device.reset()
+    with pytest.raises(BoardResetError):
+        stream.wait(2.0)
+
+
+def test_what_a_board_refuses() -> None:
+    device = SimulatedBoard()
+    board = board_on(SimulatedLine(device))
+    for ahead, says in ((1, "expected 2 or more"), (500, "holds 127 packets")):
+        with pytest.raises(ConfigError, match=says):
+            board.stream(LINK, ahead)
+    huge = load_link(overrides=["air.frames_per_packet=700"])
+    with pytest.raises(RefusedError):
+        board.stream(huge)
+    with board.stream(LINK) as stream:
+        with pytest.raises(ConfigError, match=r"shape \(9, 16\), expected \(10, 16\)"):
+            stream.send(symbols(LINK, 1)[0][:9])
+        with pytest.raises(ConfigError):
+            stream.send(np.full((10, 16), 64))
+    fast = load_link(overrides=["air.chip_rate_hz=20000.0"])
+    provision(board, bank_of(symbols(LINK, 1), LINK), Settings())
+    with pytest.raises(RefusedError, match=r"keeps its rate"):
+        board.stream(fast)
+    board.stop()
+    board.wait_dark()
+    with board.stream(fast) as stream:
+        stream.send(symbols(fast, 1)[0])
+    with pytest.raises(RefusedError) as told:
+        board.save()
+    assert told.value.status == Status.NOTHING_COMMITTED, "a stream is not saved"
+    object.__setattr__(board.about, "capabilities", board.about.capabilities & ~Capability.STREAM)
+    with pytest.raises(IncompatibleError, match="has no streams"):
+        board.stream(LINK)
+
+
+class Queue:
+    """What a board's queue should do, in Python."""
+
+    def __init__(self, slots: int, size: int) -> None:
+        self.slots, self.size = slots, size
+        self.packets: list[bytes] = []
+        self.part = b""
+        self.ended = False
+
+    def push(self, number: int, offset: int, data: bytes, last: bool, begun: int) -> tuple[int, int]:
+        room = len(self.packets) - begun + 1 < self.slots
+        is_next = (number, offset) == (len(self.packets), len(self.part))
+        if is_next and data and room and not self.ended and offset + len(data) <= self.size:
+            self.part += data
+            if len(self.part) == self.size:
+                self.packets.append(self.part)
+                self.part = b""
+        if last and not self.part and len(self.packets) == number + bool(data):
+            self.ended = True
+        return len(self.packets), len(self.part)
+
+
+@given(st.data())
+@settings(max_examples=30, deadline=None)
+def test_the_queue_takes_what_a_queue_should(data: st.DataObject) -> None:
+    """Pieces of any number, offset and length, and time between them, against a model."""
+    link = load_link(overrides=["air.frames_per_packet=320"])  # 10 240 bytes a packet: 4 slots
+    device = SimulatedBoard()
+    board = board_on(SimulatedLine(device))
+    like = Bank(Format.WORDS, 0, b"", link.codebook, link.packet)
+    board.prepare(like)
+    request = StreamRequest(0, Format.WORDS, bytes.fromhex(link.codebook.digest))
+    slots = board.session.call(request, StreamReply).slots
+    assert slots == 4
+    board.start()
+    model = Queue(slots, 10_240)
+    begun = 0
+    for _ in range(data.draw(st.integers(1, 60))):
+        if data.draw(st.booleans()):
+            number, offset = len(model.packets), len(model.part)
+        else:
+            number = data.draw(st.integers(0, len(model.packets) + 1))
+            offset = data.draw(st.sampled_from([0, len(model.part), 490, 10_239]))
+        left = 10_240 - offset
+        count = data.draw(st.sampled_from([0, 1, 490, 490, 490]))
+        count = min(count, left) if data.draw(st.booleans()) else count
+        payload = bytes([data.draw(st.integers(0, 255))]) * count
+        last = data.draw(st.integers(0, 20)) == 0
+        reply = board.session.call(PushRequest(0, number, offset, int(last), payload), PushReply)
+        # the model knows when packets begin only from the board; they never go back
+        assert begun <= reply.begun <= len(model.packets)
+        begun = reply.begun
+        assert (reply.number, reply.offset) == model.push(number, offset, payload, last, begun)
+        device.run(data.draw(st.sampled_from([0, 100, 2_000_000])))
+    held = board.read(0, 0, 4 * 10_240)
+    for n in range(max(0, len(model.packets) - 2), len(model.packets)):
+        at = n % 4 * 10_240
+        assert held[at : at + 10_240] == model.packets[n]
+
+
+def test_masks_may_be_streamed_too() -> None:
+    device = SimulatedBoard()
+    board = board_on(SimulatedLine(device))
+    like = Bank(Format.WORDS, 0, b"", LINK.codebook, LINK.packet)
+    board.prepare(like)
+    digest = bytes.fromhex(LINK.codebook.digest)
+    assert board.session.call(StreamRequest(1, Format.MASKS, digest), StreamReply).slots == 40960 // (
+        346 * 12
+    )
+    rows = np.random.default_rng(0).integers(0, 2, (346, 96), dtype=np.uint8)
+    content = np.packbits(rows, axis=1).tobytes()
+    for at in range(0, len(content), 480):
+        piece = content[at : at + 480]
+        board.session.call(PushRequest(1, 0, at, int(at + 480 >= len(content)), piece), PushReply)
+    board.start()
+    device.run(60_000)
+    shown = device.records().played().chips(96)
+    assert shown.tobytes() == rows.tobytes()
+    assert board.status().state == State.DARK
+    for bank, status in ((0, Status.NOTHING_COMMITTED), (2, Status.OUT_OF_RANGE)):
+        with pytest.raises(RefusedError) as told:
+            board.session.call(PushRequest(bank, 0, 0, 0, b"x"), PushReply)
+        assert told.value.status == status
+
+
+def test_the_benchmark_says_what_it_should() -> None:
+    from benchmarks.board_stream import measure
+
+    alone = measure(0.016, 4, 0.1, packets=6)
+    # a millisecond of USB, 3.4 of wire, at most four chips until the idle pattern is over
+    assert 1.0 + 3.4 <= alone.delays_ms.min() <= alone.delays_ms.max() <= 1.0 + 3.6 + 0.4
+    full = measure(0.016, 2, 0.0, packets=12)
+    assert full.underruns == 0
+    assert full.delays_ms.max() <= 3 * 34.6
+    assert full.round_trips <= 2.0
