@@ -619,6 +619,11 @@ class Stm32:
         self.drivers.look()
 
     @property
+    def stack(self) -> int:
+        """The stack pointer."""
+        return int(self.uc.reg_read(arm_const.UC_ARM_REG_SP))
+
+    @property
     def pclk2(self) -> int:
         """Clock of APB2, Hz."""
         divider = self.plain.get(0x40023808, 0) >> 13 & 7

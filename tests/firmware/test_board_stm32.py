@@ -28,6 +28,7 @@ from firmware_host.emulators.stm32 import (
     ModelLine,
     Shown,
     Stm32,
+    Usart,
 )
 
 CHIP = 100 * US
@@ -340,3 +341,140 @@ def test_emulate_serves_the_model(cli, needs: Callable[..., None], book: Codeboo
     assert whole >= len(once)
     assert (chips[start : start + whole] == np.tile(once, (whole // len(once), 1))).all()
     assert not chips[start + whole :].any()
+
+
+def symbol(name: str) -> int:
+    """Address of a variable of the image."""
+    table = subprocess.run(
+        ["arm-none-eabi-nm", build.arm_image("stm32f405")], capture_output=True, text=True, check=True
+    ).stdout
+    return next(int(line.split()[0], 16) for line in table.splitlines() if line.split()[-1] == name)
+
+
+def word(chip: Stm32, at: int) -> int:
+    return int.from_bytes(chip.uc.mem_read(at, 4), "little")
+
+
+def test_blank_is_dark_at_once_and_the_next_start_plays_whole(bar: Bar) -> None:
+    for moment in (3_333, 5_050, 7_777):
+        begin = len(bar.log)
+        bar.board.start()
+        bar.chip.run(moment)
+        rows, times = played(bar.log[begin:])
+        assert (rows == bar.expected(len(rows))).all()
+        bar.board.blank()
+        went = max(s.time for s in bar.log if s.dark)
+        assert bar.dark
+        assert went - times[-1] < 40 * CHIP  # the request itself took some chips
+        bar.chip.run(2_000)
+        assert bar.dark
+        assert bar.board.status().state == State.DARK
+
+
+def test_a_swap_leaves_no_chip_out(bar: Bar, book: Codebook) -> None:
+    begin = len(bar.log)
+    bar.board.start()
+    bar.chip.run(4_000)
+    other = random_symbols(2, 4, book, np.random.default_rng(9))
+    bar.board.program(Bank.of_symbols(other, book))
+    bar.chip.run(30_000)
+    rows, times = played(bar.log[begin:])
+    assert (np.diff(times) == CHIP).all()
+    lead = int(bar.chips.any(1).argmax())
+    after = symbol_chips(other, book)
+    found = []
+    for packets in range(1, 30):
+        chips = np.vstack([np.tile(bar.chips, (packets, 1)), np.tile(after, (40, 1))])[lead:]
+        found += [packets] * bool((np.repeat(chips[: len(rows)], 6, axis=1) == rows).all())
+    assert len(found) == 1
+    assert len(rows) > (found[0] + 2) * len(bar.chips)
+
+
+def test_a_reset_is_dark_and_what_is_programmed_after_it_plays(bar: Bar, book: Codebook) -> None:
+    bar.board.start()
+    bar.chip.run(7_000)
+    assert not bar.dark
+    at = bar.chip.now
+    bar.chip.reset(RESET_BY_PIN)
+    assert bar.dark
+    bar.chip.run(BOOT_US)
+    assert all(s.dark for s in bar.log if s.time > at)
+    board = bar.connect()
+    symbols = random_symbols(1, 4, book, np.random.default_rng(1))
+    begin = len(bar.log)
+    provision(board, Bank.of_symbols(symbols, book), Settings())
+    bar.chip.run(15_000)
+    rows, _ = played(bar.log[begin:])
+    assert (rows[:100] == bar.expected(100)).all()
+    assert board.status().faults == 0
+
+
+def test_counters_pass_two_to_the_32(bar: Bar) -> None:
+    """TIM2, the milliseconds, the chips and the packets sent all wrap while it plays."""
+    chip = bar.chip
+    bar.board.start()
+    chip.run(20_000)
+    bar.board.blank()
+    status = bar.board.status()
+    board = symbol("board")
+    memory = bytes(chip.uc.mem_read(board, 90_000))
+    pattern = status.packets_sent.to_bytes(4, "little") + status.chips_sent.to_bytes(4, "little")
+    places = [n for n in range(0, len(memory), 4) if memory[n : n + 8] == pattern]
+    # the counters, and after them the reply that has just told of them
+    assert len(places) == 2
+    chip.uc.mem_write(board + places[0], b"\xff\xff\xff\xff" + (2**32 - 60).to_bytes(4, "little"))
+    last = symbol("last_count")
+    chip.uc.mem_write(symbol("millis"), (2**32 - 25).to_bytes(4, "little"))
+    ticks = 84_000  # of TIM2 in a millisecond
+    chip.tim2.hold(2**32 - 15 * ticks)
+    chip.uc.mem_write(last, (2**32 - 15 * ticks).to_bytes(4, "little"))
+    begin = len(bar.log)
+    bar.board.start()
+    chip.run(40_000)
+    assert chip.tim2.counter() < 2**31
+    status = bar.board.status()
+    assert status.uptime_ms < 1_000
+    assert 0 < status.packets_sent < 10
+    assert 300 < status.chips_sent < 400
+    assert (status.state, status.faults) == (State.PLAYING, 0)
+    rows, times = played(bar.log[begin:])
+    assert len(rows) > 390
+    assert (rows == bar.expected(len(rows))).all()
+    assert (np.diff(times) == CHIP).all()
+
+
+def test_interrupts_stack_and_line_have_room(bar: Bar, book: Codebook) -> None:
+    """At 20 000 chips per second and 1 Mbit/s both ways: no byte lost, no chip late."""
+    chip = bar.chip
+    lowest = symbol("link_bss_end")
+    room = chip.stack - 64 - lowest
+    chip.uc.mem_write(lowest, b"\xa5" * room)
+    masks = np.zeros((26 + 32 * 30, 96), np.uint8)
+    masks[::2] = np.random.default_rng(0).integers(0, 2, masks[::2].shape)
+    link = load_link(overrides=["air.chip_rate_hz=20000.0", "air.frames_per_packet=30"])
+    bank = Bank.of_masks(masks, book, link.packet)
+    provision(bar.board, bank, Settings())
+    before = bar.board.status()
+    spare = 1 - before.active_bank
+    content = np.random.default_rng(1).integers(0, 256, 1_500, np.uint8).tobytes()
+    began = chip.now
+    assert bar.board.fill(spare, content) == len(content)
+    assert bar.board.read(spare, 0, len(content)) == content
+    took_us = (chip.now - began) / US
+    status = bar.board.status()
+    assert (status.overflow_errors, status.crc_errors, status.framing_errors) == (0, 0, 0)
+    assert (status.state, status.faults) == (State.PLAYING, 0)
+    assert bar.board.session.client.retries == 0
+    assert took_us < 2.5 * 20 * len(content)  # at most 2.5 times the bytes' own time on the line
+    # a chip takes 50 us; an instruction is a clock here, on the part up to three
+    assert chip.longest[16 + Dma.IRQ] < 50 * US / 3
+    assert chip.longest[16 + Usart.IRQ] < 3 * US
+    assert status.lateness_max_ticks < 14 * 10
+    bar.board.stop()
+    bar.board.wait_dark()
+    bar.board.save()
+    bar.board.test_leds(0, 1, 1)
+    bar.board.wait_dark()
+    used = room - next(n for n, byte in enumerate(chip.uc.mem_read(lowest, room)) if byte != 0xA5)
+    assert used < 3_000
+    assert room > 8_192

@@ -1,0 +1,85 @@
+"""The STM32F405 image on the model of the part: what it shows, how fast it is dark, what its interrupts take.
+
+Prints a table; times are the model's, which counts an instruction of the core as a clock.
+"""
+
+import numpy as np
+
+from evlcp_sdk.link.resolve import load_link
+from firmware_host import build
+from firmware_host.board.bank import Bank, random_symbols, symbol_chips
+from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.session import Session
+from firmware_host.emulators.stm32 import US, Dma, ModelLine, Stm32, Usart
+from firmware_host.protocol.client import Timing
+
+MOMENTS = 12
+CHIP_US = 100
+BREAKS = {
+    "TIM1 stands": lambda chip: chip.tim1.stop_for_good(),
+    "DMA stands": lambda chip: setattr(chip.dma, "dead", True),
+    "DMA transfer error": lambda chip: chip.dma.error(Dma.TRANSFER_ERROR),
+    "SPI1 stands": lambda chip: setattr(chip.spi, "dead", True),
+    "TIM3 stands": lambda chip: chip.tim3.stop_for_good(),
+    "crystal stops": lambda chip: chip.stop_crystal(),
+    "supply falls": lambda chip: chip.pending.add(16 + 1),
+}
+
+
+def programmed(seed: int) -> tuple[Stm32, Board, np.ndarray]:
+    """A bar on the model, and its rows from the first lit one on."""
+    book = load_link().codebook
+    chip = Stm32(build.arm_image("stm32f405"))
+    chip.run(15_000)
+    board = Board(Session(ModelLine(chip), Timing(latency_s=0.02)))
+    symbols = random_symbols(1, 4, book, np.random.default_rng(seed))
+    provision(board, Bank.of_symbols(symbols, book), Settings(start=False))
+    chips = symbol_chips(symbols, book)
+    rows = np.repeat(np.roll(chips, -int(chips.any(1).argmax()), axis=0), 6, axis=1)
+    return chip, board, rows
+
+
+def right(chip: Stm32, begin: int, rows: np.ndarray) -> tuple[int, int]:
+    """How many of the rows since `begin` are right, and how many there are."""
+    shown = [s.row for s in chip.drivers.log[begin:] if s.latched and not s.dark]
+    while shown and not shown[0]:
+        del shown[0]
+    bits = np.array([[int(bit) for bit in f"{row:096b}"] for row in shown], np.uint8)
+    return int((bits == np.resize(rows, bits.shape)).all(1).sum()), len(bits)
+
+
+def main() -> None:
+    """Print the table."""
+    chip, board, rows = programmed(1)
+    for n in range(1, 5):
+        begin = len(chip.drivers.log)
+        board.start()
+        chip.run(21_500)
+        good, shown = right(chip, begin, rows)
+        print(f"START {n}                  {good} of {shown} chips right on 96 LEDs")
+        board.blank()
+    status = board.status()
+    print(f"chip interrupt           {chip.longest[16 + Dma.IRQ] / US:.1f} us at most, a chip is {CHIP_US}")
+    print(f"receive interrupt        {chip.longest[16 + Usart.IRQ] / US:.1f} us at most, a byte is 10")
+    print(f"bytes lost               {status.overflow_errors}, datagrams {status.crc_errors}")
+    for name, breaks in BREAKS.items():
+        late = []
+        for moment in range(MOMENTS):
+            rng = np.random.default_rng(moment)
+            chip, board, _ = programmed(1)
+            board.start()
+            chip.run(5_000 + float(rng.uniform(0, 1_000)))
+            at = chip.now
+            breaks(chip)
+            chip.run(1_000)
+            late.append(
+                (max(s.time for s in chip.drivers.log if s.dark) - at) / US if chip.drivers.dark else 1e9
+            )
+        faults = board.status().faults
+        print(
+            f"{name:24} dark after {max(late) / CHIP_US:.2f} chips at most, of {MOMENTS}; faults {faults:#x}"
+        )
+
+
+if __name__ == "__main__":
+    main()
