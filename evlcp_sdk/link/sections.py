@@ -108,14 +108,20 @@ class PositionSpec:
         Field(
             ge=0, description="Error that a bar's points share: motion inside the pilot, up to half a pixel."
         ),
-    ] = 0.1
+    ] = 0.05
+    shared_share: Annotated[
+        float, Field(ge=0, le=0.1, description="The same that grows with the bar: a share of its length.")
+    ] = 0.0008
+    stretch_share: Annotated[
+        float, Field(ge=0, le=0.1, description="By how much a bar looks too long, or short, all the time.")
+    ] = 0.0005
     pixel_sigma_px: Annotated[
         float,
         Field(
             ge=0,
             description="Error of a point that no averaging over frames removes: where in a pixel it is.",
         ),
-    ] = 0.08
+    ] = 0.05
     min_view_deg: Annotated[
         float,
         Field(ge=0, lt=90, description="Angle between a bar and the line of sight that a lone bar needs."),
@@ -149,6 +155,9 @@ class PositionSpec:
         float,
         Field(gt=0, description="Power density of the change of speed: 1 m/s2 that lasts for a second."),
     ] = 1.0
+    slow_s: Annotated[
+        float, Field(gt=0, description="Time in which errors within pixels change, as the image moves.")
+    ] = 0.3
     gate_sigmas: Annotated[
         float,
         Field(gt=1, description="Sigmas from the prediction beyond which a trajectory leaves a fix out."),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.sections import PositionSpec
-from evlcp_sdk.place.observations import BarView, project_bars
+from evlcp_sdk.place.observations import BarView, project_bars, shared_sigmas
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
 __all__ = ["PARAMETERS", "Calibrated", "CalibrationView", "calibrate"]
@@ -101,7 +101,7 @@ def calibrate(
 
     All parameters are fitted together, within what lenses usually have. One is determined where the views say
     more than that, and leave the image's corners uncertain by no more than a limit; the sigmas of these
-    contain what is not known of the others. An error that a bar's points share is `spec.shared_sigma_px`;
+    contain what is not known of the others. Errors that a bar's points share are those of positions;
     errors of a bar's site are the same in all views.
 
     Args:
@@ -189,8 +189,9 @@ class _Seen:
             points.append(bar.points_px[good])
             number.append(np.full(int(good.sum()), bar.transmitter))
             arm.append(bar.enu_m[good] - bar.enu_m.mean(0))
-            survey[bar.transmitter] = bar.survey
-            covariance = np.diag(bar.sigma_px[good] ** 2) + spec.shared_sigma_px**2
+            shift, *site = shared_sigmas(bar, good, spec)
+            survey[bar.transmitter] = (site[0], site[1], site[2])
+            covariance = np.diag(bar.sigma_px[good] ** 2) + shift**2
             whiten.append(np.linalg.inv(np.linalg.cholesky(covariance)))
         size = sum(map(len, points))
         joined, at = np.zeros((size, size)), 0

@@ -12,7 +12,7 @@ from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
-__all__ = ["EXACT_RAD", "BarView", "Problem", "project_bars"]
+__all__ = ["EXACT_RAD", "BarView", "Problem", "project_bars", "shared_sigmas"]
 
 Floats = NDArray[np.float64]
 
@@ -166,7 +166,7 @@ class Problem:
             spec,
             points,
             bar,
-            np.array([(spec.shared_sigma_px, *v.survey) for v, _ in kept]),
+            np.array([shared_sigmas(view, seen, spec) for view, seen in kept]),
             tuple(v.transmitter for v, _ in kept),
             np.array(
                 [camera.focal_px, *camera.centre_px, camera.k1, camera.k2, camera.p1, camera.p2, camera.k3]
@@ -190,6 +190,16 @@ class Problem:
         ray = np.ones((len(flat), 3))
         ray[:, :2] = flat
         return np.asarray(ray / np.sqrt((ray * ray).sum(1))[:, None])
+
+
+def shared_sigmas(view: BarView, seen: NDArray[np.bool_], spec: PositionSpec) -> tuple[float, ...]:
+    """Of a bar: its image's shift, px; its place, m, turn, radians, and length, a share."""
+    rows = np.flatnonzero(seen)
+    across = view.points_px[rows[-1]] - view.points_px[rows[0]]
+    length_px = math.hypot(across[0], across[1]) * len(view.points_px) / (rows[-1] - rows[0])
+    place, turn, length = view.survey
+    shift = math.hypot(spec.shared_sigma_px, spec.shared_share * length_px)
+    return shift, place, turn, math.hypot(length, spec.stretch_share)
 
 
 def _whitening(attitude: Attitude) -> Floats:

@@ -23,7 +23,7 @@ from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
 CAMERA = CameraModel()
 BENT = CameraModel(k1=-0.3, k2=0.1, p1=1e-3, p2=-1e-3, centre_x_px=655.0, centre_y_px=350.0)
-POINT_ONLY = PositionSpec(shared_sigma_px=0)
+POINT_ONLY = PositionSpec(shared_sigma_px=0, shared_share=0, stretch_share=0)
 LEVEL = Attitude(gravity_sigma_deg=0)
 UP = Attitude(pitch_deg=5.0, heading_deg=0.0)
 """The camera looks up by 5 degrees, as it must to see bars on poles 4 m above it at 50 m."""
@@ -175,8 +175,8 @@ def test_errors_at_50_m_and_their_sigmas(
 
 def test_an_error_that_a_bars_points_share_is_accounted_for() -> None:
     rng = np.random.default_rng(3)
-    bars, rotation, spec = [bar(p) for p in THREE], UP.rotation(), PositionSpec(shared_sigma_px=0.2)
-    square = []
+    bars, rotation = [bar(p) for p in THREE], UP.rotation()
+    spec, square = dataclasses.replace(POINT_ONLY, shared_sigma_px=0.2), []
     for _ in range(200):
         seen = [
             BarView(v.transmitter, v.enu_m, v.points_px + rng.normal(0, 0.2, 2), v.sigma_px)
@@ -214,7 +214,10 @@ def drawn(
         arm = view.enu_m - view.enu_m.mean(0)
         said = view.enu_m + rng.normal(0, survey[0], 3) + np.cross(rng.normal(0, survey[1], 3), arm)
         said = said + rng.normal(0, survey[2]) * arm
-        points = view.points_px + rng.normal(0, spec.shared_sigma_px, 2)
+        said = said + rng.normal(0, spec.stretch_share) * arm
+        long_px = np.linalg.norm(view.points_px[-1] - view.points_px[0]) * 16 / 15
+        shift = math.hypot(spec.shared_sigma_px, spec.shared_share * float(long_px))
+        points = view.points_px + rng.normal(0, shift, 2)
         seen.append(BarView(view.transmitter, said, points, view.sigma_px, survey))
     told = None
     if known is not None:
@@ -380,7 +383,7 @@ def test_a_cluster_that_the_edge_cuts_off_is_left_out() -> None:
 @pytest.mark.parametrize("gravity_sigma_deg", [0.0, 0.1])
 def test_a_lone_bar_and_a_poor_compass(gravity_sigma_deg: float) -> None:
     """Half a degree is a compass's usual error: 0.44 m at 50 m, along an arc 8 mm off its tangent."""
-    rng, spec = np.random.default_rng(5), PositionSpec()
+    rng, spec = np.random.default_rng(5), dataclasses.replace(POINT_ONLY, shared_sigma_px=0.1)
     squares = []
     for _ in range(60):
         told = Attitude(
@@ -450,7 +453,7 @@ def test_a_mirrored_solution_is_refused_not_chosen() -> None:
     wide = CameraModel(focal_mm=4.0)
     bars = [0.2 * bar((x, 0, z)) + [0, 60.0, 0] for x, z in ((-10.0, 0.0), (10.0, 0.0), (0.0, 10.0))]
     seen = views(bars, np.zeros(3), Attitude().rotation(), rng, 0.3, wide)
-    found = solve_pose(seen, wide, None, PositionSpec(shared_sigma_px=0, max_sigma_m=100))
+    found = solve_pose(seen, wide, None, dataclasses.replace(POINT_ONLY, max_sigma_m=100))
     if isinstance(found, Pose):
         assert np.linalg.norm(found.enu_m) < 5 * math.sqrt(np.trace(found.covariance[:3, :3]))
     else:

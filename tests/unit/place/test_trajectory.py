@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -21,6 +22,7 @@ def fix(t_us: float, enu_m: NDArray[np.float64], standing_m: float = 0.0) -> Fix
         enu_m=enu_m,
         noise_m2=noise,
         covariance_m2=noise + standing_m**2 * np.eye(3),
+        standing={"attitude": standing_m * np.eye(3)} if standing_m else {},
     )
 
 
@@ -76,9 +78,9 @@ def test_filter_and_smoother_are_the_batch_solution() -> None:
     smooth = smooth_trajectory(points, spec)
     for axis in range(3):
         mean, variance = batch(t_us, seen, axis)
-        np.testing.assert_allclose([p.mean[axis::3] for p in smooth], mean, atol=1e-6)
-        np.testing.assert_allclose([np.diag(p.noise)[axis::3] for p in smooth], variance, rtol=1e-6)
-        np.testing.assert_allclose(points[-1].mean[axis::3], mean[-1], atol=1e-6)
+        np.testing.assert_allclose([p.mean[axis:6:3] for p in smooth], mean, atol=1e-6)
+        np.testing.assert_allclose([np.diag(p.covariance)[axis:6:3] for p in smooth], variance, rtol=1e-6)
+        np.testing.assert_allclose(points[-1].mean[axis:6:3], mean[-1], atol=1e-6)
         np.testing.assert_allclose(points[-1].mean, smooth[-1].mean)
 
 
@@ -117,7 +119,189 @@ def test_refused_fixes_have_no_point_and_the_state_is_not_changed() -> None:
     refused = Fix.refused(1e5, (0,), "misfit", "far off")
     points = filter_fixes([fix(0, np.zeros(3)), refused, fix(2e5, np.ones(3) * 0.1)], SPEC)
     assert [p.t_us for p in points] == [0, 2e5]
-    before = points[0].mean.copy(), points[0].noise.copy()
+    before = points[0].mean.copy(), points[0].covariance.copy()
     trajectory_step(points[0], fix(3e5, np.ones(3)), SPEC)
     np.testing.assert_array_equal(before[0], points[0].mean)
-    np.testing.assert_array_equal(before[1], points[0].noise)
+    np.testing.assert_array_equal(before[1], points[0].covariance)
+
+
+def moves_at(t_us: float, name: str) -> NDArray[np.float64]:
+    """How a part's standing errors move a fix: more and less along a drive, as with the distance."""
+    share = 1 + 0.5 * np.sin(t_us * 1e-6 + len(name))
+    return np.array([[0.4, 0.1], [0.0, 0.3], [0.2, -0.1]]) * share
+
+
+def seen_by(t_us: float) -> list[str]:
+    """Three bars in turn, two at a time, and the camera."""
+    at = t_us * 1e-6
+    return ["camera", *(f"bar {i}" for i in range(3) if abs(at - 0.5 * i) < 0.6)]
+
+
+def disturbed(
+    rng: np.random.Generator, t_us: NDArray[np.float64], states: NDArray[np.float64], slow_m: float
+) -> tuple[list[Fix], dict[str, NDArray[np.float64]]]:
+    """Fixes with noise, with errors of a memory, and with standing errors."""
+    standing = {name: rng.normal(size=2) for name in ("camera", "bar 0", "bar 1", "bar 2")}
+    slow, fixes, last = rng.normal(size=3), [], t_us[0]
+    for t, state in zip(t_us, states, strict=True):
+        fade = np.exp(-(t - last) * 1e-6 / SPEC.slow_s)
+        slow = fade * slow + np.sqrt(1 - fade**2) * rng.normal(size=3)
+        last = t
+        moves = {name: moves_at(t, name) for name in seen_by(t)}
+        place = state[:3] + rng.normal(size=3) * SIGMA_M + slow_m * slow
+        place = place + sum((m @ standing[n] for n, m in moves.items()), np.zeros(3))
+        spread = np.diag(SIGMA_M**2) + slow_m**2 * np.eye(3) + sum(m @ m.T for m in moves.values())
+        fixes.append(
+            dataclasses.replace(
+                fix(t, place), covariance_m2=spread, slow_m2=slow_m**2 * np.eye(3), standing=moves
+            )
+        )
+    return fixes, standing
+
+
+def dense(
+    fixes: list[Fix], names: list[str]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """All states of all times, and all standing errors, by one weighted least-squares problem.
+
+    Means (n, 9), covariances of the positions (n, 3, 3), and the standing errors' means.
+    """
+    n = len(fixes)
+    size = 9 * n + 2 * len(names)
+    rows, right = [], []
+
+    def add(row: NDArray[np.float64], value: NDArray[np.float64], covariance: NDArray[np.float64]) -> None:
+        white = np.linalg.inv(np.linalg.cholesky(covariance))
+        rows.append(white @ row)
+        right.append(white @ value)
+
+    def block(height: int, *parts: tuple[int, NDArray[np.float64]]) -> NDArray[np.float64]:
+        row = np.zeros((height, size))
+        for at, part in parts:
+            row[:, at : at + part.shape[1]] = part
+        return row
+
+    add(block(3, (3, np.eye(3))), np.zeros(3), 30.0**2 * np.eye(3))
+    add(block(3, (6, np.eye(3))), np.zeros(3), np.eye(3))
+    whole = np.eye(2 * len(names))
+    add(block(len(whole), (9 * n, whole)), np.zeros(len(whole)), whole)
+    for i, one in enumerate(fixes):
+        slow = np.sqrt(one.slow_m2[0, 0]) * np.eye(3)
+        causes = [(9 * n + 2 * names.index(name), moves) for name, moves in one.standing.items()]
+        add(block(3, (9 * i, np.eye(3)), (9 * i + 6, slow), *causes), one.enu_m, one.noise_m2)
+        if i:
+            dt = (one.t_us - fixes[i - 1].t_us) * 1e-6
+            step = np.eye(6) + dt * np.eye(6, k=3)
+            power = SPEC.acceleration_m2_s3 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+            add(block(6, (9 * i, np.eye(6)), (9 * i - 9, -step)), np.zeros(6), np.kron(power, np.eye(3)))
+            fade = np.exp(-dt / SPEC.slow_s)
+            add(
+                block(3, (9 * i + 6, np.eye(3)), (9 * i - 3, -fade * np.eye(3))),
+                np.zeros(3),
+                (1 - fade**2) * np.eye(3),
+            )
+    a, b = np.concatenate(rows), np.concatenate(right)
+    covariance = np.linalg.inv(a.T @ a)
+    mean = covariance @ (a.T @ b)
+    places = np.array([covariance[9 * i : 9 * i + 3, 9 * i : 9 * i + 3] for i in range(n)])
+    return mean[: 9 * n].reshape(n, 9), places, mean[9 * n :]
+
+
+def test_standing_and_slow_errors_are_those_of_the_dense_problem() -> None:
+    rng = np.random.default_rng(21)
+    t_us, states = drive(rng, 14)
+    fixes, _ = disturbed(rng, t_us, states, 0.2)
+    spec = dataclasses.replace(SPEC, gate_sigmas=50.0)
+    points = filter_fixes(fixes, spec)
+    smooth = smooth_trajectory(points, spec)
+    names = [cause.name for cause in points[-1].causes]
+    mean, places, standing = dense(fixes, names)
+    np.testing.assert_allclose([p.mean[:9] for p in smooth], mean, atol=1e-5)
+    np.testing.assert_allclose([p.covariance_m2 for p in smooth], places, atol=1e-6)
+    np.testing.assert_allclose(points[-1].mean[9:], standing, atol=1e-5)
+    for i, name in enumerate(names):
+        found = points[-1].standing(name)
+        assert found is not None
+        np.testing.assert_allclose(found[0], standing[2 * i : 2 * i + 2], atol=1e-5)
+    assert points[-1].standing("bar 9") is None
+
+
+def test_errors_that_stay_are_not_averaged_away() -> None:
+    """Forward and smoothed, consistent at each time; as if they were white, they would not be."""
+    rng = np.random.default_rng(22)
+    forward, backward, naive, estimates = [], [], [], []
+    for _ in range(80):
+        t_us, states = drive(rng, 30)
+        t_us = t_us[0] + np.arange(30) * 33e3
+        fixes, standing = disturbed(rng, t_us, states[:1] + np.zeros((30, 1)), 0.1)
+        spec = dataclasses.replace(SPEC, acceleration_m2_s3=1e-3)
+        states = np.concatenate([states[0, :3] + 0 * t_us[:, None], np.zeros((30, 3))], 1)
+        points = filter_fixes(fixes, spec)
+        for found, kept in ((points, forward), (smooth_trajectory(points, spec), backward)):
+            error = found[20].mean[:3] - states[20, :3]
+            kept.append(error @ np.linalg.solve(found[20].covariance_m2, error))
+        white = [
+            dataclasses.replace(f, standing={}, noise_m2=f.covariance_m2, slow_m2=0 * f.slow_m2)
+            for f in fixes
+        ]
+        point = smooth_trajectory(filter_fixes(white, spec), spec)[20]
+        error = point.mean[:3] - states[20, :3]
+        naive.append(error @ np.linalg.solve(point.covariance_m2, error))
+        camera = points[-1].standing("camera")
+        assert camera is not None
+        off = camera[0] - standing["camera"]
+        estimates.append(off @ np.linalg.solve(camera[1], off))
+    low, high = stats.chi2.interval(0.999, 3 * 80) / np.array(80)
+    assert low < np.mean(forward) < high
+    assert low < np.mean(backward) < high
+    assert np.mean(naive) > 10
+    low, high = stats.chi2.interval(0.999, 2 * 80) / np.array(80)
+    assert low < np.mean(estimates) < high
+
+
+@pytest.mark.parametrize("rate_deg_s", [45.0, -45.0, 5.0])
+def test_a_car_that_turns_stays_on_its_track(rate_deg_s: float) -> None:
+    """At 10 m/s and 45 degrees/s it is pushed aside by 8 m/s2; the camera's heading says so."""
+    rng = np.random.default_rng(23)
+    rate, squares, noise = np.radians(rate_deg_s), [], np.diag([0.02, 0.02, 0.02]) ** 2
+    for trial in range(40):
+        fixes, truth = [], []
+        for i in range(60):
+            t = i * 0.033 + (0.3 if i > 30 else 0.0)
+            heading = rate * t
+            radius = 10.0 / rate
+            place = np.array([radius * (1 - np.cos(heading)), radius * np.sin(heading), 0.0])
+            truth.append(place)
+            fixes.append(
+                dataclasses.replace(
+                    fix(t * 1e6, place + rng.normal(0, 0.02, 3)),
+                    noise_m2=noise, covariance_m2=noise,
+                    heading_deg=np.degrees(heading) + rng.normal(0, 0.02),
+                )
+            )  # fmt: skip
+        points = filter_fixes(fixes, PositionSpec(acceleration_m2_s3=0.01))
+        assert not any(p.misses for p in points)
+        at = 20 + trial % 30
+        for found in (points, smooth_trajectory(points, PositionSpec(acceleration_m2_s3=0.01))):
+            error = found[at].mean[:3] - truth[at]
+            squares.append(error @ np.linalg.solve(found[at].covariance_m2, error))
+    assert np.mean(squares) < stats.chi2.isf(1e-4, 120) / 40
+
+
+def test_a_bar_long_out_of_sight_is_forgotten() -> None:
+    """The states of a drive past many bars stay few; what is left is the dense problem without the rest."""
+    fixes = []
+    for i in range(200):
+        name = f"bar {i // 5}"
+        noise = np.diag(SIGMA_M**2)
+        fixes.append(
+            dataclasses.replace(
+                fix(i * 1e6, np.array([float(i), 0, 0])), noise_m2=noise, standing={name: 0.1 * np.eye(3)}
+            )
+        )
+    points = filter_fixes(fixes, SPEC)
+    assert max(len(p.mean) for p in points) <= 9 + 3 * 4
+    smooth = smooth_trajectory(points, SPEC)
+    assert [len(p.mean) for p in smooth] == [len(p.mean) for p in points]
+    assert all(np.linalg.eigvalsh(p.covariance)[0] > 0 for p in smooth)
+    assert max(abs(p.mean[0] - i) for i, p in enumerate(smooth)) < 1e-3
