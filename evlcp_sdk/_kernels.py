@@ -1,4 +1,4 @@
-"""Loops over grid cells, compiled."""
+"""Loops over grid cells and over the times of events, compiled."""
 
 from typing import Any
 
@@ -36,3 +36,87 @@ def take_in(heard: Array, prior: Array, out: Array) -> None:
                 total += prior[k, r, c] * (heard[k, r, c] * odds + unheard)
             for k in range(clusters):
                 out[k, r, c] = prior[k, r, c] * (heard[k, r, c] * odds + unheard) / total
+
+
+@njit(cache=True, nogil=True)
+def all_ordered(t_us: Array, x: Array, y: Array, width: int, height: int, origin: int, since: Array) -> bool:
+    """Whether no event is off the sensor or before its predecessor; times since an origin.
+
+    Without a branch, so that it is quick.
+    """
+    bad = 0
+    for i in range(1, t_us.size):
+        bad += int(t_us[i] < t_us[i - 1])
+    for i in range(t_us.size):
+        bad += int(x[i] >= width) | int(y[i] >= height)
+        since[i] = t_us[i] - origin
+    return bad == 0
+
+
+@njit(cache=True, nogil=True)
+def sort_out(
+    t_us: Array,
+    x: Array,
+    y: Array,
+    width: int,
+    height: int,
+    limits: tuple[int, int, int, int, int, int, int],
+    state: Array,
+    verdicts: Array,
+) -> tuple[int, bool]:
+    """Judge events one by one: 0 before its predecessor, 1 off the sensor, 2 doubtful, 3 kept, 4 held.
+
+    Args:
+        t_us: Camera clock, int64 (n,).
+        x: Columns, uint16 (n,).
+        y: Rows, uint16 (n,).
+        width: Columns of the sensor.
+        height: Its rows.
+        limits: (longest pause, the same among those held, longest setback, events that agree, over how long,
+            most held, farthest time).
+        state: Time of the last kept, of the first and the last held, how many are held; int64 (4,), carried
+            on. How many becomes -1 where an event makes those held believed: it is the last one judged.
+        verdicts: Takes the verdicts, uint8 (n,).
+
+    Returns:
+        (events judged, whether those held from earlier calls have become doubtful).
+    """
+    leap, held_leap, setback, enough, span, most, far = limits
+    last, first_held, last_held, held = state[0], state[1], state[2], state[3]
+    since = 0
+    lost = False
+    done = t_us.size
+    for i in range(t_us.size):
+        t = t_us[i]
+        if x[i] >= width or y[i] >= height:
+            verdicts[i] = 1
+        elif t > far or t < -far:
+            verdicts[i] = 2
+        elif last <= t <= last + leap:
+            if held:
+                lost = lost or since == 0
+                for k in range(since, i):
+                    verdicts[k] = 2 if verdicts[k] == 4 else verdicts[k]
+                held = 0
+            verdicts[i] = 3
+            last = t
+        elif last - setback <= t < last or (held and last_held - setback <= t < last_held):
+            verdicts[i] = 0
+        else:
+            if held and not last_held <= t <= last_held + held_leap:
+                lost = lost or since == 0
+                for k in range(since, i):
+                    verdicts[k] = 2 if verdicts[k] == 4 else verdicts[k]
+                held = 0
+            if not held:
+                first_held = t
+                since = i
+            verdicts[i] = 4
+            last_held = t
+            held += 1
+            if (held >= enough and t - first_held >= span) or held >= most:
+                held = -1
+                done = i + 1
+                break
+    state[0], state[1], state[2], state[3] = last, first_held, last_held, held
+    return done, lost

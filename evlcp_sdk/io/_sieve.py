@@ -3,21 +3,27 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.values import Events
 
 __all__ = ["Sieve"]
 
 MEANINGS: Final = {
-    "outside_sensor": "events outside the sensor; dropped",
-    "time_backward": "events earlier than the one before; dropped",
+    "outside_sensor": ("dropped_off_sensor", "events outside the sensor; dropped"),
+    "time_backward": ("dropped_time_backward", "events earlier than the one before; dropped"),
+    "time_doubtful": (
+        "dropped_time_doubtful",
+        "events at times that no others agree with; dropped",
+    ),
 }
 
 
 class Sieve:
-    """Drops and counts events outside the sensor and events earlier than the one before.
+    """Drops and counts events outside the sensor, in disorder, or on a clock that no others agree on.
+
+    The camera's clock may leap or restart as a receiver's stream may: see `CameraClock`.
 
     Args:
         unit: What `losses` count positions in: `line` or `row`.
@@ -27,37 +33,49 @@ class Sieve:
 
     def __init__(self, unit: str, width: int | None, height: int | None) -> None:
         self._unit = unit
-        self._width = width or 1 << 16
-        self._height = height or 1 << 16
-        self._last_us = np.iinfo(np.int64).min
-        self._counts: dict[str, int] = {}
+        self._clock = CameraClock(width or 1 << 16, height or 1 << 16, sparse=True)
         self._firsts: dict[str, int] = {}
+        self._ahead = 0
 
     def sift(self, events: Events, first: int) -> Events:
-        """Return the events to keep; the first of `events` is line or row `first`."""
-        if not len(events):
-            return events
-        outside = (events.x >= self._width) | (events.y >= self._height)
-        # An event outside does not set the time that later ones are held against.
-        times = np.where(outside, self._last_us, events.t_us)
-        latest = np.maximum(np.maximum.accumulate(times), self._last_us)
-        backward = ~outside & (events.t_us < latest)
-        self._last_us = latest[-1]
-        for name, found in (("outside_sensor", outside), ("time_backward", backward)):
-            self._note(name, found, first)
-        drop = outside | backward
-        return events[~drop] if drop.any() else events
+        """Return the events to keep, and those held before that have become believed.
 
-    def _note(self, name: str, found: NDArray[np.bool_], first: int) -> None:
-        count = int(np.count_nonzero(found))
-        if count:
-            self._firsts.setdefault(name, first + int(found.argmax()))
-            self._counts[name] = self._counts.get(name, 0) + count
+        Args:
+            events: The next ones; the columns are the caller's.
+            first: Line or row of the first of them.
+        """
+        # Lines are ahead of numbers, by a heading and by those that are empty.
+        self._ahead = first - self._clock.counts["events"]
+        return self._given(self._clock.take(events))
+
+    def close(self) -> Events:
+        """End the stream: return what is still held, where nothing contradicts it."""
+        return self._given(self._clock.close())
+
+    def _given(self, pieces: list[Events]) -> Events:
+        for name, number in self._clock.firsts.items():
+            self._firsts.setdefault(name, number + self._ahead)
+        kept = [self._on_camera(piece) for piece in pieces]
+        return kept[0] if len(kept) == 1 else Events.concat(kept)
+
+    def _on_camera(self, piece: Events) -> Events:
+        """A piece with the times that it came with."""
+        inside_us = int(piece.t_us[0])
+        offset_us = int(self._clock.camera_us(inside_us)) - inside_us
+        return Events(piece.t_us + np.int64(offset_us), piece.x, piece.y, piece.p)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Restarts of the clock that were believed, where there were any; a long pause is none."""
+        restarts = self._clock.counts["clock_restarts"]
+        return {"clock_restarts": restarts} if restarts else {}
 
     @property
     def losses(self) -> dict[str, Loss]:
         """As `EventSource.losses`."""
+        counts = self._clock.counts
         return {
-            name: Loss(count, self._firsts[name], self._unit, MEANINGS[name])
-            for name, count in self._counts.items()
+            name: Loss(counts[count], self._firsts[count], self._unit, meaning)
+            for name, (count, meaning) in MEANINGS.items()
+            if counts[count]
         }

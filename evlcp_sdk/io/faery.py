@@ -65,7 +65,8 @@ class FaerySource(EventSource):
         except Exception as error:
             raise InputError(f"{self.path}: at event {self._row}: {error}") from error
         if packet is None:
-            return None
+            events = self._sieve.close()
+            return (events, Triggers.empty()) if len(events) else None
         first = self._row
         self._row += len(packet)
         columns = (packet["t"], packet["x"], packet["y"], packet["on"])
@@ -76,6 +77,11 @@ class FaerySource(EventSource):
     def losses(self) -> dict[str, Loss]:
         """As `EventSource.losses`, with the numbers of the events."""
         return self._sieve.losses
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """As `EventSource.counts`, with `clock_restarts` where there were any."""
+        return super().counts | self._sieve.counts
 
     def close(self) -> None:
         """Close the file."""

@@ -196,7 +196,8 @@ class NpzSource(EventSource):
         events, triggers = self._events, self._triggers
         left = self._columns[0].rows - self._columns[0].row
         if not len(events) and not len(triggers) and not left:
-            return None
+            events = self._sieve.close()
+            return (events, triggers) if len(events) else None
         n, due = len(events), 0 if left else len(triggers)
         if n:
             due = int(np.searchsorted(triggers.t_us, events.t_us[-1], "right"))
@@ -224,6 +225,11 @@ class NpzSource(EventSource):
     def losses(self) -> dict[str, Loss]:
         """As `EventSource.losses`, with row numbers."""
         return self._sieve.losses
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """As `EventSource.counts`, with `clock_restarts` where there were any."""
+        return super().counts | self._sieve.counts
 
     def close(self) -> None:
         """Close the file."""
@@ -353,7 +359,8 @@ class CsvSource(EventSource):
                 more = b"\n"
             self._text += more
         if not self._text:
-            return None
+            events = self._sieve.close()
+            return (events, Triggers.empty()) if len(events) else None
         rows = max(max_events, LEAST_ROWS)
         t_us, x, y = np.empty(rows, np.int64), np.empty(rows, np.uint16), np.empty(rows, np.uint16)
         p = np.empty(rows, np.uint8)
@@ -375,6 +382,11 @@ class CsvSource(EventSource):
     def losses(self) -> dict[str, Loss]:
         """As `EventSource.losses`, with line numbers."""
         return self._sieve.losses
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """As `EventSource.counts`, with `clock_restarts` where there were any."""
+        return super().counts | self._sieve.counts
 
     def close(self) -> None:
         """Close the file."""

@@ -43,9 +43,9 @@ class Loss:
 class EventSource(ABC):
     """A recording or a camera, read once from front to back; a context manager.
 
-    Time never runs backward in what a source gives out: an event or trigger earlier than the one before is
-    dropped and counted as the loss `time_backward`. So a clock that leaps ahead for a moment, by a word gone
-    wrong, costs all events until it is caught up; the count shows it.
+    An event or trigger earlier than the one before is dropped and counted as the loss `time_backward`, one at
+    a time that no others agree with as `time_doubtful`. Time runs backward in what a source gives out only
+    where a camera's clock has restarted, as some events on end agree; a receiver judges by the same rule.
 
     A source of your own calls `super().__init__` and implements `take` and `close`.
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evlcp_sdk.rx.clock import CameraClock
+from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.values import Events
 

@@ -11,7 +11,7 @@ SDK = Path(__file__).parents[2] / "evlcp_sdk"
 LAYERS = (
     {"errors", "files", "kernels", "signals", "specs", "spelling"},
     {"air"},
-    {"values", "scene", "_kernels"},
+    {"values", "scene", "clock", "_kernels"},
     {"plugin"},
     {"link"},
     {"io", "rx", "place", "sim"},
@@ -87,7 +87,7 @@ def test_the_middle_packages_do_not_import_one_another(package: str) -> None:
 
 RX = (
     {"limits", "rhythm"},
-    {"clock", "guard", "trust"},
+    {"guard", "trust"},
     {"belief", "delays", "detection", "grid", "inbox", "packets", "placement", "ranges", "timeline"},
     {"look", "points", "steps"},
     {"echoes", "transmitters"},

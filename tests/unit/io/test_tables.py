@@ -384,3 +384,54 @@ def test_odd_npz_is_one_line(data, says, tmp_path):
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400
+
+
+def stretch(first_us, many=400, step_us=100):
+    t = first_us + np.arange(many) * step_us
+    return Events.of(t, np.arange(many) % 600, np.arange(many) % 400, np.arange(many) & 1)
+
+
+def saved(path, events):
+    """A table of events in any order, past the writers, which refuse some."""
+    if path.suffix == ".npz":
+        np.savez(path, t_us=events.t_us, x=events.x, y=events.y, p=events.p, width=640, height=480)
+    else:
+        rows = zip(*(c.tolist() for c in (events.t_us, events.x, events.y, events.p)), strict=True)
+        path.write_bytes(HEAD + "".join("{},{},{},{}\n".format(*row) for row in rows).encode())
+    return path
+
+
+ODD = Events.of([10**15], [5], [5], [1])
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.csv"])
+@pytest.mark.parametrize("size", [1, 37, 5000])
+def test_a_time_that_no_others_agree_with_costs_its_own_event(name, size, tmp_path):
+    good = stretch(1000)
+    path = saved(tmp_path / name, Events.concat([good[:200], ODD, good[200:]]))
+    with open_source(path) as source:
+        got = Events.concat(source.chunks(size))
+    assert np.array_equal(got.t_us, good.t_us)
+    first = 201 if name == "a.npz" else 202
+    assert {k: (v.count, v.first) for k, v in source.losses.items()} == {"time_doubtful": (1, first)}
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.csv"])
+@pytest.mark.parametrize("size", [1, 37, 5000])
+def test_a_clock_may_restart_and_leap(name, size, tmp_path):
+    parts = [stretch(5_000_000), stretch(0), stretch(90_000_000_000), stretch(10_000_000)]
+    path = saved(tmp_path / name, Events.concat(parts))
+    with open_source(path) as source:
+        got = Events.concat(source.chunks(size))
+    assert np.array_equal(got.t_us, np.concatenate([part.t_us for part in parts]))
+    assert source.losses == {}
+    assert source.counts["clock_restarts"] == 2
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.csv"])
+def test_pauses_of_a_sparse_table_are_kept(name, tmp_path):
+    events = Events.of([0, 10**7, 10**9, 10**12, 10**12 + 5], [1] * 5, [2] * 5, [1] * 5)
+    for size in (1, 100):
+        with open_source(saved(tmp_path / name, events)) as source:
+            assert Events.concat(source.chunks(size)).t_us.tolist() == events.t_us.tolist()
+        assert source.losses == {}

@@ -32,29 +32,6 @@ def frozen(events, step=1):
     return Events(*columns)
 
 
-def clock_faults(rng, n):
-    """Events of which some run backward and some are off the sensor."""
-    t = np.arange(n) + rng.integers(-2, 2, n)
-    return Events.of(t, rng.integers(0, WIDTH + 2, n), rng.integers(0, HEIGHT + 2, n), np.ones(n))
-
-
-@pytest.mark.parametrize("n", [0, 1, 2, 3, 40])
-@pytest.mark.parametrize("seed", SEEDS)
-def test_order_is_checked_event_by_event(seed, n):
-    rng = np.random.default_rng(seed)
-    for e in (clock_faults(rng, n), random_events(rng, n)):
-        want = twins.ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT)
-        since = np.empty(n, np.int64)
-        assert _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, -7, since) == want
-        assert_array_equal(since, e.t_us + 7)
-
-
-@pytest.mark.parametrize(("x", "y"), [(WIDTH, 0), (0, HEIGHT), (65_535, 65_535)])
-def test_the_first_event_too_may_be_off_the_sensor(x, y):
-    e = Events.of([5], [x], [y], [1])
-    assert not _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, 0, np.empty(1, np.int64))
-
-
 LOW = (1 << _kernels.CLOCK_AT) - 1
 
 

@@ -1,4 +1,4 @@
-"""The clock that the receiver believes: which events are in order, and where a camera's clock leaps.
+"""The clock that is believed, of files and cameras: which events are in order, and where a clock leaps.
 
 Clocks of cameras restart, and a flipped bit makes one leap. A leap is believed once enough events agree on
 it; until then they are held. Inside, time counts from the stream's first event and leaps are a few seconds
@@ -46,9 +46,12 @@ class CameraClock:
     Args:
         width: Columns of the sensor.
         height: Its rows.
+        sparse: Pauses may be long, as in a file that somebody wrote: events ahead are held through them, and
+            given at the end where none contradicts.
 
     Attributes:
         last_us: Time of the newest event, inside, us; long ago before the first.
+        firsts: Of each count of what is dropped, the number of the first such event, from 0.
 
     >>> clock = CameraClock(1280, 720)
     >>> [e.t_us.tolist() for e in clock.take(Events.of([70, 90, 80, 100], [1] * 4, [1] * 4, [1] * 4))]
@@ -57,7 +60,8 @@ class CameraClock:
     (100.0, 1)
     """
 
-    def __init__(self, width: int, height: int) -> None:
+    def __init__(self, width: int, height: int, *, sparse: bool = False) -> None:
+        self._sparse = sparse
         self.last_us = -_FARTHEST_US
         self._size = width, height
         self._offset_us = 0
@@ -66,6 +70,8 @@ class CameraClock:
         # Camera clock of the last event kept; of the first and the last held; how many are held.
         self._state = np.zeros(4, np.int64)
         self._held: list[Events] = []
+        self._held_at = 0
+        self.firsts: dict[str, int] = {}
         self._counts = dict.fromkeys(
             (
                 "events",
@@ -90,7 +96,7 @@ class CameraClock:
 
     def take(self, events: Events) -> list[Events]:
         """Take the next events of the stream; give those that are kept, with their times inside."""
-        from evlcp_sdk.rx import _kernels
+        from evlcp_sdk import _kernels
 
         self._counts["events"] += len(events)
         if not len(events):
@@ -109,17 +115,30 @@ class CameraClock:
                 return [Events(inside_us, x, y, events.p)]
         return self._sorted(events)
 
-    def close(self) -> None:
-        """End the stream: what is still held is dropped."""
-        self._counts["dropped_time_doubtful"] += int(self._state[3])
+    def close(self) -> list[Events]:
+        """End the stream: what is still held is dropped, or given where that is sparse and ahead."""
+        if self._sparse and self._held and self._state[1] > self._state[0]:
+            return [self._leap()]
+        self._lose_held()
         self._state[3] = 0
+        return []
+
+    def _lose_held(self) -> None:
+        """Drop what is held."""
+        if self._held:
+            self._lose("dropped_time_doubtful", self._held_at, sum(map(len, self._held)))
         self._held = []
+
+    def _lose(self, name: str, first: int, many: int) -> None:
+        self._counts[name] += many
+        self.firsts[name] = min(self.firsts.get(name, first), first)
 
     def _sorted(self, events: Events) -> list[Events]:
         """The same, event by event."""
-        from evlcp_sdk.rx import _kernels
+        from evlcp_sdk import _kernels
 
-        limits = (LEAP_US, _SETBACK_US, _AGREE_EVENTS, _AGREE_US, _MOST_HELD, _FARTHEST_US)
+        held_us = _FARTHEST_US if self._sparse else LEAP_US
+        limits = (LEAP_US, held_us, _SETBACK_US, _AGREE_EVENTS, _AGREE_US, _MOST_HELD, _FARTHEST_US)
         given: list[Events] = []
         while len(events):
             if not self._starts_us:
@@ -134,17 +153,20 @@ class CameraClock:
             done, verdicts = events[:many], verdicts[:many]
             events = events[many:]
             if lost:
-                self._counts["dropped_time_doubtful"] += sum(map(len, self._held))
-                self._held = []
+                self._lose_held()
+            number = self._counts["events"] - len(events) - many
             for name, verdict in (
                 ("dropped_time_backward", _BACKWARD),
                 ("dropped_off_sensor", _OFF_SENSOR),
                 ("dropped_time_doubtful", _DOUBTFUL),
             ):
-                self._counts[name] += int(np.count_nonzero(verdicts == verdict))
+                if (found := verdicts == verdict).any():
+                    self._lose(name, number + int(found.argmax()), int(np.count_nonzero(found)))
             if (kept := verdicts == _KEPT).any():
                 given.append(self._inside(done[kept]))
             if (held := verdicts == _HELD).any():
+                if not self._held:
+                    self._held_at = number + int(held.argmax())
                 self._held.append(done[held])
             if self._state[3] < 0:
                 # The last one has made those held believed.
@@ -158,8 +180,10 @@ class CameraClock:
         good = seen & (events.t_us <= _FARTHEST_US) & (events.t_us >= -_FARTHEST_US)
         if good.any():
             return int(events.t_us[int(good.argmax())])
-        self._counts["dropped_off_sensor"] += int(np.count_nonzero(~seen))
-        self._counts["dropped_time_doubtful"] += int(np.count_nonzero(seen))
+        number = self._counts["events"] - len(events)
+        for name, lost in (("dropped_off_sensor", ~seen), ("dropped_time_doubtful", seen)):
+            if lost.any():
+                self._lose(name, number + int(lost.argmax()), int(np.count_nonzero(lost)))
         return None
 
     def _begin(self, camera_us: int, inside_us: int) -> None:

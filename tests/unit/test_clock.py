@@ -4,11 +4,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from clock_twins import clock as twin
+from clock_twins import ordered
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rx_twins import clock as twin
 
-from evlcp_sdk.rx.clock import LEAP_US, CameraClock
+from evlcp_sdk import _kernels
+from evlcp_sdk.clock import LEAP_US, CameraClock
 from evlcp_sdk.values import Events
 
 WIDTH, HEIGHT = 8, 6
@@ -104,3 +106,48 @@ def test_what_is_held_is_bounded() -> None:
     assert clock.take(still) == []
     assert sum(map(len, clock.take(still))) == 1 << 20
     assert clock.counts["clock_restarts"] == 1
+
+
+def random_events(rng: np.random.Generator, n: int) -> Events:
+    t_us = 1000 + rng.integers(0, 4, n).cumsum()
+    return Events.of(t_us, rng.integers(0, WIDTH, n), rng.integers(0, HEIGHT, n), rng.integers(0, 2, n))
+
+
+def clock_faults(rng: np.random.Generator, n: int) -> Events:
+    """Events of which some run backward and some are off the sensor."""
+    t = np.arange(n) + rng.integers(-2, 2, n)
+    return Events.of(t, rng.integers(0, WIDTH + 2, n), rng.integers(0, HEIGHT + 2, n), np.ones(n))
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 40])
+@pytest.mark.parametrize("seed", range(8))
+def test_order_is_checked_event_by_event(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    for e in (clock_faults(rng, n), random_events(rng, n)):
+        want = ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT)
+        since = np.empty(n, np.int64)
+        assert _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, -7, since) == want
+        assert np.array_equal(since, e.t_us + 7)
+
+
+@pytest.mark.parametrize(("x", "y"), [(WIDTH, 0), (0, HEIGHT), (65_535, 65_535)])
+def test_the_first_event_too_may_be_off_the_sensor(x: int, y: int) -> None:
+    e = Events.of([5], [x], [y], [1])
+    assert not _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, 0, np.empty(1, np.int64))
+
+
+@pytest.mark.parametrize("size", [1, 17, 400])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_first_of_each_loss_is_known(seed: int, size: int) -> None:
+    events = stream(seed)
+    clock = CameraClock(WIDTH, HEIGHT)
+    kept = [e for a in range(0, len(events), size) for e in clock.take(events[a : a + size])]
+    clock.close()
+    assert set(clock.firsts) == {n for n in NAMES.values() if n.startswith("dropped") and clock.counts[n]}
+    # None is dropped before the first.
+    told = CameraClock(WIDTH, HEIGHT)
+    for number in range(min(clock.firsts.values(), default=0)):
+        told.take(events[number : number + 1])
+    told_dropped = [told.counts[n] for n in clock.firsts]
+    assert sum(told_dropped) == 0
+    assert sum(map(len, kept)) == len(events) - sum(clock.counts[n] for n in clock.firsts)
