@@ -51,6 +51,8 @@ class Kind(IntEnum):
     TEXT = 2
     DATA = 3
     SIGNATURE = 4
+    TIME = 5
+    COUNTDOWN = 6
 
 
 _KINDS = frozenset(Kind)

@@ -1,8 +1,10 @@
 """Kinds of messages: what the payload of each means, and how it is shown."""
 
+import struct
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from typing import Any, ClassVar
 
 from evlcp_sdk.air.beacons import Beacon
@@ -11,20 +13,29 @@ from evlcp_sdk.errors import ConfigError
 
 __all__ = [
     "BUILT_IN_KINDS",
+    "SIGNALS",
     "BeaconKind",
+    "Countdown",
+    "CountdownKind",
     "DataKind",
     "MessageKind",
     "SignatureKind",
     "TextKind",
+    "TimeKind",
     "kind_named",
 ]
+
+_TIME = struct.Struct("<Q")
+_COUNTDOWN = struct.Struct("<BBI")
+_LAST_TIME_S = 253_402_300_800.0
+_LONGEST_COUNTDOWN_S = 86_400.0
 
 
 class MessageKind(ABC):
     """What the payload of a message means; a derived class has no state, and its objects are picklable.
 
     Attributes:
-        number: What the four bits of a block's header say: 1 to 4 are built in, 5 to 15 are free.
+        number: What the four bits of a block's header say: 1 to 6 are built in, 7 to 15 are free.
         name: What it is called in `packets.jsonl`.
     """
 
@@ -119,8 +130,93 @@ class SignatureKind(DataKind):
     name = "signature"
 
 
+class TimeKind(MessageKind):
+    """The time at which the message's first chip is on air: seconds since 1970, UTC."""
+
+    number = Kind.TIME
+    name = "time"
+
+    def pack(self, value: float) -> bytes:
+        """Eight bytes: microseconds."""
+        if not 0.0 <= value < _LAST_TIME_S:
+            raise ConfigError(f"time: {value!r} s, expected seconds since 1970, before the year 10000")
+        return _TIME.pack(round(value * 1e6))
+
+    def unpack(self, payload: bytes) -> float:
+        """Seconds since 1970."""
+        time_s = _numbers(_TIME, payload, self.name)[0] * 1e-6
+        if not time_s < _LAST_TIME_S:
+            raise BlockError(f"time: {time_s} s is after the year 9999")
+        return float(time_s)
+
+    def to_dict(self, value: float) -> Mapping[str, Any]:
+        """The time, as seconds since 1970 and as ISO 8601 has it."""
+        return {
+            "time_s": value,
+            "time": datetime.fromtimestamp(value, UTC).isoformat(timespec="milliseconds"),
+        }
+
+
+@dataclass(frozen=True)
+class Countdown:
+    """How long a signal still shows what it does.
+
+    Attributes:
+        signal: What it shows, one of `SIGNALS`.
+        next_signal: What it will show then.
+        left_s: How long until then, s, from the message's first chip on.
+
+    >>> CountdownKind().unpack(CountdownKind().pack(Countdown("red", "green", 12.3))).left_s
+    12.3
+    """
+
+    signal: str
+    next_signal: str
+    left_s: float
+
+
+SIGNALS = ("dark", "red", "red-amber", "amber", "green", "amber-flashing")
+"""What a traffic light shows; their order is their number on air."""
+
+
+class CountdownKind(MessageKind):
+    """A traffic light's countdown: a `Countdown`."""
+
+    number = Kind.COUNTDOWN
+    name = "countdown"
+
+    def pack(self, value: Countdown) -> bytes:
+        """Six bytes: both signals, and milliseconds."""
+        for key in ("signal", "next_signal"):
+            if getattr(value, key) not in SIGNALS:
+                said = getattr(value, key)
+                raise ConfigError(f"countdown: {key} = {said!r}, expected one of {', '.join(SIGNALS)}")
+        if not 0.0 <= value.left_s <= _LONGEST_COUNTDOWN_S:
+            raise ConfigError(f"countdown: {value.left_s!r} s, expected 0 to {_LONGEST_COUNTDOWN_S:.0f}")
+        numbers = SIGNALS.index(value.signal), SIGNALS.index(value.next_signal), round(value.left_s * 1e3)
+        return _COUNTDOWN.pack(*numbers)
+
+    def unpack(self, payload: bytes) -> Countdown:
+        """A countdown."""
+        signal, then, left_ms = _numbers(_COUNTDOWN, payload, self.name)
+        if max(signal, then) >= len(SIGNALS):
+            raise BlockError(f"countdown: signal {max(signal, then)}, expected 0 to {len(SIGNALS) - 1}")
+        return Countdown(SIGNALS[signal], SIGNALS[then], left_ms / 1e3)
+
+    def to_dict(self, value: Countdown) -> Mapping[str, Any]:
+        """Its values."""
+        return asdict(value)
+
+
+def _numbers(form: struct.Struct, payload: bytes, name: str) -> tuple[int, ...]:
+    if len(payload) != form.size:
+        raise BlockError(f"{name} of {len(payload)} bytes, expected {form.size}")
+    return form.unpack(payload)
+
+
 BUILT_IN_KINDS: Mapping[int, MessageKind] = {
-    kind.number: kind for kind in (BeaconKind(), TextKind(), DataKind(), SignatureKind())
+    kind.number: kind
+    for kind in (BeaconKind(), TextKind(), DataKind(), SignatureKind(), TimeKind(), CountdownKind())
 }
 """The kinds that the format itself has, by number."""
 

@@ -172,14 +172,14 @@ def _kind_fault(kind: MessageKind, kinds: Mapping[int, MessageKind], owners: Map
     if not (isinstance(name, str) and name):
         return f"{who}: name = {name!r}, expected text"
     if not (isinstance(number, int) and 1 <= number <= _MOST_KIND):
-        return f"{who}: number = {number!r}, expected 5 to {_MOST_KIND}"
+        return f"{who}: number = {number!r}, expected 7 to {_MOST_KIND}"
     if name == "packet":
         return f"{who}: its name is that of a packet's line; choose another"
     for other in kinds.values():
         if number == other.number or name == other.name:
             return (
                 f"{who}: number {number} or its name is that of '{other.name}' of {owners[other.number]};"
-                " the SDK's are 1 to 4"
+                " the SDK's are 1 to 6"
             )
     return None
 

@@ -1,6 +1,7 @@
 """Packets onto a board as they come: a queue on the board, filled without waiting for each answer."""
 
 from bisect import insort
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Self
@@ -106,6 +107,35 @@ class Stream:
     def requests(self) -> int:
         """Requests sent, repeated ones included."""
         return self._submitted + self._session.client.retries - self._retries
+
+    @property
+    def delay_s(self) -> float:
+        """How long a packet that is sent now waits for its first chip, as far as can be told, s."""
+        begins_s = self._begun_s + (self.sent - self.begun + 1) * self.packet_s
+        return max(0.0, begins_s - self._session.transport.now())
+
+    def play(self, make: Callable[[int], Iterable[ArrayLike] | None], every_s: float) -> int:
+        """Send messages that change: each round and round until it is time for the next; how many there were.
+
+        Args:
+            make: The packets of the message of a number, from 0 on, for now plus `delay_s`; None ends it.
+            every_s: Time between two messages, s; one whose packets take longer is sent once.
+
+        Raises:
+            BoardError: The line or the board fails.
+        """
+        line = self._session.transport
+        due_s, number = line.now(), 0
+        while (packets := make(number)) is not None:
+            sent = list(packets)
+            number += 1
+            due_s = max(due_s + every_s, line.now())
+            while True:
+                for packet in sent:
+                    self.send(packet)
+                if line.now() >= due_s:
+                    break
+        return number
 
     def send(self, symbols: ArrayLike) -> int:
         """Send one packet; returns its number, from 0 on, as soon as it is on the line.

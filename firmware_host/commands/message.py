@@ -1,7 +1,7 @@
 """`evlcp tx message` and `evlcp tx keygen`: messages to packets, chips and boards."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -9,6 +9,11 @@ from evlcp_sdk.cli._common import LinkFile, Overrides
 from firmware_host.commands._json import AsJson, print_json, say
 from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, progress_bar, say_done
 from firmware_host.commands._output import save_array
+from firmware_host.commands.stream import Ahead, said_of, table_of
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 __all__ = ["keygen", "message"]
 
@@ -22,6 +27,12 @@ def message(
         Path | None, typer.Option(metavar="site.toml", help="Send where the transmitter is.")
     ] = None,
     user: Annotated[str, typer.Option(metavar="TEXT", help="The beacon's own bytes, as text.")] = "",
+    time: Annotated[bool, typer.Option("--time", help="Send the time.")] = False,
+    countdown: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Send how long a signal still shows.", min=0.0)
+    ] = None,
+    signal: Annotated[str, typer.Option(help="What it shows: red, green and the like.")] = "red",
+    next_signal: Annotated[str, typer.Option("--next", help="What it shows then.")] = "green",
     key: Annotated[
         Path | None, typer.Option(metavar="private.pem", help="Sign the beacon; needs the extra sign.")
     ] = None,
@@ -53,6 +64,17 @@ def message(
         ),
     ] = None,
     baud: Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)] = 1_000_000,
+    every: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            min=1.0,
+            help="Send it anew so often, to a board: with the time, with what is left, and in the text"
+            " {time}, {left} and {n}; end with Ctrl-C, or when nothing is left.",
+        ),
+    ] = None,
+    count: Annotated[int | None, typer.Option(min=1, help="With --every: end after so many.")] = None,
+    ahead: Ahead = 2,
     stay: KeepAlive = False,
     link_file: LinkFile = None,
     overrides: Overrides = None,
@@ -67,11 +89,18 @@ def message(
     A beacon:        [bold]evlcp tx message --beacon site.toml --key private.pem --chips chips.npy[/]
 
     Onto a board:    [bold]evlcp tx message --text "Tempo 30" --port /dev/ttyUSB0[/]
+
+    A countdown:     [bold]evlcp tx message --countdown 30 --every 1 --port /dev/ttyUSB0[/]
     """
     import dataclasses
     import json
     import os
+    from contextlib import suppress
+    from time import gmtime, strftime
+    from time import time as clock_s
 
+    from evlcp_sdk.air.blocks import Message
+    from evlcp_sdk.air.kinds import Countdown
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.files import Outputs
     from evlcp_sdk.link.compose import messages_of, packets_of, utf8
@@ -83,22 +112,69 @@ def message(
     from firmware_host.board.symbols import symbols_table
 
     link = load_link(link_file, overrides or [], Registry.load())
-    if text is None and file is None and beacon is None:
-        raise ConfigError("give what to send: --text TEXT, --file FILE or --beacon site.toml")
+    if text is None and file is None and beacon is None and not time and countdown is None:
+        raise ConfigError(
+            "give what to send: --text TEXT, --file FILE, --beacon site.toml, --time or --countdown SECONDS"
+        )
+    if every is None and count is not None:
+        raise ConfigError("--count belongs to --every SECONDS")
+    if every is not None and (out is not None or chips is not None):
+        raise ConfigError("--every sends what changes, to a board: -o and --chips hold what stays")
     if beacon is None and (key is not None or user):
         raise ConfigError("--key and --user belong to a beacon: give --beacon site.toml, too")
     for option, given in (("--text", text), ("--user", user)):
         utf8(given or "", option)
-    messages = messages_of(
-        link,
-        text=text,
-        data=None if file is None else _read(file),
-        beacon=None if beacon is None else site_that_sends(beacon, transmitter_id, "--id"),
-        user=user.encode(),
-        key=key,
-        transmitter_id=transmitter_id,
-        sequence=sequence,
-    )
+    data = None if file is None else _read(file)
+    site = None if beacon is None else site_that_sends(beacon, transmitter_id, "--id")
+    ends_s = None if countdown is None else clock_s() + countdown
+
+    def made(at_s: float, number: int | None) -> list[Message]:
+        """What is said at a time; of those that change, the one of a number."""
+        other: dict[str, Any] = {}
+        left_s = 0.0 if ends_s is None else max(0.0, ends_s - at_s)
+        if time:
+            other["time"] = at_s
+        if ends_s is not None:
+            other["countdown"] = Countdown(signal, next_signal, left_s)
+        said = text
+        if text is not None and number is not None:
+            said = text.replace("{time}", strftime("%H:%M:%S", gmtime(at_s))).replace("{n}", str(number))
+            said = said.replace("{left}", f"{left_s:.0f}")
+        first = sequence if sequence is not None else int(begun_s)
+        return messages_of(
+            link,
+            text=said,
+            data=data,
+            beacon=site,
+            user=user.encode(),
+            key=key,
+            other=other,
+            transmitter_id=transmitter_id,
+            sequence=first + (number or 0),
+        )
+
+    begun_s = clock_s()
+    if every is not None:
+        port = port or os.environ.get("EVLCP_PORT") or None
+        if port is None:
+            raise ConfigError("--every sends to a board: give --port (or EVLCP_PORT)")
+        coder = link.block_coder()
+        packets_of(made(begun_s, 0), coder, repeat)  # what is wrong is known before the board waits for it
+        with BoardLine(port, baud).open() as board:
+            stream = board.stream(link, ahead)
+
+            def next_one(number: int) -> "NDArray[np.int64] | None":
+                at_s = clock_s() + stream.delay_s
+                over = ends_s is not None and number and at_s > ends_s + every
+                if over or (count is not None and number >= count):
+                    return None
+                return packets_of(made(at_s, number), coder, repeat)
+
+            with suppress(KeyboardInterrupt), stream:
+                stream.play(next_one, every)
+        say(said_of(stream), table_of(stream), as_json)
+        return
+    messages = made(begun_s, None)
     symbols = packets_of(messages, link.block_coder(), repeat)
     table = symbols_table(symbols, link, messages=True)
     with Outputs() as outputs:

@@ -18,7 +18,7 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("block", blocks("console"), ids=["tx", "messages", "board"])
+@pytest.mark.parametrize("block", blocks("console"), ids=["tx", "messages", "changing", "board"])
 def test_commands_run(cli, block: str, tmp_path: Path) -> None:
     for line in block.splitlines():
         done = cli(*line.removeprefix("$ evlcp ").split(), cwd=tmp_path)

@@ -151,7 +151,7 @@ def test_faults_are_one_line(evlcp: Evlcp, site: Path, tmp_path: Path) -> None:
     two = tmp_path / "two.toml"
     two.write_text(SITE + SITE.replace("= 7", "= 8"))
     for options, code, told in (
-        ((), 2, "give what to send: --text TEXT, --file FILE or --beacon site.toml"),
+        ((), 2, "give what to send: --text TEXT, --file FILE, --beacon site.toml, --time or --countdown"),
         (("--text", ""), 2, "message: 0 bytes of text, expected 1 to 65535"),
         (("--text", "a\udcff"), 2, "--text: character 2 is not UTF-8"),
         (("--beacon", two, "--id", "7", "--user", "\udcff"), 2, "--user: character 1 is not UTF-8"),

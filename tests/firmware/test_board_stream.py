@@ -333,3 +333,42 @@ def test_the_benchmark_says_what_it_should() -> None:
     assert full.underruns == 0
     assert full.delays_ms.max() <= 3 * 34.6
     assert full.round_trips <= 2.0
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.016])
+def test_what_changes_is_right_at_its_first_chip(latency_s: float) -> None:
+    """A countdown made for `delay_s` ahead, against the ticks at which the board showed it."""
+    from benchmarks.board_stream import starts_of
+    from evlcp_sdk.air.blocks import Kind, Message
+    from evlcp_sdk.air.kinds import Countdown, CountdownKind
+    from evlcp_sdk.link.compose import packets_of
+
+    device, coder = SimulatedBoard(), LINK.block_coder()
+    board = board_on(UsbLine(device, latency_s))
+    made: list[np.ndarray] = []
+    due_us: list[float] = []
+    with board.stream(LINK, 2) as stream:
+
+        def next_one(number: int) -> np.ndarray | None:
+            if number == 8:
+                return None
+            at_s = device.now_us * 1e-6 + stream.delay_s
+            due_us.append(at_s * 1e6)
+            said = CountdownKind().pack(Countdown("red", "green", 100.0 - at_s))
+            made.append(packets_of([Message(Kind.COUNTDOWN, 7, number, said)], coder))
+            return made[-1]
+
+        assert stream.play(next_one, 0.25) == 8
+    assert stream.underruns == 0
+    played = device.records().played()
+    starts = starts_of(played.chips(), played.ticks, stream.sent, LINK.packet.packet_chips)
+    length = LINK.packet.packet_chips
+    first = played.chips()
+    at = [int(np.searchsorted(played.ticks, t)) for t in starts]
+    shown = [first[n : n + length].tobytes() for n in at]
+    for packets, due in zip(made, due_us, strict=True):
+        (chips,) = expected(packets, LINK)
+        begun_us = starts[shown.index(chips)] / (device.TICK_HZ / 1e6)
+        # the board's answers come late by the line's latency, and with them what is known of its queue
+        assert -8_000 <= due - begun_us <= 8_000 + 1e6 * latency_s
+        assert 6 <= shown.count(chips) <= 10, "round and round for 0.25 s"

@@ -13,6 +13,7 @@ from test_board_cli import EVLCP, Emulated
 from test_board_messages import messages_of, symbols_of
 
 from evlcp_sdk.air.blocks import Kind
+from evlcp_sdk.air.kinds import CountdownKind, TimeKind
 from evlcp_sdk.link.resolve import load_link
 from firmware_host.emulators.led_record import RECORD, LedRecord
 
@@ -98,5 +99,50 @@ def test_a_wrong_line_is_told(
     file.write_bytes(text.encode("utf-8", "surrogateescape"))
     done = evlcp("board", "stream", file, "--port", "native:", *options)
     assert done.code == 3
+    assert says in done.err
+    assert done.err.count("\n") == 1
+
+
+def test_a_message_that_changes(evlcp: Evlcp, tmp_path: Path) -> None:
+    port, leds = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin"
+    emulated = Emulated("native", "--listen", port, "--leds", leds)
+    began = time.time()
+    said = ("--text", "{n}: {left} s left at {time}", "--time", "--countdown", 100, "--sequence", 40)
+    done = evlcp(
+        *("tx", "message", *said, "--signal", "amber", "--next", "red", "--every", 1, "--count", 2),
+        *("--port", port, "--json"),
+    )
+    assert (done.code, done.err) == (0, "")
+    assert emulated.end() == 0
+    packets = packets_on(leds)
+    assert len(packets) == json.loads(done.out)["packets"] >= 45
+    first, last = (messages_of(some, LINK) for some in (packets[:3], packets[-3:]))
+    assert [m[Kind.TEXT].sequence for m in (first, last)] == [40, 41]
+    for n, found in enumerate((first, last)):
+        time_s = TimeKind().unpack(found[Kind.TIME].payload)
+        left = CountdownKind().unpack(found[Kind.COUNTDOWN].payload)
+        clock = time.strftime("%H:%M:%S", time.gmtime(time_s))
+        assert found[Kind.TEXT].text == f"{n}: {left.left_s:.0f} s left at {clock}"
+        assert (left.signal, left.next_signal) == ("amber", "red")
+        assert began + n <= time_s <= time.time()
+        assert time_s + left.left_s == pytest.approx(began + 100.0, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--text", "a", "--every", "1"), "--every sends to a board: give --port"),
+        (("--text", "a", "--every", "1", "-o", "m.json"), "-o and --chips hold what stays"),
+        (("--text", "a", "--count", "3"), "--count belongs to --every"),
+        (("--countdown", "3", "--signal", "blue", "--every", "1", "--port", "native:"), "signal = 'blue'"),
+        (("--countdown", "1e9", "--json"), "expected 0 to 86400"),
+    ],
+)
+def test_a_wrong_one_is_one_line(
+    evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], says: str
+) -> None:
+    monkeypatch.delenv("EVLCP_PORT", raising=False)
+    done = evlcp("tx", "message", *options)
+    assert done.code == 2
     assert says in done.err
     assert done.err.count("\n") == 1

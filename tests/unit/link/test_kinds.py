@@ -4,15 +4,16 @@ import json
 import pickle
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from evlcp_sdk.air.blocks import Block, Kind, Message, split
+from evlcp_sdk.air.blocks import Block, BlockError, Kind, Message, split
 from evlcp_sdk.air.frames import bits_of_symbols
-from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
+from evlcp_sdk.air.kinds import BUILT_IN_KINDS, Countdown, CountdownKind, MessageKind, TimeKind
 from evlcp_sdk.errors import ConfigError, PluginError, PluginWarning
 from evlcp_sdk.link.compose import compose, packets_of
 from evlcp_sdk.link.resolve import Link, load_link
@@ -95,12 +96,47 @@ def test_the_number_is_what_the_header_says() -> None:
 
 
 def test_the_kinds_go_with_the_link() -> None:
-    assert LINK.kinds.keys() == {1, 2, 3, 4, 15}
+    assert LINK.kinds.keys() == {1, 2, 3, 4, 5, 6, 15}
     assert pickle.loads(pickle.dumps(LINK)).kinds[15].name == "wind"
     assert LINK.with_air(pilot_every=2).kinds is LINK.kinds
     assert LINK.digest == load_link().digest
     for number, kind in BUILT_IN_KINDS.items():
         assert (kind.number, kind.name) == (number, Kind(number).name.lower())
+
+
+def test_a_time_and_a_countdown() -> None:
+    """Bytes as docs/messages.md has them, and what they cannot say."""
+    now = datetime(2026, 11, 22, 8, 56, 16, 123456, UTC)
+    payload = TimeKind().pack(now.timestamp())
+    assert payload == (1795337776123456).to_bytes(8, "little")
+    assert TimeKind().unpack(payload) == pytest.approx(now.timestamp(), abs=1e-6)
+    assert TimeKind().to_dict(now.timestamp())["time"] == "2026-11-22T08:56:16.123+00:00"
+    said = Countdown("red", "green", 12.3)
+    payload = CountdownKind().pack(said)
+    assert payload == bytes([1, 4]) + (12_300).to_bytes(4, "little")
+    assert CountdownKind().unpack(payload) == said
+    assert CountdownKind().to_dict(said) == {"signal": "red", "next_signal": "green", "left_s": 12.3}
+    for value in (-1.0, float("nan"), float("inf"), 3e11):
+        with pytest.raises(ConfigError, match=r"time: .* s, expected seconds since 1970"):
+            TimeKind().pack(value)
+    for wrong, says in (
+        (Countdown("blue", "red", 1.0), r"signal = 'blue', expected one of dark, red"),
+        (Countdown("red", "red", -0.1), r"expected 0 to 86400"),
+        (Countdown("red", "red", float("nan")), r"expected 0 to 86400"),
+    ):
+        with pytest.raises(ConfigError, match=says):
+            CountdownKind().pack(wrong)
+    for kind, data in ((TimeKind(), bytes(7)), (TimeKind(), b"\xff" * 8), (CountdownKind(), bytes(5))):
+        with pytest.raises(BlockError):
+            kind.unpack(data)
+    with pytest.raises(BlockError, match="signal 6, expected 0 to 5"):
+        CountdownKind().unpack(bytes([1, 6, 0, 0, 0, 0]))
+
+
+def test_a_countdown_is_received() -> None:
+    message = Message(Kind.COUNTDOWN, 3, 9, CountdownKind().pack(Countdown("green", "amber", 4.5)))
+    found, _ = heard([message], load_link())
+    assert [(m.kind.name, m.value) for m in found] == [("countdown", Countdown("green", "amber", 4.5))]
 
 
 def bring(number: Any, name: Any, shown: Mapping[str, Any] | None = None) -> tuple[object, MessageKind]:
@@ -125,16 +161,16 @@ def bring(number: Any, name: Any, shown: Mapping[str, Any] | None = None) -> tup
         (3, "wind", r"number 3 or its name is that of 'data' of evlcp-sdk"),
         (7, "text", r"number 7 or its name is that of 'text' of evlcp-sdk"),
         (7, "packet", r"its name is that of a packet's line"),
-        (16, "wind", r"number = 16, expected 5 to 15"),
+        (16, "wind", r"number = 16, expected 7 to 15"),
         (7, None, r"name = None, expected text"),
-        ("5", "wind", r"number = '5', expected 5 to 15"),
+        ("5", "wind", r"number = '5', expected 7 to 15"),
     ],
 )
 def test_a_kind_that_clashes_is_left_out(number: Any, name: Any, told: str) -> None:
     registry = Registry.load(bring(number, name)[0], bring(9, "fine")[0])
     with pytest.warns(PluginWarning, match=told):
         kinds = message_kinds(registry)
-    assert kinds.keys() == {1, 2, 3, 4, 9}
+    assert kinds.keys() == {1, 2, 3, 4, 5, 6, 9}
     # The next link is resolved without another word.
     assert message_kinds(registry).keys() == kinds.keys()
 
@@ -143,7 +179,7 @@ def test_of_two_kinds_of_one_number_one_stays() -> None:
     registry = Registry.load(bring(9, "here")[0], bring(9, "there")[0])
     with pytest.warns(PluginWarning, match="number 9 or its name is that of"):
         kinds = message_kinds(registry)
-    assert len(kinds) == 5
+    assert len(kinds) == 7
     assert len(registry.broken) == 1
 
 

@@ -14,7 +14,7 @@ _FORM = struct.Struct("<BH")
 class SpeedLimit(evlcp.MessageKind):
     """A speed limit: (km/h, metres)."""
 
-    number = 5
+    number = 7
     name = "speed-limit"
 
     def pack(self, value: tuple[int, int]) -> bytes:
