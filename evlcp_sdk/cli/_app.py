@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli._common import echo
+
 if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
 
@@ -93,7 +95,7 @@ def _version(show: bool) -> None:
     if show:
         from importlib.metadata import version
 
-        typer.echo(f"evlcp-sdk {version('evlcp-sdk')}")
+        echo(f"evlcp-sdk {version('evlcp-sdk')}")
         raise typer.Exit
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from evlcp_sdk.cli._common import complain
+from evlcp_sdk.cli._common import complain, console
 
 if TYPE_CHECKING:
     from evlcp_sdk.study.campaign.collect import Progress
@@ -27,13 +27,12 @@ def show_faults(progress: "Progress") -> None:
 @contextmanager
 def progress_bar(name: str) -> "Iterator[Callable[[Progress], None]]":
     """A bar by tasks, with the errors so far, on a terminal only."""
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
-    err = Console(stderr=True)
+    err = console(stderr=True)
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn("{task.fields[errors]}"),

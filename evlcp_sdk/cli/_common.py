@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._complain import complain
+from evlcp_sdk.printable import printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rich.console import Console
+    from rich.console import Console, ConsoleOptions, RenderableType
+    from rich.segment import Segment
 
     from evlcp_sdk.jobs.executor import Executor
     from evlcp_sdk.run import Advance
@@ -25,6 +27,7 @@ __all__ = [
     "bytes_bar",
     "complain",
     "console",
+    "echo",
     "make_executor",
 ]
 
@@ -57,14 +60,29 @@ Dask = Annotated[
 ]
 
 
-def console() -> "Console":
-    """Where tables go: stdout, without colour where it is not a terminal or NO_COLOR is set.
+def echo(text: str, *, nl: bool = True) -> None:
+    """Print a text on stdout; what it has of names and texts from outside moves no cursor."""
+    typer.echo(printable(text), nl=nl)
 
-    Texts are printed as they are: no brackets of a name or a plugin are taken for Rich's markup.
+
+def console(*, stderr: bool = False) -> "Console":
+    """Where tables go: stdout, without colour where it is not a terminal or NO_COLOR is set; bars to stderr.
+
+    Texts are printed as they are: no brackets of a name or a plugin are taken for Rich's markup, and no
+    control characters for the terminal's.
     """
     from rich.console import Console
+    from rich.segment import Segment
 
-    return Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
+    made = Console(highlight=False, soft_wrap=True, markup=False, emoji=False, stderr=stderr)
+    rendered = made.render
+
+    def render(renderable: "RenderableType", options: "ConsoleOptions | None" = None) -> "Iterator[Segment]":
+        for text, style, control in rendered(renderable, options):
+            yield Segment(text if control else printable(text), style, control)
+
+    made.render = render  # type: ignore[method-assign]
+    return made
 
 
 def make_executor(workers: int | None, dask: str | None) -> "Executor":
@@ -90,11 +108,15 @@ def make_executor(workers: int | None, dask: str | None) -> "Executor":
 @contextmanager
 def bytes_bar(name: str) -> "Iterator[Advance]":
     """A bar by bytes read, on a terminal only."""
-    from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
-    err = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    err = console(stderr=True)
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        DownloadColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task(name, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)

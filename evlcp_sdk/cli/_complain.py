@@ -3,17 +3,14 @@
 import sys
 from contextlib import suppress
 
-__all__ = ["complain"]
+from evlcp_sdk.printable import printable
 
-_CONTROLS = {n: f"\\x{n:02x}" for n in (*range(0x20), *range(0x7F, 0xA0)) if n != 0x09}
-"""A name from outside moves no cursor and sets no title."""
+__all__ = ["complain"]
 
 
 def complain(text: str) -> None:
     """Print one line per fault on stderr; without a stderr, nothing."""
-    lines = (f"evlcp: {line.translate(_CONTROLS)}\n" for line in text.split("\n") if line.strip())
-    # A lone surrogate stands for a byte of a file's name that is no text.
-    said = "".join(lines).encode("utf-8", "backslashreplace").decode("utf-8")
+    said = "".join(f"evlcp: {line}\n" for line in printable(text).split("\n") if line.strip())
     if sys.stderr is not None:
         with suppress(OSError, ValueError):
             sys.stderr.write(said)

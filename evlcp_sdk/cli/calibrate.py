@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, echo
 
 if TYPE_CHECKING:
     from evlcp_sdk.place.calibration import Calibrated
@@ -61,7 +61,7 @@ def calibrate(
         recordings, bars, known, link, registry=registry, limit_px=limit_px, name=str(poses)
     )
     if as_json:
-        typer.echo(json.dumps(_table(found) | {"poses": len(known)}))
+        echo(json.dumps(_table(found) | {"poses": len(known)}))
     else:
         console().print(_toml(found, len(known)))
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, console
+from evlcp_sdk.cli._common import Json, LinkFile, console, echo
 
 if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
@@ -78,7 +78,7 @@ def check(
     outcomes = hold(role, link.algorithm(role), reasons, link)
     failed = sum(outcome.status == "failed" for outcome in outcomes)
     if as_json:
-        typer.echo(
+        echo(
             json.dumps(
                 {
                     "role": role,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, complain, console, make_executor
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, complain, console, echo, make_executor
 from evlcp_sdk.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def compare(
     if comparison.tables:
         _write(comparison, out or [])
         if as_json:
-            typer.echo(comparison.to_json(), nl=False)
+            echo(comparison.to_json(), nl=False)
         else:
             _show(comparison, out or [])
     raise typer.Exit(code)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, echo
 
 __all__ = ["register"]
 
@@ -51,9 +51,9 @@ def config(
     registry = Registry.load()
     link = load_link(link_file, overrides or [], registry)
     if codebook is not None:
-        typer.echo(link.codebook.to_json() if codebook is CodebookForm.JSON else link.codebook.to_c())
+        echo(link.codebook.to_json() if codebook is CodebookForm.JSON else link.codebook.to_c())
     elif digest:
-        typer.echo(link.digest)
+        echo(link.digest)
     elif as_json:
         table = {
             "digest": link.digest,
@@ -61,6 +61,6 @@ def config(
             "revisions": link.revisions,
             "configuration": link.table,
         }
-        typer.echo(json.dumps(table, indent=2))
+        echo(json.dumps(table, indent=2))
     else:
-        typer.echo(to_toml(link, registry), nl=False)
+        echo(to_toml(link, registry), nl=False)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from evlcp_sdk.cli._common import Json, Workers, console
+from evlcp_sdk.cli._common import Json, Workers, console, echo
 from evlcp_sdk.plugin.hooks import hookimpl
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
             written = f"{out}/ber.png, rmse.png and more, {results}; {fault}"
         outputs.commit()
     if as_json:
-        typer.echo(json.dumps(summary.to_dict()))
+        echo(json.dumps(summary.to_dict()))
         return
     show_drive(summary)
     console().print(f"written: {written}", style="dim")
@@ -191,7 +191,7 @@ def _decode_recording(out: Path, as_json: bool) -> None:
     # The rows as they are written, which `evlcp score` reads, too.
     found = score_frames(read_frames(out), read_truth(truth_file))
     if as_json:
-        typer.echo(json.dumps(summary | {"score": found}))
+        echo(json.dumps(summary | {"score": found}))
         return
     _show_frames([frame for frame in frames.found if frame.echo_of is None])
     # Most of so short a run is the loading of kernels: its speed says nothing.

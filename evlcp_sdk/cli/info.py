@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json
+from evlcp_sdk.cli._common import Json, echo
 
 __all__ = ["register"]
 
@@ -28,7 +28,7 @@ def info(
 
     with open_source(recording) as source:
         table = describe(source, recording)
-    typer.echo(json.dumps(table, indent=2) if as_json else _text(table))
+    echo(json.dumps(table, indent=2) if as_json else _text(table))
 
 
 def _text(table: dict[str, Any]) -> str:

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json
+from evlcp_sdk.cli._common import Json, echo
 
 if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
@@ -30,7 +30,7 @@ def plugins(as_json: Json = False) -> None:
     from evlcp_sdk.plugin.registry import Registry
 
     table = table_of(Registry.load())
-    typer.echo(json.dumps(table, indent=2) if as_json else _text(table))
+    echo(json.dumps(table, indent=2) if as_json else _text(table))
 
 
 def table_of(registry: "Registry") -> dict[str, list[dict[str, Any]]]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Dask, LinkFile, Overrides, bytes_bar, complain, make_executor
+from evlcp_sdk.cli._common import Dask, LinkFile, Overrides, bytes_bar, complain, console, echo, make_executor
 from evlcp_sdk.cli._summary import show
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
 
@@ -186,10 +186,10 @@ def receive(
                 worst = max(worst, fault.exit_code if fault else 1)
                 if as_json:
                     failed = {"status": "failed", "error": message, "recording": {"path": job.url}}
-                    typer.echo(json.dumps(failed))
+                    echo(json.dumps(failed))
                 continue
             if as_json:
-                typer.echo(json.dumps(summary))
+                echo(json.dumps(summary))
             else:
                 show(summary, job.folder)
             if summary["status"] in ("failed", "degraded"):
@@ -326,10 +326,9 @@ def _stem(url: str) -> str:
 @contextmanager
 def _recordings_bar(number: int) -> Iterator[Callable[[], None]]:
     """A bar by recordings, on a terminal only; none for 0."""
-    from rich.console import Console
     from rich.progress import Progress
 
-    err = Console(stderr=True)
+    err = console(stderr=True)
     with Progress(console=err, transient=True, disable=not (number and err.is_terminal)) as bar:
         task = bar.add_task("recordings", total=number)
         yield lambda: bar.advance(task)

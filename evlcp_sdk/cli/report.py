@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, console
+from evlcp_sdk.cli._common import Json, console, echo
 
 if TYPE_CHECKING:
     from evlcp_sdk.study.campaign.summary import Summary
@@ -69,9 +69,9 @@ def report(
             outputs.write_text(page(summary), out)
         outputs.commit()
     if as_json:
-        typer.echo(json.dumps(summary.to_dict(), indent=1))
+        echo(json.dumps(summary.to_dict(), indent=1))
     elif markdown:
-        typer.echo(as_markdown(summary))
+        echo(as_markdown(summary))
     else:
         if summary.done < summary.tasks:
             console().print(f"{summary.done} of {summary.tasks} tasks are done", style="yellow")

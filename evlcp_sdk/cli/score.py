@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, complain, console
+from evlcp_sdk.cli._common import Json, complain, console, echo
 
 __all__ = ["register", "score"]
 
@@ -51,7 +51,7 @@ def score(
         complain(warning)
     found = score_frames(frames, truth)
     if as_json:
-        typer.echo(json.dumps(found))
+        echo(json.dumps(found))
         return
     screen = console()
     screen.print(f"rows {found['rows']}, matching no true frame {found['unmatched']}")

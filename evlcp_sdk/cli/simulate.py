@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, console
+from evlcp_sdk.cli._common import Json, console, echo
 
 __all__ = ["register", "simulate"]
 
@@ -73,7 +73,7 @@ def simulate(
 
     if presets:
         if as_json:
-            typer.echo(json.dumps(preset_names()))
+            echo(json.dumps(preset_names()))
             return
         for name in preset_names():
             about = next(
@@ -86,7 +86,7 @@ def simulate(
     if show:
         if preset is None:
             raise typer.BadParameter("--show prints a --preset", param_hint="--show")
-        typer.echo(preset_text(preset), nl=False)
+        echo(preset_text(preset), nl=False)
         return
     if preset is not None:
         preset_text(preset)  # a file of that name is not meant
@@ -115,7 +115,7 @@ def simulate(
         "events_per_s": round(counts["events"] / elapsed_s),
     }
     if as_json:
-        typer.echo(json.dumps(summary))
+        echo(json.dumps(summary))
         return
     screen = console()
     screen.print(
@@ -131,11 +131,15 @@ def simulate(
 @contextmanager
 def _progress(name: str, duration_s: float) -> Iterator[Callable[[float], None]]:
     """A bar by seconds of the scene, on a terminal only."""
-    from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-    err = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    err = console(stderr=True)
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task(name, total=duration_s)
         yield lambda done_s: bar.update(task, completed=done_s)

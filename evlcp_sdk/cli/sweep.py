@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from evlcp_sdk.cli._campaign import progress_bar, show_faults
-from evlcp_sdk.cli._common import Dask, Json, Workers, console, make_executor
+from evlcp_sdk.cli._common import Dask, Json, Workers, console, echo, make_executor
 
 __all__ = ["register", "sweep"]
 
@@ -83,7 +83,7 @@ def sweep(
     show_faults(progress)
     if as_json:
         numbers = {k: v for k, v in asdict(progress).items() if k != "faults"}
-        typer.echo(json.dumps({"results": str(path), **numbers, "failed": len(progress.faults)}))
+        echo(json.dumps({"results": str(path), **numbers, "failed": len(progress.faults)}))
     else:
         console().print(
             f"{plan.name}: {progress.done} of {progress.tasks} tasks,"

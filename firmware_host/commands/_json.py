@@ -6,6 +6,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from evlcp_sdk.cli._common import echo
+
 __all__ = ["AsJson", "JsonCommand", "fault_table", "print_json", "say"]
 
 AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, also of what goes wrong.")]
@@ -13,7 +15,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, also of wh
 
 def print_json(value: Any) -> None:
     """Print a value as one line of JSON."""
-    typer.echo(json.dumps(value))
+    echo(json.dumps(value))
 
 
 def say(text: str, table: dict[str, Any], as_json: bool) -> None:
@@ -21,7 +23,7 @@ def say(text: str, table: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print_json(table)
     elif text:
-        typer.echo(text)
+        echo(text)
 
 
 def fault_table(fault: BaseException) -> dict[str, Any]:

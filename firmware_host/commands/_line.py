@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
+from evlcp_sdk.cli._common import console, echo
 from firmware_host.commands._json import JsonCommand, print_json
 
 if TYPE_CHECKING:
@@ -156,11 +157,10 @@ def open_board(context: typer.Context) -> "Iterator[Board]":
 @contextlib.contextmanager
 def progress_bar(what: str) -> "Iterator[Any]":
     """A bar by bytes, on a terminal only: a function of what is done and what there is."""
-    from rich.console import Console
     from rich.progress import Progress
 
-    console = Console(stderr=True)
-    with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
+    screen = console(stderr=True)
+    with Progress(console=screen, disable=not screen.is_terminal, transient=True) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
@@ -169,7 +169,7 @@ def say_watchdog(action: str, timeout_ms: int) -> None:
     """Say what happens once this command has ended, unless the board goes on playing."""
     if action != "keep":
         what = "shows its idle pattern" if action == "idle" else "goes dark"
-        typer.echo(
+        echo(
             f"watchdog: the board {what} once no host has spoken for {timeout_ms / 1e3:g} s;"
             " 'evlcp board monitor' or --keep-alive keeps it playing"
         )
@@ -205,8 +205,8 @@ def say_done(done: Any, as_json: bool) -> None:
 
         print_json(dataclasses.asdict(done))
     elif not done.swapped:
-        typer.echo(f"was there already: {done.length} bytes in bank {done.bank}")
+        echo(f"was there already: {done.length} bytes in bank {done.bank}")
     else:
-        typer.echo(f"sent {done.written} of {done.length} bytes; bank {done.bank} is active")
+        echo(f"sent {done.written} of {done.length} bytes; bank {done.bank} is active")
     if not as_json:
         say_watchdog(done.watchdog, done.watchdog_ms)

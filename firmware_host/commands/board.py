@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import LinkFile, Overrides
+from evlcp_sdk.cli._common import LinkFile, Overrides, echo
 from firmware_host.commands import _firmware, _source
 from firmware_host.commands._json import AsJson, JsonCommand, fault_table, print_json, say
 from firmware_host.commands._line import (
@@ -85,7 +85,7 @@ def _show(table: dict[str, Any], as_json: bool) -> None:
         return
     for key, value in table.items():
         text = ", ".join(map(str, value)) if isinstance(value, list) else value
-        typer.echo(f"{key:20} {'-' if text in ('', None) else text}")
+        echo(f"{key:20} {'-' if text in ('', None) else text}")
 
 
 @app.command(cls=SurveyCommand)
@@ -139,10 +139,10 @@ def ports(
             about = about_table(f.about)
             what = f"{about['hal']} {about['unique_id']}, firmware {about['firmware']}"
         serial = f" {f.port.serial_number}" if f.port.serial_number else ""
-        typer.echo(f"{f.port.device}  {f.port.usb or '-'}{serial}  {f.port.description}  {what}")
+        echo(f"{f.port.device}  {f.port.usb or '-'}{serial}  {f.port.description}  {what}")
     if not found:
         which = "no serial ports" if usb is None else f"no serial port with USB id {usb}"
-        typer.echo(f"{which}; emulated boards: --port native: or --port qemu:")
+        echo(f"{which}; emulated boards: --port native: or --port qemu:")
 
 
 @app.command(cls=LineCommand)
@@ -481,7 +481,7 @@ def _print_seen(seen: "StatusReply | Gone | Back", which: dict[str, Any], as_jso
         print_json(which | status_table(seen))
     else:
         head = f"{name}  " if "id" in which else ""
-        typer.echo(
+        echo(
             f"{head}{seen.uptime_ms / 1e3:10.1f} s  {name_of(State, seen.state):12}"
             f" packets {seen.packets_sent:8}"
             f"  late {seen.lateness_ticks:5} (max {seen.lateness_max_ticks}) ticks"
@@ -622,7 +622,7 @@ def emulate(
     try:
         if emulator is not Emulator.NATIVE and (line := wait_for(listen, process)) is not None:
             line.close()
-            typer.echo(f"listening on {listen}")
+            echo(f"listening on {listen}")
         code = process.wait()
     except KeyboardInterrupt:
         process.terminate()

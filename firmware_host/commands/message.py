@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import LinkFile, Overrides
+from evlcp_sdk.cli._common import LinkFile, Overrides, echo
 from firmware_host.commands._json import AsJson, print_json, say
 from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, progress_bar, say_done
 from firmware_host.commands._output import save_array
@@ -225,14 +225,14 @@ def message(
 def _tell(summary: dict[str, Any], written: list[str], plays: bool) -> None:
     """Say what was put on packets, and where they are."""
     for m in summary["messages"]:
-        typer.echo(
+        echo(
             f"{m['kind']:9} {m['bytes']:5} bytes, transmitter {m['transmitter_id']}, sequence {m['sequence']}"
         )
     number = summary["packets"]
     said = f"{number} packet{'s' * (number != 1)}, {summary['duration_s']:.4g} s"
     if written:
         said += f", in {' and '.join(written)}"
-    typer.echo(said + ", again and again" * plays)
+    echo(said + ", again and again" * plays)
 
 
 def keygen(

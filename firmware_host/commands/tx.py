@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import LinkFile, Overrides
+from evlcp_sdk.cli._common import LinkFile, Overrides, echo
 from firmware_host.commands import _source
 from firmware_host.commands._json import AsJson, JsonCommand, print_json
 from firmware_host.commands._output import save_array
@@ -64,7 +64,7 @@ def frames(
         with Outputs() as outputs:
             save_array(chips, symbol_chips(table, link.codebook, link.packet.pilot_every), outputs)
             outputs.commit()
-    typer.echo(_FORMS[form](table, link))
+    echo(_FORMS[form](table, link))
 
 
 def _words(codes: "NDArray[np.int8]") -> list[str]:
@@ -162,10 +162,10 @@ def check(
     if as_json:
         print_json({"chip_rate_hz": chip_rate, "clusters": [r.to_dict() for r in rows]})
     else:
-        typer.echo("cluster  on-share  longest-run  worst-line  modulation  no-effect bound  verdict")
+        echo("cluster  on-share  longest-run  worst-line  modulation  no-effect bound  verdict")
         for r in rows:
             verdict = "no effect" if r.no_effect else "low risk" if r.low_risk else "FLICKERS"
-            typer.echo(
+            echo(
                 f"{r.cluster:7}  {r.on_share:8.4f}  {r.longest_run:11}  {r.line_hz:7.1f} Hz"
                 f"  {r.line_percent:8.2f} %  {r.limit_percent:13.2f} %  {verdict}"
             )

@@ -1,0 +1,22 @@
+"""Text from outside on a terminal: names, messages and headers that move no cursor and set no title."""
+
+from typing import Final
+
+__all__ = ["printable"]
+
+_CONTROLS: Final = {
+    **{n: f"\\x{n:02x}" for n in (*range(0x20), *range(0x7F, 0xA0)) if chr(n) not in "\t\n"},
+    # What turns the direction of a text, and so shows another one than it is.
+    **{n: f"\\u{n:04x}" for n in (0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A))},
+}
+
+
+def printable(text: str) -> str:
+    r"""A text with its control characters, but tabs and line feeds, as escapes.
+
+    A lone surrogate, which stands for a byte of a file's name that is no text, becomes one, too.
+
+    >>> print(printable("\x1b]0;mine\x07.raw"))
+    \x1b]0;mine\x07.raw
+    """
+    return text.translate(_CONTROLS).encode("utf-8", "backslashreplace").decode("utf-8")

@@ -1,0 +1,80 @@
+"""What names, files and plugins say moves no cursor, on a terminal as elsewhere."""
+
+import os
+import pty
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.io import write_events
+from evlcp_sdk.printable import printable
+from evlcp_sdk.values import Events
+
+TITLE = "\x1b]0;mine\x07\x9b31m\u202e"
+COMMAND = "from evlcp_sdk.cli.main import main; main()"
+
+
+def on_a_terminal(*arguments: str) -> str:
+    """Run a command on a terminal without colours; all that it shows."""
+    inside, outside = pty.openpty()
+    run = subprocess.Popen(
+        [sys.executable, "-c", COMMAND, *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=outside,
+        stderr=outside,
+        env=os.environ | {"TERM": "dumb", "NO_COLOR": "1", "PYTHONUTF8": "1"},
+    )
+    os.close(outside)
+    shown = b""
+    while True:
+        try:
+            piece = os.read(inside, 1 << 16)
+        except OSError:
+            break
+        if not piece:
+            break
+        shown += piece
+    os.close(inside)
+    run.wait()
+    return shown.decode("utf-8")
+
+
+def test_control_characters_are_escapes_and_the_rest_is_as_it_is() -> None:
+    assert printable("a\tb\nä 光 [bold]") == "a\tb\nä 光 [bold]"
+    assert printable(TITLE) == r"\x1b]0;mine\x07\x9b31m\u202e"
+    assert printable("\udcff\r\x7f") == r"\udcff\x0d\x7f"
+
+
+@pytest.mark.parametrize("what", ["receive", "info", "missing", "option", "command", "set", "config"])
+def test_no_control_character_reaches_a_terminal(what: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a{TITLE}.raw"
+    write_events(path, Events.of(np.arange(5), *np.ones((3, 5), np.int64)), 1280, 720)
+    (tmp_path / "link.toml").write_text('[air]\n"chip\\u001b[31m" = 5\n')
+    arguments = {
+        "receive": ("receive", str(path), "-o", str(tmp_path / f"out{TITLE}")),
+        "info": ("info", str(path)),
+        "missing": ("info", str(tmp_path / f"b{TITLE}.raw")),
+        "option": ("info", f"--{TITLE}", str(path)),
+        "command": (f"x{TITLE}",),
+        "set": ("config", "--set", f"air.{TITLE}=5"),
+        "config": ("config", "-c", str(tmp_path / "link.toml")),
+    }[what]
+    shown = on_a_terminal(*arguments)
+    assert r"\x1b" in shown
+    assert not {c for c in shown if c not in "\r\n\t" and (ord(c) < 0x20 or 0x7F <= ord(c) < 0xA0)}, shown
+    # A fault of the command line itself is told by typer, to whoever typed it.
+    assert what == "option" or "\u202e" not in shown
+
+
+def test_commands_print_by_the_one_way_only() -> None:
+    root = Path(__file__).parents[3]
+    files = [*root.glob("evlcp_sdk/cli/*.py"), *root.glob("firmware_host/commands/*.py")]
+    assert len(files) > 20
+    for path in files:
+        text = path.read_text()
+        if path.name == "_common.py":
+            continue
+        assert not [name for name in ("typer.echo(", " Console(", "=Console(", " print(") if name in text], path
