@@ -7,7 +7,7 @@ TOOLCHAIN := firmware_host/firmware/install-toolchain.sh
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint fuzz format pictures clean
+.PHONY: help demo test lint fuzz sbom format pictures clean
 
 help:  ## Show this list
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -26,6 +26,9 @@ lint: $(VENV)/.dev  ## Format, lint and types only
 MINUTES ?= 5
 fuzz: $(VENV)/.dev  ## Damage files of every kind and read them, for MINUTES
 	$(BIN)/python -m tests.fuzz --minutes $(MINUTES)
+
+sbom: $(VENV)/.dev  ## Write sbom.json, what the tests run with, from the lock
+	$(BIN)/python .ci/sbom.py > sbom.json
 
 format: $(VENV)/.dev  ## Format the code
 	$(BIN)/ruff format

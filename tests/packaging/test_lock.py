@@ -1,6 +1,9 @@
 """The lock of development holds what `pyproject.toml` asks for, each file by its hash."""
 
+import json
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -52,3 +55,21 @@ def test_every_package_is_pinned_by_version_and_hash() -> None:
 
 def test_the_lock_names_no_registry_and_no_machine() -> None:
     assert not re.search(r"://|index-url|find-links|^\s*-[a-z]|/[a-z]+/", LOCK)
+
+
+def test_the_sbom_names_every_package_of_the_lock() -> None:
+    """`make sbom`, by its output: the lock's packages, no more and no less, the same each time."""
+    command = [sys.executable, ROOT / ".ci" / "sbom.py"]
+    said = [subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2)]
+    assert said[0] == said[1]
+    table = json.loads(said[0])
+    assert (table["bomFormat"], table["specVersion"]) == ("CycloneDX", "1.6")
+    assert table["metadata"]["component"]["name"] == PROJECT["project"]["name"]
+    packages = {
+        (canonicalize_name(r.name), str(r.specifier).removeprefix("==")) for r in map(requirement, entries())
+    }
+    assert {(one["name"], one["version"]) for one in table["components"]} == packages
+    assert all(one["purl"] == f"pkg:pypi/{one['name']}@{one['version']}" for one in table["components"])
+    refs = [one["bom-ref"] for one in table["components"]]
+    assert len(set(refs)) == len(refs) > 50
+    assert "sbom:" in (ROOT / "Makefile").read_text()
