@@ -1,7 +1,7 @@
 """The SBOM (CycloneDX 1.6) of what `make test` runs with, from the lock and pyproject.toml: `make sbom`.
 
-Without a time and a serial number, so that the same lock gives the same bytes. The hashes of the files stay in
-the lock.
+Without a time and a serial number, so that the same lock gives the same bytes. The hashes of the files stay
+in the lock.
 """
 
 import json
@@ -53,6 +53,7 @@ def sbom(lock: str, project: dict[str, Any]) -> dict[str, Any]:
 
 
 def main() -> None:
+    """Print it as JSON."""
     lock = (ROOT / "requirements-dev.lock").read_text()
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     sys.stdout.write(json.dumps(sbom(lock, project), indent=1) + "\n")
