@@ -94,10 +94,12 @@ def native_library() -> Path:
 
 
 def arm_image(board: str) -> Path:
-    """The ARM image of a board: `mps2-an385`, `stm32f405`, `stm32f405-12mhz` or `stm32f405-netduinoplus2`.
+    """The ARM image of a board: `mps2-an385`, `stm32f405`, `stm32f405-12mhz` or `stm32f405-netduinoplus2`;
+    with `-1` or `-2` an STM32's for one of the two places of updates.
 
     Raises:
         ToolchainError: The cross compiler is missing, or fails.
     """
     _compiler("arm-none-eabi-gcc", "gcc-arm-none-eabi")
-    return make("mps2" if board == "mps2-an385" else "stm32") / f"{board}.elf"
+    goal = "mps2" if board == "mps2-an385" else "images" if board[-2:] in ("-1", "-2") else "stm32"
+    return make(goal) / f"{board}.elf"

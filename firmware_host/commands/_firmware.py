@@ -1,4 +1,4 @@
-"""`evlcp board build` and `flash`: the firmware as files, and into a part."""
+"""`evlcp board build`, `flash` and `update`: the firmware as files, into a part, and over a board's line."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 
 from firmware_host.commands._json import AsJson, say
-from firmware_host.commands._line import BoardLine, LineCommand, from_command_line, progress_bar
+from firmware_host.commands._line import BoardLine, LineCommand, from_command_line, open_board, progress_bar
 
-__all__ = ["FlashCommand", "Target", "build_images", "flash"]
+__all__ = ["FlashCommand", "Target", "build_images", "flash", "update"]
 
 
 class Target(StrEnum):
@@ -33,17 +33,24 @@ def build_images(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where to.")] = Path(),
     as_json: AsJson = False,
 ) -> None:
-    """Build the firmware: TARGET.elf, .hex and .bin.
+    """Build the firmware: TARGET.elf, .hex and .bin, and TARGET.update.json for a board in the field.
 
     For example: [bold]evlcp board build --target stm32f405-8mhz -o build[/]
     """
     from evlcp_sdk.files import Outputs, output_fault
+    from firmware_host.board.update import Package
     from firmware_host.build import TARGETS, arm_image
     from firmware_host.images import FlashImage
 
     elf = arm_image(TARGETS[target])
     image = FlashImage.read(elf)
-    contents = {".elf": elf.read_bytes(), ".hex": image.hex_text().encode(), ".bin": image.data}
+    package = Package.built(target).to_json()
+    contents = {
+        ".elf": elf.read_bytes(),
+        ".hex": image.hex_text().encode(),
+        ".bin": image.data,
+        ".update.json": package.encode(),
+    }
     paths = [output / f"{target}{suffix}" for suffix in contents]
     try:
         output.mkdir(parents=True, exist_ok=True)
@@ -59,7 +66,9 @@ def build_images(
         "bytes": len(image.data),
         "files": [str(path) for path in paths],
     }
-    say(f"{paths[0]}, .hex, .bin: {len(image.data)} bytes at {image.address:#x}", table, as_json)
+    say(
+        f"{paths[0]}, .hex, .bin, .update.json: {len(image.data)} bytes at {image.address:#x}", table, as_json
+    )
 
 
 def flash(
@@ -115,3 +124,42 @@ def flash(
     words = [f"{line.port}: {len(image.data)} bytes in sectors {sectors[0]} to {sectors[-1]}"]
     words += ["read back"] * verify + ["brown-out reset set"] * brown_out
     say("; ".join([*words, "BOOT0 low and reset starts it"]), table, as_json)
+
+
+def update(
+    context: typer.Context,
+    file: Annotated[Path | None, typer.Argument(metavar="FILE", help="TARGET.update.json.")] = None,
+    target: Annotated[Target | None, typer.Option(help="Or build it for a part and crystal.")] = None,
+    confirm: Annotated[
+        bool, typer.Option("--confirm", help="Only keep the image that runs on trial.")
+    ] = False,
+    keep: Annotated[bool, typer.Option(help="Keep the new one once it answers; else it is on trial.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Bring another firmware onto a dark board, over its own line.
+
+    It runs on trial until it has answered; one that does not is left at the third reset, and the one before
+    runs again. The power may fail at any moment.
+
+    For example: [bold]evlcp board update stm32f405-8mhz.update.json --port /dev/ttyUSB0[/]
+    """
+    from evlcp_sdk.errors import ConfigError
+    from firmware_host.board import update as field
+
+    if (file is not None) + (target is not None) + confirm != 1:
+        raise ConfigError("give an update, --target to build one, or --confirm, one of the three")
+    package = None
+    if file is not None:
+        package = field.Package.read(file)
+    elif target is not None:
+        package = field.Package.built(target)
+    with open_board(context) as board:
+        if package is None:
+            running = field.update_status(board).running
+            field.confirm(board)
+            say(f"image {running} is kept", {"image": running, "kept": True}, as_json)
+            return
+        with progress_bar("updating") as progress:
+            done = field.update(board, package, progress, keep)
+    words = f"image {done.image} runs, {done.length} bytes, firmware {done.firmware}"
+    say(words + ("" if keep else ", on trial"), done.to_dict() | {"kept": keep}, as_json)

@@ -51,6 +51,7 @@ app = typer.Typer(
 app.callback()(line_options)
 app.command("build", cls=JsonCommand)(_firmware.build_images)
 app.command(cls=_firmware.FlashCommand)(_firmware.flash)
+app.command(cls=LineCommand)(_firmware.update)
 
 Masks = Annotated[
     Path | None,

@@ -33,6 +33,9 @@ def _library() -> ctypes.CDLL:
         ("flip_flash", None, [handle, ctypes.c_uint8, ctypes.c_uint32]),
         ("shown", None, [handle, ctypes.c_char_p]),
         ("level", ctypes.c_uint16, [handle]),
+        ("running", ctypes.c_uint8, [handle]),
+        ("cut_power", None, [handle, ctypes.c_uint32]),
+        ("image", None, [handle, ctypes.c_uint8, ctypes.c_char_p]),
     ):
         function = getattr(library, f"board_{name}")
         function.restype, function.argtypes = result, arguments
@@ -95,6 +98,20 @@ class SimulatedBoard:
     def level_ma(self) -> int:
         """The LED current that the hardware is set to, mA."""
         return int(self._c.board_level(self._board))
+
+    def running(self) -> int:
+        """The image of the firmware that runs: 0 the first, 1 or 2 one that came by an update."""
+        return int(self._c.board_running(self._board))
+
+    def image(self, image: int, count: int) -> bytes:
+        """The first bytes in the place of image 1 or 2."""
+        room = ctypes.create_string_buffer(1 << 16)
+        self._c.board_image(self._board, image, room)
+        return room.raw[:count]
+
+    def cut_power(self, left: int) -> None:
+        """Let the flash do so many words and erases more, the last one by half; 0: all of them."""
+        self._c.board_cut_power(self._board, left)
 
     def set_health(self, temperature_c: float = 25.0, faults: int = 0, open_led: int = 255) -> None:
         """What the sensors report from now on; an `open_led` of 255 is none."""

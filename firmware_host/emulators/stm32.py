@@ -31,7 +31,7 @@ LEDS = 96
 RETURN = 0x1FFE0000
 """Where BX LR goes at the end of an exception: a place the part does not have."""
 
-RESET_BY_PIN, RESET_BY_IWDG = 1 << 26, 1 << 29
+RESET_BY_PIN, RESET_BY_SOFTWARE, RESET_BY_IWDG = 1 << 26, 1 << 28, 1 << 29
 SLICE = 240
 """Instructions from one look at the events to the next, at most: 1.4 us at 168 MHz."""
 
@@ -535,8 +535,8 @@ class Flash:
             self.cr = value
             if value & 0x10002 == 0x10002:
                 sector = value >> 3 & 15
-                assert 8 <= sector < 12, "the last four, of 128 KiB each"
-                self.chip.uc.mem_write(0x08080000 + 0x20000 * (sector - 8), b"\xff" * 0x20000)
+                assert 6 <= sector < 12, "the last six, of 128 KiB each"
+                self.chip.uc.mem_write(0x08040000 + 0x20000 * (sector - 6), b"\xff" * 0x20000)
                 self.chip.now += UNIT_HZ
                 self.stale = bool(self.acr & 0x600)
                 self.cr &= ~0x10000
@@ -568,7 +568,7 @@ class Stm32:
             uc.mmio_map(base, size, self._read, base, self._write, base)
         whole = FlashImage.read(image) if isinstance(image, Path) else image
         uc.mem_write(whole.address, whole.data)
-        uc.hook_add(unicorn.UC_HOOK_MEM_READ, self._slot_read, begin=0x08080000, end=0x080FFFFF)
+        uc.hook_add(unicorn.UC_HOOK_MEM_READ, self._slot_read, begin=0x080C0000, end=0x080FFFFF)
         self.now = 0
         self.events: list[tuple[int, int, Callable[[], None]]] = []
         self.order = count()
@@ -687,6 +687,7 @@ class Stm32:
             self.core_stands = True
 
     core_stands = False
+    restarts = False
     thermal_open = False
     """Too hot, or the wire to the switch is broken."""
 
@@ -747,6 +748,10 @@ class Stm32:
             self.pending -= gone - self.lines
         elif 0xE000E400 <= at < 0xE000E500:
             self.priorities[16 + at - 0xE000E400] = value & 0xF0
+        elif at == 0xE000ED0C:
+            assert value == 0x05FA0004
+            self.restarts = True
+            self.uc.emu_stop()
         elif at == 0xE000ED04:
             assert value == 1 << 25
             self.pending.discard(15)
@@ -790,7 +795,8 @@ class Stm32:
         uc.mem_write(stack, struct.pack("<8I", *frame))
         uc.reg_write(c.UC_ARM_REG_SP, stack)
         uc.reg_write(c.UC_ARM_REG_LR, RETURN | 1)
-        handler = struct.unpack("<I", uc.mem_read(0x08000000 + 4 * number, 4))[0]
+        table = self.plain.get(0xE000ED08, 0) or 0x08000000
+        handler = struct.unpack("<I", uc.mem_read(table + 4 * number, 4))[0]
         assert handler & 1, f"exception {number} has no handler"
         self.pc = handler & ~1
         self.active.append(number)
@@ -840,6 +846,9 @@ class Stm32:
             instructions = max(1, min(SLICE, (until - self.now) // self.cycle))
             resets = len(self.resets)
             self.uc.emu_start(self.pc | 1, RETURN, count=instructions)
+            if self.restarts:
+                self.restarts = False
+                self.reset(RESET_BY_SOFTWARE)
             if len(self.resets) != resets:
                 continue
             self.now += instructions * self.cycle

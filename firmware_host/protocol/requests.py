@@ -62,6 +62,18 @@ __all__ = [
     "StreamReply",
     "StreamRequest",
     "Type",
+    "UpdateBeginReply",
+    "UpdateBeginRequest",
+    "UpdateCommitReply",
+    "UpdateCommitRequest",
+    "UpdateConfirmReply",
+    "UpdateConfirmRequest",
+    "UpdateRestartReply",
+    "UpdateRestartRequest",
+    "UpdateStatusReply",
+    "UpdateStatusRequest",
+    "UpdateWriteReply",
+    "UpdateWriteRequest",
     "Watchdog",
     "WatchdogReply",
     "WatchdogRequest",
@@ -114,6 +126,12 @@ class Type(IntEnum):
     LED_TEST = 0x10
     STREAM = 0x18
     PUSH = 0x19
+    UPDATE_STATUS = 0x20
+    UPDATE_BEGIN = 0x21
+    UPDATE_WRITE = 0x22
+    UPDATE_COMMIT = 0x23
+    UPDATE_RESTART = 0x24
+    UPDATE_CONFIRM = 0x25
 
 
 class Status(IntEnum):
@@ -218,6 +236,8 @@ class Capability(IntFlag):
     """LED outputs are recorded (emulators)."""
     STREAM = 32
     """STREAM and PUSH: packets as they come."""
+    UPDATE = 256
+    """UPDATE_*: takes another image of its firmware."""
 
 
 class BoardFault(IntFlag):
@@ -985,6 +1005,167 @@ class PushReply(WireMessage):
     underruns: int
 
 
+@dataclass(frozen=True, slots=True)
+class UpdateStatusRequest(WireMessage):
+    """Which image of the firmware runs, and where another one would go."""
+
+    TYPE: ClassVar[int] = 0x20
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateStatusReply(WireMessage):
+    """What the board answers to UPDATE_STATUS.
+
+    Attributes:
+        running: Image that runs: 0 the one that was flashed, 1 or 2 one that came by an update.
+        trial: 1: it runs on trial, and is left at the third reset unless it is confirmed.
+        next: Image that an update takes the place of.
+        capacity: Largest image, bytes.
+        sequence: Number of the newest update, 0 if there was none.
+        target: What the board is, ASCII, zero-padded: part and crystal.
+    """
+
+    TYPE: ClassVar[int] = 0x20
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("B", 1),
+        ("B", 1),
+        ("I", 1),
+        ("I", 1),
+        ("16s", 1),
+    )
+
+    running: int
+    trial: int
+    next: int
+    capacity: int
+    sequence: int
+    target: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateBeginRequest(WireMessage):
+    """Erase the place of the next image; only while the LEDs are dark, and not on trial.
+
+    Attributes:
+        image: Image, as UPDATE_STATUS says.
+        length: Its bytes.
+        crc: Their CRC-32/ISO-HDLC.
+    """
+
+    TYPE: ClassVar[int] = 0x21
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("B", 1),
+        ("I", 1),
+        ("I", 1),
+    )
+
+    image: int
+    length: int
+    crc: int
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateBeginReply(WireMessage):
+    """What the board answers to UPDATE_BEGIN."""
+
+    TYPE: ClassVar[int] = 0x21
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateWriteRequest(WireMessage):
+    """Write into the place that was erased.
+
+    Attributes:
+        offset: First byte, a multiple of four.
+        data: Content.
+    """
+
+    TYPE: ClassVar[int] = 0x22
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("I", 1),
+        ("*", 1),
+    )
+
+    offset: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateWriteReply(WireMessage):
+    """What the board answers to UPDATE_WRITE.
+
+    Attributes:
+        offset: First byte.
+        count: Bytes written.
+    """
+
+    TYPE: ClassVar[int] = 0x22
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("I", 1),
+        ("H", 1),
+    )
+
+    offset: int
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateCommitRequest(WireMessage):
+    """Check the CRC of what was written; it runs on trial from the next reset on."""
+
+    TYPE: ClassVar[int] = 0x23
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateCommitReply(WireMessage):
+    """What the board answers to UPDATE_COMMIT.
+
+    Attributes:
+        sequence: Number of this update.
+    """
+
+    TYPE: ClassVar[int] = 0x23
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (("I", 1),)
+
+    sequence: int
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateRestartRequest(WireMessage):
+    """Reset, a little after the answer; only while the LEDs are dark."""
+
+    TYPE: ClassVar[int] = 0x24
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateRestartReply(WireMessage):
+    """What the board answers to UPDATE_RESTART."""
+
+    TYPE: ClassVar[int] = 0x24
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateConfirmRequest(WireMessage):
+    """Keep the image that runs: the trial is over; only while the LEDs are dark."""
+
+    TYPE: ClassVar[int] = 0x25
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateConfirmReply(WireMessage):
+    """What the board answers to UPDATE_CONFIRM."""
+
+    TYPE: ClassVar[int] = 0x25
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+
 REPLIES: dict[int, type[WireMessage]] = {
     0x01: HelloReply,
     0x02: ConfigureReply,
@@ -1004,5 +1185,11 @@ REPLIES: dict[int, type[WireMessage]] = {
     0x10: LedTestReply,
     0x18: StreamReply,
     0x19: PushReply,
+    0x20: UpdateStatusReply,
+    0x21: UpdateBeginReply,
+    0x22: UpdateWriteReply,
+    0x23: UpdateCommitReply,
+    0x24: UpdateRestartReply,
+    0x25: UpdateConfirmReply,
 }
 """The reply of each request type."""

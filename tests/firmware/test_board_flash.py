@@ -14,6 +14,7 @@ from evlcp_sdk.errors import InputError
 from firmware_host import build
 from firmware_host.board.board import Board
 from firmware_host.board.session import Session
+from firmware_host.board.update import Package
 from firmware_host.emulators.rom import RomEmulator, RomLine
 from firmware_host.errors import LineError, NoBoardError, RefusedError, VerifyError
 from firmware_host.images import FLASH_START, FlashImage
@@ -37,7 +38,8 @@ def test_files_are_those_of_objcopy(cli, needs: Callable[..., None], tmp_path: P
         done = cli("board", "build", "--target", target, "-o", tmp_path / "new", "--json")
         assert done.returncode == 0, done.stderr
         table = json.loads(done.stdout)
-        elf, hexed, binary = (Path(file) for file in table["files"])
+        elf, hexed, binary, package = (Path(file) for file in table["files"])
+        assert Package.read(package) == Package.built(target)
         for suffix, ours in (("binary", binary), ("ihex", hexed)):
             theirs = tmp_path / f"theirs.{suffix}"
             subprocess.run(["arm-none-eabi-objcopy", "-O", suffix, elf, theirs], check=True)

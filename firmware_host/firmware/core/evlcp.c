@@ -4,6 +4,7 @@
 
 #define HEALTH_EVERY_MS 100u
 #define WATCHDOG_MIN_MS 100u
+#define RESTART_AFTER_MS 20u /* the answer has left by then */
 #define HOLDS_DARK (EVLCP_FAULT_OVER_TEMPERATURE | EVLCP_FAULT_CLOCK)
 
 static const uint8_t dark[EVLCP_ROW_BYTES];
@@ -538,9 +539,76 @@ static enum evlcp_status on_led_test(struct evlcp *e, struct exchange *x)
     return EVLCP_STATUS_OK;
 }
 
+/* Flash of an image is written and erased only in the dark: the processor of a single-bank part stands meanwhile. */
+static enum evlcp_status may_update(struct evlcp *e)
+{
+    if ((e->info.capabilities & EVLCP_CAPABILITY_UPDATE) == 0u)
+        return EVLCP_STATUS_NOT_SUPPORTED;
+    return running(e) || atomic_load(&e->player.want_play) || e->test.on ? EVLCP_STATUS_BUSY : EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_update_status(struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_update_status_reply reply = {0};
+    if ((e->info.capabilities & EVLCP_CAPABILITY_UPDATE) == 0u)
+        return EVLCP_STATUS_NOT_SUPPORTED;
+    evlcp_update_tell(&reply);
+    evlcp_copy(reply.target, e->info.target, sizeof reply.target);
+    evlcp_update_status_reply_put(x->out, &reply);
+    x->out_length = EVLCP_UPDATE_STATUS_REPLY_BYTES;
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_update_write(struct evlcp *e, struct exchange *x)
+{
+    uint32_t offset = evlcp_get32(x->in);
+    uint32_t count = x->in_length - EVLCP_UPDATE_WRITE_REQUEST_BYTES;
+    enum evlcp_status status = may_update(e);
+    if (status == EVLCP_STATUS_OK)
+        status = evlcp_update_write(&e->update, offset, x->in + EVLCP_UPDATE_WRITE_REQUEST_BYTES, count, &x->detail);
+    if (status == EVLCP_STATUS_OK) {
+        const struct evlcp_update_write_reply reply = {.offset = offset, .count = (uint16_t)count};
+        evlcp_update_write_reply_put(x->out, &reply);
+        x->out_length = EVLCP_UPDATE_WRITE_REPLY_BYTES;
+    }
+    return status;
+}
+
+static enum evlcp_status on_update(struct evlcp *e, uint8_t type, struct exchange *x)
+{
+    struct evlcp_update_begin_request begin;
+    struct evlcp_update_commit_reply reply = {0};
+    enum evlcp_status status = may_update(e);
+    if (status != EVLCP_STATUS_OK)
+        return status;
+    switch (type) {
+    case EVLCP_TYPE_UPDATE_BEGIN:
+        evlcp_update_begin_request_get(x->in, &begin);
+        return evlcp_update_begin(&e->update, &begin, &x->detail);
+    case EVLCP_TYPE_UPDATE_COMMIT:
+        status = evlcp_update_commit(&e->update, &reply.sequence, &x->detail);
+        if (status == EVLCP_STATUS_OK) {
+            evlcp_update_commit_reply_put(x->out, &reply);
+            x->out_length = EVLCP_UPDATE_COMMIT_REPLY_BYTES;
+        }
+        return status;
+    case EVLCP_TYPE_UPDATE_RESTART:
+        e->update.restart = true;
+        e->update.restart_ms = hal_millis();
+        return EVLCP_STATUS_OK;
+    default:
+        return evlcp_update_confirm();
+    }
+}
+
 static enum evlcp_status on_control(struct evlcp *e, uint8_t type, struct exchange *x)
 {
     switch (type) {
+    case EVLCP_TYPE_UPDATE_BEGIN:
+    case EVLCP_TYPE_UPDATE_COMMIT:
+    case EVLCP_TYPE_UPDATE_RESTART:
+    case EVLCP_TYPE_UPDATE_CONFIRM:
+        return on_update(e, type, x);
     case EVLCP_TYPE_CONFIGURE:
         return on_configure(e, x);
     case EVLCP_TYPE_CODEBOOK:
@@ -674,6 +742,10 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
         return after(d->sequence, c->sequence) ? on_write(e, x) : EVLCP_STATUS_STALE;
     case EVLCP_TYPE_PUSH:
         return after(d->sequence, c->sequence) ? on_push(e, x) : EVLCP_STATUS_STALE;
+    case EVLCP_TYPE_UPDATE_WRITE:
+        return after(d->sequence, c->sequence) ? on_update_write(e, x) : EVLCP_STATUS_STALE;
+    case EVLCP_TYPE_UPDATE_STATUS:
+        return on_update_status(e, x);
     case EVLCP_TYPE_READ:
         return on_read(e, x);
     case EVLCP_TYPE_CRC:
@@ -775,6 +847,7 @@ void evlcp_init(struct evlcp *e)
         .action = EVLCP_WATCHDOG_KEEP, .heard_ms = hal_millis(), .asked_ms = hal_millis()};
     e->test.on = false;
     e->control = (struct evlcp_control){.known = false};
+    e->update = (struct evlcp_update){.open = false};
     e->session = EVLCP_NO_SESSION;
     e->nonce = 0u;
     e->requests = 0u;
@@ -834,4 +907,6 @@ void evlcp_poll(struct evlcp *e)
     watch(e, now);
     check_health(e, now);
     walk(e, now);
+    if (e->update.restart && now - e->update.restart_ms >= RESTART_AFTER_MS && !running(e))
+        hal_restart();
 }

@@ -7,10 +7,13 @@
 #include "hal.h"
 #include "link.h"
 #include "player.h"
+#include "update.h"
 
 #define EVLCP_VERSION_MAJOR 1u
 #define EVLCP_VERSION_MINOR 0u
+#ifndef EVLCP_VERSION_PATCH
 #define EVLCP_VERSION_PATCH 0u
+#endif
 
 #define EVLCP_SLOTS 2u
 #define EVLCP_SLOT_HEADER_BYTES 128u
@@ -53,6 +56,7 @@ struct evlcp {
     struct evlcp_watch watch;
     struct evlcp_test test;
     struct evlcp_control control;
+    struct evlcp_update update;
     struct evlcp_health health;
     uint32_t health_ms;
     uint32_t nonce;

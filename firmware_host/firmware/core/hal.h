@@ -19,6 +19,7 @@ struct evlcp_hal_info {
     uint32_t capabilities;       /* enum evlcp_capability */
     uint8_t unique_id[12];
     uint8_t name[12]; /* of the hardware layer, ASCII, zero-padded */
+    uint8_t target[16]; /* what an image is built for */
 };
 
 /* What the sensors say; a temperature of INT16_MIN is not measured. `faults` holds over_temperature, open_led and clock of enum evlcp_fault. */
@@ -58,9 +59,16 @@ bool hal_level(uint16_t level_ma);
 /* Read the sensors. */
 void hal_health(struct evlcp_health *health);
 
-/* Two flash slots of at least EVLCP_SLOT_BYTES each. Called only while no chip call runs. */
+/* Two flash slots of at least EVLCP_SLOT_BYTES each, and, with EVLCP_CAPABILITY_UPDATE, two more of
+   EVLCP_IMAGE_SLOT_BYTES. Called only while no chip call runs. */
 bool hal_flash_erase(uint8_t slot);
 bool hal_flash_write(uint8_t slot, uint32_t offset, const uint8_t *bytes, uint32_t count);
 bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t count);
+
+/* The image that runs: 0 the one that was flashed, 1 or 2 one that came by an update. */
+uint8_t hal_running(void);
+
+/* Reset; it may return before that happens. */
+void hal_restart(void);
 
 #endif

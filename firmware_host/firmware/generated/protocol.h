@@ -38,6 +38,12 @@ enum evlcp_type {
     EVLCP_TYPE_LED_TEST = 0x10,
     EVLCP_TYPE_STREAM = 0x18,
     EVLCP_TYPE_PUSH = 0x19,
+    EVLCP_TYPE_UPDATE_STATUS = 0x20,
+    EVLCP_TYPE_UPDATE_BEGIN = 0x21,
+    EVLCP_TYPE_UPDATE_WRITE = 0x22,
+    EVLCP_TYPE_UPDATE_COMMIT = 0x23,
+    EVLCP_TYPE_UPDATE_RESTART = 0x24,
+    EVLCP_TYPE_UPDATE_CONFIRM = 0x25,
 };
 
 /* How a request ended. */
@@ -99,6 +105,7 @@ enum evlcp_capability {
     EVLCP_CAPABILITY_OPEN_LED = 8, /* STATUS.open_leds is measured. */
     EVLCP_CAPABILITY_RECORDS = 16, /* LED outputs are recorded (emulators). */
     EVLCP_CAPABILITY_STREAM = 32, /* STREAM and PUSH: packets as they come. */
+    EVLCP_CAPABILITY_UPDATE = 256, /* UPDATE_*: takes another image of its firmware. */
 };
 
 /* Bits of STATUS.faults. */
@@ -827,6 +834,124 @@ static inline void evlcp_push_reply_get(const uint8_t *p, struct evlcp_push_repl
     m->underruns = evlcp_get32(p + 10);
 }
 
+#define EVLCP_UPDATE_STATUS_REQUEST_BYTES 0u
+
+#define EVLCP_UPDATE_STATUS_REPLY_BYTES 27u
+/* Answer to update_status. */
+struct evlcp_update_status_reply {
+    uint8_t running; /* Image that runs: 0 the one that was flashed, 1 or 2 one that came by an update. */
+    uint8_t trial; /* 1: it runs on trial, and is left at the third reset unless it is confirmed. */
+    uint8_t next; /* Image that an update takes the place of. */
+    uint32_t capacity; /* Largest image, bytes. */
+    uint32_t sequence; /* Number of the newest update, 0 if there was none. */
+    uint8_t target[16]; /* What the board is, ASCII, zero-padded: part and crystal. */
+};
+
+static inline void evlcp_update_status_reply_put(uint8_t *p, const struct evlcp_update_status_reply *m)
+{
+    evlcp_put8(p + 0, m->running);
+    evlcp_put8(p + 1, m->trial);
+    evlcp_put8(p + 2, m->next);
+    evlcp_put32(p + 3, m->capacity);
+    evlcp_put32(p + 7, m->sequence);
+    evlcp_copy(p + 11, m->target, 16u);
+}
+
+static inline void evlcp_update_status_reply_get(const uint8_t *p, struct evlcp_update_status_reply *m)
+{
+    m->running = evlcp_get8(p + 0);
+    m->trial = evlcp_get8(p + 1);
+    m->next = evlcp_get8(p + 2);
+    m->capacity = evlcp_get32(p + 3);
+    m->sequence = evlcp_get32(p + 7);
+    evlcp_copy(m->target, p + 11, 16u);
+}
+
+#define EVLCP_UPDATE_BEGIN_REQUEST_BYTES 9u
+/* Erase the place of the next image; only while the LEDs are dark, and not on trial. */
+struct evlcp_update_begin_request {
+    uint8_t image; /* Image, as UPDATE_STATUS says. */
+    uint32_t length; /* Its bytes. */
+    uint32_t crc; /* Their CRC-32/ISO-HDLC. */
+};
+
+static inline void evlcp_update_begin_request_put(uint8_t *p, const struct evlcp_update_begin_request *m)
+{
+    evlcp_put8(p + 0, m->image);
+    evlcp_put32(p + 1, m->length);
+    evlcp_put32(p + 5, m->crc);
+}
+
+static inline void evlcp_update_begin_request_get(const uint8_t *p, struct evlcp_update_begin_request *m)
+{
+    m->image = evlcp_get8(p + 0);
+    m->length = evlcp_get32(p + 1);
+    m->crc = evlcp_get32(p + 5);
+}
+
+#define EVLCP_UPDATE_BEGIN_REPLY_BYTES 0u
+
+#define EVLCP_UPDATE_WRITE_REQUEST_BYTES 4u
+/* Write into the place that was erased. */
+struct evlcp_update_write_request {
+    uint32_t offset; /* First byte, a multiple of four. */
+};
+
+static inline void evlcp_update_write_request_put(uint8_t *p, const struct evlcp_update_write_request *m)
+{
+    evlcp_put32(p + 0, m->offset);
+}
+
+static inline void evlcp_update_write_request_get(const uint8_t *p, struct evlcp_update_write_request *m)
+{
+    m->offset = evlcp_get32(p + 0);
+}
+
+#define EVLCP_UPDATE_WRITE_REPLY_BYTES 6u
+/* Answer to update_write. */
+struct evlcp_update_write_reply {
+    uint32_t offset; /* First byte. */
+    uint16_t count; /* Bytes written. */
+};
+
+static inline void evlcp_update_write_reply_put(uint8_t *p, const struct evlcp_update_write_reply *m)
+{
+    evlcp_put32(p + 0, m->offset);
+    evlcp_put16(p + 4, m->count);
+}
+
+static inline void evlcp_update_write_reply_get(const uint8_t *p, struct evlcp_update_write_reply *m)
+{
+    m->offset = evlcp_get32(p + 0);
+    m->count = evlcp_get16(p + 4);
+}
+
+#define EVLCP_UPDATE_COMMIT_REQUEST_BYTES 0u
+
+#define EVLCP_UPDATE_COMMIT_REPLY_BYTES 4u
+/* Answer to update_commit. */
+struct evlcp_update_commit_reply {
+    uint32_t sequence; /* Number of this update. */
+};
+
+static inline void evlcp_update_commit_reply_put(uint8_t *p, const struct evlcp_update_commit_reply *m)
+{
+    evlcp_put32(p + 0, m->sequence);
+}
+
+static inline void evlcp_update_commit_reply_get(const uint8_t *p, struct evlcp_update_commit_reply *m)
+{
+    m->sequence = evlcp_get32(p + 0);
+}
+
+#define EVLCP_UPDATE_RESTART_REQUEST_BYTES 0u
+
+#define EVLCP_UPDATE_RESTART_REPLY_BYTES 0u
+
+#define EVLCP_UPDATE_CONFIRM_REQUEST_BYTES 0u
+
+#define EVLCP_UPDATE_CONFIRM_REPLY_BYTES 0u
+
 #define EVLCP_REQUEST_MOST 69u /* longest request, data left out */
 
 /* Requests: type, whether control, whether any length may follow, and the length, that of the
@@ -849,6 +974,12 @@ static inline void evlcp_push_reply_get(const uint8_t *p, struct evlcp_push_repl
     {0x0fu, true, false, 0u, 0u}, \
     {0x10u, true, false, 4u, 4u}, \
     {0x18u, true, false, 34u, 34u}, \
-    {0x19u, false, true, 8u, 8u}
+    {0x19u, false, true, 8u, 8u}, \
+    {0x20u, false, false, 0u, 0u}, \
+    {0x21u, true, false, 9u, 9u}, \
+    {0x22u, false, true, 4u, 4u}, \
+    {0x23u, true, false, 0u, 0u}, \
+    {0x24u, true, false, 0u, 0u}, \
+    {0x25u, true, false, 0u, 0u}
 
 #endif

@@ -161,6 +161,15 @@ bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t coun
     return true;
 }
 
+uint8_t hal_running(void)
+{
+    return 0u;
+}
+
+void hal_restart(void)
+{
+}
+
 void hal_panic(void)
 {
     static const uint8_t dark[EVLCP_ROW_BYTES];

@@ -15,8 +15,9 @@ void hal_info(struct evlcp_hal_info *info)
         .level_default_ma = 20u,
         .mean_max_ma = 30u,
         .burst_chips = 64u,
-        .capabilities = EVLCP_CAPABILITY_FLASH | EVLCP_CAPABILITY_LEVEL | EVLCP_CAPABILITY_RECORDS,
-        .name = "native"};
+        .capabilities = EVLCP_CAPABILITY_FLASH | EVLCP_CAPABILITY_LEVEL | EVLCP_CAPABILITY_RECORDS | EVLCP_CAPABILITY_UPDATE,
+        .name = "native",
+        .target = "native"};
     memcpy(info->unique_id, self->unique_id, sizeof info->unique_id);
 }
 
@@ -75,30 +76,74 @@ void hal_health(struct evlcp_health *health)
     *health = self->health;
 }
 
+static uint8_t *slot_of(uint8_t slot, uint32_t *size)
+{
+    *size = slot < EVLCP_SLOTS ? EVLCP_SLOT_BYTES : EVLCP_IMAGE_SLOT_BYTES;
+    return slot < EVLCP_SLOTS ? self->flash[slot] : self->images[slot - EVLCP_SLOTS];
+}
+
+/* Whether the flash still has power; the last operation that it has power for is cut short. */
+static bool powered(bool *cut)
+{
+    *cut = false;
+    if (self->power_left == 0u)
+        return !self->power_fails;
+    if (--self->power_left == 0u) {
+        self->power_fails = true;
+        *cut = true;
+    }
+    return true;
+}
+
 bool hal_flash_erase(uint8_t slot)
 {
-    memset(self->flash[slot], 0xff, sizeof self->flash[slot]);
-    return !self->flash_fails;
+    uint32_t size;
+    bool cut;
+    uint8_t *bytes = slot_of(slot, &size);
+    if (!powered(&cut))
+        return false;
+    /* An erase that is cut short leaves some of the old bits. */
+    for (uint32_t i = 0; i < size; i++)
+        bytes[i] = cut && i % 3u != 0u ? bytes[i] | 0x5au : 0xffu;
+    return !self->flash_fails && !cut;
 }
 
 bool hal_flash_write(uint8_t slot, uint32_t offset, const uint8_t *bytes, uint32_t count)
 {
-    /* Like NOR flash: bits only go from one to zero until the next erase. */
-    for (uint32_t i = 0; i < count; i++)
-        self->flash[slot][offset + i] &= bytes[i];
-    return !self->flash_fails;
+    /* Like NOR flash: bits only go from one to zero until the next erase; word by word. */
+    uint32_t size;
+    bool cut = false;
+    uint8_t *to = slot_of(slot, &size);
+    for (uint32_t i = 0; i < count; i++) {
+        if (i % 4u == 0u && (cut || !powered(&cut)))
+            return false;
+        to[offset + i] &= cut ? bytes[i] | 0xa5u : bytes[i];
+    }
+    return !self->flash_fails && !cut;
 }
 
 bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t count)
 {
-    memcpy(bytes, self->flash[slot] + offset, count);
+    uint32_t size;
+    memcpy(bytes, slot_of(slot, &size) + offset, count);
     return true;
+}
+
+uint8_t hal_running(void)
+{
+    return self->running;
+}
+
+void hal_restart(void)
+{
+    self->restart = true;
 }
 
 void native_init(struct native *board)
 {
     memset(board, 0, sizeof *board);
     memset(board->flash, 0xff, sizeof board->flash);
+    memset(board->images, 0xff, sizeof board->images);
     board->output_room = sizeof board->output;
     board->health.temperature_dc = 250;
     native_reset(board);
@@ -111,7 +156,9 @@ void native_reset(struct native *board)
     board->period = 0u;
     board->late = 0u;
     board->output_length = 0u;
+    board->restart = false;
     memset(&board->core, 0, sizeof board->core);
+    board->running = evlcp_update_pick();
     evlcp_init(&board->core);
 }
 
@@ -122,6 +169,8 @@ static void serve(struct native *board)
         before = board->core.requests;
         evlcp_poll(&board->core);
     } while (board->core.requests != before);
+    if (board->restart)
+        native_reset(board);
 }
 
 void native_run(struct native *board, uint64_t until)

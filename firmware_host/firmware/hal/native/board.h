@@ -25,6 +25,11 @@ struct native {
     bool level_fails;
     bool flash_fails;
     uint8_t flash[EVLCP_SLOTS][EVLCP_SLOT_BYTES];
+    uint8_t images[EVLCP_IMAGES][EVLCP_IMAGE_SLOT_BYTES];
+    uint8_t running; /* image: 0, 1, 2 */
+    bool restart;
+    bool power_fails;    /* the flash takes no more */
+    uint32_t power_left; /* words and erases of the flash until then; 0: for ever */
     uint8_t output[1u << 16]; /* sent, not yet collected */
     size_t output_length;
     size_t output_room; /* bytes the line takes now; at most the buffer */

@@ -25,6 +25,9 @@ void board_set_failures(struct library *l, uint8_t level, uint8_t flash);
 void board_flip_flash(struct library *l, uint8_t slot, uint32_t offset);
 void board_shown(const struct library *l, uint8_t row[EVLCP_ROW_BYTES]);
 uint16_t board_level(const struct library *l);
+uint8_t board_running(const struct library *l);
+void board_cut_power(struct library *l, uint32_t left);
+void board_image(const struct library *l, uint8_t image, uint8_t *bytes);
 
 static void keep(void *context, const uint8_t record[NATIVE_RECORD_BYTES])
 {
@@ -124,4 +127,22 @@ void board_shown(const struct library *l, uint8_t row[EVLCP_ROW_BYTES])
 uint16_t board_level(const struct library *l)
 {
     return l->board.level_ma;
+}
+
+uint8_t board_running(const struct library *l)
+{
+    return l->board.running;
+}
+
+/* The flash does so many words and erases more, the last one by half; 0: all of them. */
+void board_cut_power(struct library *l, uint32_t left)
+{
+    l->board.power_left = left;
+    l->board.power_fails = false;
+}
+
+/* What stands in the place of an image, EVLCP_IMAGE_SLOT_BYTES. */
+void board_image(const struct library *l, uint8_t image, uint8_t *bytes)
+{
+    memcpy(bytes, l->board.images[image - 1u], EVLCP_IMAGE_SLOT_BYTES);
 }

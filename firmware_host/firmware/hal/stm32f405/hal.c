@@ -37,8 +37,16 @@
 #include "evlcp.h"
 #include "startup.h"
 
+#ifndef EVLCP_IMAGE
+#define EVLCP_IMAGE 0u /* the one that is flashed; 1 and 2 come by updates */
+#endif
 #ifndef EVLCP_HSE_HZ
 #define EVLCP_HSE_HZ 8000000u
+#endif
+#if EVLCP_HSE_HZ == 8000000u
+#define EVLCP_TARGET "stm32f405-8mhz"
+#else
+#define EVLCP_TARGET "stm32f405-12mhz"
 #endif
 
 #define CORE_HZ 168000000u
@@ -93,6 +101,9 @@
 #define SYSTICK_ON 0x7u /* core clock, exception */
 #define SCB_ICSR REGISTER(0xe000ed04u)
 #define SYSTICK_FORGET 0x02000000u
+#define SCB_VTOR REGISTER(0xe000ed08u)
+#define SCB_AIRCR REGISTER(0xe000ed0cu)
+#define SCB_RESET 0x05fa0004u
 
 #define FLASH 0x40023c00u
 #define FLASH_ACR REGISTER(FLASH + 0x00u)
@@ -181,8 +192,9 @@
 #define DAC_DHR12R1 REGISTER(0x40007408u)
 
 #define UNIQUE_ID 0x1fff7a10u
-#define SLOT_ADDRESS(slot) (0x080c0000u + 0x20000u * (slot))
-#define SLOT_SECTOR(slot) (10u + (slot))
+/* Sectors of 128 KiB: two of SAVE, then two for images of updates. */
+#define SLOT_SECTOR(slot) ((slot) < EVLCP_IMAGE_SLOT ? 10u + (slot) : 6u + (slot) - EVLCP_IMAGE_SLOT)
+#define SLOT_ADDRESS(slot) (0x08000000u + 0x20000u * (SLOT_SECTOR(slot) - 4u))
 
 #define IRQ_PVD 1u
 #define IRQ_USART1 37u
@@ -224,8 +236,10 @@ void hal_info(struct evlcp_hal_info *info)
                                     .level_default_ma = 20u,
                                     .mean_max_ma = MEAN_MAX_MA,
                                     .burst_chips = 64u,
-                                    .capabilities = EVLCP_CAPABILITY_FLASH | EVLCP_CAPABILITY_LEVEL,
-                                    .name = "stm32f405"};
+                                    .capabilities = EVLCP_CAPABILITY_FLASH | EVLCP_CAPABILITY_LEVEL |
+                                                    EVLCP_CAPABILITY_UPDATE,
+                                    .name = "stm32f405",
+                                    .target = EVLCP_TARGET};
 #ifndef EVLCP_NETDUINOPLUS2
     evlcp_copy(info->unique_id, (const uint8_t *)UNIQUE_ID, sizeof info->unique_id);
 #endif
@@ -550,6 +564,32 @@ bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t coun
     return true;
 }
 
+uint8_t hal_running(void)
+{
+    return EVLCP_IMAGE;
+}
+
+void hal_restart(void)
+{
+    outputs_off();
+    SCB_AIRCR = SCB_RESET;
+    for (;;) { /* or the watchdog does it */
+    }
+}
+
+/* The image that was flashed hands over to an update. The watchdog runs before: an update that hangs is left. */
+static void hand_over(void)
+{
+    uint8_t image = EVLCP_IMAGE == 0u ? evlcp_update_pick() : 0u;
+    if (image == 0u)
+        return;
+    IWDG_KR = IWDG_START;
+    iwdg_reload(IWDG_SHORT);
+    uint32_t base = SLOT_ADDRESS(EVLCP_IMAGE_SLOT + image - 1u);
+    SCB_VTOR = base;
+    __asm volatile("dsb\n isb\n msr msp, %0\n bx %1" ::"r"(REGISTER(base)), "r"(REGISTER(base + 4u)));
+}
+
 void hal_panic(void)
 {
     chips_stop();
@@ -680,6 +720,7 @@ static void pins_start(void)
 
 int main(void)
 {
+    hand_over();
     bool by_watchdog = (RCC_CSR & RESET_BY_IWDG) != 0u;
     RCC_CSR |= RESET_FLAGS_CLEAR;
     if (!clock_start())

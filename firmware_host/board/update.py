@@ -1,0 +1,226 @@
+"""Another firmware for a board in the field: over its line, on trial first, and back if it does not start."""
+
+import base64
+import binascii
+import json
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.files import read_json
+from firmware_host import build
+from firmware_host.board.board import Board
+from firmware_host.errors import BoardError, IncompatibleError, RefusedError, VerifyError
+from firmware_host.images import FlashImage
+from firmware_host.protocol.client import RequestOutcome
+from firmware_host.protocol.requests import (
+    Capability,
+    Status,
+    UpdateBeginReply,
+    UpdateBeginRequest,
+    UpdateCommitReply,
+    UpdateCommitRequest,
+    UpdateConfirmReply,
+    UpdateConfirmRequest,
+    UpdateRestartReply,
+    UpdateRestartRequest,
+    UpdateStatusReply,
+    UpdateStatusRequest,
+    UpdateWriteRequest,
+)
+from firmware_host.protocol.wire import WireMessage
+
+__all__ = ["Package", "Updated", "confirm", "update", "update_status"]
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Package:
+    """A firmware for both places of updates.
+
+    Attributes:
+        target: Part and crystal.
+        images: What stands in place 1 and 2.
+    """
+
+    target: str
+    images: Mapping[int, bytes]
+
+    @classmethod
+    def built(cls, target: str) -> Self:
+        """Build it for a target of `build.TARGETS`.
+
+        Raises:
+            ToolchainError: The cross compiler is missing, or fails.
+        """
+        name = build.TARGETS[target]
+        return cls(target, {n: FlashImage.read(build.arm_image(f"{name}-{n}")).data for n in (1, 2)})
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read a file that `to_json` made.
+
+        Raises:
+            InputError: It cannot be read, or is no such file.
+        """
+        table = read_json(path)
+        try:
+            images = {n: base64.b64decode(table["images"][str(n)], validate=True) for n in (1, 2)}
+            crcs = [zlib.crc32(images[n]) for n in (1, 2)]
+            good = table["evlcp_update"] == 1 and crcs == table["crc32"] and all(images.values())
+            if not good or not isinstance(table["target"], str):
+                raise ValueError
+        except (KeyError, TypeError, ValueError, binascii.Error) as fault:
+            raise InputError(
+                f"{path}: not a firmware update, or damaged; 'evlcp board build' makes TARGET.update.json"
+            ) from fault
+        return cls(table["target"], images)
+
+    def to_json(self) -> str:
+        """As the text of a file."""
+        table = {
+            "evlcp_update": 1,
+            "target": self.target,
+            "crc32": [zlib.crc32(self.images[n]) for n in (1, 2)],
+            "images": {str(n): base64.b64encode(self.images[n]).decode() for n in (1, 2)},
+        }
+        return json.dumps(table, indent=1) + "\n"
+
+
+@dataclass(frozen=True)
+class Updated:
+    """What an update did.
+
+    Attributes:
+        image: The image that runs, 1 or 2.
+        length: Its bytes.
+        sequence: Number of the update.
+        firmware: Version of the firmware that runs.
+    """
+
+    image: int
+    length: int
+    sequence: int
+    firmware: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain values."""
+        return {
+            "image": self.image,
+            "bytes": self.length,
+            "sequence": self.sequence,
+            "firmware": self.firmware,
+        }
+
+
+def update_status(board: Board) -> UpdateStatusReply:
+    """Which image of the firmware runs.
+
+    Raises:
+        RefusedError: The board takes no updates.
+    """
+    if not board.about.capabilities & Capability.UPDATE:
+        raise RefusedError(
+            f"{board.session.name}: takes no updates over its line; 'evlcp board flash' instead",
+            Status.NOT_SUPPORTED,
+        )
+    return board.session.call(UpdateStatusRequest(), UpdateStatusReply)
+
+
+def confirm(board: Board) -> None:
+    """Keep the image that runs on trial."""
+    board.session.call(UpdateConfirmRequest(), UpdateConfirmReply)
+
+
+def update(
+    board: Board, package: Package, progress: Progress | None = None, keep: bool = True, wait_s: float = 10.0
+) -> Updated:
+    """Bring another firmware onto a dark board, restart it, and keep it once it answers.
+
+    Until it is kept it runs on trial: at the third reset the board goes back to the one before. A failure at
+    any moment leaves that one.
+
+    Args:
+        board: The board; its session is opened anew.
+        package: The firmware.
+        progress: Called with bytes done and bytes in all.
+        keep: Whether to end the trial.
+        wait_s: How long the restart may take, s.
+
+    Raises:
+        IncompatibleError: The firmware is for another board.
+        RefusedError: The LEDs are not dark, or an image is on trial.
+        VerifyError: The board does not hold what was sent, or went back to another image.
+        LineError: The line fails.
+    """
+    session = board.session
+    before = update_status(board)
+    target = before.target.rstrip(b"\0").decode("ascii", "replace")
+    if target != package.target:
+        raise IncompatibleError(f"{session.name}: is a {target}, the firmware is for {package.target}")
+    if before.trial:
+        raise RefusedError(
+            f"{session.name}: image {before.running} runs on trial; keep it first, 'evlcp board update"
+            " --confirm', or reset the board until it has left it",
+            Status.BUSY,
+        )
+    data = package.images[before.next]
+    if len(data) > before.capacity:
+        raise RefusedError(
+            f"{session.name}: {len(data)} bytes of firmware, an image may have {before.capacity}",
+            Status.OUT_OF_RANGE,
+        )
+    session.call(UpdateBeginRequest(before.next, len(data), zlib.crc32(data)), UpdateBeginReply)
+    advance = progress or (lambda _done, _total: None)
+    piece = (board.about.max_payload - UpdateWriteRequest.fixed_bytes()) // 4 * 4
+    done = 0
+
+    def requests() -> Iterator[UpdateWriteRequest]:
+        for at in range(0, len(data), piece):
+            yield UpdateWriteRequest(at, data[at : at + piece])
+
+    def handle(request: WireMessage, outcome: RequestOutcome) -> None:
+        nonlocal done
+        session.checked(request, outcome)
+        done += len(request.data) if isinstance(request, UpdateWriteRequest) else 0
+        advance(done, len(data))
+
+    session.run(requests(), handle)
+    sequence = session.call(UpdateCommitRequest(), UpdateCommitReply).sequence
+    session.call(UpdateRestartRequest(), UpdateRestartReply)
+    _wait_restarted(board, wait_s)
+    after = update_status(board)
+    if after.running != before.next:
+        raise VerifyError(
+            f"{session.name}: runs image {after.running}, expected {before.next}: the new firmware did not"
+            " start; the board went back"
+        )
+    if keep:
+        confirm(board)
+    about = board.about
+    version = f"{about.version_major}.{about.version_minor}.{about.version_patch}"
+    return Updated(after.running, len(data), sequence, version)
+
+
+def _wait_restarted(board: Board, wait_s: float) -> None:
+    """Say HELLO until the board that has been reset answers."""
+    line = board.session.transport
+    begin = line.now()
+    while line.now() < begin + 0.1:  # the answer is out, and the reset under way
+        line.read(0.02)
+    while True:
+        try:
+            board.about = board.session.hello()
+        except BoardError:
+            if line.now() > begin + wait_s:
+                raise
+            continue
+        if board.about.uptime_ms < 1000 * (line.now() - begin) + 50:
+            return
+        if line.now() > begin + wait_s:
+            raise VerifyError(f"{board.session.name}: has not been reset; run the command again")
+        line.read(0.02)

@@ -1,0 +1,196 @@
+#include "update.h"
+
+#include "crc32.h"
+#include "hal.h"
+
+#define MAGIC 0x45564c55u
+#define CHUNK 256u
+#define ERASED 0xffffffffu
+
+/* Behind an image: magic, sequence, length, CRC, CRC of these; then words that are programmed to zero. */
+#define SEAL_AT EVLCP_IMAGE_BYTES
+#define SEAL_BYTES 20u
+#define TRIES_AT (SEAL_AT + 32u)
+#define CONFIRMED_AT (SEAL_AT + 48u)
+
+struct seal {
+    uint32_t sequence;
+    uint32_t length;
+    uint32_t crc;
+};
+
+static uint32_t word(uint8_t image, uint32_t offset)
+{
+    uint8_t bytes[4];
+    return hal_flash_read((uint8_t)(EVLCP_IMAGE_SLOT + image), offset, bytes, 4u) ? evlcp_get32(bytes) : 0u;
+}
+
+static bool clear(uint8_t image, uint32_t offset)
+{
+    static const uint8_t zero[4];
+    return hal_flash_write((uint8_t)(EVLCP_IMAGE_SLOT + image), offset, zero, 4u) && word(image, offset) == 0u;
+}
+
+static bool crc_of(uint8_t image, uint32_t length, uint32_t *crc)
+{
+    *crc = 0u;
+    for (uint32_t at = 0; at < length; at += CHUNK) {
+        uint8_t bytes[CHUNK];
+        uint32_t count = length - at < CHUNK ? length - at : CHUNK;
+        if (!hal_flash_read((uint8_t)(EVLCP_IMAGE_SLOT + image), at, bytes, count))
+            return false;
+        *crc = evlcp_crc32(*crc, bytes, count);
+    }
+    return true;
+}
+
+/* Whether a whole image stands in a place. */
+static bool sealed(uint8_t image, struct seal *seal)
+{
+    uint8_t b[SEAL_BYTES];
+    uint32_t crc;
+    if (!hal_flash_read((uint8_t)(EVLCP_IMAGE_SLOT + image), SEAL_AT, b, sizeof b) || evlcp_get32(b) != MAGIC ||
+        evlcp_get32(b + 16) != evlcp_crc32(0u, b, 16u))
+        return false;
+    seal->sequence = evlcp_get32(b + 4);
+    seal->length = evlcp_get32(b + 8);
+    seal->crc = evlcp_get32(b + 12);
+    return seal->length <= EVLCP_IMAGE_BYTES && crc_of(image, seal->length, &crc) && crc == seal->crc;
+}
+
+static bool newer(uint32_t a, uint32_t b)
+{
+    return (int32_t)(a - b) > 0;
+}
+
+static bool confirmed(uint8_t image)
+{
+    return word(image, CONFIRMED_AT) == 0u;
+}
+
+/* A place that holds an image which runs, or would run. */
+static bool worth(uint8_t image, struct seal *seal)
+{
+    return sealed(image, seal) && (confirmed(image) || word(image, TRIES_AT + 4u * (EVLCP_TRIES - 1u)) == ERASED);
+}
+
+uint8_t evlcp_update_pick(void)
+{
+    struct seal seals[EVLCP_IMAGES];
+    bool valid[EVLCP_IMAGES];
+    for (uint8_t i = 0; i < EVLCP_IMAGES; i++)
+        valid[i] = worth(i, &seals[i]);
+    uint8_t first = valid[1] && (!valid[0] || newer(seals[1].sequence, seals[0].sequence)) ? 1u : 0u;
+    for (uint8_t turn = 0; turn < EVLCP_IMAGES; turn++) {
+        uint8_t i = turn == 0u ? first : (uint8_t)(1u - first);
+        if (!valid[i])
+            continue;
+        if (confirmed(i))
+            return (uint8_t)(i + 1u);
+        for (uint32_t n = 0; n < EVLCP_TRIES; n++) {
+            uint32_t at = TRIES_AT + 4u * n;
+            /* A try that cannot be counted is not made. */
+            if (word(i, at) == ERASED && clear(i, at))
+                return (uint8_t)(i + 1u);
+        }
+    }
+    return 0u;
+}
+
+/* The place that an update goes to: not the one that runs, else one that is empty, else the older. */
+static uint8_t next_image(uint32_t *newest)
+{
+    struct seal seals[EVLCP_IMAGES];
+    bool valid[EVLCP_IMAGES];
+    uint8_t running = hal_running();
+    *newest = 0u;
+    for (uint8_t i = 0; i < EVLCP_IMAGES; i++) {
+        valid[i] = sealed(i, &seals[i]);
+        if (valid[i] && (*newest == 0u || newer(seals[i].sequence, *newest)))
+            *newest = seals[i].sequence;
+    }
+    if (running != 0u)
+        return running == 1u ? 1u : 0u;
+    return valid[0] && (!valid[1] || newer(seals[0].sequence, seals[1].sequence)) ? 1u : 0u;
+}
+
+static bool on_trial(void)
+{
+    uint8_t running = hal_running();
+    return running != 0u && !confirmed((uint8_t)(running - 1u));
+}
+
+void evlcp_update_tell(struct evlcp_update_status_reply *reply)
+{
+    reply->running = hal_running();
+    reply->trial = on_trial() ? 1u : 0u;
+    reply->next = (uint8_t)(next_image(&reply->sequence) + 1u);
+    reply->capacity = EVLCP_IMAGE_BYTES;
+}
+
+enum evlcp_status evlcp_update_begin(struct evlcp_update *u, const struct evlcp_update_begin_request *request,
+                                     uint32_t *detail)
+{
+    uint32_t newest;
+    uint8_t image = next_image(&newest);
+    if (on_trial()) /* the image before it must stay until this one has proven itself */
+        return EVLCP_STATUS_BUSY;
+    if (request->image != image + 1u) {
+        *detail = image + 1u;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    if (request->length == 0u || request->length > EVLCP_IMAGE_BYTES) {
+        *detail = EVLCP_IMAGE_BYTES;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    u->open = hal_flash_erase((uint8_t)(EVLCP_IMAGE_SLOT + image));
+    u->image = image;
+    u->length = request->length;
+    u->crc = request->crc;
+    return u->open ? EVLCP_STATUS_OK : EVLCP_STATUS_FLASH_FAULT;
+}
+
+enum evlcp_status evlcp_update_write(const struct evlcp_update *u, uint32_t offset, const uint8_t *bytes,
+                                     uint32_t count, uint32_t *detail)
+{
+    if (!u->open)
+        return EVLCP_STATUS_NOTHING_COMMITTED;
+    if (offset % 4u != 0u || offset > u->length || count > u->length - offset) {
+        *detail = u->length;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    return hal_flash_write((uint8_t)(EVLCP_IMAGE_SLOT + u->image), offset, bytes, count)
+               ? EVLCP_STATUS_OK
+               : EVLCP_STATUS_FLASH_FAULT;
+}
+
+enum evlcp_status evlcp_update_commit(struct evlcp_update *u, uint32_t *sequence, uint32_t *detail)
+{
+    uint8_t b[SEAL_BYTES];
+    struct seal seal;
+    if (!u->open)
+        return EVLCP_STATUS_NOTHING_COMMITTED;
+    if (!crc_of(u->image, u->length, detail))
+        return EVLCP_STATUS_FLASH_FAULT;
+    if (*detail != u->crc)
+        return EVLCP_STATUS_BAD_CRC;
+    (void)next_image(sequence);
+    *sequence += 1u;
+    u->open = false;
+    evlcp_put32(b, MAGIC);
+    evlcp_put32(b + 4, *sequence);
+    evlcp_put32(b + 8, u->length);
+    evlcp_put32(b + 12, u->crc);
+    evlcp_put32(b + 16, evlcp_crc32(0u, b, 16u));
+    if (!hal_flash_write((uint8_t)(EVLCP_IMAGE_SLOT + u->image), SEAL_AT, b, sizeof b) || !sealed(u->image, &seal))
+        return EVLCP_STATUS_FLASH_FAULT;
+    return EVLCP_STATUS_OK;
+}
+
+enum evlcp_status evlcp_update_confirm(void)
+{
+    uint8_t running = hal_running();
+    if (!on_trial())
+        return EVLCP_STATUS_OK;
+    return clear((uint8_t)(running - 1u), CONFIRMED_AT) ? EVLCP_STATUS_OK : EVLCP_STATUS_FLASH_FAULT;
+}

@@ -1,0 +1,41 @@
+/* Updates in the field: two places for images beside the one that was flashed, written in turn. A new image runs on
+   trial: it must be confirmed before the third reset, or the one before it runs again. */
+#ifndef EVLCP_UPDATE_H
+#define EVLCP_UPDATE_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "protocol.h"
+
+#define EVLCP_IMAGES 2u
+#define EVLCP_IMAGE_SLOT 2u /* flash slot of the first; those before are SAVE's */
+#define EVLCP_IMAGE_SLOT_BYTES 65536u
+#define EVLCP_IMAGE_BYTES (EVLCP_IMAGE_SLOT_BYTES - 64u)
+#define EVLCP_TRIES 3u
+
+struct evlcp_update {
+    bool open; /* erased, to be written */
+    uint8_t image;
+    uint32_t length;
+    uint32_t crc;
+    bool restart;
+    uint32_t restart_ms;
+};
+
+/* Which image to run after a reset, 1 or 2, or 0 for the one that was flashed; a trial's count goes down. Called
+   once, before anything else, by the image that was flashed. */
+uint8_t evlcp_update_pick(void);
+
+/* What UPDATE_STATUS tells, but the target. */
+void evlcp_update_tell(struct evlcp_update_status_reply *reply);
+
+/* Requests, with the LEDs dark. */
+enum evlcp_status evlcp_update_begin(struct evlcp_update *u, const struct evlcp_update_begin_request *request,
+                                     uint32_t *detail);
+enum evlcp_status evlcp_update_write(const struct evlcp_update *u, uint32_t offset, const uint8_t *bytes,
+                                     uint32_t count, uint32_t *detail);
+enum evlcp_status evlcp_update_commit(struct evlcp_update *u, uint32_t *sequence, uint32_t *detail);
+enum evlcp_status evlcp_update_confirm(void);
+
+#endif
