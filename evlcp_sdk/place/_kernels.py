@@ -3,9 +3,8 @@
 The unknowns, in this order, are GLOBAL = 14: the position, m; a small turn of the camera about east, north
 and up, radians; a focal length that is other than said, in sigmas of `fault`, which is free in no fit but
 whose column says what such a fault would do; and the camera's seven errors in their own sigmas. Beside them
-each bar has LOCAL = 9: a shift of its image to the right and down, errors of its place to the east, north
-and up, of its attitude about these, and of its length; all in their own sigmas. These are eliminated bar by
-bar.
+each bar has LOCAL = 9: a shift of its image to the right and down, errors of its length, of its place to the
+east, north and up, and of its attitude about these; all in their own sigmas. These are eliminated bar by bar.
 """
 
 import math
@@ -67,7 +66,7 @@ def normal(
     at = 0
     for b in range(bars):
         sh, sp, st, sl = bar_sigma[b]
-        tall = LOCAL if sp > 0 or st > 0 or sl > 0 else 2
+        tall = LOCAL if sp > 0 or st > 0 else 3
         for i in range(GLOBAL):
             right[b, i] = 0
             for j in range(GLOBAL):
@@ -81,14 +80,14 @@ def normal(
                 own[i, j] = 1.0 if i == j else 0.0
             for j in range(GLOBAL):
                 mixed[i, j] = 0
-        wx, wy, wz = st * local[b, 5], st * local[b, 6], st * local[b, 7]
-        grow = sl * local[b, 8]
+        wx, wy, wz = st * local[b, 6], st * local[b, 7], st * local[b, 8]
+        grow = sl * local[b, 2]
         begin = at
         while at < n and bar[at] == b:
             ax, ay, az = points[at, 3], points[at, 4], points[at, 5]
-            ox = points[at, 0] - position[0] + sp * local[b, 2] + grow * ax + wy * az - wz * ay
-            oy = points[at, 1] - position[1] + sp * local[b, 3] + grow * ay + wz * ax - wx * az
-            oz = points[at, 2] - position[2] + sp * local[b, 4] + grow * az + wx * ay - wy * ax
+            ox = points[at, 0] - position[0] + sp * local[b, 3] + grow * ax + wy * az - wz * ay
+            oy = points[at, 1] - position[1] + sp * local[b, 4] + grow * ay + wz * ax - wx * az
+            oz = points[at, 2] - position[2] + sp * local[b, 5] + grow * az + wx * ay - wy * ax
             x = rotation[0, 0] * ox + rotation[1, 0] * oy + rotation[2, 0] * oz
             y = rotation[0, 1] * ox + rotation[1, 1] * oy + rotation[2, 1] * oz
             z = rotation[0, 2] * ox + rotation[1, 2] * oy + rotation[2, 2] * oz
@@ -117,11 +116,11 @@ def normal(
                 row[a, 3] = no * oz - up * oy
                 row[a, 4] = up * ox - e * oz
                 row[a, 5] = e * oy - no * ox
-                inner[a, 2], inner[a, 3], inner[a, 4] = e * sp, no * sp, up * sp
-                inner[a, 5] = (ay * up - az * no) * st
-                inner[a, 6] = (az * e - ax * up) * st
-                inner[a, 7] = (ax * no - ay * e) * st
-                inner[a, 8] = (e * ax + no * ay + up * az) * sl
+                inner[a, 2] = (e * ax + no * ay + up * az) * sl
+                inner[a, 3], inner[a, 4], inner[a, 5] = e * sp, no * sp, up * sp
+                inner[a, 6] = (ay * up - az * no) * st
+                inner[a, 7] = (az * e - ax * up) * st
+                inner[a, 8] = (ax * no - ay * e) * st
             inner[0, 0] = inner[1, 1] = sh * w
             inner[0, 1] = inner[1, 0] = 0
             row[0, FAULT], row[1, FAULT] = bent_u * scale_f * w, bent_v * scale_f * w
@@ -395,7 +394,7 @@ def fitted(
         return False, best, position, rotation, local, error
     summed(info, right, rows, miss, error, free, whole, side)
     gain_here, step_here = gain.copy(), step.copy()
-    surveyed, still = bar_sigma[:, 1:].max() > 0, np.zeros(GLOBAL)
+    surveyed, still = bar_sigma[:, 1:3].max() > 0, np.zeros(GLOBAL)
     damping = 1e-4
     for _ in range(steps):
         if not solved(whole, side, damping, move):
@@ -473,10 +472,12 @@ def tested(
     along = turned.T @ (basis.T @ side)
     value, freedom = 0.0, 0
     for i in range(rank):
-        left[i] = max(left[i], 1e-12)
         if left[i] > least:
             value += along[i] ** 2 / left[i]
             freedom += 1
+        else:
+            # What is not tested may be of any size, or of as much as the bound allows.
+            left[i] = 1e-12
     basis = basis @ turned
     moved = np.ascontiguousarray(spread[:3]) @ (shared @ turned)
     inverse = np.linalg.inv(np.diag(left) + basis.T @ (np.ascontiguousarray(bound) @ basis))

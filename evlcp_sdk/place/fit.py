@@ -28,7 +28,7 @@ class Fit:
     Attributes:
         position: m, float64 (3,).
         rotation: Camera axes as columns in ENU, float64 (3, 3).
-        local: Each bar's own errors in their sigmas: shift of the image, place, turn, length, float64 (bars,
+        local: Each bar's own errors in their sigmas: shift of the image, length, place, turn, float64 (bars,
             9).
         lens: The camera's errors, by the root of their covariance, float64 (7,).
         cost: Twice the robust cost.
@@ -99,9 +99,8 @@ def moved(problem: Problem, at: Fit, normal: Normal, move: Floats) -> Fit:
 
 
 def _data(problem: Problem) -> tuple[Any, ...]:
-    share = np.minimum((problem.spec.pixel_sigma_px * problem.points[:, 8:9]) ** 2, 1.0)
     return (
-        np.concatenate([problem.points, share], 1),
+        problem.points,
         problem.bar,
         problem.bar_sigma,
         problem.lens,

@@ -30,7 +30,7 @@ _MOST_BEND = 3.0
 _ATTITUDE_FAULT_RAD = math.radians(1.0)
 """How far an angle may be off without anybody's knowledge (sigma): the fault that protection levels cover."""
 
-_REDUNDANT = 1e-3
+_REDUNDANT = 1e-4
 """Share of what a part says that others must say, too, for it to be tested."""
 
 
@@ -47,7 +47,7 @@ class Pose:
         slow: The part that changes as the image moves over the pixels, float64 (3, 3).
         standing: The rest by its causes, as the position's move by one sigma of each, m, float64 (3, k): of
             `camera`, its seven parameters; of `attitude`, biases of pitch, roll and heading, and the offset
-            in time; of `bar N`, its place, turn and length.
+            in time; of `bar N`, its length, and its place and turn where these have a sigma.
         misfit: Mean square of the misses in sigmas, over the degrees of freedom.
         freedom: Degrees of freedom.
         transmitters: The bars that count.
@@ -205,7 +205,9 @@ def _causes(problem: Problem, normal: Normal, spread: Floats) -> tuple[Floats, F
         standing["attitude"] = by @ normal.rows[:angles].T @ said
     for b, number in enumerate(problem.transmitters):
         if problem.bar_sigma[b, 1:].any():
-            standing[f"bar {number}"] = by @ normal.gain[b, 2:].T
+            # Its length, by which it also looks too long; place and turn where these have a sigma.
+            last = 9 if problem.bar_sigma[b, 1:3].any() else 3
+            standing[f"bar {number}"] = by @ normal.gain[b, 2:last].T
     slow = by @ normal.pixel.sum(0) @ by.T
     noise = spread[:3, :3] - slow - sum((s @ s.T for s in standing.values()), np.zeros((3, 3)))
     # What Huber's weights leave of the points' share may be less than nothing.
@@ -235,11 +237,10 @@ def _bend(problem: Problem, fit: Fit, normal: Normal, spread: Floats, wide: floa
     for side in (-1.0, 1.0):
         there = moved(problem, fit, normal, side * move)
         found = normal_equations(problem, there)
-        if not np.isnan(found.cost):
+        cost = found.cost
+        if cost - fit.cost > 4 * _MOST_BEND:
             # Errors of sites take up what is left of second order.
             cost = normal_equations(problem, moved(problem, there, found, 0 * move)).cost
-        else:
-            cost = np.nan
         growth = 1e-9 if np.isnan(cost) else max((cost - fit.cost) / 4, 1e-9)
         off = there.position - fit.position - side * move[:3]
         worst = max(worst, growth, 1 / growth, 1 + float(off @ inverse @ off))

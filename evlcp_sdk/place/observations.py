@@ -76,7 +76,7 @@ class Problem:
         attitude: What is known of its attitude; None for nothing.
         spec: Bounds and weights.
         points: A row a cluster that is seen: its place in the local axes and from its bar's centre, m, where
-            it is seen, px, 1 / sigma, and the share of its variance that stands for a while, float64 (n, 9).
+            it is seen, px, 1 / sigma, and the share of its variance that stands for a while, float64 (n, 10).
         bar: Number of each point's bar, rising, int64 (n,).
         bar_sigma: Of each bar: its image's shift, px, and its survey, float64 (bars, 4).
         transmitters: Number of each bar.
@@ -117,7 +117,7 @@ class Problem:
         kept, most = [], 0
         for view in views:
             with np.errstate(invalid="ignore"):
-                seen = np.isfinite(view.points_px).all(1) & (view.sigma_px > 0) & (view.sigma_px < np.inf)
+                seen = (view.sigma_px > 0) & (view.sigma_px < np.inf)
             seen &= _whole(view.points_px, camera)
             number = int(seen.sum())
             most = max(most, number)
@@ -136,16 +136,17 @@ class Problem:
             if len(kept) < 3 or extent[1] < _INLINE * extent[0]:
                 many = "two bars give" if len(kept) == 2 else "bars in line give"
                 return Refusal("gravity-unknown", f"{many} a position only with gravity known")
-        points = np.empty((sum(int(s.sum()) for _, s in kept), 9))
+        points = np.empty((sum(int(s.sum()) for _, s in kept), 10))
         bar = np.empty(len(points), np.int64)
         at = 0
         for i, (view, seen) in enumerate(kept):
             rows = slice(at, at + int(seen.sum()))
             points[rows, :3] = view.enu_m[seen]
             # The whole bar's centre: errors of its attitude turn it about that, whatever is seen of it.
-            points[rows, 3:6] = points[rows, :3] - view.enu_m.mean(0)
+            points[rows, 3:6] = points[rows, :3] - view.enu_m.sum(0) / len(view.enu_m)
             points[rows, 6:8] = view.points_px[seen]
             points[rows, 8] = 1 / view.sigma_px[seen]
+            points[rows, 9] = np.minimum((spec.pixel_sigma_px * points[rows, 8]) ** 2, 1.0)
             bar[rows] = i
             at = rows.stop
         felt, angles, white = np.zeros(3), 0, np.eye(3)
@@ -214,9 +215,13 @@ def _whole(points_px: Floats, camera: CameraModel) -> NDArray[np.bool_]:
 
     A cluster is as long as the spacing of neighbours; three quarters of it and a pixel of blur must be free.
     """
-    gaps = np.linalg.norm(np.diff(points_px, axis=0), axis=1)
-    gap = float(np.median(gaps[np.isfinite(gaps)])) if np.isfinite(gaps).any() else 0.0
-    margin = 0.75 * gap + 1
-    low = points_px - margin >= -0.5
-    high = points_px + margin <= np.array([camera.width, camera.height]) - 0.5
-    return np.asarray((low & high).all(1))
+    x, y = points_px.T
+    seen = np.flatnonzero(np.isfinite(x))
+    gap = 0.0
+    if len(seen) > 1:
+        first, last = seen[0], seen[-1]
+        gap = math.hypot(x[last] - x[first], y[last] - y[first]) / float(last - first)
+    edge = 0.75 * gap + 0.5
+    return np.asarray(
+        (x >= edge) & (y >= edge) & (x <= camera.width - 1 - edge) & (y <= camera.height - 1 - edge)
+    )

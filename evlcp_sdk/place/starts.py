@@ -51,10 +51,10 @@ def _halves(problem: Problem, sights: Floats, good: NDArray[np.bool_]) -> tuple[
         half = len(rows) // 2
         for part in (rows[:half], rows[half:]):
             if len(part):
-                enu.append(problem.points[part, :3].mean(0))
-                mean.append(sights[part].mean(0))
+                enu.append(problem.points[part, :3].sum(0) / len(part))
+                mean.append(sights[part].sum(0))
     found = np.array(mean)
-    return np.array(enu), found / np.linalg.norm(found, axis=1, keepdims=True)
+    return np.array(enu), found / np.sqrt((found * found).sum(1))[:, None]
 
 
 def _nearest_to_sights(enu_m: Floats, sights: Floats, rotations: Floats) -> tuple[Floats, Floats]:

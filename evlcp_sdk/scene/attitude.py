@@ -63,12 +63,12 @@ class Attitude:
 
     def rotation(self) -> NDArray[np.float64]:
         """Camera axes (x right, y down, z forward) as columns in ENU, float64 (3, 3); north if unknown."""
-        h, p, r = np.radians([self.heading_deg or 0.0, self.pitch_deg, self.roll_deg])
-        forward = np.array([np.cos(p) * np.sin(h), np.cos(p) * np.cos(h), np.sin(p)])
-        level = np.array([np.cos(h), -np.sin(h), 0.0])
-        down = np.cross(forward, level)
-        turned = [level * np.cos(r) + down * np.sin(r), down * np.cos(r) - level * np.sin(r), forward]
-        return np.stack(turned, 1)
+        h, p, r = (math.radians(v) for v in (self.heading_deg or 0.0, self.pitch_deg, self.roll_deg))
+        (sh, ch), (sp, cp), (sr, cr) = ((math.sin(v), math.cos(v)) for v in (h, p, r))
+        level, down, forward = (ch, -sh, 0.0), (sp * sh, sp * ch, -cp), (cp * sh, cp * ch, sp)
+        return np.array(
+            [[a * cr + b * sr, b * cr - a * sr, c] for a, b, c in zip(level, down, forward, strict=True)]
+        )
 
     @classmethod
     def of_rotation(cls, rotation: NDArray[np.float64]) -> "Attitude":

@@ -64,7 +64,7 @@ def misses(p: Problem, at: Fit, change: Floats) -> Floats:
         rows = p.points[p.bar == b]
         arm = rows[:, 3:6]
         place, lean, length = p.bar_sigma[b, 1:]
-        stands = rows[:, :3] + place * own[2:5] + np.cross(lean * own[5:8], arm) + length * own[8] * arm
+        stands = rows[:, :3] + place * own[3:6] + np.cross(lean * own[6:9], arm) + length * own[2] * arm
         points, _ = project_bars(stands, position, rotation, camera)
         centre = np.array(camera.centre_px)
         points = centre + (points - centre) * (1 + FOCAL_FAULT * change[6]) + p.bar_sigma[b, 0] * own[:2]
@@ -127,7 +127,7 @@ def test_what_the_pixels_say_is_counted() -> None:
     """Of points whose sigma is that of pixels alone, it is all but what the prior sigmas say."""
     p, position, rotation = problem(np.random.default_rng(2), noise=0.5)
     sharp = p.points.copy()
-    sharp[:, 8] = 1 / SPEC.pixel_sigma_px
+    sharp[:, 8:] = 1 / SPEC.pixel_sigma_px, 1.0
     p = dataclasses.replace(p, points=sharp, spec=dataclasses.replace(SPEC, huber_sigmas=100.0))
     found = normal_equations(p, Fit(position, rotation, np.zeros((2, 9)), np.zeros(7), 0.0))
     priors = np.einsum("bij,bik->bjk", found.gain, found.gain)
