@@ -30,6 +30,12 @@ def evlcp_sinks() -> Iterator[SinkRecord]:
         extra="evlcp-sdk[parquet]",
     )
     yield SinkRecord(
+        "points",
+        f"{here}.points_csv:PointsCsv",
+        ("points.csv",),
+        "where each frame's bar is in the camera's axes",
+    )
+    yield SinkRecord(
         "fixes",
         f"{here}.fixes_csv:FixesCsv",
         ("fixes.csv",),

@@ -26,6 +26,7 @@ from evlcp_sdk.results.fixes_csv import FixesCsv
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.geojson import GeoJson, cut
 from evlcp_sdk.results.nmea import Nmea
+from evlcp_sdk.results.points_csv import PointsCsv
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.attitude import Attitude
@@ -209,6 +210,26 @@ def test_a_refusal_that_is_a_formula_is_none_in_the_csv(tmp_path: Path) -> None:
         folder.finish()
     (row,) = rows(tmp_path / "fixes.csv")
     assert (row["refusal"], row["detail"]) == ("'+a", "'=1+1")
+
+
+def test_points_of_frames(tmp_path: Path) -> None:
+    (packet,) = packets(1)
+    frames = [
+        dataclasses.replace(f, range=Range(d, 0.2, 9), x_px=700.0, y_px=300.0, echo_of=e)
+        for f, d, e in zip(packet.frames, (50.0, math.nan, 40.0), (None, None, 1), strict=False)
+    ]
+    with ResultFolder(tmp_path, ["points.csv"]) as folder:
+        sink = PointsCsv(folder, Run("", LINK))
+        sink.packet(dataclasses.replace(packet, frames=tuple(frames)))
+        folder.finish()
+    (row,) = rows(tmp_path / "points.csv")
+    point = np.array([float(row[f"{axis}_m"]) for axis in "xyz"])
+    np.testing.assert_allclose(LINK.camera.project(point), [700, 300], atol=0.02)
+    assert point[2] == 50
+    assert float(row["cov_zz_m2"]) == pytest.approx(
+        0.2**2 + (50 * LINK.position.stretch_share) ** 2, rel=1e-4
+    )
+    assert float(row["cov_xz_m2"]) > 0 > float(row["cov_yz_m2"])
 
 
 def test_refused_fixes_are_listed_and_counted(tmp_path: Path) -> None:
