@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from evlcp_sdk.air.blocks import Message
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.chances import chi_square
 from evlcp_sdk.scene.sites import BarSite, LocalAxes, site_of_transmitter
@@ -19,7 +20,7 @@ _LENGTH_SHARE = 0.01
 _MOST_TRANSMITTERS = 1024
 """Transmitters whose beacons are remembered; the one not heard for longest makes way."""
 
-_BELIEVED = {"none": (), "verified": ("verified",), "any": ("verified", "unverified")}
+_BELIEVED = {"none": (), "verified": ("verified",), "any": ("verified", "lapsed", "unverified")}
 """Trust that `position.beacons` asks for."""
 
 
@@ -30,12 +31,15 @@ class _Said:
     Attributes:
         transmitter_id: Its id, None before.
         beacon: Its place by its own word.
-        trust: How far that is believed; `forged` shuts it out until a verified one comes.
+        trust: How far that is believed; `forged` shuts it out until a verified one comes; `lapsed`: it was
+            verified, and its key or its age has run out since.
+        verified: The beacon that was verified last, None before.
     """
 
     transmitter_id: int | None = None
     beacon: BarSite | None = None
     trust: str = "unverified"
+    verified: Message | None = None
 
 
 class Whereabouts:
@@ -81,9 +85,12 @@ class Whereabouts:
                 said.trust, said.beacon = "forged", None
             if heard.beacon is None or heard.trust == "forged":
                 continue
-            if said.trust in ("forged", "verified") and heard.trust != "verified":
+            if said.trust == "verified" and heard.trust != "verified" and heard.message == said.verified:
+                said.trust = "lapsed"
+            if said.trust in ("forged", "verified", "lapsed") and heard.trust != "verified":
                 # Once signed, or once forged, only a signature counts.
                 continue
+            said.verified = heard.message if heard.trust == "verified" else None
             b = heard.beacon
             said.transmitter_id, said.trust = heard.message.transmitter_id, heard.trust
             said.beacon = BarSite(

@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
+import evlcp_sdk.results.figures
 import evlcp_sdk.run
 import evlcp_sdk.study.campaign.task as task
 from evlcp_sdk.cli.main import main
@@ -101,6 +103,9 @@ class Trial:
         new: Those of the one that meets faults.
         seal: The file that is there only with all the others.
         check: Raises where the folder is not what a reader takes.
+        stale: Files of still earlier runs.
+        in_turn: Each call meets one kind of fault, in turn, instead of all.
+        calls: What the new one calls.
     """
 
     old: tuple[str, ...]
@@ -108,6 +113,7 @@ class Trial:
     seal: str
     check: Callable[[Path], None] = lambda _: None
     stale: tuple[str, ...] = ()
+    in_turn: bool = False
     calls: tuple[str, ...] = field(default=())
 
     def faults(self, work: Path) -> Iterator[str]:
@@ -134,8 +140,10 @@ class Trial:
             states.append(held(out))
         self.calls = ended.calls
         old, new = states
-        for how in HOW:
+        for kind, how in enumerate(HOW):
             for at, call in enumerate(self.calls):
+                if self.in_turn and at % len(HOW) != kind:
+                    continue
                 shutil.rmtree(out)
                 shutil.copytree(before, out)
                 ended = run(self._put(self.new, out), out, at, how)
@@ -193,7 +201,7 @@ class StandIn:
         return list(self.packets)
 
 
-def receive(work: Path, demo: Path) -> Trial:
+def receive(work: Path, demo: Path, *more: str) -> Trial:
     """Two recordings, one after the other, into one folder."""
     with evlcp_sdk.run.receive(demo) as packets:
         StandIn.packets = (next(packets),)
@@ -211,8 +219,22 @@ def receive(work: Path, demo: Path) -> Trial:
     events = Events.of(np.arange(50, dtype=np.int64), *(np.zeros((3, 50), np.int64)))
     for name in ("one.raw", "two.raw"):
         write_events(work / name, events, 1280, 720)
-    arguments = [("receive", str(work / name), "-o", "OUT") for name in ("one.raw", "two.raw")]
-    return Trial(*arguments, "summary.json", check_result, ("frames.parquet",))
+    arguments = [("receive", str(work / name), "-o", "OUT", *more) for name in ("one.raw", "two.raw")]
+    stale = () if "--parquet" in more else ("frames.parquet",)
+    return Trial(*arguments, "summary.json", check_result, stale)
+
+
+def sinks(work: Path, demo: Path) -> Trial:
+    """The same with every format that one may ask for; pictures of one colour, drawn at once."""
+    picture = Figure(figsize=(0.1, 0.1))
+    for name in ("draw_regions", "draw_presence", "draw_distance", "draw_track"):
+        setattr(evlcp_sdk.results.figures, name, lambda *_: picture)
+    site = work / "site.toml"
+    place = "latitude_deg = 35.0\nlongitude_deg = 137.0\nheight_m = 2.0\nheading_deg = 0.0\n"
+    site.write_text(f"[[bar]]\ntransmitter_id = 0\n{place}")
+    trial = receive(work, demo, "--parquet", "--mcap", "--figures", "--sites", str(site))
+    trial.in_turn = "EVLCP_ALL_FAULTS" not in os.environ
+    return trial
 
 
 def simulate(_work: Path, _demo: Path) -> Trial:
@@ -281,7 +303,7 @@ def tell(name: str, work: Path, demo: Path) -> None:
     if name == "sweep":
         faults, calls = sweep(work)
     else:
-        trial = {"receive": receive, "simulate": simulate, "tx": tx}[name](work, demo)
+        trial = {"receive": receive, "sinks": sinks, "simulate": simulate, "tx": tx}[name](work, demo)
         faults = list(trial.faults(work))
         calls = trial.calls
     print(json.dumps({"faults": faults, "calls": calls}))

@@ -25,8 +25,11 @@ def shim(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @needs_compiler
-@pytest.mark.parametrize("command", ["receive", "simulate", "tx", "sweep"])
+@pytest.mark.parametrize("command", ["receive", "sinks", "simulate", "tx", "sweep"])
 def test_a_disk_that_fails_once(command: str, shim: Path, tmp_path: Path, demo_raw: Path) -> None:
+    if command == "sinks":
+        pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
+        pytest.importorskip("mcap", reason="the extra mcap is not installed")
     done = subprocess.run(
         [sys.executable, "-m", "tests.faults.commands", command, tmp_path, demo_raw],
         cwd=HERE.parents[1],

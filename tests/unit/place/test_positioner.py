@@ -225,6 +225,34 @@ def test_a_forged_beacon_cannot_move_the_camera() -> None:
     assert 1 <= len(given) <= 4
 
 
+def test_a_beacon_whose_key_runs_out_is_believed_no_longer() -> None:
+    """The same beacon, heard again when its key was not valid any more; a renewed one counts again."""
+    first = heard(RIGHT, "verified", 0)
+    lapsed = dataclasses.replace(
+        first, trust="unverified", reason="received when its key was not valid any more"
+    )
+    liar = dataclasses.replace(RIGHT, transmitter_id=8)
+    told = {
+        0: (first,),
+        7: (lapsed,),
+        9: (heard(liar, "unverified", 9),),
+        13: (heard(RIGHT, "verified", 13),),
+    }
+    p = positioner([])
+    fixes = p.feed(packets_of(RIGHT, 0, 18, messages=told)) + p.close()
+    given = [not f.refusal for f in fixes]
+    assert_right([f for f in fixes if not f.refusal])
+    assert all(f.verified for f in fixes if not f.refusal)
+    assert given[0]
+    assert given[-1]
+    assert given.count(False) >= 3
+    # Whoever believes any beacon goes on, and is told that it is not verified; the liar never counts.
+    p = positioner([], beacons="any")
+    fixes = p.feed(packets_of(RIGHT, 0, 18, messages=told)) + p.close()
+    assert_right(fixes)
+    assert [f.verified for f in fixes] == given
+
+
 def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
     """From behind two bars the image of swapped ones is the same; what they say of themselves tells."""
     gravity = Attitude(4.0, 1.0, None, 0.0, 0.0)
