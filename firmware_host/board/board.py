@@ -148,9 +148,15 @@ class Board:
         """What the board does."""
         return self.session.call(StatusRequest(), StatusReply)
 
-    def start(self) -> None:
-        """Play the active bank."""
-        self.session.call(StartRequest(), StartReply)
+    def start(self, at_pulse: int = 0, pulse_hz: int = 1, at_clock: int = 0) -> None:
+        """Play the active bank: now, at a pulse and in step with them from then on, or at a clock.
+
+        Args:
+            at_pulse: The pulse, as STATUS counts them; 0: none.
+            pulse_hz: Pulses a second.
+            at_clock: The clock, as STATUS tells it; 0: none.
+        """
+        self.session.call(StartRequest(at_pulse, pulse_hz if at_pulse else 0, at_clock), StartReply)
 
     def stop(self) -> None:
         """Finish the packet, then dark."""

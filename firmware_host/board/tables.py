@@ -33,6 +33,7 @@ def about_table(about: HelloReply) -> dict[str, Any]:
         "max_payload": about.max_payload,
         "tick_hz": about.tick_hz,
         "chip_rate_max_hz": about.chip_rate_max_hz,
+        "clock_hz": about.clock_hz,
         "level_max_ma": about.level_max_ma,
         "mean_max_ma": about.mean_max_ma,
         "burst_chips": about.burst_chips,
@@ -100,4 +101,6 @@ def status_table(status: StatusReply) -> dict[str, Any]:
         "watchdog_ms": status.watchdog_ms,
         "silence_ms": status.silence_ms,
         "uptime_ms": status.uptime_ms,
+        "pulses": status.pulses,
+        "pulse_clocks": status.pulse_clocks,
     }

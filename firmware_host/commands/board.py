@@ -293,8 +293,27 @@ app.command(cls=LineCommand)(stream)
 
 
 @app.command(cls=LineCommand)
-def start(context: typer.Context, inventory: InventoryFile = None, as_json: AsJson = False) -> None:
-    """Play what is programmed."""
+def start(
+    context: typer.Context,
+    inventory: InventoryFile = None,
+    pulse_hz: Annotated[
+        int | None,
+        typer.Option(
+            metavar="HZ",
+            help="All at the same pulse of their pulse inputs, and in step from then on.",
+            min=1,
+            max=65535,
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Play what is programmed.
+
+    For example: [bold]evlcp board start --inventory tunnel.toml --pulse-hz 1[/]
+    """
+    if pulse_hz is not None:
+        _start_together(context, inventory, pulse_hz, as_json)
+        return
     _simple(context, inventory, as_json, lambda board: board.start(), "playing")
 
 
@@ -313,6 +332,23 @@ def stop(context: typer.Context, inventory: InventoryFile = None, as_json: AsJso
 def blank(context: typer.Context, inventory: InventoryFile = None, as_json: AsJson = False) -> None:
     """Dark at once."""
     _simple(context, inventory, as_json, lambda board: board.blank(), "dark")
+
+
+def _start_together(context: typer.Context, inventory: Path | None, pulse_hz: int, as_json: bool) -> None:
+    """One board, or all of an inventory, at the same pulse."""
+    from firmware_host.board.fleet import board_of, read_entries
+    from firmware_host.board.step import start_together
+
+    with contextlib.ExitStack() as stack:
+        if inventory is None:
+            boards = [stack.enter_context(open_board(context))]
+        else:
+            _beside_inventory(context, "pulse_hz")
+            boards = [stack.enter_context(board_of(entry)) for entry in read_entries(inventory)]
+        targets = start_together(boards, pulse_hz)
+    table = {board.session.name: target for board, target in zip(boards, targets, strict=True)}
+    words = ", ".join(f"{name} at its pulse {target}" for name, target in table.items())
+    say(words, {"state": "waiting", "at_pulse": table}, as_json)
 
 
 def _simple(

@@ -34,6 +34,7 @@ def _library() -> ctypes.CDLL:
         ("shown", None, [handle, ctypes.c_char_p]),
         ("level", ctypes.c_uint16, [handle]),
         ("running", ctypes.c_uint8, [handle]),
+        ("set_pulse", None, [handle, ctypes.c_double, ctypes.c_double]),
         ("cut_power", None, [handle, ctypes.c_uint32]),
         ("image", None, [handle, ctypes.c_uint8, ctypes.c_char_p]),
     ):
@@ -112,6 +113,10 @@ class SimulatedBoard:
     def cut_power(self, left: int) -> None:
         """Let the flash do so many words and erases more, the last one by half; 0: all of them."""
         self._c.board_cut_power(self._board, left)
+
+    def set_pulse(self, period_ticks: float, first_tick: float) -> None:
+        """Pulses on the pulse input, in ticks of the board's own crystal; a period of 0: none."""
+        self._c.board_set_pulse(self._board, period_ticks, first_tick)
 
     def set_health(self, temperature_c: float = 25.0, faults: int = 0, open_led: int = 255) -> None:
         """What the sensors report from now on; an `open_led` of 255 is none."""

@@ -55,11 +55,13 @@ class Timer:
         self.generation = 0
         self.on_edge: Callable[[bool], None] = lambda _: None
         self.slave: Timer | None = None
+        self.master: Timer | None = None
 
     @property
     def running(self) -> bool:
         """Whether the counter moves."""
-        return bool(self.r[self.CR1] & 1) and not self.stands
+        gate = self.master is None or self.r[self.SMCR] & 0x77 != 0x05 or self.master.running
+        return bool(self.r[self.CR1] & 1) and gate and not self.stands
 
     def counter(self) -> int:
         """The counter now."""
@@ -73,7 +75,15 @@ class Timer:
 
     def read(self, offset: int) -> int:
         """What the core reads of a register."""
+        if offset == self.CCR1 and self.r[self.CCMR1] & 3 == 1:
+            self.r[self.SR] &= ~2  # a capture that is read
         return self.counter() if offset == self.CNT else self.r[offset]
+
+    def capture(self) -> None:
+        """A rising edge at channel 1."""
+        if self.r[self.CCMR1] & 0xFF == 1 and self.r[self.CCER] & 0xF == 1 and self.running:
+            self.r[self.CCR1] = self.counter()
+            self.r[self.SR] |= 2
 
     def write(self, offset: int, value: int) -> None:
         """What a write of the core does."""
@@ -87,10 +97,17 @@ class Timer:
         elif offset == self.CNT:
             self.hold(value)
         else:
+            assert self.name == "TIM3" or offset != self.SMCR
             allowed = {self.CR1: 1, self.CR2: 0x70, self.SMCR: 0x77, self.DIER: 0x100, self.PSC: 0}
             assert not value & ~allowed.get(offset, 0xFFFFFFFF), (self.name, hex(offset), hex(value))
             started = offset == self.CR1 and value & 1 and not self.r[self.CR1] & 1
+            gates = offset == self.CR1 and self.slave is not None and self.slave.r[self.SMCR] & 0x77 == 0x05
+            if gates and self.slave is not None:
+                self.slave.hold(self.slave.counter())
             self.r[offset] = value
+            if gates and self.slave is not None:
+                self.slave.hold(self.slave.held)
+                self.slave.plan()
             if offset == self.DIER and not value & 0x100:
                 self.request = False
             if started and self.slave and self.r[self.CR2] & 0x70 == 0x10 and not self.stands:
@@ -597,7 +614,7 @@ class Stm32:
         self.entered: list[tuple[int, int]] = []
         self.longest: dict[int, int] = {}
         self.tim1, self.tim2, self.tim3 = Timer(self, "TIM1"), Timer(self, "TIM2"), Timer(self, "TIM3")
-        self.tim1.slave = self.tim3
+        self.tim1.slave, self.tim3.master = self.tim3, self.tim1
         self.tim3.on_edge = lambda _: self.drivers.look()
         self.dma, self.spi, self.usart = Dma(self), Spi(self), Usart(self)
         self.systick, self.iwdg, self.flash = SysTick(self), Iwdg(self), Flash(self)
@@ -667,6 +684,14 @@ class Stm32:
             timer.unit = self.timer_unit(timer.name)
             timer.plan()
         self.systick.plan()
+
+    def pulse_at(self, time: float) -> None:
+        """A rising edge on PA0 then, in units of the board's own crystal."""
+        self.at(round(time), self._pulse)
+
+    def _pulse(self) -> None:
+        if self.plain.get(0x40020000, 0) & 3 == 2 and self.plain.get(0x40020020, 0) & 15 == 1:  # TIM2
+            self.tim2.capture()
 
     def stop_crystal(self) -> None:
         """The crystal stands: with clock security the core goes on at 16 MHz, with an NMI, else it stops."""

@@ -184,8 +184,9 @@ def python_module(definition: dict[str, Any]) -> str:
                 out.append("    )")
             if message.get("since", 0):
                 out.append(f"    SINCE: ClassVar[int] = {message['since']}")
-            if any(f.since for f in fields):
-                out.append(f"    FIELD_SINCE: ClassVar[tuple[int, ...]] = {tuple(f.since for f in fields)}")
+            later = ", ".join(f'"{f.name}": {f.since}' for f in fields if f.since)
+            if later:
+                out.append(f"    FIELD_SINCE: ClassVar[dict[str, int]] = {{{later}}}")
             if fields:
                 out.append("")
             out += [f"    {f.name}: {f.python_type}{f.python_default}" for f in fields]

@@ -83,7 +83,7 @@ __all__ = [
 
 MAJOR = 2
 """Version of the protocol: of another major one no message is understood."""
-MINOR = 0
+MINOR = 1
 """Version of the protocol: what it has beyond the major version's first."""
 HEADER_BYTES = 6
 CRC_BYTES = 4
@@ -208,6 +208,8 @@ class State(IntEnum):
     """Single-LED test."""
     FAULT = 5
     """Dark because of a fault."""
+    WAITING = 6
+    """Dark until the pulse or the clock that START names."""
 
 
 class Watchdog(IntEnum):
@@ -236,6 +238,8 @@ class Capability(IntFlag):
     """LED outputs are recorded (emulators)."""
     STREAM = 32
     """STREAM and PUSH: packets as they come."""
+    PULSE = 512
+    """START at a pulse of the pulse input, in step with it from then on, or at a clock."""
     UPDATE = 256
     """UPDATE_*: takes another image of its firmware."""
 
@@ -257,6 +261,8 @@ class BoardFault(IntFlag):
     """What came next was beyond the limits of light: not shown, LEDs dark until START."""
     UNDERRUN = 64
     """The stream is empty though its end was not told: idle pattern until the next packet."""
+    PULSE = 256
+    """No pulse came, or none that fits: the board goes on by its own clock; until the next START."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,6 +313,7 @@ class HelloReply(WireMessage):
         unique_id: The part's own number.
         uptime_ms: Time since reset; smaller than before means a reset.
         hal: Name of the hardware layer, ASCII, zero-padded.
+        clock_hz: Rate of STATUS's clock, nominal.
     """
 
     TYPE: ClassVar[int] = 0x01
@@ -332,7 +339,9 @@ class HelloReply(WireMessage):
         ("12s", 1),
         ("I", 1),
         ("12s", 1),
+        ("I", 1),
     )
+    FIELD_SINCE: ClassVar[dict[str, int]] = {"clock_hz": 1}
 
     major: int
     minor: int
@@ -355,6 +364,7 @@ class HelloReply(WireMessage):
     unique_id: bytes
     uptime_ms: int
     hal: bytes
+    clock_hz: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -611,10 +621,25 @@ class CommitReply(WireMessage):
 
 @dataclass(frozen=True, slots=True)
 class StartRequest(WireMessage):
-    """Play the active bank from its first packet; nothing happens if it plays."""
+    """Play the active bank from its first packet; nothing happens if it plays.
+
+    Attributes:
+        at_pulse: Begin at this pulse, as STATUS counts them, and keep in step; 0: not.
+        pulse_hz: Pulses a second; must divide the chip rate.
+        at_clock: Without a pulse: begin when STATUS's clock stands here; 0: at once.
+    """
 
     TYPE: ClassVar[int] = 0x08
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("I", 1),
+        ("H", 1),
+        ("I", 1),
+    )
+    FIELD_SINCE: ClassVar[dict[str, int]] = {"at_pulse": 1, "pulse_hz": 1, "at_clock": 1}
+
+    at_pulse: int = 0
+    pulse_hz: int = 0
+    at_clock: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -725,6 +750,9 @@ class StatusReply(WireMessage):
         uptime_ms: Time since reset.
         digest: Digest of the active bank's codebook, or of the one set.
         underruns: How often the active bank's stream was empty before its end was told.
+        clock: The board's clock, which counts freely and wraps.
+        pulses: Pulses of the pulse input since reset.
+        pulse_clocks: Clocks from the pulse before to the latest; 0: unknown.
     """
 
     TYPE: ClassVar[int] = 0x0C
@@ -762,7 +790,11 @@ class StatusReply(WireMessage):
         ("I", 1),
         ("32s", 1),
         ("I", 1),
+        ("I", 1),
+        ("I", 1),
+        ("I", 1),
     )
+    FIELD_SINCE: ClassVar[dict[str, int]] = {"clock": 1, "pulses": 1, "pulse_clocks": 1}
 
     state: int
     faults: int
@@ -797,6 +829,9 @@ class StatusReply(WireMessage):
     uptime_ms: int
     digest: bytes
     underruns: int
+    clock: int = 0
+    pulses: int = 0
+    pulse_clocks: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,13 +22,13 @@ class WireMessage:
         TYPE: Type byte of the request the payload belongs to.
         LAYOUT: Per field its `struct` code and how many values it takes; the code `*` is the rest.
         SINCE: Minor version of the protocol that brought the message.
-        FIELD_SINCE: The same per field; empty if all came with the message.
+        FIELD_SINCE: The same of fields that came after the message; they are its last.
     """
 
     TYPE: ClassVar[int]
     LAYOUT: ClassVar[tuple[tuple[str, int], ...]]
     SINCE: ClassVar[int] = 0
-    FIELD_SINCE: ClassVar[tuple[int, ...]] = ()
+    FIELD_SINCE: ClassVar[dict[str, int]] = {}
 
     @classmethod
     def fixed_bytes(cls) -> int:
@@ -39,18 +39,18 @@ class WireMessage:
     def _lengths(cls) -> list[int]:
         """Lengths of the payload in each minor version that changed it, bytes."""
         codes = [code for code, _ in cls.LAYOUT if code != "*"]
-        since = cls.FIELD_SINCE or (0,) * len(codes)
+        later = list(cls.FIELD_SINCE.values())
         return [
-            _packer("".join(c for c, m in zip(codes, since, strict=False) if m <= minor)).size
-            for minor in sorted({0, *since})
+            _packer("".join(codes[: len(codes) - sum(since > minor for since in later)])).size
+            for minor in sorted({0, *later})
         ]
 
     def later(self, minor: int) -> str | None:
         """What of this message a board of an earlier minor version could not know; None if nothing."""
         if minor < self.SINCE:
             return "it"
-        fields = dataclasses.fields(self)  # type: ignore[arg-type]
-        for field, since in zip(fields, self.FIELD_SINCE, strict=False):
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            since = self.FIELD_SINCE.get(field.name, 0)
             if since > minor and getattr(self, field.name) != field.default:
                 return field.name
         return None
@@ -63,8 +63,8 @@ class WireMessage:
         """
         values: list[Any] = []
         rest = b""
-        since = self.FIELD_SINCE if minor is not None else ()
-        known = len(self.LAYOUT) - sum(m > (minor or 0) for m in since)
+        later = self.FIELD_SINCE.values() if minor is not None else ()
+        known = len(self.LAYOUT) - sum(since > (minor or 0) for since in later)
         for (code, count), field in zip(self.LAYOUT[:known], dataclasses.fields(self), strict=False):  # type: ignore[arg-type]
             value = getattr(self, field.name)
             if code == "*":

@@ -30,6 +30,8 @@ static uint16_t faults(struct evlcp *e)
         bits |= EVLCP_FAULT_CHIP_LOST;
     if (atomic_load(&e->player.over_limit))
         bits |= EVLCP_FAULT_OVER_LIMIT;
+    if (e->start.missed)
+        bits |= EVLCP_FAULT_PULSE;
     if (e->watch.acted)
         bits |= EVLCP_FAULT_WATCHDOG;
     uint8_t bank = atomic_load(&e->banks.active);
@@ -133,6 +135,7 @@ static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x, uint16_t 
     reply.capabilities = e->info.capabilities | EVLCP_CAPABILITY_STREAM;
     evlcp_copy(reply.unique_id, e->info.unique_id, sizeof reply.unique_id);
     evlcp_copy(reply.hal, e->info.name, sizeof reply.hal);
+    reply.clock_hz = e->info.clock_hz;
     reply.uptime_ms = hal_millis();
     evlcp_hello_reply_put(x->out, &reply);
     x->out_length = EVLCP_HELLO_REPLY_BYTES;
@@ -368,10 +371,44 @@ static enum evlcp_status start(struct evlcp *e, uint32_t *detail)
     e->latched = 0u;
     atomic_store(&e->player.chip_lost, false);
     atomic_store(&e->player.over_limit, false);
+    e->start = (struct evlcp_start){.waiting = false};
     test_end(e);
     /* evlcp_poll begins; so a START that meets the end of a STOP is not lost. */
     atomic_store(&e->player.want_play, true);
     return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_start(struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_start_request request;
+    struct evlcp_pulse pulse;
+    evlcp_start_request_get(x->in, &request);
+    bool waits = request.at_pulse != 0u || request.at_clock != 0u;
+    if (waits && (e->info.capabilities & EVLCP_CAPABILITY_PULSE) == 0u)
+        return EVLCP_STATUS_NOT_SUPPORTED;
+    if (waits && (running(e) || atomic_load(&e->player.want_play)))
+        return EVLCP_STATUS_BUSY;
+    if (request.at_pulse != 0u) {
+        uint8_t bank = atomic_load(&e->banks.active);
+        uint32_t rate = bank != EVLCP_NO_BANK ? e->banks.plan[bank].chip_rate_hz : e->setup.chip_rate_hz;
+        (void)hal_pulse(&pulse);
+        /* It takes two pulses to know how far they are apart, and one that comes. */
+        if ((int32_t)(request.at_pulse - pulse.count) < (pulse.between != 0u ? 1 : 3)) {
+            x->detail = pulse.count + 3u;
+            return EVLCP_STATUS_OUT_OF_RANGE;
+        }
+        if (request.pulse_hz == 0u || rate % request.pulse_hz != 0u) {
+            x->detail = 1u;
+            return EVLCP_STATUS_OUT_OF_RANGE;
+        }
+    }
+    enum evlcp_status status = start(e, &x->detail);
+    if (status == EVLCP_STATUS_OK && waits)
+        e->start = (struct evlcp_start){.waiting = true,
+                                        .at_pulse = request.at_pulse,
+                                        .pulse_hz = request.pulse_hz,
+                                        .at_clock = request.at_clock};
+    return status;
 }
 
 static enum evlcp_status on_level(struct evlcp *e, struct exchange *x)
@@ -406,6 +443,8 @@ static uint8_t state(struct evlcp *e)
         return EVLCP_STATE_TESTING;
     if ((faults(e) & (HOLDS_DARK | EVLCP_FAULT_CHIP_LOST | EVLCP_FAULT_OVER_LIMIT)) != 0u)
         return EVLCP_STATE_FAULT;
+    if (e->start.waiting && atomic_load(&e->player.want_play))
+        return EVLCP_STATE_WAITING;
     /* Between START and its first chip. */
     return atomic_load(&e->player.want_play) ? EVLCP_STATE_PLAYING : EVLCP_STATE_DARK;
 }
@@ -456,6 +495,11 @@ static enum evlcp_status on_status(struct evlcp *e, struct exchange *x)
     reply.watchdog_ms = e->watch.timeout_ms;
     reply.silence_ms = hal_millis() - e->watch.asked_ms;
     reply.uptime_ms = hal_millis();
+    struct evlcp_pulse pulse;
+    (void)hal_pulse(&pulse);
+    reply.clock = hal_clock();
+    reply.pulses = pulse.count;
+    reply.pulse_clocks = pulse.between;
     evlcp_status_reply_put(x->out, &reply);
     x->out_length = EVLCP_STATUS_REPLY_BYTES;
     return EVLCP_STATUS_OK;
@@ -618,7 +662,7 @@ static enum evlcp_status on_control(struct evlcp *e, uint8_t type, struct exchan
     case EVLCP_TYPE_STREAM:
         return on_stream(e, x);
     case EVLCP_TYPE_START:
-        return start(e, &x->detail);
+        return on_start(e, x);
     case EVLCP_TYPE_STOP:
         atomic_store(&e->player.want_play, false);
         test_end(e);
@@ -848,6 +892,7 @@ void evlcp_init(struct evlcp *e)
     e->test.on = false;
     e->control = (struct evlcp_control){.known = false};
     e->update = (struct evlcp_update){.open = false};
+    e->start = (struct evlcp_start){.waiting = false};
     e->session = EVLCP_NO_SESSION;
     e->nonce = 0u;
     e->requests = 0u;
@@ -886,6 +931,29 @@ void evlcp_failed(struct evlcp *e)
         atomic_store(&e->player.chip_lost, true);
 }
 
+/* Whether chips may begin: at once, or soon enough for the hardware to wait for the exact moment. */
+static bool due(struct evlcp *e)
+{
+    if (!e->start.waiting)
+        return true;
+    struct evlcp_when when = {.at = e->start.at_clock};
+    if (e->start.at_pulse != 0u) {
+        struct evlcp_pulse pulse;
+        (void)hal_pulse(&pulse);
+        if (pulse.between == 0u)
+            return false;
+        when.at = pulse.at + (e->start.at_pulse - pulse.count) * pulse.between;
+        when.pulse = e->start.at_pulse;
+        when.pulse_hz = e->start.pulse_hz;
+        when.chip_rate_hz = e->banks.plan[atomic_load(&e->banks.active)].chip_rate_hz;
+    }
+    if ((int32_t)(when.at - hal_clock()) > (int32_t)(e->info.clock_hz / 1000000u * EVLCP_START_LEAD_US))
+        return false;
+    e->start.waiting = false;
+    hal_when(&when);
+    return true;
+}
+
 void evlcp_poll(struct evlcp *e)
 {
     struct evlcp_datagram datagram;
@@ -901,9 +969,12 @@ void evlcp_poll(struct evlcp *e)
         (void)evlcp_banks_swap(&e->banks);
         if (atomic_load(&e->player.chip_lost) || atomic_load(&e->player.over_limit))
             atomic_store(&e->player.want_play, false);
-        if (atomic_load(&e->player.want_play) && atomic_load(&e->banks.active) != EVLCP_NO_BANK)
+        if (atomic_load(&e->player.want_play) && atomic_load(&e->banks.active) != EVLCP_NO_BANK && due(e))
             evlcp_player_begin(&e->player, &e->banks);
     }
+    struct evlcp_pulse pulse;
+    if (!hal_pulse(&pulse) && running(e))
+        e->start.missed = true;
     watch(e, now);
     check_health(e, now);
     walk(e, now);

@@ -36,6 +36,15 @@ struct evlcp_test {
     uint32_t since_ms;
 };
 
+/* A START that waits. */
+struct evlcp_start {
+    bool waiting;
+    bool missed; /* the pulse fault */
+    uint32_t at_pulse;
+    uint16_t pulse_hz;
+    uint32_t at_clock;
+};
+
 /* The last control request, to answer a repeated one and to refuse an older one. */
 struct evlcp_control {
     bool known;
@@ -57,6 +66,7 @@ struct evlcp {
     struct evlcp_test test;
     struct evlcp_control control;
     struct evlcp_update update;
+    struct evlcp_start start;
     struct evlcp_health health;
     uint32_t health_ms;
     uint32_t nonce;

@@ -17,16 +17,34 @@ struct evlcp_hal_info {
     uint16_t mean_max_ma;        /* largest mean of a LED's current */
     uint16_t burst_chips;        /* that a LED may be on beyond its share */
     uint32_t capabilities;       /* enum evlcp_capability */
+    uint32_t clock_hz;           /* rate of hal_clock, nominal */
     uint8_t unique_id[12];
     uint8_t name[12]; /* of the hardware layer, ASCII, zero-padded */
     uint8_t target[16]; /* what an image is built for */
 };
+
+#define EVLCP_START_LEAD_US 2000u
 
 /* What the sensors say; a temperature of INT16_MIN is not measured. `faults` holds over_temperature, open_led and clock of enum evlcp_fault. */
 struct evlcp_health {
     int16_t temperature_dc;
     uint8_t faults;
     uint8_t open_leds[EVLCP_ROW_BYTES];
+};
+
+/* Pulses of a clock that several boards share; `between` is 0 until there are two. */
+struct evlcp_pulse {
+    uint32_t count;   /* since reset */
+    uint32_t at;      /* hal_clock at the latest */
+    uint32_t between; /* from the one before, clocks */
+};
+
+/* When chips begin: with a pulse they stay in step with it. */
+struct evlcp_when {
+    uint32_t at;       /* hal_clock */
+    uint32_t pulse;    /* its number; 0: none */
+    uint16_t pulse_hz; /* divides the chip rate */
+    uint32_t chip_rate_hz;
 };
 
 /* Facts of the board. */
@@ -40,6 +58,15 @@ void hal_leds(const uint8_t *row, uint32_t chip);
 /* Call evlcp_chip every `ticks` from now on; 0 stops it, and no call comes after the return. Never called
    while it runs except to stop it. */
 void hal_chips(uint32_t ticks);
+
+/* The next hal_chips begins then, not at once; it is called up to EVLCP_START_LEAD_US before, and may wait. */
+void hal_when(const struct evlcp_when *when);
+
+/* A clock that counts freely and wraps. */
+uint32_t hal_clock(void);
+
+/* The pulses so far. False: one is overdue, or came at a wrong time, since the last hal_when. */
+bool hal_pulse(struct evlcp_pulse *pulse);
 
 /* Ticks between the moment the running chip call was due and now. */
 uint32_t hal_lateness(void);

@@ -4,7 +4,7 @@
 #include <stdint.h>
 
 #define EVLCP_PROTOCOL_MAJOR 2u
-#define EVLCP_PROTOCOL_MINOR 0u
+#define EVLCP_PROTOCOL_MINOR 1u
 #define EVLCP_HEADER_BYTES 6u
 #define EVLCP_CRC_BYTES 4u
 #define EVLCP_MAX_PAYLOAD 512u
@@ -88,6 +88,7 @@ enum evlcp_state {
     EVLCP_STATE_IDLE_PATTERN = 3, /* The watchdog's idle pattern: every LED alternates chip by chip. */
     EVLCP_STATE_TESTING = 4, /* Single-LED test. */
     EVLCP_STATE_FAULT = 5, /* Dark because of a fault. */
+    EVLCP_STATE_WAITING = 6, /* Dark until the pulse or the clock that START names. */
 };
 
 /* What happens when the host falls silent. */
@@ -105,6 +106,7 @@ enum evlcp_capability {
     EVLCP_CAPABILITY_OPEN_LED = 8, /* STATUS.open_leds is measured. */
     EVLCP_CAPABILITY_RECORDS = 16, /* LED outputs are recorded (emulators). */
     EVLCP_CAPABILITY_STREAM = 32, /* STREAM and PUSH: packets as they come. */
+    EVLCP_CAPABILITY_PULSE = 512, /* START at a pulse of the pulse input, in step with it from then on, or at a clock. */
     EVLCP_CAPABILITY_UPDATE = 256, /* UPDATE_*: takes another image of its firmware. */
 };
 
@@ -117,6 +119,7 @@ enum evlcp_fault {
     EVLCP_FAULT_WATCHDOG = 16, /* The host fell silent and the watchdog acted; cleared by the next control request. */
     EVLCP_FAULT_OVER_LIMIT = 32, /* What came next was beyond the limits of light: not shown, LEDs dark until START. */
     EVLCP_FAULT_UNDERRUN = 64, /* The stream is empty though its end was not told: idle pattern until the next packet. */
+    EVLCP_FAULT_PULSE = 256, /* No pulse came, or none that fits: the board goes on by its own clock; until the next START. */
 };
 
 static inline void evlcp_copy(uint8_t *to, const uint8_t *from, uint32_t n)
@@ -179,7 +182,7 @@ static inline void evlcp_hello_request_get(const uint8_t *p, struct evlcp_hello_
     m->nonce = evlcp_get32(p + 2);
 }
 
-#define EVLCP_HELLO_REPLY_BYTES 64u
+#define EVLCP_HELLO_REPLY_BYTES 68u
 /* Answer to hello. */
 struct evlcp_hello_reply {
     uint8_t major; /* The board's protocol. */
@@ -203,6 +206,7 @@ struct evlcp_hello_reply {
     uint8_t unique_id[12]; /* The part's own number. */
     uint32_t uptime_ms; /* Time since reset; smaller than before means a reset. */
     uint8_t hal[12]; /* Name of the hardware layer, ASCII, zero-padded. */
+    uint32_t clock_hz; /* Rate of STATUS's clock, nominal. */
 };
 
 static inline void evlcp_hello_reply_put(uint8_t *p, const struct evlcp_hello_reply *m)
@@ -228,6 +232,7 @@ static inline void evlcp_hello_reply_put(uint8_t *p, const struct evlcp_hello_re
     evlcp_copy(p + 36, m->unique_id, 12u);
     evlcp_put32(p + 48, m->uptime_ms);
     evlcp_copy(p + 52, m->hal, 12u);
+    evlcp_put32(p + 64, m->clock_hz);
 }
 
 static inline void evlcp_hello_reply_get(const uint8_t *p, struct evlcp_hello_reply *m)
@@ -253,6 +258,7 @@ static inline void evlcp_hello_reply_get(const uint8_t *p, struct evlcp_hello_re
     evlcp_copy(m->unique_id, p + 36, 12u);
     m->uptime_ms = evlcp_get32(p + 48);
     evlcp_copy(m->hal, p + 52, 12u);
+    m->clock_hz = evlcp_get32(p + 64);
 }
 
 #define EVLCP_CONFIGURE_REQUEST_BYTES 12u
@@ -501,7 +507,27 @@ static inline void evlcp_commit_reply_get(const uint8_t *p, struct evlcp_commit_
     m->commits = evlcp_get32(p + 0);
 }
 
-#define EVLCP_START_REQUEST_BYTES 0u
+#define EVLCP_START_REQUEST_BYTES 10u
+/* Play the active bank from its first packet; nothing happens if it plays. */
+struct evlcp_start_request {
+    uint32_t at_pulse; /* Begin at this pulse, as STATUS counts them, and keep in step; 0: not. */
+    uint16_t pulse_hz; /* Pulses a second; must divide the chip rate. */
+    uint32_t at_clock; /* Without a pulse: begin when STATUS's clock stands here; 0: at once. */
+};
+
+static inline void evlcp_start_request_put(uint8_t *p, const struct evlcp_start_request *m)
+{
+    evlcp_put32(p + 0, m->at_pulse);
+    evlcp_put16(p + 4, m->pulse_hz);
+    evlcp_put32(p + 6, m->at_clock);
+}
+
+static inline void evlcp_start_request_get(const uint8_t *p, struct evlcp_start_request *m)
+{
+    m->at_pulse = evlcp_get32(p + 0);
+    m->pulse_hz = evlcp_get16(p + 4);
+    m->at_clock = evlcp_get32(p + 6);
+}
 
 #define EVLCP_START_REPLY_BYTES 0u
 
@@ -533,7 +559,7 @@ static inline void evlcp_level_request_get(const uint8_t *p, struct evlcp_level_
 
 #define EVLCP_STATUS_REQUEST_BYTES 0u
 
-#define EVLCP_STATUS_REPLY_BYTES 131u
+#define EVLCP_STATUS_REPLY_BYTES 143u
 /* Answer to status. */
 struct evlcp_status_reply {
     uint8_t state; /* State. */
@@ -569,6 +595,9 @@ struct evlcp_status_reply {
     uint32_t uptime_ms; /* Time since reset. */
     uint8_t digest[32]; /* Digest of the active bank's codebook, or of the one set. */
     uint32_t underruns; /* How often the active bank's stream was empty before its end was told. */
+    uint32_t clock; /* The board's clock, which counts freely and wraps. */
+    uint32_t pulses; /* Pulses of the pulse input since reset. */
+    uint32_t pulse_clocks; /* Clocks from the pulse before to the latest; 0: unknown. */
 };
 
 static inline void evlcp_status_reply_put(uint8_t *p, const struct evlcp_status_reply *m)
@@ -606,6 +635,9 @@ static inline void evlcp_status_reply_put(uint8_t *p, const struct evlcp_status_
     evlcp_put32(p + 91, m->uptime_ms);
     evlcp_copy(p + 95, m->digest, 32u);
     evlcp_put32(p + 127, m->underruns);
+    evlcp_put32(p + 131, m->clock);
+    evlcp_put32(p + 135, m->pulses);
+    evlcp_put32(p + 139, m->pulse_clocks);
 }
 
 static inline void evlcp_status_reply_get(const uint8_t *p, struct evlcp_status_reply *m)
@@ -643,6 +675,9 @@ static inline void evlcp_status_reply_get(const uint8_t *p, struct evlcp_status_
     m->uptime_ms = evlcp_get32(p + 91);
     evlcp_copy(m->digest, p + 95, 32u);
     m->underruns = evlcp_get32(p + 127);
+    m->clock = evlcp_get32(p + 131);
+    m->pulses = evlcp_get32(p + 135);
+    m->pulse_clocks = evlcp_get32(p + 139);
 }
 
 #define EVLCP_WATCHDOG_REQUEST_BYTES 5u
@@ -964,7 +999,7 @@ static inline void evlcp_update_commit_reply_get(const uint8_t *p, struct evlcp_
     {0x05u, false, false, 7u, 7u}, \
     {0x06u, false, false, 9u, 9u}, \
     {0x07u, true, false, 44u, 44u}, \
-    {0x08u, true, false, 0u, 0u}, \
+    {0x08u, true, false, 0u, 10u}, \
     {0x09u, true, false, 0u, 0u}, \
     {0x0au, true, false, 0u, 0u}, \
     {0x0bu, true, false, 2u, 2u}, \

@@ -60,6 +60,7 @@ void hal_info(struct evlcp_hal_info *info)
         .level_default_ma = 20u,
         .mean_max_ma = 30u,
         .burst_chips = 64u,
+        .clock_hz = 1000u,
         .capabilities = EVLCP_CAPABILITY_FLASH | EVLCP_CAPABILITY_LEVEL | EVLCP_CAPABILITY_RECORDS,
         .unique_id = "QEMU-AN385",
         .name = "mps2-an385"};
@@ -159,6 +160,22 @@ bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t coun
 {
     evlcp_copy(bytes, slots[slot] + offset, count);
     return true;
+}
+
+void hal_when(const struct evlcp_when *when)
+{
+    (void)when;
+}
+
+bool hal_pulse(struct evlcp_pulse *pulse)
+{
+    *pulse = (struct evlcp_pulse){.count = 0u};
+    return true;
+}
+
+uint32_t hal_clock(void)
+{
+    return hal_millis();
 }
 
 uint8_t hal_running(void)

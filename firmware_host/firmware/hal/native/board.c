@@ -15,7 +15,8 @@ void hal_info(struct evlcp_hal_info *info)
         .level_default_ma = 20u,
         .mean_max_ma = 30u,
         .burst_chips = 64u,
-        .capabilities = EVLCP_CAPABILITY_FLASH | EVLCP_CAPABILITY_LEVEL | EVLCP_CAPABILITY_RECORDS | EVLCP_CAPABILITY_UPDATE,
+        .capabilities = EVLCP_CAPABILITY_FLASH | EVLCP_CAPABILITY_LEVEL | EVLCP_CAPABILITY_RECORDS | EVLCP_CAPABILITY_PULSE | EVLCP_CAPABILITY_UPDATE,
+        .clock_hz = NATIVE_TICK_HZ,
         .name = "native",
         .target = "native"};
     memcpy(info->unique_id, self->unique_id, sizeof info->unique_id);
@@ -37,6 +38,53 @@ void hal_chips(uint32_t ticks)
 {
     self->period = ticks;
     self->due = self->now + ticks;
+    self->in_step = false;
+    if (ticks == 0u || !self->waits)
+        return;
+    self->waits = false;
+    self->begun = self->now + (uint64_t)(int64_t)(int32_t)(self->when.at - (uint32_t)self->now);
+    self->in_step = self->when.pulse != 0u;
+    self->chips = 0u;
+    self->due = self->begun + ticks;
+}
+
+void hal_when(const struct evlcp_when *when)
+{
+    self->when = *when;
+    self->waits = true;
+}
+
+uint32_t hal_clock(void)
+{
+    return (uint32_t)self->now;
+}
+
+bool hal_pulse(struct evlcp_pulse *pulse)
+{
+    *pulse = self->pulse;
+    return !self->in_step || self->now - self->pulse.at < 1.5 * self->pulse.between;
+}
+
+static void pulses(struct native *board)
+{
+    while (board->pulse_period > 0.0 && (double)board->now >= board->pulse_next) {
+        uint32_t at = (uint32_t)(uint64_t)board->pulse_next;
+        board->pulse.between = board->pulse.count != 0u ? at - board->pulse.at : 0u;
+        board->pulse.at = at;
+        board->pulse.count++;
+        board->pulse_next += board->pulse_period;
+    }
+}
+
+/* In step, the next chip is due by the pulses: a chip is a share of the time between them. */
+static uint64_t next_due(struct native *board)
+{
+    if (!board->in_step)
+        return board->due + board->period;
+    double chip = (double)board->pulse.between * board->when.pulse_hz / board->when.chip_rate_hz;
+    double since = (double)(int32_t)(board->pulse.count - board->when.pulse) * board->when.chip_rate_hz / board->when.pulse_hz;
+    board->chips++;
+    return (uint64_t)((double)board->pulse.at + ((double)board->chips + 1.0 - since) * chip + 0.5);
 }
 
 uint32_t hal_lateness(void)
@@ -75,6 +123,8 @@ void hal_health(struct evlcp_health *health)
 {
     *health = self->health;
 }
+
+#define WAIT_TICKS (NATIVE_TICK_HZ / 2000u)
 
 static uint8_t *slot_of(uint8_t slot, uint32_t *size)
 {
@@ -157,6 +207,9 @@ void native_reset(struct native *board)
     board->late = 0u;
     board->output_length = 0u;
     board->restart = false;
+    board->pulse = (struct evlcp_pulse){.count = 0u};
+    board->waits = false;
+    board->in_step = false;
     memset(&board->core, 0, sizeof board->core);
     board->running = evlcp_update_pick();
     evlcp_init(&board->core);
@@ -177,14 +230,22 @@ void native_run(struct native *board, uint64_t until)
 {
     self = board;
     serve(board);
+    /* A START that waits is looked at often enough to begin in time. */
+    while (board->period == 0u && board->core.start.waiting && board->now + WAIT_TICKS < until) {
+        board->now += WAIT_TICKS;
+        pulses(board);
+        serve(board);
+    }
     while (board->period != 0u && board->due <= until) {
         board->now = board->due;
-        board->due += board->period;
+        pulses(board);
+        board->due = next_due(board);
         evlcp_chip(&board->core);
         serve(board);
     }
     if (board->now < until)
         board->now = until;
+    pulses(board);
     serve(board);
 }
 

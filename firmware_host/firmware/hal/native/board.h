@@ -27,6 +27,14 @@ struct native {
     uint8_t flash[EVLCP_SLOTS][EVLCP_SLOT_BYTES];
     uint8_t images[EVLCP_IMAGES][EVLCP_IMAGE_SLOT_BYTES];
     uint8_t running; /* image: 0, 1, 2 */
+    double pulse_period; /* of the pulse input, ticks; 0: none */
+    double pulse_next;
+    struct evlcp_pulse pulse;
+    struct evlcp_when when;
+    bool waits;       /* the next chips begin at `when` */
+    bool in_step;
+    uint64_t chips;   /* since the start in step */
+    uint64_t begun;   /* tick of it */
     bool restart;
     bool power_fails;    /* the flash takes no more */
     uint32_t power_left; /* words and erases of the flash until then; 0: for ever */

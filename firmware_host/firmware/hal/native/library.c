@@ -27,6 +27,7 @@ void board_shown(const struct library *l, uint8_t row[EVLCP_ROW_BYTES]);
 uint16_t board_level(const struct library *l);
 uint8_t board_running(const struct library *l);
 void board_cut_power(struct library *l, uint32_t left);
+void board_set_pulse(struct library *l, double period, double next);
 void board_image(const struct library *l, uint8_t image, uint8_t *bytes);
 
 static void keep(void *context, const uint8_t record[NATIVE_RECORD_BYTES])
@@ -145,4 +146,11 @@ void board_cut_power(struct library *l, uint32_t left)
 void board_image(const struct library *l, uint8_t image, uint8_t *bytes)
 {
     memcpy(bytes, l->board.images[image - 1u], EVLCP_IMAGE_SLOT_BYTES);
+}
+
+/* Pulses from tick `next` on, a period in ticks; 0: none. */
+void board_set_pulse(struct library *l, double period, double next)
+{
+    l->board.pulse_period = period;
+    l->board.pulse_next = next;
 }

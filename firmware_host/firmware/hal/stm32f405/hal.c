@@ -6,6 +6,8 @@
    | PA5 PA7  | SPI1 clock and data of the chain                     |
    | PA6      | latch (LE), TIM3 channel 1                           |
    | PA4      | DAC 1: reference of the LED current                  |
+   | PA0      | pulses, one a second or more, TIM2 channel 1; pulled |
+   |          | down inside                                          |
    | PB0      | output enable of the drivers, high is dark; pulled up on the board, so dark through reset |
    | PB1      | thermal switch to ground, open when too hot; pulled  |
    |          | up inside, so a broken wire is too hot as well       |
@@ -18,6 +20,10 @@
    The stream goes round and round over two rows and interrupts after each: the core fills the row that has just
    gone. The other one is on its way already, for in direct mode the stream fetches a word ahead. So a row has a
    whole chip of time to be handed in, and is on show two chips later.
+
+   In step with pulses a chip is nominally six cycles too short, and the chip interrupt stops TIM1 for as long as the
+   chip before was early; TIM3 counts only while TIM1 runs then. So both stay together, and an error of the crystal of
+   up to 350 ppm goes into the stops. TIM2 takes the time of each pulse by itself.
 
    Dark is output enable, a pin that needs neither the stream nor a timer. What sets it by itself:
 
@@ -171,6 +177,7 @@
 #define TIM_PSC(t) REGISTER((t) + 0x28u)
 #define TIM_ARR(t) REGISTER((t) + 0x2cu)
 #define TIM_CCR1(t) REGISTER((t) + 0x34u)
+#define TIM_CAPTURED 0x2u
 
 #define DMA2 0x40026400u
 #define DMA_HISR REGISTER(DMA2 + 0x04u)
@@ -205,6 +212,9 @@
 #define DAC_FULL 4095u
 #define WAIT_LOOPS 1000000u
 #define WORD_WAIT_LOOPS 1000u /* a word is on its way for 1.5 us; a stream ends with the one under way */
+#define PULSE_FITS 3000u /* a pulse may be off by that share of its distance */
+#define STEP_LEAST 8     /* counts of TIM2; a stop takes some itself */
+#define STEP_MOST 1680   /* 20 us: more is no error of a crystal */
 #define LOOKS_MIN 16u        /* longer than a word is on its way to the chain */
 
 extern uint32_t link_stack[];
@@ -219,6 +229,18 @@ static volatile uint32_t served;   /* chip interrupts since the start, up to 2 *
 static bool overrun;               /* the chip interrupt missed a row */
 static volatile bool streaming;    /* TIM1 and the stream are to run */
 static volatile bool failed;       /* went dark by itself; the core is yet to be told */
+/* Where chips should be, in counts of TIM2: `step_chip` begins at `step_at`, a chip takes `step_counts` / 65536. The
+   main loop writes it with `step_on` false. */
+static volatile bool step_on;
+static volatile uint32_t step_at;
+static volatile uint32_t step_chip;
+static volatile uint64_t step_counts;
+static uint32_t step_served; /* chip interrupts since the start */
+static bool in_step;
+static bool waits; /* the next chips begin at `when` */
+static bool pulse_fits;
+static struct evlcp_when when;
+static struct evlcp_pulse pulse;
 static volatile uint32_t chip_at;  /* TIM2 at the latest chip interrupt */
 static uint32_t slot_cycles;
 static uint32_t last_count;
@@ -237,9 +259,10 @@ void hal_info(struct evlcp_hal_info *info)
                                     .mean_max_ma = MEAN_MAX_MA,
                                     .burst_chips = 64u,
                                     .capabilities = EVLCP_CAPABILITY_FLASH | EVLCP_CAPABILITY_LEVEL |
-                                                    EVLCP_CAPABILITY_UPDATE,
+                                                    EVLCP_CAPABILITY_UPDATE | EVLCP_CAPABILITY_PULSE,
                                     .name = "stm32f405",
-                                    .target = EVLCP_TARGET};
+                                    .target = EVLCP_TARGET,
+                                    .clock_hz = CORE_HZ / 2u};
 #ifndef EVLCP_NETDUINOPLUS2
     evlcp_copy(info->unique_id, (const uint8_t *)UNIQUE_ID, sizeof info->unique_id);
 #endif
@@ -270,6 +293,8 @@ static void chips_stop(void)
     outputs_off();
     streaming = false;
     SYSTICK_CSR = 0u;
+    step_on = false;
+    in_step = false;
     TIM_CR1(TIM1) = 0u;
     TIM_DIER(TIM1) = 0u; /* or an update would ask for a word that the next stream hands out */
     TIM_CR1(TIM3) = 0u;
@@ -371,9 +396,42 @@ void hal_leds(const uint8_t *row, uint32_t chip)
     }
 }
 
+/* Lay down where chips should be, from the latest pulse. */
+static void step_set(void)
+{
+    uint32_t each = when.chip_rate_hz / when.pulse_hz;
+    step_on = false;
+    step_at = pulse.at;
+    step_chip = (pulse.count - when.pulse) * each;
+    step_counts = ((uint64_t)pulse.between << 16) / each;
+    step_on = true;
+}
+
+/* In the chip interrupt: stop TIM1 for as long as this chip is early. */
+static void step(void)
+{
+    step_served++;
+    uint32_t slot = (2u * SLOTS_PER_CHIP - DMA_S5NDTR) % SLOTS_PER_CHIP;
+    if (!step_on || slot != 0u)
+        return; /* laid down anew, or so late that the place is unsure: the next one does it */
+    int64_t chips = (int64_t)(int32_t)(step_served - step_chip);
+    uint32_t should = step_at + (uint32_t)(int32_t)(chips * (int64_t)step_counts >> 16);
+    int32_t early = (int32_t)(should + TIM_CNT(TIM1) / 2u - TIM_CNT(TIM2));
+    if (early < STEP_LEAST || early > STEP_MOST)
+        return;
+    TIM_CR1(TIM1) = 0u;
+    uint32_t from = TIM_CNT(TIM2);
+    while (TIM_CNT(TIM2) - from < (uint32_t)early) {
+    }
+    TIM_CR1(TIM1) = 1u;
+}
+
 static void chips_start(uint32_t ticks)
 {
     slot_cycles = TICK_CYCLES / SLOTS_PER_CHIP * ticks;
+    in_step = waits && when.pulse != 0u;
+    if (in_step)
+        slot_cycles -= 1u;
     static const uint8_t dark[EVLCP_ROW_BYTES];
     for (gone = 0u; gone < 2u; gone++)
         load(dark);
@@ -403,6 +461,10 @@ static void chips_start(uint32_t ticks)
     TIM_EGR(TIM3) = 1u;
     TIM_CNT(TIM3) = chip_counts - LATCH_AT_US * TIM3_PER_US;
     TIM_SMCR(TIM3) = 0x06u; /* started by ITR0 = TIM1 */
+    if (in_step) {
+        TIM_SMCR(TIM3) = 0x05u; /* counts while TIM1 does */
+        TIM_CR1(TIM3) = 1u;
+    }
 
     DMA_HIFCR = DMA_S5_FLAGS;
     DMA_S5PAR = SPI1 + 0x0cu;
@@ -420,10 +482,19 @@ static void chips_start(uint32_t ticks)
     latch_look.bad = 0u;
     latch_seen = false;
     latch_count = TIM_CNT(TIM3);
+    step_served = 0u;
+    if (waits) {
+        waits = false;
+        /* Not for ever: the core calls this EVLCP_START_LEAD_US before, or late. */
+        while ((int32_t)(when.at - TIM_CNT(TIM2)) > 0 && !failed) {
+        }
+    }
     chip_at = TIM_CNT(TIM2);
     streaming = true;
     SYSTICK_CSR = SYSTICK_ON;
     TIM_CR1(TIM1) = 1u;
+    if (in_step)
+        step_set();
 }
 
 void hal_chips(uint32_t ticks)
@@ -440,6 +511,50 @@ void hal_chips(uint32_t ticks)
     rest();
     if (!failed)
         chips_start(ticks);
+}
+
+void hal_when(const struct evlcp_when *at)
+{
+    when = *at;
+    waits = true;
+    pulse_fits = true;
+}
+
+uint32_t hal_clock(void)
+{
+    return TIM_CNT(TIM2);
+}
+
+/* A pulse may be missing; one that comes at another time than a whole number of them is none. */
+static void take_pulse(uint32_t at)
+{
+    uint32_t between = at - pulse.at;
+    uint32_t periods = 1u;
+    if (in_step) {
+        uint32_t nominal = CORE_HZ / 2u / when.pulse_hz;
+        periods = (between + nominal / 2u) / nominal;
+        uint32_t off = between > periods * nominal ? between - periods * nominal : periods * nominal - between;
+        if (periods == 0u || off > periods * (nominal / PULSE_FITS)) {
+            pulse_fits = false;
+            return;
+        }
+        between /= periods;
+    }
+    pulse.between = pulse.count != 0u ? between : 0u;
+    pulse.count += periods;
+    pulse.at = at;
+    if (in_step)
+        step_set();
+}
+
+bool hal_pulse(struct evlcp_pulse *told)
+{
+    if ((TIM_SR(TIM2) & TIM_CAPTURED) != 0u)
+        take_pulse(TIM_CCR1(TIM2)); /* the read clears the flag */
+    *told = pulse;
+    if (in_step && TIM_CNT(TIM2) - pulse.at > CORE_HZ / 2u / when.pulse_hz * 3u / 2u)
+        pulse_fits = false;
+    return !in_step || pulse_fits;
 }
 
 uint32_t hal_lateness(void)
@@ -640,6 +755,8 @@ static void chip_handler(void)
         outputs_on();
     if (served < 2u)
         served++;
+    if (in_step)
+        step();
     if (draining != 0u) {
         if (draining == 1u) {
             outputs_off();
@@ -710,11 +827,12 @@ static void pins_start(void)
     GPIO_BSRR(GPIOB) = PIN(0);                               /* dark before the pin drives */
     GPIO_MODER(GPIOB) |= MODE(0, MODE_OUTPUT);
     GPIO_PUPDR(GPIOB) |= 1u << 2;                            /* PB1 up */
-    GPIO_AFRL(GPIOA) = 5u << 20 | 2u << 24 | 5u << 28;       /* SPI1, TIM3, SPI1 */
+    GPIO_AFRL(GPIOA) = 1u | 5u << 20 | 2u << 24 | 5u << 28;  /* TIM2, SPI1, TIM3, SPI1 */
+    GPIO_PUPDR(GPIOA) |= 2u;                                 /* PA0 down */
     GPIO_AFRH(GPIOA) = 7u << 4 | 7u << 8;                    /* USART1 */
     GPIO_OSPEEDR(GPIOA) |= MODE(5, 2) | MODE(6, 2) | MODE(7, 2);
     GPIO_PUPDR(GPIOA) |= 1u << 20;                           /* PA10 up: an open line is idle */
-    GPIO_MODER(GPIOA) |= MODE(4, MODE_ANALOG) | MODE(5, MODE_ALTERNATE) | MODE(6, MODE_ALTERNATE) |
+    GPIO_MODER(GPIOA) |= MODE(0, MODE_ALTERNATE) | MODE(4, MODE_ANALOG) | MODE(5, MODE_ALTERNATE) | MODE(6, MODE_ALTERNATE) |
                          MODE(7, MODE_ALTERNATE) | MODE(9, MODE_ALTERNATE) | MODE(10, MODE_ALTERNATE);
 }
 
@@ -734,6 +852,8 @@ int main(void)
     SPI_CR1 = 1u << 11 | 1u << 9 | 1u << 8 | 2u << 3 | 1u << 2;
     SPI_CR1 |= 1u << 6;
     TIM_ARR(TIM2) = 0xffffffffu;
+    TIM_CCMR1(TIM2) = 0x01u; /* channel 1 takes the time of a rising edge */
+    TIM_CCER(TIM2) = 1u;
     TIM_EGR(TIM2) = 1u;
     TIM_CR1(TIM2) = 1u;
     last_count = TIM_CNT(TIM2);

@@ -1,0 +1,57 @@
+"""Several bars in step: one START at the same pulse of a clock that all of them see."""
+
+import contextlib
+from collections.abc import Sequence
+
+from firmware_host.board.board import Board
+from firmware_host.errors import BoardError, LineError, RefusedError
+from firmware_host.protocol.requests import Capability, Status
+
+__all__ = ["start_together"]
+
+_ROUNDS = 20
+
+
+def start_together(boards: Sequence[Board], pulse_hz: int = 1) -> list[int]:
+    """Start boards at the same pulse; each stays in step with the pulses from then on.
+
+    Boards count pulses from their own reset. A pulse is the same for all if between two readings of every
+    board's count none has changed.
+
+    Args:
+        boards: The boards, dark; they must take all their STARTs within half a second.
+        pulse_hz: Pulses a second; must divide the chip rates.
+
+    Returns:
+        The pulse of each board, as it counts them.
+
+    Raises:
+        RefusedError: A board has no pulse input, plays, or refuses; then all are stopped.
+        LineError: Pulses come faster than the boards can be asked.
+    """
+    for board in boards:
+        if not board.about.capabilities & Capability.PULSE:
+            raise RefusedError(
+                f"{board.session.name}: has no pulse input; 'evlcp board hello' shows what it can",
+                Status.NOT_SUPPORTED,
+            )
+    counts = [board.status().pulses for board in boards]
+    for _ in range(_ROUNDS):
+        before, counts = counts, [board.status().pulses for board in boards]
+        if before == counts:
+            break
+    else:
+        raise LineError(
+            f"{boards[0].session.name}: pulses come faster than the boards answer; take fewer a second"
+        )
+    after = max(3, -(-pulse_hz // 2))
+    targets = [count + after for count in counts]
+    try:
+        for board, target in zip(boards, targets, strict=True):
+            board.start(target, pulse_hz)
+    except BoardError:
+        for board in boards:
+            with contextlib.suppress(BoardError):
+                board.stop()
+        raise
+    return targets
