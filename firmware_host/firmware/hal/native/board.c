@@ -62,7 +62,7 @@ uint32_t hal_clock(void)
 bool hal_pulse(struct evlcp_pulse *pulse)
 {
     *pulse = self->pulse;
-    return !self->in_step || self->now - self->pulse.at < 1.5 * self->pulse.between;
+    return !self->in_step || (uint32_t)self->now - self->pulse.at < self->pulse.between / 2u * 3u;
 }
 
 static void pulses(struct native *board)
