@@ -37,9 +37,13 @@ __all__ = [
     "read_csv",
     "read_json",
     "read_numbers",
+    "read_secret",
     "read_whole",
     "write_new",
 ]
+
+_OTHERS = 0o077
+"""Permissions that a private file does not give."""
 
 STAGE_PREFIX = ".evlcp-"
 """How the name of a folder begins in which files grow; what a killed run leaves of it may be deleted."""
@@ -313,6 +317,24 @@ def write_new(data: bytes, path: Path, mode: int = 0o600) -> None:
         raise
     except OSError as fault:
         raise output_fault(path, fault) from fault
+
+
+def read_secret(path: Path, most_bytes: int) -> bytes:
+    """The first bytes of a file that its owner alone can use.
+
+    Raises:
+        InputError: It cannot be read, or others can use it.
+    """
+    try:
+        with path.open("rb") as file:
+            mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
+            if mode & _OTHERS:
+                raise InputError(
+                    f"{path}: mode {mode:04o}, expected a private key that its owner alone can use: chmod 600"
+                )
+            return file.read(most_bytes)
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
 
 
 def open_log(path: Path) -> TextIO:

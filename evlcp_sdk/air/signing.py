@@ -5,8 +5,6 @@ Needs the extra `sign` (package `cryptography`) to make keys, to sign, and to ch
 
 import hashlib
 import math
-import os
-import stat
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +17,7 @@ from pydantic import Field
 
 from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.errors import ConfigError, InputError, OutputError
-from evlcp_sdk.files import write_new
+from evlcp_sdk.files import read_secret, write_new
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -41,7 +39,6 @@ KEY_NAME_BYTES = 8
 _SIGNATURE_BYTES = 64
 _KEY_BYTES = 32
 _MOST_PEM_BYTES = 1 << 16
-_OTHERS = 0o077
 _DOMAIN = b"EVLCP beacon 1\0"
 _SIGNED_HEAD = struct.Struct("<II4s")
 
@@ -69,7 +66,7 @@ def make_key(path: Path) -> str:
     try:
         write_new(text, path)
     except FileExistsError as fault:
-        raise OutputError(f"{path}: exists; a key is not overwritten") from fault
+        raise OutputError(f"{path}: exists; a key is not overwritten; --show prints it again") from fault
     return public_key(key)
 
 
@@ -86,17 +83,9 @@ def read_key(path: Path) -> "Ed25519PrivateKey":
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+    text = read_secret(path, _MOST_PEM_BYTES)
     try:
-        with path.open("rb") as file:
-            mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
-            if mode & _OTHERS:
-                raise InputError(
-                    f"{path}: mode {mode:04o}, expected a private key that its owner alone can use: chmod 600"
-                )
-            text = file.read(_MOST_PEM_BYTES)
         key = serialization.load_pem_private_key(text, password=None)
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
     except (ValueError, TypeError, UnsupportedAlgorithm) as fault:
         raise InputError(f"{path}: expected an Ed25519 private key, PEM, without a password") from fault
     if not isinstance(key, Ed25519PrivateKey):

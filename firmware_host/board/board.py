@@ -17,6 +17,7 @@ from firmware_host.errors import IncompatibleError, LineError, RefusedError, Ver
 from firmware_host.protocol.client import RequestOutcome
 from firmware_host.protocol.profiles import DIGESTS
 from firmware_host.protocol.requests import (
+    KEY_BYTES,
     NO_BANK,
     BlankReply,
     BlankRequest,
@@ -31,6 +32,8 @@ from firmware_host.protocol.requests import (
     CrcRequest,
     Format,
     HelloReply,
+    KeyReply,
+    KeyRequest,
     LedTestReply,
     LedTestRequest,
     LevelReply,
@@ -189,6 +192,19 @@ class Board:
     def test_leds(self, first: int, last: int, dwell_ms: int) -> None:
         """Walk over LEDs one by one."""
         self.session.call(LedTestRequest(first, last, dwell_ms), LedTestReply)
+
+    def set_key(self, key: bytes | None) -> None:
+        """Set the board's key, or take it away; a new session begins, and SAVE keeps it.
+
+        Raises:
+            IncompatibleError: The board has no random numbers, which keys need, or no keys.
+            RefusedError: It has a key, and this host not.
+        """
+        if not self.about.capabilities & Capability.TRUST:
+            raise IncompatibleError(f"{self.session.name}: cannot have a key; see 'evlcp board hello'")
+        self.session.call(KeyRequest(key or bytes(KEY_BYTES)), KeyReply)
+        self.session.key = key
+        self.about = self.session.renew()
 
     def crc(self, bank: int, offset: int, length: int) -> int:
         """CRC-32 of a bank's bytes."""
@@ -456,7 +472,7 @@ class Board:
         total = sum(n for _, n in missing)
         advance = progress or _silent
         advance(len(content) - total, len(content))
-        piece = self.about.max_payload - _WRITE_OVERHEAD
+        piece = self.session.max_payload - _WRITE_OVERHEAD
         left = deque((at, at + n) for at, n in missing)
         state = {"piece": piece, "done": 0}
 

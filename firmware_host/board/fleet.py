@@ -20,6 +20,7 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.specs import SpecError, build, read_toml, shown
 from firmware_host.board.bank import MOST_RANDOM_FRAMES, Bank, bank_of, check_link, random_symbols, read_masks
 from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.keys import read_board_key
 from firmware_host.board.session import Session
 from firmware_host.board.sites import site_that_sends
 from firmware_host.board.symbols import read_symbols
@@ -71,6 +72,7 @@ class Entry:
         baud: Line rate, bit/s.
         level_limit_ma: Largest LED current from now on, mA.
         duty_limit: Largest share of time that a LED is on from now on.
+        board_key: File of the board's key, its path relative to the inventory's.
 
     Raises:
         ConfigError: Not exactly one of payload, random and a message is given.
@@ -98,6 +100,7 @@ class Entry:
     baud: Annotated[int, Field(ge=1200)] = DEFAULT_BAUD
     level_limit_ma: Annotated[int, Field(ge=1, le=65535)] | None = None
     duty_limit: Annotated[float, Field(ge=0.001, le=1)] | None = None
+    board_key: str | None = None
 
     def __post_init__(self) -> None:
         given = (self.payload is not None, self.random is not None, self.has_message)
@@ -291,14 +294,17 @@ def _message(folder: Path, entry: Entry, link: Link) -> NDArray[np.int64]:
 
 
 @contextlib.contextmanager
-def board_of(entry: Entry) -> Iterator[Board]:
-    """The board of an entry.
+def board_of(entry: Entry, folder: Path) -> Iterator[Board]:
+    """The board of an entry of an inventory in a folder.
 
     Raises:
         IncompatibleError: Another board is on its port.
+        InputError: Its key cannot be read.
         NoBoardError: None answers there.
+        RefusedError: It has another key.
     """
-    with Session(open_port(entry.port, entry.baud), Timing(entry.baud)) as session:
+    key = None if entry.board_key is None else read_board_key(folder / entry.board_key)
+    with Session(open_port(entry.port, entry.baud), Timing(entry.baud), key=key) as session:
         board = Board(session)
         found = board.about.unique_id.hex()
         if entry.unique_id not in (None, found):
@@ -316,8 +322,10 @@ Work = Callable[[Entry, Board], tuple[str, dict[str, Any]]]
 """What is done with a board; what it did, for a person and as plain values."""
 
 
-def run_fleet(entries: Sequence[Entry], work: Work, report: Report | None = None) -> list[Result]:
-    """Do something with all boards at once; one that fails does not hold up the others.
+def run_fleet(
+    entries: Sequence[Entry], folder: Path, work: Work, report: Report | None = None
+) -> list[Result]:
+    """Do something with all boards of an inventory in a folder; one that fails does not hold up the others.
 
     Returns:
         The results in the order of the entries.
@@ -327,7 +335,7 @@ def run_fleet(entries: Sequence[Entry], work: Work, report: Report | None = None
         start = time.monotonic()
         said, table, failed = "", dict[str, Any](), None
         try:
-            with board_of(entry) as board:
+            with board_of(entry, folder) as board:
                 said, table = work(entry, board)
         except EvlcpError as fault:
             failed = fault
@@ -365,7 +373,7 @@ def program_fleet(inventory: Inventory, verify: bool = True, report: Report | No
         elapsed = time.monotonic() - start
         return f"programmed {done.written} of {done.length} bytes in {elapsed:.2f} s", table
 
-    return run_fleet([entry for entry, _ in inventory.boards], work, report)
+    return run_fleet([entry for entry, _ in inventory.boards], inventory.path.parent, work, report)
 
 
 def verify_fleet(inventory: Inventory, report: Report | None = None) -> list[Result]:
@@ -378,7 +386,7 @@ def verify_fleet(inventory: Inventory, report: Report | None = None) -> list[Res
         table = {"bytes": len(bank.content), "bank": number, "crc": f"{bank.crc:08x}"}
         return f"same: {len(bank.content)} bytes in bank {number}, CRC {bank.crc:08x}", table
 
-    return run_fleet([entry for entry, _ in inventory.boards], work, report)
+    return run_fleet([entry for entry, _ in inventory.boards], inventory.path.parent, work, report)
 
 
 def raise_failures(path: Path, results: list[Result]) -> None:

@@ -20,11 +20,13 @@ from firmware_host.protocol.requests import (
     MAX_PAYLOAD,
     MINOR,
     NO_SESSION,
+    SEAL_BYTES,
     HelloReply,
     HelloRequest,
     Status,
     Type,
 )
+from firmware_host.protocol.seal import Sealer, key_name
 from firmware_host.protocol.wire import WireMessage
 
 __all__ = ["Session", "refusal"]
@@ -56,6 +58,8 @@ _ADVICE = {
     Status.EMPTY_SLOT: "no settings are saved; 'evlcp board save' first",
     Status.TOO_BRIGHT: "a LED would be on for longer than the limits allow ({detail} of 1000 chips at this"
     " current); lower the level, or program chips that are dark more often",
+    Status.NEEDS_KEY: "it has a key: give it with --key; without, it can only be looked at",
+    Status.BAD_SEAL: "sealed with another key, or not for this session; run the command again",
     Status.HARDWARE_FAULT: "a fault holds the LEDs dark (bits {detail:#x}); see 'evlcp board status'",
 }
 
@@ -92,8 +96,10 @@ class Session:
         first: First sequence number, by default drawn at random.
         nonce: Number of the session, by default drawn at random.
         tries: How often a request is sent before it is given up.
+        key: The board's key, which requests are sealed with if it has one.
 
     Attributes:
+        key: The same.
         max_payload: Largest payload that the board takes, bytes; HELLO says it.
     """
 
@@ -104,10 +110,12 @@ class Session:
         first: int | None = None,
         nonce: int | None = None,
         tries: int = TRIES,
+        key: bytes | None = None,
     ) -> None:
         draw = random.SystemRandom()
         self.transport = transport
         self._nonce = draw.randrange(1 << 32) if nonce is None else nonce
+        self.key = key
         self.max_payload = MAX_PAYLOAD
         self.client = Client(
             timing or Timing(),
@@ -136,8 +144,10 @@ class Session:
         Raises:
             NoBoardError: Nobody answers.
             IncompatibleError: The board speaks another protocol.
+            RefusedError: It has another key than this host.
         """
         self.client.session = NO_SESSION
+        self.client.sealer, known = None, self.client.sealer
         self.client.window = 1
         self.client.minor = MINOR
         found: list[RequestOutcome] = []
@@ -160,8 +170,31 @@ class Session:
         self.client.session = outcome.reply.session
         self.client.window = max(1, outcome.reply.window)
         self.max_payload = outcome.reply.max_payload
+        self._agree_on_key(outcome.reply, outcome.token, known)
         self.client.minor = min(MINOR, outcome.reply.minor)
         return outcome.reply
+
+    def renew(self) -> HelloReply:
+        """Open another session; faults as of `hello`."""
+        self._nonce = (self._nonce + 1) & 0xFFFFFFFF
+        return self.hello()
+
+    def _agree_on_key(self, about: HelloReply, token: int, known: Sealer | None) -> None:
+        """Seal what follows if the board has a key; without it its board can only be looked at."""
+        if not any(about.key_name) or self.key is None:
+            return
+        own = key_name(self.key)
+        if own != about.key_name:
+            raise RefusedError(
+                f"{self.name}: has the key {about.key_name.hex()}, this host's is {own.hex()};"
+                " give that board's with --key",
+                Status.BAD_SEAL,
+            )
+        # numbers begin with that of the HELLO that opened the session
+        start = ((self.client.first + token) & 0xFFFF) - token
+        same = known is not None and known.challenge == about.challenge
+        self.client.sealer = known if same else Sealer(self.key, about.challenge, start)
+        self.max_payload = about.max_payload - SEAL_BYTES
 
     def call(self, request: WireMessage, reply: type[Reply]) -> Reply:
         """One request and its answer.

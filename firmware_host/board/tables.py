@@ -38,6 +38,7 @@ def about_table(about: HelloReply) -> dict[str, Any]:
         "mean_max_ma": about.mean_max_ma,
         "burst_chips": about.burst_chips,
         "capabilities": names_of_bits(Capability, about.capabilities),
+        "key": about.key_name.hex() if any(about.key_name) else None,
         "uptime_ms": about.uptime_ms,
     }
 

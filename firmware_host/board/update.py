@@ -176,7 +176,7 @@ def update(
         )
     session.call(UpdateBeginRequest(before.next, len(data), zlib.crc32(data)), UpdateBeginReply)
     advance = progress or (lambda _done, _total: None)
-    piece = (board.about.max_payload - UpdateWriteRequest.fixed_bytes()) // 4 * 4
+    piece = (board.session.max_payload - UpdateWriteRequest.fixed_bytes()) // 4 * 4
     done = 0
 
     def requests() -> Iterator[UpdateWriteRequest]:

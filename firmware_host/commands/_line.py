@@ -41,12 +41,14 @@ class BoardLine:
         baud: Line rate, bit/s.
         trace: File to record the wire in.
         replay: Recorded wire to play back, without a board.
+        key: File of the board's key.
     """
 
     port: str | None = None
     baud: int = _BAUD
     trace: Path | None = None
     replay: Path | None = None
+    key: Path | None = None
 
     def found(self) -> str:
         """The port: the one that is named, or the one of those that are asked that has a board."""
@@ -59,11 +61,14 @@ class BoardLine:
         """The board on the line, or the recorded one."""
         from evlcp_sdk.errors import ConfigError, OutputError
         from firmware_host.board.board import Board
+        from firmware_host.board.keys import read_board_key
         from firmware_host.board.session import Session
         from firmware_host.emulators.opening import open_port
         from firmware_host.ports.transport import ReplayTransport, TraceTransport, Transport
         from firmware_host.protocol.client import Timing
 
+        # before the line is opened
+        key = None if self.key is None else read_board_key(self.key)
         transport: Transport
         first = nonce = None
         baud = self.baud
@@ -84,7 +89,7 @@ class BoardLine:
                 except OutputError:
                     transport.close()
                     raise
-        with Session(transport, Timing(baud), first, nonce) as session:
+        with Session(transport, Timing(baud), first, nonce, key=key) as session:
             yield Board(session)
 
 
@@ -107,6 +112,10 @@ def line_options(
     replay: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Play a recorded wire back; no board.")
     ] = None,
+    key: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", envvar="EVLCP_BOARD_KEY", help="The board's key, if it has one."),
+    ] = None,
 ) -> None:
     """The callback of a group whose commands work on a board."""
     name = context.invoked_subcommand or ""
@@ -114,7 +123,7 @@ def line_options(
     for option in LINE:
         if option not in taken and from_command_line(context, option):
             raise typer.BadParameter(f"'{name}' takes no --{option}", param_hint=f"--{option}")
-    context.obj = BoardLine(port, baud, trace, replay)
+    context.obj = BoardLine(port, baud, trace, replay, key)
 
 
 class LineCommand(JsonCommand):

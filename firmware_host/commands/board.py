@@ -245,7 +245,7 @@ def _on_fleet(context: typer.Context, path: Path, as_json: bool, work: "Work", *
     from firmware_host.board.fleet import raise_failures, read_entries, run_fleet
 
     _beside_inventory(context, *allowed)
-    raise_failures(path, run_fleet(read_entries(path), work, _report(as_json)))
+    raise_failures(path, run_fleet(read_entries(path), path.parent, work, _report(as_json)))
 
 
 def _program_fleet(path: Path, verify: bool, stay: bool, as_json: bool) -> None:
@@ -254,7 +254,8 @@ def _program_fleet(path: Path, verify: bool, stay: bool, as_json: bool) -> None:
     inventory = read_inventory(path)
     raise_failures(path, program_fleet(inventory, verify, _report(as_json)))
     if stay:
-        _watch_fleet([entry for entry, _ in inventory.boards], 1.0, None, True, as_json, quiet=True)
+        entries = [entry for entry, _ in inventory.boards]
+        _watch_fleet(path, entries, 1.0, None, True, as_json, quiet=True)
 
 
 @app.command(cls=LineCommand)
@@ -344,7 +345,8 @@ def _start_together(context: typer.Context, inventory: Path | None, pulse_hz: in
             boards = [stack.enter_context(open_board(context))]
         else:
             _beside_inventory(context, "pulse_hz")
-            boards = [stack.enter_context(board_of(entry)) for entry in read_entries(inventory)]
+            opened = (board_of(entry, inventory.parent) for entry in read_entries(inventory))
+            boards = [stack.enter_context(one) for one in opened]
         targets = start_together(boards, pulse_hz)
     table = {board.session.name: target for board, target in zip(boards, targets, strict=True)}
     words = ", ".join(f"{name} at its pulse {target}" for name, target in table.items())
@@ -442,7 +444,8 @@ def monitor(
         from firmware_host.board.fleet import read_entries
 
         _beside_inventory(context, "interval", "count", "reconnect")
-        _watch_fleet(list(read_entries(inventory)), interval, count, reconnect, as_json)
+        entries = list(read_entries(inventory))
+        _watch_fleet(inventory, entries, interval, count, reconnect, as_json)
         return
     line: BoardLine = context.obj
     # Where no port is named the one that is found now is meant, whatever comes later.
@@ -453,6 +456,7 @@ def monitor(
 
 
 def _watch_fleet(
+    path: Path,
     entries: "list[Entry]",
     interval: float,
     count: int | None,
@@ -463,6 +467,7 @@ def _watch_fleet(
     """Watch all boards of an inventory until Ctrl-C, or until each has been seen `count` times.
 
     Args:
+        path: The inventory.
         entries: The boards.
         interval: Seconds between two looks.
         count: Looks at each board.
@@ -481,7 +486,9 @@ def _watch_fleet(
     ended, printing = threading.Event(), threading.Lock()
 
     def one(entry: "Entry") -> None:
-        for seen in watch(partial(board_of, entry), interval, count, reconnect, reconnect, ended):
+        for seen in watch(
+            partial(board_of, entry, path.parent), interval, count, reconnect, reconnect, ended
+        ):
             if quiet and isinstance(seen, StatusReply):
                 continue
             with printing:
@@ -669,6 +676,52 @@ def emulate(
         raise typer.Exit(code)  # a file of the board's, which has said so
     if code not in (0, -signal.SIGTERM, -signal.SIGINT):
         raise ToolchainError(f"the {emulator} board ended with {code}; see its message above")
+
+
+@app.command(cls=JsonCommand)
+def keygen(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Where the key goes.")],
+    show: Annotated[bool, typer.Option("--show", help="Print the name of one that is there.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Make a key for boards, for its owner's eyes only; print its name, by which a board tells which it has.
+
+    For example: [bold]evlcp board keygen bar.key[/]
+    """
+    from firmware_host.board.keys import make_board_key, read_board_key
+    from firmware_host.protocol.seal import key_name
+
+    name = key_name(read_board_key(file)).hex() if show else make_board_key(file)
+    say(name, {"key": name}, as_json)
+
+
+@app.command(cls=LineCommand)
+def lock(
+    context: typer.Context,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The key, as 'evlcp board keygen' makes it.")],
+    as_json: AsJson = False,
+) -> None:
+    """Give a board a key: without it, the board can only be looked at; another one is taken with --key OLD.
+
+    The key goes over the line as it is: do it where nobody listens. It is gone with a reset unless saved.
+
+    For example: [bold]evlcp board --port /dev/ttyUSB0 lock bar.key[/]
+    """
+    from firmware_host.board.keys import read_board_key
+
+    key = read_board_key(file)
+    with open_board(context) as board:
+        board.set_key(key)
+        name = board.about.key_name.hex()
+    say(f"locked with key {name}; 'evlcp board save' keeps it over a reset", {"key": name}, as_json)
+
+
+@app.command(cls=LineCommand)
+def unlock(context: typer.Context, as_json: AsJson = False) -> None:
+    """Take a board's key away, with --key; it is back with a reset unless the board is saved."""
+    with open_board(context) as board:
+        board.set_key(None)
+    say("unlocked; 'evlcp board save' keeps it so over a reset", {"key": None}, as_json)
 
 
 @app.command(cls=JsonCommand)

@@ -64,6 +64,10 @@ def message(
         ),
     ] = None,
     baud: Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)] = 1_000_000,
+    board_key: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", envvar="EVLCP_BOARD_KEY", help="The board's key, if it has one."),
+    ] = None,
     every: Annotated[
         float | None,
         typer.Option(
@@ -160,7 +164,7 @@ def message(
             raise ConfigError("--every sends to a board: give --port (or EVLCP_PORT)")
         coder = link.block_coder()
         packets_of(made(begun_s, 0), coder, repeat)  # what is wrong is known before the board waits for it
-        with BoardLine(port, baud).open() as board:
+        with BoardLine(port, baud, key=board_key).open() as board:
             stream = board.stream(link, ahead)
 
             def next_one(number: int) -> "NDArray[np.int64] | None":
@@ -210,7 +214,7 @@ def message(
             raise ConfigError("nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips")
         return
     bank = bank_of(symbols, link)
-    with BoardLine(port, baud).open() as board:
+    with BoardLine(port, baud, key=board_key).open() as board:
         with progress_bar("programming") as progress:
             programmed = provision(board, bank, Settings(), True, progress)
         if as_json:
@@ -237,15 +241,16 @@ def _tell(summary: dict[str, Any], written: list[str], plays: bool) -> None:
 
 def keygen(
     private: Annotated[Path, typer.Argument(metavar="private.pem", help="Where the private key goes.")],
+    show: Annotated[bool, typer.Option("--show", help="Print the public key of one that is there.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Make an Ed25519 key that signs beacons; print the public key, for messages.trusted_keys.
 
     For example: [bold]evlcp tx keygen private.pem[/]
     """
-    from evlcp_sdk.air.signing import make_key
+    from evlcp_sdk.air.signing import make_key, public_key, read_key
 
-    public = make_key(private)
+    public = public_key(read_key(private)) if show else make_key(private)
     say(public, {"public_key": public}, as_json)
 
 

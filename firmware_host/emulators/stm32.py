@@ -8,6 +8,7 @@ setting that they do not know; ports, PWR, DAC and EXTI keep what is written.
 """
 
 import heapq
+import secrets
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -559,6 +560,34 @@ class Flash:
                 self.cr &= ~0x10000
 
 
+class Rng:
+    """Random numbers, a word in 40 cycles of the PLL's 48 MHz (RM0090 24)."""
+
+    WORD = 40 * UNIT_HZ // 48_000_000
+
+    def __init__(self, chip: "Stm32") -> None:
+        self.chip = chip
+        self.control = 0
+        self.ready = 0
+
+    def read(self, offset: int) -> int:
+        """A register."""
+        clocked = self.chip.plain.get(0x40023834, 0) >> 6 & 1 and self.chip.plain[0x40023800] >> 25 & 1
+        on = clocked and self.control >> 2 & 1
+        if offset == 0x4:
+            return int(bool(on) and self.chip.now >= self.ready)
+        if offset == 0x8 and on and self.chip.now >= self.ready:
+            self.ready = self.chip.now + self.WORD
+            return int.from_bytes(secrets.token_bytes(4), "little")
+        return self.control if offset == 0x0 else 0
+
+    def write(self, offset: int, value: int) -> None:
+        """A register."""
+        if offset == 0x0:
+            self.control = value
+            self.ready = self.chip.now + self.WORD
+
+
 class Stm32:
     """The part, from power-up on.
 
@@ -581,7 +610,7 @@ class Stm32:
         uc.mem_map(0x20000000, 1 << 17)
         uc.mem_map(0x1FFF7000, 0x1000, unicorn.UC_PROT_READ)
         uc.mem_map(RETURN, 0x1000)
-        for base, size in ((0x40000000, 0x80000), (0xE0000000, 0x100000)):
+        for base, size in ((0x40000000, 0x80000), (0x50060000, 0x1000), (0xE0000000, 0x100000)):
             uc.mmio_map(base, size, self._read, base, self._write, base)
         whole = FlashImage.read(image) if isinstance(image, Path) else image
         uc.mem_write(whole.address, whole.data)
@@ -629,6 +658,7 @@ class Stm32:
             0x40013000: self.spi,
             0x40023C00: self.flash,
             0x40026400: self.dma,
+            0x50060800: Rng(self),
         }
         stack, entry = struct.unpack("<2I", self.uc.mem_read(0x08000000, 8))
         self.uc.reg_write(arm_const.UC_ARM_REG_SP, stack)

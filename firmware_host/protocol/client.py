@@ -18,8 +18,10 @@ from firmware_host.protocol.requests import (
     NO_SESSION,
     REPLIES,
     REPLY_BIT,
+    SEALED,
     Status,
 )
+from firmware_host.protocol.seal import Sealer
 from firmware_host.protocol.wire import WireMessage
 
 __all__ = ["TRIES", "Client", "RequestOutcome", "Timing"]
@@ -97,6 +99,7 @@ class Client:
         timing: How long an answer may take.
         window: Requests under way at once; HELLO says how many the board takes.
         session: Session that HELLO gave.
+        sealer: Seals requests of the session; None where the board has no key, or this host has not.
         minor: Minor version of the protocol in which requests are sent: the board's, that HELLO gave.
         first: First sequence number, by default drawn at random.
         tries: How often a request is sent before it is given up.
@@ -114,6 +117,7 @@ class Client:
     window: int = 1
     session: int = NO_SESSION
     minor: int = MINOR
+    sealer: Sealer | None = None
     first: int = field(default_factory=lambda: random.SystemRandom().randrange(1 << 16))
     tries: int = TRIES
     retries: int = 0
@@ -127,10 +131,13 @@ class Client:
         """Queue a request; returns the token its outcome will carry."""
         sequence = (self.first + self._tokens) & 0xFFFF
         chosen = self.session if session is None else session
-        wire = Datagram(request.TYPE, 0, sequence, chosen, request.pack(self.minor)).encode()
+        token, payload, status = self._tokens, request.pack(self.minor), 0
+        if self.sealer is not None and chosen != NO_SESSION:
+            payload += self.sealer.seal(request.TYPE, chosen, token, payload)
+            status = SEALED
+        wire = Datagram(request.TYPE, status, sequence, chosen, payload).encode()
         reply = REPLIES[request.TYPE]
         longest = MAX_PAYLOAD if reply.LAYOUT[-1:] == (("*", 1),) else max(4, reply.fixed_bytes())
-        token = self._tokens
         self._tokens += 1
         self._queue.append(_Waiting(token, request.TYPE, wire, longest + HEADER_BYTES + CRC_BYTES + 4))
         return token

@@ -328,18 +328,19 @@ def c_header(definition: dict[str, Any]) -> str:
         "",
         f"#define EVLCP_REQUEST_MOST {max(sizes.values())}u /* longest request, data left out */",
         "",
-        "/* Requests: type, whether control, whether any length may follow, and the length, that of the",
-        "   first minor version and today's; a shorter one goes on with zeros. */",
+        "/* Requests: type, whether control, whether a query, whether any length may follow, and the length,",
+        "   that of the first minor version and today's; a shorter one goes on with zeros. */",
         "#define EVLCP_SHAPES \\",
     ]
     rows = []
     for message, request, _ in _messages(definition):
         least = sum(f.size for f in request if not f.since)
-        control = "true" if message["kind"] == "control" else "false"
+        control, query = (str(message["kind"] == kind).lower() for kind in ("control", "query"))
         # what a later host adds to HELLO is for the board to leave alone
         more = "true" if message["kind"] == "session" or any(not f.size for f in request) else "false"
         rows.append(
-            f"    {{0x{message['type']:02x}u, {control}, {more}, {least}u, {sizes[message['name']]}u}}"
+            f"    {{0x{message['type']:02x}u, {control}, {query}, {more}, {least}u,"
+            f" {sizes[message['name']]}u}}"
         )
     out += [", \\\n".join(rows), "", "#endif", ""]
     return "\n".join(out)

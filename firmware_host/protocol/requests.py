@@ -7,12 +7,15 @@ from typing import ClassVar
 from firmware_host.protocol.wire import WireMessage
 
 __all__ = [
+    "CHALLENGE_BYTES",
     "CHIP_DARK",
     "CHIP_TEST",
     "CLUSTERS",
     "CRC_BYTES",
     "DEFAULT_BAUD",
     "HEADER_BYTES",
+    "KEY_BYTES",
+    "KEY_NAME_BYTES",
     "LEDS",
     "MAJOR",
     "MAX_PAYLOAD",
@@ -22,6 +25,8 @@ __all__ = [
     "REPLIES",
     "REPLY_BIT",
     "ROW_BYTES",
+    "SEALED",
+    "SEAL_BYTES",
     "WINDOW",
     "BlankReply",
     "BlankRequest",
@@ -38,6 +43,8 @@ __all__ = [
     "Format",
     "HelloReply",
     "HelloRequest",
+    "KeyReply",
+    "KeyRequest",
     "LedTestReply",
     "LedTestRequest",
     "LevelReply",
@@ -99,6 +106,16 @@ NO_BANK = 0xFF
 """No bank."""
 NO_SESSION = 0x0
 """Session of a HELLO request, and of a board that knows no host."""
+SEALED = 0x1
+"""Status of a request that ends with a seal."""
+SEAL_BYTES = 0x10
+"""Length of a seal, at the end of the payload."""
+KEY_BYTES = 0x10
+"""Length of a board's key."""
+CHALLENGE_BYTES = 0x8
+"""Length of a session's challenge."""
+KEY_NAME_BYTES = 0x4
+"""First bytes of a key's SHA-256, which name it."""
 CHIP_DARK = 0xFFFFFFFF
 """Chip number in an LED record: output is dark, no chip."""
 CHIP_TEST = 0xFFFFFFFE
@@ -126,6 +143,7 @@ class Type(IntEnum):
     LED_TEST = 0x10
     STREAM = 0x18
     PUSH = 0x19
+    KEY = 0x1A
     UPDATE_STATUS = 0x20
     UPDATE_BEGIN = 0x21
     UPDATE_WRITE = 0x22
@@ -167,6 +185,10 @@ class Status(IntEnum):
     """No flash slot holds a valid setting."""
     HARDWARE_FAULT = 14
     """A fault holds the LEDs dark; detail: fault bits."""
+    NEEDS_KEY = 16
+    """The board has a key: what changes something must be sealed with it."""
+    BAD_SEAL = 17
+    """The seal is of another key, or of another request."""
     TOO_BRIGHT = 15
     """LEDs would be on for longer than the limits allow; detail: the share that they allow, permille."""
 
@@ -236,6 +258,8 @@ class Capability(IntFlag):
     """STATUS.open_leds is measured."""
     RECORDS = 16
     """LED outputs are recorded (emulators)."""
+    TRUST = 64
+    """KEY: requests that change something are sealed."""
     STREAM = 32
     """STREAM and PUSH: packets as they come."""
     PULSE = 512
@@ -314,6 +338,8 @@ class HelloReply(WireMessage):
         uptime_ms: Time since reset; smaller than before means a reset.
         hal: Name of the hardware layer, ASCII, zero-padded.
         clock_hz: Rate of STATUS's clock, nominal.
+        challenge: Drawn for the session: seals are over it.
+        key_name: First bytes of the SHA-256 of the board's key; zeros without one.
     """
 
     TYPE: ClassVar[int] = 0x01
@@ -340,8 +366,10 @@ class HelloReply(WireMessage):
         ("I", 1),
         ("12s", 1),
         ("I", 1),
+        ("8s", 1),
+        ("4s", 1),
     )
-    FIELD_SINCE: ClassVar[dict[str, int]] = {"clock_hz": 1}
+    FIELD_SINCE: ClassVar[dict[str, int]] = {"clock_hz": 1, "challenge": 1, "key_name": 1}
 
     major: int
     minor: int
@@ -365,6 +393,8 @@ class HelloReply(WireMessage):
     uptime_ms: int
     hal: bytes
     clock_hz: int = 0
+    challenge: bytes = bytes(8)
+    key_name: bytes = bytes(4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -1041,6 +1071,30 @@ class PushReply(WireMessage):
 
 
 @dataclass(frozen=True, slots=True)
+class KeyRequest(WireMessage):
+    """Set the key that requests which change something are sealed with; SAVE keeps it.
+
+    Attributes:
+        key: The key; zeros for none.
+    """
+
+    TYPE: ClassVar[int] = 0x1A
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (("16s", 1),)
+    SINCE: ClassVar[int] = 1
+
+    key: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class KeyReply(WireMessage):
+    """What the board answers to KEY."""
+
+    TYPE: ClassVar[int] = 0x1A
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    SINCE: ClassVar[int] = 1
+
+
+@dataclass(frozen=True, slots=True)
 class UpdateStatusRequest(WireMessage):
     """Which image of the firmware runs, and where another one would go."""
 
@@ -1220,6 +1274,7 @@ REPLIES: dict[int, type[WireMessage]] = {
     0x10: LedTestReply,
     0x18: StreamReply,
     0x19: PushReply,
+    0x1A: KeyReply,
     0x20: UpdateStatusReply,
     0x21: UpdateBeginReply,
     0x22: UpdateWriteReply,

@@ -114,6 +114,7 @@ static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x, uint16_t 
         e->control.known = false;
         e->control.newest = sequence;
         e->control.sequence = sequence;
+        evlcp_trust_session(&e->trust, sequence);
     }
     reply.major = EVLCP_PROTOCOL_MAJOR;
     reply.minor = EVLCP_PROTOCOL_MINOR;
@@ -133,6 +134,11 @@ static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x, uint16_t 
     reply.mean_max_ma = e->info.mean_max_ma;
     reply.burst_chips = e->info.burst_chips;
     reply.capabilities = e->info.capabilities | EVLCP_CAPABILITY_STREAM;
+    if (e->trust.able) {
+        reply.capabilities |= EVLCP_CAPABILITY_TRUST;
+        evlcp_copy(reply.challenge, e->trust.challenge, sizeof reply.challenge);
+        evlcp_trust_name(&e->trust, reply.key_name);
+    }
     evlcp_copy(reply.unique_id, e->info.unique_id, sizeof reply.unique_id);
     evlcp_copy(reply.hal, e->info.name, sizeof reply.hal);
     reply.clock_hz = e->info.clock_hz;
@@ -661,6 +667,11 @@ static enum evlcp_status on_control(struct evlcp *e, uint8_t type, struct exchan
         return on_commit(e, x);
     case EVLCP_TYPE_STREAM:
         return on_stream(e, x);
+    case EVLCP_TYPE_KEY:
+        if (!e->trust.able)
+            return EVLCP_STATUS_NOT_SUPPORTED;
+        evlcp_trust_set(&e->trust, x->in);
+        return EVLCP_STATUS_OK;
     case EVLCP_TYPE_START:
         return on_start(e, x);
     case EVLCP_TYPE_STOP:
@@ -688,6 +699,7 @@ static enum evlcp_status on_control(struct evlcp *e, uint8_t type, struct exchan
 struct shape {
     uint8_t type;
     bool control;
+    bool query;
     bool open_ended;
     uint16_t least;
     uint16_t bytes;
@@ -741,8 +753,10 @@ static void heard(struct evlcp *e)
     atomic_store(&e->player.want_idle, false);
 }
 
-static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *d, struct exchange *x)
+static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *d, bool sealed, struct exchange *x)
 {
+    /* Who has no key may look, but neither change anything nor stand in for the host. */
+    bool trusted = sealed || !e->trust.locked;
     const struct shape *shape = shape_of(d->type);
     if (shape == 0)
         return EVLCP_STATUS_UNKNOWN_TYPE;
@@ -759,17 +773,23 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
     }
     if (d->type == EVLCP_TYPE_HELLO) {
         enum evlcp_status status = on_hello(e, x, d->sequence);
-        if (status == EVLCP_STATUS_OK)
+        if (status == EVLCP_STATUS_OK && trusted)
             heard(e);
         return status;
     }
     if (d->session != e->session || e->session == EVLCP_NO_SESSION)
         return EVLCP_STATUS_NO_SESSION;
-    heard(e);
-    if (d->type != EVLCP_TYPE_STATUS)
-        e->watch.asked_ms = e->watch.heard_ms;
     struct evlcp_control *c = &e->control;
-    if (after(d->sequence, c->newest)) {
+    /* What is answered again is not done again: a KEY, say, whose answer was lost. */
+    bool again = shape->control && c->known && d->sequence == c->sequence && d->type == c->type;
+    if (!trusted && !shape->query && !again)
+        return EVLCP_STATUS_NEEDS_KEY;
+    if (trusted) {
+        heard(e);
+        if (d->type != EVLCP_TYPE_STATUS)
+            e->watch.asked_ms = e->watch.heard_ms;
+    }
+    if (trusted && after(d->sequence, c->newest)) {
         c->newest = d->sequence;
         /* Keep the last control request within the half of the numbers that counts as before. */
         if ((uint16_t)(c->newest - c->sequence) > 0x4000u) {
@@ -778,7 +798,7 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
         }
     }
     if (shape->control) {
-        e->watch.acted = false;
+        e->watch.acted = e->watch.acted && !trusted;
         return controlled(e, d, x);
     }
     switch (d->type) {
@@ -796,20 +816,27 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
         return on_crc(e, x);
     default: {
         enum evlcp_status status = on_status(e, x);
-        e->watch.asked_ms = e->watch.heard_ms; /* after, for the status tells how long it was */
+        if (trusted)
+            e->watch.asked_ms = e->watch.heard_ms; /* after, for the status tells how long it was */
         return status;
     }
     }
 }
 
-static void answer(struct evlcp *e, const struct evlcp_datagram *d)
+static void answer(struct evlcp *e, struct evlcp_datagram *d)
 {
-    struct exchange x = {.in = d->payload, .in_length = d->length, .out = e->payload};
+    struct exchange x = {.in = d->payload, .out = e->payload};
+    bool sealed = false;
     /* Replies go to hosts; one that comes here was echoed by the line. */
     if ((d->type & EVLCP_REPLY_BIT) != 0u)
         return;
     e->requests++;
-    enum evlcp_status status = dispatch(e, d, &x);
+    enum evlcp_status status = EVLCP_STATUS_OK;
+    if (d->session == e->session && e->session != EVLCP_NO_SESSION)
+        status = evlcp_trust_open(&e->trust, d, &sealed);
+    x.in_length = d->length;
+    if (status == EVLCP_STATUS_OK)
+        status = dispatch(e, d, sealed, &x);
     if (status != EVLCP_STATUS_OK) {
         evlcp_put32(e->payload, x.detail);
         x.out_length = 4u;
@@ -904,6 +931,8 @@ void evlcp_init(struct evlcp *e)
     (void)evlcp_light(e, e->info.level_default_ma, e->info.level_max_ma, 1000u);
     hal_health(&e->health);
     e->health_ms = hal_millis();
+    e->trust = (struct evlcp_trust){.able = false};
+    evlcp_settings_key(e);
     struct evlcp_recall_reply recalled;
     uint32_t detail;
     if (evlcp_settings_recall(e, true, &recalled) == EVLCP_STATUS_OK)

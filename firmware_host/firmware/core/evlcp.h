@@ -7,6 +7,7 @@
 #include "hal.h"
 #include "link.h"
 #include "player.h"
+#include "trust.h"
 #include "update.h"
 
 #define EVLCP_VERSION_MAJOR 1u
@@ -67,6 +68,7 @@ struct evlcp {
     struct evlcp_control control;
     struct evlcp_update update;
     struct evlcp_start start;
+    struct evlcp_trust trust;
     struct evlcp_health health;
     uint32_t health_ms;
     uint32_t nonce;
@@ -98,6 +100,9 @@ void evlcp_poll(struct evlcp *e);
 /* Storing settings; see settings.c. */
 enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct evlcp_save_reply *reply);
 enum evlcp_status evlcp_settings_recall(struct evlcp *e, bool only_autostart, struct evlcp_recall_reply *reply);
+
+/* The key of the newest slot that is whole. */
+void evlcp_settings_key(struct evlcp *e);
 
 /* Share of time that a LED may be on with a current, permille. */
 uint32_t evlcp_allowed(const struct evlcp *e, uint32_t level_ma);

@@ -74,6 +74,9 @@ uint32_t hal_lateness(void);
 /* Milliseconds since reset, free to wrap. */
 uint32_t hal_millis(void);
 
+/* Random numbers that nobody can foresee; false if the board has none. */
+bool hal_random(uint8_t *bytes, uint32_t count);
+
 /* Take bytes to send; returns how many were taken, and never waits. */
 uint32_t hal_send(const uint8_t *bytes, uint32_t count);
 

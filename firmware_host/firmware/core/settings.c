@@ -14,6 +14,7 @@ struct slot {
     uint32_t watchdog_ms;
     uint16_t level_limit_ma;
     uint16_t duty_limit;
+    uint8_t key[EVLCP_KEY_BYTES];
     struct evlcp_plan plan;
 };
 
@@ -42,6 +43,7 @@ static void put_header(const struct slot *s, uint8_t b[EVLCP_SLOT_HEADER_BYTES])
     evlcp_copy(b + 72, s->plan.digest, 32u);
     evlcp_put16(b + 104, s->level_limit_ma);
     evlcp_put16(b + 106, s->duty_limit);
+    evlcp_copy(b + 108, s->key, EVLCP_KEY_BYTES);
     evlcp_put32(b + EVLCP_SLOT_HEADER_BYTES - 4u, evlcp_crc32(0u, b, EVLCP_SLOT_HEADER_BYTES - 4u));
 }
 
@@ -73,6 +75,7 @@ static bool get_header(struct evlcp *e, uint8_t index, struct slot *s)
     evlcp_copy(s->plan.digest, b + 72, 32u);
     s->level_limit_ma = evlcp_get16(b + 104);
     s->duty_limit = evlcp_get16(b + 106);
+    evlcp_copy(s->key, b + 108, EVLCP_KEY_BYTES);
     return s->plan.chip_rate_hz != 0u && e->info.tick_hz % s->plan.chip_rate_hz == 0u &&
            s->plan.length <= EVLCP_BANK_BYTES;
 }
@@ -106,7 +109,7 @@ enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct ev
     } else if (valid[1]) {
         sequence = found[1].sequence + 1u;
     }
-    const struct slot slot = {.sequence = sequence,
+    struct slot slot = {.sequence = sequence,
                               .autostart = autostart,
                               .watchdog = e->watch.action,
                               .level_ma = e->level_ma,
@@ -114,6 +117,7 @@ enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct ev
                               .level_limit_ma = e->level_limit_ma,
                               .duty_limit = e->duty_limit,
                               .plan = e->banks.plan[active]};
+    evlcp_copy(slot.key, e->trust.key, EVLCP_KEY_BYTES);
     put_header(&slot, header);
     /* The header goes last: until it is complete the slot is empty. */
     if (!hal_flash_erase(to) ||
@@ -201,4 +205,18 @@ enum evlcp_status evlcp_settings_recall(struct evlcp *e, bool only_autostart, st
         }
     }
     return EVLCP_STATUS_EMPTY_SLOT;
+}
+
+void evlcp_settings_key(struct evlcp *e)
+{
+    struct slot found[EVLCP_SLOTS];
+    bool valid[EVLCP_SLOTS];
+    if ((e->info.capabilities & EVLCP_CAPABILITY_FLASH) == 0u)
+        return;
+    for (uint8_t i = 0; i < EVLCP_SLOTS; i++)
+        valid[i] = get_header(e, i, &found[i]);
+    /* Not that of an older slot, whatever RECALL does: a key that was changed is not believed again. */
+    uint8_t newest = valid[1] && (!valid[0] || newer(found[1].sequence, found[0].sequence)) ? 1u : 0u;
+    if (valid[newest])
+        evlcp_trust_set(&e->trust, found[newest].key);
 }

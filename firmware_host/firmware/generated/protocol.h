@@ -16,6 +16,11 @@
 #define EVLCP_REPLY_BIT 0x80u /* Set in the type of a reply. */
 #define EVLCP_NO_BANK 0xffu /* No bank. */
 #define EVLCP_NO_SESSION 0x0u /* Session of a HELLO request, and of a board that knows no host. */
+#define EVLCP_SEALED 0x1u /* Status of a request that ends with a seal. */
+#define EVLCP_SEAL_BYTES 0x10u /* Length of a seal, at the end of the payload. */
+#define EVLCP_KEY_BYTES 0x10u /* Length of a board's key. */
+#define EVLCP_CHALLENGE_BYTES 0x8u /* Length of a session's challenge. */
+#define EVLCP_KEY_NAME_BYTES 0x4u /* First bytes of a key's SHA-256, which name it. */
 #define EVLCP_CHIP_DARK 0xffffffffu /* Chip number in an LED record: output is dark, no chip. */
 #define EVLCP_CHIP_TEST 0xfffffffeu /* Chip number in an LED record: single-LED test, no chip. */
 
@@ -38,6 +43,7 @@ enum evlcp_type {
     EVLCP_TYPE_LED_TEST = 0x10,
     EVLCP_TYPE_STREAM = 0x18,
     EVLCP_TYPE_PUSH = 0x19,
+    EVLCP_TYPE_KEY = 0x1a,
     EVLCP_TYPE_UPDATE_STATUS = 0x20,
     EVLCP_TYPE_UPDATE_BEGIN = 0x21,
     EVLCP_TYPE_UPDATE_WRITE = 0x22,
@@ -63,6 +69,8 @@ enum evlcp_status {
     EVLCP_STATUS_NOT_SUPPORTED = 12, /* This board cannot do that. */
     EVLCP_STATUS_EMPTY_SLOT = 13, /* No flash slot holds a valid setting. */
     EVLCP_STATUS_HARDWARE_FAULT = 14, /* A fault holds the LEDs dark; detail: fault bits. */
+    EVLCP_STATUS_NEEDS_KEY = 16, /* The board has a key: what changes something must be sealed with it. */
+    EVLCP_STATUS_BAD_SEAL = 17, /* The seal is of another key, or of another request. */
     EVLCP_STATUS_TOO_BRIGHT = 15, /* LEDs would be on for longer than the limits allow; detail: the share that they allow, permille. */
 };
 
@@ -105,6 +113,7 @@ enum evlcp_capability {
     EVLCP_CAPABILITY_TEMPERATURE = 4, /* STATUS.temperature_dc is measured. */
     EVLCP_CAPABILITY_OPEN_LED = 8, /* STATUS.open_leds is measured. */
     EVLCP_CAPABILITY_RECORDS = 16, /* LED outputs are recorded (emulators). */
+    EVLCP_CAPABILITY_TRUST = 64, /* KEY: requests that change something are sealed. */
     EVLCP_CAPABILITY_STREAM = 32, /* STREAM and PUSH: packets as they come. */
     EVLCP_CAPABILITY_PULSE = 512, /* START at a pulse of the pulse input, in step with it from then on, or at a clock. */
     EVLCP_CAPABILITY_UPDATE = 256, /* UPDATE_*: takes another image of its firmware. */
@@ -182,7 +191,7 @@ static inline void evlcp_hello_request_get(const uint8_t *p, struct evlcp_hello_
     m->nonce = evlcp_get32(p + 2);
 }
 
-#define EVLCP_HELLO_REPLY_BYTES 68u
+#define EVLCP_HELLO_REPLY_BYTES 80u
 /* Answer to hello. */
 struct evlcp_hello_reply {
     uint8_t major; /* The board's protocol. */
@@ -207,6 +216,8 @@ struct evlcp_hello_reply {
     uint32_t uptime_ms; /* Time since reset; smaller than before means a reset. */
     uint8_t hal[12]; /* Name of the hardware layer, ASCII, zero-padded. */
     uint32_t clock_hz; /* Rate of STATUS's clock, nominal. */
+    uint8_t challenge[8]; /* Drawn for the session: seals are over it. */
+    uint8_t key_name[4]; /* First bytes of the SHA-256 of the board's key; zeros without one. */
 };
 
 static inline void evlcp_hello_reply_put(uint8_t *p, const struct evlcp_hello_reply *m)
@@ -233,6 +244,8 @@ static inline void evlcp_hello_reply_put(uint8_t *p, const struct evlcp_hello_re
     evlcp_put32(p + 48, m->uptime_ms);
     evlcp_copy(p + 52, m->hal, 12u);
     evlcp_put32(p + 64, m->clock_hz);
+    evlcp_copy(p + 68, m->challenge, 8u);
+    evlcp_copy(p + 76, m->key_name, 4u);
 }
 
 static inline void evlcp_hello_reply_get(const uint8_t *p, struct evlcp_hello_reply *m)
@@ -259,6 +272,8 @@ static inline void evlcp_hello_reply_get(const uint8_t *p, struct evlcp_hello_re
     m->uptime_ms = evlcp_get32(p + 48);
     evlcp_copy(m->hal, p + 52, 12u);
     m->clock_hz = evlcp_get32(p + 64);
+    evlcp_copy(m->challenge, p + 68, 8u);
+    evlcp_copy(m->key_name, p + 76, 4u);
 }
 
 #define EVLCP_CONFIGURE_REQUEST_BYTES 12u
@@ -869,6 +884,24 @@ static inline void evlcp_push_reply_get(const uint8_t *p, struct evlcp_push_repl
     m->underruns = evlcp_get32(p + 10);
 }
 
+#define EVLCP_KEY_REQUEST_BYTES 16u
+/* Set the key that requests which change something are sealed with; SAVE keeps it. */
+struct evlcp_key_request {
+    uint8_t key[16]; /* The key; zeros for none. */
+};
+
+static inline void evlcp_key_request_put(uint8_t *p, const struct evlcp_key_request *m)
+{
+    evlcp_copy(p + 0, m->key, 16u);
+}
+
+static inline void evlcp_key_request_get(const uint8_t *p, struct evlcp_key_request *m)
+{
+    evlcp_copy(m->key, p + 0, 16u);
+}
+
+#define EVLCP_KEY_REPLY_BYTES 0u
+
 #define EVLCP_UPDATE_STATUS_REQUEST_BYTES 0u
 
 #define EVLCP_UPDATE_STATUS_REPLY_BYTES 27u
@@ -989,32 +1022,33 @@ static inline void evlcp_update_commit_reply_get(const uint8_t *p, struct evlcp_
 
 #define EVLCP_REQUEST_MOST 69u /* longest request, data left out */
 
-/* Requests: type, whether control, whether any length may follow, and the length, that of the
-   first minor version and today's; a shorter one goes on with zeros. */
+/* Requests: type, whether control, whether a query, whether any length may follow, and the length,
+   that of the first minor version and today's; a shorter one goes on with zeros. */
 #define EVLCP_SHAPES \
-    {0x01u, false, true, 6u, 6u}, \
-    {0x02u, true, false, 12u, 12u}, \
-    {0x03u, true, false, 69u, 69u}, \
-    {0x04u, false, true, 5u, 5u}, \
-    {0x05u, false, false, 7u, 7u}, \
-    {0x06u, false, false, 9u, 9u}, \
-    {0x07u, true, false, 44u, 44u}, \
-    {0x08u, true, false, 0u, 10u}, \
-    {0x09u, true, false, 0u, 0u}, \
-    {0x0au, true, false, 0u, 0u}, \
-    {0x0bu, true, false, 2u, 2u}, \
-    {0x0cu, false, false, 0u, 0u}, \
-    {0x0du, true, false, 5u, 5u}, \
-    {0x0eu, true, false, 1u, 1u}, \
-    {0x0fu, true, false, 0u, 0u}, \
-    {0x10u, true, false, 4u, 4u}, \
-    {0x18u, true, false, 34u, 34u}, \
-    {0x19u, false, true, 8u, 8u}, \
-    {0x20u, false, false, 0u, 0u}, \
-    {0x21u, true, false, 9u, 9u}, \
-    {0x22u, false, true, 4u, 4u}, \
-    {0x23u, true, false, 0u, 0u}, \
-    {0x24u, true, false, 0u, 0u}, \
-    {0x25u, true, false, 0u, 0u}
+    {0x01u, false, false, true, 6u, 6u}, \
+    {0x02u, true, false, false, 12u, 12u}, \
+    {0x03u, true, false, false, 69u, 69u}, \
+    {0x04u, false, false, true, 5u, 5u}, \
+    {0x05u, false, true, false, 7u, 7u}, \
+    {0x06u, false, true, false, 9u, 9u}, \
+    {0x07u, true, false, false, 44u, 44u}, \
+    {0x08u, true, false, false, 0u, 10u}, \
+    {0x09u, true, false, false, 0u, 0u}, \
+    {0x0au, true, false, false, 0u, 0u}, \
+    {0x0bu, true, false, false, 2u, 2u}, \
+    {0x0cu, false, true, false, 0u, 0u}, \
+    {0x0du, true, false, false, 5u, 5u}, \
+    {0x0eu, true, false, false, 1u, 1u}, \
+    {0x0fu, true, false, false, 0u, 0u}, \
+    {0x10u, true, false, false, 4u, 4u}, \
+    {0x18u, true, false, false, 34u, 34u}, \
+    {0x19u, false, false, true, 8u, 8u}, \
+    {0x1au, true, false, false, 16u, 16u}, \
+    {0x20u, false, true, false, 0u, 0u}, \
+    {0x21u, true, false, false, 9u, 9u}, \
+    {0x22u, false, false, true, 4u, 4u}, \
+    {0x23u, true, false, false, 0u, 0u}, \
+    {0x24u, true, false, false, 0u, 0u}, \
+    {0x25u, true, false, false, 0u, 0u}
 
 #endif

@@ -120,6 +120,13 @@ uint32_t hal_send(const uint8_t *bytes, uint32_t count)
     return sent;
 }
 
+bool hal_random(uint8_t *bytes, uint32_t count)
+{
+    (void)bytes;
+    (void)count;
+    return false;
+}
+
 uint32_t hal_lost(void)
 {
     if ((UART_STATE(UART0) & UART_RXOVERRUN) != 0u) {

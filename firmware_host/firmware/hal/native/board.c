@@ -1,6 +1,7 @@
 #include "board.h"
 
 #include <string.h>
+#include <sys/random.h>
 
 /* The HAL has no context argument, as on a board; here it is the board that runs on this thread. */
 static _Thread_local struct native *self;
@@ -105,6 +106,11 @@ uint32_t hal_send(const uint8_t *bytes, uint32_t count)
     memcpy(self->output + self->output_length, bytes, count);
     self->output_length += count;
     return count;
+}
+
+bool hal_random(uint8_t *bytes, uint32_t count)
+{
+    return getrandom(bytes, count, 0) == (ssize_t)count;
 }
 
 uint32_t hal_lost(void)

@@ -69,6 +69,7 @@
 #define RCC_CFGR REGISTER(RCC + 0x08u)
 #define RCC_CIR REGISTER(RCC + 0x0cu)
 #define RCC_AHB1ENR REGISTER(RCC + 0x30u)
+#define RCC_AHB2ENR REGISTER(RCC + 0x34u)
 #define RCC_APB1ENR REGISTER(RCC + 0x40u)
 #define RCC_APB2ENR REGISTER(RCC + 0x44u)
 #define RCC_CSR REGISTER(RCC + 0x74u)
@@ -100,6 +101,14 @@
 #define EXTI_RTSR REGISTER(EXTI + 0x08u)
 #define EXTI_PR REGISTER(EXTI + 0x14u)
 #define EXTI_PVD 0x00010000u
+
+#define RNG 0x50060800u
+#define RNG_CR REGISTER(RNG + 0x0u)
+#define RNG_SR REGISTER(RNG + 0x4u)
+#define RNG_DR REGISTER(RNG + 0x8u)
+#define RNG_ON 0x4u
+#define RNG_READY 0x1u
+#define RNG_ERRORS 0x66u /* clock or seed, now or since */
 
 #define SYSTICK_CSR REGISTER(0xe000e010u)
 #define SYSTICK_RVR REGISTER(0xe000e014u)
@@ -585,6 +594,22 @@ uint32_t hal_send(const uint8_t *bytes, uint32_t count)
     return sent;
 }
 
+bool hal_random(uint8_t *bytes, uint32_t count)
+{
+    for (uint32_t i = 0; i < count; i += 4u) {
+        /* A word takes 40 cycles of 48 MHz. */
+        uint32_t n = 0u;
+        while ((RNG_SR & RNG_READY) == 0u && n < WAIT_LOOPS / 1000u)
+            n++;
+        if ((RNG_SR & RNG_ERRORS) != 0u || (RNG_SR & RNG_READY) == 0u)
+            return false;
+        uint32_t word = RNG_DR;
+        for (uint32_t j = i; j < i + 4u && j < count; j++)
+            bytes[j] = (uint8_t)(word >> 8u * (j - i));
+    }
+    return true;
+}
+
 uint32_t hal_lost(void)
 {
     uint32_t total = lost;
@@ -822,6 +847,7 @@ static bool clock_start(void)
 static void pins_start(void)
 {
     RCC_AHB1ENR |= 1u << 22 | 1u << 1 | 1u << 0;             /* DMA2, GPIOB, GPIOA */
+    RCC_AHB2ENR |= 1u << 6;                                  /* RNG */
     RCC_APB1ENR |= 1u << 29 | 1u << 28 | 1u << 1 | 1u << 0;  /* DAC, PWR, TIM3, TIM2 */
     RCC_APB2ENR |= 1u << 12 | 1u << 4 | 1u << 0;             /* SPI1, USART1, TIM1 */
     GPIO_BSRR(GPIOB) = PIN(0);                               /* dark before the pin drives */
@@ -847,6 +873,7 @@ int main(void)
     IWDG_KR = IWDG_START;
     iwdg_reload(clock_failed ? IWDG_LONG : IWDG_SHORT);
     DAC_CR = 1u;
+    RNG_CR = RNG_ON;
     /* 16 bits, master, most significant first, data taken on the rising edge, 84 MHz / 8. */
     SPI_CR2 = 0u;
     SPI_CR1 = 1u << 11 | 1u << 9 | 1u << 8 | 2u << 3 | 1u << 2;

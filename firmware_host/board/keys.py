@@ -1,0 +1,43 @@
+"""Files of boards' keys: 32 hex digits, for their owner's eyes only."""
+
+import secrets
+from pathlib import Path
+
+from evlcp_sdk.errors import InputError, OutputError
+from evlcp_sdk.files import read_secret, write_new
+from firmware_host.protocol.requests import KEY_BYTES
+from firmware_host.protocol.seal import key_name
+
+__all__ = ["make_board_key", "read_board_key"]
+
+_MOST_BYTES = 1024
+
+
+def make_board_key(path: Path) -> str:
+    """Make a key and write it; returns its name, 8 hex digits.
+
+    Raises:
+        OutputError: The file exists, or cannot be written.
+    """
+    key = secrets.token_bytes(KEY_BYTES)
+    try:
+        write_new(key.hex().encode() + b"\n", path)
+    except FileExistsError as fault:
+        raise OutputError(f"{path}: exists; a key is not overwritten; --show prints it again") from fault
+    return key_name(key).hex()
+
+
+def read_board_key(path: Path) -> bytes:
+    """The key of a file.
+
+    Raises:
+        InputError: The file cannot be read, others than its owner may use it, or it holds no key.
+    """
+    text = read_secret(path, _MOST_BYTES)
+    try:
+        key = bytes.fromhex(text.decode("ascii").strip())
+    except ValueError:
+        key = b""
+    if len(key) != KEY_BYTES or not any(key):
+        raise InputError(f"{path}: expected {2 * KEY_BYTES} hex digits, as 'evlcp board keygen' makes them")
+    return key
