@@ -15,6 +15,7 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from evt3_decode import tile
 from numpy.typing import NDArray
 
 import evlcp_sdk as evlcp
+from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.io import read_events
 from evlcp_sdk.io.evt2 import EVT2
 from evlcp_sdk.io.raw import RawWriter, format_header
@@ -116,6 +118,22 @@ def in_code(share: float, duration_us: int) -> Recorded:
             yield Events.of(t, place % WIDTH, place // WIDTH, np.full(many, p))
 
 
+def a_wall() -> Recorded:
+    """A bar as large as the sensor, 45 rows a cluster; a tenth of the pixels answers at each edge."""
+    rng = np.random.default_rng(0)
+    link = evlcp.load_link()
+    shape = (3, link.packet.frames, link.codebook.clusters)
+    symbols = rng.integers(0, len(link.codebook.codewords), shape)
+    chips = np.concatenate([packet_chips(one, link.codebook) for one in symbols]).astype(int)
+    rows = HEIGHT // chips.shape[1]
+    for n, (before, after) in enumerate(pairwise(chips), 1):
+        changed = np.flatnonzero(before != after)
+        many = round(WIDTH * rows * 0.1)
+        y = (changed[:, None] * rows + rng.integers(0, rows, (len(changed), many))).ravel()
+        t_us = n * CHIP_US + rng.integers(0, 20, y.size)
+        yield in_order(t_us, rng.integers(0, WIDTH, y.size), y, np.repeat(after[changed], many))
+
+
 def eight_bars() -> Recorded:
     """Eight bars side by side at 40 m, rendered."""
     bars = [{"x_m": -7.0 + 2 * k, "y_m": 0.2, "seed": k + 1} for k in range(8)]
@@ -182,6 +200,7 @@ def triggers(path: Path) -> Path:
 CASES: dict[str, Callable[[Path], Path]] = {
     "night-50m, tiled to 40 Mev": tiled,
     "eight bars": lambda path: raw(path, eight_bars()),
+    "a bar as large as the sensor": lambda path: raw(path, a_wall()),
     "252 blobs of 4 px, 40 Mev/s": lambda path: raw(path, blobs(21, 12, 40e6, 300_000)),
     "3600 blobs of 4 px, 40 Mev/s": lambda path: raw(path, blobs(80, 45, 40e6, 150_000)),
     "noise, 60 Mev/s": lambda path: raw(path, noise(60e6, 300_000)),

@@ -296,10 +296,9 @@ def draw_regions(probe: FigureProbe, title: str) -> Figure:
     axes = figure.subplots(1, 1 + len(zooms), width_ratios=[8] + [1.6] * len(zooms), squeeze=False)[0]
     height, width = probe.image.shape
     top = max(float(np.quantile(probe.image[probe.image > 0], 0.99)) if probe.image.any() else 1.0, 1.0)
+    shades = np.log1p(probe.image, dtype=np.float32)
     for axis in axes:
-        axis.imshow(
-            np.log1p(probe.image), cmap="Greys", vmin=0, vmax=math.log1p(top), interpolation="nearest"
-        )
+        axis.imshow(shades, cmap="Greys", vmin=0, vmax=math.log1p(top), interpolation="nearest")
         axis.set_xlabel("column, px")
     whole = axes[0]
     whole.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), ylabel="row, px")

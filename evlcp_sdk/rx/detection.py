@@ -301,6 +301,11 @@ class RegionFollower:
                     self.counts["dropped_no_room"] += many
                     followed.cut_us = followed.first_us = oldest_us + self._spec.step_us
 
+    def close(self) -> None:
+        """End the stream: forget all events."""
+        self.skip()
+        self.alive = []
+
     def skip(self) -> None:
         """Pass over a gap in time, with no region alive."""
         self._fresh = []

@@ -163,6 +163,8 @@ class Receiver:
         packets = self._read(packets + self._judged.close())
         if self._messages is not None:
             self._messages.close()
+        # Whoever draws or writes now needs the room.
+        self._regions.close()
         return packets
 
     def _run(self, step: TimeStep) -> list[Packet]:

@@ -183,6 +183,16 @@ def test_any_split_gives_the_same_within_limits() -> None:
     assert len(whole) >= 5
 
 
+def test_a_stream_that_has_ended_takes_no_memory() -> None:
+    receiver = Receiver(LINK)
+    receiver.feed(CROWD)
+    assert receiver._regions._recent
+    receiver.close()
+    assert not receiver._regions._recent
+    assert not receiver._regions.alive
+    assert receiver.counts["events"] == len(CROWD)
+
+
 def test_within_the_defaults_nothing_is_left_out() -> None:
     frames, counts = told(len(CROWD), LIMITS)
     assert len(frames) >= 10
