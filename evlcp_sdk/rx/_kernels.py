@@ -778,7 +778,8 @@ def believe(
     read: Array,
     llr: Array,
     seen: Array,
-    worth: float,
+    frame_worth: float,
+    expected_worth: float,
     spread: float,
     least: float,
     symbols: Array,
@@ -786,9 +787,10 @@ def believe(
 ) -> float:
     """Scale LLRs (K, bits) so that their sizes' variance is twice the mean, give the symbols that are sure.
 
-    The variance is pooled with an expected one, `spread` of the mean squared, worth `worth` sizes. Clusters
-    unseen, or with a symbol of -1, are given LLRs of 0 and a symbol of -1; so are those less sure than
-    `least`, but for their LLRs.
+    A cluster's variance is pooled with that of all sizes of the frame, which is worth `frame_worth` sizes,
+    and with an expected one, `spread` of its mean squared, worth `expected_worth`. Clusters unseen, or with a
+    symbol of -1, are given LLRs of 0 and a symbol of -1; so are those less sure than `least`, but for their
+    LLRs.
 
     Returns:
         Probability that all that are given are right; 0 if none is.
@@ -809,11 +811,17 @@ def believe(
         if seen[k] and read[k] >= 0:
             for b in range(bits):
                 squares += (abs(np.float64(llr[k, b])) - mean) ** 2
-    scale = 2 * mean * (n + worth) / (squares + worth * (spread * mean) ** 2)
     given, right = 0, 1.0
     for k in range(clusters):
         if seen[k] and read[k] >= 0:
-            nearest = np.inf
+            own, off, nearest = 0.0, 0.0, np.inf
+            for b in range(bits):
+                own += abs(np.float64(llr[k, b])) / bits
+            for b in range(bits):
+                off += (abs(np.float64(llr[k, b])) - own) ** 2
+            off += frame_worth * squares / n + expected_worth * (spread * own) ** 2
+            # One of the bits goes into the mean.
+            scale = 2 * own * (bits - 1 + frame_worth + expected_worth) / off if own > 0 else 0.0
             for b in range(bits):
                 scaled[k, b] = llr[k, b] * scale
                 nearest = min(nearest, abs(llr[k, b] * scale))

@@ -76,7 +76,8 @@ def _gross(m: Measured) -> str:
 
 
 COLUMNS = (
-    Column("found_share", "frames", _frames, lambda m: -m.found_share),
+    # Who finds none is not the best of those.
+    Column("found_share", "frames", _frames, lambda m: -m.found_share or math.nan),
     Column("packets", "packets", lambda m: str(m.statistics.packets), None),
     Column("ber", "BER", _ber, lambda m: m.tally.ber),
     Column("ber_interval", "95 %", _interval, None),

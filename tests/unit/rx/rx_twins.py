@@ -202,14 +202,18 @@ def info_activity(sums, weight, grid, pilot_chips, least):
     return (weight * (info - least * pilot)).sum((1, 2))
 
 
-def believe(read, llr, seen, worth, spread, least):
+def believe(read, llr, seen, frame_worth, expected_worth, spread, least):
     seen = seen & (read >= 0)
-    size = np.abs(llr[seen].astype(float))
-    if not size.any():
+    size = np.abs(llr.astype(float))
+    if not size[seen].any():
         return np.full_like(read, -1), np.zeros_like(llr), 0.0
-    mean = size.mean()
-    variance = np.average([((size - mean) ** 2).mean(), (spread * mean) ** 2], weights=[size.size, worth])
-    scaled = np.where(seen[:, None], llr * (2 * mean / variance), 0)
+    mean = size.mean(1)
+    # A cluster's own variance is NaN with one bit, which is worth nothing.
+    own = np.nan_to_num(size.var(1, ddof=1)) if size.shape[1] > 1 else np.zeros(len(size))
+    parts = [own, np.full(len(size), size[seen].var()), (spread * mean) ** 2]
+    variance = np.average(parts, axis=0, weights=[size.shape[1] - 1, frame_worth, expected_worth])
+    factor = np.divide(2 * mean, variance, out=np.zeros_like(mean), where=mean > 0)
+    scaled = np.where(seen[:, None], llr * factor[:, None], 0)
     sure = 1 / (1 + np.exp(-np.abs(scaled).min(1)))
     given = seen & (sure >= least)
     return np.where(given, read, -1), scaled, sure[given].prod() if given.any() else 0.0
