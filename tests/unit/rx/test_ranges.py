@@ -72,7 +72,7 @@ def test_without_a_distance_nothing_changes() -> None:
 
 
 def foreshortened(
-    along: float = 0.0, about_deg: float = 0.0, sigma_deg: float = 0.7, share: float = 0.05
+    along: float = 0.0, about_deg: float = 0.0, sigma_deg: float = 0.7, share: float = 0.03
 ) -> tuple[float, float]:
     """Mean and standard deviation of the foreshortening over what is likely of a lean, by quadrature."""
     sigma, most, about = math.radians(sigma_deg), math.radians(5), math.radians(about_deg)
