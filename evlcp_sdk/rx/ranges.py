@@ -31,8 +31,9 @@ _LEAST_SIGMA = 1e-6
 
 _LEVEL_DEG, _LEANING_DEG, _LEANING_SHARE = 0.7, 5.0, 0.03
 """What is likely of a bar's lean before it is measured: none but for a mount's error and the car's springs
-(sigma), and of three cameras in a hundred, whose mount nobody levelled, anything up to the steepest. With more of
-these, sigmas of level bars far away are too large; with fewer, those of leaning ones too small for longer."""
+(sigma), and of three cameras in a hundred, whose mount nobody levelled, anything up to the steepest. With
+more of these, sigmas of level bars far away are too large; with fewer, those of leaning ones too small for
+longer."""
 
 _TILT_MEMORY_S = 1.0
 """A car's pitch changes within a second when it brakes."""
