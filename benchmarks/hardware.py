@@ -82,6 +82,7 @@ def microcontroller() -> Part:
         "7": ("NRST", "NRST"),
         "12": ("VSSA", "GND"),
         "13": ("VDDA", "VDDA"),
+        "14": ("PA0", "PULSE"),
         "18": ("VSS", "GND"),
         "19": ("VDD", "+3V3"),
         "20": ("PA4", "LEVEL"),
@@ -198,6 +199,14 @@ def parts() -> list[Part]:
             },
         ),
         Part(
+            "J4",
+            "pins 1x3",
+            "pulse of a GPS receiver",
+            "Connector:1x03",
+            0.20,
+            {"1": ("VCC", "+3V3"), "2": ("PPS", "PULSE_IN"), "3": ("GND", "GND")},
+        ),
+        Part(
             "J3",
             "pins 1x5",
             "debugger (SWD)",
@@ -232,6 +241,8 @@ def parts() -> list[Part]:
         ("100R", "gate", "GATE_DRIVE", "GATE"),
         ("100k", "gate down: no current without the amplifier", "GATE", "GND"),
         ("432R 1%", "3.3 V of the LED supply", "TRIM", "GND"),
+        ("1k", "pulse input", "PULSE_IN", "PULSE"),
+        ("10k", "PULSE down: no pulse without a wire", "PULSE", "GND"),
     ):
         found.append(resistor(f"R{next(r)}", value, what, a, b))
     c = iter(range(1, 100))

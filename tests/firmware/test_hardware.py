@@ -90,6 +90,7 @@ def test_pins_are_those_of_the_firmware(bar: ModuleType) -> None:
         ("PA5 PA7", ("CLK", "SDI"), "SPI1 clock and data"),
         ("PA6", ("LE",), "latch"),
         ("PA4", ("LEVEL",), "DAC 1"),
+        ("PA0", ("PULSE",), "pulses"),
         ("PB0", ("OE",), "output enable"),
         ("PB1", ("HOT",), "thermal"),
     ):
@@ -106,7 +107,7 @@ def test_dark_without_the_firmware(bar: ModuleType) -> None:
             rail = "GND" if "GND" in nets else "+3V3"
             pulls[next(n for n in nets if n != rail)] = rail
     assert pulls["OE"] == pulls["HOT"] == "+3V3"
-    assert {pulls[net] for net in ("LE", "CLK", "SDI", "LEVEL", "GATE", "BOOT0", "BOOT1")} == {"GND"}
+    assert {pulls[net] for net in ("LE", "CLK", "SDI", "LEVEL", "GATE", "PULSE", "BOOT0", "BOOT1")} == {"GND"}
     # no level asks for a current with the pin at 0 V
     assert bar.led_ma(0) == 0.0
 
