@@ -227,10 +227,10 @@ def test_stm32f405_register_writes(tmp_path: Path, book: Codebook) -> None:
         assert at("Flash Int", 0x00, boot) == [0x705]
         assert at("RCC", 0x08, boot)[0] == 5 << 10 | 4 << 13
         assert at("RCC", 0x08, boot)[1] & 3 == 2
-        # SPI1 and TIM3 on PA5 PA6 PA7, USART1 on PA9 PA10, DAC on PA4
-        assert at("GPIOA", 0x20, boot) == [0x52500000]
+        # TIM2 on PA0, SPI1 and TIM3 on PA5 PA6 PA7, USART1 on PA9 PA10, DAC on PA4
+        assert at("GPIOA", 0x20, boot) == [0x52500001]
         assert at("GPIOA", 0x24, boot) == [0x00000770]
-        assert at("GPIOA", 0x00, boot)[0] == 3 << 8 | 2 << 10 | 2 << 12 | 2 << 14 | 2 << 18 | 2 << 20
+        assert at("GPIOA", 0x00, boot)[0] == 2 | 3 << 8 | 2 << 10 | 2 << 12 | 2 << 14 | 2 << 18 | 2 << 20
         # devices that QEMU has: 1 Mbit/s, SPI master 16 bits at 10.5 MHz
         assert netduino.register(0x40011008) == 84
         assert netduino.register(0x40013000) == 1 << 11 | 1 << 9 | 1 << 8 | 1 << 6 | 2 << 3 | 1 << 2
