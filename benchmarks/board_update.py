@@ -1,7 +1,7 @@
 """Firmware into a part by its ROM, and over the line of a board: what it takes, and where power may fail.
 
-Prints the time that flashing takes by the clock of the line, on lines that lose bytes too, and for an update how
-the board comes back from a power cut at each word and erase of the flash.
+Prints the time that flashing takes by the clock of the line, on lines that lose bytes too, and how, after an
+update, the board comes back from a power cut at each word and erase of the flash.
 """
 
 import contextlib

@@ -144,7 +144,10 @@ def test_a_signed_beacon(evlcp: Evlcp, site: Path, tmp_path: Path) -> None:
     keys = TrustedKeys([TrustedKey(made.out.strip())])
     assert keys.check(found[Kind.BEACON], link.block_coder().digest, found[Kind.SIGNATURE]) is True
     again = evlcp("tx", "keygen", key)
-    assert (again.code, again.err) == (1, f"evlcp: {key}: exists; a key is not overwritten; --show prints it again\n")
+    assert (again.code, again.err) == (
+        1,
+        f"evlcp: {key}: exists; a key is not overwritten; --show prints it again\n",
+    )
 
 
 def test_faults_are_one_line(evlcp: Evlcp, site: Path, tmp_path: Path) -> None:
