@@ -1,10 +1,8 @@
-"""Text from outside on a terminal: names, messages and headers that move no cursor and set no title."""
-
-from typing import Final
+"""Text from outside on a terminal: names, messages and headers that move no cursor and set no title; imports nothing."""
 
 __all__ = ["printable"]
 
-_CONTROLS: Final = {
+_CONTROLS = {
     **{n: f"\\x{n:02x}" for n in (*range(0x20), *range(0x7F, 0xA0)) if chr(n) not in "\t\n"},
     # What turns the direction of a text, and so shows another one than it is.
     **{n: f"\\u{n:04x}" for n in (0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A))},

@@ -76,7 +76,13 @@ def test_the_entry_point_can_be_interrupted_from_the_start() -> None:
     code = "import sys; import evlcp_sdk.cli.main; print(*sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert {name for name in said.split() if name.startswith("evlcp")} == {
-        *("evlcp_sdk", "evlcp_sdk.cli", "evlcp_sdk.cli.main", "evlcp_sdk.cli._complain"),
+        *(
+            "evlcp_sdk",
+            "evlcp_sdk.cli",
+            "evlcp_sdk.cli.main",
+            "evlcp_sdk.cli._complain",
+            "evlcp_sdk.printable",
+        ),
     }
     assert not {"typer", "rich", "typing", "pathlib", "logging"} & set(said.split())
 
