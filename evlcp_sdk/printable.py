@@ -1,4 +1,4 @@
-"""Text from outside on a terminal: names, messages and headers that move no cursor and set no title; imports nothing."""
+"""Text from outside on a terminal moves no cursor and sets no title; this imports nothing."""
 
 __all__ = ["printable"]
 
