@@ -201,6 +201,22 @@ def test_a_noisy_line_and_a_reset_half_way() -> None:
     assert update(board_on(SimulatedLine(device)), package(5)).image == 2
 
 
+def test_a_board_with_a_key_takes_updates_from_its_host_alone(book: Codebook) -> None:
+    key = bytes(range(16))
+    device, board = fresh()
+    bank = Bank.of_symbols(random_symbols(1, 10, book, np.random.default_rng(0)), book)
+    provision(board, bank, Settings(start=False))
+    board.set_key(key)
+    board.save()  # or the key is gone with the restart
+    with pytest.raises(RefusedError, match="NEEDS_KEY"):
+        update(board_on(SimulatedLine(device)), package(1))
+    with pytest.raises(RefusedError, match="NEEDS_KEY"):
+        board_on(SimulatedLine(device)).session.call(UpdateWriteRequest(0, b"1234"), UpdateWriteReply)
+    assert device.running() == 0
+    done = update(Board(Session(SimulatedLine(device), Timing(latency_s=0.01), key=key)), package(1))
+    assert done.image == device.running() == 1
+
+
 def test_a_file_of_an_update(tmp_path: Path) -> None:
     path = tmp_path / "a.update.json"
     path.write_text(package(1).to_json())
