@@ -487,6 +487,8 @@ class Iwdg:
         self.open = self.on = False
         self.busy_until = 0
         self.generation = 0
+        self.due = 0
+        self.looks_at = 1 << 62
 
     @property
     def timeout(self) -> int:
@@ -514,14 +516,24 @@ class Iwdg:
 
     def feed(self) -> None:
         """Begin anew."""
-        self.generation += 1
+        self.due = self.chip.now + self.timeout
+        if self.due < self.looks_at:
+            self._look_at(self.due)
+
+    def _look_at(self, time: int) -> None:
+        """Look then whether it bites: it is fed much more often than it could."""
+        self.looks_at = time
         generation = self.generation
 
-        def bites() -> None:
-            if generation == self.generation:
+        def looks() -> None:
+            if generation != self.generation or self.looks_at != time:
+                return
+            if self.chip.now >= self.due:
                 self.chip.reset(RESET_BY_IWDG)
+            else:
+                self._look_at(self.due)
 
-        self.chip.at(self.chip.now + self.timeout, bites)
+        self.chip.at(time, looks)
 
 
 class Flash:
