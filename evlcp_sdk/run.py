@@ -10,7 +10,9 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
 from numba.core.event import install_timer
+from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.io import EventSource, Loss, open_source
@@ -22,6 +24,8 @@ from evlcp_sdk.place.navigator import PositionPlan
 from evlcp_sdk.place.observations import BarView
 from evlcp_sdk.place.points import points_at
 from evlcp_sdk.place.poses import KnownPose
+from evlcp_sdk.place.survey import SurveyedBar
+from evlcp_sdk.place.survey import survey as survey_bars
 from evlcp_sdk.place.whereabouts import Whereabouts
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.summary import Status
@@ -45,6 +49,7 @@ __all__ = [
     "receive",
     "receive_to_folder",
     "stop_on_request",
+    "survey",
 ]
 
 Advance = Callable[[int, int | None], None]
@@ -396,9 +401,37 @@ def _views(
     registry: Registry,
 ) -> list[CalibrationView]:
     """What a recording shows at the times of known poses."""
+    who = Whereabouts(sites, link.position)
+    seen = _seen_at(url, poses, link, registry, who)
+    for how in who.contradicted.values():
+        raise ConfigError(f"{url}: {how}")
+    stands_at, views = who.stands_at, []
+    for pose, points in zip(poses, seen, strict=True):
+        bars = []
+        for number, found in points.items():
+            if number in stands_at:
+                site = stands_at[number]
+                enu = site.cluster_positions_m(link.bar.clusters, axes)
+                bars.append(BarView(site.transmitter_id, enu, *found, site.survey))
+        views.append(_view(pose, bars, axes))
+    return views
+
+
+def _view(pose: KnownPose, bars: Sequence[BarView], axes: LocalAxes) -> CalibrationView:
+    place = (pose.latitude_deg, pose.longitude_deg, pose.height_m)
+    rotation = None
+    if pose.attitude is not None:
+        rotation = axes.turn_from(LocalAxes(*place)) @ pose.attitude.rotation()
+    where = axes.to_enu(*place)
+    return CalibrationView(tuple(bars), where, pose.position_sigma_m, rotation, pose.attitude_sigma_deg)
+
+
+def _seen_at(
+    url: str, poses: Sequence[KnownPose], link: Link, registry: Registry, who: Whereabouts
+) -> list[dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]]]:
+    """Image points and their sigmas of each transmitter at the times of known poses."""
     clusters, spec = link.bar.clusters, link.position
     period_us = link.packet.packet_chips * link.packet.chip_us
-    who = Whereabouts(sites, spec)
     frames: dict[int, list[Frame]] = {}
     with receive(url, link, registry=registry) as packets:
         for packet in packets:
@@ -412,29 +445,49 @@ def _views(
                     abs(one.points_t_us - pose.t_us) <= period_us for pose in poses
                 ):
                     kept.append(one)
-    for how in who.contradicted.values():
-        raise ConfigError(f"{url}: {how}")
-    stands_at = who.stands_at
-    views = []
-    for pose in poses:
-        bars = []
-        for number, seen in frames.items():
-            points = points_at(seen, pose.t_us, period_us, clusters, spec)
-            if points is not None and number in stands_at:
-                site = stands_at[number]
-                enu = site.cluster_positions_m(clusters, axes)
-                bars.append(BarView(site.transmitter_id, enu, *points, site.survey))
-        place = (pose.latitude_deg, pose.longitude_deg, pose.height_m)
-        rotation = None
-        if pose.attitude is not None:
-            rotation = axes.turn_from(LocalAxes(*place)) @ pose.attitude.rotation()
-        views.append(
-            CalibrationView(
-                tuple(bars),
-                axes.to_enu(*place),
-                pose.position_sigma_m,
-                rotation,
-                pose.attitude_sigma_deg,
-            )
-        )
-    return views
+    return [
+        {
+            number: points
+            for number, seen in frames.items()
+            if (points := points_at(seen, pose.t_us, period_us, clusters, spec)) is not None
+        }
+        for pose in poses
+    ]
+
+
+def survey(
+    recordings: Sequence[str],
+    poses: Sequence[KnownPose],
+    link: Link | None = None,
+    *,
+    registry: Registry | None = None,
+    name: str = "poses",
+) -> list[SurveyedBar]:
+    """Estimate where bars stand that send their ids, from known poses; the camera is known as the link says.
+
+    Args:
+        recordings: Recordings of the bars.
+        poses: Where the camera was, how it was turned, and when.
+        link: The configuration, or a `link.toml`; None for all defaults.
+        registry: The plugins; None for all that are installed.
+        name: What a message calls the poses: the file they come from, which has a heading and a line a pose.
+
+    Raises:
+        InputError: A recording cannot be read.
+        ConfigError: A pose belongs to none of the recordings, or has no attitude, or too little was seen.
+    """
+    registry = Registry.load() if registry is None else registry
+    link = link if isinstance(link, Link) else load_link(link, registry=registry)
+    _check_names(recordings, poses, name)
+    first = poses[0]
+    axes = LocalAxes(first.latitude_deg, first.longitude_deg, first.height_m)
+    views: list[CalibrationView] = []
+    for url in recordings:
+        mine = [pose for pose in poses if pose.recording in ("", Path(url).name)]
+        who = Whereabouts((), link.position)
+        seen = _seen_at(url, mine, link, registry, who)
+        ids = who.ids
+        for pose, points in zip(mine, seen, strict=True):
+            bars = [BarView(ids[n], np.empty((0, 3)), *found) for n, found in points.items() if n in ids]
+            views.append(_view(pose, bars, axes))
+    return survey_bars(views, axes, link.bar.length_m, link.camera, link.camera_sigma, link.position)

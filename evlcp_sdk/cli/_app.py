@@ -36,6 +36,7 @@ def make_app() -> typer.Typer:
         report,
         score,
         simulate,
+        survey,
         sweep,
     )
 
@@ -44,7 +45,7 @@ def make_app() -> typer.Typer:
     )
     app.callback()(_root)
     first = (receive, info, compare, simulate, score, sweep, report, demo)
-    for module in (*first, calibrate, config, plugins, check):
+    for module in (*first, calibrate, survey, config, plugins, check):
         module.register(app)
     return app
 

@@ -3,5 +3,5 @@
 `positioner` joins the others: `whereabouts` (which bar stands where), `points` (a bar at a time between its
 frames) and `pose`, which fits: `observations` (misses and slopes), `starts`, `fit`, `judgement`, `refusals`.
 `navigator` joins it with `trajectory` (filter and smoother of fixes); beside them: `calibration` (of a
-camera, from known `poses`) and `bearing` (a bar in the camera's axes, by one frame).
+camera, from known `poses`), `survey` (of bars) and `bearing` (a bar in the camera's axes, by one frame).
 """

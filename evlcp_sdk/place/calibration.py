@@ -16,7 +16,15 @@ from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.observations import BarView, project_bars, shared_sigmas
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
-__all__ = ["PARAMETERS", "Calibrated", "CalibrationView", "calibrate"]
+__all__ = [
+    "PARAMETERS",
+    "Calibrated",
+    "CalibrationView",
+    "SeenView",
+    "SolvedViews",
+    "calibrate",
+    "solve_views",
+]
 
 Floats = NDArray[np.float64]
 
@@ -114,12 +122,15 @@ def calibrate(
         ConfigError: Not even the focal length is determined, or the views do not fit their places.
     """
     spec = PositionSpec() if spec is None else spec
-    seen = [_Seen.of(view, camera, spec) for view in views]
+    seen = [SeenView.of(view, camera, spec) for view in views]
     seen = [view for view in seen if len(view.points_px)]
     if not seen:
         raise ConfigError("no view shows a bar at a known site: nothing to calibrate from")
     start = replace(camera, centre_x_px=camera.centre_px[0], centre_y_px=camera.centre_px[1])
-    found, covariance, misfit = _fit(seen, start)
+    loose = np.diag([1 / sigma for sigma in _usual_sigma(start).values()])
+    solved = solve_views(seen, start, loose)
+    found, misfit, covariance = solved.camera, solved.misfit, solved.covariance[: len(PARAMETERS)]
+    covariance = covariance[:, : len(PARAMETERS)]
     sigma = dict(zip(PARAMETERS, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     corner = {name: _at_corner(start, name) * sigma[name] for name in PARAMETERS}
     usual = _usual_sigma(start)
@@ -163,7 +174,7 @@ def _usual_sigma(camera: CameraModel) -> dict[str, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class SeenView:
     """A view's points in one array, with what makes their errors white and of one sigma."""
 
     enu_m: Floats
@@ -178,7 +189,8 @@ class _Seen:
     turn_sigma_rad: float
 
     @classmethod
-    def of(cls, view: CalibrationView, camera: CameraModel, spec: PositionSpec) -> "_Seen":
+    def of(cls, view: CalibrationView, camera: CameraModel, spec: PositionSpec) -> "SeenView":
+        """The points of the bars of which enough is seen."""
         enu, points, whiten, number, arm = [], [], [], [], []
         survey: dict[int, tuple[float, float, float]] = {}
         for bar in view.bars:
@@ -246,8 +258,40 @@ def _at_corner(camera: CameraModel, name: str) -> float:
     return float(np.linalg.norm(moved, axis=1).max())
 
 
-def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, Floats, float]:
-    """Least squares over everything; the camera, its parameters' covariance, and the misfit."""
+@dataclass(frozen=True, eq=False)
+class SolvedViews:
+    """All views solved together.
+
+    Attributes:
+        camera: With its parameters as found.
+        x: All unknowns: the camera's parameters, six of each view, seven of each bar's site, in its sigmas,
+            and six that all views share, float64 (n,).
+        covariance: Of these, float64 (n, n).
+        bars: Where a bar's seven are.
+        misfit: Mean square of the misses in sigmas, over the degrees of freedom.
+    """
+
+    camera: CameraModel
+    x: Floats
+    covariance: Floats
+    bars: Mapping[int, slice]
+    misfit: float
+
+
+def solve_views(
+    views: Sequence[SeenView],
+    camera: CameraModel,
+    loose: Floats,
+    common: tuple[float, float] | None = None,
+) -> SolvedViews:
+    """Least squares over everything.
+
+    Args:
+        views: What is seen.
+        camera: Where the fit starts.
+        loose: What whitens the camera's errors as they are known beforehand, float64 (7, 7).
+        common: Sigmas of an error of place, m, and of a turn, radians, that all views share; None for none.
+    """
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
@@ -257,8 +301,9 @@ def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, Floa
     bars = {number: shared + 6 * len(views) + 7 * i for i, number in enumerate(sorted(surveys))}
     first = np.array([float(getattr(camera, name)) for name in names])
     start = np.concatenate([first, np.zeros(6 * len(views) + 7 * len(bars))])
-    usual = _usual_sigma(camera)
-    loose = np.array([1 / usual[name] for name in names])
+    last = slice(len(start), len(start) + 6)
+    if common is not None:
+        start = np.append(start, np.zeros(6))
 
     def camera_of(x: Floats) -> CameraModel:
         values = dict(zip(names, x[:shared].tolist(), strict=True))
@@ -267,12 +312,13 @@ def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, Floa
 
     def parts(x: Floats) -> tuple[Floats, Floats]:
         now = camera_of(x)
-        misses, rows = [(x[:shared] - start[:shared]) * loose], [np.diag(loose) @ np.eye(shared, len(x))]
+        misses, rows = [loose @ (x[:shared] - start[:shared])], [loose @ np.eye(shared, len(x))]
+        drift = x[last] if common is not None else np.zeros(6)
         for i, view in enumerate(views):
             at = shared + 6 * i
-            turn = x[at + 3 : at + 6]
+            turn = x[at + 3 : at + 6] + drift[3:]
             rotation = Rotation.from_rotvec(turn).as_matrix() @ view.rotation
-            position = view.place_m + x[at : at + 3]
+            position = view.place_m + x[at : at + 3] + drift[:3]
             stands, moves = view.enu_m.copy(), {}
             for number, column in bars.items():
                 mine = view.bar == number
@@ -285,6 +331,8 @@ def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, Floa
             block[:, :, :shared] = _slopes(now, seen[:, :2] / seen[:, 2:], place, names)
             block[:, :, at : at + 3] = slope[:, :, :3]
             block[:, :, at + 3 : at + 6] = slope[:, :, 3:] @ _turn_slope(turn)
+            if common is not None:
+                block[:, :, last] = block[:, :, at : at + 6]
             for column, (mine, by_site) in moves.items():
                 block[mine, :, column : column + 7] = -slope[mine][:, :, :3] @ by_site
             for axis in (0, 1):
@@ -298,8 +346,12 @@ def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, Floa
             prior[:, at : at + 6] = np.diag(scale)
             rows.append(prior)
         at = shared + 6 * len(views)
-        misses.append(x[at:])
-        rows.append(np.eye(len(x))[at:])
+        misses.append(x[at : last.start])
+        rows.append(np.eye(len(x))[at : last.start])
+        if common is not None:
+            scale = np.repeat([1 / common[0], 1 / common[1]], 3)
+            misses.append(drift * scale)
+            rows.append(np.eye(len(x))[last] * scale[:, None])
         return np.concatenate(misses), np.concatenate(rows)
 
     def miss(x: Floats) -> Floats:
@@ -315,7 +367,8 @@ def _fit(views: Sequence[_Seen], camera: CameraModel) -> tuple[CameraModel, Floa
     covariance = (half @ half.T) * scale * scale[:, None]
     points = 2 * sum(len(v.points_px) for v in views)
     freedom = max(points - shared - 3 * len(views), 1)
-    return camera_of(fit.x), covariance[:shared, :shared], float(misses @ misses) / freedom
+    where = {number: slice(column, column + 7) for number, column in bars.items()}
+    return SolvedViews(camera_of(fit.x), fit.x, covariance, where, float(misses @ misses) / freedom)
 
 
 def _site_slope(arm_m: Floats, survey: tuple[float, float, float]) -> Floats:

@@ -66,6 +66,12 @@ class Whereabouts:
         return {number: site for number, site in found.items() if site is not None}
 
     @property
+    def ids(self) -> dict[int, int]:
+        """Ids of the transmitters that said theirs and were not forged."""
+        said = self._said.items()
+        return {n: s.transmitter_id for n, s in said if s.transmitter_id is not None and s.trust != "forged"}
+
+    @property
     def contradicted(self) -> dict[int, str]:
         """Transmitters that are left out as their beacons contradict their sites, and how."""
         found = {number: self.contradiction(number) for number in sorted(self._said)}

@@ -17,6 +17,7 @@ import pytest
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource, open_source, write_events
+from evlcp_sdk.scene.sites import LocalAxes, load_sites
 from evlcp_sdk.values import Events, Triggers
 
 Evlcp = Callable[..., Any]
@@ -44,7 +45,7 @@ def names_in(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-COMMANDS = ["receive", "info", "sweep", "report", "demo", "calibrate", "config", "plugins"]
+COMMANDS = ["receive", "info", "sweep", "report", "demo", "calibrate", "survey", "config", "plugins"]
 
 
 def test_help_lists_commands_and_exit_codes(evlcp: Evlcp) -> None:
@@ -490,6 +491,38 @@ def test_faults_of_position_options(
     assert done.code in (2, 3)
     assert says in " ".join(done.err.replace("│", " ").split())
     assert not (tmp_path / "out").exists()
+
+
+def test_survey_finds_the_sites(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
+    path = json.loads((street / "rec.truth.json").read_text())["camera_path"]
+    names = ("latitude_deg", "longitude_deg", "height_m", "heading_deg", "pitch_deg", "roll_deg")
+    lines = ["t_us," + ",".join(names) + ",attitude_sigma_deg"]
+    for ms in (50, 80, 110):
+        lines.append(f"{ms * 1000}," + ",".join(str(path[name][ms]) for name in names) + ",0.01")
+    poses, site = tmp_path / "poses.csv", tmp_path / "new.toml"
+    poses.write_text("\n".join(lines) + "\n")
+    done = evlcp("survey", street / "rec.raw", "--poses", poses, "-o", site, "--json")
+    assert done.code == 0, done.err
+    told = json.loads(done.out)["bars"]
+    want = {bar.transmitter_id: bar for bar in load_sites(street / "site.toml")}
+    found = load_sites(site)
+    assert {bar.transmitter_id for bar in found} == set(want)
+    for bar, said in zip(found, told, strict=True):
+        true = want[bar.transmitter_id]
+        error = LocalAxes.of([true]).to_enu(bar.latitude_deg, bar.longitude_deg, bar.height_m)
+        assert error @ np.linalg.solve(said["covariance_m2"], error) < 30
+        assert bar.position_sigma_m == pytest.approx(said["position_sigma_m"])
+        assert bar.position_sigma_m < 0.3
+        assert said["views"] == 3
+    # With these sites the drive is where it was.
+    out = tmp_path / "out"
+    angles = ("--pitch-deg", "4", "--roll-deg", "0", "--gravity-sigma-deg", "0.1")
+    assert evlcp("receive", street / "rec.raw", "-o", out, "--sites", site, *angles).code == 0
+    poses.write_text("t_us,latitude_deg,longitude_deg,height_m\n50000,35.1,137.0,50\n")
+    assert (
+        "needs poses with heading_deg"
+        in evlcp("survey", street / "rec.raw", "--poses", poses, "-o", site).err
+    )
 
 
 def test_calibrate_finds_the_focal_length(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:

@@ -1,0 +1,77 @@
+"""`evlcp survey`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console
+
+if TYPE_CHECKING:
+    from evlcp_sdk.place.survey import SurveyedBar
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("survey")(survey)
+
+
+def survey(
+    recordings: Annotated[
+        list[str], typer.Argument(metavar="REC...", help="Recordings of bars that send their ids.")
+    ],
+    poses: Annotated[
+        Path,
+        typer.Option(
+            "--poses", metavar="poses.csv", help="Where the camera was, how it was turned, and when."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="site.toml", help="Where the bars stand.")],
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
+    as_json: Json = False,
+) -> None:
+    """Estimate where bars stand, from a calibrated camera at known places; write site.toml.
+
+    One recording:            [bold]evlcp survey REC.raw --poses poses.csv -o site.toml[/]
+
+    By a calibrated camera:   [bold]evlcp survey REC.raw --poses poses.csv -c camera.toml -o site.toml[/]
+
+    poses.csv is that of `evlcp calibrate`, with heading_deg, pitch_deg and roll_deg. What all poses may have
+    wrong in common, by position_sigma_m and attitude_sigma_deg, is in the sigmas of the sites.
+    """
+    import json
+    from dataclasses import asdict
+
+    from evlcp_sdk import run
+    from evlcp_sdk.files import Outputs
+    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.place.poses import read_poses
+    from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.scene.sites import to_toml
+
+    registry = Registry.load()
+    link = load_link(link_file, overrides or [], registry)
+    found = run.survey(recordings, read_poses(poses), link, registry=registry, name=str(poses))
+    with Outputs() as outputs:
+        outputs.open(out).write(to_toml([bar.site for bar in found]))
+        outputs.commit()
+    if as_json:
+        bars = [
+            asdict(bar.site) | {"covariance_m2": bar.covariance_m2.tolist(), "views": bar.views}
+            for bar in found
+        ]
+        typer.echo(json.dumps({"bars": bars}))
+    else:
+        for bar in found:
+            console().print(_line(bar))
+
+
+def _line(bar: "SurveyedBar") -> str:
+    site = bar.site
+    return (
+        f"transmitter {site.transmitter_id}: {site.latitude_deg:.9f}, {site.longitude_deg:.9f} deg,"
+        f" {site.height_m:.3f} m, to {site.position_sigma_m:.3f} m, from {bar.views} views"
+    )

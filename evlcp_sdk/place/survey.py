@@ -1,0 +1,171 @@
+"""Where bars stand, from a calibrated camera at known places: the other way round than a calibration.
+
+One least-squares problem over all views of all bars: each bar's place and attitude, and as far as they are
+not exact the camera, every view's pose, and an error of all poses in common, as an antenna's place or an
+IMU's mount.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.calibration import CalibrationView, SeenView, solve_views
+from evlcp_sdk.scene.camera import CameraModel, CameraSigma
+from evlcp_sdk.scene.sites import BarSite, LocalAxes
+
+__all__ = ["SurveyedBar", "survey"]
+
+Floats = NDArray[np.float64]
+
+_PLACE_M, _TURN_RAD = 100.0, 0.5
+"""Sigmas of a bar's place and attitude about their start: next to nothing is known."""
+
+_PASSES, _TURNED_RAD = 8, 1e-4
+"""Fits about the last one's attitudes, until these stay: a turn is a straight line in each."""
+
+_EXACT = 1e-9
+"""Sigma of a camera's parameter that is exact, so that it stays solvable."""
+
+_MOST_MISFIT = 4.0
+"""Mean square of the misses, in sigmas, above which nothing is believed."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyedBar:
+    """A bar as it was surveyed.
+
+    Attributes:
+        site: With its sigmas.
+        covariance_m2: Of its place, to the east, north and up, float64 (3, 3).
+        views: From how many places it was seen.
+    """
+
+    site: BarSite
+    covariance_m2: Floats
+    views: int
+
+
+def survey(
+    views: Sequence[CalibrationView],
+    axes: LocalAxes,
+    length_m: float,
+    camera: CameraModel,
+    sigma: CameraSigma | None = None,
+    spec: PositionSpec | None = None,
+) -> list[SurveyedBar]:
+    """Estimate where bars stand.
+
+    Args:
+        views: From known places with known attitudes; the bars' `transmitter` is the id, their `enu_m` does
+            not count.
+        axes: The local axes of the views.
+        length_m: Length of the bars.
+        camera: The camera.
+        sigma: How precisely it is known; None: exactly.
+        spec: Weights; None for the defaults.
+
+    Raises:
+        ConfigError: A view's attitude is not known, no bar is seen, or the views do not fit one another.
+    """
+    spec = PositionSpec() if spec is None else spec
+    if any(view.rotation is None for view in views):
+        raise ConfigError("a survey needs poses with heading_deg, pitch_deg and roll_deg")
+    started = {number: _start(views, number, camera, length_m) for number in _numbers(views)}
+    start = replace(camera, centre_x_px=camera.centre_px[0], centre_y_px=camera.centre_px[1])
+    loose = _whitening(camera, sigma)
+    for _ in range(_PASSES):
+        placed = [SeenView.of(_placed(view, started, length_m), camera, spec) for view in views]
+        placed = [view for view in placed if len(view.points_px)]
+        if not placed:
+            raise ConfigError("no view shows a bar: nothing to survey")
+        common = (max(v.place_sigma_m for v in placed), max(v.turn_sigma_rad for v in placed))
+        solved = solve_views(placed, start, loose, common)
+        turned = 0.0
+        for number, at in solved.bars.items():
+            centre, axis = started[number]
+            moved = solved.x[at]
+            there = axis + _TURN_RAD * np.cross(moved[3:6], axis)
+            there = there / np.linalg.norm(there)
+            turned = max(turned, float(np.linalg.norm(there - axis)))
+            started[number] = centre + _PLACE_M * moved[:3], there
+        if turned < _TURNED_RAD:
+            break
+    if solved.misfit > _MOST_MISFIT:
+        raise ConfigError(
+            f"the views miss one another by {math.sqrt(solved.misfit):.1f} sigmas (rms):"
+            " a pose is not as was said"
+        )
+    found = []
+    for number, at in solved.bars.items():
+        centre, axis = started[number]
+        spread = solved.covariance[at, at]
+        # A turn about its own axis moves nothing.
+        across = _TURN_RAD * np.cross(np.eye(3), axis)
+        place = LocalAxes(*(float(v) for v in axes.to_geodetic(centre)))
+        east, north, up = place.turn_from(axes) @ axis
+        covariance = _PLACE_M**2 * spread[:3, :3]
+        leans = across.T @ spread[3:6, 3:6] @ across
+        site = BarSite(
+            transmitter_id=number,
+            latitude_deg=place.latitude_deg,
+            longitude_deg=place.longitude_deg,
+            height_m=place.height_m,
+            heading_deg=math.degrees(math.atan2(east, north)) % 360,
+            tilt_deg=math.degrees(math.acos(min(max(up, -1.0), 1.0))),
+            length_m=length_m,
+            position_sigma_m=math.sqrt(float(np.linalg.eigvalsh(covariance)[-1])),
+            attitude_sigma_deg=math.degrees(math.sqrt(float(np.linalg.eigvalsh(leans)[-1]))),
+        )
+        found.append(SurveyedBar(site, covariance, sum(number in v.bar for v in placed)))
+    return found
+
+
+def _numbers(views: Sequence[CalibrationView]) -> list[int]:
+    return sorted({bar.transmitter for view in views for bar in view.bars})
+
+
+def _start(
+    views: Sequence[CalibrationView], number: int, camera: CameraModel, length_m: float
+) -> tuple[Floats, Floats]:
+    """Centre and axis of a bar by its size and direction in the image, as if it were parallel to the sensor."""
+    centres, axes = [], []
+    for view in views:
+        for bar in view.bars:
+            rows = np.flatnonzero(np.isfinite(bar.points_px).all(1))
+            if bar.transmitter != number or len(rows) < 2:
+                continue
+            assert view.rotation is not None
+            ends = camera.undistort(bar.points_px[rows[[0, -1]]])
+            share = (rows[-1] - rows[0]) / len(bar.points_px)
+            depth = length_m * share / np.linalg.norm(ends[1] - ends[0])
+            middle = camera.undistort(bar.points_px[rows]).mean(0)
+            centres.append(view.enu_m + view.rotation @ np.append(middle, 1.0) * depth)
+            # From its last cluster to its first, which is at its top.
+            axes.append(view.rotation @ np.append(ends[0] - ends[1], 0.0))
+    axis = np.sum(axes, 0)
+    return np.mean(centres, 0), axis / np.linalg.norm(axis)
+
+
+def _placed(
+    view: CalibrationView, started: dict[int, tuple[Floats, Floats]], length_m: float
+) -> CalibrationView:
+    bars = []
+    for bar in view.bars:
+        clusters = len(bar.points_px)
+        along = (0.5 - (np.arange(clusters) + 0.5) / clusters) * length_m
+        centre, axis = started[bar.transmitter]
+        survey = (_PLACE_M, _TURN_RAD, 0.0)
+        bars.append(replace(bar, enu_m=centre + along[:, None] * axis, survey=survey))
+    return replace(view, bars=tuple(bars))
+
+
+def _whitening(camera: CameraModel, sigma: CameraSigma | None) -> Floats:
+    """What makes the camera's errors independent and of sigma 1, its focal length in mm: float64 (7, 7)."""
+    root = (CameraSigma() if sigma is None else sigma).root(camera)
+    root[0] *= camera.focal_mm / camera.focal_px
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(root @ root.T + _EXACT**2 * np.eye(7))))

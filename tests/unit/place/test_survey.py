@@ -1,0 +1,95 @@
+"""A survey: bars come back within their sigmas, also by poses that are all off alike."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.calibration import CalibrationView
+from evlcp_sdk.place.observations import BarView, project_bars
+from evlcp_sdk.place.survey import survey
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.camera import CameraModel, CameraSigma
+from evlcp_sdk.scene.sites import BarSite, LocalAxes
+
+AXES = LocalAxes(35.0, 137.0, 50.0)
+CAMERA = CameraModel(focal_mm=16.0)
+SPEC = PositionSpec(shared_sigma_px=0, shared_share=0, stretch_share=0)
+ROTATION = Attitude(3.0, 1.0, 2.0).rotation()
+
+
+def site(number: int, enu: list[float], tilt: float, heading: float) -> BarSite:
+    latitude, longitude, height = (float(v) for v in AXES.to_geodetic(np.array(enu)))
+    return BarSite(number, latitude, longitude, height, heading, tilt)
+
+
+BARS = [site(7, [-3.0, 45.0, 3.0], 4.0, 200.0), site(9, [3.0, 50.0, 4.0], 90.0, 80.0)]
+
+
+def views(
+    rng: np.random.Generator, place_m: float, turn_deg: float, focal: float = 0.0
+) -> list[CalibrationView]:
+    """A drive of 12 m towards the bars; poses are off by one error in common, and by one each."""
+    lens = dataclasses.replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + focal * rng.normal()))
+    drift, tilt = rng.normal(0, place_m, 3), rng.normal(0, math.radians(turn_deg), 3)
+    found = []
+    for step in range(7):
+        place = np.array([0.2 * step, 2.0 * step, 0.0])
+        seen = []
+        for bar in BARS:
+            enu = bar.cluster_positions_m(16, AXES)
+            points, _ = project_bars(enu, place, ROTATION, lens)
+            points = points + rng.normal(0, 0.1, points.shape)
+            seen.append(BarView(bar.transmitter_id, np.empty((0, 3)), points, np.full(16, 0.1)))
+        off = tilt + rng.normal(0, math.radians(turn_deg), 3)
+        said = Rotation.from_rotvec(off).as_matrix() @ ROTATION
+        where = place + drift + rng.normal(0, place_m, 3)
+        found.append(CalibrationView(tuple(seen), where, place_m, said, turn_deg))
+    return found
+
+
+def test_bars_come_back_within_their_sigmas() -> None:
+    rng = np.random.default_rng(8)
+    squares, wide = [], []
+    for _ in range(25):
+        found = survey(views(rng, 0.02, 0.05, 0.002), AXES, 0.96, CAMERA, CameraSigma(focal_mm=0.032), SPEC)
+        assert [bar.site.transmitter_id for bar in found] == [7, 9]
+        for bar, true in zip(found, BARS, strict=True):
+            place = LocalAxes.of([true])
+            error = place.to_enu(bar.site.latitude_deg, bar.site.longitude_deg, bar.site.height_m)
+            squares.append(error @ np.linalg.solve(bar.covariance_m2, error))
+            wide.append(bar.site.position_sigma_m)
+            assert bar.views == 7
+            assert bar.site.length_m == 0.96
+            assert np.linalg.eigvalsh(bar.covariance_m2)[-1] == pytest.approx(
+                (bar.site.position_sigma_m or 0) ** 2
+            )
+            off = math.degrees(math.acos(min(bar.site.axis_enu() @ true.axis_enu(), 1)))
+            assert off < 4 * bar.site.attitude_sigma_deg
+    # The two bars of a survey share its errors: the bounds are those of the surveys.
+    assert stats.chi2.isf(0.999, 75) / 25 < np.mean(squares) < stats.chi2.isf(0.001, 75) / 25
+    assert 0.03 < np.mean(wide) < 0.5
+
+
+def test_by_exact_poses_bars_are_where_they_stand() -> None:
+    found = survey(views(np.random.default_rng(9), 1e-5, 1e-5), AXES, 0.96, CAMERA, None, SPEC)
+    for bar, true in zip(found, BARS, strict=True):
+        place = LocalAxes.of([true])
+        error = place.to_enu(bar.site.latitude_deg, bar.site.longitude_deg, bar.site.height_m)
+        assert np.linalg.norm(error) < 5 * (bar.site.position_sigma_m or 0) < 0.1
+
+
+def test_what_cannot_be_surveyed_is_told() -> None:
+    seen = views(np.random.default_rng(10), 0.02, 0.05)
+    with pytest.raises(ConfigError, match="needs poses with heading_deg"):
+        survey([dataclasses.replace(seen[0], rotation=None)], AXES, 0.96, CAMERA)
+    with pytest.raises(ConfigError, match="no view shows a bar"):
+        survey([dataclasses.replace(view, bars=()) for view in seen], AXES, 0.96, CAMERA)
+    wrong = dataclasses.replace(seen[3], enu_m=seen[3].enu_m + np.array([3.0, 0.0, 0.0]))
+    with pytest.raises(ConfigError, match="miss one another"):
+        survey([*seen[:3], wrong, *seen[4:]], AXES, 0.96, CAMERA, None, SPEC)
