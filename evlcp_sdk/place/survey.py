@@ -132,7 +132,7 @@ def _numbers(views: Sequence[CalibrationView]) -> list[int]:
 def _start(
     views: Sequence[CalibrationView], number: int, camera: CameraModel, length_m: float
 ) -> tuple[Floats, Floats]:
-    """Centre and axis of a bar by its size and direction in the image, as if it were parallel to the sensor."""
+    """Centre and axis of a bar by its size and direction in the image, as if parallel to the sensor."""
     centres, axes = [], []
     for view in views:
         for bar in view.bars:
