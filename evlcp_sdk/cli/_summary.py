@@ -52,7 +52,7 @@ def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
         )
     for warning in summary["warnings"]:
         out.print(f"warning: {warning}", style="yellow")
-    out.print(f"written: {folder}/frames.csv, packets.jsonl, summary.json", style="dim")
+    out.print(f"written: {folder}/{', '.join([*summary['files'], 'summary.json'])}", style="dim")
 
 
 def _who(told: Mapping[str, Any]) -> str:

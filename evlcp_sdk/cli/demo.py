@@ -197,7 +197,6 @@ def _decode_recording(out: Path, as_json: bool) -> None:
     # Most of so short a run is the loading of kernels: its speed says nothing.
     show(summary, out, speed=False)
     _show_score(found)
-    console().print(f"figures: {out}/regions.png, presence.png, distance.png", style="dim")
 
 
 def _show_score(found: "Mapping[str, Any]") -> None:

@@ -401,7 +401,11 @@ def _draw_one_presence(part: SubFigure, best: _Shown, who: str) -> None:
             )
     profile.set(xlabel="pilot correlation of the row", xlim=(0, None))
     _plain(profile)
-    _title(profile, f"{who}, packet {frame.packet}, frame {frame.frame}")
+    _title(profile, "rows")
+    # Over the whole part: beside a reflection's number there is no room for the frame's above the rows alone.
+    part.suptitle(
+        f"{who}, packet {frame.packet}, frame {frame.frame}", x=0.02, ha="left", fontsize=10, color=_INK
+    )
 
 
 def draw_distance(probe: FigureProbe, title: str) -> Figure:

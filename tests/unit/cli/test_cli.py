@@ -98,8 +98,11 @@ def test_receive_writes_and_tells(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) 
 
 def test_receive_draws_figures_and_parquet(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
-    assert evlcp("receive", demo_raw, "-o", tmp_path, "--figures", "--parquet").code == 0
+    done = evlcp("receive", demo_raw, "-o", tmp_path, "--figures", "--parquet")
+    assert done.code == 0
     assert names_in(tmp_path) == FILES | {"frames.parquet", *FIGURE_NAMES}
+    told = " ".join(done.out.split("written: ")[1].split())  # a narrow screen breaks the line
+    assert {name.rpartition("/")[2] for name in told.split(", ")} == names_in(tmp_path)
     for name in FIGURE_NAMES:
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
     with (tmp_path / "frames.csv").open(newline="") as file:

@@ -97,9 +97,16 @@ def test_a_reflection_is_named_as_one() -> None:
     """By the newest frame, which knows most; the clearest may have been told before."""
     probe = told(FigureProbe(CameraModel()), 2, 6)
     probe.evlcp_stage_finished("frame", replace(frame(1, 6, 44.0), echo_of=0))
+    presences = draw_presence(probe, "REC.raw")
+    parts = presences.subfigs
+    presences.draw_without_rendering()
+    for part in parts:
+        (label,) = part.texts
+        assert label.get_window_extent().x0 >= part.bbox.x0
+        assert label.get_window_extent().x1 <= part.bbox.x1
     titles = [
-        [axis.get_title(loc="left") for axis in figure.get_axes()]
-        for figure in (draw_presence(probe, "REC.raw"), draw_distance(probe, "REC.raw"))
+        [part.get_suptitle() for part in parts],
+        [axis.get_title(loc="left") for axis in draw_distance(probe, "REC.raw").get_axes()],
     ]
     for every in titles:
         named = [title for title in every if title.startswith("transmitter")]
