@@ -5,6 +5,7 @@ Kernels read and write where what they are given says, so all of it is checked b
 
 import math
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import NoReturn
@@ -54,9 +55,9 @@ class Guard:
         self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
     ) -> None:
         # To exit is not an algorithm's to decide; to interrupt is the user's.
-        if isinstance(fault, (Exception, SystemExit)) and not isinstance(fault, EvlcpError):
+        if fault is not None and not isinstance(fault, (EvlcpError, KeyboardInterrupt)):
             last = traceback.extract_tb(trace)[-1]
-            what = f"{type(fault).__name__}: {fault}".splitlines()[0]
+            what = f"{type(fault).__name__}: {_shown(str, fault)}".splitlines()[0]
             where = f"{Path(last.filename).name}, line {last.lineno}"
             raise PluginError(f"{self._who}: {what} ({where}); {self._hint}") from fault
 
@@ -101,7 +102,7 @@ class Guard:
         except (TypeError, ValueError):
             fine = False
         if not fine:
-            self.refuse(f"{name} = {found!r:.40}", f"a number from {least:g} to {most:g}")
+            self.refuse(f"{name} = {_shown(repr, found):.40}", f"a number from {least:g} to {most:g}")
 
     def expect_lock(self, lock: SyncLock, until_us: float, packet: PacketFormat) -> None:
         """Check what a synchronization heard until a time, us.
@@ -198,8 +199,16 @@ class Guard:
 def _unknown(value: object) -> bool:
     try:
         return math.isnan(value)  # type: ignore[arg-type]
-    except TypeError:
+    except (TypeError, OverflowError):
         return False
+
+
+def _shown(form: Callable[[object], str], what: object) -> str:
+    """As `str` or `repr` has it, where that fails (integers of 5000 digits, code of a plugin), the type."""
+    try:
+        return form(what)
+    except Exception:
+        return f"a {type(what).__name__} that cannot be shown"
 
 
 _KINDS = {"f": "floats", "b": "booleans", "i": "integers", "u": "unsigned ones"}

@@ -17,9 +17,10 @@ from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Corrected, Filter, Tracker
+from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
-from evlcp_sdk.values import SoftSymbols
+from evlcp_sdk.values import Range, SoftSymbols
 
 LINK = load_link(overrides=["tracking.id=kalman"])
 EVENTS = ideal_events(LINK, IdealBar(random_symbols(LINK, 2)))
@@ -127,6 +128,24 @@ def test_an_algorithm_that_exits_is_named(role: str) -> None:
     gives["tracking"].distance.predict = lambda *_: None
     with pytest.raises(PluginError, match=rf"^{role} algorithm 'mine': SystemExit: 0"):
         received(link_with(role, lambda *_: gives.get(role, exits)))
+
+
+class MuteError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("no words")
+
+
+@pytest.mark.parametrize("fault", [GeneratorExit(), MuteError()])
+def test_faults_that_are_no_exceptions_or_have_no_words_are_named(fault: BaseException) -> None:
+    says = f"^ranging algorithm 'joint-scale': {type(fault).__name__}: "
+    with pytest.raises(PluginError, match=says), Guard(LINK, "ranging"):
+        raise fault
+
+
+@pytest.mark.parametrize("digits", [400, 5000])
+def test_integers_beyond_floats_are_refused(digits: int) -> None:
+    with pytest.raises(PluginError, match=r"^ranging algorithm 'joint-scale': gave distance_m = "):
+        Guard(LINK, "ranging").expect_range(Range(10**digits, 1.0, 3))
 
 
 def test_an_interrupt_in_an_algorithm_is_the_user_s() -> None:
