@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 from firmware_host.board.board import Board
 from firmware_host.errors import BoardError, LineError, NoBoardError
-from firmware_host.protocol.requests import StatusReply
+from firmware_host.protocol.requests import StatusReply, Watchdog
 
-__all__ = ["Back", "Gone", "watch"]
+__all__ = ["Back", "Gone", "Unheard", "watch"]
 
 _FIRST_PAUSE_S = 0.25
 _LONGEST_PAUSE_S = 5.0
@@ -39,6 +39,11 @@ class Back:
     after_s: float
 
 
+@dataclass(frozen=True)
+class Unheard:
+    """The board's watchdog acts all the same: it has a key, and this host speaks without."""
+
+
 def watch(
     opened: Callable[[], AbstractContextManager[Board]],
     interval_s: float,
@@ -46,8 +51,10 @@ def watch(
     reconnect: bool = True,
     at_first: bool = False,
     end: threading.Event | None = None,
-) -> Iterator[StatusReply | Gone | Back]:
+) -> Iterator[StatusReply | Gone | Back | Unheard]:
     """What a board says, every `interval_s`; in between its watchdog does not act, as it hears of this host.
+
+    A board with a key hears only of a host that has it, too; otherwise `Unheard` comes once.
 
     Args:
         opened: Opens the line to the board.
@@ -62,6 +69,7 @@ def watch(
     """
     ended = end or threading.Event()
     seen = 0
+    told = False
     gone_s: float | None = None
     pause_s = _FIRST_PAUSE_S
     with ExitStack() as stack:
@@ -74,6 +82,10 @@ def watch(
                 if gone_s is not None:
                     yield Back(time.monotonic() - gone_s)
                 gone_s, pause_s = None, _FIRST_PAUSE_S
+                keyless = any(board.about.key_name) and board.session.key is None
+                if keyless and status.watchdog != Watchdog.KEEP and not told:
+                    told = True
+                    yield Unheard()
                 yield status
                 seen += 1
                 if seen == count:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from firmware_host.board.board import Board
     from firmware_host.board.fleet import Entry, Result, Work
-    from firmware_host.board.monitor import Back, Gone
+    from firmware_host.board.monitor import Back, Gone, Unheard
     from firmware_host.protocol.requests import StatusReply
 
 __all__ = ["app"]
@@ -505,10 +505,10 @@ def _watch_fleet(
             ended.set()
 
 
-def _print_seen(seen: "StatusReply | Gone | Back", which: dict[str, Any], as_json: bool) -> None:
+def _print_seen(seen: "StatusReply | Gone | Back | Unheard", which: dict[str, Any], as_json: bool) -> None:
     """A line of `monitor`: of a board that is there on stdout, of one that goes and comes on stderr."""
     from evlcp_sdk.cli._complain import complain
-    from firmware_host.board.monitor import Back, Gone
+    from firmware_host.board.monitor import Back, Gone, Unheard
     from firmware_host.board.tables import name_of, status_table
     from firmware_host.protocol.requests import State
 
@@ -521,6 +521,8 @@ def _print_seen(seen: "StatusReply | Gone | Back", which: dict[str, Any], as_jso
         if as_json:
             print_json(which | {"back_after_s": round(seen.after_s, 3)})
         complain(f"{name}: answers again after {seen.after_s:.1f} s")
+    elif isinstance(seen, Unheard):
+        complain(f"{name}: has a key: without it (--key) this host does not keep its watchdog from acting")
     elif as_json:
         print_json(which | status_table(seen))
     else:

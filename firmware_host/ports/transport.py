@@ -6,6 +6,7 @@ A port is named by a device or any pyserial URL, by `usb:VID:PID` or `usb:VID:PI
 
 import contextlib
 import json
+import re
 import select
 import socket
 import time
@@ -84,9 +85,15 @@ class SocketTransport:
         """Connect to `unix:PATH` or `tcp:HOST:PORT`.
 
         Raises:
-            NoBoardError: Nobody listens there.
+            NoBoardError: Nobody listens there, or it is no such place.
         """
         scheme, _, place = spec.partition(":")
+        host, _, port = place.rpartition(":")
+        # Not left to the system: some take a port modulo 65536.
+        if scheme == "tcp" and not (host and re.fullmatch("[0-9]{1,5}", port) and 1 <= int(port) <= 65535):
+            raise NoBoardError(f"{spec}: expected tcp:HOST:PORT with a port from 1 to 65535")
+        if scheme == "unix" and not place:
+            raise NoBoardError(f"{spec}: expected unix:PATH")
         try:
             if scheme == "unix":
                 if not hasattr(socket, "AF_UNIX"):
@@ -99,7 +106,6 @@ class SocketTransport:
                     connected.close()
                     raise
             else:
-                host, _, port = place.rpartition(":")
                 connected = socket.create_connection((host, int(port)), timeout=5.0)
                 connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         except (OSError, ValueError, OverflowError) as fault:

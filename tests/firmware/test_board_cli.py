@@ -202,8 +202,9 @@ def test_trace_and_replay(cli, tmp_path: Path) -> None:
     [
         ("unix:/nowhere/at/all", "no board listens there"),
         ("tcp:127.0.0.1:1", "no board listens there"),
-        ("tcp:what", "no board listens there"),
-        ("tcp:127.0.0.1:99999", "no board listens there"),
+        ("tcp:what", "tcp:what: expected tcp:HOST:PORT with a port from 1 to 65535"),
+        ("tcp:127.0.0.1:99999", "expected tcp:HOST:PORT"),
+        ("unix:", "expected unix:PATH"),
         ("/dev/nowhere", "cannot be opened"),
         ("what://ever", "cannot be opened"),
         ("loop://", "no board answers; check power"),

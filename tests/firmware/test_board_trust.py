@@ -1,5 +1,6 @@
 """Boards with a key: what is not sealed, sealed wrongly or played back does nothing."""
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from evlcp_sdk.link.resolve import load_link
 from firmware_host.board.bank import bank_of, random_symbols
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.keys import make_board_key, read_board_key
+from firmware_host.board.monitor import Unheard, watch
 from firmware_host.board.session import Session
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import RefusedError
@@ -241,6 +243,23 @@ def test_who_has_no_key_does_not_stand_in_for_the_host() -> None:
         device.run(50_000)
     assert not device.shown().any(), "the watchdog acts though a stranger asks"
     assert stranger.status().state == State.DARK
+
+
+def test_a_monitor_without_the_key_says_that_the_watchdog_acts() -> None:
+    def kinds(device: SimulatedBoard, key: bytes | None) -> list[type]:
+        def opened() -> Any:
+            return contextlib.nullcontext(board_on(SimulatedLine(device), key))
+
+        return [type(seen) for seen in watch(opened, 0.01, count=2)]
+
+    device = SimulatedBoard()
+    board_on(SimulatedLine(device)).watchdog(Watchdog.DARK, 1000)
+    assert kinds(device, None) == [StatusReply] * 2
+    locked(device)
+    assert kinds(device, KEY) == [StatusReply] * 2
+    assert kinds(device, None) == [Unheard, *[StatusReply] * 2]
+    board_on(SimulatedLine(device), KEY).watchdog(Watchdog.KEEP, 0)
+    assert kinds(device, None) == [StatusReply] * 2
 
 
 def test_a_key_is_kept_and_changed() -> None:
