@@ -104,6 +104,17 @@ class Guard:
         if not fine:
             self.refuse(f"{name} = {_shown(repr, found):.40}", f"a number from {least:g} to {most:g}")
 
+    def expect_locks(self, locks: object) -> None:
+        """Check that a synchronization heard no more packets in a step than there is time for.
+
+        Raises:
+            PluginError: It is no list, or a longer one.
+        """
+        self.expect(locks, list)
+        assert isinstance(locks, list)
+        if len(locks) > _MOST_LOCKS:
+            self.refuse(f"{len(locks)} locks in a step", f"at most {_MOST_LOCKS}")
+
     def expect_lock(self, lock: SyncLock, until_us: float, packet: PacketFormat) -> None:
         """Check what a synchronization heard until a time, us.
 
@@ -212,6 +223,8 @@ def _shown(form: Callable[[object], str], what: object) -> str:
 
 
 _KINDS = {"f": "floats", "b": "booleans", "i": "integers", "u": "unsigned ones"}
+_MOST_LOCKS = 1000
+"""A step of 1.5 ms has room for fifty packets of thirty chips at a million chips a second."""
 _ONE = 1 + 1e-5
 """Rounding of 32 bits is no fault."""
 _LATEST_CHIPS = 1e6

@@ -128,7 +128,7 @@ class Steps:
         self._announcer.start()
         with guard:
             state, locks = self._synchronizer.step(state, events.t_us, events.p, until_us)
-        guard.expect(locks, list)
+        guard.expect_locks(locks)
         for lock in locks:
             guard.expect_lock(lock, until_us, self._packet)
             self._announcer.lap("synchronization", lock)

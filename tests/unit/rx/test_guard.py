@@ -20,7 +20,7 @@ from evlcp_sdk.plugin.roles import Corrected, Filter, Tracker
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
-from evlcp_sdk.values import Range, SoftSymbols
+from evlcp_sdk.values import Range, SoftSymbols, SyncLock
 
 LINK = load_link(overrides=["tracking.id=kalman"])
 EVENTS = ideal_events(LINK, IdealBar(random_symbols(LINK, 2)))
@@ -110,6 +110,13 @@ def test_a_synchronization_that_gives_no_locks_is_named() -> None:
     with pytest.raises(
         PluginError, match=r"^synchronization algorithm 'mine': gave tuple, expected SyncLock"
     ):
+        received(link_with("synchronization", lambda *_: gives))
+
+
+def test_more_locks_than_a_step_has_room_for_are_refused() -> None:
+    lock = SyncLock(0.0, 100.0, 10.0, 20.0, 1.0)
+    gives = SimpleNamespace(init=lambda: None, step=lambda *_: (None, [lock] * 1001))
+    with pytest.raises(PluginError, match=r"gave 1001 locks in a step, expected at most 1000"):
         received(link_with("synchronization", lambda *_: gives))
 
 
