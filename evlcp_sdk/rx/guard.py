@@ -14,7 +14,7 @@ import numpy as np
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.errors import EvlcpError, PluginError
+from evlcp_sdk.errors import ConfigError, PluginError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.values import Bend, PresenceMap, Range, SoftSymbols, SyncLock
 
@@ -30,11 +30,13 @@ _FARTHEST_M = 1e15
 class Guard:
     """A context in which code of one algorithm runs: what it raises becomes a `PluginError` that names it.
 
-    What the SDK itself raises on purpose passes. The original exception is the cause.
+    Interrupts pass, and `ConfigError` where an algorithm may refuse its configuration. The original exception
+    is the cause.
 
     Args:
         link: The configuration that names the algorithm.
         role: Its role.
+        may_refuse: Whether it is compiled there: a stream is no place to refuse a configuration.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> with Guard(load_link(), "ranging"):
@@ -43,8 +45,11 @@ class Guard:
     evlcp_sdk.errors.PluginError: ranging algorithm 'joint-scale': KeyError: 'boom' (...
     """
 
-    def __init__(self, link: Link, role: str) -> None:
+    def __init__(self, link: Link, role: str, *, may_refuse: bool = False) -> None:
         id = link.table[role]["id"]
+        # To exit is not an algorithm's to decide; to interrupt is the user's.
+        passes: list[type[BaseException]] = [PluginError, KeyboardInterrupt]
+        self._passes = (*passes, ConfigError) if may_refuse else tuple(passes)
         self._who = f"{role} algorithm '{id}'"
         self._hint = f"try: evlcp check {role} {id}"
 
@@ -54,8 +59,7 @@ class Guard:
     def __exit__(
         self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
     ) -> None:
-        # To exit is not an algorithm's to decide; to interrupt is the user's.
-        if fault is not None and not isinstance(fault, (EvlcpError, KeyboardInterrupt)):
+        if fault is not None and not isinstance(fault, self._passes):
             last = traceback.extract_tb(trace)[-1]
             what = f"{type(fault).__name__}: {_shown(str, fault)}".splitlines()[0]
             where = f"{Path(last.filename).name}, line {last.lineno}"

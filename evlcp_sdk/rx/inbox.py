@@ -150,12 +150,12 @@ class MessageAssembler:
         """
         if not link.messages.decode:
             return None
-        guard = Guard(link, "error-correction")
         try:
-            with guard:
+            with Guard(link, "error-correction", may_refuse=True):
                 coder = link.block_coder()
         except ConfigError:
             return None
+        guard = Guard(link, "error-correction")
         return cls(coder, link.messages, link.kinds, guard, clock_zero)
 
     @property

@@ -96,7 +96,8 @@ class Steps:
         self._packet = link.packet
         self._keeper = RangeKeeper()
         self._announcer = announcer
-        self._guards = guards = {role: Guard(link, role) for role in ROLES}
+        self._guards = {role: Guard(link, role) for role in ROLES}
+        guards = {role: Guard(link, role, may_refuse=True) for role in ROLES}
         with guards["synchronization"]:
             self._synchronizer: Synchronizer = link.algorithm("synchronization").compile(
                 link.codebook, link.packet
@@ -110,8 +111,8 @@ class Steps:
         with guards["tracking"]:
             tracker: Tracker = link.algorithm("tracking").compile()
             position, distance = tracker.position, tracker.distance
-        self.position = _guarded(position, guards["tracking"])
-        self._distance = _guarded(distance, guards["tracking"])
+        self.position = _guarded(position, self._guards["tracking"])
+        self._distance = _guarded(distance, self._guards["tracking"])
 
     def sync_init(self) -> Any:
         """State of a region's synchronization before its first event."""

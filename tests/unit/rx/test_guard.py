@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evlcp_sdk.errors import ConfigError, PluginError, PluginWarning
+from evlcp_sdk.errors import ConfigError, InputError, PluginError, PluginWarning
 from evlcp_sdk.io import open_source
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.hooks import hookimpl
@@ -135,6 +135,17 @@ def test_an_algorithm_that_exits_is_named(role: str) -> None:
     gives["tracking"].distance.predict = lambda *_: None
     with pytest.raises(PluginError, match=rf"^{role} algorithm 'mine': SystemExit: 0"):
         received(link_with(role, lambda *_: gives.get(role, exits)))
+
+
+@pytest.mark.parametrize("fault", [InputError("liar.raw: damaged"), ConfigError("no such key")])
+def test_the_sdk_s_own_errors_are_an_algorithm_s_in_a_stream(fault: Exception) -> None:
+    with (
+        pytest.raises(PluginError, match=rf"^ranging algorithm 'joint-scale': {type(fault).__name__}: "),
+        Guard(LINK, "ranging"),
+    ):
+        raise fault
+    with pytest.raises(ConfigError), Guard(LINK, "ranging", may_refuse=True):
+        raise ConfigError("three clusters at least")
 
 
 class MuteError(Exception):
