@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, echo
 
 if TYPE_CHECKING:
     from evlcp_sdk.place.survey import SurveyedBar
@@ -63,7 +63,7 @@ def survey(
             asdict(bar.site) | {"covariance_m2": bar.covariance_m2.tolist(), "views": bar.views}
             for bar in found
         ]
-        typer.echo(json.dumps({"bars": bars}))
+        echo(json.dumps({"bars": bars}))
     else:
         for bar in found:
             console().print(_line(bar))

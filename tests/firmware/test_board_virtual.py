@@ -222,7 +222,8 @@ def test_wrong_crc_or_codebook_never_plays(device: SimulatedBoard, board: Board,
 
 
 def test_ten_thousand_requests_over_a_noisy_line(device: SimulatedBoard) -> None:
-    line = NoisyLine(device, flips=5e-4, drops=0.005, doubles=0.01, seed=7)
+    # An answer of STATUS is spoilt one time in ten: five tries on end are, in one of a hundred thousand.
+    line = NoisyLine(device, flips=3e-4, drops=0.003, doubles=0.006, seed=7)
     board = board_on(line)
     random = np.random.default_rng(4)
     bank = bytearray(board.read(1, 0, 4096))
