@@ -20,7 +20,7 @@ _GUARD_CHIPS = 3
 one and two chips away."""
 
 _TIMING_SIGMA_US = 2.0
-"""Spread of one packet's time, from the grid of the correlation and the jitter of the pixels."""
+"""Least spread of one packet's time, from the grid of the correlation and the jitter of the pixels."""
 
 _LATENCY_SIGMA_US = 0.5
 """Change of the pixels' latency from packet to packet: it is 3.3 us W/m2 over the light, 20 us at 0.17 W/m2,
@@ -50,9 +50,10 @@ class BarkerSync(Synchronization):
     In a preamble all clusters blink in phase; in pilots they cancel, and in info segments they differ. So the
     signed events of a whole region, summed over windows of one chip, correlate with the preamble's chips
     there and nowhere else. Positive and negative events come with different delays, which are
-    measured apart at every packet. The clock's rate is all but constant and within a bound; latency
-    wanders with the light, and jumps where the light does. A measurement far from its prediction is a jump
-    of the latency and says nothing of the rate.
+    measured apart at every packet, each with its sigma, by the jackknife over the preamble's values: a panel
+    behind the bar adds events to some of them. The clock's rate is all but constant and within a bound;
+    latency wanders with the light, and jumps where the light does. A measurement far from its prediction is
+    a jump of the latency and says nothing of the rate.
     """
 
     steps_per_chip: Annotated[int, Field(ge=4, le=100, description="Correlation steps in a chip.")] = 10
@@ -86,12 +87,15 @@ class BarkerSync(Synchronization):
 
 @dataclass(frozen=True)
 class _Heard:
-    """One preamble's times, us; `off_us` is NaN without negative events."""
+    """One preamble's times, us, and their variances, us2; `off_us` is NaN without negative events."""
 
     on_us: float
     off_us: float
     onset_us: float
     quality: float
+    on_noise: float
+    off_noise: float
+    onset_noise: float
 
 
 @dataclass(frozen=True)
@@ -159,9 +163,6 @@ class BarkerSynchronizer:
         self._packet = packet
         self._chips = 2.0 * chips_of_values(codebook.preamble) - 1
         self._bin_us = packet.chip_us / spec.steps_per_chip
-        # A sum over chips of a window's count is a difference of the running count at the chips' bounds.
-        padded = np.concatenate([[0.0], self._chips, [0.0]])
-        self._weights = padded[:-1] - padded[1:]
         self._rising = np.flatnonzero(np.diff(self._chips) > 0) + 1
 
     def init(self) -> SyncState:
@@ -223,33 +224,30 @@ class BarkerSynchronizer:
         n = self._spec.steps_per_chip
         start = max(lag - n, 0)
         stop = min(lag + n + 1, counts.shape[1] - n * len(self._chips) + 1)
-
         bounds = np.arange(start, stop)[:, None] + n * np.arange(len(self._chips) + 1)
 
-        def centre(count: NDArray[np.float64], sign: float) -> float:
+        def centre(count: NDArray[np.float64], sign: float) -> tuple[float, float]:
             running = np.concatenate([[0.0], np.cumsum(count)])
-            part = sign * (running[bounds] @ self._weights)
-            if part.max() <= 0:
-                return math.nan
-            # The top is flat where a window holds all events of an edge: its middle is the best window.
-            weight = np.maximum(part - 0.9 * part.max(), 0)
-            return start + float(weight @ np.arange(len(part)) / weight.sum())
+            values = sign * self._chips * np.diff(running[bounds], axis=1)
+            # Without each value in turn, a pair of chips, it says how sure it is.
+            values = values.reshape(len(bounds), -1, 2).sum(2)
+            found = _middles(values.sum(1)[None])[0]
+            return start + found, _jackknife(_middles(values.sum(1) - values.T))
 
         off, on = counts
-        middle_on, middle_off = centre(on, 1), centre(off, -1)
+        middle_on, noise_on = centre(on, 1)
+        middle_off, noise_off = centre(off, -1)
         if math.isnan(middle_on):
-            middle_on = middle_off
+            middle_on, noise_on = middle_off, noise_off
         # The onset of the positive events, averaged over the rising edges inside the preamble.
         edges = lag + n * self._rising
         steps = np.arange(-n, n)
-        response = on[np.clip(edges[:, None] + steps, 0, len(on) - 1)].sum(0)
-        half = response.max() / 2
-        k = int(np.argmax(response >= half))
-        below = response[k - 1] if k else 0.0
-        rise = (half - below) / (response[k] - below) if response[k] > below else 0.0
-        onset = lag + float(steps[k] - 0.5 + rise)
-        at = [(first_bin + v) * self._bin_us for v in (middle_on, middle_off, onset)]
-        return _Heard(at[0], at[1], at[2], quality)
+        response = on[np.clip(edges[:, None] + steps, 0, len(on) - 1)]
+        found = _onsets(response.sum(0)[None])[0]
+        noise_onset = _jackknife(_onsets(response.sum(0) - response))
+        at = [(first_bin + v) * self._bin_us for v in (middle_on, middle_off, lag - n + found)]
+        noises = [_TIMING_SIGMA_US**2 + v * self._bin_us**2 for v in (noise_on, noise_off, noise_onset)]
+        return _Heard(at[0], at[1], at[2], quality, *noises)
 
     def _accept(
         self, clock: _Clock | None, stray: _Heard | None, found: _Heard
@@ -279,7 +277,7 @@ class BarkerSynchronizer:
         return self._spec.clock_tolerance_ppm * 1e-6 * self._packet.packet_chips * self._packet.chip_us
 
     def _first(self, found: _Heard) -> _Clock:
-        noise = _TIMING_SIGMA_US**2
+        noise = found.on_noise
         apart = found.off_us - found.on_us
         return _Clock(
             packet=0,
@@ -288,8 +286,10 @@ class BarkerSynchronizer:
             rate_us=0.0,
             # The bound is two sigmas of what clocks have.
             variances=(noise, 0.0, (self._most_us() / 2) ** 2),
-            apart=_Level(0.0, self._packet.chip_us**2) if math.isnan(apart) else _Level(apart, 2 * noise),
-            onset=_Level(found.onset_us - found.on_us, 2 * noise),
+            apart=_Level(0.0, self._packet.chip_us**2)
+            if math.isnan(apart)
+            else _Level(apart, noise + found.off_noise),
+            onset=_Level(found.onset_us - found.on_us, noise + found.onset_noise),
             quality=found.quality,
         )
 
@@ -313,7 +313,7 @@ class BarkerSynchronizer:
 
     def _next(self, clock: _Clock, found: _Heard, packets: int) -> _Clock:
         """The lock with a preamble more."""
-        noise = _TIMING_SIGMA_US**2
+        noise = found.on_noise
         expected, time, both, rate = self._ahead(clock, packets)
         late = found.on_us - expected
         if late**2 > _CHANGED_SIGMAS**2 * (time + noise):
@@ -331,8 +331,10 @@ class BarkerSynchronizer:
             on_us=expected + time / spread * late,
             rate_us=rate_us,
             variances=(time * noise / spread, both * noise / spread, rate - both**2 / spread),
-            apart=clock.apart if math.isnan(apart) else clock.apart.measured(apart, walk, 2 * noise),
-            onset=clock.onset.measured(found.onset_us - found.on_us, walk, 2 * noise),
+            apart=clock.apart
+            if math.isnan(apart)
+            else clock.apart.measured(apart, walk, noise + found.off_noise),
+            onset=clock.onset.measured(found.onset_us - found.on_us, walk, noise + found.onset_noise),
             quality=clock.quality + (found.quality - clock.quality) / heard,
         )
 
@@ -350,3 +352,32 @@ class BarkerSynchronizer:
 def _first_maximum(values: NDArray[np.float64], start: int, stop: int) -> int:
     start = max(start, 0)
     return start + int(np.argmax(values[start:stop]))
+
+
+def _middles(fits: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where each row of correlations is best, in steps; NaN where none is positive.
+
+    The top is flat where a window holds all events of an edge: its middle is the best window.
+    """
+    top = fits.max(1, keepdims=True)
+    weight = np.maximum(fits - 0.9 * top, 0)
+    total = weight.sum(1)
+    found = weight @ np.arange(fits.shape[1])
+    return np.where(top[:, 0] > 0, found / np.where(total > 0, total, 1), np.nan)
+
+
+def _onsets(responses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where each row of counts first reaches half of its most, over what comes all the time, in steps."""
+    rows = np.arange(len(responses))
+    always = np.sort(responses, axis=1)[:, responses.shape[1] // 4]
+    half = (always + responses.max(1)) / 2
+    k = (responses >= half[:, None]).argmax(1)
+    at, below = responses[rows, k], np.where(k > 0, responses[rows, k - 1], 0.0)
+    rises = at > below
+    return np.asarray(k - 0.5 + np.where(rises, (half - below) / np.where(rises, at - below, 1), 0.0))
+
+
+def _jackknife(without: NDArray[np.float64]) -> float:
+    """Variance of what was found of all, by what is found without each; parts that say nothing left out."""
+    without = without[np.isfinite(without)]
+    return float((len(without) - 1) * without.var()) if len(without) else 0.0

@@ -402,6 +402,45 @@ def test_a_preamble_half_in_the_dark_spoils_nothing(half):
         assert abs(lock.chip_us / usual[round(n)].chip_us - 1) < 30e-6
 
 
+def starts_of(locks):
+    """How late each packet is, us."""
+    return np.array(
+        [k.packet_t_us - START_US - round(n) * PERIOD_US for k, n in zip(locks, numbers(locks), strict=True)]
+    )
+
+
+def among(events, t_us, p):
+    """Events with others among them, in order."""
+    t = np.concatenate([events[0], t_us])
+    order = np.argsort(t, kind="stable")
+    return t[order], np.concatenate([events[1], p])[order].astype(np.uint8)
+
+
+@pytest.mark.parametrize(("rate_hz", "seed"), [(1000, 0), (2000, 0), (2000, 1)])
+def test_a_panel_behind_is_no_latency(rate_hz, seed):
+    rng = np.random.default_rng(seed)
+    bar = twins.events_of(packets_of(rng, 6), rng, START_US, per_edge=6)
+    apart_us = 5e5 / rate_hz
+    switches = rng.uniform(0, 2 * apart_us) + apart_us * np.arange(bar[0][-1] / apart_us - 1)
+    # As many at each switch as half of the bar's clusters have at an edge, or all of them.
+    when = np.repeat(np.arange(len(switches)), 200_000 // rate_hz)
+    t = np.floor(switches[when] + 30 + rng.normal(0, 8, len(when))).astype(np.int64)
+    locks, _ = locks_of(*among(bar, t, when % 2))
+    assert len(locks) >= 5
+    assert np.ptp(starts_of(locks)[1:]) < 8
+    assert max(abs(lock.chip_us / twins.CHIP_US - 1) for lock in locks) < 30e-6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_leaves_behind_are_no_latency(seed):
+    rng = np.random.default_rng(seed)
+    bar = twins.events_of(packets_of(rng, 6), rng, START_US, per_edge=6)
+    n = 2 * len(bar[0])
+    locks, _ = locks_of(*among(bar, rng.integers(0, bar[0][-1], n), rng.integers(0, 2, n)))
+    steady, _ = locks_of(*bar)
+    assert starts_of(locks).mean() == pytest.approx(starts_of(steady).mean(), abs=2.5)
+
+
 def test_positive_events_alone_are_enough():
     rng = np.random.default_rng(13)
     t, p = twins.events_of(packets_of(rng, 6), rng, START_US, per_edge=4)
