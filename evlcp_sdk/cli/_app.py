@@ -1,10 +1,14 @@
 """What the `evlcp` command line consists of, plugins' commands included."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from evlcp_sdk.cli._common import echo
+from evlcp_sdk.printable import printable
 
 if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
@@ -20,6 +24,31 @@ Exit codes: [bold]0[/] done (also when no transmitter was there), [bold]1[/] fai
 [bold]2[/] usage, configuration or an algorithm that cannot be used, [bold]3[/] input that cannot be read,
 [bold]70[/] a fault of evlcp itself, [bold]130[/] interrupted. A broken plugin is left out with a warning.
 """
+
+
+class _Commands(TyperGroup):
+    """The commands; what Typer says of a wrong command line repeats it, and moves no cursor either."""
+
+    def make_context(self, *args: Any, **more: Any) -> Any:
+        with _printable_faults():
+            return super().make_context(*args, **more)
+
+    def invoke(self, ctx: Any) -> Any:
+        with _printable_faults():
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _printable_faults() -> Iterator[None]:
+    """Have those exceptions say it in printable words that Typer itself shows."""
+    try:
+        yield
+    except Exception as fault:
+        words = getattr(fault, "format_message", None)
+        if words is not None:
+            said = printable(words())
+            fault.format_message = lambda: said  # type: ignore[attr-defined]
+        raise
 
 
 def make_app() -> typer.Typer:
@@ -41,7 +70,12 @@ def make_app() -> typer.Typer:
     )
 
     app = typer.Typer(
-        name="evlcp", no_args_is_help=True, rich_markup_mode="rich", pretty_exceptions_enable=False, help=HELP
+        name="evlcp",
+        cls=_Commands,
+        no_args_is_help=True,
+        rich_markup_mode="rich",
+        pretty_exceptions_enable=False,
+        help=HELP,
     )
     app.callback()(_root)
     first = (receive, info, compare, simulate, score, sweep, report, demo)

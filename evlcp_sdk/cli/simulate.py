@@ -68,6 +68,7 @@ def simulate(
     import time
 
     from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.files import is_there
     from evlcp_sdk.sim import preset_names, preset_text
     from evlcp_sdk.simulated import simulate as render
 
@@ -90,6 +91,10 @@ def simulate(
         return
     if preset is not None:
         preset_text(preset)  # a file of that name is not meant
+    elif scene_file is not None and scene_file in preset_names() and not is_there(scene_file):
+        raise typer.BadParameter(
+            f"{scene_file}: no such file; for the preset: --preset {scene_file}", param_hint="scene.toml"
+        )
     source: Path | str = preset if preset is not None else Path(scene_file or "")
     if out is None:
         raise typer.BadParameter("where should the recording go?", param_hint="-o REC.raw")

@@ -9,7 +9,7 @@ from evlcp_sdk.air.blocks import DIGEST_BYTES, HEADER_BYTES
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat, symbols_of_bits
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.plugin.roles import Code
+from evlcp_sdk.plugin.roles import Code, Corrected
 
 __all__ = ["BlockCoder", "interleaver", "packet_bits"]
 
@@ -59,6 +59,8 @@ class BlockCoder:
         self._frames = packet.frames
         self._code = code
         self.bits = packet_bits(codebook, packet)
+        if not hasattr(code, "message_bits"):
+            raise TypeError(f"gave {type(code).__name__} at compile(), expected an object with message_bits")
         self.block_bytes = code.message_bits // 8
         if self.block_bytes <= HEADER_BYTES:
             raise ConfigError(
@@ -96,6 +98,8 @@ class BlockCoder:
         if np.count_nonzero(llr) < self._code.message_bits:
             return None
         found = self._code.decode(np.ascontiguousarray(llr[self._order], np.float32))
+        if not isinstance(found, Corrected):
+            raise TypeError(f"gave {type(found).__name__}, expected Corrected")
         if np.shape(found.bits) != (self._code.message_bits,):
             raise ValueError(f"gave bits of shape {np.shape(found.bits)}, expected {self._code.message_bits}")
         if not found.ok or found.bits[8 * self.block_bytes :].any():

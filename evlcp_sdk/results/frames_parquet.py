@@ -1,14 +1,19 @@
 """`frames.parquet`: the rows of `frames.csv` with their types."""
 
-import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from itertools import chain
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from evlcp_sdk.results.columns import FILTERED_COLUMNS, FRAME_COLUMNS, frame_value
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.frames_csv import is_filtered
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.values import Packet
+
+if TYPE_CHECKING:
+    import pyarrow
 
 __all__ = ["FramesParquet"]
 
@@ -28,20 +33,22 @@ class FramesParquet(Sink):
         self._columns = FRAME_COLUMNS + (FILTERED_COLUMNS if is_filtered(run) else ())
         types += [real] * (len(self._columns) - len(types))
         self._schema = pyarrow.schema(list(zip(self._columns, types, strict=True)))
-        self._arrow = pyarrow
         self._writer = pyarrow.parquet.ParquetWriter(folder.path("frames.parquet"), self._schema)
-        self._waiting: list[dict[str, Any]] = []
+        self._waiting: list[list[Any]] = []
 
     def packet(self, packet: Packet) -> None:
         """Keep the frames, and write a group when there are enough."""
         for frame in packet.frames:
-            found = {name: frame_value(frame, name) for name in self._columns}
-            self._waiting.append({name: _given(value) for name, value in found.items()})
+            self._waiting.append([frame_value(frame, name) for name in self._columns])
             if len(self._waiting) == self.GROUP:
                 self._flush()
 
     def _flush(self) -> None:
-        self._writer.write_table(self._arrow.Table.from_pylist(self._waiting, schema=self._schema))
+        import pyarrow
+
+        columns = zip(*self._waiting, strict=True)
+        arrays = [_array(values, kind) for values, kind in zip(columns, self._schema.types, strict=True)]
+        self._writer.write_batch(pyarrow.RecordBatch.from_arrays(arrays, schema=self._schema))
         self._waiting = []
 
     def finish(self) -> Mapping[str, Any]:
@@ -52,6 +59,22 @@ class FramesParquet(Sink):
         return {}
 
 
-def _given(value: Any) -> Any:
-    """A value as it is; None for NaN and infinity."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _array(values: Sequence[Any], kind: "pyarrow.DataType") -> "pyarrow.Array":
+    """Numbers as an array of Arrow; null for None, NaN and infinity.
+
+    Made from buffers: `pyarrow.array` imports pandas where that is installed, 50 MB of memory.
+    """
+    import pyarrow
+
+    if pyarrow.types.is_list(kind):
+        ends = np.cumsum([0, *map(len, values)]).astype(np.int32)
+        inner = _array(list(chain.from_iterable(values)), kind.value_type)
+        return pyarrow.Array.from_buffers(
+            kind, len(values), [None, pyarrow.py_buffer(ends)], children=[inner]
+        )
+    known = np.array([value is not None and np.isfinite(value) for value in values], bool)
+    filled = [value if there else 0 for value, there in zip(values, known.tolist(), strict=True)]
+    numbers = np.array(filled, np.int64 if pyarrow.types.is_integer(kind) else np.float64)
+    there = np.packbits(known, bitorder="little")
+    buffers = [pyarrow.py_buffer(there), pyarrow.py_buffer(numbers)]
+    return pyarrow.Array.from_buffers(kind, len(values), buffers)

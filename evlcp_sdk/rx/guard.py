@@ -82,6 +82,20 @@ class Guard:
         if not isinstance(found, kind):
             self.refuse(type(found).__name__, kind.__name__)
 
+    def expect_compiled(self, found: object, *methods: str) -> None:
+        """Check what `compile` gave: a function, or an object with these methods.
+
+        Raises:
+            PluginError: It is neither.
+        """
+        if methods and not all(callable(getattr(found, name, None)) for name in methods):
+            expected = f"an object with {' and '.join(f'{name}()' for name in methods)}"
+        elif not methods and not callable(found):
+            expected = "a function"
+        else:
+            return
+        self.refuse(f"{type(found).__name__} at compile()", expected)
+
     def expect_array(self, found: object, name: str, shape: tuple[int, ...], kinds: str) -> None:
         """Check an array's shape, and its type by NumPy's letters for kinds, e.g. `"iu"`.
 
@@ -95,8 +109,10 @@ class Guard:
         if found.dtype.kind not in kinds:
             self.refuse(f"{name} of {found.dtype}", " or ".join(_KINDS[kind] for kind in kinds))
 
-    def expect_number(self, found: object, name: str, least: float, most: float) -> None:
-        """Check a number.
+    def expect_number(
+        self, found: object, name: str, least: float, most: float, expected: str | None = None
+    ) -> None:
+        """Check a number; `expected` says its range where the limits themselves would say it badly.
 
         Raises:
             PluginError: It is none, or out of range.
@@ -106,7 +122,9 @@ class Guard:
         except (TypeError, ValueError):
             fine = False
         if not fine:
-            self.refuse(f"{name} = {_shown(repr, found):.40}", f"a number from {least:g} to {most:g}")
+            self.refuse(
+                f"{name} = {_shown(repr, found):.40}", expected or f"a number from {least:g} to {most:g}"
+            )
 
     def expect_locks(self, locks: object) -> None:
         """Check that a synchronization heard no more packets in a step than there is time for.
@@ -145,7 +163,7 @@ class Guard:
         self.expect(found, PresenceMap)
         grid = found.grid_px
         if not isinstance(grid, int | np.integer) or grid < 1:
-            self.refuse(f"grid_px = {grid!r:.40}", "a whole number of pixels")
+            self.refuse(f"grid_px = {_shown(repr, grid):.40}", "a whole number of pixels from 1")
         cells = (clusters, height // grid, width // grid)
         self.expect_array(found.probability, "probability", cells, "f")
         self.expect_array(found.selected, "selected", cells, "b")
@@ -173,6 +191,7 @@ class Guard:
             self.refuse(f"symbol {least if least < -1 else most}", f"0 to {top}, or -1 for one not given")
         if not math.isfinite(soft.llr.sum()):
             self.refuse("llr of other values", "finite ones")
+        self.expect_number(soft.quality, "quality", 0.0, _ONE)
 
     def expect_range(self, found: Range) -> None:
         """Check what a ranging gave.
@@ -181,12 +200,11 @@ class Guard:
             PluginError: It is no `Range`, or its numbers are not those of a distance.
         """
         self.expect(found, Range)
-        for name, value, least in (
-            ("distance_m", found.distance_m, math.ulp(0.0)),
-            ("sigma_m", found.sigma_m, 0.0),
-        ):
-            if not _unknown(value):
-                self.expect_number(value, name, least, _FARTHEST_M if name == "distance_m" else math.inf)
+        if not _unknown(found.distance_m):
+            above = f"a number above 0 and up to {_FARTHEST_M:g}, or NaN"
+            self.expect_number(found.distance_m, "distance_m", math.ulp(0.0), _FARTHEST_M, above)
+        if not _unknown(found.sigma_m):
+            self.expect_number(found.sigma_m, "sigma_m", 0.0, math.inf, "a number from 0, or NaN")
         self.expect_number(found.pairs, "pairs", 0, 1 << 32)
         self.expect_number(found.late_chips, "late_chips", -_LATEST_CHIPS, _LATEST_CHIPS)
         if found.bend is not None:

@@ -102,15 +102,23 @@ class Steps:
             self._synchronizer: Synchronizer = link.algorithm("synchronization").compile(
                 link.codebook, link.packet
             )
+            guards["synchronization"].expect_compiled(self._synchronizer, "init", "step")
         with guards["separation"]:
             self._separate = link.algorithm("separation").compile(link.codebook)
+            guards["separation"].expect_compiled(self._separate)
         with guards["decoding"]:
             self._decode = link.algorithm("decoding").compile(link.codebook)
+            guards["decoding"].expect_compiled(self._decode)
         with guards["ranging"]:
             self._measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+            guards["ranging"].expect_compiled(self._measure)
         with guards["tracking"]:
             tracker: Tracker = link.algorithm("tracking").compile()
+            guards["tracking"].expect(tracker, Tracker)
             position, distance = tracker.position, tracker.distance
+            for filter_ in (position, distance):
+                if filter_ is not None:
+                    guards["tracking"].expect_compiled(filter_, "init", "step", "predict")
         self.position = _guarded(position, self._guards["tracking"])
         self._distance = _guarded(distance, self._guards["tracking"])
 

@@ -393,6 +393,22 @@ def test_a_closed_pipe_is_silent() -> None:
     assert done.stdout.startswith("# EVLCP link")
 
 
+def test_a_preset_named_as_a_file_is_told_as_one(
+    evlcp: Evlcp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = evlcp("simulate", "drive-30kmh", "-o", "rec.raw")
+    assert done.code == 2
+    assert "drive-30kmh: no such file; for the preset: --preset drive-30kmh" in " ".join(
+        done.err.replace("│", " ").split()
+    )
+    # A file of that name is a scene.
+    (tmp_path / "drive-30kmh").write_text("nothing = 1\n")
+    done = evlcp("simulate", "drive-30kmh", "-o", "rec.raw")
+    assert done.code == 2
+    assert done.err.startswith("evlcp: drive-30kmh: nothing = 1: unknown key")
+
+
 @pytest.fixture(scope="module")
 def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated drive towards two bars that send their beacons, with its truth and sites."""

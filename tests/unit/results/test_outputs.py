@@ -4,6 +4,8 @@ import csv
 import hashlib
 import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -360,6 +362,20 @@ def test_parquet_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(ConfigError, match="needs the extra: pip install"):
         ResultWriter(tmp_path / "out", LINK, sinks=["parquet"])
     assert not (tmp_path / "out").exists()
+
+
+def test_parquet_imports_no_pandas() -> None:
+    """Which takes 50 MB, and a second."""
+    pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
+    code = (
+        "import sys, math, pyarrow\n"
+        "from evlcp_sdk.results.frames_parquet import _array\n"
+        "real, rows = pyarrow.float64(), pyarrow.list_(pyarrow.int64())\n"
+        "print(_array([1.5, math.nan, None, 2], real).to_pylist())\n"
+        "print(_array([[1, None], [], [3]], rows).to_pylist(), 'pandas' in sys.modules)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[1.5, None, None, 2.0]\n[[1, None], [], [3]] False\n"
 
 
 def test_parquet_holds_the_same_frames(tmp_path: Path) -> None:

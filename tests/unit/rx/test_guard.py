@@ -69,6 +69,26 @@ def test_what_fails_to_compile_is_named(role: str) -> None:
         Receiver(link_with(role, fails))
 
 
+FUNCTION, METHODS = "a function", r"an object with init\(\) and step\(\)"
+
+
+@pytest.mark.parametrize(
+    ("role", "gives", "says"),
+    [
+        ("synchronization", None, rf"NoneType at compile\(\), expected {METHODS}"),
+        ("synchronization", SimpleNamespace(init=None, step=fails), f"SimpleNamespace at .*{METHODS}"),
+        ("separation", None, rf"NoneType at compile\(\), expected {FUNCTION}"),
+        ("decoding", 3, rf"int at compile\(\), expected {FUNCTION}"),
+        ("ranging", None, rf"NoneType at compile\(\), expected {FUNCTION}"),
+        ("tracking", None, "NoneType, expected Tracker"),
+        ("tracking", Tracker(None, 5), r"int at compile\(\), .* init\(\) and step\(\) and predict\(\)"),  # type: ignore[arg-type]
+    ],
+)
+def test_what_compiles_to_nothing_that_runs_is_named(role: str, gives: object, says: str) -> None:
+    with pytest.raises(PluginError, match=f"^{role} algorithm 'mine': gave {says}; try: evlcp check"):
+        Receiver(link_with(role, lambda *_: gives))
+
+
 def test_what_the_sdk_says_itself_is_left_as_it_is() -> None:
     def refuses(*_args: object) -> None:
         raise ConfigError("ranging.clusters = [99]: expected 0 to 15")
@@ -242,7 +262,7 @@ ODD: list[tuple[str, Callable[[Any], Any], str]] = [
     ("synchronization", but(quality=2.0), r"quality = 2\.0, expected a number from 0 to 1"),
     ("synchronization", but(row_us=math.nan), "row_us = nan"),
     ("separation", but(grid_px=10**6), r"probability of shape \(16, \d+, \d+\), expected \(16, 0, 0\)"),
-    ("separation", but(grid_px=0), "grid_px = 0, expected a whole number of pixels"),
+    ("separation", but(grid_px=0), "grid_px = 0, expected a whole number of pixels from 1"),
     ("separation", but(grid_px=2.0), r"grid_px = 2\.0, expected a whole number"),
     ("separation", but(grid_px="2"), "grid_px = '2', expected a whole number"),
     ("separation", but(probability=[0.5]), "probability of type list, expected an array"),
@@ -256,11 +276,14 @@ ODD: list[tuple[str, Callable[[Any], Any], str]] = [
     ("decoding", spoilt("symbols", 10**12), "symbol 1000000000000, expected 0 to 63"),
     ("decoding", spoilt("symbols", 1, np.float64), "symbols of float64, expected integers or unsigned"),
     ("decoding", spoilt("llr", math.nan), "llr of other values, expected finite ones"),
-    ("ranging", but(distance_m=-5.0), r"distance_m = -5\.0, expected a number from"),
-    ("ranging", but(distance_m="50 m"), "distance_m = '50 m', expected a number from"),
-    ("ranging", but(distance_m=math.inf), "distance_m = inf, expected a number from"),
-    ("ranging", but(distance_m=None), "distance_m = None, expected a number from"),
-    ("ranging", but(sigma_m=-1.0), r"sigma_m = -1\.0, expected a number from 0"),
+    ("decoding", but(quality="good"), "quality = 'good', expected a number from 0 to 1"),
+    ("decoding", but(quality=1.1), r"quality = 1\.1, expected a number from 0 to 1"),
+    ("ranging", but(distance_m=-5.0), r"distance_m = -5\.0, expected a number above 0 and up to 1e\+15"),
+    ("ranging", but(distance_m=0.0), r"distance_m = 0\.0, expected a number above 0"),
+    ("ranging", but(distance_m="50 m"), "distance_m = '50 m', expected a number above 0"),
+    ("ranging", but(distance_m=math.inf), "distance_m = inf, expected a number above 0"),
+    ("ranging", but(distance_m=None), "distance_m = None, expected a number above 0"),
+    ("ranging", but(sigma_m=-1.0), r"sigma_m = -1\.0, expected a number from 0, or NaN"),
     ("ranging", but(pairs="many"), "pairs = 'many', expected a number"),
     ("ranging", but(late_chips=math.nan), "late_chips = nan, expected a number"),
     ("ranging", but(bend=3), "int, expected Bend"),
@@ -302,7 +325,7 @@ def test_other_types_of_right_values_pass(role: str, change: Callable[[Any], Any
 @pytest.mark.parametrize(
     ("gives", "says"),
     [
-        (None, "AttributeError: "),
+        (None, "TypeError: gave NoneType, expected Corrected"),
         (Corrected(np.zeros(3, np.uint8), True, 0), r"ValueError: gave bits of shape \(3,\), expected"),
     ],
 )
@@ -316,6 +339,12 @@ def test_an_error_correction_that_gives_another_thing_is_named(gives: object, sa
 
     with pytest.raises(PluginError, match=f"^error-correction algorithm 'mine': {says}"):
         received(link_with("error-correction", compile_code))
+
+
+def test_an_error_correction_that_compiles_to_nothing_is_named() -> None:
+    says = "^error-correction algorithm 'mine': TypeError: gave NoneType at compile"
+    with pytest.raises(PluginError, match=says):
+        received(link_with("error-correction", lambda *_: None))
 
 
 def test_hooks_that_exit_end_nothing(demo_raw: Path) -> None:
