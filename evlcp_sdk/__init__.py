@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.io.replay import ReplaySource
     from evlcp_sdk.link.compose import compose
     from evlcp_sdk.link.resolve import Link, load_link
+    from evlcp_sdk.place.gnss import GnssLog
     from evlcp_sdk.place.navigator import Place, PositionPlan, Settled
     from evlcp_sdk.plugin.hooks import Algorithm, SinkRecord, hookimpl
     from evlcp_sdk.plugin.registry import Registry
@@ -108,6 +109,7 @@ __all__ = [
     "Fix",
     "Frame",
     "FrameView",
+    "GnssLog",
     "InputError",
     "InterruptedRunError",
     "Link",
@@ -187,6 +189,7 @@ _HOMES = {
     "io.replay": ("ReplaySource",),
     "link.compose": ("compose",),
     "link.resolve": ("Link", "load_link"),
+    "place.gnss": ("GnssLog",),
     "place.navigator": ("Place", "PositionPlan", "Settled"),
     "plugin.hooks": ("Algorithm", "SinkRecord", "hookimpl"),
     "plugin.registry": ("Registry",),

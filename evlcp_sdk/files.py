@@ -11,6 +11,7 @@ import errno
 import hashlib
 import io
 import json
+import math
 import os
 import shutil
 import stat
@@ -21,7 +22,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, BinaryIO, Self, TextIO
 
-from evlcp_sdk.errors import InputError, OutputError
+from evlcp_sdk.errors import ConfigError, InputError, OutputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,6 +31,7 @@ __all__ = [
     "Outputs",
     "check_output",
     "check_sha256",
+    "csv_number",
     "defused",
     "is_there",
     "open_log",
@@ -402,6 +404,26 @@ def read_csv(path: Path | str) -> tuple[tuple[str, ...], list[tuple[int, dict[st
         raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
     except (UnicodeDecodeError, csv.Error) as fault:
         raise InputError(f"{path}: not a CSV file: {fault}") from fault
+
+
+_MOST = 1e18
+"""Size of the largest number of a CSV file: microseconds since 1970 are 1e15."""
+
+
+def csv_number(path: Path | str, line: int, name: str, text: str | None) -> float:
+    """A number of a CSV file that was read.
+
+    Raises:
+        ConfigError: It is not one, or larger than any that makes sense.
+    """
+    try:
+        value = float(text if text is not None else "")
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= _MOST:
+        wanted = "a number" if not math.isfinite(value) else f"at most {_MOST:g}"
+        raise ConfigError(f"{path}: line {line}: {name} = {text!r:.40}: expected {wanted}")
+    return value
 
 
 def is_there(path: Path | str) -> bool:

@@ -514,6 +514,8 @@ class Fix:
         vpl_m: The vertical one.
         excluded: What was left out as the rest contradicts it: `bar N`, `heading`, `attitude`, `focal
             length`.
+        source: `bars`, or `gnss`: a fix of satellites, which is taken for the track.
+        contradicted: What the track stands on where it contradicts this fix, if bars and GNSS disagree.
     """
 
     t_us: float
@@ -538,17 +540,21 @@ class Fix:
     hpl_m: float = math.inf
     vpl_m: float = math.inf
     excluded: tuple[str, ...] = ()
+    source: str = "bars"
+    contradicted: tuple[str, ...] = ()
 
     @property
     def alarms(self) -> tuple[str, ...]:
         """What a user must know before this fix is used.
 
-        `excluded`: a part was left out; `unavailable`: there is no protection level; and the refusals
-        `misfit` and `site-contradicted`, by which parts contradict one another.
+        `excluded`: a part was left out; `contradicted`: bars and GNSS disagree; `unavailable`: there is no
+        protection level; and the refusals `misfit` and `site-contradicted`, by which parts contradict one
+        another.
         """
         if self.refusal:
             return (self.refusal,) if self.refusal in ("misfit", "site-contradicted") else ()
-        out = ("excluded",) if self.excluded else ()
+        out: tuple[str, ...] = ("excluded",) if self.excluded else ()
+        out += ("contradicted",) if self.contradicted else ()
         return out if math.isfinite(self.hpl_m) and math.isfinite(self.vpl_m) else (*out, "unavailable")
 
     def __repr__(self) -> str:

@@ -66,6 +66,12 @@ def receive(
             help="The camera's attitude over time, for distances and positions.",
         ),
     ] = None,
+    gnss: Annotated[
+        Path | None,
+        typer.Option(
+            "--gnss", metavar="FILE.csv", help="Fixes of satellites, with sigmas, which enter the track."
+        ),
+    ] = None,
     heading_deg: Annotated[
         float | None, typer.Option("--heading-deg", help="Its heading, clockwise from north, if known.")
     ] = None,
@@ -130,6 +136,9 @@ def receive(
 
     Positions, with an IMU's log: [bold]evlcp receive REC.raw -o out --sites site.toml --attitude imu.csv[/]
 
+    A track between bars, too:    [bold]evlcp receive REC.raw -o out --sites site.toml --attitude imu.csv
+    --gnss gnss.csv[/]
+
     OUT gets frames.csv (a row per frame), packets.jsonl (a line per packet or message) and summary.json.
     With --sites it gets fixes.csv, track.csv, fixes.geojson and fixes.nmea, too. --figures, --parquet and
     --mcap are short for --sink figures, parquet and mcap; plugins bring other formats.
@@ -153,7 +162,7 @@ def receive(
         gravity_sigma_deg = 0.5 if attitude_file is None else 0.1
     sigmas = (gravity_sigma_deg, heading_sigma_deg, white_sigma_deg, time_sigma_us)
     attitude = _attitude(attitude_file, angles, sigmas)
-    plan, zero = _position_plan(sites, mcap), _clock_zero(clock_zero)
+    plan, zero = _position_plan(sites, gnss, mcap), _clock_zero(clock_zero)
     short = {"figures": figures, "parquet": parquet, "mcap": mcap}
     asked = tuple(dict.fromkeys([*(name for name, given in short.items() if given), *(sinks or [])]))
     load_sinks(choose_sinks(registry, asked, positions=plan is not None))
@@ -234,16 +243,18 @@ def _attitude(
     return Attitude(pitch, roll, heading, *sigmas) if pitch is not None and roll is not None else None
 
 
-def _position_plan(sites: Path | None, mcap: bool) -> "PositionPlan | None":
+def _position_plan(sites: Path | None, gnss: Path | None, mcap: bool) -> "PositionPlan | None":
     """What the options say of positions; None without sites."""
     if sites is None:
-        if mcap:
-            raise typer.BadParameter("needs --sites", param_hint="--mcap")
+        for name, given in (("--mcap", mcap), ("--gnss", gnss is not None)):
+            if given:
+                raise typer.BadParameter("needs --sites", param_hint=name)
         return None
+    from evlcp_sdk.place.gnss import GnssLog
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.scene.sites import load_sites
 
-    return PositionPlan(load_sites(sites))
+    return PositionPlan(load_sites(sites), None if gnss is None else GnssLog.read(gnss))
 
 
 def _clock_zero(text: str | None) -> "datetime | None":

@@ -158,6 +158,27 @@ class PositionSpec:
     slow_s: Annotated[
         float, Field(gt=0, description="Time in which errors within pixels change, as the image moves.")
     ] = 0.3
+    rate_sigma_deg_s: Annotated[float, Field(gt=0, description="Bias of an IMU's rates (sigma).")] = 0.1
+    rate_white_deg_rts: Annotated[
+        float, Field(ge=0, description="How an IMU's angle drifts in a second by noise, degrees.")
+    ] = 0.02
+    push_sigma_m_s2: Annotated[
+        float,
+        Field(gt=0, description="Bias of an IMU's accelerations, by its attitude's error, too (sigma)."),
+    ] = 0.05
+    push_white_m2_s3: Annotated[
+        float, Field(gt=0, description="Power density of the noise of an IMU's accelerations.")
+    ] = 1e-3
+    gnss_s: Annotated[float, Field(gt=0, description="Time in which most of a GNSS fix's error changes.")] = (
+        30.0
+    )
+    gnss_white_share: Annotated[
+        float, Field(gt=0, le=1, description="Share of its variance that is new with every fix.")
+    ] = 0.1
+    antenna_m: Annotated[
+        tuple[float, float, float],
+        Field(description="The GNSS antenna's place from the camera: right, down, forward, m."),
+    ] = (0.0, 0.0, 0.0)
     gate_sigmas: Annotated[
         float,
         Field(gt=1, description="Sigmas from the prediction beyond which a trajectory leaves a fix out."),

@@ -2,16 +2,24 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.place.gnss import GnssLog, attitude_of, gnss_fix
 from evlcp_sdk.place.positioner import Positioner
-from evlcp_sdk.place.trajectory import TrajectoryPoint, smooth_trajectory, trajectory_step
+from evlcp_sdk.place.trajectory import (
+    GNSS,
+    TrajectoryPoint,
+    heading_at,
+    smooth_trajectory,
+    trajectory_step,
+)
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
-from evlcp_sdk.scene.sites import BarSite
+from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Fix, Packet
 
 __all__ = ["Navigator", "Place", "Placed", "PositionPlan", "Settled"]
@@ -23,15 +31,21 @@ _BLOCK = 1024
 acceleration of 1 m/s2 lasts against fixes of centimetres."""
 
 
+_STANDS_US = 10e6
+"""Time in which a track stands on what it took last of bars, and of satellites."""
+
+
 @dataclass(frozen=True)
 class PositionPlan:
     """What positions are computed from beside what the camera sees and how it is turned.
 
     Attributes:
         sites: Where the bars stand.
+        gnss: Fixes of satellites, which enter the track; None for none.
     """
 
     sites: tuple[BarSite, ...]
+    gnss: GnssLog | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +61,7 @@ class Place:
         covariance_m2: Of `enu_m`, float64 (3, 3).
         speed_m_s: Over ground.
         course_deg: Where it moves to, clockwise from north.
-        left_out: The fix at this time was beyond the gate and does not count.
+        left_out: The fix at this time was beyond the gate, or failed its test, and does not count.
         starts: A trajectory starts here; nothing is known of its speed, unless it is smoothed.
     """
 
@@ -115,17 +129,66 @@ class Navigator:
             link.position,
             link.camera_sigma,
         )
+        self._imu = attitude.between if isinstance(attitude, AttitudeLog) else None
+        self._attitude_at = attitude_source(attitude)
+        self._gnss, self._gnss_next = plan.gnss, 0
+        self._span: tuple[float, float] | None = None
+        self._taken: dict[str, float] = {}
+        self._counts = dict.fromkeys(("gnss", "gnss_left_out", "gnss_without_heading"), 0)
         self._state: TrajectoryPoint | None = None
         self._window: list[tuple[Fix, TrajectoryPoint, Place]] = []
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Fixes of satellites: taken, left out of the track, and without a heading that the antenna needs."""
+        return dict(self._counts)
+
+    def seen(self, first_us: float, last_us: float) -> None:
+        """Be told that the recording has events from one time to another: fixes of satellites count in it.
+
+        Without being told, those from the first fix of bars to the last one count.
+        """
+        self._span = (first_us if self._span is None else self._span[0], last_us)
+
     def feed(self, packets: Iterable[Packet]) -> list[Placed]:
         """Take the receiver's next packets; return the fixes that no later packet can change."""
-        return [self._placed(fix) for fix in self.positioner.feed(packets)]
+        return self._in_time(self.positioner.feed(packets))
 
     def close(self) -> tuple[list[Placed], tuple[Settled, ...]]:
         """End the stream; return the rest of the fixes, and what was not settled before."""
-        placed = [self._placed(fix) for fix in self.positioner.close()]
+        placed = self._in_time(self.positioner.close())
+        if self._span is not None:
+            placed += self._satellites(self._span[1])
         return placed, self._settle(len(self._window))
+
+    def _in_time(self, fixes: Iterable[Fix]) -> list[Placed]:
+        """Fixes of bars, and those of satellites before each."""
+        placed = []
+        for fix in fixes:
+            if self._span is None:
+                self._span = (fix.t_us, fix.t_us)
+            placed += self._satellites(fix.t_us)
+            placed.append(self._placed(fix))
+        return placed
+
+    def _satellites(self, until_us: float) -> list[Placed]:
+        log, placed = self._gnss, []
+        if log is None or self._span is None:
+            return []
+        first = max(self._gnss_next, int(np.searchsorted(log.t_us, self._span[0])))
+        self._gnss_next = max(first, int(np.searchsorted(log.t_us, until_us, "right")))
+        for row in range(first, self._gnss_next):
+            if self.positioner.axes is None:
+                self.positioner.axes = LocalAxes(*log.place[row].tolist())
+            attitude = attitude_of(self._attitude_at(log.t_us[row]), partial(self._heading, log.t_us[row]))
+            fix = gnss_fix(log, row, self.positioner.axes, attitude, self._spec)
+            self._counts["gnss" if fix is not None else "gnss_without_heading"] += 1
+            if fix is not None:
+                placed.append(self._placed(fix))
+        return placed
+
+    def _heading(self, t_us: float) -> tuple[float, float] | None:
+        return None if self._state is None else heading_at(self._state, t_us, self._imu)
 
     def bars_enu_m(self) -> dict[int, Floats]:
         """Centres of the bars whose places are known, in the local axes, m, float64 (3,) each."""
@@ -140,10 +203,22 @@ class Navigator:
     def _placed(self, fix: Fix) -> Placed:
         if fix.refusal:
             return Placed(fix, None)
-        point = self._state = trajectory_step(self._state, fix, self._spec)
+        point = self._state = trajectory_step(self._state, fix, self._spec, self._imu)
+        fix = self._compared(fix, point)
         filtered = self._place(point)
         self._window.append((fix, point, filtered))
         return Placed(fix, filtered, self._settle(_BLOCK) if len(self._window) == 2 * _BLOCK else ())
+
+    def _compared(self, fix: Fix, point: TrajectoryPoint) -> Fix:
+        """A fix with what contradicts it: bars, GNSS, on which the track stood when it was left out."""
+        if point.starts:
+            self._taken = {}
+        if not point.misses:
+            self._taken[fix.source] = fix.t_us
+            return fix
+        self._counts["gnss_left_out"] += fix.source == GNSS
+        others = (n for n, t in self._taken.items() if n != fix.source and fix.t_us - t <= _STANDS_US)
+        return replace(fix, contradicted=tuple(others))
 
     def _settle(self, count: int) -> tuple[Settled, ...]:
         """Smooth the window, and drop its first points from it."""

@@ -1,5 +1,7 @@
 """The camera's way from its fixes: a Kalman filter forward, live, and a smoother backward, offline.
 
+Fixes are of bars or of GNSS; between them the way turns, and is pushed, as an IMU says, where there is one.
+
 What stays wrong over many fixes - a bar's site, the camera's focal length, an IMU's bias and clock - is a
 state beside position and velocity, so that it is never averaged away as if it were noise, and is estimated
 where a drive shows it. What changes as the image moves over the pixels is one with a memory of a fraction of
@@ -7,18 +9,37 @@ a second.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.carried import Carried, carried, imu_sigmas
+from evlcp_sdk.place.chances import chi_square
+from evlcp_sdk.scene.swing import Swing
 from evlcp_sdk.values import Fix
 
-__all__ = ["TrajectoryPoint", "filter_fixes", "smooth_trajectory", "trajectory_step"]
+__all__ = [
+    "GNSS",
+    "IMU",
+    "SwingSource",
+    "TrajectoryPoint",
+    "filter_fixes",
+    "heading_at",
+    "smooth_trajectory",
+    "trajectory_step",
+]
 
 Floats = NDArray[np.float64]
+
+SwingSource = Callable[[float, float], Swing | None]
+"""How the camera turned from one time to a later one, us; None where that is not known."""
+
+GNSS, IMU = "gnss", "imu"
+"""Causes of standing errors: a receiver of satellites, whose errors have a memory of `position.gnss_s`, and
+the IMU's rates and accelerations."""
 
 _SPEED_M_S = 30.0
 """Speeds that are likely at first (sigma): a car's."""
@@ -64,7 +85,10 @@ class TrajectoryPoint:
             `causes` in a row, in their own sigmas, float64 (n,).
         covariance: Of these, float64 (n, n).
         causes: What the standing errors are of.
-        heading_deg: Of the camera at the last fix.
+        heading_deg: Of the camera, as a fix or the IMU said last.
+        heading_t_us: When that was.
+        heading_sigma_deg: Of it.
+        swing: How the camera turned from the point before to this one.
         misses: Fixes in a row that were left out, this one included; 0 where it counts.
         starts: A trajectory starts here.
     """
@@ -74,6 +98,9 @@ class TrajectoryPoint:
     covariance: Floats
     causes: tuple[Cause, ...] = ()
     heading_deg: float = math.nan
+    heading_t_us: float = -math.inf
+    heading_sigma_deg: float = 0.0
+    swing: Swing | None = None
     misses: int = 0
     starts: bool = False
 
@@ -101,43 +128,51 @@ def _columns(causes: Iterable[Cause]) -> list[tuple[Cause, slice]]:
     return found
 
 
-def trajectory_step(state: TrajectoryPoint | None, fix: Fix, spec: PositionSpec) -> TrajectoryPoint:
+def trajectory_step(
+    state: TrajectoryPoint | None, fix: Fix, spec: PositionSpec, imu: SwingSource | None = None
+) -> TrajectoryPoint:
     """Take a fix: velocity that turns as the camera does, driven by white acceleration (Bar-Shalom, chapter
-    6).
+    6), or that changes as an accelerometer says.
 
-    A fix beyond `spec.gate_sigmas` is left out, and after many of those in a row the trajectory starts anew.
+    A fix beyond `spec.gate_sigmas`, one of GNSS that fails its test at `spec.false_alarm`, is left out, and
+    after many of those in a row the trajectory starts anew.
 
     Args:
         state: The last point, None at the start; not changed.
         fix: One that is given, not before the last.
         spec: Power of the acceleration, memory of the slow errors, and the gate.
+        imu: How the camera turns between fixes; None, or where it does not know: as the fixes' headings do.
     """
     if state is None:
         return _first(fix)
-    ahead = _joined(_ahead(state, fix.t_us, _turn_rad(state, fix), spec), fix)
+    swing = _swing(state, fix, imu)
+    ahead = _joined(_ahead(state, fix.t_us, swing, spec), fix)
     seen = _seen(ahead.causes, fix)
     known = ahead.covariance @ seen.T
     spread = seen @ known + fix.noise_m2
     innovation = fix.enu_m - seen @ ahead.mean
-    if innovation @ np.linalg.solve(spread, innovation) > spec.gate_sigmas**2:
+    limit = chi_square(spec.false_alarm, 3) if fix.source == GNSS else spec.gate_sigmas**2
+    if innovation @ np.linalg.solve(spread, innovation) > limit:
         if state.misses + 1 > _MOST_MISSES:
             return _first(fix)
-        return replace(ahead, heading_deg=fix.heading_deg, misses=state.misses + 1)
+        return replace(_faced(ahead, fix), misses=state.misses + 1)
     gain = np.linalg.solve(spread, known.T).T
     # Joseph's form keeps the covariance positive.
     change = gain @ known.T
     after = ahead.covariance - change - change.T + gain @ spread @ gain.T
     mean = ahead.mean + gain @ innovation
     after = (after + after.T) / 2
-    return replace(ahead, mean=mean, covariance=after, heading_deg=fix.heading_deg, misses=0)
+    return replace(_faced(ahead, fix), mean=mean, covariance=after, misses=0)
 
 
-def filter_fixes(fixes: Iterable[Fix], spec: PositionSpec) -> list[TrajectoryPoint]:
+def filter_fixes(
+    fixes: Iterable[Fix], spec: PositionSpec, imu: SwingSource | None = None
+) -> list[TrajectoryPoint]:
     """Filter the fixes that are given, one point each; refused ones have none."""
     points: list[TrajectoryPoint] = []
     for fix in fixes:
         if not fix.refusal:
-            points.append(trajectory_step(points[-1] if points else None, fix, spec))
+            points.append(trajectory_step(points[-1] if points else None, fix, spec, imu))
     return points
 
 
@@ -148,11 +183,12 @@ def smooth_trajectory(points: Sequence[TrajectoryPoint], spec: PositionSpec) -> 
         if points[i + 1].starts:
             continue
         here, after = points[i], smoothed[i + 1]
-        turn = _between(here.heading_deg, points[i + 1].heading_deg, after.t_us - here.t_us)
-        move, noise, causes = _motion(here, after.t_us, turn, spec)
+        swing = points[i + 1].swing
+        assert swing is not None
+        ahead, move, noise, causes, _ = _motion(here, after.t_us, swing, spec)
         # Causes that came later are independent of this point: what is common has passed on.
         common = _shared(causes, after.causes)
-        mean = (move @ here.mean)[: len(common)]
+        mean = ahead[: len(common)]
         spread = (move @ here.covariance @ move.T + noise)[: len(common), : len(common)]
         crossed = (move @ here.covariance)[: len(common)]
         gain = np.linalg.solve(spread, crossed).T
@@ -166,6 +202,19 @@ def smooth_trajectory(points: Sequence[TrajectoryPoint], spec: PositionSpec) -> 
     return smoothed
 
 
+def heading_at(
+    point: TrajectoryPoint, t_us: float, imu: SwingSource | None = None
+) -> tuple[float, float] | None:
+    """The camera's heading at a time not before a point, and its sigma, degrees; None if not known."""
+    if not math.isfinite(point.heading_deg):
+        return None
+    swing = imu(point.heading_t_us, t_us) if imu is not None and t_us > point.heading_t_us else None
+    if swing is not None:
+        return point.heading_deg + math.degrees(float(swing.turn_rad[-1])), point.heading_sigma_deg
+    recent = t_us - point.heading_t_us <= _TURN_US
+    return (point.heading_deg, point.heading_sigma_deg) if recent else None
+
+
 def _first(fix: Fix) -> TrajectoryPoint:
     """A trajectory that starts at a fix: its position is off by what stays as the fix is."""
     causes = tuple(Cause(name, moves.shape[1], fix.t_us) for name, moves in fix.standing.items())
@@ -177,7 +226,7 @@ def _first(fix: Fix) -> TrajectoryPoint:
     covariance[:3, _MOTION:] = -moves
     covariance[_MOTION:, :3] = -moves.T
     mean = np.concatenate([fix.enu_m, np.zeros(size - 3)])
-    return TrajectoryPoint(fix.t_us, mean, covariance, causes, fix.heading_deg, starts=True)
+    return _faced(TrajectoryPoint(fix.t_us, mean, covariance, causes, starts=True), fix)
 
 
 def _seen(causes: Sequence[Cause], fix: Fix) -> Floats:
@@ -206,31 +255,83 @@ def _joined(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
     return replace(point, mean=mean, covariance=covariance, causes=(*causes, *new))
 
 
-def _ahead(point: TrajectoryPoint, t_us: float, turn_rad: float, spec: PositionSpec) -> TrajectoryPoint:
-    move, noise, causes = _motion(point, t_us, turn_rad, spec)
+def _ahead(point: TrajectoryPoint, t_us: float, swing: Swing, spec: PositionSpec) -> TrajectoryPoint:
+    mean, move, noise, causes, turn_rad = _motion(point, t_us, swing, spec)
     covariance = move @ point.covariance @ move.T + noise
+    ahead = replace(
+        point, t_us=t_us, mean=mean, covariance=covariance, causes=causes, swing=swing, starts=False
+    )
+    if not swing.gyro:
+        return ahead
+    drift_deg = spec.rate_white_deg_rts * math.sqrt(float(swing.t_s[-1]))
     return replace(
-        point, t_us=t_us, mean=move @ point.mean, covariance=covariance, causes=causes, starts=False
+        ahead,
+        heading_deg=point.heading_deg + math.degrees(turn_rad),
+        heading_t_us=t_us,
+        heading_sigma_deg=math.hypot(point.heading_sigma_deg, drift_deg),
     )
 
 
+def _faced(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
+    """A point with the heading of a fix that has one."""
+    if not math.isfinite(fix.heading_deg):
+        return point
+    sigma_deg = fix.heading_sigma_deg if math.isfinite(fix.heading_sigma_deg) else 0.0
+    return replace(point, heading_deg=fix.heading_deg, heading_t_us=fix.t_us, heading_sigma_deg=sigma_deg)
+
+
 def _motion(
-    point: TrajectoryPoint, t_us: float, turn_rad: float, spec: PositionSpec
-) -> tuple[Floats, Floats, tuple[Cause, ...]]:
-    """What takes a point to a later time, (m, n), what that adds, (m, m), and the causes that are kept."""
+    point: TrajectoryPoint, t_us: float, swing: Swing, spec: PositionSpec
+) -> tuple[Floats, Floats, Floats, tuple[Cause, ...], float]:
+    """A point at a later time, (m,), how it depends on it, (m, n), what is new, (m, m), causes, the turn."""
     dt = (t_us - point.t_us) * 1e-6
     kept = [(c, at) for c, at in _columns(point.causes) if _stays(c, t_us)]
     rows = [*range(_FIXED), *(i for _, at in kept for i in range(at.start, at.stop))]
     move = np.eye(len(point.mean))[rows]
-    along, turned = _turned(dt, turn_rad)
-    move[:3, 3:6], move[3:6, 3:6] = along, turned
+    noise = np.zeros((len(rows), len(rows)))
+    own = next((at for c, at in _columns(point.causes) if c.name == IMU), None)
+    way, biases = _way(point, swing, own, spec)
+    move[:_MOTION, :_MOTION] = way.move
+    noise[:_MOTION, :_MOTION] = way.noise
     fade = math.exp(-dt / spec.slow_s)
     move[_SLOW] *= fade
-    noise = np.zeros((len(rows), len(rows)))
-    power = spec.acceleration_m2_s3 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-    noise[:_MOTION, :_MOTION] = np.kron(power, np.eye(3))
     noise[_SLOW, _SLOW] = (1 - fade**2) * np.eye(3)
-    return move, noise, tuple(cause for cause, _ in kept)
+    causes = [cause for cause, _ in kept]
+    for cause, at in _columns(causes):
+        if cause.name == GNSS:
+            fade = math.exp(-dt / spec.gnss_s)
+            move[at] *= fade
+            noise[at, at] = (1 - fade**2) * np.eye(cause.size)
+    mean = move @ point.mean
+    mean[:_MOTION] += way.added
+    if not biases:
+        return mean, move, noise, tuple(causes), way.turn_rad
+    if own is not None:
+        # The mean has them already, the move by them is what is left.
+        move[:_MOTION, own.start : own.start + biases] = way.by_imu
+        return mean, move, noise, tuple(causes), way.turn_rad
+    # Biases that nothing has shown are new, and have moved the point by as much.
+    new = np.concatenate([way.by_imu, np.zeros((len(rows) - _MOTION, biases)), np.eye(biases)])
+    wide = np.zeros((len(new), len(new)))
+    wide[: len(rows), : len(rows)] = noise
+    move = np.concatenate([move, np.zeros((biases, move.shape[1]))])
+    causes.append(Cause(IMU, biases, t_us))
+    return np.append(mean, np.zeros(biases)), move, wide + new @ new.T, tuple(causes), way.turn_rad
+
+
+def _way(point: TrajectoryPoint, swing: Swing, own: slice | None, spec: PositionSpec) -> tuple[Carried, int]:
+    """Position and velocity as a swing carries them, and how many biases it has."""
+    biases = len(imu_sigmas(swing, spec))
+    imu = np.zeros(biases) if own is None else point.mean[own][:biases]
+    heading = point.heading_deg
+    if swing.push_m_s2 is not None and not math.isfinite(heading):
+        # Where a push points to is not known without a heading.
+        swing = replace(swing, push_m_s2=None)
+        imu = imu[: len(imu_sigmas(swing, spec))]
+    sigma = math.radians(point.heading_sigma_deg)
+    way = carried(swing, point.mean[3:_MOTION], math.radians(heading), sigma, imu, spec)
+    unused = np.zeros((_MOTION, biases - way.by_imu.shape[1]))
+    return replace(way, by_imu=np.concatenate([way.by_imu, unused], 1)), biases
 
 
 def _stays(cause: Cause, t_us: float) -> bool:
@@ -243,21 +344,12 @@ def _shared(causes: Sequence[Cause], later: Sequence[Cause]) -> list[int]:
     return [*range(_FIXED), *(i for c in causes for i in range(at[c.name].start, at[c.name].stop))]
 
 
-def _turned(dt: float, turn_rad: float) -> tuple[Floats, Floats]:
-    """What a velocity becomes on the way and in the end, turning clockwise at an even rate, (3, 3) each."""
-    cos, sin = math.cos(turn_rad), math.sin(turn_rad)
-    turned = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    if abs(turn_rad) < 1e-6:
-        return dt * np.eye(3), turned
-    even, aside = sin / turn_rad, (1 - cos) / turn_rad
-    return dt * np.array([[even, aside, 0.0], [-aside, even, 0.0], [0.0, 0.0, 1.0]]), turned
-
-
-def _turn_rad(state: TrajectoryPoint, fix: Fix) -> float:
-    return _between(state.heading_deg, fix.heading_deg, fix.t_us - state.t_us)
-
-
-def _between(before_deg: float, after_deg: float, dt_us: float) -> float:
-    """By how much a way turns between two fixes: as the camera did, if that is known."""
-    turn = math.remainder(after_deg - before_deg, 360.0)
-    return math.radians(turn) if dt_us <= _TURN_US and math.isfinite(turn) else 0.0
+def _swing(state: TrajectoryPoint, fix: Fix, imu: SwingSource | None) -> Swing:
+    """How the way turns to a fix: as the IMU says, else as the camera's headings do, if they are known."""
+    found = imu(state.t_us, fix.t_us) if imu is not None and fix.t_us > state.t_us else None
+    if found is not None:
+        return found
+    turn = math.remainder(fix.heading_deg - state.heading_deg, 360.0)
+    recent = fix.t_us - state.heading_t_us <= _TURN_US
+    turn_rad = math.radians(turn) if recent and math.isfinite(turn) else 0.0
+    return Swing.even((fix.t_us - state.t_us) * 1e-6, turn_rad)

@@ -69,7 +69,7 @@ def warnings_of(
 
 
 def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[str]:
-    if not positions["fixes"] + sum(positions["refused"].values()):
+    if not positions["fixes"] + sum(positions["refused"].values()) + positions["gnss"]:
         return
     exact = positions["bars_exact"]
     unsaid = [f"bars {', '.join(map(str, exact))} (position_sigma_m in site.toml)"] if exact else []
@@ -84,6 +84,16 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[str]:
         yield (
             f"{number} positions are without {name}, which the rest contradicts: compare its place or angles"
             " and their sigmas with what is there"
+        )
+    if number := positions["alarms"].get("contradicted", 0):
+        yield (
+            f"{number} times bars and GNSS contradict one another: compare the sigmas of both,"
+            " position.antenna_m, and the clock of the GNSS file with the camera's"
+        )
+    if number := positions["gnss_without_heading"]:
+        yield (
+            f"{number} GNSS fixes not used, as no heading says where the antenna is (position.antenna_m):"
+            " give an attitude with a heading"
         )
     if number := positions["refused"].get("misfit", 0):
         yield (

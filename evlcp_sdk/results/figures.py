@@ -240,7 +240,11 @@ def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]],
             height.plot(t_s, way[:, 2], "-", lw=1.4, color=colour)
         height.plot(t_s, fixed[:, 2], ".", ms=3, color=_INK)
         for i, name in enumerate(("east", "north", "up")):
-            sigma = [math.sqrt(point.fix.covariance_m2[i, i]) for point in points]
+            # Those of satellites are far larger than those of bars.
+            sigma = [
+                math.sqrt(point.fix.covariance_m2[i, i]) if point.fix.source == "bars" else math.nan
+                for point in points
+            ]
             spread.plot(t_s, sigma, lw=1.2, color=TRANSMITTER_COLOURS[i], label=name)
         for name, style in (("hpl_m", "-"), ("vpl_m", ":")):
             # A gap where there is none.

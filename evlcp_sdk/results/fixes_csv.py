@@ -37,6 +37,8 @@ FIX_COLUMNS = (
     "alarms",
     "refusal",
     "detail",
+    "source",
+    "contradicted",
 )
 """Columns of `fixes.csv`."""
 
@@ -73,5 +75,7 @@ class FixesCsv(Sink):
                 " ".join(fix.alarms),
                 defused(fix.refusal),
                 defused(fix.detail),
+                fix.source,
+                " ".join(fix.contradicted),
             ]
         )

@@ -9,7 +9,7 @@ from typing import Any
 from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.results.text import integrity, sigmas
+from evlcp_sdk.results.text import integrity, number_or_none, sigmas
 from evlcp_sdk.values import Fix
 
 __all__ = ["GeoJson", "cut"]
@@ -37,7 +37,7 @@ class GeoJson(Sink):
             [round(fix.longitude_deg, 9), round(fix.latitude_deg, 9), round(fix.height_m, 4)],
             {
                 "t_us": round(fix.t_us, 1),
-                "heading_deg": round(fix.heading_deg, 3),
+                "heading_deg": number_or_none(fix.heading_deg, 3),
                 "sigma_m": [round(value, 4) for value in sigmas(fix.covariance_m2)],
                 "covariance_m2": [[float(f"{v:.6g}") for v in row] for row in fix.covariance_m2.tolist()],
                 "bars": list(fix.transmitters),

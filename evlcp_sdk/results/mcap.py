@@ -1,5 +1,6 @@
 """`fixes.mcap`: positions as MCAP with well-known schemas: `/fix`, `/pose`, `/track`, `/integrity`."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,8 +24,9 @@ class Mcap(Sink):
     """Writes `fixes.mcap`, message by message.
 
     `/fix` (foxglove.LocationFix) and `/pose` (foxglove.PoseInFrame, camera axes in ENU) hold each fix as it
-    was measured; `/track` (foxglove.LocationFix) the filtered position at its time; `/integrity`
-    (google.protobuf.Struct) protection levels, what was left out and alarms, of refused fixes, too.
+    was measured, `/pose` those of bars; `/track` (foxglove.LocationFix) the filtered position at its time;
+    `/integrity` (google.protobuf.Struct) protection levels, what was left out and alarms, of refused fixes,
+    too.
     """
 
     def __init__(self, folder: ResultFolder, run: Run) -> None:
@@ -47,6 +49,8 @@ class Mcap(Sink):
         place = (filtered.latitude_deg, filtered.longitude_deg, filtered.height_m)
         self._location("/fix", fix.t_us, measured, fix.covariance_m2)
         self._location("/track", fix.t_us, place, filtered.covariance_m2)
+        if not math.isfinite(fix.heading_deg):
+            return
         axes = Attitude(fix.pitch_deg, fix.roll_deg, fix.heading_deg).rotation()
         turn = Rotation.from_matrix(axes).as_quat()
         pose = PoseInFrame(frame_id=FRAME_ID)

@@ -52,6 +52,8 @@ class Nmea(Sink):
 def _in_words(fix: Fix, alarm: str) -> str:
     if alarm == "excluded":
         return f"EXCLUDED {' '.join(fix.excluded)}"
+    if alarm == "contradicted":
+        return f"{fix.source.upper()} CONTRADICTED BY {' '.join(fix.contradicted).upper()}"
     return "NO PROTECTION LEVEL" if alarm == "unavailable" else alarm.upper()
 
 
@@ -119,7 +121,7 @@ def gst(t_us: float, zero: datetime | None, misfit: float, covariance_m2: NDArra
     Args:
         t_us: Camera clock, us.
         zero: UTC of the camera clock's 0; None: the clock itself is written as time of day.
-        misfit: Root mean square of the misses, in sigmas.
+        misfit: Root mean square of the misses, in sigmas; NaN where there are none.
         covariance_m2: Of east, north and up, m2, float64 (3, 3).
     """
     clock, _ = _time(t_us, zero)
@@ -127,8 +129,9 @@ def gst(t_us: float, zero: datetime | None, misfit: float, covariance_m2: NDArra
     minor, major = np.sqrt(np.maximum(values, 0)).tolist()
     turned = math.degrees(math.atan2(axes[0, 1], axes[1, 1])) % 180
     east, north, up = sigmas(covariance_m2)
+    missed = f"{misfit:.2f}" if math.isfinite(misfit) else ""
     return _sentence(
-        f"INGST,{clock},{misfit:.2f},{major:.3f},{minor:.3f},{turned:.1f},{north:.3f},{east:.3f},{up:.3f}"
+        f"INGST,{clock},{missed},{major:.3f},{minor:.3f},{turned:.1f},{north:.3f},{east:.3f},{up:.3f}"
     )
 
 

@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.place.navigator import Placed
-from evlcp_sdk.place.positioner import Positioner
+from evlcp_sdk.place.navigator import Navigator, Placed
 from evlcp_sdk.place.refusals import REFUSALS
+from evlcp_sdk.place.trajectory import GNSS
 from evlcp_sdk.results.text import number_or_none
 from evlcp_sdk.values import Packet
 
@@ -196,12 +196,15 @@ class PositionTally:
         if placed.filtered is None:
             self.refused[placed.fix.refusal] += 1
             return
+        if placed.fix.source == GNSS:
+            return
         self.given += 1
         self.verified += placed.fix.verified
         self.left_out += placed.filtered.left_out
 
-    def to_dict(self, positioner: Positioner) -> dict[str, Any]:
+    def to_dict(self, navigator: Navigator) -> dict[str, Any]:
         """The figures as JSON values, with what is known of the bars in the end."""
+        positioner = navigator.positioner
         axes = positioner.axes
         return {
             "fixes": self.given,
@@ -210,6 +213,7 @@ class PositionTally:
             "alarms": dict(sorted(self.alarms.items())),
             "excluded": dict(sorted(self.excluded.items())),
             "left_out_of_track": self.left_out,
+            **navigator.counts,
             "frames_late": positioner.counts["frames_late"],
             "beacons_forged": positioner.counts["beacons_forged"],
             "sites_contradicted": {str(n): how for n, how in positioner.contradicted.items()},

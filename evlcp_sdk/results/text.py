@@ -40,10 +40,12 @@ def covariances(covariance: NDArray[np.float64]) -> list[float]:
 def integrity(fix: Fix) -> dict[str, Any]:
     """How far a fix may be trusted, as values of JSON: misfit, levels, what was left out, alarms."""
     return {
+        "source": fix.source,
         "misfit": number_or_none(fix.misfit, 4),
         "freedom": fix.freedom,
         "hpl_m": number_or_none(fix.hpl_m, 3),
         "vpl_m": number_or_none(fix.vpl_m, 3),
         "excluded": list(fix.excluded),
+        "contradicted": list(fix.contradicted),
         "alarms": list(fix.alarms),
     }

@@ -22,6 +22,7 @@ TRACK_COLUMNS = (
     "course_deg",
     *(f"filtered_{name}" for name in _PLACE_COLUMNS),
     "left_out",
+    "source",
 )
 """Columns of `track.csv`: smoothed, then filtered."""
 
@@ -45,6 +46,7 @@ class TrackCsv(Sink):
                     f"{one.smoothed.course_deg:.2f}",
                     *_place_row(one.filtered),
                     int(one.filtered.left_out),
+                    one.fix.source,
                 ]
             )
 

@@ -70,6 +70,8 @@ class ResultWriter:
 
     def events(self, events: Events) -> None:
         """Take events that the receiver gets."""
+        if self._navigator is not None and len(events):
+            self._navigator.seen(int(events.t_us[0]), int(events.t_us[-1]))
         self._sinks.events(events)
 
     def write(self, packets: Iterable[Packet]) -> None:
@@ -116,7 +118,7 @@ class ResultWriter:
             fixes, settled = self._navigator.close()
             self._place(fixes)
             self._sinks.settle(settled)
-            positions = self._positions.to_dict(self._navigator.positioner)
+            positions = self._positions.to_dict(self._navigator)
         table = summary_of(
             status,
             self._link,

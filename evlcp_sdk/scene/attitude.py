@@ -3,21 +3,29 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import read_csv
+from evlcp_sdk.files import csv_number, read_csv
+from evlcp_sdk.scene.swing import Swing
 
 __all__ = ["Attitude", "AttitudeLog", "attitude_source"]
 
-_MOST = 1e18
-"""Size of the largest number of a log: microseconds since 1970 are 1e15."""
-
 _NEEDED = ("t_us", "pitch_deg", "roll_deg")
 _OPTIONAL = ("heading_deg", "gravity_sigma_deg", "heading_sigma_deg")
+_AXES = ("right", "down", "forward")
+_RATES = tuple(f"rate_{axis}_deg_s" for axis in _AXES)
+_FORCES = tuple(f"force_{axis}_m_s2" for axis in _AXES)
+
+_GRAVITY_M_S2 = 9.80665
+"""On earth it is within 0.03 of this, less than an accelerometer's bias."""
+
+_MOST_KNOTS = 4096
+"""Lines of a log that one step of a track goes by; of more, every second, third ... counts."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +106,10 @@ class AttitudeLog:
         heading_sigma_deg: float64 (n,).
         white_sigma_deg: As an `Attitude` has it.
         time_sigma_us: The same.
+        rates_deg_s: What a gyroscope measures about the camera's axes right, down and forward, float64
+            (n, 3); None where there is none. A turn to the right is positive about down.
+        forces_m_s2: What an accelerometer measures along the same axes, float64 (n, 3): at rest and level
+            -9.8 down; None where there is none.
     """
 
     t_us: NDArray[np.float64]
@@ -108,10 +120,12 @@ class AttitudeLog:
     heading_sigma_deg: NDArray[np.float64]
     white_sigma_deg: float = 0.0
     time_sigma_us: float = 0.0
+    rates_deg_s: NDArray[np.float64] | None = None
+    forces_m_s2: NDArray[np.float64] | None = None
 
     @classmethod
     def read(cls, path: Path | str, usual: Attitude | None = None) -> "AttitudeLog":
-        """Read a CSV of t_us, pitch_deg, roll_deg and, optionally, heading_deg and both sigmas.
+        """Read a CSV of t_us, pitch_deg, roll_deg; optionally heading_deg, both sigmas, rates and forces.
 
         Args:
             path: The file.
@@ -119,7 +133,8 @@ class AttitudeLog:
 
         Raises:
             InputError: The file cannot be read.
-            ConfigError: A column is missing, a value is not a number, or times do not rise.
+            ConfigError: A column is missing, a value is not a number, or times do not rise; of rates or
+                forces one axis is there and another is not, or there are forces and no rates.
         """
         usual = Attitude() if usual is None else usual
         names, rows = read_csv(path)
@@ -128,10 +143,16 @@ class AttitudeLog:
         if missing:
             known = ", ".join(_NEEDED + _OPTIONAL)
             raise ConfigError(f"{path}: line 1: no column {missing[0]} (columns: {known})")
+        for axes in (_RATES, _FORCES):
+            absent = [name for name in axes if name not in names]
+            if 0 < len(absent) < len(axes):
+                raise ConfigError(f"{path}: line 1: no column {absent[0]} (columns: {', '.join(axes)})")
+        if _FORCES[0] in names and _RATES[0] not in names:
+            raise ConfigError(f"{path}: line 1: no column {_RATES[0]}: forces need the rates, too")
         table: dict[str, NDArray[np.float64]] = {}
-        for name in _NEEDED + _OPTIONAL:
+        for name in _NEEDED + _OPTIONAL + _RATES + _FORCES:
             if name in names:
-                table[name] = np.array([_number(path, line, name, row[name]) for line, row in rows])
+                table[name] = np.array([csv_number(path, line, name, row[name]) for line, row in rows])
         t_us = table["t_us"]
         if len(t_us) < 2:
             raise ConfigError(f"{path}: expected two lines or more with rising t_us")
@@ -154,6 +175,7 @@ class AttitudeLog:
             table.get("heading_sigma_deg", np.full(len(t_us), usual.heading_sigma_deg)),
             usual.white_sigma_deg,
             usual.time_sigma_us,
+            *(np.stack([table[n] for n in a], 1) if a[0] in table else None for a in (_RATES, _FORCES)),
         )
 
     def to_csv(self) -> str:
@@ -167,6 +189,9 @@ class AttitudeLog:
         if self.heading_deg is not None:
             columns["heading_deg"] = [f"{v % 360:.5f}" for v in self.heading_deg]
             columns["heading_sigma_deg"] = [f"{v:g}" for v in self.heading_sigma_deg]
+        for names, values in ((_RATES, self.rates_deg_s), (_FORCES, self.forces_m_s2)):
+            if values is not None:
+                columns |= {n: [f"{v:.5f}" for v in c] for n, c in zip(names, values.T, strict=True)}
         lines = [",".join(columns), *(",".join(row) for row in zip(*columns.values(), strict=True))]
         return "\n".join(lines) + "\n"
 
@@ -189,6 +214,56 @@ class AttitudeLog:
             self._rate_deg_s(t_us),
         )
 
+    def between(self, start_us: float, end_us: float) -> Swing | None:
+        """How the camera turned, and was pushed, from one time to a later one; None where that is not known.
+
+        By the rates where there are any, else by the headings.
+        """
+        turned = self._turned_rad
+        if turned is None or not self.t_us[0] <= start_us < end_us <= self.t_us[-1]:
+            return None
+        first, last = np.searchsorted(self.t_us, (start_us, end_us), "right").tolist()
+        inner = self.t_us[first:last]
+        inner = inner[inner < end_us][:: 1 + len(inner) // _MOST_KNOTS]
+        t_us = np.concatenate([[start_us], inner, [end_us]])
+        angle = np.interp(t_us, self.t_us, turned)
+        push = self._push_m_s2
+        if push is not None:
+            push = np.stack([np.interp(t_us, self.t_us, column) for column in push.T], 1)
+        return Swing((t_us - start_us) * 1e-6, angle - angle[0], self.rates_deg_s is not None, push)
+
+    @cached_property
+    def _turned_rad(self) -> NDArray[np.float64] | None:
+        """The heading's change since the first line."""
+        if self.rates_deg_s is None:
+            return None if self.heading_deg is None else np.radians(self.heading_deg - self.heading_deg[0])
+        rate = -(self.rates_deg_s * self._up()).sum(1)
+        steps = np.diff(self.t_us) * (rate[1:] + rate[:-1]) / 2
+        return np.radians(np.concatenate([[0.0], np.cumsum(steps)]) * 1e-6)
+
+    @cached_property
+    def _push_m_s2(self) -> NDArray[np.float64] | None:
+        """Acceleration without gravity to the right, forward and up, level."""
+        if self.forces_m_s2 is None:
+            return None
+        right, down, forward = self.forces_m_s2.T
+        pitch, roll = np.radians(self.pitch_deg), np.radians(self.roll_deg)
+        below = right * np.sin(roll) + down * np.cos(roll)
+        return np.stack(
+            [
+                right * np.cos(roll) - down * np.sin(roll),
+                below * np.sin(pitch) + forward * np.cos(pitch),
+                (self.forces_m_s2 * self._up()).sum(1) - _GRAVITY_M_S2,
+            ],
+            1,
+        )
+
+    def _up(self) -> NDArray[np.float64]:
+        """Up in the camera's axes, float64 (n, 3)."""
+        pitch, roll = np.radians(self.pitch_deg), np.radians(self.roll_deg)
+        level = -np.cos(pitch)
+        return np.stack([level * np.sin(roll), level * np.cos(roll), np.sin(pitch)], 1)
+
     def _rate_deg_s(self, t_us: float) -> tuple[float, float, float]:
         """How fast the angles change between the lines about a time."""
         after = min(max(int(np.searchsorted(self.t_us, t_us, "right")), 1), len(self.t_us) - 1)
@@ -203,14 +278,3 @@ class AttitudeLog:
 def attitude_source(attitude: Attitude | AttitudeLog | None) -> Callable[[float], Attitude | None]:
     """The attitude at a time, us; None where nothing is known."""
     return attitude.at if isinstance(attitude, AttitudeLog) else lambda _t_us: attitude
-
-
-def _number(path: Path | str, line: int, name: str, text: str | None) -> float:
-    try:
-        value = float(text if text is not None else "")
-    except ValueError:
-        value = math.nan
-    if not abs(value) <= _MOST:
-        wanted = "a number" if not math.isfinite(value) else f"at most {_MOST:g}"
-        raise ConfigError(f"{path}: line {line}: {name} = {text!r:.40}: expected {wanted}")
-    return value

@@ -73,6 +73,10 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, demo_raw: Path) -
     (site,) = [text for text in blocks(ROOT / "docs" / "messages.md", "text") if "[[bar]]" in text]
     (tmp_path / "site.toml").write_text(site)
     (tmp_path / "imu.csv").write_text("t_us,pitch_deg,roll_deg,heading_deg\n0,0,0,0\n1000000,0,0,0\n")
+    (tmp_path / "gnss.csv").write_text(
+        "t_us,latitude_deg,longitude_deg,height_m,sigma_east_m,sigma_north_m,sigma_up_m\n"
+        "50000,35,137,50,1,1,2\n"
+    )
     if find_spec("cryptography") is not None:
         make_key(tmp_path / "private.pem")
     monkeypatch.chdir(tmp_path)

@@ -41,6 +41,7 @@ NAMES = [
     "Fix",
     "Frame",
     "FrameView",
+    "GnssLog",
     "InputError",
     "InterruptedRunError",
     "Link",

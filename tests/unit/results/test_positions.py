@@ -18,6 +18,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import STAGE_PREFIX
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place import navigator
+from evlcp_sdk.place.gnss import GnssLog
 from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan
 from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.trajectory import trajectory_step
@@ -31,7 +32,7 @@ from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.values import Fix, Frame, Packet, Range, SoftSymbols
+from evlcp_sdk.values import Events, Fix, Frame, Packet, Range, SoftSymbols
 
 LINK = load_link()
 ZERO = datetime(2026, 3, 1, 10, 15, tzinfo=UTC)
@@ -60,6 +61,14 @@ def packets(count: int, seed: int = 1, transmitter: int = 0) -> list[Packet]:
     return found
 
 
+def satellites(times_us: Sequence[float], off_m: float = 0.0) -> GnssLog:
+    """What a receiver says of that drive, to half a metre; all of it `off_m` to the east."""
+    t_us = np.asarray(times_us, np.float64)
+    enu = np.stack([2.0 + off_m + 0 * t_us, -60 + 10e-6 * t_us, -4.0 + 0 * t_us], 1)
+    place = np.stack(LocalAxes.of([SITE]).to_geodetic(enu), 1)
+    return GnssLog(t_us, place, np.tile(0.25 * np.eye(3), (len(t_us), 1, 1)))
+
+
 def write(
     folder: Path,
     stream: Iterable[Packet],
@@ -67,9 +76,12 @@ def write(
     sinks: Sequence[str] = (),
     attitude: Attitude = ATTITUDE,
     zero: datetime | None = None,
+    span_us: tuple[int, int] | None = None,
 ) -> dict[str, Any]:
     known = {"plan": plan, "attitude": attitude, "clock_zero": zero}
     with ResultWriter(folder, LINK, sinks=sinks, **known) as results:  # type: ignore[arg-type]
+        if span_us is not None:
+            results.events(Events.of(span_us, [1, 1], [1, 1], [1, 1]))
         results.write(stream)
         told: dict[str, Any] = results.finish("complete", {}, {}, {}, {})["positions"]
     return told
@@ -168,6 +180,49 @@ def test_covariance_and_integrity_are_in_every_file(tmp_path: Path) -> None:
     along = np.array([math.sin(way), math.cos(way)])
     assert along @ spread[:2, :2] @ along == pytest.approx(major**2, rel=1e-4)
     assert gst.std_dev_latitude == pytest.approx(math.sqrt(spread[1, 1]), abs=1e-3)
+
+
+def test_a_track_goes_on_between_bars(tmp_path: Path) -> None:
+    """Bars at first and last, satellites all the time, and outside of the recording, which do not count."""
+    stream = [p for p in packets(60) if not 15 <= p.packet < 45]
+    last_us = int(60 * PACKET_US)
+    plan = PositionPlan((SITE,), satellites(np.arange(-5, 40) * 1e5 + 7))
+    told = write(tmp_path, stream, plan, ["figures", "mcap"], zero=ZERO, span_us=(0, last_us))
+    assert (told["gnss"], told["gnss_left_out"], told["gnss_without_heading"]) == (21, 0, 0)
+    fixes, track = rows(tmp_path / "fixes.csv"), rows(tmp_path / "track.csv")
+    assert [r["t_us"] for r in fixes] == [r["t_us"] for r in track]
+    assert [float(r["t_us"]) for r in track] == sorted(float(r["t_us"]) for r in track)
+    sources = [r["source"] for r in track]
+    assert (sources.count("gnss"), sources.count("bars")) == (21, told["fixes"])
+    axes = LocalAxes.of([SITE])
+    for row in track:
+        t_us = float(row["t_us"])
+        place = axes.to_enu(*(float(row[k]) for k in ("latitude_deg", "longitude_deg", "height_m")))
+        sigma = [float(row[f"sigma_{axis}_m"]) for axis in ("east", "north", "up")]
+        assert (np.abs(place - [2.0, -60 + 10e-6 * t_us, -4.0]) < 5 * np.array(sigma)).all()
+        assert max(sigma) < 0.5
+    shapes = json.loads((tmp_path / "fixes.geojson").read_text())["features"]
+    assert [s["properties"]["source"] for s in shapes if "source" in s["properties"]].count("gnss") == 21
+    for sentence in (tmp_path / "fixes.nmea").read_text().split("\n")[:-1]:
+        pynmea2.parse(sentence.strip(), check=True)
+
+
+def test_bars_and_satellites_that_contradict_one_another(tmp_path: Path) -> None:
+    plan = PositionPlan((SITE,), satellites(np.arange(5, 20) * 1e5 + 7, 20.0))
+    told = write(tmp_path, packets(60), plan, zero=ZERO, span_us=(0, int(60 * PACKET_US)))
+    assert told["alarms"]["contradicted"] == told["gnss_left_out"] == told["gnss"] == 15
+    fixes = rows(tmp_path / "fixes.csv")
+    assert {r["contradicted"] for r in fixes if r["source"] == "gnss"} == {"bars"}
+    assert "15 times bars and GNSS contradict" in " ".join(
+        json.loads((tmp_path / "summary.json").read_text())["warnings"]
+    )
+    assert "GNSS CONTRADICTED BY BARS" in (tmp_path / "fixes.nmea").read_text()
+    plan = PositionPlan((SITE,), satellites([1e6]))
+    link = load_link(overrides=["position.antenna_m=[1,0,0]"])
+    way = Navigator(link, plan, Attitude(5.0, 0.0))
+    way.seen(0, 2e6)
+    assert way.close() == ([], ())
+    assert way.counts["gnss_without_heading"] == 1
 
 
 def test_the_figure_of_a_track(tmp_path: Path) -> None:

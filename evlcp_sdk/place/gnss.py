@@ -1,0 +1,161 @@
+"""Fixes of a receiver of satellites: from a file, and as the track takes them."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import csv_number, read_csv
+from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.trajectory import GNSS
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.sites import LocalAxes
+from evlcp_sdk.values import Fix
+
+__all__ = ["GnssLog", "attitude_of", "gnss_fix"]
+
+Floats = NDArray[np.float64]
+
+_PLACE = {
+    "latitude_deg": (-90.0, 90.0),
+    "longitude_deg": (-180.0, 180.0),
+    "height_m": (-12_000.0, 20_000.0),
+}
+_SIGMAS = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
+_LEAST_M, _MOST_M = 1e-4, 1e6
+"""What a sigma may be: with one of 0 nothing else would count."""
+_CROSSED = {"cov_east_north_m2": (0, 1), "cov_east_up_m2": (0, 2), "cov_north_up_m2": (1, 2)}
+
+_GRAVITY_RAD = math.radians(10.0)
+"""Sigma of pitch and roll where nothing tells them, for where the antenna is."""
+
+
+@dataclass(frozen=True, eq=False)
+class GnssLog:
+    """Fixes of a receiver of satellites at rising times.
+
+    Attributes:
+        t_us: Camera clock, us, float64 (n,), rising.
+        place: Of the antenna: latitude and longitude, degrees, height above the ellipsoid, m, float64
+            (n, 3).
+        covariance_m2: Of its place, east, north and up, float64 (n, 3, 3).
+    """
+
+    t_us: Floats
+    place: Floats
+    covariance_m2: Floats
+
+    @classmethod
+    def read(cls, path: Path | str) -> "GnssLog":
+        """Read a CSV whose columns are named as those of `fixes.csv`.
+
+        t_us, latitude_deg, longitude_deg, height_m, sigma_east_m, sigma_north_m, sigma_up_m; optional
+        cov_east_north_m2, cov_east_up_m2, cov_north_up_m2.
+
+        Raises:
+            InputError: The file cannot be read.
+            ConfigError: A column is missing, a value is not a number or is out of range, times do not rise,
+                or a covariance is none.
+        """
+        names, rows = read_csv(path)
+        needed = ("t_us", *_PLACE, *_SIGMAS)
+        missing = [name for name in needed if name not in names]
+        if missing:
+            known = ", ".join((*needed, *_CROSSED))
+            raise ConfigError(f"{path}: line 1: no column {missing[0]} (columns: {known})")
+        if not rows:
+            raise ConfigError(f"{path}: expected one line of values or more")
+        t_us, place = np.empty(len(rows)), np.empty((len(rows), 3))
+        spread = np.empty((len(rows), 3, 3))
+        for i, (line, row) in enumerate(rows):
+
+            def value(name: str, line: int = line, row: dict[str, str | None] = row) -> float:
+                return csv_number(path, line, name, row[name])
+
+            def within(name: str, low: float, high: float, line: int = line) -> float:
+                number = value(name)
+                if not low <= number <= high:
+                    raise ConfigError(
+                        f"{path}: line {line}: {name} = {number:g}: expected {low:g} to {high:g}"
+                    )
+                return number
+
+            t_us[i] = value("t_us")
+            if i and not t_us[i] > t_us[i - 1]:
+                raise ConfigError(
+                    f"{path}: line {line}: t_us = {t_us[i]:.16g}: expected more than the line before,"
+                    f" {t_us[i - 1]:.16g}: rising t_us"
+                )
+            place[i] = [within(name, low, high) for name, (low, high) in _PLACE.items()]
+            spread[i] = np.diag([within(name, _LEAST_M, _MOST_M) ** 2 for name in _SIGMAS])
+            for name, (a, b) in _CROSSED.items():
+                if name in names:
+                    spread[i, a, b] = spread[i, b, a] = value(name)
+            if not np.linalg.eigvalsh(spread[i])[0] > 0:
+                raise ConfigError(f"{path}: line {line}: sigmas and covariances: expected a covariance")
+        return cls(t_us, place, spread)
+
+
+def gnss_fix(
+    log: GnssLog,
+    row: int,
+    axes: LocalAxes,
+    attitude: Attitude | None,
+    spec: PositionSpec,
+) -> Fix | None:
+    """A fix of satellites as one of the camera; None where no heading tells where the antenna is from it.
+
+    Args:
+        log: The fixes.
+        row: Which one.
+        axes: The local axes.
+        attitude: The camera's, with heading; None where that is not known.
+        spec: Where the antenna is, and how the error lasts.
+    """
+    here = LocalAxes(*log.place[row].tolist())
+    arm, spread = np.zeros(3), log.covariance_m2[row]
+    if any(spec.antenna_m):
+        if attitude is None or attitude.heading_deg is None:
+            return None
+        arm = attitude.rotation() @ spec.antenna_m
+        # About east, north and up: gravity by the camera's turn about level axes, heading by that about up.
+        level, upright = math.radians(attitude.gravity_sigma_deg), math.radians(attitude.heading_sigma_deg)
+        turned = np.cross(np.diag([level, level, upright]), arm)
+        spread = spread + turned.T @ turned
+    latitude, longitude, height = (float(v) for v in here.to_geodetic(-arm))
+    turn = axes.turn_from(here)
+    spread = turn @ spread @ turn.T
+    values, own = np.linalg.eigh((1 - spec.gnss_white_share) * spread)
+    unknown = math.nan
+    return Fix(
+        t_us=float(log.t_us[row]),
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=height,
+        enu_m=axes.to_enu(latitude, longitude, height),
+        covariance_m2=spread,
+        noise_m2=spec.gnss_white_share * spread,
+        heading_deg=unknown,
+        pitch_deg=unknown,
+        roll_deg=unknown,
+        heading_sigma_deg=unknown,
+        transmitters=(),
+        verified=False,
+        standing={GNSS: (own * np.sqrt(np.maximum(values, 0))) @ own.T},
+        source=GNSS,
+    )
+
+
+def attitude_of(known: Attitude | None, heading: Callable[[], tuple[float, float] | None]) -> Attitude | None:
+    """An attitude with a heading: its own, or the track's; gravity is level where nothing tells it."""
+    if known is not None and known.heading_deg is not None:
+        return known
+    found = heading()
+    if found is None:
+        return known
+    level = Attitude(gravity_sigma_deg=math.degrees(_GRAVITY_RAD)) if known is None else known
+    return Attitude(level.pitch_deg, level.roll_deg, found[0] % 360, level.gravity_sigma_deg, found[1])

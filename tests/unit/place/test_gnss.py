@@ -1,0 +1,187 @@
+"""Fixes of satellites in the track: against the same as a Gaussian process, and by simulated drives."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.gnss import GnssLog, attitude_of, gnss_fix
+from evlcp_sdk.place.trajectory import GNSS, filter_fixes, smooth_trajectory, trajectory_step
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.sites import LocalAxes
+from evlcp_sdk.values import Fix
+
+Floats = NDArray[np.float64]
+
+SPEC = PositionSpec(acceleration_m2_s3=0.5, gnss_s=4.0, gate_sigmas=50.0)
+SIGMA_M = {"bars": np.array([0.03, 0.05, 0.02]), GNSS: np.array([0.8, 0.6, 1.5])}
+
+
+def fix(t_s: float, enu_m: Floats, source: str) -> Fix:
+    spread = np.diag(SIGMA_M[source] ** 2)
+    share = SPEC.gnss_white_share if source == GNSS else 1.0
+    return dataclasses.replace(
+        Fix.refused(t_s * 1e6, (), "", ""),
+        enu_m=enu_m,
+        covariance_m2=spread,
+        noise_m2=share * spread,
+        standing={GNSS: np.sqrt((1 - share) * spread)} if source == GNSS else {},
+        source=source,
+    )
+
+
+def mixed() -> list[tuple[float, str]]:
+    """Bars at first and last, satellites all the time."""
+    seen = [(0.04 + 0.1 * i, GNSS) for i in range(60)]
+    seen += [(0.1 * i + 0.013, "bars") for i in range(60) if not 15 < i < 45]
+    return sorted(seen)
+
+
+def drive(rng: np.random.Generator) -> tuple[list[Fix], Floats]:
+    seen = mixed()
+    place, velocity, slow = rng.normal(0, 10, 3), rng.normal(0, 20, 3), rng.normal(size=3)
+    fixes, truth, now = [], [], 0.0
+    for t, source in seen:
+        dt, now = t - now, t
+        power = SPEC.acceleration_m2_s3 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        kick = np.linalg.cholesky(power) @ rng.normal(size=(2, 3))
+        place, velocity = place + dt * velocity + kick[0], velocity + kick[1]
+        fade = math.exp(-dt / SPEC.gnss_s)
+        slow = fade * slow + math.sqrt(1 - fade**2) * rng.normal(size=3)
+        share = SPEC.gnss_white_share
+        off = rng.normal(size=3)
+        if source == GNSS:
+            off = math.sqrt(share) * off + math.sqrt(1 - share) * slow
+        fixes.append(fix(t, place + SIGMA_M[source] * off, source))
+        truth.append(place)
+    return fixes, np.array(truth)
+
+
+def process(seen: list[tuple[float, str]], axis: int) -> tuple[Floats, Floats]:
+    """Covariances of one axis' places, and of the errors of what is seen, (n, n) each."""
+    t = np.array([when for when, _ in seen])
+    since, sooner, later = t[0], np.minimum.outer(t, t), np.maximum.outer(t, t)
+    sooner, later, t = sooner - since, later - since, t - since
+    wandering = sooner**3 / 3 + sooner**2 * (later - sooner) / 2
+    places = 1e4 + 30.0**2 * np.outer(t, t) + SPEC.acceleration_m2_s3 * wandering
+    sigma = np.array([SIGMA_M[source][axis] for _, source in seen])
+    both = np.logical_and.outer(*2 * [np.array([source == GNSS for _, source in seen])])
+    share = SPEC.gnss_white_share
+    lasting = both * (1 - share) * np.exp(-np.abs(np.subtract.outer(t, t)) / SPEC.gnss_s)
+    new = np.diag([share if source == GNSS else 1.0 for _, source in seen])
+    return places, np.outer(sigma, sigma) * (lasting + new)
+
+
+def test_the_track_is_the_gaussian_process() -> None:
+    rng = np.random.default_rng(3)
+    fixes, _ = drive(rng)
+    smooth = smooth_trajectory(filter_fixes(fixes, SPEC), SPEC)
+    assert [cause.name for cause in smooth[-1].causes] == [GNSS]
+    for axis in range(3):
+        places, errors = process(mixed(), axis)
+        weight = np.linalg.solve(places + errors, places).T
+        seen = np.array([one.enu_m[axis] for one in fixes])
+        mean, spread = weight @ (seen - seen[0]) + seen[0], places - weight @ places
+        np.testing.assert_allclose([p.mean[axis] for p in smooth], mean, atol=2e-4)
+        np.testing.assert_allclose(
+            [p.covariance[axis, axis] for p in smooth], np.diag(spread), rtol=2e-3, atol=1e-6
+        )
+
+
+def test_between_bars_errors_are_as_said() -> None:
+    rng, trials = np.random.default_rng(4), 12
+    squares: dict[tuple[str, int], float] = {}
+    widths = []
+    for _ in range(trials):
+        fixes, truth = drive(rng)
+        points = filter_fixes(fixes, PositionSpec(acceleration_m2_s3=0.5, gnss_s=4.0))
+        for name, found in (("forward", points), ("smoothed", smooth_trajectory(points, SPEC))):
+            for at in (10, 45, 58, 80):
+                off = found[at].mean[:3] - truth[at]
+                square = float(off @ np.linalg.solve(found[at].covariance_m2, off))
+                squares[name, at] = squares.get((name, at), 0.0) + square
+            widths.append(math.sqrt(found[45].covariance[0, 0]))
+    low, high = stats.chi2.interval(0.9999, 3 * trials)
+    assert all(low < square < high for square in squares.values())
+    # Bars before and behind make satellites better than by themselves.
+    assert max(widths[1::2]) < 0.5 * SIGMA_M[GNSS][0]
+
+
+def test_a_jump_of_satellites_is_left_out() -> None:
+    fixes, _ = drive(np.random.default_rng(5))
+    jumped = dataclasses.replace(fixes[40], enu_m=fixes[40].enu_m + np.array([12.0, 0, 0]))
+    assert jumped.source == GNSS
+    points = filter_fixes(fixes[:40], SPEC)
+    assert trajectory_step(points[-1], jumped, SPEC).misses == 1
+    assert trajectory_step(points[-1], fixes[40], SPEC).misses == 0
+
+
+def test_the_antenna_is_not_the_camera() -> None:
+    axes = LocalAxes(35.0, 137.0, 50.0)
+    place = np.stack(axes.to_geodetic(np.array([[200.0, 300.0, 4.0]])), 1)
+    log = GnssLog(np.array([5.0]), place, np.diag([0.04, 0.09, 0.25])[None])
+    spec = PositionSpec(antenna_m=(0.5, -1.0, -2.0))
+    # Heading east: right is south, forward is east.
+    east = Attitude(0.0, 0.0, 90.0, 0.0, math.degrees(0.1))
+    found = gnss_fix(log, 0, axes, east, spec)
+    assert found is not None
+    np.testing.assert_allclose(found.enu_m, [202.0, 300.5, 3.0], atol=1e-3)
+    # A heading that is wrong by 0.1 moves the antenna's place by 0.2 to the side, 0.05 along.
+    expected = np.diag([0.04, 0.09, 0.25]) + np.outer([0.05, -0.2, 0], [0.05, -0.2, 0])
+    np.testing.assert_allclose(found.covariance_m2, expected, atol=1e-4)
+    whole = found.noise_m2 + found.standing[GNSS] @ found.standing[GNSS].T
+    np.testing.assert_allclose(whole, found.covariance_m2)
+    assert found.alarms == ("unavailable",)
+    assert gnss_fix(log, 0, axes, Attitude(0.0, 0.0), spec) is None
+    assert gnss_fix(log, 0, axes, None, PositionSpec()) is not None
+
+
+def test_headings_for_the_antenna() -> None:
+    compass = Attitude(1.0, 2.0, 3.0)
+    assert attitude_of(compass, lambda: None) is compass
+    assert attitude_of(None, lambda: None) is None
+    found = attitude_of(Attitude(1.0, 2.0, None, 0.3), lambda: (-10.0, 0.5))
+    assert found == Attitude(1.0, 2.0, 350.0, 0.3, 0.5)
+    found = attitude_of(None, lambda: (10.0, 0.5))
+    assert found is not None
+    assert found.gravity_sigma_deg == pytest.approx(10)
+
+
+HEAD = "t_us,latitude_deg,longitude_deg,height_m,sigma_east_m,sigma_north_m,sigma_up_m"
+
+
+def test_a_file_of_fixes(tmp_path: Path) -> None:
+    path = tmp_path / "gnss.csv"
+    path.write_text(f"{HEAD},cov_east_north_m2\n0,35,137,50,1,2,3,0.5\n1e5,35.1,137,50,1,2,3,-0.5\n")
+    log = GnssLog.read(path)
+    assert log.t_us.tolist() == [0, 1e5]
+    assert log.place[1].tolist() == [35.1, 137, 50]
+    np.testing.assert_array_equal(log.covariance_m2[0], [[1, 0.5, 0], [0.5, 4, 0], [0, 0, 9]])
+    with pytest.raises(InputError, match="cannot be read"):
+        GnssLog.read(tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (HEAD.replace(",height_m", "") + "\n", "line 1: no column height_m"),
+        (HEAD + "\n", "one line of values or more"),
+        (HEAD + "\n0,95,137,50,1,1,1\n", "line 2: latitude_deg = 95: expected -90 to 90"),
+        (HEAD + "\n0,35,137,50,1,1,0\n", "line 2: sigma_up_m = 0: expected 0.0001 to 1e"),
+        (HEAD + "\n0,35,137,x,1,1,1\n", "line 2: height_m = 'x': expected a number"),
+        (HEAD + "\n0,35,137,5,1,1,1\n0,35,137,5,1,1,1\n", "line 3: t_us = 0: expected more than"),
+        (HEAD + ",cov_east_up_m2\n0,35,137,5,1,1,1,2\n", "line 2: sigmas and covariances"),
+        (HEAD + "\n0,35\n", "line 2: longitude_deg = None: expected a number"),
+    ],
+)
+def test_faults_of_a_file(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "gnss.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        GnssLog.read(path)
