@@ -13,7 +13,8 @@ _FEW_FRAMES = 10
 """Frames of a packet by default: of fewer, nothing is said."""
 
 _REJECTED_SHARE = 0.1
-"""Rejected frames of which more is said: a bar that comes into view, or leaves it, loses a frame or two."""
+"""Rejected frames, or unread ones, of which more is said: a bar that comes into view, or leaves it, loses a
+frame or two."""
 
 _ASKEW_SHARE = 0.5
 """Of frames that contradict the attitude: fewer are one bar of several that is mounted askew."""
@@ -117,7 +118,12 @@ def _frames(counts: Mapping[str, int]) -> Iterator[str]:
             f"{rejected} of {frames + rejected} frames rejected, as their clusters do not stand where the bar"
             " has them: compare the link's [bar] and [pilots] with the transmitter's, and see --figures"
         )
-
+    unread = counts.get("frames_unread", 0)
+    if unread >= _FEW_FRAMES and unread > _REJECTED_SHARE * (frames + unread):
+        yield (
+            f"{unread} of {frames + unread} frames show their clusters, but not one symbol that is sure:"
+            " compare modulation.id with the transmitter's; in little light another decoding.id may do"
+        )
     askew = counts.get("frames_askew", 0)
     if askew >= _FEW_FRAMES and askew > _ASKEW_SHARE * frames:
         yield (

@@ -9,6 +9,7 @@ import numpy as np
 import pluggy
 from numpy.typing import NDArray
 
+from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.belief import believed, still_lit
@@ -43,6 +44,9 @@ clusters place it less well than all."""
 _SAME_PX = 5.0
 """How far apart the centres of two regions of one bar may be: before lit leaves an end is good to some px."""
 
+_DARK = 0.25
+"""Share of a pilot's events below which a bar that was seen before is out of sight, or hidden."""
+
 _COUNTS = (
     "events_in_regions",
     "regions_opened",
@@ -51,6 +55,8 @@ _COUNTS = (
     "preambles",
     "frames",
     "frames_rejected",
+    "frames_dark",
+    "frames_unread",
     "frames_reflected",
     "frames_askew",
     "frames_cut",
@@ -227,40 +233,47 @@ class Receiver:
         if cut_us is not None and transmitter.grid.lock is not None:
             self._counts["frames_cut"] += transmitter.grid.skip_before(cut_us)
         while (due := transmitter.grid.due(until_us)) is not None:
-            sighting = self._decode(transmitter, due)
-            if sighting is None and self._put_together(transmitter):
+            found = self._decode(transmitter, due)
+            if found == "frames_rejected" and self._put_together(transmitter):
                 continue
             transmitter.grid.frame += 1
-            if sighting is None:
-                self._counts["frames_rejected"] += 1
-                if transmitter.region.id in self._joined:
-                    return
+            if transmitter.region.id in self._joined:
+                # Another region shows the frame.
+                return
+            if isinstance(found, str):
+                self._counts[found] += 1
                 continue
             self._counts["frames"] += 1
-            self._judged.add(transmitter.packets, due, sighting)
+            self._judged.add(transmitter.packets, due, found)
 
-    def _decode(self, transmitter: Transmitter, due: DueFrame) -> Sighting | None:
-        """Read a frame; None if it does not show where the clusters are."""
+    def _decode(self, transmitter: Transmitter, due: DueFrame) -> Sighting | str:
+        """Read a frame; of one that is not given, the count that it belongs to."""
         self._announcer.start()
         look = self._look(transmitter, due)
         if look is None:
-            return None
+            return "frames_dark" if _went_dark(transmitter, due, self._packet) else "frames_rejected"
         if transmitter.number is None and self._echoes.shown(due.start_us, look.centre_px):
             # The same bar once more: where the first region was then is not known as well as what it showed.
             self._regions.drop(transmitter.region)
             self._let_go(transmitter.region)
-            return None
-        number = self._transmitters.number(transmitter)
-        soft = self._steps.decode(look.presence, look.sums)
+            return "frames_rejected"
+        read = self._steps.decode(look.presence, look.sums)
         lit = still_lit(look.sums, look.presence, self._packet.pilot_chips)
+        soft = believed(read, look.placement.seen & lit)
         distance, points, centre_px, sight = _NO_RANGE, _NO_POINTS, look.centre_px, BarSight()
         if due.has_pilot:
             # Another distance of the same pilot, or other points, would say nothing new.
-            distance = self._steps.measure(FrameView(look.sums, look.offset_px, look.presence, soft))
+            distance = self._steps.measure(FrameView(look.sums, look.offset_px, look.presence, read))
             points_px, sigma_px = self._find_points(look.presence, look.placement)
             points = points_px + look.corner_px, sigma_px
             centre_px = self._looker.centre(look, points[0])
             sight = self._sight(points, look.middle_us)
+        if not (soft.symbols >= 0).any() and (
+            transmitter.number is None or not math.isfinite(distance.distance_m)
+        ):
+            # What says nothing is no transmitter, and of one that is known its distance may still be of use.
+            return "frames_unread"
+        number = self._transmitters.number(transmitter)
         transmitter.distance, distance, filtered = self._steps.follow(
             transmitter.distance, due.start_us, due.lock.chip_us, distance, sight
         )
@@ -271,7 +284,7 @@ class Receiver:
             packet=due.packet - transmitter.first,
             frame=due.index,
             t_us=due.start_us,
-            soft=believed(soft, look.placement.seen & lit),
+            soft=soft,
             range=distance,
             filtered=filtered,
             x_px=centre_px[0],
@@ -376,3 +389,11 @@ class Receiver:
         """A packet with the times of the camera's clock."""
         frames = tuple(on_camera(frame, self._clock.camera_us) for frame in packet.frames)
         return replace(packet, t_us=self._clock.camera_us(packet.t_us), frames=frames)
+
+
+def _went_dark(transmitter: Transmitter, due: DueFrame, packet: PacketFormat) -> bool:
+    """Whether a bar that was seen before has few events in a frame by now."""
+    if transmitter.number is None or transmitter.pilot is None:
+        return False
+    expected = int(np.abs(transmitter.pilot.sums).sum(dtype=np.int64)) * due.chips / packet.pilot_chips
+    return transmitter.region.events_between(due.start_us, due.end_us) < _DARK * expected

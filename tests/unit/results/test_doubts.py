@@ -80,6 +80,10 @@ def test_clusters_that_are_never_seen() -> None:
 def test_frames_rejected_and_blocks_that_cannot_be_read() -> None:
     (line,) = told(tally_of(RANDOM), frames=60, frames_rejected=20)
     assert line.startswith("20 of 80 frames rejected")
+    (line,) = told(tally_of(RANDOM), frames=60, frames_unread=20)
+    assert line.startswith("20 of 80 frames show their clusters, but not one symbol")
+    # A truck before it is no fault of the link's.
+    assert told(tally_of(RANDOM), frames=60, frames_dark=60, frames_rejected=6, frames_unread=6) == []
     (line,) = told(tally_of(RANDOM), blocks_tried=6)
     assert "error-correction.id" in line
     assert warnings_of(tally_of(RANDOM), {"blocks_tried": 6}, LINK, reads_messages=False) == []

@@ -113,6 +113,35 @@ def test_a_pilot_in_the_dark_takes_its_frames_with_it() -> None:
     assert receiver.counts["frames_rejected"] == 4
 
 
+def test_a_bar_out_of_sight_is_not_rejected() -> None:
+    bar = IdealBar(random_symbols(LINK, 2))
+    events = ideal_events(LINK, bar)
+    begin_us, end_us = (
+        bar.start_us + 100 * (LINK.packet.packet_chips + LINK.packet.frame_start_chip(f)) for f in (2, 9)
+    )
+    dark = (events.t_us >= begin_us) & (events.t_us < end_us)
+    receiver = Receiver(LINK)
+    packets = receiver.feed(events[~dark]) + receiver.close()
+    assert [f.frame for f in packets[1].frames] == [0, 1, 9]
+    assert (receiver.counts["frames_dark"], receiver.counts["frames_rejected"]) == (7, 0)
+
+
+def test_a_bar_that_says_nothing_is_no_transmitter() -> None:
+    """Preambles and pilots show its clusters; the info segments are dark."""
+    bar = IdealBar(random_symbols(LINK, 2))
+    events = ideal_events(LINK, bar)
+    dark = np.zeros(len(events), bool)
+    for packet in range(2):
+        for frame in range(LINK.packet.frames):
+            chip = packet * LINK.packet.packet_chips + LINK.packet.frame_start_chip(frame)
+            # The last edge of the pilot belongs to it.
+            begin_us = bar.start_us + 100 * (chip + LINK.packet.pilot_chips + 1)
+            dark |= (events.t_us >= begin_us) & (events.t_us < begin_us + 100 * (LINK.packet.info_chips - 1))
+    receiver = Receiver(LINK)
+    assert receiver.feed(events[~dark]) + receiver.close() == []
+    assert (receiver.counts["frames_unread"], receiver.counts["frames"]) == (20, 0)
+
+
 def test_distance_is_that_of_the_spacing() -> None:
     bar = IdealBar(random_symbols(LINK, 3), cluster_px=9.0)
     ranges = [f.range for p in received(LINK, ideal_events(LINK, bar)) for f in p.frames]
