@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.gnss import GnssLog, attitude_of, gnss_fix
+from evlcp_sdk.place.learnt import Learnt, focal_share, learnt
 from evlcp_sdk.place.positioner import Positioner
 from evlcp_sdk.place.trajectory import (
     GNSS,
@@ -30,6 +31,9 @@ _BLOCK = 1024
 """Points smoothed at a time; those behind them, as many again, are over half a minute: far more than an
 acceleration of 1 m/s2 lasts against fixes of centimetres."""
 
+
+_MOST_PARTS = 256
+"""Parts whose standing errors are remembered; the one not seen for longest makes way."""
 
 _STANDS_US = 10e6
 """Time in which a track stands on what it took last of bars, and of satellites."""
@@ -63,6 +67,9 @@ class Place:
         course_deg: Where it moves to, clockwise from north.
         left_out: The fix at this time was beyond the gate, or failed its test, and does not count.
         starts: A trajectory starts here; nothing is known of its speed, unless it is smoothed.
+        focal_share: By what share the focal length is longer than stated, as far as the track tells; NaN
+            where it was stated exactly.
+        focal_share_sigma: Of it.
     """
 
     t_us: float
@@ -75,6 +82,8 @@ class Place:
     course_deg: float
     left_out: bool
     starts: bool
+    focal_share: float = math.nan
+    focal_share_sigma: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +143,9 @@ class Navigator:
         self._gnss, self._gnss_next = plan.gnss, 0
         self._span: tuple[float, float] | None = None
         self._taken: dict[str, float] = {}
+        self._link = link
+        self._attitude: Attitude | None = None
+        self._standing: dict[str, tuple[Floats, Floats]] = {}
         self._counts = dict.fromkeys(("gnss", "gnss_left_out", "gnss_without_heading"), 0)
         self._state: TrajectoryPoint | None = None
         self._window: list[tuple[Fix, TrajectoryPoint, Place]] = []
@@ -190,6 +202,11 @@ class Navigator:
     def _heading(self, t_us: float) -> tuple[float, float] | None:
         return None if self._state is None else heading_at(self._state, t_us, self._imu)
 
+    def learnt(self) -> list[Learnt]:
+        """What the drive tells so far of standing errors: of the camera, the attitude, the IMU, the sites."""
+        link, sites = self._link, self.positioner.stands_at
+        return learnt(self._standing, link.camera, link.camera_sigma, self._attitude, sites, link.position)
+
     def bars_enu_m(self) -> dict[int, Floats]:
         """Centres of the bars whose places are known, in the local axes, m, float64 (3,) each."""
         axes = self.positioner.axes
@@ -205,6 +222,13 @@ class Navigator:
             return Placed(fix, None)
         point = self._state = trajectory_step(self._state, fix, self._spec, self._imu)
         fix = self._compared(fix, point)
+        self._attitude = self._attitude_at(fix.t_us) or self._attitude
+        for cause in point.causes:
+            # The last of many bars are kept.
+            self._standing.pop(cause.name, None)
+            self._standing[cause.name] = point.standing(cause.name)  # type: ignore[assignment]
+        while len(self._standing) > _MOST_PARTS:
+            del self._standing[next(iter(self._standing))]
         filtered = self._place(point)
         self._window.append((fix, point, filtered))
         return Placed(fix, filtered, self._settle(_BLOCK) if len(self._window) == 2 * _BLOCK else ())
@@ -235,6 +259,8 @@ class Navigator:
         assert axes is not None
         latitude, longitude, height = axes.to_geodetic(point.mean[:3])
         east, north = float(point.mean[3]), float(point.mean[4])
+        link = self._link
+        focal = focal_share(point.standing("camera"), link.camera, link.camera_sigma)
         return Place(
             t_us=point.t_us,
             latitude_deg=float(latitude),
@@ -246,4 +272,6 @@ class Navigator:
             course_deg=math.degrees(math.atan2(east, north)) % 360,
             left_out=point.misses > 0,
             starts=point.starts,
+            focal_share=focal[0],
+            focal_share_sigma=focal[1],
         )

@@ -1,13 +1,16 @@
 """What looks wrong in a result, in words, each with the next step to try."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.results.tallies import RunTally, TransmitterTally
 
 __all__ = ["warnings_of"]
+
+_TOLD_SIGMAS = 3.0
+"""Sigmas beyond which what a drive tells is hinted at."""
 
 _FEW_FRAMES = 10
 """Frames of a packet by default: of fewer, nothing is said."""
@@ -86,6 +89,7 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[str]:
             f"{number} positions are without {name}, which the rest contradicts: compare its place or angles"
             " and their sigmas with what is there"
         )
+    yield from _learnt(positions["learnt"], link)
     if number := positions["alarms"].get("contradicted", 0):
         yield (
             f"{number} times bars and GNSS contradict one another: compare the sigmas of both,"
@@ -101,6 +105,23 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[str]:
             f"{number} positions refused, as bars, attitude and camera contradict one another: compare sites,"
             " angles and [camera] with what is there, and their sigmas"
         )
+
+
+def _learnt(rows: Sequence[Mapping[str, Any]], link: Link) -> Iterator[str]:
+    for row in rows:
+        off, sigma, stated = row["correction"], row["sigma"], row["stated_sigma"]
+        if not row["told"]:
+            continue
+        if abs(off) > _TOLD_SIGMAS * stated:
+            yield (
+                f"the drive shows {row['part']}, {row['what']}, {off:+.3g} off what is stated, {stated:.3g}"
+                f" (sigma): {abs(off) / stated:.1f} sigmas; compare it with what is there"
+            )
+        elif row["what"] == "focal_mm" and abs(off) > _TOLD_SIGMAS * sigma:
+            yield (
+                f"the drive shows a focal length of {link.camera.focal_mm + off:.5g} +- {sigma:.2g} mm, not"
+                f" {link.camera.focal_mm:g}: camera.focal_mm and camera_sigma.focal_mm may say so"
+            )
 
 
 def _frames(counts: Mapping[str, int]) -> Iterator[str]:

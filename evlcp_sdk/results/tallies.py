@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.place.learnt import Learnt
 from evlcp_sdk.place.navigator import Navigator, Placed
 from evlcp_sdk.place.refusals import REFUSALS
 from evlcp_sdk.place.trajectory import GNSS
@@ -217,7 +218,18 @@ class PositionTally:
             "frames_late": positioner.counts["frames_late"],
             "beacons_forged": positioner.counts["beacons_forged"],
             "sites_contradicted": {str(n): how for n, how in positioner.contradicted.items()},
+            "learnt": [_learnt_row(one) for one in navigator.learnt()],
             "origin": asdict(axes) if axes is not None else None,
             "bars_exact": [n for n, s in positioner.stands_at.items() if s.position_sigma_m is None],
             "bars": {str(n): s.transmitter_id for n, s in positioner.stands_at.items()},
         }
+
+
+def _learnt_row(one: Learnt) -> dict[str, Any]:
+    numbers = {name: getattr(one, name) for name in ("correction", "sigma", "stated_sigma")}
+    return {
+        "part": one.part,
+        "what": one.what,
+        **{name: float(f"{value:.6g}") for name, value in numbers.items()},
+        "told": one.told,
+    }

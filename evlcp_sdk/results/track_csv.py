@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.results.text import covariances, sigmas
+from evlcp_sdk.results.text import covariances, sigmas, text_or_empty
 
 __all__ = ["TRACK_COLUMNS", "TrackCsv"]
 
@@ -23,6 +23,8 @@ TRACK_COLUMNS = (
     *(f"filtered_{name}" for name in _PLACE_COLUMNS),
     "left_out",
     "source",
+    "focal_share",
+    "focal_share_sigma",
 )
 """Columns of `track.csv`: smoothed, then filtered."""
 
@@ -47,6 +49,8 @@ class TrackCsv(Sink):
                     *_place_row(one.filtered),
                     int(one.filtered.left_out),
                     one.fix.source,
+                    text_or_empty(one.smoothed.focal_share, 6),
+                    text_or_empty(one.smoothed.focal_share_sigma, 6),
                 ]
             )
 

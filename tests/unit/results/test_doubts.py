@@ -119,3 +119,34 @@ def test_what_there_was_no_room_for_is_told() -> None:
     (line,) = told(tally_of(RANDOM), frames=60, dropped_crowded=7, frames_cut=3, steps_forgotten=50)
     assert "7 events of crowded time steps dropped; 3 frames passed over" in line
     assert told(tally_of(RANDOM), frames=60, steps_forgotten=50, areas_left_out=9) == []
+
+
+@pytest.mark.parametrize(
+    ("part", "what", "off", "sigma", "hint"),
+    [
+        ("camera", "focal_mm", 0.1, 0.02, "a focal length of 35.1 +- 0.02 mm, not 35"),
+        ("camera", "focal_mm", 0.05, 0.02, None),
+        ("camera", "focal_mm", 0.1, 0.199, None),
+        ("bar 2", "east_m", 0.1, 0.02, None),
+        ("bar 2", "east_m", -0.9, 0.02, "shows bar 2, east_m, -0.9 off what is stated, 0.2 (sigma): 4.5"),
+    ],
+)
+def test_what_a_drive_tells_of_its_errors(
+    part: str, what: str, off: float, sigma: float, hint: str | None
+) -> None:
+    row = {"part": part, "what": what, "correction": off, "sigma": sigma, "stated_sigma": 0.2}
+    row["told"] = sigma < 0.18
+    positions = {
+        "fixes": 1,
+        "refused": {},
+        "gnss": 0,
+        "gnss_without_heading": 0,
+        "bars_exact": [],
+        "excluded": {},
+        "alarms": {},
+        "learnt": [row],
+    }
+    link = load_link(overrides=["camera_sigma.focal_mm=0.2"])
+    found = warnings_of(RunTally(link.packet), {}, link, positions=positions)
+    assert len(found) == (hint is not None)
+    assert hint is None or hint in found[0]

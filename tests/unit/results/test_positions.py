@@ -97,6 +97,9 @@ def test_files_of_a_drive(tmp_path: Path) -> None:
     fixes = rows(tmp_path / "fixes.csv")
     assert told["fixes"] == len(fixes) == 12
     assert told["bars"] == {"0": 7}
+    assert [(r["part"], r["what"]) for r in told["learnt"]] == [
+        ("attitude", name) for name in ("pitch_deg", "roll_deg", "heading_deg")
+    ]
     axes = LocalAxes.of([SITE])
     for row in fixes + rows(tmp_path / "track.csv"):
         t_us = float(row["t_us"])
