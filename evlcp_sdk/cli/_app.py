@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from evlcp_sdk.cli._common import echo
+from evlcp_sdk.cli._common import echo, hush
 from evlcp_sdk.printable import printable
 
 if TYPE_CHECKING:
@@ -170,6 +170,7 @@ def run() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("always", PluginWarning)
         warnings.showwarning = show
+        hush()
         app = make_app()
         add_plugin_commands(app, Registry.load())
         app()

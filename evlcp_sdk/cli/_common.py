@@ -1,5 +1,6 @@
 """What the commands share: their options, where jobs run, what goes to stderr."""
 
+import logging
 import os
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated
@@ -28,6 +29,7 @@ __all__ = [
     "complain",
     "console",
     "echo",
+    "hush",
     "make_executor",
 ]
 
@@ -63,6 +65,11 @@ Dask = Annotated[
 def echo(text: str, *, nl: bool = True) -> None:
     """Print a text on stdout; what it has of names and texts from outside moves no cursor."""
     typer.echo(printable(text), nl=nl)
+
+
+def hush() -> None:
+    """Keep Matplotlib from saying on stderr where it keeps its caches when there is no home."""
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
 def console(*, stderr: bool = False) -> "Console":

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Dask, LinkFile, Overrides, bytes_bar, complain, console, echo, make_executor
+from evlcp_sdk.cli._common import (
+    Dask,
+    LinkFile,
+    Overrides,
+    bytes_bar,
+    complain,
+    console,
+    echo,
+    hush,
+    make_executor,
+)
 from evlcp_sdk.cli._summary import show
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
 
@@ -293,6 +303,7 @@ def _decode_job(
     if stopped is not None:
         with bytes_bar(Path(job.url).name) as advance:
             return decode(advance=advance, stopped=stopped)
+    hush()
     # A terminal sends Ctrl-C to workers, too.
     with stop_on_request() as asked:
         return decode(stopped=asked)

@@ -87,6 +87,16 @@ def test_the_entry_point_can_be_interrupted_from_the_start() -> None:
     assert not {"typer", "rich", "typing", "pathlib", "logging"} & set(said.split())
 
 
+def test_without_a_home_libraries_say_nothing() -> None:
+    code = f"import sys; sys.argv = ['evlcp', '--version']\ntry: {MAIN}\nexcept SystemExit: pass\n"
+    code += "import matplotlib; matplotlib.get_cachedir()"
+    nowhere = dict.fromkeys(("HOME", "MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME"), "/dev/null/none")
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ | nowhere
+    )
+    assert done.stderr == ""
+
+
 def test_a_fault_of_ours_says_so_and_what_to_report(
     evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch, demo_raw: Path
 ) -> None:
