@@ -37,52 +37,43 @@ def normal(
     (3,), `rotation` (3, 3), `local` (bars, 9), `error` (7,).
 
     Out, bar by bar with its local unknowns eliminated: `info` (bars, 14, 14), `right` (bars, 14), `gain`
-    (bars, 9, 14) and `step` (bars, 9), by which the local unknowns follow, `cost` (bars,), `pixel`
-    (bars, 14, 14), the information that counts errors of pixels only. `rows` (3, 14) and `miss` (3,) are
-    those of the attitude.
+    (bars, 9, 14) and `step` (bars, 9), by which the local unknowns follow, `cost` (bars,), and, unless it is
+    empty, `pixel` (bars, 14, 14), the information that counts errors of pixels only. `rows` (3, 14) and
+    `miss` (3,) are those of the attitude.
     """
     n, bars = len(points), len(cost)
     errors = False
     for i in range(7):
         errors = errors or lens_root[i, i] != 0
     wide = GLOBAL if errors else LENS
+    asked = len(pixel) > 0
     now = lens.copy()
     for i in range(7):
         for j in range(i + 1):
             now[i] += lens_root[i, j] * error[j]
     f, cx, cy, k1, k2, p1, p2, k3 = now
     scale_f = fault * lens[0]
-    row = np.zeros((2, GLOBAL))
-    inner = np.zeros((2, LOCAL))
-    own = np.zeros((LOCAL, LOCAL))
-    own_right = np.zeros(LOCAL)
-    mixed = np.zeros((LOCAL, GLOBAL))
-    slope = np.zeros((2, 3))
+    # A point's two rows: what is the bar's own, the unknowns of all, the miss.
+    row = np.zeros((2, LOCAL + GLOBAL + 1))
+    sums = np.zeros((LOCAL + GLOBAL + 1, LOCAL + GLOBAL + 1))
+    slow = np.zeros((LOCAL + GLOBAL + 1, LOCAL + GLOBAL + 1))
     by_lens = np.zeros((2, 7))
-    keep = np.zeros((n, 2, GLOBAL))
-    keep_inner = np.zeros((n, 2, LOCAL))
-    keep_weight = np.zeros(n)
     total = 0.0
     at = 0
     for b in range(bars):
         sh, sp, st, sl = bar_sigma[b]
         tall = LOCAL if sp > 0 or st > 0 else 3
-        for i in range(GLOBAL):
-            right[b, i] = 0
-            for j in range(GLOBAL):
-                info[b, i, j] = 0
-                pixel[b, i, j] = 0
+        last = tall + wide
+        sums[:] = 0
+        slow[:] = 0
         sum_ = 0.0
+        for i in range(tall):
+            sums[i, i] = 1
+            sums[i, last] = -local[b, i]
         for i in range(LOCAL):
-            own_right[i] = -local[b, i]
             sum_ += local[b, i] ** 2
-            for j in range(LOCAL):
-                own[i, j] = 1.0 if i == j else 0.0
-            for j in range(GLOBAL):
-                mixed[i, j] = 0
         wx, wy, wz = st * local[b, 6], st * local[b, 7], st * local[b, 8]
         grow = sl * local[b, 2]
-        begin = at
         while at < n and bar[at] == b:
             ax, ay, az = points[at, 3], points[at, 4], points[at, 5]
             ox = points[at, 0] - position[0] + sp * local[b, 3] + grow * ax + wy * az - wz * ay
@@ -102,28 +93,30 @@ def normal(
             w = points[at, 8]
             mx = (points[at, 6] - (cx + f * bent_u) - sh * local[b, 0]) * w
             my = (points[at, 7] - (cy + f * bent_v) - sh * local[b, 1]) * w
+            row[0, last], row[1, last] = mx, my
             cross = u * v * growth + 2 * p1 * u + 2 * p2 * v
             uu = radial + u * u * growth + 2 * p1 * v + 6 * p2 * u
             vv = radial + v * v * growth + 6 * p1 * v + 2 * p2 * u
-            for j in range(3):
-                du = (rotation[j, 0] - u * rotation[j, 2]) / z
-                dv = (rotation[j, 1] - v * rotation[j, 2]) / z
-                slope[0, j] = f * w * (uu * du + cross * dv)
-                slope[1, j] = f * w * (cross * du + vv * dv)
             for a in range(2):
-                e, no, up = slope[a, 0], slope[a, 1], slope[a, 2]
-                row[a, 0], row[a, 1], row[a, 2] = -e, -no, -up
-                row[a, 3] = no * oz - up * oy
-                row[a, 4] = up * ox - e * oz
-                row[a, 5] = e * oy - no * ox
-                inner[a, 2] = (e * ax + no * ay + up * az) * sl
-                inner[a, 3], inner[a, 4], inner[a, 5] = e * sp, no * sp, up * sp
-                inner[a, 6] = (ay * up - az * no) * st
-                inner[a, 7] = (az * e - ax * up) * st
-                inner[a, 8] = (ax * no - ay * e) * st
-            inner[0, 0] = inner[1, 1] = sh * w
-            inner[0, 1] = inner[1, 0] = 0
-            row[0, FAULT], row[1, FAULT] = bent_u * scale_f * w, bent_v * scale_f * w
+                by_u, by_v = (uu, cross) if a == 0 else (cross, vv)
+                by_u, by_v = f * w / z * by_u, f * w / z * by_v
+                by_z = -(by_u * u + by_v * v)
+                e = by_u * rotation[0, 0] + by_v * rotation[0, 1] + by_z * rotation[0, 2]
+                no = by_u * rotation[1, 0] + by_v * rotation[1, 1] + by_z * rotation[1, 2]
+                up = by_u * rotation[2, 0] + by_v * rotation[2, 1] + by_z * rotation[2, 2]
+                row[a, 2] = (e * ax + no * ay + up * az) * sl
+                if tall == LOCAL:
+                    row[a, 3], row[a, 4], row[a, 5] = e * sp, no * sp, up * sp
+                    row[a, 6] = (ay * up - az * no) * st
+                    row[a, 7] = (az * e - ax * up) * st
+                    row[a, 8] = (ax * no - ay * e) * st
+                row[a, tall], row[a, tall + 1], row[a, tall + 2] = -e, -no, -up
+                row[a, tall + 3] = no * oz - up * oy
+                row[a, tall + 4] = up * ox - e * oz
+                row[a, tall + 5] = e * oy - no * ox
+            row[0, 0] = row[1, 1] = sh * w
+            row[0, 1] = row[1, 0] = 0
+            row[0, tall + FAULT], row[1, tall + FAULT] = bent_u * scale_f * w, bent_v * scale_f * w
             if errors:
                 by_lens[0, 0], by_lens[1, 0] = bent_u, bent_v
                 by_lens[0, 1] = by_lens[1, 2] = 1
@@ -137,7 +130,7 @@ def normal(
                         value = 0.0
                         for i in range(j, 7):
                             value += by_lens[a, i] * lens_root[i, j]
-                        row[a, LENS + j] = value * w
+                        row[a, tall + LENS + j] = value * w
             size = math.sqrt(mx * mx + my * my)
             weight = 1.0
             if size > huber:
@@ -145,83 +138,81 @@ def normal(
                 sum_ += huber * (2 * size - huber)
             else:
                 sum_ += size * size
-            keep_weight[at] = weight
-            for a in range(2):
-                m = mx if a == 0 else my
-                for i in range(wide):
-                    keep[at, a, i] = row[a, i]
-                    value = weight * row[a, i]
-                    right[b, i] += value * m
-                    for j in range(i + 1):
-                        info[b, i, j] += value * row[a, j]
-                    for j in range(tall):
-                        mixed[j, i] += value * inner[a, j]
-                for i in range(tall):
-                    keep_inner[at, a, i] = inner[a, i]
-                    value = weight * inner[a, i]
-                    own_right[i] += value * m
-                    for j in range(i + 1):
-                        own[i, j] += value * inner[a, j]
+            _gathered(row, weight, last + 1, sums)
+            if asked:
+                _gathered(row, points[at, 9] * weight**2, last, slow)
             at += 1
-        # Cholesky of what is the bar's own, and the bar's own unknowns eliminated.
-        for i in range(tall):
-            for j in range(i + 1):
-                value = own[i, j]
-                for k in range(j):
-                    value -= own[i, k] * own[j, k]
-                own[i, j] = math.sqrt(value) if i == j else value / own[j, j]
-        for i in range(tall):
-            value = own_right[i]
-            for k in range(i):
-                value -= own[i, k] * own_right[k]
-            own_right[i] = value / own[i, i]
-            for j in range(wide):
-                value = mixed[i, j]
-                for k in range(i):
-                    value -= own[i, k] * mixed[k, j]
-                mixed[i, j] = value / own[i, i]
+        # Cholesky as far as what is the bar's own, which leaves the rest with it eliminated.
+        for k in range(tall):
+            inverse = 1 / math.sqrt(sums[k, k])
+            for j in range(k, last + 1):
+                sums[k, j] *= inverse
+            for i in range(k + 1, last + 1):
+                share = sums[k, i]
+                for j in range(i, last + 1):
+                    sums[i, j] -= share * sums[k, j]
         cost[b] = sum_
-        for i in range(tall):
-            cost[b] -= own_right[i] ** 2
-        for i in range(wide):
-            for k in range(tall):
-                right[b, i] -= mixed[k, i] * own_right[k]
-            for j in range(i + 1):
-                value = info[b, i, j]
-                for k in range(tall):
-                    value -= mixed[k, i] * mixed[k, j]
-                info[b, i, j] = value
-                info[b, j, i] = value
-        for i in range(tall - 1, -1, -1):
-            value = own_right[i]
-            for k in range(i + 1, tall):
-                value -= own[k, i] * step[b, k]
-            step[b, i] = value / own[i, i]
-            for j in range(wide):
-                value = mixed[i, j]
-                for k in range(i + 1, tall):
-                    value -= own[k, i] * gain[b, k, j]
-                gain[b, i, j] = value / own[i, i]
-        for i in range(tall, LOCAL):
+        for k in range(tall):
+            cost[b] -= sums[k, last] ** 2
+        for i in range(GLOBAL):
+            right[b, i] = sums[tall + i, last] if i < wide else 0.0
+            for j in range(i, GLOBAL):
+                info[b, i, j] = info[b, j, i] = sums[tall + i, tall + j] if j < wide else 0.0
+        for i in range(LOCAL - 1, -1, -1):
             step[b, i] = 0
             for j in range(GLOBAL):
                 gain[b, i, j] = 0
-        for p in range(begin, at):
-            share = points[p, 9] * keep_weight[p] ** 2
-            for a in range(2):
-                for i in range(wide):
-                    value = keep[p, a, i]
-                    for k in range(tall):
-                        value -= keep_inner[p, a, k] * gain[b, k, i]
-                    row[a, i] = value
-                for i in range(wide):
+            if i < tall:
+                inverse = 1 / sums[i, i]
+                value = sums[i, last]
+                for j in range(wide):
+                    gain[b, i, j] = sums[i, tall + j]
+                for k in range(i + 1, tall):
+                    share = sums[i, k]
+                    value -= share * step[b, k]
                     for j in range(wide):
-                        pixel[b, i, j] += share * row[a, i] * row[a, j]
+                        gain[b, i, j] -= share * gain[b, k, j]
+                step[b, i] = value * inverse
+                for j in range(wide):
+                    gain[b, i, j] *= inverse
+        if asked:
+            _followed(slow, gain[b], tall, wide, pixel[b])
         total += sum_
     for i in range(7):
         total += error[i] ** 2
     total += _attitude(felt, heading, known, white, rotation, rows, miss)
     return total
+
+
+@njit(cache=True, nogil=True)
+def _gathered(row: Array, weight: float, wide: int, sums: Array) -> None:
+    """Add the weighted products of two rows, (2, w): the upper half of `sums` (w, w)."""
+    for i in range(wide):
+        one, two = weight * row[0, i], weight * row[1, i]
+        for j in range(i, wide):
+            sums[i, j] += one * row[0, j] + two * row[1, j]
+
+
+@njit(cache=True, nogil=True)
+def _followed(sums: Array, gain: Array, tall: int, wide: int, out: Array) -> None:
+    """Products of the rows once the first `tall` unknowns follow the others: `out` (14, 14)."""
+    for i in range(tall + wide):
+        for j in range(i):
+            sums[i, j] = sums[j, i]
+    out[:] = 0
+    for i in range(tall + wide):
+        for k in range(tall):
+            share = sums[i, k]
+            for j in range(wide):
+                sums[i, tall + j] -= share * gain[k, j]
+    for i in range(wide):
+        for j in range(wide):
+            out[i, j] = sums[tall + i, tall + j]
+    for k in range(tall):
+        for i in range(wide):
+            share = gain[k, i]
+            for j in range(wide):
+                out[i, j] -= share * sums[k, tall + j]
 
 
 @njit(cache=True, nogil=True)
@@ -292,11 +283,9 @@ def summed(
 
 
 @njit(cache=True, nogil=True)
-def solved(whole: Array, side: Array, damping: float, move: Array) -> bool:
-    """Solve the damped equations by Cholesky, scaled to a unit diagonal; False where they are singular."""
-    n = len(side)
-    scale = np.zeros(n)
-    low = np.zeros((n, n))
+def _factored(whole: Array, damping: float, scale: Array, low: Array) -> bool:
+    """Cholesky of the damped equations, scaled to a unit diagonal; False where they are singular."""
+    n = len(scale)
     for i in range(n):
         if not whole[i, i] > 0:
             return False
@@ -309,11 +298,18 @@ def solved(whole: Array, side: Array, damping: float, move: Array) -> bool:
             for k in range(j):
                 value -= low[i, k] * low[j, k]
             if i == j:
-                if not value > 0:
+                # What rounding leaves of a diagonal of 1 is nothing.
+                if not value > 1e-14:
                     return False
                 low[i, i] = math.sqrt(value)
             else:
                 low[i, j] = value / low[j, j]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _substituted(low: Array, scale: Array, side: Array, move: Array) -> None:
+    n = len(side)
     for i in range(n):
         value = side[i] * scale[i]
         for k in range(i):
@@ -326,7 +322,69 @@ def solved(whole: Array, side: Array, damping: float, move: Array) -> bool:
         move[i] = value / low[i, i]
     for i in range(n):
         move[i] *= scale[i]
+
+
+@njit(cache=True, nogil=True)
+def solved(whole: Array, side: Array, damping: float, move: Array) -> bool:
+    """Solve the damped equations by Cholesky, scaled to a unit diagonal; False where they are singular."""
+    n = len(side)
+    scale, low = np.zeros(n), np.zeros((n, n))
+    if not _factored(whole, damping, scale, low):
+        return False
+    _substituted(low, scale, side, move)
     return True
+
+
+@njit(cache=True, nogil=True)
+def inverted(whole: Array, out: Array) -> bool:
+    """The inverse of a positive matrix; False where it is singular."""
+    n = len(whole)
+    scale, low, unit = np.zeros(n), np.zeros((n, n)), np.zeros(n)
+    if not _factored(whole, 0.0, scale, low):
+        return False
+    for i in range(n):
+        unit[i] = 1
+        _substituted(low, scale, unit, out[i])
+        unit[i] = 0
+    return True
+
+
+@njit(cache=True, nogil=True)
+def eigen(matrix: Array, values: Array, axes: Array) -> None:
+    """Eigenvalues of a symmetric matrix, in no order, and its axes as columns, by Jacobi's turns.
+
+    For the few rows here a fraction of what LAPACK takes. The matrix is overwritten.
+    """
+    n = len(values)
+    for i in range(n):
+        for j in range(n):
+            axes[i, j] = 1.0 if i == j else 0.0
+    for _ in range(30):
+        off = size = 0.0
+        for i in range(n):
+            size += matrix[i, i] ** 2
+            for j in range(i):
+                off += matrix[i, j] ** 2
+        if not off > 1e-32 * size:
+            break
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                if matrix[p, q] == 0:
+                    continue
+                half = (matrix[q, q] - matrix[p, p]) / (2 * matrix[p, q])
+                t = math.copysign(1 / (abs(half) + math.sqrt(half * half + 1)), half)
+                c = 1 / math.sqrt(t * t + 1)
+                s = t * c
+                for k in range(n):
+                    one, two = matrix[k, p], matrix[k, q]
+                    matrix[k, p], matrix[k, q] = c * one - s * two, s * one + c * two
+                for k in range(n):
+                    one, two = matrix[p, k], matrix[q, k]
+                    matrix[p, k], matrix[q, k] = c * one - s * two, s * one + c * two
+                    one, two = axes[k, p], axes[k, q]
+                    axes[k, p], axes[k, q] = c * one - s * two, s * one + c * two
+    for i in range(n):
+        values[i] = matrix[i, i]
 
 
 @njit(cache=True, nogil=True)
@@ -377,11 +435,14 @@ def fitted(
     felt: Array, heading: float, known: int, white: Array, huber: float, free: Array, steps: int,
     position: Array, rotation: Array, local: Array, error: Array,
 ) -> tuple[bool, float, Array, Array, Array, Array]:  # fmt: skip
-    """Levenberg-Marquardt from a point; whether it settled, twice the cost, and the point."""
+    """Levenberg-Marquardt from a point; whether it settled, twice the cost, and the point.
+
+    The damping follows how much of what the equations promise a step wins (Nielsen 1999).
+    """
     bars = len(bar_sigma)
     info, right, cost = np.zeros((bars, GLOBAL, GLOBAL)), np.zeros((bars, GLOBAL)), np.zeros(bars)
     gain, step = np.zeros((bars, LOCAL, GLOBAL)), np.zeros((bars, LOCAL))
-    rows, miss, pixel = np.zeros((3, GLOBAL)), np.zeros(3), np.zeros((bars, GLOBAL, GLOBAL))
+    rows, miss, pixel = np.zeros((3, GLOBAL)), np.zeros(3), np.zeros((0, GLOBAL, GLOBAL))
     whole, side, move = np.zeros((GLOBAL, GLOBAL)), np.zeros(GLOBAL), np.zeros(GLOBAL)
     centre = np.zeros(3)
     for i in range(3):
@@ -395,7 +456,7 @@ def fitted(
     summed(info, right, rows, miss, error, free, whole, side)
     gain_here, step_here = gain.copy(), step.copy()
     surveyed, still = bar_sigma[:, 1:3].max() > 0, np.zeros(GLOBAL)
-    damping = 1e-4
+    damping, growth = 1e-4, 4.0
     for _ in range(steps):
         if not solved(whole, side, damping, move):
             return False, best, position, rotation, local, error
@@ -413,19 +474,26 @@ def fitted(
                 points, bar, bar_sigma, lens, lens_root, fault, felt, heading, known, white, huber,
                 there, turned, own, off, info, right, gain, step, cost, rows, miss, pixel,
             )  # fmt: skip
-        promise = 0.0
+        # What the damped step promises to win; what is a bar's own follows anyway.
+        promise = hoped = 0.0
         for i in range(GLOBAL):
             promise += side[i] * move[i]
+            hoped += move[i] * (side[i] + damping * whole[i, i] * move[i])
         if found <= best:
             won = best - found
             position, rotation, local, error, best = there, turned, own, off, found
             summed(info, right, rows, miss, error, free, whole, side)
             gain_here, step_here = gain.copy(), step.copy()
-            damping = max(damping / 10, 1e-12)
-            if won <= 1e-6 * (1 + found) and abs(promise) < 1e-5:
+            ratio = won / hoped if hoped > 0 else 1.0
+            damping = min(max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), 1e-12), 1e12)
+            growth = 4.0
+            # What misses so far is refused, wherever exactly it ends.
+            near = 1e-3 if found > 20 * len(points) else 1e-7
+            if won <= max(near, 1e-6) * (1 + found) and abs(promise) < near * (100 + found):
                 return True, best, position, rotation, local, error
         else:
-            damping *= 10
+            damping *= growth
+            growth *= 2
             if damping > 1e12 or abs(promise) < 1e-9:
                 # No step is an improvement any more: rounding decides.
                 return promise < 1e-3, best, position, rotation, local, error
@@ -451,39 +519,372 @@ def tested(
         (3, 3), and the covariance by which the position may have moved unnoticed, in units of the test
         value, (3, 3).
     """
-    m = len(side)
-    scale = np.zeros(m)
+    m, n = len(side), len(spread)
+    added, unseen = np.zeros((3, 3)), np.zeros((3, 3))
+    scale, values, axes = np.zeros(m), np.zeros(m), np.zeros((m, m))
+    left, basis = np.zeros((m, m)), np.zeros((m, m))
     for i in range(m):
         scale[i] = 1 / math.sqrt(information[i, i]) if information[i, i] > 0 else 0.0
-    values, axes = np.linalg.eigh(information * scale * scale.reshape(m, 1))
-    basis = np.zeros((m, m))
+    for i in range(m):
+        for j in range(m):
+            left[i, j] = information[i, j] * scale[i] * scale[j]
+    eigen(left, values, axes)
     rank = 0
     for i in range(m):
         if values[i] > 1e-9:
-            basis[:, rank] = scale * axes[:, i] / math.sqrt(values[i])
+            for j in range(m):
+                basis[j, rank] = scale[j] * axes[j, i] / math.sqrt(values[i])
             rank += 1
     if rank == 0:
-        return 0.0, 0, np.zeros((3, 3)), np.zeros((3, 3))
-    basis = np.ascontiguousarray(basis[:, :rank])
-    shared = np.ascontiguousarray(column) @ basis
-    seen = shared.T @ (spread @ shared)
-    left, turned = np.linalg.eigh(np.eye(rank) - (seen + seen.T) / 2)
-    turned = np.ascontiguousarray(turned)
-    along = turned.T @ (basis.T @ side)
-    value, freedom = 0.0, 0
+        return 0.0, 0, added, unseen
+    # In this basis the fault's own information is 1; what is left of it where the unknowns may follow.
+    shared, follow = np.zeros((n, rank)), np.zeros((n, rank))
+    for i in range(n):
+        for k in range(m):
+            for j in range(rank):
+                shared[i, j] += column[i, k] * basis[k, j]
+    for i in range(n):
+        for k in range(n):
+            for j in range(rank):
+                follow[i, j] += spread[i, k] * shared[k, j]
+    left, turn, share = np.zeros((rank, rank)), np.zeros((rank, rank)), np.zeros(rank)
     for i in range(rank):
-        if left[i] > least:
-            value += along[i] ** 2 / left[i]
+        left[i, i] = 1
+        for k in range(n):
+            for j in range(rank):
+                left[i, j] -= (shared[k, i] * follow[k, j] + shared[k, j] * follow[k, i]) / 2
+    eigen(left, share, turn)
+    turned, moved, along = np.zeros((m, rank)), np.zeros((3, rank)), np.zeros(rank)
+    for k in range(rank):
+        for j in range(rank):
+            for i in range(m):
+                turned[i, j] += basis[i, k] * turn[k, j]
+            for i in range(3):
+                moved[i, j] += follow[i, k] * turn[k, j]
+    value, freedom = 0.0, 0
+    for j in range(rank):
+        for i in range(m):
+            along[j] += turned[i, j] * side[i]
+        if share[j] > least:
+            value += along[j] ** 2 / share[j]
             freedom += 1
         else:
             # What is not tested may be of any size, or of as much as the bound allows.
-            left[i] = 1e-12
-    basis = basis @ turned
-    moved = np.ascontiguousarray(spread[:3]) @ (shared @ turned)
-    inverse = np.linalg.inv(np.diag(left) + basis.T @ (np.ascontiguousarray(bound) @ basis))
-    moves = moved @ inverse
-    unseen = moves * left @ np.ascontiguousarray(moves.T)
-    return value, freedom, moves @ np.ascontiguousarray(moved.T), unseen
+            share[j] = 1e-12
+    known, inverse = np.zeros((rank, rank)), np.zeros((rank, rank))
+    for i in range(rank):
+        for j in range(rank):
+            for k in range(m):
+                for p in range(m):
+                    known[i, j] += turned[k, i] * bound[k, p] * turned[p, j]
+        known[i, i] += share[i]
+    if not inverted(known, inverse):
+        return 0.0, 0, added + math.inf, unseen + math.inf
+    moves = np.zeros((3, rank))
+    for i in range(3):
+        for k in range(rank):
+            for j in range(rank):
+                moves[i, j] += moved[i, k] * inverse[k, j]
+    for i in range(3):
+        for j in range(3):
+            for k in range(rank):
+                added[i, j] += moves[i, k] * moved[j, k]
+                unseen[i, j] += moves[i, k] * share[k] * moves[j, k]
+    return value, freedom, added, unseen
+
+
+@njit(cache=True, nogil=True)
+def weighed(
+    points: Array, bar: Array, bar_sigma: Array, lens: Array, lens_root: Array, fault: float,
+    felt: Array, heading: float, known: int, white: Array, huber: float, free: Array, said: Array,
+    position: Array, rotation: Array, local: Array, error: Array, cost: float,
+    attitude_fault: float, limits: Array, least: float, most_sigma: float, flat: float, high: float,
+) -> tuple[Any, ...]:  # fmt: skip
+    """What a settled fit is worth: covariance and its causes, tests of each part, protection levels.
+
+    Args, beside those of `normal` and `fitted`: `said` (3, 4), what moves the angles as they are said, by its
+    sigmas; `attitude_fault`, radians; `limits` (7,) of a test by its degrees of freedom; `flat` and `high`,
+    sigmas to the risk, horizontal and vertical.
+
+    Returns:
+        Whether the equations are regular; sigma of the least certain direction, m; the larger of the ratios,
+        or of their inverses, of the true and the expected growth of the cost two sigmas away along it to both
+        sides, and of one and the square of how far the way there, an arc about the bars, is from that axis,
+        in sigmas - infinite, and then nothing after it is of use, where the sigma is above `most_sigma`;
+        covariance (14, 14); of each part - bars, focal length, attitude, heading as far as there are - the
+        test's value and its degrees of freedom, (parts,); horizontal and vertical protection level, m: for
+        each fault, how far the solution may have moved with the test just passed, and how far one that does
+        without the part may be off at the risk; the covariance's causes: noise and slow, (3, 3), moves by the
+        camera (3, 7), by the attitude (3, 4) and by what is each bar's (bars, 3, 7).
+    """
+    bars = len(bar_sigma)
+    info, right, bar_cost = np.zeros((bars, GLOBAL, GLOBAL)), np.zeros((bars, GLOBAL)), np.zeros(bars)
+    gain, step = np.zeros((bars, LOCAL, GLOBAL)), np.zeros((bars, LOCAL))
+    rows, miss, pixel = np.zeros((3, GLOBAL)), np.zeros(3), np.zeros((bars, GLOBAL, GLOBAL))
+    whole, side, spread = np.zeros((GLOBAL, GLOBAL)), np.zeros(GLOBAL), np.zeros((GLOBAL, GLOBAL))
+    noise, slow = np.zeros((3, 3)), np.zeros((3, 3))
+    by_camera, by_attitude, by_bar = np.zeros((3, 7)), np.zeros((3, 4)), np.zeros((bars, 3, 7))
+    turns = free[3] or free[4] or free[5]
+    parts = bars + 1
+    if known > 0 and turns:
+        parts += 2 if known == 3 else 1
+    values, freedom = np.zeros(parts), np.zeros(parts, np.int64)
+    wide, bent, hpl, vpl = 0.0, math.inf, math.inf, math.inf
+    normal(
+        points, bar, bar_sigma, lens, lens_root, fault, felt, heading, known, white, huber,
+        position, rotation, local, error, info, right, gain, step, bar_cost, rows, miss, pixel,
+    )  # fmt: skip
+    summed(info, right, rows, miss, error, free, whole, side)
+    regular = inverted(whole, spread)
+    for i in range(GLOBAL):
+        if not free[i]:
+            for j in range(GLOBAL):
+                spread[i, j] = spread[j, i] = 0
+    if regular:
+        size, axes = np.zeros(3), np.zeros((3, 3))
+        eigen(spread[:3, :3].copy(), size, axes)
+        most = 0
+        for i in range(3):
+            most = i if size[i] > size[most] else most
+        wide = math.sqrt(max(size[most], 0.0))
+    if regular and wide <= most_sigma:
+        spare = info.copy(), right.copy(), gain.copy(), step.copy(), bar_cost.copy(), rows.copy(), miss.copy()
+        move, still, centre = np.zeros(GLOBAL), np.zeros(GLOBAL), np.zeros(3)
+        for i in range(3):
+            centre[i] = points[:, i].mean()
+        bent = 1.0
+        for way in (-2 / wide, 2 / wide):
+            for i in range(GLOBAL):
+                move[i] = 0
+                for j in range(3):
+                    move[i] += way * spread[i, j] * axes[j, most]
+            there, turned, own, off = stepped(move, gain, step, centre, position, rotation, local, error)
+            for again in range(2):
+                found = normal(
+                    points, bar, bar_sigma, lens, lens_root, fault, felt, heading, known, white, huber,
+                    there, turned, own, off, spare[0], spare[1], spare[2], spare[3], spare[4], spare[5],
+                    spare[6], pixel[:0],
+                )  # fmt: skip
+                if again or not found - cost > 12:
+                    break
+                # Errors of sites take up what is left of second order.
+                there, turned, own, off = stepped(still, spare[2], spare[3], centre, there, turned, own, off)
+            growth = 1e-9 if math.isnan(found) else max((found - cost) / 4, 1e-9)
+            square = 0.0
+            for i in range(3):
+                along = 0.0
+                for j in range(3):
+                    along += axes[j, i] * (there[j] - position[j] - move[j])
+                square += along**2 / max(size[i], 1e-15 * size[most])
+            bent = max(bent, growth, 1 / growth, 1 + square)
+        hpl = flat * _widest(spread)
+        vpl = high * math.sqrt(max(spread[2, 2], 0.0))
+        none = np.zeros((6, 6))
+        columns = np.zeros((GLOBAL, 6))
+        for part in range(parts):
+            columns[:] = 0
+            if part < bars:
+                for i in range(GLOBAL):
+                    for j in range(6):
+                        columns[i, j] = info[part, i, j] if free[i] else 0.0
+                value, freed, added, unseen = tested(
+                    info[part, :6, :6].copy(), columns, right[part, :6].copy(), spread, none, least
+                )
+            elif part == bars:
+                own, mean = np.zeros((1, 1)), np.zeros(1)
+                for b in range(bars):
+                    mean[0] += right[b, FAULT]
+                    own[0, 0] += info[b, FAULT, FAULT]
+                    for i in range(GLOBAL):
+                        columns[i, 0] += info[b, i, FAULT] if free[i] else 0.0
+                value, freed, added, unseen = tested(
+                    own, columns[:, :1].copy(), mean, spread, np.ones((1, 1)), least
+                )
+            else:
+                first = 2 if part == bars + 2 else 0
+                bound = _attitude_bound(white, known, attitude_fault)
+                for i in range(GLOBAL):
+                    for j in range(first, known):
+                        columns[i, j - first] = rows[j, i] if free[i] else 0.0
+                value, freed, added, unseen = tested(
+                    np.eye(known - first),
+                    columns[:, : known - first].copy(),
+                    miss[first:known].copy(),
+                    spread,
+                    bound[first:, first:].copy(),
+                    least,
+                )
+            values[part], freedom[part] = value, freed
+            if part < bars + 2:
+                limit = limits[freed]
+                for i in range(3):
+                    for j in range(3):
+                        added[i, j] += spread[i, j]
+                hpl = max(hpl, math.sqrt(limit) * _widest(unseen) + flat * _widest(added))
+                vpl = max(
+                    vpl,
+                    math.sqrt(limit * max(unseen[2, 2], 0.0)) + high * math.sqrt(max(added[2, 2], 0.0)),
+                )
+        for i in range(3):
+            for j in range(7):
+                by_camera[i, j] = -spread[i, LENS + j]
+            for a in range(known):
+                value = 0.0
+                for j in range(GLOBAL):
+                    value += spread[i, j] * rows[a, j]
+                for j in range(4):
+                    by_attitude[i, j] += value * said[a, j]
+            for b in range(bars):
+                for k in range(7):
+                    for j in range(GLOBAL):
+                        by_bar[b, i, k] += spread[i, j] * gain[b, k + 2, j]
+        for b in range(bars):
+            by_pixel = np.zeros((3, GLOBAL))
+            for i in range(3):
+                for k in range(GLOBAL):
+                    for j in range(GLOBAL):
+                        by_pixel[i, j] += spread[i, k] * pixel[b, k, j]
+            for i in range(3):
+                for j in range(3):
+                    for k in range(GLOBAL):
+                        slow[i, j] += by_pixel[i, k] * spread[j, k]
+        rest = np.zeros((3, 3))
+        for i in range(3):
+            for j in range(3):
+                rest[i, j] = spread[i, j] - (slow[i, j] + slow[j, i]) / 2
+                for k in range(7):
+                    rest[i, j] -= by_camera[i, k] * by_camera[j, k]
+                    for b in range(bars):
+                        rest[i, j] -= by_bar[b, i, k] * by_bar[b, j, k]
+                for k in range(4):
+                    rest[i, j] -= by_attitude[i, k] * by_attitude[j, k]
+        # What Huber's weights leave of the points' share may be less than nothing.
+        eigen(rest, size, axes)
+        for i in range(3):
+            for j in range(3):
+                for k in range(3):
+                    noise[i, j] += axes[i, k] * max(size[k], 1e-12) * axes[j, k]
+    return regular, wide, bent, spread, values, freedom, hpl, vpl, noise, slow, by_camera, by_attitude, by_bar
+
+
+@njit(cache=True, nogil=True)
+def _widest(covariance: Array) -> float:
+    """Sigma of the horizontal direction that is the least certain."""
+    a, b, c = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    return math.sqrt(max((a + c) / 2 + math.hypot((a - c) / 2, b), 0.0))
+
+
+@njit(cache=True, nogil=True)
+def _attitude_bound(white: Array, known: int, fault: float) -> Array:
+    """Inverse covariance of the attitude's fault, as whitened, (known, known)."""
+    covariance, out = np.zeros((known, known)), np.zeros((known, known))
+    for i in range(known):
+        for j in range(known):
+            for k in range(known):
+                covariance[i, j] += fault**2 * white[i, k] * white[j, k]
+    inverted(covariance, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def whole(points_px: Array, sigma_px: Array, width: int, height: int, out: Array) -> int:
+    """Which clusters of a bar count, `out` (K,), and how many: seen, with a sigma, and not cut off.
+
+    Of a cluster that touches the image's edge only a part is seen. It is as long as the spacing of
+    neighbours; three quarters of that and a pixel of blur must be free.
+    """
+    first = last = -1
+    for i in range(len(points_px)):
+        if math.isfinite(points_px[i, 0]):
+            first = i if first < 0 else first
+            last = i
+    edge = 0.5
+    if last > first:
+        dx, dy = points_px[last, 0] - points_px[first, 0], points_px[last, 1] - points_px[first, 1]
+        edge += 0.75 * math.hypot(dx, dy) / (last - first)
+    number = 0
+    for i in range(len(points_px)):
+        x, y = points_px[i, 0], points_px[i, 1]
+        inside = x >= edge and y >= edge and x <= width - 1 - edge and y <= height - 1 - edge
+        out[i] = inside and sigma_px[i] > 0 and sigma_px[i] < math.inf
+        number += out[i]
+    return number
+
+
+@njit(cache=True, nogil=True)
+def gathered(
+    enu_m: Array, points_px: Array, sigma_px: Array, seen: Array, pixel_sigma: float, number: int,
+    points: Array, bar: Array,
+) -> None:  # fmt: skip
+    """A bar's clusters that are `seen` (K,) as rows of a `Problem`: `points` (n, 10) and `bar` (n,)."""
+    count = len(enu_m)
+    x = y = z = 0.0
+    for i in range(count):
+        x, y, z = x + enu_m[i, 0] / count, y + enu_m[i, 1] / count, z + enu_m[i, 2] / count
+    at = 0
+    for i in range(count):
+        if seen[i]:
+            points[at, 0], points[at, 1], points[at, 2] = enu_m[i, 0], enu_m[i, 1], enu_m[i, 2]
+            # From the whole bar's centre: errors of its attitude turn it about that, whatever is seen of it.
+            points[at, 3], points[at, 4], points[at, 5] = enu_m[i, 0] - x, enu_m[i, 1] - y, enu_m[i, 2] - z
+            points[at, 6], points[at, 7] = points_px[i, 0], points_px[i, 1]
+            points[at, 8] = 1 / sigma_px[i]
+            points[at, 9] = min((pixel_sigma / sigma_px[i]) ** 2, 1.0)
+            bar[at] = number
+            at += 1
+
+
+@njit(cache=True, nogil=True)
+def whitening(causes: Array, least: float, out: Array) -> None:
+    """What makes errors independent and of sigma 1: the inverse of the lower root, `out` (3, 3).
+
+    Their covariance is that of `causes` (3, k) and `least`, a variance, on the diagonal.
+    """
+    low = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            value = least if i == j else 0.0
+            for k in range(causes.shape[1]):
+                value += causes[i, k] * causes[j, k]
+            for k in range(j):
+                value -= low[i, k] * low[j, k]
+            low[i, j] = math.sqrt(value) if i == j else value / low[j, j]
+    for j in range(3):
+        for i in range(3):
+            value = 1.0 if i == j else 0.0
+            for k in range(i):
+                value -= low[i, k] * out[k, j]
+            out[i, j] = value / low[i, i]
+
+
+@njit(cache=True, nogil=True)
+def halves(points: Array, bar: Array, sights: Array, enu: Array, mean: Array) -> int:
+    """Mean places and sights of the halves of each bar, `enu` and `mean` (2 bars, 3), and how many.
+
+    `sights` (n, 3); NaN where there is none.
+    """
+    rows, at, found = np.zeros(len(bar), np.int64), 0, 0
+    while at < len(bar):
+        number, count = bar[at], 0
+        while at < len(bar) and bar[at] == number:
+            if math.isfinite(sights[at, 0]):
+                rows[count] = at
+                count += 1
+            at += 1
+        for half in range(2):
+            begin, end = (0, count // 2) if half == 0 else (count // 2, count)
+            if begin == end:
+                continue
+            for j in range(3):
+                enu[found, j] = mean[found, j] = 0
+                for i in range(begin, end):
+                    enu[found, j] += points[rows[i], j] / (end - begin)
+                    mean[found, j] += sights[rows[i], j]
+            size = math.sqrt(mean[found, 0] ** 2 + mean[found, 1] ** 2 + mean[found, 2] ** 2)
+            for j in range(3):
+                mean[found, j] /= size
+            found += 1
+    return found
 
 
 @njit(cache=True, nogil=True)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place import _kernels
 from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -116,13 +117,11 @@ class Problem:
         """What the views give, or why that is too little for a position."""
         kept, most = [], 0
         for view in views:
-            with np.errstate(invalid="ignore"):
-                seen = (view.sigma_px > 0) & (view.sigma_px < np.inf)
-            seen &= _whole(view.points_px, camera)
-            number = int(seen.sum())
+            seen = np.zeros(len(view.sigma_px), np.bool_)
+            number = _kernels.whole(view.points_px, view.sigma_px, camera.width, camera.height, seen)
             most = max(most, number)
             if number >= spec.min_points:
-                kept.append((view, seen))
+                kept.append((view, seen, number))
         if not kept:
             return Refusal(
                 "too-few-clusters", f"{most} whole clusters of a bar seen, {spec.min_points} needed"
@@ -131,23 +130,18 @@ class Problem:
         if not compass and len(kept) == 1:
             return Refusal("heading-unknown", "one bar gives a position only with the camera's heading known")
         if attitude is None:
-            centres = np.array([v.enu_m[s].mean(0) for v, s in kept])
+            centres = np.array([v.enu_m[s].mean(0) for v, s, _ in kept])
             extent = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
             if len(kept) < 3 or extent[1] < _INLINE * extent[0]:
                 many = "two bars give" if len(kept) == 2 else "bars in line give"
                 return Refusal("gravity-unknown", f"{many} a position only with gravity known")
-        points = np.empty((sum(int(s.sum()) for _, s in kept), 10))
+        points = np.empty((sum(number for *_, number in kept), 10))
         bar = np.empty(len(points), np.int64)
         at = 0
-        for i, (view, seen) in enumerate(kept):
-            rows = slice(at, at + int(seen.sum()))
-            points[rows, :3] = view.enu_m[seen]
-            # The whole bar's centre: errors of its attitude turn it about that, whatever is seen of it.
-            points[rows, 3:6] = points[rows, :3] - view.enu_m.sum(0) / len(view.enu_m)
-            points[rows, 6:8] = view.points_px[seen]
-            points[rows, 8] = 1 / view.sigma_px[seen]
-            points[rows, 9] = np.minimum((spec.pixel_sigma_px * points[rows, 8]) ** 2, 1.0)
-            bar[rows] = i
+        for i, (view, seen, number) in enumerate(kept):
+            rows = slice(at, at + number)
+            given = view.enu_m, view.points_px, view.sigma_px, seen, spec.pixel_sigma_px
+            _kernels.gathered(*given, i, points[rows], bar[rows])
             at = rows.stop
         felt, angles, white = np.zeros(3), 0, np.eye(3)
         free = np.ones(14, np.bool_)
@@ -157,7 +151,7 @@ class Problem:
         if attitude is not None:
             felt, angles = attitude.rotation()[2].copy(), 3 if compass else 2
             heading = math.radians(attitude.heading_deg or 0.0)
-            white[:angles, :angles] = _whitening(attitude)[:angles, :angles]
+            white = _whitening(attitude, angles)
             if attitude.gravity_sigma_deg == attitude.white_sigma_deg == attitude.time_sigma_us == 0:
                 free[3:5] = False
                 free[5] = not compass or attitude.heading_sigma_deg > 0
@@ -167,8 +161,8 @@ class Problem:
             spec,
             points,
             bar,
-            np.array([shared_sigmas(view, seen, spec) for view, seen in kept]),
-            tuple(v.transmitter for v, _ in kept),
+            np.array([shared_sigmas(view, seen, spec) for view, seen, _ in kept]),
+            tuple(view.transmitter for view, *_ in kept),
             np.array(
                 [camera.focal_px, *camera.centre_px, camera.k1, camera.k2, camera.p1, camera.p2, camera.k3]
             ),
@@ -203,25 +197,11 @@ def shared_sigmas(view: BarView, seen: NDArray[np.bool_], spec: PositionSpec) ->
     return shift, place, turn, math.hypot(length, spec.stretch_share)
 
 
-def _whitening(attitude: Attitude) -> Floats:
+def _whitening(attitude: Attitude, angles: int) -> Floats:
     """What makes errors of pitch, roll and heading independent and of sigma 1, float64 (3, 3)."""
-    causes = attitude.standing()
+    white = np.zeros((3, 3))
     least = math.radians(attitude.white_sigma_deg) ** 2 + EXACT_RAD**2
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(causes @ causes.T + least * np.eye(3))))
-
-
-def _whole(points_px: Floats, camera: CameraModel) -> NDArray[np.bool_]:
-    """Which clusters do not touch the image's edge: of one that is cut off, only a part is seen.
-
-    A cluster is as long as the spacing of neighbours; three quarters of it and a pixel of blur must be free.
-    """
-    x, y = points_px.T
-    seen = np.flatnonzero(np.isfinite(x))
-    gap = 0.0
-    if len(seen) > 1:
-        first, last = seen[0], seen[-1]
-        gap = math.hypot(x[last] - x[first], y[last] - y[first]) / float(last - first)
-    edge = 0.75 * gap + 0.5
-    return np.asarray(
-        (x >= edge) & (y >= edge) & (x <= camera.width - 1 - edge) & (y <= camera.height - 1 - edge)
-    )
+    _kernels.whitening(attitude.standing(), least, white)
+    if angles < 3:
+        white[2] = (0.0, 0.0, 1.0)
+    return white

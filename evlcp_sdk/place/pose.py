@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from evlcp_sdk.link.sections import PositionSpec
-from evlcp_sdk.place.fit import fit_pose
-from evlcp_sdk.place.judgement import FOCAL, Judged, Pose, judged
+from evlcp_sdk.place.fit import STEPS, Fit, fit_pose
+from evlcp_sdk.place.judgement import FOCAL, Judged, Pose, judged, misfits
 from evlcp_sdk.place.observations import BarView, Problem
 from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.place.starts import closed_form_starts
@@ -28,6 +28,15 @@ _ODDS = 18.4
 
 _APART_SIGMAS = 6.0
 """Solutions nearer to each other, in sigmas of the position, are one."""
+
+_OTHER_STEPS = 15
+"""Steps of a fit from another start, once there is one that the tests let pass."""
+
+_HOPELESS = 0.02
+"""Share of the largest test value below which a part explains nothing of a misfit."""
+
+_FAR = 1e3
+"""Test value above which that is so, whatever is not linear: beyond 30 sigmas."""
 
 _FREE_FOCAL = 0.02
 """Sigma of a focal length that is other than said, as a share: what is left to be known of it."""
@@ -70,7 +79,10 @@ def solve_pose(
         doubt, tests = found.detail, {}
     fits: list[tuple[str, Pose]] = []
     unsure = []
+    most = max(tests.values(), default=0.0)
     for name, fewer, other, looser in _without(views, camera, attitude, sigma):
+        if tests.get(name, most) < _HOPELESS * most and most > _FAR:
+            continue
         again = _plain(fewer, camera, other, spec, looser)
         if isinstance(again, Judged) and not again.doubt:
             fits.append((name, again.pose))
@@ -121,7 +133,14 @@ def _plain(
     starts = closed_form_starts(problem)
     if not starts:
         return Refusal("not-determined", "no place from which the bars would be seen so")
-    fits = [fit for start in starts if (fit := fit_pose(problem, *start)) is not None]
+    fits: list[Fit] = []
+    enough = False
+    for start in starts:
+        # Where one start has led to a fit that explains everything, a second solution is one that is near.
+        fit = fit_pose(problem, *start, _OTHER_STEPS if enough else STEPS)
+        if fit is not None:
+            fits.append(fit)
+            enough = enough or not misfits(problem, fit)
     if not fits:
         return Refusal("not-determined", "the fit does not settle: the bars do not determine a position")
     best = min(fits, key=lambda fit: fit.cost)

@@ -23,14 +23,16 @@ _HEADINGS[:, 2, 2] = 1
 
 
 def closed_form_starts(problem: Problem) -> list[tuple[Floats, Floats]]:
-    """Pairs of position, m, float64 (3,), and camera axes as columns in ENU, float64 (3, 3), to fit from."""
+    """Pairs of position, m, float64 (3,), and camera axes as columns in ENU, float64 (3, 3), to fit from.
+
+    The likeliest comes first.
+    """
     sights = problem.sights()
-    good = np.isfinite(sights[:, 0])
-    if good.sum() < 3:
+    if np.isfinite(sights[:, 0]).sum() < 3:
         return []
     if problem.attitude is None:
         return _three_point_starts(problem, sights)
-    enu, mean = _halves(problem, sights, good)
+    enu, mean = _halves(problem, sights)
     known = problem.attitude.rotation()
     if problem.angles == 3:
         positions, costs = _nearest_to_sights(enu, mean, known[None])
@@ -43,18 +45,12 @@ def closed_form_starts(problem: Problem) -> list[tuple[Floats, Floats]]:
     return [(positions[i], rotations[i]) for i in order]
 
 
-def _halves(problem: Problem, sights: Floats, good: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def _halves(problem: Problem, sights: Floats) -> tuple[Floats, Floats]:
     """Mean places and sights of the halves of each bar: what a start needs of its points."""
-    enu, mean = [], []
-    for b in range(len(problem.transmitters)):
-        rows = np.flatnonzero((problem.bar == b) & good)
-        half = len(rows) // 2
-        for part in (rows[:half], rows[half:]):
-            if len(part):
-                enu.append(problem.points[part, :3].sum(0) / len(part))
-                mean.append(sights[part].sum(0))
-    found = np.array(mean)
-    return np.array(enu), found / np.sqrt((found * found).sum(1))[:, None]
+    bars = len(problem.transmitters)
+    enu, mean = np.empty((2 * bars, 3)), np.empty((2 * bars, 3))
+    found = _kernels.halves(problem.points, problem.bar, sights, enu, mean)
+    return enu[:found], mean[:found]
 
 
 def _nearest_to_sights(enu_m: Floats, sights: Floats, rotations: Floats) -> tuple[Floats, Floats]:
@@ -68,7 +64,7 @@ def _three_point_starts(problem: Problem, sights: Floats) -> list[tuple[Floats, 
     """Grunert's solutions for the three bars that span the largest triangle."""
     centres, seen = problem.centres_m(), []
     for i in range(len(centres)):
-        mean = np.nanmean(sights[problem.bar == i], 0)
+        mean = np.nansum(sights[problem.bar == i], 0)
         seen.append(mean / np.linalg.norm(mean))
 
     def area(three: list[int]) -> float:
@@ -76,7 +72,14 @@ def _three_point_starts(problem: Problem, sights: Floats) -> list[tuple[Floats, 
         return float(np.linalg.norm(np.cross(b - a, c - a)))
 
     three = max((list(c) for c in combinations(range(len(centres)), 3)), key=area)
-    return three_point_poses(centres[three], np.array(seen)[three])
+    found = three_point_poses(centres[three], np.array(seen)[three])
+    return sorted(found, key=lambda start: _off(problem, sights, *start))
+
+
+def _off(problem: Problem, sights: Floats, position: Floats, rotation: Floats) -> float:
+    """By how much the points are away from where they are seen: the sum of 1 - cosine of the angles."""
+    away = (problem.points[:, :3] - position) @ rotation
+    return -float(np.nansum((away * sights).sum(1) / np.sqrt((away * away).sum(1))))
 
 
 def three_point_poses(enu_m: Floats, sights: Floats) -> list[tuple[Floats, Floats]]:
@@ -105,7 +108,9 @@ def three_point_poses(enu_m: Floats, sights: Floats) -> list[tuple[Floats, Float
         (1 + q) ** 2 - 4 * a2 / b2 * cg**2,
     ]  # fmt: skip
     found = []
-    for v in np.roots(quartic).real:
+    roots = np.roots(quartic)
+    # Of a conjugate pair, the real part counts once.
+    for v in roots[roots.imag >= 0].real:
         bottom = 2 * (cg - v * ca)
         if v <= 0 or abs(bottom) < 1e-15:
             continue

@@ -63,11 +63,9 @@ class Attitude:
 
         The causes are the bias of each, and the offset in time; all in their own sigmas.
         """
-        causes = np.zeros((3, 4))
-        bias = (self.gravity_sigma_deg, self.gravity_sigma_deg, self.heading_sigma_deg)
-        causes[:, :3] = np.diag(np.radians(bias))
-        causes[:, 3] = np.radians(self.rate_deg_s) * self.time_sigma_us * 1e-6
-        return causes
+        tilt, turn = math.radians(self.gravity_sigma_deg), math.radians(self.heading_sigma_deg)
+        pitch, roll, heading = (math.radians(v) * self.time_sigma_us * 1e-6 for v in self.rate_deg_s)
+        return np.array([[tilt, 0.0, 0.0, pitch], [0.0, tilt, 0.0, roll], [0.0, 0.0, turn, heading]])
 
     def rotation(self) -> NDArray[np.float64]:
         """Camera axes (x right, y down, z forward) as columns in ENU, float64 (3, 3); north if unknown."""

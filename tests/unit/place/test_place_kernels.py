@@ -2,16 +2,19 @@
 
 import dataclasses
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.optimize import approx_fprime, least_squares
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place import _kernels
-from evlcp_sdk.place.fit import FOCAL_FAULT, Fit, fit_pose, moved, normal_equations
+from evlcp_sdk.place.fit import FOCAL_FAULT, Fit, data, fit_pose
+from evlcp_sdk.place.judgement import Judged, judged
 from evlcp_sdk.place.observations import BarView, Problem, project_bars
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
@@ -40,6 +43,52 @@ def problem(rng: np.random.Generator, bars: int = 2, noise: float = 3.0) -> tupl
     found = Problem.of(views, BENT, attitude, SPEC, LENS)
     assert isinstance(found, Problem)
     return found, position, rotation
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Normal equations at a point: see `_kernels.normal` for its arrays.
+
+    Attributes:
+        cost: Twice the robust cost; NaN where a point is behind the camera.
+        bar_cost: Of each bar, least over its own unknowns, float64 (bars,).
+        whole: The sum over everything, float64 (14, 14).
+        side: Its right-hand side, float64 (14,).
+    """
+
+    cost: float
+    info: Floats
+    right: Floats
+    gain: Floats
+    step: Floats
+    bar_cost: Floats
+    rows: Floats
+    miss: Floats
+    pixel: Floats
+    whole: Floats
+    side: Floats
+
+
+def normal_equations(problem: Problem, at: Fit) -> Normal:
+    """Normal equations at a point."""
+    bars, wide, own = len(problem.transmitters), _kernels.GLOBAL, _kernels.LOCAL
+    info, right, cost = np.zeros((bars, wide, wide)), np.zeros((bars, wide)), np.zeros(bars)
+    gain, step, pixel = np.zeros((bars, own, wide)), np.zeros((bars, own)), np.zeros((bars, wide, wide))
+    rows, miss = np.zeros((3, wide)), np.zeros(3)
+    point = (at.position, at.rotation, at.local, at.lens)
+    found = (info, right, gain, step, cost, rows, miss, pixel)
+    total = _kernels.normal(*data(problem), *point, *found)  # type: ignore[call-arg]
+    whole, side = np.zeros((wide, wide)), np.zeros(wide)
+    if not np.isnan(total):
+        _kernels.summed(info, right, rows, miss, at.lens, problem.free, whole, side)
+    return Normal(total, info, right, gain, step, cost, rows, miss, pixel, whole, side)
+
+
+def moved(problem: Problem, at: Fit, normal: Normal, move: Floats) -> Fit:
+    """A point with its unknowns moved by (14,), about the bars; what is a bar's own follows."""
+    point = (at.position, at.rotation, at.local, at.lens)
+    centre = problem.points[:, :3].mean(0)
+    return Fit(*_kernels.stepped(move, normal.gain, normal.step, centre, *point), np.nan)
 
 
 def misses(p: Problem, at: Fit, change: Floats) -> Floats:
@@ -247,3 +296,117 @@ def test_equations_that_are_singular_are_not_solved() -> None:
     assert not _kernels.solved(whole, np.ones(14), 0.0, move)
     whole[:2, :2] = 1
     assert not _kernels.solved(whole, np.ones(14), 0.0, move)
+
+
+def test_jacobis_turns_give_the_axes_of_numpy() -> None:
+    rng = np.random.default_rng(7)
+    for n in (1, 2, 3, 6):
+        root = rng.normal(size=(n, n)) * 10.0 ** rng.uniform(-4, 4, n)
+        matrix = root @ root.T
+        values, axes = np.zeros(n), np.zeros((n, n))
+        _kernels.eigen(matrix.copy(), values, axes)
+        largest = np.linalg.eigvalsh(matrix)[-1]
+        np.testing.assert_allclose(np.sort(values), np.linalg.eigvalsh(matrix), atol=1e-13 * largest)
+        np.testing.assert_allclose(axes @ axes.T, np.eye(n), atol=1e-13)
+        np.testing.assert_allclose((axes * values) @ axes.T, matrix, atol=1e-13 * largest)
+
+
+def test_inverses_are_those_of_numpy() -> None:
+    root, out = np.random.default_rng(8).normal(size=(14, 14)), np.zeros((14, 14))
+    matrix = root @ root.T
+    assert _kernels.inverted(matrix, out)
+    np.testing.assert_allclose(out, np.linalg.inv(matrix), rtol=1e-7, atol=1e-9)
+    assert not _kernels.inverted(np.ones((2, 2)), out[:2, :2].copy())
+
+
+def test_what_whitens_is_the_inverse_of_the_root() -> None:
+    causes, out = np.random.default_rng(9).normal(size=(3, 4)), np.zeros((3, 3))
+    _kernels.whitening(causes, 0.1, out)
+    want = np.linalg.inv(np.linalg.cholesky(causes @ causes.T + 0.1 * np.eye(3)))
+    np.testing.assert_allclose(out, want, atol=1e-12)
+
+
+def test_clusters_that_count_and_their_rows() -> None:
+    """12 px apart: beside an edge, three quarters of that and half a pixel must be free."""
+    rng = np.random.default_rng(10)
+    enu, sigma = rng.normal(size=(8, 3)), rng.uniform(0.04, 0.2, 8)
+    points = np.stack([np.full(8, 100.0), 9.0 + 12 * np.arange(8)], 1)
+    points[3], sigma[4], sigma[5] = np.nan, 0.0, np.inf
+    points[6, 0] = 9.4
+    seen = np.zeros(8, np.bool_)
+    assert _kernels.whole(points, sigma, 1280, 720, seen) == 3
+    assert seen.nonzero()[0].tolist() == [1, 2, 7]
+    out, bar = np.zeros((3, 10)), np.zeros(3, np.int64)
+    _kernels.gathered(enu, points, sigma, seen, 0.05, 4, out, bar)
+    arm, sharp = enu - enu.mean(0), 1 / sigma[seen]
+    want = np.column_stack([enu[seen], arm[seen], points[seen], sharp, np.minimum((0.05 * sharp) ** 2, 1)])
+    np.testing.assert_allclose(out, want)
+    assert (bar == 4).all()
+
+
+def test_halves_of_bars() -> None:
+    rng = np.random.default_rng(11)
+    points, sights = rng.normal(size=(11, 10)), rng.normal(size=(11, 3))
+    bar = np.repeat([0, 1, 2], [6, 4, 1])
+    sights[2] = np.nan
+    enu, mean = np.zeros((6, 3)), np.zeros((6, 3))
+    assert _kernels.halves(points, bar, sights, enu, mean) == 5
+    for i, rows in enumerate(([0, 1], [3, 4, 5], [6, 7], [8, 9], [10])):
+        np.testing.assert_allclose(enu[i], points[rows, :3].mean(0))
+        total = sights[rows].sum(0)
+        np.testing.assert_allclose(mean[i], total / np.linalg.norm(total))
+
+
+@pytest.mark.parametrize("bars", [2, 3])
+def test_a_fit_is_judged_as_by_numpy(bars: int) -> None:
+    """Covariance, causes, tests of each part and protection levels, written out anew."""
+    p, position, rotation = problem(np.random.default_rng(12), bars, noise=1.0)
+    fit = fit_pose(p, position, rotation)
+    assert fit is not None
+    found = judged(p, fit)
+    assert isinstance(found, Judged)
+    normal, pose = normal_equations(p, fit), found.pose
+    free = np.flatnonzero(p.free)
+    spread = np.zeros((14, 14))
+    spread[np.ix_(free, free)] = np.linalg.inv(normal.whole[np.ix_(free, free)])
+    np.testing.assert_allclose(pose.covariance, spread[:6, :6], rtol=1e-6, atol=1e-12)
+    slow = spread[:3] @ normal.pixel.sum(0) @ spread[:3].T
+    np.testing.assert_allclose(pose.slow, slow, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(pose.standing["camera"], -spread[:3, 7:], rtol=1e-6, atol=1e-9)
+    assert p.attitude is not None
+    angles = spread[:3] @ normal.rows.T @ p.white @ p.attitude.standing()
+    np.testing.assert_allclose(pose.standing["attitude"], angles, rtol=1e-6, atol=1e-9)
+    for b in range(bars):
+        moves = spread[:3] @ normal.gain[b, 2:].T
+        np.testing.assert_allclose(pose.standing[f"bar {b}"], moves, rtol=1e-6, atol=1e-9)
+    rest = spread[:3, :3] - slow - sum(m @ m.T for m in pose.standing.values())
+    values, axes = np.linalg.eigh((rest + rest.T) / 2)
+    np.testing.assert_allclose(pose.noise, (axes * np.maximum(values, 1e-12)) @ axes.T, atol=1e-11)
+
+    focal = normal.info.sum(0)[:, [6]]
+    bound = np.linalg.inv(math.radians(1.0) ** 2 * p.white @ p.white.T)
+    parts = {
+        f"bar {b}": (normal.info[b, :6, :6], normal.info[b, :, :6], normal.right[b, :6], np.zeros((6, 6)))
+        for b in range(bars)
+    }
+    parts["focal length"] = focal[6:7], focal, normal.right.sum(0)[6:7], np.eye(1)
+    parts["attitude"] = np.eye(3), normal.rows.T, normal.miss, bound
+    parts["heading"] = np.eye(1), normal.rows[2:].T, normal.miss[2:], bound[2:, 2:]
+    levels = [(0.0, np.zeros((3, 3)), np.zeros((3, 3)))]
+    for name, (own, column, side, prior) in parts.items():
+        column = np.where(p.free[:, None], column, 0)
+        value, freed, added, unseen = _kernels.tested(own, column, side, spread, prior, 1e-4)
+        assert found.tests[name] == pytest.approx(value, rel=1e-6)
+        if name != "heading":
+            levels.append((stats.chi2.isf(SPEC.false_alarm / 2 / len(parts), freed), added, unseen))
+
+    def level(limit: float, added: Floats, unseen: Floats, axis: slice) -> float:
+        moved_m = limit * np.linalg.eigvalsh(unseen[axis, axis])[-1]
+        off_m = stats.chi2.isf(SPEC.risk, axis.stop - axis.start)
+        return math.sqrt(moved_m) + math.sqrt(
+            off_m * np.linalg.eigvalsh((spread[:3, :3] + added)[axis, axis])[-1]
+        )
+
+    for given, axis in ((pose.hpl_m, slice(0, 2)), (pose.vpl_m, slice(2, 3))):
+        want = max(level(*each, axis) for each in levels)
+        assert given == pytest.approx(want, rel=1e-6) or (math.isinf(given) and want > SPEC.max_protection_m)
