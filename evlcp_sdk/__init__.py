@@ -69,6 +69,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.scene.sites import BarSite, load_sites
     from evlcp_sdk.simulated import SimulatedSource, simulate
     from evlcp_sdk.values import (
+        Alternative,
         Bend,
         Events,
         Fix,
@@ -86,6 +87,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Algorithm",
+    "Alternative",
     "Attitude",
     "AttitudeLog",
     "BarLayout",
@@ -223,6 +225,7 @@ _HOMES = {
     "scene.sites": ("BarSite", "load_sites"),
     "simulated": ("SimulatedSource", "simulate"),
     "values": (
+        "Alternative",
         "Bend",
         "Events",
         "Fix",

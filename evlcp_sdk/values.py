@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import pyarrow
 
 __all__ = [
+    "Alternative",
     "Bend",
     "Events",
     "Fix",
@@ -484,6 +485,34 @@ class Packet:
 
 
 @dataclass(frozen=True, eq=False)
+class Alternative:
+    """One of the poses that fit where a fix is refused, as more than one does.
+
+    Attributes:
+        latitude_deg: WGS-84.
+        longitude_deg: The same.
+        height_m: Above the ellipsoid, m.
+        enu_m: The same place in the local axes, m, float64 (3,).
+        covariance_m2: Of `enu_m`, if this is the right one, float64 (3, 3); NaN where an ellipse does not
+            describe its error.
+        heading_deg: Where the optical axis points to, clockwise from north.
+        pitch_deg: How far it points above the horizon.
+        roll_deg: How far the camera's top leans to its right.
+        likelihood: How likely the image is from here, against the likeliest.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    enu_m: NDArray[np.float64]
+    covariance_m2: NDArray[np.float64]
+    heading_deg: float
+    pitch_deg: float
+    roll_deg: float
+    likelihood: float
+
+
+@dataclass(frozen=True, eq=False)
 class Fix:
     """A position at one time, or why there is none: a row of `fixes.csv`.
 
@@ -516,6 +545,7 @@ class Fix:
             length`.
         source: `bars`, or `gnss`: a fix of satellites, which is taken for the track.
         contradicted: What the track stands on where it contradicts this fix, if bars and GNSS disagree.
+        alternatives: Of a fix refused as `two-solutions`, the poses that fit, the likeliest first.
     """
 
     t_us: float
@@ -542,6 +572,7 @@ class Fix:
     excluded: tuple[str, ...] = ()
     source: str = "bars"
     contradicted: tuple[str, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
 
     @property
     def alarms(self) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ points share as a further unknown. What the geometry does not determine is refus
 that the rest contradicts is left out, and named. Frames and signs: `docs/position.md`.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -16,7 +17,7 @@ from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.fit import STEPS, Fit, fit_pose
 from evlcp_sdk.place.judgement import FOCAL, Judged, Pose, judged, misfits
 from evlcp_sdk.place.observations import BarView, Problem
-from evlcp_sdk.place.refusals import Refusal
+from evlcp_sdk.place.refusals import Candidate, Refusal
 from evlcp_sdk.place.starts import closed_form_starts
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -147,12 +148,27 @@ def _plain(
     found = judged(problem, best)
     if isinstance(found, Refusal):
         return found
-    for other in fits:
-        if other is best or other.cost - best.cost >= _ODDS:
-            continue
-        apart = other.position - best.position
-        if apart @ np.linalg.pinv(found.pose.covariance[:3, :3]) @ apart > _APART_SIGMAS**2:
-            return Refusal(
-                "two-solutions", f"two positions {np.linalg.norm(apart):.2f} m apart fit the image alike"
-            )
+    known = [best]
+    for other in sorted(fits, key=lambda fit: fit.cost):
+        if other.cost - best.cost < _ODDS and _apart(other, known, found.pose):
+            known.append(other)
+    if len(known) > 1:
+        apart_m = float(np.linalg.norm(known[1].position - best.position))
+        detail = f"two positions {apart_m:.2f} m apart fit the image alike"
+        return Refusal("two-solutions", detail, tuple(_candidate(problem, fit, best) for fit in known))
     return found
+
+
+def _apart(fit: Fit, others: Sequence[Fit], pose: Pose) -> bool:
+    """Whether a fit is another solution than these, by the covariance of the likeliest one."""
+    for other in others:
+        apart = fit.position - other.position
+        if fit is other or not apart @ np.linalg.pinv(pose.covariance[:3, :3]) @ apart > _APART_SIGMAS**2:
+            return False
+    return True
+
+
+def _candidate(problem: Problem, fit: Fit, best: Fit) -> Candidate:
+    found = judged(problem, fit)
+    spread = found.pose.covariance[:3, :3] if isinstance(found, Judged) else np.full((3, 3), math.nan)
+    return Candidate(fit.position, fit.rotation, spread, math.exp((best.cost - fit.cost) / 2))

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from evlcp_sdk.place.whereabouts import Whereabouts
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.values import Fix, Frame, Packet
+from evlcp_sdk.values import Alternative, Fix, Frame, Packet
 
 __all__ = ["Positioner"]
 
@@ -149,7 +150,8 @@ class Positioner:
             return Fix.refused(t_us, tuple(views), "no-site", f"no site is known of transmitter {which}")
         pose = solve_pose(sited, self._camera, self._attitude_at(t_us), self._spec, self._camera_sigma)
         if isinstance(pose, Refusal):
-            return Fix.refused(t_us, tuple(views), pose.kind, pose.detail)
+            refused = Fix.refused(t_us, tuple(views), pose.kind, pose.detail)
+            return replace(refused, alternatives=_alternatives(pose, here, self.axes))
         verified = all(self._bars.verified(n) for n in pose.transmitters)
         attitude = Attitude.of_rotation(pose.rotation)
         latitude, longitude, height = (float(v) for v in here.to_geodetic(pose.enu_m))
@@ -177,3 +179,27 @@ class Positioner:
             vpl_m=pose.vpl_m,
             excluded=pose.excluded,
         )
+
+
+def _alternatives(refusal: Refusal, here: LocalAxes, axes: LocalAxes) -> tuple[Alternative, ...]:
+    """The poses that a refusal leaves open, on earth."""
+    turn = axes.turn_from(here)
+    found = []
+    for one in refusal.candidates:
+        attitude = Attitude.of_rotation(one.rotation)
+        latitude, longitude, height = (float(v) for v in here.to_geodetic(one.enu_m))
+        assert attitude.heading_deg is not None
+        found.append(
+            Alternative(
+                latitude,
+                longitude,
+                height,
+                axes.to_enu(latitude, longitude, height),
+                turn @ one.covariance_m2 @ turn.T,
+                attitude.heading_deg,
+                attitude.pitch_deg,
+                attitude.roll_deg,
+                one.likelihood,
+            )
+        )
+    return tuple(found)

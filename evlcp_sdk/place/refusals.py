@@ -2,7 +2,10 @@
 
 from dataclasses import dataclass
 
-__all__ = ["REFUSALS", "Refusal"]
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["REFUSALS", "Candidate", "Refusal"]
 
 REFUSALS = {
     "no-site": "no bar in view stands at a known place",
@@ -19,6 +22,24 @@ REFUSALS = {
 """Kinds of refusal, and what they mean."""
 
 
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One of the poses that fit.
+
+    Attributes:
+        enu_m: Position in the local axes, m, float64 (3,).
+        rotation: Camera axes as columns in ENU, float64 (3, 3).
+        covariance_m2: Of the position, if it is the right one, float64 (3, 3); NaN where an ellipse does not
+            describe its error.
+        likelihood: How likely the image is from here, against the likeliest.
+    """
+
+    enu_m: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    covariance_m2: NDArray[np.float64]
+    likelihood: float
+
+
 @dataclass(frozen=True)
 class Refusal:
     """Why there is no position.
@@ -26,7 +47,9 @@ class Refusal:
     Attributes:
         kind: One of `REFUSALS`.
         detail: The same in words, with the figures of this case.
+        candidates: Of `two-solutions`, the poses that fit, the likeliest first.
     """
 
     kind: str
     detail: str
+    candidates: tuple[Candidate, ...] = ()

@@ -44,6 +44,13 @@ def evlcp_sinks() -> Iterator[SinkRecord]:
         positions=True,
     )
     yield SinkRecord(
+        "alternatives",
+        f"{here}.alternatives_csv:AlternativesCsv",
+        ("alternatives.csv",),
+        "the poses that fit where a position is refused as two do",
+        positions=True,
+    )
+    yield SinkRecord(
         "track",
         f"{here}.track_csv:TrackCsv",
         ("track.csv",),

@@ -18,6 +18,7 @@ FACE = Path(evlcp.__file__)
 
 NAMES = [
     "Algorithm",
+    "Alternative",
     "Attitude",
     "AttitudeLog",
     "BarLayout",

@@ -460,6 +460,25 @@ def test_a_mirrored_solution_is_refused_not_chosen() -> None:
         assert found.kind in ("two-solutions", "uncertain")
 
 
+def test_both_poses_are_told_where_two_fit() -> None:
+    """Two small bars, noisy and far: seen alike from the side, too. One of them is the truth."""
+    rng = np.random.default_rng(0)
+    bars = [0.1 * bar((0, 0, 0)) + [-2.6, 58.4, 3.9], 0.1 * bar((0, 0, 0)) + [0.5, 57.1, 5.8]]
+    seen = views(bars, np.zeros(3), UP.rotation(), rng, 1.0)
+    found = solve_pose(seen, CAMERA, Attitude(5.0, 0.0, None, 0.1), POINT_ONLY)
+    assert refused(found) == "two-solutions"
+    assert isinstance(found, Refusal)
+    likelihoods = [one.likelihood for one in found.candidates]
+    assert likelihoods[0] == 1
+    assert 1e-4 < likelihoods[1] < 1
+    right = found.candidates[0]
+    assert right.enu_m @ np.linalg.solve(right.covariance_m2, right.enu_m) < stats.chi2.isf(1e-4, 3)
+    for one in found.candidates:
+        image, _ = project_bars(np.concatenate(bars), one.enu_m, one.rotation, CAMERA)
+        missed = image - np.concatenate([view.points_px for view in seen])
+        assert np.sqrt((missed**2).mean()) < 1.5
+
+
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.sampled_from(["all", "gravity", "none"]))
 def test_never_a_silent_wrong_position(seed: int, count: int, told: str) -> None:
     """Bars anywhere in view: what is given lies within its sigmas, or is refused."""

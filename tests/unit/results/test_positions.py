@@ -22,6 +22,7 @@ from evlcp_sdk.place.gnss import GnssLog
 from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan
 from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.trajectory import trajectory_step
+from evlcp_sdk.results.alternatives_csv import AlternativesCsv
 from evlcp_sdk.results.figures import TrackProbe, draw_track
 from evlcp_sdk.results.fixes_csv import FixesCsv
 from evlcp_sdk.results.folder import ResultFolder
@@ -32,7 +33,7 @@ from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.values import Events, Fix, Frame, Packet, Range, SoftSymbols
+from evlcp_sdk.values import Alternative, Events, Fix, Frame, Packet, Range, SoftSymbols
 
 LINK = load_link()
 ZERO = datetime(2026, 3, 1, 10, 15, tzinfo=UTC)
@@ -226,6 +227,23 @@ def test_bars_and_satellites_that_contradict_one_another(tmp_path: Path) -> None
     way.seen(0, 2e6)
     assert way.close() == ([], ())
     assert way.counts["gnss_without_heading"] == 1
+
+
+def test_the_poses_that_fit_are_a_file(tmp_path: Path) -> None:
+    turned = (10.0, 5.0, 0.0)
+    both = (
+        Alternative(35.0, 137.0, 5.0, np.zeros(3), np.eye(3) * 0.04, *turned, 1.0),
+        Alternative(35.1, 137.0, 5.0, np.ones(3), np.full((3, 3), math.nan), *turned, 0.25),
+    )
+    fix = dataclasses.replace(Fix.refused(2e6, (0, 1), "two-solutions", ""), alternatives=both)
+    with ResultFolder(tmp_path, ["alternatives.csv"]) as folder:
+        sink = AlternativesCsv(folder, Run("", LINK))
+        sink.fix(fix, None)
+        sink.fix(Fix.refused(3e6, (0,), "heading-unknown", ""), None)
+        folder.finish()
+    first, second = rows(tmp_path / "alternatives.csv")
+    assert (first["number"], first["likelihood"], first["sigma_up_m"]) == ("0", "1", "0.2000")
+    assert (second["latitude_deg"], second["sigma_up_m"], second["bars"]) == ("35.1000000000", "", "0 1")
 
 
 def test_the_figure_of_a_track(tmp_path: Path) -> None:

@@ -1,0 +1,43 @@
+"""`alternatives.csv`: a row per pose that fits where a fix is refused, as more than one does."""
+
+import csv
+from math import isfinite
+
+from evlcp_sdk.place.navigator import Place
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.sink import Run, Sink
+from evlcp_sdk.results.text import covariances, sigmas, text_or_empty
+from evlcp_sdk.values import Fix
+
+__all__ = ["ALTERNATIVE_COLUMNS", "AlternativesCsv"]
+
+ALTERNATIVE_COLUMNS = (
+    *("t_us", "number", "likelihood", "latitude_deg", "longitude_deg", "height_m"),
+    *("sigma_east_m", "sigma_north_m", "sigma_up_m"),
+    *("cov_east_north_m2", "cov_east_up_m2", "cov_north_up_m2"),
+    *("heading_deg", "pitch_deg", "roll_deg", "bars"),
+)
+"""Columns of `alternatives.csv`."""
+
+
+class AlternativesCsv(Sink):
+    """Writes `alternatives.csv`."""
+
+    def __init__(self, folder: ResultFolder, run: Run) -> None:
+        super().__init__(folder, run)
+        self._rows = csv.writer(folder.open("alternatives.csv"), lineterminator="\n")
+        self._rows.writerow(ALTERNATIVE_COLUMNS)
+
+    def fix(self, fix: Fix, filtered: Place | None) -> None:
+        """Write a row per pose, the likeliest first."""
+        for number, one in enumerate(fix.alternatives):
+            self._rows.writerow(
+                [
+                    *(f"{fix.t_us:.1f}", number, f"{one.likelihood:.6g}"),
+                    *(f"{one.latitude_deg:.10f}", f"{one.longitude_deg:.10f}", f"{one.height_m:.4f}"),
+                    *(text_or_empty(value, 4) for value in sigmas(one.covariance_m2)),
+                    *(f"{v:.6g}" if isfinite(v) else "" for v in covariances(one.covariance_m2)),
+                    *(f"{angle:.4f}" for angle in (one.heading_deg, one.pitch_deg, one.roll_deg)),
+                    " ".join(map(str, fix.transmitters)),
+                ]
+            )
