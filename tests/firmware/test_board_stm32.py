@@ -63,10 +63,20 @@ class Bar:
         return self.chip.drivers.dark
 
 
-@pytest.fixture
-def bar(book: Codebook, needs: Callable[..., None]) -> Bar:
+@pytest.fixture(scope="module")
+def programmed(book: Codebook, needs: Callable[..., None]) -> tuple[Bar, Callable[[], None]]:
+    """The bar that all tests share, and what sets it back."""
     needs("cc", "make", "arm-none-eabi-gcc")
-    return Bar(book)
+    bar = Bar(book)
+    return bar, bar.chip.snapshot()
+
+
+@pytest.fixture
+def bar(programmed: tuple[Bar, Callable[[], None]]) -> Bar:
+    bar, back = programmed
+    back()
+    bar.board = bar.connect()
+    return bar
 
 
 def played(log: list[Shown]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
