@@ -1,7 +1,7 @@
 """Messages to the packets that a transmitter plays."""
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.scene.sites import BarSite
 
-__all__ = ["beacon_of_site", "compose", "messages_of", "packets_of", "utf8"]
+__all__ = ["beacon_of_site", "compose", "each_packet", "messages_of", "packets_of", "utf8"]
 
 
 def compose(
@@ -129,12 +129,20 @@ def packets_of(messages: Iterable[Message], coder: BlockCoder, repeat: int = 1) 
         coder: How packets carry blocks.
         repeat: How many times in a row each packet is sent.
     """
-    blocks = [
-        block.pack(coder.block_bytes)
-        for message in messages
-        for block in split(message, coder.digest, coder.block_bytes)
-    ]
-    return np.repeat(np.stack([coder.symbols(block) for block in blocks]), repeat, axis=0)
+    return np.stack(list(each_packet(messages, coder, repeat)))
+
+
+def each_packet(
+    messages: Iterable[Message], coder: BlockCoder, repeat: int = 1
+) -> Iterator[NDArray[np.int64]]:
+    """The same one by one, int64 (frames, clusters), each made when it is taken."""
+    blocks = [block for one in messages for block in split(one, coder.digest, coder.block_bytes)]
+
+    def made() -> Iterator[NDArray[np.int64]]:
+        for block in blocks:
+            yield from [coder.symbols(block.pack(coder.block_bytes))] * repeat
+
+    return made()
 
 
 def beacon_of_site(site: BarSite, user: bytes = b"") -> Beacon:

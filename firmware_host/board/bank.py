@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.air.frames import PacketFormat, info_words, packet_chips
+from evlcp_sdk.air.codebook import Codebook, word_of_values
+from evlcp_sdk.air.frames import PacketFormat, info_words, packet_chips, pilot_words
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import read_numbers
 from evlcp_sdk.link.resolve import Link
@@ -105,6 +105,21 @@ class Bank:
         if self.format == Format.MASKS:
             return ROW_BYTES * replace(self.packet, frames=frames).packet_chips
         return 2 * self.codebook.clusters * frames
+
+    @cached_property
+    def duty(self) -> int:
+        """Share of time that it has a LED on, that of the brightest, permille, rounded up."""
+        chips = self.packets * self.packet.packet_chips
+        if self.format == Format.MASKS:
+            rows = np.frombuffer(self.content, np.uint8).reshape(chips, ROW_BYTES)
+            on = int(np.unpackbits(rows, axis=1).sum(0, dtype=np.int64).max())
+        else:
+            words = np.frombuffer(self.content, "<u2").reshape(-1, self.codebook.clusters)
+            pilots = -(-self.packet.frames // self.packet.pilot_every)
+            own = pilots * np.bitwise_count(pilot_words(self.codebook)).astype(np.int64)
+            own += word_of_values(self.codebook.preamble).bit_count()
+            on = int((np.bitwise_count(words).sum(0, dtype=np.int64) + self.packets * own).max())
+        return -(-1000 * on // chips)
 
     @cached_property
     def crc(self) -> int:

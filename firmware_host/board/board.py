@@ -238,10 +238,24 @@ class Board:
             duty: Largest share of time that a LED is on, 0.001 to 1; None leaves it.
 
         Raises:
-            RefusedError: The board cannot take a value.
+            RefusedError: The board cannot take a value, or what it plays is brighter; nothing is changed.
         """
-        permille = 0 if duty is None else round(1000 * duty)
-        self._configure(bank, level_ma or 0, permille)
+        if duty is not None:
+            status = self.status()
+            if status.active_bank != NO_BANK:
+                self.check_duty("what is programmed", status.duty, duty)
+        self._configure(bank, level_ma or 0, 0 if duty is None else round(1000 * duty))
+
+    def check_duty(self, what: str, permille: int, limit: float) -> None:
+        """Raise RefusedError if something has a LED on for a larger share of time than a limit."""
+        if permille > round(1000 * limit):
+            raise RefusedError(
+                f"{self.session.name}: {what} has a LED on for {permille / 1000:g} of the time, the duty"
+                f" limit is {limit:g}: give a limit of at least {permille / 1000:g}, or program chips that"
+                " are dark more often; nothing was changed",
+                Status.TOO_BRIGHT,
+                round(1000 * limit),
+            )
 
     def prepare(self, bank: Bank) -> None:
         """Set chip rate, profile and codebook for the next commit.
@@ -421,6 +435,10 @@ class Board:
         again = "'evlcp board program' brings it there"
         if s.active_bank == NO_BANK:
             raise VerifyError(f"{name}: nothing is programmed; {again}")
+        if not s.length:
+            raise VerifyError(
+                f"{name}: its bank is the queue of a stream, which holds nothing to compare; {again}"
+            )
         self.check_same_air(bank, s)
         packet = bank.packet
         shape = (s.format, s.packets, s.frames, s.pilot_every, s.length)
@@ -573,16 +591,22 @@ def provision(
 ) -> Programmed:
     """Bring a board to a bank and settings; what is so already is left alone.
 
-    The level comes first: a board that cannot take it keeps its old bank.
+    Limits and level come first: a board that cannot take them keeps its old bank. A duty limit that is too
+    low for the old bank alone comes after the new one, and limits by which that is refused do not stay.
 
     Raises:
-        BoardError: See `Board.program` and `Board.level`.
+        BoardError: See `Board.limit`, `Board.program` and `Board.level`.
         ConfigError: The bank does not fit the board.
     """
     board.check_fits(bank)
-    status = board.status()
-    if settings.level_limit_ma is not None or settings.duty_limit is not None:
-        board.limit(bank, settings.level_limit_ma, settings.duty_limit)
+    before = status = board.status()
+    most_ma, duty = settings.level_limit_ma, settings.duty_limit
+    last = False
+    if duty is not None:
+        board.check_duty("this payload", bank.duty, duty)
+        last = before.active_bank != NO_BANK and before.duty > round(1000 * duty)
+    if most_ma is not None or (duty is not None and not last):
+        board.limit(bank, most_ma, None if last else duty)
         status = board.status()
     level, later = settings.level_ma, False
     if level is not None and status.level_ma != level:
@@ -596,7 +620,15 @@ def provision(
     wanted = (settings.watchdog, settings.watchdog_ms)
     if settings.watchdog is not None and (status.watchdog, status.watchdog_ms) != wanted:
         board.watchdog(settings.watchdog, settings.watchdog_ms)
-    done = board.program(bank, verify, progress)
+    try:
+        done = board.program(bank, verify, progress)
+    except RefusedError:
+        if (status.level_limit_ma, status.duty_limit) != (before.level_limit_ma, before.duty_limit):
+            board.limit(bank, before.level_limit_ma, before.duty_limit / 1000)
+            board.level(before.level_ma)
+        raise
+    if last:
+        board.limit(bank, None, duty)
     if level is not None and later:
         board.level(level)
     if settings.start and status.state != State.PLAYING:

@@ -48,16 +48,17 @@ _ADVICE = {
     Status.BUSY: "not while it plays, swaps or tests its LEDs; 'evlcp board stop' first, or try again",
     Status.BAD_CRC: "the bank holds other bytes than were sent (CRC {detail:08x}); program it again",
     Status.FOREIGN_CODEBOOK: "the firmware was built with another codebook; update firmware or host",
-    Status.NO_SESSION: "the board was reset, or another program took it over; run the command again,"
-    " it goes on where it was",
+    Status.NO_SESSION: "the board was reset, or another program took it over; run the command again",
     Status.STALE: "the board has done a later request already; run the command again",
-    Status.NOTHING_COMMITTED: "nothing is programmed; 'evlcp board program' first",
+    Status.NOTHING_COMMITTED: "nothing is programmed that could play: a stream that has ended, say, is gone;"
+    " 'evlcp board program' first",
     Status.INCOMPATIBLE: f"it speaks protocol {{protocol}}, this host {MAJOR}.{MINOR}; update the {{older}}",
     Status.FLASH_FAULT: "its flash does not hold the data; try again, then replace the board",
     Status.NOT_SUPPORTED: "this board cannot do that; 'evlcp board hello' shows what it can",
     Status.EMPTY_SLOT: "no settings are saved; 'evlcp board save' first",
     Status.TOO_BRIGHT: "a LED would be on for longer than the limits allow ({detail} of 1000 chips at this"
-    " current); lower the level, or program chips that are dark more often",
+    " current); lower the level, raise --duty-limit if the installation allows it, or program chips that are"
+    " dark more often",
     Status.NEEDS_KEY: "it has a key: give it with --key; without, it can only be looked at",
     Status.BAD_SEAL: "sealed with another key, or not for this session; run the command again",
     Status.HARDWARE_FAULT: "a fault holds the LEDs dark (bits {detail:#x}); see 'evlcp board status'",
@@ -230,7 +231,7 @@ class Session:
         if outcome.status is None:
             raise LineError(
                 f"{self.name}: no answer to {Type(request.TYPE).name} after {outcome.tries} tries;"
-                " check the line and run the command again, it goes on where it was"
+                " check the line and run the command again"
             )
         if outcome.reply is None:
             raise refusal(self.name, request.TYPE, outcome.status, outcome.detail)
@@ -263,7 +264,7 @@ class Session:
                     self.transport.write(data)
                 wait = 0.0 if deadline is None else max(0.0, deadline - self.transport.now())
                 received = self.transport.read(wait) if sent else b""
-                for outcome in self.client.receive(received):
+                for outcome in self.client.receive(received, self.transport.now()):
                     handle(sent.pop(outcome.token), outcome)
                     more = True
                 if not sent and not more:

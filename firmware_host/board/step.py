@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 from firmware_host.board.board import Board
 from firmware_host.errors import BoardError, LineError, RefusedError
-from firmware_host.protocol.requests import Capability, Status
+from firmware_host.protocol.requests import Capability, State, Status
 
-__all__ = ["start_together"]
+__all__ = ["start_together", "wait_for_pulse"]
 
 _ROUNDS = 20
 
@@ -55,3 +55,29 @@ def start_together(boards: Sequence[Board], pulse_hz: int = 1) -> list[int]:
                 board.stop()
         raise
     return targets
+
+
+def wait_for_pulse(boards: Sequence[Board], timeout_s: float) -> None:
+    """Wait until boards that `start_together` has armed play; those that do not are stopped.
+
+    Raises:
+        LineError: They do not within `timeout_s`.
+    """
+    line = boards[0].session.transport
+    end = line.now() + timeout_s
+    waiting = list(boards)
+    while waiting := [board for board in waiting if board.status().state == State.WAITING]:
+        if line.now() >= end:
+            pulses = [board.status().pulses for board in waiting]
+            for board in boards:
+                with contextlib.suppress(BoardError):
+                    board.stop()
+            told = ", ".join(
+                f"{board.session.name} has counted {count}"
+                for board, count in zip(waiting, pulses, strict=True)
+            )
+            raise LineError(
+                f"{waiting[0].session.name}: the pulse that it waits for has not come in {timeout_s:g} s"
+                f" (pulses since reset: {told}): check the wire of the pulse input; all are stopped"
+            )
+        line.read(min(0.02, max(0.0, end - line.now())))

@@ -118,7 +118,8 @@ class Stream:
         """Send messages that change: each round and round until it is time for the next; how many there were.
 
         Args:
-            make: The packets of the message of a number, from 0 on, for now plus `delay_s`; None ends it.
+            make: The packets of the message of a number, from 0 on, for now plus `delay_s`; None ends it. An
+                iterator that makes each when it is taken holds nothing up.
             every_s: Time between two messages, s; one whose packets take longer is sent once.
 
         Raises:
@@ -127,14 +128,15 @@ class Stream:
         line = self._session.transport
         due_s, number = line.now(), 0
         while (packets := make(number)) is not None:
-            sent = list(packets)
             number += 1
             due_s = max(due_s + every_s, line.now())
-            while True:
+            sent = []
+            for packet in packets:
+                sent.append(packet)
+                self.send(packet)
+            while sent and line.now() < due_s:
                 for packet in sent:
                     self.send(packet)
-                if line.now() >= due_s:
-                    break
         return number
 
     def send(self, symbols: ArrayLike) -> int:
@@ -240,7 +242,7 @@ class Stream:
         # a packet that has gone out is not waited for
         done = not self._pieces and client.room and bool(data)
         received = line.read(0.0 if done else max(0.0, end - line.now()))
-        for outcome in client.receive(received):
+        for outcome in client.receive(received, line.now()):
             self._take(outcome)
 
     def _take(self, outcome: RequestOutcome) -> None:

@@ -13,7 +13,7 @@ from evlcp_sdk.errors import InputError
 from evlcp_sdk.files import read_json
 from firmware_host import build
 from firmware_host.board.board import Board
-from firmware_host.errors import BoardError, IncompatibleError, RefusedError, VerifyError
+from firmware_host.errors import BoardError, IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.images import FlashImage
 from firmware_host.protocol.client import RequestOutcome
 from firmware_host.protocol.requests import (
@@ -36,6 +36,11 @@ from firmware_host.protocol.wire import WireMessage
 __all__ = ["Package", "Updated", "confirm", "update", "update_status"]
 
 Progress = Callable[[int, int], None]
+
+_NO_UPDATE = (
+    "not a firmware update, or damaged; expected TARGET.update.json, as 'evlcp board build' makes it"
+    " ('evlcp board flash' takes .bin, .hex and .elf)"
+)
 
 
 @dataclass(frozen=True)
@@ -67,7 +72,12 @@ class Package:
         Raises:
             InputError: It cannot be read, or is no such file.
         """
-        table = read_json(path)
+        try:
+            table = read_json(path)
+        except InputError as fault:
+            if isinstance(fault.__cause__, OSError):
+                raise
+            raise InputError(f"{path}: {_NO_UPDATE}") from fault
         try:
             images = {n: base64.b64decode(table["images"][str(n)], validate=True) for n in (1, 2)}
             crcs = [zlib.crc32(images[n]) for n in (1, 2)]
@@ -75,9 +85,7 @@ class Package:
             if not good or not isinstance(table["target"], str):
                 raise ValueError
         except (KeyError, TypeError, ValueError, binascii.Error) as fault:
-            raise InputError(
-                f"{path}: not a firmware update, or damaged; 'evlcp board build' makes TARGET.update.json"
-            ) from fault
+            raise InputError(f"{path}: {_NO_UPDATE}") from fault
         return cls(table["target"], images)
 
     def to_json(self) -> str:
@@ -189,10 +197,14 @@ def update(
         done += len(request.data) if isinstance(request, UpdateWriteRequest) else 0
         advance(done, len(data))
 
-    session.run(requests(), handle)
-    sequence = session.call(UpdateCommitRequest(), UpdateCommitReply).sequence
-    session.call(UpdateRestartRequest(), UpdateRestartReply)
-    _wait_restarted(board, wait_s)
+    try:
+        session.run(requests(), handle)
+        sequence = session.call(UpdateCommitRequest(), UpdateCommitReply).sequence
+    except LineError as fault:
+        raise type(fault)(
+            f"{fault}; it begins anew, and the board keeps the firmware that it runs"
+        ) from fault
+    _restart(board, wait_s)
     after = update_status(board)
     if after.running != before.next:
         raise VerifyError(
@@ -206,21 +218,25 @@ def update(
     return Updated(after.running, len(data), sequence, version)
 
 
-def _wait_restarted(board: Board, wait_s: float) -> None:
-    """Say HELLO until the board that has been reset answers."""
-    line = board.session.transport
+def _restart(board: Board, wait_s: float) -> None:
+    """Restart the board, and say HELLO until it answers; one that has been reset has taken fewer requests."""
+    session, line = board.session, board.session.transport
+    taken = board.status().requests
+    session.call(UpdateRestartRequest(), UpdateRestartReply)
     begin = line.now()
+    # a slow one gets longer
+    end = begin + wait_s + 20 * session.client.latency_s
     while line.now() < begin + 0.1:  # the answer is out, and the reset under way
         line.read(0.02)
     while True:
         try:
-            board.about = board.session.hello()
+            board.about = session.hello()
+            if board.status().requests < taken:
+                return
         except BoardError:
-            if line.now() > begin + wait_s:
+            if line.now() > end:
                 raise
             continue
-        if board.about.uptime_ms < 1000 * (line.now() - begin) + 50:
-            return
-        if line.now() > begin + wait_s:
-            raise VerifyError(f"{board.session.name}: has not been reset; run the command again")
+        if line.now() > end:
+            raise VerifyError(f"{session.name}: has not been reset; run the command again")
         line.read(0.02)

@@ -106,6 +106,7 @@ def flash(
     transport = open_transport(line.port, line.baud if given else BAUD, even_parity=True)
     try:
         loader = RomLoader(transport)
+        had_brown_out = loader.has_brown_out()
         with progress_bar("flashing") as progress:
             sectors = flash_image(loader, image, verify, start and not brown_out, progress)
         if brown_out:
@@ -119,11 +120,14 @@ def flash(
         "sectors": sectors,
         "verified": verify,
         "started": start and not brown_out,
-        "brown_out": brown_out,
+        "brown_out": brown_out or had_brown_out,
     }
     words = [f"{line.port}: {len(image.data)} bytes in sectors {sectors[0]} to {sectors[-1]}"]
     words += ["read back"] * verify + ["brown-out reset set"] * brown_out
-    say("; ".join([*words, "BOOT0 low and reset starts it"]), table, as_json)
+    words.append("BOOT0 low and reset starts it")
+    if table["brown_out"] is False:
+        words.append("brown-out reset is off: flash with --brown-out, or LEDs may stay lit below 2.7 V")
+    say("; ".join(words), table, as_json)
 
 
 def update(

@@ -78,6 +78,7 @@ class Emulator(StrEnum):
     NATIVE = "native"
     QEMU = "qemu"
     STM32 = "stm32"
+    ROM = "rom"
 
 
 def _show(table: dict[str, Any], as_json: bool) -> None:
@@ -306,15 +307,29 @@ def start(
             max=65535,
         ),
     ] = None,
+    timeout: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            min=0.0,
+            help="With --pulse-hz: stay until they play; if the pulse has not come by then, stop them.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Play what is programmed.
 
+    With --pulse-hz a board is armed, and waits in the dark for a pulse on its pulse input (PPS).
+
     For example: [bold]evlcp board start --inventory tunnel.toml --pulse-hz 1[/]
     """
+    from evlcp_sdk.errors import ConfigError
+
     if pulse_hz is not None:
-        _start_together(context, inventory, pulse_hz, as_json)
+        _start_together(context, inventory, pulse_hz, timeout, as_json)
         return
+    if timeout is not None:
+        raise ConfigError("--timeout belongs to --pulse-hz: without it a board plays at once")
     _simple(context, inventory, as_json, lambda board: board.start(), "playing")
 
 
@@ -335,22 +350,33 @@ def blank(context: typer.Context, inventory: InventoryFile = None, as_json: AsJs
     _simple(context, inventory, as_json, lambda board: board.blank(), "dark")
 
 
-def _start_together(context: typer.Context, inventory: Path | None, pulse_hz: int, as_json: bool) -> None:
+def _start_together(
+    context: typer.Context, inventory: Path | None, pulse_hz: int, timeout_s: float | None, as_json: bool
+) -> None:
     """One board, or all of an inventory, at the same pulse."""
     from firmware_host.board.fleet import board_of, read_entries
-    from firmware_host.board.step import start_together
+    from firmware_host.board.step import start_together, wait_for_pulse
 
     with contextlib.ExitStack() as stack:
         if inventory is None:
             boards = [stack.enter_context(open_board(context))]
         else:
-            _beside_inventory(context, "pulse_hz")
+            _beside_inventory(context, "pulse_hz", "timeout")
             opened = (board_of(entry, inventory.parent) for entry in read_entries(inventory))
             boards = [stack.enter_context(one) for one in opened]
         targets = start_together(boards, pulse_hz)
-    table = {board.session.name: target for board, target in zip(boards, targets, strict=True)}
-    words = ", ".join(f"{name} at its pulse {target}" for name, target in table.items())
-    say(words, {"state": "waiting", "at_pulse": table}, as_json)
+        table = {board.session.name: target for board, target in zip(boards, targets, strict=True)}
+        words = ", ".join(f"{name} for its pulse {target}" for name, target in table.items())
+        if timeout_s is None:
+            said = (
+                f"armed: waits for a pulse on PPS ({words}); 'evlcp board status' shows whether it has come"
+            )
+            say(said, {"state": "waiting", "at_pulse": table}, as_json)
+            return
+        if not as_json:
+            echo(f"armed: waits for a pulse on PPS ({words}), for at most {timeout_s:g} s")
+        wait_for_pulse(boards, timeout_s)
+    say("plays", {"state": "playing", "at_pulse": table}, as_json)
 
 
 def _simple(
@@ -622,13 +648,18 @@ def recall(context: typer.Context, as_json: AsJson = False) -> None:
 @app.command()
 def emulate(
     emulator: Annotated[
-        Emulator, typer.Argument(help="native: a program; qemu: an ARM image; stm32: the image as flashed.")
+        Emulator,
+        typer.Argument(
+            help="native: a program; qemu: an ARM image; stm32: the image as flashed; rom: a part to flash."
+        ),
     ],
     listen: Annotated[
         str, typer.Option(metavar="WHERE", help="unix:PATH, tcp:HOST:PORT, or (native) pty.")
     ] = "pty",
     leds: Annotated[Path | None, typer.Option(metavar="FILE", help="Record the LED outputs.")] = None,
-    flash: Annotated[Path | None, typer.Option(metavar="FILE", help="(native) keep SAVE slots here.")] = None,
+    flash: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="(native) keep SAVE slots here; (rom) the flash.")
+    ] = None,
     link: Annotated[Path | None, typer.Option(metavar="PATH", help="(native) name for the pty.")] = None,
     baud: Annotated[int, typer.Option(help="(native) keep to a line rate; 0 as fast as it goes.", min=0)] = 0,
     unique_id: Annotated[int, typer.Option(help="(native) the board's number.", min=0, max=2**64 - 1)] = 0,
@@ -643,7 +674,14 @@ def emulate(
 
     from evlcp_sdk.errors import ConfigError, InputError
     from evlcp_sdk.files import check_output
-    from firmware_host.emulators.processes import native_command, qemu_command, stm32_command, wait_for
+    from firmware_host.emulators.listening import check_free
+    from firmware_host.emulators.processes import (
+        native_command,
+        qemu_command,
+        rom_command,
+        stm32_command,
+        wait_for,
+    )
     from firmware_host.errors import ToolchainError
 
     scheme, _, place = listen.partition(":")
@@ -654,10 +692,13 @@ def emulate(
         host, _, number = place.rpartition(":")
         if not host or not re.fullmatch("[0-9]{1,5}", number) or not 1 <= int(number) <= 65535:
             raise ConfigError(f"--listen {listen}: expected tcp:HOST:PORT with a port from 1 to 65535")
+    check_free(listen)
     if leds is not None:
         check_output(leds, regular=False)
     if emulator is Emulator.QEMU:
         command = qemu_command(listen, leds)
+    elif emulator is Emulator.ROM:
+        command = rom_command(listen, flash, leds)
     elif emulator is Emulator.STM32:
         command = stm32_command(listen, leds)
     else:

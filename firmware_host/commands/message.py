@@ -12,6 +12,8 @@ from firmware_host.commands._output import save_array
 from firmware_host.commands.stream import Ahead, said_of, table_of
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     import numpy as np
     from numpy.typing import NDArray
 
@@ -100,6 +102,7 @@ def message(
     import json
     import os
     from contextlib import suppress
+    from math import ceil
     from time import gmtime, strftime
     from time import time as clock_s
 
@@ -107,7 +110,7 @@ def message(
     from evlcp_sdk.air.kinds import Countdown
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.files import Outputs
-    from evlcp_sdk.link.compose import messages_of, packets_of, utf8
+    from evlcp_sdk.link.compose import each_packet, messages_of, packets_of, utf8
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
     from firmware_host.board.bank import bank_of
@@ -158,21 +161,29 @@ def message(
         )
 
     begun_s = clock_s()
+    packet_s = link.packet.packet_chips / link.air.chip_rate_hz
     if every is not None:
         port = port or os.environ.get("EVLCP_PORT") or None
         if port is None:
             raise ConfigError("--every sends to a board: give --port (or EVLCP_PORT)")
         coder = link.block_coder()
-        packets_of(made(begun_s, 0), coder, repeat)  # what is wrong is known before the board waits for it
+        # what is wrong is known before the board waits for it
+        takes_s = len(packets_of(made(begun_s, 0), coder, repeat)) * packet_s
+        if takes_s > every:
+            raise ConfigError(
+                f"--every {every:g}: what is to be sent takes {takes_s:.4g} s on air,"
+                f" {takes_s / packet_s:.0f} packets of {1e3 * packet_s:.4g} ms;"
+                f" give --every {ceil(takes_s)} or more, or send less"
+            )
         with BoardLine(port, baud, key=board_key).open() as board:
             stream = board.stream(link, ahead)
 
-            def next_one(number: int) -> "NDArray[np.int64] | None":
+            def next_one(number: int) -> "Iterator[NDArray[np.int64]] | None":
                 at_s = clock_s() + stream.delay_s
                 over = ends_s is not None and number and at_s > ends_s + every
                 if over or (count is not None and number >= count):
                     return None
-                return packets_of(made(at_s, number), coder, repeat)
+                return each_packet(made(at_s, number), coder, repeat)
 
             with suppress(KeyboardInterrupt), stream:
                 stream.play(next_one, every)
@@ -191,7 +202,6 @@ def message(
         outputs.commit()
     written = [str(path) for path in (out, chips) if path is not None]
     port = port or (None if written else os.environ.get("EVLCP_PORT") or None)
-    packet_s = link.packet.packet_chips / link.air.chip_rate_hz
     summary: dict[str, Any] = {
         "messages": [
             {

@@ -1,7 +1,7 @@
 """`evlcp board stream`: packets onto a board as they come."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -103,15 +103,15 @@ def table_of(stream: "Stream") -> dict[str, Any]:
 
 def _packets(
     file: Path, link: "Link", coder: "BlockCoder | None", transmitter_id: int, repeat: int
-) -> "Iterator[NDArray[np.int64] | None]":
-    """Packets (packets, frames, clusters) of each line as it comes; None while none does."""
+) -> "Iterator[Iterable[NDArray[np.int64]] | None]":
+    """Packets (frames, clusters) of each line as it comes; None while none does."""
     import json
     import time
 
     import numpy as np
 
     from evlcp_sdk.errors import ConfigError, InputError
-    from evlcp_sdk.link.compose import messages_of, packets_of
+    from evlcp_sdk.link.compose import each_packet, messages_of
     from firmware_host.board.symbols import symbols_of
 
     sequence = 0
@@ -132,7 +132,7 @@ def _packets(
                 # a later message has a higher number, also within a second
                 sequence = max(sequence + 1, int(time.time()))
                 said = messages_of(link, text=line, transmitter_id=transmitter_id, sequence=sequence)
-                yield packets_of(said, coder, repeat)
+                yield each_packet(said, coder, repeat)
         except (ValueError, RecursionError) as fault:
             raise InputError(f"{file}: line {number}: not JSON: {fault}") from fault
         except ConfigError as fault:

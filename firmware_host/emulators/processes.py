@@ -13,12 +13,14 @@ from pathlib import Path
 from evlcp_sdk.errors import InputError
 from firmware_host import build
 from firmware_host.errors import LineError, NoBoardError, ToolchainError
+from firmware_host.images import FLASH_BYTES
 from firmware_host.ports.transport import SocketTransport
 
 __all__ = [
     "ProcessTransport",
     "native_command",
     "qemu_command",
+    "rom_command",
     "start_native",
     "start_qemu",
     "stm32_command",
@@ -143,6 +145,30 @@ def stm32_command(listen: str, leds: Path | None = None) -> list[str]:
     image = build.arm_image("stm32f405")
     command = [sys.executable, "-m", "firmware_host.emulators.stm32_server", str(image), "--listen", listen]
     return command if leds is None else [*command, "--leds", str(leds)]
+
+
+def rom_command(listen: str, flash: Path | None = None, leds: Path | None = None) -> list[str]:
+    """Command line of an STM32F405 that waits in its ROM, and runs on its model what it is told to.
+
+    Args:
+        listen: `unix:PATH` or `tcp:HOST:PORT`.
+        flash: File that keeps its flash, 1 MiB; new or there.
+        leds: File for the LED records of what runs.
+
+    Raises:
+        InputError: The flash file cannot be used.
+    """
+    if flash is not None:
+        _check_flash(flash)
+        if flash.is_file() and flash.stat().st_size != FLASH_BYTES:
+            raise InputError(
+                f"{flash}: {flash.stat().st_size} bytes, expected {FLASH_BYTES}, the flash of the part"
+            )
+    command = [sys.executable, "-m", "firmware_host.emulators.rom_server", "--listen", listen]
+    for name, value in (("--flash", flash), ("--leds", leds)):
+        if value is not None:
+            command += [name, str(value)]
+    return command
 
 
 def wait_for(

@@ -13,10 +13,11 @@ import time
 from pathlib import Path
 from typing import BinaryIO
 
+from firmware_host.emulators.listening import listener
 from firmware_host.emulators.stm32 import UNIT_HZ, Shown, Stm32
 from firmware_host.protocol.requests import CHIP_DARK, LEDS
 
-__all__ = ["main", "records"]
+__all__ = ["main", "records", "serve"]
 
 _UNITS_A_TICK = UNIT_HZ // 14_000_000
 _STEP_US = 200
@@ -37,25 +38,15 @@ def records(log: list[Shown], chip: int = 0) -> tuple[bytes, int]:
     return b"".join(out), chip
 
 
-def _listener(listen: str) -> socket.socket:
-    scheme, _, place = listen.partition(":")
-    if scheme == "unix":
-        path = Path(place)
-        if path.is_socket():
-            path.unlink()
-        server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        server.bind(place)
-        server.listen(1)
-    else:
-        host, _, port = place.rpartition(":")
-        server = socket.create_server((host, int(port)))
-    return server
-
-
-def _serve(chip: Stm32, server: socket.socket, leds: BinaryIO | None) -> None:
-    begun, line, number = time.monotonic(), None, 0
+def serve(
+    chip: Stm32, server: socket.socket, leds: BinaryIO | None = None, line: socket.socket | None = None
+) -> None:
+    """Run a model for hosts at a socket, one at a time, until it is ended; `line` is the first one's."""
+    begun, number = time.monotonic(), 0
     with selectors.DefaultSelector() as selector:
         selector.register(server, selectors.EVENT_READ)
+        if line is not None:
+            selector.register(line, selectors.EVENT_READ)
         while True:
             chip.run(_STEP_US)
             ahead = chip.now / UNIT_HZ - (time.monotonic() - begun)
@@ -103,7 +94,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     leds = options.leds.open("wb") if options.leds else None
     try:
-        _serve(Stm32(options.image), _listener(options.listen), leds)
+        serve(Stm32(options.image), listener(options.listen), leds)
     except KeyboardInterrupt:
         pass
     except OSError as fault:

@@ -198,6 +198,13 @@ class RomLoader:
         """Level of the brown-out reset in the option bytes: 0 resets below 2.7 V, 3 is off but for 1.7 V."""
         return (self.read(_OPTIONS, 4)[0] & _BROWN_OUT) >> 2
 
+    def has_brown_out(self) -> bool | None:
+        """Whether the part resets below 2.1 V, or above that; None: it does not say."""
+        try:
+            return self.brown_out() < 3
+        except RefusedError:
+            return None
+
     def set_brown_out(self) -> None:
         """Have the part reset below 2.7 V; it resets now, to take that."""
         options = bytearray(self.read(_OPTIONS, 16))

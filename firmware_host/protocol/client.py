@@ -30,6 +30,16 @@ TRIES = 5
 """How often a request is sent before it is given up, unless the caller says otherwise."""
 
 
+MOST_LATENCY_S = 10.0
+"""The most that a measured latency makes a request wait for its first answer, s."""
+
+SLOW_S = 0.1
+"""A board whose answers are later than that gets requests one at a time, s; a USB bridge's take 16 ms."""
+
+MOST_PATIENCE = 32.0
+"""The most by which requests that were sent again make the next one wait longer."""
+
+
 @dataclass(frozen=True)
 class Timing:
     """How long an answer may take.
@@ -89,11 +99,16 @@ class _Waiting:
     reply_bytes: int
     tries: int = 0
     due: float = 0.0
+    sent: float = 0.0
+    wire_s: float = 0.0
 
 
 @dataclass
 class Client:
     """Requests in, outcomes out; between them bytes and time.
+
+    What answers take beyond their time on the line is measured, as TCP does (RFC 6298): a slow board gets
+    longer than `timing` says, never less.
 
     Args:
         timing: How long an answer may take.
@@ -126,6 +141,44 @@ class Client:
     _queue: deque[_Waiting] = field(default_factory=deque)
     _flight: dict[int, _Waiting] = field(default_factory=dict)
     _outcomes: list[RequestOutcome] = field(default_factory=list)
+    _now: float = 0.0
+    _mean_s: float | None = None
+    _spread_s: float = 0.0
+    _patience: float = 1.0
+    _largest: int = 32
+
+    @property
+    def latency_s(self) -> float:
+        """What an answer may take beyond its time on the line, s; `timing` says at least how much."""
+        measured = min((self._mean_s or 0.0) + 4 * self._spread_s, MOST_LATENCY_S)
+        return max(self.timing.latency_s, measured) * self._patience
+
+    def _may_go(self, waiting: _Waiting) -> bool:
+        """Whether a request may go out beside those under way.
+
+        What waits for its turn at a slow board would be sent again before: it gets one at a time, and of one
+        whose short answers are late already the first long one is waited for.
+        """
+        if not self._flight:
+            return True
+        late_s = self._mean_s or 0.0
+        alone = late_s > SLOW_S or (late_s > SLOW_S / 4 and len(waiting.wire) > 2 * self._largest)
+        return not alone and len(self._flight) < self.window
+
+    def _measure(self, waiting: _Waiting) -> None:
+        """Take in how long an answer took; if its request was sent again, it may be to any of these."""
+        if waiting.tries > 1:
+            # until one is answered at its first try, as long as this one needed
+            self._patience = min(self._patience * self.timing.backoff ** (waiting.tries - 1), MOST_PATIENCE)
+            return
+        self._patience = 1.0
+        self._largest = max(self._largest, len(waiting.wire))
+        late_s = max(0.0, self._now - waiting.sent - waiting.wire_s)
+        if self._mean_s is None:
+            self._mean_s, self._spread_s = late_s, late_s / 2
+        else:
+            self._spread_s += (abs(late_s - self._mean_s) - self._spread_s) / 4
+            self._mean_s += (late_s - self._mean_s) / 8
 
     def submit(self, request: WireMessage, session: int | None = None) -> int:
         """Queue a request; returns the token its outcome will carry."""
@@ -157,8 +210,9 @@ class Client:
         self._queue.clear()
         self._flight.clear()
 
-    def receive(self, data: bytes) -> list[RequestOutcome]:
-        """Take what was read from the line; give what it settles."""
+    def receive(self, data: bytes, now: float | None = None) -> list[RequestOutcome]:
+        """Take what was read from the line, at a time; give what it settles."""
+        self._now = self._now if now is None else now
         for datagram in self.decoder.feed(data):
             waiting = self._flight.get(datagram.sequence)
             if waiting is None or datagram.type != waiting.type | REPLY_BIT:
@@ -166,6 +220,7 @@ class Client:
             outcome = _outcome(waiting, datagram)
             if outcome is not None:
                 del self._flight[datagram.sequence]
+                self._measure(waiting)
                 self._outcomes.append(outcome)
         done, self._outcomes = self._outcomes, []
         return done
@@ -176,7 +231,8 @@ class Client:
         Requests that have had all their tries are settled without a status; `receive` gives them.
         """
         out = []
-        while self._queue and len(self._flight) < self.window:
+        self._now = now
+        while self._queue and self._may_go(self._queue[0]):
             waiting = self._queue.popleft()
             self._flight[(self.first + waiting.token) & 0xFFFF] = waiting
             out.append(self._send(waiting, now))
@@ -196,7 +252,9 @@ class Client:
     def _send(self, waiting: _Waiting, now: float) -> bytes:
         queued = sum(len(w.wire) for w in self._flight.values())
         replies = sum(w.reply_bytes for w in self._flight.values())
-        waiting.due = now + self.timing.timeout_s(queued, replies, waiting.tries)
+        waiting.wire_s = self.timing.timeout_s(queued, replies, 0) - self.timing.latency_s
+        waiting.due = now + (waiting.wire_s + self.latency_s) * self.timing.backoff**waiting.tries
+        waiting.sent = now
         waiting.tries += 1
         return waiting.wire
 

@@ -252,6 +252,34 @@ def test_no_place_to_build_is_told(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
+def test_an_emulator_does_not_take_anothers_place(evlcp, native: str, tmp_path: Path) -> None:
+    for emulator in ("native", "qemu", "stm32", "rom"):
+        done = evlcp("board", "emulate", emulator, "--listen", native)
+        assert (done.code, done.out) == (2, "")
+        assert done.err.count("\n") == 1
+        assert f"--listen {native}: another program answers there; end it, or listen elsewhere" in done.err
+    assert evlcp("board", "hello", "--port", native).code == 0
+    # what one that was killed leaves behind is no hindrance
+    path = tmp_path / "stale"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as left:
+        left.bind(str(path))
+    emulated = Emulated("native", "--listen", f"unix:{path}")
+    assert evlcp("board", "hello", "--port", f"unix:{path}").code == 0
+    assert emulated.end() == 0
+
+
+def test_a_duty_limit_below_what_plays_is_one_line(evlcp, native: str) -> None:
+    assert evlcp("board", "program", "--random", 2, "--port", native).code == 0
+    done = evlcp("board", "program", "--random", 2, "--duty-limit", 0.3, "--port", native)
+    assert done.code == 5
+    assert (
+        "this payload has a LED on for 0.5 of the time, the duty limit is 0.3: give a limit of at least 0.5"
+        in (done.err)
+    )
+    status = json.loads(evlcp("board", "status", "--json", "--port", native).out)
+    assert (status["state"], status["duty_limit"], status["faults"]) == ("playing", 1.0, [])
+
+
 def test_pty_and_tcp(cli, tmp_path: Path) -> None:
     emulated = Emulated("native", "--listen", "pty", "--link", tmp_path / "tty")
     assert emulated.said == f"listening on {tmp_path / 'tty'}\n"

@@ -95,3 +95,33 @@ def test_refusal_carries_status_and_detail() -> None:
         request = sent(client.poll(0.0)[0])[0]
         outcome = client.receive(reply(request, (60).to_bytes(4, "little"), int(status)))[0]
         assert (outcome.status, outcome.detail, outcome.reply) == (status, 60, None)
+
+
+def answer(client: Client, now: float, after_s: float) -> float:
+    """A CRC request that is sent again until its answer, which takes so long, is there; gives that time."""
+    client.submit(CrcRequest(0, 0, 1))
+    wire, deadline = client.poll(now)
+    request, end = sent(wire)[0], now + after_s
+    while deadline is not None and deadline < end:
+        deadline = client.poll(deadline)[1]
+    (done,) = client.receive(reply(request, CrcReply(9).pack()), end)
+    assert done.status == Status.OK
+    return end
+
+
+def test_a_slow_board_gets_the_time_that_it_takes() -> None:
+    client = Client(Timing(latency_s=0.1))
+    now = 0.0
+    for _ in range(20):
+        now = answer(client, now, 0.01)
+    assert client.latency_s == 0.1  # never less
+    for _ in range(30):
+        now = answer(client, now, 0.7)
+    before = client.retries
+    for _ in range(30):
+        now = answer(client, now, 0.7)
+    assert client.retries == before
+    assert 0.7 <= client.latency_s < 2.0
+    for _ in range(60):
+        now = answer(client, now, 0.01)
+    assert client.latency_s == 0.1

@@ -1,14 +1,16 @@
 """The firmware as files, and into a part by its ROM; what is in there then boots on the model."""
 
+import contextlib
 import json
 import socket
 import subprocess
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from test_board_cli import Emulated
 
 from evlcp_sdk.errors import InputError
 from firmware_host import build
@@ -199,38 +201,75 @@ def test_brown_out_is_set_and_nothing_else() -> None:
     assert rom.options[1:] == before[1:]
 
 
-@pytest.mark.parametrize(
-    ("target", "hse_hz"), [("stm32f405-8mhz", 8_000_000), ("stm32f405-12mhz", 12_000_000)]
-)
-def test_what_the_command_flashes_boots(cli, image: FlashImage, target: str, hse_hz: int) -> None:
-    del image  # built
+def test_what_the_command_flashes_boots_where_it_was_flashed(cli, image: FlashImage, tmp_path: Path) -> None:
+    pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
+    port, kept = f"unix:{tmp_path / 'part'}", tmp_path / "flash.bin"
+    kept.write_bytes(some(1 << 20, 5).data)
+    emulated = Emulated("rom", "--listen", port, "--flash", kept)
+    try:
+        assert emulated.said == f"listening on {port}\n"
+        done = cli("board", "flash", "--target", "stm32f405-8mhz", "--port", port, "--json")
+        assert done.returncode == 0, done.stderr
+        table = json.loads(done.stdout)
+        assert (table["verified"], table["started"], table["brown_out"]) == (True, True, False)
+        assert table["sectors"][0] == 0
+        assert kept.read_bytes()[: len(image.data)] == image.data
+        about = json.loads(cli("board", "hello", "--port", port, "--json").stdout)
+        assert about["hal"] == "stm32f405"
+    finally:
+        assert emulated.end() == 0
+    done = cli(
+        "board", "emulate", "rom", "--listen", port, "--flash", tmp_path / "part.bin", "--leds", tmp_path
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    (tmp_path / "short.bin").write_bytes(b"12")
+    done = cli("board", "emulate", "rom", "--listen", port, "--flash", tmp_path / "short.bin")
+    assert done.returncode == 3
+    assert "2 bytes, expected 1048576, the flash of the part" in done.stderr
+
+
+def test_the_image_for_another_crystal_boots_by_that_one(image: FlashImage) -> None:
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
     from firmware_host.emulators.stm32 import ModelLine, Stm32
 
     rom = RomEmulator(some(1 << 20, 5).data)
-    server = socket.create_server(("127.0.0.1", 0))
-
-    def serve() -> None:
-        line, _ = server.accept()
-        with line:
-            while data := line.recv(4096):
-                line.sendall(rom.receive(data))
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    port = f"tcp:127.0.0.1:{server.getsockname()[1]}"
-    done = cli("board", "flash", "--target", target, "--port", port, "--json")
-    thread.join()
-    server.close()
-    assert done.returncode == 0, done.stderr
-    table = json.loads(done.stdout)
-    assert (table["verified"], table["started"], table["sectors"][0]) == (True, True, 0)
-    chip = Stm32(FlashImage(FLASH_START, bytes(rom.flash)), hse_hz)
+    flash_image(RomLoader(RomLine(rom)), FlashImage.read(build.arm_image("stm32f405-12mhz")))
+    flash = FlashImage(FLASH_START, bytes(rom.flash))
+    chip = Stm32(flash, 12_000_000)
     chip.run(15_000)
     about = Board(Session(ModelLine(chip), Timing(latency_s=0.02))).about
     assert about.hal.rstrip(b"\0") == b"stm32f405"
-    with pytest.raises(AssertionError, match="not 168 MHz by this crystal"):
-        Stm32(FlashImage(FLASH_START, bytes(rom.flash)), 20_000_000 - hse_hz).run(15_000)
+    for wrong, hse_hz in ((flash, 8_000_000), (image, 12_000_000)):
+        with pytest.raises(AssertionError, match="not 168 MHz by this crystal"):
+            Stm32(wrong, hse_hz).run(15_000)
+
+
+def test_a_part_without_brown_out_is_told(evlcp, tmp_path: Path) -> None:
+    (tmp_path / "image.bin").write_bytes(some(1_000).data)
+    for said, options in ((True, ()), (False, ("--brown-out",))):
+        rom = RomEmulator()
+        with serving(rom) as port:
+            done = evlcp("board", "flash", tmp_path / "image.bin", "--port", port, *options)
+        assert done.code == 0, done.err
+        assert ("brown-out reset is off: flash with --brown-out" in done.out) == said
+        assert rom.resets == (not said)
+
+
+@contextlib.contextmanager
+def serving(rom: RomEmulator) -> Iterator[str]:
+    """A ROM at a port, for one host."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            line, _ = server.accept()
+            with line:
+                while data := line.recv(4096):
+                    line.sendall(rom.receive(data))
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield f"tcp:127.0.0.1:{server.getsockname()[1]}"
+        thread.join(10)
 
 
 def test_options_of_flash_are_checked(cli, tmp_path: Path) -> None:

@@ -91,16 +91,55 @@ def test_limits_hold_at_once_and_outlive_a_reset_by_save(book: Codebook) -> None
     board = board_on(SimulatedLine(device))
     status = board.status()
     assert (status.level_ma, status.level_limit_ma, status.duty_limit) == (25, 25, 500)
-    # a limit below what plays: dark, named, until START is allowed again
-    board.limit(good, duty=0.4)
+    # a limit below what plays: refused by host and board, with both numbers, and it plays on
+    with pytest.raises(
+        RefusedError, match=r"a LED on for 0\.5 of the time, the duty limit is 0\.4: .* at least 0\.5"
+    ):
+        board.limit(good, duty=0.4)
+    with pytest.raises(RefusedError, match=r"TOO_BRIGHT.*400 of 1000 chips"):
+        board._configure(good, 20, 400)
     device.run(200_000)
     status = board.status()
-    assert (status.state, status.faults) == (State.FAULT, BoardFault.OVER_LIMIT)
-    assert not device.shown().any()
+    assert (status.state, status.faults) == (State.PLAYING, 0)
+    assert (status.level_ma, status.level_limit_ma, status.duty_limit) == (25, 25, 500)
     with pytest.raises(RefusedError, match="nearest value the board can take is 60"):
         board.limit(good, level_ma=61)
     with pytest.raises(ConfigError, match="duty_limit = 0: expected"):
         Settings(duty_limit=0)
+
+
+def test_a_duty_limit_fits_what_is_programmed_with_it(book: Codebook) -> None:
+    device, board = device_and_board()
+    good = Bank.of_symbols(random_symbols(2, 10, book, np.random.default_rng(0)), book)
+    rows = np.zeros((CHIPS, 96), np.uint8)
+    rows[::5] = 1
+    dim = bank_of_rows(rows)
+    assert (good.duty, dim.duty) == (500, int(np.ceil(1000 * rows.mean(0).max())))
+    provision(board, good, Settings())
+    assert board.status().duty == good.duty
+    for _ in range(2):  # there already, or another one as bright
+        with pytest.raises(RefusedError, match=r"this payload has a LED on for 0\.5 of the time") as refused:
+            provision(board, good, Settings(duty_limit=0.3))
+        assert (refused.value.status, refused.value.exit_code) == (Status.TOO_BRIGHT, 5)
+        device.run(50_000)
+        status = board.status()
+        assert (status.state, status.faults, status.duty_limit) == (State.PLAYING, 0, 1000)
+    # what plays is too bright for the limit, what comes is not: first the one, then the other
+    provision(board, dim, Settings(duty_limit=0.3))
+    device.run(100_000)
+    status = board.status()
+    assert (status.state, status.faults, status.duty, status.duty_limit) == (State.PLAYING, 0, dim.duty, 300)
+    with pytest.raises(RefusedError, match=r"TOO_BRIGHT.*300 of 1000 chips"):
+        board.program(good)
+    # limits by which a bank is refused do not stay
+    provision(board, dim, Settings(duty_limit=1.0, level_ma=60))
+    ones = bank_of_rows(np.ones((CHIPS, 96), np.uint8))
+    with pytest.raises(RefusedError, match=r"TOO_BRIGHT.*545 of 1000 chips"):
+        provision(board, ones, Settings(level_limit_ma=55))
+    status = board.status()
+    assert (status.level_ma, status.level_limit_ma, status.duty_limit) == (60, 60, 1000)
+    assert board.holds(dim, status)
+    assert status.state == State.PLAYING
 
 
 @st.composite

@@ -12,9 +12,9 @@ from firmware_host import build
 from firmware_host.board.bank import Bank, random_symbols
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
-from firmware_host.board.step import start_together
+from firmware_host.board.step import start_together, wait_for_pulse
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
-from firmware_host.errors import RefusedError
+from firmware_host.errors import LineError, RefusedError
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.requests import BoardFault, State
 
@@ -78,6 +78,23 @@ def test_start_at_a_clock(book: Codebook) -> None:
     device.run(100_000)
     assert not len(device.records().played())
     assert board.status().state == State.DARK
+
+
+def test_a_pulse_that_does_not_come_is_told_and_the_board_stopped(book: Codebook) -> None:
+    device, board = crystal(book, 0.0)
+    device.set_pulse(0, 0)
+    assert start_together([board]) == [3]
+    with pytest.raises(
+        LineError,
+        match=r"has not come in 2 s \(pulses since reset: simulated: has counted 0\): check the wire",
+    ):
+        wait_for_pulse([board], 2.0)
+    assert board.status().state == State.DARK
+    device.set_pulse(1e6, 1e5)
+    device.run(500_000)
+    start_together([board], 10)
+    wait_for_pulse([board], 2.0)
+    assert board.status().state == State.PLAYING
 
 
 def test_pulses_that_cease_are_named_and_playing_goes_on(book: Codebook) -> None:

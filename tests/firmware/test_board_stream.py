@@ -1,10 +1,13 @@
 """Streams: every packet once and in order over any line, underruns named, dark at the end."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from board_lines import NoisyLine
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.air.frames import packet_chips
@@ -15,7 +18,7 @@ from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.board.stream import Stream
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine, UsbLine
-from firmware_host.errors import BoardResetError, IncompatibleError, RefusedError
+from firmware_host.errors import BoardResetError, IncompatibleError, RefusedError, VerifyError
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.requests import (
     BoardFault,
@@ -372,3 +375,45 @@ def test_what_changes_is_right_at_its_first_chip(latency_s: float) -> None:
         # the board's answers come late by the line's latency, and with them what is known of its queue
         assert -8_000 <= due - begun_us <= 8_000 + 1e6 * latency_s
         assert 6 <= shown.count(chips) <= 10, "round and round for 0.25 s"
+
+
+def test_after_a_stream_nothing_can_be_started_or_compared() -> None:
+    device = SimulatedBoard()
+    board = board_on(SimulatedLine(device))
+    with board.stream(LINK) as stream:
+        stream.send(symbols(LINK, 1)[0])
+    assert board.status().state == State.DARK
+    with pytest.raises(RefusedError, match=r"NOTHING_COMMITTED.*a stream that has ended, say, is gone"):
+        board.start()
+    device.run(10_000)
+    assert board.status().state == State.DARK
+    bank = bank_of(symbols(LINK, 1), LINK)
+    with pytest.raises(
+        VerifyError, match="its bank is the queue of a stream, which holds nothing to compare"
+    ):
+        board.verify(bank)
+    provision(board, bank, Settings())
+    assert board.status().state == State.PLAYING
+    board.verify(bank)
+
+
+def test_a_text_of_many_packets_leaves_no_gap() -> None:
+    """Each takes half as long to make as to play: all of them at once would starve the board."""
+    board = board_on(SimulatedLine(SimulatedBoard()))
+    line = board.session.transport
+    some = symbols(LINK, 25)
+
+    with board.stream(LINK, 2) as stream:
+
+        def slowly(number: int) -> Iterator[NDArray[np.int64]] | None:
+            def made() -> Iterator[NDArray[np.int64]]:
+                for packet in some:
+                    stream.wait(stream.packet_s / 2)
+                    yield packet
+
+            return made() if number < 3 else None
+
+        stream.play(slowly, 1.0)
+        assert line.now() > 2.0
+    assert stream.underruns == 0
+    assert stream.sent >= 75

@@ -136,6 +136,10 @@ def test_a_message_that_changes(evlcp: Evlcp, tmp_path: Path) -> None:
         (("--text", "a", "--count", "3"), "--count belongs to --every"),
         (("--countdown", "3", "--signal", "blue", "--every", "1", "--port", "native:"), "signal = 'blue'"),
         (("--countdown", "1e9", "--json"), "expected 0 to 86400"),
+        (
+            ("--text", "a" * 8000, "--every", "1", "--port", "native:"),
+            "takes 6.955 s on air, 201 packets of 34.6 ms; give --every 7 or more, or send less",
+        ),
     ],
 )
 def test_a_wrong_one_is_one_line(

@@ -82,6 +82,7 @@ def test_a_locked_board_does_all_with_its_key_and_nothing_without() -> None:
     assert board.verify(BANK) == 0
     with board.stream(LINK) as stream:
         stream.send(random_symbols(1, 10, LINK.codebook, np.random.default_rng(1))[0])
+    provision(board, BANK, Settings(start=False))
     board.start()
     stranger = board_on(SimulatedLine(device))
     before = stranger.status()

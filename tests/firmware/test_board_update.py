@@ -201,6 +201,59 @@ def test_a_noisy_line_and_a_reset_half_way() -> None:
     assert update(board_on(SimulatedLine(device)), package(5)).image == 2
 
 
+def test_interrupted_and_run_again() -> None:
+    class Ends(SimulatedLine):
+        left = 4_000
+
+        def to_board(self, data: bytes) -> bytes:
+            self.left -= len(data)
+            return data if self.left > 0 else b""
+
+    device, board = fresh()
+    update(board, package(1, 20_000))
+    board = Board(Session(Ends(device), Timing(latency_s=0.01)))
+    with pytest.raises(LineError, match="it begins anew, and the board keeps the firmware that it runs"):
+        update(board, package(2, 20_000))
+    board = board_on(SimulatedLine(device))
+    assert (update_status(board).running, update_status(board).trial) == (1, 0)
+    done = update(board, package(2, 20_000))
+    assert (done.image, device.image(2, 20_000)) == (2, package(2, 20_000).images[2])
+
+
+class SlowLine(SimulatedLine):
+    """A line and a board that take two hundred times as long as they should."""
+
+    def __init__(self, board: SimulatedBoard) -> None:
+        super().__init__(board)
+        self.under_way: list[tuple[int, bytes]] = []
+
+    def now(self) -> float:
+        return 200 * super().now()
+
+    def write(self, data: bytes) -> None:
+        begins = max([self.board.now_us, *(at for at, _ in self.under_way)])
+        self.under_way.append((begins + 10 * len(data), data))
+
+    def read(self, timeout_s: float) -> bytes:
+        end = self.board.now_us + max(self.step_us, int(timeout_s / 200 * 1e6))
+        while self.board.now_us < end:
+            while self.under_way and self.under_way[0][0] <= self.board.now_us:
+                self.board.receive(self.under_way.pop(0)[1])
+            self.board.run(self.step_us)
+            if data := self.board.sent():
+                return data
+        return b""
+
+
+def test_a_slow_board_is_waited_for() -> None:
+    device = SimulatedBoard()
+    board = Board(Session(SlowLine(device), Timing()))
+    done = update(board, package(3, 30_000))
+    assert (done.image, device.running()) == (1, 1)
+    # the first ones go out again; then it is known how long an answer takes
+    assert board.session.client.retries < 20
+
+
 def test_a_board_with_a_key_takes_updates_from_its_host_alone(book: Codebook) -> None:
     key = bytes(range(16))
     device, board = fresh()
@@ -222,6 +275,16 @@ def test_a_file_of_an_update(tmp_path: Path) -> None:
     path.write_text(package(1).to_json())
     assert Package.read(path) == package(1)
     table = json.loads(path.read_text())
+    for name, content in (("x.bin", b"\xff\xfe\x00\x20" * 100), ("x.json", b"{"), ("y.bin", b"")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError) as told:
+            Package.read(tmp_path / name)
+        assert str(told.value).startswith(
+            f"{tmp_path / name}: not a firmware update, or damaged; expected TARGET."
+        )
+        assert "codec" not in str(told.value)
+    with pytest.raises(InputError, match="cannot be read: No such file"):
+        Package.read(tmp_path / "none.json")
     for harm in ({"crc32": [1, 2]}, {"images": {"1": "AAAA"}}, {"evlcp_update": 2}, {"target": 5}):
         path.write_text(json.dumps(table | harm))
         with pytest.raises(InputError, match="not a firmware update, or damaged"):

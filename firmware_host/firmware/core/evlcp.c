@@ -65,17 +65,17 @@ void evlcp_activate(struct evlcp *e, uint8_t bank)
         (void)evlcp_banks_swap(&e->banks);
 }
 
-uint32_t evlcp_allowed(const struct evlcp *e, uint32_t level_ma)
+uint32_t evlcp_allowed(const struct evlcp *e, uint32_t level_ma, uint32_t duty_limit)
 {
     uint32_t most = level_ma > e->info.mean_max_ma ? 1000u * e->info.mean_max_ma / level_ma : 1000u;
-    return most < e->duty_limit ? most : e->duty_limit;
+    return most < duty_limit ? most : duty_limit;
 }
 
 bool evlcp_light(struct evlcp *e, uint16_t level_ma, uint16_t level_limit_ma, uint16_t duty_limit)
 {
     e->level_limit_ma = level_limit_ma;
     e->duty_limit = duty_limit;
-    uint32_t duty = evlcp_allowed(e, level_ma);
+    uint32_t duty = evlcp_allowed(e, level_ma, duty_limit);
     uint32_t old = atomic_load(&e->player.guard.duty);
     /* What plays meanwhile keeps to the lower of both. */
     if (duty < old)
@@ -194,7 +194,15 @@ static enum evlcp_status on_configure(struct evlcp *e, struct exchange *x)
     }
     uint16_t limit = request.level_limit_ma != 0u ? request.level_limit_ma : e->level_limit_ma;
     uint16_t share = request.duty_limit != 0u ? request.duty_limit : e->duty_limit;
-    if (!evlcp_light(e, e->level_ma < limit ? e->level_ma : limit, limit, share))
+    uint16_t level_ma = e->level_ma < limit ? e->level_ma : limit;
+    /* What plays, or would with the next START, must not end in the dark. */
+    uint32_t allowed = evlcp_allowed(e, level_ma, share);
+    if (request.duty_limit != 0u && (!bright_enough(e, atomic_load(&e->banks.pending), allowed) ||
+                                     !bright_enough(e, atomic_load(&e->banks.active), allowed))) {
+        x->detail = allowed;
+        return EVLCP_STATUS_TOO_BRIGHT;
+    }
+    if (!evlcp_light(e, level_ma, limit, share))
         return EVLCP_STATUS_HARDWARE_FAULT;
     e->setup.chip_rate_hz = request.chip_rate_hz;
     e->setup.ticks_per_chip = e->info.tick_hz / request.chip_rate_hz;
@@ -304,7 +312,7 @@ static enum evlcp_status on_commit(struct evlcp *e, struct exchange *x)
     enum evlcp_status status = evlcp_banks_check(&e->banks, &e->setup, &request, &x->detail);
     if (status != EVLCP_STATUS_OK)
         return status;
-    uint32_t allowed = evlcp_allowed(e, e->level_ma);
+    uint32_t allowed = evlcp_allowed(e, e->level_ma, e->duty_limit);
     if (!bright_enough(e, request.bank, allowed)) {
         x->detail = allowed;
         return EVLCP_STATUS_TOO_BRIGHT;
@@ -367,7 +375,9 @@ static enum evlcp_status on_push(struct evlcp *e, struct exchange *x)
 
 static enum evlcp_status start(struct evlcp *e, uint32_t *detail)
 {
-    if (atomic_load(&e->banks.active) == EVLCP_NO_BANK && atomic_load(&e->banks.pending) == EVLCP_NO_BANK)
+    uint8_t pending = atomic_load(&e->banks.pending);
+    uint8_t bank = pending != EVLCP_NO_BANK ? pending : atomic_load(&e->banks.active);
+    if (bank == EVLCP_NO_BANK || evlcp_stream_over(&e->banks.stream[bank]))
         return EVLCP_STATUS_NOTHING_COMMITTED;
     hal_health(&e->health);
     if ((e->health.faults & HOLDS_DARK) != 0u) {
@@ -427,7 +437,7 @@ static enum evlcp_status on_level(struct evlcp *e, struct exchange *x)
         x->detail = e->level_limit_ma;
         return EVLCP_STATUS_OUT_OF_RANGE;
     }
-    uint32_t allowed = evlcp_allowed(e, request.level_ma);
+    uint32_t allowed = evlcp_allowed(e, request.level_ma, e->duty_limit);
     if (!bright_enough(e, atomic_load(&e->banks.pending), allowed) ||
         !bright_enough(e, atomic_load(&e->banks.active), allowed)) {
         x->detail = allowed;
@@ -575,7 +585,7 @@ static enum evlcp_status on_led_test(struct evlcp *e, struct exchange *x)
         return EVLCP_STATUS_HARDWARE_FAULT;
     }
     /* A LED is on for as long as the host likes: with no more than the mean that it may have. */
-    uint32_t most = (uint32_t)e->level_ma * evlcp_allowed(e, e->level_ma) / 1000u;
+    uint32_t most = (uint32_t)e->level_ma * evlcp_allowed(e, e->level_ma, e->duty_limit) / 1000u;
     if (!hal_level((uint16_t)most)) {
         x->detail = 0u;
         return EVLCP_STATUS_HARDWARE_FAULT;

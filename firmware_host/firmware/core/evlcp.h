@@ -104,8 +104,8 @@ enum evlcp_status evlcp_settings_recall(struct evlcp *e, bool only_autostart, st
 /* The key of the newest slot that is whole. */
 void evlcp_settings_key(struct evlcp *e);
 
-/* Share of time that a LED may be on with a current, permille. */
-uint32_t evlcp_allowed(const struct evlcp *e, uint32_t level_ma);
+/* Share of time that a LED may be on with a current and a limit, permille. */
+uint32_t evlcp_allowed(const struct evlcp *e, uint32_t level_ma, uint32_t duty_limit);
 
 /* Set current and limits, as they are allowed together; false if the hardware does not follow. */
 bool evlcp_light(struct evlcp *e, uint16_t level_ma, uint16_t level_limit_ma, uint16_t duty_limit);

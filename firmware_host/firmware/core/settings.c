@@ -171,7 +171,7 @@ static enum evlcp_status load(struct evlcp *e, uint8_t index, const struct slot 
     if (s->level_limit_ma > e->info.level_max_ma || s->level_ma > s->level_limit_ma || s->duty_limit > 1000u ||
         !evlcp_light(e, s->level_ma, s->level_limit_ma, s->duty_limit))
         return EVLCP_STATUS_HARDWARE_FAULT;
-    if (e->banks.plan[bank].duty > evlcp_allowed(e, s->level_ma))
+    if (e->banks.plan[bank].duty > evlcp_allowed(e, s->level_ma, e->duty_limit))
         return EVLCP_STATUS_TOO_BRIGHT;
     e->setup = setup;
     e->watch.action = s->watchdog <= EVLCP_WATCHDOG_DARK ? s->watchdog : EVLCP_WATCHDOG_KEEP;

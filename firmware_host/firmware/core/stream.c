@@ -30,6 +30,11 @@ void evlcp_stream_push(struct evlcp_stream *stream, uint8_t *content, uint32_t n
     }
 }
 
+bool evlcp_stream_over(const struct evlcp_stream *stream)
+{
+    return stream->on && atomic_load(&stream->ended) && atomic_load(&stream->begun) == atomic_load(&stream->pushed);
+}
+
 enum evlcp_stream_next evlcp_stream_take(struct evlcp_stream *stream, bool hold, uint32_t *slot)
 {
     uint32_t begun = atomic_load(&stream->begun);

@@ -38,6 +38,9 @@ void evlcp_stream_begin(struct evlcp_stream *stream, uint32_t packet_bytes, uint
 void evlcp_stream_push(struct evlcp_stream *stream, uint8_t *content, uint32_t number, uint32_t offset,
                        const uint8_t *bytes, uint32_t count);
 
+/* Whether it has ended, and all that was put in has begun to play. */
+bool evlcp_stream_over(const struct evlcp_stream *stream);
+
 /* Take the next packet out, at a packet boundary; what it held before may be overwritten from now on. `hold`: not
    now, show the idle pattern. */
 enum evlcp_stream_next evlcp_stream_take(struct evlcp_stream *stream, bool hold, uint32_t *slot);
