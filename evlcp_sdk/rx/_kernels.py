@@ -594,6 +594,76 @@ def pilot_light(sums: Array, codes: Array, prior: Array, grid: int, out: Array) 
 
 
 @njit(cache=True, nogil=True)
+def spread_between(
+    sums: Array,
+    codes: Array,
+    places: Array,
+    seen: Array,
+    pairs: Array,
+    half: float,
+    first: float,
+    last: float,
+    out: Array,
+) -> None:
+    """Count answers of the pixels on the way from a cluster to its neighbour to the neighbour's edges.
+
+    Chips of a value are off and on, or on and off: between two values a cluster stays as it is if they
+    differ, and switches if they are alike. `out` (2, 2, 3): the first of the pair stays on, or off; answers
+    and edges; before the share `first` of the way, up to `last`, beyond.
+    """
+    values = codes.shape[1]
+    _, height, width = sums.shape
+    for pair in range(len(pairs)):
+        a, b = pairs[pair]
+        way = places[b] - places[a]
+        length = abs(way)
+        if not (seen[a] and seen[b]) or length == 0:
+            continue
+        left, right = min(places[a].real, places[b].real) - half, max(places[a].real, places[b].real) + half
+        top, bottom = min(places[a].imag, places[b].imag) - half, max(places[a].imag, places[b].imag) + half
+        for v in range(max(int(top), 0), min(int(bottom) + 2, height)):
+            for u in range(max(int(left), 0), min(int(right) + 2, width)):
+                off = (complex(u, v) - places[a]) * way.conjugate() / length
+                if abs(off.imag) > half or off.real < 0 or off.real >= length:
+                    continue
+                zone = int(off.real >= first * length) + int(off.real >= last * length)
+                for i in range(values - 1):
+                    if codes[a, i] == codes[a, i + 1] or codes[b, i] != codes[b, i + 1]:
+                        continue
+                    dark = int(codes[a, i] < 0)
+                    out[dark, 0, zone] += int(sums[2 * i + 2, v, u] * codes[b, i] < 0)
+                    out[dark, 1, zone] += 1
+
+
+@njit(cache=True, nogil=True)
+def spread_across(
+    sums: Array, codes: Array, places: Array, seen: Array, way: complex, along: float, out: Array
+) -> None:
+    """Count answers of the pixels beside the middle of clusters to the edge within each of their values.
+
+    `way` is the direction of the line, of size 1; `along`, how far from a middle pixels may lie on it; `out`
+    (2, 2 n + 1): answers and edges by column, n to either side.
+    """
+    values = codes.shape[1]
+    _, height, width = sums.shape
+    most = out.shape[1] // 2
+    reach = along + most + 1
+    for k in range(len(places)):
+        if not seen[k]:
+            continue
+        x, y = places[k].real, places[k].imag
+        for v in range(max(int(y - reach), 0), min(int(y + reach) + 2, height)):
+            for u in range(max(int(x - reach), 0), min(int(x + reach) + 2, width)):
+                off = (complex(u, v) - places[k]) * way.conjugate()
+                column = int(np.floor(off.imag + 0.5)) + most
+                if abs(off.real) > along or column < 0 or column > 2 * most:
+                    continue
+                for i in range(values):
+                    out[0, column] += int(sums[2 * i + 1, v, u] * codes[k, i] > 0)
+                    out[1, column] += 1
+
+
+@njit(cache=True, nogil=True)
 def copy_near(pixels: Array, places: Array, unit: complex, along: float, across: float, out: Array) -> None:
     """Copy what lies within reach of each cluster's place, along a direction and across it."""
     _, height, width = pixels.shape

@@ -1,9 +1,9 @@
 """Which transmitter is the reflection of which, and frames that wait until that is known.
 
-A wet road, a guard rail or a window shows a bar a second time: the same chips at the same time, weaker, and
-in a mirror on the road in the opposite order. Whatever repeats the symbols of another transmitter on its
-packet grid is its reflection: two transmitters on one clock that send other data agree in one symbol of as
-many as there are codewords.
+A wet road, a guard rail or a window shows a bar a second time: the same chips at the same time, weaker, maybe
+blurred, and in a mirror on the road in the opposite order. Whatever repeats the symbols of another
+transmitter on its packet grid is its reflection: two transmitters on one clock that send other data agree in
+one symbol of as many as there are codewords.
 """
 
 import math
@@ -19,6 +19,7 @@ from evlcp_sdk.rx.delays import LONGEST_ROW_US
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.look import Look
 from evlcp_sdk.rx.packets import PacketAssembler
+from evlcp_sdk.rx.spread import Spread, sharper
 from evlcp_sdk.values import Frame, Packet
 
 __all__ = ["EchoQueue", "Echoes", "Sighting", "brighter", "originals", "repeats"]
@@ -38,10 +39,17 @@ bar: one installation in 150 hangs upside down over a mirror."""
 
 _LIGHT = 0.3
 """Logarithm of the cells that show a cluster of the bar over those of its reflection, and how much it varies:
-a pixel answers a step with few events, however high it is, so a fifth of the light takes a third of them."""
+a pixel answers a step with few events, however high it is, so a fifth of the light takes a third of them. It
+counts where nothing is known of how light spreads: of a layout without neighbours."""
 
 _MOST_LIGHT = 3.0
-"""Log odds that light can give at the most: a reflection that is blurred wakes more pixels than the bar."""
+"""Log odds that cells can give at the most: a reflection that is blurred wakes more pixels than the bar."""
+
+_MOST_SHARP = 4.0
+"""Log odds that light and sharpness can give at the most: less than a mirror image's order does."""
+
+_ANEW = 1.25
+"""Share of frames by which those in common must have grown before their sharpness is compared again."""
 
 _WHOLE = 1.0
 """Log odds for each e-fold of clusters that the one shows more of: a rail is lower than the bar, so that its
@@ -69,18 +77,20 @@ class Sighting:
         light: Grid cells that show a cluster, on average: what shines more shows in more of them.
         seen: Clusters that are seen.
         mirrored: The order of the clusters is the opposite of the layout's.
+        spread: How light spreads in it; None where that is not known.
     """
 
     frame: Frame
     light: float
     seen: int
     mirrored: bool
+    spread: Spread | None = None
 
     @classmethod
     def of(cls, frame: Frame, look: Look) -> "Sighting":
         """What a frame's image shows."""
         placed, seen = look.placement, max(int(look.placement.seen.sum()), 1)
-        return cls(frame, placed.cells / seen, seen, placed.mirrored)
+        return cls(frame, placed.cells / seen, seen, placed.mirrored, look.spread)
 
 
 def repeats(one: NDArray[np.int64], other: NDArray[np.int64], codewords: int) -> float:
@@ -153,6 +163,9 @@ class _Pair:
         light: Sum of the logarithms of the first one's light over the second's.
         seen: The same of the clusters that are seen.
         mirrored: Frames in which only the second is mirrored less those in which only the first is.
+        spread: How light spreads in each, by the frames that tell it of both.
+        sharper: Log odds of the first being sharper and brighter, by the frames up to some; None if unknown.
+        compared: Frames by which that is.
         last_us: Time of the newest frame in common, us.
     """
 
@@ -163,6 +176,9 @@ class _Pair:
     light: float = 0.0
     seen: float = 0.0
     mirrored: int = 0
+    spread: tuple[Spread, Spread] | None = None
+    sharper: float | None = None
+    compared: int = 0
     last_us: float = -math.inf
 
     def add(self, one: Sighting, other: Sighting, codewords: int) -> None:
@@ -177,13 +193,23 @@ class _Pair:
             self.light += math.log(one.light / other.light)
             self.seen += math.log(one.seen / other.seen)
         self.mirrored += other.mirrored - one.mirrored
+        if one.spread is not None and other.spread is not None:
+            known = self.spread
+            both = one.spread, other.spread
+            self.spread = both if known is None else (known[0] + both[0], known[1] + both[1])
         self.last_us = max(one.frame.t_us, other.frame.t_us, self.last_us)
 
     def odds(self) -> float:
         """Log odds of the first being the bar and the second its reflection."""
         turned = _MIRRORED * self.mirrored / max(self.frames, 1)
         lit = max(self.lit, 1)
-        return turned + brighter(self.light / lit) + _WHOLE * self.seen / lit
+        if self.spread is not None and self.spread[0].frames >= self.compared * _ANEW:
+            self.sharper, self.compared = sharper(*self.spread), self.spread[0].frames
+        if self.sharper is None:
+            light = brighter(self.light / lit)
+        else:
+            light = min(max(self.sharper, -_MOST_SHARP), _MOST_SHARP)
+        return turned + light + _WHOLE * self.seen / lit
 
 
 class Echoes:

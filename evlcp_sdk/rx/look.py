@@ -12,6 +12,7 @@ from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.detection import Followed
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements
+from evlcp_sdk.rx.spread import Spread, neighbours
 from evlcp_sdk.values import Events, PresenceMap, SyncLock
 
 __all__ = ["Look", "Looker", "Pilot", "polarity_sums"]
@@ -54,6 +55,7 @@ class Look:
             `middle_us`.
         middle_us: Middle of the pilot, or of the info segment of a frame without one, where a chip starts: a
             chip's events show the image at its first edge.
+        spread: How light spreads in it; None of a frame without a pilot.
     """
 
     sums: NDArray[np.int16]
@@ -63,6 +65,7 @@ class Look:
     others: tuple[Placement, ...]
     corner_px: tuple[float, float]
     middle_us: float
+    spread: Spread | None = None
 
     @property
     def centre_px(self) -> tuple[float, float]:
@@ -95,6 +98,7 @@ class Looker:
         self._packet = packet
         self._spec = spec
         self._layout = layout_of(centres_m)
+        self._pairs = neighbours(self._layout)
         self._pilots = pilots.astype(np.int64)
         self._separate = separate
         self._sensor_px = sensor_px
@@ -122,6 +126,7 @@ class Looker:
             size = pilot.size_px
         pieces = [e for t, e in region.pieces if t < due.end_us and t + self._spec.step_us > due.start_us]
         sums, offset_px = polarity_sums(pieces, lock, due.start_us, (x, y), size)
+        spread = None
         if due.has_pilot:
             heard, moved = sums[: packet.pilot_chips], offset_px[:, : packet.pilot_chips]
             presence = self._separate(heard)
@@ -133,6 +138,7 @@ class Looker:
             presence, placement = lit(heard, self._pilots, presence, found[0])
             if not placement.seen.any():
                 return None, pilot
+            spread = Spread.of(heard, self._pilots, self._layout, self._pairs, placement)
             pilot = Pilot(due.number, size, heard, moved, presence, placement, tuple(found[1:]))
         else:
             assert pilot is not None
@@ -146,7 +152,9 @@ class Looker:
             float(y[middle]) - (size[1] - 1) / 2 - float(rest_px[1]),
         )
         middle_us = float(middles[middle]) - lock.chip_us / 2
-        look = Look(sums, offset_px, pilot.presence, pilot.placement, pilot.others, corner_px, middle_us)
+        look = Look(
+            sums, offset_px, pilot.presence, pilot.placement, pilot.others, corner_px, middle_us, spread
+        )
         return look, pilot
 
     def centre(self, look: Look, points_px: NDArray[np.float64]) -> tuple[float, float]:

@@ -13,10 +13,11 @@ from scipy.special import ndtr, ndtri
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.scene.optics import Blur
 from evlcp_sdk.sim import _kernels
 from evlcp_sdk.sim.light import Source, sources_of, wiper_switches
 from evlcp_sdk.sim.motion import CameraPath, project
-from evlcp_sdk.sim.optics import Blur, blur_of, step_table, strip_table
+from evlcp_sdk.sim.optics import blur_of, step_table, strip_table
 from evlcp_sdk.sim.scene import NEAREST_M, Scene, SensorSpec
 from evlcp_sdk.values import Events
 

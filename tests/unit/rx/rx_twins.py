@@ -288,3 +288,36 @@ def slope_of_rows(rows, fit, seen, fewest, chance, least):
     rest = places - slope * rows
     spread = max(1.48 * np.median(np.abs(rest - np.median(rest))), least)
     return slope, spread / np.sqrt(((rows - rows.mean()) ** 2).sum())
+
+
+def spread_between(sums, codes, places, seen, pairs, half, first, last):
+    out = np.zeros((2, 2, 3), int)
+    v, u = np.indices(sums.shape[1:])
+    for a, b in pairs:
+        if not (seen[a] and seen[b]):
+            continue
+        way = places[b] - places[a]
+        off = (u + 1j * v - places[a]) / (way / abs(way))
+        share = off.real / abs(way)
+        near = (np.abs(off.imag) <= half) & (share >= 0) & (share < 1)
+        zones = np.digitize(share, [first, last])
+        stays, switches = codes[a, :-1] != codes[a, 1:], codes[b, :-1] == codes[b, 1:]
+        for i in np.flatnonzero(stays & switches):
+            # Of a value +1 the second chip is on; of the value after it, if it is alike, the first is off.
+            answers = sums[2 * i + 2] * -codes[b, i] > 0
+            for zone in range(3):
+                here = near & (zones == zone)
+                out[int(codes[a, i] < 0), :, zone] += [(answers & here).sum(), here.sum()]
+    return out
+
+
+def spread_across(sums, codes, places, seen, way, along, most):
+    out = np.zeros((2, 2 * most + 1), int)
+    v, u = np.indices(sums.shape[1:])
+    for place, code in zip(places[seen], codes[seen], strict=True):
+        off = (u + 1j * v - place) / way
+        for column in range(-most, most + 1):
+            here = (np.abs(off.real) <= along) & (np.floor(off.imag + 0.5) == column)
+            answers = (sums[1::2] * code[:, None, None] > 0) & here
+            out[:, column + most] += [answers.sum(), here.sum() * len(code)]
+    return out

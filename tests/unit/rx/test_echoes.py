@@ -349,7 +349,7 @@ def test_a_reflection_that_comes_and_goes() -> None:
 
 def test_half_a_reflection() -> None:
     """Eight of sixteen clusters are mirrored, weaker than the bar: it is a reflection, or nothing."""
-    image = ideal_events(LINK, replace(BAR, x_px=480.3, width_px=2), seed=2, missing=0.2)
+    image = ideal_events(LINK, replace(BAR, x_px=480.3), seed=2, missing=0.2)
     packets = received(merged(OWN, image[image.y > 350]))
     own = [p for p in packets if p.echo_of is None]
     assert {p.frames[0].x_px < 440 for p in own} == {True}

@@ -359,6 +359,22 @@ def test_light_in_step_with_the_pilot(seed, grid):
     assert out[2] == 0
 
 
+@pytest.mark.parametrize("turn", [1j, 1, np.exp(1.4j)])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_answers_between_and_across_clusters(seed, turn):
+    rng = np.random.default_rng(seed)
+    codes = rng.choice([-1, 1], (4, 8))
+    sums = rng.integers(-2, 3, (16, 26, 24)).astype(np.int16)
+    # One cluster lies beyond the image.
+    places = 11.3 + 9.1j + turn * np.array([-4.2, 0.9, 6.1, 17.0])
+    seen, pairs = np.array([True, seed != SEEDS[0], True, True]), np.array([[0, 1], [1, 0], [1, 2], [2, 3]])
+    between, across = np.zeros((2, 2, 3), int), np.zeros((2, 11), int)
+    _kernels.spread_between(sums, codes, places, seen, pairs, 0.8, 0.2, 0.75, between)
+    assert_array_equal(between, twins.spread_between(sums, codes, places, seen, pairs, 0.8, 0.2, 0.75))
+    _kernels.spread_across(sums, codes, places, seen, turn, 1.3, across)
+    assert_array_equal(across, twins.spread_across(sums, codes, places, seen, turn, 1.3, 5))
+
+
 @pytest.mark.parametrize("apart", [0j, 0.5 + 0.5j, -0.9j])
 def test_centres_in_one_pixel_have_no_boundary(apart):
     """A reflection beside a bar may bring the centres of two neighbours together."""

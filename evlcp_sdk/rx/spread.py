@@ -1,0 +1,241 @@
+"""How light spreads in an image of a bar: what tells the bar from its reflection.
+
+A reflection has less light, and a rough mirror blurs it; none makes it sharper. The number of pixels that
+fire tells neither: less light makes it smaller, blur makes it larger. Three lengths together tell both, as a
+pixel answers ratios of light:
+
+- how far beyond the middle between two clusters the one shows while the other shines on: a ratio of the two
+  lights, whatever their amount, so it grows with blur alone, unless the background is as bright;
+- the same while the other is dark: down to a share of the background, so it grows with light, too;
+- how wide a cluster is across a line of them: the same again, with the lens' wings.
+
+What they should be follows from the lens, for each blur and each background, as a share of the light. Of two
+images, both on one background, the one is the bar if it is sharper and brighter; how likely that is rather
+than the opposite is summed over all that they may be.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.rx.placement import Layout, Placement
+
+__all__ = ["Spread", "neighbours", "sharper"]
+
+Floats = NDArray[np.float64]
+
+_AXIS_PX = 0.8
+"""Pixels no farther from the line between two clusters are asked: one or two side by side."""
+
+_FROM, _TO = 0.2, 0.75
+"""Shares of the way from a cluster to its neighbour between which light of the one gives way to the other's;
+before, only noise shows the neighbour, beyond, nothing but the neighbour shows."""
+
+_ACROSS_PX = 8
+"""How far from a line its light is sought, px."""
+
+_RATIO = 0.25
+"""Change of a pixel's light that wakes it."""
+
+_UNIT_PX = 0.26
+"""Wavelength times f-number: 630 nm at f/2, on pixels of 4.86 um."""
+
+_REST_PX = 0.36
+"""Blur of a lens in focus, beside diffraction, px."""
+
+_STRIP = 0.083
+"""Width of a line of LEDs in spacings of its clusters: 5 mm of 6 cm."""
+
+_BLURS_PX = np.array([0.0, 0.2, 0.35, 0.5, 0.7, 0.9, 1.2, 1.6, 2.1])
+"""What a mirror, or the weather, may add, px."""
+
+_BACKGROUNDS = np.geomspace(0.004, 2.5, 20)
+"""Background's light, in that of the middle of a cluster: with less, a falling edge takes longer than a chip;
+with more, nothing is seen."""
+
+_ERRORS_PX = np.array([0.1, 0.15, 0.2])
+"""Errors of the three lengths in one frame, px, by the scatter of frames of simulated scenes."""
+
+_KEPT_PX = np.array([0.02, 0.05, 0.05])
+"""Errors that no number of frames makes smaller: where the clusters' borders lie in their pixels."""
+
+_COMMON_PX = np.array([0.08, 0.2, 0.4])
+"""Errors that both images have: another lens, another strip, a camera in motion."""
+
+_STEPS_PER_E = 4
+"""Spacings that are told apart within a factor of e; what is expected changes little with them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Answers to the chips of pilots, by place. They add up over frames.
+
+    Attributes:
+        between: Of pixels between two clusters, to edges of the second one while the first one [shines on, is
+            dark]: [answers, edges] [before `_FROM`, up to `_TO`, beyond], int64 (2, 2, 3).
+        across: Of pixels beside the middle of a cluster of a line, to its edges: [answers, edges] by column
+            from its axis, int64 (2, 2 * 8 + 1).
+        spacing_px: Sum of the spacings, px.
+        frames: How many frames.
+    """
+
+    between: NDArray[np.int64]
+    across: NDArray[np.int64]
+    spacing_px: float
+    frames: int = 1
+
+    @classmethod
+    def of(
+        cls,
+        sums: NDArray[np.int16],
+        pilots: NDArray[np.int64],
+        layout: Layout,
+        pairs: NDArray[np.int64],
+        placement: Placement,
+    ) -> "Spread":
+        """Ask the pixels of a pilot.
+
+        Args:
+            sums: Polarity sums of the pilot, int16 (chips, height, width).
+            pilots: The clusters' codes, int64 (K, values).
+            layout: What is shown.
+            pairs: Its neighbours, int64 (n, 2).
+            placement: Where it is shown.
+        """
+        from evlcp_sdk.rx import _kernels
+
+        between = np.zeros((2, 2, 3), np.int64)
+        across = np.zeros((2, 2 * _ACROSS_PX + 1), np.int64)
+        spacing_px = abs(placement.scale) * layout.spacing_m
+        if spacing_px > 0:
+            places, seen = placement.places(layout), placement.seen
+            _kernels.spread_between(sums, pilots, places, seen, pairs, _AXIS_PX, _FROM, _TO, between)
+            if layout.line:
+                way = placement.scale / abs(placement.scale) * layout.way
+                _kernels.spread_across(sums, pilots, places, seen, way, spacing_px / 4, across)
+        return cls(between, across, spacing_px)
+
+    def __add__(self, other: "Spread") -> "Spread":
+        return Spread(
+            self.between + other.between,
+            self.across + other.across,
+            self.spacing_px + other.spacing_px,
+            self.frames + other.frames,
+        )
+
+    def lengths(self) -> Floats | None:
+        """The three lengths, px, float64 (3,), the last NaN of what is no line; None if pixels do not say."""
+        shown, asked = self.between[:, 0], self.between[:, 1]
+        if not asked.all():
+            return None
+        rate = shown / asked
+        noise, most = rate[:, 0].min(), rate[0, 2]
+        if most <= noise:
+            return None
+        part = (rate[:, 1] - noise) / (most - noise) * (_TO - _FROM)
+        beyond = (part + (1 - _TO) - 0.5) * self.spacing_px / self.frames
+        return np.array([*beyond, self._width_px()])
+
+    def _width_px(self) -> float:
+        """Columns that answer, those that answer half as often half; what lies beyond a gap is another's."""
+        if not self.across[1].any():
+            return math.nan
+        rate = self.across[0] / np.maximum(self.across[1], 1)
+        peak, most, width = _ACROSS_PX, float(rate.max()), 0.0
+        if most == 0:
+            return math.nan
+        for way in (1, -1):
+            last = most
+            for value in rate[peak + way :: way].tolist():
+                if value > last and last < most / 2:
+                    break
+                width += value
+                last = value
+        return (width + float(rate[peak])) / most
+
+
+def neighbours(layout: Layout) -> NDArray[np.int64]:
+    """Pairs of clusters that stand side by side, in both orders, int64 (n, 2).
+
+    >>> from evlcp_sdk.rx.placement import layout_of
+    >>> neighbours(layout_of(np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 2.0]]))).tolist()
+    [[0, 1], [1, 0], [1, 2], [2, 1]]
+    """
+    gaps = np.abs(layout.at_m[:, None] - layout.at_m[None])
+    beside = (gaps > 0) & (gaps < 1.1 * layout.spacing_m)
+    return np.argwhere(beside).astype(np.int64)
+
+
+def sharper(one: Spread, other: Spread) -> float | None:
+    """Log odds of the first being sharper and brighter against the second being so; None if unknown."""
+    here, there = one.lengths(), other.lengths()
+    if here is None or there is None:
+        return None
+    spacing_px = (one.spacing_px + other.spacing_px) / (one.frames + other.frames)
+    expected = _expected(round(math.log(spacing_px) * _STEPS_PER_E))
+    error = np.hypot(_ERRORS_PX / math.sqrt(min(one.frames, other.frames)), _KEPT_PX)
+    fits: Floats = np.zeros((len(expected), len(expected)))
+    for k in np.flatnonzero(~np.isnan(here + there)):
+        off_here, off_there = here[k] - expected[:, k], there[k] - expected[:, k]
+        # Of two errors with a common part, their difference has none of it, their mean all.
+        apart = (off_here[:, None] - off_there) ** 2 / (2 * error[k] ** 2)
+        mean = ((off_here[:, None] + off_there) / 2) ** 2 / (_COMMON_PX[k] ** 2 + error[k] ** 2 / 2)
+        fits -= (apart + mean) / 2
+    likely = np.exp(fits - fits.max())
+    first = _no_sharper()
+    return math.log(float((likely * first).sum()) / float((likely * first.T).sum()))
+
+
+@lru_cache(maxsize=1)
+def _no_sharper() -> NDArray[np.bool_]:
+    """Whether of two of what is expected the second is no sharper than the first and no brighter."""
+    blur, light = np.indices((len(_BLURS_PX), len(_BACKGROUNDS))).reshape(2, -1)
+    second: NDArray[np.bool_] = (blur[None] >= blur[:, None]) & (light[None] >= light[:, None])
+    return second
+
+
+@lru_cache(maxsize=32)
+def _expected(steps: int) -> Floats:
+    """The three lengths for each blur and each background, px, float64 (n, 3), at a spacing."""
+    return expected_lengths(math.exp(steps / _STEPS_PER_E), _BLURS_PX, _BACKGROUNDS)
+
+
+def expected_lengths(spacing_px: float, blurs_px: Floats, backgrounds: Sequence[float] | Floats) -> Floats:
+    """What `Spread.lengths` is of a line of clusters, all of which shine alike.
+
+    Args:
+        spacing_px: From one cluster to the next.
+        blurs_px: What is added to the lens' own blur.
+        backgrounds: In the light of the middle of a cluster.
+
+    Returns:
+        float64 (blurs * backgrounds, 3).
+    """
+    from evlcp_sdk.scene.optics import airy_blur, step
+
+    half = _STRIP * spacing_px / 2
+    along, across = np.linspace(-spacing_px / 2, spacing_px / 2, 201), np.linspace(0, _ACROSS_PX, 401)
+    lengths = []
+    for blur_px in blurs_px:
+        blur = airy_blur(_UNIT_PX, math.hypot(_REST_PX, blur_px))
+        sigma, share = blur.sigma_px[:, None], blur.share[:, None]
+        strip = share * (step(across + half, sigma) - step(across - half, sigma))
+        line = strip.sum(0) / strip.sum(0)[0]
+        core = (
+            strip[:, across <= _AXIS_PX].mean(1, keepdims=True) / strip[:, across <= _AXIS_PX].mean(1).sum()
+        )
+        own = (core * (step(along, sigma) - step(along - spacing_px, sigma))).sum(0)
+        for background in backgrounds:
+            threshold = _RATIO * background
+            lengths.append(
+                (
+                    ((own > _RATIO * own[::-1] + threshold).mean() - 0.5) * spacing_px,
+                    ((own > threshold).mean() - 0.5) * spacing_px,
+                    2 * (line > threshold).mean() * _ACROSS_PX,
+                )
+            )
+    return np.array(lengths)
