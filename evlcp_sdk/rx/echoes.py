@@ -22,7 +22,7 @@ from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.spread import Spread, sharper
 from evlcp_sdk.values import Frame, Packet
 
-__all__ = ["EchoQueue", "Echoes", "Sighting", "brighter", "originals", "repeats"]
+__all__ = ["SAME_PX", "EchoQueue", "Echoes", "Sighting", "brighter", "originals", "repeats"]
 
 _REPEATED = 0.25
 """Share of the symbols that a reflection repeats at the least; with fewer, nothing would be read of it."""
@@ -58,8 +58,8 @@ image is cut more often than the bar is covered."""
 _STAYS = 1.0
 """Log odds for what was said to be the bar before: what wavers by less changes nothing."""
 
-_APART_PX = 5.0
-"""Centres nearer than that, a region's seam, are one image that two regions saw before they were joined."""
+SAME_PX = 5.0
+"""How far apart centres of two regions of one image may be: before lit leaves an end is good to some px."""
 
 _LOOKBACK_PACKETS = 3
 """Packets of frames remembered: a new transmitter begins with the last two packets before its lock."""
@@ -239,7 +239,7 @@ class Echoes:
             for sighting in known:
                 frame = sighting.frame
                 off_px = max(abs(frame.x_px - centre_px[0]), abs(frame.y_px - centre_px[1]))
-                if off_px <= _APART_PX and abs(frame.t_us - t_us) < self._chip_us / 2:
+                if off_px <= SAME_PX and abs(frame.t_us - t_us) < self._chip_us / 2:
                     return True
         return False
 
@@ -275,7 +275,7 @@ class Echoes:
             return None
         within_us = self._chip_us / 2 + LONGEST_ROW_US * abs(nearest.frame.y_px - frame.y_px)
         off_px = max(abs(nearest.frame.x_px - frame.x_px), abs(nearest.frame.y_px - frame.y_px))
-        return nearest if apart_us(nearest) < within_us and off_px > _APART_PX else None
+        return nearest if apart_us(nearest) < within_us and off_px > SAME_PX else None
 
     def _forget(self) -> None:
         for known in self._seen.values():

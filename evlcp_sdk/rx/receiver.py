@@ -15,7 +15,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.belief import believed, still_lit
 from evlcp_sdk.rx.delays import RowDelays
 from evlcp_sdk.rx.detection import Followed, RegionFollower
-from evlcp_sdk.rx.echoes import Echoes, EchoQueue, Sighting
+from evlcp_sdk.rx.echoes import SAME_PX, Echoes, EchoQueue, Sighting
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.limits import LIMITS, Limits
@@ -40,9 +40,6 @@ _TAIL_CHIPS = 2
 _LOOKS = 3
 """Looks at a region's first frame: at what was found of a bar, at the whole of it, and once more, as few
 clusters place it less well than all."""
-
-_SAME_PX = 5.0
-"""How far apart the centres of two regions of one bar may be: before lit leaves an end is good to some px."""
 
 _DARK = 0.25
 """Share of a pilot's events below which a bar that was seen before is out of sight, or hidden."""
@@ -337,7 +334,7 @@ class Receiver:
     def _join(self, region: Followed, t_us: float) -> bool:
         """Let other regions of the bar seen at a time go; False if this one goes, as the other is known."""
         for other in list(self._regions.alive):
-            if other is region or not region.holds(other, t_us, _SAME_PX):
+            if other is region or not region.holds(other, t_us, SAME_PX):
                 continue
             gone = region if other.size_px is not None and other.id < region.id else other
             self._regions.drop(gone)

@@ -89,7 +89,8 @@ RX = (
     {"limits", "rhythm"},
     {"guard", "trust"},
     {"belief", "delays", "detection", "grid", "inbox", "packets", "placement", "ranges", "timeline"},
-    {"look", "points", "steps"},
+    {"points", "spread", "steps"},
+    {"look"},
     {"echoes", "transmitters"},
     {"receiver"},
 )
