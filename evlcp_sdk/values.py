@@ -535,7 +535,8 @@ class Fix:
         refusal: Kind of refusal, empty for a fix that is given.
         detail: The refusal in words.
         standing: What is left of the covariance by its causes, as the position's moves by one sigma of each
-            error that stays, m, float64 (3, k): `camera`, `attitude` and `bar N`, as a `Pose` has them.
+            error that stays, m, float64 (3, k): `camera`, `attitude`, `bar N` and `doubt`, as a `Pose` has
+            them.
         misfit: Mean square of the misses in sigmas, over the degrees of freedom.
         freedom: Degrees of freedom; 0 where the fix is refused.
         hpl_m: Horizontal protection level: beyond it the error is with the probability `position.risk`, even

@@ -599,12 +599,13 @@ def weighed(
     felt: Array, heading: float, known: int, white: Array, huber: float, free: Array, said: Array,
     position: Array, rotation: Array, local: Array, error: Array, cost: float,
     attitude_fault: float, limits: Array, least: float, most_sigma: float, flat: float, high: float,
+    rarely: float, larger: float,
 ) -> tuple[Any, ...]:  # fmt: skip
     """What a settled fit is worth: covariance and its causes, tests of each part, protection levels.
 
     Args, beside those of `normal` and `fitted`: `said` (3, 4), what moves the angles as they are said, by its
     sigmas; `attitude_fault`, radians; `limits` (7,) of a test by its degrees of freedom; `flat` and `high`,
-    sigmas to the risk, horizontal and vertical.
+    sigmas to the risk, horizontal and vertical; `rarely` and `larger` as in `doubted`.
 
     Returns:
         Whether the equations are regular; sigma of the least certain direction, m; the larger of the ratios,
@@ -614,7 +615,7 @@ def weighed(
         covariance (14, 14); of each part - bars, focal length, attitude, heading as far as there are - the
         test's value and its degrees of freedom, (parts,); horizontal and vertical protection level, m: for
         each fault, how far the solution may have moved with the test just passed, and how far one that does
-        without the part may be off at the risk; the covariance's causes: noise and slow, (3, 3), moves by the
+        without the part may be off at the risk; what doubt adds (6, 6); the covariance's causes: noise and slow, (3, 3), moves by the
         camera (3, 7), by the attitude (3, 4) and by what is each bar's (bars, 3, 7).
     """
     bars = len(bar_sigma)
@@ -622,7 +623,7 @@ def weighed(
     gain, step = np.zeros((bars, LOCAL, GLOBAL)), np.zeros((bars, LOCAL))
     rows, miss, pixel = np.zeros((3, GLOBAL)), np.zeros(3), np.zeros((bars, GLOBAL, GLOBAL))
     whole, side, spread = np.zeros((GLOBAL, GLOBAL)), np.zeros(GLOBAL), np.zeros((GLOBAL, GLOBAL))
-    noise, slow = np.zeros((3, 3)), np.zeros((3, 3))
+    noise, slow, doubt = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((6, 6))
     by_camera, by_attitude, by_bar = np.zeros((3, 7)), np.zeros((3, 4)), np.zeros((bars, 3, 7))
     turns = free[3] or free[4] or free[5]
     parts = bars + 1
@@ -764,7 +765,69 @@ def weighed(
             for j in range(3):
                 for k in range(3):
                     noise[i, j] += axes[i, k] * max(size[k], 1e-12) * axes[j, k]
-    return regular, wide, bent, spread, values, freedom, hpl, vpl, noise, slow, by_camera, by_attitude, by_bar
+        if known > 0 and turns:
+            doubted(spread, rows[:known].copy(), miss[:known].copy(), rarely, larger, doubt)
+    return (
+        regular, wide, bent, spread, values, freedom, hpl, vpl,
+        doubt, noise, slow, by_camera, by_attitude, by_bar,
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def doubted(spread: Array, rows: Array, miss: Array, rarely: float, larger: float, out: Array) -> None:
+    """What the doubt adds to a covariance whether the attitude's errors are larger than their sigmas say.
+
+    The mean over both hypotheses, by their odds after the fit: as said, or `larger` times as large, which is so
+    `rarely`. What is no likelier after the fit than before is in the sigmas already.
+
+    Args:
+        spread: Covariance of the unknowns, (14, 14).
+        rows: What the unknowns do to the angles, whitened, (k, 14).
+        miss: Said minus seen angles, whitened, (k,).
+        rarely: How rarely.
+        larger: How much.
+        out: What is added to the covariance of position and turn, (6, 6).
+    """
+    k, n = len(miss), len(spread)
+    follow, redundant, whole = np.zeros((6, k)), np.zeros((k, k)), np.zeros((k, k))
+    more = larger**2 - 1
+    for a in range(k):
+        by = np.zeros(n)
+        for i in range(n):
+            for j in range(n):
+                by[i] += spread[i, j] * rows[a, j]
+        for i in range(6):
+            follow[i, a] = by[i]
+        for b in range(k):
+            redundant[a, b] = 1.0 if a == b else 0.0
+            for i in range(n):
+                redundant[a, b] -= rows[b, i] * by[i]
+    for a in range(k):
+        for b in range(k):
+            whole[a, b] = more * redundant[a, b] + (1.0 if a == b else 0.0)
+    inverse, axes, values = np.zeros((k, k)), np.zeros((k, k)), np.zeros(k)
+    if not inverted(whole, inverse):
+        return
+    eigen(whole, values, axes)
+    evidence = math.log(rarely / (1 - rarely))
+    off = np.zeros(k)
+    for a in range(k):
+        evidence -= 0.5 * math.log(values[a])
+        for b in range(k):
+            off[a] += more * inverse[a, b] * miss[b]
+        evidence += 0.5 * miss[a] * off[a]
+    weight = 1 / (1 + math.exp(-evidence))
+    moved = np.zeros(6)
+    for i in range(6):
+        for a in range(k):
+            moved[i] += follow[i, a] * off[a]
+    for i in range(6):
+        for j in range(6):
+            wider = 0.0
+            for a in range(k):
+                for b in range(k):
+                    wider += follow[i, a] * more * inverse[a, b] * follow[j, b]
+            out[i, j] = max(weight - rarely, 0.0) * wider + weight * moved[i] * moved[j]
 
 
 @njit(cache=True, nogil=True)

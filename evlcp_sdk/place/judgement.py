@@ -32,6 +32,15 @@ _MOST_BEND = 3.0
 _ATTITUDE_FAULT_RAD = math.radians(1.0)
 """How far an angle may be off without anybody's knowledge (sigma): the fault that protection levels cover."""
 
+_RARELY = 0.05
+"""How rarely errors of an attitude are larger than their sigmas say."""
+
+_LARGER = 4.0
+"""By how much they are then."""
+
+_LITTLE = 0.01
+"""Share of a position's variance below which a doubt does not count."""
+
 _REDUNDANT = 1e-4
 """Share of what a part says that others must say, too, for it to be tested."""
 
@@ -49,7 +58,8 @@ class Pose:
         slow: The part that changes as the image moves over the pixels, float64 (3, 3).
         standing: The rest by its causes, as the position's move by one sigma of each, m, float64 (3, k): of
             `camera`, its seven parameters; of `attitude`, biases of pitch, roll and heading, and the offset
-            in time; of `bar N`, its length, and its place and turn where these have a sigma.
+            in time; of `bar N`, its length, and its place and turn where these have a sigma; `doubt` whether
+            the attitude errs more than its sigmas say.
         misfit: Mean square of the misses in sigmas, over the degrees of freedom.
         freedom: Degrees of freedom.
         transmitters: The bars that count.
@@ -108,8 +118,10 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
         spec.max_sigma_m,
         math.sqrt(chi_square(spec.risk, 2)),
         math.sqrt(chi_square(spec.risk, 1)),
+        _RARELY,
+        _LARGER,
     )
-    regular, wide, bent, spread, values, freed, hpl, vpl, noise, slow, *moves = found
+    regular, wide, bent, spread, values, freed, hpl, vpl, doubted, noise, slow, *moves = found
     if not regular:
         return Refusal("not-determined", "the equations are singular")
     if len(problem.transmitters) == 1:
@@ -137,14 +149,16 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
             if value / limits[tested] > worst:
                 worst = value / limits[tested]
                 doubt = f"{name} does not fit the rest: {math.sqrt(value):.1f} sigmas"
+    if np.trace(doubted[:3, :3]) < _LITTLE * np.trace(spread[:3, :3]):
+        doubted = np.zeros((6, 6))
     most = spec.max_protection_m
     pose = Pose(
         fit.position,
         fit.rotation,
-        np.ascontiguousarray(spread[:6, :6]),
+        spread[:6, :6] + doubted,
         noise,
         slow,
-        _standing(problem, *moves),
+        _standing(problem, doubted[:3, :3], *moves),
         fit.cost / freedom,
         freedom,
         problem.transmitters,
@@ -186,9 +200,15 @@ def _said(problem: Problem) -> Floats:
     return np.asarray(problem.white @ problem.attitude.standing())
 
 
-def _standing(problem: Problem, camera: Floats, attitude: Floats, bars: Floats) -> dict[str, Floats]:
+def _standing(
+    problem: Problem, doubted: Floats, camera: Floats, attitude: Floats, bars: Floats
+) -> dict[str, Floats]:
     """The position's moves by what stays, by name."""
     standing = {}
+    if doubted.any():
+        values, axes = np.linalg.eigh(doubted)
+        # The symmetric root changes little from fix to fix.
+        standing["doubt"] = (axes * np.sqrt(np.maximum(values, 0))) @ axes.T
     if problem.free[7]:
         standing["camera"] = camera
     if problem.attitude is not None and problem.free[3:6].any():

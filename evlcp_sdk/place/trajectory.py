@@ -335,7 +335,8 @@ def _way(point: TrajectoryPoint, swing: Swing, own: slice | None, spec: Position
 
 
 def _stays(cause: Cause, t_us: float) -> bool:
-    return not cause.name.startswith("bar ") or t_us - cause.t_us <= _KEPT_US
+    passing = cause.name.startswith("bar ") or cause.name == "doubt"
+    return not passing or t_us - cause.t_us <= _KEPT_US
 
 
 def _shared(causes: Sequence[Cause], later: Sequence[Cause]) -> list[int]:

@@ -410,3 +410,27 @@ def test_a_fit_is_judged_as_by_numpy(bars: int) -> None:
     for given, axis in ((pose.hpl_m, slice(0, 2)), (pose.vpl_m, slice(2, 3))):
         want = max(level(*each, axis) for each in levels)
         assert given == pytest.approx(want, rel=1e-6) or (math.isinf(given) and want > SPEC.max_protection_m)
+
+
+@pytest.mark.parametrize("off", [0.0, 2.0, 6.0])
+def test_a_doubt_is_the_mean_over_both_hypotheses(off: float) -> None:
+    """A linear problem, whose evidence is that of all observations under a wide prior of the unknowns."""
+    rng, rarely, larger = np.random.default_rng(13), 0.05, 4.0
+    rows, angles = rng.normal(size=(30, 14)), 0.5 * rng.normal(size=(3, 14))
+    seen = np.concatenate([rng.normal(size=30), rng.normal(size=3) + [off, 0, -off]])
+    both = np.concatenate([rows, angles])
+    found = []
+    for size in (1.0, larger):
+        noise = np.diag([1.0] * 30 + [size**2] * 3)
+        spread = np.linalg.inv(both.T @ np.linalg.solve(noise, both))
+        mean = spread @ both.T @ np.linalg.solve(noise, seen)
+        evidence = stats.multivariate_normal(np.zeros(33), 1e6 * both @ both.T + noise).logpdf(seen)
+        found.append((evidence, mean, spread))
+    (one, at, spread), (two, there, wider) = found
+    weight = rarely * math.exp(two - one) / (1 - rarely + rarely * math.exp(two - one))
+    away = (there - at)[:6]
+    want = max(weight - rarely, 0) * (wider - spread)[:6, :6] + weight * np.outer(away, away)
+    out = np.zeros((6, 6))
+    _kernels.doubted(spread, angles, seen[30:] - angles @ at, rarely, larger, out)
+    np.testing.assert_allclose(out, want, rtol=1e-3, atol=1e-6)
+    assert (np.trace(out) > 0.1 * np.trace(spread[:6, :6])) == (off > 5)
