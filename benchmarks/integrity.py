@@ -9,8 +9,8 @@ knowledge. A row:
 
 - NEES: mean of e' P^-1 e, 3 where covariances are right; its 99.73 % bound is 14.2
 - kept: fixes given, of those that the geometry allows
-- silent: fixes given whose error is beyond the 99.73 % bound of their own covariance, of the same; by chance alone,
-  with a covariance that is exact, .0027 of those given
+- silent: fixes given whose error is beyond the 99.73 % bound of their own covariance, of the same; with an
+  exact covariance chance alone makes it .0027 of those given
 - not covered: silent fixes that have no protection level, or are beyond it
 - left out: fixes given without a part that is named
 - protected: fixes with both protection levels; their medians; and the share beyond one of them
@@ -45,8 +45,7 @@ BOUND = 14.156
 """99.73 % of chi squared with 3 degrees of freedom."""
 
 CHANCE = 0.0027
-"""What is beyond it by chance. Of a covariance whose bound leaves .001 out, it would be 16.27 / 14.16 times as
-large, and NEES 2.6."""
+"""What is beyond it by chance. For .001, covariances are 16.27 / 14.16 times as large, and NEES is 2.6."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +274,7 @@ def judge(reached: dict[str, dict[str, float]], fixes: int) -> None:
     single = {
         name: found
         for name, found in reached.items()
-        if name not in clean and (name.startswith("3 bars") or name.startswith("2 bars, heading"))
+        if name not in clean and name.startswith(("3 bars", "2 bars, heading"))
     }
     if not clean or not single:
         return

@@ -615,8 +615,8 @@ def weighed(
         covariance (14, 14); of each part - bars, focal length, attitude, heading as far as there are - the
         test's value and its degrees of freedom, (parts,); horizontal and vertical protection level, m: for
         each fault, how far the solution may have moved with the test just passed, and how far one that does
-        without the part may be off at the risk; what doubt adds (6, 6); the covariance's causes: noise and slow, (3, 3), moves by the
-        camera (3, 7), by the attitude (3, 4) and by what is each bar's (bars, 3, 7).
+        without the part may be off at the risk; what doubt adds (6, 6); the covariance's causes: noise and
+        slow, (3, 3), moves by the camera (3, 7), by the attitude (3, 4), by what is each bar's (bars, 3, 7).
     """
     bars = len(bar_sigma)
     info, right, bar_cost = np.zeros((bars, GLOBAL, GLOBAL)), np.zeros((bars, GLOBAL)), np.zeros(bars)
@@ -777,8 +777,8 @@ def weighed(
 def doubted(spread: Array, rows: Array, miss: Array, rarely: float, larger: float, out: Array) -> None:
     """What the doubt adds to a covariance whether the attitude's errors are larger than their sigmas say.
 
-    The mean over both hypotheses, by their odds after the fit: as said, or `larger` times as large, which is so
-    `rarely`. What is no likelier after the fit than before is in the sigmas already.
+    The mean over both hypotheses, by their odds after the fit: as said, or `larger` times as large, which is
+    so `rarely`. What is no likelier after the fit than before is in the sigmas already.
 
     Args:
         spread: Covariance of the unknowns, (14, 14).

@@ -10,13 +10,21 @@ from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.positioner import Positioner
 from evlcp_sdk.scene.attitude import AttitudeLog, attitude_source
+from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.sim.truth import Truth
 from evlcp_sdk.study.frames import GivenFrame
 from evlcp_sdk.study.match import NEAREST_PX, BarFrames, BarPackets, match, nearest_bar
 from evlcp_sdk.study.tally import Statistics, Tally, in_nm, segment_of
 from evlcp_sdk.values import Frame, Packet
 
-__all__ = ["bar_tallies", "message_tallies", "position_tallies", "statistics_of", "without_truth"]
+__all__ = [
+    "bar_tallies",
+    "message_tallies",
+    "position_tallies",
+    "sites_seen",
+    "statistics_of",
+    "without_truth",
+]
 
 
 def bar_tallies(sent: BarFrames, pairs: Iterable[tuple[GivenFrame, int]]) -> list[tuple[int, Tally]]:
@@ -143,6 +151,21 @@ def message_tallies(packets: Iterable[Packet], truth: Truth, coder: BlockCoder) 
     return tallies
 
 
+def sites_seen(packets: Sequence[Packet], truth: Truth) -> list[BarSite]:
+    """The sites of the truth, each with the number that the receiver gave to its transmitter."""
+    sites = list(truth.sites)
+    first: dict[int, Frame] = {}
+    for packet in packets:
+        for frame in packet.frames:
+            if frame.echo_of is None:
+                first.setdefault(packet.transmitter, frame)
+    for number, frame in first.items():
+        nearest = nearest_bar(truth.bars, truth, frame.t_us - truth.t0_us, frame)
+        if nearest is not None and nearest[1] <= NEAREST_PX and sites[nearest[0]].transmitter is None:
+            sites[nearest[0]] = replace(sites[nearest[0]], transmitter=number)
+    return sites
+
+
 def position_tallies(
     packets: Sequence[Packet], truth: Truth, link: Link, attitude: AttitudeLog | None
 ) -> list[tuple[int, Tally]]:
@@ -156,16 +179,7 @@ def position_tallies(
         link: The link they were received with.
         attitude: What is known of the camera's attitude; None for nothing.
     """
-    sites = list(truth.sites)
-    first: dict[int, Frame] = {}
-    for packet in packets:
-        for frame in packet.frames:
-            if frame.echo_of is None:
-                first.setdefault(packet.transmitter, frame)
-    for number, frame in first.items():
-        nearest = nearest_bar(truth.bars, truth, frame.t_us - truth.t0_us, frame)
-        if nearest is not None and nearest[1] <= NEAREST_PX and sites[nearest[0]].transmitter is None:
-            sites[nearest[0]] = replace(sites[nearest[0]], transmitter=number)
+    sites = sites_seen(packets, truth)
     positioner = Positioner(
         link.camera,
         link.bar.clusters,

@@ -417,7 +417,8 @@ def test_a_doubt_is_the_mean_over_both_hypotheses(off: float) -> None:
     """A linear problem, whose evidence is that of all observations under a wide prior of the unknowns."""
     rng, rarely, larger = np.random.default_rng(13), 0.05, 4.0
     rows, angles = rng.normal(size=(30, 14)), 0.5 * rng.normal(size=(3, 14))
-    seen = np.concatenate([rng.normal(size=30), rng.normal(size=3) + [off, 0, -off]])
+    seen = rng.normal(size=33)
+    seen[30:] += np.array([off, 0, -off])
     both = np.concatenate([rows, angles])
     found = []
     for size in (1.0, larger):
