@@ -248,6 +248,32 @@ def bar_values(
     row_values(sums, line, np.maximum(light - veil * light.max(), 0), full, out)
 
 
+@njit(cache=True, nogil=True)
+def dimmer(pilots: Array, seen: Array, spacing: float, centre: float, values: Array) -> float:
+    """How large negative values (values, rows) are, as a share of the positive ones, at the clusters' middles.
+
+    A camera may miss more events of one polarity. The half spacing of rows about each cluster's middle tells
+    both levels in its pilot, which comes first; clusters that say one of them only do not count. 1 where
+    nothing is told.
+    """
+    clusters, first = pilots.shape
+    rows = values.shape[1]
+    total = np.zeros(2)
+    for k in range(clusters):
+        middle = (rows - 1) / 2 + centre + spacing * (k - (clusters - 1) / 2)
+        top = max(int(np.ceil(middle - spacing / 4)), 0)
+        bottom = min(int(np.floor(middle + spacing / 4)), rows - 1)
+        levels, counts = np.zeros(2), np.zeros(2)
+        for i in range(first):
+            sign = int(pilots[k, i] > 0)
+            for v in range(top, bottom + 1):
+                levels[sign] += values[i, v]
+                counts[sign] += 1
+        if seen[k] and counts.min() > 0:
+            total += levels / counts
+    return float(max(-total[0], 0.0) / total[1]) if total[1] > 0 else 1.0
+
+
 _REACH = 12.0
 """Widths of a boundary's core beyond which it is not felt: 6 of 100000 of tails thrice as wide are left."""
 
@@ -296,6 +322,7 @@ def equations(
     when: Array,
     profile: Array,
     blur: float,
+    dim: float,
     huber: float,
     prior: float,
     seen_values: Array,
@@ -308,7 +335,7 @@ def equations(
     Across a boundary where codes differ, a value goes from one code times the gain to the next as `profile`
     has it: that and its slope, (2, n), at n steps from 0 to `_REACH` widths; a width is blur * exp(width) px.
     Residuals beyond `huber` weigh less, so that a cluster that was decoded wrong does not bend the fit.
-    `prior` is the weight of a width of 0.
+    `prior` is the weight of a width of 0; negative values are `dim` times as large as positive ones.
     """
     clusters, values = codes.shape
     rows = seen_values.shape[1]
@@ -333,6 +360,9 @@ def equations(
                 beyond, density = _profile_at(profile, z, scale)
                 level = 0.5 * (both + (step if z > 0 else -step) * beyond)
                 steep = -steepest * step * density
+                if level < 0:
+                    level *= dim
+                    steep *= dim
                 residual = seen_values[i, v] - gain * level
                 size = abs(residual)
                 weight = 1.0 if size <= huber else huber / size
@@ -376,6 +406,7 @@ def leftovers(
     when: Array,
     profile: Array,
     blur: float,
+    dim: float,
     huber: float,
     seen_values: Array,
     fit: Array,
@@ -413,6 +444,9 @@ def leftovers(
                 beyond, density = _profile_at(profile, z, scale)
                 level = 0.5 * (codes[b, i] + codes[b - 1, i] + (step if z > 0 else -step) * beyond)
                 steep = 0.5 * gain * step * density / width
+                if level < 0:
+                    level *= dim
+                    steep *= dim
                 residual = seen_values[i, v] - gain * level
                 spent += residual * residual
                 all_squares += seen_values[i, v] * seen_values[i, v]
@@ -474,6 +508,7 @@ def solve(
     when: Array,
     profile: Array,
     blur: float,
+    dim: float,
     huber: float,
     prior: float,
     seen_values: Array,
@@ -495,7 +530,7 @@ def solve(
     right, new_normal, new_right = np.empty(5), np.empty((5, 5)), np.empty(5)
     factor, move = np.zeros((5, 5)), np.empty(5)
     cost = equations(
-        codes, first, last, offset, when, profile, blur, huber, prior, seen_values, fit, normal, right
+        codes, first, last, offset, when, profile, blur, dim, huber, prior, seen_values, fit, normal, right
     )
     damping = 1e-3
     outside = False
@@ -518,6 +553,7 @@ def solve(
                 when,
                 profile,
                 blur,
+                dim,
                 huber,
                 prior,
                 seen_values,
@@ -563,6 +599,7 @@ def fit_bar(
     when: Array,
     profile: Array,
     blur: float,
+    dim: float,
     huber: float,
     prior: float,
     seen_values: Array,
@@ -599,6 +636,7 @@ def fit_bar(
             when,
             profile,
             blur,
+            dim,
             huber,
             prior,
             seen_values,
@@ -618,6 +656,7 @@ def fit_bar(
             when,
             profile,
             blur,
+            dim,
             huber,
             seen_values,
             fit,

@@ -71,6 +71,10 @@ class JointScaleRanging(Ranging):
     motion within the frame is known from the track, its rate is fitted, and what is neither is found value by
     value, as far as it stands out of the noise.
 
+    Cameras miss more events of one polarity than of the other, so values of that sign are smaller. How much
+    is measured in the clusters' middles, once a frame: else a boundary whose pilots step up more often than
+    down would seem shifted, and with them the scale.
+
     Cells out of line with the layout, boundaries out of line with the others, and info values of clusters
     whose symbol is not known are left out. There is no distance where the fit leaves the cells, or does not
     explain the values.
@@ -150,8 +154,9 @@ class JointScaleRanging(Ranging):
                 values, moved = np.ascontiguousarray(values[:, ::-1]), -moved
                 spacing, first = -spacing, height - 1 - first
             centre = first + spacing * (clusters - 1) / 2 - (height - 1) / 2
+            dim = _kernels.dimmer(pilots, place.seen, spacing, centre, values)
             fit = np.array([spacing, centre, 0.0, _STARTING_GAIN, 0.0])
-            fitted = self._fit(codes, known, moved, values, fit, least)
+            fitted = self._fit(codes, known, moved, dim, values, fit, least)
             if fitted is None:
                 return _NONE
             fit, sigma_px, off = fitted
@@ -179,6 +184,7 @@ class JointScaleRanging(Ranging):
         codes: Floats,
         known: NDArray[np.bool_],
         offset: Floats,
+        dim: float,
         values: Floats,
         fit: Floats,
         least: int,
@@ -197,6 +203,7 @@ class JointScaleRanging(Ranging):
             _when(len(values)),
             _profile(self.core_share),
             self.blur_px,
+            dim,
             self.huber,
             _NOISE**2 / _WIDTH_SIGMA**2,
             values,

@@ -201,6 +201,10 @@ def test_profile_is_a_mixture_of_normal_distributions() -> None:
     assert_allclose(table[1], 2 * (SHARE * norm.pdf(z) + (1 - SHARE) * norm.pdf(z / 3) / 3), atol=1e-12)
 
 
+DIM = 0.6
+"""How large negative values are, as a share of the positive ones."""
+
+
 class Twin:
     """Values about boundaries, fitted: each boundary by itself, with the profile from SciPy."""
 
@@ -217,7 +221,7 @@ class Twin:
         _kernels.rows_felt(self.known, self.offset, self.when, reach, self.fit, rows, self.first, self.last)
         self.reach = min(reach, 5.3 / 2)
         self.seen = 0.7 * rng.choice([-1.0, 1.0], (6, rows)) + rng.normal(0, 0.5, (6, rows))
-        self.args = (self.codes, self.first, self.last, self.offset, self.when, _profile(SHARE), BLUR)
+        self.args = (self.codes, self.first, self.last, self.offset, self.when, _profile(SHARE), BLUR, DIM)
 
     def place(self, fit: np.ndarray, b: int, i: int) -> float:
         middle = (self.rows - 1) / 2 + self.offset[i] + fit[1] + fit[2] * self.when[i]
@@ -236,7 +240,7 @@ class Twin:
                             z = (v - self.place(fit, b, i)) / (BLUR * np.exp(fit[4]))
                             share = SHARE * norm.cdf(z) + (1 - SHARE) * norm.cdf(z / 3)
                             value = self.codes[b - 1, i] * (1 - share) + self.codes[b, i] * share
-                            out.append((b, i, v, fit[3] * value))
+                            out.append((b, i, v, fit[3] * value * (DIM if value < 0 else 1)))
         return np.array(out)
 
     def slopes(self) -> np.ndarray:
@@ -363,7 +367,7 @@ def test_solve_leaves_no_score() -> None:
     fit, normal = truth * [1.004, 1, 1, 1, 1], np.empty((5, 5))
     first, last = np.empty((2, K + 1, 6), np.int64)
     assert _kernels.solve(
-        twin.codes, twin.known, twin.offset, twin.when, _profile(SHARE), BLUR, 0.5, 2.0, seen, 50, 1e-12,
+        twin.codes, twin.known, twin.offset, twin.when, _profile(SHARE), BLUR, DIM, 0.5, 2.0, seen, 50, 1e-12,
         fit, normal, first, last,
     )  # fmt: skip
     again, score = np.empty((5, 5)), np.empty(5)
@@ -375,6 +379,7 @@ def test_solve_leaves_no_score() -> None:
         twin.when,
         _profile(SHARE),
         BLUR,
+        DIM,
         0.5,
         2.0,
         seen,
@@ -503,7 +508,7 @@ def test_rounds_of_fits(seed: int) -> None:
     profile, start = _profile(SHARE), twin.fit * [1.003, 1, 1, 1, 1]
     fit, by_boundary = start.copy(), np.empty((2, K + 1))
     variance = _kernels.fit_bar(
-        twin.codes, twin.known, twin.offset, twin.when, profile, BLUR, 0.5, 2.0, seen,
+        twin.codes, twin.known, twin.offset, twin.when, profile, BLUR, DIM, 0.5, 2.0, seen,
         (12, 2, 1e-3, 1e-5), (6, 4.0, 0.25, 0.3), fit, by_boundary,
     )  # fmt: skip
     known, moved, want = twin.known, twin.offset, start.copy()
@@ -517,11 +522,24 @@ def test_rounds_of_fits(seed: int) -> None:
     for left in (2, 1, 0):
         tolerance = 1e-3 if left else 1e-5
         assert _kernels.solve(
-            twin.codes, known, moved, twin.when, profile, BLUR, 0.5, 2.0, seen, 12, tolerance,
+            twin.codes, known, moved, twin.when, profile, BLUR, DIM, 0.5, 2.0, seen, 12, tolerance,
             want, normal, first, last,
         )  # fmt: skip
         noise, _, _ = _kernels.leftovers(
-            twin.codes, first, last, moved, twin.when, profile, BLUR, 0.5, seen, want, by, by_value, scores
+            twin.codes,
+            first,
+            last,
+            moved,
+            twin.when,
+            profile,
+            BLUR,
+            DIM,
+            0.5,
+            seen,
+            want,
+            by,
+            by_value,
+            scores,
         )
         used = by[1] > 0
         if left:
@@ -540,6 +558,45 @@ def test_rounds_of_fits(seed: int) -> None:
     assert variance == pytest.approx((by_row + by_scatter) / 2, rel=1e-5)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_how_dim_negative_values_are(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    seen, spacing, centre, rows = rng.random(K) > 0.2, 5.3, 0.4, 90
+    values = rng.normal(0, 1, (10, rows)) + 0.5
+    middles = (rows - 1) / 2 + centre + spacing * (np.arange(K) - (K - 1) / 2)
+    levels = []
+    for k in np.flatnonzero(seen & (np.ptp(PILOTS, axis=1) > 0)):
+        of = values[: PILOTS.shape[1], np.abs(np.arange(rows) - middles[k]) <= spacing / 4]
+        levels.append([of[PILOTS[k] < 0].mean(), of[PILOTS[k] > 0].mean()])
+    low, high = np.sum(levels, axis=0)
+    pilots = PILOTS.astype(np.float64)
+    want = max(-low, 0) / high if high > 0 else 1.0
+    assert _kernels.dimmer(pilots, seen, spacing, centre, values) == pytest.approx(want)
+    assert _kernels.dimmer(pilots, seen, spacing, centre, -np.abs(values)) == 1.0
+
+
+@pytest.mark.parametrize("dim", [0.05, 0.5, 2.0])
+def test_boundaries_stay_where_one_sign_is_missed(dim: float) -> None:
+    """Pilots, and symbols, say more steps of one sign at some boundaries."""
+    rng = np.random.default_rng(3)
+    symbols = rng.integers(0, 64, K)
+    codes = np.concatenate([PILOTS, WORDS[symbols]], axis=1).astype(np.float64)
+    spacing, rows = 8.6, 150
+    at = np.arange(rows) - (rows - 1) / 2
+    share = norm.cdf((at[:, None] - spacing * (np.arange(1, K) - K / 2)) / 0.45)
+    values = 0.6 * (codes[0] + share @ np.diff(codes, axis=0)).T
+    values *= np.where(values < 0, dim, 1)
+    known = np.ones((K + 1, 16), np.bool_)
+    known[[0, K]] = False
+    joint = JointScaleRanging(huber=9.0, blur_px=0.45, core_share=1.0)
+    start = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0])
+    found_dim = _kernels.dimmer(PILOTS.astype(np.float64), np.ones(K, np.bool_), spacing, 0.0, values)
+    assert found_dim == pytest.approx(dim, rel=0.02)
+    found = joint._fit(codes, known, np.zeros(16), found_dim, values, start, 6)
+    assert found is not None
+    assert found[0][0] == pytest.approx(spacing, rel=2e-5)
+
+
 def noisy_fit(distance_m: float, noise: float, seed: int) -> tuple[float, np.ndarray]:
     """The fit's distance for a frame made of the model plus Gaussian noise, and the symbols."""
     rng = np.random.default_rng(seed)
@@ -556,7 +613,7 @@ def noisy_fit(distance_m: float, noise: float, seed: int) -> tuple[float, np.nda
     known[[0, K]] = False
     # With the profile of the bound: a normal distribution.
     joint = JointScaleRanging(huber=9.0, blur_px=0.45, core_share=1.0)
-    found = joint._fit(codes, known, np.zeros(16), values, start, 6)
+    found = joint._fit(codes, known, np.zeros(16), 1.0, values, start, 6)
     assert found is not None
     return LINK.camera.focal_px * 0.06 / found[0][0], symbols
 
