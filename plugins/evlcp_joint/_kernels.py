@@ -250,7 +250,7 @@ def bar_values(
 
 @njit(cache=True, nogil=True)
 def dimmer(pilots: Array, seen: Array, spacing: float, centre: float, values: Array) -> float:
-    """How large negative values (values, rows) are, as a share of the positive ones, at the clusters' middles.
+    """How large negative values (values, rows) are, as a share of positive ones, in the clusters' middles.
 
     A camera may miss more events of one polarity. The half spacing of rows about each cluster's middle tells
     both levels in its pilot, which comes first; clusters that say one of them only do not count. 1 where
