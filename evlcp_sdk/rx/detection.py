@@ -18,7 +18,10 @@ from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
 
-__all__ = ["Followed", "RegionFollower"]
+__all__ = ["SAME_PX", "Followed", "RegionFollower"]
+
+SAME_PX = 5.0
+"""How far apart centres of two regions of one image may be: before lit leaves an end is good to some px."""
 
 _CELL_SHIFT = 2
 """Cells of 4 x 4 px: no larger than the gap at which two bars are two, and few enough to label each step."""
@@ -279,7 +282,12 @@ class RegionFollower:
         seen = list(self.alive)
         for followed in self.alive:
             followed.released |= end_us - followed.latest.t_us > spec.fade_us
+        lost = [followed for followed in self.alive if followed.released and followed.size_px is not None]
         self.alive = [followed for followed in self.alive if not followed.released]
+        for followed in self.alive:
+            # A bar that was seen in what another was taken for is no halo when it is seen again.
+            if any(_lies_in_outgrown(followed, gone.latest) for gone in lost):
+                followed.outgrown = None
         return seen
 
     def _remember(self, start_us: int, events: Events) -> None:
@@ -619,10 +627,19 @@ class RegionFollower:
         return True
 
     def _merge(self) -> None:
-        """Keep the older of two regions that have grown together."""
+        """Keep the older of two regions that have grown together.
+
+        Of bars that frames have shown, each stays as large as it is: where a jolt brings one region over
+        another, both are followed, until they follow the same.
+        """
         for i, older in enumerate(self.alive):
             for younger in self.alive[i + 1 :]:
-                if not younger.released and _overlap(_tight(older.latest), _tight(younger.latest)):
+                one, other = older.latest, younger.latest
+                if younger.released or not _overlap(_tight(one), _tight(other)):
+                    continue
+                shown = older.size_px is not None and younger.size_px is not None
+                apart_px = max(abs(one.x_px - other.x_px), abs(one.y_px - other.y_px))
+                if not shown or apart_px <= SAME_PX:
                     younger.released = True
         # The survivor reaches over both within a few steps, as its seam finds the other's pixels.
 
@@ -669,8 +686,15 @@ def _outgrown(followed: Followed) -> Region:
 
 
 def _left_by(like: Followed, region: Region) -> bool:
-    """Whether a region lies in what another was taken for, before a frame showed its size."""
+    """Whether a region lies in what another was lately taken for, before a frame showed its size."""
     if like.outgrown is None or region.t_us > like.outgrown[4]:
+        return False
+    return _lies_in_outgrown(like, region)
+
+
+def _lies_in_outgrown(like: Followed, region: Region) -> bool:
+    """Whether a region's centre lies in what another was taken for, at any time."""
+    if like.outgrown is None:
         return False
     whole = _outgrown(like)
     right, down = abs(region.x_px - whole.x_px), abs(region.y_px - whole.y_px)

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.delays import LONGEST_ROW_US
+from evlcp_sdk.rx.detection import SAME_PX
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.look import Look
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.spread import Spread, sharper
 from evlcp_sdk.values import Frame, Packet
 
-__all__ = ["SAME_PX", "EchoQueue", "Echoes", "Sighting", "brighter", "originals", "repeats"]
+__all__ = ["EchoQueue", "Echoes", "Sighting", "brighter", "originals", "repeats"]
 
 _REPEATED = 0.25
 """Share of the symbols that a reflection repeats at the least; with fewer, nothing would be read of it."""
@@ -57,9 +58,6 @@ image is cut more often than the bar is covered."""
 
 _STAYS = 1.0
 """Log odds for what was said to be the bar before: what wavers by less changes nothing."""
-
-SAME_PX = 5.0
-"""How far apart centres of two regions of one image may be: before lit leaves an end is good to some px."""
 
 _LOOKBACK_PACKETS = 3
 """Packets of frames remembered: a new transmitter begins with the last two packets before its lock."""

@@ -14,8 +14,8 @@ from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.belief import believed, still_lit
 from evlcp_sdk.rx.delays import RowDelays
-from evlcp_sdk.rx.detection import Followed, RegionFollower
-from evlcp_sdk.rx.echoes import SAME_PX, Echoes, EchoQueue, Sighting
+from evlcp_sdk.rx.detection import SAME_PX, Followed, RegionFollower
+from evlcp_sdk.rx.echoes import Echoes, EchoQueue, Sighting
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.limits import LIMITS, Limits

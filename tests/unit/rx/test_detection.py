@@ -257,6 +257,49 @@ def test_another_image_moves_with_its_bar() -> None:
     assert regions.alive == [region]
 
 
+def test_what_frames_have_shown_to_be_two_stays_two() -> None:
+    """A bar over its image, found as one: a jolt brings one region over the other; a pole hides the bar."""
+    bar = IdealBar(random_symbols(LINK, 2), start_us=0)
+    image = replace(bar, y_px=bar.y_px + 138)
+    own, other = ideal_events(LINK, bar), ideal_events(LINK, image, seed=2)
+    hidden = (own.t_us >= 30_000) & (own.t_us < 50_000)
+    spec, size = replace(SPEC, fade_us=10_000), (4.0, 128.0)
+    regions = RegionFollower(spec, CameraModel(), LINK.packet.chip_us)
+    for start, part in steps(merged(own[~hidden], other), 60_000):
+        regions.step(start, part)
+        now = {one.id: one for one in regions.alive}
+        if start == 10_000:
+            (whole,) = regions.alive
+            assert whole.latest.height_px > 250
+            t_us = whole.latest.t_us
+            regions.shape(whole, t_us, (image.x_px - 0.5, image.y_px - 0.5), size)
+            beside = regions.beside(whole, t_us, (bar.x_px - 0.5, bar.y_px - 0.5), size)
+        elif start == 20_000:
+            whole.positions = deque(replace(p, y_px=p.y_px - 30) for p in whole.positions)
+        elif start == 25_000:
+            # The next frame shows where it is.
+            assert set(now) == {whole.id, beside.id}
+            regions.shape(whole, whole.latest.t_us, (image.x_px - 0.5, image.y_px - 0.5), size)
+        elif start == 45_000:
+            assert set(now) == {whole.id}
+    # What is seen where it was is no halo: it is found again.
+    assert whole.id in now
+    assert len(now) == 2
+    assert [round(one.latest.y_px) for one in regions.alive] == pytest.approx([488, 350], abs=2)
+
+
+def test_of_two_regions_that_follow_the_same_the_older_stays() -> None:
+    bar = IdealBar(random_symbols(LINK, 2), start_us=0)
+    regions, centre, size = follower(), (bar.x_px - 0.5, bar.y_px - 0.5), (4.0, 128.0)
+    for start, part in steps(ideal_events(LINK, bar), 15_000):
+        regions.step(start, part)
+        if start == 10_000:
+            (first,) = regions.alive
+            regions.shape(first, first.latest.t_us, centre, size)
+            regions.beside(first, first.latest.t_us, (centre[0], centre[1] + 3), size)
+    assert regions.alive == [first]
+
+
 def test_parts_of_a_bar_that_hear_the_same_become_one_region() -> None:
     """The middle is dark for longer than parts are joined over."""
     bar = IdealBar(random_symbols(LINK, 2), start_us=0)
