@@ -13,19 +13,31 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-__all__ = ["Markup", "details", "document", "escape", "table"]
+__all__ = ["Markup", "details", "document", "escape", "table", "tiles"]
 
 _CSS = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #333; max-width: 70rem; margin: 2rem auto;
-  padding: 0 1rem }
-h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin: 2.5rem 0 0.3rem }
+:root { color-scheme: light dark; --ink: #333; --dim: #666; --line: #e6e6e6; --paper: #fff;
+  --panel: #f6f6f6; --good: #00694b; --bad: #a03c00 }
+@media (prefers-color-scheme: dark) { :root { --ink: #ddd; --dim: #a0a0a0; --line: #3c3c3c; --paper: #161616;
+  --panel: #242424; --good: #4cc38a; --bad: #ff9a5c } }
+body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 70rem;
+  margin: 2rem auto; padding: 0 1rem }
+a { color: inherit } h1 { font-size: 1.5rem; overflow-wrap: anywhere }
+h2 { font-size: 1.15rem; margin: 2.5rem 0 0.3rem }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.87rem; margin: 0.6rem 0 }
-th, td { padding: 0.15rem 0.7rem; text-align: right; border-bottom: 1px solid #e6e6e6; white-space: nowrap }
-th { color: #666; font-weight: 600 } td:first-child, th:first-child { text-align: left }
-.chart { height: 430px } .note, .digest { color: #666; font-size: 0.87rem }
-.digest { overflow-wrap: anywhere }
-.yes { color: #00694b } .no { color: #a03c00; font-weight: 600 } .wide { overflow-x: auto }
-pre { background: #f6f6f6; padding: 0.7rem; overflow-x: auto; font-size: 0.8rem } summary { cursor: pointer }
+th, td { padding: 0.15rem 0.7rem; text-align: right; border-bottom: 1px solid var(--line);
+  white-space: nowrap }
+th { color: var(--dim); font-weight: 600 } td:first-child, th:first-child { text-align: left }
+.chart { height: 430px } .note, .digest { color: var(--dim); font-size: 0.87rem }
+.digest { overflow-wrap: anywhere } .wide { overflow-x: auto }
+.yes { color: var(--good) } .no { color: var(--bad); font-weight: 600 }
+pre { background: var(--panel); padding: 0.7rem; overflow-x: auto; font-size: 0.8rem }
+summary { cursor: pointer }
+.tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(9.5rem, 1fr)); gap: 0.6rem;
+  margin: 1rem 0 }
+.tile { background: var(--panel); border-radius: 0.4rem; padding: 0.5rem 0.8rem }
+.tile span { display: block; color: var(--dim); font-size: 0.8rem }
+.tile b { display: block; font-size: 1.25rem; font-weight: 600; overflow-wrap: anywhere }
 """
 
 _PAGE = Markup(
@@ -48,7 +60,11 @@ _PAGE = Markup(
 
 
 def document(
-    title: str, body: Iterable[str], scripts: Sequence[str] = (), data: Mapping[str, Any] | None = None
+    title: str,
+    body: Iterable[str],
+    scripts: Sequence[str] = (),
+    data: Mapping[str, Any] | None = None,
+    style: str = "",
 ) -> str:
     """A whole page.
 
@@ -58,6 +74,7 @@ def document(
         scripts: JavaScript, run in this order once the body is there; written by us, nothing of it by others.
         data: What the scripts read, as JSON: name to values. The text of the script element with the id
             `name` is the JSON of its values.
+        style: CSS of this page's own, after that of all pages; written by us.
 
     Raises:
         ValueError: A script holds what would end its element.
@@ -82,7 +99,9 @@ def document(
     )
     # The quotes of a policy are those that it is known by.
     return str(
-        _PAGE.format(policy=Markup(policy), title=title, css=Markup(_CSS), body=Markup("\n").join(parts))
+        _PAGE.format(
+            policy=Markup(policy), title=title, css=Markup(_CSS + style), body=Markup("\n").join(parts)
+        )
     )
 
 
@@ -107,3 +126,13 @@ def details(title: str, values: Any) -> Markup:
     """JSON values that show when their title is clicked."""
     held = Markup('<details><summary class="digest">{}</summary><pre>{}</pre></details>')
     return held.format(title, json.dumps(values, indent=1, sort_keys=True))
+
+
+def tiles(figures: Iterable[tuple[str, str, str]]) -> Markup:
+    """Headline figures side by side: what each is, its value, and what is to be said of it (may be empty)."""
+    tile = Markup('<div class="tile"><span>{}</span><b>{}</b>{}</div>')
+    said = Markup("<span>{}</span>")
+    held = Markup("\n").join(
+        tile.format(what, value, said.format(note) if note else "") for what, value, note in figures
+    )
+    return Markup('<div class="tiles">{}</div>').format(held)

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from evlcp_sdk.study.markup import Markup, details, document, table
+from evlcp_sdk.study.markup import Markup, details, document, table, tiles
 
 HOSTILE = (
     "</script><script>document.title='caught'</script><img src=x onerror=\"document.title='caught'\">'\"&"
@@ -62,14 +62,15 @@ def test_text_stays_text_wherever_it_enters() -> None:
         Markup("<h1>{}</h1>").format(HOSTILE),
         table([HOSTILE, Markup("<b>bold</b>")], [[HOSTILE, Markup("<i>{}</i>").format(HOSTILE)]]),
         details(HOSTILE, values),
+        tiles([(HOSTILE, HOSTILE, HOSTILE)]),
     ]
     page = Elements(document(HOSTILE, body, ["run()"], {"held": values}))
     assert {tag for tag, _ in page.tags} == {
         *("html", "head", "meta", "link", "title", "style", "body", "h1", "div", "table", "tr", "th", "td"),
-        *("b", "i", "details", "summary", "pre", "script"),
+        *("b", "i", "details", "summary", "pre", "script", "span"),
     }
     assert not [a for _, attrs in page.tags for a in attrs if a.startswith("on") or a == "src"]
-    assert page.text.count(HOSTILE) == 7
+    assert page.text.count(HOSTILE) == 10
     data, script = page.scripts
     assert json.loads(data) == values
     assert script == "run()"
