@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import datetime
 from html import escape
 from pathlib import Path
@@ -20,8 +20,9 @@ from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.place.calibration import Calibrated, CalibrationView
 from evlcp_sdk.place.calibration import calibrate as fit_camera
-from evlcp_sdk.place.navigator import PositionPlan
+from evlcp_sdk.place.navigator import Navigator, PositionPlan
 from evlcp_sdk.place.observations import BarView
+from evlcp_sdk.place.own_poses import OwnPoses
 from evlcp_sdk.place.points import points_at
 from evlcp_sdk.place.poses import KnownPose
 from evlcp_sdk.place.survey import SurveyedBar
@@ -32,7 +33,7 @@ from evlcp_sdk.results.summary import Status
 from evlcp_sdk.results.tables import frames_table
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
+from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.signals import ENDING, heard_by
 from evlcp_sdk.values import Frame, Packet
@@ -50,6 +51,7 @@ __all__ = [
     "receive_to_folder",
     "stop_on_request",
     "survey",
+    "survey_on_the_way",
 ]
 
 Advance = Callable[[int, int | None], None]
@@ -462,6 +464,7 @@ def survey(
     *,
     registry: Registry | None = None,
     name: str = "poses",
+    known: Sequence[BarSite] = (),
 ) -> list[SurveyedBar]:
     """Estimate where bars stand that send their ids, from known poses; the camera is known as the link says.
 
@@ -471,6 +474,7 @@ def survey(
         link: The configuration, or a `link.toml`; None for all defaults.
         registry: The plugins; None for all that are installed.
         name: What a message calls the poses: the file they come from, which has a heading and a line a pose.
+        known: Bars that need no survey.
 
     Raises:
         InputError: A recording cannot be read.
@@ -479,6 +483,7 @@ def survey(
     registry = Registry.load() if registry is None else registry
     link = link if isinstance(link, Link) else load_link(link, registry=registry)
     _check_names(recordings, poses, name)
+    listed = {site.transmitter_id for site in known}
     first = poses[0]
     axes = LocalAxes(first.latitude_deg, first.longitude_deg, first.height_m)
     views: list[CalibrationView] = []
@@ -488,6 +493,75 @@ def survey(
         seen = _seen_at(url, mine, link, registry, who)
         ids = who.ids
         for pose, points in zip(mine, seen, strict=True):
-            bars = [BarView(ids[n], np.empty((0, 3)), *found) for n, found in points.items() if n in ids]
+            new = [(ids[n], found) for n, found in points.items() if n in ids and ids[n] not in listed]
+            bars = [BarView(number, np.empty((0, 3)), *found) for number, found in new]
             views.append(_view(pose, bars, axes))
     return survey_bars(views, axes, link.bar.length_m, link.camera, link.camera_sigma, link.position)
+
+
+def survey_on_the_way(
+    recordings: Sequence[str],
+    plan: PositionPlan,
+    link: Link | None = None,
+    *,
+    attitude: Attitude | AttitudeLog | None = None,
+    registry: Registry | None = None,
+) -> list[SurveyedBar]:
+    """Estimate where new bars stand from the camera's own track past known ones.
+
+    A recording is read two times, and a third time where a new bar was alone in view before it sent its id.
+
+    Args:
+        recordings: Recordings in which known bars, or fixes of satellites, give positions, and new bars send
+            their ids.
+        plan: Where the known bars stand; fixes of satellites.
+        link: The configuration, or a `link.toml`; None for all defaults.
+        attitude: What is known of the camera's attitude, the same always or over time; None for nothing.
+        registry: The plugins; None for all that are installed.
+
+    Raises:
+        InputError: A recording cannot be read.
+        ConfigError: No new bar is in view where the track is known, or too little was seen.
+    """
+    registry = Registry.load() if registry is None else registry
+    link = link if isinstance(link, Link) else load_link(link, registry=registry)
+    poses: list[KnownPose] = []
+    known = {site.transmitter_id: site for site in plan.sites}
+    for url in recordings:
+        found, placed = _own_poses(url, plan, link, attitude, registry)
+        poses += found
+        known = {site.transmitter_id: site for site in placed} | known
+    if not poses:
+        raise ConfigError("no new bar was in view where the track is known: nothing to survey")
+    return survey(recordings, poses, link, registry=registry, name="track", known=[*known.values()])
+
+
+def _own_poses(
+    url: str,
+    plan: PositionPlan,
+    link: Link,
+    attitude: Attitude | AttitudeLog | None,
+    registry: Registry,
+) -> tuple[list[KnownPose], list[BarSite]]:
+    """The poses of a recording's own track while new bars are in view, and the bars that it goes by."""
+    navigator = Navigator(link, plan, attitude)
+    own = OwnPoses(navigator, attitude_source(attitude), Path(url).name)
+    taken: dict[int, BarSite] = {}
+    with receive(url, link, registry=registry, attitude=attitude) as packets:
+        for packet in packets:
+            own.take(packet)
+            taken = navigator.positioner.stands_at | taken
+    poses, ids = own.close(), navigator.positioner.ids
+    wrong = [n for n, site in taken.items() if ids.get(n, site.transmitter_id) != site.transmitter_id]
+    if not wrong:
+        return poses, list(taken.values())
+    # A new bar was taken for a known one as long as it had not sent its id: its number is no site's.
+    numbers = {said: number for number, said in ids.items()}
+    none = max(ids) + 1
+    sites = tuple(
+        replace(site, transmitter=numbers.get(site.transmitter_id, none + i))
+        for i, site in enumerate(plan.sites)
+    )
+    if sites == plan.sites:
+        raise ConfigError(f"{url}: transmitter {wrong[0]} sends one id and then another")
+    return _own_poses(url, replace(plan, sites=sites), link, attitude, registry)

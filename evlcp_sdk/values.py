@@ -546,6 +546,8 @@ class Fix:
             length`.
         source: `bars`, or `gnss`: a fix of satellites, which is taken for the track.
         contradicted: What the track stands on where it contradicts this fix, if bars and GNSS disagree.
+        attitude_sigma_deg: Standard deviation of a turn of the camera about the least certain axis; NaN where
+            no attitude is given.
         alternatives: Of a fix refused as `two-solutions`, the poses that fit, the likeliest first.
     """
 
@@ -573,6 +575,7 @@ class Fix:
     excluded: tuple[str, ...] = ()
     source: str = "bars"
     contradicted: tuple[str, ...] = ()
+    attitude_sigma_deg: float = math.nan
     alternatives: tuple[Alternative, ...] = ()
 
     @property

@@ -22,13 +22,29 @@ def survey(
     recordings: Annotated[
         list[str], typer.Argument(metavar="REC...", help="Recordings of bars that send their ids.")
     ],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="site.toml", help="Where the bars stand.")],
     poses: Annotated[
-        Path,
+        Path | None,
         typer.Option(
             "--poses", metavar="poses.csv", help="Where the camera was, how it was turned, and when."
         ),
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", metavar="site.toml", help="Where the bars stand.")],
+    ] = None,
+    sites: Annotated[
+        Path | None,
+        typer.Option(
+            "--sites",
+            metavar="known.toml",
+            help="Bars that are known: the camera's own track tells the rest.",
+        ),
+    ] = None,
+    attitude: Annotated[
+        Path | None,
+        typer.Option("--attitude", metavar="FILE.csv", help="With --sites: the camera's attitude over time."),
+    ] = None,
+    gnss: Annotated[
+        Path | None,
+        typer.Option("--gnss", metavar="FILE.csv", help="With --sites: fixes of satellites, with sigmas."),
+    ] = None,
     link_file: LinkFile = None,
     overrides: Overrides = None,
     as_json: Json = False,
@@ -39,6 +55,9 @@ def survey(
 
     By a calibrated camera:   [bold]evlcp survey REC.raw --poses poses.csv -c camera.toml -o site.toml[/]
 
+    By its own track past known bars: [bold]evlcp survey REC.raw --sites known.toml --attitude imu.csv
+    -c camera.toml -o new.toml[/]
+
     poses.csv is that of `evlcp calibrate`, with heading_deg, pitch_deg and roll_deg. What all poses may have
     wrong in common, by position_sigma_m and attitude_sigma_deg, is in the sigmas of the sites.
     """
@@ -48,13 +67,27 @@ def survey(
     from evlcp_sdk import run
     from evlcp_sdk.files import Outputs
     from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.place.gnss import GnssLog
+    from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.place.poses import read_poses
     from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.scene.sites import to_toml
+    from evlcp_sdk.scene.attitude import AttitudeLog
+    from evlcp_sdk.scene.sites import load_sites, to_toml
 
+    if (poses is None) == (sites is None):
+        raise typer.BadParameter("give --poses, or --sites of known bars", param_hint="--poses")
     registry = Registry.load()
     link = load_link(link_file, overrides or [], registry)
-    found = run.survey(recordings, read_poses(poses), link, registry=registry, name=str(poses))
+    if poses is not None:
+        for name, given in (("--attitude", attitude), ("--gnss", gnss)):
+            if given is not None:
+                raise typer.BadParameter("needs --sites", param_hint=name)
+        found = run.survey(recordings, read_poses(poses), link, registry=registry, name=str(poses))
+    else:
+        assert sites is not None
+        plan = PositionPlan(load_sites(sites), None if gnss is None else GnssLog.read(gnss))
+        known = None if attitude is None else AttitudeLog.read(attitude)
+        found = run.survey_on_the_way(recordings, plan, link, attitude=known, registry=registry)
     with Outputs() as outputs:
         outputs.open(out).write(to_toml([bar.site for bar in found]))
         outputs.commit()

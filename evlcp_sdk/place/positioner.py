@@ -71,6 +71,11 @@ class Positioner:
         return self._bars.stands_at
 
     @property
+    def ids(self) -> dict[int, int]:
+        """Ids of the transmitters that said theirs."""
+        return self._bars.ids
+
+    @property
     def contradicted(self) -> dict[int, str]:
         """Transmitters that are left out as their beacons contradict their sites, and how."""
         return self._bars.contradicted
@@ -178,6 +183,7 @@ class Positioner:
             hpl_m=pose.hpl_m,
             vpl_m=pose.vpl_m,
             excluded=pose.excluded,
+            attitude_sigma_deg=math.degrees(math.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])),
         )
 
 

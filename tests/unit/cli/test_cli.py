@@ -1,6 +1,7 @@
 """The command line: what it prints, what it writes, how it ends."""
 
 import csv
+import dataclasses
 import json
 import os
 import shutil
@@ -17,7 +18,7 @@ import pytest
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource, open_source, write_events
-from evlcp_sdk.scene.sites import LocalAxes, load_sites
+from evlcp_sdk.scene.sites import LocalAxes, load_sites, to_toml
 from evlcp_sdk.values import Events, Triggers
 
 Evlcp = Callable[..., Any]
@@ -542,6 +543,28 @@ def test_survey_finds_the_sites(evlcp: Evlcp, street: Path, tmp_path: Path) -> N
         "needs poses with heading_deg"
         in evlcp("survey", street / "rec.raw", "--poses", poses, "-o", site).err
     )
+
+
+def test_a_car_surveys_a_new_bar_on_its_way(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
+    """By one bar of two that is known, and the attitude."""
+    path = json.loads((street / "rec.truth.json").read_text())["camera_path"]
+    names = ("heading_deg", "pitch_deg", "roll_deg")
+    lines = ["t_us," + ",".join(names) + ",gravity_sigma_deg,heading_sigma_deg"]
+    for ms in range(len(path["pitch_deg"])):
+        lines.append(f"{ms * 1000}," + ",".join(str(path[name][ms]) for name in names) + ",0.02,0.02")
+    imu, one, new = tmp_path / "imu.csv", tmp_path / "one.toml", tmp_path / "new.toml"
+    imu.write_text("\n".join(lines) + "\n")
+    bars = load_sites(street / "site.toml")
+    one.write_text(to_toml([dataclasses.replace(bars[0], position_sigma_m=0.01)]))
+    done = evlcp("survey", street / "rec.raw", "--sites", one, "--attitude", imu, "-o", new, "--json")
+    assert done.code == 0, done.err
+    (bar,), (told,) = load_sites(new), json.loads(done.out)["bars"]
+    assert bar.transmitter_id == bars[1].transmitter_id
+    error = LocalAxes.of([bars[1]]).to_enu(bar.latitude_deg, bar.longitude_deg, bar.height_m)
+    assert error @ np.linalg.solve(told["covariance_m2"], error) < 20
+    assert 0.01 < bar.position_sigma_m < 0.5
+    for given in ((), ("--poses", "x.csv", "--sites", one), ("--poses", "x.csv", "--gnss", "x.csv")):
+        assert evlcp("survey", street / "rec.raw", "-o", new, *given).code == 2
 
 
 def test_calibrate_finds_the_focal_length(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
