@@ -26,8 +26,8 @@ _PLACE = {
     "height_m": (-12_000.0, 20_000.0),
 }
 _SIGMAS = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
-_LEAST_M, _MOST_M = 1e-4, 1e6
-"""What a sigma may be: with one of 0 nothing else would count."""
+_LEAST_M, _MOST_M = 1e-4, 1e4
+"""What a sigma may be: with one of 0 nothing else would count, and of 10 km it says nothing."""
 _CROSSED = {"cov_east_north_m2": (0, 1), "cov_east_up_m2": (0, 2), "cov_north_up_m2": (1, 2)}
 
 _GRAVITY_RAD = math.radians(10.0)

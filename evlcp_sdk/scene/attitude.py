@@ -24,6 +24,9 @@ _FORCES = tuple(f"force_{axis}_m_s2" for axis in _AXES)
 _GRAVITY_M_S2 = 9.80665
 """On earth it is within 0.03 of this, less than an accelerometer's bias."""
 
+_MOST_MEASURED = 1e5
+"""Rate, degrees/s, or force, m/s2, of more than any sensor's."""
+
 _MOST_KNOTS = 4096
 """Lines of a log that one step of a track goes by; of more, every second, third ... counts."""
 
@@ -164,6 +167,13 @@ class AttitudeLog:
             if name in table and (table[name] < 0).any():
                 i = int(np.flatnonzero(table[name] < 0)[0])
                 raise ConfigError(f"{path}: line {lines[i]}: {name} = {table[name][i]:g}: expected 0 or more")
+        for name in _RATES + _FORCES:
+            if name in table and (np.abs(table[name]) > _MOST_MEASURED).any():
+                i = int(np.flatnonzero(np.abs(table[name]) > _MOST_MEASURED)[0])
+                raise ConfigError(
+                    f"{path}: line {lines[i]}: {name} = {table[name][i]:g}: expected at most"
+                    f" {_MOST_MEASURED:g}"
+                )
         return cls(
             t_us,
             table["pitch_deg"],

@@ -91,6 +91,13 @@ def test_rates_and_forces_are_read_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.forces_m_s2, log.forces_m_s2, atol=1e-5)
 
 
+def test_a_rate_that_no_sensor_has_is_told(tmp_path: Path) -> None:
+    names = "t_us,pitch_deg,roll_deg,rate_right_deg_s,rate_down_deg_s,rate_forward_deg_s"
+    (tmp_path / "imu.csv").write_text(f"{names}\n0,0,0,0,0,0\n1000,0,0,0,1e17,0\n")
+    with pytest.raises(ConfigError, match=r"line 3: rate_down_deg_s = .*: expected at most 100000"):
+        AttitudeLog.read(tmp_path / "imu.csv")
+
+
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
