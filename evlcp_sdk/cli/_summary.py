@@ -72,6 +72,8 @@ def _positions(told: Mapping[str, Any]) -> str:
     text = f"{told['fixes']} position{'s' * (told['fixes'] != 1)}"
     if told["fixes_verified"]:
         text += f", {told['fixes_verified']} verified"
+    if told["gnss"]:
+        text += f", {told['gnss'] - told['gnss_left_out']} of {told['gnss']} GNSS fixes in the track"
     for kind, number in told["refused"].items():
         text += f"; {number} refused: {kind}"
     for how in told["sites_contradicted"].values():
