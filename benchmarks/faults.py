@@ -70,6 +70,17 @@ def moved(numbers: tuple[int, ...], *way_m: float) -> Fault:
     return fault
 
 
+def unheard(fault: Fault) -> Fault:
+    """The same where beacons, which would tell, are not believed."""
+
+    def silent(told: Told) -> Told:
+        wrong = fault(told)
+        position = replace(wrong.link.position, beacons="none")
+        return replace(wrong, link=replace(wrong.link, position=position))
+
+    return silent
+
+
 def swapped(told: Told) -> Told:
     """The first two sites stand at each other's place."""
     one, two, *rest = told.sites
@@ -112,10 +123,12 @@ def late(told: Told) -> Told:
 FAULTS: dict[str, Fault] = {
     "nothing": nothing,
     "a site .5 m to the east": moved((0,), 0.5, 0.0, 0.0),
-    "a site .5 m to the north": moved((0,), 0.0, 0.5, 0.0),
-    "a site .5 m up": moved((0,), 0.0, 0.0, 0.5),
+    "the same, beacons not believed": unheard(moved((0,), 0.5, 0.0, 0.0)),
+    "a site .5 m to the north, the same": unheard(moved((0,), 0.0, 0.5, 0.0)),
+    "a site .5 m up, the same": unheard(moved((0,), 0.0, 0.0, 0.5)),
     "all sites .9 m from their beacons": moved((0, 1, 2), 0.9, 0.0, 0.0),
     "two sites swapped": swapped,
+    "the same, no beacons believed": unheard(swapped),
     "focal length .5 % off": refocused,
     "pitch 1 degree off": turned(1.0, 0.0, 0.0),
     "roll 1 degree off": turned(0.0, 1.0, 0.0),

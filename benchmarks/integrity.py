@@ -260,7 +260,11 @@ def main() -> None:
         if given.only in name:
             found = reached[name] = row(world, fault, given.fixes, i)
             texts = (
-                f"{found[key]:.4f}" if key in ("silent", "not covered", "beyond") else f"{found[key]:.3g}"
+                "-"
+                if math.isnan(found[key])
+                else f"{found[key]:.4f}"
+                if key in ("silent", "not covered", "beyond")
+                else f"{found[key]:.3g}"
                 for key in head
             )
             print(f"| {name} | " + " | ".join(texts) + " |", flush=True)

@@ -10,6 +10,7 @@ that the rest contradicts is left out, and named. Frames and signs: `docs/positi
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -97,12 +98,30 @@ def solve_pose(
         name, pose = fits[0]
         rivals = [n for n in unsure if tests.get(name, 0.0) - tests.get(n, 0.0) < _ODDS and n in tests]
         if not rivals and tests:
-            return replace(pose, excluded=(name,))
+            for mix, mixed in _exchanged(views):
+                again = _plain(mixed, camera, attitude, spec, sigma)
+                if isinstance(again, Judged) and not again.doubt:
+                    rivals.append(mix)
+            if not rivals:
+                return replace(pose, excluded=(name,))
         names = [name, *rivals]
     if isinstance(found, Refusal) and not names:
         return found
     could = f"; it may be {' or '.join(names)}" if names else ""
     return Refusal("misfit", doubt + could)
+
+
+def _exchanged(views: Sequence[BarView]) -> Iterator[tuple[str, list[BarView]]]:
+    """The same with each two sites at each other's place, and what that is called.
+
+    From behind, two bars are seen the other way round: without a third that is in the way, they would be
+    believed to be where they are not.
+    """
+    for i, j in combinations(range(len(views)), 2):
+        one, two, mixed = views[i], views[j], list(views)
+        mixed[i] = replace(one, enu_m=two.enu_m, survey=two.survey)
+        mixed[j] = replace(two, enu_m=one.enu_m, survey=one.survey)
+        yield f"bar {one.transmitter} at the site of bar {two.transmitter} and the reverse", mixed
 
 
 def _without(

@@ -309,6 +309,25 @@ def test_two_bars_that_disagree_are_refused() -> None:
     assert "bar 1" in found.detail
 
 
+def test_two_sites_mixed_up_are_not_a_third_bar_at_fault() -> None:
+    """From behind, two upright bars are seen the other way round, and only the third is in the way."""
+    rng = np.random.default_rng(16)
+    bars = [bar((-2.0, 50.0, 4.5)), bar((2.0, 54.0, 4.5)), bar((0.0, 58.0, 5.5), (1, 0, 0.02))]
+    seen = views(bars, np.zeros(3), UP.rotation(), rng, 0.1)
+    mixed = [
+        dataclasses.replace(seen[0], enu_m=seen[1].enu_m),
+        dataclasses.replace(seen[1], enu_m=seen[0].enu_m),
+        seen[2],
+    ]
+    behind = solve_pose(mixed[:2], CAMERA, Attitude(5.0, 0.0, None, 0.1))
+    assert isinstance(behind, Pose)
+    assert np.linalg.norm(behind.enu_m) > 80
+    found = solve_pose(mixed, CAMERA, Attitude(5.0, 0.0, None, 0.1))
+    assert refused(found) == "misfit"
+    assert isinstance(found, Refusal)
+    assert "bar 0 at the site of bar 1 and the reverse" in found.detail
+
+
 def test_protection_levels_cover_what_no_test_finds() -> None:
     """Faults of every size, most of them too small to be found: none of these few is beyond a level."""
     rng = np.random.default_rng(16)
