@@ -59,6 +59,7 @@ def make_app() -> typer.Typer:
         compare,
         config,
         demo,
+        diagnose,
         info,
         plugins,
         receive,
@@ -78,7 +79,7 @@ def make_app() -> typer.Typer:
         help=HELP,
     )
     app.callback()(_root)
-    first = (receive, info, compare, simulate, score, sweep, report, demo)
+    first = (receive, info, diagnose, compare, simulate, score, sweep, report, demo)
     for module in (*first, calibrate, survey, config, plugins, check):
         module.register(app)
     return app

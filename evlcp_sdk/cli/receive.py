@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -28,17 +29,26 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.link.resolve import Link
     from evlcp_sdk.place.navigator import PositionPlan
+    from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 
 __all__ = ["register"]
 
 
+class LinkMode(StrEnum):
+    """Where the link comes from."""
+
+    GIVEN = "given"
+    AUTO = "auto"
+
+
 @dataclass(frozen=True)
 class ReceiveJob:
-    """One recording and the folder that its result goes to."""
+    """One recording, the folder that its result goes to, and its link if it is not the one of all."""
 
     url: str
     folder: Path
+    link: "Link | None" = None
 
 
 def register(app: typer.Typer) -> None:
@@ -55,6 +65,13 @@ def receive(
     ],
     link_file: LinkFile = None,
     overrides: Overrides = None,
+    link_mode: Annotated[
+        LinkMode,
+        typer.Option(
+            "--link",
+            help="auto: chip rate, modulation, frames per packet and per pilot are tried, the best taken.",
+        ),
+    ] = LinkMode.GIVEN,
     as_json: Annotated[bool, typer.Option("--json", help="Each summary as one line of JSON.")] = False,
     figures: Annotated[
         bool, typer.Option("--figures", help="Draw regions.png, presence.png, distance.png, track.png.")
@@ -133,6 +150,8 @@ def receive(
 
     Another profile:     [bold]evlcp receive REC.raw -o out --set modulation.id=wh8[/]
 
+    Settings unknown:    [bold]evlcp receive REC.raw -o out --link auto[/]
+
     Your own link:       [bold]evlcp receive REC.raw -o out -c link.toml[/]
 
     Several recordings:  [bold]evlcp receive a.raw b.raw -o out[/] writes out/a and out/b
@@ -166,6 +185,8 @@ def receive(
     jobs = _jobs(recordings, out)
     registry = Registry.load()
     link = load_link(link_file, overrides or [], registry)
+    if link_mode is LinkMode.AUTO:
+        jobs = [_fitted(job, link, registry) for job in jobs]
     angles = (heading_deg, pitch_deg, roll_deg)
     if gravity_sigma_deg is None:
         # An IMU's samples follow a camera that sways; angles by hand hold for a whole drive.
@@ -222,6 +243,22 @@ def receive(
             folder = interrupted[0] if len(interrupted) == 1 else out
             raise InterruptedRunError(f"interrupted; what was decoded until then is in {folder}")
     raise typer.Exit(worst or DEGRADED * degraded)
+
+
+def _fitted(job: ReceiveJob, link: "Link", registry: "Registry") -> ReceiveJob:
+    """A job with the link that fits its recording best; says which."""
+    from evlcp_sdk.io.open import open_source
+    from evlcp_sdk.study.diagnosis.diagnose import infer_link
+
+    with open_source(job.url, registry) as source:
+        best = infer_link(source, link, registry)[0]
+    name, due = Path(job.url).name, best.frames + best.rejected
+    if not best.fits:
+        complain(f"{name}: no link that was tried fits, so the one given is taken; see evlcp diagnose {name}")
+        return job
+    chosen = best.options() or "as given"
+    complain(f"{name}: link {chosen}, {best.frames} of {due} frames accepted")
+    return replace(job, link=best.link)
 
 
 def _attitude(
@@ -299,7 +336,7 @@ def _decode_job(
     from evlcp_sdk.run import receive_to_folder, stop_on_request
 
     known: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock_zero}
-    decode = partial(receive_to_folder, job.url, job.folder, link, **known, sinks=sinks)
+    decode = partial(receive_to_folder, job.url, job.folder, job.link or link, **known, sinks=sinks)
     if stopped is not None:
         with bytes_bar(Path(job.url).name) as advance:
             return decode(advance=advance, stopped=stopped)

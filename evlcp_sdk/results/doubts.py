@@ -7,7 +7,7 @@ from typing import Any
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.results.tallies import RunTally, TransmitterTally
 
-__all__ = ["warnings_of"]
+__all__ = ["codewords_never", "warnings_of"]
 
 _TOLD_SIGMAS = 3.0
 """Sigmas beyond which what a drive tells is hinted at."""
@@ -170,14 +170,10 @@ def _transmitter(one: TransmitterTally, link: Link) -> Iterator[str]:
             f"its clock is {ppm:+.0f} ppm off the link's, crystals stay within {_CRYSTALS_PPM:.0f}:"
             f" air.chip_rate_hz = {fits:.6g} would fit"
         )
-    codewords = len(link.codebook.codewords)
-    never = codewords - len(one.values)
-    # Equally likely codewords; the union of all sets of so many bounds the chance that they never occur.
-    ways = math.lgamma(codewords + 1) - math.lgamma(never + 1) - math.lgamma(codewords - never + 1)
-    if one.given and never and ways + one.given * math.log1p(-never / codewords) < math.log(_BY_CHANCE):
+    if never := codewords_never(one, link):
         yield (
-            f"{never} of {codewords} codewords never occur in {one.given} symbols: data that repeats,"
-            " or another modulation than modulation.id"
+            f"{never} of {len(link.codebook.codewords)} codewords never occur in {one.given} symbols: data"
+            " that repeats, or another modulation than modulation.id"
         )
     own = (one.frames - one.echoes) / link.packet.pilot_every
     if one.ranged < _RANGED_SHARE * own:
@@ -191,6 +187,22 @@ def _transmitter(one: TransmitterTally, link: Link) -> Iterator[str]:
             f"clusters never seen: {', '.join(map(str, hidden))}: something covers them, or the bar has other"
             " clusters than the link's"
         )
+
+
+def codewords_never(one: TransmitterTally, link: Link) -> int:
+    """How many codewords never occur in what a transmitter sent, 0 where that may be chance.
+
+    Packets may repeat one another, so that all of them say no more than one.
+    """
+    codewords = len(link.codebook.codewords)
+    never = codewords - len(one.values)
+    if not one.given or not never:
+        return 0
+    # Equally likely codewords; the union of all sets of so many bounds the chance that they never occur.
+    ways = math.lgamma(codewords + 1) - math.lgamma(never + 1) - math.lgamma(codewords - never + 1)
+    given = min(one.given, link.packet.frames * link.codebook.clusters)
+    chance = ways + given * math.log1p(-never / codewords)
+    return never if chance < math.log(_BY_CHANCE) else 0
 
 
 def _blocks(counts: Mapping[str, int], tally: RunTally) -> Iterator[str]:

@@ -1,0 +1,109 @@
+"""`evlcp diagnose`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, bytes_bar, console, echo
+
+if TYPE_CHECKING:
+    from evlcp_sdk.study.diagnosis.diagnose import Diagnosis
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("diagnose")(diagnose)
+
+
+def diagnose(
+    recording: Annotated[str, typer.Argument(metavar="REC", help="A recording.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--out", metavar="PAGE.html", help="Also write one page with maps of the picture."
+        ),
+    ] = None,
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
+    as_json: Json = False,
+) -> None:
+    """Say why a recording is read, or is not: what blinks, and each stage of the receiver.
+
+    In words:       [bold]evlcp diagnose REC.raw[/]
+
+    With pictures:  [bold]evlcp diagnose REC.raw -o REC.html[/]
+
+    Against a link: [bold]evlcp diagnose REC.raw -c link.toml[/]
+
+    Sources of light are found without a link, too: what blinks at which rate, lamps and all. Where a stage
+    fails, other chip rates, modulations and lengths of a packet are tried. Ends with 0 whatever is wrong.
+    """
+    import json
+
+    from evlcp_sdk.files import Outputs
+    from evlcp_sdk.io.open import open_source
+    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.study.diagnosis.diagnose import diagnose as run
+
+    registry = Registry.load()
+    link = load_link(link_file, overrides or [], registry)
+    with open_source(recording, registry) as source, bytes_bar(Path(recording).name) as advance:
+        found = run(source, link, registry, name=recording, advance=advance)
+    if out is not None:
+        from evlcp_sdk.study.diagnosis.page import page
+
+        with Outputs() as outputs:
+            outputs.write_text(page(found), out)
+            outputs.commit()
+    if as_json:
+        echo(json.dumps(found.to_dict()))
+        return
+    _show(found)
+    if out is not None:
+        console().print(f"written: {out}", style="dim")
+
+
+_STYLES = {
+    "pass": ("ok", "green"),
+    "doubt": ("doubt", "yellow"),
+    "fail": ("fails", "bold red"),
+    "skip": ("-", "dim"),
+}
+
+
+def _show(found: "Diagnosis") -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    out = console()
+    out.print(Text.assemble((Path(found.recording).name, "bold"), f": {found.headline}"))
+    stages = Table(box=None, pad_edge=False, show_header=False)
+    for one in found.checks:
+        word, style = _STYLES[one.verdict]
+        stages.add_row(one.stage, Text(word, style), one.said)
+    out.print(stages)
+    if found.sources:
+        sources = Table(box=None, pad_edge=False, header_style="dim")
+        for name in ("source", "rate", "columns", "rows", "size", "events", "negative"):
+            sources.add_column(name, justify="right")
+        for light in found.sources[:8]:
+            left, top, right, bottom = light.box_px
+            sources.add_row(
+                light.kind,
+                f"{light.rate_hz:,.0f} Hz",
+                f"{left} to {right}",
+                f"{top} to {bottom}",
+                f"{light.wide_px:.0f} x {light.high_px:.0f} px" if light.wide_px else "-",
+                f"{light.events:,}",
+                f"{light.negative_share:.0%}",
+            )
+        out.print(sources)
+        if len(found.sources) > 8:
+            out.print(f"and {len(found.sources) - 8} more", style="dim")
+    for one in found.checks:
+        if one.next_step and one.verdict in ("doubt", "fail"):
+            out.print(f"next: {one.next_step}", style="yellow")

@@ -1,0 +1,65 @@
+"""Loops over events, compiled."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.kernels import njit
+
+Array = NDArray[Any]
+
+FINE_US, FINE = 10, 256
+"""Width and number of the bins of short intervals: 1 / f of chips down to 400 a second."""
+
+COARSE_US, COARSE = 100, 256
+"""The same of those beyond, to 28 ms: lamps on mains."""
+
+SHORT = 128
+"""Bins of `FINE_US` of the time from one event of a pixel to its next."""
+
+BINS = FINE + COARSE
+
+SOONEST_US = 60
+"""Time after a rise in which no other counts: two chips at 30 kHz. Events of strong light ring so long."""
+
+
+@njit(cache=True, nogil=True)
+def add_events(
+    t_us: Array,
+    x: Array,
+    y: Array,
+    p: Array,
+    last_us: Array,
+    last_p: Array,
+    rise_us: Array,
+    intervals: Array,
+    gaps: Array,
+    signs: Array,
+    shift: int,
+    calm_us: int,
+) -> None:
+    """Add events to what is counted of each cell of 2^shift px.
+
+    A rise is a positive event after a negative one of its pixel, or after `calm_us` without any, and not
+    within SOONEST_US of the one before. `last_us`
+    and `rise_us` int64 and `last_p` uint8 (height, width) are of each pixel; `intervals` uint32 (rows,
+    columns, BINS) counts the times from rise to rise, `gaps` uint32 (rows, columns, SHORT) those from event
+    to event, `signs` int64 (rows, columns, 2) the events.
+    """
+    for i in range(t_us.size):
+        t, row, column, sign = t_us[i], y[i], x[i], p[i]
+        r, c = row >> shift, column >> shift
+        gap = t - last_us[row, column]
+        if 0 <= gap < FINE_US * SHORT:
+            gaps[r, c, gap // FINE_US] += np.uint32(1)
+        signs[r, c, sign] += 1
+        since = t - rise_us[row, column]
+        if sign and since >= SOONEST_US and (last_p[row, column] == 0 or gap > calm_us):
+            if since < FINE_US * FINE:
+                intervals[r, c, since // FINE_US] += np.uint32(1)
+            elif since < FINE_US * FINE + COARSE_US * COARSE:
+                intervals[r, c, FINE + (since - FINE_US * FINE) // COARSE_US] += np.uint32(1)
+            rise_us[row, column] = t
+        last_us[row, column] = t
+        last_p[row, column] = sign

@@ -1,0 +1,536 @@
+"""The stages that light passes on its way to a message, each passed or failed with the count that says so."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.results.doubts import codewords_never
+from evlcp_sdk.results.tallies import RunTally
+from evlcp_sdk.study.diagnosis.light import LightSource
+from evlcp_sdk.study.diagnosis.probe import Trial
+
+__all__ = ["Check", "Facts", "checks_of"]
+
+Verdict = Literal["pass", "doubt", "fail", "skip"]
+"""Of a stage: passed; passed, but near its limit; failed; not reached."""
+
+CAPPED_SHARE = 0.2
+"""Share of milliseconds with the very same number of events, to half a percent, above which the readout is
+at its limit: chips, and the noise of their number, change it by more."""
+
+FEW_NEGATIVE = 0.1
+"""Share of negative events below which they are missing: as much light goes as comes."""
+
+BLIND_CHIPS = 1.1
+"""Time from event to event of a pixel, in chips, above which edges one chip apart are lost."""
+
+SMALLEST_PX, SMALL_PX = 1.5, 2.5
+"""Pixels a cluster below which clusters cannot be told apart, and below which errors are to be expected: two
+sampled points a cluster are the least, and the pixels between two clusters show both."""
+
+SMEARED_CLUSTERS = 2.0
+"""Width of a source, in clusters, above which the light of each covers its neighbours on both sides."""
+
+RARE_CHIPS, WEAK = 5.0, 0.35
+"""Median time between rises, in chips, and mean of the comb, beyond both of which light is too weak: a code
+rises every 2.7 chips, and jitter of 20 us leaves .45 of the mean at 10 kHz."""
+
+ACCEPTED_SHARE = 0.8
+"""Share of the frames due that are accepted, below which something is wrong with all of them."""
+
+NEAR_RATE = 0.8
+"""Share of its largest mean that a source has at the link's rate if that is its rate, or a multiple."""
+
+_FEW = 4
+"""Frames of which nothing is said."""
+
+_UNSEEN_SHARE = 0.05
+"""Share of unseen clusters of which something is said."""
+
+_BESIDE = 0.1
+"""Events of a source, of those of the largest, below which it is the halo of a lamp rather than a bar."""
+
+_EDGE_PX = 8
+"""Seam of the picture: a source that comes so near may go on outside."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """A stage, and what became of it.
+
+    Attributes:
+        stage: Its name.
+        verdict: `pass`, `doubt`, `fail`, or `skip` where it was not reached.
+        code: What is wrong, in one word, e.g. `defocus`; the stage's name where nothing is.
+        said: The count that says so.
+        next_step: What to try; empty where nothing is wrong.
+    """
+
+    stage: str
+    verdict: Verdict
+    code: str
+    said: str
+    next_step: str = ""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is known of a recording.
+
+    Attributes:
+        link: The link that it was received with.
+        events: How many there are.
+        duration_s: From the first to the last, s.
+        size_px: (width, height) of the sensor.
+        capped_share: Share of milliseconds that are as full as the fullest.
+        peak_events_s: Events a second in the fullest.
+        sources: What blinks, by events.
+        restless: Box of where far more happens than elsewhere, px; None for nowhere.
+        counts: The receiver's counts.
+        tally: Its figures.
+        order: 1 where columns, and rows, of clusters grow as in the bar, -1 where they fall, 0 unknown.
+        spacing_px: From cluster to cluster along the bar, mean of the frames read; NaN without any.
+        trials: Other links that were tried.
+        losses: What the reader skipped, in words.
+    """
+
+    link: Link
+    events: int
+    duration_s: float
+    size_px: tuple[int, int]
+    capped_share: float
+    peak_events_s: float
+    sources: Sequence[LightSource]
+    restless: tuple[int, int, int, int] | None
+    counts: Mapping[str, int]
+    tally: RunTally
+    order: tuple[int, int] = (0, 0)
+    spacing_px: float = math.nan
+    trials: Sequence[Trial] = ()
+    losses: Sequence[str] = ()
+
+    @property
+    def bar(self) -> LightSource | None:
+        """The source that is most likely to be a bar of the link, by its rhythm; None where there is none."""
+        rate = self.link.packet.chip_rate_hz
+        fit = [one for one in self.sources if one.kind != "lamp" and _has_rate(one, rate)]
+        codes = [one for one in self.sources if one.kind == "code"]
+        first = next(iter(fit or codes), None)
+        if first is None or self.reads or first.events >= _BESIDE * self.sources[0].events:
+            return first
+        return None
+
+    @property
+    def at_edge(self) -> bool:
+        """Whether the bar's source touches the edge of the picture."""
+        if self.bar is None:
+            return False
+        left, top, right, bottom = self.bar.box_px
+        width, height = self.size_px
+        return min(left, top) < _EDGE_PX or right > width - _EDGE_PX or bottom > height - _EDGE_PX
+
+    @property
+    def reads(self) -> bool:
+        """Whether most frames are accepted."""
+        frames, rejected = self.counts["frames"], self.counts["frames_rejected"]
+        return frames >= _FEW and frames >= ACCEPTED_SHARE * (frames + rejected)
+
+    @property
+    def better(self) -> Trial | None:
+        """Another link that fits, the best of those tried."""
+        fit = [trial for trial in self.trials if trial.fits]
+        return max(fit, key=lambda one: one.rank, default=None)
+
+    @property
+    def cluster_px(self) -> float:
+        """From cluster to cluster, px: in frames that are read, else by the bar's source; NaN without one."""
+        if self.spacing_px > 0:
+            return self.spacing_px
+        if self.bar is None:
+            return math.nan
+        axis, many = self.clusters_along
+        return (self.bar.wide_px, self.bar.high_px)[axis] / many
+
+    @property
+    def clusters_along(self) -> tuple[int, int]:
+        """The axis along which the link's bar has most clusters, 0 for columns, and how many."""
+        centres = self.link.bar.cluster_centres_m()
+        along = [len(np.unique(np.round(centres[:, axis], 6))) for axis in (0, 1)]
+        axis = int(along[1] >= along[0])
+        return axis, along[axis]
+
+    @property
+    def across_px(self) -> float:
+        """Its extent across that, px."""
+        if self.bar is None:
+            return math.nan
+        return min(self.bar.wide_px, self.bar.high_px)
+
+
+def _has_rate(source: LightSource, rate_hz: float) -> bool:
+    return source.strength_at(rate_hz) >= NEAR_RATE * source.strength
+
+
+def checks_of(facts: Facts) -> list[Check]:
+    """All stages, in the order in which light passes them.
+
+    Behind one that fails, those that cannot tell without it are skipped.
+    """
+    found: list[Check] = []
+    failed = False
+    for stage, judge, needs in _STAGES:
+        if failed and needs:
+            found.append(Check(stage, "skip", stage, "not reached"))
+            continue
+        check = judge(facts)
+        found.append(check)
+        failed |= check.verdict == "fail"
+    return found
+
+
+def _events(facts: Facts) -> Check:
+    if not facts.events:
+        return Check(
+            "events", "fail", "empty", "no events", "record again: `evlcp info` says what is in the file"
+        )
+    said = f"{facts.events:,} events in {facts.duration_s:.3f} s"
+    if facts.losses:
+        return Check(
+            "events",
+            "doubt",
+            "damaged",
+            f"{said}; lost: {'; '.join(facts.losses)}",
+            "copy or record it again; what is left was read",
+        )
+    return Check("events", "pass", "events", said)
+
+
+def _readout(facts: Facts) -> Check:
+    rate = f"{facts.peak_events_s / 1e6:.3g} Mev/s"
+    if facts.capped_share >= CAPPED_SHARE and facts.duration_s > 0.01:
+        return Check(
+            "readout",
+            "doubt" if facts.reads else "fail",
+            "saturated",
+            f"{facts.capped_share:.0%} of all milliseconds hold {rate}, no more and no less: the readout is"
+            " at its limit, and what is beyond is lost",
+            "fewer events: mask rows and columns beside the bar, close the aperture, raise bias_diff_on and"
+            " bias_diff_off; or raise the camera's event-rate limit",
+        )
+    return Check("readout", "pass", "readout", f"at most {rate}, not at a limit")
+
+
+def _light(facts: Facts) -> Check:
+    width, height = facts.size_px
+    focal = facts.link.camera.focal_px
+    view = (
+        f"the picture is {2 * math.degrees(math.atan(width / 2 / focal)):.1f} by"
+        f" {2 * math.degrees(math.atan(height / 2 / focal)):.1f} degrees, {50 * width / focal:.1f} by"
+        f" {50 * height / focal:.1f} m at 50 m"
+    )
+    if facts.reads:
+        return Check("light", "pass", "light", _sources_said(facts))
+    if not facts.sources and facts.restless is not None:
+        left, top, right, bottom = facts.restless
+        return Check(
+            "light",
+            "fail",
+            "dim",
+            f"something flickers in columns {left} to {right}, rows {top} to {bottom}, without any rhythm:"
+            " light that is too weak for its chips, or something that moves",
+            _BRIGHTER,
+        )
+    if not facts.sources:
+        return Check(
+            "light",
+            "fail",
+            "dark",
+            "nothing blinks: no rhythm between 60 Hz and 25 kHz anywhere",
+            f"is a bar in the picture ({view}), and on (`evlcp board status`)? One that is too weak, too far"
+            " or behind a strong blur shows no rhythm, either",
+        )
+    bar = facts.bar
+    if bar is None or (
+        not _has_rate(bar, facts.link.packet.chip_rate_hz) and facts.sources[0].kind == "lamp"
+    ):
+        lamps = [one for one in facts.sources if one.kind == "lamp"]
+        rates = ", ".join(_hz(one.rate_hz) for one in lamps[:4])
+        if lamps:
+            return Check(
+                "light",
+                "fail",
+                "lamp",
+                f"{len(lamps)} lamps blink ({rates}{', ...' if len(lamps) > 4 else ''}), nothing sends chips",
+                f"is a bar in the picture ({view}), and on (`evlcp board status`)?",
+            )
+        return Check(
+            "light",
+            "fail",
+            "dim",
+            f"{_sources_said(facts)}, but too rarely to tell a code",
+            _BRIGHTER,
+        )
+    return Check("light", "pass", "light", _sources_said(facts))
+
+
+_BRIGHTER = (
+    "more light: nearer, a wider aperture, brighter LEDs, or a more sensitive sensor (lower bias_diff_on and"
+    " bias_diff_off, faster pixels by bias_fo)"
+)
+
+
+def _polarity(facts: Facts) -> Check:
+    bar = facts.bar
+    if bar is None:
+        return Check("polarity", "skip", "polarity", "not reached")
+    said = f"{bar.negative_share:.0%} of the bar's events are negative"
+    for few, name, bias in (
+        (bar.negative_share, "negative", "off"),
+        (1 - bar.negative_share, "positive", "on"),
+    ):
+        if few < FEW_NEGATIVE:
+            return Check(
+                "polarity",
+                "doubt" if facts.reads else "fail",
+                f"no-{name}",
+                f"only {few:.0%} of the bar's events are {name}",
+                f"{'no' if few < 0.02 else 'few'} {name} events: set bias_diff_{bias} so that there are more",
+            )
+    return Check("polarity", "pass", "polarity", said)
+
+
+def _pixels(facts: Facts) -> Check:
+    bar = facts.bar
+    if bar is None:
+        return Check("pixels", "skip", "pixels", "not reached")
+    chips = bar.blind_us * 1e-6 * facts.link.packet.chip_rate_hz
+    if chips > BLIND_CHIPS:
+        return Check(
+            "pixels",
+            "doubt" if facts.reads else "fail",
+            "refractory",
+            f"a pixel is silent for {bar.blind_us:.0f} us after an event, {chips:.1f} chips: edges that come"
+            " sooner are lost",
+            "a shorter refractory time (bias_refr), or a lower air.chip_rate_hz at both ends",
+        )
+    return Check(
+        "pixels",
+        "pass",
+        "pixels",
+        f"pixels answer again within {bar.blind_us:.0f} us" if bar.blind_us else "pixels answer at once",
+    )
+
+
+def _brightness(facts: Facts) -> Check:
+    bar = facts.bar
+    if bar is None:
+        return Check("brightness", "skip", "brightness", "not reached")
+    chips = bar.typical_us * 1e-6 * facts.link.packet.chip_rate_hz
+    said = f"a pixel of it rises every {chips:.1f} chips"
+    if not facts.reads and chips > RARE_CHIPS and bar.strength < WEAK:
+        return Check(
+            "brightness", "fail", "dim", f"{said}, and late by many microseconds: it is too weak", _BRIGHTER
+        )
+    return Check("brightness", "pass", "brightness", said)
+
+
+def _rate(facts: Facts) -> Check:
+    bar, link = facts.bar, facts.link.packet.chip_rate_hz
+    if bar is None:
+        return Check("chip rate", "skip", "chip rate", "not reached")
+    better = dict(facts.better.changes).get("air.chip_rate_hz") if facts.better is not None else None
+    if not facts.reads and (better is not None or not _has_rate(bar, link)):
+        rate = bar.rate_hz if better is None else better
+        return Check(
+            "chip rate",
+            "fail",
+            "rate",
+            f"blinks at {_hz(rate)}, the link says {_hz(link)}",
+            f"--set air.chip_rate_hz={rate:g}"
+            + ("" if better is not None else ", or the rate that it is sent with"),
+        )
+    return Check("chip rate", "pass", "chip rate", f"{_hz(link)}, as the link says")
+
+
+def _size(facts: Facts) -> Check:
+    px = facts.cluster_px
+    if not px > 0:
+        return Check("size", "skip", "size", "not reached")
+    said = f"{px:.1f} px a cluster"
+    if px >= (SMALL_PX if facts.reads else SMALLEST_PX):
+        return Check("size", "pass", "size", said)
+    long_px = px * facts.clusters_along[1]
+    far_m = facts.link.camera.focal_px * facts.link.bar.length_m / long_px
+    return Check(
+        "size",
+        "doubt" if facts.reads else "fail",
+        "far",
+        f"{said}, as of a bar {far_m:.0f} m away",
+        f"{said}: nearer, or a longer lens" + ("" if facts.reads else " (or fewer, larger clusters)"),
+    )
+
+
+def _focus(facts: Facts) -> Check:
+    bar, px = facts.bar, facts.cluster_px
+    if bar is None or not px > 0:
+        return Check("focus", "skip", "focus", "not reached")
+    said = f"{facts.across_px:.0f} px across, {px:.1f} px a cluster along it"
+    if not facts.reads and facts.across_px > SMEARED_CLUSTERS * px:
+        return Check(
+            "focus",
+            "fail",
+            "defocus",
+            f"{said}: the light of each cluster covers its neighbours",
+            "focus the lens, clean it and the window; a smaller aperture is sharper",
+        )
+    return Check("focus", "pass", "focus", said)
+
+
+def _preamble(facts: Facts) -> Check:
+    heard, regions = facts.counts["preambles"], facts.counts["regions_opened"]
+    if not heard:
+        return Check(
+            "preamble",
+            "fail",
+            "no-preamble",
+            f"none heard in {regions} region{'s' * (regions != 1)}",
+            "compare pilots.id, its parameters and air.chip_rate_hz with the transmitter's: `evlcp config` at"
+            " both ends",
+        )
+    return Check("preamble", "pass", "preamble", f"{heard} heard in {regions} region{'s' * (regions != 1)}")
+
+
+def _frames(facts: Facts) -> Check:
+    frames, rejected = facts.counts["frames"], facts.counts["frames_rejected"]
+    said = f"{frames} of {frames + rejected} accepted"
+    if facts.reads and facts.at_edge and (unseen := _unseen_share(facts)) > _UNSEEN_SHARE:
+        return Check(
+            "frames",
+            "doubt",
+            "outside",
+            f"{said}, {unseen:.0%} of their clusters unseen; the source touches the picture's edge",
+            "turn the camera so that the whole bar is in the picture",
+        )
+    if facts.reads:
+        return Check("frames", "pass", "frames", said)
+    better = facts.better
+    changes = dict(better.changes) if better is not None else {}
+    if better is not None and "air.frames_per_packet" in changes:
+        return Check(
+            "frames",
+            "fail",
+            "frames-per-packet",
+            f"{said}; with {changes['air.frames_per_packet']} frames a packet {better.frames} of"
+            f" {better.frames + better.rejected}",
+            better.options(),
+        )
+    if better is not None:
+        return Check(
+            "frames", "fail", "link", f"{said}; another link reads {better.frames}", better.options()
+        )
+    if facts.at_edge:
+        return Check(
+            "frames",
+            "fail",
+            "outside",
+            f"{said}; the source touches the picture's edge",
+            "turn the camera so that the whole bar is in the picture",
+        )
+    return Check(
+        "frames",
+        "fail",
+        "frames",
+        f"{said}: the clusters do not stand where the link's bar has them",
+        "compare [bar] and [pilots] with the transmitter's: `evlcp config` at both ends",
+    )
+
+
+def _unseen_share(facts: Facts) -> float:
+    own = [one for one in facts.tally.transmitters.values() if one.frames > one.echoes]
+    given, erased = sum(one.given for one in own), sum(one.erased for one in own)
+    return erased / max(given + erased, 1)
+
+
+def _orientation(facts: Facts) -> Check:
+    right, down = facts.order
+    if -1 not in facts.order:
+        return Check("orientation", "pass", "orientation", "clusters stand as in the link's bar")
+    # Of a column, left and right are not seen.
+    how = "mirrored" if right * down == -1 else "upside down"
+    return Check(
+        "orientation",
+        "doubt",
+        how.replace(" ", "-"),
+        f"the bar is {how} in the picture; its symbols and distances are right, positions are not",
+        "turn the camera, or flip rows where it is read"
+        + ("" if right else " (a column does not say whether left and right are mirrored, too)"),
+    )
+
+
+def _codewords(facts: Facts) -> Check:
+    own = [one for one in facts.tally.transmitters.values() if one.frames > one.echoes]
+    many = len(facts.link.codebook.codewords)
+    never = max((codewords_never(one, facts.link) for one in own), default=0)
+    if not never:
+        return Check("codewords", "pass", "codewords", f"all of {many} that should occur do")
+    better = facts.better
+    name = dict(better.changes).get("modulation.id") if better is not None else None
+    return Check(
+        "codewords",
+        "fail",
+        "profile",
+        f"only {many - never} of {many} symbols ever occur",
+        f"was this sent with {name}? try {better.options()}"
+        if better is not None and name is not None
+        else "data that repeats, or another modulation.id than the transmitter's",
+    )
+
+
+def _messages(facts: Facts) -> Check:
+    tried = facts.counts.get("blocks_tried", 0)
+    read = facts.counts.get("blocks_decoded", 0) + facts.counts.get("blocks_combined", 0)
+    if not tried:
+        return Check("messages", "skip", "messages", "not looked for")
+    said = f"{read} of {tried} packets carry a block that can be read"
+    if read:
+        return Check("messages", "pass", "messages", said)
+    return Check(
+        "messages",
+        "skip",
+        "no-messages",
+        said,
+        "right for symbols without messages; else compare error-correction.id with the transmitter's",
+    )
+
+
+_STAGES: tuple[tuple[str, Callable[[Facts], Check], bool], ...] = (
+    ("events", _events, False),
+    ("readout", _readout, True),
+    ("light", _light, True),
+    ("polarity", _polarity, True),
+    ("pixels", _pixels, True),
+    ("size", _size, True),
+    ("focus", _focus, True),
+    ("brightness", _brightness, True),
+    ("chip rate", _rate, True),
+    ("preamble", _preamble, True),
+    ("frames", _frames, True),
+    ("orientation", _orientation, True),
+    ("codewords", _codewords, True),
+    ("messages", _messages, True),
+)
+"""Name, judge, and whether it can tell only where those before have passed."""
+
+
+def _sources_said(facts: Facts) -> str:
+    by = {kind: sum(one.kind == kind for one in facts.sources) for kind in ("code", "lamp", "unclear")}
+    names = {"code": "send chips", "lamp": "are lamps", "unclear": "blink unclearly"}
+    return ", ".join(f"{many} {names[kind]}" for kind, many in by.items() if many) or "no source of its own"
+
+
+def _hz(rate_hz: float) -> str:
+    return f"{rate_hz / 1e3:.4g} kHz" if rate_hz >= 1000 else f"{rate_hz:.3g} Hz"

@@ -1,0 +1,296 @@
+"""Diagnosis of a recording: one pass through the receiver and past it, then what may be wrong is tried."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.io.sensor import check_sensor
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.source import EventSource
+from evlcp_sdk.results.doubts import warnings_of
+from evlcp_sdk.results.tallies import RunTally
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.study.diagnosis.checks import Check, Facts, checks_of
+from evlcp_sdk.study.diagnosis.light import LightSource, LightSurvey
+from evlcp_sdk.study.diagnosis.probe import MOST_EVENTS, Trial, better_links, try_link
+from evlcp_sdk.values import Events, Packet
+
+__all__ = ["Diagnosis", "diagnose", "infer_link"]
+
+_TRIAL_US = 400_000
+"""Time of the events that other links are tried on: some packets."""
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What is in a recording, and what becomes of it.
+
+    Attributes:
+        recording: Its name.
+        headline: What is wrong first of all, or that nothing is, in one line.
+        checks: The stages in the order in which light passes them.
+        sources: What blinks, most events first.
+        trials: Other links that were tried.
+        warnings: What `receive` would warn of.
+        counts: The receiver's counts.
+        cell_px: Size of the cells of the maps, px.
+        frequency_hz: What each cell blinks with, NaN where it does not, float64 (rows, columns).
+        events_map: Negative and positive events of each cell, int64 (rows, columns, 2).
+        duration_s: From the first event to the last, s.
+    """
+
+    recording: str
+    headline: str
+    checks: tuple[Check, ...]
+    sources: tuple[LightSource, ...]
+    trials: tuple[Trial, ...]
+    warnings: tuple[str, ...]
+    counts: dict[str, int]
+    cell_px: int
+    frequency_hz: NDArray[np.float64]
+    events_map: NDArray[np.int64]
+    duration_s: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """The diagnosis as JSON values, without the maps."""
+        return {
+            "recording": self.recording,
+            "headline": self.headline,
+            "checks": [
+                {
+                    "stage": one.stage,
+                    "verdict": one.verdict,
+                    "code": one.code,
+                    "said": one.said,
+                    "next_step": one.next_step,
+                }
+                for one in self.checks
+            ],
+            "sources": [
+                {
+                    "kind": one.kind,
+                    "rate_hz": round(one.rate_hz, 1),
+                    "strength": round(one.strength, 3),
+                    "box_px": list(one.box_px),
+                    "size_px": [one.wide_px, one.high_px],
+                    "events": one.events,
+                    "negative_share": round(one.negative_share, 4),
+                }
+                for one in self.sources
+            ],
+            "tried": [
+                {
+                    "changes": dict(one.changes),
+                    "frames": one.frames,
+                    "rejected": one.rejected,
+                    "fits": one.fits,
+                }
+                for one in self.trials
+            ],
+            "warnings": list(self.warnings),
+            "counts": self.counts,
+            "duration_s": self.duration_s,
+        }
+
+
+def diagnose(
+    source: EventSource,
+    link: Link,
+    registry: Registry | None = None,
+    *,
+    name: str | None = None,
+    advance: Callable[[int, int | None], None] = lambda _done, _of: None,
+) -> Diagnosis:
+    """Say why a recording is read, or is not.
+
+    Args:
+        source: What is read, to its end; not closed.
+        link: The link that it is expected to have been sent with.
+        registry: Where other modulations are found; None for all that are installed.
+        name: What the recording is called; None for its path.
+        advance: Says how far the reading is.
+
+    Raises:
+        InputError: The source cannot be read on.
+        ConfigError: It is of another sensor than the link's camera.
+    """
+    registry = Registry.load() if registry is None else registry
+    name = str(source.path) if name is None else name
+    check_sensor(source, name, link.camera)
+    width, height = link.camera.width, link.camera.height
+    survey = LightSurvey(width, height)
+    receiver, tally = Receiver(link), RunTally(link.packet)
+    sample, order = _Sample(), _Order(link)
+    for events in source.chunks():
+        for packet in receiver.feed(events):
+            tally.add(packet)
+            order.add(packet)
+        survey.feed(_on_sensor(events, width, height))
+        sample.feed(events, seen=receiver.counts["regions_opened"] > 0)
+        advance(source.position_bytes, source.size_bytes)
+    for packet in receiver.close():
+        tally.add(packet)
+        order.add(packet)
+    capped, peak = survey.capped_share()
+    sources = survey.sources()
+    losses = [str(loss) for loss in source.losses.values()]
+    seconds = survey.duration_s
+
+    def facts(trials: tuple[Trial, ...] = ()) -> Facts:
+        return Facts(
+            link,
+            source.counts["events"],
+            seconds,
+            (width, height),
+            capped,
+            peak * 1000,
+            sources,
+            survey.restless(),
+            receiver.counts,
+            tally,
+            order.found(),
+            order.spacing_px(),
+            trials,
+            losses,
+        )
+
+    checks = checks_of(facts())
+    trials: tuple[Trial, ...] = ()
+    if any(one.verdict == "fail" for one in checks) and sources and not facts().at_edge:
+        events = sample.events()
+        trials = tuple(better_links(link, events, registry, _rates(sources, link)))
+        checks = checks_of(facts(trials))
+    return Diagnosis(
+        name,
+        _headline(checks, tally),
+        tuple(checks),
+        tuple(sources),
+        trials,
+        tuple(warnings_of(tally, receiver.counts, link, reads_messages=link.messages.decode)),
+        receiver.counts,
+        survey.cell_px,
+        survey.frequency_map(),
+        survey.signs,
+        seconds,
+    )
+
+
+def infer_link(source: EventSource, link: Link, registry: Registry | None = None) -> list[Trial]:
+    """Links that may have sent a recording, the best first: what `receive --link auto` takes.
+
+    Tried are chip rates of what blinks, modulations, frames per packet and frames per pilot; all else is as
+    given. Reads until some packets have been seen.
+
+    Args:
+        source: What is read; not closed.
+        link: What is given, one of those tried.
+        registry: Where other modulations are found; None for all that are installed.
+
+    Raises:
+        InputError: The source cannot be read on.
+    """
+    registry = Registry.load() if registry is None else registry
+    width, height = link.camera.width, link.camera.height
+    survey, receiver, sample = LightSurvey(width, height), Receiver(link), _Sample()
+    for events in source.chunks():
+        receiver.feed(events)
+        survey.feed(_on_sensor(events, width, height))
+        sample.feed(events, seen=receiver.counts["regions_opened"] > 0)
+        if sample.full and sample.seen:
+            break
+    events = sample.events()
+    rates = _rates(survey.sources(), link)
+    trials = [try_link(link, events), *better_links(link, events, registry, rates)]
+    return sorted(trials, key=lambda one: one.rank, reverse=True)
+
+
+class _Sample:
+    """The first events of a recording, or those from where the receiver first finds something."""
+
+    def __init__(self) -> None:
+        self._pieces: list[Events] = []
+        self._many = 0
+        self.seen = False
+
+    @property
+    def full(self) -> bool:
+        first = self._pieces[0].t_us[0] if self._pieces else 0
+        last = self._pieces[-1].t_us[-1] if self._pieces else 0
+        return self._many >= MOST_EVENTS or bool(last - first > _TRIAL_US)
+
+    def feed(self, events: Events, *, seen: bool) -> None:
+        if seen and not self.seen:
+            self.seen = True
+            # What was found had begun to blink in the piece before.
+            self._pieces = self._pieces[-1:]
+            self._many = sum(map(len, self._pieces))
+        if not self.full:
+            self._pieces.append(events)
+            self._many += len(events)
+
+    def events(self) -> Events:
+        return Events.concat(self._pieces)[:MOST_EVENTS]
+
+
+class _Order:
+    """Which way round the clusters of bars stand in the picture."""
+
+    def __init__(self, link: Link) -> None:
+        centres = link.bar.cluster_centres_m()
+        self._centres_m = centres - centres.mean(0)
+        self._moment = np.zeros(2)
+        self._spread_m2 = np.zeros(2)
+
+    def add(self, packet: Packet) -> None:
+        for frame in packet.frames:
+            seen = np.isfinite(frame.points_px).all(-1)
+            if len(frame.points_px) == len(self._centres_m) and seen.any():
+                centres = self._centres_m[seen] - self._centres_m[seen].mean(0)
+                self._moment += (frame.points_px[seen] * centres).sum(0)
+                self._spread_m2 += (centres**2).sum(0)
+
+    def found(self) -> tuple[int, int]:
+        """1 where columns, and rows, grow as the bar's own x and y do, -1 where they fall, 0 unknown."""
+        right, down = np.sign(self._moment).astype(int)
+        wide = float(np.ptp(self._centres_m[:, 0])) > 1e-9
+        high = float(np.ptp(self._centres_m[:, 1])) > 1e-9
+        return int(right) * wide, int(down) * high
+
+    def spacing_px(self) -> float:
+        """From cluster to cluster along the longer axis, px; NaN where no frame shows it."""
+        axis = int(self._spread_m2[1] >= self._spread_m2[0])
+        if not self._spread_m2[axis]:
+            return math.nan
+        step_m = float(np.diff(np.unique(np.round(self._centres_m[:, axis], 6))).min())
+        return abs(float(self._moment[axis] / self._spread_m2[axis])) * step_m
+
+
+def _on_sensor(events: Events, width: int, height: int) -> Events:
+    inside = (events.x < width) & (events.y < height)
+    return events if inside.all() else events[inside]
+
+
+def _rates(sources: Sequence[LightSource], link: Link) -> list[float]:
+    """Chip rates that what blinks may have, rounded, as people choose them, and not; not the link's own."""
+    rates: list[float] = []
+    if any(one.strength_at(link.packet.chip_rate_hz) > 0.9 * one.strength for one in sources[:1]):
+        return rates
+    for source in [one for one in sources if one.kind != "lamp"][:3]:
+        for rate in (float(f"{source.rate_hz:.2g}"), float(f"{source.rate_hz:.3g}"), 2 * source.rate_hz):
+            if abs(rate / link.packet.chip_rate_hz - 1) > 1e-4 and rate not in rates:
+                rates.append(float(f"{rate:.4g}"))
+    return rates
+
+
+def _headline(checks: list[Check], tally: RunTally) -> str:
+    wrong = next((one for one in checks if one.verdict == "fail"), None)
+    if wrong is None:
+        doubts = [one for one in checks if one.verdict == "doubt"]
+        but = f"; but {doubts[0].said}" if doubts else ""
+        return f"it is read: {tally.headline()}{but}"
+    return f"{wrong.stage}: {wrong.said}"

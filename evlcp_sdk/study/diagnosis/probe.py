@@ -1,0 +1,182 @@
+"""Which link fits a recording: the same events received with other settings, ranked."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from evlcp_sdk.errors import EvlcpError
+from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.results.doubts import codewords_never
+from evlcp_sdk.results.tallies import RunTally
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.values import Events
+
+__all__ = ["Trial", "better_links", "try_link"]
+
+FRAME_COUNTS = (1, 2, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64)
+"""Frames per packet that are tried first, and then those beside the best: the share of frames accepted falls
+to both sides of the right number."""
+
+PILOT_SPACINGS = (1, 2, 4, 8)
+"""Values of `air.pilot_every` that are tried."""
+
+MOST_EVENTS = 2_000_000
+"""Events of a trial: with fewer of a bar than a tenth of a second has, there may be no preamble in them."""
+
+_FEW_FRAMES = 4
+"""Frames below which a link that was tried is no find: chance gives one or two."""
+
+_GAIN = 0.2
+"""How much more of the frames a change must bring to be kept though it does not fit: chance brings .1."""
+
+_WHOLE_SHARE = 0.97
+"""Frames accepted, of those due, that are all: of packets one frame too long or short, one in ten fails."""
+
+_GOOD_SHARE = 0.8
+"""Frames accepted, of those due, from which on a link fits: a bar that enters or leaves the picture loses
+some."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a link makes of some events.
+
+    Attributes:
+        changes: What it has other than the link that was given: `table.key` to value.
+        link: The link.
+        frames: Frames accepted.
+        rejected: Frames rejected.
+        quality: Mean quality of the frames; 0 without any.
+        never: Codewords that never occur though they should have, by far.
+        codewords: How many the modulation has.
+    """
+
+    changes: tuple[tuple[str, Any], ...]
+    link: Link
+    frames: int
+    rejected: int
+    quality: float
+    never: int
+    codewords: int
+
+    @property
+    def share(self) -> float:
+        """Share of the frames due that are accepted."""
+        return self.frames / max(self.frames + self.rejected, 1)
+
+    @property
+    def whole(self) -> bool:
+        """Whether nearly all frames due are accepted, whatever is read from them."""
+        return self.frames >= _FEW_FRAMES and self.share >= _WHOLE_SHARE
+
+    @property
+    def fits(self) -> bool:
+        """Whether frames are read with it, and all codewords occur that should."""
+        return self.frames >= _FEW_FRAMES and self.share >= _GOOD_SHARE and not self.never
+
+    @property
+    def rank(self) -> tuple[bool, float, float, int]:
+        """What trials are sorted by, the best largest."""
+        return self.fits, round(self.share, 2), round(self.quality, 1), -self.codewords
+
+    def options(self) -> str:
+        """The changes as options of the command line."""
+        return " ".join(
+            f"--set {name}={value:g}" if isinstance(value, float) else f"--set {name}={value}"
+            for name, value in self.changes
+        )
+
+
+def try_link(link: Link, events: Events, changes: Sequence[tuple[str, Any]] = ()) -> Trial:
+    """Receive events with a link and count.
+
+    Args:
+        link: The link.
+        events: All of them on its sensor.
+        changes: What it has other than another; kept.
+    """
+    receiver, tally = Receiver(link), RunTally(link.packet)
+    for packet in [*receiver.feed(events), *receiver.close()]:
+        tally.add(packet)
+    own = [one for one in tally.transmitters.values() if one.frames > one.echoes]
+    frames = sum(one.frames for one in own)
+    return Trial(
+        tuple(changes),
+        link,
+        receiver.counts["frames"],
+        receiver.counts["frames_rejected"],
+        sum(one.quality_sum for one in own) / frames if frames else 0.0,
+        max((codewords_never(one, link) for one in own), default=0),
+        len(link.codebook.codewords),
+    )
+
+
+def better_links(
+    link: Link, events: Events, registry: Registry, rates_hz: Iterable[float] = ()
+) -> Iterator[Trial]:
+    """Try what may be wrong in a link, one thing at a time and then on top of the best; yield what was tried.
+
+    The chip rates that light was seen to have, frames a pilot, frames a packet, and the modulations that are
+    installed. What fits already is not tried.
+
+    Args:
+        link: The link to start from; not tried itself.
+        events: All of them on its sensor.
+        registry: Where other modulations are found.
+        rates_hz: Chip rates to try.
+    """
+    best = try_link(link, events)
+    others = [one.algorithm.id for one in registry.installed("modulation")]
+    # Modulations of the same length only differ in what is read from frames that are accepted.
+    alike = [one for one in others if _chips(_with(link, "modulation.id", one, registry)) == _chips(link)]
+    rest = [one for one in others if one not in alike]
+
+    for name, values, by_frames in (
+        ("air.chip_rate_hz", rates_hz, True),
+        ("modulation.id", rest, True),
+        ("air.pilot_every", PILOT_SPACINGS, True),
+        ("air.frames_per_packet", FRAME_COUNTS, True),
+        ("air.frames_per_packet", None, True),
+        ("modulation.id", alike, False),
+    ):
+        if best.whole if by_frames else best.fits:
+            continue
+        if name == "air.frames_per_packet" and not best.frames:
+            # Whatever the length of a packet, the first frame behind a preamble is accepted.
+            continue
+        start, counts = best, name == "air.frames_per_packet"
+        for value in _beside(start.link.air.frames_per_packet) if values is None else values:
+            other = _with(start.link, name, value, registry)
+            if other is None or other.digest == start.link.digest:
+                continue
+            trial = try_link(other, events, tuple({**dict(start.changes), name: value}.items()))
+            yield trial
+            first = trial.frames >= _FEW_FRAMES > best.frames
+            if trial.rank > best.rank and (counts or trial.fits or first or trial.share > best.share + _GAIN):
+                best = trial
+            if counts and best.whole:
+                break
+
+
+def _chips(link: Link | None) -> int:
+    """Chips of a codeword."""
+    return link.codebook.codewords.shape[-1] if link is not None else 0
+
+
+def _beside(frames: int) -> list[int]:
+    """Numbers of frames between the neighbours of one in those that were tried."""
+    below = max((n for n in FRAME_COUNTS if n < frames), default=0)
+    above = min((n for n in FRAME_COUNTS if n > frames), default=frames + 8)
+    return [n for n in range(below + 1, above) if n != frames]
+
+
+def _with(link: Link, name: str, value: Any, registry: Registry) -> Link | None:
+    """The link with another value; None where that is no link."""
+    table, key = name.split(".")
+    # Parameters of one modulation are not those of another.
+    keys = {} if key == "id" else dict(link.table[table])
+    try:
+        return resolve({**link.table, table: {**keys, key: value}}, registry)
+    except EvlcpError:
+        return None

@@ -1,0 +1,210 @@
+"""Diagnosis: each thing that may be wrong, rendered by the simulator, is the one that is named."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from evlcp_sdk.cli._app import make_app
+from evlcp_sdk.io import open_source
+from evlcp_sdk.io.open import write_events
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.sim import load_scene
+from evlcp_sdk.simulated import SimulatedSource, simulate
+from evlcp_sdk.study.diagnosis import _kernels
+from evlcp_sdk.study.diagnosis.diagnose import Diagnosis, diagnose, infer_link
+from evlcp_sdk.study.diagnosis.light import LightSurvey, comb
+from evlcp_sdk.study.diagnosis.page import page
+from evlcp_sdk.values import Events
+
+LINK = load_link()
+
+
+def rendered(link: tuple[str, ...] = (), duration_s: float = 0.12, **changes: Any) -> SimulatedSource:
+    light = {"background.light_w_m2": 0.01, "bars.0.led_w_m2": 8.0}
+    keys = {"duration_s": duration_s, **light, **changes}
+    scene = load_scene("night", keys, link=load_link(overrides=link))
+    return simulate(scene, seed=3)
+
+
+def found(link: tuple[str, ...] = (), duration_s: float = 0.12, **changes: Any) -> Diagnosis:
+    with rendered(link, duration_s, **changes) as source:
+        return diagnose(source, LINK)
+
+
+def code_of(diagnosis: Diagnosis) -> str:
+    """What is wrong first of all."""
+    wrong = [one for one in diagnosis.checks if one.verdict == "fail"]
+    doubts = [one for one in diagnosis.checks if one.verdict == "doubt"]
+    return (wrong or doubts)[0].code if wrong or doubts else ""
+
+
+@pytest.mark.parametrize(
+    ("code", "changes"),
+    [
+        ("", {}),
+        ("far", {"motion.distance_m": 400.0}),
+        ("no-negative", {"sensor.p_off_miss": 0.98}),
+        ("refractory", {"sensor.refr_us": 300.0}),
+        ("dim", {"bars.0.led_w_m2": 0.1}),
+        ("defocus", {"lens.focus_m": 3.0, "duration_s": 0.06, "bars.0.led_w_m2": 30.0}),
+        ("saturated", {"sensor.cap_mev_s": 1.5}),
+        ("dark", {"bars.0.x_m": 30.0}),
+        ("dark", {"bars.0.led_w_m2": 0.0}),
+        ("lamp", {"bars.0.led_w_m2": 0.0, "flicker_lamps": 2, "duration_s": 0.08}),
+        ("outside", {"bars.0.x_m": 0.0, "bars.0.y_m": 2.45}),
+    ],
+)
+def test_what_is_wrong_is_named(code: str, changes: dict[str, Any]) -> None:
+    diagnosis = found(**changes)
+    assert code_of(diagnosis) == code
+    assert all(one.next_step for one in diagnosis.checks if one.verdict in ("fail", "doubt"))
+    assert diagnosis.headline
+
+
+@pytest.mark.parametrize(
+    ("code", "sent", "step"),
+    [
+        ("rate", ("air.chip_rate_hz=8000",), "--set air.chip_rate_hz=8000"),
+        ("profile", ("modulation.id=wh8",), "--set modulation.id=wh8"),
+        ("frames-per-packet", ("air.frames_per_packet=7",), "--set air.frames_per_packet=7"),
+    ],
+)
+def test_what_a_link_has_wrong_is_found_and_said(code: str, sent: tuple[str, ...], step: str) -> None:
+    diagnosis = found(sent, 0.16)
+    (wrong,) = [one for one in diagnosis.checks if one.verdict == "fail"]
+    assert wrong.code == code
+    assert step in wrong.next_step
+
+
+def test_rate_is_measured_without_a_link() -> None:
+    survey = LightSurvey(1280, 720)
+    with rendered(("air.chip_rate_hz=6250",)) as source:
+        for events in source.chunks():
+            survey.feed(events)
+    (bar,) = survey.sources()
+    assert bar.kind == "code"
+    assert bar.rate_hz == pytest.approx(6250, rel=3e-3)
+    # 0.96 m of 7202 px at 50 m.
+    assert bar.high_px == pytest.approx(0.96 * 7202 / 50, abs=8)
+
+
+def test_links_are_inferred_and_ranked() -> None:
+    with rendered(("modulation.id=wh8", "air.pilot_every=2", "air.chip_rate_hz=8000"), 0.2) as source:
+        best, *rest = infer_link(source, LINK)
+    assert dict(best.changes) == {"air.chip_rate_hz": 8000, "modulation.id": "wh8", "air.pilot_every": 2}
+    assert best.fits
+    assert all(best.rank >= other.rank for other in rest)
+    with rendered() as source:
+        assert infer_link(source, LINK)[0].changes == ()
+
+
+def test_picture_upside_down_is_noticed(tmp_path: Path) -> None:
+    with rendered() as source:
+        events, _ = source.read()
+    turned = Events(events.t_us, 1279 - events.x, 719 - events.y, events.p)
+    write_events(tmp_path / "turned.raw", turned, 1280, 720)
+    with open_source(tmp_path / "turned.raw") as source:
+        diagnosis = diagnose(source, LINK)
+    assert code_of(diagnosis) == "upside-down"
+    assert diagnosis.counts["frames_rejected"] == 0
+
+
+def test_command_says_it_in_words_as_json_and_on_a_page(tmp_path: Path) -> None:
+    with rendered(("air.chip_rate_hz=8000",)) as source:
+        events, _ = source.read()
+    write_events(tmp_path / "slow.raw", events, 1280, 720)
+    run = CliRunner().invoke(
+        make_app(), ["diagnose", str(tmp_path / "slow.raw"), "-o", str(tmp_path / "slow.html")]
+    )
+    assert run.exit_code == 0, run.output
+    assert "blinks at 8 kHz, the link says 10 kHz" in run.stdout
+    assert "next: --set air.chip_rate_hz=8000" in run.stdout
+    text = (tmp_path / "slow.html").read_text()
+    assert "http" not in text.replace("http-equiv", "")
+    assert text.count("data:image/png;base64,") == 2
+    told = json.loads(
+        CliRunner().invoke(make_app(), ["diagnose", str(tmp_path / "slow.raw"), "--json"]).stdout
+    )
+    assert [one["code"] for one in told["checks"] if one["verdict"] == "fail"] == ["rate"]
+    assert told["sources"][0]["rate_hz"] == pytest.approx(8000, rel=3e-3)
+
+
+def test_page_escapes_the_recordings_name() -> None:
+    with rendered(duration_s=0.01) as source:
+        diagnosis = diagnose(source, LINK, name="<img src=x onerror=1>.raw")
+    assert "<img src=x" not in page(diagnosis)
+
+
+def counted_twin(events: Events, shape: tuple[int, int], shift: int, calm_us: int) -> tuple[Any, Any, Any]:
+    """The counts of the kernel, pixel by pixel."""
+    cells = ((shape[0] - 1 >> shift) + 1, (shape[1] - 1 >> shift) + 1)
+    intervals = np.zeros((*cells, _kernels.BINS), np.uint32)
+    gaps = np.zeros((*cells, _kernels.SHORT), np.uint32)
+    signs = np.zeros((*cells, 2), np.int64)
+    for y in range(shape[0]):
+        for x in range(shape[1]):
+            mine = events[(events.x == x) & (events.y == y)]
+            cell = (y >> shift, x >> shift)
+            rise = last = None
+            before = 1
+            for t, p in zip(mine.t_us.tolist(), mine.p.tolist(), strict=True):
+                gap = np.inf if last is None else t - last
+                if gap < _kernels.FINE_US * _kernels.SHORT:
+                    gaps[cell][gap // _kernels.FINE_US] += 1
+                signs[cell][p] += 1
+                since = np.inf if rise is None else t - rise
+                if p and since >= _kernels.SOONEST_US and (before == 0 or gap > calm_us):
+                    fine = _kernels.FINE_US * _kernels.FINE
+                    if since < fine:
+                        intervals[cell][since // _kernels.FINE_US] += 1
+                    elif since < fine + _kernels.COARSE_US * _kernels.COARSE:
+                        intervals[cell][_kernels.FINE + (since - fine) // _kernels.COARSE_US] += 1
+                    rise = t
+                last, before = t, p
+    return intervals, gaps, signs
+
+
+def test_kernel_counts_as_its_twin_does() -> None:
+    rng = np.random.default_rng(5)
+    n, shape = 4000, (12, 20)
+    events = Events.of(
+        np.cumsum(rng.integers(0, 9, n)),
+        rng.integers(0, shape[1], n),
+        rng.integers(0, shape[0], n),
+        rng.integers(0, 2, n),
+    )
+    expected = counted_twin(events, shape, 3, 400)
+    long_ago = np.iinfo(np.int64).min // 2
+    given = [np.full(shape, long_ago), np.ones(shape, np.uint8), np.full(shape, long_ago)]
+    counts = [np.zeros_like(one) for one in expected]
+    for part in (events[:1500], events[1500:]):
+        _kernels.add_events(part.t_us, part.x, part.y, part.p, *given, *counts, 3, 400)
+    for one, other in zip(counts, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_comb_of_whole_periods_is_one() -> None:
+    times = np.zeros(_kernels.BINS)
+    times[[20, 30, 40]] = 5, 3, 2
+    tau_us = np.array([204.5, 304.5, 404.5])
+    rate = np.array([9000.0, 10_000.0, 700.0])
+    expected = [np.cos(2e-6 * np.pi * f * tau_us) @ [5, 3, 2] / 10 for f in rate]
+    np.testing.assert_allclose(comb(times, rate), expected)
+    assert comb(times, np.array([1e6 / 102.0]))[0] > 0.95
+
+
+def test_receive_takes_the_link_that_fits(tmp_path: Path) -> None:
+    with rendered(("modulation.id=wh8",)) as source:
+        events, _ = source.read()
+    write_events(tmp_path / "wh8.raw", events, 1280, 720)
+    run = CliRunner().invoke(
+        make_app(), ["receive", str(tmp_path / "wh8.raw"), "-o", str(tmp_path / "out"), "--link", "auto"]
+    )
+    assert run.exit_code == 0, run.output
+    assert "link --set modulation.id=wh8" in run.stderr
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["codebook"]["profile"] == "wh8"
