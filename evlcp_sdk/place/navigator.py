@@ -152,8 +152,12 @@ class Navigator:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Fixes of satellites: taken, left out of the track, and without a heading that the antenna needs."""
-        return dict(self._counts)
+        """Fixes of satellites: taken, left out of the track, without a heading that the antenna needs, and
+        outside of the recording's time, as far as it has come.
+        """
+        used = self._counts["gnss"] + self._counts["gnss_without_heading"]
+        given = 0 if self._gnss is None else len(self._gnss.t_us)
+        return self._counts | {"gnss_outside": given - used}
 
     def seen(self, first_us: float, last_us: float) -> None:
         """Be told that the recording has events from one time to another: fixes of satellites count in it.

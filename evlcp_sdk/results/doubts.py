@@ -73,7 +73,12 @@ def warnings_of(
 
 
 def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[str]:
-    if not positions["fixes"] + sum(positions["refused"].values()) + positions["gnss"]:
+    if (
+        not positions["fixes"]
+        + sum(positions["refused"].values())
+        + positions["gnss"]
+        + positions["gnss_outside"]
+    ):
         return
     exact = positions["bars_exact"]
     unsaid = [f"bars {', '.join(map(str, exact))} (position_sigma_m in site.toml)"] if exact else []
@@ -94,6 +99,11 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[str]:
         yield (
             f"{number} times bars and GNSS contradict one another: compare the sigmas of both,"
             " position.antenna_m, and the clock of the GNSS file with the camera's"
+        )
+    if (number := positions["gnss_outside"]) and not positions["gnss"]:
+        yield (
+            f"none of {number} GNSS fixes is within the recording's time: t_us of their file has to be the"
+            " camera's clock"
         )
     if number := positions["gnss_without_heading"]:
         yield (

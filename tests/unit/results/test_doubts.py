@@ -141,6 +141,7 @@ def test_what_a_drive_tells_of_its_errors(
         "refused": {},
         "gnss": 0,
         "gnss_without_heading": 0,
+        "gnss_outside": 0,
         "bars_exact": [],
         "excluded": {},
         "alarms": {},

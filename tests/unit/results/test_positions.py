@@ -194,6 +194,7 @@ def test_a_track_goes_on_between_bars(tmp_path: Path) -> None:
     told = write(tmp_path, stream, plan, ["figures", "mcap"], zero=ZERO, span_us=(0, last_us))
     assert (told["gnss"], told["gnss_left_out"], told["gnss_without_heading"]) == (21, 0, 0)
     fixes, track = rows(tmp_path / "fixes.csv"), rows(tmp_path / "track.csv")
+    assert told["gnss_outside"] == 24
     assert [r["t_us"] for r in fixes] == [r["t_us"] for r in track]
     assert [float(r["t_us"]) for r in track] == sorted(float(r["t_us"]) for r in track)
     sources = [r["source"] for r in track]
@@ -227,6 +228,9 @@ def test_bars_and_satellites_that_contradict_one_another(tmp_path: Path) -> None
     way.seen(0, 2e6)
     assert way.close() == ([], ())
     assert way.counts["gnss_without_heading"] == 1
+    write(tmp_path / "late", packets(4), PositionPlan((SITE,), satellites([1e9, 2e9])))
+    said = json.loads((tmp_path / "late" / "summary.json").read_text())["warnings"]
+    assert "none of 2 GNSS fixes is within the recording's time" in " ".join(said)
 
 
 def test_the_poses_that_fit_are_a_file(tmp_path: Path) -> None:
