@@ -150,7 +150,7 @@ def _paper_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
     from evlcp_sdk.study.campaign.summary import beside_paper
 
     rows = [list(row) for row in comparison_rows(beside_paper(summary.series))]
-    return ["figure", "distance", "series", "paper", "here", "95 %", "agrees"], rows
+    return ["figure", "distance", "series", "paper", "here", "95 %", "verdict"], rows
 
 
 def _print_table(head: list[str], rows: list[list[str]]) -> None:

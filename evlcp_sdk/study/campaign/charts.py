@@ -1,11 +1,13 @@
 """The charts of a campaign as plain data, and how Matplotlib draws them; `report` draws them in a page."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from evlcp_sdk.files import Outputs, output_fault
@@ -280,15 +282,6 @@ def draw(chart: Chart, title: str) -> Drawing:
                 )
     for mark in chart.marks:
         axis.plot([mark.x0, mark.x1], [mark.y, mark.y], "-", color=_INK, lw=2.5 if not mark.bound else 1.2)
-        text = (
-            ("at most " if mark.bound else "")
-            + f"{mark.y:g}"
-            + (f" ({mark.clusters})" if mark.clusters else "")
-        )
-        axis.annotate(
-            text, ((mark.x0 + mark.x1) / 2, mark.y), xytext=(0, 3), textcoords="offset points", ha="center",
-            fontsize=8, color=_INK,
-        )  # fmt: skip
     if chart.marks:
         axis.plot([], [], "-", color=_INK, lw=2.5, label=f"{PAPER_NAME} (clusters)")
     if chart.log_y:
@@ -299,16 +292,47 @@ def draw(chart: Chart, title: str) -> Drawing:
             axis.yaxis.set_minor_formatter(NullFormatter())
     axis.set(xlabel=chart.x_label, ylabel=chart.y_label)
     if chart.steps:
-        axis.set_xlim(*_core(chart))
+        axis.set_xlim(*_ends(chart))
+        axis.set_ylim(bottom=0)
+    _name_marks(axis, chart)
     axis.set_title(f"{title}: {chart.title}", loc="left", fontsize=11, color=_INK, parse_math=False)
     axis.grid(color="#e6e6e6", lw=0.8)
     axis.set_axisbelow(True)
     for side in ("top", "right"):
         axis.spines[side].set_visible(False)
-    if axis.get_legend_handles_labels()[1]:
-        for entry in axis.legend(frameon=False, fontsize=8).get_texts():
+    if labels := axis.get_legend_handles_labels()[1]:
+        # Below, where no line runs; a column as wide as the longest name.
+        columns = max(1, min(len(labels), 110 // (8 + max(map(len, labels)))))
+        legend = figure.legend(loc="outside lower left", frameon=False, fontsize=8, ncols=columns)
+        for entry in legend.get_texts():
             entry.set_parse_math(False)
     return figure
+
+
+def _name_marks(axis: Axes, chart: Chart) -> None:
+    """Write each reference's figure above or below its level, where it stands on the fewest dots."""
+    place = axis.transData.transform
+    dots = [(d.x, y) for line in chart.lines for d in line.dots for y in (d.y, d.low, d.high)]
+    spots = place([*dots, *(((m.x0 + m.x1) / 2, m.y) for m in chart.marks)])
+    for mark in chart.marks:
+        text = f"{'at most ' * mark.bound}{mark.y:g}" + (f" ({mark.clusters})" if mark.clusters else "")
+        x, y = place(((mark.x0 + mark.x1) / 2, mark.y))
+        half = _LETTER_PX * len(text) / 2 + _LETTER_PX
+
+        def covered(side: int, x: float = x, y: float = y, half: float = half) -> int:
+            above = side * (spots[:, 1] - y)
+            return int(((abs(spots[:, 0] - x) < half) & (above > 1) & (above < 4 * _LETTER_PX)).sum())
+
+        side = min((1, -1), key=covered)
+        axis.annotate(
+            text, ((mark.x0 + mark.x1) / 2, mark.y), xytext=(0, 3 * side), textcoords="offset points",
+            ha="center", va="bottom" if side > 0 else "top", fontsize=8, color=_INK,
+            path_effects=[withStroke(linewidth=3, foreground="white")],
+        )  # fmt: skip
+
+
+_LETTER_PX = 7.0
+"""Width of a letter at Matplotlib's own resolution, about."""
 
 
 def decades(chart: Chart) -> float:
@@ -317,22 +341,10 @@ def decades(chart: Chart) -> float:
     return math.log10(max(levels) / min(levels)) if levels else 0.0
 
 
-def _core(chart: Chart) -> tuple[float, float]:
-    """Where nearly all of a histogram lies."""
-    reach = max(
-        (_quantile(line.dots, 0.99) for line in chart.lines if line.dots),
-        default=1.0,
-    )
-    return -reach, reach
-
-
-def _quantile(dots: Iterable[Dot], share: float) -> float:
-    total = 0.0
-    for dot in sorted(dots, key=lambda d: abs(d.x)):
-        total += dot.y
-        if total >= share:
-            return abs(dot.x) + BIN_M
-    return math.inf
+def _ends(chart: Chart) -> tuple[float, float]:
+    """Where a histogram begins and ends: at its outermost bins that hold something."""
+    held = [d.x for line in chart.lines for d in line.dots if d.y]
+    return (min(held) - BIN_M, max(held) + BIN_M) if held else (-1.0, 1.0)
 
 
 def save_charts(charts: Sequence[Chart], title: str, folder: Path, outputs: Outputs) -> list[Path]:

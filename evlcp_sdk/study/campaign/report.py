@@ -6,20 +6,19 @@ network for anything.
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.study.campaign.charts import Chart, charts_of, decades
+from evlcp_sdk.study.campaign.charts import Chart, Line, charts_of, decades
 from evlcp_sdk.study.campaign.paper import PAPER_NAME
 from evlcp_sdk.study.campaign.plan import digest_of
-from evlcp_sdk.study.campaign.summary import PaperComparison, Summary, beside_paper
+from evlcp_sdk.study.campaign.summary import AGREEMENT, PaperComparison, Series, Summary, beside_paper
 from evlcp_sdk.study.intervals import INTERVALS, Figure, measure
-from evlcp_sdk.study.markup import Markup, details, document, escape, table
+from evlcp_sdk.study.markup import Markup, details, document, escape, table, tiles
 from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
-__all__ = ["comparison_rows", "page"]
-
-_INK = "#333333"
+__all__ = ["comparison_rows", "page", "title_of"]
 
 
 def page(summary: Summary) -> str:
@@ -32,26 +31,138 @@ def page(summary: Summary) -> str:
         from plotly.offline import get_plotlyjs
     except ImportError as fault:
         raise ConfigError("a report needs the extra: pip install 'evlcp-sdk[report]'") from fault
-    charts = charts_of(summary)
-    statistics = [one.statistics for one in summary.series]
-    events, seconds = sum(s.events for s in statistics), sum(s.duration_us for s in statistics) * 1e-6
-    part = (
-        f"{summary.done} of {summary.tasks} tasks"
-        if summary.done < summary.tasks
-        else f"{summary.done} tasks"
-    )
+    charts, title, beside = charts_of(summary), title_of(summary), beside_paper(summary.series)
     body = [
-        Markup("<h1>{}</h1>").format(summary.name),
-        Markup("<p>{}, {} s received, {} million events.</p>").format(
-            part, f"{seconds:,.1f}", f"{events / 1e6:,.1f}"
-        ),
+        Markup("<h1>{}</h1>").format(title),
+        Markup("<p>{}</p>").format(" ".join(_about(summary))),
+        tiles(_headlines(summary, beside)),
     ]
     for chart in charts:
         body.append(Markup('<h2>{}</h2><div class="chart" id="{}"></div>').format(chart.title, chart.id))
+        body.append(_legend(chart))
         body.append(Markup('<p class="note">{}</p>').format(chart.note))
-    body += [_paper_table(beside_paper(summary.series)), _figures_table(summary), _configuration(summary)]
+    body += [_paper_table(beside), _figures_table(summary), _configuration(summary)]
     drawn = {chart.id: _plotly(chart) for chart in charts}
-    return document(summary.name, body, (get_plotlyjs(), _SCRIPT), {_DATA: drawn})
+    return document(title, body, (get_plotlyjs(), _SCRIPT), {_DATA: drawn}, _STYLE)
+
+
+def title_of(summary: Summary) -> str:
+    """What was measured, at which distances, and the campaign's name."""
+    tallies = [tally for one in summary.series for _, tally in one.statistics.segments]
+    begins = [begin for one in summary.series for begin, _ in one.statistics.segments]
+    if not begins:
+        return f"{summary.name}: nothing measured yet"
+    what = ["bit errors", "distance errors"]
+    what += ["messages"] * any(t.messages_sent for t in tallies)
+    what += ["positions"] * any(t.fixes or t.fixes_refused for t in tallies)
+    said = f"{', '.join(what[:-1])} and {what[-1]}"
+    return f"{summary.name}: {said}, {min(begins)} to {max(begins) + SEGMENT_M} m"
+
+
+def _about(summary: Summary) -> list[str]:
+    """How much was done, and what the series differ in."""
+    few = summary.done < summary.tasks
+    done = f"{summary.done} of {summary.tasks} tasks" if few else f"{summary.done} tasks"
+    statistics = [one.statistics for one in summary.series]
+    events, seconds = sum(s.events for s in statistics), sum(s.duration_us for s in statistics) * 1e-6
+    told = [f"{done}, {seconds:,.1f} s received, {events / 1e6:,.1f} million events."]
+    if len(summary.series) > 1:
+        told.append(f"{len(summary.series)} series: {'; '.join(_varied(summary.series))}.")
+    return told
+
+
+def _varied(series: Sequence[Series]) -> list[str]:
+    """Each thing that series differ in, and its values."""
+    found = []
+    for key in dict.fromkeys(key for one in series for key in one.labels):
+        values = dict.fromkeys(
+            replace(one, labels={key: one.labels[key]}).name for one in series if key in one.labels
+        )
+        if len(values) > 1:
+            *most, last = values
+            found.append(f"{', '.join(most)} or {last}")
+    return found
+
+
+def _headlines(summary: Summary, beside: Sequence[PaperComparison]) -> list[tuple[str, str, str]]:
+    """The figures that a reader looks for first: of all distances, from the best series to the worst."""
+    everything = [(one, one.statistics.total()) for one in summary.series]
+    total = Tally.together(tally for _, tally in everything)
+    several = f"all distances, {len(everything)} series" if len(everything) > 1 else "all distances"
+    shown = []
+
+    def figures(kind: str, form: str, unit: str = "") -> str:
+        found = [measure(tuple(r.total() for r in one.recordings), kind) for one, _ in everything]
+        known = sorted((f for f in found if f.count), key=lambda figure: figure.value)
+        if not known:
+            return ""
+        ends = [f"below {f.high:{form}}" if f.none else f"{f.value:{form}}" for f in (known[0], known[-1])]
+        return " to ".join(dict.fromkeys(ends)) + unit
+
+    if total.frames_sent:
+        share = f"{total.frames_found / total.frames_sent:.1%} of frames sent"
+        shown.append(("frames found", f"{total.frames_found:,} of {total.frames_sent:,}", share))
+    for what, kind, form, unit in (
+        ("bit error rate", "ber", ".2g", ""),
+        ("distance RMSE", "rmse_m", ".3f", " m"),
+        ("errors of 0.5 m or more", "gross_share", ".2%", ""),
+        ("position RMSE in space", "position_rmse_m", ".3f", " m"),
+    ):
+        if value := figures(kind, form, unit):
+            shown.append((what, value, several))
+    if total.messages_sent:
+        wrong = f"{total.messages_wrong} read wrong"
+        shown.append(("messages read", f"{total.messages_found:,} of {total.messages_sent:,}", wrong))
+    if beside:
+        counts = {v: sum(one.verdict == v for one in beside) for v in ("better", "agrees", "worse")}
+        said = ", ".join(f"{n} {_SAID[verdict]}" for verdict, n in counts.items() if n)
+        shown.append(("beside the paper", said, f"of {len(beside)} figures of {PAPER_NAME}"))
+    return shown
+
+
+_SAID = {"better": "better", "agrees": "agree", "worse": "worse"}
+
+_STYLE = """
+.chart { height: 400px } .key { display: flex; flex-wrap: wrap; gap: 0.1rem 0.4rem; margin: 0.2rem 0 }
+.key button { display: flex; align-items: center; gap: 0.4rem; padding: 0.15rem 0.4rem; border: 0;
+  background: none; color: var(--ink); font: inherit; font-size: 0.83rem; text-align: left; cursor: pointer;
+  overflow-wrap: anywhere }
+.key button[aria-pressed=false] { opacity: 0.4 } .key svg { flex: none; width: 34px; height: 12px }
+@media (max-width: 600px) { .chart { height: 330px } }
+"""
+
+_SWATCHES = {
+    "circle": '<circle cx="17" cy="6" r="4"/>',
+    "diamond": '<path d="M17 1l5 5-5 5-5-5z"/>',
+    "square": '<path d="M13 2h8v8h-8z"/>',
+    "cross": '<path d="M15 2h4v2h2v4h-2v2h-4v-2h-2v-4h2z"/>',
+}
+_DASHES = {"solid": "none", "dash": "8 4", "dot": "2 3", "dashdot": "8 3 2 3"}
+_SWATCH = Markup('<svg viewBox="0 0 34 12" color="{}" fill="currentColor" stroke="currentColor">{}{}</svg>')
+_STROKE = Markup('<path d="M0 6H34" stroke-width="{}" stroke-dasharray="{}"/>')
+
+
+def _legend(chart: Chart) -> Markup:
+    """What each line is, below the chart: each shows or hides its own, whose numbers it has."""
+    entries = []
+    for number, line in enumerate(chart.lines):
+        entries.append((str(number), _swatch(line, plain=chart.steps), line.name))
+    marks: dict[str, list[int]] = {}
+    for number, mark in enumerate(chart.marks, len(chart.lines)):
+        marks.setdefault(mark.name, []).append(number)
+    for name, numbers in marks.items():
+        mark = chart.marks[numbers[0] - len(chart.lines)]
+        stroke = _STROKE.format(3, "8 4" if mark.clusters == 2 else "none")
+        entries.append((" ".join(map(str, numbers)), _SWATCH.format("inherit", stroke, ""), name))
+    button = Markup('<button type="button" aria-pressed="true" data-lines="{}">{}<span>{}</span></button>')
+    return Markup('<div class="key" data-chart="{}">{}</div>').format(
+        chart.id, Markup("").join(button.format(*entry) for entry in entries)
+    )
+
+
+def _swatch(line: Line, *, plain: bool) -> Markup:
+    symbol = "" if plain else _SWATCHES[line.symbol]
+    return _SWATCH.format(line.colour, _STROKE.format(1.6, _DASHES[line.dash]), Markup(symbol))
 
 
 _DATA = "charts"
@@ -59,8 +170,29 @@ _SCRIPT = f"""
 const charts = JSON.parse(document.getElementById("{_DATA}").textContent);
 // The library would offer to upload a chart.
 const config = {{displaylogo: false, responsive: true, showSendToCloud: false, plotlyServerURL: ""}};
-for (const [id, c] of Object.entries(charts)) Plotly.newPlot(id, c.data, c.layout, config);
+const dark = matchMedia("(prefers-color-scheme: dark)");
+const colour = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const look = c => {{
+  const [ink, line, dim] = ["--ink", "--line", "--dim"].map(colour);
+  const axis = a => ({{[a + ".gridcolor"]: line, [a + ".linecolor"]: dim, [a + ".tickcolor"]: dim,
+    ...(c.layout[a].minor ? {{[a + ".minor.gridcolor"]: line}} : {{}})}});
+  return {{"font.color": ink, "modebar.color": dim, "modebar.activecolor": ink,
+    "modebar.bgcolor": "rgba(0,0,0,0)", ...axis("xaxis"), ...axis("yaxis")}};
+}};
+const dressed = (id, c) => Plotly.relayout(id, look(c)).then(
+  () => c.ink.length && Plotly.restyle(id, {{"line.color": colour("--ink")}}, c.ink));
+for (const [id, c] of Object.entries(charts))
+  Plotly.newPlot(id, c.data, c.layout, config).then(() => dressed(id, c));
+dark.addEventListener("change", () => Object.entries(charts).forEach(([id, c]) => dressed(id, c)));
+for (const key of document.querySelectorAll(".key")) key.addEventListener("click", event => {{
+  const button = event.target.closest("button");
+  if (!button) return;
+  const shown = button.getAttribute("aria-pressed") !== "true";
+  button.setAttribute("aria-pressed", shown);
+  Plotly.restyle(key.dataset.chart, {{visible: shown}}, button.dataset.lines.split(" ").map(Number));
+}});
 """
+"""Colours are those of the page: a browser says which scheme holds, and when it changes."""
 
 
 def _plotly(chart: Chart) -> dict[str, Any]:
@@ -95,7 +227,6 @@ def _plotly(chart: Chart) -> dict[str, Any]:
                 },
             }
         data.append(trace)
-    named: set[str] = set()
     for mark in chart.marks:
         middle = (mark.x0 + mark.x1) / 2
         said = f"{mark.name}<br>{mark.x0:g} to {mark.x1:g} m: {'at most ' if mark.bound else ''}{mark.y:g}"
@@ -104,38 +235,35 @@ def _plotly(chart: Chart) -> dict[str, Any]:
                 "type": "scatter",
                 "mode": "lines",
                 "name": mark.name,
-                "legendgroup": mark.name,
-                "showlegend": mark.name not in named,
                 "x": [mark.x0, middle, mark.x1],
                 "y": [mark.y] * 3,
                 "text": [said] * 3,
                 "hovertemplate": "%{text}<extra></extra>",
                 "line": {
-                    "color": _INK,
                     "width": 2 if mark.bound else 4,
                     "dash": "dash" if mark.clusters == 2 else "solid",
                 },
             }
         )
-        named.add(mark.name)
-    axis = {"gridcolor": "#e6e6e6", "linecolor": "#999999", "zeroline": False, "ticks": "outside"}
-    y_axis = axis | {"title": {"text": chart.y_label}}
+    axis = {"zeroline": False, "ticks": "outside", "automargin": True}
+    y_axis = axis | {"title": {"text": chart.y_label, "standoff": 8}}
     if chart.log_y:
-        y_axis |= {"type": "log", "minor": {"showgrid": True, "gridcolor": "#f2f2f2"}}
+        y_axis |= {"type": "log", "minor": {"showgrid": True, "griddash": "dot"}}
         narrow = decades(chart) < 2
         y_axis |= {"dtick": "D2", "tickformat": "~g"} if narrow else {"dtick": 1, "exponentformat": "power"}
     else:
         y_axis |= {"rangemode": "tozero"}
     layout = {
-        "margin": {"l": 70, "r": 20, "t": 34, "b": 50},
-        "paper_bgcolor": "white",
-        "plot_bgcolor": "white",
-        "font": {"color": _INK},
+        "margin": {"l": 10, "r": 10, "t": 34, "b": 10},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
         "hovermode": "closest",
-        "xaxis": axis | {"title": {"text": chart.x_label}},
+        "showlegend": False,
+        "xaxis": axis | {"title": {"text": chart.x_label, "standoff": 8}},
         "yaxis": y_axis,
     }
-    return {"data": data, "layout": layout}
+    first = len(chart.lines)
+    return {"data": data, "layout": layout, "ink": list(range(first, first + len(chart.marks)))}
 
 
 def _paper_table(comparisons: Sequence[PaperComparison]) -> Markup:
@@ -143,23 +271,25 @@ def _paper_table(comparisons: Sequence[PaperComparison]) -> Markup:
         return Markup("")
     rows = []
     for cells, one in zip(comparison_rows(comparisons), comparisons, strict=True):
-        agrees = Markup('<span class="{}">{}</span>').format("yes" if one.agrees else "no", cells[-1])
-        rows.append([*cells[:-1], agrees])
+        said = Markup('<span class="{}">{}</span>').format(_MARKED[one.verdict], cells[-1])
+        rows.append([*cells[:-1], said])
     note = (
-        "A bound agrees when the worst segment of 10 m keeps it, a figure when ours lies within 30 % of it."
+        f"A figure agrees when ours lies within {AGREEMENT:.0%} of it, and is better where it is smaller."
+        f" A bound agrees when the worst segment of {SEGMENT_M} m keeps it."
     )
     return Markup('<h2>{}</h2>{}<p class="note">{}</p>').format(
         f"Beside {PAPER_NAME}",
-        table(("figure", "distance", "series", "paper", "here", "95 %", "agrees"), rows),
+        table(("figure", "distance", "series", "paper", "here", "95 %", "verdict"), rows),
         note,
     )
 
 
+_MARKED = {"better": "yes", "agrees": "", "worse": "no"}
 _MEASURES = {"ber": "bit error rate", "rmse_m": "distance RMSE, m", "gross_share": "errors of 0.5 m or more"}
 
 
 def comparison_rows(comparisons: Iterable[PaperComparison]) -> list[tuple[str, ...]]:
-    """Figure, distance, series, paper, here, its interval, and whether they agree, as text."""
+    """Figure, distance, series, paper, here, its interval, and the verdict, as text."""
     rows: list[tuple[str, ...]] = []
     for one in comparisons:
         r, percent = one.reference, one.reference.measure == "gross_share"
@@ -176,7 +306,7 @@ def comparison_rows(comparisons: Iterable[PaperComparison]) -> list[tuple[str, .
                 ("at most " if r.bound else "") + shown(r.value),
                 shown(one.ours.value) + (f" at {one.from_m} to {one.to_m} m" if wide else ""),
                 one.ours.interval(".2%" if percent else ".3g") or "-",
-                "yes" if one.agrees else "no",
+                one.verdict,
             )
         )
     return rows

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import zip_longest
-from typing import Any
+from typing import Any, Literal
 
 from evlcp_sdk.study.campaign.collect import Counted
 from evlcp_sdk.study.campaign.paper import PAPER, Measure, Reference
@@ -18,7 +18,7 @@ from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.intervals import Figure, measure
 from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
 
-__all__ = ["PaperComparison", "Series", "Summary", "beside_paper", "summarize"]
+__all__ = ["PaperComparison", "Series", "Summary", "Verdict", "beside_paper", "summarize", "verdict_of"]
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class Summary:
             "paper": [
                 asdict(c.reference)
                 | {"series": c.series, "ours": _plain(asdict(c.ours)), "ours_at_m": [c.from_m, c.to_m]}
-                | {"agrees": c.agrees}
+                | {"verdict": c.verdict}
                 for c in beside_paper(self.series)
             ],
         }
@@ -222,7 +222,7 @@ class PaperComparison:
         ours: The measured one; where the paper gives a bound, that of the worst segment.
         from_m: Start of the distances that ours was measured at, m.
         to_m: Their end, m.
-        agrees: Ours keeps the paper's bound, or lies within 30 % of its figure.
+        verdict: Ours beside the paper's, as `verdict_of` says.
     """
 
     reference: Reference
@@ -230,10 +230,24 @@ class PaperComparison:
     ours: Figure
     from_m: int
     to_m: int
-    agrees: bool
+    verdict: "Verdict"
 
+
+Verdict = Literal["better", "agrees", "worse"]
 
 AGREEMENT = 0.3
+"""Up to what share two figures that agree differ."""
+
+
+def verdict_of(ours: float, reference: Reference) -> Verdict:
+    """Hold a figure against the paper's; the smaller one is the better.
+
+    A bound is kept, which agrees, or not, which is worse: how far the paper stays below it, it does not say.
+    """
+    ratio = ours / reference.value
+    if ratio > 1 + (0 if reference.bound else AGREEMENT):
+        return "worse"
+    return "agrees" if reference.bound or ratio >= 1 - AGREEMENT else "better"
 
 
 def beside_paper(series: Iterable[Series], references: Iterable[Reference] = PAPER) -> list[PaperComparison]:
@@ -251,9 +265,8 @@ def beside_paper(series: Iterable[Series], references: Iterable[Reference] = PAP
             if reference.bound:
                 ours, at = _worst(one, reference)
             if ours.count:
-                ratio = ours.value / reference.value
-                agrees = ratio <= 1 if reference.bound else abs(ratio - 1) <= AGREEMENT
-                found.append(PaperComparison(reference, one.name, ours, *at, agrees))
+                verdict = verdict_of(ours.value, reference)
+                found.append(PaperComparison(reference, one.name, ours, *at, verdict))
     return found
 
 

@@ -15,14 +15,14 @@ from evlcp_sdk.study.campaign.charts import charts_of, save_charts
 from evlcp_sdk.study.campaign.collect import collect
 from evlcp_sdk.study.campaign.paper import PAPER
 from evlcp_sdk.study.campaign.plan import Case, Plan, make_plan
-from evlcp_sdk.study.campaign.report import page
+from evlcp_sdk.study.campaign.report import page, title_of
 from evlcp_sdk.study.campaign.store import Store
-from evlcp_sdk.study.campaign.summary import Series, Summary, beside_paper, summarize
+from evlcp_sdk.study.campaign.summary import Series, Summary, beside_paper, summarize, verdict_of
 from evlcp_sdk.study.intervals import measure
 from evlcp_sdk.study.tally import Statistics, Tally
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
 from tests.unit.study.campaign.fake import run_fake
-from tests.unit.study.test_markup import HOSTILE
+from tests.unit.study.test_markup import HOSTILE, Elements
 
 TWO = "two clusters <!--<script>"
 """In a script element, such a name would keep its end tag from ending it."""
@@ -82,21 +82,22 @@ def test_the_paper_is_held_beside_the_series_it_speaks_of(summary: Summary) -> N
     assert beside_paper([ours]) == []
 
 
-def test_agreement_is_a_kept_bound_or_a_figure_within_30_percent(summary: Summary) -> None:
+def test_a_smaller_figure_is_better_and_a_kept_bound_agrees(summary: Summary) -> None:
     link = summary.series[0].link
     for reference in PAPER:
         if reference.measure != "rmse_m" or reference.clusters != 16:
             continue
-        for factor, agrees in (
-            (1.4, False),
-            (0.99, True),
-            (0.5, reference.bound),
-            (1.25, not reference.bound),
+        for factor, verdict in (
+            (1.4, "worse"),
+            (0.99, "agrees"),
+            (0.5, "agrees" if reference.bound else "better"),
+            (1.25, "worse" if reference.bound else "agrees"),
         ):
             tally = Tally.distance(reference.value * factor)
             at = Statistics.of([(reference.from_m, tally)], tasks=1)
             (one,) = beside_paper([Series({}, {"speed_kmh": 30}, link, (at,))], [reference])
-            assert one.agrees is agrees, (reference, factor)
+            assert one.verdict == verdict, (reference, factor)
+            assert verdict_of(reference.value * factor, reference) == verdict
 
 
 def test_a_seed_is_one_recording_over_all_distances(summary: Summary) -> None:
@@ -113,7 +114,7 @@ def test_json_has_every_figure(summary: Summary) -> None:
     assert len(table["series"]) == 4
     first = table["series"][0]["segments"][0]
     assert first["ber"]["value"] == first["bit_errors"] / first["bits"]
-    assert {"ours", "agrees", "value"} <= set(table["paper"][0])
+    assert {"ours", "verdict", "value"} <= set(table["paper"][0])
 
 
 def test_charts_are_saved_as_png_and_svg(summary: Summary, tmp_path: Path) -> None:
@@ -132,6 +133,7 @@ def test_an_empty_campaign_has_a_page(tmp_path: Path) -> None:
         store.adopt(plan_of_two_methods())
         nothing = summarize(store)
     assert "0 of 40 tasks" in page(nothing)
+    assert title_of(nothing) == "two methods </script>: nothing measured yet"
     with Outputs() as outputs:
         assert len(save_charts(charts_of(nothing), "nothing", tmp_path, outputs)) == 10
 
@@ -146,6 +148,17 @@ def test_the_page_tells_everything(summary: Summary) -> None:
     pytest.importorskip("plotly", reason="the extra report is not installed")
     text = page(summary)
     assert summary.digest in text
+    assert "<h1>two methods &lt;/script&gt;: bit errors and distance errors, 30 to 80 m</h1>" in text
+    assert "4 series: 20 km/h or 30 km/h; 16 clusters or two clusters &lt;!--&lt;script&gt;." in text
+    head = Elements(text.partition("<h2>")[0])
+    total = Tally.together(one.statistics.total() for one in summary.series)
+    assert f"{total.frames_found:,} of {total.frames_sent:,}" in head.text
+    by_series = sorted(one.statistics.total().rmse_m for one in summary.series)
+    assert f"{by_series[0]:.3f} to {by_series[-1]:.3f} m" in head.text
+    verdicts = [one.verdict for one in beside_paper(summary.series)]
+    assert f"{verdicts.count('worse')} worse" in head.text
+    assert text.count('<span class="no">worse</span>') == verdicts.count("worse")
+    assert text.count('<span class="yes">better</span>') == verdicts.count("better")
     assert "arXiv 2510.17203" in text
     assert "d" * 64 in text
     for tag in re.findall(
@@ -175,6 +188,21 @@ def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) ->
         for chart in CHARTS:
             told = hovered(browser, chart)
             assert "km/h" in told, f"{chart}: nothing is told where the pointer is"
+        for width in (1280, 390):
+            for dark in (False, True):
+                browser.dress(width, dark=dark)
+                seen = {chart: browser.value(f"({SEEN})('{chart}')") for chart in CHARTS}
+                for chart, one in seen.items():
+                    assert one["paper"] == "rgba(0, 0, 0, 0)", chart
+                    assert one["plot"] > 0.7 * one["room"], f"{chart}: little left of {width} px"
+                    assert one["room"] <= width - 20, f"{chart}: wider than {width} px"
+                    assert one["key"] >= one["bottom"], f"{chart}: the legend is not below"
+                    assert (one["ink"] > 128) is dark, f"{chart}: not for this scheme"
+                assert browser.value("document.documentElement.scrollWidth") <= width
+        drawn_lines = "document.querySelectorAll('#rmse .scatterlayer .trace').length"
+        before = browser.value(drawn_lines)
+        browser.value("document.querySelector('.key[data-chart=rmse] button').click()")
+        assert browser.value(drawn_lines) == before - 1
         asked = [
             m["params"]["request"]["url"]
             for m in browser.heard
@@ -213,8 +241,26 @@ def test_no_script_but_the_page_s_own_runs_in_a_browser(tmp_path: Path) -> None:
             told = hovered(browser, "histogram")
             assert "<img src=x" in told
             browser.value("new Promise(done => setTimeout(done, 200))")
-            assert browser.value("document.title") == HOSTILE
+            assert browser.value("document.title").startswith(f"{HOSTILE}: bit errors")
             assert browser.value("document.querySelectorAll('img').length") == (name == "b")
+
+
+SEEN = """async id => {
+  const e = document.getElementById(id), frame = () => new Promise(requestAnimationFrame);
+  let before = "";
+  for (let i = 0; i < 90; i++) {
+    await frame();
+    const now = JSON.stringify([e._fullLayout.width, e._fullLayout.font.color, e.clientWidth]);
+    if (i > 10 && now === before && e._fullLayout.width === e.clientWidth) break;
+    before = now;
+  }
+  const r = e.getBoundingClientRect(), text = e.querySelector(".xtick text");
+  return {room: r.width, bottom: Math.round(r.bottom), plot: e._fullLayout._size.w,
+    paper: getComputedStyle(e.querySelector(".main-svg")).backgroundColor,
+    key: Math.round(document.querySelector(`.key[data-chart=${id}]`).getBoundingClientRect().top),
+    ink: Number(getComputedStyle(text).fill.match(/\\d+/)[0])};
+}"""
+"""How a chart stands once it has settled."""
 
 
 def hovered(browser: Browser, chart: str) -> str:

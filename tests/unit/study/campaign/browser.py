@@ -85,6 +85,14 @@ class Browser:
         while not any(m.get("method") == "Page.loadEventFired" for m in self.heard):
             self.heard.append(self._read())
 
+    def dress(self, width: int, *, dark: bool) -> None:
+        """Show the page as wide as that, in light or in the dark."""
+        self.say(
+            "Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=False
+        )
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.say("Emulation.setEmulatedMedia", features=[scheme])
+
     def value(self, expression: str) -> Any:
         """What a JavaScript expression or promise gives."""
         answer = self.say("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)

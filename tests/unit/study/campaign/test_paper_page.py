@@ -7,7 +7,7 @@ import pytest
 
 from evlcp_sdk.study.campaign.paper import PAPER, Reference
 from evlcp_sdk.study.campaign.report import comparison_rows
-from evlcp_sdk.study.campaign.summary import Figure, PaperComparison
+from evlcp_sdk.study.campaign.summary import Figure, PaperComparison, verdict_of
 from tests.conftest import ROOT
 
 PAGE = (ROOT / "docs" / "paper.md").read_text()
@@ -18,7 +18,7 @@ FIELDS = ("measure", "clusters", "speed_kmh", "from_m", "to_m", "value", "bound"
 def comparison(table: dict[str, Any]) -> PaperComparison:
     reference = Reference(**{name: table[name] for name in FIELDS})
     return PaperComparison(
-        reference, table["series"], Figure(**table["ours"]), *table["ours_at_m"], table["agrees"]
+        reference, table["series"], Figure(**table["ours"]), *table["ours_at_m"], table["verdict"]
     )
 
 
@@ -27,6 +27,7 @@ def comparison(table: dict[str, Any]) -> PaperComparison:
 )
 def test_every_comparison_is_on_the_page(table: dict[str, Any]) -> None:
     (row,) = comparison_rows([comparison(table)])
+    assert table["verdict"] == verdict_of(table["ours"]["value"], comparison(table).reference)
     assert f"| {' | '.join(row)} |" in PAGE
 
 
@@ -45,7 +46,7 @@ def test_the_guesses_bring_the_near_figures_within_30_percent() -> None:
         t for t in RESULT["paper"] if t["measure"] == "rmse_m" and t["clusters"] == 16 and t["to_m"] <= 50
     ]
     assert [t["value"] for t in near] == [0.0702, 0.1216]
-    assert all(t["agrees"] for t in near)
+    assert all(t["verdict"] == "agrees" for t in near)
 
 
 def test_every_segment_is_on_the_page() -> None:
