@@ -202,6 +202,7 @@ def measured(path: Path, make: Make, table: Mapping[str, Any], tool: Path, round
             "rows": score.rows,
             "ghosts": score.unmatched,
             "echoes": score.echoes,
+            "warnings": [warning["code"] for warning in summary["warnings"]],
             "independent": "absent" if other is None else "agrees" if other == score.to_road() else "differs",
         }
         for number, bar in enumerate(score.bars):

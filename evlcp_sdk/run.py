@@ -311,6 +311,7 @@ def _run(
         counts=receiver.counts,
         losses={kind: asdict(loss) for kind, loss in source.losses.items()},
         error=error,
+        lit_us=receiver.lit_us,
     )
 
 

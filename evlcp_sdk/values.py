@@ -549,6 +549,7 @@ class Fix:
         attitude_sigma_deg: Standard deviation of a turn of the camera about the least certain axis; NaN where
             no attitude is given.
         alternatives: Of a fix refused as `two-solutions`, the poses that fit, the likeliest first.
+        suspects: Of a fix refused as `misfit`, the parts of which one, if it were left out, would explain it.
     """
 
     t_us: float
@@ -577,6 +578,7 @@ class Fix:
     contradicted: tuple[str, ...] = ()
     attitude_sigma_deg: float = math.nan
     alternatives: tuple[Alternative, ...] = ()
+    suspects: tuple[str, ...] = ()
 
     @property
     def alarms(self) -> tuple[str, ...]:

@@ -14,6 +14,8 @@ def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
     from rich.table import Table
     from rich.text import Text
 
+    from evlcp_sdk.results.doubts import Doubt
+
     out = console()
     recording, processing = summary["recording"], summary["processing"]
     out.print(Text.assemble((Path(recording["path"]).name, "bold"), f": {summary['result']}"))
@@ -50,8 +52,10 @@ def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
             f"lost: {loss['count']} {loss['meaning']} (first at {loss['unit']} {loss['first']})",
             style="yellow",
         )
+    for note in summary["notes"]:
+        out.print(str(Doubt(**note)), style="dim")
     for warning in summary["warnings"]:
-        out.print(f"warning: {warning}", style="yellow")
+        out.print(f"warning: {Doubt(**warning)}", style="yellow")
     out.print(f"written: {folder}/{', '.join([*summary['files'], 'summary.json'])}", style="dim")
 
 

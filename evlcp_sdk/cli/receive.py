@@ -72,6 +72,7 @@ def receive(
             help="auto: chip rate, modulation, frames per packet and per pilot are tried, the best taken.",
         ),
     ] = LinkMode.GIVEN,
+    strict: Annotated[bool, typer.Option("--strict", help="End with 1 where there are warnings.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Each summary as one line of JSON.")] = False,
     figures: Annotated[
         bool, typer.Option("--figures", help="Draw regions.png, presence.png, distance.png, track.png.")
@@ -199,7 +200,7 @@ def receive(
     load_sinks(choose_sinks(registry, asked, positions=plan is not None))
     here = dask is None and (not workers or len(jobs) == 1)
     executor = make_executor(0 if here else workers or None, dask)
-    worst, degraded = 0, False
+    worst, degraded, warned = 0, False, False
     interrupted: list[Path] = []
     pass_on = (lambda: None) if here else stop_workers
     with (
@@ -237,12 +238,13 @@ def receive(
             if summary["status"] == "failed":
                 worst = max(worst, InputError.exit_code)
             degraded |= summary["status"] == "degraded"
+            warned |= bool(summary["warnings"])
             if summary["status"] == "interrupted":
                 interrupted.append(job.folder)
         if stopped():
             folder = interrupted[0] if len(interrupted) == 1 else out
             raise InterruptedRunError(f"interrupted; what was decoded until then is in {folder}")
-    raise typer.Exit(worst or DEGRADED * degraded)
+    raise typer.Exit(worst or DEGRADED * degraded or int(strict and warned))
 
 
 def _fitted(job: ReceiveJob, link: "Link", registry: "Registry") -> ReceiveJob:

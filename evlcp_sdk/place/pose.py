@@ -108,7 +108,7 @@ def solve_pose(
     if isinstance(found, Refusal) and not names:
         return found
     could = f"; it may be {' or '.join(names)}" if names else ""
-    return Refusal("misfit", doubt + could)
+    return Refusal("misfit", doubt + could, suspects=tuple(names))
 
 
 def _exchanged(views: Sequence[BarView]) -> Iterator[tuple[str, list[BarView]]]:

@@ -156,7 +156,8 @@ class Positioner:
         pose = solve_pose(sited, self._camera, self._attitude_at(t_us), self._spec, self._camera_sigma)
         if isinstance(pose, Refusal):
             refused = Fix.refused(t_us, tuple(views), pose.kind, pose.detail)
-            return replace(refused, alternatives=_alternatives(pose, here, self.axes))
+            others = _alternatives(pose, here, self.axes)
+            return replace(refused, alternatives=others, suspects=pose.suspects)
         verified = all(self._bars.verified(n) for n in pose.transmitters)
         attitude = Attitude.of_rotation(pose.rotation)
         latitude, longitude, height = (float(v) for v in here.to_geodetic(pose.enu_m))

@@ -48,8 +48,10 @@ class Refusal:
         kind: One of `REFUSALS`.
         detail: The same in words, with the figures of this case.
         candidates: Of `two-solutions`, the poses that fit, the likeliest first.
+        suspects: Of `misfit`, the parts of which one, if it were left out, would explain it.
     """
 
     kind: str
     detail: str
     candidates: tuple[Candidate, ...] = ()
+    suspects: tuple[str, ...] = ()

@@ -1,13 +1,20 @@
-"""What looks wrong in a result, in words, each with the next step to try."""
+"""What looks wrong in a result, in words, each with the next step to try; and what it has none of."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from evlcp_sdk.link.resolve import Link
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import EvlcpError
+from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.results.readout import CAPPED_SHARE, ReadoutTally
 from evlcp_sdk.results.tallies import RunTally, TransmitterTally
 
-__all__ = ["codewords_never", "warnings_of"]
+__all__ = ["Doubt", "Seen", "codewords_never", "notes_of", "other_codewords", "warnings_of"]
 
 _TOLD_SIGMAS = 3.0
 """Sigmas beyond which what a drive tells is hinted at."""
@@ -31,17 +38,108 @@ _MANY_EVENTS = 100_000
 _RANGED_SHARE = 0.25
 """Frames with a distance of which fewer is said."""
 
+_SIZE_OFF = 0.1
+"""Share by which distances and the bar's length in the picture may disagree: distances of far bars, and of
+bars that lean, are off by some percent."""
+
+_LENGTH_OFF = 0.02
+"""Share by which a beacon's length of its bar may be another than the link's: both are measured by hand."""
+
+_ALIKE = 3
+"""Packets that repeat others without being read, from which on there is something to be read."""
+
+_FAILED_SHARE = 0.5
+"""Packets that cannot be read, where others can, of which more is said."""
+
+_SPLIT = 0.9
+"""Share of the symbols that are another modulation's from which on that one is taken to be what is sent."""
+
+_COVERED = 0.5
+"""Share of a recording of which no more is without frames unless it is said."""
+
+_LIT_SHARE, _LIT_PACKETS = 0.2, 3
+"""Share of a recording, and packets, for which a bar is in the picture without a frame before it is said."""
+
+_DROPPED_SHARE, _DROPPED_LEAST = 0.001, 100
+"""Of the events: dropped ones of which more is said. A restart of the camera costs fewer."""
+
+_SATURATED_S = 0.01
+"""Recordings shorter than this are too short to tell a limit from chance."""
+
 _NO_ROOM = (
-    ("dropped_crowded", "{} events of crowded time steps dropped"),
-    ("dropped_no_room", "{} events of regions forgotten early"),
-    ("frames_cut", "{} frames passed over for it"),
-    ("regions_left_out", "{} times a region more was not followed"),
-    ("regions_gave_way", "{} regions without a bar let go for others"),
+    ("dropped_crowded", "{} event{} of crowded time steps dropped"),
+    ("dropped_no_room", "{} event{} of regions forgotten early"),
+    ("frames_cut", "{} frame{} passed over for it"),
+    ("regions_left_out", "{} time{} a region more was not followed"),
+    ("regions_gave_way", "{} region{} without a bar let go for others"),
 )
 """Counts of what there was no room for, and how they are told."""
 
 _BY_CHANCE = 1e-6
 """Probability of a finding by chance below which it is told."""
+
+_SUSPECTS = {
+    "focal length": "camera.focal_mm, or give camera_sigma.focal_mm, and the drive shows the right one",
+    "heading": "--heading-deg, or that of the attitude file: the camera's, clockwise from north",
+    "attitude": "pitch and roll, their signs, and how the camera is mounted",
+}
+"""What to compare where a part of a position is what the rest contradicts."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Something that looks wrong, or a plain statement of what there was none of.
+
+    Attributes:
+        code: What it is, in a word or two, e.g. `frames-rejected`; the same in every version.
+        text: The same in words, with the counts that say so.
+        next_step: What to try; empty where there is nothing to do.
+        transmitter: Number of the transmitter that it is about; None for all of the recording.
+
+    >>> print(Doubt("clock", "its clock is 900 ppm off", "try another rate", 0))
+    transmitter 0: its clock is 900 ppm off: try another rate
+    """
+
+    code: str
+    text: str
+    next_step: str = ""
+    transmitter: int | None = None
+
+    def __str__(self) -> str:
+        whose = "" if self.transmitter is None else f"transmitter {self.transmitter}: "
+        return f"{whose}{self.text}" + (f": {self.next_step}" if self.next_step else "")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The same as JSON values."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What is known of a recording beside its transmitters and the receiver's counts.
+
+    Attributes:
+        first_us: Its first event, camera clock, us.
+        last_us: Its last, us.
+        lit_us: Of each transmitter, from when until when frames of it were due and its light was there, by
+            number, us.
+        readout: Events in each millisecond; None where they were not counted.
+        losses: Events and words that the source could not use.
+        others: Codewords of other modulations by id, int8 (symbols, values); asked where it matters.
+    """
+
+    first_us: float = math.nan
+    last_us: float = math.nan
+    lit_us: Mapping[int, tuple[float, float]] | None = None
+    readout: ReadoutTally | None = None
+    losses: int = 0
+    others: Callable[[], Mapping[str, NDArray[np.int8]]] = dict
+
+    @property
+    def duration_us(self) -> float:
+        """From the first event to the last; 0 where nothing is known of it."""
+        length_us = self.last_us - self.first_us
+        return length_us if length_us > 0 else 0.0
 
 
 def warnings_of(
@@ -49,154 +147,329 @@ def warnings_of(
     counts: Mapping[str, int],
     link: Link,
     *,
+    seen: Seen | None = None,
     reads_messages: bool = True,
     positions: Mapping[str, Any] | None = None,
-) -> list[str]:
-    """What looks wrong in a result, a line each.
+) -> list[Doubt]:
+    """What looks wrong in a result, the recording first, then each transmitter, messages and positions.
 
     Args:
         tally: Figures of the transmitters; what is said to be a reflection is not doubted.
         counts: The receiver's counts.
         link: The configuration that it ran with.
+        seen: What else is known of the recording; None for nothing.
         reads_messages: Whether messages were looked for.
         positions: Figures of the positions, where they were computed.
     """
-    found = [*_frames(counts), *_room(counts)]
+    seen = Seen() if seen is None else seen
+    found = [*_readout(seen), *_dropped(counts, seen), *_frames(counts), *_room(counts)]
     for number, one in sorted(tally.transmitters.items()):
         if one.frames - one.echoes >= _FEW_FRAMES:
-            found += [f"transmitter {number}: {text}" for text in _transmitter(one, link)]
+            found += _transmitter(number, one, link, counts, seen)
+        found += _coverage(number, one, link, seen)
+        found += _length(number, one, link)
     if reads_messages:
-        found += _blocks(counts, tally)
+        found += _blocks(counts)
     if positions is not None:
         found += _positions(positions, link)
     return found
 
 
-def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[str]:
-    if (
-        not positions["fixes"]
-        + sum(positions["refused"].values())
-        + positions["gnss"]
-        + positions["gnss_outside"]
-    ):
+def notes_of(
+    tally: RunTally,
+    counts: Mapping[str, int],
+    *,
+    seen: Seen | None = None,
+    reads_messages: bool = True,
+) -> list[Doubt]:
+    """Plain statements: reflections, what there were no frames of, and that there were no messages.
+
+    Args:
+        tally: Figures of the transmitters.
+        counts: The receiver's counts.
+        seen: What else is known of the recording; None for nothing.
+        reads_messages: Whether messages were looked for.
+    """
+    found = [
+        Doubt("reflection", f"a reflection of transmitter {one.echo_of}, {one.echoes} frames", "", number)
+        for number, one in sorted(tally.transmitters.items())
+        if one.echoes and one.echo_of is not None
+    ]
+    seen = Seen() if seen is None else seen
+    if seen.duration_us and tally.transmitters:
+        covered_us = tally.covered_us
+        if covered_us < (1 - _COVERED) * seen.duration_us:
+            first_us = min(one.first_us for one in tally.transmitters.values())
+            last_us = max(one.last_us for one in tally.transmitters.values())
+            found.append(
+                Doubt(
+                    "coverage",
+                    f"frames in {_ms(covered_us)} of {_ms(seen.duration_us)}: nothing before"
+                    f" {_ms(first_us - seen.first_us)}, nothing after {_ms(last_us - seen.first_us)}",
+                )
+            )
+    tried = counts.get("blocks_tried", 0)
+    if reads_messages and tried and not _read(counts):
+        what = f"none of {tried} packets has" if tried > 1 else "the packet does not have"
+        found.append(Doubt("no-messages", f"no messages: {what} a block that can be read"))
+    return found
+
+
+def other_codewords(link: Link, registry: Registry) -> dict[str, NDArray[np.int8]]:
+    """Codewords of the other modulations that are installed, by id, int8 (symbols, values)."""
+    found = {}
+    for installed in registry.installed("modulation"):
+        name = installed.algorithm.id
+        if name == link.table["modulation"]["id"]:
+            continue
+        try:
+            other = resolve({**link.table, "modulation": {"id": name}}, registry)
+        except EvlcpError:
+            continue
+        found[name] = other.codebook.codewords
+    return found
+
+
+def _ms(t_us: float) -> str:
+    return f"{t_us * 1e-3:.0f} ms" if t_us < 1e7 else f"{t_us * 1e-6:.1f} s"
+
+
+def _s(number: int) -> str:
+    return "s" * (number != 1)
+
+
+def _read(counts: Mapping[str, int]) -> int:
+    return counts.get("blocks_decoded", 0) + counts.get("blocks_combined", 0)
+
+
+def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Doubt]:
+    satellites = positions["gnss"] + positions["gnss_outside"]
+    if not positions["fixes"] + sum(positions["refused"].values()) + satellites:
         return
     exact = positions["bars_exact"]
     unsaid = [f"bars {', '.join(map(str, exact))} (position_sigma_m in site.toml)"] if exact else []
     if not link.camera_sigma.known:
         unsaid.append("the camera ([camera_sigma], which evlcp calibrate prints)")
     if unsaid:
-        yield (
+        yield Doubt(
+            "no-sigma",
             f"positions take as exact what has no sigma: {' and '.join(unsaid)}; their sigmas and protection"
-            " levels hold only if it is"
+            " levels hold only if it is",
         )
     for name, number in positions["excluded"].items():
-        yield (
-            f"{number} positions are without {name}, which the rest contradicts: compare its place or angles"
-            " and their sigmas with what is there"
+        yield Doubt(
+            "excluded",
+            f"{number} position{_s(number)} without {name}, which the rest contradicts",
+            f"compare {_SUSPECTS.get(name, 'its place, angles and length, and their sigmas')}",
         )
     yield from _learnt(positions["learnt"], link)
     if number := positions["alarms"].get("contradicted", 0):
-        yield (
-            f"{number} times bars and GNSS contradict one another: compare the sigmas of both,"
-            " position.antenna_m, and the clock of the GNSS file with the camera's"
+        yield Doubt(
+            "gnss-contradicted",
+            f"{number} time{_s(number)} bars and GNSS contradict one another",
+            "compare the sigmas of both, position.antenna_m, and both clocks",
         )
     if (number := positions["gnss_outside"]) and not positions["gnss"]:
-        yield (
-            f"none of {number} GNSS fixes is within the recording's time: t_us of their file has to be the"
-            " camera's clock"
+        yield Doubt(
+            "gnss-outside",
+            f"none of {number} GNSS fixes is within the recording's time",
+            "t_us of their file has to be the camera's clock",
         )
     if number := positions["gnss_without_heading"]:
-        yield (
-            f"{number} GNSS fixes not used, as no heading says where the antenna is (position.antenna_m):"
-            " give an attitude with a heading"
+        yield Doubt(
+            "gnss-without-heading",
+            f"{number} GNSS fix{'es' * (number != 1)} not used, as no heading says where the antenna is"
+            " (position.antenna_m)",
+            "give an attitude with a heading",
         )
     if number := positions["refused"].get("misfit", 0):
-        yield (
-            f"{number} positions refused, as bars, attitude and camera contradict one another: compare sites,"
-            " angles and [camera] with what is there, and their sigmas"
+        yield _misfit(number, positions.get("suspects", {}))
+
+
+def _misfit(number: int, suspects: Mapping[str, int]) -> Doubt:
+    """Positions refused, with the part that would explain most of them."""
+    text = f"{number} position{_s(number)} refused, as bars, attitude and camera contradict one another"
+    likely = [name for name, times in suspects.items() if 2 * times > number]
+    if not likely:
+        return Doubt(
+            "misfit", text, "compare sites, angles and [camera] with what is there, and their sigmas"
         )
+    likely.sort(key=lambda name: -suspects[name])
+    steps = "; ".join(_SUSPECTS.get(name, f"place, angles and length of {name}") for name in likely)
+    return Doubt(
+        "misfit", f"{text}; another {' or another '.join(likely)} would explain it", f"compare {steps}"
+    )
 
 
-def _learnt(rows: Sequence[Mapping[str, Any]], link: Link) -> Iterator[str]:
+def _learnt(rows: Sequence[Mapping[str, Any]], link: Link) -> Iterator[Doubt]:
     for row in rows:
         off, sigma, stated = row["correction"], row["sigma"], row["stated_sigma"]
         if not row["told"]:
             continue
         if abs(off) > _TOLD_SIGMAS * stated:
-            yield (
+            yield Doubt(
+                "learnt",
                 f"the drive shows {row['part']}, {row['what']}, {off:+.3g} off what is stated, {stated:.3g}"
-                f" (sigma): {abs(off) / stated:.1f} sigmas; compare it with what is there"
+                f" (sigma): {abs(off) / stated:.1f} sigmas",
+                "compare it with what is there",
             )
         elif row["what"] == "focal_mm" and abs(off) > _TOLD_SIGMAS * sigma:
-            yield (
+            yield Doubt(
+                "focal",
                 f"the drive shows a focal length of {link.camera.focal_mm + off:.5g} +- {sigma:.2g} mm, not"
-                f" {link.camera.focal_mm:g}: camera.focal_mm and camera_sigma.focal_mm may say so"
+                f" {link.camera.focal_mm:g}",
+                "camera.focal_mm and camera_sigma.focal_mm may say so",
             )
 
 
-def _frames(counts: Mapping[str, int]) -> Iterator[str]:
+def _readout(seen: Seen) -> Iterator[Doubt]:
+    """A readout that is at its limit."""
+    if seen.readout is None or seen.duration_us < _SATURATED_S * 1e6:
+        return
+    share, peak = seen.readout.capped()
+    if share >= CAPPED_SHARE:
+        yield Doubt(
+            "saturated",
+            f"{share:.0%} of all milliseconds, {seen.readout.capped_ms}, hold {peak / 1e3:.3g} Mev/s, no more"
+            " and no less: the sensor's readout is at its limit, and what is beyond is lost",
+            "mask rows and columns beside the bar, close the aperture, or raise the event-rate limit",
+        )
+
+
+def _dropped(counts: Mapping[str, int], seen: Seen) -> Iterator[Doubt]:
+    """Events that were there and did not count, for other reasons than room."""
+    names = [name for name, _ in _NO_ROOM]
+    dropped = {n: k for n, k in counts.items() if n.startswith("dropped_") and k and n not in names}
+    number = sum(dropped.values()) + seen.losses
+    if number >= _DROPPED_LEAST and number > _DROPPED_SHARE * (counts.get("events", 0) + seen.losses):
+        kinds = [f"{k} {n.removeprefix('dropped_').replace('_', ' ')}" for n, k in dropped.items()]
+        kinds += [f"{seen.losses} in the file"] * (seen.losses > 0)
+        yield Doubt(
+            "dropped",
+            f"{number} events or words dropped ({', '.join(kinds)})",
+            "losses and counts in summary.json say where and why; `evlcp info` says what is in the recording",
+        )
+
+
+def _frames(counts: Mapping[str, int]) -> Iterator[Doubt]:
     blinking = counts.get("events_in_regions", 0)
     if blinking >= _MANY_EVENTS and not counts.get("locks", 0):
         regions = counts.get("regions_opened", 0)
-        yield (
-            f"something blinks, {blinking} events in {regions} regions, but no preamble is heard: compare"
-            " air.chip_rate_hz and the preamble with the transmitter's; a panel or leaves behind a bar may"
-            " drown it, see `evlcp info` and --figures"
+        yield Doubt(
+            "no-preamble",
+            f"something blinks, {blinking} events in {regions} region{_s(regions)}, but no preamble is heard",
+            "compare air.chip_rate_hz and the preamble with the transmitter's; a panel or leaves behind a bar"
+            " may drown it; `evlcp diagnose` says what blinks, and how fast",
         )
     rejected, frames = counts.get("frames_rejected", 0), counts.get("frames", 0)
     if rejected >= _FEW_FRAMES and rejected > _REJECTED_SHARE * (frames + rejected):
-        yield (
+        yield Doubt(
+            "frames-rejected",
             f"{rejected} of {frames + rejected} frames rejected, as their clusters do not stand where the bar"
-            " has them: compare the link's [bar] and [pilots] with the transmitter's, and see --figures"
+            " has them",
+            "compare the link's [bar], [pilots] and [air] with the transmitter's, or try --link auto",
         )
     unread = counts.get("frames_unread", 0)
     if unread >= _FEW_FRAMES and unread > _REJECTED_SHARE * (frames + unread):
-        yield (
-            f"{unread} of {frames + unread} frames show their clusters, but not one symbol that is sure:"
-            " compare modulation.id with the transmitter's; in little light another decoding.id may do"
+        yield Doubt(
+            "frames-unread",
+            f"{unread} of {frames + unread} frames show their clusters, but not one symbol that is sure",
+            "compare modulation.id with the transmitter's; in little light another decoding.id may do",
         )
     askew = counts.get("frames_askew", 0)
     if askew >= _FEW_FRAMES and askew > _ASKEW_SHARE * frames:
-        yield (
-            f"{askew} of {frames} frames show bars that do not stand plumb by the camera's attitude: it does"
-            " not correct their distances; check pitch and roll, their signs and their sigma"
+        yield Doubt(
+            "attitude",
+            f"{askew} of {frames} frames show bars that do not stand plumb by the camera's attitude, which"
+            " does not correct their distances",
+            "check pitch and roll, their signs and their sigma",
         )
 
 
-def _room(counts: Mapping[str, int]) -> Iterator[str]:
+def _room(counts: Mapping[str, int]) -> Iterator[Doubt]:
     """What the receiver had no room for."""
-    found = [text for name, text in _NO_ROOM if (n := counts.get(name, 0)) for text in [text.format(n)]]
+    found = [text.format(n, _s(n)) for name, text in _NO_ROOM if (n := counts.get(name, 0))]
     if found:
-        yield f"more than the receiver holds at a time: {'; '.join(found)}; frames may be missing"
+        yield Doubt(
+            "no-room",
+            f"more than the receiver holds at a time: {'; '.join(found)}; frames may be missing",
+        )
 
 
-def _transmitter(one: TransmitterTally, link: Link) -> Iterator[str]:
+def _transmitter(
+    number: int, one: TransmitterTally, link: Link, counts: Mapping[str, int], seen: Seen
+) -> Iterator[Doubt]:
     ppm = one.clock_ppm()
     # A packet's time may be half a chip off where the light changes.
     unsure_ppm = link.packet.chip_us / 2 / one.steps_us * 1e6 if one.steps_us else math.inf
     if abs(ppm) > _CRYSTALS_PPM + unsure_ppm:
         fits = link.packet.chip_rate_hz * (1 + ppm * 1e-6)
-        yield (
-            f"its clock is {ppm:+.0f} ppm off the link's, crystals stay within {_CRYSTALS_PPM:.0f}:"
-            f" air.chip_rate_hz = {fits:.6g} would fit"
+        yield Doubt(
+            "clock",
+            f"its clock is {ppm:+.0f} ppm off the link's, crystals stay within {_CRYSTALS_PPM:.0f}",
+            f"air.chip_rate_hz = {fits:.6g} would fit",
+            number,
         )
-    if never := codewords_never(one, link):
-        yield (
-            f"{never} of {len(link.codebook.codewords)} codewords never occur in {one.given} symbols: data"
-            " that repeats, or another modulation than modulation.id"
-        )
+    yield from _codewords(number, one, link, counts, seen)
     own = (one.frames - one.echoes) / link.packet.pilot_every
     if one.ranged < _RANGED_SHARE * own:
-        yield (
+        yield Doubt(
+            "few-distances",
             f"{one.ranged} of {own:.0f} frames have a distance: too few boundaries between clusters are seen,"
-            " or their values do not fit the layout; another ranging.id may bear it"
+            " or their values do not fit the layout",
+            "another ranging.id may bear it",
+            number,
         )
     hidden = [k for k in range(link.codebook.clusters) if one.unseen[k] == one.frames]
     if hidden:
-        yield (
-            f"clusters never seen: {', '.join(map(str, hidden))}: something covers them, or the bar has other"
-            " clusters than the link's"
+        yield Doubt(
+            "clusters-hidden",
+            f"clusters never seen: {', '.join(map(str, hidden))}",
+            "is something before them? if not, compare the link's [bar] and [pilots] with the bar",
+            number,
         )
+    yield from _size(number, one, link)
+
+
+def _codewords(
+    number: int, one: TransmitterTally, link: Link, counts: Mapping[str, int], seen: Seen
+) -> Iterator[Doubt]:
+    """Codewords that never occur, and the modulation that they are all of."""
+    never = codewords_never(one, link)
+    if not never:
+        return
+    codewords, occur = len(link.codebook.codewords), len(one.values)
+    tried = counts.get("blocks_tried", 0)
+    unread = f", {tried} of {tried} blocks unreadable" if tried and not _read(counts) else ""
+    for name, words in seen.others().items():
+        inside = _among(link.codebook.codewords, words)
+        heard = [s for s in np.flatnonzero(inside).tolist() if one.values[s]]
+        share = sum(one.values[s] for s in heard) / one.given
+        if len(words) < codewords and share >= _SPLIT and len(heard) > len(words) / 2:
+            text = f"only {occur} of {codewords} symbols ever occur"
+            if occur > len(words):
+                text = f"{share:.0%} of its symbols are {len(heard)} of {codewords}"
+            yield Doubt(
+                "profile",
+                f"{text}{unread}",
+                f"was this sent with {name}? try --set modulation.id={name}",
+                number,
+            )
+            return
+    yield Doubt(
+        "codewords",
+        f"{never} of {codewords} codewords never occur in {one.given} symbols{unread}",
+        "data that repeats, or another modulation than modulation.id",
+        number,
+    )
+
+
+def _among(words: NDArray[np.int8], others: NDArray[np.int8]) -> NDArray[np.bool_]:
+    """Which words are others, too, bool (symbols,); none where they are of another length."""
+    if words.shape[1] != others.shape[1]:
+        return np.zeros(len(words), np.bool_)
+    known = {row.tobytes() for row in np.ascontiguousarray(others, np.int8)}
+    return np.array([row.tobytes() in known for row in np.ascontiguousarray(words, np.int8)])
 
 
 def codewords_never(one: TransmitterTally, link: Link) -> int:
@@ -215,15 +488,80 @@ def codewords_never(one: TransmitterTally, link: Link) -> int:
     return never if chance < math.log(_BY_CHANCE) else 0
 
 
-def _blocks(counts: Mapping[str, int], tally: RunTally) -> Iterator[str]:
-    tried = counts.get("blocks_tried", 0)
-    read = counts.get("blocks_decoded", 0) + counts.get("blocks_combined", 0)
+def _size(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
+    """Distances against those that the bar's length in the picture gives."""
+    if one.sized < _FEW_FRAMES:
+        return
+    centres_m = link.bar.cluster_centres_m()
+    reach = math.exp(one.reach_sum / one.sized)
+    share = reach / (link.camera.focal_px * math.dist(centres_m[0], centres_m[-1])) - 1
+    if abs(share) > _SIZE_OFF:
+        yield Doubt(
+            "size",
+            f"its distances are {abs(share):.0%} too {'long' if share > 0 else 'short'} for a bar of"
+            f" {link.bar.length_m:g} m that looks as long as this one",
+            "try another ranging.id; a bar that leans looks shorter",
+            number,
+        )
+
+
+def _length(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
+    """The bar's length as its own beacon says it."""
+    said_m, length_m = one.beacon_m, link.bar.length_m
+    if not math.isnan(said_m) and abs(said_m / length_m - 1) > _LENGTH_OFF:
+        how = f"{abs(length_m / said_m - 1):.0%} too {'long' if length_m > said_m else 'short'}"
+        yield Doubt(
+            "bar-length",
+            f"its beacon says that the bar is {said_m:.3f} m long, the link {length_m:.3f}: its distances are"
+            f" {how} if the beacon is right",
+            "compare the link's [bar] with the transmitter's",
+            number,
+        )
+
+
+def _coverage(number: int, one: TransmitterTally, link: Link, seen: Seen) -> Iterator[Doubt]:
+    """Light that is there before the first frame or after the last one."""
+    lit = (seen.lit_us or {}).get(number)
+    if lit is None or not seen.duration_us:
+        return
+    least_us = max(
+        _LIT_SHARE * seen.duration_us, _LIT_PACKETS * link.packet.packet_chips * link.packet.chip_us
+    )
+    at = [_ms(t_us - seen.first_us) for t_us in (one.first_us, lit[0], one.last_us, lit[1])]
+    said = []
+    if one.first_us - lit[0] > least_us:
+        said.append(f"nothing before {at[0]}, though its light is there from {at[1]} on")
+    if lit[1] - one.last_us > least_us:
+        said.append(f"nothing after {at[2]}, though its light is there until {at[3]}")
+    if said:
+        yield Doubt(
+            "coverage",
+            "; ".join(said),
+            "compare air.chip_rate_hz and air.frames_per_packet with the transmitter's, or try --link auto",
+            number,
+        )
+
+
+def _blocks(counts: Mapping[str, int]) -> Iterator[Doubt]:
+    tried, read = counts.get("blocks_tried", 0), _read(counts)
     if other := counts.get("blocks_other_codebook", 0):
-        yield f"{other} packets were sent with another codebook: compare both ends' `evlcp config`"
-    # Packets with frames missing may fail by themselves.
-    whole = sum(one.frames - one.echoes for one in tally.transmitters.values()) >= _FEW_FRAMES
-    if tried and not read and whole:
-        yield (
-            f"none of {tried} packets has a block that can be read: another error correction than"
-            " error-correction.id, or no messages were sent (say messages.decode = false)"
+        yield Doubt(
+            "other-codebook",
+            f"{other} packet{_s(other)} sent with another codebook",
+            "compare both ends' `evlcp config`",
+        )
+    alike = counts.get("blocks_alike", 0)
+    if not read and alike >= _ALIKE:
+        yield Doubt(
+            "blocks-unread",
+            f"none of {tried} packets has a block that can be read, though {alike} of them repeat others",
+            "another error correction than error-correction.id; if no messages are sent, say"
+            " messages.decode = false",
+        )
+    failed = counts.get("blocks_failed", 0)
+    if read and failed >= _FEW_FRAMES and failed > _FAILED_SHARE * tried:
+        yield Doubt(
+            "blocks-failed",
+            f"{failed} of {tried} packets cannot be read",
+            "more light, a nearer or a better focused bar, or an error correction of a lower rate",
         )

@@ -8,7 +8,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import output_fault
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.records import SUMMARY
-from evlcp_sdk.results.doubts import warnings_of
+from evlcp_sdk.results.doubts import Seen, notes_of, warnings_of
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.tallies import RunTally
 
@@ -29,6 +29,7 @@ def summary_of(
     counts: Mapping[str, int],
     losses: Mapping[str, Mapping[str, Any]],
     versions: Mapping[str, str],
+    seen: Seen | None = None,
     error: str | None = None,
     positions: Mapping[str, Any] | None = None,
     sinks: Mapping[str, Mapping[str, Any]] | None = None,
@@ -44,10 +45,14 @@ def summary_of(
         counts: The receiver's counts.
         losses: What the reader skipped, by kind, with byte offsets.
         versions: Installed versions.
+        seen: What warnings need to know beside; None for nothing.
         error: The message, when `status` is `failed` or `degraded`.
         positions: Figures of the positions, where they were computed.
         sinks: What sinks say, by name; those that say nothing are left out.
     """
+    off = _messages_off(link)
+    warnings = warnings_of(tally, counts, link, seen=seen, reads_messages=off is None, positions=positions)
+    notes = notes_of(tally, counts, seen=seen, reads_messages=off is None)
     return {
         "status": status,
         "error": error,
@@ -56,8 +61,9 @@ def summary_of(
         "recording": dict(recording),
         "processing": dict(processing),
         "counts": dict(counts),
-        "messages_off": (off := _messages_off(link)),
-        "warnings": warnings_of(tally, counts, link, reads_messages=off is None, positions=positions),
+        "messages_off": off,
+        "warnings": [warning.to_dict() for warning in warnings],
+        "notes": [note.to_dict() for note in notes],
         "losses": {kind: dict(loss) for kind, loss in losses.items()},
         "digest": link.digest,
         "codebook": {"digest": link.codebook.digest, "profile": link.codebook.profile},

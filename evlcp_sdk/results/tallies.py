@@ -11,7 +11,7 @@ from evlcp_sdk.place.navigator import Navigator, Placed
 from evlcp_sdk.place.refusals import REFUSALS
 from evlcp_sdk.place.trajectory import GNSS
 from evlcp_sdk.results.text import number_or_none
-from evlcp_sdk.values import Packet
+from evlcp_sdk.values import Frame, Packet
 
 __all__ = ["PositionTally", "RunTally", "TransmitterTally"]
 
@@ -32,6 +32,12 @@ class TransmitterTally:
     Args:
         packet_frames: Frames that a packet has.
         nominal_packet_us: Length of a packet that the configuration states, us.
+
+    Attributes:
+        first_us: Start of its first frame, us; its last one starts at `last_us`.
+        reach_sum: Sum over `sized` frames of the logarithm of the distance, m, times how far apart the first
+            and the last cluster are in the image, px.
+        beacon_m: Length of the bar by its newest beacon, m; NaN without.
     """
 
     packet_frames: int
@@ -52,6 +58,11 @@ class TransmitterTally:
     echo_of: int | None = None
     values: Counter[int] = field(default_factory=Counter)
     unseen: Counter[int] = field(default_factory=Counter)
+    first_us: float = math.inf
+    last_us: float = -math.inf
+    reach_sum: float = 0.0
+    sized: int = 0
+    beacon_m: float = math.nan
 
     def add(self, packet: Packet) -> None:
         """Count a packet and its frames."""
@@ -63,10 +74,14 @@ class TransmitterTally:
             self.steps_us += step_us
             self.nominal_steps_us += nominal_us
         self.last_packet = (packet.packet, packet.t_us)
+        for message in packet.messages:
+            if message.beacon is not None:
+                self.beacon_m = message.beacon.length_m
         for frame in packet.frames:
             number = frame.packet * self.packet_frames + frame.frame
             self.first_frame = number if self.first_frame < 0 else self.first_frame
             self.last_frame = number
+            self.first_us, self.last_us = min(self.first_us, frame.t_us), max(self.last_us, frame.t_us)
             self.quality_sum += frame.soft.quality
             self.echoes += frame.echo_of is not None
             self.echo_of = frame.echo_of
@@ -80,6 +95,17 @@ class TransmitterTally:
                 if self.ranged == 1:
                     self.first_m = distance_m
                 self.cells[round(min(distance_m, _FARTHEST_M) / _CELL_M)] += 1
+                self._add_size(frame, distance_m)
+
+    def _add_size(self, frame: Frame, distance_m: float) -> None:
+        """Add how long the bar looks times its distance, which is the same wherever it is."""
+        if len(frame.points_px) < 2:
+            return
+        (x0, y0), (x1, y1) = frame.points_px[0].tolist(), frame.points_px[-1].tolist()
+        reach = distance_m * math.hypot(x1 - x0, y1 - y0)
+        if math.isfinite(reach) and reach > 0:
+            self.reach_sum += math.log(reach)
+            self.sized += 1
 
     def median_m(self) -> float:
         """Median distance to the centimetre, m; NaN without any."""
@@ -141,12 +167,15 @@ class RunTally:
         transmitters: Figures by number.
         others: Transmitters whose figures were dropped, as there are too many; a number may come twice.
         others_frames: Their frames.
+        covered_us: Time in which frames of any transmitter were received, us; a packet counts as a whole.
     """
 
     def __init__(self, form: PacketFormat) -> None:
         self.transmitters: OrderedDict[int, TransmitterTally] = OrderedDict()
         self.others = self.others_frames = 0
+        self.covered_us = 0.0
         self._packet_us = form.packet_chips * form.chip_us
+        self._until_us = -math.inf
 
     def add(self, packet: Packet) -> None:
         """Count a packet and its frames."""
@@ -154,6 +183,9 @@ class RunTally:
         if tally is None:
             tally = self.transmitters[packet.transmitter] = TransmitterTally(packet.sent, self._packet_us)
         tally.add(packet)
+        end_us = packet.t_us + self._packet_us
+        self.covered_us += min(max(end_us - max(packet.t_us, self._until_us), 0.0), self._packet_us)
+        self._until_us = end_us
         self.transmitters.move_to_end(packet.transmitter)
         if len(self.transmitters) > _MOST_TRANSMITTERS:
             self.others += 1
@@ -189,6 +221,7 @@ class PositionTally:
     refused: Counter[str] = field(default_factory=Counter)
     alarms: Counter[str] = field(default_factory=Counter)
     excluded: Counter[str] = field(default_factory=Counter)
+    suspects: Counter[str] = field(default_factory=Counter)
 
     def add(self, placed: Placed) -> None:
         """Count a fix."""
@@ -196,6 +229,7 @@ class PositionTally:
         self.excluded.update(placed.fix.excluded)
         if placed.filtered is None:
             self.refused[placed.fix.refusal] += 1
+            self.suspects.update(placed.fix.suspects)
             return
         if placed.fix.source == GNSS:
             return
@@ -213,6 +247,7 @@ class PositionTally:
             "refused": {kind: self.refused[kind] for kind in REFUSALS if self.refused[kind]},
             "alarms": dict(sorted(self.alarms.items())),
             "excluded": dict(sorted(self.excluded.items())),
+            "suspects": dict(sorted(self.suspects.items())),
             "left_out_of_track": self.left_out,
             **navigator.counts,
             "frames_late": positioner.counts["frames_late"],

@@ -1,8 +1,10 @@
 """One run's result: packets in; tallies, positions and files out."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -11,7 +13,9 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.navigator import Navigator, Placed, PositionPlan
 from evlcp_sdk.plugin.records import choose_sinks, installed_sinks
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.results.doubts import Seen, other_codewords
 from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.readout import ReadoutTally
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.sinks import Sinks, load_sinks
 from evlcp_sdk.results.summary import Status, summary_of, write_summary
@@ -58,6 +62,7 @@ class ResultWriter:
         self._registry = Registry.load() if registry is None else registry
         self._link = link
         self._tally, self._positions = RunTally(link.packet), PositionTally()
+        self._readout = ReadoutTally()
         self._navigator = Navigator(link, plan, attitude) if plan is not None else None
         classes = load_sinks(choose_sinks(self._registry, sinks, positions=plan is not None))
         files = [file for s in installed_sinks(self._registry).values() for file in s.record.files]
@@ -70,6 +75,7 @@ class ResultWriter:
 
     def events(self, events: Events) -> None:
         """Take events that the receiver gets."""
+        self._readout.add(events)
         if self._navigator is not None and len(events):
             self._navigator.seen(int(events.t_us[0]), int(events.t_us[-1]))
         self._sinks.events(events)
@@ -95,6 +101,7 @@ class ResultWriter:
         counts: Mapping[str, int],
         losses: Mapping[str, Mapping[str, Any]],
         error: str | None = None,
+        lit_us: Mapping[int, tuple[float, float]] | None = None,
     ) -> dict[str, Any]:
         """End the sinks, move all files into place, the summary last, and drop what an earlier run left.
 
@@ -105,6 +112,7 @@ class ResultWriter:
             counts: The receiver's counts.
             losses: What the reader skipped, by kind, with byte offsets.
             error: The message, when `status` is `failed` or `degraded`.
+            lit_us: From when until when the light of each transmitter was there, us; None if it is not known.
 
         Returns:
             The content of `summary.json`.
@@ -119,6 +127,15 @@ class ResultWriter:
             self._place(fixes)
             self._sinks.settle(settled)
             positions = self._positions.to_dict(self._navigator)
+        first_us, last_us = recording.get("first_us"), recording.get("last_us")
+        seen = Seen(
+            math.nan if first_us is None else first_us,
+            math.nan if last_us is None else last_us,
+            lit_us,
+            self._readout,
+            sum(loss["count"] for loss in losses.values()),
+            partial(other_codewords, self._link, self._registry),
+        )
         table = summary_of(
             status,
             self._link,
@@ -128,6 +145,7 @@ class ResultWriter:
             counts=counts,
             losses=losses,
             versions=self._registry.versions(),
+            seen=seen,
             error=error,
             positions=positions,
             sinks=self._sinks.finish(),

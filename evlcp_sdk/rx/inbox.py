@@ -121,6 +121,7 @@ class MessageAssembler:
                 "blocks_decoded",
                 "blocks_combined",
                 "blocks_failed",
+                "blocks_alike",
                 "blocks_malformed",
                 "blocks_other_codebook",
                 "parts_repeated",
@@ -217,6 +218,7 @@ class MessageAssembler:
         if best < 0 or alike[best] < _SAME_BLOCK_SIGMA:
             inbox.sums = [*inbox.sums, _Sum(llr, 1)][-self._spec.combine_packets :]
             return None, 0
+        self._counts["blocks_alike"] += 1
         one = inbox.sums.pop(best)
         total = _Sum(one.llr + llr, one.packets + 1)
         with self._guard:

@@ -44,6 +44,9 @@ clusters place it less well than all."""
 _DARK = 0.25
 """Share of a pilot's events below which a bar that was seen before is out of sight, or hidden."""
 
+_MOST_LIT = 1024
+"""Transmitters of which is known when their light was there."""
+
 _COUNTS = (
     "events_in_regions",
     "regions_opened",
@@ -73,6 +76,10 @@ class Receiver:
             against the sensor. None for nothing.
         clock_zero: UTC of the camera clock's 0, for the age of signed beacons; None if it is not known.
         limits: How much it holds at the most.
+
+    Attributes:
+        lit_us: Of each transmitter, the newest thousand, starts of the first and the last frame that was due
+            while its light was there, given or not, by number, camera clock, us.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> receiver = Receiver(load_link())
@@ -131,6 +138,7 @@ class Receiver:
         self._due: deque[Followed] = deque()
         self._closed = False
         self._counts = dict.fromkeys(_COUNTS, 0)
+        self.lit_us: dict[int, tuple[float, float]] = {}
 
     @property
     def counts(self) -> dict[str, int]:
@@ -237,11 +245,23 @@ class Receiver:
             if transmitter.region.id in self._joined:
                 # Another region shows the frame.
                 return
+            if found != "frames_dark":
+                self._lit_in(transmitter, due)
             if isinstance(found, str):
                 self._counts[found] += 1
                 continue
             self._counts["frames"] += 1
             self._judged.add(transmitter.packets, due, found)
+
+    def _lit_in(self, transmitter: Transmitter, due: DueFrame) -> None:
+        """Note that a transmitter's light is there in a frame that is due."""
+        start_us = self._clock.camera_us(due.start_us)
+        transmitter.lit_us = start_us if transmitter.lit_us is None else transmitter.lit_us
+        if transmitter.number is not None:
+            first_us, _ = self.lit_us.pop(transmitter.number, (transmitter.lit_us, start_us))
+            self.lit_us[transmitter.number] = (first_us, start_us)
+            while len(self.lit_us) > _MOST_LIT:
+                del self.lit_us[next(iter(self.lit_us))]
 
     def _decode(self, transmitter: Transmitter, due: DueFrame) -> Sighting | str:
         """Read a frame; of one that is not given, the count that it belongs to."""

@@ -39,6 +39,7 @@ class Transmitter:
         first: Number of the first packet on the grid that had a frame, None before.
         rows: How late the rows of its bar are read.
         pilot: The newest pilot, None where it showed no bar.
+        lit_us: When the first frame was due in which its light was there, camera clock, us; None before.
     """
 
     region: Followed
@@ -50,6 +51,7 @@ class Transmitter:
     first: int | None = None
     rows: RowDelay = field(default_factory=RowDelay)
     pilot: Pilot | None = None
+    lit_us: float | None = None
 
 
 class Transmitters:

@@ -54,6 +54,7 @@ def test_figures_are_reached(name: str, tmp_path: Path, evlcp: Callable[..., Run
         "receive", RECORDINGS / f"{name}.raw", "-o", tmp_path, "--set", f"modulation.id={profile}", "--json"
     )
     assert run.code == 0
+    assert json.loads(run.out)["warnings"] == []
     score = scored(tmp_path, name)
     assert score["unmatched"] == 0, "a row that matches no true frame"
     assert len(score["bars"]) == len(FIGURES[name])

@@ -9,6 +9,7 @@ import numpy as np
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.results.doubts import codewords_never
+from evlcp_sdk.results.readout import CAPPED_SHARE
 from evlcp_sdk.results.tallies import RunTally
 from evlcp_sdk.study.diagnosis.light import LightSource
 from evlcp_sdk.study.diagnosis.probe import Trial
@@ -17,10 +18,6 @@ __all__ = ["Check", "Facts", "checks_of"]
 
 Verdict = Literal["pass", "doubt", "fail", "skip"]
 """Of a stage: passed; passed, but near its limit; failed; not reached."""
-
-CAPPED_SHARE = 0.2
-"""Share of milliseconds with the very same number of events, to half a percent, above which the readout is
-at its limit: chips, and the noise of their number, change it by more."""
 
 FEW_NEGATIVE = 0.1
 """Share of negative events below which they are missing: as much light goes as comes."""

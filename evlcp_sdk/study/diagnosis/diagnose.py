@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
-from evlcp_sdk.results.doubts import warnings_of
+from evlcp_sdk.results.doubts import Doubt, Seen, other_codewords, warnings_of
 from evlcp_sdk.results.tallies import RunTally
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.study.diagnosis.checks import Check, Facts, checks_of
@@ -49,7 +50,7 @@ class Diagnosis:
     checks: tuple[Check, ...]
     sources: tuple[LightSource, ...]
     trials: tuple[Trial, ...]
-    warnings: tuple[str, ...]
+    warnings: tuple[Doubt, ...]
     counts: dict[str, int]
     cell_px: int
     frequency_hz: NDArray[np.float64]
@@ -92,7 +93,7 @@ class Diagnosis:
                 }
                 for one in self.trials
             ],
-            "warnings": list(self.warnings),
+            "warnings": [warning.to_dict() for warning in self.warnings],
             "counts": self.counts,
             "duration_s": self.duration_s,
         }
@@ -136,7 +137,7 @@ def diagnose(
     for packet in receiver.close():
         tally.add(packet)
         order.add(packet)
-    capped, peak = survey.capped_share()
+    capped, peak = survey.readout.capped()
     sources = survey.sources()
     losses = [str(loss) for loss in source.losses.values()]
     seconds = survey.duration_s
@@ -165,13 +166,23 @@ def diagnose(
         events = sample.events()
         trials = tuple(better_links(link, events, registry, _rates(sources, link)))
         checks = checks_of(facts(trials))
+    seen = Seen(
+        math.nan if survey.first_us is None else survey.first_us,
+        math.nan if survey.last_us is None else survey.last_us,
+        receiver.lit_us,
+        survey.readout,
+        sum(loss.count for loss in source.losses.values()),
+        partial(other_codewords, link, registry),
+    )
+    reads = link.messages.decode
+    warnings = warnings_of(tally, receiver.counts, link, seen=seen, reads_messages=reads)
     return Diagnosis(
         name,
         _headline(checks, tally),
         tuple(checks),
         tuple(sources),
         trials,
-        tuple(warnings_of(tally, receiver.counts, link, reads_messages=link.messages.decode)),
+        tuple(warnings),
         receiver.counts,
         survey.cell_px,
         survey.frequency_map(),

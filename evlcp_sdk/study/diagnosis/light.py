@@ -7,7 +7,6 @@ and near 0, within 1 / sqrt(2 n) of n times, where they have nothing to do with 
 near the largest mean is the source's; below 1 / tau of its shortest times there is nothing to find.
 """
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from evlcp_sdk.results.readout import ReadoutTally
 from evlcp_sdk.study.diagnosis import _kernels
 from evlcp_sdk.study.diagnosis._kernels import BINS, COARSE, COARSE_US, FINE, FINE_US, SHORT
 from evlcp_sdk.values import Events
@@ -69,9 +69,6 @@ camera that shakes moves by 3 px at the most."""
 
 _MOST_KEPT = 200_000
 """Events of a window that are kept."""
-
-_CAP_BIN = 0.005
-"""Width of the bins of events in a millisecond, as a share."""
 
 _TAU_US = np.concatenate(
     [
@@ -131,7 +128,7 @@ class LightSurvey:
 
     Attributes:
         cell_px: Size of the cells that light is looked for in, px.
-        rate_hist: How many milliseconds had how many events: bins of half a percent, int64.
+        readout: Events in each millisecond.
     """
 
     def __init__(self, width: int, height: int) -> None:
@@ -150,8 +147,7 @@ class LightSurvey:
         self._signs = np.zeros((*cells, 2), np.int64)
         self._windows: list[tuple[int, list[NDArray[np.uint32]]]] = []
         self._every_us = _EVERY_US
-        self.rate_hist = np.zeros(1 + _rate_bin(1e9), np.int64)
-        self._ms = (0, 0)
+        self.readout = ReadoutTally()
         self.first_us: int | None = None
         self.last_us: int | None = None
 
@@ -176,7 +172,7 @@ class LightSurvey:
             self._shift,
             _CALM_US,
         )
-        self._count_rate(events)
+        self.readout.add(events)
         self._keep(events)
 
     @property
@@ -188,17 +184,6 @@ class LightSurvey:
     def signs(self) -> NDArray[np.int64]:
         """Negative and positive events of each cell, int64 (rows, columns, 2)."""
         return self._signs
-
-    def capped_share(self) -> tuple[float, float]:
-        """Share of the milliseconds with events that are within half a percent of the fullest; its events.
-
-        Light that sends data varies by more from millisecond to millisecond; a readout at its limit does not.
-        """
-        many = self.rate_hist.sum()
-        if not many:
-            return 0.0, 0.0
-        top = int(np.flatnonzero(self.rate_hist)[-1])
-        return float(self.rate_hist[max(top - 1, 0) :].sum() / many), float((1 + _CAP_BIN) ** top)
 
     def sources(self) -> list[LightSource]:
         """What blinks, by the number of events, most first."""
@@ -309,23 +294,6 @@ class LightSurvey:
         wide, high = np.median(sizes, 0)
         return float(wide), float(high)
 
-    def _count_rate(self, events: Events) -> None:
-        """Count the events of each millisecond that has some."""
-        edges = np.flatnonzero(np.diff(events.t_us // 1000, prepend=events.t_us[0] // 1000 - 1))
-        many = np.diff(edges, append=len(events))
-        ms = events.t_us[edges] // 1000
-        now, before = self._ms
-        if ms[0] == now:
-            many[0] += before
-        elif before:
-            self._note(np.array([before]))
-        self._note(many[:-1])
-        self._ms = int(ms[-1]), int(many[-1])
-
-    def _note(self, many: NDArray[np.int64]) -> None:
-        if len(many):
-            np.add.at(self.rate_hist, _rate_bins(many), 1)
-
     def _keep(self, events: Events) -> None:
         """Keep the positive events of a short window now and then; of too many windows every second one."""
         if not self._windows or events.t_us[0] >= self._windows[-1][0] + self._every_us:
@@ -417,11 +385,3 @@ def _extent(profile: Floats) -> float:
     level = 0.2 * np.quantile(lit, 0.9)
     inside = np.flatnonzero(profile >= level)
     return float(inside[-1] - inside[0] + 1)
-
-
-def _rate_bin(many: float) -> int:
-    return round(math.log(max(many, 1.0)) / math.log1p(_CAP_BIN))
-
-
-def _rate_bins(many: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.round(np.log(np.maximum(many, 1)) / math.log1p(_CAP_BIN)).astype(np.int64)

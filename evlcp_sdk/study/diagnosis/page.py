@@ -2,6 +2,7 @@
 
 import base64
 import io
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,9 @@ def page(diagnosis: Diagnosis) -> str:
     if diagnosis.trials:
         body.append(_trials(diagnosis))
     if diagnosis.warnings:
-        body.append(Markup("<h2>Warnings of receive</h2><ul>{}</ul>").format(_items(diagnosis.warnings)))
+        body.append(
+            Markup("<h2>Warnings of receive</h2><ul>{}</ul>").format(_items(map(str, diagnosis.warnings)))
+        )
     body.append(details("counts of the receiver", diagnosis.counts))
     return document(f"{name}: diagnosis", body)
 
@@ -81,7 +84,7 @@ def _steps(diagnosis: Diagnosis) -> Markup:
     return Markup("<h2>Next steps</h2><ul>{}</ul>").format(_items(steps))
 
 
-def _items(texts: list[str] | tuple[str, ...]) -> Markup:
+def _items(texts: Iterable[str]) -> Markup:
     return Markup("").join(Markup("<li>{}</li>").format(text) for text in texts)
 
 

@@ -4,37 +4,70 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from evlcp_sdk.link.resolve import Link, load_link
-from evlcp_sdk.results.doubts import warnings_of
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.results.doubts import Seen, notes_of, other_codewords, warnings_of
+from evlcp_sdk.results.readout import ReadoutTally
 from evlcp_sdk.results.tallies import RunTally
-from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
+from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols
 
 LINK = load_link()
+NO_POSITIONS = {
+    "fixes": 0,
+    "refused": {},
+    "gnss": 0,
+    "gnss_without_heading": 0,
+    "gnss_outside": 0,
+    "bars_exact": [],
+    "excluded": {},
+    "alarms": {},
+    "learnt": [],
+}
 NONE = Range(float("nan"), float("nan"), 0)
 NEAR = Range(50.0, 0.1, 15)
 
 
 def tally_of(
-    symbols: np.ndarray, *, ppm: float = 0.0, echo_of: int | None = None, distance: Range = NEAR
+    symbols: np.ndarray,
+    *,
+    ppm: float = 0.0,
+    echo_of: int | None = None,
+    distance: Range = NEAR,
+    every_us: float = 0.0,
+    start_us: float = 0.0,
+    points: np.ndarray | None = None,
 ) -> RunTally:
     """Packets of ten frames with these symbols, (packets, 10, 16)."""
     tally = RunTally(LINK.packet)
+    period_us = LINK.packet.packet_chips * 100.0 / (1 + ppm * 1e-6)
+    more = {} if points is None else {"points_px": points}
     for n, packet in enumerate(symbols):
+        at_us = start_us + n * period_us
         frames = tuple(
             Frame(
-                0, n, f, 0.0, SoftSymbols(said, np.zeros((16, 6), np.float32), 1.0), distance, None, 0.0, 0.0
+                0,
+                n,
+                f,
+                at_us + f * every_us,
+                SoftSymbols(said, np.zeros((16, 6), np.float32), 1.0),
+                distance,
+                None,
+                0.0,
+                0.0,
+                **more,
             )
             for f, said in enumerate(packet)
         )
         frames = tuple(replace(frame, echo_of=echo_of) for frame in frames)
-        period_us = LINK.packet.packet_chips * 100.0 / (1 + ppm * 1e-6)
-        tally.add(Packet(0, n, n * period_us, 100.0, frames, 10))
+        tally.add(Packet(0, n, at_us, 100.0, frames, 10))
     return tally
 
 
 def told(tally: RunTally, link: Link = LINK, **counts: int) -> list[str]:
-    return warnings_of(tally, counts, link)
+    return [str(doubt) for doubt in warnings_of(tally, counts, link)]
 
 
 RANDOM = np.random.default_rng(1).integers(0, 64, (6, 10, 16))
@@ -53,7 +86,7 @@ def test_what_is_right_is_not_doubted() -> None:
 def test_codewords_that_never_occur() -> None:
     (line,) = told(tally_of(RANDOM % 16))
     assert line.startswith("transmitter 0: 48 of 64 codewords never occur in 960 symbols")
-    assert "modulation.id" in line
+    assert line.endswith("another modulation than modulation.id")
 
 
 @pytest.mark.parametrize("ppm", [-5000.0, 600.0])
@@ -84,11 +117,148 @@ def test_frames_rejected_and_blocks_that_cannot_be_read() -> None:
     assert line.startswith("20 of 80 frames show their clusters, but not one symbol")
     # A truck before it is no fault of the link's.
     assert told(tally_of(RANDOM), frames=60, frames_dark=60, frames_rejected=6, frames_unread=6) == []
-    (line,) = told(tally_of(RANDOM), blocks_tried=6)
+
+
+def test_blocks_are_doubted_where_there_is_something_to_read() -> None:
+    # Random symbols are no blocks: that is said plainly.
+    random = {"blocks_tried": 6, "blocks_failed": 6}
+    assert warnings_of(tally_of(RANDOM), random, LINK) == []
+    (note,) = notes_of(tally_of(RANDOM), random)
+    assert (note.code, str(note)) == (
+        "no-messages",
+        "no messages: none of 6 packets has a block that can be read",
+    )
+    assert notes_of(tally_of(RANDOM), random, reads_messages=False) == []
+    # Packets that repeat one another are.
+    (line,) = told(tally_of(RANDOM), blocks_tried=6, blocks_failed=6, blocks_alike=4)
+    assert line.startswith("none of 6 packets has a block that can be read, though 4 of them repeat others")
     assert "error-correction.id" in line
-    assert warnings_of(tally_of(RANDOM), {"blocks_tried": 6}, LINK, reads_messages=False) == []
-    (line,) = told(tally_of(RANDOM), blocks_tried=6, blocks_decoded=4, blocks_other_codebook=2)
-    assert line.startswith("2 packets were sent with another codebook")
+    (line,) = told(tally_of(RANDOM), blocks_tried=6, blocks_decoded=5, blocks_other_codebook=1)
+    assert line.startswith("1 packet sent with another codebook")
+    (line,) = told(tally_of(RANDOM), blocks_tried=30, blocks_decoded=10, blocks_failed=20, blocks_alike=9)
+    assert line.startswith("20 of 30 packets cannot be read")
+    assert told(tally_of(RANDOM), blocks_tried=30, blocks_decoded=20, blocks_failed=10) == []
+
+
+def test_the_modulation_that_was_sent() -> None:
+    """Symbols that are all of wh8, read as those of wh4x2: of 64 words of 8 values 16 are words of wh8."""
+    ours = LINK.codebook.codewords.tolist()
+    theirs = load_link(overrides=["modulation.id=wh8"]).codebook.codewords.tolist()
+    inside = np.array([i for i, word in enumerate(ours) if word in theirs])
+    assert len(inside) == 16
+    sent = inside[np.random.default_rng(2).integers(0, 16, (6, 10, 16))]
+    seen = Seen(others=lambda: other_codewords(LINK, Registry.load()))
+    (doubt,) = warnings_of(tally_of(sent), {"blocks_tried": 9, "blocks_failed": 9}, LINK, seen=seen)
+    assert (doubt.code, doubt.transmitter) == ("profile", 0)
+    assert doubt.text == "only 16 of 64 symbols ever occur, 9 of 9 blocks unreadable"
+    assert doubt.next_step == "was this sent with wh8? try --set modulation.id=wh8"
+    noisy = np.where(np.random.default_rng(3).random(sent.shape) < 0.02, RANDOM, sent)
+    (doubt,) = warnings_of(tally_of(noisy), {}, LINK, seen=seen)
+    assert doubt.code in ("profile", "codewords") or len(np.unique(noisy)) == 64
+    # All the same, which every modulation has.
+    (doubt,) = warnings_of(tally_of(sent * 0), {}, LINK, seen=seen)
+    assert doubt.code == "codewords"
+
+
+@pytest.mark.parametrize(
+    ("start_us", "lit_us", "says"),
+    [
+        (17e3, (17e3, 1.0e6), "nothing after 214 ms, though its light is there until 995 ms"),
+        (717e3, (45e3, 9e5), "nothing before 712 ms, though its light is there from 40 ms on"),
+        (17e3, (17e3, 3e5), None),
+        (17e3, None, None),
+    ],
+)
+def test_light_without_frames(start_us: float, lit_us: tuple[float, float] | None, says: str | None) -> None:
+    """Six packets of 34.6 ms, the last frame 31.4 ms before their end, in a recording of a second."""
+    tally = tally_of(RANDOM, every_us=3200.0, start_us=start_us)
+    seen = Seen(5e3, 1.005e6, None if lit_us is None else {0: lit_us})
+    found = warnings_of(tally, {}, LINK, seen=seen)
+    assert [doubt.code for doubt in found] == ["coverage"] * (says is not None)
+    assert says is None or found[0].text == says
+    # Where nothing is received is said in any case, but a road without bars is nothing wrong.
+    (note,) = notes_of(tally, {}, seen=seen)
+    first_ms = round((start_us - 5e3) / 1e3)
+    assert note.text == (
+        f"frames in 208 ms of 1000 ms: nothing before {first_ms} ms, nothing after {first_ms + 202} ms"
+    )
+    assert notes_of(tally, {}, seen=Seen(5e3, 3e5)) == []
+
+
+def test_distances_that_the_size_contradicts() -> None:
+    centres_m = LINK.bar.cluster_centres_m()
+    at_50_m = 400 + LINK.camera.focal_px * centres_m / 50
+    assert told(tally_of(RANDOM, points=at_50_m)) == []
+    (line,) = told(tally_of(RANDOM, points=400 + (at_50_m - 400) * 0.8))
+    assert line.startswith("transmitter 0: its distances are 20% too short for a bar of")
+    (line,) = told(tally_of(RANDOM, points=400 + (at_50_m - 400) * 1.5))
+    assert "50% too long" in line
+
+
+def test_a_beacon_that_says_another_length() -> None:
+    tally = tally_of(RANDOM)
+    tally.transmitters[0].beacon_m = LINK.bar.length_m * 1.001
+    assert told(tally) == []
+    tally.transmitters[0].beacon_m = LINK.bar.length_m * 1.25
+    (line,) = told(tally)
+    assert "its distances are 20% too short if the beacon is right" in line
+
+
+def test_a_readout_at_its_limit() -> None:
+    """3000 events in each millisecond, against 3000 on average."""
+    rng = np.random.default_rng(4)
+    for many, capped in (
+        (np.full(300, 3000), True),
+        (rng.poisson(3000, 300), False),
+        (rng.poisson(20, 300), False),
+    ):
+        t_us = np.sort(np.concatenate([1000 * i + rng.integers(0, 1000, n) for i, n in enumerate(many)]))
+        readout = ReadoutTally()
+        for piece in np.array_split(t_us, 7):
+            readout.add(Events.of(piece, piece * 0, piece * 0, piece * 0))
+        found = warnings_of(RunTally(LINK.packet), {}, LINK, seen=Seen(0.0, 3e5, readout=readout))
+        assert [doubt.code for doubt in found] == ["saturated"] * capped
+        assert not capped or "hold 3 Mev/s" in found[0].text
+
+
+@given(st.lists(st.integers(0, 3_000), min_size=1, max_size=300), st.integers(1, 9))
+def test_events_of_each_millisecond(steps: list[int], pieces: int) -> None:
+    """Against NumPy's count of the milliseconds that are over."""
+    t_us = np.cumsum(steps) * 7
+    readout = ReadoutTally()
+    for piece in np.array_split(t_us, pieces):
+        readout.add(Events.of(piece, piece * 0, piece * 0, piece * 0))
+    many = np.unique(t_us // 1000, return_counts=True)[1][:-1]
+    share, most = readout.capped()
+    assert most == pytest.approx(many.max(initial=0), rel=0.004)
+    assert share == pytest.approx(
+        (many == many.max()).mean() if len(many) else 0.0, abs=0 if most < 100 else 1
+    )
+
+
+def test_events_that_were_dropped() -> None:
+    nothing = RunTally(LINK.packet)
+    assert told(nothing, events=1_000_000, dropped_backward=90) == []
+    (line,) = told(nothing, events=50_000, dropped_backward=90, dropped_off_sensor=20)
+    assert line.startswith("110 events or words dropped (90 backward, 20 off sensor)")
+    (doubt,) = warnings_of(nothing, {"events": 50_000}, LINK, seen=Seen(losses=200))
+    assert "200 in the file" in doubt.text
+
+
+def test_a_misfit_names_what_would_explain_it() -> None:
+    for suspects, says in (
+        ({"heading": 9, "bar 1": 2}, "another heading would explain it: compare --heading-deg"),
+        (
+            {"focal length": 10, "bar 0": 6},
+            "another focal length or another bar 0 would explain it: compare camera.",
+        ),
+        ({"bar 0": 3}, "contradict one another: compare sites, angles and [camera]"),
+    ):
+        positions = dict(NO_POSITIONS, refused={"misfit": 10}, suspects=suspects)
+        (doubt,) = [
+            d for d in warnings_of(RunTally(LINK.packet), {}, LINK, positions=positions) if d.code == "misfit"
+        ]
+        assert says in str(doubt)
 
 
 def test_an_attitude_that_the_image_contradicts() -> None:
@@ -105,7 +275,7 @@ def test_a_reflection_is_not_doubted() -> None:
 def test_what_blinks_without_a_preamble() -> None:
     nothing = RunTally(LINK.packet)
     (line,) = told(nothing, events_in_regions=5_000_000, regions_opened=1)
-    assert line.startswith("something blinks, 5000000 events in 1 regions, but no preamble is heard")
+    assert line.startswith("something blinks, 5000000 events in 1 region, but no preamble is heard")
     assert told(nothing, events_in_regions=5_000_000, regions_opened=2, locks=1) == []
     assert told(nothing, events_in_regions=20_000, regions_opened=3) == []
 
@@ -136,18 +306,8 @@ def test_what_a_drive_tells_of_its_errors(
 ) -> None:
     row = {"part": part, "what": what, "correction": off, "sigma": sigma, "stated_sigma": 0.2}
     row["told"] = sigma < 0.18
-    positions = {
-        "fixes": 1,
-        "refused": {},
-        "gnss": 0,
-        "gnss_without_heading": 0,
-        "gnss_outside": 0,
-        "bars_exact": [],
-        "excluded": {},
-        "alarms": {},
-        "learnt": [row],
-    }
+    positions = dict(NO_POSITIONS, fixes=1, learnt=[row])
     link = load_link(overrides=["camera_sigma.focal_mm=0.2"])
-    found = warnings_of(RunTally(link.packet), {}, link, positions=positions)
+    found = [str(doubt) for doubt in warnings_of(RunTally(link.packet), {}, link, positions=positions)]
     assert len(found) == (hint is not None)
     assert hint is None or hint in found[0]
