@@ -3,22 +3,22 @@
     python benchmarks/receive.py [RECORDING ...] [--events 20000000] [--bytes 2000000000]
 
 Without names, all recordings of `../shared`. Each is received in turn by what `evlcp receive` calls, in
-one process, one thread, kernels warm; the best of the rounds counts. Then the first is tiled in time to
-`--events` and received once, beside the plain decoding of the same file, and a file of `--bytes` is received
-in a fresh process for its peak resident memory (0 leaves either out).
+one process, one thread, kernels warm; times are processor times, and the best of the rounds counts. Then the
+first is tiled in time to `--events` and received once, beside the plain decoding of the same file, and a file
+of `--bytes` is received in a fresh process for its peak resident memory (0 leaves either out).
 """
 
 import argparse
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 from evt3_decode import tile
 
 from evlcp_sdk.io import open_source, read_events
 from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.pace import Stopwatch
 from evlcp_sdk.run import receive_to_folder
 
 SHARED = Path(__file__).parents[2] / "shared" / "recordings"
@@ -38,12 +38,12 @@ def receive(path: Path, folder: Path) -> dict[str, float]:
 
 
 def plain_decoding(path: Path) -> float:
-    """Seconds to read a file's events and drop them: the part of the receiver's time that is the file's."""
-    began = time.perf_counter()
-    with open_source(path) as source:
+    """Processor time, s, to read a file's events and drop them: the file's part of the receiver's time."""
+    watch = Stopwatch()
+    with open_source(path) as source, watch.running():
         for _ in source.chunks():
             pass
-    return time.perf_counter() - began
+    return watch.processor_s
 
 
 def peak_memory(path: Path, folder: Path) -> float:
@@ -72,9 +72,9 @@ def main() -> None:
         out = Path(folder) / "out"
         for path in recordings:
             receive(path, out)
-            best = min((receive(path, out) for _ in range(args.rounds)), key=lambda r: r["elapsed_s"])
+            best = min((receive(path, out) for _ in range(args.rounds)), key=lambda r: r["processor_s"])
             print(
-                f"{path.name:32} {best['events'] / best['elapsed_s'] / 1e6:6.1f} Mev/s"
+                f"{path.name:32} {best['events_per_s'] / 1e6:6.1f} Mev/s"
                 f"  {best['times_real_time']:6.2f} x real time",
                 flush=True,
             )
@@ -83,11 +83,11 @@ def main() -> None:
             tile(read_events(recordings[0]), big, args.events)
             file_s = min(plain_decoding(big) for _ in range(2))
             result = receive(big, out)
-            rate = result["events"] / result["elapsed_s"] / 1e6
+            rate = result["events_per_s"] / 1e6
             print(
                 f"{big.name} tiled to {result['events'] / 1e6:.0f} Mev: {rate:.1f} Mev/s,"
                 f" {result['times_real_time']:.2f} x real time; decoding alone is"
-                f" {file_s / result['elapsed_s']:.0%} of the time"
+                f" {file_s / result['processor_s']:.0%} of the time"
             )
         if args.bytes:
             events = read_events(recordings[0])

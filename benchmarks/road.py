@@ -39,6 +39,7 @@ from evt3_decode import tile
 from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.io import read_events
 from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.pace import times_real_time
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.rx.detection import RegionFollower
 from evlcp_sdk.rx.look import Looker
@@ -174,7 +175,7 @@ def speed(path: Path, folder: Path, link: Link, rounds: int) -> Plain:
                 "processor_s": total_s,
                 "recorded_s": recorded_s,
                 "events": events,
-                "real_time": recorded_s / total_s,
+                "real_time": times_real_time(recorded_s, total_s),
                 "mev_s": events / total_s / 1e6,
                 "parts_ms_per_s": {part: s / recorded_s * 1e3 for part, s in clock.spent_s.items()},
             }

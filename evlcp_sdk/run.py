@@ -1,6 +1,5 @@
 """The use cases: what a program does with a recording, and what the commands parse and print."""
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -11,13 +10,13 @@ from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from numba.core.event import install_timer
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.io import EventSource, Loss, open_source
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.pace import Stopwatch, times_real_time
 from evlcp_sdk.place.calibration import Calibrated, CalibrationView
 from evlcp_sdk.place.calibration import calibrate as fit_camera
 from evlcp_sdk.place.navigator import Navigator, PositionPlan
@@ -266,9 +265,8 @@ def _run(
     status: Status = "complete"
     error = None
     first_us = last_us = None
-    compiled_s: list[float] = []
-    began = time.perf_counter()
-    with install_timer("numba:compile", compiled_s.append):
+    watch = Stopwatch()
+    with watch.running():
         try:
             for events in source.chunks():
                 first_us = int(events.t_us[0]) if first_us is None else first_us
@@ -284,8 +282,6 @@ def _run(
         writer.write(receiver.close())
     if status == "complete" and (told := _much_dropped(source, receiver)):
         status, error = "degraded", f"{url}: {told}"
-    # Kernels are compiled once on a machine, which says nothing of the receiver's speed.
-    elapsed_s = time.perf_counter() - began - sum(compiled_s)
     read = source.counts["events"]
     duration_s = (last_us - first_us) * 1e-6 if first_us is not None and last_us is not None else 0.0
     return writer.finish(
@@ -303,10 +299,13 @@ def _run(
             "counts": dict(source.counts),
         },
         processing={
-            "elapsed_s": round(elapsed_s, 6),
-            "compiled_s": round(sum(compiled_s), 6),
-            "events_per_s": round(read / elapsed_s),
-            "times_real_time": round(duration_s / elapsed_s, 3),
+            "processor_s": round(watch.processor_s, 6),
+            "elapsed_s": round(watch.elapsed_s, 6),
+            "kernels_s": round(watch.kernels_s, 6),
+            "events_per_s": round(read / watch.processor_s),
+            "times_real_time": round(times_real_time(duration_s, watch.processor_s), 3)
+            if duration_s
+            else None,
         },
         counts=receiver.counts,
         losses={kind: asdict(loss) for kind, loss in source.losses.items()},

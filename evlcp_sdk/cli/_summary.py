@@ -9,7 +9,7 @@ from evlcp_sdk.cli._common import console
 __all__ = ["show"]
 
 
-def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
+def show(summary: dict[str, Any], folder: Path) -> None:
     """Print what was found, what was lost, where the result is, and how fast it went."""
     from rich.table import Table
     from rich.text import Text
@@ -39,14 +39,14 @@ def show(summary: dict[str, Any], folder: Path, *, speed: bool = True) -> None:
         out.print(text)
     if "positions" in summary:
         out.print(_positions(summary["positions"]))
-    if speed:
-        out.print(
-            f"{recording['counts']['events'] / 1e6:.2f} Mev of {recording['duration_s']:.3f} s"
-            f" in {processing['elapsed_s']:.2f} s:"
-            f" {processing['events_per_s'] / 1e6:.1f} Mev/s, {processing['times_real_time']:.2f} x real time"
-        )
-        if processing["compiled_s"] > 1:
-            out.print(f"kernels compiled in {processing['compiled_s']:.0f} s", style="dim")
+    out.print(
+        f"{recording['counts']['events'] / 1e6:.2f} Mev of {recording['duration_s']:.3f} s"
+        f" in {processing['processor_s']:.2f} s of one core:"
+        f" {processing['events_per_s'] / 1e6:.1f} Mev/s,"
+        f" {_or_dash(processing['times_real_time'], '{:.2f}')} x real time"
+    )
+    if processing["kernels_s"] > 1:
+        out.print(f"kernels compiled or loaded in {processing['kernels_s']:.0f} s", style="dim")
     for loss in summary["losses"].values():
         out.print(
             f"lost: {loss['count']} {loss['meaning']} (first at {loss['unit']} {loss['first']})",

@@ -194,8 +194,7 @@ def _decode_recording(out: Path, as_json: bool) -> None:
         echo(json.dumps(summary | {"score": found}))
         return
     _show_frames([frame for frame in frames.found if frame.echo_of is None])
-    # Most of so short a run is the loading of kernels: its speed says nothing.
-    show(summary, out, speed=False)
+    show(summary, out)
     _show_score(found)
 
 

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.pace import times_real_time
 from evlcp_sdk.study.intervals import Figure, measure
 from evlcp_sdk.study.tally import Statistics, Tally
 
@@ -51,7 +52,7 @@ class Times:
         frame_us: Time of every frame in the stages `STAGES` together, us.
         stage_us: The same of each stage.
         recorded_s: Duration of the recordings, s.
-        cpu_s: Processor time for reading and receiving them, s.
+        cpu_s: Processor time for reading and receiving them, as `Stopwatch` counts it, s.
     """
 
     frame_us: tuple[float, ...] = ()
@@ -111,8 +112,7 @@ class Measured:
     @property
     def times_real_time(self) -> float:
         """Recorded time over the processor time that reading and receiving took."""
-        times = self.times
-        return times.recorded_s / times.cpu_s if times.recorded_s and times.cpu_s else math.nan
+        return times_real_time(self.times.recorded_s, self.times.cpu_s)
 
 
 def median(values: Sequence[float]) -> float:

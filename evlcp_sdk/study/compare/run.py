@@ -5,13 +5,14 @@ the same and time is measured in one run. What comes out is counted as the road 
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io import EventSource
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.pace import Stopwatch
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
@@ -90,13 +91,12 @@ class _Lane:
         self.receiver = Receiver(link, Registry.load(self.watch, *others).hook)
         self.frames: list[GivenFrame] = []
         self.packets = 0
-        self.cpu_s = 0.0
+        self.spent = Stopwatch()
 
     def feed(self, events: Events | None) -> None:
         """Take events; None ends the stream."""
-        began = time.process_time()
-        packets = self.receiver.close() if events is None else self.receiver.feed(events)
-        self.cpu_s += time.process_time() - began
+        with self.spent.running():
+            packets = self.receiver.close() if events is None else self.receiver.feed(events)
         self.packets += len(packets)
         self.frames += frames_of(packets)
 
@@ -132,11 +132,9 @@ def measure_recording(
     bound = _bound_of(variants[0].link)
     lanes = [_Lane(variant.link, None if n else bound) for n, variant in enumerate(variants)]
     first_us = last_us = None
-    reading_s = 0.0
+    reading = Stopwatch()
     with open_source() as source:
-        began = time.process_time()
-        for number, events in enumerate(source.chunks()):
-            reading_s += time.process_time() - began
+        for number, events in enumerate(_timed(source.chunks(), reading)):
             first_us = int(events.t_us[0]) if first_us is None else first_us
             last_us = int(events.t_us[-1])
             # Who comes first brings the events into the cache: each in turn.
@@ -146,18 +144,27 @@ def measure_recording(
             if bound is not None:
                 bound.settle()
             advance(source)
-            began = time.process_time()
     for lane in lanes:
         lane.feed(None)
     if bound is not None:
         bound.settle()
     recorded_s = 0.0 if first_us is None or last_us is None else (last_us - first_us) * 1e-6
     rows = tuple(
-        Row(variant.name, _measured(name, lane, truth, recorded_s, reading_s))
+        Row(variant.name, _measured(name, lane, truth, recorded_s, reading.processor_s))
         for variant, lane in zip(variants, lanes, strict=True)
     )
     sigma_m = [] if bound is None else bound.sigma_m
     return Table(name, rows, Moments.of(np.array(sigma_m, np.float64)))
+
+
+def _timed(pieces: Iterator[Events], watch: Stopwatch) -> Iterator[Events]:
+    """The same pieces, the time that it takes to get them counted."""
+    while True:
+        with watch.running():
+            piece = next(pieces, None)
+        if piece is None:
+            return
+        yield piece
 
 
 def _warm(source: EventSource, variants: Sequence[Variant]) -> None:
@@ -189,7 +196,7 @@ def _measured(name: str, lane: _Lane, truth: Truth | None, recorded_s: float, re
         frame_us=tuple(lane.watch.frame_us),
         stage_us={stage: tuple(lane.watch.stage_us[stage]) for stage in STAGES},
         recorded_s=recorded_s,
-        cpu_s=reading_s + lane.cpu_s,
+        cpu_s=reading_s + lane.spent.processor_s,
     )
     if truth is None:
         return Measured(without_truth(lane.frames, lane.packets), times)

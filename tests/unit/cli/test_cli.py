@@ -90,6 +90,11 @@ def test_receive_writes_and_tells(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) 
     assert "\x1b" not in done.out
     assert names_in(tmp_path / "out") == FILES
     table = summary_of(tmp_path / "out")
+    spent = table["processing"]
+    pace = spent["times_real_time"]
+    assert pace == pytest.approx(table["recording"]["duration_s"] / spent["processor_s"], abs=1e-3)
+    assert spent["events_per_s"] == pytest.approx(764_142 / spent["processor_s"], rel=1e-3)
+    assert f" in {spent['processor_s']:.2f} s of one core: " in done.out
     assert table["status"] == "complete"
     assert table["counts"]["events"] == table["recording"]["counts"]["events"] == 764_142
     assert len(table["digest"]) == 64
