@@ -77,6 +77,9 @@ def receive(
     figures: Annotated[
         bool, typer.Option("--figures", help="Draw regions.png, presence.png, distance.png, track.png.")
     ] = False,
+    report: Annotated[
+        bool, typer.Option("--report", help="Write report.html: the recording on one page, to look at.")
+    ] = False,
     parquet: Annotated[bool, typer.Option("--parquet", help="Also write frames.parquet.")] = False,
     workers: Annotated[
         int, typer.Option("--workers", min=0, metavar="N", help="Processes for many recordings; 0: this one.")
@@ -149,6 +152,8 @@ def receive(
 
     With figures:        [bold]evlcp receive REC.raw -o out --figures[/]
 
+    A page to look at:   [bold]evlcp receive REC.raw -o out --report[/] writes out/report.html
+
     Another profile:     [bold]evlcp receive REC.raw -o out --set modulation.id=wh8[/]
 
     Settings unknown:    [bold]evlcp receive REC.raw -o out --link auto[/]
@@ -170,8 +175,8 @@ def receive(
     --gnss gnss.csv[/]
 
     OUT gets frames.csv (a row per frame), packets.jsonl (a line per packet or message) and summary.json.
-    With --sites it gets fixes.csv, track.csv, fixes.geojson and fixes.nmea, too. --figures, --parquet and
-    --mcap are short for --sink figures, parquet and mcap; plugins bring other formats.
+    With --sites it gets fixes.csv, track.csv, fixes.geojson and fixes.nmea, too. --figures, --report,
+    --parquet and --mcap are short for --sink figures, report, parquet and mcap; plugins bring other formats.
     An earlier result there is replaced when the new one is complete.
     """
     import json
@@ -195,7 +200,7 @@ def receive(
     sigmas = (gravity_sigma_deg, heading_sigma_deg, white_sigma_deg, time_sigma_us)
     attitude = _attitude(attitude_file, angles, sigmas)
     plan, zero = _position_plan(sites, gnss, mcap), _clock_zero(clock_zero)
-    short = {"figures": figures, "parquet": parquet, "mcap": mcap}
+    short = {"figures": figures, "report": report, "parquet": parquet, "mcap": mcap}
     asked = tuple(dict.fromkeys([*(name for name, given in short.items() if given), *(sinks or [])]))
     load_sinks(choose_sinks(registry, asked, positions=plan is not None))
     here = dask is None and (not workers or len(jobs) == 1)

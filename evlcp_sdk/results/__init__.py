@@ -89,3 +89,9 @@ def evlcp_sinks() -> Iterator[SinkRecord]:
         ("regions.png", "presence.png", "distance.png", "track.png"),
         "regions, presence, distance and track as pictures",
     )
+    yield SinkRecord(
+        "report",
+        f"{here}.report:Report",
+        ("report.html",),
+        "the recording on one page: slow motion, charts, map, messages, warnings",
+    )

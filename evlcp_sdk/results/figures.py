@@ -14,12 +14,13 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.patches import Ellipse, Rectangle
+from matplotlib.patches import Polygon, Rectangle
 from numpy.typing import NDArray
 
 from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.plots import ellipse
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Frame, PresenceMap, Region
@@ -233,7 +234,8 @@ def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]],
         t_s = np.array([point.fix.t_us for point in points]) * 1e-6
         for axis in (plan, close):
             for point in points[:: max(1, len(points) // _MOST_ELLIPSES)]:
-                axis.add_patch(_ellipse(point.fix.enu_m[:2], point.fix.covariance_m2[:2, :2]))
+                line = ellipse(point.fix.enu_m[:2], point.fix.covariance_m2[:2, :2], 0.95)
+                axis.add_patch(Polygon(line, closed=True, fill=False, ec="#999999", lw=0.8))
             axis.plot(fixed[:, 0], fixed[:, 1], ".", ms=4, color=_INK, label="fix, with 95 % ellipse")
         for way, colour, label in ((live, "#56b4e9", "filtered"), (smooth, "#d55e00", "smoothed")):
             for axis in (plan, close):
@@ -271,15 +273,6 @@ def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]],
         axis.set_axisbelow(True)
     figure.suptitle(f"{title}: {len(points)} positions shown", fontsize=11, color=_INK)
     return figure
-
-
-def _ellipse(centre: NDArray[np.float64], covariance: NDArray[np.float64]) -> Ellipse:
-    """The ellipse that holds 95 % of a normal distribution of the plane."""
-    values, axes = np.linalg.eigh(covariance)
-    # The 95 % quantile of chi squared with two degrees of freedom is -2 ln 0.05.
-    wide, long = 2 * np.sqrt(-2 * math.log(0.05) * np.maximum(values, 0))
-    angle = math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
-    return Ellipse((centre[0], centre[1]), long, wide, angle=angle, fill=False, ec="#999999", lw=0.8)
 
 
 def transmitter_colour(number: int) -> str:

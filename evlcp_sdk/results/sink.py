@@ -62,3 +62,6 @@ class Sink:
     def finish(self) -> Mapping[str, Any]:
         """Write the rest; return what the summary shall say under `sinks`, as JSON values."""
         return {}
+
+    def conclude(self, summary: Mapping[str, Any]) -> None:
+        """Take the summary, all but its `files`, and write what depends on it; called last."""

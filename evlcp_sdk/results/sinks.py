@@ -99,6 +99,12 @@ class Sinks:
                     said[installed.record.name] = dict(part)
         return said
 
+    def conclude(self, summary: Mapping[str, Any]) -> None:
+        """Hand on the summary, all but its `files`."""
+        for installed, sink in self._sinks:
+            with self._blame(installed):
+                sink.conclude(summary)
+
     @contextmanager
     def _blame(self, installed: InstalledSink) -> Iterator[None]:
         try:

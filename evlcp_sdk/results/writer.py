@@ -150,6 +150,7 @@ class ResultWriter:
             positions=positions,
             sinks=self._sinks.finish(),
         )
+        self._sinks.conclude(table)
         table["files"] = self._folder.digests()
         write_summary(table, self._folder)
         self._folder.finish()

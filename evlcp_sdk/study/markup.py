@@ -37,7 +37,7 @@ summary { cursor: pointer }
   margin: 1rem 0 }
 .tile { background: var(--panel); border-radius: 0.4rem; padding: 0.5rem 0.8rem }
 .tile span { display: block; color: var(--dim); font-size: 0.8rem }
-.tile b { display: block; font-size: 1.25rem; font-weight: 600; overflow-wrap: anywhere }
+.tile b { display: block; font-size: 1.15rem; font-weight: 600; overflow-wrap: anywhere }
 """
 
 _PAGE = Markup(

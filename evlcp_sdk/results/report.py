@@ -1,0 +1,456 @@
+"""`report.html`: a recording on one page, which opens anywhere, asks no network, and is read on a phone, too.
+
+What is shown is kept as it comes, a bounded share of it, so that a recording of any length takes constant
+memory; all frames are in `frames.csv`, all messages in `packets.jsonl`.
+"""
+
+import json
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from evlcp_sdk.place.navigator import Settled
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.results.doubts import Doubt
+from evlcp_sdk.results.figures import Thinned, TrackProbe, cluster_colours, transmitter_colour
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.motion import MotionProbe
+from evlcp_sdk.results.packets_jsonl import message_line
+from evlcp_sdk.results.plots import PLOT_STYLE, Plot, ellipse
+from evlcp_sdk.results.sink import Run, Sink
+from evlcp_sdk.study.markup import Markup, details, document, table, tiles
+from evlcp_sdk.values import Events, Frame, Packet
+
+__all__ = ["Report"]
+
+_MOST_TRANSMITTERS = 6
+_MOST_POINTS = 512
+_MOST_ROWS = 40
+_MOST_MESSAGES = 50
+_MOST_ELLIPSES = 40
+_MOST_CHARACTERS = 2_000
+
+_SECONDS = 5.0
+"""Length of a recording whose charts count in seconds."""
+
+_STYLE = (
+    PLOT_STYLE
+    + """
+#motion { background: var(--panel); border-radius: 0.4rem; padding: 0.8rem }
+#motion canvas { width: 100%; display: block }
+#motion .hand { display: flex; gap: 0.6rem; align-items: center; flex-wrap: wrap; margin-top: 0.6rem }
+#motion input { flex: 1 1 10rem; min-width: 8rem } #motion select { max-width: 100% }
+#motion button, #motion select { font: inherit; padding: 0.2rem 0.8rem }
+.symbols td { padding: 0.1rem 0.35rem } .symbols td[style] { background: hsl(var(--hue) 65% 88%) }
+@media (prefers-color-scheme: dark) { .symbols td[style] { background: hsl(var(--hue) 35% 25%) } }
+.messages td, .messages th { text-align: left }
+.messages td:last-child { white-space: normal; overflow-wrap: anywhere; min-width: 12rem }
+.grid { max-height: 26rem; overflow: auto }
+.warnings { padding-left: 1.1rem } .warnings li { margin: 0.3rem 0; overflow-wrap: anywhere }
+#image { max-width: 36rem } .plot + h2 { margin-top: 1rem }
+.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 26rem), 1fr));
+  gap: 0 1.5rem }
+"""
+)
+
+
+@dataclass(eq=False)
+class _Seen:
+    """What is kept of a transmitter.
+
+    Attributes:
+        frames: A share of its frames, without what is large in them.
+        first: The first ones, whole in a table.
+        count: How many there were.
+        echo_of: Of which transmitter it is a reflection, as the newest packet says.
+    """
+
+    frames: Thinned[Frame] = field(default_factory=lambda: Thinned(_MOST_POINTS))
+    first: list[Frame] = field(default_factory=list)
+    count: int = 0
+    echo_of: int | None = None
+
+
+class Report(Sink):
+    """Writes `report.html`."""
+
+    def __init__(self, folder: ResultFolder, run: Run) -> None:
+        super().__init__(folder, run)
+        self._motion = MotionProbe()
+        self._track = TrackProbe(1024)
+        self._seen: dict[int, _Seen] = {}
+        self._first_us: int | None = None
+        self._messages: list[dict[str, Any]] = []
+        self._latest: deque[dict[str, Any]] = deque(maxlen=_MOST_MESSAGES)
+        self._many_messages = 0
+        self._axis, self._step_ms = "ms since the first event", 1.0
+
+    def events(self, events: Events) -> None:
+        """Note when the recording starts."""
+        if self._first_us is None and len(events):
+            self._first_us = int(events.t_us[0])
+
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str, value: Any) -> None:
+        """Keep what frames look like."""
+        self._motion.evlcp_stage_finished(stage, value)
+
+    def packet(self, packet: Packet) -> None:
+        """Keep frames and messages."""
+        number = packet.transmitter
+        if packet.frames and (number in self._seen or len(self._seen) < _MOST_TRANSMITTERS):
+            seen = self._seen.setdefault(number, _Seen())
+            seen.echo_of = packet.echo_of
+            for frame in packet.frames:
+                seen.count += 1
+                seen.frames.add(frame)
+                if len(seen.first) < _MOST_ROWS:
+                    seen.first.append(frame)
+        for message in packet.messages:
+            self._many_messages += 1
+            line = json.loads(message_line(message))
+            (self._messages if len(self._messages) < _MOST_MESSAGES else self._latest).append(line)
+
+    def settle(self, settled: Sequence[Settled]) -> None:
+        """Keep places."""
+        for one in settled:
+            self._track.add(one)
+
+    def conclude(self, summary: Mapping[str, Any]) -> None:
+        """Write the page."""
+        if summary["recording"]["duration_s"] > _SECONDS:
+            self._axis, self._step_ms = "s since the first event", 1000.0
+        plots: list[Plot] = []
+        motions = [
+            motion.to_dict(
+                self.run.link.codebook,
+                cluster_colours(self.run.link.codebook.clusters),
+                self.run.link.packet.chip_us,
+                self._ms,
+            )
+            for motion in self._motion.motions()
+        ]
+        body = [
+            Markup("<h1>{}</h1>").format(self.run.name),
+            self._headline(summary),
+            _warnings(summary),
+            _motion(motions),
+            self._charts(plots),
+            self._map(plots),
+            self._messages_table(),
+            self._symbols(),
+            _configuration(summary),
+        ]
+        told: dict[str, Any] = {plot.id: plot.told for plot in plots}
+        script = files("evlcp_sdk.results").joinpath("report.js").read_text(encoding="utf-8")
+        data = {"report": {"plots": told, "motions": motions}}
+        page = document(f"{self.run.name}: report", body, [script], data, _STYLE)
+        self.folder.open("report.html").write(page)
+
+    def _ms(self, t_us: float) -> float:
+        """Time since the first event, ms."""
+        return (t_us - (self._first_us or 0)) * 1e-3
+
+    def _headline(self, summary: Mapping[str, Any]) -> Markup:
+        recording, processing = summary["recording"], summary["processing"]
+        own = [t for t in summary["transmitters"] if t["echo_of"] is None]
+        given = sum(t["symbols_given"] for t in own)
+        found, expected = (sum(t[key] for t in own) for key in ("frames_found", "frames_expected"))
+        figures = [("frames", f"{found:,}", f"of {expected:,} sent" if found else "")]
+        if found:
+            erased = sum(t["symbols_erased"] for t in own)
+            bits = given * self.run.link.codebook.bits_per_symbol
+            not_seen = f"{erased / (given + erased):.1%} of symbols not given" if erased else ""
+            quality = sum(t["quality"] * t["frames_found"] for t in own) / found
+            figures += [
+                ("bits", f"{bits:,}", not_seen),
+                ("quality", f"{quality:.1%}", "of frames expected to be right"),
+            ]
+        distances = [t[key] for t in own for key in ("distance_first_m", "distance_last_m")]
+        distances = [d for d in distances if d is not None]
+        if distances:
+            first, last = distances[0], distances[-1]
+            shown = f"{first:.2f} to {last:.2f} m"
+            if len(own) > 1:
+                shown = f"{min(distances):.1f} to {max(distances):.1f} m"
+            figures.append(("distance", shown, f"{sum(t['frames_ranged'] for t in own):,} frames have one"))
+        if len(summary["transmitters"]) > 1:
+            echoes = len(summary["transmitters"]) - len(own)
+            note = f"and {echoes} reflection{'s' * (echoes != 1)}" if echoes else ""
+            figures.append(("transmitters", str(len(own)), note))
+        if summary["messages_off"] is None:
+            figures.append(("messages", f"{summary['counts'].get('messages', 0):,}", ""))
+        if "positions" in summary:
+            refused = sum(summary["positions"]["refused"].values())
+            note = f"{refused} refused" if refused else ""
+            figures.append(("positions", f"{summary['positions']['fixes']:,}", note))
+        figures += [
+            ("recording", f"{recording['duration_s']:.3g} s", f"{recording['counts']['events']:,} events"),
+            ("speed", f"{processing['times_real_time']:.2f} x", "real time"),
+        ]
+        head = Markup("<p>{}</p>").format(summary["result"])
+        if summary["status"] != "complete":
+            said = ": ".join(part for part in (summary["status"], summary["error"]) if part)
+            head += Markup('<p class="no">{}</p>').format(said)
+        return head + tiles(figures)
+
+    def _charts(self, plots: list[Plot]) -> Markup:
+        """Distance and quality over time, and where in the image."""
+        if not self._seen:
+            return Markup("")
+        camera = self.run.link.camera
+        distances: list[Plot] = []
+        quality = Plot("quality", self._axis, "quality", y_limits=(-0.03, 1.06))
+        image = Plot(
+            "image",
+            "column, px",
+            "row, px",
+            aspect=camera.width / camera.height,
+            down=True,
+            x_limits=(0, camera.width),
+            y_limits=(0, camera.height),
+        )
+        for number, seen in sorted(self._seen.items()):
+            frames = sorted(seen.frames, key=lambda frame: frame.t_us)
+            colour, who = transmitter_colour(number), _who(number, seen.echo_of)
+            t = np.array([self._ms(frame.t_us) for frame in frames]) / self._step_ms
+            depth = np.array([frame.range.distance_m for frame in frames])
+            sigma = np.array([frame.range.sigma_m for frame in frames])
+            said = [f"{who}\n{_said(frame, self._ms(frame.t_us))}" for frame in frames]
+            known = np.isfinite(depth)
+            distance = Plot(f"distance-{number}", self._axis, "distance, m")
+            distances.append(distance)
+            distance.band(t[known], (depth - sigma)[known], (depth + sigma)[known], colour)
+            distance.dots(t, depth, colour, f"{who}, with one sigma", said)
+            filtered = [math.nan if f.filtered is None else f.filtered.distance_m for f in frames]
+            if np.isfinite(filtered).any():
+                distance.line(t, filtered, colour)
+            quality.dots(t, [frame.soft.quality for frame in frames], colour, who, said)
+            places = np.array([(frame.x_px, frame.y_px) for frame in frames])
+            image.dots(places[:, 0], places[:, 1], colour, who, said)
+            if len(frames) and np.isfinite(places[-1]).all():
+                image.name(float(places[-1, 0]), float(places[-1, 1]), str(number))
+        heard = sum(seen.count for seen in self._seen.values())
+        shown = sum(len(seen.frames) for seen in self._seen.values())
+        note = "Point at a dot for its values."
+        if shown < heard:
+            note += f" {shown:,} of {heard:,} frames are shown, evenly spread; frames.csv has all."
+        parts = [Markup('<h2>Distance and quality</h2><p class="note">{}</p>').format(note)]
+        drawn = [plot for plot in distances if not plot.empty]
+        if not drawn:
+            parts.append(Markup('<p class="note">No frame has a distance.</p>'))
+        held = Markup("\n").join(plot.markup() for plot in drawn)
+        parts.append(Markup('<div class="charts">{}</div>').format(held))
+        parts += [quality.markup(), Markup("<h2>Where in the image</h2>"), image.markup()]
+        plots += [*drawn, quality, image]
+        return Markup("\n").join(parts)
+
+    def _map(self, plots: list[Plot]) -> Markup:
+        """Fixes and bars in local metres, and the sigmas over time."""
+        navigator = self.run.navigator
+        if navigator is None:
+            return Markup("")
+        points = list(self._track.points)
+        plan = Plot("map", "east, m", "north, m", aspect=4 / 3)
+        close = Plot("track", "east, m", "north, m", aspect=4 / 3)
+        height = Plot("height", self._axis, "up, m")
+        spread = Plot("spread", self._axis, "sigma, m")
+        if points:
+            fixed = np.array([point.fix.enu_m for point in points])
+            smooth = np.array([point.smoothed.enu_m for point in points])
+            t_ms = np.array([self._ms(point.fix.t_us) for point in points])
+            sigma = np.sqrt([np.diag(point.fix.covariance_m2) for point in points])
+            said = [
+                f"{ms:.1f} ms, {p.fix.source}\neast {e:z.3f} ± {se:.2g} m\nnorth {n:z.3f} ± {sn:.2g} m"
+                f"\nup {u:z.3f} ± {su:.2g} m"
+                for p, ms, (e, n, u), (se, sn, su) in zip(
+                    points, t_ms.tolist(), fixed.tolist(), sigma.tolist(), strict=True
+                )
+            ]
+            larger = _enlarged(points)
+            name = "95 % ellipse" + (f", {larger} times as large" if larger > 1 else "")
+            for point in points[:: max(1, -(-len(points) // _MOST_ELLIPSES))]:
+                covariance = point.fix.covariance_m2[:2, :2] * larger**2
+                close.ring(ellipse(point.fix.enu_m[:2], covariance, 0.95), "#999999", name)
+            for plot in (plan, close):
+                plot.line(smooth[:, 0], smooth[:, 1], "#d55e00", "smoothed")
+                plot.dots(fixed[:, 0], fixed[:, 1], "#56b4e9", "fix", said)
+            t = t_ms / self._step_ms
+            height.band(t, fixed[:, 2] - sigma[:, 2], fixed[:, 2] + sigma[:, 2], "#56b4e9")
+            height.dots(t, fixed[:, 2], "#56b4e9", "fix, with one sigma", said)
+            height.line(t, smooth[:, 2], "#d55e00", "smoothed")
+            for i, name in enumerate(("east", "north", "up")):
+                spread.dots(t, sigma[:, i], transmitter_colour(i), name, said)
+        for number, enu in sorted(navigator.bars_enu_m().items()):
+            who = f"bar {number}"
+            east, north, up = enu.tolist()
+            place = f"{who}\neast {east:z.3f} m\nnorth {north:z.3f} m\nup {up:z.3f} m"
+            plan.dots([east], [north], "var(--ink)", "bar", [place])
+            plan.name(east, north, who)
+        parts = []
+        for plot in (plan, close, height, spread):
+            if not plot.empty:
+                parts.append(plot.markup())
+                plots.append(plot)
+        if not points:
+            parts.append(Markup('<p class="note">No position was found: counts and warnings say why.</p>'))
+        return Markup('<h2>Map</h2><div class="charts">{}</div>').format(Markup("\n").join(parts))
+
+    def _messages_table(self) -> Markup:
+        if not self._many_messages:
+            return Markup("")
+        rows = [
+            (f"{self._ms(line['t_us']):.1f}", line["kind"], f"{line['transmitter_id']}", line["trust"], words)
+            for line in (*self._messages, *self._latest)
+            for words in [_words(line)]
+        ]
+        left = self._many_messages - len(rows)
+        note = f"{left:,} between the first and the last ones are left out; packets.jsonl has all." * (
+            left > 0
+        )
+        head = ("ms", "kind", "from", "trust", "what it says")
+        held = Markup('<h2>Messages</h2><div class="messages">{}</div><p class="note">{}</p>')
+        return held.format(table(head, rows), note)
+
+    def _symbols(self) -> Markup:
+        """The symbols of the first frames of each transmitter, as a grid."""
+        parts = []
+        most = max(len(self.run.link.codebook.codewords), 1)
+        for number, seen in sorted(self._seen.items()):
+            rows = []
+            for frame in seen.first:
+                depth = frame.range
+                found = f"{depth.distance_m:.2f} ± {depth.sigma_m:.2f}"
+                start = (
+                    f"{frame.packet}/{frame.frame}",
+                    f"{self._ms(frame.t_us):.1f}",
+                    found if math.isfinite(depth.distance_m) else "-",
+                    f"{frame.soft.quality:.2f}",
+                )
+                rows.append(
+                    Markup("<tr>{}{}</tr>").format(
+                        Markup("").join(Markup("<td>{}</td>").format(text) for text in start),
+                        Markup("").join(_cell(symbol, most) for symbol in frame.soft.symbols.tolist()),
+                    )
+                )
+            clusters = self.run.link.codebook.clusters
+            names = ("frame", "ms", "distance, m", "quality", *map(str, range(clusters)))
+            head = Markup("").join(Markup("<th>{}</th>").format(name) for name in names)
+            more = seen.count - len(seen.first)
+            title = f"{_who(number, seen.echo_of)}: {seen.count:,} frames"
+            title += f", the first {len(seen.first)}" * (more > 0)
+            held = Markup(
+                '<p class="note">{}</p><div class="grid"><table class="symbols"><tr>{}</tr>{}</table></div>'
+            )
+            parts.append(held.format(title, head, Markup("\n").join(rows)))
+        if not parts:
+            return Markup("")
+        return Markup("<h2>Symbols</h2>") + Markup("\n").join(parts)
+
+
+def _enlarged(points: Sequence[Settled]) -> int:
+    """How many times as large ellipses are to be drawn to be seen beside a track: 1, 10, 100 or 1000."""
+    places = np.array([point.fix.enu_m[:2] for point in points])
+    extent_m = float(np.ptp(places, axis=0).max())
+    sizes = [math.sqrt(max(np.linalg.eigvalsh(point.fix.covariance_m2[:2, :2]))) for point in points]
+    size_m = float(np.median(sizes))
+    return next((factor for factor in (1, 10, 100) if factor * size_m > 0.01 * extent_m), 1000)
+
+
+def _cell(symbol: int, most: int) -> Markup:
+    if symbol < 0:
+        return Markup("<td>-</td>")
+    return Markup('<td style="--hue:{}">{}</td>').format(round(300 * symbol / most), symbol)
+
+
+def _who(number: int, echo_of: int | None) -> str:
+    return f"transmitter {number}" + ("" if echo_of is None else f", reflection of {echo_of}")
+
+
+def _said(frame: Frame, ms: float) -> str:
+    """A frame where the pointer is."""
+    depth = frame.range
+    lines = [f"packet {frame.packet}, frame {frame.frame}, {ms:.1f} ms"]
+    if math.isfinite(depth.distance_m):
+        lines.append(f"{depth.distance_m:.4f} ± {depth.sigma_m:.4f} m")
+    lines.append(f"quality {frame.soft.quality:.4f}")
+    return "\n".join(lines)
+
+
+_COMMON = (
+    *("kind", "transmitter", "packet", "t_us", "transmitter_id", "sequence"),
+    *("verified", "trust", "reason", "age_s"),
+)
+
+
+def _words(line: Mapping[str, Any]) -> str:
+    """What a message says, its start where it is long."""
+    shown = {key: value for key, value in line.items() if key not in _COMMON and value != ""}
+    if list(shown) == ["text"]:
+        text = str(shown["text"])
+    else:
+        text = ", ".join(
+            f"{key} {value if isinstance(value, str) else json.dumps(value)}" for key, value in shown.items()
+        )
+    return text if len(text) <= _MOST_CHARACTERS else f"{text[:_MOST_CHARACTERS]}..."
+
+
+def _warnings(summary: Mapping[str, Any]) -> Markup:
+    """What looks wrong, with the next step; and what there was none of."""
+    held = Markup("<li>{}{}</li>")
+    step = Markup('<div class="note">{}</div>')
+    items = [
+        held.format(str(Doubt(**{**told, "next_step": ""})), step.format(told["next_step"]))
+        for told in summary["warnings"]
+    ]
+    items += [
+        held.format(f"lost: {loss['count']} {loss['meaning']} (first at {loss['unit']} {loss['first']})", "")
+        for loss in summary["losses"].values()
+    ]
+    if items:
+        shown = Markup('<h2>Warnings</h2><ul class="warnings">{}</ul>').format(Markup("").join(items))
+    else:
+        shown = Markup('<p class="yes">Nothing looks wrong.</p>')
+    for note in summary["notes"]:
+        shown += Markup('<p class="note">{}</p>').format(str(Doubt(**note)))
+    return shown
+
+
+def _motion(motions: Sequence[Mapping[str, Any]]) -> Markup:
+    if not motions:
+        return Markup("")
+    options = Markup("").join(
+        Markup('<option value="{}">{}</option>').format(n, motion["name"]) for n, motion in enumerate(motions)
+    )
+    return Markup(
+        "<h2>The bar in slow motion</h2>"
+        '<p class="note">Left, the events of each chip: yellow where it gets brighter, blue where darker.'
+        " Then the clusters where the pilot found them, lit as they send. Right, the chips of each cluster:"
+        " pilot and symbol, whose number stands behind it.</p>"
+        '<div id="motion"><canvas role="img" aria-label="events and clusters, chip by chip"></canvas>'
+        '<div class="hand"><button type="button">Play</button>'
+        '<input type="range" min="0" max="1" step="1" value="0" aria-label="chip">'
+        '<select aria-label="frame"{}>{}</select></div><output class="note"></output></div>'
+    ).format(Markup(" hidden") if len(motions) == 1 else "", options)
+
+
+def _configuration(summary: Mapping[str, Any]) -> Markup:
+    counts = {name: value for name, value in summary["counts"].items() if value}
+    parts = [
+        Markup("<h2>Configuration and counts</h2>"),
+        Markup('<p class="digest">{}; SHA-256 of the configuration {}</p>').format(
+            summary["recording"]["path"], summary["digest"]
+        ),
+        details("configuration", summary["configuration"]),
+        details("counts", counts),
+        details("transmitters", summary["transmitters"]),
+    ]
+    if "positions" in summary:
+        parts.append(details("positions", summary["positions"]))
+    parts.append(details("versions", summary["versions"]))
+    return Markup("\n").join(parts)

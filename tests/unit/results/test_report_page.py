@@ -1,0 +1,321 @@
+"""The report of a recording: its numbers are those of the files, it is bounded, and a browser shows it."""
+
+import csv
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.air.frames import packet_chips
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.place.navigator import PositionPlan
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.motion import Motion, MotionProbe, cluster_map, sent_chips
+from evlcp_sdk.results.plots import Plot, ellipse
+from evlcp_sdk.results.report import Report
+from evlcp_sdk.results.sink import Run
+from evlcp_sdk.results.writer import ResultWriter
+from evlcp_sdk.run import receive_to_folder
+from evlcp_sdk.values import Frame, FrameView, Packet, PresenceMap, Range, SoftSymbols
+from tests.unit.results.test_positions import ATTITUDE, SITE, packets
+from tests.unit.study.campaign.browser import CHROMIUM, Browser
+from tests.unit.study.test_markup import HOSTILE, Elements
+
+LINK = load_link()
+SUMMARY: dict[str, Any] = {
+    "status": "complete",
+    "error": None,
+    "result": HOSTILE,
+    "transmitters": [],
+    "recording": {"path": HOSTILE, "duration_s": 1.0, "counts": {"events": 7}},
+    "processing": {"times_real_time": 1.0},
+    "counts": {},
+    "messages_off": HOSTILE,
+    "warnings": [{"code": "a", "text": HOSTILE, "next_step": HOSTILE, "transmitter": 1}],
+    "notes": [{"code": "b", "text": HOSTILE, "next_step": "", "transmitter": None}],
+    "losses": {},
+    "digest": "d" * 64,
+    "configuration": {HOSTILE: HOSTILE},
+    "versions": {},
+}
+
+
+@pytest.fixture(scope="module")
+def result(demo_raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report")
+    receive_to_folder(demo_raw, folder, LINK, sinks=["report"])
+    return folder
+
+
+def held(page: str) -> dict[str, Any]:
+    """What the page's script reads."""
+    found: dict[str, Any] = json.loads(Elements(page).scripts[0])
+    return found
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / "frames.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_numbers_are_those_of_the_files(result: Path) -> None:
+    page = (result / "report.html").read_text()
+    rows = rows_of(result)
+    assert len(rows) == 21
+    body = re.findall(r"<tr><td>(\d+)/(\d+)</td>(.*?)</tr>", page)
+    for row, (packet, frame, cells) in zip(rows, body, strict=True):
+        values = re.findall(r"<td[^>]*>(.*?)</td>", cells)
+        assert (packet, frame) == (row["packet"], row["frame"])
+        assert values[3:] == row["symbols"].split()
+        assert values[1] == f"{float(row['distance_m']):.2f} ± {float(row['distance_sigma_m']):.2f}"
+    told = held(page)["plots"]
+    for row, (_, _, text) in zip(rows, told["distance-0"], strict=True):
+        assert f"{row['distance_m']} ± {row['distance_sigma_m']} m" in text
+        assert f"quality {row['quality']}" in text
+        assert f"packet {row['packet']}, frame {row['frame']}," in text
+    # Dots stand where their times are, to a thousandth of the chart.
+    x = np.array([x for x, _, _ in told["quality"]])
+    t_us = np.array([float(row["t_us"]) for row in rows])
+    assert x == pytest.approx(np.polyval(np.polyfit(t_us, x, 1), t_us), abs=1.1)
+    assert all(a[1] <= b[1] for a, b in zip(told["distance-0"], told["distance-0"][1:], strict=False))
+    summary = json.loads((result / "summary.json").read_text())
+    doubts = [one["text"] for one in (*summary["warnings"], *summary["notes"])]
+    for text in (summary["result"], *doubts, summary["digest"]):
+        assert text in Elements(page).text
+    assert f"<b>{21 * 16 * 6:,}</b>" in page
+    assert summary["files"]["report.html"]["bytes"] == len(page.encode()) < 1_000_000
+
+
+def test_the_slow_motion_is_what_was_sent(result: Path) -> None:
+    (first,) = [m for m in held((result / "report.html").read_text())["motions"] if "frame 0" in m["name"]]
+    row = rows_of(result)[0]
+    symbols = [int(s) for s in row["symbols"].split()]
+    assert first["symbols"] == symbols
+    sent = packet_chips(np.array([symbols]), LINK.codebook)[LINK.packet.preamble_chips :]
+    assert first["lit"] == ["".join(map(str, chips)) for chips in sent.T.tolist()]
+    shape = (first["chips"], first["height"], first["width"])
+    sums = (np.frombuffer(first["events"].encode(), np.uint8).astype(int) - ord("e")).reshape(shape)
+    clusters = np.array(first["clusters"]).reshape(shape[1:])
+    assert set(clusters.ravel()) == set(range(-1, 16))
+    # What a cluster shows changes with what it sends: events of a rising edge are positive.
+    change = np.diff(sent.astype(int), axis=0)
+    for k in range(16):
+        seen = sums[1:, clusters == k].sum(1)
+        assert np.corrcoef(seen, change[:, k])[0, 1] > 0.8
+
+
+def test_a_symbol_that_is_not_given_is_neither_light_nor_dark() -> None:
+    symbols = np.arange(16)
+    symbols[5] = -1
+    soft = SoftSymbols(symbols, np.zeros((16, 6), np.float32), 0.5)
+    frame = Frame(0, 0, 0, 0.0, soft, Range(math.nan, math.nan, 0), None, 0.0, 0.0)
+    chips = sent_chips(frame, LINK.codebook)
+    assert (chips[5, LINK.packet.pilot_chips :] == -1).all()
+    assert set(np.delete(chips, 5, 0).ravel()) == {0, 1}
+
+
+def view_of(height: int, width: int, clusters: int = 16) -> FrameView:
+    grid = 2
+    probability = np.zeros((clusters, height // grid, width // grid), np.float32)
+    for k, rows in enumerate(np.array_split(np.arange(4, height // grid - 4), clusters)):
+        probability[k, rows, 4:-4] = 0.9
+    presence = PresenceMap(
+        probability, grid, probability > 0.5, np.zeros((clusters, height, width), np.float32)
+    )
+    soft = SoftSymbols(np.zeros(clusters, np.int64), np.zeros((clusters, 6), np.float32), 0.9)
+    sums = np.random.default_rng(1).integers(-1, 2, (32, height, width)).astype(np.int16)
+    return FrameView(sums, np.zeros((2, 32)), presence, soft)
+
+
+def frame_of(view: FrameView, number: int, transmitter: int = 0) -> Frame:
+    nothing = Range(math.nan, math.nan, 0)
+    return Frame(transmitter, 0, number, 3200.0 * number, view.soft, nothing, None, 5.0, 6.0)
+
+
+def test_a_picture_is_bounded_whatever_its_size() -> None:
+    view = view_of(700, 400)
+    motion = Motion.of(frame_of(view, 0), view)
+    assert motion.sums[0].shape == motion.clusters.shape
+    assert motion.sums.size <= 300_000
+    assert list(np.unique(motion.clusters)) == list(range(-1, 16))
+    small = view_of(40, 24)
+    cut = Motion.of(frame_of(small, 0), small)
+    rows, columns = np.nonzero(cluster_map(small.presence, (40, 24)) >= 0)
+    top, left = rows.min() - 3, columns.min() - 3
+    height, width = cut.clusters.shape
+    assert (cut.sums == small.sums[:, top : top + height, left : left + width]).all()
+
+
+def test_the_first_and_the_largest_frames_of_some_transmitters_are_kept() -> None:
+    probe = MotionProbe(most=2)
+    for number, (height, transmitter) in enumerate([(40, 0), (60, 0), (50, 0), (40, 1), (80, 2)]):
+        view = view_of(height, 24)
+        probe.evlcp_stage_finished("view", view)
+        probe.evlcp_stage_finished("frame", frame_of(view, number, transmitter))
+        # A frame without a pilot has no view.
+        probe.evlcp_stage_finished("frame", frame_of(view, 100 + number, transmitter))
+    assert [(m.frame.transmitter, m.frame.frame) for m in probe.motions()] == [(0, 0), (0, 1), (1, 3)]
+
+
+def test_an_ellipse_holds_its_share() -> None:
+    rng = np.random.default_rng(2)
+    covariance = np.array([[4.0, 1.5], [1.5, 1.0]])
+    line = ellipse(np.array([3.0, -2.0]), covariance, 0.95) - (3.0, -2.0)
+    off = np.einsum("ni,ij,nj->n", line, np.linalg.inv(covariance), line)
+    assert off == pytest.approx(off[0])
+    drawn = rng.multivariate_normal([0, 0], covariance, 40_000)
+    inside = np.einsum("ni,ij,nj->n", drawn, np.linalg.inv(covariance), drawn) < off[0]
+    assert inside.mean() == pytest.approx(0.95, abs=0.005)
+
+
+def test_a_chart_has_gaps_where_values_are_missing() -> None:
+    plot = Plot("a", "x", "y", x_limits=(0, 10), y_limits=(0, 2))
+    plot.line([0, 5, math.nan, 10], [0, 1, 1, 2], "#000")
+    plot.dots([0, 5, 10], [math.nan, 1, 2], "#111", said=["none", "middle", "end"])
+    text = str(plot.markup())
+    assert plot.told == [(500, 500, "middle"), (1000, 0, "end")]
+    assert re.findall(r'd="(M[^"]*)"/>', text)[-3:] == [
+        "M0 2000L1000 1000",
+        "M2000 0",
+        "M1000 1000h0M2000 0h0",
+    ]
+    down = Plot("a", "x", "y", down=True, x_limits=(0, 10), y_limits=(0, 2))
+    down.dots([10], [2], "#111", said=["end"])
+    down.markup()
+    assert down.told == [(1000, 1000, "end")]
+    square = Plot("a", "x", "y", aspect=2.0)
+    square.dots([0, 10], [0, 10], "#111", said=["a", "b"])
+    square.markup()
+    (x0, y0, _), (x1, y1, _) = square.told
+    assert 2 * (x1 - x0) == pytest.approx(y0 - y1, abs=4)
+
+
+def test_a_recording_of_any_length_has_a_page_of_bounded_size(tmp_path: Path) -> None:
+    """A long one is thinned: what is kept, and the page, do not grow."""
+    soft = SoftSymbols(np.arange(16), np.zeros((16, 6), np.float32), 0.9)
+    with ResultFolder(tmp_path, ["report.html"]) as folder:
+        sink = Report(folder, Run("long.raw", LINK))
+        for n in range(4000):
+            frames = tuple(
+                Frame(n % 9, n, k, 34e3 * n + 3200 * k, soft, Range(50 - n / 100, 0.1, 9), None, 5.0, 6.0)
+                for k in range(10)
+            )
+            sink.packet(Packet(n % 9, n, 34e3 * n, 100.0, frames, 10))
+        assert len(sink._seen) == 6
+        assert all(len(seen.frames) <= 512 and len(seen.first) == 40 for seen in sink._seen.values())
+        sink.conclude(SUMMARY)
+        folder.finish()
+    page = (tmp_path / "report.html").read_text()
+    assert len(page) < 1_500_000
+    assert re.search(r"[\d,]+ of 26,6\d0 frames are shown", page)
+
+
+def test_what_others_wrote_stays_text(tmp_path: Path) -> None:
+    with ResultFolder(tmp_path, ["report.html"]) as folder:
+        sink = Report(folder, Run(HOSTILE, LINK))
+        for _ in range(101):
+            sink._many_messages += 1
+        sink._messages.append(
+            {"kind": HOSTILE, "t_us": 1.0, "transmitter_id": 7, "trust": "unverified", "text": HOSTILE}
+        )
+        sink.conclude(SUMMARY)
+        folder.finish()
+    page = Elements((tmp_path / "report.html").read_text())
+    assert not [tag for tag, _ in page.tags if tag in ("img", "iframe")]
+    assert len(page.scripts) == 2
+    assert page.text.count(HOSTILE) == 9
+    assert "100 between the first and the last ones are left out" in page.text
+
+
+def test_the_map_shows_fixes_and_bars(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, LINK, sinks=["report"], plan=PositionPlan((SITE,)), attitude=ATTITUDE) as out:
+        out.write(packets(13))
+        recording = {"path": "a.raw", "duration_s": 0.5, "counts": {"events": 1}}
+        summary = out.finish("complete", recording, {"times_real_time": 1.0}, {}, {})
+    told = held((tmp_path / "report.html").read_text())["plots"]
+    with (tmp_path / "fixes.csv").open(newline="") as file:
+        fixes = list(csv.DictReader(file))
+    assert summary["positions"]["fixes"] == len(fixes) == len(told["track"]) == len(told["map"]) - 1
+    for fix, (_, _, text) in zip(fixes, told["track"], strict=True):
+        east, north, up = (float(value) for value in re.findall(r"± (\S+) m", text))
+        for shown, axis in ((east, "east"), (north, "north"), (up, "up")):
+            assert shown == pytest.approx(float(fix[f"sigma_{axis}_m"]), rel=0.051)
+    assert told["map"][-1][2].startswith("bar 0\neast 0.000 m\nnorth 0.000 m")
+    assert {"height", "spread"} <= told.keys()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_a_browser_shows_it_wide_and_narrow_light_and_dark(result: Path, tmp_path: Path) -> None:
+    with Browser(tmp_path / "profile") as browser:
+        for width, scheme in ((1280, "light"), (390, "dark")):
+            browser.say(
+                "Emulation.setDeviceMetricsOverride",
+                width=width,
+                height=900,
+                deviceScaleFactor=1,
+                mobile=width < 500,
+            )
+            features = [
+                {"name": "prefers-color-scheme", "value": scheme},
+                {"name": "prefers-reduced-motion", "value": "reduce"},
+            ]
+            browser.say("Emulation.setEmulatedMedia", features=features)
+            browser.open(result / "report.html")
+            assert browser.value("document.documentElement.scrollWidth") <= width
+            paper = browser.value("getComputedStyle(document.body).backgroundColor")
+            assert (sum(map(int, re.findall(r"\d+", paper))) > 380) == (scheme == "light")
+            pictures = [picture(browser, chip) for chip in (0, 20, 20)]
+            assert pictures[0] != pictures[1] == pictures[2]
+            assert "chip 21 of 32, symbol, " in browser.value("document.querySelector('output').textContent")
+            assert (
+                hovered(browser, "distance-0", 10)
+                == held((result / "report.html").read_text())["plots"]["distance-0"][10][2]
+            )
+            # The picture moves by itself until it is stopped.
+            browser.value("document.querySelector('#motion button').click()")
+            moving = "document.querySelector('#motion input').value"
+            assert browser.value(
+                f"new Promise(done => {{ const at = {moving}, until = Date.now() + 5000; const look = () =>"
+                f" {moving} !== at || Date.now() > until ? done({moving} !== at) : setTimeout(look, 30);"
+                " look() })"
+            )
+            asked = [
+                m["params"]["request"]["url"]
+                for m in browser.heard
+                if m.get("method") == "Network.requestWillBeSent"
+            ]
+            assert {url.split(":")[0] for url in asked} <= {"file", "data"}
+            wrong = ("Runtime.exceptionThrown", "Log.entryAdded", "Runtime.consoleAPICalled")
+            assert [m for m in browser.heard if m.get("method") in wrong] == []
+
+
+def picture(browser: Browser, chip: int) -> str:
+    """The slow-motion picture with the slider at a chip."""
+    return str(
+        browser.value(
+            f"(() => {{ const s = document.querySelector('#motion input'); s.value = {chip};"
+            " s.dispatchEvent(new Event('input')); return document.querySelector('canvas').toDataURL() })()"
+        )
+    )
+
+
+def hovered(browser: Browser, chart: str, number: int) -> str:
+    """What a chart tells when the pointer is on one of its dots."""
+    place = browser.value(
+        f"(() => {{ const e = document.querySelector('#{chart} .area');"
+        " e.scrollIntoView({block: 'center'});"
+        f" const r = e.getBoundingClientRect(), t = held.plots['{chart}'][{number}];"
+        " return {x: r.left + t[0] / 1000 * r.width, y: r.top + t[1] / 1000 * r.height} })()"
+    )
+    browser.point_at(place["x"], place["y"])
+    return str(
+        browser.value(
+            "new Promise(done => { const until = Date.now() + 3000; const look = () => {"
+            f" const t = document.querySelector('#{chart} .tip');"
+            " !t.hidden || Date.now() > until ? done(t.textContent) : setTimeout(look, 30) }; look() })"
+        )
+    )
