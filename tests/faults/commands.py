@@ -232,7 +232,7 @@ def sinks(work: Path, demo: Path) -> Trial:
     site = work / "site.toml"
     place = "latitude_deg = 35.0\nlongitude_deg = 137.0\nheight_m = 2.0\nheading_deg = 0.0\n"
     site.write_text(f"[[bar]]\ntransmitter_id = 0\n{place}")
-    trial = receive(work, demo, "--parquet", "--mcap", "--figures", "--sites", str(site))
+    trial = receive(work, demo, "--parquet", "--mcap", "--figures", "--report", "--sites", str(site))
     trial.in_turn = "EVLCP_ALL_FAULTS" not in os.environ
     return trial
 
