@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.results.folder import ResultFolder
     from evlcp_sdk.results.sink import Run, Sink
     from evlcp_sdk.results.tables import frames_table
-    from evlcp_sdk.run import Reception, receive, receive_to_folder
+    from evlcp_sdk.run import Reception, diagnose, receive, receive_to_folder
     from evlcp_sdk.rx.receiver import Receiver
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
     from evlcp_sdk.scene.bar import BarLayout
@@ -156,6 +156,7 @@ __all__ = [
     "Triggers",
     "UnknownAlgorithmError",
     "compose",
+    "diagnose",
     "frames_table",
     "hookimpl",
     "load_link",
@@ -217,7 +218,7 @@ _HOMES = {
     "results.folder": ("ResultFolder",),
     "results.sink": ("Run", "Sink"),
     "results.tables": ("frames_table",),
-    "run": ("Reception", "receive", "receive_to_folder"),
+    "run": ("Reception", "diagnose", "receive", "receive_to_folder"),
     "rx.receiver": ("Receiver",),
     "scene.attitude": ("Attitude", "AttitudeLog"),
     "scene.bar": ("BarLayout",),

@@ -35,6 +35,7 @@ from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.signals import ENDING, heard_by
+from evlcp_sdk.study.diagnosis.diagnose import Diagnosis, diagnosis_of
 from evlcp_sdk.values import Frame, Packet
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ __all__ = [
     "Reception",
     "Stopped",
     "calibrate",
+    "diagnose",
     "receive",
     "receive_to_folder",
     "stop_on_request",
@@ -343,6 +345,32 @@ def stop_on_request(pass_on: Callable[[], None] = lambda: None) -> Iterator[Stop
 
     with heard_by(ask, *ENDING) as restore:
         yield lambda: asked
+
+
+def diagnose(
+    source: EventSource | str | Path,
+    link: Link | Path | str | None = None,
+    *,
+    registry: Registry | None = None,
+    advance: Advance = lambda _done, _of: None,
+) -> Diagnosis:
+    """Say why a recording is read, or is not: what blinks in it, and which stage of the receiver stops it.
+
+    Args:
+        source: What to open, plugins asked first; or a source that is open, which is read on and closed.
+        link: The link that it is expected to have been sent with, or a `link.toml`; None for all defaults.
+        registry: The plugins; None for all that are installed.
+        advance: Says how far the reading is.
+
+    Raises:
+        InputError: The source cannot be opened, or read on.
+        ConfigError: The file does not describe a link, or the recording's sensor is not the link's.
+    """
+    registry = Registry.load() if registry is None else registry
+    link = link if isinstance(link, Link) else load_link(link, registry=registry)
+    url = str(source.path if isinstance(source, EventSource) else source)
+    with source if isinstance(source, EventSource) else open_source(source, registry) as opened:
+        return diagnosis_of(opened, link, registry, name=url, advance=advance)
 
 
 def calibrate(

@@ -44,15 +44,14 @@ def diagnose(
     import json
 
     from evlcp_sdk.files import Outputs
-    from evlcp_sdk.io.open import open_source
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.study.diagnosis.diagnose import diagnose as run
+    from evlcp_sdk.run import diagnose as run
 
     registry = Registry.load()
     link = load_link(link_file, overrides or [], registry)
-    with open_source(recording, registry) as source, bytes_bar(Path(recording).name) as advance:
-        found = run(source, link, registry, name=recording, advance=advance)
+    with bytes_bar(Path(recording).name) as advance:
+        found = run(recording, link, registry=registry, advance=advance)
     if out is not None:
         from evlcp_sdk.study.diagnosis.page import page
 

@@ -87,6 +87,7 @@ NAMES = [
     "Triggers",
     "UnknownAlgorithmError",
     "compose",
+    "diagnose",
     "frames_table",
     "hookimpl",
     "load_link",

@@ -21,7 +21,7 @@ from evlcp_sdk.study.diagnosis.light import LightSource, LightSurvey
 from evlcp_sdk.study.diagnosis.probe import MOST_EVENTS, Trial, better_links, try_link
 from evlcp_sdk.values import Events, Packet
 
-__all__ = ["Diagnosis", "diagnose", "infer_link"]
+__all__ = ["Diagnosis", "diagnosis_of", "infer_link"]
 
 _TRIAL_US = 400_000
 """Time of the events that other links are tried on: some packets."""
@@ -99,7 +99,7 @@ class Diagnosis:
         }
 
 
-def diagnose(
+def diagnosis_of(
     source: EventSource,
     link: Link,
     registry: Registry | None = None,

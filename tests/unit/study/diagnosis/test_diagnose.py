@@ -15,10 +15,11 @@ from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.sim import load_scene
 from evlcp_sdk.simulated import SimulatedSource, simulate
 from evlcp_sdk.study.diagnosis import _kernels
-from evlcp_sdk.study.diagnosis.diagnose import Diagnosis, diagnose, infer_link
+from evlcp_sdk.study.diagnosis.diagnose import Diagnosis, diagnosis_of, infer_link
 from evlcp_sdk.study.diagnosis.light import LightSurvey, comb
 from evlcp_sdk.study.diagnosis.page import page
 from evlcp_sdk.values import Events
+from tests.unit.study.campaign.browser import CHROMIUM, Browser
 
 LINK = load_link()
 
@@ -32,7 +33,7 @@ def rendered(link: tuple[str, ...] = (), duration_s: float = 0.12, **changes: An
 
 def found(link: tuple[str, ...] = (), duration_s: float = 0.12, **changes: Any) -> Diagnosis:
     with rendered(link, duration_s, **changes) as source:
-        return diagnose(source, LINK)
+        return diagnosis_of(source, LINK)
 
 
 def code_of(diagnosis: Diagnosis) -> str:
@@ -108,7 +109,7 @@ def test_picture_upside_down_is_noticed(tmp_path: Path) -> None:
     turned = Events(events.t_us, 1279 - events.x, 719 - events.y, events.p)
     write_events(tmp_path / "turned.raw", turned, 1280, 720)
     with open_source(tmp_path / "turned.raw") as source:
-        diagnosis = diagnose(source, LINK)
+        diagnosis = diagnosis_of(source, LINK)
     assert code_of(diagnosis) == "upside-down"
     assert diagnosis.counts["frames_rejected"] == 0
 
@@ -135,8 +136,31 @@ def test_command_says_it_in_words_as_json_and_on_a_page(tmp_path: Path) -> None:
 
 def test_page_escapes_the_recordings_name() -> None:
     with rendered(duration_s=0.01) as source:
-        diagnosis = diagnose(source, LINK, name="<img src=x onerror=1>.raw")
+        diagnosis = diagnosis_of(source, LINK, name="<img src=x onerror=1>.raw")
     assert "<img src=x" not in page(diagnosis)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def test_page_is_read_on_a_phone_and_in_the_dark(tmp_path: Path) -> None:
+    with rendered(**{"bars.0.led_w_m2": 0.0, "flicker_lamps": 2, "duration_s": 0.05}) as source:
+        diagnosis = diagnosis_of(source, LINK, name="lamps.raw")
+    (tmp_path / "page.html").write_text(page(diagnosis), encoding="utf-8")
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(tmp_path / "page.html")
+        for width, dark in ((1280, False), (390, True)):
+            browser.dress(width, dark=dark)
+            wide = browser.value("document.documentElement.scrollWidth")
+            assert wide <= width
+            images = browser.value("[...document.images].map(i => [i.naturalWidth, i.clientWidth])")
+            assert all(cells == 160 and shown > 0.85 * width - 100 for cells, shown in images)
+            assert len(images) == 2
+            marks = browser.value("document.querySelectorAll('.map svg rect').length")
+            assert marks == 2 * min(len(diagnosis.sources), 40)
+        asked = [m["params"]["request"]["url"] for m in browser.heard if m.get("method") == NETWORK]
+        assert all(url.startswith(("file:", "data:")) for url in asked)
+
+
+NETWORK = "Network.requestWillBeSent"
 
 
 def counted_twin(events: Events, shape: tuple[int, int], shift: int, calm_us: int) -> tuple[Any, Any, Any]:
