@@ -193,6 +193,7 @@ class StandIn:
 
     def __init__(self, *_: object) -> None:
         self.counts: dict[str, int] = {}
+        self.lit_us: dict[int, tuple[float, float]] = {}
 
     def feed(self, _events: Events) -> list[Packet]:
         return []
