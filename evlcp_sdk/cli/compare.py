@@ -24,6 +24,9 @@ _SQLITE = b"SQLite format 3\0"
 _PIPE_WIDTH = 200
 _GAP = 2
 
+_Column = Sequence[tuple[str, bool]]
+"""Its heading and its cells, and whether each is the best."""
+
 
 @dataclass(frozen=True)
 class CompareJob:
@@ -195,8 +198,6 @@ def _write(comparison: "Comparison", paths: Sequence[Path]) -> None:
 
 
 def _show(comparison: "Comparison", paths: Sequence[Path]) -> None:
-    from evlcp_sdk.study.compare.table import LEGEND
-
     out = console()
     if not out.is_terminal:
         # A pipe has no width that a table should be cut to.
@@ -204,24 +205,35 @@ def _show(comparison: "Comparison", paths: Sequence[Path]) -> None:
     for one in comparison.tables:
         out.print(one.name, style="bold")
         head, lines = one.cells()
-        columns = [[(title, False) for title in head], *lines]
-        if _width(zip(*columns, strict=True)) <= out.width:
-            columns = [list(column) for column in zip(*columns, strict=True)]
-        # A screen too narrow for a line a variant gets a column a variant.
-        out.print(_grid(columns))
-        out.print()
+        columns = list(zip([(title, False) for title in head], *lines, strict=True))
+        # Of more columns than the screen is wide, the others stand below, with the variants again.
+        for part in _parts(columns, out.width):
+            out.print(_grid(part))
+            out.print()
     for note in comparison.notes:
         out.print(note, style="yellow")
-    out.print(LEGEND, style="dim")
+    out.print(comparison.legend, style="dim")
     if paths:
         out.print(f"written: {', '.join(map(str, paths))}", style="dim")
 
 
-def _width(columns: Iterable[Sequence[tuple[str, bool]]]) -> int:
+def _parts(columns: Sequence[_Column], width: int) -> Iterator[list[_Column]]:
+    """Columns that fit side by side, the first of all in front of each."""
+    names, *others = columns
+    part = [names]
+    for column in others:
+        if len(part) > 1 and _width([*part, column]) > width:
+            yield part
+            part = [names]
+        part.append(column)
+    yield part
+
+
+def _width(columns: Iterable[_Column]) -> int:
     return sum(max(len(text) for text, _ in column) + _GAP for column in columns)
 
 
-def _grid(columns: Sequence[Sequence[tuple[str, bool]]]) -> "Grid":
+def _grid(columns: Sequence[_Column]) -> "Grid":
     """A table of columns, each with its heading first; the best in bold type."""
     from rich.table import Table as Grid
     from rich.text import Text

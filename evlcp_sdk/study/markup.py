@@ -7,13 +7,15 @@ no script run but those that it was written with.
 import base64
 import hashlib
 import json
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from markupsafe import Markup, escape
 
-__all__ = ["Markup", "details", "document", "escape", "table", "tiles"]
+__all__ = ["Bar", "Markup", "bars", "details", "document", "escape", "table", "tiles"]
 
 _CSS = """
 :root { color-scheme: light dark; --ink: #333; --dim: #666; --line: #e6e6e6; --paper: #fff;
@@ -38,6 +40,15 @@ summary { cursor: pointer }
 .tile { background: var(--panel); border-radius: 0.4rem; padding: 0.5rem 0.8rem }
 .tile span { display: block; color: var(--dim); font-size: 0.8rem }
 .tile b { display: block; font-size: 1.15rem; font-weight: 600; overflow-wrap: anywhere }
+.charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(20rem, 100%), 1fr));
+  gap: 0.4rem 2rem } .bars { margin: 0.6rem 0; font-size: 0.85rem } .bars b { color: var(--dim) }
+.bar { display: grid; grid-template-columns: minmax(4rem, 35%) 1fr 5.5rem; gap: 0.6rem; align-items: center }
+.bar span { overflow-wrap: anywhere } .bar span:last-child { font-variant-numeric: tabular-nums }
+.bar div { position: relative; height: 0.75rem; background: var(--panel) }
+.bar i { position: absolute; inset: 0 auto 0 0; background: #0072b2 } .bar.best i { background: #009e73 }
+.bar.dim i { background: var(--dim) }
+.bar u { position: absolute; top: 25%; bottom: 25%; border: 1px solid var(--ink); border-width: 0 1px;
+  background: linear-gradient(var(--ink), var(--ink)) center / 100% 1px no-repeat }
 """
 
 _PAGE = Markup(
@@ -136,3 +147,45 @@ def tiles(figures: Iterable[tuple[str, str, str]]) -> Markup:
         tile.format(what, value, said.format(note) if note else "") for what, value, note in figures
     )
     return Markup('<div class="tiles">{}</div>').format(held)
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A figure as a bar.
+
+    Attributes:
+        name: What it is of.
+        value: Its length, at least 0.
+        text: The figure as it is written.
+        low: Lower end of its interval; NaN where there is none.
+        high: Upper end.
+        best: It is to stand out.
+        dim: It is a reference.
+    """
+
+    name: str
+    value: float
+    text: str
+    low: float = math.nan
+    high: float = math.nan
+    best: bool = False
+    dim: bool = False
+
+
+def bars(title: str, values: Sequence[Bar]) -> Markup:
+    """Figures below one another, to one scale from 0, with their intervals."""
+    longest = max((v for one in values for v in (one.value, one.high) if math.isfinite(v)), default=0) or 1
+    bar = Markup('<div class="{}"><span>{}</span><div><i style="width:{}%"></i>{}</div><span>{}</span></div>')
+    span = Markup('<u style="left:{}%;width:{}%"></u>')
+    lines = []
+    for one in values:
+        ends = ""
+        if one.high > one.low:
+            ends = span.format(_percent(one.low, longest), _percent(one.high - one.low, longest))
+        kind = "bar" + " best" * one.best + " dim" * one.dim
+        lines.append(bar.format(kind, one.name, _percent(one.value, longest), ends, one.text))
+    return Markup('<div class="bars"><b>{}</b>{}</div>').format(title, Markup("").join(lines))
+
+
+def _percent(value: float, of: float) -> str:
+    return f"{100 * value / of:.2f}"

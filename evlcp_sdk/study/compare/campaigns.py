@@ -38,7 +38,7 @@ def of_campaign(summary: Summary) -> Comparison:
         tables.append(total_of(tables, "all scenes"))
     if summary.done < summary.tasks:
         notes.append(f"{summary.done} of {summary.tasks} tasks are done")
-    return Comparison(links, tuple(tables), tuple(notes), summary.plan.environment)
+    return Comparison(links, tuple(tables), tuple(notes), summary.plan.environment, "scene")
 
 
 def _measured(series: Series) -> Measured:

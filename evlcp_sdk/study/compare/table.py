@@ -10,10 +10,10 @@ from typing import Any
 
 from evlcp_sdk.files import defused
 from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments, median
-from evlcp_sdk.study.intervals import FEWEST_RECORDINGS
-from evlcp_sdk.study.markup import Markup, details, document, table
+from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, measure
+from evlcp_sdk.study.markup import Bar, Markup, bars, details, document, table
 
-__all__ = ["BOUND_NAME", "COLUMNS", "LEGEND", "MARK", "Column", "Comparison", "Row", "Table", "total_of"]
+__all__ = ["BOUND_NAME", "COLUMNS", "MARK", "Column", "Comparison", "Row", "Table", "total_of"]
 
 BOUND_NAME = "Cramer-Rao bound"
 """Name of the reference row."""
@@ -21,13 +21,16 @@ BOUND_NAME = "Cramer-Rao bound"
 MARK = "*"
 """Follows the best figure of a column, where bold type may be lost."""
 
-LEGEND = (
-    f"{MARK} best of its column. BER of the symbols that are given; its 95 % interval is a bootstrap over"
-    f" recordings, from {FEWEST_RECORDINGS} on; < is an upper limit, as if frames were independent; filtered"
-    " is the RMSE after tracking; sigma is what the ranging itself states, root mean square; us/frame is the"
-    " median processor time of separation, decoding and ranging; x real time is recorded time over the"
-    " processor time of reading and receiving."
-)
+_LEGEND = {
+    "ber": "BER is of the symbols that are given",
+    "ber_interval": "its 95 % interval is a bootstrap over recordings, from "
+    f"{FEWEST_RECORDINGS} on, and < an upper limit, as if frames were independent",
+    "filtered_rmse_m": "filtered is the RMSE after tracking",
+    "sigma_m": "sigma is what the ranging itself states, root mean square",
+    "us_per_frame": "us/frame is the median processor time of separation, decoding and ranging",
+    "times_real_time": "x real time is recorded time over the processor time of reading and receiving",
+}
+"""What has to be said of a column, by its key."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,14 @@ def _gross(m: Measured) -> str:
     return f"{m.tally.gross_share:.1%} ({m.tally.gross})" if m.tally.ranged else "-"
 
 
+def _ends(m: Measured, key: str) -> tuple[float, float]:
+    """The interval over recordings, of what has one; else the figure itself."""
+    if key not in ("found_share", "ber", "rmse_m", "gross_share"):
+        return math.nan, math.nan
+    figure = measure(tuple(m.recordings.values()), key)
+    return (figure.low, figure.high) if figure.recordings >= FEWEST_RECORDINGS else (math.nan, math.nan)
+
+
 COLUMNS = (
     # Who finds none is not the best of those.
     Column("found_share", "frames", _frames, lambda m: -m.found_share or math.nan),
@@ -120,11 +131,13 @@ class Table:
         name: Of the recording.
         rows: One a variant.
         bound_m: The frames' Cramer-Rao bounds, m.
+        together: It is of all the other tables' recordings.
     """
 
     name: str
     rows: tuple[Row, ...]
     bound_m: Moments = field(default_factory=Moments)
+    together: bool = False
 
     def best(self) -> tuple[frozenset[str], ...]:
         """Of each row, the keys of the columns in which it is the best, or as good as the best.
@@ -143,13 +156,38 @@ class Table:
                         keys.add(column.key)
         return tuple(map(frozenset, found))
 
+    def columns(self) -> list["Column"]:
+        """Those that have a figure of any row."""
+        return [c for c in COLUMNS if any(c.cell(row.measured) != "-" for row in self.rows)]
+
+    def charts(self) -> list[tuple[str, list[Bar]]]:
+        """Of each column in which rows differ: its title, and a bar for each row that has a figure."""
+        found = []
+        best = self.best()
+        for column in self.columns():
+            if column.rank is None:
+                continue
+            ranks = [column.rank(row.measured) for row in self.rows]
+            if len({rank for rank in ranks if not math.isnan(rank)}) < 2:
+                continue
+            bars = []
+            for row, rank, keys in zip(self.rows, ranks, best, strict=True):
+                if not math.isnan(rank):
+                    low, high = _ends(row.measured, column.key)
+                    text = column.cell(row.measured)
+                    bars.append(Bar(row.variant, abs(rank), text, low, high, best=column.key in keys))
+            if column.key == "rmse_m" and self.bound_m.count:
+                bound_m = self.bound_m.rms
+                bars.append(Bar(BOUND_NAME, bound_m, _text(bound_m, ".4f"), bound_m, bound_m, dim=True))
+            found.append((column.title, bars))
+        return found
+
     def cells(self) -> tuple[list[str], list[list[tuple[str, bool]]]]:
         """Headings, and of each row the cells as (text, is best); columns without any figure are left out.
 
         The best have a mark behind; the last row is the bound, if there is one.
         """
-        best = self.best()
-        columns = [c for c in COLUMNS if any(c.cell(row.measured) != "-" for row in self.rows)]
+        best, columns = self.best(), self.columns()
         lines = []
         for row, keys in zip(self.rows, best, strict=True):
             line = [(row.variant, False)]
@@ -217,12 +255,14 @@ class Comparison:
         tables: One per recording; over all, the last, where there are several.
         notes: What a reader must know.
         versions: What was installed.
+        each: What a table is of, in a word.
     """
 
     variants: Mapping[str, Mapping[str, Any]]
     tables: tuple[Table, ...]
     notes: tuple[str, ...]
     versions: Mapping[str, Any]
+    each: str = "recording"
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as JSON values; what was not measured is null."""
@@ -248,22 +288,44 @@ class Comparison:
             writer.writerow({k: defused(v) if isinstance(v, str) else v for k, v in row.items()})
         return out.getvalue()
 
+    @property
+    def legend(self) -> str:
+        """What the columns are that the tables have."""
+        present = {column.key for one in self.tables for column in one.columns()}
+        said = [text for key, text in _LEGEND.items() if key in present]
+        if any(keys for one in self.tables for keys in one.best()):
+            said.insert(0, f"{MARK} is the best of its column")
+        return "; ".join(said) + "."
+
+    @property
+    def title(self) -> str:
+        """Which variants are compared, on what."""
+        *most, last = self.variants
+        names = f"{', '.join(most)} and {last}" if most else last
+        each = [one.name for one in self.tables if not one.together]
+        return f"{names} on {each[0] if len(each) == 1 else f'{len(each)} {self.each}s'}"
+
     def to_html(self) -> str:
-        """One self-contained page."""
-        body = [Markup("<h1>Variants compared</h1>")]
-        for one in self.tables:
+        """One self-contained page: first the table of all, with its figures as bars."""
+        body = [Markup("<h1>Variants compared: {}</h1>").format(self.title)]
+        for number, one in enumerate(sorted(self.tables, key=lambda one: not one.together)):
             head, lines = one.cells()
             rows = [
                 [Markup("<b>{}</b>").format(text) if best else text for text, best in row] for row in lines
             ]
             body += [Markup("<h2>{}</h2>").format(one.name), table(head, rows)]
-        body += [Markup('<p class="note">{}</p>').format(text) for text in (LEGEND, *self.notes)]
+            charts = Markup("").join(bars(title, drawn) for title, drawn in one.charts())
+            if charts:
+                held = '<div class="charts">{}</div>'
+                folded = f'<details><summary class="note">as bars</summary>{held}</details>'
+                body.append(Markup(folded if number else held).format(charts))
+        body += [Markup('<p class="note">{}</p>').format(text) for text in (self.legend, *self.notes)]
         body.append(Markup("<h2>Configuration and digests</h2>"))
         for name, values in self.variants.items():
             about = ", ".join(values["settings"]) or "the link as it is"
             body.append(details(f"{name}: {about}; SHA-256 {values['digest']}", values))
         body.append(details("versions", dict(self.versions)))
-        return document("Variants compared", body)
+        return document(f"Variants compared: {self.title}", body)
 
 
 def total_of(tables: Sequence[Table], name: str = "all") -> Table:
@@ -271,4 +333,4 @@ def total_of(tables: Sequence[Table], name: str = "all") -> Table:
     rows = []
     for same in zip(*(one.rows for one in tables), strict=True):
         rows.append(Row(same[0].variant, sum((row.measured for row in same), Measured())))
-    return Table(name, tuple(rows), sum((one.bound_m for one in tables), Moments()))
+    return Table(name, tuple(rows), sum((one.bound_m for one in tables), Moments()), together=True)

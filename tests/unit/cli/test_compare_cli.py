@@ -136,9 +136,13 @@ def test_no_figure_is_cut_on_a_narrow_screen(
     done = evlcp("compare", recording, *OPTIONS[:4], "-o", recording.with_suffix(".csv"))
     assert done.code == 0
     text = re.sub(r"\x1b\[[0-9;]*m", "", said.getvalue())
-    lines = text.split("* best of its column")[0].splitlines()[1:]
+    lines = text.split("* is the best of its column")[0].splitlines()[1:]
     assert max(map(len, lines)) <= width
-    assert ("…" in text, lines[0].split()[1]) == (False, "paper" if width == 80 else "frames")
+    assert "…" not in text
+    heads = [line.split() for line in lines if line.startswith("variant ")]
+    assert heads[0][1] == "frames"
+    assert len(heads) == (2 if width == 80 else 1)
+    assert sum(line.startswith("filtered ") for line in lines) == len(heads)
     with recording.with_suffix(".csv").open(newline="") as file:
         for row in csv.DictReader(file):
             assert f"{float(row['rmse_m']):.4f}" in text

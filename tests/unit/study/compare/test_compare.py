@@ -219,11 +219,52 @@ def test_json_csv_and_html_parse_back() -> None:
     page = Cells()
     page.feed(whole.to_html())
     assert page.asks == []
+    assert "<h1>Variants compared: v0 and v1 on 2 recordings</h1>" in whole.to_html()
     for found, one in zip(page.tables, whole.tables, strict=True):
         head, lines = one.cells()
         assert [text for text, _ in found[0]] == head
         assert found[1:] == lines
     assert "&lt;brackets&gt;" in whole.to_html()
+
+
+def test_figures_in_which_rows_differ_are_drawn() -> None:
+    one = table(measured(), measured(bit_errors=0))
+    charts = dict(one.charts())
+    assert "frames" not in charts
+    assert "RMSE, m" not in charts
+    assert [(bar.name, bar.value, bar.text, bar.best) for bar in charts["BER"]] == [
+        ("v0", 3 / 8448, "3.6e-04", False),
+        ("v1", 0, "0", True),
+    ]
+    far = table(measured(errors(0.4)), measured(errors(-0.2)), measured(Tally()))
+    (near, half, bound) = dict(far.charts())["RMSE, m"]
+    assert [bar.value for bar in (near, half)] == pytest.approx([0.4, 0.2])
+    assert (bound.name, bound.dim, bound.value) == (BOUND_NAME, True, pytest.approx(0.05))
+    page = comparison(far).to_html()
+    assert page.count('<i style="width:50.00%">') >= 2
+    assert page.count('<i style="width:12.50%">') == 1
+
+
+def test_of_five_recordings_a_bar_has_its_interval() -> None:
+    parts = []
+    for n in range(5):
+        rows = [measured(errors(error_m + 0.01 * n)) for error_m in (0.1, 0.2)]
+        parts.append(table(*(replace(m, recordings={f"{n}": m.tally}) for m in rows)))
+    first, *_ = dict(total_of(parts).charts())["RMSE, m"]
+    assert 0.1 < first.low < first.value < first.high < 0.2
+    whole = comparison(*parts, total_of(parts))
+    page = whole.to_html()
+    assert page.count("<u style=") == 2
+    # All first, with its bars in sight; those of one recording on demand.
+    assert page.index("<h2>all</h2>") < page.index(f"<h2>{parts[0].name}</h2>")
+    assert page.count("as bars") == 5
+
+
+def test_the_legend_speaks_of_the_columns_that_are_there() -> None:
+    assert "x real time" in comparison(table(measured(), measured())).legend
+    plain = comparison(table(measured(times={})))
+    assert "BER is of" in plain.legend
+    assert "best of its column" not in plain.legend
 
 
 @pytest.mark.parametrize(
@@ -283,7 +324,11 @@ def test_a_campaign_is_a_table_a_scene(tmp_path: Path) -> None:
     counted = [series.statistics for series in summary.series]
     rows = [row.measured.statistics for one in whole.tables for row in one.rows]
     assert rows == [*counted, counted[0] + counted[2], counted[1] + counted[3]]
-    assert "link 1" in whole.to_html()
+    page = whole.to_html()
+    assert "Variants compared: link 0 and link 1 on 2 scenes" in page
+    assert page.index("<h2>all scenes</h2>") < page.index("<h2>distance 30 m</h2>")
+    assert "us/frame" not in whole.legend
+    assert "x real time" not in whole.legend
     # Twice the error in every frame.
     assert "rmse_m" in whole.tables[2].best()[0]
     head, lines = whole.tables[0].cells()
