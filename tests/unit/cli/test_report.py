@@ -18,6 +18,7 @@ from evlcp_sdk.study.campaign.plan import Case, Plan, make_plan
 from evlcp_sdk.study.campaign.report import page, title_of
 from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.campaign.summary import Series, Summary, beside_paper, summarize, verdict_of
+from evlcp_sdk.study.compare.campaigns import of_campaign
 from evlcp_sdk.study.intervals import measure
 from evlcp_sdk.study.tally import Statistics, Tally
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
@@ -211,6 +212,14 @@ def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) ->
         assert {url.split(":")[0] for url in asked} <= {"file", "data", "blob"}
         wrong = [m for m in browser.heard if m.get("method") == "Runtime.exceptionThrown"]
         assert wrong == []
+        (tmp_path / "compare.html").write_text(of_campaign(summary).to_html(), encoding="utf-8")
+        browser.open(tmp_path / "compare.html")
+        for width in (1280, 390):
+            browser.dress(width, dark=True)
+            assert browser.value("document.documentElement.scrollWidth") <= width
+            rooms = browser.value("[...document.querySelectorAll('.bar div')].map(e => e.clientWidth)")
+            assert min(room for room in rooms if room) > 100
+            assert len([room for room in rooms if room]) < len(rooms), "bars of a scene are not folded"
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
