@@ -38,7 +38,7 @@ pictures: $(VENV)/.installed  ## Draw the pictures of the docs again
 	cp demo-out/presence.png demo-out/distance.png docs/images/
 
 clean:  ## Remove .venv and everything that was generated
-	rm -rf $(VENV) demo-out .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo-out loop-out quickstart-out .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Without it the firmware's tests would be skipped: CI takes that for a failure, a developer may go on.

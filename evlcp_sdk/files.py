@@ -134,6 +134,20 @@ class Outputs:
         with self.told(target), self.open(target) as file:
             file.write(text)
 
+    def write_array(self, array: "NDArray[Any]", target: Path) -> None:
+        """Write an array as `.npy` under exactly this name.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        import numpy as np
+
+        # To a file itself NumPy writes past Python, which a pipe cannot take.
+        whole = io.BytesIO()
+        np.save(whole, array)
+        with self.told(target), self.open_binary(target) as file:
+            file.write(whole.getbuffer())
+
     @contextmanager
     def told(self, target: Path) -> Iterator[None]:
         """What the system refuses within becomes an `OutputError` that names the file."""

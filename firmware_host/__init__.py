@@ -12,7 +12,7 @@ __all__ = ["evlcp_register_commands"]
 
 @hookimpl
 def evlcp_register_commands(app: "typer.Typer") -> None:
-    """Add `evlcp board` and `evlcp tx`."""
+    """Add `evlcp board`, `evlcp tx` and `evlcp loop`."""
     from firmware_host.commands import register
 
     register(app)

@@ -79,7 +79,7 @@ def native_program() -> Path:
     Raises:
         ToolchainError: No C compiler, or it fails.
     """
-    _compiler(os.environ.get("CC", "cc"), "gcc")
+    _compiler(os.environ.get("CC", "cc"), "gcc libc6-dev make")
     return make("native") / "evlcp-board"
 
 
@@ -89,7 +89,7 @@ def native_library() -> Path:
     Raises:
         ToolchainError: No C compiler, or it fails.
     """
-    _compiler(os.environ.get("CC", "cc"), "gcc")
+    _compiler(os.environ.get("CC", "cc"), "gcc libc6-dev make")
     return make("library") / "libevlcp-board.so"
 
 

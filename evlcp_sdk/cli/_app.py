@@ -17,7 +17,8 @@ __all__ = ["make_app", "run"]
 
 HELP = """Read data and distance from blinking LEDs with an event camera.
 
-[bold]evlcp demo[/] decodes a small recording that comes with the package;
+[bold]evlcp loop[/] sends a text from end to end on this machine, emulated board and simulated camera;
+[bold]evlcp demo[/] simulates a drive and compares with the paper;
 [bold]evlcp receive REC.raw -o out[/] decodes yours.
 
 Exit codes: [bold]0[/] done (also when no transmitter was there), [bold]1[/] failed,

@@ -26,6 +26,10 @@ _REJECTED_SHARE = 0.1
 """Rejected frames, or unread ones, of which more is said: a bar that comes into view, or leaves it, loses a
 frame or two."""
 
+_REJECTED_BESIDE_READ_SHARE = 0.3
+"""The same of rejected frames where most blocks are read, so that the link is right: a false lock costs a
+packet; of three bars, one of another layout is still told."""
+
 _ASKEW_SHARE = 0.5
 """Of frames that contradict the attitude: fewer are one bar of several that is mounted askew."""
 
@@ -362,7 +366,9 @@ def _frames(counts: Mapping[str, int]) -> Iterator[Doubt]:
             " may drown it; `evlcp diagnose` says what blinks, and how fast",
         )
     rejected, frames = counts.get("frames_rejected", 0), counts.get("frames", 0)
-    if rejected >= _FEW_FRAMES and rejected > _REJECTED_SHARE * (frames + rejected):
+    read = counts.get("blocks_decoded", 0) + counts.get("blocks_combined", 0)
+    share = _REJECTED_BESIDE_READ_SHARE if read > counts.get("blocks_failed", 0) else _REJECTED_SHARE
+    if rejected >= _FEW_FRAMES and rejected > share * (frames + rejected):
         yield Doubt(
             "frames-rejected",
             f"{rejected} of {frames + rejected} frames rejected, as their clusters do not stand where the bar"

@@ -785,7 +785,6 @@ def leds(
     """
     from evlcp_sdk.errors import ConfigError, InputError
     from evlcp_sdk.files import Outputs
-    from firmware_host.commands._output import save_array
     from firmware_host.emulators.led_record import LedRecord
 
     played = LedRecord.read(record).played()
@@ -794,8 +793,8 @@ def leds(
     except ConfigError as fault:
         raise InputError(f"{record}: {fault}") from fault
     with Outputs() as outputs:
-        save_array(chips, table, outputs)
-        save_array(chips.with_suffix(".ticks.npy"), played.ticks, outputs)
+        outputs.write_array(table, chips)
+        outputs.write_array(played.ticks, chips.with_suffix(".ticks.npy"))
         outputs.commit()
     say(f"{len(played)} chips", {"chips": len(played), "cut_bytes": played.cut_bytes}, as_json)
     if played.cut_bytes:

@@ -8,7 +8,6 @@ import typer
 from evlcp_sdk.cli._common import LinkFile, Overrides, echo
 from firmware_host.commands._json import AsJson, print_json, say
 from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, progress_bar, say_done
-from firmware_host.commands._output import save_array
 from firmware_host.commands.stream import Ahead, said_of, table_of
 
 if TYPE_CHECKING:
@@ -196,7 +195,7 @@ def message(
         if chips is not None:
             from firmware_host.board.bank import symbol_chips
 
-            save_array(chips, symbol_chips(symbols, link.codebook, link.packet.pilot_every), outputs)
+            outputs.write_array(symbol_chips(symbols, link.codebook, link.packet.pilot_every), chips)
         if out is not None:
             outputs.write_text(json.dumps(table) + "\n", out)
         outputs.commit()

@@ -9,7 +9,6 @@ import typer
 from evlcp_sdk.cli._common import LinkFile, Overrides, echo
 from firmware_host.commands import _source
 from firmware_host.commands._json import AsJson, JsonCommand, print_json
-from firmware_host.commands._output import save_array
 from firmware_host.commands._source import RandomPackets, Seed, SymbolsFile
 from firmware_host.commands.message import keygen, message
 
@@ -62,7 +61,7 @@ def frames(
         from firmware_host.board.bank import symbol_chips
 
         with Outputs() as outputs:
-            save_array(chips, symbol_chips(table, link.codebook, link.packet.pilot_every), outputs)
+            outputs.write_array(symbol_chips(table, link.codebook, link.packet.pilot_every), chips)
             outputs.commit()
     echo(_FORMS[form](table, link))
 

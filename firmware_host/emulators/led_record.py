@@ -79,6 +79,13 @@ class LedRecord:
             )
         return replace(cls.of_records(records), cut_bytes=cut)
 
+    def to_bytes(self) -> bytes:
+        """What `read` takes."""
+        records = np.empty(len(self), RECORD)
+        records["tick"] = self.ticks.astype(np.uint64) & np.uint64(0xFFFFFFFF)
+        records["chip"], records["row"] = self.numbers, self.rows
+        return records.tobytes()
+
     def played(self) -> "LedRecord":
         """Without the records that are not a chip: dark, and the single-LED test."""
         keep = (self.numbers != CHIP_DARK) & (self.numbers != CHIP_TEST)

@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 HOST = ROOT / "firmware_host"
 
-LAYERS = ("errors build flicker images", "protocol", "ports", "emulators", "board", "commands")
+LAYERS = ("errors build flicker images", "protocol", "ports", "emulators", "board", "loop", "commands")
 """From the ground up: a module imports from its own layer and those below; lazy imports count."""
 
 ATOP = {""}

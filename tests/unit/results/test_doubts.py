@@ -113,6 +113,11 @@ def test_clusters_that_are_never_seen() -> None:
 def test_frames_rejected_and_blocks_that_cannot_be_read() -> None:
     (line,) = told(tally_of(RANDOM), frames=60, frames_rejected=20)
     assert line.startswith("20 of 80 frames rejected")
+    # Where most packets are read, the link is right.
+    blocks = {"blocks_tried": 6, "blocks_decoded": 4, "blocks_failed": 2}
+    assert told(tally_of(RANDOM), frames=60, frames_rejected=20, **blocks) == []
+    (line,) = told(tally_of(RANDOM), frames=60, frames_rejected=30, **blocks)
+    assert line.startswith("30 of 90 frames rejected")
     (line,) = told(tally_of(RANDOM), frames=60, frames_unread=20)
     assert line.startswith("20 of 80 frames show their clusters, but not one symbol")
     # A truck before it is no fault of the link's.

@@ -1,0 +1,139 @@
+"""`evlcp loop`: a text by an emulated board to a simulated camera, and back."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from evlcp_sdk.cli._common import LinkFile, Overrides, console, echo
+
+__all__ = ["loop"]
+
+
+def loop(
+    text: Annotated[str, typer.Option("--text", metavar="TEXT", help="What is sent.")] = "Road works",
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder of all files.")] = Path(
+        "loop-out"
+    ),
+    distance_m: Annotated[
+        float, typer.Option("--distance", metavar="M", min=1.0, max=1000.0, help="From camera to bar.")
+    ] = 50.0,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, max=2**32 - 1, help="Seed of the scene: its noise, its start.")
+    ] = 0,
+    figures: Annotated[
+        bool, typer.Option("--figures", help="Draw what the receiver saw, as 'evlcp receive' does.")
+    ] = False,
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Each step as a line of JSON.")] = False,
+) -> None:
+    """Send a text from end to end on this machine: board, LEDs, camera, recording, receiver, text.
+
+    The board runs the real firmware, compiled here (needs cc and make); the camera is simulated. Ends with 1
+    if the text does not arrive.
+
+    Your own text:       [bold]evlcp loop --text "Tempo 30" --distance 60[/]
+
+    At slower chips:     [bold]evlcp loop --set air.chip_rate_hz=5000.0[/]
+    """
+    import json
+
+    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.results.doubts import Doubt
+    from firmware_host.loop import loop as steps
+
+    link = load_link(link_file, overrides or [], Registry.load())
+    screen = console()
+    if not as_json:
+        screen.print(
+            "a text from end to end (the first run also compiles firmware and kernels) ...", style="dim"
+        )
+    done: Mapping[str, Any] = {}
+    files: list[str] = []
+    sinks = ["figures"] if figures else []
+    with _progress() as advance:
+        for step in steps(text, link, out, distance_m=distance_m, seed=seed, sinks=sinks, advance=advance):
+            done = step.figures
+            files += step.files
+            if as_json:
+                echo(json.dumps({"step": step.name, **done, "files": list(step.files)}))
+                continue
+            screen.print(f"{step.name:9} {_WORDS[step.name](done)}")
+            for warning in done.get("warnings", ()):
+                screen.print(f"          warning: {Doubt(**warning)}", style="yellow")
+    if not as_json:
+        screen.print(f"written: {out}/{', '.join(files)}", style="dim")
+    if not done["as_sent"]:
+        raise typer.Exit(1)
+
+
+def _message(step: Mapping[str, Any]) -> str:
+    packets = "1 packet" if step["packets"] == 1 else f"{step['packets']} packets"
+    return (
+        f'"{step["text"]}", {step["bytes"]} bytes: {packets} with error correction, {step["bits"]} bits as'
+        f" {step['symbols']} symbols in {step['chips']} chips, {1e3 * step['duration_s']:.4g} ms"
+    )
+
+
+def _board(step: Mapping[str, Any]) -> str:
+    return (
+        f"emulated, firmware {step['firmware']}: programmed over its line ({step['payload_bytes']} bytes),"
+        " read back, started"
+    )
+
+
+def _light(step: Mapping[str, Any]) -> str:
+    return (
+        f"{step['leds']} LEDs, {step['chip_rate_hz']:g} chips a second, on for {step['on_share']:.0%} of the"
+        f" time; {step['chips']} chips watched, each what the message says"
+    )
+
+
+def _scene(step: Mapping[str, Any]) -> str:
+    return (
+        f"a camera {step['distance_m']:g} m away looks for {step['duration_s']:.2g} s:"
+        f" {step['events'] / 1e6:.2f} million events, {step['bytes'] / 1e6:.1f} MB"
+    )
+
+
+def _receiver(step: Mapping[str, Any]) -> str:
+    if step["distance_m"] is None:
+        return f"{step['result']}; {step['frames_sent']} frames were sent"
+    share = step["bit_errors"] / step["bits"] if step["bits"] else 0.0
+    return (
+        f"{step['frames']} of {step['frames_sent']} frames, {step['bit_errors']} of {step['bits']} bits wrong"
+        f" (BER {share:.2g}); distance {step['distance_m']:.2f} m"
+    )
+
+
+def _text(step: Mapping[str, Any]) -> str:
+    if not step["texts"]:
+        return "none was read"
+    times = "once" if step["packets"] == 1 else f"from {step['packets']} packets"
+    read = ", ".join(f'"{text}"' for text in step["texts"])
+    return f"{read}, read {times}" + ("" if step["as_sent"] else ": not what was sent")
+
+
+_WORDS: dict[str, Callable[[Mapping[str, Any]], str]] = {
+    "message": _message,
+    "board": _board,
+    "light": _light,
+    "scene": _scene,
+    "receiver": _receiver,
+    "text": _text,
+}
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[float], None]]:
+    """A bar while the scene is rendered, on a terminal only."""
+    from rich.progress import Progress
+
+    err = console(stderr=True)
+    with Progress(console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task("rendering", total=1.0, visible=False)
+        yield lambda share: bar.update(task, completed=share, visible=share < 1)

@@ -1,0 +1,310 @@
+"""The whole link on this machine: a text, an emulated board, its LEDs, a scene, a recording, the text."""
+
+import json
+import math
+import random
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evlcp_sdk.air.blocks import Kind
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import Outputs, output_fault, read_json
+from evlcp_sdk.link.compose import messages_of, packets_of
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.link.text import to_toml
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.run import receive_to_folder
+from evlcp_sdk.sim import read_truth
+from evlcp_sdk.simulated import simulate
+from evlcp_sdk.study.frames import read_frames
+from evlcp_sdk.study.score import score_frames
+from evlcp_sdk.values import ReceivedMessage
+from firmware_host.board.bank import bank_of, symbol_chips
+from firmware_host.board.board import Board, Programmed, Settings, provision
+from firmware_host.board.session import Session
+from firmware_host.board.symbols import symbols_table
+from firmware_host.board.tables import about_table
+from firmware_host.emulators.led_record import LedRecord
+from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.errors import VerifyError
+from firmware_host.ports.transport import TraceTransport, Transport
+from firmware_host.protocol.client import Timing
+from firmware_host.protocol.requests import DEFAULT_BAUD
+
+__all__ = ["RECEIVED", "RECORDING", "EmulatedLight", "Step", "light_of", "loop"]
+
+RECORDING = "loop.raw"
+"""Name of the recording in the folder."""
+
+RECEIVED = "received"
+"""Name of the folder in it that has what was received."""
+
+_LEAST_PACKETS = 8
+"""Packets in view at least: a quarter of a second of the default link."""
+
+_TRANSMITTER_ID = 1
+
+
+@dataclass(frozen=True, eq=False)
+class EmulatedLight:
+    """What the LEDs of an emulated board did from START on.
+
+    Attributes:
+        record: The LEDs, chip by chip.
+        chips: The same by clusters, uint8 (chips, clusters).
+        rate_hz: Chips a second by the board's own crystal.
+        programmed: What programming did.
+        firmware: Version of the board's firmware.
+    """
+
+    record: LedRecord
+    chips: NDArray[np.uint8]
+    rate_hz: float
+    programmed: Programmed
+    firmware: str
+
+
+def light_of(symbols: ArrayLike, link: Link, chips: int, trace: Path | None = None) -> EmulatedLight:
+    """Program an emulated board as one on a serial line, and watch its LEDs play.
+
+    The board is the firmware that parts run, compiled for this machine; its time is virtual.
+
+    Args:
+        symbols: Symbols, int64 (packets, frames, clusters), played again and again.
+        link: What they are sent with.
+        chips: How many chips to watch at least.
+        trace: File to record the line in, as `evlcp board --trace` does.
+
+    Raises:
+        BoardError: The board refuses, or its LEDs do something else than the symbols say.
+        ConfigError: A board cannot play this link.
+        OutputError: The trace cannot be written.
+        ToolchainError: The firmware cannot be built: no C compiler, or no make.
+    """
+    bank = bank_of(symbols, link)
+    device = SimulatedBoard()
+    line: Transport = SimulatedLine(device, "emulated")
+    first, nonce = random.randrange(1 << 16), random.randrange(1 << 32)
+    if trace is not None:
+        line = TraceTransport(line, trace, DEFAULT_BAUD, first, nonce)
+    with Session(line, Timing(DEFAULT_BAUD), first, nonce) as session:
+        board = Board(session)
+        programmed = provision(board, bank, Settings())
+        device.run(math.ceil(chips / link.air.chip_rate_hz * 1e6) + 1000)
+        about = board.about
+        record = device.records().played()
+    told = symbol_chips(symbols, link.codebook, link.packet.pilot_every)
+    played = record.chips(link.codebook.clusters)
+    differ = played != told[np.arange(len(played)) % len(told)]
+    if len(played) < chips or differ.any():
+        raise VerifyError(
+            f"emulated: its LEDs did {len(played)} chips, expected at least {chips};"
+            f" {np.count_nonzero(differ)} of them are not what the symbols say"
+        )
+    rate_hz = (len(record) - 1) * about.tick_hz / float(record.ticks[-1] - record.ticks[0])
+    return EmulatedLight(record, played, rate_hz, programmed, about_table(about)["firmware"])
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the loop, when it is done.
+
+    Attributes:
+        name: message, board, light, scene, receiver or text.
+        figures: What was measured, as JSON values.
+        files: What it wrote, within the folder.
+    """
+
+    name: str
+    figures: dict[str, Any]
+    files: tuple[str, ...] = ()
+
+
+def loop(
+    text: str,
+    link: Link,
+    folder: Path,
+    *,
+    distance_m: float = 50.0,
+    seed: int = 0,
+    sinks: Sequence[str] = (),
+    advance: Callable[[float], None] = lambda _: None,
+) -> Iterator[Step]:
+    """Send a text by an emulated board to a simulated camera, and read it: the steps, each as it is done.
+
+    Every step leaves its files in the folder, and the next one takes them from there.
+
+    Args:
+        text: What is sent.
+        link: What both ends share.
+        folder: Made if need be.
+        distance_m: From the camera to the bar.
+        seed: Of the scene: its noise, and the moment at which the camera begins to look.
+        sinks: Output formats beside the default ones, by name.
+        advance: Called while the scene is rendered with the share that is done.
+
+    Raises:
+        BoardError: The board refuses; see `light_of`.
+        ConfigError: The text cannot be sent, a board cannot play the link, or the scene cannot be rendered.
+        OutputError: The folder cannot be written.
+        ToolchainError: The firmware cannot be built.
+    """
+    if not text:
+        raise ConfigError("text: expected at least one character")
+    nearest_m = link.bar.length_m * link.camera.focal_px / link.camera.height
+    if distance_m < nearest_m:
+        raise ConfigError(
+            f"distance = {distance_m:g} m: the bar, {link.bar.length_m:g} m high, fits into the image from"
+            f" {nearest_m:.1f} m on"
+        )
+    coder = link.block_coder()
+    (message,) = messages_of(link, text=text, transmitter_id=_TRANSMITTER_ID, sequence=seed & 0xFFFFFFFF)
+    symbols = packets_of([message], coder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as fault:
+        raise output_fault(folder, fault) from fault
+    packet = link.packet
+    with Outputs() as outputs:
+        outputs.write_text(to_toml(link, Registry.load()), folder / "link.toml")
+        outputs.write_text(
+            json.dumps(symbols_table(symbols, link, messages=True)) + "\n", folder / "message.json"
+        )
+        outputs.commit()
+    yield Step(
+        "message",
+        {
+            "text": text,
+            "bytes": len(message.payload),
+            "packets": len(symbols),
+            "symbols": symbols.size,
+            "bits": coder.bits * len(symbols),
+            "chips": packet.packet_chips * len(symbols),
+            "duration_s": round(packet.packet_chips * len(symbols) / link.air.chip_rate_hz, 6),
+        },
+        ("link.toml", "message.json"),
+    )
+
+    # Every packet passes whole, a second time if the first has begun before the camera looks.
+    in_view = max(_LEAST_PACKETS, 2 * len(symbols) + 2)
+    light = light_of(symbols, link, (in_view + 2) * packet.packet_chips, folder / "wire.jsonl")
+    programmed = light.programmed
+    yield Step(
+        "board",
+        {"firmware": light.firmware, "payload_bytes": programmed.length, "retries": programmed.retries},
+        ("wire.jsonl",),
+    )
+    chips_file = folder / "chips.npy"
+    with Outputs() as outputs:
+        outputs.open_binary(folder / "leds.bin").write(light.record.to_bytes())
+        outputs.write_array(light.chips, chips_file)
+        outputs.commit()
+    yield Step(
+        "light",
+        {
+            "leds": 8 * light.record.rows.shape[1],
+            "chips": len(light.chips),
+            "chip_rate_hz": round(light.rate_hz, 3),
+            "on_share": round(float(light.chips.mean()), 4),
+        },
+        ("leds.bin", chips_file.name),
+    )
+
+    start_chip = round(float(np.random.default_rng([seed, 1]).uniform(0, packet.packet_chips)), 1)
+    duration_s = in_view * packet.packet_chips / light.rate_hz
+    bar = {
+        "x_m": 0.0,
+        "chips_file": str(chips_file),
+        "start_chip": start_chip,
+        "ppm": round((light.rate_hz / link.air.chip_rate_hz - 1) * 1e6, 3),
+    }
+    scene = {
+        "name": Path(RECORDING).stem,
+        "duration_s": duration_s,
+        "link": {section: dict(keys) for section, keys in link.table.items()},
+        "camera": dict(link.table["camera"]),
+        "lens": {"focus_m": distance_m},
+        "motion": {"distance_m": distance_m, "speed_mps": 0.0},
+        "bars": [bar],
+    }
+    raw = folder / RECORDING
+    simulated = simulate(scene, seed)
+    _, truth_file = simulated.save(raw, lambda done_s: advance(done_s / duration_s))
+    _say_symbols(truth_file, symbols, len(light.chips) // packet.packet_chips)
+    counts = simulated.simulation.counts
+    yield Step(
+        "scene",
+        {
+            "distance_m": distance_m,
+            "duration_s": round(duration_s, 6),
+            "events": counts["events"],
+            "bytes": raw.stat().st_size,
+        },
+        (raw.name, truth_file.name),
+    )
+
+    heard = _Heard()
+    summary = receive_to_folder(raw, folder / RECEIVED, link, registry=Registry.load(heard), sinks=sinks)
+    # The rows as they are written, which `evlcp score` reads, too.
+    found = score_frames(read_frames(folder / RECEIVED), read_truth(truth_file))
+    (scored,) = found["bars"]
+    told = summary["transmitters"]
+    yield Step(
+        "receiver",
+        {
+            "result": summary["result"],
+            "frames": scored["frames_found"],
+            "frames_sent": scored["frames_sent"],
+            "frames_false": found["unmatched"],
+            "bits": found["road"]["bars"][0]["bits"],
+            "bit_errors": found["road"]["bars"][0]["bit_errors"],
+            "distance_m": told[0]["distance_last_m"] if told else None,
+            "rmse_m": scored["rmse_m"],
+            "warnings": summary["warnings"],
+        },
+        tuple(f"{RECEIVED}/{name}" for name in (*summary["files"], "summary.json")),
+    )
+    counted = summary["counts"]
+    texts = list(dict.fromkeys(heard.texts))
+    yield Step(
+        "text",
+        {
+            "texts": texts,
+            "packets": counted["blocks_decoded"] + counted["blocks_combined"],
+            "as_sent": text in texts,
+        },
+    )
+
+
+class _Heard:
+    """Keeps the texts as the receiver announces them."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str, value: object) -> None:
+        if stage == "message" and isinstance(value, ReceivedMessage) and value.message.kind == Kind.TEXT:
+            self.texts.append(value.value)
+
+
+def _say_symbols(truth_file: Path, symbols: NDArray[np.int64], packets: int) -> None:
+    """Say in the truth what the chips of the LEDs stand for, which `light_of` has compared with them."""
+    table = read_json(truth_file)
+    (bar,) = table["bars"]
+    whole = symbols[np.arange(packets) % len(symbols)]
+    bar |= {
+        "symbols": whole.tolist(),
+        "payload": "messages",
+        "chips_file": None,
+        "packet_chips": bar["packet_chips"] // packets,
+    }
+    with Outputs() as outputs:
+        outputs.write_text(json.dumps(table), truth_file)
+        outputs.commit()

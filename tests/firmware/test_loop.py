@@ -1,0 +1,106 @@
+"""A text from end to end: what the steps say and leave is what other readers find in their files."""
+
+import json
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import load_link
+from firmware_host.board.bank import random_symbols, symbol_chips
+from firmware_host.emulators.led_record import RECORD, LedRecord
+from firmware_host.loop import light_of
+
+pytestmark = pytest.mark.usefixtures("compiler")
+
+
+def test_a_text_arrives_and_every_file_is_what_others_read(evlcp, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = evlcp("loop", "--text", "Grüße [b]", "--distance", "80", "--seed", "3", "-o", out)
+    assert done.code == 0, done.err
+    lines = dict(line.split(maxsplit=1) for line in done.out.splitlines() if not line.startswith(" "))
+    assert list(lines)[1:] == ["message", "board", "light", "scene", "receiver", "text", "written:"]
+    assert lines["message"].startswith('"Grüße [b]", 11 bytes: 1 packet with')
+    assert lines["text"].startswith('"Grüße [b]", read from ')
+    frames, rest = lines["receiver"].split(" frames, ")
+    found, sent = map(int, frames.split(" of "))
+    assert sent - 1 <= found <= sent
+    assert rest.startswith("0 of ")
+    assert float(rest.split("distance ")[1].split(" m")[0]) == pytest.approx(80, abs=0.1)
+
+    told = json.loads((out / "message.json").read_text())["symbols"]
+    expected = symbol_chips(np.array(told), load_link().codebook)
+    played = LedRecord.read(out / "leds.bin")
+    assert (np.diff(played.ticks) == 1000).all()
+    chips = np.load(out / "chips.npy")
+    assert (played.chips() == chips).all()
+    assert (chips == np.resize(expected, chips.shape)).all()
+
+    scored = json.loads(evlcp("score", out / "received", out / "loop.truth.json", "--json").out)
+    (bar,) = scored["bars"]
+    assert (bar["frames_found"], bar["bit_errors"]) == (found, 0)
+    again = evlcp("board", "--replay", out / "wire.jsonl", "program", out / "message.json")
+    assert again.code == 0, again.err
+    assert evlcp("config", "-c", out / "link.toml", "--digest").out == evlcp("config", "--digest").out
+
+
+def test_a_text_that_does_not_arrive_ends_with_1(evlcp, tmp_path: Path) -> None:
+    done = evlcp("loop", "--distance", "900", "--json", "-o", tmp_path)
+    assert done.code == 1
+    steps = [json.loads(line) for line in done.out.splitlines()]
+    assert [step["step"] for step in steps] == ["message", "board", "light", "scene", "receiver", "text"]
+    assert steps[-1]["as_sent"] is False
+    assert steps[-1]["texts"] == []
+    for step in steps:
+        assert all((tmp_path / name).is_file() for name in step["files"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--text", ""], "text: expected at least one character"),
+        (["--distance", "5"], "the bar, 0.96 m high, fits into the image from 9.6 m on"),
+        (["--set", "bar.rows=48"], "the driver board cannot play this link: bar of 8 clusters"),
+        (["--set", "air.chip_rate_hz=30000.0"], "emulated: no chip rate of 30000 Hz"),
+    ],
+    ids=["no text", "too near", "another bar", "too fast"],
+)
+def test_what_cannot_be_is_said_in_one_line(evlcp, tmp_path: Path, arguments: list[str], says: str) -> None:
+    done = evlcp("loop", "-o", tmp_path, *arguments)
+    assert done.code in (2, 5)
+    assert says in done.err
+    assert len(done.err.splitlines()) == 1
+
+
+def test_without_a_compiler_it_says_what_to_install(cli, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    done: subprocess.CompletedProcess[str] = cli("loop", "-o", tmp_path / "out")
+    assert done.returncode == 1
+    assert done.stderr == (
+        "evlcp: cc is missing: apt-get install --no-install-recommends gcc libc6-dev make\n"
+    )
+
+
+def test_light_is_what_the_symbols_say() -> None:
+    link = load_link(None, ["air.chip_rate_hz=6250.0", "modulation.id=wh8", "air.frames_per_packet=2"])
+    symbols = random_symbols(3, 2, link.codebook, np.random.default_rng(1))
+    light = light_of(symbols, link, 500)
+    expected = symbol_chips(symbols, link.codebook)
+    assert len(light.chips) >= 500
+    assert (light.chips == np.resize(expected, light.chips.shape)).all()
+    assert light.rate_hz == 6250
+    with pytest.raises(ConfigError, match="cannot play this link"):
+        light_of(symbols, load_link(None, ["bar.rows=48"]), 500)
+
+
+def test_a_record_that_is_written_is_the_one_that_is_read(tmp_path: Path) -> None:
+    made = np.zeros(3, RECORD)
+    made["tick"], made["chip"] = [2**32 - 500, 500, 1500], [0, 1, 2]
+    made["row"] = np.random.default_rng(0).integers(0, 256, (3, 12))
+    record = LedRecord.of_records(made)
+    assert record.ticks.tolist() == [2**32 - 500, 2**32 + 500, 2**32 + 1500]
+    assert record.to_bytes() == made.tobytes()
+    (tmp_path / "leds.bin").write_bytes(record.to_bytes())
+    assert (LedRecord.read(tmp_path / "leds.bin").rows == made["row"]).all()
