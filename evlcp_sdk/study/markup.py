@@ -31,7 +31,7 @@ th, td { padding: 0.15rem 0.7rem; text-align: right; border-bottom: 1px solid va
   white-space: nowrap }
 th { color: var(--dim); font-weight: 600 } td:first-child, th:first-child { text-align: left }
 .chart { height: 430px } .note, .digest { color: var(--dim); font-size: 0.87rem }
-.digest { overflow-wrap: anywhere } .wide { overflow-x: auto }
+.note, .digest { overflow-wrap: anywhere } .wide { overflow-x: auto }
 .yes { color: var(--good) } .no { color: var(--bad); font-weight: 600 }
 pre { background: var(--panel); padding: 0.7rem; overflow-x: auto; font-size: 0.8rem }
 summary { cursor: pointer }
