@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.io import EventSource, Loss, open_source
+from evlcp_sdk.io.open import STDIN
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.pace import Stopwatch, times_real_time
@@ -197,7 +198,7 @@ class Reception(Iterator[Packet]):
 
 def receive_to_folder(
     source: EventSource | str | Path,
-    folder: Path,
+    folder: Path | None,
     link: Link | Path | str | None = None,
     *,
     registry: Registry | None = None,
@@ -205,6 +206,7 @@ def receive_to_folder(
     attitude: Attitude | AttitudeLog | None = None,
     clock_zero: datetime | None = None,
     sinks: Sequence[str] = (),
+    lines: Callable[[str], None] | None = None,
     advance: Advance = lambda _done, _of: None,
     stopped: Stopped = lambda: False,
 ) -> dict[str, Any]:
@@ -213,7 +215,7 @@ def receive_to_folder(
     Args:
         source: What to open, plugins asked first; or a source that is open, which is read on and closed.
         folder: Where the result goes; made if need be. An earlier result is replaced when the new one is
-            complete.
+            complete. None: nothing is written.
         link: The configuration, or a `link.toml`; None for all defaults.
         registry: The plugins; None for all that are installed.
         plan: What positions are computed from; None for none.
@@ -222,6 +224,7 @@ def receive_to_folder(
         clock_zero: UTC of the camera clock's 0, for the age of signed beacons, and for formats with UTC; None
             if it is not known.
         sinks: Output formats beside the default ones, by name, e.g. `parquet`.
+        lines: Takes a line of JSON for each frame, message and fix as it comes; None for nobody.
         advance: Says how far the reading is.
         stopped: Ends the run early; what was decoded until then is written.
 
@@ -239,6 +242,7 @@ def receive_to_folder(
     link = link if isinstance(link, Link) else load_link(link, registry=registry)
     url = str(source.path if isinstance(source, EventSource) else source)
     with source if isinstance(source, EventSource) else open_source(source, registry) as opened:
+        url = str(opened.path) if url == STDIN else url
         check_sensor(opened, url, link.camera)
         name = Path(url).name
         with ResultWriter(
@@ -250,6 +254,7 @@ def receive_to_folder(
             attitude=attitude,
             clock_zero=clock_zero,
             sinks=sinks,
+            lines=lines,
         ) as writer:
             receiver = Receiver(link, registry.hook, attitude=attitude, clock_zero=clock_zero)
             return _run(opened, url, receiver, writer, advance, stopped)

@@ -427,8 +427,13 @@ class ReceivedMessage:
         """What a beacon says; None for other kinds."""
         return self.value if self.message.kind == Kind.BEACON else None
 
+    def said(self, most: int = 60) -> str:
+        """What it says, the first `most` characters at least, for people to read."""
+        return _said(self, most)
+
     def __repr__(self) -> str:
-        return f"ReceivedMessage({_said(self)}, {self.t_us / 1e3:.1f} ms)"
+        who = f"{self.said()} from {self.message.transmitter_id}, {self.trust}"
+        return f"ReceivedMessage({who}, {self.t_us / 1e3:.1f} ms)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -477,7 +482,10 @@ class Packet:
             for f in self.frames
         )
         head = "".join(f"<th>{name}</th>" for name in ("frame", "ms", "symbols", "quality", "distance"))
-        messages = "".join(f"<li>{escape(_said(m))}</li>" for m in self.messages)
+        messages = "".join(
+            f"<li>{escape(f'{m.said()} from {m.message.transmitter_id}, {m.trust}')}</li>"
+            for m in self.messages
+        )
         return (
             f"<p>{escape(repr(self))}</p><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
             + (f"<ul>{messages}</ul>" if messages else "")
@@ -667,8 +675,8 @@ def _distance(found: Range) -> str:
     return f"{found.distance_m:.2f} ± {found.sigma_m:.2f} m"
 
 
-def _said(received: ReceivedMessage, most: int = 60) -> str:
-    """What a message says, its start at least, and who sent it."""
+def _said(received: ReceivedMessage, most: int) -> str:
+    """What a message says, its start at least."""
     message = received.message
     text = message.text
     if received.beacon is not None:
@@ -681,4 +689,4 @@ def _said(received: ReceivedMessage, most: int = 60) -> str:
     else:
         value = repr(received.value)
         what = f"{received.kind.name} {value if len(value) <= most else f'{value[:most]}...'}"
-    return f"{what} from {message.transmitter_id}, {received.trust}"
+    return what

@@ -8,15 +8,18 @@ from evlcp_sdk.cli._common import console
 
 __all__ = ["show"]
 
+_MOST_SHOWN, _MOST_SAID = 8, 200
+"""Messages that are shown, the newest, and characters of each."""
 
-def show(summary: dict[str, Any], folder: Path) -> None:
-    """Print what was found, what was lost, where the result is, and how fast it went."""
+
+def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) -> None:
+    """Print what was found and received, what was lost, where the result is, and how fast it went."""
     from rich.table import Table
     from rich.text import Text
 
     from evlcp_sdk.results.doubts import Doubt
 
-    out = console()
+    out = console(stderr=stderr)
     recording, processing = summary["recording"], summary["processing"]
     out.print(Text.assemble((Path(recording["path"]).name, "bold"), f": {summary['result']}"))
     if summary["transmitters"]:
@@ -37,8 +40,14 @@ def show(summary: dict[str, Any], folder: Path) -> None:
         out.print(table)
     if text := _messages(summary["counts"]):
         out.print(text)
+    for told in summary["messages"][-_MOST_SHOWN:]:
+        out.print(f"  {_message(told)}")
+    if (more := summary["counts"].get("messages", 0) - _MOST_SHOWN) > 0:
+        out.print(f"  {more} before that: packets.jsonl" if folder else f"  {more} before that", style="dim")
     if "positions" in summary:
         out.print(_positions(summary["positions"]))
+        if last := summary["positions"]["last"]:
+            out.print(f"  {_last(last)}")
     out.print(
         f"{recording['counts']['events'] / 1e6:.2f} Mev of {recording['duration_s']:.3f} s"
         f" in {processing['processor_s']:.2f} s of one core:"
@@ -56,7 +65,26 @@ def show(summary: dict[str, Any], folder: Path) -> None:
         out.print(str(Doubt(**note)), style="dim")
     for warning in summary["warnings"]:
         out.print(f"warning: {Doubt(**warning)}", style="yellow")
-    out.print(f"written: {folder}/{', '.join([*summary['files'], 'summary.json'])}", style="dim")
+    if folder is not None:
+        out.print(f"written: {folder}/{', '.join([*summary['files'], 'summary.json'])}", style="dim")
+
+
+def _message(told: Mapping[str, Any]) -> str:
+    """What a message says, on one line, and from whom."""
+    said = told["said"]
+    text = said if len(said) <= _MOST_SAID else f"{said[:_MOST_SAID]}..."
+    kind = "text " if told["kind"] == "text" else ""
+    return f"{kind}{text}, from {told['transmitter_id']}, {told['trust']}, at {told['t_us'] / 1e3:.1f} ms"
+
+
+def _last(told: Mapping[str, Any]) -> str:
+    """The last position, in one line."""
+    east, north, up = told["sigma_m"]
+    heading = "" if told["heading_deg"] is None else f", heading {told['heading_deg']:.1f} deg"
+    return (
+        f"the last one {told['latitude_deg']:.7f}, {told['longitude_deg']:.7f} deg, {told['height_m']:.2f} m"
+        f" (sigma {east:.2g} E, {north:.2g} N, {up:.2g} U m){heading}, at {told['t_us'] / 1e3:.1f} ms"
+    )
 
 
 def _who(told: Mapping[str, Any]) -> str:
@@ -93,20 +121,24 @@ def _messages(counts: Mapping[str, int]) -> str:
     text = f"{number} message{'s' * (number != 1)}"
     trusts = {t: counts[f"beacons_{t}"] for t in ("verified", "unverified", "forged")}
     if any(trusts.values()):
-        text += f"; beacons {', '.join(f'{n} times {t}' for t, n in trusts.items() if n)}"
+        text += f"; beacons {', '.join(_times(n, t) for t, n in trusts.items() if n)}"
     if counts["beacons_undated"]:
         text += "; how old verified ones are is not known without --clock-zero"
-    for key, lost in (
-        ("blocks_failed", "packets not readable"),
-        ("blocks_other_codebook", "packets of another codebook"),
-        ("blocks_malformed", "packets with no block of this format"),
-        ("parts_missing", "parts missing"),
-        ("messages_mixed", "messages put together from parts of two, left out"),
-        ("messages_undecodable", "messages without meaning"),
+    for key, what, lost in (
+        ("blocks_failed", "packet", "not readable"),
+        ("blocks_other_codebook", "packet", "of another codebook"),
+        ("blocks_malformed", "packet", "with no block of this format"),
+        ("parts_missing", "part", "missing"),
+        ("messages_mixed", "message", "put together from parts of two, left out"),
+        ("messages_undecodable", "message", "without meaning"),
     ):
         if counts[key]:
-            text += f"; {counts[key]} {lost}"
+            text += f"; {counts[key]} {what}{'s' * (counts[key] != 1)} {lost}"
     return text
+
+
+def _times(number: int, what: str) -> str:
+    return f"once {what}" if number == 1 else f"{number} times {what}"
 
 
 def _or_dash(value: float | None, form: str) -> str:

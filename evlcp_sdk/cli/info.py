@@ -15,7 +15,8 @@ def register(app: typer.Typer) -> None:
 
 
 def info(
-    recording: Annotated[str, typer.Argument(metavar="REC", help="A recording.")], as_json: Json = False
+    recording: Annotated[str, typer.Argument(metavar="REC", help="A recording; - for standard input.")],
+    as_json: Json = False,
 ) -> None:
     """Say what a recording holds: header, duration, rate, triggers, anomalies.
 
@@ -24,10 +25,10 @@ def info(
     import json
 
     from evlcp_sdk.io.describe import describe
-    from evlcp_sdk.io.open import open_source
+    from evlcp_sdk.io.open import STDIN, open_source
 
     with open_source(recording) as source:
-        table = describe(source, recording)
+        table = describe(source, str(source.path) if recording == STDIN else recording)
     echo(json.dumps(table, indent=2) if as_json else _text(table))
 
 

@@ -1,5 +1,6 @@
 """`evlcp receive`."""
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
@@ -47,7 +48,7 @@ class ReceiveJob:
     """One recording, the folder that its result goes to, and its link if it is not the one of all."""
 
     url: str
-    folder: Path
+    folder: Path | None
     link: "Link | None" = None
 
 
@@ -58,11 +59,15 @@ def register(app: typer.Typer) -> None:
 
 def receive(
     recordings: Annotated[
-        list[str], typer.Argument(metavar="REC...", help="Recordings, or what a plugin can open.")
+        list[str],
+        typer.Argument(
+            metavar="REC...", help="Recordings, or what a plugin can open; - for RAW on standard input."
+        ),
     ],
     out: Annotated[
-        Path, typer.Option("-o", "--out", metavar="OUT", help="Folder of the result; made if need be.")
-    ],
+        Path | None,
+        typer.Option("-o", "--out", metavar="OUT", help="Folder of the result; made if need be."),
+    ] = None,
     link_file: LinkFile = None,
     overrides: Overrides = None,
     link_mode: Annotated[
@@ -74,6 +79,14 @@ def receive(
     ] = LinkMode.GIVEN,
     strict: Annotated[bool, typer.Option("--strict", help="End with 1 where there are warnings.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Each summary as one line of JSON.")] = False,
+    json_lines: Annotated[
+        str | None,
+        typer.Option(
+            "--json-lines",
+            metavar="-",
+            help="Frames, messages and fixes as lines of JSON on stdout as they come; OUT may be left out.",
+        ),
+    ] = None,
     figures: Annotated[
         bool, typer.Option("--figures", help="Draw regions.png, presence.png, distance.png, track.png.")
     ] = False,
@@ -160,6 +173,8 @@ def receive(
 
     Your own link:       [bold]evlcp receive REC.raw -o out -c link.toml[/]
 
+    As it comes:         [bold]CAMERA | evlcp receive - --json-lines -[/]
+
     Several recordings:  [bold]evlcp receive a.raw b.raw -o out[/] writes out/a and out/b
 
     Two at a time:       [bold]evlcp receive *.raw -o out --workers 2[/]
@@ -188,7 +203,8 @@ def receive(
     from evlcp_sdk.results.sinks import load_sinks
     from evlcp_sdk.run import stop_on_request
 
-    jobs = _jobs(recordings, out)
+    lines = _json_lines(json_lines, recordings, as_json=as_json)
+    jobs = _jobs(recordings, out, lines)
     registry = Registry.load()
     link = load_link(link_file, overrides or [], registry)
     if link_mode is LinkMode.AUTO:
@@ -203,10 +219,14 @@ def receive(
     short = {"figures": figures, "report": report, "parquet": parquet, "mcap": mcap}
     asked = tuple(dict.fromkeys([*(name for name, given in short.items() if given), *(sinks or [])]))
     load_sinks(choose_sinks(registry, asked, positions=plan is not None))
+    if asked and out is None:
+        raise typer.BadParameter(f"{', '.join(asked)} goes into a folder: give -o OUT", param_hint="--out")
     here = dask is None and (not workers or len(jobs) == 1)
+    if lines is not None and not here:
+        raise typer.BadParameter("are given by this process only", param_hint="--json-lines")
     executor = make_executor(0 if here else workers or None, dask)
     worst, degraded, warned = 0, False, False
-    interrupted: list[Path] = []
+    interrupted: list[Path | None] = []
     pass_on = (lambda: None) if here else stop_workers
     with (
         stop_on_request(pass_on) as stopped,
@@ -220,6 +240,7 @@ def receive(
             attitude=attitude,
             clock_zero=zero,
             sinks=asked,
+            lines=lines,
             stopped=stopped if here else None,
         )
         outcomes = stack.enter_context(closing(executor.run(run, _until(stopped, jobs))))
@@ -234,10 +255,12 @@ def receive(
                     failed = {"status": "failed", "error": message, "recording": {"path": job.url}}
                     echo(json.dumps(failed))
                 continue
+            if lines is not None:
+                lines(json.dumps({"line": "summary"} | summary))
             if as_json:
                 echo(json.dumps(summary))
-            else:
-                show(summary, job.folder)
+            elif lines is None or not lines.gone or job.folder is not None:
+                show(summary, job.folder, stderr=lines is not None)
             if summary["status"] in ("failed", "degraded"):
                 complain(summary["error"])
             if summary["status"] == "failed":
@@ -248,15 +271,20 @@ def receive(
                 interrupted.append(job.folder)
         if stopped():
             folder = interrupted[0] if len(interrupted) == 1 else out
-            raise InterruptedRunError(f"interrupted; what was decoded until then is in {folder}")
+            where = "was printed" if folder is None else f"is in {folder}"
+            raise InterruptedRunError(f"interrupted; what was decoded until then {where}")
     raise typer.Exit(worst or DEGRADED * degraded or int(strict and warned))
 
 
 def _fitted(job: ReceiveJob, link: "Link", registry: "Registry") -> ReceiveJob:
     """A job with the link that fits its recording best; says which."""
-    from evlcp_sdk.io.open import open_source
+    from evlcp_sdk.io.open import STDIN, open_source
     from evlcp_sdk.study.diagnosis.diagnose import infer_link
 
+    if job.url == STDIN:
+        raise typer.BadParameter(
+            "standard input is read once, and links are tried on it first", param_hint="--link"
+        )
     with open_source(job.url, registry) as source:
         best = infer_link(source, link, registry)[0]
     name, due = Path(job.url).name, best.frames + best.rejected
@@ -337,6 +365,7 @@ def _decode_job(
     attitude: "Attitude | AttitudeLog | None",
     clock_zero: "datetime | None",
     sinks: tuple[str, ...],
+    lines: "_Lines | None",
     stopped: Callable[[], bool] | None,
 ) -> dict[str, Any]:
     """Decode a recording here, with a bar; or, without `stopped`, quietly in a worker."""
@@ -345,8 +374,12 @@ def _decode_job(
     known: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock_zero}
     decode = partial(receive_to_folder, job.url, job.folder, job.link or link, **known, sinks=sinks)
     if stopped is not None:
-        with bytes_bar(Path(job.url).name) as advance:
-            return decode(advance=advance, stopped=stopped)
+
+        def ended() -> bool:
+            return stopped() or (job.folder is None and lines is not None and lines.gone)
+
+        with bytes_bar(_named(job.url)) as advance:
+            return decode(lines=lines, advance=advance, stopped=ended)
     hush()
     # A terminal sends Ctrl-C to workers, too.
     with stop_on_request() as asked:
@@ -360,7 +393,57 @@ def _until(stopped: Callable[[], bool], jobs: Sequence[ReceiveJob]) -> Iterator[
         yield job
 
 
-def _jobs(recordings: Sequence[str], out: Path) -> list[ReceiveJob]:
+class _Lines:
+    """Prints lines as they come, until whoever reads them has left.
+
+    Attributes:
+        gone: The reader has left.
+    """
+
+    def __init__(self) -> None:
+        self.gone = False
+
+    def __call__(self, line: str) -> None:
+        if self.gone:
+            return
+        try:
+            echo(line)
+        except BrokenPipeError:
+            self.gone = True
+            # Or else the interpreter tries once more as it ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
+def _json_lines(where: str | None, recordings: Sequence[str], *, as_json: bool) -> _Lines | None:
+    from evlcp_sdk.io.open import STDIN
+
+    if where is None:
+        return None
+    for wrong, why in (
+        (where != STDIN, f"{where}: expected -, standard output"),
+        (as_json, "end with the summary: give one of --json and --json-lines"),
+        (len(recordings) > 1, "are those of one recording"),
+    ):
+        if wrong:
+            raise typer.BadParameter(why, param_hint="--json-lines")
+    return _Lines()
+
+
+def _named(url: str) -> str:
+    from evlcp_sdk.io.open import STDIN
+
+    return "standard input" if url == STDIN else Path(url).name
+
+
+def _jobs(recordings: Sequence[str], out: Path | None, lines: _Lines | None) -> list[ReceiveJob]:
+    from evlcp_sdk.io.open import STDIN
+
+    if STDIN in recordings and len(recordings) > 1:
+        raise typer.BadParameter("standard input is received by itself", param_hint="REC...")
+    if out is None:
+        if lines is None:
+            raise typer.BadParameter("give -o OUT, or --json-lines -", param_hint="--out")
+        return [ReceiveJob(recordings[0], None)]
     if len(recordings) == 1:
         return [ReceiveJob(recordings[0], out)]
     for url in recordings:
@@ -368,19 +451,18 @@ def _jobs(recordings: Sequence[str], out: Path) -> list[ReceiveJob]:
             raise typer.BadParameter(
                 f"{url}: gives no name of a folder in {out}; receive it by itself", param_hint="REC..."
             )
-    jobs = [ReceiveJob(url, out / _stem(url)) for url in recordings]
-    for job in jobs:
+    folders = [out / _stem(url) for url in recordings]
+    for folder in folders:
         # The user named OUT, and nobody what is in it.
-        if job.folder.is_symlink():
-            raise OutputError(f"{job.folder}: cannot be written: it is a link, which may lead out of {out}")
-    folders = [job.folder for job in jobs]
-    for job in jobs:
-        if folders.count(job.folder) > 1:
+        if folder.is_symlink():
+            raise OutputError(f"{folder}: cannot be written: it is a link, which may lead out of {out}")
+    for folder in folders:
+        if folders.count(folder) > 1:
             raise typer.BadParameter(
-                f"two recordings would both be written to {job.folder}; receive them one by one",
+                f"two recordings would both be written to {folder}; receive them one by one",
                 param_hint="REC...",
             )
-    return jobs
+    return [ReceiveJob(url, folder) for url, folder in zip(recordings, folders, strict=True)]
 
 
 def _stem(url: str) -> str:

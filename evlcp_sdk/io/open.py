@@ -1,5 +1,6 @@
 """Open and save recordings of any format, and whatever plugins bring."""
 
+import io
 import re
 from pathlib import Path
 from typing import Final
@@ -15,9 +16,12 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["open_source", "open_writer", "read_events", "write_events"]
+__all__ = ["STDIN", "open_source", "open_writer", "read_events", "write_events"]
 
 WRITABLE: Final = {".raw": "EVT3", ".npz": "NPZ", ".csv": "CSV", ".csv.gz": "CSV"}
+
+STDIN: Final = "-"
+"""What is opened as standard input."""
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 
@@ -30,7 +34,7 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
     name does no harm.
 
     Args:
-        url: A file, or what a plugin opens, e.g. `cam:0`.
+        url: A file, or what a plugin opens, e.g. `cam:0`; `-` for RAW words on standard input.
         registry: The plugins that are asked; None for all that are installed.
 
     Raises:
@@ -40,6 +44,8 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
     source = _ask_plugins(str(url), registry)
     if source is not None:
         return source
+    if str(url) == STDIN:
+        return _open_stdin()
     scheme = _SCHEME.match(str(url))
     if scheme is None or is_there(url):
         return _open_file(url)
@@ -70,6 +76,18 @@ def _ask_plugins(url: str, registry: Registry) -> EventSource | None:
             what = f"gave {type(source).__name__}, expected an EventSource"
             registry.leave_out(impl.plugin_name, f"evlcp_open_events({url!r}) {what}")
     return None
+
+
+def _open_stdin() -> EventSource:
+    """RAW words on standard input: a pipe, which is read once, or a file."""
+    name = "standard input"
+    try:
+        file = io.FileIO(0, closefd=False)
+    except OSError as error:
+        raise InputError(f"{name}: {error.strerror}") from error
+    if file.isatty():
+        raise InputError(f"{name} is a terminal, expected a recording: evlcp receive - < REC.raw")
+    return RawSource(name, file=file)
 
 
 def _open_file(path: Path | str) -> EventSource:

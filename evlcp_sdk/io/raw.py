@@ -1,6 +1,8 @@
 """Prophesee RAW files: a header of text lines, then the words of EVT2 or EVT3."""
 
+import io
 import os
+import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +27,8 @@ CODECS: Final = {codec.name: codec for codec in (EVT2, EVT3)}
 
 MAX_HEADER_BYTES = 1 << 16
 BUFFER_BYTES = 1 << 20
+PIPE_BYTES = 1 << 17
+"""Bytes of a pipe that are waited for first: a header, and words enough to tell their encoding."""
 WRITE_WORDS = 1 << 15
 MIN_READ, MAX_READ = 1 << 20, 1 << 27
 
@@ -181,40 +185,45 @@ def _describe(data: bytes) -> str:
 
 
 class RawSource(EventSource):
-    """A RAW file, read with one buffer of fixed size.
+    """A RAW file, read with one buffer of fixed size; of a pipe what is there is given out at once.
 
     Args:
         path: The file.
         buffer_bytes: Size of the buffer; half a megabyte at the least.
+        file: What is read if it is open already, without a buffer of its own; `path` is then what faults
+            call it.
 
     Raises:
         InputError: The file cannot be opened.
         RawFormatError: Its header is not one, or its words are of another encoding than the header says.
     """
 
-    def __init__(self, path: Path | str, buffer_bytes: int = BUFFER_BYTES) -> None:
+    def __init__(
+        self, path: Path | str, buffer_bytes: int = BUFFER_BYTES, file: io.FileIO | None = None
+    ) -> None:
         self._path = Path(path)
         self._buffer = np.empty(max(buffer_bytes, 2 * _words.LOOK_BYTES), np.uint8)
         self._position = 0  # byte offset in the file of the first byte not decoded
         self._start = self._end = 0  # the bytes of the buffer not decoded
         self._exhausted = False
         try:
-            self._file = self._path.open("rb", buffering=0)
+            self._file = self._path.open("rb", buffering=0) if file is None else file
+            status = os.fstat(self._file.fileno())
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}") from error
+        self._is_pipe = not stat.S_ISREG(status.st_mode)
         try:
-            self._fill()
+            self._fill(PIPE_BYTES)
             header = parse_header(self._buffer[: self._end].tobytes(), self._path)
-            size = os.fstat(self._file.fileno()).st_size
-            super().__init__(
-                self._path, header.codec.name, header.width, header.height, header.fields, size or None
-            )
+            size = None if self._is_pipe else status.st_size
+            super().__init__(self._path, header.codec.name, header.width, header.height, header.fields, size)
             self._codec = header.codec
             self._decoder = Decoder(header.codec, header.width, header.height)
             if not header.closed:
                 self._decoder.note(_words.HEADER_OPEN, header.size_bytes)
             self._start = self._position = self._data_start = header.size_bytes
-            self._fill()
+            if not self._is_pipe:
+                self._fill()
             self._probe()
         except BaseException:
             self._file.close()
@@ -235,13 +244,17 @@ class RawSource(EventSource):
                 f"{self.format}, as the header says",
             )
 
-    def _fill(self) -> None:
-        """Move what is left to the front of the buffer and read on until it is full or the file ends."""
+    def _fill(self, least: int = 1) -> None:
+        """Move what is left to the front of the buffer and read on until it is full or the file ends.
+
+        Of a pipe until `least` bytes more are there.
+        """
         left = self._end - self._start
         self._buffer[:left] = self._buffer[self._start : self._end]
         self._start, self._end = 0, left
         view = self._buffer.data
-        while not self._exhausted and self._end < len(self._buffer):
+        enough = min(left + least, len(self._buffer)) if self._is_pipe else len(self._buffer)
+        while not self._exhausted and self._end < enough:
             try:
                 size = self._file.readinto(view[self._end :])
             except (OSError, ValueError) as error:  # ValueError: the file is closed
@@ -279,19 +292,26 @@ class RawSource(EventSource):
         return self._join(min(max(words, MIN_READ), MAX_READ) + self._codec.burst)
 
     def _decode_into(self, out: Columns) -> bool:
-        """Decode until `out` is full, and return False, or to the end of the file, and return True."""
+        """Decode until `out` is full, and return False, or to the end of the file, and return True.
+
+        Of a pipe until there is something and more would have to be waited for.
+        """
         while out.events <= len(out.t_us) - self._codec.burst and out.triggers < len(out.channel):
             words = self._words()
             if not len(words):
                 if self._exhausted:
                     self._finish()
                     return True
+                if self._is_pipe and (out.events or out.triggers):
+                    return False
                 self._fill()
                 continue
             used = self._decoder.decode(words, self._position, out, self._exhausted)
             self._start += used
             self._position += used
             if not used or self._start % words.itemsize:
+                if not used and self._is_pipe and not self._exhausted and (out.events or out.triggers):
+                    return False
                 self._fill()
             if not self._decoder.has_time and self._position - self._data_start > TIMELESS_BYTES:
                 self._raise_timeless()

@@ -366,8 +366,7 @@ def _frames(counts: Mapping[str, int]) -> Iterator[Doubt]:
             " may drown it; `evlcp diagnose` says what blinks, and how fast",
         )
     rejected, frames = counts.get("frames_rejected", 0), counts.get("frames", 0)
-    read = counts.get("blocks_decoded", 0) + counts.get("blocks_combined", 0)
-    share = _REJECTED_BESIDE_READ_SHARE if read > counts.get("blocks_failed", 0) else _REJECTED_SHARE
+    share = _REJECTED_BESIDE_READ_SHARE if _read(counts) > counts.get("blocks_failed", 0) else _REJECTED_SHARE
     if rejected >= _FEW_FRAMES and rejected > share * (frames + rejected):
         yield Doubt(
             "frames-rejected",

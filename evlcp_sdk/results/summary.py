@@ -61,6 +61,7 @@ def summary_of(
         "recording": dict(recording),
         "processing": dict(processing),
         "counts": dict(counts),
+        "messages": tally.messages(),
         "messages_off": off,
         "warnings": [warning.to_dict() for warning in warnings],
         "notes": [note.to_dict() for note in notes],

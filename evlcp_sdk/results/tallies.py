@@ -10,10 +10,10 @@ from evlcp_sdk.place.learnt import Learnt
 from evlcp_sdk.place.navigator import Navigator, Placed
 from evlcp_sdk.place.refusals import REFUSALS
 from evlcp_sdk.place.trajectory import GNSS
-from evlcp_sdk.results.text import number_or_none
-from evlcp_sdk.values import Frame, Packet
+from evlcp_sdk.results.text import number_or_none, sigmas
+from evlcp_sdk.values import Fix, Frame, Packet, ReceivedMessage
 
-__all__ = ["PositionTally", "RunTally", "TransmitterTally"]
+__all__ = ["MOST_MESSAGES", "PositionTally", "RunTally", "TransmitterTally"]
 
 _CELL_M = 0.01
 _FARTHEST_M = 1_000.0
@@ -23,6 +23,12 @@ _MOST_TRANSMITTERS = 1024
 """Transmitters with figures of their own; of more, those not heard for longest are only counted."""
 
 _MOST_CLOCK_ERROR = 0.01
+
+MOST_MESSAGES = 20
+"""Messages that a summary shows, the newest."""
+
+_MOST_SAID = 2000
+"""Characters of a message that it shows; `packets.jsonl` has all."""
 
 
 @dataclass
@@ -174,6 +180,7 @@ class RunTally:
         self.transmitters: OrderedDict[int, TransmitterTally] = OrderedDict()
         self.others = self.others_frames = 0
         self.covered_us = 0.0
+        self._messages: OrderedDict[tuple[int, int, int], ReceivedMessage] = OrderedDict()
         self._packet_us = form.packet_chips * form.chip_us
         self._until_us = -math.inf
 
@@ -183,6 +190,14 @@ class RunTally:
         if tally is None:
             tally = self.transmitters[packet.transmitter] = TransmitterTally(packet.sent, self._packet_us)
         tally.add(packet)
+        for message in packet.messages:
+            said = message.message
+            key = (said.transmitter_id, said.kind, said.sequence)
+            # A beacon's trust may change later.
+            self._messages.pop(key, None)
+            self._messages[key] = message
+            if len(self._messages) > MOST_MESSAGES:
+                self._messages.popitem(last=False)
         end_us = packet.t_us + self._packet_us
         self.covered_us += min(max(end_us - max(packet.t_us, self._until_us), 0.0), self._packet_us)
         self._until_us = end_us
@@ -206,6 +221,20 @@ class RunTally:
             if frames
         )
 
+    def messages(self) -> list[dict[str, Any]]:
+        """The newest messages as JSON values: what each says, who sent it, and how far it may be believed."""
+        return [
+            {
+                "kind": one.kind.name,
+                "transmitter": one.transmitter,
+                "transmitter_id": one.message.transmitter_id,
+                "t_us": round(one.t_us, 2),
+                "trust": one.trust,
+                "said": one.said(_MOST_SAID),
+            }
+            for one in self._messages.values()
+        ]
+
     def to_list(self) -> list[dict[str, Any]]:
         """The figures of each transmitter as JSON values."""
         return [{"transmitter": n} | tally.to_dict() for n, tally in sorted(self.transmitters.items())]
@@ -222,6 +251,7 @@ class PositionTally:
     alarms: Counter[str] = field(default_factory=Counter)
     excluded: Counter[str] = field(default_factory=Counter)
     suspects: Counter[str] = field(default_factory=Counter)
+    last: Fix | None = None
 
     def add(self, placed: Placed) -> None:
         """Count a fix."""
@@ -234,6 +264,7 @@ class PositionTally:
         if placed.fix.source == GNSS:
             return
         self.given += 1
+        self.last = placed.fix
         self.verified += placed.fix.verified
         self.left_out += placed.filtered.left_out
 
@@ -244,6 +275,7 @@ class PositionTally:
         return {
             "fixes": self.given,
             "fixes_verified": self.verified,
+            "last": None if self.last is None else _last(self.last),
             "refused": {kind: self.refused[kind] for kind in REFUSALS if self.refused[kind]},
             "alarms": dict(sorted(self.alarms.items())),
             "excluded": dict(sorted(self.excluded.items())),
@@ -258,6 +290,17 @@ class PositionTally:
             "bars_exact": [n for n, s in positioner.stands_at.items() if s.position_sigma_m is None],
             "bars": {str(n): s.transmitter_id for n, s in positioner.stands_at.items()},
         }
+
+
+def _last(fix: Fix) -> dict[str, Any]:
+    return {
+        "t_us": round(fix.t_us, 1),
+        "latitude_deg": round(fix.latitude_deg, 10),
+        "longitude_deg": round(fix.longitude_deg, 10),
+        "height_m": round(fix.height_m, 4),
+        "sigma_m": [round(value, 4) for value in sigmas(fix.covariance_m2)],
+        "heading_deg": number_or_none(fix.heading_deg, 4),
+    }
 
 
 def _learnt_row(one: Learnt) -> dict[str, Any]:

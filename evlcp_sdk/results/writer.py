@@ -1,7 +1,7 @@
 """One run's result: packets in; tallies, positions and files out."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from datetime import datetime
 from functools import partial
@@ -15,6 +15,8 @@ from evlcp_sdk.plugin.records import choose_sinks, installed_sinks
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.doubts import Seen, other_codewords
 from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.frames_csv import is_filtered
+from evlcp_sdk.results.lines import JsonLines
 from evlcp_sdk.results.readout import ReadoutTally
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.sinks import Sinks, load_sinks
@@ -32,14 +34,15 @@ class ResultWriter:
     In the context, sinks that have hooks are called by the registry: make the receiver in it.
 
     Args:
-        folder: Made if need be; an earlier result in it is replaced by `finish`.
+        folder: Made if need be; an earlier result in it is replaced by `finish`. None: nothing is written.
         link: The configuration that the receiver runs with.
         registry: Where sinks are found; None for all that are installed.
         name: Name of the recording, for titles.
         plan: What positions are computed from; None for none.
         attitude: What is known of the camera's attitude, for positions; None for nothing.
         clock_zero: UTC of the camera clock's 0; None if it is not known.
-        sinks: Output formats beside the default ones, by name.
+        sinks: Output formats beside the default ones, by name; none without a folder.
+        lines: Takes frames, messages and fixes as lines of JSON as they come; None for nobody.
 
     Raises:
         OutputError: The folder cannot be written.
@@ -49,7 +52,7 @@ class ResultWriter:
 
     def __init__(
         self,
-        folder: Path,
+        folder: Path | None,
         link: Link,
         registry: Registry | None = None,
         *,
@@ -58,19 +61,24 @@ class ResultWriter:
         attitude: Attitude | AttitudeLog | None = None,
         clock_zero: datetime | None = None,
         sinks: Sequence[str] = (),
+        lines: Callable[[str], None] | None = None,
     ) -> None:
         self._registry = Registry.load() if registry is None else registry
         self._link = link
         self._tally, self._positions = RunTally(link.packet), PositionTally()
         self._readout = ReadoutTally()
         self._navigator = Navigator(link, plan, attitude) if plan is not None else None
-        classes = load_sinks(choose_sinks(self._registry, sinks, positions=plan is not None))
-        files = [file for s in installed_sinks(self._registry).values() for file in s.record.files]
+        run = Run(name, link, plan, self._navigator, clock_zero)
+        self._lines = None if lines is None else JsonLines(lines, filtered=is_filtered(run))
+        self._folder: ResultFolder | None = None
+        self._sinks: Sinks | None = None
         with ExitStack() as stack:
-            self._folder = stack.enter_context(ResultFolder(folder, files))
-            run = Run(name, link, plan, self._navigator, clock_zero)
-            self._sinks = Sinks(classes, self._folder, run)
-            stack.enter_context(self._registry.joined(*self._sinks.all))
+            if folder is not None:
+                classes = load_sinks(choose_sinks(self._registry, sinks, positions=plan is not None))
+                files = [file for s in installed_sinks(self._registry).values() for file in s.record.files]
+                self._folder = stack.enter_context(ResultFolder(folder, files))
+                self._sinks = Sinks(classes, self._folder, run)
+                stack.enter_context(self._registry.joined(*self._sinks.all))
             self._stack = stack.pop_all()
 
     def events(self, events: Events) -> None:
@@ -78,7 +86,8 @@ class ResultWriter:
         self._readout.add(events)
         if self._navigator is not None and len(events):
             self._navigator.seen(int(events.t_us[0]), int(events.t_us[-1]))
-        self._sinks.events(events)
+        if self._sinks is not None:
+            self._sinks.events(events)
 
     def write(self, packets: Iterable[Packet]) -> None:
         """Take the receiver's next packets.
@@ -89,7 +98,10 @@ class ResultWriter:
         """
         for packet in packets:
             self._tally.add(packet)
-            self._sinks.packet(packet)
+            if self._sinks is not None:
+                self._sinks.packet(packet)
+            if self._lines is not None:
+                self._lines.packet(packet)
             if self._navigator is not None:
                 self._place(self._navigator.feed([packet]))
 
@@ -125,7 +137,8 @@ class ResultWriter:
         if self._navigator is not None:
             fixes, settled = self._navigator.close()
             self._place(fixes)
-            self._sinks.settle(settled)
+            if self._sinks is not None:
+                self._sinks.settle(settled)
             positions = self._positions.to_dict(self._navigator)
         first_us, last_us = recording.get("first_us"), recording.get("last_us")
         seen = Seen(
@@ -148,18 +161,23 @@ class ResultWriter:
             seen=seen,
             error=error,
             positions=positions,
-            sinks=self._sinks.finish(),
+            sinks={} if self._sinks is None else self._sinks.finish(),
         )
-        self._sinks.conclude(table)
-        table["files"] = self._folder.digests()
-        write_summary(table, self._folder)
-        self._folder.finish()
+        table["files"] = {}
+        if self._sinks is not None and self._folder is not None:
+            self._sinks.conclude(table)
+            table["files"] = self._folder.digests()
+            write_summary(table, self._folder)
+            self._folder.finish()
         return table
 
     def _place(self, fixes: Iterable[Placed]) -> None:
         for placed in fixes:
             self._positions.add(placed)
-            self._sinks.placed(placed)
+            if self._sinks is not None:
+                self._sinks.placed(placed)
+            if self._lines is not None:
+                self._lines.fix(placed.fix)
 
     def __enter__(self) -> Self:
         return self

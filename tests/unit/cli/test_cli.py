@@ -461,6 +461,56 @@ def test_receive_writes_positions(evlcp: Evlcp, street: Path, tmp_path: Path) ->
             assert abs(off) * metres < 0.15
 
 
+def test_what_is_found_comes_as_lines(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
+    angles = ("--pitch-deg", "4", "--roll-deg", "0", "--sites", street / "site.toml")
+    done = evlcp("receive", street / "rec.raw", "-o", tmp_path, *angles, "--json-lines", "-")
+    assert done.code == 0
+    lines = [json.loads(line) for line in done.out.splitlines()]
+    kinds = [one.pop("line") for one in lines]
+    with (tmp_path / "frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    frames = [one for one, kind in zip(lines, kinds, strict=True) if kind == "frame"]
+    assert [one["t_us"] for one in frames] == [float(row["t_us"]) for row in rows]
+    assert [one["distance_m"] for one in frames] == [float(row["distance_m"]) for row in rows]
+    said = [json.loads(line) for line in (tmp_path / "packets.jsonl").read_text().splitlines()]
+    messages = [one for one, kind in zip(lines, kinds, strict=True) if kind == "message"]
+    assert messages == [one for one in said if one["kind"] != "packet"] != []
+    with (tmp_path / "fixes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    fixes = [one for one, kind in zip(lines, kinds, strict=True) if kind == "fix"]
+    assert [one["refusal"] for one in fixes] == [row["refusal"] for row in rows]
+    # A packet's frames are told before the next packet's, and the summary last.
+    assert kinds[-1] == "summary"
+    assert kinds.index("message") < len(kinds) - 1 - kinds[::-1].index("frame")
+    assert lines[-1] == summary_of(tmp_path)
+    # People read what was received, and where the camera was in the end.
+    told = summary_of(tmp_path)
+    assert [one["said"].startswith("beacon at 35.") for one in told["messages"]] == [True, True]
+    assert told["messages"][0]["said"] in done.err
+    last = [row for row in rows if not row["refusal"]][-1]
+    assert told["positions"]["last"]["t_us"] == float(last["t_us"])
+    assert f"the last one {float(last['latitude_deg']):.7f}, " in done.err
+
+
+def test_lines_need_no_folder(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:
+    done = evlcp("receive", demo_raw, "--json-lines", "-")
+    assert done.code == 0
+    assert json.loads(done.out.splitlines()[-1])["files"] == {}
+    assert "written:" not in done.err
+    for options, says in (
+        ((demo_raw,), "give -o OUT, or --json-lines -"),
+        ((demo_raw, "--json-lines", "x.jsonl"), "expected -, standard output"),
+        ((demo_raw, "--json-lines", "-", "--figures"), "figures goes into a folder"),
+        ((demo_raw, demo_raw, "--json-lines", "-"), "are those of one recording"),
+        ((demo_raw, "--json", "--json-lines", "-"), "give one of --json and --json-lines"),
+        ((demo_raw, "-", "-o", tmp_path), "standard input is received by itself"),
+        (("-", "-o", tmp_path, "--link", "auto"), "standard input is read once"),
+    ):
+        done = evlcp("receive", *options)
+        assert done.code == 2
+        assert says in " ".join(done.err.replace("│", " ").split())
+
+
 def test_an_attitude_alone_corrects_distances(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
     """Two upright bars before a camera that looks up by 4 degrees, and no sites."""
     truth = json.loads((street / "rec.truth.json").read_text())

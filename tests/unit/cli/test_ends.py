@@ -1,5 +1,6 @@
 """How the command line ends when it is not the command that decides: stdout, Ctrl-C, faults of ours."""
 
+import json
 import os
 import signal
 import subprocess
@@ -36,6 +37,16 @@ def test_a_reader_who_leaves_is_no_fault() -> None:
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     assert done.returncode in (0, 1)
+
+
+def test_a_reader_of_lines_who_leaves_ends_the_run(demo_raw: Path) -> None:
+    """What comes in by a pipe goes out by another, whose reader takes one line."""
+    command = f"cat {demo_raw} | {sys.executable} -c '{MAIN}' receive - --json-lines - | head -n 1"
+    done = subprocess.run(
+        ["bash", "-c", f"{command}; exit ${{PIPESTATUS[1]}}"], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["line"] == "frame"
 
 
 def test_ctrl_c_during_imports_is_one_line(demo_raw: Path) -> None:

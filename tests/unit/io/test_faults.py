@@ -1,13 +1,18 @@
 """Bad RAW input: each fault is an error that says where, what and what else, or a counted loss."""
 
+import io
+import json
 import os
+import pty
+import subprocess
+import sys
 import threading
 
 import numpy as np
 import pytest
 
 from evlcp_sdk.errors import EvlcpError, InputError, RawFormatError, StreamError
-from evlcp_sdk.io import RawWriter, open_source, write_events
+from evlcp_sdk.io import RawSource, RawWriter, open_source, write_events
 from evlcp_sdk.io.raw import CODECS, format_header, parse_header
 from evlcp_sdk.values import Events
 
@@ -264,6 +269,57 @@ def test_pipe_is_read_without_its_size(tmp_path):
         assert source.size_bytes is None
         assert len(source.read()[0]) == 100_000
     writer.join()
+
+
+@pytest.mark.parametrize("bytes_at_a_time", [1000, 4099, 70_001])
+def test_a_pipe_gives_what_is_there(bytes_at_a_time):
+    """Words in pieces of any size are read as if they came at once, and given before the next ones come."""
+    good = np.array(GOOD * 60_000, "<u2")
+    # Bytes that are missing make the reader look ahead.
+    data = HEADER + good[:200_000].tobytes() + good[200_000:].tobytes()[101:]
+    with RawSource("whole", file=_piped(data, len(data))) as source:
+        whole, _ = source.read()
+        losses = source.losses
+    seen = threading.Event()
+    with RawSource("pieces", file=_piped(data, bytes_at_a_time, seen)) as source:
+        pieces = []
+        for events in source.chunks():
+            pieces.append(events)
+            seen.set()
+    assert len(pieces) > 2
+    together = Events.concat(pieces)
+    for column in ("t_us", "x", "y", "p"):
+        assert (getattr(together, column) == getattr(whole, column)).all()
+    assert source.losses == losses
+
+
+def _piped(data, at_a_time, seen=None):
+    """The end of a pipe into which a thread writes; behind the middle only when the first half is `seen`."""
+    end, start = os.pipe()
+
+    def write():
+        with os.fdopen(start, "wb", buffering=0) as file:
+            for at in range(0, len(data), at_a_time):
+                if seen is not None and at > len(data) // 2:
+                    assert seen.wait(20)
+                file.write(data[at : at + at_a_time])
+
+    threading.Thread(target=write, daemon=True).start()
+    return io.FileIO(end)
+
+
+def test_standard_input_is_a_recording(tmp_path):
+    path = raw(tmp_path / "a.raw", GOOD * 100)
+    command = [sys.executable, "-c", "from evlcp_sdk.cli.main import main; main()", "info", "-", "--json"]
+    with path.open("rb") as file:
+        told = json.loads(subprocess.run(command, stdin=file, capture_output=True, check=True).stdout)
+    assert (told["path"], told["counts"]["events"]) == ("standard input", 100)
+    inside, outside = pty.openpty()
+    done = subprocess.run(command, stdin=outside, capture_output=True, text=True, check=False)
+    os.close(inside)
+    os.close(outside)
+    assert done.returncode == 3
+    assert "standard input is a terminal, expected a recording" in done.stderr
 
 
 def test_file_that_cannot_be_written(tmp_path):
