@@ -1,12 +1,11 @@
 """The use cases: what a program does with a recording, and what the commands parse and print."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 from datetime import datetime
 from html import escape
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -35,7 +34,7 @@ from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.signals import ENDING, heard_by
+from evlcp_sdk.signals import Stopped, stop_on_request
 from evlcp_sdk.study.diagnosis.diagnose import Diagnosis, diagnosis_of
 from evlcp_sdk.values import Frame, Packet
 
@@ -61,9 +60,6 @@ Advance = Callable[[int, int | None], None]
 
 DEGRADED_SHARE, DEGRADED_LEAST = 0.01, 100
 """Share, and number, of events and words dropped from which on a result is `degraded`."""
-
-Stopped = Callable[[], bool]
-"""Asked after each piece whether to end early."""
 
 
 def receive(
@@ -329,27 +325,6 @@ def _much_dropped(source: EventSource, receiver: Receiver) -> str | None:
     if dropped < DEGRADED_LEAST or share <= DEGRADED_SHARE:
         return None
     return f"{dropped} events or words, {share:.1%}, were dropped: losses and counts in summary.json say why"
-
-
-@contextmanager
-def stop_on_request(pass_on: Callable[[], None] = lambda: None) -> Iterator[Stopped]:
-    """Let Ctrl-C, SIGTERM or SIGHUP end a run after the piece in hand; a second one ends it at once.
-
-    Gives what `receive_to_folder` takes as `stopped`. Only a main thread can listen.
-
-    Args:
-        pass_on: Called at the first one, to tell others.
-    """
-    asked = False
-
-    def ask(_number: int, _frame: FrameType | None) -> None:
-        nonlocal asked
-        asked = True
-        restore()
-        pass_on()
-
-    with heard_by(ask, *ENDING) as restore:
-        yield lambda: asked
 
 
 def diagnose(

@@ -6,12 +6,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["ENDING", "heard_by", "interrupt"]
+__all__ = ["ENDING", "Stopped", "heard_by", "interrupt", "stop_on_request"]
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """All are answered in the same way."""
 
 Handler = Callable[[int, FrameType | None], None]
+
+Stopped = Callable[[], bool]
+"""Asked after each piece of work whether to end early."""
 
 
 @contextmanager
@@ -35,6 +38,27 @@ def heard_by(handler: Handler, *numbers: signal.Signals) -> Iterator[Callable[[]
         yield restore
     finally:
         restore()
+
+
+@contextmanager
+def stop_on_request(pass_on: Callable[[], None] = lambda: None) -> Iterator[Stopped]:
+    """Let Ctrl-C, SIGTERM or SIGHUP end a run after the piece in hand; a second one ends it at once.
+
+    Gives what `receive_to_folder` takes as `stopped`. Only a main thread can listen.
+
+    Args:
+        pass_on: Called at the first one, to tell others.
+    """
+    asked = False
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        restore()
+        pass_on()
+
+    with heard_by(ask, *ENDING) as restore:
+        yield lambda: asked
 
 
 def interrupt(_number: int, _frame: FrameType | None) -> None:

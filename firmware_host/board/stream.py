@@ -3,6 +3,7 @@
 from bisect import insort
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from itertools import takewhile
 from types import TracebackType
 from typing import Self
 
@@ -114,28 +115,34 @@ class Stream:
         begins_s = self._begun_s + (self.sent - self.begun + 1) * self.packet_s
         return max(0.0, begins_s - self._session.transport.now())
 
-    def play(self, make: Callable[[int], Iterable[ArrayLike] | None], every_s: float) -> int:
+    def play(
+        self,
+        make: Callable[[int], Iterable[ArrayLike] | None],
+        every_s: float,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> int:
         """Send messages that change: each round and round until it is time for the next; how many there were.
 
         Args:
             make: The packets of the message of a number, from 0 on, for now plus `delay_s`; None ends it. An
                 iterator that makes each when it is taken holds nothing up.
             every_s: Time between two messages, s; one whose packets take longer is sent once.
+            stopped: Asked before each packet whether to end early.
 
         Raises:
             BoardError: The line or the board fails.
         """
         line = self._session.transport
         due_s, number = line.now(), 0
-        while (packets := make(number)) is not None:
+        while not stopped() and (packets := make(number)) is not None:
             number += 1
             due_s = max(due_s + every_s, line.now())
             sent = []
-            for packet in packets:
+            for packet in takewhile(lambda _: not stopped(), packets):
                 sent.append(packet)
                 self.send(packet)
-            while sent and line.now() < due_s:
-                for packet in sent:
+            while sent and line.now() < due_s and not stopped():
+                for packet in takewhile(lambda _: not stopped(), sent):
                     self.send(packet)
         return number
 

@@ -112,6 +112,7 @@ def message(
     from evlcp_sdk.link.compose import each_packet, messages_of, packets_of, utf8
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.signals import stop_on_request
     from firmware_host.board.bank import bank_of
     from firmware_host.board.board import Settings, provision
     from firmware_host.board.sites import site_that_sends
@@ -184,8 +185,8 @@ def message(
                     return None
                 return each_packet(made(at_s, number), coder, repeat)
 
-            with suppress(KeyboardInterrupt), stream:
-                stream.play(next_one, every)
+            with suppress(KeyboardInterrupt), stop_on_request() as asked, stream:
+                stream.play(next_one, every, asked)
         say(said_of(stream), table_of(stream), as_json)
         return
     messages = made(begun_s, None)

@@ -62,8 +62,11 @@ def stream(
 
     For example: [bold]date +%T | evlcp board --port native: stream[/]
     """
+    from itertools import takewhile
+
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.signals import stop_on_request
 
     link = load_link(link_file, overrides or [], Registry.load())
     # before the board waits for packets
@@ -73,12 +76,14 @@ def stream(
     packets = _packets(file, link, coder, transmitter_id, repeat)
     with open_board(context) as board:
         started = board.stream(link, ahead)
-        with contextlib.suppress(KeyboardInterrupt), started:
+        with contextlib.suppress(KeyboardInterrupt), stop_on_request() as asked, started:
             for some in packets:
+                if asked():
+                    break
                 if some is None:
                     started.wait(_LOOK_S)
                     continue
-                for packet in some:
+                for packet in takewhile(lambda _: not asked(), some):
                     started.send(packet)
     say(said_of(started), table_of(started), as_json)
 

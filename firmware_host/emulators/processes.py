@@ -2,12 +2,14 @@
 
 import contextlib
 import importlib.util
+import os
 import shutil
 import socket
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from evlcp_sdk.errors import InputError
@@ -18,6 +20,7 @@ from firmware_host.ports.transport import SocketTransport
 
 __all__ = [
     "ProcessTransport",
+    "bound",
     "native_command",
     "qemu_command",
     "rom_command",
@@ -26,6 +29,23 @@ __all__ = [
     "stm32_command",
     "wait_for",
 ]
+
+
+_DIES_WITH_PARENT = (
+    "import ctypes, os, signal, sys;"
+    " ctypes.CDLL(None).prctl(1, signal.SIGTERM);"  # PR_SET_PDEATHSIG, which holds over exec
+    " os.getppid() == int(sys.argv[1]) and os.execvp(sys.argv[2], sys.argv[2:])"
+)
+
+
+def bound(command: Sequence[str]) -> list[str]:
+    """A command line that ends with the process that starts it, however that ends; on Linux.
+
+    The command takes the place of the process that is started, so its number stays.
+    """
+    if sys.platform != "linux":
+        return list(command)
+    return [sys.executable, "-IS", "-c", _DIES_WITH_PARENT, str(os.getpid()), *command]
 
 
 class ProcessTransport(SocketTransport):
@@ -106,7 +126,7 @@ def _check_flash(path: Path) -> None:
 
 
 def qemu_command(listen: str, leds: Path | None = None, wait: bool = False) -> list[str]:
-    """Command line of QEMU with the board's ARM image.
+    """Command line of QEMU with the board's ARM image; it ends with the process that starts it.
 
     Args:
         listen: `unix:PATH` or `tcp:HOST:PORT`; QEMU drops bytes on a pseudo-terminal.
@@ -123,11 +143,13 @@ def qemu_command(listen: str, leds: Path | None = None, wait: bool = False) -> l
     # A comma in a name stands doubled in QEMU's options.
     serial = f"{listen.replace(',', ',,')},server=on,wait={'on' if wait else 'off'}"
     record = "null" if leds is None else f"file:{str(leds).replace(',', ',,')}"
-    return [
-        *("qemu-system-arm", "-M", "mps2-an385", "-kernel", str(build.arm_image("mps2-an385"))),
-        *("-icount", "shift=3,sleep=off", "-display", "none", "-monitor", "none", "-nodefaults"),
-        *("-serial", serial, "-serial", record),
-    ]
+    return bound(
+        [
+            *("qemu-system-arm", "-M", "mps2-an385", "-kernel", str(build.arm_image("mps2-an385"))),
+            *("-icount", "shift=3,sleep=off", "-display", "none", "-monitor", "none", "-nodefaults"),
+            *("-serial", serial, "-serial", record),
+        ]
+    )
 
 
 def stm32_command(listen: str, leds: Path | None = None) -> list[str]:

@@ -24,7 +24,7 @@ from firmware_host.board.bank import Bank, random_symbols
 from firmware_host.board.board import Board
 from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import RECORD, LedRecord
-from firmware_host.emulators.processes import native_command, wait_for
+from firmware_host.emulators.processes import bound, native_command, wait_for
 from firmware_host.errors import LineError
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -54,7 +54,7 @@ class Emulated:
     """`evlcp board emulate` in the background."""
 
     def __init__(self, *options: object) -> None:
-        command = [*EVLCP, "board", "emulate", *map(str, options)]
+        command = bound([*EVLCP, "board", "emulate", *map(str, options)])
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL)
         assert self.process.stdout is not None
         self.said = self.process.stdout.readline()

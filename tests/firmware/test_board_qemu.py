@@ -18,7 +18,7 @@ from firmware_host.board.bank import Bank, random_symbols
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import LedRecord
-from firmware_host.emulators.processes import start_qemu
+from firmware_host.emulators.processes import bound, start_qemu
 from firmware_host.errors import RefusedError
 from firmware_host.ports.transport import SocketTransport
 from firmware_host.protocol.requests import BoardFault, State, StatusReply, StatusRequest
@@ -163,13 +163,15 @@ class Netduino:
     def __init__(self, folder: Path) -> None:
         self.log = folder / "unimplemented.log"
         self.process = subprocess.Popen(
-            [
-                *("qemu-system-arm", "-M", "netduinoplus2", "-display", "none", "-nodefaults"),
-                *("-kernel", str(build.arm_image("stm32f405-netduinoplus2"))),
-                *("-serial", f"unix:{folder / 'uart'},server=on,wait=off"),
-                *("-monitor", f"unix:{folder / 'monitor'},server=on,wait=off"),
-                *("-d", "unimp,guest_errors", "-D", str(self.log)),
-            ],
+            bound(
+                [
+                    *("qemu-system-arm", "-M", "netduinoplus2", "-display", "none", "-nodefaults"),
+                    *("-kernel", str(build.arm_image("stm32f405-netduinoplus2"))),
+                    *("-serial", f"unix:{folder / 'uart'},server=on,wait=off"),
+                    *("-monitor", f"unix:{folder / 'monitor'},server=on,wait=off"),
+                    *("-d", "unimp,guest_errors", "-D", str(self.log)),
+                ]
+            ),
             stdin=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
