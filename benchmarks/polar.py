@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import ndtri
 
+from evlcp_sdk.results.figures import TRANSMITTER_COLOURS, plain, titled
 from evlcp_sdk.study.intervals import proportion_interval
 
 AIR_S = 346 * 100e-6
@@ -243,20 +244,25 @@ def draw(found: dict[tuple[int, bool], list[tuple[float, int, int]]], path: Path
     """The curves."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.2, 3.6), layout="constrained")
+    figure = Figure(figsize=(9, 4.4), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
-    for ax, soft, title in zip(axes, (True, False), ("AWGN, soft input", "BSC, hard input"), strict=True):
-        for n, marker in ((256, "o"), (640, "s"), (960, "^")):
+    for ax, soft, title in zip(axes, (True, False), ("soft input, AWGN", "hard input, BSC"), strict=True):
+        for (n, marker), colour in zip(
+            ((256, "o"), (640, "s"), (960, "^")), TRANSMITTER_COLOURS, strict=False
+        ):
             points = [p for p in found[n, soft] if p[1]]
             x = [p[0] for p in points]
             y = np.array([lost / done for _, lost, done in points])
             bars = np.array([proportion_interval(lost, done) for _, lost, done in points]).T
-            ax.errorbar(x, y, np.abs(bars - y), fmt=f"{marker}-", ms=4, lw=1, capsize=2, label=f"n = {n}")
-        ax.set(yscale="log", xlabel="bit error rate of hard decisions", title=title)
-        ax.grid(alpha=0.3)
-        ax.legend(fontsize=8)
-    axes[0].set_ylabel("frame error rate")
-    figure.savefig(path, dpi=120)
+            style = {"ms": 5, "lw": 1.2, "capsize": 2, "color": colour, "label": f"n = {n}"}
+            ax.errorbar(x, y, np.abs(bars - y), fmt=f"{marker}-", **style)
+        ax.set(yscale="log", xlabel="bit error rate of hard decisions")
+        titled(ax, title)
+        plain(ax)
+    axes[0].set_ylabel("frame error rate, with 95 % interval")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower left", frameon=False, fontsize=9, ncols=3)
+    figure.savefig(path, dpi=150)
 
 
 SECTIONS = ("curves", "variants", "orders", "ending", "rates", "undetected")

@@ -8,6 +8,7 @@ import colorsys
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import fill
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -15,6 +16,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from evlcp_sdk.place.navigator import Settled
@@ -34,6 +36,9 @@ __all__ = [
     "draw_presence",
     "draw_regions",
     "draw_track",
+    "off_neighbours",
+    "plain",
+    "titled",
 ]
 
 TRANSMITTER_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -222,24 +227,37 @@ def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]],
     plan, close, height = (parts[name] for name in ("plan", "close", "height"))
     spread, protected = parts["spread"], parts["protected"]
     points = list(probe.points)
+    middle = np.mean([enu[:2] for enu in bars_enu_m.values()], axis=0) if bars_enu_m else np.zeros(2)
     for number, enu in sorted(bars_enu_m.items()):
         plan.plot(enu[0], enu[1], "s", ms=7, color=transmitter_colour(number))
+        # Away from the other bars, so that no name is on another's mark.
+        left, below = enu[0] < middle[0], enu[1] < middle[1]
         plan.annotate(
-            f"bar {number}", (enu[0], enu[1]), xytext=(6, 4), textcoords="offset points", fontsize=9
+            f"bar {number}",
+            (enu[0], enu[1]),
+            xytext=(-7 if left else 7, -7 if below else 7),
+            textcoords="offset points",
+            ha="right" if left else "left",
+            va="top" if below else "bottom",
+            fontsize=9,
         )
     if points:
         fixed = np.array([point.fix.enu_m for point in points])
         live = np.array([point.filtered.enu_m for point in points])
         smooth = np.array([point.smoothed.enu_m for point in points])
         t_s = np.array([point.fix.t_us for point in points]) * 1e-6
+        chosen = [point.fix for point in points[:: max(1, len(points) // _MOST_ELLIPSES)]]
+        times = _magnified([fix.covariance_m2 for fix in chosen], fixed)
+        said = "95 % ellipse" + (f",\n{times} times as large" if times > 1 else "")
+        for fix in chosen:
+            line = ellipse(fix.enu_m[:2], fix.covariance_m2[:2, :2] * times**2, 0.95)
+            close.add_patch(Polygon(line, closed=True, fc=_ELLIPSE, ec="#8fb4cc", lw=0.8, alpha=0.7))
+        close.plot([], [], "o", ms=9, mfc=_ELLIPSE, mec="#8fb4cc", label=said)
         for axis in (plan, close):
-            for point in points[:: max(1, len(points) // _MOST_ELLIPSES)]:
-                line = ellipse(point.fix.enu_m[:2], point.fix.covariance_m2[:2, :2], 0.95)
-                axis.add_patch(Polygon(line, closed=True, fill=False, ec="#999999", lw=0.8))
-            axis.plot(fixed[:, 0], fixed[:, 1], ".", ms=4, color=_INK, label="fix, with 95 % ellipse")
+            axis.plot(fixed[:, 0], fixed[:, 1], ".", ms=5, color=_INK, label="fix", zorder=3)
         for way, colour, label in ((live, "#56b4e9", "filtered"), (smooth, "#d55e00", "smoothed")):
             for axis in (plan, close):
-                axis.plot(way[:, 0], way[:, 1], "-", lw=1.4, color=colour, label=label)
+                axis.plot(way[:, 0], way[:, 1], "-", lw=1.2, color=colour, label=label)
             height.plot(t_s, way[:, 2], "-", lw=1.4, color=colour)
         height.plot(t_s, fixed[:, 2], ".", ms=3, color=_INK)
         for i, name in enumerate(("east", "north", "up")):
@@ -256,23 +274,37 @@ def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]],
             protected.plot(t_s, shown, style, lw=1.4, color=_INK, label=_LEVELS[name])
         alarmed = [t for t, point in zip(t_s, points, strict=True) if point.fix.excluded]
         protected.plot(alarmed, np.zeros(len(alarmed)), "x", ms=5, color="#d55e00", label="a part left out")
-        protected.legend(frameon=False, fontsize=9, ncols=3)
-        close.legend(frameon=False, fontsize=9)
-        spread.legend(frameon=False, fontsize=9, ncols=3)
+        for axis in (spread, protected):
+            # Beside the lines, not on them.
+            axis.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        close.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
     for axis in (plan, close):
         axis.set(xlabel="east, m", ylabel="north, m")
         axis.set_aspect("equal", adjustable="datalim")
-    _title(plan, "bars and track")
-    _title(close, "the track alone")
+    titled(plan, "bars and track")
+    titled(close, "the track alone")
     height.set(ylabel="up, m")
     spread.set(ylabel="sigma, m", ylim=(0, None))
     protected.set(ylabel="protection, m", xlabel="camera clock, s", ylim=(0, None))
     for axis in (plan, close, height, spread, protected):
-        _plain(axis)
-        axis.grid(color="#e6e6e6", lw=0.8)
-        axis.set_axisbelow(True)
+        plain(axis)
     figure.suptitle(f"{title}: {len(points)} positions shown", fontsize=11, color=_INK)
     return figure
+
+
+def _magnified(covariances_m2: Sequence[NDArray[np.float64]], places: NDArray[np.float64]) -> int:
+    """How many times as large ellipses are to be drawn to be seen beside a track of places."""
+    extent_m = float(np.ptp(places[:, :2], axis=0).max())
+    longest_m2 = [np.linalg.eigvalsh(covariance[:2, :2]).max() for covariance in covariances_m2]
+    # 95 % lie within 2.45 sigmas; a diameter is twice that.
+    long_m = 4.9 * math.sqrt(float(np.median(longest_m2)))
+    seen = [times for times in (1, 2, 5, 10, 20, 50) if times * long_m <= _ELLIPSE_SHARE * extent_m]
+    return max(seen, default=1)
+
+
+_ELLIPSE = "#cfe5f3"
+_ELLIPSE_SHARE = 0.15
+"""Length of an ellipse beside the extent of its track, at most, where it is drawn larger than it is."""
 
 
 def transmitter_colour(number: int) -> str:
@@ -307,7 +339,7 @@ def draw_regions(probe: FigureProbe, title: str) -> Figure:
         many += f", {len(probe.regions)} shown"
     if zooms:
         many += " (beside: dotted at first, solid at last)"
-    _title(whole, f"{title}: {probe.image.sum():,} events, {many}")
+    titled(whole, f"{title}: {probe.image.sum():,} events, {many}")
     for n, (number, places) in enumerate(sorted(probe.regions.items())):
         colour = transmitter_colour(n)
         path = list(places)
@@ -324,6 +356,7 @@ def draw_regions(probe: FigureProbe, title: str) -> Figure:
             textcoords="offset points",
             color=colour,
             va="top",
+            path_effects=[_halo()],
         )
         if number in zooms:
             axis = axes[1 + zooms.index(number)]
@@ -343,20 +376,35 @@ def draw_regions(probe: FigureProbe, title: str) -> Figure:
                         lw=1.4,
                     )
                 )
-            _title(axis, f"region {number}")
+            titled(axis, f"region {number}")
     return figure
 
 
 def draw_presence(probe: FigureProbe, title: str) -> Figure:
     """Which pixels show which cluster, in one frame of each transmitter, and the profile of each cluster."""
     shown = [probe.clearest[n] for n in sorted(probe.clearest)[:_MOST_ZOOMS]]
-    figure = Figure(figsize=(6 * len(shown), 6.4), layout="constrained")
+    figure = Figure(figsize=(6.4 * len(shown), 7.4), layout="constrained")
+    figure.supxlabel(
+        fill(_PRESENCE.format(size=shown[0].presence.grid_px), 92 * len(shown)),
+        x=0.02,
+        ha="left",
+        fontsize=9,
+        color=_INK,
+    )
     parts = figure.subfigures(1, len(shown), squeeze=False)[0]
     for part, best in zip(parts, shown, strict=True):
         number = best.frame.transmitter
         _draw_one_presence(part, best, _who(number, probe.echo_of[number]))
-    figure.suptitle(f"{title}: presence of the clusters", fontsize=11, color=_INK)
+    figure.suptitle(f"{title}: which pixels show which cluster", fontsize=11, color=_INK)
     return figure
+
+
+_PRESENCE = (
+    "Each cluster of LEDs sends a pilot of its own, by which it is found in the image; a colour is a cluster."
+    " Cells: squares of {size} x {size} px that surely show one. Pixels: the cluster whose pilot each pixel"
+    " repeats best, the paler the less. Rows: how well each row of pixels repeats each pilot, with the"
+    " clusters' numbers; distances are measured from where neighbouring curves cross."
+)
 
 
 def _draw_one_presence(part: SubFigure, best: _Shown, who: str) -> None:
@@ -377,12 +425,12 @@ def _draw_one_presence(part: SubFigure, best: _Shown, who: str) -> None:
         extent=(-0.5, columns * size - 0.5, rows * size - 0.5, -0.5),
         interpolation="nearest",
     )
-    _title(cells, f"cells, {size} x {size} px")
+    titled(cells, "cells")
     signal = np.clip(presence.pixels, 0, None)
     strongest = signal.max(0)
     scale = float(np.quantile(strongest[strongest > 0], 0.9)) if strongest.any() else 1.0
     pixels.imshow(_coloured(signal, np.clip(strongest / scale, 0, 1), colours), interpolation="nearest")
-    _title(pixels, "pixels")
+    titled(pixels, "pixels")
     for axis in (cells, pixels):
         axis.set(xlim=(left, right), ylim=(lower, upper), xlabel="column, px", aspect="auto")
     cells.set_ylabel("row of the region, px")
@@ -400,8 +448,8 @@ def _draw_one_presence(part: SubFigure, best: _Shown, who: str) -> None:
                 annotation_clip=False,
             )
     profile.set(xlabel="pilot correlation of the row", xlim=(0, None))
-    _plain(profile)
-    _title(profile, "rows")
+    plain(profile)
+    titled(profile, "rows")
     # Over the whole part: beside a reflection's number there is no room for the frame's above the rows alone.
     part.suptitle(
         f"{who}, packet {frame.packet}, frame {frame.frame}", x=0.02, ha="left", fontsize=10, color=_INK
@@ -411,31 +459,70 @@ def _draw_one_presence(part: SubFigure, best: _Shown, who: str) -> None:
 def draw_distance(probe: FigureProbe, title: str) -> Figure:
     """Distance of each transmitter with its one-sigma band, and the quality of each frame, over time."""
     numbers = sorted(probe.frames)[:_MOST_ZOOMS]
-    figure = Figure(figsize=(8, 2.6 + 2.4 * len(numbers)), layout="constrained")
-    axes = figure.subplots(len(numbers) + 1, 1, sharex=True, height_ratios=[2.4] * len(numbers) + [1])
+    figure = Figure(figsize=(8, 2.2 + 3.6 * len(numbers)), layout="constrained")
+    axes = figure.subplots(
+        2 * len(numbers) + 1, 1, sharex=True, height_ratios=[2.2, 1.4] * len(numbers) + [1]
+    )
     begin_us = probe.first_us or 0
     last = axes[-1]
-    for axis, number in zip(axes, numbers, strict=False):
+    for n, (axis, off, number) in enumerate(zip(axes[:-1:2], axes[1::2], numbers, strict=True)):
         frames = sorted(probe.frames[number], key=lambda f: f.t_us)
         colour = transmitter_colour(number)
         t_s = np.array([f.t_us - begin_us for f in frames]) * 1e-6
         distance = np.array([f.range.distance_m for f in frames])
         sigma = np.array([f.range.sigma_m for f in frames])
         known = np.isfinite(distance)
-        axis.plot(t_s[known], distance[known], "o", ms=3, color=colour, label="a frame")
-        near, far = (distance - sigma)[known], (distance + sigma)[known]
-        axis.fill_between(t_s[known], near, far, color=colour, alpha=0.25, lw=0, label="one sigma")
+        t, d, s = t_s[known], distance[known], sigma[known]
+        line = off_neighbours(t, d)
+        for where, values in ((axis, d), (off, line)):
+            where.plot(t, values, "o", ms=2.5, color=colour, label="a frame")
+        axis.fill_between(t, d - s, d + s, color=colour, alpha=0.25, lw=0)
+        off.fill_between(
+            t, -s, s, color=colour, alpha=0.25, lw=0, label="one sigma, as the ranging states it"
+        )
         axis.set_ylabel("distance, m")
-        _title(axis, f"{_who(number, probe.echo_of[number])}, {known.sum()} distances")
-        axis.legend(frameon=False, fontsize=9)
-        last.plot(t_s, [f.soft.quality for f in frames], "o", ms=2.5, color=colour)
-    last.set(ylabel="quality", xlabel="time since the first event, s", ylim=(0, 1.05))
+        off.set_ylabel("off its\nneighbours, m")
+        titled(axis, f"{_who(number, probe.echo_of[number])}, {known.sum()} distances")
+        off.legend(frameon=False, fontsize=9, ncols=2, loc="lower left", bbox_to_anchor=(0, 1))
+        # Rings of other sizes: equal qualities are seen all the same.
+        last.plot(
+            t_s, [f.soft.quality for f in frames], "o", ms=2.5 + 2 * n, mfc="none", mew=0.8, color=colour
+        )
+    last.set(ylabel="quality", xlabel="time since the first event, s", ylim=(0, 1.1))
     for axis in axes:
-        _plain(axis)
-        axis.grid(color="#e6e6e6", lw=0.8)
-        axis.set_axisbelow(True)
+        plain(axis)
     figure.suptitle(f"{title}: distance along the optical axis", fontsize=11, color=_INK)
     return figure
+
+
+def off_neighbours(t_s: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What each value lies off a straight line through itself and its neighbours in time.
+
+    Args:
+        t_s: Times, s, float64 (n,), ascending.
+        values: Float64 (n,).
+
+    Returns:
+        Float64 (n,), of the values' unit.
+    """
+    n = len(values)
+    wide = min(_NEIGHBOURS, n)
+    if wide < 3:
+        return np.zeros(n)
+    first = np.clip(np.arange(n) - wide // 2, 0, n - wide)
+    near = first[:, None] + np.arange(wide)
+    t, v = t_s[near], values[near]
+    middle_t, middle_v = t.mean(1), v.mean(1)
+    apart = t - middle_t[:, None]
+    slope = (apart * v).sum(1) / np.maximum((apart**2).sum(1), 1e-30)
+    line = middle_v + slope * (t_s - middle_t)
+    # The line goes through a value itself, too: as much nearer as it weighs.
+    weight = 1 / wide + (t_s - middle_t) ** 2 / np.maximum((apart**2).sum(1), 1e-30)
+    found: NDArray[np.float64] = (values - line) / np.sqrt(np.maximum(1 - weight, 1 / wide))
+    return found
+
+
+_NEIGHBOURS = 11
 
 
 def _coloured(
@@ -467,10 +554,19 @@ def _who(transmitter: int, echo_of: int | None) -> str:
     return f"transmitter {transmitter}" + ("" if echo_of is None else f" (reflection of {echo_of})")
 
 
-def _title(axis: Axes, text: str) -> None:
+def _halo() -> withStroke:
+    """What sets a text apart from what it is written on."""
+    return withStroke(linewidth=2.5, foreground="white")
+
+
+def titled(axis: Axes, text: str) -> None:
+    """Write a heading in the style of the house: on the left, small."""
     axis.set_title(text, loc="left", fontsize=10, color=_INK)
 
 
-def _plain(axis: Axes) -> None:
+def plain(axis: Axes) -> None:
+    """Draw axes in the style of the house: no frame, a pale grid below what is drawn."""
     for side in ("top", "right"):
         axis.spines[side].set_visible(False)
+    axis.grid(color="#e6e6e6", lw=0.8)
+    axis.set_axisbelow(True)

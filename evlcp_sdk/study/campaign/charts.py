@@ -11,7 +11,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from evlcp_sdk.files import Outputs, output_fault
-from evlcp_sdk.results.figures import TRANSMITTER_COLOURS
+from evlcp_sdk.results.figures import TRANSMITTER_COLOURS, plain
 from evlcp_sdk.study.campaign.paper import PAPER_NAME, Measure
 from evlcp_sdk.study.campaign.summary import Series, Summary, reference_marks
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, INTERVALS, Figure, measure
@@ -296,10 +296,7 @@ def draw(chart: Chart, title: str) -> Drawing:
         axis.set_ylim(bottom=0)
     _name_marks(axis, chart)
     axis.set_title(f"{title}: {chart.title}", loc="left", fontsize=11, color=_INK, parse_math=False)
-    axis.grid(color="#e6e6e6", lw=0.8)
-    axis.set_axisbelow(True)
-    for side in ("top", "right"):
-        axis.spines[side].set_visible(False)
+    plain(axis)
     if labels := axis.get_legend_handles_labels()[1]:
         # Below, where no line runs; a column as wide as the longest name.
         columns = max(1, min(len(labels), 110 // (8 + max(map(len, labels)))))

@@ -256,11 +256,16 @@ def test_the_figure_of_a_track(tmp_path: Path) -> None:
     way.feed(packets(13))
     for settled in way.close()[1]:
         probe.add(settled)
-    (ellipse, *_) = draw_track(probe, way.bars_enu_m(), "").axes[0].patches
+    plan, close, *_ = draw_track(probe, way.bars_enu_m(), "").axes
+    (ellipse, *_) = close.patches
+    assert not plan.patches
+    # Drawn larger by as much as the legend says.
+    said = " ".join(close.get_legend().get_texts()[0].get_text().split())
+    times = int(said.removeprefix("95 % ellipse, ").removesuffix(" times as large")) if "," in said else 1
     # 95 % of a normal distribution of the plane lies within 2.4477 sigma.
     fix = next(iter(probe.points)).fix
     values = np.linalg.eigvalsh(fix.covariance_m2[:2, :2])
-    want = (2 * 2.44775 * np.sqrt(values)).tolist()
+    want = (2 * 2.44775 * times * np.sqrt(values)).tolist()
     radii = np.linalg.norm(ellipse.get_xy() - fix.enu_m[:2], axis=1)
     assert (2 * radii.min(), 2 * radii.max()) == pytest.approx(tuple(want), rel=1e-4)
 
