@@ -58,6 +58,12 @@ _FAILED_SHARE = 0.5
 _SPLIT = 0.9
 """Share of the symbols that are another modulation's from which on that one is taken to be what is sent."""
 
+_UNSURE_SHARE = 0.3
+"""Share of symbols of every cluster that are not given, of which more is said."""
+
+_HEAD_DOWN = 0.5
+"""Cosine beyond which a bar stands on its head: one that lies may point either way."""
+
 _COVERED = 0.5
 """Share of a recording of which no more is without frames unless it is said."""
 
@@ -172,6 +178,8 @@ def warnings_of(
             found += _transmitter(number, one, link, counts, seen)
         found += _coverage(number, one, link, seen)
         found += _length(number, one, link)
+        if positions is None:
+            found += _turned(number, one, link)
     if reads_messages:
         found += _blocks(counts)
     if positions is not None:
@@ -416,6 +424,7 @@ def _transmitter(
             number,
         )
     yield from _codewords(number, one, link, counts, seen)
+    yield from _unsure(number, one, link, seen)
     own = (one.frames - one.echoes) / link.packet.pilot_every
     if one.ranged < _RANGED_SHARE * own:
         yield Doubt(
@@ -469,6 +478,25 @@ def _codewords(
     )
 
 
+def _unsure(number: int, one: TransmitterTally, link: Link, seen: Seen) -> Iterator[Doubt]:
+    """Symbols that are not given, of every cluster: what covers some of a bar is no fault of the link's."""
+    clusters = [k for k in range(link.codebook.clusters) if one.unseen[k] < one.frames]
+    if not clusters or min(one.unseen[k] for k in clusters) < _UNSURE_SHARE * one.frames:
+        return
+    share = sum(one.unseen[k] for k in clusters) / (one.frames * len(clusters))
+    own = link.codebook.codewords
+    larger = [
+        name for name, words in seen.others().items() if len(words) > len(own) and _among(own, words).all()
+    ]
+    asked = f"was this sent with {' or '.join(larger)} (modulation.id)? if not, " if larger else ""
+    yield Doubt(
+        "unsure",
+        f"{share:.0%} of its symbols are not sure, of every cluster {_UNSURE_SHARE:.0%} and more",
+        f"{asked}more light, or another decoding.id",
+        number,
+    )
+
+
 def _among(words: NDArray[np.int8], others: NDArray[np.int8]) -> NDArray[np.bool_]:
     """Which words are others, too, bool (symbols,); none where they are of another length."""
     if words.shape[1] != others.shape[1]:
@@ -506,6 +534,19 @@ def _size(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
             f"its distances are {abs(share):.0%} too {'long' if share > 0 else 'short'} for a bar of"
             f" {link.bar.length_m:g} m that looks as long as this one",
             "try another ranging.id; a bar that leans looks shorter",
+            number,
+        )
+
+
+def _turned(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
+    """A bar that stands on its head in the picture; where positions are computed, they tell."""
+    centres_m = link.bar.cluster_centres_m()
+    along, way = np.array(one.along_px), centres_m[-1] - centres_m[0]
+    if one.sized >= _FEW_FRAMES and along @ way < -_HEAD_DOWN * math.hypot(*along) * math.hypot(*way):
+        yield Doubt(
+            "turned",
+            "its clusters stand the other way round in the picture",
+            "is the camera upside down, its picture mirrored, or the bar mounted so? positions have to know",
             number,
         )
 

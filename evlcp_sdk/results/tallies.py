@@ -43,6 +43,7 @@ class TransmitterTally:
         first_us: Start of its first frame, us; its last one starts at `last_us`.
         reach_sum: Sum over `sized` frames of the logarithm of the distance, m, times how far apart the first
             and the last cluster are in the image, px.
+        along_px: Sum of the ways from the first to the last, right and down, px.
         beacon_m: Length of the bar by its newest beacon, m; NaN without.
     """
 
@@ -68,6 +69,7 @@ class TransmitterTally:
     last_us: float = -math.inf
     reach_sum: float = 0.0
     sized: int = 0
+    along_px: tuple[float, float] = (0.0, 0.0)
     beacon_m: float = math.nan
 
     def add(self, packet: Packet) -> None:
@@ -112,6 +114,7 @@ class TransmitterTally:
         if math.isfinite(reach) and reach > 0:
             self.reach_sum += math.log(reach)
             self.sized += 1
+            self.along_px = (self.along_px[0] + x1 - x0, self.along_px[1] + y1 - y0)
 
     def median_m(self) -> float:
         """Median distance to the centimetre, m; NaN without any."""

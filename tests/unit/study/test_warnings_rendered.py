@@ -1,0 +1,89 @@
+"""Warnings of recordings that the simulator renders: of each fault the one that is meant, of none none."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evlcp_sdk.io import write_events
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.plugin.source import EventSource
+from evlcp_sdk.run import receive_to_folder
+from evlcp_sdk.sim import load_scene
+from evlcp_sdk.simulated import simulate
+
+Keys = dict[str, Any]
+
+
+def rendered(sent: tuple[str, ...], duration_s: float, changes: Keys) -> EventSource:
+    light = {"background.light_w_m2": 0.01, "bars.0.led_w_m2": 8.0}
+    scene = load_scene(
+        "night", {"duration_s": duration_s, **light, **changes}, link=load_link(overrides=sent)
+    )
+    return simulate(scene, seed=3)
+
+
+def warned(
+    sent: tuple[str, ...] = (), read: tuple[str, ...] = (), duration_s: float = 0.12, **changes: Any
+) -> list[Keys]:
+    summary = receive_to_folder(rendered(sent, duration_s, changes), None, load_link(overrides=read))
+    warnings: list[Keys] = summary["warnings"]
+    return warnings
+
+
+MESSAGES = {
+    "bars.0.payload": "messages",
+    "world.latitude_deg": 35.1,
+    "world.longitude_deg": 137.0,
+    "world.height_m": 50.0,
+}
+
+
+@pytest.mark.parametrize("changes", [{}, MESSAGES])
+def test_nothing_is_wrong(changes: Keys) -> None:
+    assert warned(duration_s=0.2, **changes) == []
+
+
+@pytest.mark.parametrize(
+    ("codes", "sent", "read", "says"),
+    [
+        ({"profile"}, ("modulation.id=wh8",), (), "was this sent with wh8? try --set modulation.id=wh8"),
+        ({"unsure"}, (), ("modulation.id=wh8",), "was this sent with raw8 or wh4x2 (modulation.id)?"),
+        ({"clock"}, ("air.chip_rate_hz=10012",), (), "air.chip_rate_hz = 100"),
+        ({"frames-rejected", "coverage"}, (), ("air.chip_rate_hz=9900",), "air.frames_per_packet"),
+        ({"frames-rejected"}, ("air.frames_per_packet=7",), (), "--link auto"),
+    ],
+)
+def test_a_link_that_is_not_the_senders(
+    codes: set[str], sent: tuple[str, ...], read: tuple[str, ...], says: str
+) -> None:
+    found = warned(sent, read, 0.2 if "coverage" in codes else 0.13)
+    assert {one["code"] for one in found} == codes
+    assert any(says in one["next_step"] for one in found)
+
+
+def test_a_readout_at_its_limit() -> None:
+    assert "saturated" in [one["code"] for one in warned(**{"sensor.cap_mev_s": 1.5})]
+
+
+def test_messages_that_cannot_be_read() -> None:
+    """Another error correction than the sender's: its beacon comes again and again."""
+    (one,) = warned(("error-correction.id=reed-solomon",), duration_s=0.2, **MESSAGES)
+    assert one["code"] == "blocks-unread"
+    assert "error-correction.id" in one["next_step"]
+
+
+def test_a_bar_of_another_length() -> None:
+    """The beacon says .96 m, the link 1.2: all distances are a quarter too long."""
+    found = warned((), ("bar.led_pitch_m=0.0125",), **MESSAGES)
+    assert [one["code"] for one in found] == ["bar-length"]
+    assert "25% too long" in found[0]["text"]
+
+
+def test_a_picture_that_is_upside_down(tmp_path: Path) -> None:
+    with rendered((), 0.12, {}) as source:
+        events, _ = source.read()
+    turned = type(events)(events.t_us, 1279 - events.x, 719 - events.y, events.p)
+    write_events(tmp_path / "turned.npz", turned, 1280, 720)
+    summary = receive_to_folder(tmp_path / "turned.npz", None)
+    assert [one["code"] for one in summary["warnings"]] == ["turned"]
