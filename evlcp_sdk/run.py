@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.files import Outputs
 from evlcp_sdk.io import EventSource, Loss, open_source
 from evlcp_sdk.io.open import STDIN
 from evlcp_sdk.io.sensor import check_sensor
@@ -48,6 +49,7 @@ __all__ = [
     "Stopped",
     "calibrate",
     "diagnose",
+    "film",
     "receive",
     "receive_to_folder",
     "stop_on_request",
@@ -351,6 +353,131 @@ def diagnose(
     url = str(source.path if isinstance(source, EventSource) else source)
     with source if isinstance(source, EventSource) else open_source(source, registry) as opened:
         return diagnosis_of(opened, link, registry, name=url, advance=advance)
+
+
+def film(
+    recording: Path | str,
+    out: Path,
+    link: Link | Path | str | None = None,
+    *,
+    registry: Registry | None = None,
+    from_ms: float | None = None,
+    for_ms: float = 20.0,
+    slow: float = 400.0,
+    longest_px: int = 640,
+    whole: bool = False,
+    advance: Advance = lambda _done, _of: None,
+) -> dict[str, Any]:
+    """Film a recording in slow motion, with regions, symbols and distances drawn in; in bounded memory.
+
+    The recording is read twice: to decode it until the end of what is shown, and for the events.
+
+    Args:
+        recording: What to open, plugins asked first.
+        out: An animated picture, `.webp` or `.gif`.
+        link: The configuration, or a `link.toml`; None for all defaults.
+        registry: The plugins; None for all that are installed.
+        from_ms: Where it starts, ms after the first event; None for the first frame that is decoded, or the
+            start where there is none.
+        for_ms: How much of the recording it shows, ms.
+        slow: How many times slower than it was.
+        longest_px: Longest side of a picture, px.
+        whole: Show the whole image, not the bars only.
+        advance: Says how far the reading is.
+
+    Returns:
+        What it shows: pictures, their size, time, transmitters, frames.
+
+    Raises:
+        InputError: The recording cannot be read, or has nothing there.
+        ConfigError: The film would have too many pictures, or is to be of another kind.
+        OutputError: It cannot be written.
+    """
+    # Matplotlib and Pillow take longer to import than other use cases to start.
+    from evlcp_sdk.results.film import (
+        FILM_KINDS,
+        MOST_PICTURES,
+        FilmProbe,
+        draw_film,
+        pictures_of,
+        plan_film,
+        save_film,
+    )
+
+    if (kind := FILM_KINDS.get(out.suffix.lower())) is None:
+        raise ConfigError(f"{out}: a film is written as {' or '.join(f'NAME{end}' for end in FILM_KINDS)}")
+    if (pictures := pictures_of(for_ms, slow)) > MOST_PICTURES:
+        raise ConfigError(
+            f"{for_ms:g} ms at 1/{slow:g} would be {pictures} pictures, at most {MOST_PICTURES}: show less,"
+            " or faster"
+        )
+    registry = Registry.load() if registry is None else registry
+    link = link if isinstance(link, Link) else load_link(link, registry=registry)
+    probe = FilmProbe()
+    frames: list[Frame] = []
+    start_us: float | None = None
+    first_us = last_us = None
+    late_us = _FILM_LATE_PACKETS * link.packet.packet_chips * link.packet.chip_us
+    with open_source(recording, registry) as source, registry.joined(probe):
+        check_sensor(source, recording, link.camera)
+        receiver = Receiver(link, registry.hook)
+        for events in source.chunks():
+            first_us = int(events.t_us[0]) if first_us is None else first_us
+            last_us = int(events.t_us[-1])
+            if from_ms is not None:
+                start_us = first_us + from_ms * 1e3
+            start_us = _film_frames(receiver.feed(events), frames, start_us, for_ms * 1e3)
+            advance(source.position_bytes, source.size_bytes)
+            if start_us is not None and last_us > start_us + for_ms * 1e3 + late_us:
+                break
+        start_us = _film_frames(receiver.close(), frames, start_us, for_ms * 1e3)
+    if first_us is None or last_us is None:
+        raise InputError(f"{recording}: no events")
+    start_us = first_us if start_us is None else start_us
+    if start_us > last_us:
+        raise InputError(
+            f"{recording}: ends {(last_us - first_us) * 1e-3:.1f} ms after its first event, nothing to show"
+            f" from {from_ms:g} ms on"
+        )
+    until_us = start_us + for_ms * 1e3
+    regions = [region for region in probe.regions if start_us - 1e4 <= region.t_us <= until_us]
+    plan = plan_film(start_us, for_ms * 1e3, slow, frames, regions, link.camera, longest_px, whole=whole)
+    with open_source(recording, registry) as source:
+        drawn = list(draw_film(plan, source.chunks(), frames, regions, link))
+    with Outputs() as outputs:
+        with outputs.told(out):
+            save_film(drawn, outputs.path(out), kind)
+        outputs.commit()
+    width, height = plan.size_px
+    return {
+        "film": str(out),
+        "pictures": plan.pictures,
+        "width": width,
+        "height": height,
+        "bytes": out.stat().st_size,
+        "from_ms": round((start_us - first_us) * 1e-3, 3),
+        "for_ms": for_ms,
+        "slow": slow,
+        "transmitters": sorted({frame.transmitter for frame in frames}),
+        "frames": len(frames),
+    }
+
+
+_FILM_LATE_PACKETS = 3
+"""Packets after which the frames of a time are told."""
+
+
+def _film_frames(
+    packets: Sequence[Packet], frames: list[Frame], start_us: float | None, for_us: float
+) -> float | None:
+    """Add the frames of the film's time; where it starts, by the first one where nothing else says so."""
+    found = [frame for packet in packets for frame in packet.frames]
+    if start_us is None and found:
+        start_us = min(frame.t_us for frame in found)
+    if start_us is not None:
+        # The one before the first picture is still shown in it.
+        frames += [frame for frame in found if start_us - for_us <= frame.t_us <= start_us + for_us]
+    return start_us
 
 
 def calibrate(

@@ -69,6 +69,7 @@ def make_app() -> typer.Typer:
         simulate,
         survey,
         sweep,
+        video,
     )
 
     app = typer.Typer(
@@ -80,7 +81,7 @@ def make_app() -> typer.Typer:
         help=HELP,
     )
     app.callback()(_root)
-    first = (receive, info, diagnose, compare, simulate, score, sweep, report, demo)
+    first = (receive, video, info, diagnose, compare, simulate, score, sweep, report, demo)
     for module in (*first, calibrate, survey, config, plugins, check):
         module.register(app)
     return app

@@ -191,8 +191,9 @@ class Report(Sink):
             figures.append(("positions", f"{summary['positions']['fixes']:,}", note))
         figures += [
             ("recording", f"{recording['duration_s']:.3g} s", f"{recording['counts']['events']:,} events"),
-            ("speed", f"{processing['times_real_time']:.2f} x", "real time"),
         ]
+        if (speed := processing["times_real_time"]) is not None:
+            figures.append(("speed", f"{speed:.2f} x", "real time, of one core"))
         head = Markup("<p>{}</p>").format(summary["result"])
         if summary["status"] != "complete":
             said = ": ".join(part for part in (summary["status"], summary["error"]) if part)
@@ -414,8 +415,10 @@ def _warnings(summary: Mapping[str, Any]) -> Markup:
     ]
     if items:
         shown = Markup('<h2>Warnings</h2><ul class="warnings">{}</ul>').format(Markup("").join(items))
-    else:
+    elif summary["transmitters"]:
         shown = Markup('<p class="yes">Nothing looks wrong.</p>')
+    else:
+        shown = Markup('<p class="note">What blinks in it, and which stage stops it: evlcp diagnose.</p>')
     for note in summary["notes"]:
         shown += Markup('<p class="note">{}</p>').format(str(Doubt(**note)))
     return shown

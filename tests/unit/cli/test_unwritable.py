@@ -30,6 +30,7 @@ COMMANDS = {
     "receive": ("receive", "REC.raw", "-o", "OUT"),
     "receive many": ("receive", "REC.raw", "b.raw", "-o", "OUT"),
     "receive --figures": ("receive", "REC.raw", "-o", "OUT", "--figures"),
+    "video": ("video", "REC.raw", "-o", "OUT.webp", "--for-ms", "0.1", "--size", "64"),
     "simulate": ("simulate", "--preset", "night", "-o", "OUT.raw", "--set", "duration_s=0.01"),
     "sweep": ("sweep", "campaign.toml", "-o", "OUT.sqlite", "--workers", "0"),
     "report": ("report", "results.sqlite", "-o", "OUT.html"),

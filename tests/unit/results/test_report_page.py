@@ -20,7 +20,7 @@ from evlcp_sdk.results.report import Report
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.run import receive_to_folder
-from evlcp_sdk.values import Frame, FrameView, Packet, PresenceMap, Range, SoftSymbols
+from evlcp_sdk.values import Events, Frame, FrameView, Packet, PresenceMap, Range, SoftSymbols
 from tests.unit.results.test_positions import ATTITUDE, SITE, packets
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
 from tests.unit.study.test_markup import HOSTILE, Elements
@@ -246,6 +246,18 @@ def test_the_map_shows_fixes_and_bars(tmp_path: Path) -> None:
             assert shown == pytest.approx(float(fix[f"sigma_{axis}_m"]), rel=0.051)
     assert told["map"][-1][2].startswith("bar 0\neast 0.000 m\nnorth 0.000 m")
     assert {"height", "spread"} <= told.keys()
+
+
+def test_nothing_found_has_a_page(tmp_path: Path) -> None:
+    events = Events.empty()
+    with ResultWriter(tmp_path, LINK, sinks=["report"]) as out:
+        out.events(events)
+        recording = {"path": "a.raw", "duration_s": 0.0, "counts": {"events": 0}}
+        out.finish("complete", recording, {"times_real_time": None}, {}, {})
+    text = Elements((tmp_path / "report.html").read_text()).text
+    assert "no transmitter was found" in text
+    assert "Nothing looks wrong" not in text
+    assert "evlcp diagnose" in text
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")

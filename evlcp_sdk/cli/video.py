@@ -1,0 +1,100 @@
+"""`evlcp video`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, bytes_bar, console, echo
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("video")(video)
+
+
+def video(
+    recording: Annotated[
+        str, typer.Argument(metavar="REC", help="A recording, or what a plugin can open twice.")
+    ],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="FILM", help="Where the film goes: NAME.webp or NAME.gif.")
+    ],
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
+    from_ms: Annotated[
+        float | None,
+        typer.Option(
+            "--from-ms",
+            min=0,
+            help="Start, after the first event.  [default: the first frame that is decoded]",
+            show_default=False,
+        ),
+    ] = None,
+    for_ms: Annotated[
+        float, typer.Option("--for-ms", min=0.001, help="How much of the recording to show.")
+    ] = 20.0,
+    slow: Annotated[float, typer.Option("--slow", min=1, help="How many times slower than it was.")] = 400.0,
+    size: Annotated[
+        int, typer.Option("--size", min=64, max=1280, metavar="PX", help="Longest side of the picture.")
+    ] = 640,
+    whole: Annotated[bool, typer.Option("--whole", help="Show the whole image, not the bars only.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Film the events in slow motion, with regions, symbols and distances drawn in.
+
+    The first frames:     [bold]evlcp video REC.raw -o REC.webp[/]
+
+    More, and faster:     [bold]evlcp video REC.raw -o REC.webp --for-ms 100 --slow 100[/]
+
+    A second later:       [bold]evlcp video REC.raw -o REC.webp --from-ms 1000[/]
+
+    All that is in view:  [bold]evlcp video REC.raw -o REC.gif --whole --size 1280[/]
+
+    Yellow is where it gets brighter, blue where darker, at 1/400 chip by chip; in faster films a picture
+    shows the last chip before it. Beside a bar stand the symbols of the frame that is on air, above it its
+    number and distance. Browsers show both WebP and GIF.
+    """
+    import json
+
+    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.run import film
+
+    registry = Registry.load()
+    link = load_link(link_file, overrides or [], registry)
+    with bytes_bar(Path(recording).name) as advance:
+        told = film(
+            recording,
+            out,
+            link,
+            registry=registry,
+            from_ms=from_ms,
+            for_ms=for_ms,
+            slow=slow,
+            longest_px=size,
+            whole=whole,
+            advance=advance,
+        )
+    if as_json:
+        echo(json.dumps(told))
+        return
+    screen = console()
+    if told["frames"]:
+        number = len(told["transmitters"])
+        found = (
+            f"{number} transmitter{'s' * (number != 1)}, {told['frames']} frame{'s' * (told['frames'] != 1)}"
+        )
+    else:
+        found = "no frame is decoded there"
+    screen.print(
+        f"{Path(recording).name}: {told['for_ms']:g} ms from {told['from_ms']:.1f} ms on, at"
+        f" 1/{told['slow']:g}; {found}"
+    )
+    screen.print(
+        f"written: {out}, {told['pictures']} pictures of {told['width']} x {told['height']} px,"
+        f" {told['bytes'] / 1e6:.1f} MB",
+        style="dim",
+    )

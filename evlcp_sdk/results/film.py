@@ -1,0 +1,331 @@
+"""A film of a recording: its events in slow motion, with regions, symbols and distances drawn in."""
+
+import math
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.results.figures import cluster_colours, transmitter_colour
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.values import Events, Frame, Region
+
+__all__ = [
+    "FILM_KINDS",
+    "MOST_PICTURES",
+    "Film",
+    "FilmProbe",
+    "draw_film",
+    "pictures_of",
+    "plan_film",
+    "save_film",
+]
+
+FILM_KINDS: Mapping[str, Literal["WEBP", "GIF"]] = {".webp": "WEBP", ".gif": "GIF"}
+"""How a film is written, by the end of its file's name."""
+
+MOST_PICTURES = 500
+"""Pictures of a film: all of them are held until it is written."""
+
+PICTURES_PER_S = 25
+"""Of the film, when it is shown."""
+
+_DARK, _ON, _OFF = np.array([16, 16, 20]), np.array([255, 205, 70]), np.array([70, 150, 255])
+_INK, _DIM = (235, 235, 235), (150, 150, 150)
+_MOST_SCALE = 8.0
+
+_TEXT_PX = 13
+_HEAD_PX = 20
+_COLOURS = 128
+
+
+@dataclass(frozen=True)
+class Film:
+    """What a film shows.
+
+    Attributes:
+        start_us: Camera clock where it starts, us.
+        picture_us: Time from a picture to the next, us.
+        pictures: How many there are.
+        left: First column of the sensor that is shown.
+        top: First row.
+        columns: Columns that are shown.
+        rows: Rows that are shown.
+        scale: Pixels of a picture for one of the sensor, at most 8.
+        slow: How many times slower than it was it is shown.
+    """
+
+    start_us: float
+    picture_us: float
+    pictures: int
+    left: int
+    top: int
+    columns: int
+    rows: int
+    scale: float
+    slow: float
+
+    @property
+    def end_us(self) -> float:
+        """Camera clock where it ends, us."""
+        return self.start_us + self.pictures * self.picture_us
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height) of its pictures, with the line above."""
+        width, height = (math.ceil(n * self.scale - 1e-9) for n in (self.columns, self.rows))
+        return width, height + _HEAD_PX
+
+
+def pictures_of(for_ms: float, slow: float) -> int:
+    """How many pictures a film of some time has.
+
+    >>> pictures_of(40, slow=100)
+    100
+    """
+    return max(1, math.ceil(for_ms * 1e3 / _picture_us(slow) - 1e-9))
+
+
+def _picture_us(slow: float) -> float:
+    return 1e6 / PICTURES_PER_S / slow
+
+
+class FilmProbe:
+    """Keeps the newest regions that a receiver follows; register it with `Registry.load(probe)`.
+
+    Args:
+        most: How many to keep.
+    """
+
+    def __init__(self, most: int = 20_000) -> None:
+        self.regions: deque[Region] = deque(maxlen=most)
+
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str, value: Any) -> None:
+        """Keep a region."""
+        if stage == "regions":
+            self.regions.append(value)
+
+
+def plan_film(
+    start_us: float,
+    for_us: float,
+    slow: float,
+    frames: Sequence[Frame],
+    regions: Iterable[Region],
+    camera: CameraModel,
+    longest_px: int,
+    *,
+    whole: bool = False,
+) -> Film:
+    """What to show: the bars that are read, with a margin, or else what blinks, or else all.
+
+    Args:
+        start_us: Camera clock where the film starts, us.
+        for_us: How much of the recording it shows, us.
+        slow: How many times slower than it was.
+        frames: Those of that time.
+        regions: The same.
+        camera: Has the size of the image.
+        longest_px: Longest side of a picture, but for the line above.
+        whole: Show all of the image.
+    """
+    left, top, right, bottom = 0, 0, camera.width, camera.height
+    boxes = [] if whole else [*map(_box_of_frame, frames)] or [*map(_box_of_region, regions)]
+    if boxes:
+        low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
+        middle, size = (low + high) / 2, high - low
+        margin = max(8.0, 0.15 * float(size.max()))
+        # Symbols stand beside a bar, its distance above.
+        columns, rows = size + 2 * margin
+        columns = max(columns, 0.7 * rows, 60.0)
+        rows = max(rows, 0.4 * columns)
+        left, right = _within(float(middle[0]), float(columns), camera.width)
+        top, bottom = _within(float(middle[1]), float(rows), camera.height)
+    longest = max(right - left, bottom - top)
+    scale = min(longest_px / longest, _MOST_SCALE)
+    pictures, picture_us = pictures_of(for_us * 1e-3, slow), _picture_us(slow)
+    return Film(start_us, picture_us, pictures, left, top, right - left, bottom - top, scale, slow)
+
+
+def draw_film(
+    film: Film, events: Iterable[Events], frames: Sequence[Frame], regions: Sequence[Region], link: Link
+) -> Iterator[Image.Image]:
+    """Draw the pictures one after another; reads no further than to the last one's events."""
+    overlay = _Overlay(film, frames, regions, link)
+    lit = np.zeros((2, film.rows, film.columns), np.float32)
+    # What blinks would be white all over, were a picture exposed for longer than a chip.
+    open_from = 1 - min(link.packet.chip_us / film.picture_us, 1.0)
+    # In one of less than a chip, what the chip has shown before stays.
+    stays = 0.0 if open_from else 0.5 ** (film.picture_us / link.packet.chip_us)
+    number = 0
+    for piece in events:
+        if number == film.pictures:
+            break
+        at, through = np.divmod((piece.t_us - film.start_us) / film.picture_us, 1.0)
+        while number < film.pictures:
+            _add(lit, piece[(at == number) & (through >= open_from)], film)
+            if not len(at) or at.max() <= number:
+                break
+            yield overlay.draw(number, _picture(lit, film))
+            lit *= stays
+            number += 1
+    for rest in range(number, film.pictures):
+        yield overlay.draw(rest, _picture(lit, film))
+        lit *= stays
+
+
+def save_film(pictures: Sequence[Image.Image], path: Path, kind: Literal["WEBP", "GIF"]) -> None:
+    """Write an animated picture that starts anew when it ends."""
+    first, *rest = pictures
+    duration_ms = round(1000 / PICTURES_PER_S)
+    more: dict[str, Any] = {"quality": 80, "method": 2} if kind == "WEBP" else {"optimize": False}
+    first.save(path, kind, save_all=True, append_images=rest, duration=duration_ms, loop=0, **more)
+
+
+def _within(middle: float, size: float, most: int) -> tuple[int, int]:
+    """From where to where a stretch of this size goes, moved so that it is inside."""
+    whole = min(math.ceil(size), most)
+    first = min(max(round(middle - whole / 2), 0), most - whole)
+    return first, first + whole
+
+
+def _box_of_frame(frame: Frame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    known = frame.points_px[np.isfinite(frame.points_px).all(1)] if len(frame.points_px) else frame.points_px
+    points = np.concatenate([known, [[frame.x_px, frame.y_px]]])
+    # Half a cluster more than the middles of the clusters.
+    more = np.ptp(points, axis=0).max() / 2 / max(len(known) - 1, 1)
+    return points.min(0) - more, points.max(0) + more
+
+
+def _box_of_region(region: Region) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    middle, half = np.array([region.x_px, region.y_px]), np.array([region.width_px, region.height_px]) / 2
+    return middle - half, middle + half
+
+
+def _add(lit: NDArray[np.float32], events: Events, film: Film) -> None:
+    x, y = events.x.astype(np.int64) - film.left, events.y.astype(np.int64) - film.top
+    inside = (x >= 0) & (x < film.columns) & (y >= 0) & (y < film.rows)
+    np.add.at(lit, (events.p[inside].astype(np.int64), y[inside], x[inside]), 1.0)
+
+
+def _picture(lit: NDArray[np.float32], film: Film) -> Image.Image:
+    """The events' light in colours, enlarged or made smaller."""
+    width, height = film.size_px
+    height -= _HEAD_PX
+    if film.scale < 1:
+        # The strongest of the pixels that share one: a bar is a few columns wide.
+        for axis, size in ((1, height), (2, width)):
+            first = (np.arange(size) / film.scale).astype(np.int64)
+            lit = np.maximum.reduceat(lit, np.minimum(first, lit.shape[axis] - 1), axis=axis)
+    net, most = lit[1].astype(np.float64) - lit[0], lit.max(0)
+    share = np.where(net == 0, 0.5, (np.sign(net) + 1) / 2)[..., None]
+    light = (1 - np.exp2(-most))[..., None]
+    colour = _DARK + (share * _ON + (1 - share) * _OFF - _DARK) * light
+    picture = Image.fromarray(np.clip(colour, 0, 255).astype(np.uint8))
+    return picture.resize((width, height), Image.Resampling.NEAREST)
+
+
+class _Overlay:
+    """Draws what was found over the events.
+
+    Args:
+        film: What is shown.
+        frames: Frames of that time.
+        regions: Regions of that time.
+        link: Lengths of frames, number of clusters.
+    """
+
+    def __init__(self, film: Film, frames: Sequence[Frame], regions: Sequence[Region], link: Link) -> None:
+        self._film = film
+        self._frames = sorted(frames, key=lambda frame: frame.t_us)
+        self._regions = sorted(regions, key=lambda region: region.t_us)
+        self._packet = link.packet
+        self._step_us = link.regions.step_us
+        colours = (255 * cluster_colours(link.codebook.clusters)).astype(int)
+        # On a dark ground, dark ones are lifted.
+        self._colours = [tuple(int(90 + v * 165 / 255) for v in colour) for colour in colours]
+        self._font = ImageFont.load_default(_TEXT_PX)
+
+    def draw(self, number: int, light: Image.Image) -> Image.Image:
+        """One picture, in a palette of its own."""
+        film, (width, _) = self._film, self._film.size_px
+        picture = Image.new("RGB", film.size_px, tuple(_DARK.tolist()))
+        picture.paste(light, (0, _HEAD_PX))
+        pen = ImageDraw.Draw(picture)
+        t_us = film.start_us + (number + 0.5) * film.picture_us
+        self._draw_regions(pen, t_us)
+        self._draw_frames(pen, t_us)
+        pen.rectangle((0, 0, width, _HEAD_PX - 3), fill=tuple(_DARK.tolist()))
+        pen.text((4, 1), f"{t_us * 1e-3:.2f} ms", fill=_INK, font=self._font)
+        pen.text((width - 4, 1), f"1/{film.slow:g}", fill=_DIM, font=self._font, anchor="ra")
+        done = (number + 1) / film.pictures * width
+        pen.line((0, _HEAD_PX - 3, done, _HEAD_PX - 3), fill=_DIM)
+        return picture.quantize(_COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+
+    def _at(self, x_px: float, y_px: float) -> tuple[float, float]:
+        film = self._film
+        return (x_px + 0.5 - film.left) * film.scale, (y_px + 0.5 - film.top) * film.scale + _HEAD_PX
+
+    def _draw_regions(self, pen: ImageDraw.ImageDraw, t_us: float) -> None:
+        now: dict[int, Region] = {}
+        for region in self._regions:
+            if region.t_us > t_us + self._step_us / 2:
+                break
+            if region.t_us > t_us - 1.5 * self._step_us:
+                now[region.id] = region
+        for region in now.values():
+            (x0, y0), (x1, y1) = _box_of_region(region)
+            pen.rectangle((*self._at(x0 - 1, y0 - 1), *self._at(x1 + 1, y1 + 1)), outline=(90, 90, 90))
+
+    def _draw_frames(self, pen: ImageDraw.ImageDraw, t_us: float) -> None:
+        packet = self._packet
+        newest: dict[int, Frame] = {}
+        for frame in self._frames:
+            if frame.t_us > t_us:
+                break
+            if frame.t_us > t_us - packet.packet_chips * packet.chip_us:
+                newest[frame.transmitter] = frame
+        for frame in newest.values():
+            chips = packet.frame_chips if packet.has_pilot(frame.frame) else packet.info_chips
+            (left, top), (right, _) = _box_of_frame(frame)
+            self._name(pen, frame, self._at(left, top))
+            if t_us < frame.t_us + chips * packet.chip_us:
+                self._symbols(pen, frame, right)
+
+    def _name(self, pen: ImageDraw.ImageDraw, frame: Frame, corner: tuple[float, float]) -> None:
+        distance = frame.range
+        text = f"{frame.transmitter}"
+        if frame.echo_of is not None:
+            text += f", reflection of {frame.echo_of}"
+        if math.isfinite(distance.distance_m):
+            text += f": {distance.distance_m:.2f} ± {distance.sigma_m:.2f} m"
+        width, _ = self._film.size_px
+        x = min(max(corner[0], 2), max(width - pen.textlength(text, self._font) - 4, 2))
+        y = max(corner[1] - 1.6 * _TEXT_PX, _HEAD_PX)
+        pen.text((x, y), text, fill=_light(transmitter_colour(frame.transmitter)), font=self._font)
+
+    def _symbols(self, pen: ImageDraw.ImageDraw, frame: Frame, right_px: float) -> None:
+        points = frame.points_px
+        known = [k for k, point in enumerate(points) if np.isfinite(point).all()]
+        rows = np.sort([points[k, 1] for k in known])
+        if len(rows) < 2 or np.ptp(rows) * self._film.scale < 0.8 * _TEXT_PX * (len(rows) - 1):
+            # A panel's, or those of a bar too far away, would cover one another.
+            return
+        for k in known:
+            x, y = self._at(right_px, points[k, 1])
+            symbol = int(frame.soft.symbols[k])
+            text = str(symbol) if symbol >= 0 else "-"
+            pen.text((x + 8, y), text, fill=self._colours[k], font=self._font, anchor="lm")
+
+
+def _light(colour: str) -> tuple[int, ...]:
+    """A colour fit for a dark ground."""
+    return tuple(90 + int(colour[i : i + 2], 16) * 165 // 255 for i in (1, 3, 5))
