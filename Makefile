@@ -36,6 +36,14 @@ format: $(VENV)/.dev  ## Format the code
 pictures: $(VENV)/.installed  ## Draw the pictures of the docs again
 	$(BIN)/evlcp demo --recording
 	cp demo-out/presence.png demo-out/distance.png docs/images/
+	$(BIN)/evlcp video examples/recordings/night-50m-30kmh-cut.raw -o docs/images/film.webp \
+	  --for-ms 10 --size 420
+	$(BIN)/python benchmarks/link_picture.py docs/images/link.svg
+	$(BIN)/evlcp simulate examples/scenes/gate.toml -o demo-out/gate.raw
+	$(BIN)/evlcp receive demo-out/gate.raw -o demo-out/gate --sites demo-out/gate.site.toml \
+	  --attitude demo-out/gate.attitude.csv --figures
+	cp demo-out/gate/track.png docs/images/
+	$(BIN)/python benchmarks/polar.py curves --figure docs/images/error-correction.png
 
 clean:  ## Remove .venv and everything that was generated
 	rm -rf $(VENV) demo-out loop-out quickstart-out .mypy_cache .pytest_cache .ruff_cache .hypothesis
