@@ -224,13 +224,14 @@ def loop(
         "start_chip": start_chip,
         "ppm": round((light.rate_hz / link.air.chip_rate_hz - 1) * 1e6, 3),
     }
+    # A still camera: by the swing of a car it sees more than a first look needs.
     scene = {
         "name": Path(RECORDING).stem,
         "duration_s": duration_s,
         "link": {section: dict(keys) for section, keys in link.table.items()},
         "camera": dict(link.table["camera"]),
         "lens": {"focus_m": distance_m},
-        "motion": {"distance_m": distance_m, "speed_mps": 0.0},
+        "motion": {"distance_m": distance_m, "speed_mps": 0.0, "vib_rate_rad_s": 0.0},
         "bars": [bar],
     }
     raw = folder / RECORDING

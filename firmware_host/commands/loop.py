@@ -23,8 +23,8 @@ def loop(
     seed: Annotated[
         int, typer.Option("--seed", min=0, max=2**32 - 1, help="Seed of the scene: its noise, its start.")
     ] = 0,
-    figures: Annotated[
-        bool, typer.Option("--figures", help="Draw what the receiver saw, as 'evlcp receive' does.")
+    report: Annotated[
+        bool, typer.Option("--report", help="Also write received/report.html: the bar in slow motion, plots.")
     ] = False,
     link_file: LinkFile = None,
     overrides: Overrides = None,
@@ -54,7 +54,7 @@ def loop(
         )
     done: Mapping[str, Any] = {}
     files: list[str] = []
-    sinks = ["figures"] if figures else []
+    sinks = ["report"] if report else []
     with _progress() as advance:
         for step in steps(text, link, out, distance_m=distance_m, seed=seed, sinks=sinks, advance=advance):
             done = step.figures
@@ -95,7 +95,7 @@ def _light(step: Mapping[str, Any]) -> str:
 
 def _scene(step: Mapping[str, Any]) -> str:
     return (
-        f"a camera {step['distance_m']:g} m away looks for {step['duration_s']:.2g} s:"
+        f"a still camera {step['distance_m']:g} m away looks for {step['duration_s']:.2g} s:"
         f" {step['events'] / 1e6:.2f} million events, {step['bytes'] / 1e6:.1f} MB"
     )
 

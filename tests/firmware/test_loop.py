@@ -1,7 +1,6 @@
 """A text from end to end: what the steps say and leave is what other readers find in their files."""
 
 import json
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from firmware_host.board.bank import random_symbols, symbol_chips
+from firmware_host.emulators import simulated
 from firmware_host.emulators.led_record import RECORD, LedRecord
 from firmware_host.loop import light_of
 
@@ -18,8 +18,11 @@ pytestmark = pytest.mark.usefixtures("compiler")
 
 def test_a_text_arrives_and_every_file_is_what_others_read(evlcp, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    done = evlcp("loop", "--text", "Grüße [b]", "--distance", "80", "--seed", "3", "-o", out)
+    done = evlcp("loop", "--text", "Grüße [b]", "--distance", "80", "--seed", "3", "--report", "-o", out)
     assert done.code == 0, done.err
+    assert "warning" not in done.out
+    assert "received/report.html" in done.out
+    assert (out / "received" / "report.html").is_file()
     lines = dict(line.split(maxsplit=1) for line in done.out.splitlines() if not line.startswith(" "))
     assert list(lines)[1:] == ["message", "board", "light", "scene", "receiver", "text", "written:"]
     assert lines["message"].startswith('"Grüße [b]", 11 bytes: 1 packet with')
@@ -74,13 +77,15 @@ def test_what_cannot_be_is_said_in_one_line(evlcp, tmp_path: Path, arguments: li
     assert len(done.err.splitlines()) == 1
 
 
-def test_without_a_compiler_it_says_what_to_install(cli, tmp_path: Path, monkeypatch) -> None:
+def test_without_a_compiler_it_says_what_to_install(
+    evlcp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    done: subprocess.CompletedProcess[str] = cli("loop", "-o", tmp_path / "out")
-    assert done.returncode == 1
-    assert done.stderr == (
-        "evlcp: cc is missing: apt-get install --no-install-recommends gcc libc6-dev make\n"
-    )
+    monkeypatch.delenv("CC", raising=False)
+    simulated._library.cache_clear()  # of tests before, which had one
+    done = evlcp("loop", "-o", tmp_path / "out")
+    assert done.code == 1
+    assert done.err == "evlcp: cc is missing: apt-get install --no-install-recommends gcc libc6-dev make\n"
 
 
 def test_light_is_what_the_symbols_say() -> None:
