@@ -396,6 +396,7 @@ def film(
     # Matplotlib and Pillow take longer to import than other use cases to start.
     from evlcp_sdk.results.film import (
         FILM_KINDS,
+        MOST_MEGAPIXELS,
         MOST_PICTURES,
         FilmProbe,
         draw_film,
@@ -410,6 +411,10 @@ def film(
         raise ConfigError(
             f"{for_ms:g} ms at 1/{slow:g} would be {pictures} pictures, at most {MOST_PICTURES}: show less,"
             " or faster"
+        )
+    if str(recording) == STDIN:
+        raise ConfigError(
+            "a film needs a file: it reads the recording twice, and standard input gives it once"
         )
     registry = Registry.load() if registry is None else registry
     link = link if isinstance(link, Link) else load_link(link, registry=registry)
@@ -442,13 +447,18 @@ def film(
     until_us = start_us + for_ms * 1e3
     regions = [region for region in probe.regions if start_us - 1e4 <= region.t_us <= until_us]
     plan = plan_film(start_us, for_ms * 1e3, slow, frames, regions, link.camera, longest_px, whole=whole)
+    width, height = plan.size_px
+    if (megapixels := pictures * width * height * 1e-6) > MOST_MEGAPIXELS:
+        raise ConfigError(
+            f"{pictures} pictures of {width} x {height} px are {megapixels:.0f} megapixels, at most"
+            f" {MOST_MEGAPIXELS}: smaller, shorter, or faster"
+        )
     with open_source(recording, registry) as source:
         drawn = list(draw_film(plan, source.chunks(), frames, regions, link))
     with Outputs() as outputs:
         with outputs.told(out):
             save_film(drawn, outputs.path(out), kind)
         outputs.commit()
-    width, height = plan.size_px
     return {
         "film": str(out),
         "pictures": plan.pictures,

@@ -19,6 +19,7 @@ from evlcp_sdk.values import Events, Frame, Region
 
 __all__ = [
     "FILM_KINDS",
+    "MOST_MEGAPIXELS",
     "MOST_PICTURES",
     "Film",
     "FilmProbe",
@@ -31,8 +32,8 @@ __all__ = [
 FILM_KINDS: Mapping[str, Literal["WEBP", "GIF"]] = {".webp": "WEBP", ".gif": "GIF"}
 """How a film is written, by the end of its file's name."""
 
-MOST_PICTURES = 500
-"""Pictures of a film: all of them are held until it is written."""
+MOST_PICTURES, MOST_MEGAPIXELS = 500, 160
+"""Pictures of a film, and pixels of all of them, which are held until it is written, a byte each."""
 
 PICTURES_PER_S = 25
 """Of the film, when it is shown."""

@@ -24,6 +24,7 @@ PLOT_STYLE = """
   border-bottom: 1px solid var(--dim); touch-action: pan-y }
 .area svg { position: absolute; inset: 0; width: 100%; height: 100%; overflow: hidden }
 .area path { fill: none; vector-effect: non-scaling-stroke } .area path.grid { stroke: var(--line) }
+@media (prefers-color-scheme: dark) { .area svg, .legend i { filter: brightness(1.5) } }
 .area span { position: absolute; color: var(--dim); font-size: 0.75rem; line-height: 1; white-space: nowrap }
 .area .x { top: calc(100% + 0.4rem); transform: translateX(-50%) }
 .area .y { right: calc(100% + 0.4rem); transform: translateY(-50%) }

@@ -37,7 +37,7 @@ if (motion) {
   const slider = motion.querySelector("input"), button = motion.querySelector("button");
   const choice = motion.querySelector("select"), text = motion.querySelector("output");
   const DARK = [16, 16, 20], ON = [255, 205, 70], OFF = [70, 150, 255];
-  const GAP = 14, HEAD = 18, NUMBERS = 26;
+  const GAP = 14, HEAD = 18, NUMBERS = 26, NARROWEST = 50;
   let shown = null, timer = null;
   const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
   const mixed = (a, b, share) => a.map((v, i) => v + (b[i] - v) * share);
@@ -61,7 +61,8 @@ if (motion) {
     let scale = Math.min(8, 460 / shown.height);
     const stacked = 2 * (shown.width * scale + GAP) + 180 > wide;
     if (stacked) scale = Math.min(8, 300 / shown.height, (wide - GAP) / 2 / shown.width);
-    const w = shown.width * scale, h = shown.height * scale;
+    // A bar is far narrower than high: it is drawn wider where it would be a line.
+    const w = Math.max(shown.width * scale, NARROWEST), h = shown.height * scale;
     const left = stacked ? 0 : 2 * (w + GAP), top = stacked ? h + 2 * HEAD + GAP : HEAD;
     const rasterWide = Math.min(wide - left - NUMBERS, 22 * shown.chips);
     const rasterHigh = stacked ? Math.min(14 * clusters, 400) : h;

@@ -4,7 +4,6 @@ What is shown is kept as it comes, a bounded share of it, so that a recording of
 memory; all frames are in `frames.csv`, all messages in `packets.jsonl`.
 """
 
-import json
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -20,7 +19,6 @@ from evlcp_sdk.results.doubts import Doubt
 from evlcp_sdk.results.figures import Thinned, TrackProbe, cluster_colours, transmitter_colour
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.motion import MotionProbe
-from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.results.plots import PLOT_STYLE, Plot, ellipse
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.study.markup import Markup, details, document, table, tiles
@@ -85,8 +83,8 @@ class Report(Sink):
         self._track = TrackProbe(1024)
         self._seen: dict[int, _Seen] = {}
         self._first_us: int | None = None
-        self._messages: list[dict[str, Any]] = []
-        self._latest: deque[dict[str, Any]] = deque(maxlen=_MOST_MESSAGES)
+        self._messages: list[tuple[str, ...]] = []
+        self._latest: deque[tuple[str, ...]] = deque(maxlen=_MOST_MESSAGES)
         self._many_messages = 0
         self._axis, self._step_ms = "ms since the first event", 1.0
 
@@ -113,8 +111,14 @@ class Report(Sink):
                     seen.first.append(frame)
         for message in packet.messages:
             self._many_messages += 1
-            line = json.loads(message_line(message))
-            (self._messages if len(self._messages) < _MOST_MESSAGES else self._latest).append(line)
+            row = (
+                f"{self._ms(message.t_us):.1f}",
+                message.kind.name,
+                str(message.message.transmitter_id),
+                message.trust,
+                message.said(_MOST_CHARACTERS),
+            )
+            (self._messages if len(self._messages) < _MOST_MESSAGES else self._latest).append(row)
 
     def settle(self, settled: Sequence[Settled]) -> None:
         """Keep places."""
@@ -305,11 +309,7 @@ class Report(Sink):
     def _messages_table(self) -> Markup:
         if not self._many_messages:
             return Markup("")
-        rows = [
-            (f"{self._ms(line['t_us']):.1f}", line["kind"], f"{line['transmitter_id']}", line["trust"], words)
-            for line in (*self._messages, *self._latest)
-            for words in [_words(line)]
-        ]
+        rows = [*self._messages, *self._latest]
         left = self._many_messages - len(rows)
         note = f"{left:,} between the first and the last ones are left out; packets.jsonl has all." * (
             left > 0
@@ -381,24 +381,6 @@ def _said(frame: Frame, ms: float) -> str:
         lines.append(f"{depth.distance_m:.4f} ± {depth.sigma_m:.4f} m")
     lines.append(f"quality {frame.soft.quality:.4f}")
     return "\n".join(lines)
-
-
-_COMMON = (
-    *("kind", "transmitter", "packet", "t_us", "transmitter_id", "sequence"),
-    *("verified", "trust", "reason", "age_s"),
-)
-
-
-def _words(line: Mapping[str, Any]) -> str:
-    """What a message says, its start where it is long."""
-    shown = {key: value for key, value in line.items() if key not in _COMMON and value != ""}
-    if list(shown) == ["text"]:
-        text = str(shown["text"])
-    else:
-        text = ", ".join(
-            f"{key} {value if isinstance(value, str) else json.dumps(value)}" for key, value in shown.items()
-        )
-    return text if len(text) <= _MOST_CHARACTERS else f"{text[:_MOST_CHARACTERS]}..."
 
 
 def _warnings(summary: Mapping[str, Any]) -> Markup:

@@ -139,6 +139,10 @@ def test_what_cannot_be_filmed(demo_raw: Path, tmp_path: Path) -> None:
         film(demo_raw, tmp_path / "a.mp4", LINK)
     with pytest.raises(ConfigError, match="100 ms at 1/400 would be 1000 pictures, at most 500"):
         film(demo_raw, tmp_path / "a.gif", LINK, for_ms=100)
+    with pytest.raises(ConfigError, match="500 pictures of 1280 x 740 px are 474 megapixels, at most 160"):
+        film(demo_raw, tmp_path / "a.gif", LINK, for_ms=50, whole=True, longest_px=1280)
+    with pytest.raises(ConfigError, match="a film needs a file"):
+        film("-", tmp_path / "a.gif", LINK)
     write_events(tmp_path / "few.raw", Events.of([10, 3010], [1, 2], [3, 4], [1, 0]), 1280, 720)
     with pytest.raises(InputError, match=r"ends 3\.0 ms after its first event, nothing to show from 4 ms on"):
         film(tmp_path / "few.raw", tmp_path / "a.gif", LINK, from_ms=4)

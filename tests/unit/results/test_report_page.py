@@ -219,9 +219,7 @@ def test_what_others_wrote_stays_text(tmp_path: Path) -> None:
         sink = Report(folder, Run(HOSTILE, LINK))
         for _ in range(101):
             sink._many_messages += 1
-        sink._messages.append(
-            {"kind": HOSTILE, "t_us": 1.0, "transmitter_id": 7, "trust": "unverified", "text": HOSTILE}
-        )
+        sink._messages.append(("1.0", HOSTILE, "7", "unverified", HOSTILE))
         sink.conclude(SUMMARY)
         folder.finish()
     page = Elements((tmp_path / "report.html").read_text())
