@@ -96,8 +96,11 @@ if (motion) {
       const y = top + (shown.upside ? clusters - 1 - k : k) * row;
       for (let c = 0; c < shown.chips; c++) {
         pen.globalAlpha = c > chip ? 0.35 : 1;
-        pen.fillStyle = shown.lit[k][c] === "1" ? shown.colours[k] : panel;
-        pen.fillRect(left + c * cell, y + 1, Math.max(cell - 1, 1), Math.max(row - 2, 1));
+        const lit = shown.lit[k][c];
+        pen.fillStyle = lit === "1" ? shown.colours[k] : lit === "?" ? dim : panel;
+        // What is not known is a dash.
+        const thick = lit === "?" ? 1 : Math.max(row - 2, 1);
+        pen.fillRect(left + c * cell, y + (row - thick) / 2, Math.max(cell - 1, 1), thick);
       }
       pen.globalAlpha = 1;
       if (row >= 9) {
