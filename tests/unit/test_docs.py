@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from shutil import which
 from typing import Any, get_type_hints
+from xml.etree.ElementTree import fromstring
 
 import pytest
 from pydantic.fields import FieldInfo
@@ -285,6 +286,14 @@ def test_the_quickstart_is_the_example(capsys: pytest.CaptureFixture[str], workp
 def test_what_users_read_first_uses_the_public_face_only(path: str) -> None:
     found = set(re.findall(r"^ *(?:import|from) +evlcp_sdk\b.*$", (ROOT / path).read_text(), re.MULTILINE))
     assert found == {"import evlcp_sdk as evlcp"}
+
+
+def test_the_drawing_of_the_link_is_what_its_program_draws() -> None:
+    from benchmarks.link_picture import TEXT, drawing
+
+    assert (ROOT / "docs" / "images" / "link.svg").read_text(encoding="utf-8") == drawing()
+    assert drawing().count(f">{TEXT}</text>") == 2
+    fromstring(drawing())
 
 
 @pytest.mark.parametrize(
