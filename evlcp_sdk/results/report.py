@@ -414,9 +414,9 @@ def _motion(motions: Sequence[Mapping[str, Any]]) -> Markup:
     )
     return Markup(
         "<h2>The bar in slow motion</h2>"
-        '<p class="note">First the events of each chip: yellow where it gets brighter, blue where darker; then'
-        " the clusters where the pilot shows them, lit as they send by the symbols that were decoded; then the"
-        " chips of each cluster, pilot and symbol, whose number stands behind them.</p>"
+        '<p class="note">First the events of each chip: yellow where it gets brighter, blue where darker;'
+        " then the clusters where the pilot shows them, lit as they send by the symbols that were decoded;"
+        " then the chips of each cluster, pilot and symbol, whose number stands behind them.</p>"
         '<div id="motion"><canvas role="img" aria-label="events and clusters, chip by chip"></canvas>'
         '<div class="hand"><button type="button">Play</button>'
         '<input type="range" min="0" max="1" step="1" value="0" aria-label="chip">'
