@@ -41,8 +41,10 @@ pictures: $(VENV)/.installed  ## Draw the pictures of the docs again
 	$(BIN)/python benchmarks/link_picture.py docs/images/link.svg
 	$(BIN)/evlcp simulate examples/scenes/gate.toml -o demo-out/gate.raw
 	$(BIN)/evlcp receive demo-out/gate.raw -o demo-out/gate --sites demo-out/gate.site.toml \
-	  --attitude demo-out/gate.attitude.csv --figures
+	  --attitude demo-out/gate.attitude.csv --figures --report
 	cp demo-out/gate/track.png docs/images/
+	chromium --headless --hide-scrollbars --force-prefers-reduced-motion --window-size=1280,1640 \
+	  --screenshot=docs/images/report.png demo-out/gate/report.html
 	$(BIN)/python benchmarks/polar.py curves --figure docs/images/error-correction.png
 
 clean:  ## Remove .venv and everything that was generated

@@ -126,6 +126,7 @@ if (motion) {
   const choose = () => {
     shown = held.motions[choice.value];
     slider.max = shown.chips - 1;
+    slider.value = shown.pilot + 4;
     draw();
   };
   slider.addEventListener("input", () => { stop(); draw(); });
@@ -133,7 +134,6 @@ if (motion) {
   choice.addEventListener("change", choose);
   window.addEventListener("resize", draw);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
-  slider.value = 0;
   choose();
   if (!matchMedia("(prefers-reduced-motion: reduce)").matches) play();
 }

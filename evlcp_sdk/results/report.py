@@ -62,8 +62,8 @@ class _Seen:
     """What is kept of a transmitter.
 
     Attributes:
-        frames: A share of its frames, without what is large in them.
-        first: The first ones, whole in a table.
+        frames: A share of its frames, for the charts.
+        first: The first ones, for the table.
         count: How many there were.
         echo_of: Of which transmitter it is a reflection, as the newest packet says.
     """
