@@ -10,9 +10,9 @@ import numpy as np
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.results.doubts import codewords_never
 from evlcp_sdk.results.readout import CAPPED_SHARE
-from evlcp_sdk.results.tallies import RunTally
+from evlcp_sdk.results.tallies import RunTally, TransmitterTally
 from evlcp_sdk.study.diagnosis.light import LightSource
-from evlcp_sdk.study.diagnosis.probe import Trial
+from evlcp_sdk.study.diagnosis.probe import SURE, Trial
 
 __all__ = ["Check", "Facts", "checks_of"]
 
@@ -47,6 +47,22 @@ _FEW = 4
 
 _UNSEEN_SHARE = 0.05
 """Share of unseen clusters of which something is said."""
+
+_SOME = 0.02
+"""Share of all events below which what blinks is not worth a word where nothing sends chips."""
+
+_MIN_CODE = 1000
+"""Rises from which a source may be a bar: one of 20 x 3 px has them in 5 ms; leaves and edges that pass have
+some hundred."""
+
+_MOST = 0.6
+"""Share of the frames that a recording has room for, from which a bar is read whatever happens beside it."""
+
+_BLURRED_SHARE = 0.2
+"""Width of what flickers, as a share of its length, above which its light is too weak for being spread."""
+
+_SAME_RATE = 0.03
+"""How far two rates may be apart and be one."""
 
 _BESIDE = 0.1
 """Events of a source, of those of the largest, below which it is the halo of a lamp rather than a bar."""
@@ -114,8 +130,9 @@ class Facts:
     def bar(self) -> LightSource | None:
         """The source that is most likely to be a bar of the link, by its rhythm; None where there is none."""
         rate = self.link.packet.chip_rate_hz
-        fit = [one for one in self.sources if one.kind != "lamp" and _has_rate(one, rate)]
-        codes = [one for one in self.sources if one.kind == "code"]
+        large = [one for one in self.sources if one.rises >= _MIN_CODE]
+        fit = [one for one in large if one.kind != "lamp" and _has_rate(one, rate)]
+        codes = [one for one in large if one.kind == "code"]
         first = next(iter(fit or codes), None)
         if first is None or self.reads or first.events >= _BESIDE * self.sources[0].events:
             return first
@@ -134,12 +151,25 @@ class Facts:
     def reads(self) -> bool:
         """Whether most frames are accepted."""
         frames, rejected = self.counts["frames"], self.counts["frames_rejected"]
-        return frames >= _FEW and frames >= ACCEPTED_SHARE * (frames + rejected)
+        if frames >= _FEW and frames >= ACCEPTED_SHARE * (frames + rejected):
+            return True
+        # What is no bar may lose its frames elsewhere in the picture.
+        form = self.link.packet
+        sent = form.frames / (form.packet_chips * form.chip_us * 1e-6) * self.duration_s
+        return any(
+            one.frames >= max(_FEW, ACCEPTED_SHARE * (one.last_frame - one.first_frame + 1), _MOST * sent)
+            for one in self.own
+        )
+
+    @property
+    def own(self) -> list[TransmitterTally]:
+        """Figures of the transmitters that are no reflections."""
+        return [one for one in self.tally.transmitters.values() if one.frames > one.echoes]
 
     @property
     def better(self) -> Trial | None:
         """Another link that fits, the best of those tried."""
-        fit = [trial for trial in self.trials if trial.fits]
+        fit = [trial for trial in self.trials if trial.fits and trial.quality >= SURE]
         return max(fit, key=lambda one: one.rank, default=None)
 
     @property
@@ -242,18 +272,9 @@ def _light(facts: Facts) -> Check:
             _BRIGHTER,
         )
     if not facts.sources:
-        return Check(
-            "light",
-            "fail",
-            "dark",
-            "nothing blinks: no rhythm between 60 Hz and 25 kHz anywhere",
-            f"is a bar in the picture ({view}), and on (`evlcp board status`)? One that is too weak, too far"
-            " or behind a strong blur shows no rhythm, either",
-        )
+        return _dark(view)
     bar = facts.bar
-    if bar is None or (
-        not _has_rate(bar, facts.link.packet.chip_rate_hz) and facts.sources[0].kind == "lamp"
-    ):
+    if bar is None or _is_lamp(bar, facts):
         lamps = [one for one in facts.sources if one.kind == "lamp"]
         rates = ", ".join(_hz(one.rate_hz) for one in lamps[:4])
         if lamps:
@@ -264,15 +285,39 @@ def _light(facts: Facts) -> Check:
                 f"{len(lamps)} lamps blink ({rates}{', ...' if len(lamps) > 4 else ''}), nothing sends chips",
                 f"is a bar in the picture ({view}), and on (`evlcp board status`)?",
             )
-        return Check(
-            "light",
-            "fail",
-            "dim",
-            f"{_sources_said(facts)}, but too rarely to tell a code",
-            _BRIGHTER,
-        )
+        first = facts.sources[0]
+        if first.events < _SOME * facts.events:
+            return _dark(view)
+        said = f"{_sources_said(facts)}, but too rarely to tell a code"
+        long_px, wide_px = max(first.wide_px, first.high_px), min(first.wide_px, first.high_px)
+        if wide_px > _BLURRED_SHARE * long_px:
+            said = f"{said}: {wide_px:.0f} px wide, {long_px:.0f} px long, its light is spread"
+            return Check("light", "fail", "defocus", said, _SHARPER)
+        return Check("light", "fail", "dim", said, _BRIGHTER)
     return Check("light", "pass", "light", _sources_said(facts))
 
+
+def _is_lamp(source: LightSource, facts: Facts) -> bool:
+    """Whether a source is rather the light of a lamp, with periods missing, than a bar of another rate."""
+    if _has_rate(source, facts.link.packet.chip_rate_hz) or facts.better is not None:
+        return False
+    lamps = [one.rate_hz for one in facts.sources if one.kind == "lamp"]
+    same = (abs(times * source.rate_hz / rate - 1) < _SAME_RATE for rate in lamps for times in (0.5, 1, 2))
+    return facts.sources[0].kind == "lamp" or any(same)
+
+
+def _dark(view: str) -> Check:
+    return Check(
+        "light",
+        "fail",
+        "dark",
+        "nothing blinks: no rhythm between 60 Hz and 25 kHz anywhere",
+        f"is a bar in the picture ({view}), and on (`evlcp board status`)? One that is too weak, too far"
+        " or behind a strong blur shows no rhythm, either",
+    )
+
+
+_SHARPER = "focus the lens, clean it and the window; a smaller aperture is sharper"
 
 _BRIGHTER = (
     "more light: nearer, a wider aperture, brighter LEDs, or a more sensitive sensor (lower bias_diff_on and"
@@ -382,7 +427,7 @@ def _focus(facts: Facts) -> Check:
             "fail",
             "defocus",
             f"{said}: the light of each cluster covers its neighbours",
-            "focus the lens, clean it and the window; a smaller aperture is sharper",
+            _SHARPER,
         )
     return Check("focus", "pass", "focus", said)
 
@@ -447,8 +492,7 @@ def _frames(facts: Facts) -> Check:
 
 
 def _unseen_share(facts: Facts) -> float:
-    own = [one for one in facts.tally.transmitters.values() if one.frames > one.echoes]
-    given, erased = sum(one.given for one in own), sum(one.erased for one in own)
+    given, erased = sum(one.given for one in facts.own), sum(one.erased for one in facts.own)
     return erased / max(given + erased, 1)
 
 
@@ -469,18 +513,22 @@ def _orientation(facts: Facts) -> Check:
 
 
 def _codewords(facts: Facts) -> Check:
-    own = [one for one in facts.tally.transmitters.values() if one.frames > one.echoes]
     many = len(facts.link.codebook.codewords)
-    never = max((codewords_never(one, facts.link) for one in own), default=0)
-    if not never:
+    never = max((codewords_never(one, facts.link) for one in facts.own), default=0)
+    frames = sum(one.frames for one in facts.own)
+    quality = sum(one.quality_sum for one in facts.own) / max(frames, 1)
+    if not never and quality >= SURE:
         return Check("codewords", "pass", "codewords", f"all of {many} that should occur do")
     better = facts.better
     name = dict(better.changes).get("modulation.id") if better is not None else None
+    unsure = f"mean quality of {frames} frames {quality:.2f}: their symbols are not sure"
+    if not never and name is None and facts.trials:
+        return Check("codewords", "doubt", "noisy", unsure, _BRIGHTER)
     return Check(
         "codewords",
         "fail",
         "profile",
-        f"only {many - never} of {many} symbols ever occur",
+        f"only {many - never} of {many} symbols ever occur" if never else unsure,
         f"was this sent with {name}? try {better.options()}"
         if better is not None and name is not None
         else "data that repeats, or another modulation.id than the transmitter's",

@@ -23,6 +23,9 @@ from evlcp_sdk.values import Events, Packet
 
 __all__ = ["Diagnosis", "diagnosis_of", "infer_link"]
 
+_RATE_SHARE = 0.005
+"""How far a measured rate may be off: half of that is seen where rows are read late."""
+
 _TRIAL_US = 400_000
 """Time of the events that other links are tried on: some packets."""
 
@@ -289,12 +292,19 @@ def _on_sensor(events: Events, width: int, height: int) -> Events:
 def _rates(sources: Sequence[LightSource], link: Link) -> list[float]:
     """Chip rates that what blinks may have, rounded, as people choose them, and not; not the link's own."""
     rates: list[float] = []
-    if any(one.strength_at(link.packet.chip_rate_hz) > 0.9 * one.strength for one in sources[:1]):
+    own = link.packet.chip_rate_hz
+    if any(
+        one.strength_at(own) > 0.9 * one.strength and abs(one.rate_hz / own - 1) < _RATE_SHARE
+        for one in sources[:1]
+    ):
         return rates
     for source in [one for one in sources if one.kind != "lamp"][:3]:
-        for rate in (float(f"{source.rate_hz:.2g}"), float(f"{source.rate_hz:.3g}"), 2 * source.rate_hz):
-            if abs(rate / link.packet.chip_rate_hz - 1) > 1e-4 and rate not in rates:
-                rates.append(float(f"{rate:.4g}"))
+        rounded = [float(f"{source.rate_hz:.{digits}g}") for digits in (1, 2, 3)]
+        for rate in (*rounded, float(f"{2 * source.rate_hz:.3g}")):
+            # None further off than what is measured may be, or half of it.
+            near = any(abs(rate / f - 1) < 0.05 for f in (source.rate_hz, 2 * source.rate_hz))
+            if near and abs(rate / own - 1) > 1e-4 and rate not in rates:
+                rates.append(rate)
     return rates
 
 

@@ -52,12 +52,12 @@ _MIN_SOURCE = 300
 """Rises of a cell, and of a source, below which it is left out."""
 
 _REGULAR = 0.6
-"""Share of times that are the same number of periods, above which a source repeats itself: of a code half are
-of two chips."""
+"""Share of times that are the same number of periods, or one and two, above which a source repeats itself: of
+a code .4 are of two chips."""
 
-_NONE, _SOME = 0.1, 0.25
-"""Share of times of one chip, and of two to eight, up to and from which on a source sends a code: a code
-never rises after one chip, and most times go missing where light is weak or pixels are blind."""
+_NONE, _SOME = 0.1, 0.04
+"""Share of times of one chip up to which, and of two, of three and of four from which, a source sends a code:
+a code never rises after one chip, and after two to four in .38, .25 and .14 where nothing is missing."""
 
 _BUSY, _MIN_BUSY, _BUSY_CELLS, _MOST_BUSY = 8.0, 30, 3, 0.05
 """How many times the median of a cell's events are many, and at least so many; of so many cells together, and
@@ -334,9 +334,9 @@ def _kind(times: NDArray[np.int64], rate_hz: float) -> Literal["code", "lamp", "
     """What sends rises so far apart."""
     periods = _TAU_US * rate_hz * 1e-6
     share = [times[np.abs(periods - k) < 0.3].sum() / times.sum() for k in range(1, 9)]
-    if max(share) >= _REGULAR:
+    if max(*share, share[0] + share[1]) >= _REGULAR:
         return "lamp"
-    return "code" if share[0] <= _NONE and sum(share[1:]) >= _SOME else "unclear"
+    return "code" if share[0] <= _NONE and min(share[1:4]) >= _SOME else "unclear"
 
 
 def _allowed(times: NDArray[np.generic]) -> NDArray[np.bool_]:

@@ -27,6 +27,10 @@ MOST_EVENTS = 2_000_000
 _FEW_FRAMES = 4
 """Frames below which a link that was tried is no find: chance gives one or two."""
 
+SURE = 0.8
+"""Mean quality of frames from which their symbols are the link's; below, light may be too weak, or the
+modulation another one."""
+
 _GAIN = 0.2
 """How much more of the frames a change must bring to be kept though it does not fit: chance brings .1."""
 
@@ -140,7 +144,7 @@ def better_links(
         ("air.frames_per_packet", None, True),
         ("modulation.id", alike, False),
     ):
-        if best.whole if by_frames else best.fits:
+        if best.whole if by_frames else best.fits and best.quality >= SURE:
             continue
         if name == "air.frames_per_packet" and not best.frames:
             # Whatever the length of a packet, the first frame behind a preamble is accepted.
