@@ -6,10 +6,12 @@ into the cache is therefore compiled by a child, which ends when it has grown, a
 
 import gc
 import importlib
+import logging
 import os
 import signal
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -19,7 +21,7 @@ from typing import Any, NoReturn, TypeVar
 
 import numba
 from numba.core.caching import FunctionCache
-from numba.core.event import trigger_event
+from numba.core.event import Event, Listener, register, trigger_event
 from numba.core.sigutils import normalize_signature
 
 from evlcp_sdk.signals import ENDING
@@ -30,6 +32,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 _GROWN_MB = 200
 """How much a child may grow before another takes its place, which compiles some helpers once more."""
+
+_LONG_S = 2.0
+"""Time spent on compiling after which that is said."""
 
 _IDLE_S = 5.0
 """How long a child waits for another kernel."""
@@ -83,6 +88,34 @@ class _Cache(FunctionCache):
     def _guard_against_spurious_io_errors(self) -> Iterator[None]:
         with suppress(OSError):
             yield
+
+
+class _Patience(Listener):
+    """Says once in a process, to the log, that kernels are being compiled, when that takes long."""
+
+    def __init__(self) -> None:
+        self._spent_s = self._began_s = 0.0
+        self._depth = 0
+        self._told = False
+
+    def on_start(self, event: Event) -> None:
+        """A kernel begins, which may need others."""
+        if not self._depth:
+            self._began_s = time.perf_counter()
+            self._tell()
+        self._depth += 1
+
+    def on_end(self, event: Event) -> None:
+        """It ends."""
+        self._depth -= 1
+        if not self._depth:
+            self._spent_s += time.perf_counter() - self._began_s
+            self._tell()
+
+    def _tell(self) -> None:
+        if self._spent_s > _LONG_S and not self._told:
+            self._told = True
+            logging.getLogger(__name__).info("compiling kernels, once on a machine; half a minute in all")
 
 
 class _Compiler:
@@ -143,6 +176,7 @@ class _Compiler:
 
 
 _COMPILER = _Compiler()
+register("numba:compile", _Patience())  # type: ignore[no-untyped-call]
 
 
 def _serve(pipe: Connection) -> NoReturn:

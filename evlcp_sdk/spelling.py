@@ -1,9 +1,18 @@
-"""What to say of a word that is not known."""
+"""How messages speak of what is not known, and of how many."""
 
 import difflib
 from collections.abc import Sequence
 
-__all__ = ["nearest"]
+__all__ = ["counted", "nearest"]
+
+
+def counted(number: int, what: str) -> str:
+    """A number of things, with thousands apart.
+
+    >>> counted(1, "frame"), counted(4000, "frame")
+    ('1 frame', '4,000 frames')
+    """
+    return f"{number:,} {what}{'s' * (number != 1)}"
 
 
 def nearest(word: str, known: Sequence[str], kind: str = "known") -> str:

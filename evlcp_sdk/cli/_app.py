@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from evlcp_sdk.cli._common import echo, hush
+from evlcp_sdk.cli._common import echo, hush, log_on_stderr
 from evlcp_sdk.printable import printable
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ def run() -> None:
         else:
             others(message, category, *place, **more)
 
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), log_on_stderr():
         warnings.simplefilter("always", PluginWarning)
         warnings.showwarning = show
         hush()

@@ -30,6 +30,7 @@ __all__ = [
     "console",
     "echo",
     "hush",
+    "log_on_stderr",
     "make_executor",
 ]
 
@@ -65,6 +66,27 @@ Dask = Annotated[
 def echo(text: str, *, nl: bool = True) -> None:
     """Print a text on stdout; what it has of names and texts from outside moves no cursor."""
     typer.echo(printable(text), nl=nl)
+
+
+class _Complaints(logging.Handler):
+    """Says on stderr what the SDK writes to its log."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        complain(record.getMessage())
+
+
+@contextmanager
+def log_on_stderr() -> "Iterator[None]":
+    """Say on stderr what the SDK has to say while it works: that kernels are compiled."""
+    log, handler = logging.getLogger("evlcp_sdk"), _Complaints(logging.INFO)
+    before = log.level
+    log.setLevel(logging.INFO)
+    log.addHandler(handler)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(before)
 
 
 def hush() -> None:
@@ -114,16 +136,32 @@ def make_executor(workers: int | None, dask: str | None) -> "Executor":
 
 @contextmanager
 def bytes_bar(name: str) -> "Iterator[Advance]":
-    """A bar by bytes read, on a terminal only."""
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+    """A bar by bytes read, on a terminal only; of what has no size it says how much, or how long it took."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     err = console(stderr=True)
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
-        DownloadColumn(),
+        TextColumn("{task.fields[read]}", markup=False),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task(name, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        task = bar.add_task(name, total=None, read="")
+
+        def advance(done: int, total: int | None) -> None:
+            read = read_so_far(done, total, bar.tasks[0].elapsed or 0.0)
+            bar.update(task, completed=done, total=total, read=read)
+
+        yield advance
+
+
+def read_so_far(done: int, total: int | None, elapsed_s: float) -> str:
+    """What a bar says: of a file how much of it, of a pipe how much, of what counts no bytes how long.
+
+    >>> read_so_far(1_500_000, 2_000_000, 1.0), read_so_far(1_500_000, None, 1.0), read_so_far(0, None, 7.2)
+    ('1.5 of 2.0 MB', '1.5 MB', '7 s')
+    """
+    if total is not None:
+        return f"{done / 1e6:.1f} of {total / 1e6:.1f} MB"
+    return f"{done / 1e6:.1f} MB" if done else f"{elapsed_s:.0f} s"

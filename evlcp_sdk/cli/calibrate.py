@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, echo
+from evlcp_sdk.spelling import counted
 
 if TYPE_CHECKING:
     from evlcp_sdk.place.calibration import Calibrated
@@ -81,7 +82,8 @@ def _table(found: "Calibrated") -> dict[str, Any]:
 def _toml(found: "Calibrated", poses: int) -> str:
     """The tables `[camera]` and `[camera_sigma]`; as comments what was not determined."""
     lines = [
-        f"# {found.views} views, {found.points} points, misses of {found.misfit**0.5:.2f} sigmas (rms)",
+        f"# {counted(found.views, 'view')}, {counted(found.points, 'point')},"
+        f" misses of {found.misfit**0.5:.2f} sigmas (rms)",
         *([f"# {poses - found.views} of {poses} poses show no bar"] if poses > found.views else []),
         "[camera]",
     ]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from evlcp_sdk.cli._common import Json, Workers, console, echo
+from evlcp_sdk.cli._common import Json, Workers, complain, console, echo
 from evlcp_sdk.plugin.hooks import hookimpl
 
 if TYPE_CHECKING:
@@ -74,6 +74,7 @@ def demo(
 def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     import json
     from contextlib import suppress
+    from importlib.util import find_spec
 
     from evlcp_sdk.cli._campaign import progress_bar, show_faults
     from evlcp_sdk.cli._common import make_executor
@@ -88,11 +89,9 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
 
     plan = plan_of(demo_campaign())
     if not as_json:
-        console().print(
-            f"simulating and receiving {len(plan.jobs)} stretches of a drive"
-            " (the first run also compiles the kernels) ...",
-            style="dim",
-        )
+        console().print(f"simulating and receiving {len(plan.jobs)} stretches of a drive ...", style="dim")
+        if find_spec("plotly") is None:
+            complain("report.html will be left out: it needs the extra: pip install 'evlcp-sdk[report]'")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as fault:
@@ -184,9 +183,7 @@ def _decode_recording(out: Path, as_json: bool) -> None:
     registry = Registry.load(frames)
     link = load_link(None, (), registry)
     if not as_json:
-        console().print(
-            f"decoding {recording.name} (the first run also compiles the kernels) ...", style="dim"
-        )
+        console().print(f"decoding {recording.name} ...", style="dim")
     summary = receive_to_folder(recording, out, link, registry=registry, sinks=["figures"])
     # The rows as they are written, which `evlcp score` reads, too.
     found = score_frames(read_frames(out), read_truth(truth_file))

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from evlcp_sdk.cli._common import Json, console, echo
+from evlcp_sdk.spelling import counted
 
 __all__ = ["register", "simulate"]
 
@@ -129,7 +130,9 @@ def simulate(
         f" ({summary['events_per_s'] / 1e6:.1f} Mev/s)"
     )
     if counts["dropped_by_rate_cap"]:
-        screen.print(f"lost to the event-rate limit: {counts['dropped_by_rate_cap']} events", style="yellow")
+        screen.print(
+            f"lost to the event-rate limit: {counted(counts['dropped_by_rate_cap'], 'event')}", style="yellow"
+        )
     screen.print(f"written: {', '.join(map(str, written))}", style="dim")
 
 

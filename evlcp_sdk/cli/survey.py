@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, echo
+from evlcp_sdk.spelling import counted
 
 if TYPE_CHECKING:
     from evlcp_sdk.place.survey import SurveyedBar
@@ -106,5 +107,5 @@ def _line(bar: "SurveyedBar") -> str:
     site = bar.site
     return (
         f"transmitter {site.transmitter_id}: {site.latitude_deg:.9f}, {site.longitude_deg:.9f} deg,"
-        f" {site.height_m:.3f} m, to {site.position_sigma_m:.3f} m, from {bar.views} views"
+        f" {site.height_m:.3f} m, to {site.position_sigma_m:.3f} m, from {counted(bar.views, 'view')}"
     )

@@ -151,7 +151,8 @@ class Positioner:
             how = [text for number in views if (text := self._bars.contradiction(number))]
             if how:
                 return Fix.refused(t_us, tuple(views), "site-contradicted", "; ".join(how))
-            which = ", ".join(map(str, views))
+            ids = self._bars.ids
+            which = ", ".join(f"{n} (id {ids[n]})" if n in ids else f"{n} (no id heard)" for n in views)
             return Fix.refused(t_us, tuple(views), "no-site", f"no site is known of transmitter {which}")
         pose = solve_pose(sited, self._camera, self._attitude_at(t_us), self._spec, self._camera_sigma)
         if isinstance(pose, Refusal):

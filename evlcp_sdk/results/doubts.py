@@ -13,6 +13,7 @@ from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.readout import CAPPED_SHARE, ReadoutTally
 from evlcp_sdk.results.tallies import RunTally, TransmitterTally
+from evlcp_sdk.spelling import counted
 
 __all__ = ["Doubt", "Seen", "codewords_never", "notes_of", "other_codewords", "warnings_of"]
 
@@ -203,7 +204,12 @@ def notes_of(
         reads_messages: Whether messages were looked for.
     """
     found = [
-        Doubt("reflection", f"a reflection of transmitter {one.echo_of}, {one.echoes} frames", "", number)
+        Doubt(
+            "reflection",
+            f"a reflection of transmitter {one.echo_of}, {counted(one.echoes, 'frame')}",
+            "",
+            number,
+        )
         for number, one in sorted(tally.transmitters.items())
         if one.echoes and one.echo_of is not None
     ]
@@ -294,6 +300,14 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Doubt]:
             " (position.antenna_m)",
             "give an attitude with a heading",
         )
+    if (number := positions["refused"].get("no-site", 0)) and not positions["fixes"]:
+        heard = sorted(set(positions["heard"].values()))
+        ids = f"id{_s(len(heard))} {', '.join(map(str, heard))}" if heard else "no id"
+        yield Doubt(
+            "no-site",
+            f"{number} position{_s(number)} refused, as no bar in view stands at a known place; heard: {ids}",
+            "compare transmitter_id in site.toml",
+        )
     if number := positions["refused"].get("misfit", 0):
         yield _misfit(number, positions.get("suspects", {}))
 
@@ -304,7 +318,9 @@ def _misfit(number: int, suspects: Mapping[str, int]) -> Doubt:
     likely = [name for name, times in suspects.items() if 2 * times > number]
     if not likely:
         return Doubt(
-            "misfit", text, "compare sites, angles and [camera] with what is there, and their sigmas"
+            "misfit",
+            text,
+            "compare sites, angles and [camera], its focal_mm first, with what is there, and their sigmas",
         )
     likely.sort(key=lambda name: -suspects[name])
     steps = "; ".join(_SUSPECTS.get(name, f"place, angles and length of {name}") for name in likely)

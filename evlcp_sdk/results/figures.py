@@ -25,6 +25,7 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.plots import ellipse
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.spelling import counted
 from evlcp_sdk.values import Events, Frame, PresenceMap, Region
 
 __all__ = [
@@ -288,7 +289,7 @@ def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]],
     protected.set(ylabel="protection, m", xlabel="camera clock, s", ylim=(0, None))
     for axis in (plan, close, height, spread, protected):
         plain(axis)
-    figure.suptitle(f"{title}: {len(points)} positions shown", fontsize=11, color=_INK)
+    figure.suptitle(f"{title}: {counted(len(points), 'position')} shown", fontsize=11, color=_INK)
     return figure
 
 

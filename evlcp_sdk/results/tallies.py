@@ -291,6 +291,7 @@ class PositionTally:
             "learnt": [_learnt_row(one) for one in navigator.learnt()],
             "origin": asdict(axes) if axes is not None else None,
             "bars_exact": [n for n, s in positioner.stands_at.items() if s.position_sigma_m is None],
+            "heard": {str(n): one for n, one in sorted(positioner.ids.items())},
             "bars": {str(n): s.transmitter_id for n, s in positioner.stands_at.items()},
         }
 

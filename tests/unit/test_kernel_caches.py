@@ -205,3 +205,20 @@ def test_a_child_that_has_grown_makes_room_for_another(tmp_path: Path) -> None:
     code = "import evlcp_sdk.kernels; evlcp_sdk.kernels._GROWN_MB = -1000\n"
     code += COMPILED.format(before="").replace("mine.twice(2)", "mine.twice(2) + mine.twice(2j).imag")
     assert ran(tmp_path, code).split()[:2] == ["8.0", "2" if sys.platform == "linux" else "0"]
+
+
+def test_compiling_is_said_when_it_takes_long(caplog: pytest.LogCaptureFixture) -> None:
+    from evlcp_sdk import kernels
+
+    now_s = iter([0.0, 1.5, 10.0, 11.0, 20.0, 25.0])
+    patience = kernels._Patience()
+    with pytest.MonkeyPatch.context() as patch, caplog.at_level("INFO", "evlcp_sdk"):
+        patch.setattr(kernels.time, "perf_counter", lambda: next(now_s))
+        for said in (0, 1, 1):
+            patience.on_start(None)  # type: ignore[arg-type]
+            # One that it needs.
+            patience.on_start(None)  # type: ignore[arg-type]
+            patience.on_end(None)  # type: ignore[arg-type]
+            patience.on_end(None)  # type: ignore[arg-type]
+            assert len(caplog.messages) == said
+    assert caplog.messages[0].startswith("compiling kernels")

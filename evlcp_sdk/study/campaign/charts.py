@@ -177,7 +177,7 @@ def _as_measure(kind: str) -> Measure:
 
 
 def _mark_name(clusters: int | None, speed_kmh: float | None) -> str:
-    parts = [f"{clusters} clusters"] if clusters and speed_kmh else []
+    parts = [f"{clusters} cluster{'s' * (clusters != 1)}"] if clusters and speed_kmh else []
     parts += [f"{speed_kmh:g} km/h"] if speed_kmh else ["20 to 40 km/h"]
     return f"{PAPER_NAME}: {', '.join(parts)}"
 
@@ -219,7 +219,8 @@ def _dots(series: Series, kind: str, shift: float, *, log: bool) -> tuple[Dot, .
             "rmse_m": f"{tally.ranged} distances, bias {tally.bias_m:+.3f} m",
             "gross_share": f"{tally.gross} of {tally.ranged} distances",
             "found_share": f"{tally.frames_found} of {tally.frames_sent} frames",
-            "position_rmse_m": f"{tally.fixes} positions, half within {tally.position_quantile_m(0.5):.3f} m,"
+            "position_rmse_m": f"{tally.fixes} position{'s' * (tally.fixes != 1)},"
+            f" half within {tally.position_quantile_m(0.5):.3f} m,"
             f" 95 % within {tally.position_quantile_m(0.95):.3f} m; {tally.fixes_refused} refused",
         }[kind]
         shown = f"below {figure.high:.2g}" if none else f"{figure.value:.4g}"

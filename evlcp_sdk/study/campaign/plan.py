@@ -172,7 +172,8 @@ class Plan:
 
 
 _SHA256 = r"^[0-9a-f]{64}$"
-_NAME = r"^[\w.-]+$"
+_NAME = r"^[\w.-]+( [\w.-]+)*$"
+"""Words of letters, digits, dots and dashes: a campaign names files."""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.spelling import counted
 from evlcp_sdk.study.campaign.charts import Chart, Line, charts_of, decades
 from evlcp_sdk.study.campaign.paper import PAPER_NAME
 from evlcp_sdk.study.campaign.plan import digest_of
@@ -62,7 +63,7 @@ def title_of(summary: Summary) -> str:
 def _about(summary: Summary) -> list[str]:
     """How much was done, and what the series differ in."""
     few = summary.done < summary.tasks
-    done = f"{summary.done} of {summary.tasks} tasks" if few else f"{summary.done} tasks"
+    done = f"{summary.done} of {summary.tasks} tasks" if few else counted(summary.done, "task")
     statistics = [one.statistics for one in summary.series]
     events, seconds = sum(s.events for s in statistics), sum(s.duration_us for s in statistics) * 1e-6
     told = [f"{done}, {seconds:,.1f} s received, {events / 1e6:,.1f} million events."]

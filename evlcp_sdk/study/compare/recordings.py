@@ -67,9 +67,9 @@ def comparison_of(
     for i, variant in enumerate(variants):
         counted = [one.rows[i].measured.statistics for one in tables]
         if ghosts := sum(one.unmatched for one in counted):
-            notes.append(f"{variant.name}: {ghosts} frames match no true one")
+            notes.append(f"{variant.name}: {ghosts} frame{'s' * (ghosts != 1)} without a true one")
         if echoes := sum(one.echoes for one in counted):
-            notes.append(f"{variant.name}: {echoes} frames are said to be reflections and left out")
+            notes.append(f"{variant.name}: {echoes} frame{'s' * (echoes != 1)} of reflections, left out")
     all_of = (total_of(tables),) if len(tables) > 1 else ()
     about = {v.name: v.to_dict() for v in variants}
     return Comparison(about, (*tables, *all_of), tuple(notes), dict(versions))

@@ -11,6 +11,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.results.doubts import codewords_never
 from evlcp_sdk.results.readout import CAPPED_SHARE
 from evlcp_sdk.results.tallies import RunTally, TransmitterTally
+from evlcp_sdk.spelling import counted
 from evlcp_sdk.study.diagnosis.light import LightSource
 from evlcp_sdk.study.diagnosis.probe import SURE, Trial
 
@@ -282,7 +283,8 @@ def _light(facts: Facts) -> Check:
                 "light",
                 "fail",
                 "lamp",
-                f"{len(lamps)} lamps blink ({rates}{', ...' if len(lamps) > 4 else ''}), nothing sends chips",
+                f"{counted(len(lamps), 'lamp')} blinking ({rates}{', ...' if len(lamps) > 4 else ''}),"
+                " nothing sends chips",
                 f"is a bar in the picture ({view}), and on (`evlcp board status`)?",
             )
         first = facts.sources[0]

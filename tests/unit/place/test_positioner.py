@@ -175,6 +175,7 @@ def test_an_unknown_site_is_refused() -> None:
     fixes = p.feed(packets_of(RIGHT, 3, 4)) + p.close()
     assert {f.refusal for f in fixes} == {"no-site"}
     assert fixes[0].transmitters == (3,)
+    assert fixes[0].detail == "no site is known of transmitter 3 (no id heard)"
     assert p.counts["refused"] == len(fixes)
 
 

@@ -250,6 +250,21 @@ def test_events_that_were_dropped() -> None:
     assert "200 in the file" in doubt.text
 
 
+def test_bars_at_no_known_place_are_named_by_their_ids() -> None:
+    for heard, says in (
+        ({"0": 9, "1": 7, "2": 9}, "heard: ids 7, 9: compare"),
+        ({}, "heard: no id: compare"),
+    ):
+        positions = dict(NO_POSITIONS, refused={"no-site": 4}, heard=heard)
+        found = warnings_of(RunTally(LINK.packet), {}, LINK, positions=positions)
+        assert [says in str(one) for one in found if one.code == "no-site"] == [True]
+        # A bar more beside those that are known is none.
+        known = dict(positions, fixes=9)
+        assert all(
+            one.code != "no-site" for one in warnings_of(RunTally(LINK.packet), {}, LINK, positions=known)
+        )
+
+
 def test_a_misfit_names_what_would_explain_it() -> None:
     for suspects, says in (
         ({"heading": 9, "bar 1": 2}, "another heading would explain it: compare --heading-deg"),
@@ -257,7 +272,7 @@ def test_a_misfit_names_what_would_explain_it() -> None:
             {"focal length": 10, "bar 0": 6},
             "another focal length or another bar 0 would explain it: compare camera.",
         ),
-        ({"bar 0": 3}, "contradict one another: compare sites, angles and [camera]"),
+        ({"bar 0": 3}, "contradict one another: compare sites, angles and [camera], its focal_mm"),
     ):
         positions = dict(NO_POSITIONS, refused={"misfit": 10}, suspects=suspects)
         (doubt,) = [

@@ -90,7 +90,7 @@ def test_an_id_follows_everything_that_determines_the_result_and_nothing_else(tm
         return len(ids & {task for point in other.points for task in point.tasks})
 
     assert shared() == 36
-    assert shared(overrides=["campaign.name=other", "campaign.max_bits=5"]) == 36
+    assert shared(overrides=["campaign.name=other day", "campaign.max_bits=5"]) == 36
     assert shared(TEXT.replace("16 clusters", "all")) == 36
     assert shared(overrides=["campaign.seeds=5"]) == 36
     assert shared(overrides=["campaign.first_seed=11"]) == 24
@@ -126,7 +126,8 @@ def test_an_override_takes_the_place_of_an_axis(tmp_path: Path) -> None:
         ("seeds = 3", "seeds = 0", "c.toml: campaign.seeds = 0: expected greater than or equal to 1"),
         ("seeds = 3", "sedes = 3", "c.toml: campaign.sedes = 3: unknown key; did you mean 'seeds'?"),
         ('name = "try"', "", "c.toml: campaign.name: missing"),
-        ('name = "try"', 'name = "a b"', 'campaign.name = "a b": expected to match pattern'),
+        ('name = "try"', 'name = "a/b"', 'campaign.name = "a/b": expected to match pattern'),
+        ('name = "try"', 'name = "a "', 'campaign.name = "a ": expected to match pattern'),
         ("[20, 30]", "20", "c.toml: scene.grid.speed_kmh = 20: expected a list of values"),
         ("[20, 30]", "[20, 20]", "c.toml: scene.grid.speed_kmh: a value stands there twice"),
         ("[20, 30]", "[]", "expected a list of values"),
