@@ -5,12 +5,16 @@ import os
 import pty
 import subprocess
 import sys
+import threading
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
-from evlcp_sdk.cli._common import log_on_stderr, read_so_far
+from evlcp_sdk.cli import _common
+from evlcp_sdk.cli._common import bytes_bar, log_on_stderr, read_so_far
 from evlcp_sdk.io import write_events
 from evlcp_sdk.printable import printable
 from evlcp_sdk.values import Events
@@ -94,3 +98,16 @@ def test_the_log_is_said_on_stderr(capsys: pytest.CaptureFixture[str]) -> None:
     logging.getLogger("evlcp_sdk.kernels").info("not said")
     said = capsys.readouterr()
     assert (said.out, said.err) == ("", "evlcp: compiling\\x1b\n")
+
+
+def test_a_bar_has_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With another thread, kernels would be compiled in this process, which takes 300 MB."""
+    said = StringIO()
+    screen = Console(file=said, force_terminal=True, width=80)
+    monkeypatch.setattr(_common, "console", lambda stderr: screen)
+    before = threading.active_count()
+    with bytes_bar("night.raw") as advance:
+        advance(1_000_000, 4_000_000)
+        assert threading.active_count() == before
+        advance(4_000_000, 4_000_000)
+    assert "1.0 of 4.0 MB" in said.getvalue()
