@@ -18,13 +18,13 @@ __all__ = ["PLOT_STYLE", "Plot", "ellipse"]
 
 PLOT_STYLE = """
 .plot { margin: 0.4rem 0 1.2rem } .plot .legend { color: var(--dim); font-size: 0.85rem }
-.legend i { display: inline-block; width: 0.8em; height: 0.8em; border-radius: 50%; margin: 0 0.3em 0 0.9em }
-.legend i:first-child { margin-left: 0 }
+.legend i { display: inline-block; width: 0.8em; height: 0.8em; border-radius: 50%; margin-right: 0.3em }
+.legend span { white-space: nowrap; margin-right: 0.7em }
 .area { position: relative; margin: 1.5rem 0.5rem 2.6rem 3.4rem; border-left: 1px solid var(--dim);
   border-bottom: 1px solid var(--dim); touch-action: pan-y }
 .area svg { position: absolute; inset: 0; width: 100%; height: 100%; overflow: hidden }
 .area path { fill: none; vector-effect: non-scaling-stroke } .area path.grid { stroke: var(--line) }
-@media (prefers-color-scheme: dark) { .area svg, .legend i { filter: brightness(1.5) } }
+@media (prefers-color-scheme: dark) { .area svg, .legend i { filter: brightness(1.3) } }
 .area span { position: absolute; color: var(--dim); font-size: 0.75rem; line-height: 1; white-space: nowrap }
 .area .x { top: calc(100% + 0.4rem); transform: translateX(-50%) }
 .area .y { right: calc(100% + 0.4rem); transform: translateY(-50%) }
@@ -164,7 +164,7 @@ class Plot:
             for x, y, text in self._said
         ]
         legend = Markup("").join(
-            Markup('<i style="background:{}"></i>{}').format(colour, name)
+            Markup('<span><i style="background:{}"></i>{}</span> ').format(colour, name)
             for name, colour in self._legend.items()
         )
         height = "height:15rem" if self.aspect is None else f"aspect-ratio:{self.aspect:.4f}"
