@@ -126,7 +126,7 @@ class Report(Sink):
             self._track.add(one)
 
     def conclude(self, summary: Mapping[str, Any]) -> None:
-        """Write the page."""
+        """Write the page, which is the same for the same recording: how long it took is not in it."""
         if summary["recording"]["duration_s"] > _SECONDS:
             self._axis, self._step_ms = "s since the first event", 1000.0
         plots: list[Plot] = []
@@ -161,7 +161,7 @@ class Report(Sink):
         return (t_us - (self._first_us or 0)) * 1e-3
 
     def _headline(self, summary: Mapping[str, Any]) -> Markup:
-        recording, processing = summary["recording"], summary["processing"]
+        recording = summary["recording"]
         own = [t for t in summary["transmitters"] if t["echo_of"] is None]
         given = sum(t["symbols_given"] for t in own)
         found, expected = (sum(t[key] for t in own) for key in ("frames_found", "frames_expected"))
@@ -196,8 +196,6 @@ class Report(Sink):
         figures += [
             ("recording", f"{recording['duration_s']:.3g} s", f"{recording['counts']['events']:,} events"),
         ]
-        if (speed := processing["times_real_time"]) is not None:
-            figures.append(("speed", f"{speed:.2f} x", "real time, of one core"))
         head = Markup("<p>{}</p>").format(summary["result"])
         if summary["status"] != "complete":
             said = ": ".join(part for part in (summary["status"], summary["error"]) if part)

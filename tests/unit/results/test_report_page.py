@@ -246,6 +246,19 @@ def test_the_map_shows_fixes_and_bars(tmp_path: Path) -> None:
     assert {"height", "spread"} <= told.keys()
 
 
+def test_the_same_recording_has_the_same_page(tmp_path: Path) -> None:
+    """However long it took: a result's digests can be compared."""
+    pages = []
+    for speed in (0.5, 2.0):
+        with ResultFolder(tmp_path, ["report.html"]) as folder:
+            sink = Report(folder, Run("a.raw", LINK))
+            sink.packet(packets(1)[0])
+            sink.conclude(SUMMARY | {"processing": {"times_real_time": speed, "elapsed_s": 1 / speed}})
+            folder.finish()
+        pages.append((tmp_path / "report.html").read_bytes())
+    assert pages[0] == pages[1]
+
+
 def test_nothing_found_has_a_page(tmp_path: Path) -> None:
     events = Events.empty()
     with ResultWriter(tmp_path, LINK, sinks=["report"]) as out:
