@@ -177,7 +177,8 @@ def warnings_of(
     for number, one in sorted(tally.transmitters.items()):
         if one.frames - one.echoes >= _FEW_FRAMES:
             found += _transmitter(number, one, link, counts, seen)
-        found += _coverage(number, one, link, seen)
+        if one.frames > one.echoes:
+            found += _coverage(number, one, link, seen)
         found += _length(number, one, link)
         if positions is None:
             found += _turned(number, one, link)

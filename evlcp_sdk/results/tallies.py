@@ -103,7 +103,9 @@ class TransmitterTally:
                 if self.ranged == 1:
                     self.first_m = distance_m
                 self.cells[round(min(distance_m, _FARTHEST_M) / _CELL_M)] += 1
-                self._add_size(frame, distance_m)
+                if frame.echo_of is None:
+                    # A mirror image stands on its head.
+                    self._add_size(frame, distance_m)
 
     def _add_size(self, frame: Frame, distance_m: float) -> None:
         """Add how long the bar looks times its distance, which is the same wherever it is."""

@@ -290,6 +290,14 @@ def test_an_attitude_that_the_image_contradicts() -> None:
 
 def test_a_reflection_is_not_doubted() -> None:
     assert told(tally_of(RANDOM % 16, ppm=5000, echo_of=3), blocks_tried=0) == []
+    # In a wet road it stands on its head.
+    head_down = 400 - LINK.camera.focal_px * LINK.bar.cluster_centres_m() / 50
+    (line,) = told(tally_of(RANDOM, points=head_down))
+    assert line.startswith("transmitter 0: its clusters stand the other way round")
+    assert told(tally_of(RANDOM, points=head_down, echo_of=3)) == []
+    tally = tally_of(RANDOM, points=head_down, echo_of=3)
+    seen = Seen(0.0, 1e6, lit_us={0: (0.0, 9e5)})
+    assert warnings_of(tally, {}, LINK, seen=seen) == []
 
 
 def test_what_blinks_without_a_preamble() -> None:
