@@ -54,7 +54,8 @@ def test_it_shows_the_speed_of_the_recording(demo_raw: Path) -> None:
     assert len(speed) == len(lines) - 2
     assert abs(speed[-1] - true_m_s) < 1.0
     assert 0.05 < sigma[-1] < 0.5
-    assert sigma[-1] < sigma[3] / 5
+    # The first six, as one of them is good to a third only.
+    assert sigma[-1] < sigma[:6].mean() / 5
     assert km_h == pytest.approx(3.6 * speed, abs=0.1)
 
 

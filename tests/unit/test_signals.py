@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -41,7 +42,9 @@ def test_a_run_that_is_told_to_end_keeps_what_it_has(
         file.write(data[: len(data) // 2])
         process.send_signal(number)
         time.sleep(0.2)
-        file.write(data[len(data) // 2 :])
+        # It may have ended by now, and nobody reads on.
+        with suppress(BrokenPipeError):
+            file.write(data[len(data) // 2 :])
         _, said = process.communicate(timeout=60)
     assert said == f"evlcp: interrupted; what was decoded until then is in {out}\n"
     assert process.returncode == 130

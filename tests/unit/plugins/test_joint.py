@@ -111,17 +111,20 @@ def test_it_stands_tilt_motion_and_damage(how: dict[str, float]) -> None:
 
 
 def test_unknown_symbols_leave_the_pilot_of_their_clusters() -> None:
-    view = view_of(50.0, noise=0.5, seed=4)
-    symbols = view.soft.symbols.copy()
-    symbols[[2, 3, 9]] = -1
-    soft = SoftSymbols(symbols, view.soft.llr, 1.0)
-    found = measured(FrameView(view.sums, view.offset_px, view.presence, soft))
-    assert found.distance_m == pytest.approx(50, rel=4e-3)
-    assert found.pairs == 15
-    # Guessed at, they would be left out or bend the fit.
-    symbols[[2, 3, 9]] = (view.soft.symbols[[2, 3, 9]] + 1) % 64
-    guessed = measured(FrameView(view.sums, view.offset_px, view.presence, soft))
-    assert found.sigma_m < guessed.sigma_m
+    sigma_m = []
+    for seed in range(4, 12):
+        view = view_of(50.0, noise=0.5, seed=seed)
+        symbols = view.soft.symbols.copy()
+        symbols[[2, 3, 9]] = -1
+        soft = SoftSymbols(symbols, view.soft.llr, 1.0)
+        found = measured(FrameView(view.sums, view.offset_px, view.presence, soft))
+        assert found.distance_m == pytest.approx(50, rel=4e-3)
+        assert found.pairs == 15
+        # Guessed at, they would be left out or bend the fit.
+        symbols[[2, 3, 9]] = (view.soft.symbols[[2, 3, 9]] + 1) % 64
+        guessed = measured(FrameView(view.sums, view.offset_px, view.presence, soft))
+        sigma_m.append((found.sigma_m, guessed.sigma_m))
+    assert np.mean(sigma_m, 0)[0] < np.mean(sigma_m, 0)[1], sigma_m
 
 
 def test_a_reflection_beside_the_bar_does_not_matter() -> None:

@@ -148,7 +148,7 @@ def test_from_a_scene_to_the_lines_of_a_result(evlcp: Any, tmp_path: Path) -> No
     assert (text["text"], text["transmitter_id"], text["sequence"]) == ("Tempo_30", 7, 5)
     (beacon,) = (m for m in messages if m["verified"])
     assert (beacon["latitude_deg"], beacon["longitude_deg"], beacon["height_m"]) == (35.1, 136.9, 52.4)
-    assert "2 messages; beacons 1 times verified, 1 times unverified; how old verified ones are" in told.out
+    assert "2 messages; beacons once verified, once unverified; how old verified ones are" in told.out
     assert beacon["reason"] == "signed 1970-01-01 00:00:05 UTC; when it was received is not known"
     assert beacon["age_s"] is None
     counts = json.loads((out / "summary.json").read_text())["counts"]
