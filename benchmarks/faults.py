@@ -6,7 +6,7 @@ The drives are those of examples/campaigns/position.toml with two and three bars
 all. Each is simulated and received once: all faults are made on the way from packets to positions, one at a
 time, and nobody is told of them. A row has all drives of one setting:
 
-- refused: refused as a misfit, or as contradicted by the beacons; others are in none of the columns
+- refused: as a misfit, as not determined, or as contradicted by the beacons; others are in no column
 - silent: given, with an error beyond the 99.73 % bound of the fix's own covariance
 - not covered: the same, and no protection level covers it
 - excluded: given without a part that is named
@@ -15,7 +15,7 @@ time, and nobody is told of them. A row has all drives of one setting:
 import argparse
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -147,10 +147,8 @@ class Count:
     uncovered: int = 0
     excluded: int = 0
     protected: int = 0
-
-    def __post_init__(self) -> None:
-        self.errors: list[float] = []
-        self.squares: list[float] = []
+    errors: list[float] = field(default_factory=list)
+    squares: list[float] = field(default_factory=list)
 
 
 def count(into: Count, packets: list[Packet], truth: Truth, told: Told) -> None:

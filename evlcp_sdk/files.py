@@ -424,11 +424,17 @@ _MOST = 1e18
 """Size of the largest number of a CSV file: microseconds since 1970 are 1e15."""
 
 
-def csv_number(path: Path | str, line: int, name: str, text: str | None) -> float:
+def csv_number(
+    path: Path | str,
+    line: int,
+    name: str,
+    text: str | None,
+    within: tuple[float, float] = (-math.inf, math.inf),
+) -> float:
     """A number of a CSV file that was read.
 
     Raises:
-        ConfigError: It is not one, or larger than any that makes sense.
+        ConfigError: It is not one, larger than any that makes sense, or not between these two.
     """
     try:
         value = float(text if text is not None else "")
@@ -437,6 +443,9 @@ def csv_number(path: Path | str, line: int, name: str, text: str | None) -> floa
     if not abs(value) <= _MOST:
         wanted = "a number" if not math.isfinite(value) else f"at most {_MOST:g}"
         raise ConfigError(f"{path}: line {line}: {name} = {text!r:.40}: expected {wanted}")
+    low, high = within
+    if not low <= value <= high:
+        raise ConfigError(f"{path}: line {line}: {name} = {text!r:.40}: expected {low:g} to {high:g}")
     return value
 
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import csv_number, read_csv
 from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.poses import PLACE
 from evlcp_sdk.place.trajectory import GNSS
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import LocalAxes
@@ -20,13 +22,8 @@ __all__ = ["GnssLog", "attitude_of", "gnss_fix"]
 
 Floats = NDArray[np.float64]
 
-_PLACE = {
-    "latitude_deg": (-90.0, 90.0),
-    "longitude_deg": (-180.0, 180.0),
-    "height_m": (-12_000.0, 20_000.0),
-}
 _SIGMAS = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
-_LEAST_M, _MOST_M = 1e-4, 1e4
+_SIGMA_M = (1e-4, 1e4)
 """What a sigma may be: with one of 0 nothing else would count, and of 10 km it says nothing."""
 _CROSSED = {"cov_east_north_m2": (0, 1), "cov_east_up_m2": (0, 2), "cov_north_up_m2": (1, 2)}
 
@@ -62,7 +59,7 @@ class GnssLog:
                 or a covariance is none.
         """
         names, rows = read_csv(path)
-        needed = ("t_us", *_PLACE, *_SIGMAS)
+        needed = ("t_us", *PLACE, *_SIGMAS)
         missing = [name for name in needed if name not in names]
         if missing:
             known = ", ".join((*needed, *_CROSSED))
@@ -72,29 +69,18 @@ class GnssLog:
         t_us, place = np.empty(len(rows)), np.empty((len(rows), 3))
         spread = np.empty((len(rows), 3, 3))
         for i, (line, row) in enumerate(rows):
-
-            def value(name: str, line: int = line, row: dict[str, str | None] = row) -> float:
-                return csv_number(path, line, name, row[name])
-
-            def within(name: str, low: float, high: float, line: int = line) -> float:
-                number = value(name)
-                if not low <= number <= high:
-                    raise ConfigError(
-                        f"{path}: line {line}: {name} = {number:g}: expected {low:g} to {high:g}"
-                    )
-                return number
-
-            t_us[i] = value("t_us")
+            value = partial(csv_number, path, line)
+            t_us[i] = value("t_us", row["t_us"])
             if i and not t_us[i] > t_us[i - 1]:
                 raise ConfigError(
                     f"{path}: line {line}: t_us = {t_us[i]:.16g}: expected more than the line before,"
                     f" {t_us[i - 1]:.16g}: rising t_us"
                 )
-            place[i] = [within(name, low, high) for name, (low, high) in _PLACE.items()]
-            spread[i] = np.diag([within(name, _LEAST_M, _MOST_M) ** 2 for name in _SIGMAS])
+            place[i] = [value(name, row[name], within) for name, within in PLACE.items()]
+            spread[i] = np.diag([value(name, row[name], _SIGMA_M) ** 2 for name in _SIGMAS])
             for name, (a, b) in _CROSSED.items():
                 if name in names:
-                    spread[i, a, b] = spread[i, b, a] = value(name)
+                    spread[i, a, b] = spread[i, b, a] = value(name, row[name])
             if not np.linalg.eigvalsh(spread[i])[0] > 0:
                 raise ConfigError(f"{path}: line {line}: sigmas and covariances: expected a covariance")
         return cls(t_us, place, spread)

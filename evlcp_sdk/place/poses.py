@@ -1,20 +1,23 @@
 """Where a camera was when: the poses that a calibration goes by, from a file."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import read_csv
+from evlcp_sdk.files import csv_number, read_csv
 from evlcp_sdk.scene.attitude import Attitude
 
-__all__ = ["KnownPose", "read_poses"]
+__all__ = ["PLACE", "KnownPose", "read_poses"]
 
-_RANGES = {
+PLACE = {
     "latitude_deg": (-90.0, 90.0),
     "longitude_deg": (-180.0, 180.0),
     "height_m": (-12_000.0, 20_000.0),
+}
+"""Columns of a place on earth, and what they may be, least and most."""
+
+_RANGES = PLACE | {
     "position_sigma_m": (1e-6, 1e6),
     "attitude_sigma_deg": (1e-6, 1e6),
     "heading_deg": (-360.0, 360.0),
@@ -22,7 +25,7 @@ _RANGES = {
     "roll_deg": (-360.0, 360.0),
     "t_us": (-1e18, 1e18),
 }
-"""What a pose's values may be, least and most; exact ones would outweigh all in double precision."""
+"""What a pose's values may be; exact ones would outweigh all in double precision."""
 
 
 @dataclass(frozen=True)
@@ -66,20 +69,13 @@ def read_poses(path: Path | str) -> list[KnownPose]:
     poses = []
     for line, row in rows:
 
-        def value(name: str, usual: float | None = None, line: int = line, row: Any = row) -> float:
+        def value(
+            name: str, usual: float | None = None, line: int = line, row: dict[str, Any] = row
+        ) -> float:
             text = row.get(name)
             if usual is not None and text in (None, ""):
                 return usual
-            try:
-                number = float(text)
-            except (TypeError, ValueError):
-                number = math.nan
-            if not math.isfinite(number):
-                raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected a number")
-            low, high = _RANGES[name]
-            if not low <= number <= high:
-                raise ConfigError(f"{path}: line {line}: {name} = {text!r}: expected {low:g} to {high:g}")
-            return number
+            return csv_number(path, line, name, text, _RANGES[name])
 
         angles = [name for name in ("heading_deg", "pitch_deg", "roll_deg") if row.get(name)]
         attitude = None

@@ -172,8 +172,8 @@ def test_a_file_of_fixes(tmp_path: Path) -> None:
     [
         (HEAD.replace(",height_m", "") + "\n", "line 1: no column height_m"),
         (HEAD + "\n", "one line of values or more"),
-        (HEAD + "\n0,95,137,50,1,1,1\n", "line 2: latitude_deg = 95: expected -90 to 90"),
-        (HEAD + "\n0,35,137,50,1,1,0\n", "line 2: sigma_up_m = 0: expected 0.0001 to 10000"),
+        (HEAD + "\n0,95,137,50,1,1,1\n", "line 2: latitude_deg = '95': expected -90 to 90"),
+        (HEAD + "\n0,35,137,50,1,1,0\n", "line 2: sigma_up_m = '0': expected 0.0001 to 10000"),
         (HEAD + "\n0,35,137,x,1,1,1\n", "line 2: height_m = 'x': expected a number"),
         (HEAD + "\n0,35,137,5,1,1,1\n0,35,137,5,1,1,1\n", "line 3: t_us = 0: expected more than"),
         (HEAD + ",cov_east_up_m2\n0,35,137,5,1,1,1,2\n", "line 2: sigmas and covariances"),
