@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.results.readout import CAPPED_SHARE, ReadoutTally
+from evlcp_sdk.results.readout import ReadoutTally
 from evlcp_sdk.results.tallies import RunTally, TransmitterTally
 from evlcp_sdk.spelling import counted
 
-__all__ = ["Doubt", "Seen", "codewords_never", "notes_of", "other_codewords", "warnings_of"]
+__all__ = ["Doubt", "Seen", "codewords_never", "notes_of", "other_codewords", "saturation", "warnings_of"]
 
 _TOLD_SIGMAS = 3.0
 """Sigmas beyond which what a drive tells is hinted at."""
@@ -73,9 +73,6 @@ _LIT_SHARE, _LIT_PACKETS = 0.2, 3
 
 _DROPPED_SHARE, _DROPPED_LEAST = 0.001, 100
 """Of the events: dropped ones of which more is said. A restart of the camera costs fewer."""
-
-_SATURATED_S = 0.01
-"""Recordings shorter than this are too short to tell a limit from chance."""
 
 _NO_ROOM = (
     ("dropped_crowded", "{} event{} of crowded time steps dropped"),
@@ -152,6 +149,11 @@ class Seen:
         length_us = self.last_us - self.first_us
         return length_us if length_us > 0 else 0.0
 
+    @property
+    def peak_mev_s(self) -> float:
+        """Events a second in the fullest millisecond, in millions; 0 where they were not counted."""
+        return self.readout.capped()[1] / 1e3 if self.readout is not None else 0.0
+
 
 def warnings_of(
     tally: RunTally,
@@ -173,7 +175,7 @@ def warnings_of(
         positions: Figures of the positions, where they were computed.
     """
     seen = Seen() if seen is None else seen
-    found = [*_readout(seen), *_dropped(counts, seen), *_frames(counts), *_room(counts)]
+    found = [*saturation(seen), *_dropped(counts, seen), *_frames(counts), *_room(counts)]
     for number, one in sorted(tally.transmitters.items()):
         if one.frames - one.echoes >= _FEW_FRAMES:
             found += _transmitter(number, one, link, counts, seen)
@@ -351,16 +353,14 @@ def _learnt(rows: Sequence[Mapping[str, Any]], link: Link) -> Iterator[Doubt]:
             )
 
 
-def _readout(seen: Seen) -> Iterator[Doubt]:
+def saturation(seen: Seen) -> Iterator[Doubt]:
     """A readout that is at its limit."""
-    if seen.readout is None or seen.duration_us < _SATURATED_S * 1e6:
-        return
-    share, peak = seen.readout.capped()
-    if share >= CAPPED_SHARE:
+    if seen.readout is not None and seen.readout.at_limit:
+        share, _ = seen.readout.capped()
         yield Doubt(
             "saturated",
-            f"{share:.0%} of all milliseconds, {seen.readout.capped_ms}, hold {peak / 1e3:.3g} Mev/s, no more"
-            " and no less: the sensor's readout is at its limit, and what is beyond is lost",
+            f"{share:.0%} of all milliseconds, {seen.readout.capped_ms}, hold {seen.peak_mev_s:.3g} Mev/s, no"
+            " more and no less: the sensor's readout is at its limit, and what is beyond is lost",
             "mask rows and columns beside the bar, close the aperture, or raise the event-rate limit",
         )
 

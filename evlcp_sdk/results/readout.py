@@ -7,11 +7,14 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.values import Events
 
-__all__ = ["CAPPED_SHARE", "ReadoutTally"]
+__all__ = ["ReadoutTally"]
 
-CAPPED_SHARE = 0.2
+_CAPPED_SHARE = 0.2
 """Share of milliseconds with the very same number of events, to half a percent, above which the readout is
 at its limit: chips, and the noise of their number, change it by more."""
+
+_LEAST_MS = 10
+"""Milliseconds with events below which chance may be taken for a limit."""
 
 _BIN = 0.005
 """Width of the bins of events in a millisecond, as a share."""
@@ -58,6 +61,11 @@ class ReadoutTally:
         if not many:
             return 0.0, 0.0
         return self.capped_ms / many, float((1 + _BIN) ** self._top)
+
+    @property
+    def at_limit(self) -> bool:
+        """Whether the readout was at its limit."""
+        return int(self._hist.sum()) >= _LEAST_MS and self.capped()[0] >= _CAPPED_SHARE
 
     @property
     def capped_ms(self) -> int:

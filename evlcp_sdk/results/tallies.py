@@ -211,6 +211,17 @@ class RunTally:
             self.others += 1
             self.others_frames += self.transmitters.popitem(last=False)[1].frames
 
+    @property
+    def own(self) -> list[TransmitterTally]:
+        """Figures of the transmitters that are no reflections."""
+        return [one for one in self.transmitters.values() if one.frames > one.echoes]
+
+    @property
+    def quality(self) -> float:
+        """Mean quality of their frames; 0 without any."""
+        own = self.own
+        return sum(one.quality_sum for one in own) / max(sum(one.frames for one in own), 1)
+
     def headline(self) -> str:
         """What was found, in one sentence."""
         if not self.transmitters:

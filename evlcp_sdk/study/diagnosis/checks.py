@@ -8,9 +8,8 @@ from typing import Literal
 import numpy as np
 
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.results.doubts import codewords_never
-from evlcp_sdk.results.readout import CAPPED_SHARE
-from evlcp_sdk.results.tallies import RunTally, TransmitterTally
+from evlcp_sdk.results.doubts import Seen, codewords_never, saturation
+from evlcp_sdk.results.tallies import RunTally
 from evlcp_sdk.spelling import counted
 from evlcp_sdk.study.diagnosis.light import LightSource
 from evlcp_sdk.study.diagnosis.probe import SURE, Trial
@@ -68,6 +67,9 @@ _SAME_RATE = 0.03
 _BESIDE = 0.1
 """Events of a source, of those of the largest, below which it is the halo of a lamp rather than a bar."""
 
+_ASIDE_M = 1e-9
+"""Way from a bar's first cluster to its last, in one direction, below which there is none."""
+
 _EDGE_PX = 8
 """Seam of the picture: a source that comes so near may go on outside."""
 
@@ -98,34 +100,24 @@ class Facts:
     Attributes:
         link: The link that it was received with.
         events: How many there are.
-        duration_s: From the first to the last, s.
-        size_px: (width, height) of the sensor.
-        capped_share: Share of milliseconds that are as full as the fullest.
-        peak_events_s: Events a second in the fullest.
+        seen: Its length, and the events of each millisecond.
         sources: What blinks, by events.
         restless: Box of where far more happens than elsewhere, px; None for nowhere.
         counts: The receiver's counts.
         tally: Its figures.
-        order: 1 where columns, and rows, of clusters grow as in the bar, -1 where they fall, 0 unknown.
-        spacing_px: From cluster to cluster along the bar, mean of the frames read; NaN without any.
-        trials: Other links that were tried.
         losses: What the reader skipped, in words.
+        trials: Links that were tried, the one given first.
     """
 
     link: Link
     events: int
-    duration_s: float
-    size_px: tuple[int, int]
-    capped_share: float
-    peak_events_s: float
+    seen: Seen
     sources: Sequence[LightSource]
     restless: tuple[int, int, int, int] | None
     counts: Mapping[str, int]
     tally: RunTally
-    order: tuple[int, int] = (0, 0)
-    spacing_px: float = math.nan
-    trials: Sequence[Trial] = ()
     losses: Sequence[str] = ()
+    trials: Sequence[Trial] = ()
 
     @property
     def bar(self) -> LightSource | None:
@@ -145,7 +137,7 @@ class Facts:
         if self.bar is None:
             return False
         left, top, right, bottom = self.bar.box_px
-        width, height = self.size_px
+        width, height = self.link.camera.width, self.link.camera.height
         return min(left, top) < _EDGE_PX or right > width - _EDGE_PX or bottom > height - _EDGE_PX
 
     @property
@@ -156,40 +148,47 @@ class Facts:
             return True
         # What is no bar may lose its frames elsewhere in the picture.
         form = self.link.packet
-        sent = form.frames / (form.packet_chips * form.chip_us * 1e-6) * self.duration_s
+        sent = form.frames / (form.packet_chips * form.chip_us * 1e-6) * self.seen.duration_us * 1e-6
         return any(
             one.frames >= max(_FEW, ACCEPTED_SHARE * (one.last_frame - one.first_frame + 1), _MOST * sent)
-            for one in self.own
+            for one in self.tally.own
         )
-
-    @property
-    def own(self) -> list[TransmitterTally]:
-        """Figures of the transmitters that are no reflections."""
-        return [one for one in self.tally.transmitters.values() if one.frames > one.echoes]
 
     @property
     def better(self) -> Trial | None:
         """Another link that fits, the best of those tried."""
-        fit = [trial for trial in self.trials if trial.fits and trial.quality >= SURE]
+        fit = [trial for trial in self.trials if trial.changes and trial.fits and trial.quality >= SURE]
         return max(fit, key=lambda one: one.rank, default=None)
 
     @property
     def cluster_px(self) -> float:
         """From cluster to cluster, px: in frames that are read, else by the bar's source; NaN without one."""
-        if self.spacing_px > 0:
-            return self.spacing_px
+        read = [one for one in self.tally.own if one.sized]
+        if read:
+            one = max(read, key=lambda tally: tally.sized)
+            return math.hypot(*one.along_px) / one.sized / self.steps_along
         if self.bar is None:
             return math.nan
-        axis, many = self.clusters_along
-        return (self.bar.wide_px, self.bar.high_px)[axis] / many
+        # A source shows the clusters at the ends whole.
+        return max(self.bar.wide_px, self.bar.high_px) / (self.steps_along + 1)
 
     @property
-    def clusters_along(self) -> tuple[int, int]:
-        """The axis along which the link's bar has most clusters, 0 for columns, and how many."""
-        centres = self.link.bar.cluster_centres_m()
-        along = [len(np.unique(np.round(centres[:, axis], 6))) for axis in (0, 1)]
-        axis = int(along[1] >= along[0])
-        return axis, along[axis]
+    def steps_along(self) -> float:
+        """How many steps from cluster to neighbour it is from the link's first to its last."""
+        centres_m = self.link.bar.cluster_centres_m()
+        if len(centres_m) < 2:
+            return 1.0
+        step_m = min(math.dist(centres_m[0], other) for other in centres_m[1:])
+        return math.dist(centres_m[0], centres_m[-1]) / step_m
+
+    @property
+    def order(self) -> tuple[int, int]:
+        """1 where columns, and rows, of clusters grow as in the bar, -1 where they fall, 0 unknown."""
+        centres_m = self.link.bar.cluster_centres_m()
+        way_m = centres_m[-1] - centres_m[0]
+        along_px = np.sum([one.along_px for one in self.tally.own], 0) if self.tally.own else np.zeros(2)
+        right, down = np.sign(along_px * np.where(np.abs(way_m) > _ASIDE_M, way_m, 0.0)).astype(int).tolist()
+        return right, down
 
     @property
     def across_px(self) -> float:
@@ -206,17 +205,12 @@ def _has_rate(source: LightSource, rate_hz: float) -> bool:
 def checks_of(facts: Facts) -> list[Check]:
     """All stages, in the order in which light passes them.
 
-    Behind one that fails, those that cannot tell without it are skipped.
+    Those behind one that fails are skipped.
     """
     found: list[Check] = []
-    failed = False
-    for stage, judge, needs in _STAGES:
-        if failed and needs:
-            found.append(Check(stage, "skip", stage, "not reached"))
-            continue
-        check = judge(facts)
-        found.append(check)
-        failed |= check.verdict == "fail"
+    for stage, judge in _STAGES:
+        failed = bool(found) and "fail" in (one.verdict for one in found)
+        found.append(Check(stage, "skip", stage, "not reached") if failed else judge(facts))
     return found
 
 
@@ -225,7 +219,7 @@ def _events(facts: Facts) -> Check:
         return Check(
             "events", "fail", "empty", "no events", "record again: `evlcp info` says what is in the file"
         )
-    said = f"{facts.events:,} events in {facts.duration_s:.3f} s"
+    said = f"{facts.events:,} events in {facts.seen.duration_us * 1e-6:.3f} s"
     if facts.losses:
         return Check(
             "events",
@@ -238,22 +232,14 @@ def _events(facts: Facts) -> Check:
 
 
 def _readout(facts: Facts) -> Check:
-    rate = f"{facts.peak_events_s / 1e6:.3g} Mev/s"
-    if facts.capped_share >= CAPPED_SHARE and facts.duration_s > 0.01:
-        return Check(
-            "readout",
-            "doubt" if facts.reads else "fail",
-            "saturated",
-            f"{facts.capped_share:.0%} of all milliseconds hold {rate}, no more and no less: the readout is"
-            " at its limit, and what is beyond is lost",
-            "fewer events: mask rows and columns beside the bar, close the aperture, raise bias_diff_on and"
-            " bias_diff_off; or raise the camera's event-rate limit",
-        )
-    return Check("readout", "pass", "readout", f"at most {rate}, not at a limit")
+    for doubt in saturation(facts.seen):
+        verdict: Verdict = "doubt" if facts.reads else "fail"
+        return Check("readout", verdict, doubt.code, doubt.text, doubt.next_step)
+    return Check("readout", "pass", "readout", f"at most {facts.seen.peak_mev_s:.3g} Mev/s, not at a limit")
 
 
 def _light(facts: Facts) -> Check:
-    width, height = facts.size_px
+    width, height = facts.link.camera.width, facts.link.camera.height
     focal = facts.link.camera.focal_px
     view = (
         f"the picture is {2 * math.degrees(math.atan(width / 2 / focal)):.1f} by"
@@ -407,8 +393,7 @@ def _size(facts: Facts) -> Check:
     said = f"{px:.1f} px a cluster"
     if px >= (SMALL_PX if facts.reads else SMALLEST_PX):
         return Check("size", "pass", "size", said)
-    long_px = px * facts.clusters_along[1]
-    far_m = facts.link.camera.focal_px * facts.link.bar.length_m / long_px
+    far_m = facts.link.camera.focal_px * facts.link.bar.length_m / (px * (facts.steps_along + 1))
     return Check(
         "size",
         "doubt" if facts.reads else "fail",
@@ -494,7 +479,7 @@ def _frames(facts: Facts) -> Check:
 
 
 def _unseen_share(facts: Facts) -> float:
-    given, erased = sum(one.given for one in facts.own), sum(one.erased for one in facts.own)
+    given, erased = sum(one.given for one in facts.tally.own), sum(one.erased for one in facts.tally.own)
     return erased / max(given + erased, 1)
 
 
@@ -516,9 +501,8 @@ def _orientation(facts: Facts) -> Check:
 
 def _codewords(facts: Facts) -> Check:
     many = len(facts.link.codebook.codewords)
-    never = max((codewords_never(one, facts.link) for one in facts.own), default=0)
-    frames = sum(one.frames for one in facts.own)
-    quality = sum(one.quality_sum for one in facts.own) / max(frames, 1)
+    never = max((codewords_never(one, facts.link) for one in facts.tally.own), default=0)
+    frames, quality = sum(one.frames for one in facts.tally.own), facts.tally.quality
     if not never and quality >= SURE:
         return Check("codewords", "pass", "codewords", f"all of {many} that should occur do")
     better = facts.better
@@ -554,29 +538,33 @@ def _messages(facts: Facts) -> Check:
     )
 
 
-_STAGES: tuple[tuple[str, Callable[[Facts], Check], bool], ...] = (
-    ("events", _events, False),
-    ("readout", _readout, True),
-    ("light", _light, True),
-    ("polarity", _polarity, True),
-    ("pixels", _pixels, True),
-    ("size", _size, True),
-    ("focus", _focus, True),
-    ("brightness", _brightness, True),
-    ("chip rate", _rate, True),
-    ("preamble", _preamble, True),
-    ("frames", _frames, True),
-    ("orientation", _orientation, True),
-    ("codewords", _codewords, True),
-    ("messages", _messages, True),
+_STAGES: tuple[tuple[str, Callable[[Facts], Check]], ...] = (
+    ("events", _events),
+    ("readout", _readout),
+    ("light", _light),
+    ("polarity", _polarity),
+    ("pixels", _pixels),
+    ("size", _size),
+    ("focus", _focus),
+    ("brightness", _brightness),
+    ("chip rate", _rate),
+    ("preamble", _preamble),
+    ("frames", _frames),
+    ("orientation", _orientation),
+    ("codewords", _codewords),
+    ("messages", _messages),
 )
-"""Name, judge, and whether it can tell only where those before have passed."""
+"""Name and judge, in the order in which light passes them."""
 
 
 def _sources_said(facts: Facts) -> str:
     by = {kind: sum(one.kind == kind for one in facts.sources) for kind in ("code", "lamp", "unclear")}
-    names = {"code": "send chips", "lamp": "are lamps", "unclear": "blink unclearly"}
-    return ", ".join(f"{many} {names[kind]}" for kind, many in by.items() if many) or "no source of its own"
+    said = {
+        "code": f"{counted(by['code'], 'source')} of chips",
+        "lamp": counted(by["lamp"], "lamp"),
+        "unclear": counted(by["unclear"], "unclear source"),
+    }
+    return ", ".join(words for kind, words in said.items() if by[kind]) or "no source of its own"
 
 
 def _hz(rate_hz: float) -> str:

@@ -1,8 +1,7 @@
 """Diagnosis of a recording: one pass through the receiver and past it, then what may be wrong is tried."""
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -18,8 +17,8 @@ from evlcp_sdk.results.tallies import RunTally
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.study.diagnosis.checks import Check, Facts, checks_of
 from evlcp_sdk.study.diagnosis.light import LightSource, LightSurvey
-from evlcp_sdk.study.diagnosis.probe import MOST_EVENTS, Trial, better_links, try_link
-from evlcp_sdk.values import Events, Packet
+from evlcp_sdk.study.diagnosis.probe import MOST_EVENTS, Trial, better_links
+from evlcp_sdk.values import Events
 
 __all__ = ["Diagnosis", "diagnosis_of", "infer_link"]
 
@@ -39,7 +38,7 @@ class Diagnosis:
         headline: What is wrong first of all, or that nothing is, in one line.
         checks: The stages in the order in which light passes them.
         sources: What blinks, most events first.
-        trials: Other links that were tried.
+        trials: Links that were tried, the one given first.
         warnings: What `receive` would warn of.
         counts: The receiver's counts.
         cell_px: Size of the cells of the maps, px.
@@ -65,16 +64,7 @@ class Diagnosis:
         return {
             "recording": self.recording,
             "headline": self.headline,
-            "checks": [
-                {
-                    "stage": one.stage,
-                    "verdict": one.verdict,
-                    "code": one.code,
-                    "said": one.said,
-                    "next_step": one.next_step,
-                }
-                for one in self.checks
-            ],
+            "checks": [asdict(one) for one in self.checks],
             "sources": [
                 {
                     "kind": one.kind,
@@ -129,54 +119,33 @@ def diagnosis_of(
     width, height = link.camera.width, link.camera.height
     survey = LightSurvey(width, height)
     receiver, tally = Receiver(link), RunTally(link.packet)
-    sample, order = _Sample(), _Order(link)
+    sample = _Sample()
     for events in source.chunks():
         for packet in receiver.feed(events):
             tally.add(packet)
-            order.add(packet)
         survey.feed(_on_sensor(events, width, height))
         sample.feed(events, seen=receiver.counts["regions_opened"] > 0)
         advance(source.position_bytes, source.size_bytes)
     for packet in receiver.close():
         tally.add(packet)
-        order.add(packet)
-    capped, peak = survey.readout.capped()
-    sources = survey.sources()
-    losses = [str(loss) for loss in source.losses.values()]
-    seconds = survey.duration_s
-
-    def facts(trials: tuple[Trial, ...] = ()) -> Facts:
-        return Facts(
-            link,
-            source.counts["events"],
-            seconds,
-            (width, height),
-            capped,
-            peak * 1000,
-            sources,
-            survey.restless(),
-            receiver.counts,
-            tally,
-            order.found(),
-            order.spacing_px(),
-            trials,
-            losses,
-        )
-
-    checks = checks_of(facts())
-    trials: tuple[Trial, ...] = ()
-    if any(one.verdict == "fail" for one in checks) and sources and not facts().at_edge:
-        events = sample.events()
-        trials = tuple(better_links(link, events, registry, _rates(sources, link)))
-        checks = checks_of(facts(trials))
+    sources, frequency_hz = survey.found()
     seen = Seen(
-        math.nan if survey.first_us is None else survey.first_us,
-        math.nan if survey.last_us is None else survey.last_us,
+        survey.first_us,
+        survey.last_us,
         receiver.lit_us,
         survey.readout,
         sum(loss.count for loss in source.losses.values()),
         partial(other_codewords, link, registry),
     )
+    losses = [str(loss) for loss in source.losses.values()]
+    facts = Facts(
+        link, source.counts["events"], seen, sources, survey.restless(), receiver.counts, tally, losses
+    )
+    checks = checks_of(facts)
+    trials: tuple[Trial, ...] = ()
+    if any(one.verdict == "fail" for one in checks) and sources and not facts.at_edge:
+        trials = tuple(better_links(link, sample.events(), registry, _rates(sources, link)))
+        checks = checks_of(replace(facts, trials=trials))
     reads = link.messages.decode
     warnings = warnings_of(tally, receiver.counts, link, seen=seen, reads_messages=reads)
     return Diagnosis(
@@ -188,9 +157,9 @@ def diagnosis_of(
         tuple(warnings),
         receiver.counts,
         survey.cell_px,
-        survey.frequency_map(),
+        frequency_hz,
         survey.signs,
-        seconds,
+        seen.duration_us * 1e-6,
     )
 
 
@@ -217,9 +186,8 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
         sample.feed(events, seen=receiver.counts["regions_opened"] > 0)
         if sample.full and sample.seen:
             break
-    events = sample.events()
-    rates = _rates(survey.sources(), link)
-    trials = [try_link(link, events), *better_links(link, events, registry, rates)]
+    sources, _ = survey.found()
+    trials = better_links(link, sample.events(), registry, _rates(sources, link))
     return sorted(trials, key=lambda one: one.rank, reverse=True)
 
 
@@ -249,39 +217,6 @@ class _Sample:
 
     def events(self) -> Events:
         return Events.concat(self._pieces)[:MOST_EVENTS]
-
-
-class _Order:
-    """Which way round the clusters of bars stand in the picture."""
-
-    def __init__(self, link: Link) -> None:
-        centres = link.bar.cluster_centres_m()
-        self._centres_m = centres - centres.mean(0)
-        self._moment = np.zeros(2)
-        self._spread_m2 = np.zeros(2)
-
-    def add(self, packet: Packet) -> None:
-        for frame in packet.frames:
-            seen = np.isfinite(frame.points_px).all(-1)
-            if len(frame.points_px) == len(self._centres_m) and seen.any():
-                centres = self._centres_m[seen] - self._centres_m[seen].mean(0)
-                self._moment += (frame.points_px[seen] * centres).sum(0)
-                self._spread_m2 += (centres**2).sum(0)
-
-    def found(self) -> tuple[int, int]:
-        """1 where columns, and rows, grow as the bar's own x and y do, -1 where they fall, 0 unknown."""
-        right, down = np.sign(self._moment).astype(int)
-        wide = float(np.ptp(self._centres_m[:, 0])) > 1e-9
-        high = float(np.ptp(self._centres_m[:, 1])) > 1e-9
-        return int(right) * wide, int(down) * high
-
-    def spacing_px(self) -> float:
-        """From cluster to cluster along the longer axis, px; NaN where no frame shows it."""
-        axis = int(self._spread_m2[1] >= self._spread_m2[0])
-        if not self._spread_m2[axis]:
-            return math.nan
-        step_m = float(np.diff(np.unique(np.round(self._centres_m[:, axis], 6))).min())
-        return abs(float(self._moment[axis] / self._spread_m2[axis])) * step_m
 
 
 def _on_sensor(events: Events, width: int, height: int) -> Events:

@@ -7,7 +7,7 @@ and near 0, within 1 / sqrt(2 n) of n times, where they have nothing to do with 
 near the largest mean is the source's; below 1 / tau of its shortest times there is nothing to find.
 """
 
-from collections.abc import Iterator
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -46,6 +46,9 @@ _LEAST = 0.2
 
 _NEAR = 0.85
 """Share of the largest mean that a lower frequency must reach to be the one."""
+
+_AT_ONCE = 1024
+"""Cells whose means are computed together: 6 MB of them."""
 
 _MIN_RISES = 60
 _MIN_SOURCE = 300
@@ -129,6 +132,9 @@ class LightSurvey:
     Attributes:
         cell_px: Size of the cells that light is looked for in, px.
         readout: Events in each millisecond.
+        signs: Negative and positive events of each cell, int64 (rows, columns, 2).
+        first_us: Its first event, camera clock, us; NaN before.
+        last_us: Its last, us.
     """
 
     def __init__(self, width: int, height: int) -> None:
@@ -144,20 +150,19 @@ class LightSurvey:
         self._last_p = np.ones((height, width), np.uint8)
         self._intervals = np.zeros((*cells, BINS), np.uint32)
         self._gaps = np.zeros((*cells, SHORT), np.uint32)
-        self._signs = np.zeros((*cells, 2), np.int64)
+        self.signs = np.zeros((*cells, 2), np.int64)
         self._windows: list[tuple[int, list[NDArray[np.uint32]]]] = []
         self._every_us = _EVERY_US
         self.readout = ReadoutTally()
-        self.first_us: int | None = None
-        self.last_us: int | None = None
+        self.first_us = self.last_us = math.nan
 
     def feed(self, events: Events) -> None:
         """Take the next events; all of them are on the sensor."""
         if not len(events):
             return
-        if self.first_us is None:
-            self.first_us = int(events.t_us[0])
-        self.last_us = int(events.t_us[-1])
+        if math.isnan(self.first_us):
+            self.first_us = float(events.t_us[0])
+        self.last_us = float(events.t_us[-1])
         _kernels.add_events(
             events.t_us,
             events.x,
@@ -168,26 +173,19 @@ class LightSurvey:
             self._rise_us,
             self._intervals,
             self._gaps,
-            self._signs,
+            self.signs,
             self._shift,
             _CALM_US,
         )
         self.readout.add(events)
         self._keep(events)
 
-    @property
-    def duration_s(self) -> float:
-        """From the first event to the last, s."""
-        return (self.last_us - self.first_us) * 1e-6 if self.first_us is not None and self.last_us else 0.0
+    def found(self) -> tuple[list[LightSource], Floats]:
+        """What blinks, by the number of events, most first; and what each cell blinks with.
 
-    @property
-    def signs(self) -> NDArray[np.int64]:
-        """Negative and positive events of each cell, int64 (rows, columns, 2)."""
-        return self._signs
-
-    def sources(self) -> list[LightSource]:
-        """What blinks, by the number of events, most first."""
-        _, found = self._cells()
+        The latter in Hz, NaN where it does not, float64 (rows, columns).
+        """
+        frequency, found = self._cells()
         # A cell more may be missing in between, where the light of several clusters meets.
         labels, _ = ndimage.label(ndimage.binary_dilation(found, np.ones((2, 2), np.bool_)), np.ones((3, 3)))
         sources = []
@@ -199,7 +197,8 @@ class LightSurvey:
             source = self._source(place, inside, times)
             if source is not None:
                 sources.append(source)
-        return sorted(sources, key=lambda source: -source.events)
+        frequency[~found] = np.nan
+        return sorted(sources, key=lambda source: -source.events), frequency
 
     def restless(self) -> tuple[int, int, int, int] | None:
         """Where far more happens than elsewhere: (left, top, right, bottom), px; None for nowhere.
@@ -207,7 +206,7 @@ class LightSurvey:
         The largest area of cells with eight times the events of the others; not one of a hot pixel, nor
         half a picture of moving trees.
         """
-        many = self._signs.sum(-1)
+        many = self.signs.sum(-1)
         busy = many >= max(_BUSY * float(np.median(many)), _MIN_BUSY)
         labels, areas = ndimage.label(busy, np.ones((3, 3)))
         if not areas or busy.mean() > _MOST_BUSY:
@@ -217,18 +216,14 @@ class LightSurvey:
             return None
         return self._box(ndimage.find_objects(labels)[largest - 1])
 
-    def frequency_map(self) -> Floats:
-        """Frequency that each cell blinks with, Hz; NaN where it does not, float64 (rows, columns)."""
-        frequency, found = self._cells()
-        return np.where(found, frequency, np.nan)
-
     def _cells(self) -> tuple[Floats, NDArray[np.bool_]]:
         """Frequency of each cell, and where it is no chance."""
         many = self._intervals.sum(-1, dtype=np.int64)
         frequency = np.zeros(many.shape)
         found = np.zeros(many.shape, np.bool_)
         rows, columns = np.nonzero(many >= _MIN_RISES)
-        for part in _parts(len(rows), 1024):
+        for start in range(0, len(rows), _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
             times = self._intervals[rows[part], columns[part]].astype(np.float64)
             mean = _beyond_chance(times)
             best = mean.max(-1)
@@ -251,7 +246,7 @@ class LightSurvey:
         fine = comb(times, near)
         rate_hz, strength = float(near[fine.argmax()]), float(fine.max())
         gaps = self._gaps[place][inside].sum(0, dtype=np.int64)
-        signs = self._signs[place][inside].sum(0)
+        signs = self.signs[place][inside].sum(0)
         box = self._box(place)
         wide, high = self._size(box)
         return LightSource(
@@ -354,11 +349,6 @@ def _beyond_chance(times: NDArray[np.generic]) -> Floats:
     many = np.where(FREQUENCIES_HZ > _COARSE_HZ, counts[:, :FINE].sum(-1)[:, None], counts.sum(-1)[:, None])
     sure = mean > _SURE / np.sqrt(2 * np.maximum(many, 1))
     return np.asarray(np.where(_allowed(counts) & sure, mean, -1.0))
-
-
-def _parts(many: int, most: int) -> Iterator[slice]:
-    for start in range(0, many, most):
-        yield slice(start, start + most)
 
 
 def _quantile(counts: NDArray[np.int64], at: Floats | NDArray[np.int64], share: float) -> float:

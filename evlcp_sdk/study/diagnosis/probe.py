@@ -85,7 +85,7 @@ class Trial:
         return self.fits, round(self.share, 2), round(self.quality, 1), -self.codewords
 
     def options(self) -> str:
-        """The changes as options of the command line."""
+        """The changes as options of the command line; empty for the link as it was given."""
         return " ".join(
             f"--set {name}={value:g}" if isinstance(value, float) else f"--set {name}={value}"
             for name, value in self.changes
@@ -103,15 +103,13 @@ def try_link(link: Link, events: Events, changes: Sequence[tuple[str, Any]] = ()
     receiver, tally = Receiver(link), RunTally(link.packet)
     for packet in [*receiver.feed(events), *receiver.close()]:
         tally.add(packet)
-    own = [one for one in tally.transmitters.values() if one.frames > one.echoes]
-    frames = sum(one.frames for one in own)
     return Trial(
         tuple(changes),
         link,
         receiver.counts["frames"],
         receiver.counts["frames_rejected"],
-        sum(one.quality_sum for one in own) / frames if frames else 0.0,
-        max((codewords_never(one, link) for one in own), default=0),
+        tally.quality,
+        max((codewords_never(one, link) for one in tally.own), default=0),
         len(link.codebook.codewords),
     )
 
@@ -121,16 +119,17 @@ def better_links(
 ) -> Iterator[Trial]:
     """Try what may be wrong in a link, one thing at a time and then on top of the best; yield what was tried.
 
-    The chip rates that light was seen to have, frames a pilot, frames a packet, and the modulations that are
-    installed. What fits already is not tried.
+    First the link as it is, then the chip rates that light was seen to have, frames a pilot, frames a packet,
+    and the modulations that are installed. Of what fits already nothing else is tried.
 
     Args:
-        link: The link to start from; not tried itself.
+        link: The link to start from.
         events: All of them on its sensor.
         registry: Where other modulations are found.
         rates_hz: Chip rates to try.
     """
     best = try_link(link, events)
+    yield best
     others = [one.algorithm.id for one in registry.installed("modulation")]
     # Modulations of the same length only differ in what is read from frames that are accepted.
     alike = [one for one in others if _chips(_with(link, "modulation.id", one, registry)) == _chips(link)]

@@ -86,7 +86,7 @@ def test_rate_is_measured_without_a_link() -> None:
     with rendered(("air.chip_rate_hz=6250",)) as source:
         for events in source.chunks():
             survey.feed(events)
-    (bar,) = survey.sources()
+    (bar,) = survey.found()[0]
     assert bar.kind == "code"
     assert bar.rate_hz == pytest.approx(6250, rel=3e-3)
     # 0.96 m of 7202 px at 50 m.
