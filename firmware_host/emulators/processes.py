@@ -215,9 +215,11 @@ def start_native(
         ToolchainError: It cannot be built.
     """
     ours, theirs = socket.socketpair()
-    with theirs:
+    with contextlib.ExitStack() as undo, theirs:
+        undo.enter_context(ours)
         command = native_command(f"fd:{theirs.fileno()}", leds, flash, None, baud, unique_id)
         process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL)
+        undo.pop_all()
     return ProcessTransport("native:", ours, process)
 
 

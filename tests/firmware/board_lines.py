@@ -1,7 +1,9 @@
 """Lines to a simulated board that go wrong, and what its LEDs may show all the same."""
 
+import subprocess
 from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,7 @@ from firmware_host.board.bank import symbol_chips
 from firmware_host.board.board import Board
 from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import LedRecord
+from firmware_host.emulators.processes import bound, native_command
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.protocol.client import Timing
 
@@ -18,6 +21,22 @@ PACKET = 346
 
 class HostDiedError(Exception):
     """The host died here."""
+
+
+class Native:
+    """The native board in the background, as `evlcp board emulate native` starts it; options are its own."""
+
+    def __init__(self, listen: str, **options: Any) -> None:
+        command = bound(native_command(listen, **options))
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL)
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == f"listening on {listen}\n"
+
+    def end(self) -> None:
+        self.process.terminate()
+        self.process.wait(10)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
 
 
 class FatalLine(SimulatedLine):

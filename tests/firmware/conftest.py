@@ -1,9 +1,6 @@
 """What the tests of the transmitter share: codebook, tools that may be missing, boards."""
 
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 
 import pytest
@@ -37,15 +34,8 @@ def compiler() -> None:
     tool("cc", "make")
 
 
-@pytest.fixture(scope="session")
-def cli() -> Callable[..., "subprocess.CompletedProcess[str]"]:
-    """Run `evlcp` with these arguments."""
-
-    def run(*arguments: object, **options: object) -> "subprocess.CompletedProcess[str]":
-        command = [sys.executable, "-c", "from evlcp_sdk.cli.main import main; main()", *map(str, arguments)]
-        env = {k: v for k, v in os.environ.items() if k != "EVLCP_PORT"} | {"COLUMNS": "200"}
-        return subprocess.run(
-            command, capture_output=True, text=True, timeout=120, check=False, env=env, **options
-        )
-
-    return run
+@pytest.fixture(autouse=True)
+def _no_port_and_a_wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the command line must not find in a developer's environment, and how wide its lines may be."""
+    monkeypatch.delenv("EVLCP_PORT", raising=False)
+    monkeypatch.setenv("COLUMNS", "200")

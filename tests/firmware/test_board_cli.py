@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import check_order, packet_sequence
+from board_lines import Native, check_order, packet_sequence
 
 from evlcp_sdk.air.codebook import Codebook
 from firmware_host.board.bank import Bank, random_symbols
@@ -26,25 +26,26 @@ from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import RECORD, LedRecord
 from firmware_host.emulators.processes import bound, native_command, wait_for
 from firmware_host.errors import LineError
+from tests.conftest import Run
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
 EVLCP = [sys.executable, "-c", "from evlcp_sdk.cli.main import main; main()"]
 
 
-def test_qemu_in_the_foreground(cli, needs, tmp_path: Path) -> None:
+def test_qemu_in_the_foreground(evlcp, needs, tmp_path: Path) -> None:
     needs("qemu-system-arm", "arm-none-eabi-gcc")
     port, leds, out = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin", tmp_path / "out.npy"
     emulated = Emulated("qemu", "--listen", port, "--leds", leds)
     assert emulated.said == f"listening on {port}\n"
-    done = cli("board", "program", "--random", 3, "--seed", 2, "--port", port)
-    assert done.returncode == 0, done.stderr
-    assert cli("board", "verify", "--random", 3, "--seed", 2, "--port", port).returncode == 0
-    assert cli("board", "stop", "--port", port).returncode == 0
+    done = evlcp("board", "program", "--random", 3, "--seed", 2, "--port", port)
+    assert done.code == 0, done.err
+    assert evlcp("board", "verify", "--random", 3, "--seed", 2, "--port", port).code == 0
+    assert evlcp("board", "stop", "--port", port).code == 0
     assert emulated.end() == 0
-    assert cli("board", "leds", leds, "--chips", out).returncode == 0
+    assert evlcp("board", "leds", leds, "--chips", out).code == 0
     frames = tmp_path / "frames.npy"
-    cli("tx", "frames", "--random", 3, "--seed", 2, "--chips", frames)
+    evlcp("tx", "frames", "--random", 3, "--seed", 2, "--chips", frames)
     played, expected = np.load(out), np.load(frames)
     assert len(played) >= 346
     assert (played == np.resize(expected, played.shape)).all()
@@ -69,35 +70,33 @@ class Emulated:
 
 @pytest.fixture
 def native(tmp_path: Path) -> Iterator[str]:
-    emulated = Emulated(
-        *("native", "--listen", f"unix:{tmp_path / 'board'}", "--leds", tmp_path / "leds.bin"),
-        *("--flash", tmp_path / "flash.bin"),
-    )
-    yield f"unix:{tmp_path / 'board'}"
-    assert emulated.end() == 0
+    place = f"unix:{tmp_path / 'board'}"
+    board = Native(place, leds=tmp_path / "leds.bin", flash=tmp_path / "flash.bin")
+    yield place
+    board.end()
 
 
-def test_a_users_first_hour(cli, native: str, tmp_path: Path) -> None:
-    def board(*arguments: object) -> "subprocess.CompletedProcess[str]":
-        return cli("board", *arguments, "--port", native)
+def test_a_users_first_hour(evlcp, native: str, tmp_path: Path) -> None:
+    def board(*arguments: object) -> Run:
+        return evlcp("board", *arguments, "--port", native)
 
-    about = json.loads(board("hello", "--json").stdout)
+    about = json.loads(board("hello", "--json").out)
     assert (about["hal"], about["clusters"], about["leds"]) == ("native", 16, 96)
-    assert board("start").returncode == 5
-    assert "'evlcp board program' first" in board("send", "--random", 1).stderr
+    assert board("start").code == 5
+    assert "'evlcp board program' first" in board("send", "--random", 1).err
     done = board("program", "--random", 8, "--seed", 3, "--level", 25, "--watchdog", "idle")
-    assert done.returncode == 0
-    sent, told = done.stdout.splitlines()
+    assert done.code == 0
+    sent, told = done.out.splitlines()
     assert sent == "sent 2560 of 2560 bytes; bank 0 is active"
     assert told.startswith("watchdog: the board shows its idle pattern once no host has spoken for 5 s;")
-    status = json.loads(board("status", "--json").stdout)
+    status = json.loads(board("status", "--json").out)
     assert (status["state"], status["level_ma"], status["watchdog"]) == ("playing", 25, "idle")
-    assert "was there already" in board("program", "--random", 8, "--seed", 3).stdout
-    assert board("verify", "--random", 8, "--seed", 3).returncode == 0
+    assert "was there already" in board("program", "--random", 8, "--seed", 3).out
+    assert board("verify", "--random", 8, "--seed", 3).code == 0
     other = board("verify", "--random", 8, "--seed", 4)
-    assert other.returncode == 7
-    assert "byte 0 of bank 0" in other.stderr
-    assert board("verify", "--random", 9, "--seed", 4).returncode == 7
+    assert other.code == 7
+    assert "byte 0 of bank 0" in other.err
+    assert board("verify", "--random", 9, "--seed", 4).code == 7
     for other_air, says in (
         ("modulation.id=wh8", "this payload's link has codebook"),
         (
@@ -107,64 +106,64 @@ def test_a_users_first_hour(cli, native: str, tmp_path: Path) -> None:
     ):
         for command in ("send", "verify"):
             foreign = board(command, "--random", 8, "--seed", 3, "--set", other_air)
-            assert foreign.returncode == 8
-            assert says in foreign.stderr
-            assert foreign.stderr.count("\n") == 1
-    assert board("send", "--random", 2, "--seed", 9, "--json").returncode == 0
-    lines = board("monitor", "--count", 2, "--interval", 0.05).stdout.splitlines()
+            assert foreign.code == 8
+            assert says in foreign.err
+            assert foreign.err.count("\n") == 1
+    assert board("send", "--random", 2, "--seed", 9, "--json").code == 0
+    lines = board("monitor", "--count", 2, "--interval", 0.05).out.splitlines()
     assert len(lines) == 2
     assert "playing" in lines[0]
     refused = board("level", 61)
-    assert refused.returncode == 5
-    assert "the nearest value the board can take is 60" in refused.stderr
-    assert board("watchdog", "dark", "--after-ms", 60_000).returncode == 0
-    assert board("save").returncode == 5
-    assert board("stop").returncode == 0
-    assert board("save").stdout == "saved in slot 0, number 1\n"
-    assert board("test-leds", "--dwell-ms", 1).returncode == 0
-    assert board("recall").stdout == "recalled slot 0, number 1\n"
-    assert board("start").returncode == 0
-    assert board("blank").returncode == 0
-    assert json.loads(board("status", "--json").stdout)["state"] == "dark"
+    assert refused.code == 5
+    assert "the nearest value the board can take is 60" in refused.err
+    assert board("watchdog", "dark", "--after-ms", 60_000).code == 0
+    assert board("save").code == 5
+    assert board("stop").code == 0
+    assert board("save").out == "saved in slot 0, number 1\n"
+    assert board("test-leds", "--dwell-ms", 1).code == 0
+    assert board("recall").out == "recalled slot 0, number 1\n"
+    assert board("start").code == 0
+    assert board("blank").code == 0
+    assert json.loads(board("status", "--json").out)["state"] == "dark"
     assert (tmp_path / "flash.bin").stat().st_size > 80_000
 
 
-def test_masks_and_leds(cli, native: str, tmp_path: Path) -> None:
+def test_masks_and_leds(evlcp, native: str, tmp_path: Path) -> None:
     chips = tmp_path / "chips.npy"
-    cli("tx", "frames", "--random", 3, "--seed", 1, "--chips", chips)
-    done = cli("board", "program", "--masks", chips, "--port", native)
-    assert done.returncode == 0, done.stderr
+    evlcp("tx", "frames", "--random", 3, "--seed", 1, "--chips", chips)
+    done = evlcp("board", "program", "--masks", chips, "--port", native)
+    assert done.code == 0, done.err
     time.sleep(0.3)
-    cli("board", "stop", "--port", native)
+    evlcp("board", "stop", "--port", native)
     out = tmp_path / "out.npy"
-    assert cli("board", "leds", tmp_path / "leds.bin", "--chips", out).returncode == 0
+    assert evlcp("board", "leds", tmp_path / "leds.bin", "--chips", out).code == 0
     assert (np.load(out)[: 3 * 346] == np.load(chips)).all()
     assert len(np.load(tmp_path / "out.ticks.npy")) == len(np.load(out))
-    assert cli("board", "leds", tmp_path / "leds.bin", "--chips", out, "--per-led").returncode == 0
+    assert evlcp("board", "leds", tmp_path / "leds.bin", "--chips", out, "--per-led").code == 0
     assert np.load(out).shape[1] == 96
 
 
-def test_wrong_records_are_told(cli, tmp_path: Path) -> None:
+def test_wrong_records_are_told(evlcp, tmp_path: Path) -> None:
     torn = tmp_path / "leds.bin"
     records = np.zeros(3, RECORD)
     records["chip"] = (0, 1, 3)
     torn.write_bytes(records.tobytes())
-    done = cli("board", "leds", torn, "--chips", tmp_path / "c.npy")
-    assert done.returncode == 3
-    assert "at byte 40: chip 3 after chip 1: not an LED record" in done.stderr
+    done = evlcp("board", "leds", torn, "--chips", tmp_path / "c.npy")
+    assert done.code == 3
+    assert "at byte 40: chip 3 after chip 1: not an LED record" in done.err
     torn.write_bytes(records.tobytes()[:45])
-    cut = cli("board", "leds", torn, "--chips", tmp_path / "c.npy")
-    assert (cut.returncode, cut.stdout) == (3, "2 chips\n")
-    assert "the last record is cut off (5 bytes)" in cut.stderr
-    assert cut.stderr.count("\n") == 1
+    cut = evlcp("board", "leds", torn, "--chips", tmp_path / "c.npy")
+    assert (cut.code, cut.out) == (3, "2 chips\n")
+    assert "the last record is cut off (5 bytes)" in cut.err
+    assert cut.err.count("\n") == 1
     assert len(np.load(tmp_path / "c.npy")) == 2
     for count in (0, 19):
         torn.write_bytes(records.tobytes()[:count])
-        none = cli("board", "leds", torn, "--chips", tmp_path / "none.npy")
-        assert (none.returncode, none.stdout) == (3, "")
-        assert f"{torn}: {count} bytes, expected LED records of 20 bytes" in none.stderr
+        none = evlcp("board", "leds", torn, "--chips", tmp_path / "none.npy")
+        assert (none.code, none.out) == (3, "")
+        assert f"{torn}: {count} bytes, expected LED records of 20 bytes" in none.err
         assert not (tmp_path / "none.npy").exists()
-    assert cli("board", "leds", tmp_path / "no", "--chips", tmp_path / "c.npy").returncode == 3
+    assert evlcp("board", "leds", tmp_path / "no", "--chips", tmp_path / "c.npy").code == 3
 
 
 def test_ticks_unwrap() -> None:
@@ -174,27 +173,27 @@ def test_ticks_unwrap() -> None:
     assert len(LedRecord.of_records(records[:0])) == 0
 
 
-def test_trace_and_replay(cli, tmp_path: Path) -> None:
+def test_trace_and_replay(evlcp, tmp_path: Path) -> None:
     trace = tmp_path / "wire.jsonl"
     arguments = ("board", "program", "--random", 8, "--seed", 3)
-    live = cli(*arguments, "--port", "native:", "--trace", trace)
-    assert live.returncode == 0, live.stderr
+    live = evlcp(*arguments, "--port", "native:", "--trace", trace)
+    assert live.code == 0, live.err
     lines = [json.loads(x) for x in trace.read_text().splitlines()]
     assert lines[0]["evlcp_trace"] == 1
     assert {x["dir"] for x in lines[1:]} == {"tx", "rx"}
-    replayed = cli(*arguments, "--replay", trace)
-    assert (replayed.returncode, replayed.stdout) == (0, live.stdout)
-    other = cli("board", "program", "--random", 8, "--seed", 4, "--replay", trace)
-    assert other.returncode == 6
-    assert "is another one" in other.stderr
+    replayed = evlcp(*arguments, "--replay", trace)
+    assert (replayed.code, replayed.out) == (0, live.out)
+    other = evlcp("board", "program", "--random", 8, "--seed", 4, "--replay", trace)
+    assert other.code == 6
+    assert "is another one" in other.err
     trace.write_text("\n".join(trace.read_text().splitlines()[:5]) + "\n")
-    assert "the trace ends here" in cli(*arguments, "--replay", trace).stderr
+    assert "the trace ends here" in evlcp(*arguments, "--replay", trace).err
     trace.write_text('{"evlcp_trace": 1, "first": 1, "nonce": 2, "baud": 9600}\n{"dir": "up"}\n')
-    wrong = cli(*arguments, "--replay", trace)
-    assert wrong.returncode == 3
-    assert f"{trace}: line 2: not a trace" in wrong.stderr
-    both = cli(*arguments, "--replay", trace, "--trace", trace)
-    assert both.returncode == 2
+    wrong = evlcp(*arguments, "--replay", trace)
+    assert wrong.code == 3
+    assert f"{trace}: line 2: not a trace" in wrong.err
+    both = evlcp(*arguments, "--replay", trace, "--trace", trace)
+    assert both.code == 2
 
 
 @pytest.mark.parametrize(
@@ -210,14 +209,14 @@ def test_trace_and_replay(cli, tmp_path: Path) -> None:
         ("loop://", "no board answers; check power"),
     ],
 )
-def test_no_board_is_four(cli, port: str, says: str) -> None:
-    done = cli("board", "hello", "--port", port)
-    assert done.returncode == 4
-    assert says in done.stderr
-    assert done.stderr.count("\n") == 1
+def test_no_board_is_four(evlcp, port: str, says: str) -> None:
+    done = evlcp("board", "hello", "--port", port)
+    assert done.code == 4
+    assert says in done.err
+    assert done.err.count("\n") == 1
 
 
-def test_usage_is_two(cli) -> None:
+def test_usage_is_two(evlcp) -> None:
     for arguments in (
         ("program", "--port", "native:"),
         ("program", "--random", 1, "--masks", "x.npy", "--port", "native:"),
@@ -230,19 +229,20 @@ def test_usage_is_two(cli) -> None:
         ("emulate", "native", "--unique-id", 2**64),
         ("level", "much"),
     ):
-        done = cli("board", *arguments)
-        assert done.returncode == 2, (arguments, done.stderr)
-        assert "Traceback" not in done.stderr
+        done = evlcp("board", *arguments)
+        assert done.code == 2, (arguments, done.err)
+        assert "Traceback" not in done.err
 
 
-def test_port_from_the_environment(native: str) -> None:
-    env = os.environ | {"EVLCP_PORT": native}
-    done = subprocess.run([*EVLCP, "board", "hello"], env=env, capture_output=True, text=True, check=False)
-    assert done.returncode == 0
-    assert "native" in done.stdout
+def test_port_from_the_environment(evlcp, native: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EVLCP_PORT", native)
+    done = evlcp("board", "hello")
+    assert done.code == 0
+    assert "native" in done.out
 
 
 def test_no_place_to_build_is_told(tmp_path: Path) -> None:
+    """In a process of its own: this one has built it."""
     (tmp_path / "file").write_text("")
     env = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "file")}
     command = [*EVLCP, "board", "hello", "--port", "native:"]
@@ -280,18 +280,18 @@ def test_a_duty_limit_below_what_plays_is_one_line(evlcp, native: str) -> None:
     assert (status["state"], status["duty_limit"], status["faults"]) == ("playing", 1.0, [])
 
 
-def test_pty_and_tcp(cli, tmp_path: Path) -> None:
+def test_pty_and_tcp(evlcp, tmp_path: Path) -> None:
     emulated = Emulated("native", "--listen", "pty", "--link", tmp_path / "tty")
     assert emulated.said == f"listening on {tmp_path / 'tty'}\n"
-    done = cli("board", "program", "--random", 64, "--port", tmp_path / "tty")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert cli("board", "verify", "--random", 64, "--port", tmp_path / "tty").returncode == 0
+    done = evlcp("board", "program", "--random", 64, "--port", tmp_path / "tty")
+    assert (done.code, done.err) == (0, "")
+    assert evlcp("board", "verify", "--random", 64, "--port", tmp_path / "tty").code == 0
     assert emulated.end() == 0
     with socket.create_server(("127.0.0.1", 0)) as free:
         place = f"127.0.0.1:{free.getsockname()[1]}"
     emulated = Emulated("native", "--listen", f"tcp:{place}")
-    assert cli("board", "hello", "--port", f"tcp:{place}").returncode == 0
-    assert cli("board", "hello", "--port", f"socket://{place}").returncode == 0
+    assert evlcp("board", "hello", "--port", f"tcp:{place}").code == 0
+    assert evlcp("board", "hello", "--port", f"socket://{place}").code == 0
     assert emulated.end() == 0
 
 
@@ -308,7 +308,7 @@ def test_ports_are_asked(native: str, tmp_path: Path) -> None:
     assert find(1_000_000, listed) == native
     with pytest.raises(NoBoardError, match=r"no board answers on any serial port \(.*gone|nowhere"):
         find(1_000_000, [listed[0], listed[2]])
-    second = Emulated("native", "--listen", f"unix:{tmp_path / 'second'}")
+    second = Native(f"unix:{tmp_path / 'second'}")
     with pytest.raises(NoBoardError, match="2 boards answer"):
         find(1_000_000, [listed[1], SerialPort(f"unix:{tmp_path / 'second'}", usb="0403:6015")])
     second.end()
@@ -316,9 +316,9 @@ def test_ports_are_asked(native: str, tmp_path: Path) -> None:
     os.close(other)
 
 
-def test_host_processes_killed(native: str, tmp_path: Path, book: Codebook, cli) -> None:
+def test_host_processes_killed(native: str, tmp_path: Path, book: Codebook, evlcp) -> None:
     payloads = {"0": random_symbols(2, 10, book, np.random.default_rng(0))}
-    assert cli("board", "program", "--random", 2, "--seed", 0, "--port", native).returncode == 0
+    assert evlcp("board", "program", "--random", 2, "--seed", 0, "--port", native).code == 0
     draw = random.Random(5)
     killed = 0
     for n in range(1, 9):
@@ -329,23 +329,23 @@ def test_host_processes_killed(native: str, tmp_path: Path, book: Codebook, cli)
         process.kill()
         killed += process.wait() == -signal.SIGKILL
     assert killed
-    last = cli("board", "program", "--random", 2, "--seed", 0, "--port", native)
-    assert last.returncode == 0, last.stderr
-    cli("board", "stop", "--port", native)
+    last = evlcp("board", "program", "--random", 2, "--seed", 0, "--port", native)
+    assert last.code == 0, last.err
+    evlcp("board", "stop", "--port", native)
     played = LedRecord.read(tmp_path / "leds.bin").played()
     assert (np.diff(played.ticks) == 1000).all()
     sequence = packet_sequence(played, payloads, book)
     assert check_order(sequence, {n: len(s) for n, s in payloads.items()})[0] == "0"
 
 
-def test_board_that_hangs_up_is_told(cli, tmp_path: Path) -> None:
-    emulated = Emulated("native", "--listen", f"unix:{tmp_path / 'b'}")
+def test_board_that_hangs_up_is_told(tmp_path: Path) -> None:
+    board = Native(f"unix:{tmp_path / 'b'}")
     options = ("--interval", "0.05", "--no-reconnect", "--port", f"unix:{tmp_path / 'b'}")
     command = [*EVLCP, "board", "monitor", *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     process.stdout.readline()
-    emulated.end()
+    board.end()
     said = process.communicate(timeout=20)[1]
     assert process.returncode == 6
     assert "the board hung up; start it again" in said
@@ -363,37 +363,37 @@ def test_programming_is_near_the_wire_time() -> None:
     "option",
     [("--no-start",), ("--level", 30), ("--seed", 1), ("--port", "native:"), ("--set", "air.pilot_every=2")],
 )
-def test_an_inventory_takes_no_settings_from_the_command_line(cli, option: tuple[object, ...]) -> None:
-    done = cli("board", "program", "--inventory", "x.toml", *option)
-    assert done.returncode == 2
-    assert str(option[0]) in done.stderr
+def test_an_inventory_takes_no_settings_from_the_command_line(evlcp, option: tuple[object, ...]) -> None:
+    done = evlcp("board", "program", "--inventory", "x.toml", *option)
+    assert done.code == 2
+    assert str(option[0]) in done.err
 
 
-def test_nor_before_the_command(cli) -> None:
-    done = cli("board", "--port", "native:", "program", "--inventory", "x.toml")
-    assert done.returncode == 2
-    assert "write --port there" in done.stderr
+def test_nor_before_the_command(evlcp) -> None:
+    done = evlcp("board", "--port", "native:", "program", "--inventory", "x.toml")
+    assert done.code == 2
+    assert "write --port there" in done.err
 
 
-def test_options_of_the_line_stand_before_or_behind_the_command(cli, native: str, tmp_path: Path) -> None:
-    before = cli("board", "--port", native, "hello", "--json")
-    behind = cli("board", "hello", "--json", "--port", native)
-    assert (before.returncode, behind.returncode) == (0, 0)
-    assert json.loads(before.stdout)["unique_id"] == json.loads(behind.stdout)["unique_id"]
+def test_options_of_the_line_stand_before_or_behind_the_command(
+    evlcp, native: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = evlcp("board", "--port", native, "hello", "--json")
+    behind = evlcp("board", "hello", "--json", "--port", native)
+    assert (before.code, behind.code) == (0, 0)
+    assert json.loads(before.out)["unique_id"] == json.loads(behind.out)["unique_id"]
     # behind counts more, and either more than the environment
-    assert cli("board", "--port", "unix:/nowhere", "start", "--port", native).returncode == 5
-    env = os.environ | {"EVLCP_PORT": "unix:/nowhere"}
-    done = subprocess.run(
-        [*EVLCP, "board", "--port", native, "hello"], env=env, capture_output=True, check=False
-    )
-    assert done.returncode == 0
+    assert evlcp("board", "--port", "unix:/nowhere", "start", "--port", native).code == 5
+    with monkeypatch.context() as environment:
+        environment.setenv("EVLCP_PORT", "unix:/nowhere")
+        assert evlcp("board", "--port", native, "hello").code == 0
     trace = tmp_path / "wire.jsonl"
-    assert cli("board", "--port", native, "--trace", trace, "status").returncode == 0
-    assert cli("board", "--replay", trace, "status").returncode == 0
+    assert evlcp("board", "--port", native, "--trace", trace, "status").code == 0
+    assert evlcp("board", "--replay", trace, "status").code == 0
     for command in (("leds", "x", "--chips", "y"), ("emulate", "native"), ("ports",)):
-        refused = cli("board", "--port", native, *command)
-        assert refused.returncode == 2
-        assert f"'{command[0]}' takes no --port" in refused.stderr
+        refused = evlcp("board", "--port", native, *command)
+        assert refused.code == 2
+        assert f"'{command[0]}' takes no --port" in refused.err
 
 
 @pytest.mark.parametrize("command", ["hello", "program", "start", "level", "test-leds", "recall"])
@@ -411,27 +411,27 @@ def test_a_command_on_a_board_has_the_options_of_the_line(evlcp, command: str) -
         ("tx", "check", "--random", 1, "--set", "air.chip_rate_hz=inf"),
     ],
 )
-def test_numbers_beyond_reason_are_usage(cli, command: tuple[object, ...]) -> None:
-    done = cli(*command)
-    assert done.returncode == 2
-    assert "Traceback" not in done.stderr
+def test_numbers_beyond_reason_are_usage(evlcp, command: tuple[object, ...]) -> None:
+    done = evlcp(*command)
+    assert done.code == 2
+    assert "Traceback" not in done.err
 
 
 @pytest.mark.parametrize("head", ['{"first": 1e999, "nonce": 1, "baud": 1}', "[" * 100_000])
-def test_a_trace_of_nonsense_is_one_line(cli, tmp_path: Path, head: str) -> None:
+def test_a_trace_of_nonsense_is_one_line(evlcp, tmp_path: Path, head: str) -> None:
     path = tmp_path / "wire.jsonl"
     path.write_text(head)
-    done = cli("board", "hello", "--replay", path)
-    assert done.returncode == 3
-    assert done.stderr.count("\n") == 1
+    done = evlcp("board", "hello", "--replay", path)
+    assert done.code == 3
+    assert done.err.count("\n") == 1
 
 
 @pytest.mark.parametrize("option", ["--listen", "--link"])
-def test_an_emulator_leaves_a_users_file_alone(cli, tmp_path: Path, option: str) -> None:
+def test_an_emulator_leaves_a_users_file_alone(evlcp, tmp_path: Path, option: str) -> None:
     path = tmp_path / "notes.txt"
     path.write_text("mine")
     place = f"unix:{path}" if option == "--listen" else path
-    assert cli("board", "emulate", "native", option, place).returncode == 1
+    assert evlcp("board", "emulate", "native", option, place).code == 1
     assert path.read_text() == "mine"
 
 
@@ -474,7 +474,7 @@ def test_a_flash_file_is_replaced_whole(tmp_path: Path, book: Codebook) -> None:
 
 
 @pytest.mark.parametrize("through", ["--flash", "native:"])
-def test_a_flash_file_that_cannot_be_used_is_told_at_once(cli, tmp_path: Path, through: str) -> None:
+def test_a_flash_file_that_cannot_be_used_is_told_at_once(evlcp, tmp_path: Path, through: str) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "notes.txt").write_text("mine")
     for name, says in (
@@ -485,20 +485,22 @@ def test_a_flash_file_that_cannot_be_used_is_told_at_once(cli, tmp_path: Path, t
         path = tmp_path / name
         listen = ("--listen", f"unix:{tmp_path / 'b'}")
         done = (
-            cli("board", "emulate", "native", *listen, "--flash", path)
+            evlcp("board", "emulate", "native", *listen, "--flash", path)
             if through == "--flash"
-            else cli("board", "hello", "--port", f"native:{path}")
+            else evlcp("board", "hello", "--port", f"native:{path}")
         )
-        assert done.returncode == 3, (name, done.stderr)
-        assert says in done.stderr
-        assert done.stderr.count("\n") == 1
+        assert done.code == 3, (name, done.err)
+        assert says in done.err
+        assert done.err.count("\n") == 1
 
 
-def test_a_file_that_is_no_flash_is_left_alone(cli, tmp_path: Path) -> None:
+def test_a_file_that_is_no_flash_is_left_alone(tmp_path: Path) -> None:
+    """In a process of its own: the board itself says so."""
     path = tmp_path / "notes.bin"
+    command = [*EVLCP, "board", "emulate", "native", "--listen", f"unix:{tmp_path / 'b'}", "--flash", path]
     for size in (4, 100_000):
         path.write_bytes(bytes(size))
-        done = cli("board", "emulate", "native", "--listen", f"unix:{tmp_path / 'b'}", "--flash", path)
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 3
         assert f"{path}: not a flash file of" in done.stderr
         assert done.stderr.count("\n") == 1

@@ -19,10 +19,11 @@ def blocks(language: str) -> list[str]:
 
 
 @pytest.mark.parametrize("block", blocks("console"), ids=["tx", "messages", "changing", "board"])
-def test_commands_run(cli, block: str, tmp_path: Path) -> None:
+def test_commands_run(evlcp, block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     for line in block.splitlines():
-        done = cli(*line.removeprefix("$ evlcp ").split(), cwd=tmp_path)
-        assert (done.returncode, done.stderr) == (0, ""), line
+        done = evlcp(*line.removeprefix("$ evlcp ").split())
+        assert (done.code, done.err) == (0, ""), line
 
 
 def test_inventory_is_valid(tmp_path: Path) -> None:

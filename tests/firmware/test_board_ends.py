@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_board_cli import EVLCP, Emulated
+from board_lines import Native
+from test_board_cli import EVLCP
 
 from evlcp_sdk.link.resolve import load_link
 from firmware_host.board.bank import random_symbols
@@ -31,9 +32,9 @@ Evlcp = Callable[..., Any]
 @pytest.fixture
 def port(tmp_path: Path) -> Iterator[str]:
     where = f"unix:{tmp_path / 'board'}"
-    emulated = Emulated("native", "--listen", where, "--leds", tmp_path / "leds.bin")
+    emulated = Native(where, leds=tmp_path / "leds.bin")
     yield where
-    assert emulated.end() == 0
+    emulated.end()
 
 
 def is_there(pid: int) -> bool:

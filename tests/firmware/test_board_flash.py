@@ -5,6 +5,7 @@ import json
 import socket
 import subprocess
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -34,12 +35,12 @@ def some(count: int, seed: int = 0, address: int = FLASH_START) -> FlashImage:
     return FlashImage(address, np.random.default_rng(seed).integers(0, 256, count, np.uint8).tobytes())
 
 
-def test_files_are_those_of_objcopy(cli, needs: Callable[..., None], tmp_path: Path) -> None:
+def test_files_are_those_of_objcopy(evlcp, needs: Callable[..., None], tmp_path: Path) -> None:
     needs("make", "arm-none-eabi-gcc", "arm-none-eabi-objcopy")
     for target in build.TARGETS:
-        done = cli("board", "build", "--target", target, "-o", tmp_path / "new", "--json")
-        assert done.returncode == 0, done.stderr
-        table = json.loads(done.stdout)
+        done = evlcp("board", "build", "--target", target, "-o", tmp_path / "new", "--json")
+        assert done.code == 0, done.err
+        table = json.loads(done.out)
         elf, hexed, binary, package = (Path(file) for file in table["files"])
         assert Package.read(package) == Package.built(target)
         for suffix, ours in (("binary", binary), ("ihex", hexed)):
@@ -201,31 +202,37 @@ def test_brown_out_is_set_and_nothing_else() -> None:
     assert rom.options[1:] == before[1:]
 
 
-def test_what_the_command_flashes_boots_where_it_was_flashed(cli, image: FlashImage, tmp_path: Path) -> None:
+def test_what_the_command_flashes_boots_where_it_was_flashed(
+    evlcp, image: FlashImage, tmp_path: Path
+) -> None:
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
     port, kept = f"unix:{tmp_path / 'part'}", tmp_path / "flash.bin"
     kept.write_bytes(some(1 << 20, 5).data)
     emulated = Emulated("rom", "--listen", port, "--flash", kept)
     try:
         assert emulated.said == f"listening on {port}\n"
-        done = cli("board", "flash", "--target", "stm32f405-8mhz", "--port", port, "--json")
-        assert done.returncode == 0, done.stderr
-        table = json.loads(done.stdout)
+        done = evlcp("board", "flash", "--target", "stm32f405-8mhz", "--port", port, "--json")
+        assert done.code == 0, done.err
+        table = json.loads(done.out)
         assert (table["verified"], table["started"], table["brown_out"]) == (True, True, False)
         assert table["sectors"][0] == 0
-        assert kept.read_bytes()[: len(image.data)] == image.data
-        about = json.loads(cli("board", "hello", "--port", port, "--json").stdout)
+        # what was flashed answers when the file has it
+        end = time.monotonic() + 20.0
+        while (hello := evlcp("board", "hello", "--port", port, "--json")).code:
+            assert time.monotonic() < end, hello
+        about = json.loads(hello.out)
         assert about["hal"] == "stm32f405"
+        assert kept.read_bytes()[: len(image.data)] == image.data
     finally:
         assert emulated.end() == 0
-    done = cli(
+    done = evlcp(
         "board", "emulate", "rom", "--listen", port, "--flash", tmp_path / "part.bin", "--leds", tmp_path
     )
-    assert (done.returncode, done.stdout) == (1, "")
+    assert (done.code, done.out) == (1, "")
     (tmp_path / "short.bin").write_bytes(b"12")
-    done = cli("board", "emulate", "rom", "--listen", port, "--flash", tmp_path / "short.bin")
-    assert done.returncode == 3
-    assert "2 bytes, expected 1048576, the flash of the part" in done.stderr
+    done = evlcp("board", "emulate", "rom", "--listen", port, "--flash", tmp_path / "short.bin")
+    assert done.code == 3
+    assert "2 bytes, expected 1048576, the flash of the part" in done.err
 
 
 def test_the_image_for_another_crystal_boots_by_that_one(image: FlashImage) -> None:
@@ -272,13 +279,13 @@ def serving(rom: RomEmulator) -> Iterator[str]:
         thread.join(10)
 
 
-def test_options_of_flash_are_checked(cli, tmp_path: Path) -> None:
+def test_options_of_flash_are_checked(evlcp, tmp_path: Path) -> None:
     for arguments, words in (
         (("--port", "tcp:127.0.0.1:1"), "give an image, or --target"),
         (("--target", "stm32f405-8mhz"), "--port: expected"),
     ):
-        done = cli("board", "flash", *arguments)
-        assert (done.returncode, done.stdout) == (2, "")
-        assert words in done.stderr
-    done = cli("board", "flash", tmp_path / "no.bin", "--port", "tcp:127.0.0.1:1")
-    assert done.returncode == 3
+        done = evlcp("board", "flash", *arguments)
+        assert (done.code, done.out) == (2, "")
+        assert words in done.err
+    done = evlcp("board", "flash", tmp_path / "no.bin", "--port", "tcp:127.0.0.1:1")
+    assert done.code == 3

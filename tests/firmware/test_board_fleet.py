@@ -80,16 +80,16 @@ def test_a_payload_has_its_own_link(evlcp, tmp_path: Path) -> None:
         read_inventory(file)
 
 
-def test_thirty_of_thirty_two(cli, boards: list[str], tmp_path: Path) -> None:
+def test_thirty_of_thirty_two(evlcp, boards: list[str], tmp_path: Path) -> None:
     # one port has nobody, one board cannot take the level
     silent = socket.socket(socket.AF_UNIX)
     silent.bind(str(tmp_path / "silent"))
     silent.listen()
     ports = [*boards[:7], f"unix:{tmp_path / 'silent'}", *boards[8:]]
     file = inventory(tmp_path / "tunnel.toml", ports, {20: "level_ma = 500\n"})
-    done = cli("board", "program", "--inventory", file)
+    done = evlcp("board", "program", "--inventory", file)
     silent.close()
-    lines = done.stdout.splitlines()
+    lines = done.out.splitlines()
     assert len(lines) == 32
     good = [x for x in lines if "programmed 5120 of 5120 bytes" in x]
     bad = sorted(x for x in lines if "FAILED" in x)
@@ -99,17 +99,17 @@ def test_thirty_of_thirty_two(cli, boards: list[str], tmp_path: Path) -> None:
     assert bad[1].startswith("T20")
     assert "FAILED (5)" in bad[1]
     assert "nearest value the board can take is 60" in bad[1]
-    assert done.returncode == 4
-    assert done.stderr.startswith(f"evlcp: {file}: 2 of 32 boards failed (T07, T20)")
+    assert done.code == 4
+    assert done.err.startswith(f"evlcp: {file}: 2 of 32 boards failed (T07, T20)")
     for n in (0, 31):
-        same = cli("board", "verify", "--random", 16, "--seed", n, "--port", boards[n])
-        assert same.returncode == 0, same.stderr
+        same = evlcp("board", "verify", "--random", 16, "--seed", n, "--port", boards[n])
+        assert same.code == 0, same.err
 
     # repaired, the next run does only what is missing
     file = inventory(tmp_path / "tunnel.toml", boards, {})
-    again = cli("board", "program", "--inventory", file, "--json")
-    assert again.returncode == 0, again.stderr
-    rows = [json.loads(x) for x in again.stdout.splitlines()]
+    again = evlcp("board", "program", "--inventory", file, "--json")
+    assert again.code == 0, again.err
+    rows = [json.loads(x) for x in again.out.splitlines()]
     assert sorted(r["id"] for r in rows if r["written_bytes"]) == ["T07", "T20"]
     assert all(r["ok"] for r in rows)
     assert len(rows) == 32
@@ -151,22 +151,22 @@ GOOD = 'id = "a"\nport = "native:"\nposition_m = [0, 0, 0]\nrandom = 1\n'
         ("[[board]]\n" + GOOD.replace("random = 1", 'payload = "no.json"'), "no.json: cannot be read"),
     ],
 )
-def test_wrong_inventory_is_one_line(cli, tmp_path: Path, text: str, expected: str) -> None:
+def test_wrong_inventory_is_one_line(evlcp, tmp_path: Path, text: str, expected: str) -> None:
     file = tmp_path / "tunnel.toml"
     file.write_text(text)
-    done = cli("board", "program", "--inventory", file)
-    assert done.returncode == (3 if "payload" in text else 2)
-    assert done.stdout == ""
-    assert done.stderr.startswith(f"evlcp: {file}: ")
-    assert expected in done.stderr
-    assert done.stderr.count("\n") == 1
+    done = evlcp("board", "program", "--inventory", file)
+    assert done.code == (3 if "payload" in text else 2)
+    assert done.out == ""
+    assert done.err.startswith(f"evlcp: {file}: ")
+    assert expected in done.err
+    assert done.err.count("\n") == 1
 
 
-def test_another_board_on_the_port_is_refused(cli, tmp_path: Path) -> None:
+def test_another_board_on_the_port_is_refused(evlcp, tmp_path: Path) -> None:
     file = tmp_path / "tunnel.toml"
     file.write_text("[[board]]\n" + GOOD + f'unique_id = "{"0" * 23}7"\n')
-    done = cli("board", "program", "--inventory", file)
-    assert done.returncode == 8
-    assert "the inventory expects" in done.stdout
+    done = evlcp("board", "program", "--inventory", file)
+    assert done.code == 8
+    assert "the inventory expects" in done.out
     file.write_text("[[board]]\n" + GOOD + f'unique_id = "{"0" * 24}"\n')
-    assert cli("board", "program", "--inventory", file).returncode == 0
+    assert evlcp("board", "program", "--inventory", file).code == 0

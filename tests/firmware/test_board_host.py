@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import board_on
-from test_board_cli import EVLCP, Emulated
+from board_lines import Native, board_on
+from test_board_cli import EVLCP
 
 from evlcp_sdk.air.codebook import Codebook
 from firmware_host.board.bank import Bank, random_symbols
@@ -22,10 +22,11 @@ from firmware_host.errors import NoBoardError, RefusedError, VerifyError
 from firmware_host.ports.transport import SocketTransport
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.requests import BoardFault, State, Status, Watchdog
+from tests.conftest import Run
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
-Cli = Callable[..., "subprocess.CompletedProcess[str]"]
+Evlcp = Callable[..., Run]
 
 
 def payload(book: Codebook, seed: int = 0, rate: float = 10_000.0) -> Bank:
@@ -56,9 +57,9 @@ def test_staying_with_a_board_that_plays_on_asks_nothing(book: Codebook) -> None
     assert board.status().requests == before.requests + 1
 
 
-def test_program_keeps_alive_until_it_is_ended(cli: Cli, tmp_path: Path) -> None:
+def test_program_keeps_alive_until_it_is_ended(evlcp: Evlcp, tmp_path: Path) -> None:
     port = f"unix:{tmp_path / 'board'}"
-    emulated = Emulated("native", "--listen", port, "--leds", tmp_path / "leds.bin")
+    emulated = Native(port, leds=tmp_path / "leds.bin")
     options = ("--random", "1", "--watchdog", "idle", "--watchdog-ms", "300", "--port", port)
     command = [*EVLCP, "board", "program", *options, "--keep-alive", "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -73,19 +74,19 @@ def test_program_keeps_alive_until_it_is_ended(cli: Cli, tmp_path: Path) -> None
     process.stdout.close()
     process.stderr.close()
     # nobody else has looked since: no packet of the idle pattern has been played
-    status = json.loads(cli("board", "status", "--json", "--port", port).stdout)
+    status = json.loads(evlcp("board", "status", "--json", "--port", port).out)
     assert "watchdog" not in status["faults"] or status["silence_ms"] >= 300
     assert status["packets_sent"] > 25
     emulated.end()
 
 
 @pytest.mark.parametrize(("action", "what"), [("idle", "shows its idle pattern"), ("dark", "goes dark")])
-def test_what_the_watchdog_will_do_is_said(cli: Cli, action: str, what: str) -> None:
+def test_what_the_watchdog_will_do_is_said(evlcp: Evlcp, action: str, what: str) -> None:
     options = ("--port", "native:", "--random", 1)
-    done = cli("board", "program", *options, "--watchdog", action, "--watchdog-ms", 1500)
-    assert f"watchdog: the board {what} once no host has spoken for 1.5 s" in done.stdout
-    assert "watchdog" not in cli("board", "program", *options, "--watchdog", "keep").stdout
-    said = cli("board", "watchdog", action, "--after-ms", 1500, "--port", "native:").stdout
+    done = evlcp("board", "program", *options, "--watchdog", action, "--watchdog-ms", 1500)
+    assert f"watchdog: the board {what} once no host has spoken for 1.5 s" in done.out
+    assert "watchdog" not in evlcp("board", "program", *options, "--watchdog", "keep").out
+    said = evlcp("board", "watchdog", action, "--after-ms", 1500, "--port", "native:").out
     assert f"the board {what}" in said
 
 
@@ -118,23 +119,23 @@ def test_a_bank_that_does_not_hold_is_not_blamed_on_the_rate(book: Codebook) -> 
 
 
 @pytest.mark.parametrize("url", ["socket://localhost", "socket://", "socket://localhost:x", "rfc2217://"])
-def test_a_url_without_a_port_is_one_line(evlcp: Callable[..., object], url: str) -> None:
+def test_a_url_without_a_port_is_one_line(evlcp: Evlcp, url: str) -> None:
     done = evlcp("board", "hello", "--port", url)
     assert done.code == 4
     assert f"cannot be opened: expected {url.split(':')[0]}://HOST:PORT" in done.err
     assert done.err.count("\n") == 1
 
 
-def test_a_second_host_learns_of_the_first(cli: Cli, tmp_path: Path) -> None:
+def test_a_second_host_learns_of_the_first(evlcp: Evlcp, tmp_path: Path) -> None:
     port = f"unix:{tmp_path / 'board'}"
-    emulated = Emulated("native", "--listen", port)
+    emulated = Native(port)
     with Session(SocketTransport.connect(port)) as session:
         first = Board(session)
         start = time.monotonic()
-        second = cli("board", "hello", "--port", port)
-        assert second.returncode == 4
-        assert "another host is connected to it" in second.stderr
-        assert "power" not in second.stderr
+        second = evlcp("board", "hello", "--port", port)
+        assert second.code == 4
+        assert "another host is connected to it" in second.err
+        assert "power" not in second.err
         assert time.monotonic() - start < 5.0
         assert first.status().state == State.DARK
     # the first has left: nobody is turned away

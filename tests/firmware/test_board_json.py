@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 import typer
-from test_board_cli import EVLCP, Emulated
+from board_lines import Native
+from test_board_cli import EVLCP
 
 from firmware_host.board.board import Board
 from firmware_host.board.monitor import Back, Gone, watch
@@ -44,9 +45,10 @@ def test_every_command_on_a_board_takes_json() -> None:
 
 @pytest.fixture
 def native(tmp_path: Path) -> Iterator[str]:
-    emulated = Emulated("native", "--listen", f"unix:{tmp_path / 'board'}", "--flash", tmp_path / "f.bin")
-    yield f"unix:{tmp_path / 'board'}"
-    assert emulated.end() == 0
+    place = f"unix:{tmp_path / 'board'}"
+    board = Native(place, flash=tmp_path / "f.bin")
+    yield place
+    board.end()
 
 
 def test_what_is_done_is_one_object(evlcp: Evlcp, native: str) -> None:
@@ -105,11 +107,11 @@ def test_a_fault_of_tx_is_json_too(evlcp: Evlcp, tmp_path: Path) -> None:
         assert json.loads(done.out)["error"]["kind"] == kind, done.err
 
 
-def fleet(path: Path, count: int) -> tuple[Path, list[Emulated]]:
+def fleet(path: Path, count: int) -> tuple[Path, list[Native]]:
     """An inventory of boards that run."""
     (path / "site.toml").write_text(SITE)
     ports = [f"unix:{path / f'b{n}'}" for n in range(count)]
-    emulated = [Emulated("native", "--listen", port, "--unique-id", n) for n, port in enumerate(ports)]
+    emulated = [Native(port, unique_id=n) for n, port in enumerate(ports)]
     text = '[defaults]\nsequence = 4\nbeacon = "site.toml"\nuser = "north"\ntext = "Tempo 30"\n'
     for n, port in enumerate(ports):
         text += f'[[board]]\nid = "T{n}"\nport = "{port}"\nposition_m = [0, 0, {n}]\n'
@@ -139,7 +141,7 @@ def test_an_inventory_for_all_that_is_done_with_boards(evlcp: Evlcp, tmp_path: P
     assert sorted(line.split("  ")[0] for line in said) == ["T0", "T1", "T2"]
     assert all("playing, " in line for line in said)
     # one that is off does not hold up the others
-    assert emulated[1].end() == 0
+    emulated[1].end()
     done = evlcp("board", "stop", "--inventory", file, "--json")
     assert done.code == 4
     *ended, error = map(json.loads, done.out.splitlines())
@@ -247,7 +249,7 @@ def test_a_monitor_finds_its_board_again() -> None:
 
 def test_monitor_survives_a_board_that_restarts(tmp_path: Path) -> None:
     port = f"unix:{tmp_path / 'b'}"
-    emulated = Emulated("native", "--listen", port)
+    emulated = Native(port)
     command = [*EVLCP, "board", "monitor", "--interval", "0.05", "--json", "--port", port]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -257,7 +259,7 @@ def test_monitor_survives_a_board_that_restarts(tmp_path: Path) -> None:
     lines = iter(process.stdout.readline, "")
     gone = next(row for row in map(json.loads, lines) if "error" in row)
     assert gone["error"]["exit_code"] in (4, 6)
-    emulated = Emulated("native", "--listen", port)
+    emulated = Native(port)
     back = next(row for row in map(json.loads, lines) if "back_after_s" in row)
     assert back["back_after_s"] > 0.0
     assert json.loads(next(lines))["state"] == "dark"

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_board_cli import Emulated
+from board_lines import Native
 
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Block, Kind, Message, joined
@@ -263,22 +263,24 @@ def test_the_port_may_come_from_the_environment(
 
 
 @pytest.mark.usefixtures("compiler")
-def test_a_board_plays_it(cli: Evlcp, site: Path, tmp_path: Path) -> None:
+def test_a_board_plays_it(evlcp: Evlcp, site: Path, tmp_path: Path) -> None:
     port, leds, chips = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin", tmp_path / "c.npy"
-    emulated = Emulated("native", "--listen", port, "--leds", leds)
-    done = cli("tx", "message", "--text", "Tempo 30 " * 20, "--beacon", site, "--sequence", 3, "--port", port)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "sent 1920 of 1920 bytes; bank 0 is active"
-    assert done.stdout.splitlines()[-2].endswith(", again and again")
+    emulated = Native(port, leds=leds)
+    done = evlcp(
+        "tx", "message", "--text", "Tempo 30 " * 20, "--beacon", site, "--sequence", 3, "--port", port
+    )
+    assert done.code == 0, done.err
+    assert done.out.splitlines()[-1] == "sent 1920 of 1920 bytes; bank 0 is active"
+    assert done.out.splitlines()[-2].endswith(", again and again")
     # More packets than a bank holds are refused, and what plays goes on.
     (tmp_path / "big").write_bytes(bytes(60_000))
-    refused = cli("tx", "message", "--file", tmp_path / "big", "--port", port)
-    assert refused.returncode == 2
-    assert "packets of 320 bytes, a bank of" in refused.stderr
+    refused = evlcp("tx", "message", "--file", tmp_path / "big", "--port", port)
+    assert refused.code == 2
+    assert "packets of 320 bytes, a bank of" in refused.err
     time.sleep(0.5)
-    assert cli("board", "stop", "--port", port).returncode == 0
-    assert emulated.end() == 0
-    assert cli("board", "leds", leds, "--chips", chips).returncode == 0
+    assert evlcp("board", "stop", "--port", port).code == 0
+    emulated.end()
+    assert evlcp("board", "leds", leds, "--chips", chips).code == 0
     link = load_link()
     found = messages_of(symbols_of(np.load(chips), link), link)
     assert found[Kind.TEXT].text == "Tempo 30 " * 20
@@ -286,7 +288,7 @@ def test_a_board_plays_it(cli: Evlcp, site: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("compiler")
-def test_a_board_is_programmed_with_the_files_own_link(evlcp: Evlcp, cli: Evlcp, tmp_path: Path) -> None:
+def test_a_board_is_programmed_with_the_files_own_link(evlcp: Evlcp, tmp_path: Path) -> None:
     port, leds, chips = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin", tmp_path / "c.npy"
     settings = (
         "modulation.id=wh8",
@@ -297,19 +299,19 @@ def test_a_board_is_programmed_with_the_files_own_link(evlcp: Evlcp, cli: Evlcp,
     options = [part for setting in settings for part in ("--set", setting)]
     for text in ("one", "two"):
         assert evlcp("tx", "message", "--text", text, "-o", tmp_path / f"{text}.json", *options).code == 0
-    emulated = Emulated("native", "--listen", port, "--leds", leds)
+    emulated = Native(port, leds=leds)
     board = ("board", "--port", port)
-    assert cli(*board, "program", tmp_path / "one.json").returncode == 0
-    status = json.loads(cli(*board, "status", "--json").stdout)
+    assert evlcp(*board, "program", tmp_path / "one.json").code == 0
+    status = json.loads(evlcp(*board, "status", "--json").out)
     assert (status["profile"], status["chip_rate_hz"]) == ("wh8", 5000)
     assert (status["frames"], status["pilot_every"]) == (12, 3)
-    assert cli(*board, "verify", tmp_path / "one.json", *options).returncode == 0
-    assert cli(*board, "verify", tmp_path / "two.json").returncode == 7
-    assert cli(*board, "send", tmp_path / "two.json").returncode == 0
+    assert evlcp(*board, "verify", tmp_path / "one.json", *options).code == 0
+    assert evlcp(*board, "verify", tmp_path / "two.json").code == 7
+    assert evlcp(*board, "send", tmp_path / "two.json").code == 0
     time.sleep(0.5)
-    assert cli(*board, "stop").returncode == 0
-    assert emulated.end() == 0
-    assert cli("board", "leds", leds, "--chips", chips).returncode == 0
+    assert evlcp(*board, "stop").code == 0
+    emulated.end()
+    assert evlcp("board", "leds", leds, "--chips", chips).code == 0
     link = load_link(overrides=settings)
     packets = symbols_of(np.load(chips), link)
     texts = [messages_of(packet[None], link)[Kind.TEXT].text for packet in packets]

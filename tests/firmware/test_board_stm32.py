@@ -322,7 +322,7 @@ def test_led_test_and_save_wait_until_the_last_rows_have_left(bar: Bar) -> None:
         bar.board.blank()
 
 
-def test_emulate_serves_the_model(cli, needs: Callable[..., None], book: Codebook, tmp_path: Path) -> None:
+def test_emulate_serves_the_model(evlcp, needs: Callable[..., None], book: Codebook, tmp_path: Path) -> None:
     needs("cc", "make", "arm-none-eabi-gcc")
     listen, record = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin"
     command = "from evlcp_sdk.cli.main import main; main()"
@@ -332,17 +332,17 @@ def test_emulate_serves_the_model(cli, needs: Callable[..., None], book: Codeboo
         assert process.stdout is not None
         assert process.stdout.readline() == f"listening on {listen}\n"
         random = ("--random", 1, "--seed", 4, "--set", "air.frames_per_packet=2")
-        done = cli("board", "program", *random, "--port", listen)
-        assert done.returncode == 0, done.stderr
-        done = cli("board", "stop", "--port", listen)
-        assert done.returncode == 0, done.stderr
+        done = evlcp("board", "program", *random, "--port", listen)
+        assert done.code == 0, done.err
+        done = evlcp("board", "stop", "--port", listen)
+        assert done.code == 0, done.err
     finally:
         process.terminate()
         assert process.wait(10) == 0
         assert process.stdout is not None
         process.stdout.close()
-    done = cli("board", "leds", record, "--chips", tmp_path / "chips.npy")
-    assert done.returncode == 0, done.stderr
+    done = evlcp("board", "leds", record, "--chips", tmp_path / "chips.npy")
+    assert done.code == 0, done.err
     chips = np.load(tmp_path / "chips.npy")
     packet = load_link(overrides=["air.frames_per_packet=2"]).packet
     once = symbol_chips(random_symbols(1, 2, book, np.random.default_rng(4)), book, packet.pilot_every)

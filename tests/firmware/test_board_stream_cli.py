@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_board_cli import EVLCP, Emulated
+from board_lines import Native
+from test_board_cli import EVLCP
 from test_board_messages import messages_of, symbols_of
 
 from evlcp_sdk.air.blocks import Kind
@@ -41,7 +42,7 @@ def packets_on(leds: Path) -> np.ndarray:
 
 def test_texts_go_out_as_they_come(tmp_path: Path) -> None:
     port, leds = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin"
-    emulated = Emulated("native", "--listen", port, "--leds", leds)
+    emulated = Native(port, leds=leds)
     command = [*EVLCP, "board", "stream", "--port", port, "--id", "7", "--json"]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdin is not None
@@ -57,7 +58,7 @@ def test_texts_go_out_as_they_come(tmp_path: Path) -> None:
     done = json.loads(process.stdout.read())
     assert process.wait(20) == 0
     process.stdout.close()
-    assert emulated.end() == 0
+    emulated.end()
     packets = packets_on(leds)
     said = [messages_of(packet[None], LINK)[Kind.TEXT] for packet in packets]
     assert [m.text for m in said] == ["Green in 3 s", "Green in 2 s", "Green in 1 s"]
@@ -73,11 +74,11 @@ def test_symbols_from_a_file(evlcp: Evlcp, tmp_path: Path) -> None:
     file = tmp_path / "lines.jsonl"
     # a packet a line, then two on one
     file.write_text("\n".join(map(json.dumps, (table[0], table[1], table[2:]))) + "\n\n")
-    emulated = Emulated("native", "--listen", port, "--leds", leds)
+    emulated = Native(port, leds=leds)
     done = evlcp("board", "stream", file, "--lines", "symbols", "--repeat", 2, "--port", port)
     assert (done.code, done.err) == (0, "")
     assert done.out.startswith("8 packets, ")
-    assert emulated.end() == 0
+    emulated.end()
     assert packets_on(leds).tolist() == [packet for packet in table for _ in range(2)]
 
 
@@ -105,7 +106,7 @@ def test_a_wrong_line_is_told(
 
 def test_a_message_that_changes(evlcp: Evlcp, tmp_path: Path) -> None:
     port, leds = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin"
-    emulated = Emulated("native", "--listen", port, "--leds", leds)
+    emulated = Native(port, leds=leds)
     began = time.time()
     said = ("--text", "{n}: {left} s left at {time}", "--time", "--countdown", 100, "--sequence", 40)
     done = evlcp(
@@ -113,7 +114,7 @@ def test_a_message_that_changes(evlcp: Evlcp, tmp_path: Path) -> None:
         *("--port", port, "--json"),
     )
     assert (done.code, done.err) == (0, "")
-    assert emulated.end() == 0
+    emulated.end()
     packets = packets_on(leds)
     assert len(packets) == json.loads(done.out)["packets"] >= 45
     first, last = (messages_of(some, LINK) for some in (packets[:3], packets[-3:]))

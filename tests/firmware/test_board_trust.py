@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from board_lines import NoisyLine
+from board_lines import Native, NoisyLine
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_board_cli import Emulated
 
 from evlcp_sdk.link.resolve import load_link
 from firmware_host.board.bank import bank_of, random_symbols
@@ -345,7 +344,7 @@ def test_locked_from_the_command_line(
 ) -> None:
     port, file, other = f"unix:{tmp_path / 'board'}", tmp_path / "bar.key", tmp_path / "other.key"
     name, _ = make_board_key(file), make_board_key(other)
-    emulated = Emulated("native", "--listen", port, "--flash", tmp_path / "f.bin")
+    emulated = Native(port, flash=tmp_path / "f.bin")
 
     def board(*arguments: object) -> Any:
         return evlcp("board", *map(str, arguments), "--port", port)
@@ -371,15 +370,15 @@ def test_locked_from_the_command_line(
         assert evlcp("board", command, "--inventory", tmp_path / "one.toml").code == 0
     monkeypatch.setenv("EVLCP_BOARD_KEY", str(file))
     assert board("start").code == 0
-    assert emulated.end() == 0
-    emulated = Emulated("native", "--listen", port, "--flash", tmp_path / "f.bin")
+    emulated.end()
+    emulated = Native(port, flash=tmp_path / "f.bin")
     assert json.loads(board("hello", "--json").out)["key"] == name
     assert board("lock", other).code == 0
     assert board("unlock", "--key", other).code == 0
     monkeypatch.delenv("EVLCP_BOARD_KEY")
     assert board("level", 9).code == 0
     assert read_board_key(file) != read_board_key(other)
-    assert emulated.end() == 0
+    emulated.end()
 
 
 def test_the_image_of_the_part_seals(needs: Callable[..., None]) -> None:

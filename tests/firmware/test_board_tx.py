@@ -36,35 +36,35 @@ def example(tmp_path: Path) -> Path:
 TWO_FRAMES = ("--set", "air.frames_per_packet=2")
 
 
-def test_chips_are_the_air_vectors(cli, example: Path, tmp_path: Path) -> None:
+def test_chips_are_the_air_vectors(evlcp, example: Path, tmp_path: Path) -> None:
     out = tmp_path / "chips.npy"
-    assert cli("tx", "frames", example, "--chips", out, *TWO_FRAMES).returncode == 0
+    assert evlcp("tx", "frames", example, "--chips", out, *TWO_FRAMES).code == 0
     chips = np.load(out)
     assert chips.dtype == np.uint8
     assert chips.shape == (90, 16)
     assert masks_of(chips) == EXAMPLE["cluster_masks"]
 
 
-def test_every_form_has_the_same_words(cli, example: Path) -> None:
-    table = json.loads(cli("tx", "frames", example, "--format", "json", *TWO_FRAMES).stdout)
+def test_every_form_has_the_same_words(evlcp, example: Path) -> None:
+    table = json.loads(evlcp("tx", "frames", example, "--format", "json", *TWO_FRAMES).out)
     assert table["pilot_words"] == AIR["pilot_words"]
     info = [w for frame in table["info_words"][0] for w in frame]
     expected = [AIR["info_words"]["wh4x2"][s] for frame in EXAMPLE["symbols"] for s in frame]
     assert info == expected
-    hexed = cli("tx", "frames", example, "--format", "hex", *TWO_FRAMES).stdout.split()
+    hexed = evlcp("tx", "frames", example, "--format", "hex", *TWO_FRAMES).out.split()
     assert [h[4:] for h in hexed] == expected
     assert [h[:4] for h in hexed] == 2 * AIR["pilot_words"]
-    c = cli("tx", "frames", example, "--format", "c", *TWO_FRAMES).stdout
+    c = evlcp("tx", "frames", example, "--format", "c", *TWO_FRAMES).out
     assert [w for w in expected if f"0x{w}u" not in c] == []
-    rows = cli("tx", "frames", example, *TWO_FRAMES).stdout.splitlines()[1:]
+    rows = evlcp("tx", "frames", example, *TWO_FRAMES).out.splitlines()[1:]
     assert [r.split()[5] for r in rows] == expected
 
 
 @pytest.mark.parametrize("profile", ["wh4x2", "wh8", "raw8"])
-def test_random_is_a_seed(cli, profile: str, tmp_path: Path) -> None:
+def test_random_is_a_seed(evlcp, profile: str, tmp_path: Path) -> None:
     def run(seed: int) -> str:
         options = ("--random", 2, "--seed", seed, "--set", f"modulation.id={profile}", "--format", "hex")
-        return str(cli("tx", "frames", *options).stdout)
+        return str(evlcp("tx", "frames", *options).out)
 
     assert run(1) == run(1) != run(2)
     assert len(run(1).splitlines()) == 20
@@ -110,41 +110,41 @@ def test_torn_cluster_is_told() -> None:
         (json.dumps([[[0] * 16] * 10, [[0] * 16] * 2]), "symbols[1]: found 2 elements, expected 10 frames"),
     ],
 )
-def test_wrong_symbols_are_one_line(cli, tmp_path: Path, text: str, expected: str) -> None:
+def test_wrong_symbols_are_one_line(evlcp, tmp_path: Path, text: str, expected: str) -> None:
     path = tmp_path / "s.json"
     path.write_text(text)
-    done = cli("tx", "frames", path)
-    assert done.returncode == 3
-    assert done.stderr.startswith(f"evlcp: {path}: ")
-    assert expected in done.stderr
-    assert done.stderr.count("\n") == 1
+    done = evlcp("tx", "frames", path)
+    assert done.code == 3
+    assert done.err.startswith(f"evlcp: {path}: ")
+    assert expected in done.err
+    assert done.err.count("\n") == 1
 
 
 @pytest.mark.parametrize("digest", ['"00"', "5", "null"])
-def test_symbols_of_another_codebook_are_refused(cli, tmp_path: Path, digest: str) -> None:
-    said = cli("tx", "frames", "--random", 1, "--format", "json").stdout
+def test_symbols_of_another_codebook_are_refused(evlcp, tmp_path: Path, digest: str) -> None:
+    said = evlcp("tx", "frames", "--random", 1, "--format", "json").out
     path = tmp_path / "s.json"
     path.write_text(said)
-    assert cli("tx", "frames", path, "--format", "json").stdout == said
+    assert evlcp("tx", "frames", path, "--format", "json").out == said
     own = json.loads(said)["codebook"]
     path.write_text(said.replace(f'"{own}"', digest))
-    done = cli("tx", "frames", path)
-    assert done.returncode == 8
-    assert f"{path}: codebook = {digest}" in done.stderr
-    assert f"expected {own[:16]}" in done.stderr
-    assert done.stderr.count("\n") == 1
+    done = evlcp("tx", "frames", path)
+    assert done.code == 8
+    assert f"{path}: codebook = {digest}" in done.err
+    assert f"expected {own[:16]}" in done.err
+    assert done.err.count("\n") == 1
 
 
-def test_missing_files_and_usage(cli, tmp_path: Path) -> None:
-    missing = cli("tx", "frames", tmp_path / "no.json")
-    assert missing.returncode == 3
-    assert "cannot be read" in missing.stderr
-    assert cli("tx", "frames").returncode == 2
-    assert cli("tx", "frames", "--random", 1, "--set", "modulation.id=wh9").returncode == 2
-    assert "did you mean" in cli("tx", "frames", "--random", 1, "--set", "modulation.id=wh9").stderr
-    unwritable = cli("tx", "frames", "--random", 1, "--chips", tmp_path / "no" / "x.npy")
-    assert unwritable.returncode == 1
-    assert unwritable.stderr.count("\n") == 1
+def test_missing_files_and_usage(evlcp, tmp_path: Path) -> None:
+    missing = evlcp("tx", "frames", tmp_path / "no.json")
+    assert missing.code == 3
+    assert "cannot be read" in missing.err
+    assert evlcp("tx", "frames").code == 2
+    assert evlcp("tx", "frames", "--random", 1, "--set", "modulation.id=wh9").code == 2
+    assert "did you mean" in evlcp("tx", "frames", "--random", 1, "--set", "modulation.id=wh9").err
+    unwritable = evlcp("tx", "frames", "--random", 1, "--chips", tmp_path / "no" / "x.npy")
+    assert unwritable.code == 1
+    assert unwritable.err.count("\n") == 1
 
 
 def test_wrong_masks_are_told(book: Codebook, tmp_path: Path) -> None:
@@ -174,10 +174,10 @@ def test_wrong_masks_are_told(book: Codebook, tmp_path: Path) -> None:
     assert (payload.packets, payload.packet.frames, len(payload.content)) == (2, 10, 2 * 346 * 12)
 
 
-def test_codebook_packets_are_balanced_and_do_not_flicker(cli) -> None:
-    done = cli("tx", "check", "--random", 40, "--json")
-    assert done.returncode == 0
-    rows = json.loads(done.stdout)["clusters"]
+def test_codebook_packets_are_balanced_and_do_not_flicker(evlcp) -> None:
+    done = evlcp("tx", "check", "--random", 40, "--json")
+    assert done.code == 0
+    rows = json.loads(done.out)["clusters"]
     assert len(rows) == 16
     assert all(r["on_share"] == 0.5 and r["longest_run"] == 2 and r["low_risk"] for r in rows)
 
@@ -198,33 +198,33 @@ def test_flicker_of_known_waves() -> None:
         assert flicker.check(np.full((100, 1), level, np.uint8), 10_000.0)[0].no_effect
 
 
-def test_a_flickering_payload_ends_with_one(cli, tmp_path: Path) -> None:
+def test_a_flickering_payload_ends_with_one(evlcp, tmp_path: Path) -> None:
     # at 300 chips/s the codes themselves are slow enough to see
-    done = cli("tx", "check", "--random", 10, "--set", "air.chip_rate_hz=300.0")
-    assert done.returncode == 1
-    assert "FLICKERS" in done.stdout
+    done = evlcp("tx", "check", "--random", 10, "--set", "air.chip_rate_hz=300.0")
+    assert done.code == 1
+    assert "FLICKERS" in done.out
 
 
-def test_pilots_in_some_frames_only(cli, tmp_path: Path, book: Codebook) -> None:
+def test_pilots_in_some_frames_only(evlcp, tmp_path: Path, book: Codebook) -> None:
     file = tmp_path / "chips.npy"
     sparse = ("--set", "air.frames_per_packet=6", "--set", "air.pilot_every=4")
     options = ("tx", "frames", "--random", 2, "--seed", 3, *sparse)
     symbols = random_symbols(2, 6, book, np.random.default_rng(3))
-    assert cli(*options, "--chips", file).returncode == 0
+    assert evlcp(*options, "--chips", file).code == 0
     expected = np.concatenate([packet_chips(packet, book, 4) for packet in symbols])
     assert np.load(file).tolist() == expected.tolist()
     masks = read_masks(file, book, PacketFormat.of(book, 6, pilot_every=4))
     assert masks.packets == 2
     assert masks.packet.pilot_every == 4
-    rows = [line.split() for line in cli(*options, "--format", "table").stdout.splitlines()[1:]]
+    rows = [line.split() for line in evlcp(*options, "--format", "table").out.splitlines()[1:]]
     assert {row[1] for row in rows if row[4] == "-"} == {"1", "2", "3", "5"}
-    words = cli(*options, "--format", "hex").stdout.splitlines()
+    words = evlcp(*options, "--format", "hex").out.splitlines()
     assert [len(line.split()[0]) for line in words] == [8, 4, 4, 4, 8, 4] * 2
-    assert json.loads(cli(*options, "--format", "json").stdout)["link"]["air"]["pilot_every"] == 4
+    assert json.loads(evlcp(*options, "--format", "json").out)["link"]["air"]["pilot_every"] == 4
     for profile in ("wh4x2", "wh8", "raw8"):
         settings = ("air.frames_per_packet=20", "air.pilot_every=4", f"modulation.id={profile}")
         options = ("--random", 20, *(part for setting in settings for part in ("--set", setting)))
-        assert cli("tx", "check", *options).returncode == 0
+        assert evlcp("tx", "check", *options).code == 0
 
 
 def test_masks_that_are_no_array_are_one_line(book: Codebook, tmp_path: Path) -> None:
@@ -239,12 +239,12 @@ def test_masks_that_are_no_array_are_one_line(book: Codebook, tmp_path: Path) ->
         read_masks(path, book, PacketFormat.of(book, 10))
 
 
-def test_check_without_a_line_below_3_khz_is_json(cli) -> None:
+def test_check_without_a_line_below_3_khz_is_json(evlcp) -> None:
     one = ("--set", "air.frames_per_packet=1", "--set", "air.chip_rate_hz=1e6")
-    done = cli("tx", "check", "--random", 1, "--json", *one)
+    done = evlcp("tx", "check", "--random", 1, "--json", *one)
 
     def no_number(name: str) -> None:
         raise AssertionError(f"{name} is not JSON")
 
-    rows = json.loads(done.stdout, parse_constant=no_number)["clusters"]
+    rows = json.loads(done.out, parse_constant=no_number)["clusters"]
     assert {row["limit_percent"] for row in rows} == {None}
