@@ -1,67 +1,24 @@
 """The receiver: events in, packets out."""
 
-import math
-from collections import deque
 from dataclasses import replace
 from datetime import datetime
 
-import numpy as np
 import pluggy
-from numpy.typing import NDArray
 
-from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.rx.belief import believed, still_lit
-from evlcp_sdk.rx.delays import RowDelays
-from evlcp_sdk.rx.detection import SAME_PX, Followed, RegionFollower
-from evlcp_sdk.rx.echoes import Echoes, EchoQueue, Sighting
-from evlcp_sdk.rx.grid import DueFrame
+from evlcp_sdk.rx.detection import RegionFollower
+from evlcp_sdk.rx.echoes import Echoes, EchoQueue
+from evlcp_sdk.rx.framing import PacketFraming
 from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.limits import LIMITS, Limits
-from evlcp_sdk.rx.look import Look, Looker
-from evlcp_sdk.rx.placement import layout_of
-from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.steps import Announcer, Steps, on_camera
 from evlcp_sdk.rx.timeline import Timeline, TimeStep
-from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Transmitter, Transmitters
+from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
-from evlcp_sdk.scene.lean import BarSight, sight_of
-from evlcp_sdk.values import Events, Frame, FrameView, Packet, Range, SyncLock
+from evlcp_sdk.values import Events, Packet
 
 __all__ = ["Receiver"]
-
-_NO_RANGE = Range(math.nan, math.nan, 0)
-_NO_POINTS = (np.empty((0, 2)), np.empty(0))
-
-_TAIL_CHIPS = 2
-"""A frame is whole if the stream goes on for this long after it: its last events come late."""
-
-_LOOKS = 3
-"""Looks at a region's first frame: at what was found of a bar, at the whole of it, and once more, as few
-clusters place it less well than all."""
-
-_DARK = 0.25
-"""Share of a pilot's events below which a bar that was seen before is out of sight, or hidden."""
-
-_MOST_LIT = 1024
-"""Transmitters of which is known when their light was there."""
-
-_COUNTS = (
-    "events_in_regions",
-    "regions_opened",
-    "regions_released",
-    "locks",
-    "preambles",
-    "frames",
-    "frames_rejected",
-    "frames_dark",
-    "frames_unread",
-    "frames_reflected",
-    "frames_askew",
-    "frames_cut",
-    "packets",
-)
 
 
 class Receiver:
@@ -76,10 +33,6 @@ class Receiver:
             against the sensor. None for nothing.
         clock_zero: UTC of the camera clock's 0, for the age of signed beacons; None if it is not known.
         limits: How much it holds at the most.
-
-    Attributes:
-        lit_us: Of each transmitter, the newest thousand, starts of the first and the last frame that was due
-            while its light was there, given or not, by number, camera clock, us.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> receiver = Receiver(load_link())
@@ -100,52 +53,48 @@ class Receiver:
         clock_zero: datetime | None = None,
         limits: Limits = LIMITS,
     ) -> None:
-        centres_m = link.bar.cluster_centres_m()
-        self._camera = link.camera
-        self._is_column = float(np.ptp(centres_m[:, 0])) < 1e-9
-        self._attitude_at = attitude_source(attitude)
-        self._packet = link.packet
-        self._step_us = link.regions.step_us
-        self._seam_px = link.regions.margin_px
-        self._tail_us = _TAIL_CHIPS * link.packet.chip_us
-        self._timeline = Timeline(self._step_us, link.camera.width, link.camera.height, limits)
+        self._timeline = Timeline(link.regions.step_us, link.camera.width, link.camera.height, limits)
         self._clock = self._timeline.clock
         self._announcer = Announcer(hook, self._clock.camera_us)
-        self._steps = Steps(link, self._announcer)
+        steps = Steps(link, self._announcer)
         self._regions = RegionFollower(
             link.regions,
             link.camera,
             link.packet.chip_us,
-            self._steps.position,
+            steps.position,
             LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us,
             limits,
         )
-        self._transmitters = Transmitters(link.packet, self._step_us, limits)
-        self._looker = Looker(
-            link.packet,
-            link.regions,
-            centres_m,
-            link.codebook.pilots,
-            self._steps.separate,
-            (link.camera.width, link.camera.height),
+        self._judged = EchoQueue(Echoes(link.packet, len(link.codebook.codewords)))
+        self._framing = PacketFraming(
+            link,
+            steps,
+            self._regions,
+            self._judged,
+            self._clock,
+            self._announcer,
+            attitude_source(attitude),
+            limits,
         )
-        self._rows = RowDelays(link.codebook.preamble)
-        self._find_points = points_finder(layout_of(centres_m))
-        self._echoes = Echoes(link.packet, len(link.codebook.codewords))
-        self._judged = EchoQueue(self._echoes)
         self._messages = MessageAssembler.of(link, clock_zero)
-        self._joined: set[int] = set()
-        self._due: deque[Followed] = deque()
         self._closed = False
-        self._counts = dict.fromkeys(_COUNTS, 0)
-        self.lit_us: dict[int, tuple[float, float]] = {}
+        self._given = {"frames_reflected": 0, "packets": 0}
+
+    @property
+    def lit_us(self) -> dict[int, tuple[float, float]]:
+        """Of each transmitter, the newest thousand, by number, when its light was there.
+
+        Starts of the first and the last frame that was due while it was, given or not, camera clock, us.
+        """
+        return self._framing.lit_us
 
     @property
     def counts(self) -> dict[str, int]:
         """What was taken, found and dropped so far."""
         messages = self._messages.counts if self._messages is not None else {}
         dropped = {"dropped_crowded": self._timeline.dropped}
-        return self._clock.counts | dropped | self._regions.counts | self._counts | messages
+        found = self._regions.counts | self._framing.counts
+        return self._clock.counts | dropped | found | self._given | messages
 
     def feed(self, events: Events) -> list[Packet]:
         """Take the next events of the stream; return the packets that are complete.
@@ -169,8 +118,7 @@ class Receiver:
             return []
         self._closed = True
         packets = [packet for step in self._timeline.close() for packet in self._run(step)]
-        for transmitter in self._transmitters.close():
-            self._end(transmitter, self._clock.last_us)
+        self._framing.close()
         packets = self._read(packets + self._judged.close())
         if self._messages is not None:
             self._messages.close()
@@ -186,211 +134,13 @@ class Receiver:
         regions = self._regions.step(step.start_us, step.events)
         for region in regions:
             self._announcer.lap("regions", region.latest)
-        self._joined.clear()
-        # A frame may show another image of its bar: that is a region, too, and heard at once.
-        self._due = deque(regions)
-        while self._due:
-            region = self._due.popleft()
-            if region.id in self._joined:
-                continue
-            transmitter = self._hear(region, step)
-            self._decode_due(transmitter, step.end_us - self._tail_us)
-            if region.id in self._joined:
-                continue
-            self._transmitters.forget(transmitter, step.end_us)
-            if region.released:
-                self._counts["regions_released"] += 1
-                self._end(transmitter, step.end_us)
-                self._transmitters.release(transmitter)
+        self._framing.step(regions, step)
         return self._judged.step()
-
-    def _hear(self, region: Followed, step: TimeStep) -> Transmitter:
-        """Listen to a region's events of a time step, or to all that it has if it is new."""
-        new = region not in self._transmitters
-        if new:
-            self._counts["regions_opened"] += 1
-            self._transmitters.open(region, self._steps.sync_init(), self._steps.distance_init())
-        transmitter = self._transmitters[region]
-        for start_us, events in list(region.pieces) if new else [region.pieces[-1]]:
-            self._counts["events_in_regions"] += len(events)
-            until_us = min(start_us + self._step_us, step.end_us)
-            transmitter.sync, locks = self._steps.synchronize(transmitter.sync, events, until_us)
-            for heard in locks:
-                self._counts["preambles"] += 1
-                lock = self._late_rows(transmitter, heard)
-                self._counts["locks"] += self._transmitters.adopt(transmitter, lock)
-        return transmitter
-
-    def _late_rows(self, transmitter: Transmitter, lock: SyncLock) -> SyncLock:
-        """A lock with what its preamble says of the rows of its bar."""
-        region = transmitter.region
-        middle_us = lock.packet_t_us + self._packet.preamble_chips / 2 * lock.chip_us
-        _, y = region.at(np.array([middle_us]))
-        _, height_px = region.size_at(middle_us)
-        transmitter.rows, lock = self._rows.hear(
-            transmitter.rows, lock, region.pieces, float(y[0]), height_px
-        )
-        return lock
-
-    def _decode_due(self, transmitter: Transmitter, until_us: float) -> None:
-        """Decode the frames that lie before a time, with the events after their last edge."""
-        cut_us = transmitter.region.cut_us
-        if cut_us is not None and transmitter.grid.lock is not None:
-            self._counts["frames_cut"] += transmitter.grid.skip_before(cut_us)
-        while (due := transmitter.grid.due(until_us)) is not None:
-            found = self._decode(transmitter, due)
-            if found == "frames_rejected" and self._put_together(transmitter):
-                continue
-            transmitter.grid.frame += 1
-            if transmitter.region.id in self._joined:
-                # Another region shows the frame.
-                return
-            if found != "frames_dark":
-                self._lit_in(transmitter, due)
-            if isinstance(found, str):
-                self._counts[found] += 1
-                continue
-            self._counts["frames"] += 1
-            self._judged.add(transmitter.packets, due, found)
-
-    def _lit_in(self, transmitter: Transmitter, due: DueFrame) -> None:
-        """Note that a transmitter's light is there in a frame that is due."""
-        start_us = self._clock.camera_us(due.start_us)
-        transmitter.lit_us = start_us if transmitter.lit_us is None else transmitter.lit_us
-        if transmitter.number is not None:
-            first_us, _ = self.lit_us.pop(transmitter.number, (transmitter.lit_us, start_us))
-            self.lit_us[transmitter.number] = (first_us, start_us)
-            while len(self.lit_us) > _MOST_LIT:
-                del self.lit_us[next(iter(self.lit_us))]
-
-    def _decode(self, transmitter: Transmitter, due: DueFrame) -> Sighting | str:
-        """Read a frame; of one that is not given, the count that it belongs to."""
-        self._announcer.start()
-        look = self._look(transmitter, due)
-        if look is None:
-            return "frames_dark" if _went_dark(transmitter, due, self._packet) else "frames_rejected"
-        if transmitter.number is None and self._echoes.shown(due.start_us, look.centre_px):
-            # The same bar once more: where the first region was then is not known as well as what it showed.
-            self._regions.drop(transmitter.region)
-            self._let_go(transmitter.region)
-            return "frames_rejected"
-        read = self._steps.decode(look.presence, look.sums)
-        lit = still_lit(look.sums, look.presence, self._packet.pilot_chips)
-        soft = believed(read, look.placement.seen & lit)
-        distance, points, centre_px, sight = _NO_RANGE, _NO_POINTS, look.centre_px, BarSight()
-        if due.has_pilot:
-            # Another distance of the same pilot, or other points, would say nothing new.
-            distance = self._steps.measure(FrameView(look.sums, look.offset_px, look.presence, read))
-            points_px, sigma_px = self._find_points(look.presence, look.placement)
-            points = points_px + look.corner_px, sigma_px
-            centre_px = self._looker.centre(look, points[0])
-            sight = self._sight(points, look.middle_us)
-        if not (soft.symbols >= 0).any() and (
-            transmitter.number is None or not math.isfinite(distance.distance_m)
-        ):
-            # What says nothing is no transmitter, and of one that is known its distance may still be of use.
-            return "frames_unread"
-        number = self._transmitters.number(transmitter)
-        transmitter.distance, distance, filtered = self._steps.follow(
-            transmitter.distance, due.start_us, due.lock.chip_us, distance, sight
-        )
-        if transmitter.first is None:
-            transmitter.first = due.packet
-        frame = Frame(
-            transmitter=number,
-            packet=due.packet - transmitter.first,
-            frame=due.index,
-            t_us=due.start_us,
-            soft=soft,
-            range=distance,
-            filtered=filtered,
-            x_px=centre_px[0],
-            y_px=centre_px[1],
-            points_px=points[0],
-            points_sigma_px=points[1],
-            points_t_us=look.middle_us,
-            echo_of=self._echoes.echo_of(number),
-        )
-        self._announcer.total("frame", frame)
-        return Sighting.of(frame, look)
-
-    def _sight(self, points: tuple[NDArray[np.float64], NDArray[np.float64]], t_us: float) -> BarSight:
-        """Where a bar is seen, and how it leans; a panel has no direction, and counts as level."""
-        if not self._is_column:
-            return BarSight()
-        sight = sight_of(self._camera, *points, self._attitude_at(self._clock.camera_us(t_us)))
-        self._counts["frames_askew"] += sight.askew
-        return sight
-
-    def _look(self, transmitter: Transmitter, due: DueFrame) -> Look | None:
-        """Look at a frame; set its region right by it, join what is of the same bar, open what is another."""
-        region = transmitter.region
-        others: list[tuple[float, tuple[float, float], tuple[float, float]]] = []
-        most_px = 0.0
-        for _ in range(_LOOKS):
-            whole = region.size_px is not None
-            look, transmitter.pilot = self._looker.look(region, due, transmitter.pilot)
-            if look is None or not due.has_pilot:
-                break
-            # What the first look shows beside the bar is out of the second one's sight.
-            others += [(look.middle_us, *self._looker.box(look, other)) for other in look.others]
-            off_px = self._regions.shape(region, look.middle_us, *self._looker.box(look, look.placement))
-            most_px = max(most_px, off_px)
-            if off_px > 0 and not self._join(region, look.middle_us):
-                return None
-            if whole or off_px == 0:
-                break
-            self._regions.gather(region, due.start_us, due.end_us)
-        if most_px > self._seam_px / 2:
-            self._regions.gather(region)
-        if look is None:
-            return None
-        for middle_us, centre_px, size_px in others:
-            known = any(one.covers(middle_us, centre_px) for one in self._regions.alive)
-            if not known and self._regions.has_room():
-                self._due.append(self._regions.beside(region, middle_us, centre_px, size_px))
-        return look
-
-    def _join(self, region: Followed, t_us: float) -> bool:
-        """Let other regions of the bar seen at a time go; False if this one goes, as the other is known."""
-        for other in list(self._regions.alive):
-            if other is region or not region.holds(other, t_us, SAME_PX):
-                continue
-            gone = region if other.size_px is not None and other.id < region.id else other
-            self._regions.drop(gone)
-            self._let_go(gone)
-            if gone is region:
-                return False
-        return True
-
-    def _put_together(self, transmitter: Transmitter) -> bool:
-        """Unite a region that shows too little of a bar with others that hear the same, if there are any."""
-        parts = self._transmitters.in_step(transmitter)
-        if transmitter.region.id in self._joined or not parts:
-            return False
-        for part in parts:
-            self._regions.unite(transmitter.region, part.region)
-            self._let_go(part.region)
-        return True
-
-    def _let_go(self, region: Followed) -> None:
-        """Forget a region that has become a part of another."""
-        self._joined.add(region.id)
-        if region in self._transmitters:
-            self._counts["regions_released"] += 1
-            self._judged.end(self._transmitters[region].packets)
-            self._transmitters.release(self._transmitters[region])
-
-    def _end(self, transmitter: Transmitter, now_us: float) -> None:
-        """Decode what a region that has ended still shows; its last packet is over."""
-        seen_us = transmitter.region.latest.t_us + self._step_us
-        self._decode_due(transmitter, min(now_us - self._tail_us, seen_us))
-        self._judged.end(transmitter.packets)
 
     def _read(self, packets: list[Packet]) -> list[Packet]:
         """Read the messages that packets carry."""
-        self._counts["packets"] += len(packets)
-        self._counts["frames_reflected"] += sum(len(p.frames) for p in packets if p.echo_of is not None)
+        self._given["packets"] += len(packets)
+        self._given["frames_reflected"] += sum(len(p.frames) for p in packets if p.echo_of is not None)
         packets = [self._on_camera(packet) for packet in packets]
         if self._messages is None:
             return packets
@@ -406,11 +156,3 @@ class Receiver:
         """A packet with the times of the camera's clock."""
         frames = tuple(on_camera(frame, self._clock.camera_us) for frame in packet.frames)
         return replace(packet, t_us=self._clock.camera_us(packet.t_us), frames=frames)
-
-
-def _went_dark(transmitter: Transmitter, due: DueFrame, packet: PacketFormat) -> bool:
-    """Whether a bar that was seen before has few events in a frame by now."""
-    if transmitter.number is None or transmitter.pilot is None:
-        return False
-    expected = int(np.abs(transmitter.pilot.sums).sum(dtype=np.int64)) * due.chips / packet.pilot_chips
-    return transmitter.region.events_between(due.start_us, due.end_us) < _DARK * expected

@@ -92,6 +92,7 @@ RX = (
     {"points", "spread", "steps"},
     {"look"},
     {"echoes", "transmitters"},
+    {"framing"},
     {"receiver"},
 )
 """The receiver from its stages up to what joins them: a module imports from below its own row only."""
