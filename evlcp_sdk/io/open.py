@@ -9,6 +9,7 @@ from urllib.parse import unquote
 from evlcp_sdk.errors import EvlcpError, InputError, StreamError
 from evlcp_sdk.files import Outputs, is_there
 from evlcp_sdk.io.faery import FORMATS, FaerySource
+from evlcp_sdk.io.lists import ListSource, is_list
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
 from evlcp_sdk.io.tables import CSV_HEADER, CsvSource, CsvWriter, NpzSource, NpzWriter
 from evlcp_sdk.io.writers import EventWriter
@@ -103,9 +104,9 @@ def _open_file(path: Path | str) -> EventSource:
     if start.startswith(b"% "):
         return RawSource(path)
     if start.startswith(b"PK\x03\x04") or suffix == ".npz":
-        return NpzSource(path)
+        return ListSource(path) if start and is_list(target) else NpzSource(path)
     if start.startswith((b"\x1f\x8b", CSV_HEADER)) or suffix in (".csv", ".csv.gz"):
-        return CsvSource(path)
+        return ListSource(path) if start and is_list(target) else CsvSource(path)
     return RawSource(path)  # which says what is wrong
 
 

@@ -21,7 +21,7 @@ from evlcp_sdk.io.writers import LAST_TIME_US, EventWriter
 from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["CsvSource", "CsvWriter", "NpzSource", "NpzWriter"]
+__all__ = ["CsvSource", "CsvWriter", "NpzColumn", "NpzSource", "NpzWriter", "said", "show"]
 
 COLUMNS: Final = ("t_us", "x", "y", "p")
 TRIGGER_COLUMNS: Final = ("trigger_t_us", "trigger_channel", "trigger_value")
@@ -57,15 +57,32 @@ DAMAGE: Final = (
 """What reading a member of a ZIP file raises; RuntimeError: encrypted, or packed by an unknown method."""
 
 
-class _Column:
+class NpzColumn:
     """One array of an NPZ file, read from front to back.
 
+    Args:
+        path: The file, for messages.
+        archive: The open file.
+        name: Of the array.
+        stack: Closes it.
+        kinds: Kinds of types that it may have, as NumPy's.
+        bounded: Values are checked against those that its column of a table of events may have.
+
     Raises:
-        InputError: There is no such array, or it is not one of integers in one dimension.
+        InputError: There is no such array, or it is not one of numbers of these kinds in one dimension.
     """
 
-    def __init__(self, path: Path, archive: zipfile.ZipFile, name: str, stack: ExitStack) -> None:
+    def __init__(
+        self,
+        path: Path,
+        archive: zipfile.ZipFile,
+        name: str,
+        stack: ExitStack,
+        kinds: str = "iub",
+        bounded: bool = True,
+    ) -> None:
         self.name = name
+        self._bounded = bounded
         self.row = 0
         self._path = path
         try:
@@ -74,7 +91,7 @@ class _Column:
             found = ", ".join(sorted(member.removesuffix(".npy") for member in archive.namelist()))
             raise InputError(f"{path}: found the arrays {found or 'none'}, expected {name} too") from None
         except DAMAGE as error:
-            raise InputError(f"{path}: array {name}: {_said(error)}") from error
+            raise InputError(f"{path}: array {name}: {said(error)}") from error
         try:
             version = np.lib.format.read_magic(self._file)
             read = np.lib.format.read_array_header_1_0
@@ -83,9 +100,10 @@ class _Column:
             shape, _, dtype = read(self._file)
         except Exception as error:
             # NumPy evaluates the header as a piece of Python, which may fail in any way.
-            raise InputError(f"{path}: array {name}: {_said(error)}") from error
-        if dtype.kind not in "iub" or len(shape) > 1 or min(shape, default=0) < 0:
-            raise InputError(f"{path}: array {name}: found {dtype} {shape}, expected integers (n,)")
+            raise InputError(f"{path}: array {name}: {said(error)}") from error
+        if dtype.kind not in kinds or len(shape) > 1 or min(shape, default=0) < 0:
+            what = "numbers" if "f" in kinds else "integers"
+            raise InputError(f"{path}: array {name}: found {dtype} {shape}, expected {what} (n,)")
         self.dtype = dtype
         self.is_scalar = not shape
         self.rows = shape[0] if shape else 1
@@ -102,6 +120,9 @@ class _Column:
             found = self.row + len(data) // self.dtype.itemsize
             raise InputError(f"{self._path}: array {self.name}: found {found} values, expected {self.rows}")
         values = np.frombuffer(data, self.dtype)
+        if not self._bounded:
+            self.row += rows
+            return values
         last = LAST_VALUES.get(self.name, 0xFFFF)
         first = -last if self.name in ("t_us", "trigger_t_us") else 0
         if rows and not (first <= values.min() and values.max() <= last):
@@ -124,7 +145,7 @@ class _Column:
         return int(self.take(1)[0])
 
 
-def _said(error: Exception) -> str:
+def said(error: Exception) -> str:
     """What an error says, in one line."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 200 else f"{text[:200]}..."
@@ -154,18 +175,18 @@ class NpzSource(EventSource):
             except (zipfile.BadZipFile, UnicodeDecodeError, NotImplementedError) as error:
                 raise InputError(f"{path}: found no NPZ file, expected one ({error})") from error
             try:
-                self._columns = [_Column(target, archive, name, stack) for name in COLUMNS]
+                self._columns = [NpzColumn(target, archive, name, stack) for name in COLUMNS]
                 sizes = {column.name: column.rows for column in self._columns if not column.is_scalar}
                 if len(sizes) < len(COLUMNS) or len(set(sizes.values())) > 1:
                     raise InputError(f"{path}: found arrays of the lengths {sizes}, expected one length")
                 names = archive.namelist()
                 width, height = (
-                    _Column(target, archive, name, stack).one() if f"{name}.npy" in names else None
+                    NpzColumn(target, archive, name, stack).one() if f"{name}.npy" in names else None
                     for name in ("width", "height")
                 )
-                self._trigger_columns: list[_Column] = []
+                self._trigger_columns: list[NpzColumn] = []
                 if "trigger_t_us.npy" in names:
-                    columns = [_Column(target, archive, name, stack) for name in TRIGGER_COLUMNS]
+                    columns = [NpzColumn(target, archive, name, stack) for name in TRIGGER_COLUMNS]
                     lengths = {column.name: column.rows for column in columns}
                     if len(set(lengths.values())) > 1:
                         raise InputError(
@@ -173,7 +194,7 @@ class NpzSource(EventSource):
                         )
                     self._trigger_columns = columns
             except DAMAGE as error:
-                raise InputError(f"{path}: damaged NPZ file: {_said(error)}") from error
+                raise InputError(f"{path}: damaged NPZ file: {said(error)}") from error
             super().__init__(target, "NPZ", width, height, None, target.stat().st_size)
             self._sieve = Sieve("row", width, height)
             self._events, self._triggers = Events.empty(), Triggers.empty()
@@ -192,7 +213,7 @@ class NpzSource(EventSource):
                 self._events = self._sieve.sift(taken, row + 1)
             self._more_triggers(max(max_events, LEAST_ROWS))
         except DAMAGE as error:
-            raise InputError(f"{self.path}: damaged NPZ file at row {row + 1}: {_said(error)}") from error
+            raise InputError(f"{self.path}: damaged NPZ file at row {row + 1}: {said(error)}") from error
         events, triggers = self._events, self._triggers
         left = self._columns[0].rows - self._columns[0].row
         if not len(events) and not len(triggers) and not left:
@@ -332,7 +353,7 @@ class CsvSource(EventSource):
             raise
         if header[0].removeprefix(b"\xef\xbb\xbf").rstrip(b"\r") != CSV_HEADER:
             self.close()
-            raise InputError(f"{path}: line 1: found {_show(header[0])}, expected '{CSV_HEADER.decode()}'")
+            raise InputError(f"{path}: line 1: found {show(header[0])}, expected '{CSV_HEADER.decode()}'")
         self._text = header[2]
         self._line = 2
 
@@ -370,7 +391,7 @@ class CsvSource(EventSource):
         self._line += lines
         if not good or (used == 0 and rows == 0):
             line = self._text.partition(b"\n")[0].rstrip(b"\r")
-            raise InputError(f"{self.path}: line {self._line}: found {_show(line)}, expected {CSV_ROW}")
+            raise InputError(f"{self.path}: line {self._line}: found {show(line)}, expected {CSV_ROW}")
         return self._sieve.sift(Events(t_us[:rows], x[:rows], y[:rows], p[:rows]), first), Triggers.empty()
 
     @property
@@ -394,7 +415,7 @@ class CsvSource(EventSource):
         self._raw.close()
 
 
-def _show(line: bytes) -> str:
+def show(line: bytes) -> str:
     """Return the start of a line for a message."""
     text = line[:60].decode("utf-8", "replace")
     return repr(text + ("..." if len(line) > 60 else ""))
