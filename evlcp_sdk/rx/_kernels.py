@@ -50,8 +50,8 @@ def score_rises(
     """Score each pixel by the rhythm of its rises; add those of candidates to their cell's `hits`; how many.
 
     `pixels` (height, width) are uint32, see `Rhythm`. A rise sooner than `soon` ticks after the one before is
-    the same; `kinds` says what a number of ticks is, the last for all beyond, and `lows` what becomes of
-    chips and score. A tick is 2^tick_shift us.
+    the same; `kinds` says what a number of ticks is, the last, 0, for all beyond, and `lows` what becomes of
+    chips and score. A tick is 2^tick_shift us. A rise beyond is no hit.
     """
     width, columns = np.uint32(pixels.shape[1]), np.uint32(hits.shape[1])
     states, cells = pixels.reshape(-1), hits.reshape(-1)
@@ -84,7 +84,8 @@ def score_rises(
         again = kind == ((state >> np.uint32(CHIPS_AT)) & np.uint32(15))
         same = min(same + 1, MOST_SAME) if again else max(same - 2, 0)
         states[at] = (state & ~_LOW) | (np.uint32(same) << np.uint32(SAME_AT)) | low
-        if (low & np.uint32(SCORES)) >= least:
+        # One that comes after long is no blinking yet, however a pixel blinked when a bar was there.
+        if (low & np.uint32(SCORES)) >= least and kind != np.uint32(0):
             row = at // width
             cells[(row >> shift) * columns + ((at - row * width) >> shift)] += 1
             candidates += 1

@@ -10,7 +10,11 @@ it by two from five chips on: a lamp of 1 or 2 kHz repeats its period, a code wi
 A lamp whose period is two, three or four whole chips is in rhythm, too, as far as a score tells; but its time
 comes again and again, which one of a code does not for long: before a frame shows where the bar is, such
 pixels are not listened to. Falls are not looked at: they come later or sooner than rises by the light,
-they are the first to go missing, and some cameras send none. One pass, four bytes a pixel.
+they are the first to go missing, and some cameras send none.
+
+A pixel that a bar has left keeps its score, as it hardly rises any more; but where the camera shakes, the
+veil around the bar comes nearer again, and all pixels of the trail rise once, with a chip. So a region is
+opened by rises only that come soon after the one before. One pass, four bytes a pixel.
 """
 
 import math

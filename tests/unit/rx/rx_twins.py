@@ -28,7 +28,7 @@ def score_rises(events, shape, start, chip_us, min_score, cell_shift):
         score[v, u] = sorted((0, score[v, u], 40))[1]
         same[v, u] = min(same[v, u] + 1, 7) if again else max(same[v, u] - 2, 0)
         rose[v, u], chips[v, u] = t, whole
-        if score[v, u] >= min_score:
+        if score[v, u] >= min_score and whole:
             cell = v >> cell_shift, u >> cell_shift
             hits[cell] = hits.get(cell, 0) + 1
     return (rose, chips, same, score), hits

@@ -189,6 +189,25 @@ def test_a_moving_edge_is_no_region() -> None:
     assert not any(followed(events, 100_000).values())
 
 
+def test_what_a_bar_has_left_is_no_region() -> None:
+    """Where a bar was, its veil lets each pixel rise with a chip now and then, not twice within 12 chips."""
+    bar = IdealBar(random_symbols(LINK, 1), start_us=0, width_px=12)
+    seen = ideal_events(LINK, bar)
+    seen = seen[seen.t_us < 30_000]
+    left = np.unique(np.stack([seen.x, seen.y]), axis=1)
+    rng = np.random.default_rng(0)
+    first = 1400 * rng.integers(0, 7, left.shape[1]) + 100 * rng.integers(0, 2, left.shape[1])
+    t = 90_000 + first + 1400 * 7 * np.arange(6)[:, None]
+    order = np.argsort(t, axis=None, kind="stable")
+    x, y = (np.broadcast_to(v, t.shape).ravel()[order] for v in left)
+    trail = Events.of(t.ravel()[order], x, y, np.ones(t.size))
+    # As many candidates in a step as a region needs, time after time.
+    assert np.bincount((trail.t_us - 90_000) // 1400).min() > 5 * SPEC.min_rises
+    by_step = followed(merged(seen, trail), 150_000)
+    assert {region.id for found in by_step.values() for region in found} == {0}
+    assert not by_step[149_000]
+
+
 @pytest.mark.parametrize("merge_px", [8, 15, 16, 32])
 def test_bars_farther_apart_than_the_gap_are_two_regions_for_every_gap(merge_px: int) -> None:
     one, two = IdealBar(random_symbols(LINK, 1)), IdealBar(random_symbols(LINK, 1), x_px=500, start_us=5300)

@@ -119,6 +119,15 @@ def test_times_count_alike_at_every_chip_rate(chip_us):
         assert pixels[2, 3] & _kernels.SCORES == 10 + score, chips
 
 
+@pytest.mark.parametrize(
+    ("run_us", "hit"), [(300, True), (700, True), (1250, True), (1251, False), (9**5, False)]
+)
+def test_a_rise_long_after_the_last_is_no_hit(run_us, hit):
+    """Whatever a pixel's score is: that of one that a bar has left is high."""
+    pixels = np.full((HEIGHT, WIDTH), states(1000, 2, 40), np.uint32)
+    assert scored(Events.of([1000 + run_us], [3], [2], [1]), pixels).any() == hit
+
+
 def test_falls_are_not_looked_at():
     pixels = np.full((HEIGHT, WIDTH), states(1000, 0, 0), np.uint32)
     before = pixels.copy()
