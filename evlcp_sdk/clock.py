@@ -7,10 +7,17 @@ long, so that no stage sees one and floating point is as fine late on a clock as
 
 from bisect import bisect_right
 from collections import deque
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evlcp_sdk.late import Late
 from evlcp_sdk.values import Events
+
+if TYPE_CHECKING:
+    from evlcp_sdk import _kernels
+else:
+    _kernels = Late("evlcp_sdk._kernels")
 
 __all__ = ["LEAP_US", "CameraClock"]
 
@@ -96,8 +103,6 @@ class CameraClock:
 
     def take(self, events: Events) -> list[Events]:
         """Take the next events of the stream; give those that are kept, with their times inside."""
-        from evlcp_sdk import _kernels
-
         self._counts["events"] += len(events)
         if not len(events):
             return []
@@ -135,8 +140,6 @@ class CameraClock:
 
     def _sorted(self, events: Events) -> list[Events]:
         """The same, event by event."""
-        from evlcp_sdk import _kernels
-
         held_us = _FARTHEST_US if self._sparse else LEAP_US
         limits = (LEAP_US, held_us, _SETBACK_US, _AGREE_EVENTS, _AGREE_US, _MOST_HELD, _FARTHEST_US)
         given: list[Events] = []

@@ -13,10 +13,16 @@ from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Block, Kind, Message
 from evlcp_sdk.air.kinds import MessageKind
 from evlcp_sdk.errors import ConfigError, StreamError
+from evlcp_sdk.late import Late
 
 if TYPE_CHECKING:
     import pandas
     import pyarrow
+
+if TYPE_CHECKING:
+    from evlcp_sdk import _kernels
+else:
+    _kernels = Late("evlcp_sdk._kernels")
 
 __all__ = [
     "Alternative",
@@ -253,8 +259,6 @@ class PresenceMap:
         prior = self.prior
         if prior is None:
             return self
-        from evlcp_sdk import _kernels
-
         probability = np.empty_like(self.probability)
         _kernels.take_in(self.probability, prior, probability)
         return replace(self, probability=probability)

@@ -1,9 +1,17 @@
 """How far a frame's symbols are believed: one measure for every decoding."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.late import Late
 from evlcp_sdk.values import PresenceMap, SoftSymbols
+
+if TYPE_CHECKING:
+    from evlcp_sdk.rx import _kernels
+else:
+    _kernels = Late("evlcp_sdk.rx._kernels")
 
 __all__ = ["believed", "still_lit"]
 
@@ -34,8 +42,6 @@ def still_lit(sums: NDArray[np.int16], presence: PresenceMap, pilot_chips: int) 
         presence: Where the clusters are.
         pilot_chips: Chips of the pilot.
     """
-    from evlcp_sdk.rx import _kernels
-
     over = np.empty(len(presence.probability))
     _kernels.info_activity(sums, presence.probability, presence.grid_px, pilot_chips, _LEAST_EVENTS, over)
     return over > 0
@@ -55,8 +61,6 @@ def believed(soft: SoftSymbols, seen: NDArray[np.bool_]) -> SoftSymbols:
         soft: What a decoding says.
         seen: Clusters that are in sight, bool (K,); nothing is given of the others, and their LLRs are 0.
     """
-    from evlcp_sdk.rx import _kernels
-
     symbols, llr = np.empty_like(soft.symbols), np.empty_like(soft.llr)
     quality = _kernels.believe(
         soft.symbols,

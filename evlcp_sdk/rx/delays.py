@@ -8,12 +8,19 @@ its rows wait for one another: 20 us from end to end at 50 m, 90 us at 16 m.
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import chips_of_values
+from evlcp_sdk.late import Late
 from evlcp_sdk.values import Events, SyncLock
+
+if TYPE_CHECKING:
+    from evlcp_sdk.rx import _kernels
+else:
+    _kernels = Late("evlcp_sdk.rx._kernels")
 
 __all__ = ["LONGEST_ROW_US", "RowDelay", "RowDelays"]
 
@@ -97,8 +104,6 @@ class RowDelays:
         self, lock: SyncLock, pieces: Iterable[tuple[int, Events]], centre_px: float, height_px: float
     ) -> tuple[float, float]:
         """Delay from one row to the next in a preamble, and its sigma, us; NaN where too few rows show it."""
-        from evlcp_sdk.rx import _kernels
-
         blocks = round(height_px / _BLOCK_PX)
         if blocks < _FEWEST_BLOCKS:
             return math.nan, math.nan

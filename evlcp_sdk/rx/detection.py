@@ -1,22 +1,27 @@
 """Finds regions that blink in the rhythm of the chips and follows them while the camera moves."""
 
 import math
-from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass, field, replace
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.plugin.roles import Filter
 from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
+
+if TYPE_CHECKING:
+    from evlcp_sdk.rx import _kernels
+else:
+    _kernels = Late("evlcp_sdk.rx._kernels")
 
 __all__ = ["SAME_PX", "Followed", "RegionFollower"]
 
@@ -178,26 +183,46 @@ class Followed:
             t, x, y = ([v[0] - n * (v[1] - v[0]), *v, v[-1] + n * (v[-1] - v[-2])] for v in (t, x, y))
         return np.interp(t_us, t, x), np.interp(t_us, t, y)
 
+    def place_at(self, t_us: float) -> tuple[float, float]:
+        """The same as `at` for one time."""
+        positions = self.positions
+        n = len(positions)
+        last = positions[-1]
+        if n == 1:
+            return last.x_px, last.y_px
+        # The line from the place before a time to the one after it; the outermost ones go on for a little.
+        right = n - 1
+        while right > 1 and positions[right - 1].t_us > t_us:
+            right -= 1
+        one, other = positions[right - 1], positions[right]
+        long_us = other.t_us - one.t_us
+        base = other if t_us > other.t_us else one
+        after_us = min(max(t_us - base.t_us, -_MOST_AHEAD_STEPS * long_us), _MOST_AHEAD_STEPS * long_us)
+        x = base.x_px + (other.x_px - one.x_px) / long_us * after_us
+        return x, base.y_px + (other.y_px - one.y_px) / long_us * after_us
+
     def size_at(self, t_us: float) -> tuple[float, float]:
         """(width, height) measured nearest to a time, px."""
-        times = [r.t_us for r in self.positions]
-        i = min(bisect_left(times, t_us), len(times) - 1)
-        if i and t_us - times[i - 1] < times[i] - t_us:
+        positions = self.positions
+        i = len(positions) - 1
+        while i and positions[i - 1].t_us >= t_us:
             i -= 1
-        return self.positions[i].width_px, self.positions[i].height_px
+        if i and t_us - positions[i - 1].t_us < positions[i].t_us - t_us:
+            i -= 1
+        return positions[i].width_px, positions[i].height_px
 
     def covers(self, t_us: float, point_px: tuple[float, float]) -> bool:
         """Whether a point on the sensor (column, row) is inside the region at a time."""
-        (x,), (y,) = self.at(np.array([t_us]))
+        x, y = self.place_at(t_us)
         width, height = self.size_at(t_us)
-        return abs(point_px[0] - float(x)) <= width / 2 and abs(point_px[1] - float(y)) <= height / 2
+        return abs(point_px[0] - x) <= width / 2 and abs(point_px[1] - y) <= height / 2
 
     def holds(self, other: "Followed", t_us: float, same_px: float) -> bool:
         """Whether another region is a part of this bar, or the same bar, its centre so near at a time."""
         mine, its = self.latest, other.latest
         when = t_us if other.size_px is not None else its.t_us
-        (x, y), (u, v) = self.at(np.array([when])), other.at(np.array([when]))
-        right, down = abs(float(u[0] - x[0])), abs(float(v[0] - y[0]))
+        (x, y), (u, v) = self.place_at(when), other.place_at(when)
+        right, down = abs(u - x), abs(v - y)
         if other.size_px is not None:
             return max(right, down) <= same_px
         # Half of it, or more, in each direction.
@@ -342,8 +367,8 @@ class RegionFollower:
             centre_px: Centre (column, row) of the whole bar at that time.
             size_px: Its (width, height).
         """
-        (x,), (y,) = followed.at(np.array([t_us]))
-        off = centre_px[0] - float(x), centre_px[1] - float(y)
+        x, y = followed.place_at(t_us)
+        off = centre_px[0] - x, centre_px[1] - y
         known = followed.size_px
         off_px = math.inf
         if known is None:
@@ -359,7 +384,7 @@ class RegionFollower:
         # Where less of the bar was seen, or more than it, its place is not that of what was seen.
         most_px = 2 * self._spec.margin_px if known is None else math.inf
         followed.positions = deque(
-            Region(
+            _region(
                 p.id,
                 p.t_us,
                 p.x_px + off[0],
@@ -644,10 +669,15 @@ class RegionFollower:
         # The survivor reaches over both within a few steps, as its seam finds the other's pixels.
 
 
+def _region(id: int, t_us: float, x_px: float, y_px: float, width_px: float, height_px: float) -> Region:
+    """A region, made without the calls that a frozen class makes for each field: there are dozens a frame."""
+    region = object.__new__(Region)
+    vars(region).update(id=id, t_us=t_us, x_px=x_px, y_px=y_px, width_px=width_px, height_px=height_px)
+    return region
+
+
 def _select(events: Events, boxes: list[Box]) -> list[Events]:
     """The events inside each box, in no more memory than twice what they need."""
-    from evlcp_sdk.rx import _kernels
-
     room = len(events) + 1
     found = []
     into: tuple[NDArray[Any], ...] = ()
@@ -712,8 +742,6 @@ def _inside(hits: NDArray[np.int32], box: Box) -> NDArray[np.int32]:
 
 def _cleared(hits: NDArray[np.int32], box: Box) -> int:
     """Set the cells that a box touches to 0; return what they had."""
-    from evlcp_sdk.rx import _kernels
-
     return _kernels.clear_cells(hits, box, _CELL_SHIFT)
 
 

@@ -163,11 +163,9 @@ class PacketFraming:
         """A lock with what its preamble says of the rows of its bar."""
         region = transmitter.region
         middle_us = lock.packet_t_us + self._packet.preamble_chips / 2 * lock.chip_us
-        _, y = region.at(np.array([middle_us]))
+        _, y = region.place_at(middle_us)
         _, height_px = region.size_at(middle_us)
-        transmitter.rows, lock = self._rows.hear(
-            transmitter.rows, lock, region.pieces, float(y[0]), height_px
-        )
+        transmitter.rows, lock = self._rows.hear(transmitter.rows, lock, region.pieces, y, height_px)
         return lock
 
     def _decode_due(self, transmitter: Transmitter, until_us: float) -> None:

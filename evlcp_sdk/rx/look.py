@@ -3,17 +3,24 @@
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.detection import Followed
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements
 from evlcp_sdk.rx.spread import Spread, neighbours
 from evlcp_sdk.values import Events, PresenceMap, SyncLock
+
+if TYPE_CHECKING:
+    from evlcp_sdk.rx import _kernels
+else:
+    _kernels = Late("evlcp_sdk.rx._kernels")
 
 __all__ = ["Look", "Looker", "Pilot", "polarity_sums"]
 
@@ -162,8 +169,6 @@ class Looker:
 
         Points are finer than the cells that placed the layout; without any, those count.
         """
-        from evlcp_sdk.rx import _kernels
-
         placed = look.placement
         off = _kernels.mean_off(points_px, placed.places(self._layout))
         if off is None:
@@ -178,8 +183,6 @@ class Looker:
             look: A frame.
             placement: The bar's own or that of another instance, taken to be as wide.
         """
-        from evlcp_sdk.rx import _kernels
-
         selected, grid = look.presence.selected, look.presence.grid_px
         own, layout = look.placement, self._layout
         if own.scale == 0:
@@ -231,8 +234,6 @@ def polarity_sums(
         centre_px: Column and row of the bar's centre in each chip, float64 (chips,) each, px.
         size_px: (width, height) of the image, px.
     """
-    from evlcp_sdk.rx import _kernels
-
     width, height = size_px
     chips = len(centre_px[0])
     shift, rest_px = np.empty((2, chips), np.int64), np.empty((2, chips))

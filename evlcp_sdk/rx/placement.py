@@ -3,11 +3,18 @@
 import math
 from dataclasses import dataclass, replace
 from statistics import median
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.late import Late
 from evlcp_sdk.values import PresenceMap
+
+if TYPE_CHECKING:
+    from evlcp_sdk.rx import _kernels
+else:
+    _kernels = Late("evlcp_sdk.rx._kernels")
 
 __all__ = ["Layout", "Placement", "layout_of", "lit", "masked", "placements"]
 
@@ -142,8 +149,6 @@ def placements(
         before: In a frame shortly before: its scale still holds.
         min_share: Least share of the clusters in place that counts without a doubt.
     """
-    from evlcp_sdk.rx import _kernels
-
     blobs = _blobs_of(presence)
     clusters = len(layout.at_m)
     if not len(blobs.at):
@@ -191,8 +196,6 @@ def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> Prese
     Beyond are a halo, neighbours and reflections. Pixel maps keep a spacing, so that they still show where a
     cluster ends.
     """
-    from evlcp_sdk.rx import _kernels
-
     if placement.scale == 0:
         return presence
     unit = placement.scale / abs(placement.scale)
@@ -235,8 +238,6 @@ def lit(
         presence: As from `masked`.
         placement: Of the same image.
     """
-    from evlcp_sdk.rx import _kernels
-
     if presence.prior is None:
         return presence, placement
     light = np.empty(len(pilots))
@@ -262,8 +263,6 @@ def _turned(layout: Layout, mirrored: bool) -> NDArray[np.complex128]:
 
 def _blobs_of(presence: PresenceMap) -> _Blobs:
     """Connected cells of one cluster, those of most cells first."""
-    from evlcp_sdk.rx import _kernels
-
     selected = presence.selected
     most = int(np.count_nonzero(selected))
     at, cluster, cells = np.empty(most, np.complex128), np.empty(most, np.int64), np.empty(most, np.int64)
@@ -274,8 +273,6 @@ def _blobs_of(presence: PresenceMap) -> _Blobs:
 
 def _voted(blobs: _Blobs, layout: Layout, slack_px: float, before: Placement | None) -> Placement | None:
     """The placement that most cells are for; None without blobs that could propose one."""
-    from evlcp_sdk.rx import _kernels
-
     best_score, best = 0.0, None
     ways = (False,) if layout.line else (False, True)
     for mirrored in ways if before is None or layout.line else (before.mirrored,):
@@ -313,8 +310,6 @@ def _judged(
     proposed: int,
 ) -> Placement:
     """A similarity with what is in its place, and how likely that is by chance."""
-    from evlcp_sdk.rx import _kernels
-
     clusters = len(layout.at_m)
     places = scale * _turned(layout, mirrored) + shift
     spacing_px = abs(scale) * layout.spacing_m

@@ -1,12 +1,19 @@
 """Where each cluster of a frame is seen, to a fraction of a pixel: what a position is computed from."""
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.late import Late
 from evlcp_sdk.rx.placement import Layout, Placement
 from evlcp_sdk.values import PresenceMap
+
+if TYPE_CHECKING:
+    from evlcp_sdk.rx import _kernels
+else:
+    _kernels = Late("evlcp_sdk.rx._kernels")
 
 __all__ = ["FindPoints", "points_finder"]
 
@@ -47,8 +54,6 @@ def points_finder(layout: Layout) -> FindPoints:
                 neighbours[axis, k] = beside[0]
 
     def find(presence: PresenceMap, placement: Placement) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        from evlcp_sdk.rx import _kernels
-
         if np.count_nonzero(placement.seen) < 3:
             return np.full((clusters, 2), np.nan), np.full(clusters, np.nan)
         points, ends = np.empty((clusters, 2)), np.empty(clusters)

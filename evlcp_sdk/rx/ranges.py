@@ -2,12 +2,19 @@
 
 import math
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.late import Late
 from evlcp_sdk.scene.lean import BarSight
 from evlcp_sdk.values import Bend, Range
+
+if TYPE_CHECKING:
+    from evlcp_sdk.rx import _kernels
+else:
+    _kernels = Late("evlcp_sdk.rx._kernels")
 
 __all__ = ["RangeKeeper", "Ranges"]
 
@@ -120,8 +127,6 @@ class RangeKeeper:
 
     def _leaning(self, sums: Floats, newest: Bend | None, sight: BarSight) -> tuple[float, float]:
         """Mean and variance of the foreshortening, by what is likely and by what was seen."""
-        from evlcp_sdk.rx import _kernels
-
         likely, sine, told = self._likely, self._sine, 0.0
         if sight.sine is not None:
             told = sight.sine
@@ -149,8 +154,6 @@ def _smooth(past: Floats) -> tuple[float, float, float]:
     Distances follow a parabola whose speed and acceleration are likely as above; the squares of what is left,
     in those that the sigmas expect, scale the variances.
     """
-    from evlcp_sdk.rx import _kernels
-
     return _kernels.newest_on_parabola(
         past, _SPEED_M_S**-2, _ACCELERATION_M_S2**-2, _SCATTER_WORTH, _OUTLIER**2
     )
@@ -172,7 +175,5 @@ def _parabola(bend: Bend, sums: Floats) -> tuple[float, float] | None:
     which is fitted beside: those of even and odd number to both sides, as one of them has values that repeat,
     and those with more steps up than down, or fewer, as negative events are missed more often.
     """
-    from evlcp_sdk.rx import _kernels
-
     sine, variance = _kernels.bend_of(bend.place, bend.uneven, sums, _LEAST_WEIGHT)
     return None if math.isnan(sine) else (sine, math.sqrt(max(variance, 1e-12)))

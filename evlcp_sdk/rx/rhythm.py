@@ -18,11 +18,18 @@ opened by rises only that come soon after the one before. One pass, four bytes a
 """
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.late import Late
 from evlcp_sdk.values import Events
+
+if TYPE_CHECKING:
+    from evlcp_sdk.rx import _kernels
+else:
+    _kernels = Late("evlcp_sdk.rx._kernels")
 
 __all__ = ["Rhythm"]
 
@@ -66,8 +73,6 @@ class Rhythm:
     """
 
     def __init__(self, width: int, height: int, chip_us: float, min_score: int) -> None:
-        from evlcp_sdk.rx import _kernels
-
         late_us = _LATE_CHIPS * chip_us
         self._shift = max(math.ceil(math.log2(late_us / _LONGEST_TICKS)), 0)
         tick_us = 1 << self._shift
@@ -89,8 +94,6 @@ class Rhythm:
             hits: Of cells of 2^cell_shift px, int32 (rows, columns).
             cell_shift: See there.
         """
-        from evlcp_sdk.rx import _kernels
-
         self._grow_old(start_us >> self._shift)
         return _kernels.score_rises(
             events.t_us,
@@ -113,8 +116,6 @@ class Rhythm:
         Where leaves move, chance takes a third of their pixels to half of a candidate's score, and a tenth to
         all of it.
         """
-        from evlcp_sdk.rx import _kernels
-
         keep = np.empty(len(events), np.bool_)
         _kernels.in_rhythm(events.x, events.y, self._pixels, self._min_score, _SAME, keep)
         return events[keep]
@@ -141,16 +142,12 @@ class Rhythm:
         Returns:
             (pixels, mean column, first column, last column, upper edge, lower edge).
         """
-        from evlcp_sdk.rx import _kernels
-
         score = max(self._min_score // 2, 1)
         now, span = end_us >> self._shift, span_us >> self._shift
         return _kernels.measure_box(self._pixels, box, now, span, score, seam_px, reach_px, rows)
 
     def _grow_old(self, now: int) -> None:
         """Look at as many rows as the time since the last step asks for, at all after a gap."""
-        from evlcp_sdk.rx import _kernels
-
         height = len(self._pixels)
         passed = self._turn if self._seen is None else now - self._seen
         self._seen = now

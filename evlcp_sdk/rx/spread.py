@@ -18,11 +18,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.late import Late
 from evlcp_sdk.rx.placement import Layout, Placement
+
+if TYPE_CHECKING:
+    from evlcp_sdk.rx import _kernels
+else:
+    _kernels = Late("evlcp_sdk.rx._kernels")
 
 __all__ = ["Spread", "neighbours", "sharper"]
 
@@ -106,8 +113,6 @@ class Spread:
             pairs: Its neighbours, int64 (n, 2).
             placement: Where it is shown.
         """
-        from evlcp_sdk.rx import _kernels
-
         between = np.zeros((2, 2, 3), np.int64)
         across = np.zeros((2, 2 * _ACROSS_PX + 1), np.int64)
         spacing_px = abs(placement.scale) * layout.spacing_m

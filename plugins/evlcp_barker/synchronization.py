@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +10,14 @@ from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook, chips_of_values
 from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Synchronization
 from evlcp_sdk.values import SyncLock
+
+if TYPE_CHECKING:
+    from evlcp_barker import _kernels
+else:
+    _kernels = Late("evlcp_barker._kernels")
 
 __all__ = ["BarkerSync"]
 
@@ -173,8 +179,6 @@ class BarkerSynchronizer:
         self, state: SyncState, t_us: NDArray[np.int64], p: NDArray[np.uint8], until_us: int
     ) -> tuple[SyncState, list[SyncLock]]:
         """Count events, correlate what is complete, give a lock for each preamble (see `Synchronizer`)."""
-        from evlcp_barker import _kernels
-
         n = self._spec.steps_per_chip
         span = n * len(self._chips)
         guard = n * _GUARD_CHIPS

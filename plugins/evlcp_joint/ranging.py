@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,16 @@ from scipy import special
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Bend, FrameView, PresenceMap, Range
+
+if TYPE_CHECKING:
+    from evlcp_joint import _kernels
+else:
+    _kernels = Late("evlcp_joint._kernels")
 
 __all__ = ["JointScaleRanging"]
 
@@ -132,8 +138,6 @@ class JointScaleRanging(Ranging):
             if across:
                 # A bar that lies across the image: exchange rows and columns.
                 sums, offset = np.ascontiguousarray(sums.transpose(0, 2, 1)), offset[::-1]
-            from evlcp_joint import _kernels
-
             height, n = sums.shape[1], pilots.shape[1] + words.shape[1]
             codes, known = np.empty((clusters, n)), np.empty((clusters + 1, n), np.bool_)
             _kernels.codes_said(pilots, words, view.soft.symbols, place.seen, codes, known)
@@ -193,8 +197,6 @@ class JointScaleRanging(Ranging):
 
         Of each boundary, float64 (2, K - 1), the shift, px, and its weight, 0 where it does not count.
         """
-        from evlcp_joint import _kernels
-
         fit, by_boundary = fit.copy(), np.empty((2, len(known)))
         variance = _kernels.fit_bar(
             codes,
@@ -280,8 +282,6 @@ class _Place:
 
 def _place(presence: PresenceMap) -> tuple[_Place, bool] | None:
     """Where the bar lies by its cells, and whether it lies across the image; None with too few in line."""
-    from evlcp_joint import _kernels
-
     selected = presence.selected
     middles = np.empty((len(selected), 2))
     _kernels.cell_medians(selected, middles)

@@ -1,15 +1,21 @@
 """What the info segment of each cluster says, by likelihoods learned from the pilots."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Decode, Decoding
 from evlcp_sdk.values import PresenceMap, SoftSymbols
+
+if TYPE_CHECKING:
+    from evlcp_wh import _kernels
+else:
+    _kernels = Late("evlcp_wh._kernels")
 
 __all__ = [
     "IndependentPixels",
@@ -89,8 +95,6 @@ def learned_worth(
     Returns:
         float64 (2 n + 1, 2 n + 1), by the first chip's sum and the second's.
     """
-    from evlcp_wh import _kernels
-
     side = 2 * max_events + 1
     counts, worth = np.zeros((2, side, side)), np.empty((side, side))
     pilot = sums[: 2 * pilots.shape[1]]
@@ -110,8 +114,6 @@ def combined_values(
         worth: As from `learned_worth`.
         min_weight: Presence probability below which a cell is passed over.
     """
-    from evlcp_wh import _kernels
-
     values = np.zeros((len(presence.probability), len(sums) // 2))
     most = len(worth) // 2
     _kernels.sum_worth(sums, presence.probability, presence.grid_px, min_weight, most, worth, values)
@@ -128,8 +130,6 @@ def soft_symbols(
         words: The codewords, float64 (2**m, values).
         independent_pixels: Share of the pixels that err by themselves.
     """
-    from evlcp_wh import _kernels
-
     clusters, bits = len(values), len(words).bit_length() - 1
     symbols, llr = np.empty(clusters, np.int64), np.empty((clusters, bits), np.float32)
     quality = _kernels.read_words(values, words, independent_pixels / 2, symbols, llr)

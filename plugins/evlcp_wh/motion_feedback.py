@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass, replace
 from math import log
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Decode, Decoding
 from evlcp_sdk.values import PresenceMap, SoftSymbols
 from evlcp_wh.ml_soft import (
@@ -21,6 +22,11 @@ from evlcp_wh.ml_soft import (
     soft_symbols,
 )
 from evlcp_wh.separation import ErrorShare, MinValues
+
+if TYPE_CHECKING:
+    from evlcp_wh import _kernels
+else:
+    _kernels = Late("evlcp_wh._kernels")
 
 __all__ = ["MotionFeedback"]
 
@@ -108,8 +114,6 @@ class MotionFeedback(Decoding):
 
         float32 (K, n, n, values), from `reach_px` up and left to as much down and right.
         """
-        from evlcp_wh import _kernels
-
         _, height, width = sums.shape
         values, seam, side = len(sums) // 2, self.reach_px, 2 * self.reach_px + 1
         images = np.empty((height + 2 * seam, width + 2 * seam, values), np.float32)
@@ -125,8 +129,6 @@ class MotionFeedback(Decoding):
 
         `known` are the codes of the first n values, int64 (K, n); of the others, each cluster's is what fits.
         """
-        from evlcp_wh import _kernels
-
         values = matches.shape[3]
         scores = np.empty(matches.shape[1:], np.float64)
         _kernels.path_scores(matches, known, scores)
@@ -139,8 +141,6 @@ class MotionFeedback(Decoding):
         self, sums: NDArray[np.int16], before: PresenceMap, pilots: NDArray[np.int64]
     ) -> PresenceMap:
         """Presence by Bayes' rule of sums in which the bar stands still."""
-        from evlcp_wh import _kernels
-
         agree, disagree = log((1 - self.value_error) / 0.5), log(self.value_error / 0.5)
         probability = np.zeros_like(before.probability)
         pilot = sums[: 2 * pilots.shape[1]]
@@ -149,8 +149,6 @@ class MotionFeedback(Decoding):
 
 
 def _taken_back(sums: NDArray[np.int16], path: NDArray[np.int64]) -> NDArray[np.int16]:
-    from evlcp_wh import _kernels
-
     out = np.empty_like(sums)
     _kernels.take_back(sums, path, out)
     return out

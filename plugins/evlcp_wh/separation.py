@@ -2,15 +2,21 @@
 
 from dataclasses import dataclass
 from math import log
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Separate, Separation
 from evlcp_sdk.values import PresenceMap
+
+if TYPE_CHECKING:
+    from evlcp_wh import _kernels
+else:
+    _kernels = Late("evlcp_wh._kernels")
 
 __all__ = ["ErrorShare", "MinValues", "WhCorrelation"]
 
@@ -43,8 +49,6 @@ class WhCorrelation(Separation):
         agree, disagree = log((1 - self.value_error) / 0.5), log(self.value_error / 0.5)
 
         def separate(sums: NDArray[np.int16]) -> PresenceMap:
-            from evlcp_wh import _kernels
-
             _, height, width = sums.shape
             rows, columns = height // self.grid_px, width // self.grid_px
             probability = np.zeros((len(codes), rows, columns), np.float32)

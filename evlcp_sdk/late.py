@@ -1,0 +1,23 @@
+"""Modules that are imported when something of them is used first: those of kernels need numba."""
+
+from importlib import import_module
+from typing import Any
+
+__all__ = ["Late"]
+
+
+class Late:
+    """Stands for a module; after the first use a name of it costs what a name of any module does.
+
+    An import in a function that runs a thousand times a second takes longer than some kernels.
+
+    Args:
+        name: Of the module.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.__dict__["__name__"] = name
+
+    def __getattr__(self, name: str) -> Any:
+        found = self.__dict__[name] = getattr(import_module(self.__dict__["__name__"]), name)
+        return found
