@@ -98,6 +98,8 @@ class CameraClock:
 
     def camera_us(self, t_us: float) -> float:
         """The camera clock's time of a time inside, us."""
+        if len(self._offsets_us) == 1:
+            return t_us + self._offset_us
         at = max(bisect_right(self._starts_us, t_us) - 1, 0)
         return t_us + self._offsets_us[at] if self._offsets_us else t_us
 

@@ -93,6 +93,15 @@ def score_rises(
 
 
 @njit(cache=True, nogil=True)
+def all_within(values: Array, least: Any, most: Any) -> bool:
+    """Whether none of some values (n,) is NaN, less than `least` or more than `most`, of the same type."""
+    outside = False
+    for i in range(values.size):
+        outside |= not (values[i] >= least and values[i] <= most)
+    return not outside
+
+
+@njit(cache=True, nogil=True)
 def grow_old(pixels: Array, first: int, many: int, now: int, least: int, age: int) -> None:
     """In so many rows from the first on, round and round, set rises of `least` ticks ago or more to `age`."""
     then = (np.uint32(now) - np.uint32(age)) << _CLOCK

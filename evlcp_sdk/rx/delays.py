@@ -7,7 +7,7 @@ its rows wait for one another: 20 us from end to end at 50 m, 90 us at 16 m.
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.late import Late
-from evlcp_sdk.values import Events, SyncLock
+from evlcp_sdk.values import Events, SyncLock, changed
 
 if TYPE_CHECKING:
     from evlcp_sdk.rx import _kernels
@@ -98,7 +98,7 @@ class RowDelays:
         row_us, sigma_us = self.measure(lock, pieces, centre_px, height_px)
         if math.isfinite(row_us):
             known = known.measured(row_us, sigma_us)
-        return known, replace(lock, row_us=known.row_us, last_row_us=abs(known.row_us) * height_px / 2)
+        return known, changed(lock, row_us=known.row_us, last_row_us=abs(known.row_us) * height_px / 2)
 
     def measure(
         self, lock: SyncLock, pieces: Iterable[tuple[int, Events]], centre_px: float, height_px: float

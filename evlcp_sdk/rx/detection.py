@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from evlcp_sdk.plugin.roles import Filter
 from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import Events, Region
+from evlcp_sdk.values import Events, Region, changed
 
 if TYPE_CHECKING:
     from evlcp_sdk.rx import _kernels
@@ -453,7 +453,7 @@ class RegionFollower:
             filter=like.filter,
             opened_us=like.opened_us,
         )
-        followed.positions = deque(replace(p, id=followed.id) for p in followed.positions)
+        followed.positions = deque(changed(p, id=followed.id) for p in followed.positions)
         self._next_id += 1
         self.alive.append(followed)
         self.shape(followed, t_us, centre_px, size_px)
@@ -622,7 +622,7 @@ class RegionFollower:
                 right, down = region.x_px - like.latest.x_px, region.y_px - like.latest.y_px
                 size = {"width_px": region.width_px, "height_px": region.height_px}
                 places = deque(
-                    replace(p, id=region.id, x_px=p.x_px + right, y_px=p.y_px + down, **size)
+                    changed(p, id=region.id, x_px=p.x_px + right, y_px=p.y_px + down, **size)
                     for p in like.positions
                 )
                 pieces = deque((start, Events.empty()) for start, _ in self._recent)

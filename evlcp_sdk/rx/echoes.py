@@ -9,7 +9,7 @@ one symbol of as many as there are codewords.
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.look import Look
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.spread import Spread, sharper
-from evlcp_sdk.values import Frame, Packet
+from evlcp_sdk.values import Frame, Packet, changed
 
 __all__ = ["EchoQueue", "Echoes", "Sighting", "brighter", "originals", "repeats"]
 
@@ -335,7 +335,8 @@ class EchoQueue:
 
     def step(self) -> list[Packet]:
         """End a time step; give the packets that are complete with the frames of the step before it."""
-        self.echoes.judge(w.sighting for w in self._new if w.sighting is not None)
+        if self._new:
+            self.echoes.judge(w.sighting for w in self._new if w.sighting is not None)
         due, self._old, self._new = self._old, self._new, []
         return [packet for waiting in due for packet in self._emit(waiting)]
 
@@ -349,5 +350,5 @@ class EchoQueue:
         frame = waiting.sighting.frame
         echo_of = self.echoes.echo_of(frame.transmitter)
         if echo_of != frame.echo_of:
-            frame = replace(frame, echo_of=echo_of)
+            frame = changed(frame, echo_of=echo_of)
         return waiting.packets.add(frame, waiting.due.packet_us, waiting.due.lock.chip_us)

@@ -8,15 +8,22 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError, PluginError
+from evlcp_sdk.late import Late
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.values import Bend, PresenceMap, Range, SoftSymbols, SyncLock
+
+if TYPE_CHECKING:
+    from evlcp_sdk.rx import _kernels
+else:
+    _kernels = Late("evlcp_sdk.rx._kernels")
 
 __all__ = ["Guard"]
 
@@ -170,10 +177,10 @@ class Guard:
         self.expect_array(found.pixels, "pixels", (clusters, height, width), "f")
         if found.prior is not None:
             self.expect_array(found.prior, "prior", cells, "f")
-        if found.probability.size and not (found.probability.min() >= 0 and found.probability.max() <= _ONE):
+        if not _all_within(found.probability, 0.0, _ONE):
             self.refuse("probability of other values", "0 to 1")
-        # Two passes of NumPy's are faster than one sum.
-        if found.pixels.size and not (found.pixels.max() < math.inf and found.pixels.min() > -math.inf):
+        most = float(np.finfo(found.pixels.dtype).max)
+        if not _all_within(found.pixels, -most, most):
             self.refuse("pixels of other values", "finite ones")
 
     def expect_symbols(self, soft: SoftSymbols, codebook: Codebook) -> None:
@@ -227,6 +234,13 @@ class Guard:
             self.refuse(f"values {values.tolist()!r:.40}", "finite ones")
         if not _unknown(sigma):
             self.expect_number(sigma, "sigma", 0.0, math.inf)
+
+
+def _all_within(found: NDArray[np.floating[Any]], least: float, most: float) -> bool:
+    if found.dtype not in (np.float32, np.float64):
+        found = found.astype(np.float64)
+    one = found.dtype.type
+    return bool(_kernels.all_within(found.ravel(), one(least), one(most)))
 
 
 def _unknown(value: object) -> bool:

@@ -3,7 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Self, TypeVar
 
@@ -18,7 +18,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.sections import MessageSpec
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.trust import BeaconJudge, Standing, signed_text
-from evlcp_sdk.values import Packet, ReceivedMessage
+from evlcp_sdk.values import Packet, ReceivedMessage, changed
 
 __all__ = ["MessageAssembler"]
 
@@ -190,7 +190,7 @@ class MessageAssembler:
             self._counts["blocks_other_codebook"] += 1
             return packet
         messages = tuple(self._take(inbox, block, packet))
-        return replace(packet, block=block, block_packets=packets, messages=messages)
+        return changed(packet, block=block, block_packets=packets, messages=messages)
 
     def close(self) -> None:
         """End the stream: what is still incomplete counts as missing."""

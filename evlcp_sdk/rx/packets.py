@@ -1,8 +1,6 @@
 """Frames to packets."""
 
-from dataclasses import replace
-
-from evlcp_sdk.values import Frame, Packet
+from evlcp_sdk.values import Frame, Packet, changed
 
 __all__ = ["PacketAssembler"]
 
@@ -34,7 +32,7 @@ class PacketAssembler:
         if not self._frames:
             return []
         first, echo_of = self._frames[0], self._frames[-1].echo_of
-        frames = tuple(f if f.echo_of == echo_of else replace(f, echo_of=echo_of) for f in self._frames)
+        frames = tuple(f if f.echo_of == echo_of else changed(f, echo_of=echo_of) for f in self._frames)
         packet = Packet(first.transmitter, first.packet, *self._start, frames, self._sent)
         self._frames = []
         return [packet]

@@ -1,7 +1,7 @@
 """Where a bar's layout lies in an image of presence: one similarity for all clusters, found by votes."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import median
 from typing import TYPE_CHECKING
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.late import Late
-from evlcp_sdk.values import PresenceMap
+from evlcp_sdk.values import PresenceMap, changed
 
 if TYPE_CHECKING:
     from evlcp_sdk.rx import _kernels
@@ -95,7 +95,7 @@ class Placement:
 
     def moved(self, by_px: complex) -> "Placement":
         """The same in an image whose origin lies elsewhere."""
-        return replace(self, shift=self.shift + by_px)
+        return changed(self, shift=self.shift + by_px)
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +253,7 @@ def lit(
     pixels, selected = presence.pixels.copy(), presence.selected.copy()
     for image in (probability, prior, pixels, selected):
         image[dark] = 0
-    only = replace(presence, probability=probability, prior=prior, pixels=pixels, selected=selected)
+    only = changed(presence, probability=probability, prior=prior, pixels=pixels, selected=selected)
     return only, placement
 
 

@@ -1,6 +1,5 @@
 """The receiver: events in, packets out."""
 
-from dataclasses import replace
 from datetime import datetime
 
 import pluggy
@@ -16,7 +15,7 @@ from evlcp_sdk.rx.steps import Announcer, Steps, on_camera
 from evlcp_sdk.rx.timeline import Timeline, TimeStep
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
-from evlcp_sdk.values import Events, Packet
+from evlcp_sdk.values import Events, Packet, changed
 
 __all__ = ["Receiver"]
 
@@ -155,4 +154,4 @@ class Receiver:
     def _on_camera(self, packet: Packet) -> Packet:
         """A packet with the times of the camera's clock."""
         frames = tuple(on_camera(frame, self._clock.camera_us) for frame in packet.frames)
-        return replace(packet, t_us=self._clock.camera_us(packet.t_us), frames=frames)
+        return changed(packet, t_us=self._clock.camera_us(packet.t_us), frames=frames)

@@ -4,7 +4,6 @@ import math
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,17 @@ from evlcp_sdk.plugin.roles import ROLES, Filter, Synchronizer, Tracker
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
 from evlcp_sdk.scene.lean import BarSight
-from evlcp_sdk.values import Events, Frame, FrameView, PresenceMap, Range, Region, SoftSymbols, SyncLock
+from evlcp_sdk.values import (
+    Events,
+    Frame,
+    FrameView,
+    PresenceMap,
+    Range,
+    Region,
+    SoftSymbols,
+    SyncLock,
+    changed,
+)
 
 __all__ = ["Announcer", "Steps", "on_camera"]
 
@@ -27,12 +36,12 @@ def on_camera(value: Any, camera_us: Callable[[float], float]) -> Any:
     """What a stage gives, with the times of the camera's clock."""
     match value:
         case Region():
-            return replace(value, t_us=camera_us(value.t_us))
+            return changed(value, t_us=camera_us(value.t_us))
         case SyncLock():
-            return replace(value, packet_t_us=camera_us(value.packet_t_us))
+            return changed(value, packet_t_us=camera_us(value.packet_t_us))
         case Frame():
             points_t_us = camera_us(value.points_t_us)
-            return replace(value, t_us=camera_us(value.t_us), points_t_us=points_t_us)
+            return changed(value, t_us=camera_us(value.t_us), points_t_us=points_t_us)
     return value
 
 
@@ -55,29 +64,35 @@ class Announcer:
 
     def start(self) -> None:
         """Start the clock."""
+        if self._hook is None:
+            return
         self._start_s = self._lap_s = time.perf_counter()
 
     def lap(self, stage: str, value: object) -> None:
         """Announce what took the time since the last lap."""
+        if self._hook is None:
+            return
         now = time.perf_counter()
         elapsed_s, self._lap_s = now - self._lap_s, now
         self._say(stage, value, elapsed_s)
 
     def total(self, stage: str, value: object) -> None:
         """Announce what took all laps since the start together."""
+        if self._hook is None:
+            return
         self._say(stage, value, self._lap_s - self._start_s)
 
     def _say(self, stage: str, value: object, elapsed_s: float) -> None:
-        if self._hook is not None:
-            try:
-                self._hook(stage=stage, value=on_camera(value, self._camera_us), elapsed_s=elapsed_s)
-            except EvlcpError:
-                raise
-            except (Exception, SystemExit) as fault:
-                last = traceback.extract_tb(fault.__traceback__)[-1]
-                what = f"{type(fault).__name__}: {fault}".splitlines()[0]
-                where = f"{Path(last.filename).name}, line {last.lineno}"
-                raise PluginError(f"evlcp_stage_finished() of a plugin: {what} ({where})") from fault
+        assert self._hook is not None
+        try:
+            self._hook(stage=stage, value=on_camera(value, self._camera_us), elapsed_s=elapsed_s)
+        except EvlcpError:
+            raise
+        except (Exception, SystemExit) as fault:
+            last = traceback.extract_tb(fault.__traceback__)[-1]
+            what = f"{type(fault).__name__}: {fault}".splitlines()[0]
+            where = f"{Path(last.filename).name}, line {last.lineno}"
+            raise PluginError(f"evlcp_stage_finished() of a plugin: {what} ({where})") from fault
 
 
 class Steps:

@@ -165,6 +165,17 @@ def test_no_rise_grows_young(gap_us):
         assert_array_equal(rhythm._pixels & LOW, low)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_values_within_bounds(dtype):
+    values = np.linspace(-1, 1, 101, dtype=dtype)
+    for bad in (None, np.nan, np.inf, -np.inf, 2.0, -1.5):
+        some = values.copy()
+        if bad is not None:
+            some[17] = bad
+        assert _kernels.all_within(some, dtype(-1), dtype(1)) == (bad is None)
+    assert _kernels.all_within(values[:0], dtype(-1), dtype(1))
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_old_rises(seed):
     rng = np.random.default_rng(seed)
