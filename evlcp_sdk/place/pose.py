@@ -23,7 +23,7 @@ from evlcp_sdk.place.starts import closed_form_starts
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
-__all__ = ["solve_pose"]
+__all__ = ["fitting_focal_mm", "solve_pose"]
 
 _ODDS = 18.4
 """Square sums that differ by less are not told apart: beyond, one solution is 10 000 times likelier."""
@@ -42,6 +42,9 @@ _FAR = 1e3
 
 _FREE_FOCAL = 0.02
 """Sigma of a focal length that is other than said, as a share: what is left to be known of it."""
+
+_FOCAL_REACH, _FOCAL_STEPS = 4.0, 47
+"""Focal lengths that are tried are up to so many times longer or shorter, in so many steps of 6 %."""
 
 
 def solve_pose(
@@ -109,6 +112,40 @@ def solve_pose(
         return found
     could = f"; it may be {' or '.join(names)}" if names else ""
     return Refusal("misfit", doubt + could, suspects=tuple(names))
+
+
+def fitting_focal_mm(
+    views: Sequence[BarView],
+    camera: CameraModel,
+    attitude: Attitude | None = None,
+    spec: PositionSpec | None = None,
+    sigma: CameraSigma | None = None,
+) -> float:
+    """The focal length with which views that contradict one another fit best, mm; NaN where with none.
+
+    For what `solve_pose` refuses: it believes a focal length that is some percent off at the most, and one
+    that was mistyped is another lens altogether.
+    """
+    spec = PositionSpec() if spec is None else spec
+    sigma = CameraSigma() if sigma is None else sigma
+
+    def tried(focal_mm: float) -> Judged | None:
+        other = replace(camera, focal_mm=focal_mm)
+        # Free within a step, so that none is stepped over.
+        step_mm = float(np.hypot(sigma.focal_mm, _FREE_FOCAL * focal_mm))
+        found = _plain(views, other, attitude, spec, replace(sigma, focal_mm=step_mm, correlation=()))
+        return found if isinstance(found, Judged) else None
+
+    def best(lengths_mm: np.ndarray) -> tuple[float, Judged | None]:
+        found = [(float(f), tried(float(f))) for f in lengths_mm]
+        fit = [(f, one) for f, one in found if one is not None]
+        return min(fit, key=lambda pair: pair[1].pose.misfit, default=(math.nan, None))
+
+    around, one = best(camera.focal_mm * np.geomspace(1 / _FOCAL_REACH, _FOCAL_REACH, _FOCAL_STEPS))
+    if one is None:
+        return math.nan
+    around, one = best(around * np.linspace(0.94, 1.06, 25))
+    return around if one is not None and not one.doubt else math.nan
 
 
 def _exchanged(views: Sequence[BarView]) -> Iterator[tuple[str, list[BarView]]]:

@@ -9,7 +9,7 @@ import numpy as np
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.observations import BarView
 from evlcp_sdk.place.points import points_at
-from evlcp_sdk.place.pose import solve_pose
+from evlcp_sdk.place.pose import fitting_focal_mm, solve_pose
 from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.place.whereabouts import Whereabouts
 from evlcp_sdk.scene.attitude import Attitude
@@ -58,6 +58,7 @@ class Positioner:
         self._bars = Whereabouts(sites, self._spec)
         self._frames: dict[int, list[Frame]] = {}
         self._next: int | None = None
+        self._contradicts: tuple[list[BarView], Attitude | None] | None = None
         self._counts = dict.fromkeys(("fixes", "refused", "frames_late"), 0)
 
     @property
@@ -79,6 +80,13 @@ class Positioner:
     def contradicted(self) -> dict[int, str]:
         """Transmitters that are left out as their beacons contradict their sites, and how."""
         return self._bars.contradicted
+
+    def fitting_focal_mm(self) -> float:
+        """The focal length with which the first views that contradict one another fit, mm; NaN for none."""
+        if self._contradicts is None:
+            return math.nan
+        views, attitude = self._contradicts
+        return fitting_focal_mm(views, self._camera, attitude, self._spec, self._camera_sigma)
 
     def feed(self, packets: Iterable[Packet]) -> list[Fix]:
         """Take the next packets; return the fixes that no later packet can change."""
@@ -154,7 +162,11 @@ class Positioner:
             ids = self._bars.ids
             which = ", ".join(f"{n} (id {ids[n]})" if n in ids else f"{n} (no id heard)" for n in views)
             return Fix.refused(t_us, tuple(views), "no-site", f"no site is known of transmitter {which}")
-        pose = solve_pose(sited, self._camera, self._attitude_at(t_us), self._spec, self._camera_sigma)
+        attitude_now = self._attitude_at(t_us)
+        pose = solve_pose(sited, self._camera, attitude_now, self._spec, self._camera_sigma)
+        contradicts = pose.kind == "misfit" if isinstance(pose, Refusal) else bool(pose.excluded)
+        if contradicts and self._contradicts is None:
+            self._contradicts = sited, attitude_now
         if isinstance(pose, Refusal):
             refused = Fix.refused(t_us, tuple(views), pose.kind, pose.detail)
             others = _alternatives(pose, here, self.axes)

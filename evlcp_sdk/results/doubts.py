@@ -62,6 +62,10 @@ _SPLIT = 0.9
 _UNSURE_SHARE = 0.3
 """Share of symbols of every cluster that are not given, of which more is said."""
 
+_LEAST_QUALITY = 0.4
+"""Mean probability that all symbols of a frame are right, below which more is said: of a bar 180 m away, with
+2.4 px a cluster, it is .75."""
+
 _HEAD_DOWN = 0.5
 """Cosine beyond which a bar stands on its head: one that lies may point either way."""
 
@@ -184,6 +188,7 @@ def warnings_of(
         found += _length(number, one, link)
         if positions is None:
             found += _turned(number, one, link)
+        found += _unread(number, one)
     if reads_messages:
         found += _blocks(counts)
     if positions is not None:
@@ -217,6 +222,10 @@ def notes_of(
         if one.echoes and one.echo_of is not None
     ]
     seen = Seen() if seen is None else seen
+    if not tally.transmitters and counts.get("events", 0):
+        found.append(
+            Doubt("nothing-found", "no frame was read", "`evlcp diagnose` says what blinks, and what to try")
+        )
     if seen.duration_us and tally.transmitters:
         covered_us = tally.covered_us
         if covered_us < (1 - _COVERED) * seen.duration_us:
@@ -277,11 +286,19 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Doubt]:
             f"positions take as exact what has no sigma: {' and '.join(unsaid)}; their sigmas and protection"
             " levels hold only if it is",
         )
+    fits_mm = positions.get("focal_mm_fits")
+    lens = (
+        ""
+        if fits_mm is None
+        else f"camera.focal_mm = {link.camera.focal_mm:g}: about {fits_mm:.3g} would fit"
+    )
     for name, number in positions["excluded"].items():
+        steps = [lens] if lens and name != "focal length" else []
+        steps.append(_SUSPECTS.get(name, "its place, angles and length, and their sigmas"))
         yield Doubt(
             "excluded",
             f"{number} position{_s(number)} without {name}, which the rest contradicts",
-            f"compare {_SUSPECTS.get(name, 'its place, angles and length, and their sigmas')}",
+            f"compare {'; or '.join(steps)}",
         )
     yield from _learnt(positions["learnt"], link)
     if number := positions["alarms"].get("contradicted", 0):
@@ -312,23 +329,29 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Doubt]:
             "compare transmitter_id in site.toml",
         )
     if number := positions["refused"].get("misfit", 0):
-        yield _misfit(number, positions.get("suspects", {}))
+        yield _misfit(number, positions.get("suspects", {}), lens)
 
 
-def _misfit(number: int, suspects: Mapping[str, int]) -> Doubt:
-    """Positions refused, with the part that would explain most of them."""
+def _misfit(number: int, suspects: Mapping[str, int], lens: str) -> Doubt:
+    """Positions refused, with the parts that would each explain most of them."""
     text = f"{number} position{_s(number)} refused, as bars, attitude and camera contradict one another"
-    likely = [name for name, times in suspects.items() if 2 * times > number]
+    likely = {name: times for name, times in suspects.items() if 2 * times > number}
+    steps = {name: _SUSPECTS.get(name, f"place, angles and length of {name}") for name in likely}
+    if lens and "focal length" not in likely:
+        # One that is far off; what explains all of them at once is the first to compare.
+        likely["focal length"] = number + 1
+        steps["focal length"] = lens
     if not likely:
         return Doubt(
             "misfit",
             text,
             "compare sites, angles and [camera], its focal_mm first, with what is there, and their sigmas",
         )
-    likely.sort(key=lambda name: -suspects[name])
-    steps = "; ".join(_SUSPECTS.get(name, f"place, angles and length of {name}") for name in likely)
+    names = sorted(likely, key=lambda name: -likely[name])
     return Doubt(
-        "misfit", f"{text}; another {' or another '.join(likely)} would explain it", f"compare {steps}"
+        "misfit",
+        f"{text}; another {' or another '.join(names)} would explain it",
+        f"compare {'; '.join(steps[name] for name in names)}",
     )
 
 
@@ -496,11 +519,19 @@ def _codewords(
 
 
 def _unsure(number: int, one: TransmitterTally, link: Link, seen: Seen) -> Iterator[Doubt]:
-    """Symbols that are not given, of every cluster: what covers some of a bar is no fault of the link's."""
+    """Symbols that are not given, of every cluster, or that are said to be wrong.
+
+    What covers some of a bar is no fault of the link's.
+    """
     clusters = [k for k in range(link.codebook.clusters) if one.unseen[k] < one.frames]
-    if not clusters or min(one.unseen[k] for k in clusters) < _UNSURE_SHARE * one.frames:
+    quality = one.quality_sum / one.frames
+    if clusters and min(one.unseen[k] for k in clusters) >= _UNSURE_SHARE * one.frames:
+        share = sum(one.unseen[k] for k in clusters) / (one.frames * len(clusters))
+        text = f"{share:.0%} of its symbols are not sure, of every cluster {_UNSURE_SHARE:.0%} and more"
+    elif quality < _LEAST_QUALITY:
+        text = f"{1 - quality:.0%} of its frames have a symbol that is wrong, by the receiver's own account"
+    else:
         return
-    share = sum(one.unseen[k] for k in clusters) / (one.frames * len(clusters))
     own = link.codebook.codewords
     larger = [
         name for name, words in seen.others().items() if len(words) > len(own) and _among(own, words).all()
@@ -508,8 +539,8 @@ def _unsure(number: int, one: TransmitterTally, link: Link, seen: Seen) -> Itera
     asked = f"was this sent with {' or '.join(larger)} (modulation.id)? if not, " if larger else ""
     yield Doubt(
         "unsure",
-        f"{share:.0%} of its symbols are not sure, of every cluster {_UNSURE_SHARE:.0%} and more",
-        f"{asked}more light, or another decoding.id",
+        text,
+        f"{asked}more light, a sharper image, or another decoding.id; `evlcp diagnose` says what it lacks",
         number,
     )
 
@@ -621,10 +652,15 @@ def _blocks(counts: Mapping[str, int]) -> Iterator[Doubt]:
             "another error correction than error-correction.id; if no messages are sent, say"
             " messages.decode = false",
         )
-    failed = counts.get("blocks_failed", 0)
-    if read and failed >= _FEW_FRAMES and failed > _FAILED_SHARE * tried:
+
+
+def _unread(number: int, one: TransmitterTally) -> Iterator[Doubt]:
+    """Packets without a block of a transmitter that sends some; another one may send none at all."""
+    failed = one.packets - one.blocks
+    if one.blocks and failed >= _FEW_FRAMES and failed > _FAILED_SHARE * one.packets:
         yield Doubt(
             "blocks-failed",
-            f"{failed} of {tried} packets cannot be read",
+            f"{failed} of {one.packets} packets cannot be read",
             "more light, a nearer or a better focused bar, or an error correction of a lower rate",
+            number,
         )

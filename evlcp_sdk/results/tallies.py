@@ -44,6 +44,7 @@ class TransmitterTally:
         reach_sum: Sum over `sized` frames of the logarithm of the distance, m, times how far apart the first
             and the last cluster are in the image, px.
         along_px: Sum of the ways from the first to the last, right and down, px.
+        blocks: Packets whose block is read.
         beacon_m: Length of the bar by its newest beacon, m; NaN without.
     """
 
@@ -71,10 +72,12 @@ class TransmitterTally:
     sized: int = 0
     along_px: tuple[float, float] = (0.0, 0.0)
     beacon_m: float = math.nan
+    blocks: int = 0
 
     def add(self, packet: Packet) -> None:
         """Count a packet and its frames."""
         self.packets += 1
+        self.blocks += packet.block is not None
         self.frames += len(packet.frames)
         number, t_us = self.last_packet
         step_us, nominal_us = packet.t_us - t_us, (packet.packet - number) * self.nominal_packet_us
@@ -296,6 +299,7 @@ class PositionTally:
             "alarms": dict(sorted(self.alarms.items())),
             "excluded": dict(sorted(self.excluded.items())),
             "suspects": dict(sorted(self.suspects.items())),
+            "focal_mm_fits": number_or_none(positioner.fitting_focal_mm(), 2),
             "left_out_of_track": self.left_out,
             **navigator.counts,
             "frames_late": positioner.counts["frames_late"],

@@ -36,6 +36,10 @@ RARE_CHIPS, WEAK = 5.0, 0.35
 """Median time between rises, in chips, and mean of the comb, beyond both of which light is too weak: a code
 rises every 2.7 chips, and jitter of 20 us leaves .45 of the mean at 10 kHz."""
 
+ROW_US, SLOW_SHARE = 0.2, 0.7
+"""What an IMX636 takes to read a row, by its latency against the lit area, and the share of a chip above
+which reading a bar's rows, one after another, mixes its edges with the next chip's."""
+
 ACCEPTED_SHARE = 0.8
 """Share of the frames due that are accepted, below which something is wrong with all of them."""
 
@@ -126,7 +130,8 @@ class Facts:
         large = [one for one in self.sources if one.rises >= _MIN_CODE]
         fit = [one for one in large if one.kind != "lamp" and _has_rate(one, rate)]
         codes = [one for one in large if one.kind == "code"]
-        first = next(iter(fit or codes), None)
+        # Frames that are accepted are of a bar, however regular its light looks.
+        first = next(iter(fit or codes or (large if self.heard else [])), None)
         if first is None or self.reads or first.events >= _BESIDE * self.sources[0].events:
             return first
         return None
@@ -153,6 +158,16 @@ class Facts:
             one.frames >= max(_FEW, ACCEPTED_SHARE * (one.last_frame - one.first_frame + 1), _MOST * sent)
             for one in self.tally.own
         )
+
+    @property
+    def heard(self) -> bool:
+        """Whether some frames are accepted: more than chance gives."""
+        return self.counts["frames"] >= _FEW
+
+    @property
+    def sure(self) -> bool:
+        """Whether most frames are accepted, and their symbols are sure."""
+        return self.reads and self.tally.quality >= SURE
 
     @property
     def better(self) -> Trial | None:
@@ -274,7 +289,7 @@ def _light(facts: Facts) -> Check:
                 f"is a bar in the picture ({view}), and on (`evlcp board status`)?",
             )
         first = facts.sources[0]
-        if first.events < _SOME * facts.events:
+        if first.kind != "code" and first.events < _SOME * facts.events:
             return _dark(view)
         said = f"{_sources_said(facts)}, but too rarely to tell a code"
         long_px, wide_px = max(first.wide_px, first.high_px), min(first.wide_px, first.high_px)
@@ -287,7 +302,7 @@ def _light(facts: Facts) -> Check:
 
 def _is_lamp(source: LightSource, facts: Facts) -> bool:
     """Whether a source is rather the light of a lamp, with periods missing, than a bar of another rate."""
-    if _has_rate(source, facts.link.packet.chip_rate_hz) or facts.better is not None:
+    if facts.heard or _has_rate(source, facts.link.packet.chip_rate_hz) or facts.better is not None:
         return False
     lamps = [one.rate_hz for one in facts.sources if one.kind == "lamp"]
     same = (abs(times * source.rate_hz / rate - 1) < _SAME_RATE for rate in lamps for times in (0.5, 1, 2))
@@ -392,7 +407,7 @@ def _size(facts: Facts) -> Check:
         return Check("size", "skip", "size", "not reached")
     said = f"{px:.1f} px a cluster"
     if px >= (SMALL_PX if facts.reads else SMALLEST_PX):
-        return Check("size", "pass", "size", said)
+        return _readout_of_rows(facts) or Check("size", "pass", "size", said)
     far_m = facts.link.camera.focal_px * facts.link.bar.length_m / (px * (facts.steps_along + 1))
     return Check(
         "size",
@@ -403,15 +418,32 @@ def _size(facts: Facts) -> Check:
     )
 
 
+def _readout_of_rows(facts: Facts) -> Check | None:
+    """A bar of more rows than are read in a chip; None where it is not, or is read all the same."""
+    chip_us = facts.link.packet.chip_us
+    rows = 0.0 if facts.bar is None else facts.bar.high_px
+    if facts.sure or facts.better is not None or rows * ROW_US < SLOW_SHARE * chip_us:
+        return None
+    return Check(
+        "size",
+        "doubt" if facts.reads else "fail",
+        "near",
+        f"{rows:.0f} rows high: a sensor that reads a row in {ROW_US:g} us takes {rows * ROW_US:.0f} us for"
+        f" them, a chip lasts {chip_us:.0f}",
+        "further away, a shorter lens, the camera turned by 90 degrees, so that the bar lies along rows, or a"
+        " lower air.chip_rate_hz at both ends",
+    )
+
+
 def _focus(facts: Facts) -> Check:
     bar, px = facts.bar, facts.cluster_px
     if bar is None or not px > 0:
         return Check("focus", "skip", "focus", "not reached")
     said = f"{facts.across_px:.0f} px across, {px:.1f} px a cluster along it"
-    if not facts.reads and facts.across_px > SMEARED_CLUSTERS * px:
+    if not facts.sure and facts.across_px > SMEARED_CLUSTERS * px:
         return Check(
             "focus",
-            "fail",
+            "doubt" if facts.reads else "fail",
             "defocus",
             f"{said}: the light of each cluster covers its neighbours",
             _SHARPER,

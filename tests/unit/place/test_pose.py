@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.judgement import Pose
 from evlcp_sdk.place.observations import BarView, project_bars
-from evlcp_sdk.place.pose import solve_pose
+from evlcp_sdk.place.pose import fitting_focal_mm, solve_pose
 from evlcp_sdk.place.refusals import REFUSALS, Refusal
 from evlcp_sdk.place.starts import three_point_poses
 from evlcp_sdk.scene.attitude import Attitude
@@ -307,6 +307,24 @@ def test_two_bars_that_disagree_are_refused() -> None:
     assert isinstance(found, Refusal)
     assert "bar 0" in found.detail
     assert "bar 1" in found.detail
+
+
+@pytest.mark.parametrize("said_mm", [12.0, 50.0])
+def test_a_focal_length_that_is_another_lens_is_found(said_mm: float) -> None:
+    """35 mm: two bars, of which one is nearer, are refused; of three, one is left out by mistake."""
+    rng = np.random.default_rng(4)
+    for places, known in ((THREE[1:], UP), (THREE, Attitude(pitch_deg=5.0))):
+        seen = views([bar(p) for p in places], np.zeros(3), UP.rotation(), rng)
+        said = dataclasses.replace(CAMERA, focal_mm=said_mm)
+        found = solve_pose(seen, said, known)
+        assert found.kind == "misfit" if isinstance(found, Refusal) else found.excluded
+        assert fitting_focal_mm(seen, said, known) == pytest.approx(35.0, rel=0.04)
+
+
+def test_no_focal_length_fits_a_bar_that_is_moved_aside() -> None:
+    seen = views([bar(p) for p in THREE[1:]], np.zeros(3), UP.rotation(), np.random.default_rng(4))
+    moved = dataclasses.replace(seen[0], enu_m=np.add(seen[0].enu_m, (0.0, 0.0, 0.5)))
+    assert math.isnan(fitting_focal_mm([moved, seen[1]], CAMERA, UP))
 
 
 def test_two_sites_mixed_up_are_not_a_third_bar_at_fault() -> None:

@@ -140,9 +140,17 @@ def test_blocks_are_doubted_where_there_is_something_to_read() -> None:
     assert "error-correction.id" in line
     (line,) = told(tally_of(RANDOM), blocks_tried=6, blocks_decoded=5, blocks_other_codebook=1)
     assert line.startswith("1 packet sent with another codebook")
-    (line,) = told(tally_of(RANDOM), blocks_tried=30, blocks_decoded=10, blocks_failed=20, blocks_alike=9)
-    assert line.startswith("20 of 30 packets cannot be read")
-    assert told(tally_of(RANDOM), blocks_tried=30, blocks_decoded=20, blocks_failed=10) == []
+
+
+@pytest.mark.parametrize(("packets", "blocks", "said"), [(30, 10, True), (30, 20, False), (30, 0, False)])
+def test_a_transmitter_that_sends_some_blocks_is_expected_to_send_all(
+    packets: int, blocks: int, said: bool
+) -> None:
+    """What another one sends, beside it, may be symbols that are no blocks."""
+    tally = tally_of(RANDOM)
+    tally.transmitters[0].packets, tally.transmitters[0].blocks = packets, blocks
+    lines = told(tally, blocks_tried=60, blocks_decoded=blocks, blocks_failed=60 - blocks)
+    assert ["transmitter 0: 20 of 30 packets cannot be read" in line for line in lines] == [True] * said
 
 
 def test_the_modulation_that_was_sent() -> None:
@@ -265,16 +273,42 @@ def test_bars_at_no_known_place_are_named_by_their_ids() -> None:
         )
 
 
+@pytest.mark.parametrize(("quality", "said"), [(0.75, False), (0.3, True)])
+def test_symbols_that_are_wrong_by_the_receivers_own_account(quality: float, said: bool) -> None:
+    tally = tally_of(RANDOM)
+    tally.transmitters[0].quality_sum = quality * 60
+    lines = told(tally)
+    assert [
+        line.startswith("transmitter 0: 70% of its frames have a symbol that is wrong") for line in lines
+    ] == [True] * said
+
+
+def test_what_is_not_found_is_looked_for_elsewhere() -> None:
+    (note,) = notes_of(RunTally(LINK.packet), {"events": 9})
+    assert (note.code, note.next_step) == (
+        "nothing-found",
+        "`evlcp diagnose` says what blinks, and what to try",
+    )
+    assert notes_of(RunTally(LINK.packet), {"events": 0}) == []
+
+
 def test_a_misfit_names_what_would_explain_it() -> None:
-    for suspects, says in (
-        ({"heading": 9, "bar 1": 2}, "another heading would explain it: compare --heading-deg"),
+    for suspects, fits_mm, says in (
+        ({"heading": 9, "bar 1": 2}, None, "another heading would explain it: compare --heading-deg"),
         (
             {"focal length": 10, "bar 0": 6},
+            34.6,
             "another focal length or another bar 0 would explain it: compare camera.",
         ),
-        ({"bar 0": 3}, "contradict one another: compare sites, angles and [camera], its focal_mm"),
+        ({"bar 0": 3}, None, "contradict one another: compare sites, angles and [camera], its focal_mm"),
+        (
+            {"bar 0": 10},
+            51.2,
+            "another focal length or another bar 0 would explain it: compare camera.focal_mm = 35: about 51.2"
+            " would fit; place, angles and length of bar 0",
+        ),
     ):
-        positions = dict(NO_POSITIONS, refused={"misfit": 10}, suspects=suspects)
+        positions = dict(NO_POSITIONS, refused={"misfit": 10}, suspects=suspects, focal_mm_fits=fits_mm)
         (doubt,) = [
             d for d in warnings_of(RunTally(LINK.packet), {}, LINK, positions=positions) if d.code == "misfit"
         ]

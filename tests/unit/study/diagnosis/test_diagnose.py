@@ -1,6 +1,7 @@
 """Diagnosis: each thing that may be wrong, rendered by the simulator, is the one that is named."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,14 @@ from evlcp_sdk.cli._app import make_app
 from evlcp_sdk.io import open_source
 from evlcp_sdk.io.open import write_events
 from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.results.doubts import Seen
+from evlcp_sdk.results.tallies import RunTally, TransmitterTally
 from evlcp_sdk.sim import load_scene
 from evlcp_sdk.simulated import SimulatedSource, simulate
 from evlcp_sdk.study.diagnosis import _kernels
+from evlcp_sdk.study.diagnosis.checks import Facts, checks_of
 from evlcp_sdk.study.diagnosis.diagnose import Diagnosis, diagnosis_of, infer_link
-from evlcp_sdk.study.diagnosis.light import LightSurvey, comb
+from evlcp_sdk.study.diagnosis.light import LightSource, LightSurvey, comb
 from evlcp_sdk.study.diagnosis.page import page
 from evlcp_sdk.values import Events
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
@@ -79,6 +83,52 @@ def test_what_a_link_has_wrong_is_found_and_said(code: str, sent: tuple[str, ...
     (wrong,) = [one for one in diagnosis.checks if one.verdict == "fail"]
     assert wrong.code == code
     assert step in wrong.next_step
+
+
+def judged(*sources: LightSource, quality: float = 1.0, frames: int = 0, rejected: int = 0) -> str:
+    """What is wrong first of all with light that the survey told, and what the receiver made of it."""
+    tally = RunTally(LINK.packet)
+    if frames:
+        one = tally.transmitters[0] = TransmitterTally(10, 34_600.0)
+        one.frames, one.quality_sum, one.first_frame, one.last_frame = frames, quality * frames, 0, frames - 1
+        one.values.update(range(64))
+    counts = dict.fromkeys(("preambles", "regions_opened"), 3)
+    counts |= {"frames": frames, "frames_rejected": rejected}
+    seen = Seen(0.0, 2e5)
+    checks = checks_of(Facts(LINK, 10**6, seen, sources, None, counts, tally))
+    wrong = [one for one in checks if one.verdict in ("fail", "doubt")]
+    assert all(one.next_step for one in wrong)
+    return wrong[0].code if wrong else ""
+
+
+BAR = LightSource(
+    "code", 10_000.0, 0.9, (400, 300, 420, 450), 5.0, 140.0, 900_000, 90_000, 0.5, 300.0, 0.0,
+    np.bincount(np.repeat([20, 30, 40], [5, 3, 2]), minlength=_kernels.BINS),
+)  # fmt: skip
+TALL = replace(BAR, box_px=(400, 40, 480, 680), wide_px=25.0, high_px=600.0)
+WIDE = replace(BAR, wide_px=23.0)
+SLOW = replace(BAR, kind="lamp", rate_hz=2360.0, strength=0.6, typical_us=814.0, blind_us=390.0)
+
+
+@pytest.mark.parametrize(
+    ("code", "source", "read"),
+    [
+        ("", BAR, {"frames": 40}),
+        # Rows are read one after another: 120 us for 600 of them, where a chip lasts 100.
+        ("near", TALL, {"rejected": 30}),
+        ("near", TALL, {"frames": 40, "quality": 0.3}),
+        ("", TALL, {"frames": 40}),
+        ("defocus", WIDE, {"rejected": 30}),
+        ("defocus", WIDE, {"frames": 40, "quality": 0.3}),
+        ("", WIDE, {"frames": 40}),
+        # Pixels that answer every 400 us are as regular as a lamp, but frames are none of a lamp's.
+        ("refractory", SLOW, {"frames": 14, "rejected": 30}),
+        ("lamp", SLOW, {"rejected": 30}),
+        ("dim", replace(BAR, rises=568, events=1330), {}),
+    ],
+)
+def test_what_light_and_receiver_say_together(code: str, source: LightSource, read: dict[str, Any]) -> None:
+    assert judged(source, **read) == code
 
 
 def test_rate_is_measured_without_a_link() -> None:
