@@ -83,5 +83,5 @@ $(VENV)/.installed: pyproject.toml $(VENV)/.pip
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.pip
-	$(BIN)/python -m pip install -q -e '.[faery,parquet,pandas,cluster,report,mcap,sign]' --group dev
+	$(BIN)/python -m pip install -q -e '.[faery,parquet,pandas,cluster,report,mcap,sign,mp4]' --group dev
 	@touch $@ $(VENV)/.installed

@@ -374,7 +374,7 @@ def film(
 
     Args:
         recording: What to open, plugins asked first.
-        out: An animated picture, `.webp` or `.gif`.
+        out: An animated picture, `.webp` or `.gif`, or a film, `.mp4`.
         link: The configuration, or a `link.toml`; None for all defaults.
         registry: The plugins; None for all that are installed.
         from_ms: Where it starts, ms after the first event; None for the first frame that is decoded, or the
@@ -390,7 +390,8 @@ def film(
 
     Raises:
         InputError: The recording cannot be read, or has nothing there.
-        ConfigError: The film would have too many pictures, or is to be of another kind.
+        ConfigError: The film would have too many pictures, or is to be of another kind, or one whose
+            extra is not installed.
         OutputError: It cannot be written.
     """
     # Matplotlib and Pillow take longer to import than other use cases to start.
@@ -399,6 +400,7 @@ def film(
         MOST_MEGAPIXELS,
         MOST_PICTURES,
         FilmProbe,
+        check_kind,
         draw_film,
         pictures_of,
         plan_film,
@@ -407,6 +409,7 @@ def film(
 
     if (kind := FILM_KINDS.get(out.suffix.lower())) is None:
         raise ConfigError(f"{out}: a film is written as {' or '.join(f'NAME{end}' for end in FILM_KINDS)}")
+    check_kind(kind)
     if (pictures := pictures_of(for_ms, slow)) > MOST_PICTURES:
         raise ConfigError(
             f"{for_ms:g} ms at 1/{slow:g} would be {pictures} pictures, at most {MOST_PICTURES}: show less,"

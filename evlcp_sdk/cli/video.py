@@ -20,7 +20,10 @@ def video(
         str, typer.Argument(metavar="REC", help="A recording, or what a plugin can open twice.")
     ],
     out: Annotated[
-        Path, typer.Option("-o", "--out", metavar="FILM", help="Where the film goes: NAME.webp or NAME.gif.")
+        Path,
+        typer.Option(
+            "-o", "--out", metavar="FILM", help="Where the film goes: NAME.webp, NAME.gif or NAME.mp4."
+        ),
     ],
     link_file: LinkFile = None,
     overrides: Overrides = None,
@@ -55,7 +58,8 @@ def video(
 
     Yellow is where it gets brighter, blue where darker, at 1/400 chip by chip; in faster films a picture
     shows the last chip before it. Beside a bar stand the symbols of the frame that is on air, above it its
-    number and distance. Browsers show both WebP and GIF.
+    number and distance. Browsers show both WebP and GIF; .mp4, for all other
+    programs, takes the extra: [bold]pip install 'evlcp-sdk[mp4]'[/]
     """
     import json
 

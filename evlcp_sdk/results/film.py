@@ -4,6 +4,7 @@ import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.results.figures import cluster_colours, transmitter_colour
@@ -22,14 +24,18 @@ __all__ = [
     "MOST_MEGAPIXELS",
     "MOST_PICTURES",
     "Film",
+    "FilmKind",
     "FilmProbe",
+    "check_kind",
     "draw_film",
     "pictures_of",
     "plan_film",
     "save_film",
 ]
 
-FILM_KINDS: Mapping[str, Literal["WEBP", "GIF"]] = {".webp": "WEBP", ".gif": "GIF"}
+FilmKind = Literal["WEBP", "GIF", "MP4"]
+
+FILM_KINDS: Mapping[str, FilmKind] = {".webp": "WEBP", ".gif": "GIF", ".mp4": "MP4"}
 """How a film is written, by the end of its file's name."""
 
 MOST_PICTURES, MOST_MEGAPIXELS = 500, 160
@@ -183,12 +189,40 @@ def draw_film(
         lit *= stays
 
 
-def save_film(pictures: Sequence[Image.Image], path: Path, kind: Literal["WEBP", "GIF"]) -> None:
-    """Write an animated picture that starts anew when it ends."""
+def check_kind(kind: FilmKind) -> None:
+    """See whether films of a kind can be written here.
+
+    Raises:
+        ConfigError: The extra for it is not installed.
+    """
+    if kind == "MP4" and find_spec("av") is None:
+        raise ConfigError("films as .mp4 need the extra: pip install 'evlcp-sdk[mp4]'")
+
+
+def save_film(pictures: Sequence[Image.Image], path: Path, kind: FilmKind) -> None:
+    """Write an animated picture that starts anew when it ends, or a film that does not."""
+    if kind == "MP4":
+        _save_mp4(pictures, path)
+        return
     first, *rest = pictures
     duration_ms = round(1000 / PICTURES_PER_S)
     more: dict[str, Any] = {"quality": 80, "method": 2} if kind == "WEBP" else {"optimize": False}
     first.save(path, kind, save_all=True, append_images=rest, duration=duration_ms, loop=0, **more)
+
+
+def _save_mp4(pictures: Sequence[Image.Image], path: Path) -> None:
+    """Write H.264 in four colour samples a square, which every program plays."""
+    import av
+
+    width, height = (size + size % 2 for size in pictures[0].size)
+    with av.open(path, "w", format="mp4") as file:
+        stream = file.add_stream("libx264", PICTURES_PER_S, options={"crf": "20", "threads": "1"})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for picture in pictures:
+            whole = Image.new("RGB", (width, height))
+            whole.paste(picture)
+            file.mux(stream.encode(av.VideoFrame.from_image(whole)))
+        file.mux(stream.encode())
 
 
 def _within(middle: float, size: float, most: int) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from PIL import Image
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.io import write_events
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.results.film import Film, draw_film, pictures_of, plan_film
+from evlcp_sdk.results.film import Film, draw_film, pictures_of, plan_film, save_film
 from evlcp_sdk.run import film
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Frame, Range, Region, SoftSymbols
@@ -134,9 +134,32 @@ def test_a_film_of_a_recording(evlcp: Callable[..., Any], demo_raw: Path, tmp_pa
             assert f"{pictures} pictures of {width} x {height} px" in done.out
 
 
+def test_a_film_for_programs_that_play_no_pictures(tmp_path: Path) -> None:
+    """Read again, each of its pictures is near the one that was drawn; an odd side gets one more."""
+    av = pytest.importorskip("av")
+    shown = Film(1000.0, 400.0, 8, 5, 3, 31, 21, 3.0, 100.0)
+    drawn = list(draw_film(shown, [random_events(900)], [], [], LINK))
+    save_film(drawn, tmp_path / "a.mp4", "MP4")
+    with av.open(tmp_path / "a.mp4") as file:
+        (stream,) = file.streams
+        assert (stream.codec_context.name, stream.width, stream.height) == ("h264", 94, 84)
+        assert stream.average_rate == 25
+        again = [frame.to_ndarray(format="rgb24") for frame in file.decode(stream)]
+    assert len(again) == len(drawn) == 8
+    for picture, read in zip(drawn, again, strict=True):
+        off = np.abs(read[:83, :93].astype(int) - np.asarray(picture.convert("RGB")).astype(int))
+        assert off.mean() < 12
+
+
+def test_a_film_asks_for_its_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("evlcp_sdk.results.film.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"pip install 'evlcp-sdk\[mp4\]'"):
+        film(tmp_path / "never read.raw", tmp_path / "a.mp4", LINK)
+
+
 def test_what_cannot_be_filmed(demo_raw: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"a.mp4: a film is written as NAME.webp or NAME.gif"):
-        film(demo_raw, tmp_path / "a.mp4", LINK)
+    with pytest.raises(ConfigError, match=r"a.avi: a film is written as NAME.webp or NAME.gif or NAME.mp4"):
+        film(demo_raw, tmp_path / "a.avi", LINK)
     with pytest.raises(ConfigError, match="100 ms at 1/400 would be 1000 pictures, at most 500"):
         film(demo_raw, tmp_path / "a.gif", LINK, for_ms=100)
     with pytest.raises(ConfigError, match="500 pictures of 1280 x 740 px are 474 megapixels, at most 160"):
