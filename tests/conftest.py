@@ -3,9 +3,11 @@
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
+import typer
 from hypothesis import settings
 
 ROOT = Path(__file__).parents[1]
@@ -13,6 +15,9 @@ ROOT = Path(__file__).parents[1]
 # The same examples on every machine; --hypothesis-profile=default draws new ones. Compiling takes seconds.
 settings.register_profile("same", derandomize=True, deadline=None)
 settings.load_profile("same")
+
+# What parameters a command has is looked up at every run of one, for all of them.
+typer.main.get_params_from_function = cache(typer.main.get_params_from_function)
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,13 @@
 """The figures that the receiver must reach on recordings with truth, by the independent scorer."""
 
 import csv
+import io
 import json
-import subprocess
+import runpy
 import sys
+import warnings
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +39,13 @@ FIGURES = {
 
 def scored(out: Path, name: str, tool: str = "score.py") -> dict[str, Any]:
     """What a scorer of ../shared, which is not this project's, says of a result."""
-    command = [
-        sys.executable,
-        SHARED / "tools" / tool,
-        out,
-        RECORDINGS / f"{name}.truth.json",
-        "--json",
-    ]
-    result: dict[str, Any] = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    told = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(told), warnings.catch_warnings():
+        # It leaves the files that it reads to be closed by others.
+        warnings.simplefilter("ignore", ResourceWarning)
+        patch.setattr(sys, "argv", [tool, str(out), str(RECORDINGS / f"{name}.truth.json"), "--json"])
+        runpy.run_path(str(SHARED / "tools" / tool), run_name="__main__")
+    result: dict[str, Any] = json.loads(told.getvalue())
     return result
 
 
