@@ -1,5 +1,6 @@
 """What tests share: the shipped recording and how the command line is run."""
 
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,6 +10,11 @@ from pathlib import Path
 import pytest
 import typer
 from hypothesis import settings
+
+# A thread a core for matrices of a few rows takes ten times the processor, and each worker has a core: before
+# numpy is there, which asks once. Processes that tests start inherit it.
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
 
 ROOT = Path(__file__).parents[1]
 
