@@ -7,7 +7,7 @@ TOOLCHAIN := firmware_host/firmware/install-toolchain.sh
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint fuzz sbom format pictures clean
+.PHONY: help demo test ready lint kernels fuzz sbom format pictures clean
 
 help:  ## Show this list
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -15,13 +15,24 @@ help:  ## Show this list
 demo: $(VENV)/.installed  ## Simulate four stretches of a drive, receive them, compare with the paper; demo-out/
 	$(BIN)/evlcp demo
 
-test: $(VENV)/.dev lint toolchain  ## Format, lint, types, then every test
+test:  ## Format, lint, types, then every test
+	@$(MAKE) -j2 --no-print-directory ready
 	$(BIN)/pytest -q -n auto --dist worksteal
+
+# Two at a time: packages for Python and for the firmware are fetched, then types checked and kernels compiled.
+ready: lint toolchain kernels
 
 lint: $(VENV)/.dev  ## Format, lint and types only
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
 	$(BIN)/mypy
+
+# What the tests' workers would each compile at once. Whether it works is theirs to find.
+kernels: $(VENV)/.dev
+	@folder=$$(mktemp -d); \
+	  $(BIN)/evlcp receive examples/recordings/night-50m-30kmh-cut.raw -o $$folder/out >/dev/null 2>&1; \
+	  $(BIN)/evlcp simulate --preset night --set duration_s=0.01 -o $$folder/night.raw >/dev/null 2>&1; \
+	  rm -rf $$folder
 
 MINUTES ?= 5
 fuzz: $(VENV)/.dev  ## Damage files of every kind and read them, for MINUTES
@@ -52,8 +63,9 @@ clean:  ## Remove .venv and everything that was generated
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Without it the firmware's tests would be skipped: CI takes that for a failure, a developer may go on.
+# After the environment, which may call for the system's packages, too.
 .PHONY: toolchain
-toolchain:
+toolchain: | $(BIN)/python
 	@if [ -f $(TOOLCHAIN) ]; then bash $(TOOLCHAIN) || { \
 	  echo "make: the firmware toolchain is not installed; its tests are skipped"; [ -z "$$CI" ]; }; fi
 	@command -v chromium >/dev/null || { \
