@@ -33,9 +33,11 @@ def take_in(heard: Array, prior: Array, out: Array) -> None:
             unheard = 0.0 if share[r, c] > 0 else 1.0
             total = max(1 - place[r, c], 1e-6)
             for k in range(clusters):
-                total += prior[k, r, c] * (heard[k, r, c] * odds + unheard)
+                if prior[k, r, c] != 0:
+                    total += prior[k, r, c] * (heard[k, r, c] * odds + unheard)
             for k in range(clusters):
-                out[k, r, c] = prior[k, r, c] * (heard[k, r, c] * odds + unheard) / total
+                if prior[k, r, c] != 0:
+                    out[k, r, c] = prior[k, r, c] * (heard[k, r, c] * odds + unheard) / total
 
 
 @njit(cache=True, nogil=True)

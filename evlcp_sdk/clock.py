@@ -119,7 +119,7 @@ class CameraClock:
             if _kernels.all_ordered(t_us, x, y, *self._size, self._offset_us, inside_us):
                 self._state[0] = t_us[-1]
                 self.last_us = int(inside_us[-1])
-                return [Events(inside_us, x, y, events.p)]
+                return [Events.as_is(inside_us, x, y, events.p)]
         return self._sorted(events)
 
     def close(self) -> list[Events]:

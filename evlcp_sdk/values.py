@@ -96,6 +96,15 @@ class Events:
         )
 
     @classmethod
+    def as_is(
+        cls, t_us: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], p: NDArray[np.uint8]
+    ) -> "Events":
+        """Events from columns that are known to be of these types and of one length."""
+        events = object.__new__(Events)
+        vars(events).update(t_us=t_us, x=x, y=y, p=p)
+        return events
+
+    @classmethod
     def empty(cls) -> Self:
         """No events."""
         return cls.of([], [], [], [])
@@ -134,9 +143,7 @@ class Events:
         """The events of a slice or a mask (a view for a slice)."""
         if isinstance(rows, slice):
             # Columns of one type and length stay so.
-            part = object.__new__(Events)
-            vars(part).update(t_us=self.t_us[rows], x=self.x[rows], y=self.y[rows], p=self.p[rows])
-            return part
+            return Events.as_is(self.t_us[rows], self.x[rows], self.y[rows], self.p[rows])
         return Events(self.t_us[rows], self.x[rows], self.y[rows], self.p[rows])
 
 

@@ -27,8 +27,14 @@ CLOCK_ROUND = 1 << 32 - CLOCK_AT
 SCORES = (1 << CHIPS_AT) - 1
 
 _LOW = np.uint32((1 << CLOCK_AT) - 1)
+_HIGH = np.uint32((1 << 32) - (1 << CLOCK_AT))
 _PART = np.uint32((1 << SAME_AT) - 1)
+_SAMES = np.array([max(n - 2, 0) for n in range(8)] + [min(n + 1, MOST_SAME) for n in range(8)], np.uint32)
+"""How often the same number of chips has come again: after another number, and after the same."""
 _CLOCK = np.uint32(CLOCK_AT)
+_BLOCK = 32
+"""Events that are looked at together: of a bar alone in the dark, every other block has no stray in it."""
+
 _ROUND = np.uint32(CLOCK_ROUND - 1)
 
 
@@ -56,34 +62,35 @@ def score_rises(
     width, columns = np.uint32(pixels.shape[1]), np.uint32(hits.shape[1])
     states, cells = pixels.reshape(-1), hits.reshape(-1)
     longest, least = np.uint32(kinds.size - 1), np.uint32(min_score)
-    first, shift = np.uint32(soon), np.uint32(cell_shift)
-    # What counts is as good as random at each stage, so that it is found without a branch.
-    rises = np.empty(t_us.size + 1, np.int32)
-    n = 0
+    first, shift, ticks = np.uint32(soon), np.uint32(cell_shift), np.uint64(tick_shift)
+    # What counts is as good as random at each stage, so that it is found without a branch; and indices are
+    # unsigned, as those below 0 would count from the end.
+    where, runs = np.empty(t_us.size + 1, np.uint32), np.empty(t_us.size + 1, np.uint32)
+    n = np.uint64(0)
     for i in range(t_us.size):
-        rises[n] = i
-        n += int(p[i])
-    where, runs = np.empty(n + 1, np.uint32), np.empty(n + 1, np.uint32)
-    new = 0
-    for i in rises[:n]:
-        at = np.uint32(y[i]) * width + np.uint32(x[i])
-        tick = np.uint32(t_us[i] >> tick_shift)
+        where[n] = np.uint32(y[i]) * width + np.uint32(x[i])
+        runs[n] = np.uint32(np.uint64(t_us[i]) >> ticks)
+        n += np.uint64(p[i])
+    new = np.uint64(0)
+    for i in range(n):
+        at, tick = where[i], runs[i]
         state = states[at]
         run = (tick - (state >> _CLOCK)) & _ROUND
-        states[at] = (tick << _CLOCK) | (state & _LOW) if run >= first else state
+        fresh = run >= first
+        states[at] = (tick << _CLOCK) | (state & _LOW) if fresh else state
         where[new] = at
         runs[new] = min(run, longest)
-        new += int(run >= first)
+        new += np.uint64(fresh)
     candidates = 0
     for i in range(new):
         at = where[i]
         state = states[at]
         kind = np.uint32(kinds[runs[i]])
         low = np.uint32(lows[(kind << np.uint32(SAME_AT)) | (state & _PART)])
-        same = int((state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME))
-        again = kind == ((state >> np.uint32(CHIPS_AT)) & np.uint32(15))
-        same = min(same + 1, MOST_SAME) if again else max(same - 2, 0)
-        states[at] = (state & ~_LOW) | (np.uint32(same) << np.uint32(SAME_AT)) | low
+        again = np.uint32(kind == ((state >> np.uint32(CHIPS_AT)) & np.uint32(15)))
+        same = (state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME)
+        same = _SAMES[(again << np.uint32(3)) | same]
+        states[at] = (state & _HIGH) | (same << np.uint32(SAME_AT)) | low
         # One that comes after long is no blinking yet, however a pixel blinked when a bar was there.
         if (low & np.uint32(SCORES)) >= least and kind != np.uint32(0):
             row = at // width
@@ -115,12 +122,16 @@ def grow_old(pixels: Array, first: int, many: int, now: int, least: int, age: in
 
 
 @njit(cache=True, nogil=True)
+def _listened(state: int, least: int, same: int) -> bool:
+    again = (np.uint32(state) >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME)
+    return bool((np.uint32(state) & np.uint32(SCORES)) >= np.uint32(least)) & bool(again < np.uint32(same))
+
+
+@njit(cache=True, nogil=True)
 def in_rhythm(x: Array, y: Array, pixels: Array, least: int, same: int, keep: Array) -> None:
     """Mark events of pixels with a score of `least` or more whose rises are not `same` time after time."""
     for i in range(x.size):
-        state = pixels[y[i], x[i]]
-        again = (state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME)
-        keep[i] = (state & np.uint32(SCORES)) >= np.uint32(least) and again < np.uint32(same)
+        keep[i] = _listened(pixels[y[i], x[i]], least, same)
 
 
 @njit(cache=True, nogil=True)
@@ -213,16 +224,122 @@ def select_box(
     """Copy the events inside a box (left, top, right, bottom); how many. One more than all find room."""
     left, top = np.uint16(box[0]), np.uint16(box[1])
     width, height = np.uint16(box[2] - box[0]), np.uint16(box[3] - box[1])
-    n = 0
-    for i in range(t_us.size):
-        # Written always, kept if inside: between two bars, a branch would be a coin toss. Unsigned, one
-        # comparison does for both edges.
+    n = np.uint64(0)
+    size = t_us.size
+    whole = size - size % _BLOCK
+    for first in range(0, whole, _BLOCK):
+        many = np.uint16(0)
+        for i in range(first, first + _BLOCK):
+            # Unsigned, one comparison does for both edges.
+            many += np.uint16(np.uint16(x[i] - left) < width) & np.uint16(np.uint16(y[i] - top) < height)
+        if many == _BLOCK:
+            for i in range(_BLOCK):
+                out_t[n + np.uint64(i)] = t_us[first + i]
+            for i in range(_BLOCK):
+                out_x[n + np.uint64(i)] = x[first + i]
+            for i in range(_BLOCK):
+                out_y[n + np.uint64(i)] = y[first + i]
+            for i in range(_BLOCK):
+                out_p[n + np.uint64(i)] = p[first + i]
+            n += np.uint64(_BLOCK)
+        elif many:
+            for i in range(first, first + _BLOCK):
+                # Written always, kept if inside: between two bars, a branch would be a coin toss.
+                out_t[n] = t_us[i]
+                out_x[n] = x[i]
+                out_y[n] = y[i]
+                out_p[n] = p[i]
+                n += np.uint64(np.uint16(x[i] - left) < width) & np.uint64(np.uint16(y[i] - top) < height)
+    for i in range(whole, size):
         out_t[n] = t_us[i]
         out_x[n] = x[i]
         out_y[n] = y[i]
         out_p[n] = p[i]
-        n += int(np.uint16(x[i] - left) < width) & int(np.uint16(y[i] - top) < height)
-    return n
+        n += np.uint64(np.uint16(x[i] - left) < width) & np.uint64(np.uint16(y[i] - top) < height)
+    return int(np.int64(n))
+
+
+@njit(cache=True, nogil=True)
+def _wanted(x: int, y: int, box: Array, filtered: bool, pixels: Array, least: int, same: int) -> bool:
+    """Whether an event lies in a box (left, top, right, bottom), and its pixel is one that is listened to."""
+    if not (box[0] <= x < box[2] and box[1] <= y < box[3]):
+        return False
+    return not filtered or _listened(pixels[y, x], least, same)
+
+
+@njit(cache=True, nogil=True)
+def select_boxes(
+    t_us: Array,
+    x: Array,
+    y: Array,
+    p: Array,
+    boxes: Array,
+    filtered: Array,
+    pixels: Array,
+    least: int,
+    same: int,
+    cell_shift: int,
+    labels: Array,
+    begins: Array,
+) -> tuple[Array, Array, Array, Array]:
+    """Events inside boxes (n, 4) of (left, top, right, bottom), one box after the other.
+
+    Those of a box begin at `begins` (n + 1,). Of one that is `filtered` (n,), they are events that
+    `in_rhythm` marks. `labels` are of cells of 2^cell_shift px, 0 before and after. An event costs the same
+    however many boxes there are, but where they overlap.
+    """
+    shift = np.uint64(cell_shift)
+    several = np.int16(-1)
+    for k in range(len(boxes)):
+        if boxes[k, 0] < boxes[k, 2]:
+            for v in range(boxes[k, 1] >> cell_shift, (boxes[k, 3] - 1 >> cell_shift) + 1):
+                for u in range(boxes[k, 0] >> cell_shift, (boxes[k, 2] - 1 >> cell_shift) + 1):
+                    labels[v, u] = several if labels[v, u] else np.int16(k + 1)
+    near = np.empty(t_us.size + 1, np.uint32)
+    n = np.uint64(0)
+    for i in range(t_us.size):
+        near[n] = i
+        n += np.uint64(labels[np.uint64(y[i]) >> shift, np.uint64(x[i]) >> shift] != 0)
+    of, m = np.empty(n, np.int16), np.uint64(0)
+    begins[:] = 0
+    for j in range(n):
+        i = near[j]
+        u, v = int(x[i]), int(y[i])
+        label = int(labels[np.uint64(y[i]) >> shift, np.uint64(x[i]) >> shift])
+        if label > 0:
+            k = label - 1
+            wanted = _wanted(u, v, boxes[k], filtered[k], pixels, least, same)
+            near[m], of[m] = i, label
+            begins[k + 1] += wanted
+            m += np.uint64(wanted)
+        else:
+            some = 0
+            for k in range(len(boxes)):
+                wanted = _wanted(u, v, boxes[k], filtered[k], pixels, least, same)
+                begins[k + 1] += wanted
+                some += wanted
+            near[m], of[m] = i, label
+            m += np.uint64(some > 0)
+    for k in range(len(boxes)):
+        begins[k + 1] += begins[k]
+    total = begins[-1]
+    out_t, out_p = np.empty(total, np.int64), np.empty(total, np.uint8)
+    out_x, out_y = np.empty(total, np.uint16), np.empty(total, np.uint16)
+    place = begins[:-1].copy()
+    for j in range(m):
+        i, label = near[j], int(of[j])
+        first, last = (label - 1, label) if label > 0 else (0, len(boxes))
+        for k in range(first, last):
+            if label > 0 or _wanted(x[i], y[i], boxes[k], filtered[k], pixels, least, same):
+                at = np.uint64(place[k])
+                out_t[at], out_x[at], out_y[at], out_p[at] = t_us[i], x[i], y[i], p[i]
+                place[k] += 1
+    for k in range(len(boxes)):
+        if boxes[k, 0] < boxes[k, 2]:
+            for v in range(boxes[k, 1] >> cell_shift, (boxes[k, 3] - 1 >> cell_shift) + 1):
+                for u in range(boxes[k, 0] >> cell_shift, (boxes[k, 2] - 1 >> cell_shift) + 1):
+                    labels[v, u] = 0
+    return out_t, out_x, out_y, out_p
 
 
 @njit(cache=True, nogil=True)
@@ -665,12 +782,16 @@ def spread_across(
         for v in range(max(int(y - reach), 0), min(int(y + reach) + 2, height)):
             for u in range(max(int(x - reach), 0), min(int(x + reach) + 2, width)):
                 off = (complex(u, v) - places[k]) * way.conjugate()
-                column = int(np.floor(off.imag + 0.5)) + most
-                if abs(off.real) > along or column < 0 or column > 2 * most:
+                if abs(off.real) > along:
                     continue
+                column = int(np.floor(off.imag + 0.5)) + most
+                if column < 0 or column > 2 * most:
+                    continue
+                answers = 0
                 for i in range(values):
-                    out[0, column] += int(sums[2 * i + 1, v, u] * codes[k, i] > 0)
-                    out[1, column] += 1
+                    answers += int(sums[2 * i + 1, v, u] * codes[k, i] > 0)
+                out[0, column] += answers
+                out[1, column] += values
 
 
 @njit(cache=True, nogil=True)
@@ -827,6 +948,12 @@ def place_clusters(
 
 
 @njit(cache=True, nogil=True)
+def _count_some(values: Array, out: Array) -> None:
+    for j in range(out.size):
+        out[j] = np.int16(out[j] + np.int16(values[j] != 0))
+
+
+@njit(cache=True, nogil=True)
 def info_activity(sums: Array, weight: Array, grid: int, pilot_chips: int, least: float, out: Array) -> None:
     """Share of info chips with events, less `least` of pilot chips': weighted sum of pixels, `out` (K,).
 
@@ -834,22 +961,24 @@ def info_activity(sums: Array, weight: Array, grid: int, pilot_chips: int, least
     """
     chips, height, width = sums.shape
     clusters, rows, columns = weight.shape
-    events = np.zeros((2, height, width), np.int16)
+    flat = np.ascontiguousarray(sums).reshape(chips, height * width)
+    events = np.zeros((2, height * width), np.int16)
     for c in range(chips):
-        part = events[int(c >= pilot_chips)]
-        for v in range(height):
-            for u in range(width):
-                part[v, u] += np.int16(sums[c, v, u] != 0)
+        _count_some(flat[c], events[int(c >= pilot_chips)])
     by_info, by_pilot = 1 / max(chips - pilot_chips, 1), least / pilot_chips
     over = np.zeros((rows, columns))
-    for v in range(rows * grid):
-        for u in range(columns * grid):
-            over[v // grid, u // grid] += events[1, v, u] * by_info - events[0, v, u] * by_pilot
+    for r in range(rows):
+        for v in range(r * grid, (r + 1) * grid):
+            pilot, info = events[0, v * width :], events[1, v * width :]
+            for c in range(columns):
+                for u in range(c * grid, (c + 1) * grid):
+                    over[r, c] += info[u] * by_info - pilot[u] * by_pilot
     for k in range(clusters):
         total = 0.0
         for r in range(rows):
             for c in range(columns):
-                total += weight[k, r, c] * over[r, c]
+                if weight[k, r, c] != 0:
+                    total += weight[k, r, c] * over[r, c]
         out[k] = total
 
 

@@ -293,8 +293,8 @@ class RegionFollower:
             self._reach(e) if followed.size_px else _clear(self._reach(e), known)
             for e, followed in zip(expected, self.alive, strict=True)
         ]
-        for followed, box, inside in zip(self.alive, boxes, _select(events, boxes), strict=True):
-            followed.add(start_us, inside if followed.size_px else self._rhythmic(inside))
+        for followed, box, inside in zip(self.alive, boxes, self._select(events, boxes), strict=True):
+            followed.add(start_us, inside)
             rows = np.empty(box[3] - box[1], np.int64)
             width_px = followed.size_px[0] if followed.size_px else math.inf
             measured = self._measure(followed.id, box, end_us, rows, width_px)
@@ -314,6 +314,13 @@ class RegionFollower:
             if any(_lies_in_outgrown(followed, gone.latest) for gone in lost):
                 followed.outgrown = None
         return seen
+
+    def _select(self, events: Events, boxes: list[Box]) -> list[Events]:
+        """The events of a step inside the box of each region; those that it listens to."""
+        if not boxes or (len(boxes) == 1 and self.alive[0].size_px):
+            return _select(events, boxes)
+        unknown = np.array([followed.size_px is None for followed in self.alive])
+        return self._rhythm.select(events, np.array(boxes, np.int64), unknown)
 
     def _remember(self, start_us: int, events: Events) -> None:
         """Keep a step's events of the whole image, and as many before it as there is room for."""
@@ -690,7 +697,7 @@ def _select(events: Events, boxes: list[Box]) -> list[Events]:
             part = [column.copy() for column in part]
         else:
             into = ()
-        found.append(Events(*part))
+        found.append(Events.as_is(*part))
     return found
 
 

@@ -18,6 +18,7 @@ opened by rises only that come soon after the one before. One pass, four bytes a
 """
 
 import math
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -53,6 +54,9 @@ _SAME = 5
 times of a code half are of two chips, so that a tenth of its pixels, and more in some pilots, are taken for
 one now and then; a lamp that misses one rise in six is not."""
 
+_LABEL_SHIFT = 3
+"""Cells of 8 x 8 px say which box is near: few, so that they stay in the cache."""
+
 _LATE, _OFF = 0, 16
 """Kind of a time between rises: its number of whole chips, or 0 beyond; so much more where it is off them."""
 
@@ -81,6 +85,7 @@ class Rhythm:
         self._lows = _lows()
         self._min_score = min_score
         self._pixels = np.zeros((height, width), np.uint32)
+        self._labels = np.zeros([(n - 1 >> _LABEL_SHIFT) + 1 for n in (height, width)], np.int16)
         self._turn = _kernels.CLOCK_ROUND // 4
         self._row = 0
         self._seen: int | None = None
@@ -119,6 +124,38 @@ class Rhythm:
         keep = np.empty(len(events), np.bool_)
         _kernels.in_rhythm(events.x, events.y, self._pixels, self._min_score, _SAME, keep)
         return events[keep]
+
+    def select(self, events: Events, boxes: NDArray[np.int64], filtered: NDArray[np.bool_]) -> list[Events]:
+        """Those inside each of some boxes, in no more memory than twice what they need.
+
+        Args:
+            events: Of one step.
+            boxes: (left, top, right, bottom) of each, int64 (n, 4), px.
+            filtered: Of which boxes only candidates that are no lamps are meant, bool (n,).
+        """
+        begins = np.empty(len(boxes) + 1, np.int64)
+        columns = _kernels.select_boxes(
+            events.t_us,
+            events.x,
+            events.y,
+            events.p,
+            boxes,
+            filtered,
+            self._pixels,
+            self._min_score,
+            _SAME,
+            _LABEL_SHIFT,
+            self._labels,
+            begins,
+        )
+        total, found = len(columns[0]), []
+        ends = begins.tolist()
+        for begin, end in pairwise(ends):
+            part = [column[begin:end] for column in columns]
+            if 2 * (end - begin) < total:
+                part = [column.copy() for column in part]
+            found.append(Events.as_is(*part))
+        return found
 
     def measure(
         self,

@@ -10,20 +10,27 @@ from evlcp_sdk.kernels import njit
 Array = NDArray[Any]
 
 
+_STRIDE = 16
+"""Events that are passed over at once in search of a bin's end: a bar has dozens in a bin of 10 us."""
+
+
 @njit(cache=True, nogil=True)
 def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, known: Array, counts: Array) -> None:
     """Add events to `known` counts: by polarity (row) and time (column, `bin_us` each from `first_bin`)."""
-    bins = counts.shape[1]
+    bins, before = counts.shape[1], known.shape[1]
     for row in range(2):
-        for b in range(bins):
-            counts[row, b] = known[row, b] if b < known.shape[1] else 0.0
+        counts[row, :before] = known[row]
+        counts[row, before:] = 0.0
     i = np.searchsorted(t_us, first_bin * bin_us)
     # Time never runs backward, so each bin goes on where the last one ended.
     for b in range(bins):
         if i == t_us.size:
             break
-        begin = i
-        i += np.searchsorted(t_us[i:], (first_bin + b + 1) * bin_us)
+        begin, end_us = i, int(np.ceil((first_bin + b + 1) * bin_us))
+        while i + _STRIDE <= t_us.size and t_us[i + _STRIDE - 1] < end_us:
+            i += _STRIDE
+        while i < t_us.size and t_us[i] < end_us:
+            i += 1
         on = 0
         for j in range(begin, i):
             on += p[j]

@@ -21,25 +21,75 @@ def _value(first: int, second: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _cell_values(sums: Array, grid: int, out: Array) -> None:
-    """Values of the cells' polarity sums, `out` int32 (rows, columns, values)."""
-    rows, columns, length = out.shape
-    width = columns * grid
-    first, second = np.empty(width, np.int32), np.empty(width, np.int32)
-    for i in range(length):
+def _add(into: Array, part: Array) -> None:
+    """Long loops over flat arrays run on many pixels at once; those over a bar's few columns do not."""
+    for j in range(into.size):
+        into[j] = np.int16(into[j] + part[j])
+
+
+@njit(cache=True, nogil=True)
+def _values(first: Array, second: Array, out: Array) -> None:
+    """Values of pairs of polarity sums, as `_value` has them, `out` int8 (n,)."""
+    for j in range(out.size):
+        a, b = first[j], second[j]
+        up = np.int8(b > 0) - np.int8(b < 0)
+        down = np.int8(a < 0) - np.int8(a > 0)
+        out[j] = up + down * np.int8(b == 0)
+
+
+@njit(cache=True, nogil=True)
+def _fit(code: Array, values: Array, out: Array) -> None:
+    """How far values (n, many) agree with a code (n,), `out` int16 (many,): those alike less those unlike."""
+    out[:] = 0
+    for i in range(code.size):
+        value = values[i]
+        if code[i] > 0:
+            for j in range(out.size):
+                out[j] = np.int16(out[j] + value[j])
+        else:
+            for j in range(out.size):
+                out[j] = np.int16(out[j] - value[j])
+
+
+@njit(cache=True, nogil=True)
+def _cell_values(sums: Array, grid: int, rows: int, columns: int, out: Array) -> None:
+    """Values of the cells' polarity sums, `out` int8 (values, rows * columns)."""
+    chips, height, width = sums.shape
+    flat = sums.reshape(chips, height * width)
+    # Sums of the square of pixels that begins at each; where it leaves the image, there is no cell.
+    most = max(height * width - (grid - 1) * (width + 1), 0)
+    squares, values = np.empty((2, height * width), np.int16), np.empty(height * width, np.int8)
+    for i in range(len(out)):
+        squares[:] = 0
+        for chip in range(2):
+            for down in range(grid):
+                for right in range(grid):
+                    begin = down * width + right
+                    _add(squares[chip, :most], flat[2 * i + chip, begin : begin + most])
+        _values(squares[0], squares[1], values)
+        value = out[i]
         for r in range(rows):
-            first[:] = 0
-            second[:] = 0
-            for v in range(r * grid, (r + 1) * grid):
-                for u in range(width):
-                    first[u] += sums[2 * i, v, u]
-                    second[u] += sums[2 * i + 1, v, u]
+            line = values[r * grid * width :]
             for c in range(columns):
-                a, b = 0, 0
-                for u in range(c * grid, (c + 1) * grid):
-                    a += first[u]
-                    b += second[u]
-                out[r, c, i] = _value(a, b)
+                value[r * columns + c] = line[c * grid]
+
+
+@njit(cache=True, nogil=True)
+def _raise_to(most: Array, fit: Array) -> None:
+    for j in range(most.size):
+        most[j] = max(most[j], fit[j])
+
+
+@njit(cache=True, nogil=True)
+def _add_odds(most: Array, fit: Array, beside: Array, out: Array) -> None:
+    for j in range(out.size):
+        out[j] += beside[np.uint32(most[j] - fit[j])]
+
+
+@njit(cache=True, nogil=True)
+def _share(most: Array, fit: Array, beside: Array, norm: Array, out: Array) -> None:
+    for j in range(out.size):
+        out[j] = beside[np.uint32(most[j] - fit[j])] / norm[j]
 
 
 @njit(cache=True, nogil=True)
@@ -52,42 +102,43 @@ def presence(
     """
     clusters, length = codes.shape
     _, rows, columns = out.shape
-    values = np.empty((rows, columns, length), np.int32)
-    _cell_values(sums, grid, values)
-    by_value = np.ascontiguousarray(codes.T.astype(np.int32))
-    fits = np.empty(clusters, np.int32)
+    n = rows * columns
+    values = np.empty((length, n), np.int8)
+    _cell_values(np.ascontiguousarray(sums[: 2 * length]), grid, rows, columns, values)
+    seen = np.zeros(n, np.int64)
+    for i in range(length):
+        for j in range(n):
+            seen[j] += abs(values[i, j])
+    # The cells in which enough is seen, side by side.
+    which = np.empty(n + 1, np.int64)
+    m = 0
+    for j in range(n):
+        which[m] = j
+        m += int(seen[j] >= min_seen)
+    some = np.empty((length, m), np.int8)
+    for i in range(length):
+        for j in range(m):
+            some[i, j] = values[i, which[j]]
+    fits, most = np.empty((clusters, m), np.int16), np.full(m, -length, np.int16)
+    for k in range(clusters):
+        _fit(codes[k], some, fits[k])
+        _raise_to(most, fits[k])
     # A cluster whose fit is d below the best is `beside[d]` times as likely.
     beside = np.exp(np.arange(2 * length + 1) * (disagree - agree) / 2)
-    for r in range(rows):
-        for c in range(columns):
-            seen = 0
-            for i in range(length):
-                seen += abs(values[r, c, i])
-            if seen < min_seen:
-                continue
-            fits[:] = 0
-            for i in range(length):
-                for k in range(clusters):
-                    fits[k] += by_value[i, k] * values[r, c, i]
-            most = -length
-            for k in range(clusters):
-                most = max(most, fits[k])
-            norm = clusters * np.exp(-(agree * (seen + most) + disagree * (seen - most)) / 2)
-            for k in range(clusters):
-                norm += beside[most - fits[k]]
-            for k in range(clusters):
-                out[k, r, c] = beside[most - fits[k]] / norm
-
-
-@njit(cache=True, nogil=True)
-def _pixel_values(sums: Array, out: Array) -> None:
-    """Values of the pixels' polarity sums, `out` int8 (values, height, width)."""
-    length, height, width = out.shape
-    for i in range(length):
-        for v in range(height):
-            for u in range(width):
-                first, second = sums[2 * i, v, u], sums[2 * i + 1, v, u]
-                out[i, v, u] = (second > 0) - (second < 0) + (second == 0) * ((first < 0) - (first > 0))
+    none = np.empty((length + 1, 2 * length + 1))
+    for s in range(length + 1):
+        for best in range(-length, length + 1):
+            none[s, best + length] = clusters * np.exp(-(agree * (s + best) + disagree * (s - best)) / 2)
+    norm, share = np.empty(m), np.empty(m, out.dtype)
+    for j in range(m):
+        norm[j] = none[seen[which[j]], most[j] + length]
+    for k in range(clusters):
+        _add_odds(most, fits[k], beside, norm)
+    for k in range(clusters):
+        _share(most, fits[k], beside, norm, share)
+        for j in range(m):
+            r = which[j] // columns
+            out[k, r, which[j] - r * columns] = share[j]
 
 
 @njit(cache=True, nogil=True)
@@ -95,26 +146,36 @@ def pixel_maps(sums: Array, codes: Array, grid: int, selected: Array, out: Array
     """Pilot correlation of the pixels in each cluster's selected cells and their neighbours, 0 to 1."""
     clusters, length = codes.shape
     _, rows, columns = selected.shape
-    values = np.empty((length, sums.shape[1], sums.shape[2]), np.int8)
-    _pixel_values(sums, values)
-    done = np.zeros((rows, columns), np.bool_)
+    _, height, width = sums.shape
+    flat = np.ascontiguousarray(sums[: 2 * length]).reshape(2 * length, height * width)
+    values = np.empty((length, height * width), np.int8)
+    for i in range(length):
+        _values(flat[2 * i], flat[2 * i + 1], values[i])
+    fit = np.empty(height * width, np.int16)
+    near = np.empty((rows, columns), np.bool_)
     for k in range(clusters):
-        done[:] = False
-        for row in range(rows):
-            for column in range(columns):
-                if not selected[k, row, column]:
-                    continue
-                for r in range(max(row - 1, 0), min(row + 2, rows)):
-                    for c in range(max(column - 1, 0), min(column + 2, columns)):
-                        if done[r, c]:
-                            continue
-                        done[r, c] = True
-                        for v in range(r * grid, (r + 1) * grid):
-                            for u in range(c * grid, (c + 1) * grid):
-                                fit = 0
-                                for i in range(length):
-                                    fit += codes[k, i] * values[i, v, u]
-                                out[k, v, u] = max(fit, 0) / length
+        top, bottom = rows, 0
+        for r in range(rows):
+            if np.any(selected[k, r]):
+                top, bottom = min(top, max(r - 1, 0)), min(r + 2, rows)
+        if top >= bottom:
+            continue
+        begin, end = top * grid * width, bottom * grid * width
+        _fit(codes[k], values[:, begin:end], fit[: end - begin])
+        near[top:bottom] = False
+        for r in range(top, bottom):
+            for c in range(columns):
+                if selected[k, r, c]:
+                    for a in range(max(r - 1, 0), min(r + 2, rows)):
+                        for b in range(max(c - 1, 0), min(c + 2, columns)):
+                            near[a, b] = True
+        for r in range(top, bottom):
+            for c in range(columns):
+                if near[r, c]:
+                    for v in range(r * grid, (r + 1) * grid):
+                        line = fit[v * width - begin :]
+                        for u in range(c * grid, (c + 1) * grid):
+                            out[k, v, u] = max(line[u], 0) / length
 
 
 @njit(cache=True, nogil=True)
@@ -208,22 +269,28 @@ def read_words(values: Array, words: Array, scale: float, symbols: Array, llr: A
         Share of the values' sizes that agrees with the codewords; 0 without any.
     """
     clusters, length = values.shape
-    bits = llr.shape[1]
-    fit = np.zeros((clusters, len(words)))
-    zero, one = np.empty((clusters, bits)), np.empty((clusters, bits))
-    for k in range(clusters):
-        for s in range(len(words)):
-            for i in range(length):
-                fit[k, s] += values[k, i] * words[s, i] * scale
-    max_log(fit, bits, zero, one)
+    count, bits = len(words), llr.shape[1]
+    by_value, fit = np.ascontiguousarray(words.T), np.empty(count)
     size, agree = 0.0, 0.0
     for k in range(clusters):
-        symbols[k] = np.argmax(fit[k])
+        fit[:] = 0.0
+        for i in range(length):
+            value, column = values[k, i], by_value[i]
+            for s in range(count):
+                fit[s] += value * column[s] * scale
+        best = int(np.argmax(fit))
+        symbols[k] = best
         for b in range(bits):
-            llr[k, b] = zero[k, b] - one[k, b]
+            half = 1 << (bits - 1 - b)
+            zero, one = -np.inf, -np.inf
+            for first in range(0, count, 2 * half):
+                for s in range(first, first + half):
+                    zero = max(zero, fit[s])
+                    one = max(one, fit[s + half])
+            llr[k, b] = zero - one
         for i in range(length):
             size += abs(values[k, i])
-            if values[k, i] * words[symbols[k], i] > 0:
+            if values[k, i] * words[best, i] > 0:
                 agree += abs(values[k, i])
     return agree / size if size > 0 else 0.0
 
@@ -235,13 +302,15 @@ def sum_worth(
     """Presence-weighted sum of what each pixel's pair of sums is worth, `out` (K, values)."""
     clusters, rows, columns = probability.shape
     length = out.shape[1]
+    top = np.zeros((rows, columns), probability.dtype)
+    for k in range(clusters):
+        for r in range(rows):
+            for c in range(columns):
+                top[r, c] = max(top[r, c], probability[k, r, c])
     values = np.empty(length)
     for r in range(rows):
         for c in range(columns):
-            top = 0.0
-            for k in range(clusters):
-                top = max(top, probability[k, r, c])
-            if top < least:
+            if top[r, c] < least:
                 continue
             values[:] = 0.0
             for v in range(r * grid, (r + 1) * grid):
@@ -249,7 +318,7 @@ def sum_worth(
                     for i in range(length):
                         first = min(max(sums[2 * i, v, u], -most), most) + most
                         second = min(max(sums[2 * i + 1, v, u], -most), most) + most
-                        values[i] += worth[first, second]
+                        values[i] += worth[np.uint64(first), np.uint64(second)]
             for k in range(clusters):
                 weight = probability[k, r, c]
                 if weight >= least:

@@ -233,6 +233,33 @@ def test_events_in_boxes(n, freeze):
         assert taken == len(want)
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("many", [0, 1, 2, 40])
+def test_events_in_many_boxes_at_once(seed, many):
+    rng = np.random.default_rng(seed)
+    events = random_events(rng, 700)
+    shape = (HEIGHT, WIDTH)
+    score, same = rng.integers(0, 41, shape), rng.integers(0, 8, shape)
+    pixels = states(rng.integers(0, 2**19, shape), rng.integers(0, 14, shape), score, same)
+    # Empty ones and equal ones among them, and such that overlap.
+    left, top = rng.integers(0, WIDTH, many), rng.integers(0, HEIGHT, many)
+    right = np.minimum(left + rng.integers(0, 9, many), WIDTH)
+    boxes = np.stack([left, top, right, np.minimum(top + rng.integers(1, 9, many), HEIGHT)], 1)
+    boxes[1::7] = boxes[::7][: len(boxes[1::7])]
+    filtered = rng.random(many) < 0.5
+    labels, begins = np.zeros((2, 3), np.int16), np.empty(many + 1, np.int64)
+    columns = _kernels.select_boxes(
+        events.t_us, events.x, events.y, events.p, boxes, filtered, pixels, 20, 5, 3, labels, begins
+    )
+    assert not labels.any()
+    listened = ((score >= 20) & (same < 5))[events.y, events.x]
+    for k, (box, only) in enumerate(zip(boxes.tolist(), filtered, strict=True)):
+        want = twins.select_box(events[listened] if only else events, tuple(box))
+        for got, name in zip(columns, ("t_us", "x", "y", "p"), strict=True):
+            assert_array_equal(got[begins[k] : begins[k + 1]], getattr(want, name))
+    assert begins[-1] == len(columns[0])
+
+
 @pytest.mark.parametrize("freeze", [1, 2])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_polarity_sums(seed, freeze):
