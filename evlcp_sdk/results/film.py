@@ -221,7 +221,7 @@ def _save_mp4(pictures: Sequence[Image.Image], path: Path) -> None:
         for picture in pictures:
             whole = Image.new("RGB", (width, height))
             whole.paste(picture)
-            file.mux(stream.encode(av.VideoFrame.from_image(whole)))
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(np.asarray(whole), format="rgb24")))
         file.mux(stream.encode())
 
 
