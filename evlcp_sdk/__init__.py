@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.run import Reception, diagnose, receive, receive_to_folder
     from evlcp_sdk.rx.receiver import Receiver
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
-    from evlcp_sdk.scene.bar import BarLayout
+    from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid, LedRing, LedTable
     from evlcp_sdk.scene.camera import CameraModel
     from evlcp_sdk.scene.sites import BarSite, load_sites
     from evlcp_sdk.simulated import SimulatedSource, simulate
@@ -114,6 +114,10 @@ __all__ = [
     "GnssLog",
     "InputError",
     "InterruptedRunError",
+    "LedColumns",
+    "LedGrid",
+    "LedRing",
+    "LedTable",
     "Link",
     "Loss",
     "Measure",
@@ -221,7 +225,7 @@ _HOMES = {
     "run": ("Reception", "diagnose", "receive", "receive_to_folder"),
     "rx.receiver": ("Receiver",),
     "scene.attitude": ("Attitude", "AttitudeLog"),
-    "scene.bar": ("BarLayout",),
+    "scene.bar": ("BarLayout", "LedColumns", "LedGrid", "LedRing", "LedTable"),
     "scene.camera": ("CameraModel",),
     "scene.sites": ("BarSite", "load_sites"),
     "simulated": ("SimulatedSource", "simulate"),

@@ -16,7 +16,7 @@ from typing import Any, Literal, overload
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
-from evlcp_sdk.errors import ConfigError, EvlcpError, PluginError, UnknownAlgorithmError
+from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, PluginError, UnknownAlgorithmError
 from evlcp_sdk.link.blocks import BlockCoder, packet_bits
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
 from evlcp_sdk.plugin.records import message_kinds
@@ -32,12 +32,12 @@ from evlcp_sdk.plugin.roles import (
     Synchronization,
     Tracking,
 )
-from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.bar import BarLayout, read_leds
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
-from evlcp_sdk.specs import SpecError, build, parse_value, read_toml
+from evlcp_sdk.specs import SpecError, build, parse_value, read_toml, shown
 from evlcp_sdk.spelling import nearest
 
-__all__ = ["Link", "load_link", "resolve"]
+__all__ = ["Link", "load_link", "resolve", "with_leds"]
 
 _SPECS: dict[str, type[Any]] = {
     "camera": CameraModel,
@@ -187,7 +187,7 @@ def load_link(
     source = ""
     if path is not None:
         source = str(path)
-        table = read_toml(path)
+        table = with_leds(read_toml(path), Path(path).parent, f"{source}: ")
     set_here = set()
     for override in overrides:
         section, key, value = _parse_override(override)
@@ -195,6 +195,8 @@ def load_link(
         if not isinstance(keys, dict):
             keys = table[section] = {}
         keys[key] = value
+        if (section, key) == ("bar", "leds_file"):
+            keys.pop("leds", None)
         set_here.add((section, key))
     return resolve(table, registry, source=source, overridden=frozenset(set_here))
 
@@ -222,6 +224,8 @@ def resolve(
     8
     """
     registry = Registry.load() if registry is None else registry
+    where_leds = "--set" if ("bar", "leds_file") in overridden else source
+    table = with_leds(table, before=f"{where_leds}: " if where_leds else "")
     faults: list[str | UnknownAlgorithmError] = []
 
     def fault(section: str, key: str | None, text: str) -> None:
@@ -265,8 +269,13 @@ def resolve(
                 continue
             cls = registry.load_class(section, name)
         try:
-            built[section] = build(cls, keys)
-            resolved[section] = head | json.loads(json.dumps(asdict(built[section])))
+            if section == "bar":
+                built[section] = BarLayout.of_table(keys)
+                plain = built[section].table()
+            else:
+                built[section] = build(cls, keys)
+                plain = head | asdict(built[section])
+            resolved[section] = json.loads(json.dumps(plain))
         except SpecError as refused:
             for path, text in refused.faults:
                 fault(section, path[0], "".join(f".{part}" for part in path[1:]) + text)
@@ -278,6 +287,34 @@ def resolve(
         raise ConfigError("\n".join(str(f) for f in faults))
 
     return _assembled(built, resolved, revisions, message_kinds(registry))
+
+
+def with_leds(table: Mapping[str, Any], folder: Path = Path(), before: str = "") -> dict[str, Any]:
+    """The same table of a link, the CSV file of LEDs that its `[bar]` names read into it.
+
+    Args:
+        table: As read from TOML.
+        folder: What the file's name is relative to.
+        before: What stands in front of a fault.
+
+    Raises:
+        ConfigError: The file cannot be read, does not describe LEDs, or stands beside LEDs.
+    """
+    found, bar = dict(table), table.get("bar")
+    if not isinstance(bar, Mapping) or "leds_file" not in bar:
+        return found
+    keys = dict(bar)
+    name = keys.pop("leds_file")
+    if not isinstance(name, str):
+        raise ConfigError(f"{before}bar.leds_file = {shown(name)}: expected the name of a CSV file")
+    if "leds" in keys:
+        raise ConfigError(f"{before}bar.leds_file = {shown(name)}: expected it, or bar.leds, not both")
+    try:
+        keys["leds"] = read_leds(folder / name)
+    except (ConfigError, InputError) as fault:
+        raise ConfigError(f"{before}bar.leds_file: {fault}") from fault
+    found["bar"] = {"shape": "table", **keys}
+    return found
 
 
 def _assembled(

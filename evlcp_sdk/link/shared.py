@@ -11,7 +11,6 @@ from evlcp_sdk.specs import shown
 
 __all__ = ["differences"]
 
-_LAYOUT = ("rows", "columns", "led_pitch_m", "cluster_rows", "cluster_columns")
 _MESSAGES_TRIED = 4
 
 
@@ -39,7 +38,8 @@ def _differences(sent: Link, received: Link, messages: bool) -> Iterator[str]:
     if sent.codebook != received.codebook:
         yield from _codes(sent, received)
     if not _same_layout(sent, received):
-        yield from _keys(sent, received, "bar", *_LAYOUT)
+        other_shape = [*_keys(sent, received, "bar", "shape")]
+        yield from other_shape or _keys(sent, received, "bar", *sent.table["bar"])
     if messages and not _same_correction(sent, received):
         yield from _section(sent, received, "error-correction") or [
             _other_codes(sent, received, "error-correction")

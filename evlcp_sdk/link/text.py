@@ -6,6 +6,7 @@ from typing import Any
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
+from evlcp_sdk.scene.bar import SHAPES, BarLayout
 from evlcp_sdk.specs import spec_model, toml_value
 
 __all__ = ["to_toml"]
@@ -40,9 +41,12 @@ def _toml_lines(link: Link, registry: Registry) -> Iterator[str]:
     yield ""
     for section, values in link.table.items():
         thing = link.algorithms.get(section) or getattr(link, section)
-        schema = spec_model(type(thing)).model_json_schema()["properties"]
-        yield f"# {_first_line(type(thing))}"
+        cls = type(thing.shape if isinstance(thing, BarLayout) else thing)
+        schema = spec_model(cls).model_json_schema()["properties"]
+        yield f"# {_first_line(cls)}"
         yield f"[{section}]"
+        if "shape" in values:
+            yield f'shape = "{values["shape"]}"  # or {", ".join(s for s in SHAPES if s != values["shape"])}'
         if section in ROLES:
             ids = dict.fromkeys(e.algorithm.id for e in registry.installed(section))
             others = [id for id in ids if id != values["id"]]

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 if TYPE_CHECKING:
     # Commands that only list the roles need no NumPy.
@@ -136,7 +136,13 @@ class Decoding(ABC):
 
 
 class Ranging(ABC):
-    """A decoded frame's image to distance."""
+    """A decoded frame's image to distance.
+
+    Attributes:
+        measures: Whether it gives distances at all.
+    """
+
+    measures: ClassVar[bool] = True
 
     @abstractmethod
     def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
@@ -251,25 +257,27 @@ class Role:
         abstract: The class that its algorithms derive from.
         default: Id of the algorithm where the link names none.
         verb: What it does, in one line.
-        default_elsewhere: Id of it for a bar that is not one column of three clusters or more, which the
-            default refuses; None where that one takes every bar.
+        default_elsewhere: Ids of it, of several clusters and of one, for bars that are not one even column of
+            three clusters or more, which the default refuses; None where that one takes every bar.
     """
 
     name: str
     abstract: type[ABC]
     default: str
     verb: str
-    default_elsewhere: str | None = None
+    default_elsewhere: tuple[str, str] | None = None
 
     def default_for(self, bar: BarLayout | None) -> str:
         """Id of the algorithm where the link names none, for its bar; None for one that is not known.
 
-        >>> from evlcp_sdk.scene.bar import BarLayout
-        >>> ROLES["ranging"].default_for(BarLayout(rows=96, columns=2))
-        'poc'
+        >>> from evlcp_sdk.scene.bar import BarLayout, LedGrid
+        >>> [ROLES["ranging"].default_for(BarLayout(LedGrid(96, columns))) for columns in (1, 2)]
+        ['joint-scale', 'poc']
         """
-        column = bar is None or (bar.columns == bar.cluster_columns and bar.clusters >= 3)
-        return self.default if column or self.default_elsewhere is None else self.default_elsewhere
+        if bar is None or not self.default_elsewhere or (bar.clusters >= 3 and bar.column_pitch_m > 0):
+            return self.default
+        many, one = self.default_elsewhere
+        return one if bar.clusters == 1 else many
 
 
 ROLES: Mapping[str, Role] = MappingProxyType(
@@ -281,7 +289,7 @@ ROLES: Mapping[str, Role] = MappingProxyType(
             Role("synchronization", Synchronization, "barker", "a region's events -> packet timing"),
             Role("separation", Separation, "wh-correlation", "a pilot's image -> where each cluster is"),
             Role("decoding", Decoding, "motion-feedback", "a frame's image -> soft symbols"),
-            Role("ranging", Ranging, "joint-scale", "a decoded frame's image -> distance", "poc"),
+            Role("ranging", Ranging, "joint-scale", "a decoded frame's image -> distance", ("poc", "none")),
             Role("tracking", Tracking, "none", "distance and image position over time"),
             Role("error-correction", ErrorCorrection, "polar", "message bits <-> coded bits, soft input"),
         )

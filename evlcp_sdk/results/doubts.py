@@ -466,7 +466,7 @@ def _transmitter(
     yield from _codewords(number, one, link, counts, seen)
     yield from _unsure(number, one, link, seen)
     own = (one.frames - one.echoes) / link.packet.pilot_every
-    if one.ranged < _RANGED_SHARE * own:
+    if link.algorithm("ranging").measures and one.ranged < _RANGED_SHARE * own:
         yield Doubt(
             "few-distances",
             f"{one.ranged} of {own:.0f} frames have a distance: too few boundaries between clusters are seen,"

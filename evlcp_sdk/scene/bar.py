@@ -1,21 +1,47 @@
 """The bar: where a transmitter's LEDs stand, and which cluster each belongs to."""
 
-from dataclasses import dataclass
-from typing import Annotated
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import csv_number, read_csv
+from evlcp_sdk.specs import SpecError, build, shown
+from evlcp_sdk.spelling import nearest
 
-__all__ = ["BarLayout"]
+__all__ = [
+    "SHAPES",
+    "BarLayout",
+    "LedColumns",
+    "LedGrid",
+    "LedRing",
+    "LedTable",
+    "Shape",
+    "read_leds",
+]
 
 _MOST_LEDS = 1 << 16
 
+_MOST_M = 100.0
+"""Farther from the centre stands no LED of one transmitter."""
+
+_SAME_M = 1e-9
+
+Floats = NDArray[np.float64]
+Leds = tuple[Floats, NDArray[np.int64]]
+"""LED centres (x right, y down, z towards who looks at them), m, float64 (n, 3), and their clusters, (n,)."""
+
 
 @dataclass(frozen=True)
-class BarLayout:
+class LedGrid:
     """LEDs on a grid of rows and columns, top left first, grouped row by row into equal clusters.
 
     A bar is one column; a panel of many rows and columns is grouped into blocks of
@@ -23,12 +49,6 @@ class BarLayout:
 
     Raises:
         ConfigError: The blocks do not tile the grid, or it has more than 65536 LEDs.
-
-    >>> BarLayout().clusters
-    16
-    >>> panel = BarLayout(rows=16, columns=16, cluster_rows=4, cluster_columns=4)
-    >>> panel.cluster_centres_m()[1].round(3).tolist()
-    [-0.02, -0.06]
     """
 
     rows: Annotated[int, Field(gt=0, le=4096, description="LEDs from top to bottom.")] = 96
@@ -38,41 +58,268 @@ class BarLayout:
     cluster_columns: Annotated[int, Field(gt=0, description="LED columns of a cluster.")] = 1
 
     def __post_init__(self) -> None:
-        if self.rows * self.columns > _MOST_LEDS:
-            raise ConfigError(
-                f"bar.rows = {self.rows}, bar.columns = {self.columns}: expected at most {_MOST_LEDS} LEDs"
-            )
+        _expect_number(self.rows * self.columns, f"bar.rows = {self.rows}, bar.columns = {self.columns}")
         for name in ("rows", "columns"):
-            n, block = getattr(self, name), getattr(self, f"cluster_{name}")
-            if n % block:
-                raise ConfigError(f"bar.cluster_{name} = {block}: expected a divisor of bar.{name} = {n}")
+            _expect_divisor(f"cluster_{name}", getattr(self, f"cluster_{name}"), name, getattr(self, name))
 
     @property
+    def led_m(self) -> float:
+        """Height that one LED lights, m."""
+        return self.led_pitch_m
+
+    def placed(self) -> Leds:
+        """Where the LEDs stand, and their clusters."""
+        y, x = np.mgrid[: self.rows, : self.columns]
+        across = self.columns // self.cluster_columns
+        which = (y // self.cluster_rows) * across + x // self.cluster_columns
+        place = np.stack([x - (self.columns - 1) / 2, y - (self.rows - 1) / 2, np.zeros(x.shape)], -1)
+        return place.reshape(-1, 3) * self.led_pitch_m, which.ravel()
+
+
+@dataclass(frozen=True)
+class LedColumns:
+    """Columns of LEDs apart, such as a car's two lamps; clusters are counted down the first, then the next.
+
+    Raises:
+        ConfigError: Clusters do not tile a column, or there are more than 65536 LEDs.
+    """
+
+    columns: Annotated[int, Field(gt=0, le=64, description="How many columns.")] = 2
+    apart_m: Annotated[float, Field(ge=1e-6, le=100, description="From one column to the next.")] = 0.5
+    rows: Annotated[int, Field(gt=0, le=4096, description="LEDs of a column.")] = 48
+    led_pitch_m: Annotated[float, Field(ge=1e-6, le=100, description="Spacing of LEDs in a column.")] = 0.01
+    cluster_rows: Annotated[int, Field(gt=0, description="LEDs of a cluster.")] = 6
+
+    def __post_init__(self) -> None:
+        _expect_number(self.rows * self.columns, f"bar.rows = {self.rows}, bar.columns = {self.columns}")
+        _expect_divisor("cluster_rows", self.cluster_rows, "rows", self.rows)
+
+    @property
+    def led_m(self) -> float:
+        """Height that one LED lights, m."""
+        return self.led_pitch_m
+
+    def placed(self) -> Leds:
+        """Where the LEDs stand, and their clusters."""
+        x, y = np.mgrid[: self.columns, : self.rows]
+        place = np.stack(
+            [
+                (x - (self.columns - 1) / 2) * self.apart_m,
+                (y - (self.rows - 1) / 2) * self.led_pitch_m,
+                np.zeros(x.shape),
+            ],
+            -1,
+        )
+        which = x * (self.rows // self.cluster_rows) + y // self.cluster_rows
+        return place.reshape(-1, 3), which.ravel()
+
+
+@dataclass(frozen=True)
+class LedRing:
+    """LEDs evenly on a circle, clockwise from the top as one looks at it, grouped in that order.
+
+    Raises:
+        ConfigError: Clusters do not tile the ring.
+    """
+
+    leds: Annotated[int, Field(gt=0, le=4096, description="LEDs on the circle.")] = 12
+    radius_m: Annotated[float, Field(ge=1e-6, le=100, description="From the centre to an LED.")] = 0.25
+    cluster_leds: Annotated[int, Field(gt=0, description="Neighbouring LEDs of a cluster.")] = 1
+    led_m: Annotated[float, Field(ge=1e-6, le=1, description="Width and height that one LED lights.")] = 0.005
+
+    def __post_init__(self) -> None:
+        _expect_divisor("cluster_leds", self.cluster_leds, "leds", self.leds)
+
+    def placed(self) -> Leds:
+        """Where the LEDs stand, and their clusters."""
+        number = np.arange(self.leds)
+        turn = 2 * np.pi * number / self.leds
+        # To the nanometre, so that LEDs opposite each other stand in one row or column.
+        place = np.stack([np.sin(turn), -np.cos(turn), 0 * turn], 1) * self.radius_m
+        return np.round(place, 9), number // self.cluster_leds
+
+
+@dataclass(frozen=True)
+class LedTable:
+    """Any LEDs: one row each, in any order; clusters of any size, counted from 0.
+
+    Raises:
+        ConfigError: There are none or more than 65536, a number lies beyond 100 m, or a cluster has no LED.
+    """
+
+    leds: Annotated[
+        tuple[tuple[float, float, float, int], ...],
+        Field(
+            description="LEDs [x, y, z, cluster]: to the right, down, and towards who looks at them, m,"
+            " from the transmitter's centre."
+        ),
+    ] = ((0.0, 0.0, 0.0, 0),)
+    led_m: Annotated[float, Field(ge=1e-6, le=1, description="Width and height that one LED lights.")] = 0.005
+
+    def __post_init__(self) -> None:
+        _expect_number(len(self.leds), f"bar.leds: {len(self.leds)} LEDs")
+        for i, (*place, cluster) in enumerate(self.leds):
+            for axis, value in zip("xyz", place, strict=True):
+                if not abs(value) <= _MOST_M:
+                    raise ConfigError(f"bar.leds.{i}: {axis} = {value:g}: expected -100 to 100 m")
+            if not 0 <= cluster < _MOST_LEDS:
+                raise ConfigError(f"bar.leds.{i}: cluster = {cluster}: expected 0 to {_MOST_LEDS - 1}")
+        here: dict[tuple[int, ...], int] = {}
+        for i, led in enumerate(self.leds):
+            first = here.setdefault(tuple(round(value * 1e6) for value in led[:3]), i)
+            if first != i:
+                raise ConfigError(f"bar.leds.{i}: stands where bar.leds.{first} does, to the micrometre")
+        clusters = {led[3] for led in self.leds}
+        missing = next((k for k in range(max(clusters)) if k not in clusters), None)
+        if missing is not None:
+            raise ConfigError(
+                f"bar.leds: no LED of cluster {missing}: expected clusters 0 to {max(clusters)}, all of them"
+            )
+
+    def placed(self) -> Leds:
+        """Where the LEDs stand, and their clusters."""
+        table = np.array(self.leds, np.float64)
+        return table[:, :3].copy(), table[:, 3].astype(np.int64)
+
+
+Shape = LedGrid | LedColumns | LedRing | LedTable
+
+SHAPES: Mapping[str, type[Shape]] = MappingProxyType(
+    {"grid": LedGrid, "columns": LedColumns, "ring": LedRing, "table": LedTable}
+)
+"""What `bar.shape` names; a grid need not be named."""
+
+
+@dataclass(frozen=True)
+class BarLayout:
+    """A transmitter's LEDs and their clusters: a table, however it was described.
+
+    >>> BarLayout().clusters
+    16
+    >>> panel = BarLayout(LedGrid(rows=16, columns=16, cluster_rows=4, cluster_columns=4))
+    >>> panel.cluster_centres_m()[1].round(3).tolist()
+    [-0.02, -0.06]
+    >>> BarLayout(LedRing(leds=12)).led_clusters().tolist()
+    [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]
+    """
+
+    shape: Shape = field(default_factory=LedGrid)
+
+    @classmethod
+    def of_table(cls, table: Mapping[str, Any]) -> "BarLayout":
+        """The layout that a table `[bar]` of a link describes; what it leaves out has its default.
+
+        Raises:
+            SpecError: Keys or values are wrong.
+            ConfigError: Values that are right each by itself do not go together.
+        """
+        keys = dict(table)
+        name = keys.pop("shape", "grid")
+        if name not in SHAPES:
+            near = nearest(name, list(SHAPES)) if isinstance(name, str) else ""
+            said = f" = {shown(name)}: expected one of {', '.join(SHAPES)}{near}"
+            raise SpecError([(("shape",), said)])
+        return cls(build(SHAPES[name], keys))
+
+    @cached_property
+    def _leds(self) -> Leds:
+        place, which = self.shape.placed()
+        place.flags.writeable = which.flags.writeable = False
+        return place, which
+
+    def table(self) -> dict[str, Any]:
+        """The table `[bar]` of a link that describes it, every default written out."""
+        name = next(name for name, shape in SHAPES.items() if isinstance(self.shape, shape))
+        return ({} if name == "grid" else {"shape": name}) | asdict(self.shape)
+
+    @cached_property
     def clusters(self) -> int:
         """Number of clusters K."""
-        return (self.rows // self.cluster_rows) * (self.columns // self.cluster_columns)
+        return int(self._leds[1].max()) + 1
 
     @property
     def length_m(self) -> float:
-        """From the outer edge of the first row of LEDs to that of the last, m."""
-        return self.rows * self.led_pitch_m
+        """From the upper edge of the topmost LED to the lower edge of the lowest, m."""
+        if isinstance(self.shape, LedGrid | LedColumns):
+            return self.shape.rows * self.shape.led_pitch_m
+        return float(np.ptp(self._leds[0][:, 1])) + self.shape.led_m
 
-    def led_positions_m(self) -> NDArray[np.float64]:
-        """LED centres (x right, y down) from the bar's centre, m, float64 (rows * columns, 2)."""
-        y, x = np.mgrid[: self.rows, : self.columns]
-        xy = np.stack([x - (self.columns - 1) / 2, y - (self.rows - 1) / 2], -1)
-        return xy.reshape(-1, 2) * self.led_pitch_m
+    @property
+    def width_m(self) -> float:
+        """From the left edge of the leftmost LED to the right edge of the rightmost, m."""
+        return float(np.ptp(self._leds[0][:, 0])) + self.shape.led_m
+
+    def led_positions_m(self) -> Floats:
+        """LED centres (x right, y down, z towards who looks at them) from the bar's, m, float64 (n, 3)."""
+        return self._leds[0]
 
     def led_clusters(self) -> NDArray[np.int64]:
-        """Cluster of each LED, int64 (rows * columns,)."""
-        y, x = np.mgrid[: self.rows, : self.columns]
-        across = self.columns // self.cluster_columns
-        which: NDArray[np.int64] = (y // self.cluster_rows) * across + x // self.cluster_columns
-        return which.ravel()
+        """Cluster of each LED, int64 (n,)."""
+        return self._leds[1]
 
-    def cluster_centres_m(self) -> NDArray[np.float64]:
-        """Cluster centres (x right, y down) from the bar's centre, m, float64 (K, 2)."""
-        which = self.led_clusters()
+    def cluster_positions_m(self) -> Floats:
+        """Cluster centres (x right, y down, z towards who looks at them), m, float64 (K, 3)."""
+        place, which = self._leds
         count = np.bincount(which)
-        led = self.led_positions_m()
-        return np.stack([np.bincount(which, led[:, i]) / count for i in (0, 1)], -1)
+        return np.stack([np.bincount(which, place[:, i]) / count for i in range(3)], -1)
+
+    def cluster_centres_m(self) -> Floats:
+        """Cluster centres (x right, y down) as one looks at them from the front, m, float64 (K, 2)."""
+        return self.cluster_positions_m()[:, :2]
+
+    @property
+    def column_pitch_m(self) -> float:
+        """From cluster to cluster of one even column, the first at its top, m; NaN for another layout.
+
+        >>> round(BarLayout().column_pitch_m, 9)
+        0.06
+        """
+        centres = self.cluster_positions_m()
+        steps = np.diff(centres, axis=0)
+        if len(steps) == 0 or np.abs(steps[:, [0, 2]]).max() > _SAME_M:
+            return math.nan
+        even = steps[:, 1].min() > 0 and np.ptp(steps[:, 1]) < 1e-6 * steps[0, 1]
+        return float(steps[0, 1]) if even else math.nan
+
+
+def read_leds(path: Path | str) -> list[list[float | int]]:
+    """The rows [x, y, z, cluster] of a CSV file with the columns x_m, y_m, cluster and, if it has one, z_m.
+
+    Raises:
+        InputError: The file cannot be read, or is not CSV.
+        ConfigError: A column is missing, a value is not what it should be, or there are more than 65536 LEDs.
+    """
+    columns, rows = read_csv(path)
+    for name in ("x_m", "y_m", "cluster"):
+        if name not in columns:
+            raise ConfigError(
+                f"{path}: line 1: no column {name}, expected x_m, y_m, cluster and, if needed, z_m"
+            )
+    if len(rows) > _MOST_LEDS:
+        raise ConfigError(f"{path}: line {rows[_MOST_LEDS][0]}: expected at most {_MOST_LEDS} LEDs")
+    if not rows:
+        raise ConfigError(f"{path}: line 2: expected an LED a line")
+    found: list[list[float | int]] = []
+    for line, row in rows:
+        place = [
+            csv_number(path, line, name, row[name], (-_MOST_M, _MOST_M)) if name in row else 0.0
+            for name in ("x_m", "y_m", "z_m")
+        ]
+        cluster = csv_number(path, line, "cluster", row["cluster"], (0, _MOST_LEDS - 1))
+        if cluster != int(cluster):
+            raise ConfigError(
+                f"{path}: line {line}: cluster = {row['cluster']!r:.40}: expected a whole number"
+            )
+        found.append([*place, int(cluster)])
+    return found
+
+
+def _expect_number(leds: int, said: str) -> None:
+    if not 0 < leds <= _MOST_LEDS:
+        least = "" if leds else ", and one at least"
+        raise ConfigError(f"{said}: expected at most {_MOST_LEDS} LEDs{least}")
+
+
+def _expect_divisor(name: str, block: int, of: str, n: int) -> None:
+    if n % block:
+        raise ConfigError(f"bar.{name} = {block}: expected a divisor of bar.{of} = {n}")

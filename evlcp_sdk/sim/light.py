@@ -17,25 +17,27 @@ from evlcp_sdk.link.compose import beacon_of_site, packets_of
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.sites import BarSite
+from evlcp_sdk.sim.leds import LitStrip, lit_strips
 from evlcp_sdk.sim.motion import Strip
-from evlcp_sdk.sim.optics import led_light_w_m2, strip_width_m
+from evlcp_sdk.sim.optics import led_light_w_m2
 from evlcp_sdk.sim.scene import (
     MOST_SOURCES,
     BarSpec,
     LampSpec,
+    LensSpec,
     ReflectionSpec,
     Scene,
     WiperSpec,
     links_of,
 )
-from evlcp_sdk.sim.world import bar_across, bar_axis, sites_of
+from evlcp_sdk.sim.world import bar_across, bar_axis, bar_towards, sites_of
 
 __all__ = [
     "BarLight",
-    "ColumnLight",
     "LampLight",
     "Pane",
     "Source",
+    "StripLight",
     "reflections_of",
     "sources_of",
     "wiper_switches",
@@ -102,13 +104,13 @@ class Source(Protocol):
 class BarLight:
     """A transmitter's light: packets, one after another, or the chips of a file.
 
-    Its `strips` are what shines: one for each column of clusters, all switched by the same chips; its
-    `images` the same again for each reflection.
+    Its `strips` are what shines, all switched by the same chips, its `light_w_m2` the irradiance of a pixel
+    that the brightest fills; its `images` are the same again for each reflection.
 
     Args:
         bar: The bar.
         link: The link that it sends with.
-        light_w_m2: Irradiance of a pixel that it fills.
+        lens: The lens, by which LEDs light a pixel.
         seed: Of its payload and its start, where the bar has none of its own.
         source: What faults name.
         transmitter_id: What its messages say who it is.
@@ -124,7 +126,7 @@ class BarLight:
         self,
         bar: BarSpec,
         link: Link,
-        light_w_m2: float,
+        lens: LensSpec,
         seed: int,
         source: str = "bars",
         transmitter_id: int = 1,
@@ -133,7 +135,12 @@ class BarLight:
     ) -> None:
         self.bar = bar
         self.link = link
-        self.light_w_m2 = light_w_m2
+        try:
+            strips = lit_strips(bar, link.bar)
+        except ConfigError as refused:
+            raise ConfigError(f"{source}.link: {refused}") from refused
+        lights = [led_light_w_m2(bar, strip, lens) for strip in strips]
+        self.light_w_m2 = max(lights)
         self.centre_m = (bar.x_m, bar.y_m, bar.z_m)
         self.rate_hz = link.air.chip_rate_hz * (1 + bar.ppm * 1e-6)
         # The codes rest for two chips at most, and by half their swing from their mean.
@@ -164,25 +171,20 @@ class BarLight:
             )
         self.start_chip = start
         self._covers = self._checked_covers(source)
-        self.strips = self._strips()
+        shares = [light / self.light_w_m2 if self.light_w_m2 else 1.0 for light in lights]
+        self.strips = tuple(map(self._strip, strips, shares))
         self.images = tuple(image for one in reflections for image in self._images(one))
 
-    def _strips(self) -> tuple["ColumnLight", ...]:
-        """One strip for each column of clusters, from the left."""
-        bar, layout = self.bar, self.link.bar
-        x, y, z = (layout.length_m * part for part in bar_axis(bar))
-        across = np.array(bar_across(bar))
-        columns = layout.columns // layout.cluster_columns
-        rows = layout.rows // layout.cluster_rows
-        found = []
-        for column in range(columns):
-            aside = ((column + 0.5) * layout.cluster_columns - layout.columns / 2) * layout.led_pitch_m
-            centre = tuple((np.array(self.centre_m) + aside * across).tolist())
-            strip = Strip(centre, (x, y, z), strip_width_m(bar, layout), rows)
-            found.append(ColumnLight(self, strip, slice(column, None, columns)))
-        return tuple(found)
+    def _strip(self, strip: LitStrip, share: float) -> "StripLight":
+        """A strip of the layout in the scene, with its share of the light."""
+        axes = np.stack([bar_across(self.bar), bar_axis(self.bar), bar_towards(self.bar)])
+        x, y, z = (np.array(self.centre_m) + np.array(strip.centre_m) @ axes).tolist()
+        along_x, along_y, along_z = (strip.length_m * axes[int(strip.down)]).tolist()
+        along = along_x, along_y, along_z
+        placed = Strip((x, y, z), along, strip.width_m, len(strip.clusters), strip.cuts)
+        return StripLight(self, placed, strip.clusters, share)
 
-    def _images(self, reflection: ReflectionSpec) -> tuple["ColumnLight", ...]:
+    def _images(self, reflection: ReflectionSpec) -> tuple["StripLight", ...]:
         """The columns as a reflection shows them."""
         ends = np.concatenate([column.strip.cuts_m()[[0, -1]] for column in self.strips])
         if reflection.kind == "road":
@@ -206,7 +208,7 @@ class BarLight:
                 replace(
                     column,
                     strip=strip,
-                    share=reflection.share,
+                    share=column.share * reflection.share,
                     blur_px=reflection.blur_px,
                     pane=pane if reflection.kind == "window" else None,
                     direct=False,
@@ -335,13 +337,13 @@ class BarLight:
 
 
 @dataclass(frozen=True, eq=False)
-class ColumnLight:
-    """The light of one column of a bar's clusters, or of an image of it.
+class StripLight:
+    """The light of one strip of a bar's LEDs, or of an image of it.
 
     Attributes:
         bar: The bar.
-        strip: Where the column is.
-        clusters: Which of the bar's clusters stand in it, from its top.
+        strip: Where it is.
+        clusters: Which of the bar's clusters each of its parts shows, -1 for a dark part, int64 (parts,).
         share: Share of the bar's light.
         blur_px: Sigma of the blur that it has beside the lens's, px.
         pane: The pane that shows it; None for none.
@@ -350,7 +352,7 @@ class ColumnLight:
 
     bar: BarLight
     strip: Strip
-    clusters: slice
+    clusters: NDArray[np.int64]
     share: float = 1.0
     blur_px: float = 0.0
     pane: Pane | None = None
@@ -371,7 +373,8 @@ class ColumnLight:
         when, levels = self.bar.switches(begin_us, end_us)
         if self.direct:
             when, levels = self.bar.cover(when, levels, begin_us, end_us)
-        return when, levels[:, self.clusters]
+        # A dark part is the column behind the last cluster's.
+        return when, np.pad(levels, ((0, 0), (0, 1)))[:, self.clusters]
 
 
 def _read_chips(path: Path, clusters: int) -> NDArray[np.uint8]:
@@ -514,7 +517,7 @@ def sources_of(scene: Scene, registry: Registry | None = None) -> tuple[list[Bar
         BarLight(
             bar,
             link,
-            led_light_w_m2(bar, link.bar, scene.lens),
+            scene.lens,
             scene.seed + i,
             f"bars.{i}",
             i + 1 if bar.transmitter_id is None else bar.transmitter_id,
@@ -527,7 +530,7 @@ def sources_of(scene: Scene, registry: Registry | None = None) -> tuple[list[Bar
     columns = sum(len(bar.strips) + len(bar.images) for bar in bars)
     if columns + len(lamps) > MOST_SOURCES:
         raise ConfigError(
-            f"bars and lamps: {columns} columns of clusters and {len(lamps)} lamps, expected at most"
+            f"bars and lamps: {columns} columns and rows of LEDs and {len(lamps)} lamps, expected at most"
             f" {MOST_SOURCES} together, reflections included"
         )
     return bars, lamps

@@ -169,17 +169,19 @@ class Strip:
         centre_m: x, y, z of its middle.
         along_m: From its first end to its last.
         width_m: Its width.
-        clusters: Parts of equal length.
+        clusters: Its parts.
+        cuts: Where they start and end, shares of its length from -0.5 to 0.5; none: they are equal.
     """
 
     centre_m: tuple[float, float, float]
     along_m: tuple[float, float, float]
     width_m: float
     clusters: int
+    cuts: tuple[float, ...] = ()
 
     def cuts_m(self) -> Floats:
         """Where its clusters start and end: float64 (clusters + 1, 3)."""
-        share = np.linspace(-0.5, 0.5, self.clusters + 1)
+        share = np.array(self.cuts) if self.cuts else np.linspace(-0.5, 0.5, self.clusters + 1)
         cuts: Floats = np.asarray(self.centre_m) + share[:, None] * np.asarray(self.along_m)
         return cuts
 

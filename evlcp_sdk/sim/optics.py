@@ -9,12 +9,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.scene.optics import Blur, airy_blur, step
+from evlcp_sdk.sim.leds import LitStrip
 from evlcp_sdk.sim.scene import BarSpec, LensSpec
 
-__all__ = ["blur_of", "blur_sigma_px", "led_light_w_m2", "step_table", "strip_table", "strip_width_m"]
+__all__ = ["blur_of", "blur_sigma_px", "led_light_w_m2", "step_table", "strip_table"]
 
 Floats = NDArray[np.float64]
 
@@ -60,21 +60,16 @@ def blur_sigma_px(depth_m: float, lens: LensSpec, camera: CameraModel) -> float:
     return math.hypot(diffraction_px, _defocus_px(depth_m, lens, camera), lens.blur_px)
 
 
-def strip_width_m(bar: BarSpec, layout: BarLayout) -> float:
-    """Lit width of a column of clusters: from its first column of LEDs to its last, m."""
-    return bar.width_m + (layout.cluster_columns - 1) * layout.led_pitch_m
+def led_light_w_m2(bar: BarSpec, strip: LitStrip, lens: LensSpec) -> float:
+    """Irradiance of a pixel that a strip of LEDs fills, W/m2: E = pi L tau / (4 N^2).
 
-
-def led_light_w_m2(bar: BarSpec, layout: BarLayout, lens: LensSpec) -> float:
-    """Irradiance of a pixel that a column of clusters fills, W/m2: E = pi L tau / (4 N^2).
-
-    The radiance L is that of the LEDs' intensity spread over the column; 20 mW/sr each, 1 cm apart on 5 mm
+    The radiance L is that of the LEDs' intensity spread over the strip; 20 mW/sr each, 1 cm apart on 5 mm
     of width, at f/2 give 51 W/m2.
     """
     if bar.led_w_m2 is not None:
         return bar.led_w_m2
-    of_row = layout.cluster_columns * bar.led_mw_sr * 1e-3
-    radiance = of_row / (strip_width_m(bar, layout) * layout.led_pitch_m)
+    of_row = strip.leds * bar.led_mw_sr * 1e-3
+    radiance = of_row / (strip.width_m * strip.pitch_m)
     return math.pi * radiance * lens.transmission / (4 * lens.f_number**2)
 
 

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import is_there
-from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.link.resolve import Link, resolve, with_leds
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.camera import CameraModel
@@ -47,7 +47,7 @@ MOST_PIXELS = 4096
 """Columns and rows of a sensor."""
 
 MOST_SOURCES = 64
-"""Bars, lamps and reflections of one scene; a bar counts once for each column of its clusters."""
+"""Strips of light of one scene: lamps, and columns or rows of LEDs, each again for every reflection."""
 
 LinkTable = Mapping[str, Any]
 """A link, or what is different about it: tables as in `link.toml`."""
@@ -55,7 +55,7 @@ LinkTable = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class BarSpec:
-    """A transmitter: columns of light, cut into clusters from their top, that send packets without end."""
+    """A transmitter: the LEDs that its link describes, which send packets without end."""
 
     x_m: Annotated[float, Field(description="Its centre, to the right of the path's start.")] = -1.5
     y_m: Annotated[float, Field(description="The same, downward.")] = 0.0
@@ -67,7 +67,13 @@ class BarSpec:
             " scene's link; none: the scene's link."
         ),
     ] = None
-    width_m: Annotated[float, Field(gt=0, description="Width of one column of LEDs, as it is lit.")] = 0.005
+    width_m: Annotated[
+        float,
+        Field(
+            gt=0,
+            description="Width of one column of LEDs, as it is lit; a ring and a table say it themselves.",
+        ),
+    ] = 0.005
     lean_deg: Annotated[float, Field(gt=-90, lt=90, description="Its top leans to the right.")] = 0.0
     tilt_deg: Annotated[float, Field(gt=-90, lt=90, description="Its top leans away from the camera.")] = 0.0
     ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="How much faster its clock runs.")] = 0.0
@@ -558,7 +564,7 @@ class _Whole(dict[str, Any]):
 
     @classmethod
     def read(cls, path: Path | str) -> "_Whole":
-        whole = cls(read_toml(path))
+        whole = cls(with_leds(read_toml(path), Path(path).parent, f"{path}: "))
         whole.file = str(path)
         return whole
 
@@ -573,7 +579,13 @@ def _read_links(table: dict[str, Any], folder: Path | None, before: str) -> None
                 holder["link"] = _Whole.read(link if folder is None else folder / link)
             except ConfigError as fault:
                 raise ConfigError(f"{before}{where}: {fault}") from fault
-        elif link is not None and not isinstance(link, Mapping):
+        elif isinstance(link, Mapping):
+            whole = with_leds(link, folder or Path(), f"{before}{where}: ")
+            if isinstance(link, _Whole):
+                link.update(whole)
+            else:
+                holder["link"] = whole
+        elif link is not None:
             raise ConfigError(f"{before}{where} = {link!r}: expected a link.toml, or tables as in one")
 
     read(table, "link")
@@ -600,21 +612,27 @@ def _give_links(table: dict[str, Any], folder: Path | None, before: str) -> Link
 
 
 def _laid_over(under: LinkTable, over: LinkTable) -> dict[str, Any]:
-    """Two links' tables in one, section by section; another algorithm brings its own parameters."""
+    """Two links' tables in one, section by section; another algorithm, or shape of the bar, brings its
+    own parameters.
+    """
     found = dict(under)
     for section, keys in over.items():
         below = under.get(section, {})
         if not isinstance(keys, Mapping) or not isinstance(below, Mapping):
             found[section] = keys
             continue
-        default = ROLES[section].default if section in ROLES else None
-        same = keys.get("id", below.get("id", default)) == below.get("id", default)
+        what, default = ("shape", "grid") if section == "bar" else ("id", None)
+        if section in ROLES:
+            default = ROLES[section].default
+        same = keys.get(what, below.get(what, default)) == below.get(what, default)
         found[section] = {**below, **keys} if same else dict(keys)
     return found
 
 
 _IN_LINK = {
     "clusters": "bar.rows, bar.cluster_rows",
+    "leds": "bar.leds",
+    "shape": "bar.shape",
     "length_m": "bar.rows, bar.led_pitch_m",
     "led_pitch_m": "bar.led_pitch_m",
     "profile": "modulation.id",
@@ -699,3 +717,5 @@ def _set_link(holder: dict[str, Any], parts: Sequence[str], value: Any, key: str
         return
     keys = link.get(parts[0])
     link[parts[0]] = {**keys, parts[1]: value} if isinstance(keys, Mapping) else {parts[1]: value}
+    if parts == ["bar", "leds_file"]:
+        link["bar"].pop("leds", None)

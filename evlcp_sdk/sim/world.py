@@ -17,7 +17,15 @@ from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.sim.motion import CameraPath
 from evlcp_sdk.sim.scene import BarSpec, Scene, WorldSpec, links_of
 
-__all__ = ["attitude_log", "bar_across", "bar_axis", "camera_on_earth", "scene_to_enu", "sites_of"]
+__all__ = [
+    "attitude_log",
+    "bar_across",
+    "bar_axis",
+    "bar_towards",
+    "camera_on_earth",
+    "scene_to_enu",
+    "sites_of",
+]
 
 Floats = NDArray[np.float64]
 
@@ -32,6 +40,12 @@ def bar_across(bar: BarSpec) -> tuple[float, float, float]:
     """Unit vector from the left of a bar to its right in the scene's axes."""
     lean = math.radians(bar.lean_deg)
     return math.cos(lean), math.sin(lean), 0.0
+
+
+def bar_towards(bar: BarSpec) -> tuple[float, float, float]:
+    """Unit vector from a bar to who looks at its front in the scene's axes."""
+    x, y, z = np.cross(bar_axis(bar), bar_across(bar)).tolist()
+    return x, y, z
 
 
 def scene_to_enu(vectors: Floats, heading_deg: float) -> Floats:

@@ -217,7 +217,24 @@ def decodes_nothing(subject: Subject) -> None:
         expect(np.isfinite(soft.quality), f"a finite quality from {what}, got {soft.quality}")
 
 
+def _expect_measuring(subject: Subject) -> None:
+    """Pass over a law of distances.
+
+    Raises:
+        InapplicableLawError: The subject gives none.
+    """
+    if not subject.algorithm.measures:
+        raise InapplicableLawError("it measures nothing")
+
+
 def _measure(
+    subject: Subject, cluster_px: int = 8, seed: int = 0, right_down: tuple[int, int] = (0, 0)
+) -> Range:
+    _expect_measuring(subject)
+    return _measured(subject, cluster_px, seed, right_down)
+
+
+def _measured(
     subject: Subject, cluster_px: int = 8, seed: int = 0, right_down: tuple[int, int] = (0, 0)
 ) -> Range:
     link = link_of(subject)
@@ -237,11 +254,15 @@ def _true_m(link: Link, cluster_px: int) -> float:
 
 def range_shapes(subject: Subject) -> None:
     """Hold the law."""
-    found = _measure(subject)
+    found = _measured(subject)
     expect(
         isinstance(found.distance_m, float), f"distance_m as a float, got {type(found.distance_m).__name__}"
     )
     expect(isinstance(found.sigma_m, float), f"sigma_m as a float, got {type(found.sigma_m).__name__}")
+    if not subject.algorithm.measures:
+        nothing = np.isnan(found.distance_m) and np.isnan(found.sigma_m) and found.pairs == 0
+        expect(nothing, f"NaN, NaN and 0 pairs of what measures nothing, got {found}")
+        return
     expect(isinstance(found.pairs, int) and found.pairs > 0, f"pairs as a count above 0, got {found.pairs!r}")
     # One pair has no spread: its sigma may be unknown.
     known = found.sigma_m >= 0 or (found.pairs == 1 and np.isnan(found.sigma_m))
@@ -285,6 +306,7 @@ def stays_when_moved(subject: Subject) -> None:
 
 def scales_with_focal_length(subject: Subject) -> None:
     """Hold the law."""
+    _expect_measuring(subject)
     link = link_of(subject)
     expect_column(link)
     view = ideal_view(link.codebook, symbols_of(link.codebook))
@@ -341,7 +363,11 @@ DECODING = (
 """Laws of decoding."""
 
 RANGING = (
-    Law("shapes", "a Range of plain numbers, sigma from 0 on, or NaN for a single pair", range_shapes),
+    Law(
+        "shapes",
+        "a Range of plain numbers, sigma from 0 on, or NaN for a single pair; NaN where nothing is measured",
+        range_shapes,
+    ),
     Law("exact", "exact for clusters that lie whole pixels apart", exact),
     Law("monotone", "the wider the image, the nearer", monotone),
     Law("moved", "the same wherever the bar stands in the image", stays_when_moved),

@@ -149,9 +149,10 @@ def limits(codebook: Codebook, packet: PacketFormat) -> list[str]:
 def check_link(link: Link) -> None:
     """Raise ConfigError, one line, if a driver board cannot play a link; see `limits`."""
     faults = limits(link.codebook, link.packet)
-    leds = link.bar.cluster_rows * link.bar.cluster_columns
-    if link.codebook.clusters == CLUSTERS and leds != LEDS // CLUSTERS:
-        faults.insert(0, f"bar of {leds} LEDs a cluster, the board has {LEDS // CLUSTERS}")
+    leds = np.bincount(link.bar.led_clusters())
+    other = leds[leds != LEDS // CLUSTERS]
+    if link.codebook.clusters == CLUSTERS and len(other):
+        faults.insert(0, f"bar of {other[0]} LEDs a cluster, the board has {LEDS // CLUSTERS}")
     _refuse(faults)
 
 

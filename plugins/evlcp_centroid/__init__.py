@@ -1,4 +1,4 @@
-"""Ranging by the centres of gravity of the clusters: the simple way, to compare with."""
+"""Ranging by the centres of gravity of the clusters, the simple way, to compare with; and none."""
 
 from collections.abc import Iterator
 
@@ -11,3 +11,4 @@ __all__ = ["evlcp_algorithms"]
 def evlcp_algorithms() -> Iterator[Algorithm]:
     """The algorithms of this package."""
     yield Algorithm("ranging", "centroid", "evlcp_centroid.ranging:CentroidRanging", 1, "centres of gravity")
+    yield Algorithm("ranging", "none", "evlcp_centroid.none:NoRanging", 1, "no distance, of any layout")

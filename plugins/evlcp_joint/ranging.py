@@ -115,16 +115,14 @@ class JointScaleRanging(Ranging):
         """Precompute for a bar of one column.
 
         Raises:
-            ConfigError: The layout has more than one column of clusters, or fewer than three.
+            ConfigError: The layout is not one even column of clusters, or has fewer than three.
         """
-        centres = bar.cluster_centres_m()
-        if np.ptp(centres[:, 0]) > 1e-9 or len(centres) < 3:
+        clusters, spacing_m = bar.clusters, bar.column_pitch_m
+        if not spacing_m > 0 or clusters < 3:
             raise ConfigError(
-                "ranging 'joint-scale' needs one column of three clusters or more; " + _instead(len(centres))
+                "ranging 'joint-scale' needs one even column of three clusters or more; " + _instead(clusters)
             )
-        clusters = len(centres)
         least = min(self.min_boundaries, clusters - 1)
-        spacing_m = float(centres[1, 1] - centres[0, 1])
         pilots, words = codebook.pilots.astype(np.float64), codebook.codewords.astype(np.float64)
         boundaries = np.arange(1.0, clusters) - clusters / 2
         uneven = np.sign(np.diff(pilots, axis=0)).sum(1)
@@ -256,7 +254,7 @@ def _when(n: int) -> Floats:
 def _instead(clusters: int) -> str:
     """The ranging for a layout that this one refuses, if any is."""
     if clusters < 2:
-        return "no ranging measures the distance of one cluster"
+        return "no ranging measures the distance of one cluster: use 'none' for this layout"
     # Of few clusters, `poc` must not leave out the outermost.
     return "use 'poc' for this layout" + (", with ranging.skip_outer = 0" if clusters < 4 else "")
 

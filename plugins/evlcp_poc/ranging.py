@@ -185,7 +185,10 @@ class PocRanging(Ranging):
     def _used(self, clusters: int) -> NDArray[np.int64]:
         used = np.array(self.clusters or range(self.skip_outer, clusters - self.skip_outer), np.int64)
         if clusters < 2:
-            raise ConfigError("ranging 'poc' needs two clusters; no ranging measures the distance of one")
+            raise ConfigError(
+                "ranging 'poc' needs two clusters; no ranging measures the distance of one: use 'none' for"
+                " this layout"
+            )
         if not self.clusters and len(used) < 2:
             raise ConfigError(
                 f"ranging.skip_outer = {self.skip_outer}: leaves {len(used)} of {clusters} clusters,"

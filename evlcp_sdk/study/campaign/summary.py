@@ -11,6 +11,8 @@ from functools import cached_property
 from itertools import zip_longest
 from typing import Any, Literal
 
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.study.campaign.collect import Counted
 from evlcp_sdk.study.campaign.paper import PAPER, Measure, Reference
 from evlcp_sdk.study.campaign.plan import KeptPlan
@@ -70,10 +72,9 @@ class Series:
         """Clusters that its distances are measured from; None where the link does not say."""
         try:
             table = self.link["table"]
-            chosen, bar = table["ranging"].get("clusters"), table["bar"]
-            rows = bar["rows"] // bar["cluster_rows"]
-            return len(chosen) if chosen else int(rows * (bar["columns"] // bar["cluster_columns"]))
-        except (TypeError, KeyError, AttributeError, ArithmeticError, ValueError):
+            chosen = table["ranging"].get("clusters")
+            return len(chosen) if chosen else BarLayout.of_table(table["bar"]).clusters
+        except (TypeError, KeyError, AttributeError, ValueError, ConfigError):
             # An identity is whatever its link was when it was kept.
             return None
 

@@ -9,7 +9,7 @@ from scipy.stats import norm, theilslopes
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.study.bound import cramer_rao_sigma_m
 from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols
@@ -189,8 +189,8 @@ def test_too_few_clusters_give_no_distance() -> None:
 
 
 def test_panels_are_refused() -> None:
-    panel = BarLayout(rows=16, columns=16, cluster_rows=4, cluster_columns=4)
-    with pytest.raises(ConfigError, match="one column"):
+    panel = BarLayout(LedGrid(rows=16, columns=16, cluster_rows=4, cluster_columns=4))
+    with pytest.raises(ConfigError, match="one even column"):
         JointScaleRanging().compile(CameraModel(), panel, LINK.codebook)
 
 

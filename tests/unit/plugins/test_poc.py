@@ -13,13 +13,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
 SEEDS = range(10)
 CAMERA, BAR = CameraModel(), BarLayout()
-PANEL = BarLayout(rows=16, columns=16, cluster_rows=4, cluster_columns=4)
+PANEL = BarLayout(LedGrid(rows=16, columns=16, cluster_rows=4, cluster_columns=4))
 LINK = load_link()
 EXAMPLES = Path(__file__).parents[3] / "examples"
 SHAPES = [(24, 20), (25, 21), (16, 17), (48, 40)]
@@ -327,7 +327,7 @@ def test_distance_of_ideal_images(bar, blob, tolerance, tilt_deg, band):
 
 
 def test_a_horizontal_bar_is_a_bar():
-    bar = BarLayout(rows=1, columns=96, cluster_rows=1, cluster_columns=6)
+    bar = BarLayout(LedGrid(rows=1, columns=96, cluster_rows=1, cluster_columns=6))
     upright = measured(image_of(BAR, 50, tilt_deg=0, offset=(0.2, 0.1)))
     lying = measured(image_of(bar, 50, offset=(0.1, 0.2)), bar)
     assert lying.distance_m == pytest.approx(upright.distance_m, rel=1e-5)
@@ -474,8 +474,8 @@ def test_clusters_that_the_bar_has_not_are_refused(clusters):
     [
         (BAR, 8, "skip_outer = 8: leaves 0 of 16"),
         (BAR, 20, "set ranging.skip_outer = 7$"),
-        (BarLayout(rows=12), 1, "set ranging.skip_outer = 0$"),
-        (BarLayout(rows=6), 0, "needs two clusters"),
+        (BarLayout(LedGrid(rows=12)), 1, "set ranging.skip_outer = 0$"),
+        (BarLayout(LedGrid(rows=6)), 0, "needs two clusters"),
     ],
 )
 def test_too_few_clusters_are_refused(bar, skip, said):

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import hadamard
 from evlcp_sdk.rx.placement import layout_of, lit, masked, placements
-from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.values import PresenceMap
 
 CENTRES = BarLayout().cluster_centres_m()
 LINE = layout_of(CENTRES)
-PANEL = BarLayout(rows=16, columns=16, led_pitch_m=0.02, cluster_rows=4, cluster_columns=4)
+PANEL = BarLayout(LedGrid(rows=16, columns=16, led_pitch_m=0.02, cluster_rows=4, cluster_columns=4))
 SIZE = (48, 224)
 SEEDS = range(6)
 

@@ -14,7 +14,7 @@ from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.rx.placement import layout_of, placements
 from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.sim import Simulation, load_scene
 from evlcp_sdk.sim.motion import project
 from evlcp_sdk.values import Frame, PresenceMap
@@ -90,7 +90,7 @@ def test_dark_clusters_are_unseen_and_cells_out_of_place_are_left_out() -> None:
 
 
 def test_a_panel_has_neighbours_on_both_axes() -> None:
-    panel = BarLayout(rows=16, columns=16, cluster_rows=4, cluster_columns=4)
+    panel = BarLayout(LedGrid(rows=16, columns=16, cluster_rows=4, cluster_columns=4))
     layout = panel.cluster_centres_m()
     turn, shift = 700 * np.exp(0.05j), 64.2 + 63.7j
     presence = drawn(layout, turn, shift, np.array([0.02, 0.02]), (128, 128))

@@ -17,6 +17,7 @@ from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Modulation
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
     BarSpec,
@@ -32,6 +33,7 @@ from evlcp_sdk.sim import (
     sites_of,
     truth_of,
 )
+from evlcp_sdk.sim.leds import lit_strips
 from evlcp_sdk.sim.light import BarLight, sources_of
 from evlcp_sdk.sim.optics import led_light_w_m2
 from evlcp_sdk.sim.scene import LensSpec, links_of
@@ -72,7 +74,13 @@ def test_a_bar_lays_its_tables_over_the_scene_s(tmp_path: Path) -> None:
     )
     scene = load_scene(tmp_path / "scene.toml", ["link.air.pilot_every=2", "bars.1.link.bar.rows=48"])
     found = [
-        (k.air.chip_rate_hz, k.air.frames_per_packet, k.air.pilot_every, k.codebook.profile, k.bar.rows)
+        (
+            k.air.chip_rate_hz,
+            k.air.frames_per_packet,
+            k.air.pilot_every,
+            k.codebook.profile,
+            len(k.bar.led_clusters()),
+        )
         for k in links_of(scene)
     ]
     assert found == [
@@ -161,17 +169,17 @@ def test_a_fault_in_a_file_of_a_link_names_the_file(tmp_path: Path) -> None:
 def test_too_many_columns_are_told() -> None:
     wide = {"rows": 1, "columns": 65, "cluster_rows": 1}
     pilots = {"bar": wide | {"columns": 33}}
-    with pytest.raises(ConfigError, match="66 columns of clusters and 0 lamps, expected at most 64"):
+    with pytest.raises(ConfigError, match="66 columns and rows of LEDs and 0 lamps, expected at most 64"):
         sources_of(resolve_scene({"link": pilots, "bars": [{}, {}]}))
 
 
 def turned(bar: BarSpec, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points of an upright bar (x right, y down) in the scene, by matrices: tilted, then leaned."""
+    """Points (x right, y down, z towards the camera) in the scene, by matrices: tilted, then leaned."""
     tilt, lean = math.radians(bar.tilt_deg), math.radians(bar.lean_deg)
-    back = np.array([[1, 0, 0], [0, math.cos(tilt), 0], [0, -math.sin(tilt), 1]])
+    back = np.array([[1, 0, 0], [0, math.cos(tilt), math.sin(tilt)], [0, -math.sin(tilt), math.cos(tilt)]])
     aside = np.array([[math.cos(lean), -math.sin(lean), 0], [math.sin(lean), math.cos(lean), 0], [0, 0, 1]])
-    flat = np.column_stack([points_m, np.zeros(len(points_m))])
-    found: NDArray[np.float64] = flat @ back.T @ aside.T + [bar.x_m, bar.y_m, bar.z_m]
+    ahead = points_m * [1, 1, -1]
+    found: NDArray[np.float64] = ahead @ back.T @ aside.T + [bar.x_m, bar.y_m, bar.z_m]
     return found
 
 
@@ -179,17 +187,17 @@ def turned(bar: BarSpec, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
 def test_the_strips_are_where_the_leds_are(layout: dict[str, Any]) -> None:
     bar = BarSpec(x_m=-0.7, y_m=0.2, z_m=3.0, lean_deg=20.0, tilt_deg=35.0, link={"bar": layout})
     link = resolve({"bar": layout})
-    light = BarLight(bar, link, 1.0, seed=0)
+    light = BarLight(bar, link, LensSpec(), seed=0)
     leds, which = turned(bar, link.bar.led_positions_m()), link.bar.led_clusters()
     order = np.arange(link.codebook.clusters)
     seen = []
     for part in light.strips:
         cuts = part.strip.cuts_m()
-        for row, k in enumerate(order[part.clusters].tolist()):
+        for row, k in enumerate(part.clusters.tolist()):
             mine = leds[which == k]
             assert 0.5 * (cuts[row] + cuts[row + 1]) == pytest.approx(mine.mean(0), abs=1e-9)
             along = (mine - mine.mean(0)) @ np.array(bar_axis(bar))
-            pitch = link.bar.led_pitch_m
+            pitch = link.bar.table()["led_pitch_m"]
             assert np.linalg.norm(cuts[row + 1] - cuts[row]) == pytest.approx(np.ptp(along) + pitch)
             aside = np.linalg.norm(mine - mine.mean(0) - along[:, None] * np.array(bar_axis(bar)), axis=1)
             assert part.strip.width_m == pytest.approx(2 * aside.max() + bar.width_m)
@@ -215,8 +223,83 @@ def test_a_cluster_of_a_panel_blinks_where_its_leds_are_seen(cluster: int, tmp_p
     u, v = (camera.focal_px * a / (z + 30.0) + c for a, c in zip((x, y), camera.centre_px, strict=True))
     pixels = np.unique(np.stack([events.x, events.y], 1), axis=0)
     assert pixels.mean(0) == pytest.approx([u.mean(), v.mean()], abs=0.4)
-    size = camera.focal_px * 4 * layout.led_pitch_m / 30.0
+    size = camera.focal_px * 4 * 0.02 / 30.0
     assert np.ptp(pixels[:, 1]) == pytest.approx(size, abs=8)
+
+
+LAYOUTS: dict[str, dict[str, Any]] = {
+    "ring": {"shape": "ring", "leds": 12, "radius_m": 0.3},
+    "apart": {"shape": "columns", "apart_m": 0.4, "rows": 24, "cluster_rows": 6},
+    "table": {
+        "shape": "table",
+        "leds": [[0, 0, 0.2, 0], [0.31, 0, 0, 2], [0.1, -0.2, 0.4, 1], [0.3, 0, 0, 1]],
+    },
+    "one": {"shape": "table"},
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_every_led_shines_where_it_stands(layout: dict[str, Any]) -> None:
+    bar = BarSpec(x_m=-0.7, y_m=0.2, z_m=3.0, lean_deg=20.0, tilt_deg=35.0, width_m=0.004)
+    link = resolve({"bar": layout})
+    light = BarLight(bar, link, LensSpec(), seed=0)
+    leds, which = turned(bar, link.bar.led_positions_m()), link.bar.led_clusters()
+    lit_m2, power = 0.0, 0.0
+    shown = np.zeros(len(leds), np.int64)
+    for part in light.strips:
+        cuts = part.strip.cuts_m()
+        long_m = np.linalg.norm(np.diff(cuts, axis=0), axis=1)
+        way = (cuts[-1] - cuts[0]) / np.linalg.norm(cuts[-1] - cuts[0])
+        for start, long, k in zip(cuts[:-1], long_m, part.clusters, strict=True):
+            along = (leds - start) @ way
+            beside = np.linalg.norm(leds - start - along[:, None] * way, axis=1)
+            here = (along > -1e-9) & (along < long + 1e-9) & (beside < 1e-6)
+            assert (which[here] == k).all() or k == -1
+            assert not (k == -1 and here.any())
+            shown += here
+            area = long * part.strip.width_m * (k >= 0)
+            lit_m2, power = lit_m2 + area, power + area * part.light_w_m2
+    assert (shown == 1).all()
+    # As many watts as that many single LEDs.
+    alone = BarLight(bar, resolve({"bar": {"shape": "table"}}), LensSpec(), seed=0)
+    assert power == pytest.approx(len(leds) * alone.light_w_m2 * 0.005**2)
+
+
+@pytest.mark.parametrize(
+    ("layout", "cluster"),
+    [
+        (LAYOUTS["ring"], 0),
+        (LAYOUTS["ring"], 4),
+        (LAYOUTS["apart"], 6),
+        (LAYOUTS["table"], 0),
+        (LAYOUTS["one"], 0),
+    ],
+)
+def test_a_cluster_of_any_layout_blinks_where_a_pinhole_shows_it(
+    layout: dict[str, Any], cluster: int, tmp_path: Path
+) -> None:
+    link = resolve({"bar": layout})
+    chips = np.zeros((2, link.bar.clusters), np.uint8)
+    chips[1, cluster] = 1
+    np.save(tmp_path / "chips.npy", chips)
+    bar = BarSpec(
+        x_m=0.5, lean_deg=15.0, tilt_deg=20.0, link={"bar": layout}, chips_file=str(tmp_path / "chips.npy")
+    )
+    camera = CameraModel()
+    scene = Scene(
+        duration_s=0.01, camera=camera, lens=LensSpec(wings=False), sensor=QUIET, motion=STILL, bars=(bar,)
+    )
+    events = every(scene)
+    x, y, z = (turned(bar, link.bar.led_positions_m())[link.bar.led_clusters() == cluster]).T
+    u, v = (camera.focal_px * a / (z + 30.0) + c for a, c in zip((x, y), camera.centre_px, strict=True))
+    pixels = np.unique(np.stack([events.x, events.y], 1), axis=0)
+    assert pixels.mean(0) == pytest.approx([u.mean(), v.mean()], abs=0.4)
+
+
+def test_leds_that_no_scene_can_hold_are_refused() -> None:
+    leds = [[0.01 * i, 0.013 * i * i, 0.0, 0] for i in range(65)]
+    with pytest.raises(ConfigError, match=r"bars\.0\.link: bar: its LEDs stand in more than 64 columns"):
+        BarLight(BarSpec(), resolve({"bar": {"shape": "table", "leds": leds}}), LensSpec(), 0, "bars.0")
 
 
 def test_two_columns_are_two_bars_side_by_side(tmp_path: Path) -> None:
@@ -246,10 +329,9 @@ def test_two_columns_are_two_bars_side_by_side(tmp_path: Path) -> None:
 
 def test_the_light_of_a_row_is_that_of_its_leds() -> None:
     bar, lens = BarSpec(), LensSpec()
-    one = resolve({}).bar
-    wide = replace(one, columns=4, cluster_columns=4)
+    (one,), (wide,) = (lit_strips(bar, BarLayout(LedGrid(columns=n, cluster_columns=n))) for n in (1, 4))
     widths = (0.005, 0.005 + 3 * 0.01)
-    lights = [led_light_w_m2(bar, layout, lens) for layout in (one, wide)]
+    lights = [led_light_w_m2(bar, strip, lens) for strip in (one, wide)]
     assert lights[0] == pytest.approx(51, abs=0.5)
     assert lights[1] * widths[1] == pytest.approx(4 * lights[0] * widths[0])
     assert led_light_w_m2(replace(bar, led_w_m2=7.0), wide, lens) == 7.0

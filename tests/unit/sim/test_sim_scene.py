@@ -18,6 +18,7 @@ from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
     BarSpec,
     LampSpec,
+    LensSpec,
     Scene,
     Simulation,
     load_scene,
@@ -114,7 +115,7 @@ def test_files_that_are_no_scenes_are_told(tmp_path: Path) -> None:
 
 
 def test_a_bar_sends_what_the_air_interface_says() -> None:
-    light = BarLight(BarSpec(ppm=50.0, start_chip=300.4), LINK, 1.0, seed=4)
+    light = BarLight(BarSpec(ppm=50.0, start_chip=300.4), LINK, LensSpec(), seed=4)
     rate = 1e4 * (1 + 50e-6)
     book_chips = np.concatenate([packet_chips(light.symbols(q), LINK.codebook) for q in range(3)])
     when, levels = light.switches(2000.0, 12_000.0)
@@ -129,27 +130,34 @@ def test_a_bar_sends_what_the_air_interface_says() -> None:
 
 def test_a_bar_sends_given_symbols_and_chips(tmp_path: Path) -> None:
     symbols = ((tuple(range(16)),) * 10,)
-    light = BarLight(BarSpec(symbols=symbols, start_chip=0.0), LINK, 1.0, seed=0)
+    light = BarLight(BarSpec(symbols=symbols, start_chip=0.0), LINK, LensSpec(), seed=0)
     assert light.sent_symbols(0.05) == [[list(range(16))] * 10] * 2
     with pytest.raises(ConfigError, match=r"bars\.0\.symbols\.0: 1 frames, expected 10"):
-        BarLight(BarSpec(symbols=((tuple(range(16)),),)), LINK, 1.0, 0, "bars.0")
+        BarLight(BarSpec(symbols=((tuple(range(16)),),)), LINK, LensSpec(), 0, "bars.0")
     with pytest.raises(ConfigError, match=r"symbol 99 .*expected 0 to 63"):
-        BarLight(BarSpec(symbols=(((99,) * 16,) * 10,)), LINK, 1.0, 0, "bars.0")
+        BarLight(BarSpec(symbols=(((99,) * 16,) * 10,)), LINK, LensSpec(), 0, "bars.0")
     chips = np.random.default_rng(0).integers(0, 2, (50, 16))
     np.save(tmp_path / "chips.npy", chips)
-    sent = BarLight(BarSpec(chips_file=str(tmp_path / "chips.npy"), start_chip=40.0), LINK, 1.0, seed=0)
+    sent = BarLight(
+        BarSpec(chips_file=str(tmp_path / "chips.npy"), start_chip=40.0), LINK, LensSpec(), seed=0
+    )
     assert (sent.switches(0.0, 3000.0)[1] == np.concatenate([chips[40:], chips[:20]])).all()
     assert sent.sent_symbols(1.0) == []
     assert sent.longest_us == 100 * max(
         len(run) for row in np.tile(chips, (2, 1)).T for run in re.findall("0+|1+", "".join(map(str, row)))
     )
     with pytest.raises(ConfigError, match="8 clusters"):
-        BarLight(BarSpec(chips_file=str(tmp_path / "chips.npy")), resolve({"bar": {"rows": 48}}), 1.0, seed=0)
+        BarLight(
+            BarSpec(chips_file=str(tmp_path / "chips.npy")),
+            resolve({"bar": {"rows": 48}}),
+            LensSpec(),
+            seed=0,
+        )
     with pytest.raises(InputError, match="cannot be read"):
-        BarLight(BarSpec(chips_file=str(tmp_path / "no.npy")), LINK, 1.0, seed=0)
+        BarLight(BarSpec(chips_file=str(tmp_path / "no.npy")), LINK, LensSpec(), seed=0)
     (tmp_path / "text.npy").write_text("chips")
     with pytest.raises(InputError, match=r"not a \.npy file of plain numbers"):
-        BarLight(BarSpec(chips_file=str(tmp_path / "text.npy")), LINK, 1.0, seed=0)
+        BarLight(BarSpec(chips_file=str(tmp_path / "text.npy")), LINK, LensSpec(), seed=0)
 
 
 def test_lamps_keep_their_period_and_duty() -> None:
@@ -356,5 +364,5 @@ def test_chips_of_another_kind_of_array_are_one_line(content: str, tmp_path: Pat
         head = f"{{'descr': '<i8', 'fortran_order': False, 'shape': {shape}, }}".encode()
         path.write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(160))
     with pytest.raises(InputError, match=r"chips\.npy: not a \.npy file of plain numbers") as caught:
-        BarLight(BarSpec(chips_file=str(path)), LINK, 1.0, seed=0)
+        BarLight(BarSpec(chips_file=str(path)), LINK, LensSpec(), seed=0)
     assert len(str(caught.value).splitlines()) == 1

@@ -6,7 +6,7 @@ from scipy.stats import norm
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.study.bound import cramer_rao_sigma_m, frame_bound, lean_sigma_deg
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
@@ -160,6 +160,6 @@ def test_frames_that_show_no_boundary_have_no_bound() -> None:
 
 
 def test_panels_have_none() -> None:
-    panel = BarLayout(rows=16, columns=16, cluster_rows=4, cluster_columns=4)
+    panel = BarLayout(LedGrid(rows=16, columns=16, cluster_rows=4, cluster_columns=4))
     with pytest.raises(ConfigError, match="one column"):
         frame_bound(CameraModel(), panel, LINK.codebook)
