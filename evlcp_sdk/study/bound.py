@@ -2,7 +2,8 @@
 
 It belongs to the geometry of the problem and to no algorithm, so it stands here and not beside one: how
 sharply a boundary of the bar shows in the image, how noisy its pixels are, and how far boundaries lie apart
-bound whatever ranging there is. `frame_bound` reads these quantities from the frames of a recording.
+bound whatever ranging there is. `frame_bound` reads these quantities from the frames of a recording. This is
+of bars, one even column of clusters; `plane_bound` takes any layout.
 """
 
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.study.plane_bound import plane_frame_bound
 from evlcp_sdk.values import FrameView, PresenceMap, Range
 
 __all__ = ["cramer_rao_sigma_m", "frame_bound", "lean_sigma_deg"]
@@ -71,7 +73,7 @@ def cramer_rao_sigma_m(
         shift_px: Where the bar lies on the pixel grid, px.
 
     Raises:
-        ConfigError: A quantity that must be positive is not.
+        ConfigError: A quantity that must be positive is not, or the bar is another layout.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> link = load_link()
@@ -118,7 +120,7 @@ def lean_sigma_deg(
         shift_px: Where the bar lies on the pixel grid, px.
 
     Raises:
-        ConfigError: A quantity that must be positive is not.
+        ConfigError: A quantity that must be positive is not, or the bar is another layout.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> link = load_link()
@@ -179,7 +181,8 @@ def frame_bound(
 
     Args:
         camera: For the spacing in the image.
-        bar: One column of clusters.
+        bar: One even column of three clusters or more; of another layout, the bound is that of
+            `plane_bound.plane_frame_bound`.
         codebook: Pilots and codewords.
         full_events: Events of a pixel in a chip that count as a full value; more are clipped, as hot pixels
             send them.
@@ -189,10 +192,10 @@ def frame_bound(
         frame shows no boundaries.
 
     Raises:
-        ConfigError: The layout has more than one column of clusters, or fewer than three.
+        ConfigError: The layout is one cluster.
     """
-    if np.ptp(bar.cluster_centres_m()[:, 0]) > 1e-9 or bar.clusters < 3:
-        raise ConfigError("the Cramer-Rao bound needs a bar of one column of three clusters or more")
+    if not bar.column_pitch_m > 0 or bar.clusters < 3:
+        return plane_frame_bound(camera, bar, codebook, full_events=full_events)
     spacing_m = _spacing_m(bar)
 
     def bound(view: FrameView) -> Range:
@@ -252,8 +255,11 @@ def _row_values(
 
 def _spacing_m(bar: BarLayout) -> float:
     """Distance of neighbouring clusters, m."""
-    centres = bar.cluster_centres_m()
-    return float(centres[1, 1] - centres[0, 1])
+    if not bar.column_pitch_m > 0:
+        raise ConfigError(
+            "this Cramer-Rao bound needs one even column of two clusters or more; layout_bound takes any"
+        )
+    return bar.column_pitch_m
 
 
 def _codes(codebook: Codebook, symbols: NDArray[np.int64]) -> Array:

@@ -68,7 +68,10 @@ def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name: str
 @pytest.mark.parametrize(
     ("layout", "said"),
     [
-        ("1 clusters", "needs one even column of three clusters or more; .* of one cluster: use 'none' for this layout$"),
+        (
+            "1 clusters",
+            "needs one even column of three clusters or more; .* of one cluster: use 'none' for this layout$",
+        ),
         ("2 clusters", "needs .* or more; use 'poc' for this layout, with ranging.skip_outer = 0$"),
         ("4x4 panel", "needs .* or more; use 'poc' for this layout$"),
         ("one row of two", "needs .* or more; use 'poc' for this layout, with ranging.skip_outer = 0$"),

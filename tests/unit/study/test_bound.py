@@ -159,7 +159,10 @@ def test_frames_that_show_no_boundary_have_no_bound() -> None:
     assert np.isnan(measure(blank).sigma_m)
 
 
-def test_panels_have_none() -> None:
+def test_panels_have_that_of_the_plane_and_one_cluster_none() -> None:
     panel = BarLayout(LedGrid(rows=16, columns=16, cluster_rows=4, cluster_columns=4))
-    with pytest.raises(ConfigError, match="one column"):
-        frame_bound(CameraModel(), panel, LINK.codebook)
+    frame_bound(CameraModel(), panel, LINK.codebook)
+    with pytest.raises(ConfigError, match="layout_bound takes any"):
+        cramer_rao_sigma_m(CameraModel(), panel, LINK.codebook, 50.0, range(16), blur_px=0.4, noise=0.1)
+    with pytest.raises(ConfigError, match="needs two clusters"):
+        frame_bound(CameraModel(), BarLayout(LedGrid(rows=6)), LINK.codebook)
