@@ -5,6 +5,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 TOOLCHAIN := firmware_host/firmware/install-toolchain.sh
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Each of the many processes of the tests would read every source again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test ready lint kernels fuzz sbom format pictures clean
