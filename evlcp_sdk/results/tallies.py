@@ -45,6 +45,7 @@ class TransmitterTally:
             and the last cluster are in the image, px.
         along_px: Sum of the ways from the first to the last, right and down, px.
         blocks: Packets whose block is read.
+        last_px: Where it is in the image in its newest frame, column and row.
         beacon_m: Length of the bar by its newest beacon, m; NaN without.
     """
 
@@ -73,6 +74,7 @@ class TransmitterTally:
     along_px: tuple[float, float] = (0.0, 0.0)
     beacon_m: float = math.nan
     blocks: int = 0
+    last_px: tuple[float, float] = (math.nan, math.nan)
 
     def add(self, packet: Packet) -> None:
         """Count a packet and its frames."""
@@ -92,6 +94,7 @@ class TransmitterTally:
             number = frame.packet * self.packet_frames + frame.frame
             self.first_frame = number if self.first_frame < 0 else self.first_frame
             self.last_frame = number
+            self.last_px = frame.x_px, frame.y_px
             self.first_us, self.last_us = min(self.first_us, frame.t_us), max(self.last_us, frame.t_us)
             self.quality_sum += frame.soft.quality
             self.echoes += frame.echo_of is not None
@@ -230,8 +233,9 @@ class RunTally:
         if not self.transmitters:
             return "no transmitter was found"
         tallies = self.transmitters.values()
-        own = [t.frames - t.echoes for t in tallies if t.frames > t.echoes or not t.echoes]
-        echoes = [t.echoes for t in tallies if t.echoes]
+        # Its first frames may not have been known to be a reflection's.
+        own = [t.frames for t in tallies if t.echo_of is None]
+        echoes = [t.frames for t in tallies if t.echo_of is not None]
         others = [self.others_frames] + [0] * (self.others - 1) if self.others else []
         parts = ((own, "transmitter"), (echoes, "reflection"), (others, "earlier one"))
         return "; ".join(

@@ -29,8 +29,9 @@ SMALLEST_PX, SMALL_PX = 1.5, 2.5
 """Pixels a cluster below which clusters cannot be told apart, and below which errors are to be expected: two
 sampled points a cluster are the least, and the pixels between two clusters show both."""
 
-SMEARED_CLUSTERS = 2.0
-"""Width of a source, in clusters, above which the light of each covers its neighbours on both sides."""
+SMEARED_CLUSTERS, SHARP_PX = 2.0, 5.0
+"""Width of a source, in clusters, above which the light of each covers its neighbours on both sides, and up
+to how many px wide a column of LEDs in focus may look."""
 
 RARE_CHIPS, WEAK = 5.0, 0.35
 """Median time between rises, in chips, and mean of the comb, beyond both of which light is too weak: a code
@@ -51,6 +52,9 @@ _FEW = 4
 
 _UNSEEN_SHARE = 0.05
 """Share of unseen clusters of which something is said."""
+
+_MIN_RISES = 500
+"""The same for light that is not read beside a bar that is."""
 
 _SOME = 0.02
 """Share of all events below which what blinks is not worth a word where nothing sends chips."""
@@ -262,7 +266,7 @@ def _light(facts: Facts) -> Check:
         f" {50 * height / focal:.1f} m at 50 m"
     )
     if facts.reads:
-        return Check("light", "pass", "light", _sources_said(facts))
+        return _unread(facts) or Check("light", "pass", "light", _sources_said(facts))
     if not facts.sources and facts.restless is not None:
         left, top, right, bottom = facts.restless
         return Check(
@@ -298,6 +302,35 @@ def _light(facts: Facts) -> Check:
             return Check("light", "fail", "defocus", said, _SHARPER)
         return Check("light", "fail", "dim", said, _BRIGHTER)
     return Check("light", "pass", "light", _sources_said(facts))
+
+
+def _unread(facts: Facts) -> Check | None:
+    """Light of a code where no frame is read, beside one that is; None where there is none."""
+    link_hz = facts.link.packet.chip_rate_hz
+    for source in facts.sources:
+        left, top, right, bottom = source.box_px
+        if (
+            source.kind != "code"
+            or source.rises < _MIN_RISES
+            or any(
+                left <= one.last_px[0] <= right and top <= one.last_px[1] <= bottom
+                for one in facts.tally.transmitters.values()
+            )
+        ):
+            continue
+        same = _has_rate(source, link_hz)
+        return Check(
+            "light",
+            "doubt",
+            "unread",
+            f"{_sources_said(facts)}; no frame is read of the one in columns {left} to {right}, rows {top} to"
+            f" {bottom}, {_hz(link_hz if same else source.rate_hz)}",
+            f"another bar? {_BRIGHTER}"
+            if same
+            else "another bar, of another rate? try it with --set air.chip_rate_hz="
+            f"{float(f'{source.rate_hz:.2g}'):g}; or light that is too weak for its chips",
+        )
+    return None
 
 
 def _is_lamp(source: LightSource, facts: Facts) -> bool:
@@ -440,7 +473,7 @@ def _focus(facts: Facts) -> Check:
     if bar is None or not px > 0:
         return Check("focus", "skip", "focus", "not reached")
     said = f"{facts.across_px:.0f} px across, {px:.1f} px a cluster along it"
-    if not facts.sure and facts.across_px > SMEARED_CLUSTERS * px:
+    if not facts.sure and facts.across_px > max(SMEARED_CLUSTERS * px, SHARP_PX):
         return Check(
             "focus",
             "doubt" if facts.reads else "fail",

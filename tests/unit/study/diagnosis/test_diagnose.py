@@ -92,6 +92,7 @@ def judged(*sources: LightSource, quality: float = 1.0, frames: int = 0, rejecte
         one = tally.transmitters[0] = TransmitterTally(10, 34_600.0)
         one.frames, one.quality_sum, one.first_frame, one.last_frame = frames, quality * frames, 0, frames - 1
         one.values.update(range(64))
+        one.last_px = 410.0, 375.0
     counts = dict.fromkeys(("preambles", "regions_opened"), 3)
     counts |= {"frames": frames, "frames_rejected": rejected}
     seen = Seen(0.0, 2e5)
@@ -124,11 +125,20 @@ SLOW = replace(BAR, kind="lamp", rate_hz=2360.0, strength=0.6, typical_us=814.0,
         # Pixels that answer every 400 us are as regular as a lamp, but frames are none of a lamp's.
         ("refractory", SLOW, {"frames": 14, "rejected": 30}),
         ("lamp", SLOW, {"rejected": 30}),
+        # Of a bar 300 m away, the image of a column of LEDs is wider than two clusters are long.
+        ("frames", replace(BAR, wide_px=4.5, high_px=25.0), {"rejected": 30}),
         ("dim", replace(BAR, rises=568, events=1330), {}),
     ],
 )
 def test_what_light_and_receiver_say_together(code: str, source: LightSource, read: dict[str, Any]) -> None:
     assert judged(source, **read) == code
+
+
+def test_a_bar_that_is_not_read_beside_one_that_is() -> None:
+    other = replace(BAR, box_px=(900, 300, 920, 450))
+    assert judged(BAR, replace(other, kind="lamp"), frames=40) == ""
+    assert judged(BAR, other, frames=40) == "unread"
+    assert judged(BAR, replace(other, rises=300), frames=40) == ""
 
 
 def test_rate_is_measured_without_a_link() -> None:
