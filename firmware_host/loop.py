@@ -100,7 +100,7 @@ def light_of(symbols: ArrayLike, link: Link, chips: int, trace: Path | None = No
         about = board.about
         record = device.records().played()
     told = symbol_chips(symbols, link.codebook, link.packet.pilot_every)
-    played = record.chips(link.codebook.clusters)
+    played = record.chips(link.bar.led_clusters())
     differ = played != told[np.arange(len(played)) % len(told)]
     if len(played) < chips or differ.any():
         raise VerifyError(

@@ -1,4 +1,4 @@
-"""What a driver board is sent: symbols or chip masks, as the content of a bank."""
+"""What a driver board is sent: symbols or chips, as the content of a bank."""
 
 import zlib
 from dataclasses import dataclass, replace
@@ -15,18 +15,30 @@ from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import read_numbers
 from evlcp_sdk.link.resolve import Link
 from firmware_host.protocol.requests import CLUSTERS, LEDS, ROW_BYTES, Format
-from firmware_host.protocol.rows import rows_of_chips
+from firmware_host.protocol.rows import BOARD_LEDS, masks_of_clusters, rows_of_chips
 
-__all__ = ["Bank", "bank_of", "check_link", "limits", "random_symbols", "read_masks", "symbol_chips"]
+__all__ = [
+    "Bank",
+    "Composed",
+    "bank_of",
+    "check_link",
+    "limits",
+    "packet_content",
+    "queue_of",
+    "random_symbols",
+    "read_masks",
+    "symbol_chips",
+    "word_limits",
+]
 
 WORD_CHIPS = 16
 """Chips of a pilot, and of an info segment, that the board composes."""
 
 PREAMBLE_CHIPS = 32
-"""Chips of a preamble at most."""
+"""Chips of a preamble at most that the board composes."""
 
 MOST_FRAMES = 65_535
-"""Frames of a packet at most."""
+"""Frames of a packet at most that the board composes."""
 
 MOST_RANDOM_FRAMES = 1_000_000
 """Random frames at most: minutes of light, far beyond any bank, and within memory."""
@@ -38,22 +50,45 @@ Symbols = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
+class Composed:
+    """What the board puts packets together with.
+
+    Attributes:
+        codebook: Preamble and pilots, and what the words are of.
+        packet: Lengths of a packet's parts.
+    """
+
+    codebook: Codebook
+    packet: PacketFormat
+
+
+@dataclass(frozen=True, eq=False)
 class Bank:
     """Content of one bank.
 
     Attributes:
-        format: Info words or chip masks.
+        format: Info words, the LEDs of each chip, or the clusters of each chip.
         packets: Packets in it.
-        content: The bank's bytes.
-        codebook: The codebook it was made with.
-        packet: Lengths of a packet's parts, and the chip rate.
+        content: The bank's bytes; none if the link has more LEDs than any board.
+        digest: What its chips mean: digest of the codebook, 64 hex digits.
+        profile: The name of that.
+        chip_rate_hz: Chips per second.
+        packet_chips: Chips of a packet.
+        led_clusters: The cluster of each LED, int64 (LEDs,).
+        composed: What the board puts packets together with; None if the bank has every chip.
+        word_limits: Why it could not.
     """
 
     format: Format
     packets: int
     content: bytes
-    codebook: Codebook
-    packet: PacketFormat
+    digest: str
+    profile: str
+    chip_rate_hz: int
+    packet_chips: int
+    led_clusters: NDArray[np.int64]
+    composed: Composed | None = None
+    word_limits: tuple[str, ...] = ()
 
     @classmethod
     def of_symbols(
@@ -62,63 +97,88 @@ class Bank:
         codebook: Codebook,
         pilot_every: int = PacketFormat.pilot_every,
         chip_rate_hz: float = PacketFormat.chip_rate_hz,
+        led_clusters: NDArray[np.int64] = BOARD_LEDS,
     ) -> "Bank":
-        """Info words of symbols (packets, frames, clusters).
+        """Symbols (packets, frames, clusters): info words where a board can compose packets, else every chip.
 
         Raises:
-            ConfigError: Symbols of another shape or outside the codebook, or a board cannot play them.
+            ConfigError: Symbols of another shape or outside the codebook, or no board can play them.
 
         >>> from evlcp_sdk.link.resolve import resolve
         >>> Bank.of_symbols([[[0] * 16]], resolve({}).codebook).content[:2].hex()
         '5555'
         """
         s = _checked(symbols)
-        packet = PacketFormat.of(codebook, s.shape[1], chip_rate_hz, pilot_every)
-        _refuse(limits(codebook, packet))
-        words = np.concatenate([info_words(one, codebook) for one in s])
-        return cls(Format.WORDS, len(s), words.astype("<u2").tobytes(), codebook, packet)
+        like = _like(codebook, PacketFormat.of(codebook, s.shape[1], chip_rate_hz, pilot_every), led_clusters)
+        if len(led_clusters) > LEDS:
+            return replace(like, packets=len(s))
+        packets = (packet_content(like, one, codebook, pilot_every) for one in s)
+        return replace(like, packets=len(s), content=like.content + b"".join(packets))
 
     @classmethod
-    def of_masks(cls, chips: ArrayLike, codebook: Codebook, packet: PacketFormat) -> "Bank":
-        """Precomposed chips, uint8 (chips, 96 LEDs or 16 clusters), that fill whole packets.
+    def of_chips(
+        cls,
+        chips: ArrayLike,
+        codebook: Codebook,
+        packet: PacketFormat,
+        led_clusters: NDArray[np.int64] = BOARD_LEDS,
+    ) -> "Bank":
+        """Chips as they are, uint8 (chips, clusters or LEDs), that fill whole packets.
 
         Raises:
-            ConfigError: Another number of chips, or a board cannot play them.
+            ConfigError: Another number of chips or columns, or no board can play them.
         """
-        _refuse(limits(codebook, packet))
+        like = _like(codebook, packet, led_clusters)
         c = np.asarray(chips)
         if c.ndim != 2 or not len(c) or len(c) % packet.packet_chips:
             raise ConfigError(
                 f"array of shape {c.shape}, expected whole packets of {packet.packet_chips} chips"
                 f" ({packet.frames} frames)"
             )
-        rows = rows_of_chips(c)
-        return cls(Format.MASKS, len(rows) // packet.packet_chips, rows.tobytes(), codebook, packet)
+        packets = len(c) // packet.packet_chips
+        if len(led_clusters) > LEDS:
+            return replace(like, packets=packets)
+        if like.format == Format.CLUSTERS and c.shape[1] == codebook.clusters:
+            return replace(like, packets=packets, content=like.content + _bits_of_chips(c))
+        rows = rows_of_chips(c, led_clusters)
+        return replace(like, format=Format.MASKS, packets=packets, content=rows.tobytes())
 
     @property
-    def chip_rate_hz(self) -> int:
-        """Chips per second."""
-        return int(self.packet.chip_rate_hz)
+    def clusters(self) -> int:
+        """Clusters."""
+        return int(self.led_clusters.max()) + 1
 
-    def packet_bytes(self, frames: int) -> int:
-        """Bytes a packet of this format with another number of frames takes in a bank."""
-        if self.format == Format.MASKS:
-            return ROW_BYTES * replace(self.packet, frames=frames).packet_chips
-        return 2 * self.codebook.clusters * frames
+    @property
+    def table_bytes(self) -> int:
+        """Bytes before the first packet: the masks of the clusters."""
+        return self.clusters * ROW_BYTES if self.format == Format.CLUSTERS else 0
+
+    @property
+    def packet_bytes(self) -> int:
+        """Bytes of a packet."""
+        if self.format == Format.WORDS and self.composed is not None:
+            return 2 * CLUSTERS * self.composed.packet.frames
+        return self.chip_bytes * self.packet_chips
+
+    @property
+    def chip_bytes(self) -> int:
+        """Bytes of a chip, where every chip is in the bank."""
+        return -(-self.clusters // 8) if self.format == Format.CLUSTERS else ROW_BYTES
 
     @cached_property
     def duty(self) -> int:
         """Share of time that it has a LED on, that of the brightest, permille, rounded up."""
-        chips = self.packets * self.packet.packet_chips
-        if self.format == Format.MASKS:
-            rows = np.frombuffer(self.content, np.uint8).reshape(chips, ROW_BYTES)
-            on = int(np.unpackbits(rows, axis=1).sum(0, dtype=np.int64).max())
-        else:
-            words = np.frombuffer(self.content, "<u2").reshape(-1, self.codebook.clusters)
-            pilots = -(-self.packet.frames // self.packet.pilot_every)
-            own = pilots * np.bitwise_count(pilot_words(self.codebook)).astype(np.int64)
-            own += word_of_values(self.codebook.preamble).bit_count()
+        chips = self.packets * self.packet_chips
+        if self.format == Format.WORDS and self.composed is not None:
+            book, packet = self.composed.codebook, self.composed.packet
+            words = np.frombuffer(self.content, "<u2").reshape(-1, CLUSTERS)
+            pilots = -(-packet.frames // packet.pilot_every)
+            own = pilots * np.bitwise_count(pilot_words(book)).astype(np.int64)
+            own += word_of_values(book.preamble).bit_count()
             on = int((np.bitwise_count(words).sum(0, dtype=np.int64) + self.packets * own).max())
+        else:
+            rows = np.frombuffer(self.content, np.uint8, offset=self.table_bytes).reshape(chips, -1)
+            on = int(np.unpackbits(rows, axis=1).sum(0, dtype=np.int64).max())
         return -(-1000 * on // chips)
 
     @cached_property
@@ -127,43 +187,106 @@ class Bank:
         return zlib.crc32(self.content)
 
 
-def limits(codebook: Codebook, packet: PacketFormat) -> list[str]:
-    """What of a link a driver board cannot play; empty if it can."""
+def _bits_of_chips(chips: NDArray[Any]) -> bytes:
+    """A bit a cluster, cluster 0 the most significant of each chip's first byte."""
+    if chips.dtype.kind not in "uib" or not np.isin(chips, (0, 1)).all():
+        raise ConfigError("chips: expected integers 0 and 1")
+    return np.packbits(chips.astype(np.uint8), axis=1).tobytes()
+
+
+def _like(codebook: Codebook, packet: PacketFormat, led_clusters: NDArray[np.int64]) -> Bank:
+    """A bank without packets in the most compact format that takes a link.
+
+    Raises:
+        ConfigError: No board can play it.
+    """
+    _refuse(limits(packet))
+    clusters = int(led_clusters.max()) + 1
+    if clusters != codebook.clusters:
+        raise ConfigError(f"LEDs of {clusters} clusters, expected {codebook.clusters}, one for each pilot")
+    why = tuple(word_limits(codebook, packet, led_clusters))
+    composed = None if why else Composed(codebook, packet)
+    form = Format.WORDS if composed else Format.CLUSTERS if -(-clusters // 8) < ROW_BYTES else Format.MASKS
+    # more LEDs than a row has are refused by the board's own number
+    masks = form == Format.CLUSTERS and len(led_clusters) <= LEDS
+    return Bank(
+        form,
+        0,
+        masks_of_clusters(led_clusters).tobytes() if masks else b"",
+        codebook.digest,
+        codebook.profile,
+        int(packet.chip_rate_hz),
+        packet.packet_chips,
+        led_clusters,
+        composed,
+        why,
+    )
+
+
+def packet_content(like: Bank, symbols: ArrayLike, codebook: Codebook, pilot_every: int) -> bytes:
+    """One packet as it stands in a bank: symbols (frames, clusters).
+
+    Raises:
+        ConfigError: Symbols of another shape or outside the codebook.
+    """
+    if like.format == Format.WORDS:
+        return info_words(symbols, codebook).astype("<u2").tobytes()
+    chips = packet_chips(symbols, codebook, pilot_every)
+    if like.format == Format.CLUSTERS:
+        return _bits_of_chips(chips)
+    return rows_of_chips(chips, like.led_clusters).tobytes()
+
+
+def limits(packet: PacketFormat) -> list[str]:
+    """What of a link no driver board can play; empty if one can. The rest is for HELLO to say."""
+    rate = packet.chip_rate_hz
+    if rate != round(rate):
+        return [f"air.chip_rate_hz = {rate}: a board takes whole chips per second"]
+    if rate > MOST_CHIPS_A_SECOND:
+        return [f"air.chip_rate_hz = {rate}, at most {MOST_CHIPS_A_SECOND}"]
+    return []
+
+
+def word_limits(codebook: Codebook, packet: PacketFormat, led_clusters: NDArray[np.int64]) -> list[str]:
+    """Why a board cannot compose the packets of a link, so that it is sent every chip; empty if it can."""
     faults = []
-    if codebook.clusters != CLUSTERS:
-        faults.append(f"bar of {codebook.clusters} clusters, the board has {CLUSTERS}")
+    if not np.array_equal(led_clusters, BOARD_LEDS):
+        faults.append(
+            f"{len(led_clusters)} LEDs in {codebook.clusters} clusters, not {LEDS} in {CLUSTERS} equal ones"
+        )
     for name, chips in (("pilots", packet.pilot_chips), ("modulation", packet.info_chips)):
         if chips != WORD_CHIPS:
-            faults.append(f"{name}: codes of {chips} chips, the board's words have {WORD_CHIPS}")
+            faults.append(f"{name}: codes of {chips} chips, not {WORD_CHIPS}")
     if packet.preamble_chips > PREAMBLE_CHIPS:
-        faults.append(f"preamble of {packet.preamble_chips} chips, the board's has at most {PREAMBLE_CHIPS}")
+        faults.append(f"preamble of {packet.preamble_chips} chips, more than {PREAMBLE_CHIPS}")
     if packet.frames > MOST_FRAMES:
-        faults.append(f"air.frames_per_packet = {packet.frames}, at most {MOST_FRAMES}")
-    if packet.chip_rate_hz != round(packet.chip_rate_hz):
-        faults.append(f"air.chip_rate_hz = {packet.chip_rate_hz}: a board takes whole chips per second")
-    elif packet.chip_rate_hz > MOST_CHIPS_A_SECOND:
-        faults.append(f"air.chip_rate_hz = {packet.chip_rate_hz}, at most {MOST_CHIPS_A_SECOND}")
+        faults.append(f"air.frames_per_packet = {packet.frames}, more than {MOST_FRAMES}")
     return faults
 
 
 def check_link(link: Link) -> None:
-    """Raise ConfigError, one line, if a driver board cannot play a link; see `limits`."""
-    faults = limits(link.codebook, link.packet)
-    leds = np.bincount(link.bar.led_clusters())
-    other = leds[leds != LEDS // CLUSTERS]
-    if link.codebook.clusters == CLUSTERS and len(other):
-        faults.insert(0, f"bar of {other[0]} LEDs a cluster, the board has {LEDS // CLUSTERS}")
-    _refuse(faults)
+    """Raise ConfigError, one line, if no driver board can play a link; see `limits`."""
+    _refuse(limits(link.packet))
 
 
 def bank_of(symbols: ArrayLike, link: Link) -> Bank:
-    """Info words of symbols (packets, frames, clusters) of a link.
+    """Symbols (packets, frames, clusters) of a link.
 
     Raises:
-        ConfigError: The symbols are not the link's, or a board cannot play it.
+        ConfigError: The symbols are not the link's, or no board can play it.
     """
-    check_link(link)
-    return Bank.of_symbols(symbols, link.codebook, link.packet.pilot_every, link.packet.chip_rate_hz)
+    return Bank.of_symbols(
+        symbols, link.codebook, link.packet.pilot_every, link.packet.chip_rate_hz, link.bar.led_clusters()
+    )
+
+
+def queue_of(link: Link) -> Bank:
+    """The bank of a stream of a link's packets: without packets.
+
+    Raises:
+        ConfigError: No board can play it.
+    """
+    return _like(link.codebook, link.packet, link.bar.led_clusters())
 
 
 def _refuse(faults: list[str]) -> None:
@@ -193,16 +316,16 @@ def symbol_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -
     return np.concatenate([packet_chips(packet, codebook, pilot_every) for packet in _checked(symbols)])
 
 
-def read_masks(path: Path, codebook: Codebook, packet: PacketFormat) -> Bank:
-    """Precomposed chips of a `.npy` file: uint8 (chips, 96) or (chips, 16), whole packets.
+def read_masks(path: Path, link: Link) -> Bank:
+    """Chips of a link from a `.npy` file: uint8 (chips, LEDs) or (chips, clusters), whole packets.
 
     Raises:
-        ConfigError: A board cannot play such packets.
+        ConfigError: No board can play such packets.
         InputError: The file cannot be read, or holds something else.
     """
-    _refuse(limits(codebook, packet))
+    check_link(link)
     chips = read_numbers(path)
     try:
-        return Bank.of_masks(chips, codebook, packet)
+        return Bank.of_chips(chips, link.codebook, link.packet, link.bar.led_clusters())
     except ConfigError as fault:
         raise InputError(f"{path}: {fault}") from fault

@@ -4,24 +4,32 @@ import zlib
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from evlcp_sdk.air.codebook import Codebook, word_of_values
+import numpy as np
+from numpy.typing import ArrayLike
+
+from evlcp_sdk.air.codebook import word_of_values
 from evlcp_sdk.air.frames import pilot_words
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
-from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank, check_link
+from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank, packet_content, queue_of
 from firmware_host.board.session import Session
 from firmware_host.board.stream import AHEAD, Stream
 from firmware_host.errors import IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.protocol.client import RequestOutcome
 from firmware_host.protocol.profiles import DIGESTS
 from firmware_host.protocol.requests import (
+    CLUSTERS,
     KEY_BYTES,
+    LEDS,
     NO_BANK,
+    ROW_BYTES,
     BlankReply,
     BlankRequest,
     Capability,
+    ChipsReply,
+    ChipsRequest,
     CodebookReply,
     CodebookRequest,
     CommitReply,
@@ -66,6 +74,9 @@ __all__ = ["Board", "Programmed", "Settings", "profile_number", "provision"]
 
 _BLOCK = 2048
 """Bytes of a bank whose CRC decides together whether they are there."""
+
+_MOST_HOLD = 255
+"""Chips of its chip rate that a board shows a chip for, at most."""
 
 _LEAST = 32
 """Smallest piece that a noisy line is tried with, bytes."""
@@ -258,35 +269,51 @@ class Board:
             )
 
     def prepare(self, bank: Bank) -> None:
-        """Set chip rate, profile and codebook for the next commit.
+        """Set chip rate, profile and codebook, or how many chips a packet has, for the next commit.
 
         Raises:
-            IncompatibleError: The firmware was built with another codebook.
+            IncompatibleError: The firmware was built with another codebook, or plays no chips without one.
             RefusedError: The board cannot take a value.
         """
         self._configure(bank)
-        book = bank.codebook
+        digest = bytes.fromhex(bank.digest)
+        if bank.composed is None:
+            clusters = bank.clusters if bank.format == Format.CLUSTERS else 0
+            request = ChipsRequest(bank.packet_chips, self._hold(bank), clusters, digest)
+            self.session.call(request, ChipsReply)
+            return
+        book = bank.composed.codebook
         pilots = tuple(int(w) for w in pilot_words(book))
-        request = CodebookRequest(
-            bank.packet.preamble_chips, word_of_values(book.preamble), pilots, bytes.fromhex(book.digest)
-        )
-        self.session.call(request, CodebookReply)
+        preamble = word_of_values(book.preamble)
+        self.session.call(CodebookRequest(2 * len(book.preamble), preamble, pilots, digest), CodebookReply)
+
+    def _hold(self, bank: Bank) -> int:
+        """How many chips of the board's chip rate a chip of the bank lasts.
+
+        More than one where the board has no chips as long as these.
+        """
+        about, rate = self.about, bank.chip_rate_hz
+        if bank.composed is None:
+            for hold in range(1, min(_MOST_HOLD, about.chip_rate_max_hz // rate) + 1):
+                if rate * hold >= about.chip_rate_min_hz and about.tick_hz % (rate * hold) == 0:
+                    return hold
+        return 1
 
     def _configure(self, bank: Bank, level_limit_ma: int = 0, duty_limit: int = 0) -> None:
-        packet, chip_rate_hz, profile = bank.packet, bank.chip_rate_hz, profile_number(bank.codebook)
-        configure = ConfigureRequest(
-            chip_rate_hz, profile, packet.frames, packet.pilot_every, level_limit_ma, duty_limit
-        )
+        about, rate = self.about, bank.chip_rate_hz * self._hold(bank)
+        frames, every = _frames(bank)
+        configure = ConfigureRequest(rate, profile_number(bank), frames, every, level_limit_ma, duty_limit)
         try:
             self.session.call(configure, ConfigureReply)
         except RefusedError as fault:
             # the chip rate is what the board looks at first
-            wrong = chip_rate_hz > self.about.chip_rate_max_hz or self.about.tick_hz % chip_rate_hz
+            wrong = not about.chip_rate_min_hz <= rate <= about.chip_rate_max_hz or about.tick_hz % rate
             if fault.status != Status.OUT_OF_RANGE or not wrong:
                 raise
+            least = f"at least {about.chip_rate_min_hz}, " if about.chip_rate_min_hz else ""
             raise RefusedError(
-                f"{self.session.name}: no chip rate of {chip_rate_hz} Hz: must divide"
-                f" {self.about.tick_hz} Hz, at most {self.about.chip_rate_max_hz};"
+                f"{self.session.name}: no chip rate of {rate} Hz: must divide"
+                f" {about.tick_hz} Hz, {least}at most {about.chip_rate_max_hz};"
                 f" the nearest the board can take is {fault.detail}",
                 fault.status,
                 fault.detail,
@@ -294,27 +321,22 @@ class Board:
 
     def holds(self, bank: Bank, status: StatusReply) -> bool:
         """Whether the active bank is this one."""
-        return status.active_bank != NO_BANK and (
-            status.format,
-            status.packets,
-            status.frames,
-            status.pilot_every,
-            status.length,
-            status.crc,
-            status.chip_rate_hz,
-            status.profile,
-            status.digest.hex(),
-        ) == (
-            bank.format,
-            bank.packets,
-            bank.packet.frames,
-            bank.packet.pilot_every,
-            len(bank.content),
-            bank.crc,
-            bank.chip_rate_hz,
-            profile_number(bank.codebook),
-            bank.codebook.digest,
-        )
+        if status.active_bank == NO_BANK or not self._same_packets(bank, status):
+            return False
+        held = (status.crc, status.chip_rate_hz, status.profile, status.digest.hex())
+        rate_hz = bank.chip_rate_hz * self._hold(bank)
+        return held == (bank.crc, rate_hz, profile_number(bank), bank.digest)
+
+    def _same_packets(self, bank: Bank, status: StatusReply) -> bool:
+        """Whether the active bank has packets of the same number and lengths."""
+        if (status.format, status.packets, status.length) != (bank.format, bank.packets, len(bank.content)):
+            return False
+        if bank.composed is not None:
+            return not status.hold and (status.frames, status.pilot_every) == _frames(bank)
+        clusters = bank.clusters if bank.format == Format.CLUSTERS else 0
+        hold = self._hold(bank)
+        expected = (hold * bank.packet_chips, hold, clusters)
+        return (status.packet_chips, status.hold, status.clusters) == expected
 
     def program(self, content: Bank, verify: bool = True, progress: Progress | None = None) -> Programmed:
         """Bring a bank's content onto the board and make it active; what is there already is not sent again.
@@ -345,7 +367,7 @@ class Board:
                 f"{self.session.name}: bank {bank} does not hold what was sent; the old one goes on;"
                 " program it again, and if that does not help have the board looked at"
             )
-        digest = bytes.fromhex(content.codebook.digest)
+        digest = bytes.fromhex(content.digest)
         commit = CommitRequest(bank, content.format, content.packets, total, content.crc, digest)
         self.session.call(commit, CommitReply)
         status = self._settled()
@@ -373,21 +395,23 @@ class Board:
                 others, and how long the host may be held up.
 
         Raises:
-            ConfigError: A board cannot play the link, or `ahead` is less than 2.
-            IncompatibleError: The firmware has no streams, or another codebook.
+            ConfigError: The board cannot play the link, or `ahead` is less than 2.
+            IncompatibleError: The firmware has no streams, or another codebook, or does not play such links.
             RefusedError: The board refuses a value, or plays at another chip rate.
         """
         if ahead < 2:
             raise ConfigError(f"ahead = {ahead}, expected 2 or more packets: one plays, the next waits")
-        check_link(link)
+        like = queue_of(link)
         if not self.about.capabilities & Capability.STREAM:
             raise IncompatibleError(f"{self.session.name}: its firmware has no streams; update the firmware")
-        like = Bank(Format.WORDS, 0, b"", link.codebook, link.packet)
+        self.check_fits(like)
         status = self._settled()
         self._check_rate(like, status)
         self.prepare(like)
         bank = 1 if status.active_bank == 0 else 0
-        request = StreamRequest(bank, Format.WORDS, bytes.fromhex(link.codebook.digest))
+        if like.content:
+            self.fill(bank, like.content)
+        request = StreamRequest(bank, like.format, bytes.fromhex(like.digest))
         slots = self.session.call(request, StreamReply).slots
         if ahead >= slots:
             raise ConfigError(
@@ -396,14 +420,24 @@ class Board:
         if status.state != State.PLAYING:
             self.start()
         acts = status.watchdog != Watchdog.KEEP
-        return Stream(self.session, bank, like, ahead, min(0.5, status.watchdog_ms / 3e3) if acts else 0.5)
+
+        def content(symbols: ArrayLike) -> bytes:
+            packet, shape = np.asarray(symbols), (link.packet.frames, link.codebook.clusters)
+            if packet.shape != shape:
+                raise ConfigError(f"symbols of shape {packet.shape}, expected {shape}: frames, clusters")
+            return packet_content(like, packet, link.codebook, link.packet.pilot_every)
+
+        packet_s = like.packet_chips / like.chip_rate_hz
+        pulse_s = min(0.5, status.watchdog_ms / 3e3) if acts else 0.5
+        return Stream(self.session, bank, content, packet_s, ahead, pulse_s)
 
     def _check_rate(self, content: Bank, status: StatusReply) -> None:
         """Raise RefusedError if chips run at another rate, which a board that plays keeps."""
-        if _rate_held(status) and status.chip_rate_hz != content.chip_rate_hz:
+        rate_hz = content.chip_rate_hz * self._hold(content)
+        if _rate_held(status) and status.chip_rate_hz != rate_hz:
             raise RefusedError(
                 f"{self.session.name}: plays {status.chip_rate_hz} chips per second, this payload has"
-                f" {content.chip_rate_hz}: a board that plays keeps its rate; 'evlcp board stop' first;"
+                f" {rate_hz}: a board that plays keeps its rate; 'evlcp board stop' first;"
                 " nothing was sent",
                 Status.BUSY,
                 status.chip_rate_hz,
@@ -411,16 +445,17 @@ class Board:
 
     def check_same_air(self, bank: Bank, status: StatusReply) -> None:
         """Raise IncompatibleError unless what plays and what comes are of one codebook and one chip rate."""
-        plays, comes = f"codebook {status.digest.hex()[:16]}", f"codebook {bank.codebook.digest[:16]}"
-        if status.digest.hex() == bank.codebook.digest:
-            if status.chip_rate_hz == bank.chip_rate_hz:
+        plays, comes = f"codebook {status.digest.hex()[:16]}", f"codebook {bank.digest[:16]}"
+        if status.digest.hex() == bank.digest:
+            rate_hz = status.chip_rate_hz // max(1, status.hold)
+            if rate_hz == bank.chip_rate_hz:
                 return
             plays, comes = (
-                f"{status.chip_rate_hz} chips per second",
+                f"{rate_hz} chips per second",
                 f"air.chip_rate_hz = {bank.chip_rate_hz}",
             )
         raise IncompatibleError(
-            f"{self.session.name}: plays {plays}, this payload's link has {comes} ({bank.codebook.profile});"
+            f"{self.session.name}: plays {plays}, this payload's link has {comes} ({bank.profile});"
             " give its link with -c or --set, or 'evlcp board program' to change it"
         )
 
@@ -440,13 +475,12 @@ class Board:
                 f"{name}: its bank is the queue of a stream, which holds nothing to compare; {again}"
             )
         self.check_same_air(bank, s)
-        packet = bank.packet
-        shape = (s.format, s.packets, s.frames, s.pilot_every, s.length)
-        if shape != (bank.format, bank.packets, packet.frames, packet.pilot_every, len(bank.content)):
+        if not self._same_packets(bank, s):
+            holds = f"{s.packet_chips // s.hold} chips" if s.hold else _in_frames(s.frames, s.pilot_every)
+            wanted = _in_frames(*_frames(bank)) if bank.composed else f"{bank.packet_chips} chips"
             raise VerifyError(
-                f"{name}: holds {s.packets} packets of {s.frames} frames, pilot in every"
-                f" {s.pilot_every}, {s.length} bytes; expected {bank.packets} of {packet.frames},"
-                f" pilot in every {packet.pilot_every}, {len(bank.content)} bytes; {again}"
+                f"{name}: holds {s.packets} packets of {holds}, {s.length} bytes; expected {bank.packets} of"
+                f" {wanted}, {len(bank.content)} bytes; {again}"
             )
         held = self.read(s.active_bank, 0, s.length)
         differ = next((i for i, (a, b) in enumerate(zip(held, bank.content, strict=True)) if a != b), None)
@@ -458,24 +492,42 @@ class Board:
         return s.active_bank
 
     def check_fits(self, bank: Bank) -> None:
-        """Raise ConfigError unless the content fits the board's clusters and bank."""
-        if bank.codebook.clusters != self.about.clusters:
+        """Raise ConfigError unless the content fits the board's LEDs, formats and bank, as HELLO tells them.
+
+        Raises:
+            IncompatibleError: Its firmware does not play such links.
+        """
+        about, name, leds = self.about, self.session.name, len(bank.led_clusters)
+        if leds > about.leds:
+            raise ConfigError(f"a link of {leds} LEDs, {name} has {about.leds}: HELLO says so")
+        if bank.composed is not None and (about.leds, about.clusters) != (LEDS, CLUSTERS):
             raise ConfigError(
-                f"packets of {bank.codebook.clusters} clusters, {self.session.name} has {self.about.clusters}"
+                f"packets of {CLUSTERS} clusters and {LEDS} LEDs, {name} has {about.clusters}"
+                f" and {about.leds}: HELLO says so"
             )
-        each = len(bank.content) // bank.packets
-        room = self.about.bank_bytes
-        frames = bank.packet.frames
-        if each > room:
-            fits = bisect_right(range(1, frames + 1), room, key=bank.packet_bytes)
-            raise ConfigError(
-                f"a packet of {frames} frames takes {each} bytes, a bank of {self.session.name} has"
-                f" {room}: not one fits; a packet may have at most {fits} frames"
+        if bank.composed is None and not about.formats >> bank.format & 1:
+            reasons = "; ".join(bank.word_limits)
+            raise IncompatibleError(
+                f"{name}: its firmware (protocol {about.major}.{about.minor}) plays packets that it composes"
+                f" alone, and this link has {reasons}; update the firmware"
             )
-        if len(bank.content) > room:
+        room = about.bank_bytes - bank.table_bytes
+        what = f"a bank of {name} has {about.bank_bytes}" + (
+            f", {bank.table_bytes} of them for the clusters" if bank.table_bytes else ""
+        )
+        # a stream needs room for one that plays and one that comes
+        queue = not bank.packets
+        if bank.packet_bytes * (2 if queue else 1) > room:
+            most = _most(bank, room // 2 if queue else room)
             raise ConfigError(
-                f"{bank.packets} packets of {each} bytes, a bank of {self.session.name} has"
-                f" {room} bytes: send at most {room // each} packets"
+                f"a packet of {_length(bank)} takes {bank.packet_bytes} bytes, {what}:"
+                f" {'a stream needs room for two' if queue else 'not one fits'};"
+                f" a packet may have at most {most}"
+            )
+        if bank.packet_bytes * bank.packets > room:
+            raise ConfigError(
+                f"{bank.packets} packets of {bank.packet_bytes} bytes, {what}:"
+                f" send at most {room // bank.packet_bytes} packets"
             )
 
     def fill(self, bank: int, content: bytes, progress: Progress | None = None) -> int:
@@ -642,14 +694,47 @@ def _rate_held(status: StatusReply) -> bool:
 
 
 def _packet_s(status: StatusReply) -> float:
-    """Time a packet of the active bank takes at most, s: the longest preamble, a pilot in every frame."""
-    return (PREAMBLE_CHIPS + 2 * WORD_CHIPS * status.frames) / status.chip_rate_hz
+    """Time a packet of the active bank takes at most, s; of an older board by its frames."""
+    chips = status.packet_chips or PREAMBLE_CHIPS + 2 * WORD_CHIPS * status.frames
+    return chips / status.chip_rate_hz
+
+
+def _frames(bank: Bank) -> tuple[int, int]:
+    """Frames of a packet, and from one pilot to the next; one each where the board composes none."""
+    composed = bank.composed
+    return (composed.packet.frames, composed.packet.pilot_every) if composed else (1, 1)
+
+
+def _in_frames(frames: int, pilot_every: int) -> str:
+    return f"{frames} frames, pilot in every {pilot_every}"
+
+
+def _length(bank: Bank) -> str:
+    """How long a bank's packets are, for a person."""
+    if bank.composed is not None:
+        return f"{bank.composed.packet.frames} frames"
+    return f"{bank.packet_chips} chips"
+
+
+def _most(bank: Bank, room: int) -> str:
+    """How long a bank's packets may be, for a person."""
+    if bank.composed is None:
+        return f"{room // bank.chip_bytes} chips"
+    packet = bank.composed.packet
+
+    def size(frames: int) -> int:
+        chips = replace(packet, frames=frames).packet_chips
+        return 2 * CLUSTERS * frames if bank.format == Format.WORDS else ROW_BYTES * chips
+
+    return f"{bisect_right(range(1, packet.frames + 1), room, key=size)} frames"
 
 
 def _silent(done: int, total: int) -> None:
     del done, total
 
 
-def profile_number(book: Codebook) -> int:
-    """The protocol's number of a codebook; `custom` for one that the firmware was not built with."""
-    return next((p for p, digest in DIGESTS.items() if digest == book.digest), Profile.CUSTOM)
+def profile_number(bank: Bank) -> int:
+    """The protocol's number of a bank's codebook; `custom` for one that the firmware was not built with."""
+    if bank.composed is None:
+        return Profile.CUSTOM
+    return next((p for p, digest in DIGESTS.items() if digest == bank.digest), Profile.CUSTOM)

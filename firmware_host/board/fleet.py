@@ -261,7 +261,7 @@ def _bank(path: Path, index: int, entry: Entry, links: _Links) -> Bank:
         if entry.has_message:
             return bank_of(_message(path.parent, entry, link), link)
         if entry.payload is not None:
-            return read_masks(path.parent / entry.payload, link.codebook, link.packet)
+            return read_masks(path.parent / entry.payload, link)
         packets, frames = entry.random or 0, link.packet.frames
         if packets * frames > MOST_RANDOM_FRAMES:
             raise ConfigError(

@@ -7,12 +7,8 @@ from itertools import takewhile
 from types import TracebackType
 from typing import Self
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from evlcp_sdk.air.frames import info_words
-from evlcp_sdk.errors import ConfigError
-from firmware_host.board.bank import Bank
 from firmware_host.board.session import Session
 from firmware_host.errors import BoardError, LineError
 from firmware_host.protocol.client import RequestOutcome
@@ -60,7 +56,8 @@ class Stream:
     Args:
         session: The session with the board; nothing else may use it meanwhile.
         bank: The bank that is the queue.
-        like: An empty bank of the link that packets are sent with.
+        content: What a packet is in the bank: symbols (frames, clusters) to bytes.
+        packet_s: How long a packet takes, s.
         ahead: Packets that wait on the board, the one that plays among them: few for a short delay, many for
             a host that may be held up.
         pulse_s: How long the board may hear nothing, s.
@@ -72,10 +69,18 @@ class Stream:
         requests: Requests sent, repeated ones included.
     """
 
-    def __init__(self, session: Session, bank: int, like: Bank, ahead: int, pulse_s: float) -> None:
+    def __init__(
+        self,
+        session: Session,
+        bank: int,
+        content: Callable[[ArrayLike], bytes],
+        packet_s: float,
+        ahead: int,
+        pulse_s: float,
+    ) -> None:
         self._session = session
         self._bank = bank
-        self._like = like
+        self._content = content
         self._ahead = ahead
         self._pulse_s = pulse_s
         self._room = session.max_payload - _PIECE_OVERHEAD
@@ -84,7 +89,7 @@ class Stream:
         self._pieces: list[_Piece] = []
         self._flight: dict[int, tuple[_Piece | None, PushRequest]] = {}
         self._position = (0, 0)
-        self.packet_s = like.packet.packet_chips / like.chip_rate_hz
+        self.packet_s = packet_s
         self._heard_s = session.transport.now()
         self._hold_s = self._heard_s
         # the latest at which the newest packet that is known to have begun did so; the first begins at once
@@ -158,11 +163,7 @@ class Stream:
             ConfigError: They are not a packet of the link.
             BoardError: The line or the board fails.
         """
-        book, packet = self._like.codebook, np.asarray(symbols)
-        expected = (self._like.packet.frames, book.clusters)
-        if packet.shape != expected:
-            raise ConfigError(f"symbols of shape {packet.shape}, expected {expected}: frames, clusters")
-        number, content = self.sent, info_words(packet, book).astype("<u2").tobytes()
+        number, content = self.sent, self._content(symbols)
         self.sent += 1
         for at in range(0, len(content), self._room):
             data = content[at : at + self._room]

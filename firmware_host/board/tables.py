@@ -29,9 +29,11 @@ def about_table(about: HelloReply) -> dict[str, Any]:
         "leds": about.leds,
         "banks": about.banks,
         "bank_bytes": about.bank_bytes,
+        "formats": names_of_formats(about),
         "window": about.window,
         "max_payload": about.max_payload,
         "tick_hz": about.tick_hz,
+        "chip_rate_min_hz": about.chip_rate_min_hz,
         "chip_rate_max_hz": about.chip_rate_max_hz,
         "clock_hz": about.clock_hz,
         "level_max_ma": about.level_max_ma,
@@ -41,6 +43,16 @@ def about_table(about: HelloReply) -> dict[str, Any]:
         "key": about.key_name.hex() if any(about.key_name) else None,
         "uptime_ms": about.uptime_ms,
     }
+
+
+def names_of_formats(about: HelloReply) -> list[str]:
+    """What a bank of a board may hold, and how many chips of that.
+
+    A board that does not say so takes words and masks.
+    """
+    known = about.formats or 1 << Format.WORDS | 1 << Format.MASKS
+    numbers = [n for n in range(known.bit_length()) if known >> n & 1]
+    return [name_of(Format, n) for n in numbers]
 
 
 def name_of(enum: type[Enum], value: int) -> str:
@@ -74,9 +86,12 @@ def status_table(status: StatusReply) -> dict[str, Any]:
         table |= {
             "format": name_of(Format, status.format),
             "profile": name_of(Profile, status.profile),
-            "frames": status.frames,
-            "pilot_every": status.pilot_every,
+            "frames": None if status.hold else status.frames,
+            "pilot_every": None if status.hold else status.pilot_every,
             "packets": status.packets,
+            "packet_chips": status.packet_chips,
+            "hold": status.hold,
+            "clusters": status.clusters,
             "length": status.length,
             "crc": f"{status.crc:08x}",
         }

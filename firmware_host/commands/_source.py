@@ -87,12 +87,11 @@ def bank(
         IncompatibleError: The file was made with another link.
         InputError: The file is wrong.
     """
-    from firmware_host.board.bank import bank_of, check_link, read_masks
+    from firmware_host.board.bank import bank_of, read_masks
 
     if masks is None:
         return bank_of(*symbols(path, random, seed, link_file, overrides))
     if path is not None or random is not None:
         raise ConfigError("--masks, --random and SYMBOLS.json: give one of them")
     link = _given(link_file, overrides) or _default()
-    check_link(link)
-    return read_masks(masks, link.codebook, link.packet)
+    return read_masks(masks, link)

@@ -771,9 +771,14 @@ def unlock(context: typer.Context, as_json: AsJson = False) -> None:
 def leds(
     record: Annotated[Path, typer.Argument(metavar="FILE", help="LED record of an emulator.")],
     chips: Annotated[
-        Path, typer.Option(metavar="OUT.npy", help="Chips: uint8, one row per chip, one column per cluster.")
+        Path,
+        typer.Option(
+            metavar="OUT.npy", help="Chips: uint8, one row per chip, one column per cluster of the link."
+        ),
     ],
     per_led: Annotated[bool, typer.Option("--per-led", help="One column an LED instead.")] = False,
+    link_file: LinkFile = None,
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Turn an LED record into a chip table; the ticks go into OUT.ticks.npy.
@@ -785,11 +790,12 @@ def leds(
     """
     from evlcp_sdk.errors import ConfigError, InputError
     from evlcp_sdk.files import Outputs
+    from evlcp_sdk.link.resolve import load_link
     from firmware_host.emulators.led_record import LedRecord
 
     played = LedRecord.read(record).played()
     try:
-        table = played.chips(96 if per_led else 16)
+        table = played.chips(None if per_led else load_link(link_file, overrides or []).bar.led_clusters())
     except ConfigError as fault:
         raise InputError(f"{record}: {fault}") from fault
     with Outputs() as outputs:

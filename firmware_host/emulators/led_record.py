@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError
 from firmware_host.protocol.requests import CHIP_DARK, CHIP_TEST, ROW_BYTES
-from firmware_host.protocol.rows import chips_of_rows
+from firmware_host.protocol.rows import BOARD_LEDS, chips_of_rows
 
 __all__ = ["RECORD", "LedRecord"]
 
@@ -91,13 +91,16 @@ class LedRecord:
         keep = (self.numbers != CHIP_DARK) & (self.numbers != CHIP_TEST)
         return LedRecord(self.ticks[keep], self.numbers[keep], self.rows[keep], self.cut_bytes)
 
-    def chips(self, clusters: int = 16) -> NDArray[np.uint8]:
-        """The chip table, uint8 (n, clusters); 96 clusters give every LED.
+    def chips(self, led_clusters: NDArray[np.int64] | None = BOARD_LEDS) -> NDArray[np.uint8]:
+        """The chip table, uint8 (n, clusters).
+
+        Args:
+            led_clusters: The cluster of each LED; None for a column of every LED.
 
         Raises:
-            ConfigError: LEDs of one cluster differ.
+            ConfigError: LEDs of one cluster differ, or one that is in none is lit.
         """
-        return chips_of_rows(self.rows, clusters)
+        return chips_of_rows(self.rows, led_clusters)
 
     def __len__(self) -> int:
         return len(self.ticks)

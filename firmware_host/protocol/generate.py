@@ -184,9 +184,11 @@ def python_module(definition: dict[str, Any]) -> str:
                 out.append("    )")
             if message.get("since", 0):
                 out.append(f"    SINCE: ClassVar[int] = {message['since']}")
-            later = ", ".join(f'"{f.name}": {f.since}' for f in fields if f.since)
+            later = [f'"{f.name}": {f.since}' for f in fields if f.since]
             if later:
-                out.append(f"    FIELD_SINCE: ClassVar[dict[str, int]] = {{{later}}}")
+                head = "    FIELD_SINCE: ClassVar[dict[str, int]] = {"
+                one = f"{head}{', '.join(later)}}}"
+                out += [one] if len(one) <= 110 else [head, *(f"        {row}," for row in later), "    }"]
             if fields:
                 out.append("")
             out += [f"    {f.name}: {f.python_type}{f.python_default}" for f in fields]

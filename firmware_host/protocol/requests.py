@@ -32,6 +32,8 @@ __all__ = [
     "BlankRequest",
     "BoardFault",
     "Capability",
+    "ChipsReply",
+    "ChipsRequest",
     "CodebookReply",
     "CodebookRequest",
     "CommitReply",
@@ -90,7 +92,7 @@ __all__ = [
 
 MAJOR = 2
 """Version of the protocol: of another major one no message is understood."""
-MINOR = 1
+MINOR = 2
 """Version of the protocol: what it has beyond the major version's first."""
 HEADER_BYTES = 6
 CRC_BYTES = 4
@@ -144,6 +146,7 @@ class Type(IntEnum):
     STREAM = 0x18
     PUSH = 0x19
     KEY = 0x1A
+    CHIPS = 0x1B
     UPDATE_STATUS = 0x20
     UPDATE_BEGIN = 0x21
     UPDATE_WRITE = 0x22
@@ -200,6 +203,8 @@ class Format(IntEnum):
     """Info words u16 [packet][frame][cluster]; the board adds preamble and pilots."""
     MASKS = 1
     """Chip masks, row_bytes a chip, LED 0 the most significant bit of the first byte."""
+    CLUSTERS = 2
+    """The mask of each cluster, then chips: whole bytes, a bit a cluster, cluster 0 first."""
 
 
 class Profile(IntEnum):
@@ -340,6 +345,8 @@ class HelloReply(WireMessage):
         clock_hz: Rate of STATUS's clock, nominal.
         challenge: Drawn for the session: seals are over it.
         key_name: First bytes of the SHA-256 of the board's key; zeros without one.
+        formats: What a bank may hold, 1 << format; 0: words and masks, in packets of a codebook.
+        chip_rate_min_hz: Slowest chip rate.
     """
 
     TYPE: ClassVar[int] = 0x01
@@ -368,8 +375,16 @@ class HelloReply(WireMessage):
         ("I", 1),
         ("8s", 1),
         ("4s", 1),
+        ("H", 1),
+        ("I", 1),
     )
-    FIELD_SINCE: ClassVar[dict[str, int]] = {"clock_hz": 1, "challenge": 1, "key_name": 1}
+    FIELD_SINCE: ClassVar[dict[str, int]] = {
+        "clock_hz": 1,
+        "challenge": 1,
+        "key_name": 1,
+        "formats": 2,
+        "chip_rate_min_hz": 2,
+    }
 
     major: int
     minor: int
@@ -395,6 +410,8 @@ class HelloReply(WireMessage):
     clock_hz: int = 0
     challenge: bytes = bytes(8)
     key_name: bytes = bytes(4)
+    formats: int = 0
+    chip_rate_min_hz: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -783,6 +800,9 @@ class StatusReply(WireMessage):
         clock: The board's clock, which counts freely and wraps.
         pulses: Pulses of the pulse input since reset.
         pulse_clocks: Clocks from the pulse before to the latest; 0: unknown.
+        packet_chips: Length of a packet of the active bank, in chips of the chip rate.
+        hold: How many of these a chip of the bank lasts; 0: the bank is of a codebook.
+        clusters: Clusters of the active bank's masks; 0 without these.
     """
 
     TYPE: ClassVar[int] = 0x0C
@@ -823,8 +843,18 @@ class StatusReply(WireMessage):
         ("I", 1),
         ("I", 1),
         ("I", 1),
+        ("I", 1),
+        ("B", 1),
+        ("B", 1),
     )
-    FIELD_SINCE: ClassVar[dict[str, int]] = {"clock": 1, "pulses": 1, "pulse_clocks": 1}
+    FIELD_SINCE: ClassVar[dict[str, int]] = {
+        "clock": 1,
+        "pulses": 1,
+        "pulse_clocks": 1,
+        "packet_chips": 2,
+        "hold": 2,
+        "clusters": 2,
+    }
 
     state: int
     faults: int
@@ -862,6 +892,9 @@ class StatusReply(WireMessage):
     clock: int = 0
     pulses: int = 0
     pulse_clocks: int = 0
+    packet_chips: int = 0
+    hold: int = 0
+    clusters: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -1095,6 +1128,41 @@ class KeyReply(WireMessage):
 
 
 @dataclass(frozen=True, slots=True)
+class ChipsRequest(WireMessage):
+    """Set packets of chips alone for the next COMMIT or STREAM, in place of a codebook.
+
+    Attributes:
+        packet_chips: Chips of a packet in the bank.
+        hold: How many chips of the chip rate each of them lasts, from 1 on.
+        clusters: Clusters of the format CLUSTERS; 0: MASKS only.
+        digest: SHA-256 of what chips mean, which COMMIT repeats.
+    """
+
+    TYPE: ClassVar[int] = 0x1B
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
+        ("I", 1),
+        ("B", 1),
+        ("B", 1),
+        ("32s", 1),
+    )
+    SINCE: ClassVar[int] = 2
+
+    packet_chips: int
+    hold: int
+    clusters: int
+    digest: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class ChipsReply(WireMessage):
+    """What the board answers to CHIPS."""
+
+    TYPE: ClassVar[int] = 0x1B
+    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    SINCE: ClassVar[int] = 2
+
+
+@dataclass(frozen=True, slots=True)
 class UpdateStatusRequest(WireMessage):
     """Which image of the firmware runs, and where another one would go."""
 
@@ -1275,6 +1343,7 @@ REPLIES: dict[int, type[WireMessage]] = {
     0x18: StreamReply,
     0x19: PushReply,
     0x1A: KeyReply,
+    0x1B: ChipsReply,
     0x20: UpdateStatusReply,
     0x21: UpdateBeginReply,
     0x22: UpdateWriteReply,

@@ -40,7 +40,7 @@ def every_request(board: Board, bank: Bank, update: bytes) -> list[str]:
     except RefusedError as fault:
         say((fault.status, fault.detail))
     spare = 1 - board.status().active_bank
-    digest = bytes.fromhex(bank.codebook.digest)
+    digest = bytes.fromhex(bank.digest)
     slots = call(r.StreamRequest(spare, r.Format.WORDS, digest), r.StreamReply).slots
     say(slots)
     push = call(r.PushRequest(spare, 0, 0, 0, bank.content[:64]), r.PushReply)

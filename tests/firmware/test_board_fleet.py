@@ -51,8 +51,8 @@ def test_a_boards_link(tmp_path: Path) -> None:
     extra = {1: "link = {air = {pilot_every = 4, frames_per_packet = 8}}\n", 2: 'link = "links/fast.toml"\n'}
     file = inventory(tmp_path / "three.toml", ["unix:/a", "unix:/b", "unix:/c"], extra)
     banks = [bank for _, bank in read_inventory(file).boards]
-    assert [b.packet.pilot_every for b in banks] == [1, 4, 1]
-    assert [b.packet.frames for b in banks] == [10, 8, 10]
+    assert [b.composed.packet.pilot_every for b in banks] == [1, 4, 1]
+    assert [b.composed.packet.frames for b in banks] == [10, 8, 10]
     assert [b.chip_rate_hz for b in banks] == [10_000, 10_000, 20_000]
     inventory(file, ["unix:/a"], {0: "link = {air = {pilot_every = 0}}\n"})
     with pytest.raises(ConfigError, match=r"board\[0\]: link: air\.pilot_every = 0"):
@@ -64,7 +64,7 @@ def test_a_link_for_all_boards(tmp_path: Path) -> None:
     file.write_text(
         file.read_text().replace("random = 16", 'random = 16\nlink = {modulation = {id = "wh8"}}')
     )
-    assert [bank.codebook.profile for _, bank in read_inventory(file).boards] == ["wh8", "wh4x2"]
+    assert [bank.profile for _, bank in read_inventory(file).boards] == ["wh8", "wh4x2"]
 
 
 def test_a_payload_has_its_own_link(evlcp, tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ def test_a_payload_has_its_own_link(evlcp, tmp_path: Path) -> None:
     entry = 'id = "a"\nport = "native:"\nposition_m = [0, 0, 0]\npayload = "m.json"\n'
     file.write_text("[[board]]\n" + entry)
     ((_, bank),) = read_inventory(file).boards
-    assert (bank.codebook.profile, bank.chip_rate_hz) == ("wh8", 5000)
+    assert (bank.profile, bank.chip_rate_hz) == ("wh8", 5000)
     file.write_text("[[board]]\n" + entry + "link = {air = {chip_rate_hz = 5000.0}}\n")
     with pytest.raises(IncompatibleError, match=r"board\[0\]: .*modulation\.id: sent with .*wh8"):
         read_inventory(file)
@@ -140,8 +140,8 @@ GOOD = 'id = "a"\nport = "native:"\nposition_m = [0, 0, 0]\nrandom = 1\n'
         ),
         ('[[board]]\nlink = "no.toml"\n' + GOOD, "no.toml: cannot be read"),
         (
-            "[[board]]\nlink = {bar = {rows = 48}}\n" + GOOD,
-            "board[0]: the driver board cannot play this link: bar",
+            "[[board]]\nlink = {air = {chip_rate_hz = 2e6}}\n" + GOOD,
+            "board[0]: the driver board cannot play this link: air",
         ),
         (
             "[[board]]\nlink = {air = {chip_rate_hz = 12.5}}\n" + GOOD,

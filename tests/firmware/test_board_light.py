@@ -26,7 +26,7 @@ CHIPS = 26 + 32 * FRAMES
 
 def bank_of_rows(rows: NDArray[np.uint8]) -> Bank:
     book = load_link().codebook
-    return Bank.of_masks(rows, book, PacketFormat.of(book, FRAMES))
+    return Bank.of_chips(rows, book, PacketFormat.of(book, FRAMES))
 
 
 def excess(rows: NDArray[np.uint8], duty: float) -> NDArray[np.float64]:
@@ -42,7 +42,7 @@ def device_and_board() -> tuple[SimulatedBoard, Board]:
 
 
 def shown(device: SimulatedBoard) -> NDArray[np.uint8]:
-    return device.records().played().chips(96)
+    return device.records().played().chips(None)
 
 
 def test_the_oracle_counts_every_stretch() -> None:
@@ -182,7 +182,7 @@ def test_no_stretch_of_what_is_sent_is_beyond_the_limits(
         faults = board.status().faults
         board.blank()
         record = device.records().played()
-        part = record.chips(96)
+        part = record.chips(None)
         # the first row beyond the limits is the one that was not shown
         endless = np.resize(rows, (len(part) + 1, 96))
         assert (part == endless[:-1]).all()

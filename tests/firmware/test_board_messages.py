@@ -215,13 +215,8 @@ def test_another_link_is_refused_and_says_where(
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        (("pilots.id=barker13",), "pilots: codes of 26 chips, the board's words have 16"),
-        (("bar.rows=48",), "bar of 8 clusters, the board has 16"),
-        (("bar.rows=64", "bar.cluster_rows=4"), "bar of 4 LEDs a cluster, the board has 6"),
         (("air.chip_rate_hz=12.5",), "air.chip_rate_hz = 12.5: a board takes whole chips per second"),
         (("air.chip_rate_hz=2e6",), "air.chip_rate_hz = 2000000.0, at most 1000000"),
-        (("bar.rows=3200", "bar.cluster_rows=200"), "bar of 200 LEDs a cluster"),
-        (("bar.rows=48", "air.chip_rate_hz=1.5"), "8 clusters, the board has 16; air.chip_rate_hz = 1.5"),
     ],
 )
 def test_a_link_that_no_board_can_play_is_one_line(

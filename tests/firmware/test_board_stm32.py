@@ -462,7 +462,7 @@ def test_interrupts_stack_and_line_have_room(bar: Bar, book: Codebook) -> None:
     masks = np.zeros((26 + 32 * 30, 96), np.uint8)
     masks[::2] = np.random.default_rng(0).integers(0, 2, masks[::2].shape)
     link = load_link(overrides=["air.chip_rate_hz=20000.0", "air.frames_per_packet=30"])
-    bank = Bank.of_masks(masks, book, link.packet)
+    bank = Bank.of_chips(masks, book, link.packet)
     provision(bar.board, bank, Settings())
     before = bar.board.status()
     spare = 1 - before.active_bank

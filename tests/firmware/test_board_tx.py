@@ -9,6 +9,7 @@ import pytest
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.link.resolve import load_link
 from firmware_host import flicker
 from firmware_host.board.bank import (
     Bank,
@@ -73,7 +74,7 @@ def test_random_is_a_seed(evlcp, profile: str, tmp_path: Path) -> None:
 def test_payload_is_what_the_chips_say(book: Codebook) -> None:
     symbols = random_symbols(3, 2, book, np.random.default_rng(0))
     words = Bank.of_symbols(symbols, book)
-    masks = Bank.of_masks(symbol_chips(symbols, book), book, PacketFormat.of(book, 2))
+    masks = Bank.of_chips(symbol_chips(symbols, book), book, PacketFormat.of(book, 2))
     assert len(words.content) == 3 * 2 * 16 * 2
     assert len(masks.content) == 3 * 90 * 12
     rows = np.frombuffer(masks.content, np.uint8).reshape(-1, 12)
@@ -87,7 +88,7 @@ def test_torn_cluster_is_told() -> None:
     rows[1, 0] = 0x80
     with pytest.raises(ConfigError, match=r"chip 1: the LEDs of cluster 0 differ.*--per-led"):
         chips_of_rows(rows)
-    assert chips_of_rows(rows, 96)[1].tolist() == [1] + [0] * 95
+    assert chips_of_rows(rows, None)[1].tolist() == [1] + [0] * 95
 
 
 @pytest.mark.parametrize(
@@ -157,21 +158,21 @@ def test_wrong_masks_are_told(book: Codebook, tmp_path: Path) -> None:
     ):
         np.save(path, array)
         with pytest.raises(InputError, match=expected):
-            read_masks(path, book, PacketFormat.of(book, 10))
+            read_masks(path, load_link())
     np.savez(tmp_path / "m.npz", np.zeros((346, 16), np.uint8))
     (tmp_path / "m.npz").rename(path)
     with pytest.raises(InputError, match="an archive of several"):
-        read_masks(path, book, PacketFormat.of(book, 10))
+        read_masks(path, load_link())
     path.write_bytes(b"")
     with pytest.raises(InputError, match=r"not a \.npy file"):
-        read_masks(path, book, PacketFormat.of(book, 10))
+        read_masks(path, load_link())
     path.write_text("no array")
     with pytest.raises(InputError, match=r"not a \.npy file"):
-        read_masks(path, book, PacketFormat.of(book, 10))
+        read_masks(path, load_link())
     loaded = symbol_chips(random_symbols(2, 10, book, np.random.default_rng(0)), book)
     np.save(path, loaded)
-    payload = read_masks(path, book, PacketFormat.of(book, 10))
-    assert (payload.packets, payload.packet.frames, len(payload.content)) == (2, 10, 2 * 346 * 12)
+    payload = read_masks(path, load_link())
+    assert (payload.packets, payload.packet_chips, len(payload.content)) == (2, 346, 2 * 346 * 12)
 
 
 def test_codebook_packets_are_balanced_and_do_not_flicker(evlcp) -> None:
@@ -213,9 +214,9 @@ def test_pilots_in_some_frames_only(evlcp, tmp_path: Path, book: Codebook) -> No
     assert evlcp(*options, "--chips", file).code == 0
     expected = np.concatenate([packet_chips(packet, book, 4) for packet in symbols])
     assert np.load(file).tolist() == expected.tolist()
-    masks = read_masks(file, book, PacketFormat.of(book, 6, pilot_every=4))
+    masks = read_masks(file, load_link(overrides=["air.frames_per_packet=6", "air.pilot_every=4"]))
     assert masks.packets == 2
-    assert masks.packet.pilot_every == 4
+    assert masks.composed.packet.pilot_every == 4
     rows = [line.split() for line in evlcp(*options, "--format", "table").out.splitlines()[1:]]
     assert {row[1] for row in rows if row[4] == "-"} == {"1", "2", "3", "5"}
     words = evlcp(*options, "--format", "hex").out.splitlines()
@@ -231,12 +232,12 @@ def test_masks_that_are_no_array_are_one_line(book: Codebook, tmp_path: Path) ->
     path = tmp_path / "chips.npy"
     path.write_bytes(b"PK\x03\x04junk")
     with pytest.raises(InputError, match=r"not a \.npy file"):
-        read_masks(path, book, PacketFormat.of(book, 10))
+        read_masks(path, load_link())
     with path.open("wb") as file:
         header = {"descr": "|u1", "fortran_order": False, "shape": (10**13, 16)}
         np.lib.format.write_array_header_1_0(file, header)
     with pytest.raises(InputError, match=r"not a \.npy file"):
-        read_masks(path, book, PacketFormat.of(book, 10))
+        read_masks(path, load_link())
 
 
 def test_check_without_a_line_below_3_khz_is_json(evlcp) -> None:

@@ -44,6 +44,7 @@ from firmware_host.protocol.requests import (
     ConfigureRequest,
     CrcReply,
     CrcRequest,
+    Format,
     LevelReply,
     LevelRequest,
     Profile,
@@ -132,10 +133,10 @@ def test_from_one_pilot_rate_to_another_without_a_torn_packet(
 def test_masks_play_as_they_are(device: SimulatedBoard, board: Board, book: Codebook) -> None:
     random = np.random.default_rng(0)
     leds = random.integers(0, 2, (2 * PACKET, 96), dtype=np.uint8)
-    provision(board, Bank.of_masks(leds, book, PacketFormat.of(book, 10, 20_000.0)), Settings())
+    provision(board, Bank.of_chips(leds, book, PacketFormat.of(book, 10, 20_000.0)), Settings())
     device.run(100_000)
     played = device.records().played()
-    assert (played.chips(96)[: len(leds)] == leds).all()
+    assert (played.chips(None)[: len(leds)] == leds).all()
     assert (np.diff(played.ticks) == device.TICK_HZ // 20_000).all()
 
 
@@ -143,9 +144,10 @@ def test_masks_play_as_they_are(device: SimulatedBoard, board: Board, book: Code
 def test_a_codebook_of_ones_own(name: str, device: SimulatedBoard, board: Board) -> None:
     rows = hadamard(8)
     book = Codebook(name, np.array([1, 1, 1, -1, 1], np.int8), np.concatenate([-rows, rows]), rows)
-    assert profile_number(book) == Profile.CUSTOM
     symbols = random_symbols(2, 3, book, np.random.default_rng(0))
-    provision(board, Bank.of_symbols(symbols, book), Settings())
+    bank = Bank.of_symbols(symbols, book)
+    assert (bank.format, profile_number(bank)) == (Format.WORDS, Profile.CUSTOM)
+    provision(board, bank, Settings())
     device.run(100_000)
     expected = symbol_chips(symbols, book)
     assert (device.records().played().chips()[: len(expected)] == expected).all()
@@ -395,7 +397,7 @@ def test_too_much_is_told_before_anything_is_sent(board: Board, book: Codebook) 
     with pytest.raises(ConfigError, match=r"1281 frames takes 40992 bytes.*at most 1280 frames"):
         board.program(one)
     # 12 bytes per chip: 3413 chips, 26 of the preamble and 32 a frame
-    masks = Bank.of_masks(np.zeros((26 + 32 * 106, 96), np.uint8), book, PacketFormat.of(book, 106))
+    masks = Bank.of_chips(np.zeros((26 + 32 * 106, 96), np.uint8), book, PacketFormat.of(book, 106))
     with pytest.raises(ConfigError, match="at most 105 frames"):
         board.program(masks)
 

@@ -65,7 +65,10 @@ def test_a_text_that_does_not_arrive_ends_with_1(evlcp, tmp_path: Path) -> None:
     [
         (["--text", ""], "text: expected at least one character"),
         (["--distance", "5"], "the bar, 0.96 m high, fits into the image from 9.6 m on"),
-        (["--set", "bar.rows=48"], "the driver board cannot play this link: bar of 8 clusters"),
+        (
+            ["--set", "bar.rows=102", "--distance", "60"],
+            "a link of 102 LEDs, emulated has 96: HELLO says so",
+        ),
         (["--set", "air.chip_rate_hz=30000.0"], "emulated: no chip rate of 30000 Hz"),
     ],
     ids=["no text", "too near", "another bar", "too fast"],
@@ -97,7 +100,15 @@ def test_light_is_what_the_symbols_say() -> None:
     assert (light.chips == np.resize(expected, light.chips.shape)).all()
     assert light.rate_hz == 6250
     with pytest.raises(ConfigError, match="cannot play this link"):
-        light_of(symbols, load_link(None, ["bar.rows=48"]), 500)
+        light_of(symbols, load_link(None, ["air.chip_rate_hz=12.5"]), 500)
+
+
+def test_light_of_another_bar_and_other_codes_is_what_the_symbols_say() -> None:
+    link = load_link(None, ["bar.rows=90", "bar.cluster_rows=9", "pilots.id=barker13"])
+    symbols = random_symbols(2, 10, link.codebook, np.random.default_rng(1))
+    light = light_of(symbols, link, 900)
+    assert light.chips.shape[1] == 10
+    assert (light.chips == np.resize(symbol_chips(symbols, link.codebook), light.chips.shape)).all()
 
 
 def test_a_record_that_is_written_is_the_one_that_is_read(tmp_path: Path) -> None:

@@ -28,6 +28,9 @@ void evlcp_setup_init(struct evlcp_setup *setup, uint32_t tick_hz)
     for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
         setup->pilots[k] = evlcp_pilots[k];
     evlcp_copy(setup->digest, evlcp_digest, 32u);
+    setup->hold = 0u;
+    setup->clusters = 0u;
+    setup->packet_chips = 0u;
 }
 
 static bool equal(const uint8_t *a, const uint8_t *b, uint32_t count)
@@ -67,17 +70,51 @@ static bool already(const struct evlcp_plan *plan, const struct evlcp_setup *set
            plan->length == request->length && plan->crc == request->crc &&
            equal(plan->digest, request->digest, 32u) && equal(setup->digest, request->digest, 32u) &&
            plan->profile == setup->profile && plan->frames == setup->frames &&
-           plan->pilot_every == setup->pilot_every && plan->ticks_per_chip == setup->ticks_per_chip;
+           plan->pilot_every == setup->pilot_every && plan->ticks_per_chip == setup->ticks_per_chip &&
+           plan->hold == setup->hold && plan->clusters == setup->clusters &&
+           plan->packet_chips == evlcp_setup_chips(setup);
 }
 
-static uint32_t packet_bytes_of(const struct evlcp_setup *setup, uint8_t format, uint32_t chips)
+uint32_t evlcp_setup_chips(const struct evlcp_setup *setup)
 {
-    return format == EVLCP_FORMAT_WORDS ? setup->frames * EVLCP_FRAME_BYTES : chips * EVLCP_ROW_BYTES;
+    return setup->hold != 0u ? setup->packet_chips * setup->hold
+                             : evlcp_packet_chips(setup->preamble_chips, setup->frames, setup->pilot_every);
 }
 
-static void plan_of(struct evlcp_plan *plan, const struct evlcp_setup *setup, uint8_t format, uint32_t chips)
+/* How content of a format is laid out, and what of the setup it is played with. False: not together. */
+static bool plan_of(struct evlcp_plan *plan, const struct evlcp_setup *setup, uint8_t format)
 {
+    bool chips = setup->hold != 0u;
+    if (chips ? setup->packet_chips == 0u || setup->packet_chips > EVLCP_BANK_BYTES
+              : setup->frames == 0u || setup->pilot_every == 0u)
+        return false;
     plan->format = format;
+    plan->packet_chips = evlcp_setup_chips(setup);
+    plan->hold = setup->hold;
+    plan->clusters = setup->clusters;
+    plan->table_bytes = 0u;
+    for (uint32_t i = 0; i < EVLCP_ROW_BYTES; i++)
+        plan->lit[i] = 0xffu;
+    switch (format) {
+    case EVLCP_FORMAT_WORDS:
+        if (chips)
+            return false;
+        plan->packet_bytes = setup->frames * EVLCP_FRAME_BYTES;
+        break;
+    case EVLCP_FORMAT_MASKS:
+        plan->chip_bytes = EVLCP_ROW_BYTES;
+        plan->packet_bytes = (chips ? setup->packet_chips : plan->packet_chips) * EVLCP_ROW_BYTES;
+        break;
+    case EVLCP_FORMAT_CLUSTERS:
+        if (!chips || setup->clusters == 0u || setup->clusters > EVLCP_LEDS)
+            return false;
+        plan->chip_bytes = (uint8_t)((setup->clusters + 7u) / 8u);
+        plan->table_bytes = setup->clusters * EVLCP_ROW_BYTES;
+        plan->packet_bytes = setup->packet_chips * plan->chip_bytes;
+        break;
+    default:
+        return false;
+    }
     plan->profile = setup->profile;
     plan->preamble_chips = setup->preamble_chips;
     plan->preamble = setup->preamble;
@@ -85,10 +122,29 @@ static void plan_of(struct evlcp_plan *plan, const struct evlcp_setup *setup, ui
     plan->pilot_every = setup->pilot_every;
     plan->chip_rate_hz = setup->chip_rate_hz;
     plan->ticks_per_chip = setup->ticks_per_chip;
-    plan->packet_chips = chips;
     for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
         plan->pilots[k] = setup->pilots[k];
     evlcp_copy(plan->digest, setup->digest, 32u);
+    return true;
+}
+
+/* The LEDs of all clusters. False: one is in two of them, whose share of light would be that of neither. */
+static bool read_table(struct evlcp_plan *plan, const uint8_t *content, uint32_t *detail)
+{
+    if (plan->table_bytes == 0u)
+        return true;
+    for (uint32_t i = 0; i < EVLCP_ROW_BYTES; i++)
+        plan->lit[i] = 0u;
+    for (uint32_t k = 0; k < plan->clusters; k++) {
+        for (uint32_t i = 0; i < EVLCP_ROW_BYTES; i++, content++) {
+            if ((plan->lit[i] & *content) != 0u) {
+                *detail = k;
+                return false;
+            }
+            plan->lit[i] |= *content;
+        }
+    }
+    return true;
 }
 
 enum evlcp_status evlcp_banks_stream(struct evlcp_banks *banks, const struct evlcp_setup *setup,
@@ -101,21 +157,22 @@ enum evlcp_status evlcp_banks_stream(struct evlcp_banks *banks, const struct evl
     if (evlcp_banks_held(banks, request->bank))
         return EVLCP_STATUS_BUSY;
     struct evlcp_plan *plan = &banks->plan[request->bank];
-    plan->valid = banks->stream[request->bank].on = false;
-    if (request->format > EVLCP_FORMAT_MASKS || setup->frames == 0u || setup->pilot_every == 0u)
+    struct evlcp_stream *stream = &banks->stream[request->bank];
+    plan->valid = stream->on = false;
+    if (!plan_of(plan, setup, request->format))
         return EVLCP_STATUS_OUT_OF_RANGE;
     if (!equal(request->digest, setup->digest, 32u) || !evlcp_profile_digest_ok(setup->profile, setup->digest))
         return EVLCP_STATUS_FOREIGN_CODEBOOK;
-    uint32_t chips = evlcp_packet_chips(setup->preamble_chips, setup->frames, setup->pilot_every);
-    uint32_t packet_bytes = packet_bytes_of(setup, request->format, chips);
     /* One that plays, one that is put in meanwhile. */
-    if (packet_bytes > EVLCP_BANK_BYTES / 2u) {
+    uint32_t room = EVLCP_BANK_BYTES - plan->table_bytes;
+    if (plan->packet_bytes > room / 2u) {
         *detail = 0u;
         return EVLCP_STATUS_OUT_OF_RANGE;
     }
-    evlcp_stream_begin(&banks->stream[request->bank], packet_bytes, EVLCP_BANK_BYTES);
-    plan_of(plan, setup, request->format, chips);
-    plan->packets = (uint16_t)banks->stream[request->bank].slots;
+    if (!read_table(plan, banks->content[request->bank], detail))
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    evlcp_stream_begin(stream, plan->packet_bytes, plan->table_bytes, room);
+    plan->packets = (uint16_t)stream->slots;
     plan->duty = 0u; /* not known before: the guard looks at what is sent */
     plan->length = 0u;
     plan->crc = 0u;
@@ -131,34 +188,35 @@ enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlc
         return EVLCP_STATUS_OUT_OF_RANGE;
     }
     struct evlcp_plan *plan = &banks->plan[request->bank];
+    const uint8_t *content = banks->content[request->bank];
     if (evlcp_banks_held(banks, request->bank))
         return already(plan, setup, request) ? EVLCP_STATUS_OK : EVLCP_STATUS_BUSY;
     plan->valid = banks->stream[request->bank].on = false;
-    if (request->format > EVLCP_FORMAT_MASKS || request->packets == 0u || setup->frames == 0u ||
-        setup->pilot_every == 0u)
+    if (request->packets == 0u || !plan_of(plan, setup, request->format))
         return EVLCP_STATUS_OUT_OF_RANGE;
-    uint32_t chips = evlcp_packet_chips(setup->preamble_chips, setup->frames, setup->pilot_every);
-    uint32_t packet_bytes = packet_bytes_of(setup, request->format, chips);
-    if (packet_bytes > EVLCP_BANK_BYTES || request->packets > EVLCP_BANK_BYTES / packet_bytes) {
-        *detail = EVLCP_BANK_BYTES / packet_bytes;
+    uint32_t most = (EVLCP_BANK_BYTES - plan->table_bytes) / plan->packet_bytes;
+    if (request->packets > most) {
+        *detail = most;
         return EVLCP_STATUS_OUT_OF_RANGE;
     }
-    if (request->length != packet_bytes * request->packets) {
-        *detail = packet_bytes * request->packets;
+    uint32_t length = plan->table_bytes + plan->packet_bytes * request->packets;
+    if (request->length != length) {
+        *detail = length;
         return EVLCP_STATUS_OUT_OF_RANGE;
     }
     if (!equal(request->digest, setup->digest, 32u) || !evlcp_profile_digest_ok(setup->profile, setup->digest))
         return EVLCP_STATUS_FOREIGN_CODEBOOK;
-    uint32_t crc = evlcp_crc32(0u, banks->content[request->bank], request->length);
+    uint32_t crc = evlcp_crc32(0u, content, request->length);
     if (crc != request->crc) {
         *detail = crc;
         return EVLCP_STATUS_BAD_CRC;
     }
-    plan_of(plan, setup, request->format, chips);
+    if (!read_table(plan, content, detail))
+        return EVLCP_STATUS_OUT_OF_RANGE;
     plan->packets = request->packets;
     plan->length = request->length;
     plan->crc = crc;
-    plan->duty = evlcp_guard_duty(plan, banks->content[request->bank]);
+    plan->duty = evlcp_guard_duty(plan, content);
     plan->valid = true;
     return EVLCP_STATUS_OK;
 }

@@ -18,10 +18,8 @@ void evlcp_cursor_seek(struct evlcp_cursor *cursor, const struct evlcp_plan *pla
     cursor->chip = 0u;
     cursor->in_frame = 0u;
     cursor->to_pilot = 0u;
-    if (plan->format == EVLCP_FORMAT_WORDS)
-        cursor->at = content + packet * plan->frames * EVLCP_FRAME_BYTES;
-    else
-        cursor->at = content + packet * plan->packet_chips * EVLCP_ROW_BYTES;
+    cursor->held = 0u;
+    cursor->at = content + plan->table_bytes + packet * plan->packet_bytes;
 }
 
 void evlcp_row_of_mask(uint16_t mask, uint8_t row[EVLCP_ROW_BYTES])
@@ -53,12 +51,41 @@ static uint16_t frame_mask(const struct evlcp_cursor *c)
     return (uint16_t)mask;
 }
 
+/* The LEDs of the clusters whose bits are set; masks of clusters do not overlap. */
+static void row_of_clusters(const struct evlcp_plan *plan, const uint8_t *masks, const uint8_t *bits,
+                            uint8_t row[EVLCP_ROW_BYTES])
+{
+    uint32_t leds[EVLCP_ROW_BYTES / 4u] = {0};
+    for (uint32_t left = plan->clusters; left != 0u; bits++) {
+        uint32_t here = left < 8u ? left : 8u;
+        const uint8_t *mask = masks;
+        /* No bit beyond the last cluster: there is no mask. */
+        for (uint32_t byte = (uint32_t)*bits >> (8u - here) << (8u - here); byte != 0u; byte = byte << 1 & 0xffu) {
+            if ((byte & 0x80u) != 0u) {
+                for (uint32_t w = 0; w < EVLCP_ROW_BYTES / 4u; w++)
+                    leds[w] |= evlcp_get32(mask + 4u * w);
+            }
+            mask += EVLCP_ROW_BYTES;
+        }
+        masks += here * EVLCP_ROW_BYTES;
+        left -= here;
+    }
+    for (uint32_t w = 0; w < EVLCP_ROW_BYTES / 4u; w++)
+        evlcp_put32(row + 4u * w, leds[w]);
+}
+
 bool evlcp_cursor_row(struct evlcp_cursor *cursor, uint8_t row[EVLCP_ROW_BYTES])
 {
     const struct evlcp_plan *plan = cursor->plan;
-    if (plan->format == EVLCP_FORMAT_MASKS) {
-        evlcp_copy(row, cursor->at, EVLCP_ROW_BYTES);
-        cursor->at += EVLCP_ROW_BYTES;
+    if (plan->format != EVLCP_FORMAT_WORDS) {
+        if (plan->format == EVLCP_FORMAT_MASKS)
+            evlcp_copy(row, cursor->at, EVLCP_ROW_BYTES);
+        else
+            row_of_clusters(plan, cursor->content, cursor->at, row);
+        if (++cursor->held >= plan->hold) {
+            cursor->held = 0u;
+            cursor->at += plan->chip_bytes;
+        }
     } else if (cursor->chip < plan->preamble_chips) {
         uint32_t on = plan->preamble >> (plan->preamble_chips - 1u - cursor->chip) & 1u;
         evlcp_row_of_mask(on ? 0xffffu : 0u, row);

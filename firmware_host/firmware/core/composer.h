@@ -27,6 +27,12 @@ struct evlcp_plan {
     uint32_t ticks_per_chip;
     uint32_t packet_chips;
     uint16_t duty; /* share of time that the brightest LED is on, permille */
+    uint8_t hold;          /* of chips alone: chips that one of the content lasts; 0: it has a codebook */
+    uint8_t clusters;      /* of CLUSTERS, whose masks stand before the chips */
+    uint8_t chip_bytes;    /* of a chip, in MASKS and CLUSTERS */
+    uint32_t table_bytes;  /* before the first packet */
+    uint32_t packet_bytes;
+    uint8_t lit[EVLCP_ROW_BYTES]; /* all LEDs that the content may light */
     uint16_t pilots[EVLCP_BOARD_CLUSTERS];
     uint8_t digest[32];
 };
@@ -37,7 +43,8 @@ struct evlcp_cursor {
     const uint8_t *content;
     uint32_t packet;
     uint32_t chip;      /* of the packet */
-    const uint8_t *at;  /* words of the frame, or row of the chip */
+    const uint8_t *at;  /* words of the frame, or what the chip is */
+    uint8_t held;       /* chips that it has been shown */
     uint32_t in_frame;  /* chip of the frame; without a pilot it starts at EVLCP_PILOT_CHIPS */
     uint8_t to_pilot;   /* frames until the next one with a pilot */
 };

@@ -142,6 +142,8 @@ static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x, uint16_t 
     evlcp_copy(reply.unique_id, e->info.unique_id, sizeof reply.unique_id);
     evlcp_copy(reply.hal, e->info.name, sizeof reply.hal);
     reply.clock_hz = e->info.clock_hz;
+    reply.formats = 1u << EVLCP_FORMAT_WORDS | 1u << EVLCP_FORMAT_MASKS | 1u << EVLCP_FORMAT_CLUSTERS;
+    reply.chip_rate_min_hz = 1u + (e->info.tick_hz - 1u) / e->info.ticks_per_chip_max;
     reply.uptime_ms = hal_millis();
     evlcp_hello_reply_put(x->out, &reply);
     x->out_length = EVLCP_HELLO_REPLY_BYTES;
@@ -211,7 +213,7 @@ static enum evlcp_status on_configure(struct evlcp *e, struct exchange *x)
     e->setup.pilot_every = request.pilot_every;
     const struct evlcp_configure_reply reply = {
         .ticks_per_chip = e->setup.ticks_per_chip,
-        .packet_chips = evlcp_packet_chips(e->setup.preamble_chips, request.frames, request.pilot_every)};
+        .packet_chips = evlcp_setup_chips(&e->setup)};
     evlcp_configure_reply_put(x->out, &reply);
     x->out_length = EVLCP_CONFIGURE_REPLY_BYTES;
     return EVLCP_STATUS_OK;
@@ -240,6 +242,29 @@ static enum evlcp_status on_codebook(struct evlcp *e, struct exchange *x)
     e->setup.preamble = request.preamble;
     for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
         e->setup.pilots[k] = request.pilots[k];
+    e->setup.hold = 0u;
+    e->setup.clusters = 0u;
+    e->setup.packet_chips = 0u;
+    evlcp_copy(e->setup.digest, request.digest, sizeof e->setup.digest);
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_chips(struct evlcp *e, struct exchange *x)
+{
+    struct evlcp_chips_request request;
+    evlcp_chips_request_get(x->in, &request);
+    if (request.packet_chips == 0u || request.packet_chips > EVLCP_BANK_BYTES) {
+        x->detail = request.packet_chips == 0u ? 1u : EVLCP_BANK_BYTES;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    if (request.hold == 0u || request.clusters > EVLCP_LEDS) {
+        x->detail = request.hold == 0u ? 1u : EVLCP_LEDS;
+        return EVLCP_STATUS_OUT_OF_RANGE;
+    }
+    e->setup.profile = EVLCP_PROFILE_CUSTOM;
+    e->setup.hold = request.hold;
+    e->setup.clusters = request.clusters;
+    e->setup.packet_chips = request.packet_chips;
     evlcp_copy(e->setup.digest, request.digest, sizeof e->setup.digest);
     return EVLCP_STATUS_OK;
 }
@@ -489,6 +514,9 @@ static enum evlcp_status on_status(struct evlcp *e, struct exchange *x)
         reply.duty = plan->duty;
         reply.crc = plan->crc;
         reply.chip_rate_hz = plan->chip_rate_hz;
+        reply.packet_chips = plan->packet_chips;
+        reply.hold = plan->hold;
+        reply.clusters = plan->clusters;
         evlcp_copy(reply.digest, plan->digest, sizeof reply.digest);
         if (e->banks.stream[reply.active_bank].on)
             reply.underruns = atomic_load(&e->banks.stream[reply.active_bank].underruns);
@@ -673,6 +701,8 @@ static enum evlcp_status on_control(struct evlcp *e, uint8_t type, struct exchan
         return on_configure(e, x);
     case EVLCP_TYPE_CODEBOOK:
         return on_codebook(e, x);
+    case EVLCP_TYPE_CHIPS:
+        return on_chips(e, x);
     case EVLCP_TYPE_COMMIT:
         return on_commit(e, x);
     case EVLCP_TYPE_STREAM:

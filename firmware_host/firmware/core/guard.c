@@ -63,14 +63,21 @@ static uint32_t ones(uint32_t word)
     return n;
 }
 
-/* The most that one of 96 LEDs is on, over rows of chips: 96 counters side by side, a bit of each in every word. */
-static uint32_t most_of_rows(const uint8_t *rows, uint32_t count)
+/* The most that one of the LEDs, or clusters, is on, over `count` chips of a bit each: counters side by side, a bit
+   of each in every word. */
+static uint32_t most_of_rows(const uint8_t *rows, uint32_t count, uint32_t bytes)
 {
     uint32_t bits[COUNT_BITS][WORDS_A_ROW] = {{0}};
     uint32_t most = 0u;
-    for (uint32_t n = 0; n < count; n++, rows += EVLCP_ROW_BYTES) {
-        for (uint32_t w = 0; w < WORDS_A_ROW; w++) {
-            uint32_t carry = evlcp_get32(rows + 4u * w);
+    for (uint32_t n = 0; n < count; n++, rows += bytes) {
+        for (uint32_t w = 0; 4u * w < bytes; w++) {
+            uint32_t carry = 0u;
+            if (bytes - 4u * w >= 4u) {
+                carry = evlcp_get32(rows + 4u * w);
+            } else {
+                for (uint32_t i = 4u * w; i < bytes; i++)
+                    carry = carry << 8 | rows[i];
+            }
             for (uint32_t k = 0; carry != 0u && k < COUNT_BITS; k++) {
                 uint32_t old = bits[k][w];
                 bits[k][w] = old ^ carry;
@@ -103,8 +110,9 @@ static uint32_t most_of_words(const struct evlcp_plan *plan, const uint8_t *word
 
 uint16_t evlcp_guard_duty(const struct evlcp_plan *plan, const uint8_t *content)
 {
-    uint32_t chips = plan->packets * plan->packet_chips;
-    uint32_t on =
-        plan->format == EVLCP_FORMAT_WORDS ? most_of_words(plan, content) : most_of_rows(content, chips);
+    uint32_t chips = plan->packets * plan->packet_chips / (plan->hold != 0u ? plan->hold : 1u);
+    uint32_t on = plan->format == EVLCP_FORMAT_WORDS
+                      ? most_of_words(plan, content)
+                      : most_of_rows(content + plan->table_bytes, chips, plan->chip_bytes);
     return (uint16_t)((on * 1000u + chips - 1u) / chips);
 }

@@ -17,6 +17,7 @@ void evlcp_player_init(struct evlcp_player *player)
     atomic_store(&player->lateness_max, 0u);
     player->idle = false;
     player->halt = false;
+    player->lit = dark;
     player->dark_ms = 0u;
     player->guard = (struct evlcp_guard){.burst = 0u};
     hal_leds(dark, EVLCP_CHIP_DARK);
@@ -29,6 +30,7 @@ static void seek(struct evlcp_player *player, struct evlcp_banks *banks, uint32_
     const struct evlcp_plan *plan = &banks->plan[bank];
     player->idle = atomic_load(&player->want_idle);
     player->idle_left = plan->packet_chips;
+    player->lit = plan->lit;
     if (next >= plan->packets)
         next = 0u;
     if (banks->stream[bank].on) {
@@ -52,7 +54,7 @@ static void seek(struct evlcp_player *player, struct evlcp_banks *banks, uint32_
 static void compose(struct evlcp_player *player)
 {
     if (player->idle) {
-        evlcp_row_of_mask(player->idle_left & 1u ? 0xffffu : 0u, player->row);
+        evlcp_copy(player->row, player->idle_left & 1u ? player->lit : dark, EVLCP_ROW_BYTES);
         player->packet_done = --player->idle_left == 0u;
     } else {
         player->packet_done = evlcp_cursor_row(&player->cursor, player->row);

@@ -32,14 +32,22 @@ static void put_header(const struct slot *s, uint8_t b[EVLCP_SLOT_HEADER_BYTES])
     b[17] = s->plan.profile;
     b[18] = s->plan.preamble_chips;
     b[19] = s->plan.pilot_every;
-    evlcp_put16(b + 20, s->plan.frames);
+    /* Chips alone have neither frames nor preamble nor pilots, and a firmware that does not know them takes no packet
+       without frames. */
+    bool chips = s->plan.hold != 0u;
+    evlcp_put16(b + 20, chips ? 0u : s->plan.frames);
     evlcp_put16(b + 22, s->plan.packets);
-    evlcp_put32(b + 24, s->plan.preamble);
+    evlcp_put32(b + 24, chips ? s->plan.packet_chips / s->plan.hold : s->plan.preamble);
     evlcp_put32(b + 28, s->plan.length);
     evlcp_put32(b + 32, s->plan.crc);
     evlcp_put32(b + 36, s->plan.chip_rate_hz);
-    for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
-        evlcp_put16(b + 40 + 2u * k, s->plan.pilots[k]);
+    if (chips) {
+        b[40] = s->plan.hold;
+        b[41] = s->plan.clusters;
+    } else {
+        for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
+            evlcp_put16(b + 40 + 2u * k, s->plan.pilots[k]);
+    }
     evlcp_copy(b + 72, s->plan.digest, 32u);
     evlcp_put16(b + 104, s->level_limit_ma);
     evlcp_put16(b + 106, s->duty_limit);
@@ -70,8 +78,13 @@ static bool get_header(struct evlcp *e, uint8_t index, struct slot *s)
     s->plan.length = evlcp_get32(b + 28);
     s->plan.crc = evlcp_get32(b + 32);
     s->plan.chip_rate_hz = evlcp_get32(b + 36);
+    bool chips = s->plan.frames == 0u;
     for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
-        s->plan.pilots[k] = evlcp_get16(b + 40 + 2u * k);
+        s->plan.pilots[k] = chips ? 0u : evlcp_get16(b + 40 + 2u * k);
+    s->plan.hold = chips ? b[40] : 0u;
+    s->plan.clusters = chips ? b[41] : 0u;
+    s->plan.packet_chips = chips ? s->plan.preamble : 0u; /* in the bank */
+    s->plan.preamble = chips ? 0u : s->plan.preamble;
     evlcp_copy(s->plan.digest, b + 72, 32u);
     s->level_limit_ma = evlcp_get16(b + 104);
     s->duty_limit = evlcp_get16(b + 106);
@@ -151,6 +164,9 @@ static enum evlcp_status load(struct evlcp *e, uint8_t index, const struct slot 
                                 .pilot_every = s->plan.pilot_every,
                                 .frames = s->plan.frames,
                                 .preamble = s->plan.preamble,
+                                .hold = s->plan.hold,
+                                .clusters = s->plan.clusters,
+                                .packet_chips = s->plan.packet_chips,
                                 .chip_rate_hz = s->plan.chip_rate_hz,
                                 .ticks_per_chip = e->info.tick_hz / s->plan.chip_rate_hz};
     struct evlcp_commit_request request = {.bank = bank,

@@ -1,9 +1,10 @@
 #include "stream.h"
 
-void evlcp_stream_begin(struct evlcp_stream *stream, uint32_t packet_bytes, uint32_t room)
+void evlcp_stream_begin(struct evlcp_stream *stream, uint32_t packet_bytes, uint32_t base, uint32_t room)
 {
     stream->on = true;
     stream->slots = room / packet_bytes;
+    stream->base = base;
     stream->packet_bytes = packet_bytes;
     stream->filled = 0u;
     atomic_store(&stream->pushed, 0u);
@@ -22,7 +23,7 @@ void evlcp_stream_push(struct evlcp_stream *stream, uint8_t *content, uint32_t n
     if (number != pushed || offset != stream->filled || count > stream->packet_bytes - offset ||
         waiting + 1u >= stream->slots || atomic_load(&stream->ended))
         return;
-    evlcp_copy(content + (number % stream->slots) * stream->packet_bytes + offset, bytes, count);
+    evlcp_copy(content + stream->base + (number % stream->slots) * stream->packet_bytes + offset, bytes, count);
     stream->filled += count;
     if (stream->filled == stream->packet_bytes) {
         stream->filled = 0u;

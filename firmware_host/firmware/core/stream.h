@@ -15,6 +15,7 @@
 struct evlcp_stream {
     bool on;
     uint32_t slots;
+    uint32_t base; /* where the first slot begins */
     uint32_t packet_bytes;
     uint32_t filled;              /* bytes of the packet that is being put in */
     atomic_uint_least32_t pushed; /* whole packets put in */
@@ -31,8 +32,8 @@ enum evlcp_stream_next {
     EVLCP_STREAM_END
 };
 
-/* An empty queue of packets of `packet_bytes` in a bank of `room` bytes; at least two must fit. */
-void evlcp_stream_begin(struct evlcp_stream *stream, uint32_t packet_bytes, uint32_t room);
+/* An empty queue of packets of `packet_bytes` in the `room` bytes of a bank from `base` on; at least two must fit. */
+void evlcp_stream_begin(struct evlcp_stream *stream, uint32_t packet_bytes, uint32_t base, uint32_t room);
 
 /* Put a piece in, if it is the next one and there is room; `content` is the bank's. */
 void evlcp_stream_push(struct evlcp_stream *stream, uint8_t *content, uint32_t number, uint32_t offset,

@@ -4,7 +4,7 @@
 #include <stdint.h>
 
 #define EVLCP_PROTOCOL_MAJOR 2u
-#define EVLCP_PROTOCOL_MINOR 1u
+#define EVLCP_PROTOCOL_MINOR 2u
 #define EVLCP_HEADER_BYTES 6u
 #define EVLCP_CRC_BYTES 4u
 #define EVLCP_MAX_PAYLOAD 512u
@@ -44,6 +44,7 @@ enum evlcp_type {
     EVLCP_TYPE_STREAM = 0x18,
     EVLCP_TYPE_PUSH = 0x19,
     EVLCP_TYPE_KEY = 0x1a,
+    EVLCP_TYPE_CHIPS = 0x1b,
     EVLCP_TYPE_UPDATE_STATUS = 0x20,
     EVLCP_TYPE_UPDATE_BEGIN = 0x21,
     EVLCP_TYPE_UPDATE_WRITE = 0x22,
@@ -78,6 +79,7 @@ enum evlcp_status {
 enum evlcp_format {
     EVLCP_FORMAT_WORDS = 0, /* Info words u16 [packet][frame][cluster]; the board adds preamble and pilots. */
     EVLCP_FORMAT_MASKS = 1, /* Chip masks, row_bytes a chip, LED 0 the most significant bit of the first byte. */
+    EVLCP_FORMAT_CLUSTERS = 2, /* The mask of each cluster, then chips: whole bytes, a bit a cluster, cluster 0 first. */
 };
 
 /* Info-segment profiles of air interface 1. */
@@ -191,7 +193,7 @@ static inline void evlcp_hello_request_get(const uint8_t *p, struct evlcp_hello_
     m->nonce = evlcp_get32(p + 2);
 }
 
-#define EVLCP_HELLO_REPLY_BYTES 80u
+#define EVLCP_HELLO_REPLY_BYTES 86u
 /* Answer to hello. */
 struct evlcp_hello_reply {
     uint8_t major; /* The board's protocol. */
@@ -218,6 +220,8 @@ struct evlcp_hello_reply {
     uint32_t clock_hz; /* Rate of STATUS's clock, nominal. */
     uint8_t challenge[8]; /* Drawn for the session: seals are over it. */
     uint8_t key_name[4]; /* First bytes of the SHA-256 of the board's key; zeros without one. */
+    uint16_t formats; /* What a bank may hold, 1 << format; 0: words and masks, in packets of a codebook. */
+    uint32_t chip_rate_min_hz; /* Slowest chip rate. */
 };
 
 static inline void evlcp_hello_reply_put(uint8_t *p, const struct evlcp_hello_reply *m)
@@ -246,6 +250,8 @@ static inline void evlcp_hello_reply_put(uint8_t *p, const struct evlcp_hello_re
     evlcp_put32(p + 64, m->clock_hz);
     evlcp_copy(p + 68, m->challenge, 8u);
     evlcp_copy(p + 76, m->key_name, 4u);
+    evlcp_put16(p + 80, m->formats);
+    evlcp_put32(p + 82, m->chip_rate_min_hz);
 }
 
 static inline void evlcp_hello_reply_get(const uint8_t *p, struct evlcp_hello_reply *m)
@@ -274,6 +280,8 @@ static inline void evlcp_hello_reply_get(const uint8_t *p, struct evlcp_hello_re
     m->clock_hz = evlcp_get32(p + 64);
     evlcp_copy(m->challenge, p + 68, 8u);
     evlcp_copy(m->key_name, p + 76, 4u);
+    m->formats = evlcp_get16(p + 80);
+    m->chip_rate_min_hz = evlcp_get32(p + 82);
 }
 
 #define EVLCP_CONFIGURE_REQUEST_BYTES 12u
@@ -574,7 +582,7 @@ static inline void evlcp_level_request_get(const uint8_t *p, struct evlcp_level_
 
 #define EVLCP_STATUS_REQUEST_BYTES 0u
 
-#define EVLCP_STATUS_REPLY_BYTES 143u
+#define EVLCP_STATUS_REPLY_BYTES 149u
 /* Answer to status. */
 struct evlcp_status_reply {
     uint8_t state; /* State. */
@@ -613,6 +621,9 @@ struct evlcp_status_reply {
     uint32_t clock; /* The board's clock, which counts freely and wraps. */
     uint32_t pulses; /* Pulses of the pulse input since reset. */
     uint32_t pulse_clocks; /* Clocks from the pulse before to the latest; 0: unknown. */
+    uint32_t packet_chips; /* Length of a packet of the active bank, in chips of the chip rate. */
+    uint8_t hold; /* How many of these a chip of the bank lasts; 0: the bank is of a codebook. */
+    uint8_t clusters; /* Clusters of the active bank's masks; 0 without these. */
 };
 
 static inline void evlcp_status_reply_put(uint8_t *p, const struct evlcp_status_reply *m)
@@ -653,6 +664,9 @@ static inline void evlcp_status_reply_put(uint8_t *p, const struct evlcp_status_
     evlcp_put32(p + 131, m->clock);
     evlcp_put32(p + 135, m->pulses);
     evlcp_put32(p + 139, m->pulse_clocks);
+    evlcp_put32(p + 143, m->packet_chips);
+    evlcp_put8(p + 147, m->hold);
+    evlcp_put8(p + 148, m->clusters);
 }
 
 static inline void evlcp_status_reply_get(const uint8_t *p, struct evlcp_status_reply *m)
@@ -693,6 +707,9 @@ static inline void evlcp_status_reply_get(const uint8_t *p, struct evlcp_status_
     m->clock = evlcp_get32(p + 131);
     m->pulses = evlcp_get32(p + 135);
     m->pulse_clocks = evlcp_get32(p + 139);
+    m->packet_chips = evlcp_get32(p + 143);
+    m->hold = evlcp_get8(p + 147);
+    m->clusters = evlcp_get8(p + 148);
 }
 
 #define EVLCP_WATCHDOG_REQUEST_BYTES 5u
@@ -902,6 +919,33 @@ static inline void evlcp_key_request_get(const uint8_t *p, struct evlcp_key_requ
 
 #define EVLCP_KEY_REPLY_BYTES 0u
 
+#define EVLCP_CHIPS_REQUEST_BYTES 38u
+/* Set packets of chips alone for the next COMMIT or STREAM, in place of a codebook. */
+struct evlcp_chips_request {
+    uint32_t packet_chips; /* Chips of a packet in the bank. */
+    uint8_t hold; /* How many chips of the chip rate each of them lasts, from 1 on. */
+    uint8_t clusters; /* Clusters of the format CLUSTERS; 0: MASKS only. */
+    uint8_t digest[32]; /* SHA-256 of what chips mean, which COMMIT repeats. */
+};
+
+static inline void evlcp_chips_request_put(uint8_t *p, const struct evlcp_chips_request *m)
+{
+    evlcp_put32(p + 0, m->packet_chips);
+    evlcp_put8(p + 4, m->hold);
+    evlcp_put8(p + 5, m->clusters);
+    evlcp_copy(p + 6, m->digest, 32u);
+}
+
+static inline void evlcp_chips_request_get(const uint8_t *p, struct evlcp_chips_request *m)
+{
+    m->packet_chips = evlcp_get32(p + 0);
+    m->hold = evlcp_get8(p + 4);
+    m->clusters = evlcp_get8(p + 5);
+    evlcp_copy(m->digest, p + 6, 32u);
+}
+
+#define EVLCP_CHIPS_REPLY_BYTES 0u
+
 #define EVLCP_UPDATE_STATUS_REQUEST_BYTES 0u
 
 #define EVLCP_UPDATE_STATUS_REPLY_BYTES 27u
@@ -1044,6 +1088,7 @@ static inline void evlcp_update_commit_reply_get(const uint8_t *p, struct evlcp_
     {0x18u, true, false, false, 34u, 34u}, \
     {0x19u, false, false, true, 8u, 8u}, \
     {0x1au, true, false, false, 16u, 16u}, \
+    {0x1bu, true, false, false, 38u, 38u}, \
     {0x20u, false, true, false, 0u, 0u}, \
     {0x21u, true, false, false, 9u, 9u}, \
     {0x22u, false, false, true, 4u, 4u}, \
