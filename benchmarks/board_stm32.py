@@ -3,8 +3,12 @@
 Prints a table; times are the model's, which counts an instruction of the core as a clock.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.resolve import load_link
 from firmware_host import build
 from firmware_host.board.bank import Bank, random_symbols, symbol_chips
@@ -12,6 +16,7 @@ from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.emulators.stm32 import US, Dma, ModelLine, Stm32, Usart
 from firmware_host.protocol.client import Timing
+from firmware_host.protocol.requests import CommitReply, CommitRequest, State
 
 MOMENTS = 12
 CHIP_US = 100
@@ -48,8 +53,54 @@ def right(chip: Stm32, begin: int, rows: np.ndarray) -> tuple[int, int]:
     return int((bits == np.resize(rows, bits.shape)).all(1).sum()), len(bits)
 
 
+def banks() -> dict[str, Bank]:
+    """A bank of each kind, as full as it gets; every chip that is lit lights every LED."""
+    link = load_link()
+    book = link.codebook
+    symbols = random_symbols(128, 10, book, np.random.default_rng(1))
+    found = {"words": Bank.of_symbols(symbols, book)}
+    for clusters in (1, 10, 16, 88, 96):
+        leds = np.arange(96) * clusters // 96
+        drawn = np.random.default_rng(1).choice(np.array([-1, 1], np.int8), (clusters + 2, 24))
+        own = Codebook("drawn", book.preamble, drawn[:-2], drawn[-2:])
+        row = -(-clusters // 8)
+        most = (40_960 - (12 * clusters if row < 12 else 0)) // row
+        packet = replace(PacketFormat.of(own, 1), preamble_chips=most - 96)
+        chips = np.tile(np.array([[1], [0]], np.uint8), (most, clusters))[:most]
+        found[f"{clusters} clusters" if row < 12 else "masks of each LED"] = Bank.of_chips(
+            chips, own, packet, leds
+        )
+    return found
+
+
+def take(bank: Bank) -> tuple[float, float]:
+    """What the chip interrupt takes at most with a full bank, us, and how long a COMMIT of it does, ms."""
+    chip = Stm32(build.arm_image("stm32f405"))
+    chip.run(15_000)
+    board = Board(Session(ModelLine(chip), Timing(latency_s=0.02)))
+    board.prepare(bank)
+    board.fill(0, bank.content)
+    request = CommitRequest(
+        0, bank.format, bank.packets, len(bank.content), bank.crc, bytes.fromhex(bank.digest)
+    )
+    began = chip.now
+    board.session.call(request, CommitReply)
+    took = chip.now - began
+    board.start()
+    chip.run(10_000)
+    status = board.status()
+    assert status.state == State.PLAYING
+    return chip.longest[16 + Dma.IRQ] / US, took / US / 1e3
+
+
 def main() -> None:
     """Print the table."""
+    for name, bank in banks().items():
+        interrupt_us, commit_ms = take(bank)
+        print(
+            f"{name:24} chip interrupt {interrupt_us:.1f} us at most; {bank.packets * bank.packet_chips}"
+            f" chips in {len(bank.content)} bytes, COMMIT answered after {commit_ms:.1f} ms"
+        )
     chip, board, rows = programmed(1)
     for n in range(1, 5):
         begin = len(chip.drivers.log)

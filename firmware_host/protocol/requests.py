@@ -230,7 +230,7 @@ class State(IntEnum):
     STOPPING = 2
     """The last packet before dark."""
     IDLE_PATTERN = 3
-    """The watchdog's idle pattern: every LED alternates chip by chip."""
+    """The idle pattern: LEDs are on for a chip of two, or of more where the limits ask for it."""
     TESTING = 4
     """Single-LED test."""
     FAULT = 5

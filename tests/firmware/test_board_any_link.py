@@ -277,6 +277,23 @@ def test_silence_shows_the_idle_pattern_of_the_bars_leds(device: SimulatedBoard,
     assert not idle[:, 87:].any()
 
 
+@pytest.mark.parametrize(("limit", "every"), [(1.0, 2), (0.5, 2), (0.3, 4), (0.25, 4), (0.001, 1000)])
+def test_the_idle_pattern_keeps_to_the_limits(
+    device: SimulatedBoard, board: Board, limit: float, every: int
+) -> None:
+    """LEDs are on for no more of it than they may be, whatever the length of a packet."""
+    packet = replace(PacketFormat.of(BOOK, 1), preamble_chips=103)
+    bank = Bank.of_chips(np.zeros((151, 10), np.uint8), BOOK, packet, LED_CLUSTERS)
+    settings_ = Settings(watchdog=Watchdog.IDLE, watchdog_ms=100, duty_limit=limit)
+    provision(board, bank, settings_)
+    device.run(700_000)
+    on = np.flatnonzero(shown(device)[:, 0])
+    assert (np.diff(on) == every).all()
+    assert len(on) >= 5
+    assert on[0] % 151 == every - 1 if every < 151 else True
+    assert board.status().faults == BoardFault.WATCHDOG
+
+
 def chips_request(**changes: object) -> ChipsRequest:
     return replace(ChipsRequest(200, 1, 10, bytes.fromhex(BOOK.digest)), **changes)  # type: ignore[arg-type]
 

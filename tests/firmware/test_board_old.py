@@ -1,7 +1,7 @@
 """What boards in the field speak must not change.
 
 Wires recorded with the real firmware and the real host of protocol 2.0; and the bytes of each message of 2.0
-and 2.1, made from the definitions of these versions without the codec.
+and 2.1, and of those that 2.2 changed, made from the definitions of these versions without the codec.
 """
 
 import dataclasses

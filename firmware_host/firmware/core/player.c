@@ -18,6 +18,7 @@ void evlcp_player_init(struct evlcp_player *player)
     player->idle = false;
     player->halt = false;
     player->lit = dark;
+    player->idle_dark = 0u;
     player->dark_ms = 0u;
     player->guard = (struct evlcp_guard){.burst = 0u};
     hal_leds(dark, EVLCP_CHIP_DARK);
@@ -28,6 +29,8 @@ static void seek(struct evlcp_player *player, struct evlcp_banks *banks, uint32_
 {
     uint8_t bank = atomic_load(&banks->active);
     const struct evlcp_plan *plan = &banks->plan[bank];
+    if (!player->idle)
+        player->idle_dark = 0u;
     player->idle = atomic_load(&player->want_idle);
     player->idle_left = plan->packet_chips;
     player->lit = plan->lit;
@@ -54,7 +57,12 @@ static void seek(struct evlcp_player *player, struct evlcp_banks *banks, uint32_
 static void compose(struct evlcp_player *player)
 {
     if (player->idle) {
-        evlcp_copy(player->row, player->idle_left & 1u ? player->lit : dark, EVLCP_ROW_BYTES);
+        /* One chip of two, or of more where the limits of light ask for it. */
+        uint32_t duty = atomic_load(&player->guard.duty);
+        uint32_t most = duty >= 500u ? 1u : duty != 0u ? (1000u + duty - 1u) / duty - 1u : UINT32_MAX;
+        bool on = player->idle_dark >= most;
+        player->idle_dark = on ? 0u : player->idle_dark + 1u;
+        evlcp_copy(player->row, on ? player->lit : dark, EVLCP_ROW_BYTES);
         player->packet_done = --player->idle_left == 0u;
     } else {
         player->packet_done = evlcp_cursor_row(&player->cursor, player->row);

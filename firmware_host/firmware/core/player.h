@@ -22,6 +22,7 @@ struct evlcp_player {
     bool halt;             /* the row on show is the last */
     struct evlcp_cursor cursor;
     const uint8_t *lit; /* LEDs of the idle pattern */
+    uint32_t idle_dark; /* chips since they were lit, or since it began */
     uint32_t idle_left;
     uint32_t chip;
     uint32_t ticks_per_chip;

@@ -95,7 +95,7 @@ enum evlcp_state {
     EVLCP_STATE_DARK = 0, /* Dark; the chip timer stands. */
     EVLCP_STATE_PLAYING = 1, /* Packets of the active bank. */
     EVLCP_STATE_STOPPING = 2, /* The last packet before dark. */
-    EVLCP_STATE_IDLE_PATTERN = 3, /* The watchdog's idle pattern: every LED alternates chip by chip. */
+    EVLCP_STATE_IDLE_PATTERN = 3, /* The idle pattern: LEDs are on for a chip of two, or of more where the limits ask for it. */
     EVLCP_STATE_TESTING = 4, /* Single-LED test. */
     EVLCP_STATE_FAULT = 5, /* Dark because of a fault. */
     EVLCP_STATE_WAITING = 6, /* Dark until the pulse or the clock that START names. */

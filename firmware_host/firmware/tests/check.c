@@ -790,6 +790,82 @@ static void expected_row(const uint8_t *words, uint32_t chip, uint8_t row[EVLCP_
 }
 
 /* Frames 0, N, ... of every packet have a pilot, the others are their info words alone. */
+static uint8_t set_chips(struct host *h, uint32_t packet_chips, uint8_t hold, uint8_t clusters)
+{
+    uint8_t payload[EVLCP_CHIPS_REQUEST_BYTES];
+    const struct evlcp_chips_request request = {
+        .packet_chips = packet_chips, .hold = hold, .clusters = clusters, .digest = {7u}};
+    evlcp_chips_request_put(payload, &request);
+    return ask(h, EVLCP_TYPE_CHIPS, payload, sizeof payload);
+}
+
+static uint8_t commit_chips(struct host *h, uint8_t bank, uint8_t format, uint16_t packets, const uint8_t *content,
+                            uint32_t length)
+{
+    uint8_t payload[EVLCP_MAX_PAYLOAD];
+    payload[0] = bank;
+    evlcp_put32(payload + 1, 0u);
+    memcpy(payload + EVLCP_WRITE_REQUEST_BYTES, content, length);
+    EXPECT(ask(h, EVLCP_TYPE_WRITE, payload, EVLCP_WRITE_REQUEST_BYTES + length) == EVLCP_STATUS_OK);
+    const struct evlcp_commit_request request = {.bank = bank,
+                                                 .format = format,
+                                                 .packets = packets,
+                                                 .length = length,
+                                                 .crc = evlcp_crc32(0u, content, length),
+                                                 .digest = {7u}};
+    evlcp_commit_request_put(payload, &request);
+    return ask(h, EVLCP_TYPE_COMMIT, payload, EVLCP_COMMIT_REQUEST_BYTES);
+}
+
+static void test_chips_of_clusters(void)
+{
+    struct host h;
+    struct native *board = fresh(&h);
+    /* Two clusters, LEDs 0 and 1 and LED 95; three chips: the first, none, both, the last with bits of no cluster. */
+    uint8_t content[2u * EVLCP_ROW_BYTES + 3u] = {0};
+    content[0] = 0xc0u;
+    content[2u * EVLCP_ROW_BYTES - 1u] = 0x01u;
+    content[24] = 0x80u;
+    content[26] = 0xffu;
+    EXPECT(set_chips(&h, 0u, 1u, 2u) == EVLCP_STATUS_OUT_OF_RANGE);
+    EXPECT(set_chips(&h, 3u, 0u, 2u) == EVLCP_STATUS_OUT_OF_RANGE);
+    EXPECT(set_chips(&h, 3u, 1u, EVLCP_LEDS + 1u) == EVLCP_STATUS_OUT_OF_RANGE);
+    EXPECT(set_chips(&h, EVLCP_BANK_BYTES + 1u, 1u, 2u) == EVLCP_STATUS_OUT_OF_RANGE);
+    EXPECT(set_chips(&h, 3u, 2u, 2u) == EVLCP_STATUS_OK);
+    EXPECT(commit_chips(&h, 0u, EVLCP_FORMAT_WORDS, 1u, content, sizeof content) == EVLCP_STATUS_OUT_OF_RANGE);
+    content[EVLCP_ROW_BYTES] = 0x40u; /* LED 1 once more */
+    EXPECT(commit_chips(&h, 0u, EVLCP_FORMAT_CLUSTERS, 1u, content, sizeof content) == EVLCP_STATUS_OUT_OF_RANGE);
+    EXPECT(evlcp_get32(h.payload) == 1u);
+    content[EVLCP_ROW_BYTES] = 0u;
+    EXPECT(commit_chips(&h, 0u, EVLCP_FORMAT_CLUSTERS, 1u, content, sizeof content) == EVLCP_STATUS_OK);
+    EXPECT(ask(&h, EVLCP_TYPE_START, NULL, 0) == EVLCP_STATUS_OK);
+    watch_leds(board);
+    run_chips(board, 12u);
+    static const uint8_t first[6] = {0xc0u, 0xc0u, 0u, 0u, 0xc0u, 0xc0u};
+    static const uint8_t last[6] = {0u, 0u, 0u, 0u, 1u, 1u};
+    EXPECT(kept_count == 12u);
+    for (uint32_t n = 0; n < 12u; n++) {
+        EXPECT(kept[n][8] == first[n % 6u] && kept[n][19] == last[n % 6u]);
+        for (uint32_t i = 9u; i < 19u; i++)
+            EXPECT(kept[n][i] == 0u);
+    }
+    const struct evlcp_status_reply s = ask_status(&h);
+    EXPECT(s.packet_chips == 6u && s.hold == 2u && s.clusters == 2u && s.duty == 667u);
+    EXPECT(s.packets_sent == 2u && s.profile == EVLCP_PROFILE_CUSTOM);
+    /* A slot keeps it, and its header has neither frames nor a preamble. */
+    EXPECT(ask(&h, EVLCP_TYPE_BLANK, NULL, 0) == EVLCP_STATUS_OK);
+    EXPECT(ask(&h, EVLCP_TYPE_SAVE, (const uint8_t *)"\0", 1) == EVLCP_STATUS_OK);
+    native_reset(board);
+    say_hello(&h, 5u);
+    EXPECT(ask(&h, EVLCP_TYPE_RECALL, NULL, 0) == EVLCP_STATUS_OK);
+    EXPECT(ask(&h, EVLCP_TYPE_START, NULL, 0) == EVLCP_STATUS_OK);
+    watch_leds(board);
+    run_chips(board, 6u);
+    for (uint32_t n = 0; n < 6u; n++)
+        EXPECT(kept[n][8] == first[n] && kept[n][19] == last[n]);
+    EXPECT(ask_status(&h).hold == 2u && ask_status(&h).packet_chips == 6u);
+}
+
 static void test_sparse_pilots(void)
 {
     static const uint8_t every[] = {1u, 2u, 4u, 7u, 255u};
@@ -894,6 +970,7 @@ int main(int argc, char **argv)
     test_slot_of_older_firmware();
     test_led_test();
     test_masks();
+    test_chips_of_clusters();
     test_sparse_pilots();
     test_random_strings();
     printf("%u passed, %u failed\n", passed, failed);
