@@ -284,8 +284,8 @@ class Board:
             return
         book = bank.composed.codebook
         pilots = tuple(int(w) for w in pilot_words(book))
-        preamble = word_of_values(book.preamble)
-        self.session.call(CodebookRequest(2 * len(book.preamble), preamble, pilots, digest), CodebookReply)
+        preamble = (bank.composed.packet.preamble_chips, word_of_values(book.preamble))
+        self.session.call(CodebookRequest(*preamble, pilots, digest), CodebookReply)
 
     def _hold(self, bank: Bank) -> int:
         """How many chips of the board's chip rate a chip of the bank lasts.

@@ -18,7 +18,7 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("block", blocks("console"), ids=["tx", "messages", "changing", "board"])
+@pytest.mark.parametrize("block", blocks("console"), ids=["tx", "messages", "changing", "board", "others"])
 def test_commands_run(evlcp, block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for line in block.splitlines():
