@@ -297,33 +297,66 @@ def read_words(values: Array, words: Array, scale: float, symbols: Array, llr: A
 
 @njit(cache=True, nogil=True)
 def sum_worth(
-    sums: Array, probability: Array, grid: int, least: float, most: int, worth: Array, out: Array
+    sums: Array,
+    codes: Array,
+    probability: Array,
+    grid: int,
+    least: float,
+    most: int,
+    worth: Array,
+    odds: float,
+    out: Array,
 ) -> None:
-    """Presence-weighted sum of what each pixel's pair of sums is worth, `out` (K, values)."""
+    """Presence-weighted sum of what each pixel's pair of sums is worth in the values after the pilots.
+
+    `sums` begin with those of the pilots, `codes` (K, values); `out` is (K, values). A pixel counts by how
+    likely its pilot makes it that it shows the cluster, not what comes with both values alike; before that,
+    `odds` are against it.
+    """
     clusters, rows, columns = probability.shape
-    length = out.shape[1]
+    length, known = out.shape[1], codes.shape[1]
     top = np.zeros((rows, columns), probability.dtype)
     for k in range(clusters):
         for r in range(rows):
             for c in range(columns):
                 top[r, c] = max(top[r, c], probability[k, r, c])
-    values = np.empty(length)
+    # Log ratio of a pair's likelihood with a value of -1, or of +1, over the mean of both.
+    side = 2 * most + 1
+    fits = np.empty((2, side * side))
+    for a in range(side):
+        for b in range(side):
+            ratio = min(max(worth[a, b], -50.0), 50.0)
+            fits[0, a * side + b] = np.log(2 / (1 + np.exp(ratio)))
+            fits[1, a * side + b] = np.log(2 / (1 + np.exp(-ratio)))
+    signs = np.empty((clusters, known), np.uint64)
+    for k in range(clusters):
+        for i in range(known):
+            signs[k, i] = (codes[k, i] + 1) // 2
+    flat = worth.reshape(-1)
+    pairs, values = np.empty(known, np.uint64), np.empty(length)
     for r in range(rows):
         for c in range(columns):
             if top[r, c] < least:
                 continue
-            values[:] = 0.0
             for v in range(r * grid, (r + 1) * grid):
                 for u in range(c * grid, (c + 1) * grid):
-                    for i in range(length):
+                    for i in range(known + length):
                         first = min(max(sums[2 * i, v, u], -most), most) + most
                         second = min(max(sums[2 * i + 1, v, u], -most), most) + most
-                        values[i] += worth[np.uint64(first), np.uint64(second)]
-            for k in range(clusters):
-                weight = probability[k, r, c]
-                if weight >= least:
-                    for i in range(length):
-                        out[k, i] += weight * values[i]
+                        pair = np.uint64(first * side + second)
+                        if i < known:
+                            pairs[i] = pair
+                        else:
+                            values[i - known] = flat[pair]
+                    for k in range(clusters):
+                        weight = probability[k, r, c]
+                        if weight >= least:
+                            fit = 0.0
+                            for i in range(known):
+                                fit += fits[signs[k, i], pairs[i]]
+                            shows = weight / (1 + odds * np.exp(-fit))
+                            for i in range(length):
+                                out[k, i] += shows * values[i]
 
 
 @njit(cache=True, nogil=True)

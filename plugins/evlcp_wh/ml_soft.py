@@ -22,6 +22,7 @@ __all__ = [
     "MaxEvents",
     "MinWeight",
     "MlSoft",
+    "PixelShare",
     "PriorCount",
     "combined_values",
     "learned_worth",
@@ -45,6 +46,15 @@ IndependentPixels = Annotated[
     ),
 ]
 
+PixelShare = Annotated[
+    float,
+    Field(
+        gt=0,
+        lt=1,
+        description="Share of the pixels in a cluster's place that show it, before their pilots speak.",
+    ),
+]
+
 
 @dataclass(frozen=True)
 class MlSoft(Decoding):
@@ -54,12 +64,16 @@ class MlSoft(Decoding):
     sums, missed and late events included: two histograms over the pixels of all clusters. Their
     log ratio says what a pair of sums is worth, in the info segment of the same frame. Where the camera sends
     no negative events, silence in both chips counts for what it is worth, too.
+
+    A pixel whose pilot does not fit its cluster shows something else, too, a panel or leaves, and one that is
+    dark shows nothing: each counts by the probability that it shows the cluster, by Bayes' rule.
     """
 
     max_events: MaxEvents = 3
     min_weight: MinWeight = 0.05
     prior_count: PriorCount = 1.0
     independent_pixels: IndependentPixels = 0.25
+    pixel_share: PixelShare = 0.05
 
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's pilots and codewords."""
@@ -69,7 +83,7 @@ class MlSoft(Decoding):
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             presence = presence.informed()
             worth = learned_worth(presence, sums, pilots, self.max_events, self.prior_count)
-            values = combined_values(presence, sums[2 * pilots.shape[1] :], worth, self.min_weight)
+            values = combined_values(presence, sums, pilots, worth, self.min_weight, self.pixel_share)
             return soft_symbols(values, words, self.independent_pixels)
 
         return decode
@@ -104,19 +118,29 @@ def learned_worth(
 
 
 def combined_values(
-    presence: PresenceMap, sums: NDArray[np.int16], worth: NDArray[np.float64], min_weight: float
+    presence: PresenceMap,
+    sums: NDArray[np.int16],
+    pilots: NDArray[np.int64],
+    worth: NDArray[np.float64],
+    min_weight: float,
+    pixel_share: float,
 ) -> NDArray[np.float64]:
-    """Presence-weighted sums of what the pixels say of each value of a segment, float64 (K, values).
+    """Sums of what the pixels that show a cluster say of each value of its info segment, float64 (K, values).
 
     Args:
         presence: Of the frame.
-        sums: Polarity sums of the segment, int16 (2 values, height, width).
+        sums: The frame's polarity sums, pilot first, int16 (chips, height, width).
+        pilots: The codes, int64 (K, values).
         worth: As from `learned_worth`.
         min_weight: Presence probability below which a cell is passed over.
+        pixel_share: Share of the pixels in a cluster's place that show it.
     """
-    values = np.zeros((len(presence.probability), len(sums) // 2))
-    most = len(worth) // 2
-    _kernels.sum_worth(sums, presence.probability, presence.grid_px, min_weight, most, worth, values)
+    from evlcp_wh import _kernels
+
+    values = np.zeros((len(pilots), len(sums) // 2 - pilots.shape[1]))
+    most, odds = len(worth) // 2, (1 - pixel_share) / pixel_share
+    probability, grid = presence.probability, presence.grid_px
+    _kernels.sum_worth(sums, pilots, probability, grid, min_weight, most, worth, odds, values)
     return values
 
 

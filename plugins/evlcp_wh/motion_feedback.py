@@ -16,6 +16,7 @@ from evlcp_wh.ml_soft import (
     IndependentPixels,
     MaxEvents,
     MinWeight,
+    PixelShare,
     PriorCount,
     combined_values,
     learned_worth,
@@ -62,6 +63,7 @@ class MotionFeedback(Decoding):
     min_weight: MinWeight = 0.05
     prior_count: PriorCount = 1.0
     independent_pixels: IndependentPixels = 0.25
+    pixel_share: PixelShare = 0.05
     value_error: ErrorShare = 0.1
     min_values: MinValues = 4
     sure_llr: Annotated[
@@ -104,7 +106,7 @@ class MotionFeedback(Decoding):
         words: NDArray[np.float64],
         worth: NDArray[np.float64],
     ) -> SoftSymbols:
-        values = combined_values(presence, sums[2 * pilots.shape[1] :], worth, self.min_weight)
+        values = combined_values(presence, sums, pilots, worth, self.min_weight, self.pixel_share)
         return soft_symbols(values, words, self.independent_pixels)
 
     def _matches(

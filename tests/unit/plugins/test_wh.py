@@ -149,12 +149,12 @@ def test_histograms_of_pairs_and_their_worth(seed, grid, most):
     _kernels.count_pairs(sums, CODES.astype(np.int64), probability, grid, most, counts)
     assert_allclose(counts, twins.count_pairs(sums, CODES, probability, grid, most, 0.5), rtol=1e-6)
     worth = rng.normal(size=counts.shape[1:])
-    out = np.zeros((CLUSTERS, 8))
-    _kernels.sum_worth(sums, probability, grid, 0.2, most, worth, out)
-    cells = twins.worth_of(sums, worth)[:, : 13 // grid * grid, : 10 // grid * grid]
-    cells = cells.reshape(8, 13 // grid, grid, 10 // grid, grid).sum((2, 4))
-    weight = np.where(probability >= 0.2, probability, 0)
-    assert_allclose(out, np.einsum("krc,irc->ki", weight, cells), rtol=1e-6, atol=1e-9)
+    sums = np.concatenate([sums, random_sums(rng, (12, 13, 10))])
+    out = np.zeros((CLUSTERS, 6))
+    _kernels.sum_worth(sums, CODES.astype(np.int64), probability, grid, 0.2, most, worth, 4.0, out)
+    assert_allclose(
+        out, twins.sum_worth(sums, CODES, probability, grid, 0.2, worth, 0.2), rtol=1e-6, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -383,6 +383,24 @@ def test_learned_likelihoods_decode_every_symbol(profile, positive_only):
         assert_array_equal(soft.symbols, symbols)
         assert_array_equal(soft.llr < 0, bits_of(symbols, book.bits_per_symbol) == 1)
         assert soft.quality > 0.9
+
+
+@pytest.mark.parametrize("decoding", [MlSoft(), MotionFeedback()])
+def test_what_flickers_before_a_part_of_a_cluster_is_not_listened_to(decoding):
+    """Half of the columns of each cluster say what a panel does, not the bar."""
+    book, rng = book_of(), np.random.default_rng(0)
+    symbols = rng.integers(64, size=CLUSTERS)
+    shape = {"cluster_px": 4, "width_px": 4}
+    sums = ideal_sums(book, symbols, missing=0.3, seed=0, **shape)
+    lit = np.abs(sums).sum(0) > 0
+    columns = np.flatnonzero(lit.any(0))[: np.ptp(np.flatnonzero(lit.any(0))) // 2 + 1]
+    flicker = rng.integers(-2, 3, len(sums))
+    sums[:, :, columns] = np.where(lit[:, columns], flicker[:, None, None], 0)
+    presence = ideal_presence(CLUSTERS, **shape)
+    soft = decoding.compile(book)(presence, sums)
+    assert_array_equal(soft.symbols, symbols)
+    believing = type(decoding)(pixel_share=1 - 1e-9).compile(book)(presence, sums)
+    assert (believing.symbols != symbols).any()
 
 
 def test_what_comes_with_both_values_alike_is_worth_nothing():

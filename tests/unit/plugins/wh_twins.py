@@ -104,6 +104,21 @@ def worth_of(sums, worth):
     return worth[clipped[::2], clipped[1::2]]
 
 
+def sum_worth(sums, codes, probability, grid, least, worth, share):
+    """Pixel by pixel: how likely it shows the cluster, by Bayes' rule of its pilot, times its worth."""
+    pixels, known = worth_of(sums, worth), codes.shape[1]
+    # Of a value of +1 and -1, as the log of their ratio and a mean of 1 say.
+    likely = {1: 2 * np.exp(pixels) / (1 + np.exp(pixels)), -1: 2 / (1 + np.exp(pixels))}
+    out = np.zeros((len(codes), len(pixels) - known))
+    for k, r, c in np.ndindex(probability.shape):
+        if probability[k, r, c] < least:
+            continue
+        for v, u in itertools.product(range(r * grid, (r + 1) * grid), range(c * grid, (c + 1) * grid)):
+            shown = share * np.prod([likely[code][i, v, u] for i, code in enumerate(codes[k].tolist())])
+            out[k] += probability[k, r, c] * shown / (shown + 1 - share) * pixels[known:, v, u]
+    return out
+
+
 def cluster_matches(pixels, maps, reach):
     """What each cluster's pixels say where the bar is shifted, shift by shift, (K, n, n, values)."""
     _, height, width = pixels.shape
