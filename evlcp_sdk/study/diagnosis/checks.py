@@ -53,8 +53,9 @@ _FEW = 4
 _UNSEEN_SHARE = 0.05
 """Share of unseen clusters of which something is said."""
 
-_MIN_RISES = 500
-"""The same for light that is not read beside a bar that is."""
+_MIN_RISES, _LEAST_RATE = 500, 0.25
+"""The same for light that is not read beside a bar that is, and the least share of the link's rate that it
+has: leaves and edges that pass look like a code of some hundred chips a second."""
 
 _SOME = 0.02
 """Share of all events below which what blinks is not worth a word where nothing sends chips."""
@@ -307,16 +308,13 @@ def _light(facts: Facts) -> Check:
 def _unread(facts: Facts) -> Check | None:
     """Light of a code where no frame is read, beside one that is; None where there is none."""
     link_hz = facts.link.packet.chip_rate_hz
+    places = [one.last_px for one in facts.tally.transmitters.values()]
     for source in facts.sources:
         left, top, right, bottom = source.box_px
-        if (
-            source.kind != "code"
-            or source.rises < _MIN_RISES
-            or any(
-                left <= one.last_px[0] <= right and top <= one.last_px[1] <= bottom
-                for one in facts.tally.transmitters.values()
-            )
-        ):
+        code = source.kind == "code" and source.rises >= _MIN_RISES
+        if not code or source.rate_hz < _LEAST_RATE * link_hz:
+            continue
+        if any(left <= x <= right and top <= y <= bottom for x, y in places):
             continue
         same = _has_rate(source, link_hz)
         return Check(

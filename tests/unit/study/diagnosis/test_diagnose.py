@@ -139,6 +139,8 @@ def test_a_bar_that_is_not_read_beside_one_that_is() -> None:
     assert judged(BAR, replace(other, kind="lamp"), frames=40) == ""
     assert judged(BAR, other, frames=40) == "unread"
     assert judged(BAR, replace(other, rises=300), frames=40) == ""
+    # Leaves and their edges.
+    assert judged(BAR, replace(other, rate_hz=737.0), frames=40) == ""
 
 
 def test_rate_is_measured_without_a_link() -> None:
