@@ -53,9 +53,10 @@ _FEW = 4
 _UNSEEN_SHARE = 0.05
 """Share of unseen clusters of which something is said."""
 
-_MIN_RISES, _LEAST_RATE = 500, 0.25
-"""The same for light that is not read beside a bar that is, and the least share of the link's rate that it
-has: leaves and edges that pass look like a code of some hundred chips a second."""
+_MIN_RISES, _LEAST_RATE, _SLENDER = 500, 0.25, 4.0
+"""The same for light that is not read beside a bar that is; the least share of the link's rate that it has;
+how many times longer than wide it is. Leaves and edges that pass look like a code of some hundred chips a
+second, a lamp whose periods are missed like one of some thousand."""
 
 _SOME = 0.02
 """Share of all events below which what blinks is not worth a word where nothing sends chips."""
@@ -312,11 +313,13 @@ def _unread(facts: Facts) -> Check | None:
     for source in facts.sources:
         left, top, right, bottom = source.box_px
         code = source.kind == "code" and source.rises >= _MIN_RISES
-        if not code or source.rate_hz < _LEAST_RATE * link_hz:
+        same = _has_rate(source, link_hz)
+        long_px, wide_px = sorted((source.wide_px, source.high_px), reverse=True)
+        likely = source.rate_hz >= _LEAST_RATE * link_hz and long_px >= _SLENDER * wide_px
+        if not code or not (same or likely):
             continue
         if any(left <= x <= right and top <= y <= bottom for x, y in places):
             continue
-        same = _has_rate(source, link_hz)
         return Check(
             "light",
             "doubt",
@@ -484,6 +487,15 @@ def _focus(facts: Facts) -> Check:
 
 def _preamble(facts: Facts) -> Check:
     heard, regions = facts.counts["preambles"], facts.counts["regions_opened"]
+    packet_us = facts.link.packet.packet_chips * facts.link.packet.chip_us
+    if not facts.reads and facts.seen.duration_us < 2 * packet_us:
+        return Check(
+            "preamble",
+            "fail",
+            "short",
+            f"the recording lasts {facts.seen.duration_us * 1e-3:.1f} ms, a packet {packet_us * 1e-3:.1f} ms",
+            "record some packets: the next preamble may come after the end",
+        )
     if not heard:
         return Check(
             "preamble",

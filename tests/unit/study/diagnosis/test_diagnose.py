@@ -85,7 +85,13 @@ def test_what_a_link_has_wrong_is_found_and_said(code: str, sent: tuple[str, ...
     assert step in wrong.next_step
 
 
-def judged(*sources: LightSource, quality: float = 1.0, frames: int = 0, rejected: int = 0) -> str:
+def judged(
+    *sources: LightSource,
+    quality: float = 1.0,
+    frames: int = 0,
+    rejected: int = 0,
+    duration_us: float = 2e5,
+) -> str:
     """What is wrong first of all with light that the survey told, and what the receiver made of it."""
     tally = RunTally(LINK.packet)
     if frames:
@@ -95,7 +101,7 @@ def judged(*sources: LightSource, quality: float = 1.0, frames: int = 0, rejecte
         one.last_px = 410.0, 375.0
     counts = dict.fromkeys(("preambles", "regions_opened"), 3)
     counts |= {"frames": frames, "frames_rejected": rejected}
-    seen = Seen(0.0, 2e5)
+    seen = Seen(0.0, duration_us)
     checks = checks_of(Facts(LINK, 10**6, seen, sources, None, counts, tally))
     wrong = [one for one in checks if one.verdict in ("fail", "doubt")]
     assert all(one.next_step for one in wrong)
@@ -106,6 +112,9 @@ BAR = LightSource(
     "code", 10_000.0, 0.9, (400, 300, 420, 450), 5.0, 140.0, 900_000, 90_000, 0.5, 300.0, 0.0,
     np.bincount(np.repeat([20, 30, 40], [5, 3, 2]), minlength=_kernels.BINS),
 )  # fmt: skip
+HALF = np.bincount(np.repeat([25, 35, 45, 55], 5), minlength=_kernels.BINS)
+"""Of another rate: at that of the link, the mean is below 0."""
+
 TALL = replace(BAR, box_px=(400, 40, 480, 680), wide_px=25.0, high_px=600.0)
 WIDE = replace(BAR, wide_px=23.0)
 SLOW = replace(BAR, kind="lamp", rate_hz=2360.0, strength=0.6, typical_us=814.0, blind_us=390.0)
@@ -125,6 +134,8 @@ SLOW = replace(BAR, kind="lamp", rate_hz=2360.0, strength=0.6, typical_us=814.0,
         # Pixels that answer every 400 us are as regular as a lamp, but frames are none of a lamp's.
         ("refractory", SLOW, {"frames": 14, "rejected": 30}),
         ("lamp", SLOW, {"rejected": 30}),
+        ("short", BAR, {"rejected": 2, "duration_us": 4e4}),
+        ("", BAR, {"frames": 8, "duration_us": 4e4}),
         # Of a bar 300 m away, the image of a column of LEDs is wider than two clusters are long.
         ("frames", replace(BAR, wide_px=4.5, high_px=25.0), {"rejected": 30}),
         ("dim", replace(BAR, rises=568, events=1330), {}),
@@ -139,8 +150,10 @@ def test_a_bar_that_is_not_read_beside_one_that_is() -> None:
     assert judged(BAR, replace(other, kind="lamp"), frames=40) == ""
     assert judged(BAR, other, frames=40) == "unread"
     assert judged(BAR, replace(other, rises=300), frames=40) == ""
+    assert judged(BAR, replace(other, rate_hz=5000.0, intervals=HALF), frames=40) == "unread"
+    assert judged(BAR, replace(other, rate_hz=4000.0, intervals=HALF, high_px=8.0), frames=40) == ""
     # Leaves and their edges.
-    assert judged(BAR, replace(other, rate_hz=737.0), frames=40) == ""
+    assert judged(BAR, replace(other, rate_hz=737.0, intervals=HALF), frames=40) == ""
 
 
 def test_rate_is_measured_without_a_link() -> None:
