@@ -19,6 +19,11 @@ Array = NDArray[Any]
 
 POSE, FAULT, LENS, GLOBAL, LOCAL = 6, 6, 7, 14, 9
 
+_GOLDEN = (math.sqrt(5) - 1) / 2
+
+_HALVINGS = 12
+"""Steps of a golden section: from 10 degrees to a 30th of one."""
+
 
 @njit(cache=True, nogil=True)
 def normal(
@@ -42,10 +47,7 @@ def normal(
     `miss` (3,) are those of the attitude.
     """
     n, bars = len(points), len(cost)
-    errors = False
-    for i in range(7):
-        errors = errors or lens_root[i, i] != 0
-    wide = GLOBAL if errors else LENS
+    wide = max(_unknowns(lens_root), LENS)
     asked = len(pixel) > 0
     now = lens.copy()
     for i in range(7):
@@ -53,8 +55,8 @@ def normal(
             now[i] += lens_root[i, j] * error[j]
     f, cx, cy, k1, k2, p1, p2, k3 = now
     scale_f = fault * lens[0]
-    # A point's two rows: what is the bar's own, the unknowns of all, the miss.
-    row = np.zeros((2, LOCAL + GLOBAL + 1))
+    # Of a bar's points: what is its own, the unknowns of all, the miss; first all columns, then all rows.
+    row, stays = np.zeros((LOCAL + GLOBAL + 1, 2 * n)), np.zeros(2 * n)
     sums = np.zeros((LOCAL + GLOBAL + 1, LOCAL + GLOBAL + 1))
     slow = np.zeros((LOCAL + GLOBAL + 1, LOCAL + GLOBAL + 1))
     by_lens = np.zeros((2, 7))
@@ -64,17 +66,15 @@ def normal(
         sh, sp, st, sl = bar_sigma[b]
         tall = LOCAL if sp > 0 or st > 0 else 3
         last = tall + wide
-        sums[:] = 0
-        slow[:] = 0
         sum_ = 0.0
-        for i in range(tall):
-            sums[i, i] = 1
-            sums[i, last] = -local[b, i]
         for i in range(LOCAL):
             sum_ += local[b, i] ** 2
         wx, wy, wz = st * local[b, 6], st * local[b, 7], st * local[b, 8]
         grow = sl * local[b, 2]
-        while at < n and bar[at] == b:
+        count, k = 0, 0
+        while at + count < n and bar[at + count] == b:
+            count += 1
+        while k < count:
             ax, ay, az = points[at, 3], points[at, 4], points[at, 5]
             ox = points[at, 0] - position[0] + sp * local[b, 3] + grow * ax + wy * az - wz * ay
             oy = points[at, 1] - position[1] + sp * local[b, 4] + grow * ay + wz * ax - wx * az
@@ -93,31 +93,42 @@ def normal(
             w = points[at, 8]
             mx = (points[at, 6] - (cx + f * bent_u) - sh * local[b, 0]) * w
             my = (points[at, 7] - (cy + f * bent_v) - sh * local[b, 1]) * w
-            row[0, last], row[1, last] = mx, my
+            size = math.sqrt(mx * mx + my * my)
+            weight = 1.0
+            if size > huber:
+                weight = huber / size
+                sum_ += huber * (2 * size - huber)
+            else:
+                sum_ += size * size
+            stays[k] = stays[count + k] = points[at, 9] * weight
+            weight = math.sqrt(weight)
+            w *= weight
+            row[last, k], row[last, count + k] = mx * weight, my * weight
             cross = u * v * growth + 2 * p1 * u + 2 * p2 * v
             uu = radial + u * u * growth + 2 * p1 * v + 6 * p2 * u
             vv = radial + v * v * growth + 6 * p1 * v + 2 * p2 * u
-            for a in range(2):
-                by_u, by_v = (uu, cross) if a == 0 else (cross, vv)
+            for i in range(2):
+                a = k + i * count
+                by_u, by_v = (uu, cross) if i == 0 else (cross, vv)
                 by_u, by_v = f * w / z * by_u, f * w / z * by_v
                 by_z = -(by_u * u + by_v * v)
                 e = by_u * rotation[0, 0] + by_v * rotation[0, 1] + by_z * rotation[0, 2]
                 no = by_u * rotation[1, 0] + by_v * rotation[1, 1] + by_z * rotation[1, 2]
                 up = by_u * rotation[2, 0] + by_v * rotation[2, 1] + by_z * rotation[2, 2]
-                row[a, 2] = (e * ax + no * ay + up * az) * sl
+                row[2, a] = (e * ax + no * ay + up * az) * sl
                 if tall == LOCAL:
-                    row[a, 3], row[a, 4], row[a, 5] = e * sp, no * sp, up * sp
-                    row[a, 6] = (ay * up - az * no) * st
-                    row[a, 7] = (az * e - ax * up) * st
-                    row[a, 8] = (ax * no - ay * e) * st
-                row[a, tall], row[a, tall + 1], row[a, tall + 2] = -e, -no, -up
-                row[a, tall + 3] = no * oz - up * oy
-                row[a, tall + 4] = up * ox - e * oz
-                row[a, tall + 5] = e * oy - no * ox
-            row[0, 0] = row[1, 1] = sh * w
-            row[0, 1] = row[1, 0] = 0
-            row[0, tall + FAULT], row[1, tall + FAULT] = bent_u * scale_f * w, bent_v * scale_f * w
-            if errors:
+                    row[3, a], row[4, a], row[5, a] = e * sp, no * sp, up * sp
+                    row[6, a] = (ay * up - az * no) * st
+                    row[7, a] = (az * e - ax * up) * st
+                    row[8, a] = (ax * no - ay * e) * st
+                row[tall, a], row[tall + 1, a], row[tall + 2, a] = -e, -no, -up
+                row[tall + 3, a] = no * oz - up * oy
+                row[tall + 4, a] = up * ox - e * oz
+                row[tall + 5, a] = e * oy - no * ox
+            row[0, k], row[1, count + k] = sh * w, sh * w
+            row[0, count + k] = row[1, k] = 0
+            row[tall + FAULT, k], row[tall + FAULT, count + k] = bent_u * scale_f * w, bent_v * scale_f * w
+            if wide > LENS:
                 by_lens[0, 0], by_lens[1, 0] = bent_u, bent_v
                 by_lens[0, 1] = by_lens[1, 2] = 1
                 by_lens[0, 2] = by_lens[1, 1] = 0
@@ -126,22 +137,20 @@ def normal(
                 by_lens[0, 5], by_lens[1, 5] = 2 * f * u * v, f * (r2 + 2 * v * v)
                 by_lens[0, 6], by_lens[1, 6] = f * (r2 + 2 * u * u), 2 * f * u * v
                 for a in range(2):
-                    for j in range(7):
+                    for j in range(wide - LENS):
                         value = 0.0
                         for i in range(j, 7):
                             value += by_lens[a, i] * lens_root[i, j]
-                        row[a, tall + LENS + j] = value * w
-            size = math.sqrt(mx * mx + my * my)
-            weight = 1.0
-            if size > huber:
-                weight = huber / size
-                sum_ += huber * (2 * size - huber)
-            else:
-                sum_ += size * size
-            _gathered(row, weight, last + 1, sums)
-            if asked:
-                _gathered(row, points[at, 9] * weight**2, last, slow)
+                        row[tall + LENS + j, k + a * count] = value * w
             at += 1
+            k += 1
+        _products(row, row, last + 1, 2 * count, sums)
+        if asked:
+            shared = row[:last] * stays
+            _products(shared, row, last, 2 * count, slow)
+        for i in range(tall):
+            sums[i, i] += 1
+            sums[i, last] -= local[b, i]
         # Cholesky as far as what is the bar's own, which leaves the rest with it eliminated.
         for k in range(tall):
             inverse = 1 / math.sqrt(sums[k, k])
@@ -185,12 +194,28 @@ def normal(
 
 
 @njit(cache=True, nogil=True)
-def _gathered(row: Array, weight: float, wide: int, sums: Array) -> None:
-    """Add the weighted products of two rows, (2, w): the upper half of `sums` (w, w)."""
+def _unknowns(lens_root: Array) -> int:
+    """How many unknowns points depend on: the first ones, as far as errors of the camera have a sigma."""
+    number = POSE
+    for i in range(7):
+        for j in range(i + 1):
+            if lens_root[i, j] != 0:
+                number = max(number, LENS + j + 1)
+    return number
+
+
+# In any order, so that several are added at once: six times as fast.
+@njit(cache=True, nogil=True, fastmath={"reassoc", "nsz"})
+def _products(left: Array, right: Array, wide: int, n: int, out: Array) -> None:
+    """Products of the first `n` columns, summed: the upper half of `out` (wide, wide)."""
     for i in range(wide):
-        one, two = weight * row[0, i], weight * row[1, i]
+        one = left[i]
         for j in range(i, wide):
-            sums[i, j] += one * row[0, j] + two * row[1, j]
+            two = right[j]
+            value = 0.0
+            for k in range(n):
+                value += one[k] * two[k]
+            out[i, j] = value
 
 
 @njit(cache=True, nogil=True)
@@ -254,12 +279,12 @@ def _attitude(
 def summed(
     info: Array, right: Array, rows: Array, miss: Array, error: Array, free: Array, whole: Array, side: Array
 ) -> None:
-    """Add the bars, the attitude and what is known of the camera: `whole` (14, 14), `side` (14,).
+    """Add the bars, the attitude and what is known of the camera: `whole` (m, m), `side` (m,).
 
-    Unknowns that are not `free` (14,) are held.
+    Of the first m unknowns; those that are not `free` (14,) are held.
     """
-    bars = len(info)
-    for i in range(GLOBAL):
+    bars, n = len(info), len(side)
+    for i in range(n):
         side[i] = 0
         for b in range(bars):
             side[i] += right[b, i]
@@ -267,17 +292,17 @@ def summed(
             side[i] += rows[a, i] * miss[a]
         if i >= LENS:
             side[i] -= error[i - LENS]
-        for j in range(GLOBAL):
+        for j in range(n):
             value = 1.0 if i == j and i >= LENS else 0.0
             for b in range(bars):
                 value += info[b, i, j]
             for a in range(3):
                 value += rows[a, i] * rows[a, j]
             whole[i, j] = value
-    for i in range(GLOBAL):
+    for i in range(n):
         if not free[i]:
             side[i] = 0
-            for j in range(GLOBAL):
+            for j in range(n):
                 whole[i, j] = whole[j, i] = 0
             whole[i, i] = 1
 
@@ -339,13 +364,23 @@ def solved(whole: Array, side: Array, damping: float, move: Array) -> bool:
 def inverted(whole: Array, out: Array) -> bool:
     """The inverse of a positive matrix; False where it is singular."""
     n = len(whole)
-    scale, low, unit = np.zeros(n), np.zeros((n, n)), np.zeros(n)
+    scale, low = np.zeros(n), np.zeros((n, n))
     if not _factored(whole, 0.0, scale, low):
         return False
+    # The root's inverse in place, then its product with itself.
+    for j in range(n):
+        low[j, j] = 1 / low[j, j]
+        for i in range(j + 1, n):
+            value = 0.0
+            for k in range(j, i):
+                value -= low[i, k] * low[k, j]
+            low[i, j] = value / low[i, i]
     for i in range(n):
-        unit[i] = 1
-        _substituted(low, scale, unit, out[i])
-        unit[i] = 0
+        for j in range(i + 1):
+            value = 0.0
+            for k in range(i, n):
+                value += low[k, i] * low[k, j]
+            out[i, j] = out[j, i] = value * scale[i] * scale[j]
     return True
 
 
@@ -353,38 +388,50 @@ def inverted(whole: Array, out: Array) -> bool:
 def eigen(matrix: Array, values: Array, axes: Array) -> None:
     """Eigenvalues of a symmetric matrix, in no order, and its axes as columns, by Jacobi's turns.
 
-    For the few rows here a fraction of what LAPACK takes. The matrix is overwritten.
+    For the few rows here a fraction of what LAPACK takes. The matrix, of which the upper half counts, is
+    overwritten.
     """
     n = len(values)
+    axes[:] = 0
     for i in range(n):
-        for j in range(n):
-            axes[i, j] = 1.0 if i == j else 0.0
+        axes[i, i] = 1
     for _ in range(30):
         off = size = 0.0
         for i in range(n):
             size += matrix[i, i] ** 2
-            for j in range(i):
+            for j in range(i + 1, n):
                 off += matrix[i, j] ** 2
-        if not off > 1e-32 * size:
+        if not off > 1e-31 * size:
             break
         for p in range(n - 1):
             for q in range(p + 1, n):
-                if matrix[p, q] == 0:
+                both = matrix[p, q]
+                if both == 0:
                     continue
-                half = (matrix[q, q] - matrix[p, p]) / (2 * matrix[p, q])
+                half = (matrix[q, q] - matrix[p, p]) / (2 * both)
                 t = math.copysign(1 / (abs(half) + math.sqrt(half * half + 1)), half)
                 c = 1 / math.sqrt(t * t + 1)
                 s = t * c
-                for k in range(n):
+                matrix[p, p] -= t * both
+                matrix[q, q] += t * both
+                matrix[p, q] = 0
+                for k in range(p):
                     one, two = matrix[k, p], matrix[k, q]
                     matrix[k, p], matrix[k, q] = c * one - s * two, s * one + c * two
-                for k in range(n):
+                for k in range(p + 1, q):
+                    one, two = matrix[p, k], matrix[k, q]
+                    matrix[p, k], matrix[k, q] = c * one - s * two, s * one + c * two
+                for k in range(q + 1, n):
                     one, two = matrix[p, k], matrix[q, k]
                     matrix[p, k], matrix[q, k] = c * one - s * two, s * one + c * two
-                    one, two = axes[k, p], axes[k, q]
-                    axes[k, p], axes[k, q] = c * one - s * two, s * one + c * two
+                # Rows, which are next to each other, until the end.
+                for k in range(n):
+                    one, two = axes[p, k], axes[q, k]
+                    axes[p, k], axes[q, k] = c * one - s * two, s * one + c * two
     for i in range(n):
         values[i] = matrix[i, i]
+        for j in range(i):
+            axes[i, j], axes[j, i] = axes[j, i], axes[i, j]
 
 
 @njit(cache=True, nogil=True)
@@ -433,17 +480,20 @@ def stepped(
 def fitted(
     points: Array, bar: Array, bar_sigma: Array, lens: Array, lens_root: Array, fault: float,
     felt: Array, heading: float, known: int, white: Array, huber: float, free: Array, steps: int,
-    position: Array, rotation: Array, local: Array, error: Array,
+    hopeless: float, position: Array, rotation: Array, local: Array, error: Array,
 ) -> tuple[bool, float, Array, Array, Array, Array]:  # fmt: skip
     """Levenberg-Marquardt from a point; whether it settled, twice the cost, and the point.
 
-    The damping follows how much of what the equations promise a step wins (Nielsen 1999).
+    The damping follows how much of what the equations promise a step wins (Nielsen 1999). A cost above
+    `hopeless` that four steps in a row hardly lower is one where it has settled.
     """
     bars = len(bar_sigma)
     info, right, cost = np.zeros((bars, GLOBAL, GLOBAL)), np.zeros((bars, GLOBAL)), np.zeros(bars)
     gain, step = np.zeros((bars, LOCAL, GLOBAL)), np.zeros((bars, LOCAL))
     rows, miss, pixel = np.zeros((3, GLOBAL)), np.zeros(3), np.zeros((0, GLOBAL, GLOBAL))
-    whole, side, move = np.zeros((GLOBAL, GLOBAL)), np.zeros(GLOBAL), np.zeros(GLOBAL)
+    # What no bar depends on stays as it is.
+    n = _unknowns(lens_root)
+    whole, side, move = np.zeros((n, n)), np.zeros(n), np.zeros(GLOBAL)
     centre = np.zeros(3)
     for i in range(3):
         centre[i] = points[:, i].mean()
@@ -456,9 +506,9 @@ def fitted(
     summed(info, right, rows, miss, error, free, whole, side)
     gain_here, step_here = gain.copy(), step.copy()
     surveyed, still = bar_sigma[:, 1:3].max() > 0, np.zeros(GLOBAL)
-    damping, growth = 1e-4, 4.0
+    damping, growth, stalled = 1e-4, 4.0, 0
     for _ in range(steps):
-        if not solved(whole, side, damping, move):
+        if not solved(whole, side, damping, move[:n]):
             return False, best, position, rotation, local, error
         there, turned, own, off = stepped(
             move, gain_here, step_here, centre, position, rotation, local, error
@@ -476,9 +526,10 @@ def fitted(
             )  # fmt: skip
         # What the damped step promises to win; what is a bar's own follows anyway.
         promise = hoped = 0.0
-        for i in range(GLOBAL):
+        for i in range(n):
             promise += side[i] * move[i]
             hoped += move[i] * (side[i] + damping * whole[i, i] * move[i])
+        stalled = 0 if found < 0.7 * best else stalled + 1
         if found <= best:
             won = best - found
             position, rotation, local, error, best = there, turned, own, off, found
@@ -497,6 +548,8 @@ def fitted(
             if damping > 1e12 or abs(promise) < 1e-9:
                 # No step is an improvement any more: rounding decides.
                 return promise < 1e-3, best, position, rotation, local, error
+        if stalled == 4 and best > hopeless:
+            return True, best, position, rotation, local, error
     return False, best, position, rotation, local, error
 
 
@@ -541,50 +594,61 @@ def tested(
     shared, follow = np.zeros((n, rank)), np.zeros((n, rank))
     for i in range(n):
         for k in range(m):
+            one = column[i, k]
             for j in range(rank):
-                shared[i, j] += column[i, k] * basis[k, j]
+                shared[i, j] += one * basis[k, j]
     for i in range(n):
         for k in range(n):
+            one = spread[i, k]
             for j in range(rank):
-                follow[i, j] += spread[i, k] * shared[k, j]
+                follow[i, j] += one * shared[k, j]
     left, turn, share = np.zeros((rank, rank)), np.zeros((rank, rank)), np.zeros(rank)
     for i in range(rank):
         left[i, i] = 1
-        for k in range(n):
-            for j in range(rank):
-                left[i, j] -= (shared[k, i] * follow[k, j] + shared[k, j] * follow[k, i]) / 2
+    for k in range(n):
+        for i in range(rank):
+            one = shared[k, i]
+            for j in range(i, rank):
+                left[i, j] -= one * follow[k, j]
     eigen(left, share, turn)
     turned, moved, along = np.zeros((m, rank)), np.zeros((3, rank)), np.zeros(rank)
     for k in range(rank):
-        for j in range(rank):
-            for i in range(m):
+        for i in range(m):
+            for j in range(rank):
                 turned[i, j] += basis[i, k] * turn[k, j]
-            for i in range(3):
+        for i in range(3):
+            for j in range(rank):
                 moved[i, j] += follow[i, k] * turn[k, j]
     value, freedom = 0.0, 0
-    for j in range(rank):
-        for i in range(m):
+    for i in range(m):
+        for j in range(rank):
             along[j] += turned[i, j] * side[i]
+    for j in range(rank):
         if share[j] > least:
             value += along[j] ** 2 / share[j]
             freedom += 1
         else:
             # What is not tested may be of any size, or of as much as the bound allows.
             share[j] = 1e-12
-    known, inverse = np.zeros((rank, rank)), np.zeros((rank, rank))
-    for i in range(rank):
-        for j in range(rank):
-            for k in range(m):
-                for p in range(m):
-                    known[i, j] += turned[k, i] * bound[k, p] * turned[p, j]
-        known[i, i] += share[i]
-    if not inverted(known, inverse):
-        return 0.0, 0, added + math.inf, unseen + math.inf
     moves = np.zeros((3, rank))
-    for i in range(3):
-        for k in range(rank):
+    if bound.any():
+        known, inverse = np.zeros((rank, rank)), np.zeros((rank, rank))
+        for i in range(rank):
             for j in range(rank):
-                moves[i, j] += moved[i, k] * inverse[k, j]
+                for k in range(m):
+                    for p in range(m):
+                        known[i, j] += turned[k, i] * bound[k, p] * turned[p, j]
+            known[i, i] += share[i]
+        if not inverted(known, inverse):
+            return 0.0, 0, added + math.inf, unseen + math.inf
+        for i in range(3):
+            for k in range(rank):
+                for j in range(rank):
+                    moves[i, j] += moved[i, k] * inverse[k, j]
+    else:
+        for i in range(3):
+            for j in range(rank):
+                moves[i, j] = moved[i, j] / share[j]
     for i in range(3):
         for j in range(3):
             for k in range(rank):
@@ -612,165 +676,208 @@ def weighed(
         or of their inverses, of the true and the expected growth of the cost two sigmas away along it to both
         sides, and of one and the square of how far the way there, an arc about the bars, is from that axis,
         in sigmas - infinite, and then nothing after it is of use, where the sigma is above `most_sigma`;
-        covariance (14, 14); of each part - bars, focal length, attitude, heading as far as there are - the
-        test's value and its degrees of freedom, (parts,); horizontal and vertical protection level, m: for
-        each fault, how far the solution may have moved with the test just passed, and how far one that does
-        without the part may be off at the risk; what doubt adds (6, 6); the covariance's causes: noise and
-        slow, (3, 3), moves by the camera (3, 7), by the attitude (3, 4), by what is each bar's (bars, 3, 7).
+        covariance of the unknowns that count, which come first; of each part - bars, focal length, attitude,
+        heading as far as there are - the test's value and its degrees of freedom, (parts,); horizontal and
+        vertical protection level, m: for each fault, how far the solution may have moved with the test just
+        passed, and how far one that does without the part may be off at the risk; what doubt adds (6, 6); the
+        covariance's causes: noise and slow, (3, 3), moves by the camera (3, 7), by the attitude (3, 4), by
+        what is each bar's (bars, 3, 7).
     """
     bars = len(bar_sigma)
     info, right, bar_cost = np.zeros((bars, GLOBAL, GLOBAL)), np.zeros((bars, GLOBAL)), np.zeros(bars)
     gain, step = np.zeros((bars, LOCAL, GLOBAL)), np.zeros((bars, LOCAL))
     rows, miss, pixel = np.zeros((3, GLOBAL)), np.zeros(3), np.zeros((bars, GLOBAL, GLOBAL))
-    whole, side, spread = np.zeros((GLOBAL, GLOBAL)), np.zeros(GLOBAL), np.zeros((GLOBAL, GLOBAL))
-    noise, slow, doubt = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((6, 6))
-    by_camera, by_attitude, by_bar = np.zeros((3, 7)), np.zeros((3, 4)), np.zeros((bars, 3, 7))
-    turns = free[3] or free[4] or free[5]
+    # What no bar depends on is as known as before, and moves nothing.
+    n = _unknowns(lens_root)
+    whole, side, spread = np.zeros((n, n)), np.zeros(n), np.zeros((n, n))
+    turns = known > 0 and (free[3] or free[4] or free[5])
     parts = bars + 1
-    if known > 0 and turns:
+    if turns:
         parts += 2 if known == 3 else 1
     values, freedom = np.zeros(parts), np.zeros(parts, np.int64)
-    wide, bent, hpl, vpl = 0.0, math.inf, math.inf, math.inf
-    normal(
-        points, bar, bar_sigma, lens, lens_root, fault, felt, heading, known, white, huber,
-        position, rotation, local, error, info, right, gain, step, bar_cost, rows, miss, pixel,
-    )  # fmt: skip
+    by_camera, by_attitude, by_bar = np.zeros((3, 7)), np.zeros((3, 4)), np.zeros((bars, 3, 7))
+    noise, slow, doubt = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((6, 6))
+    wide, bent, levels = 0.0, math.inf, (math.inf, math.inf)
+    given = (points, bar, bar_sigma, lens, lens_root, fault, felt, heading, known, white, huber)
+    point = (position, rotation, local, error)
+    normal(*given, *point, info, right, gain, step, bar_cost, rows, miss, pixel)
     summed(info, right, rows, miss, error, free, whole, side)
+    size, axes = np.zeros(3), np.zeros((3, 3))
     regular = inverted(whole, spread)
-    for i in range(GLOBAL):
+    for i in range(n):
         if not free[i]:
-            for j in range(GLOBAL):
-                spread[i, j] = spread[j, i] = 0
+            spread[i, :] = 0
+            spread[:, i] = 0
     if regular:
-        size, axes = np.zeros(3), np.zeros((3, 3))
         eigen(spread[:3, :3].copy(), size, axes)
-        most = 0
-        for i in range(3):
-            most = i if size[i] > size[most] else most
-        wide = math.sqrt(max(size[most], 0.0))
+        wide = math.sqrt(max(size.max(), 0.0))
     if regular and wide <= most_sigma:
-        spare = info.copy(), right.copy(), gain.copy(), step.copy(), bar_cost.copy(), rows.copy(), miss.copy()
-        move, still, centre = np.zeros(GLOBAL), np.zeros(GLOBAL), np.zeros(3)
-        for i in range(3):
-            centre[i] = points[:, i].mean()
-        bent = 1.0
-        for way in (-2 / wide, 2 / wide):
-            for i in range(GLOBAL):
-                move[i] = 0
-                for j in range(3):
-                    move[i] += way * spread[i, j] * axes[j, most]
-            there, turned, own, off = stepped(move, gain, step, centre, position, rotation, local, error)
-            for again in range(2):
-                found = normal(
-                    points, bar, bar_sigma, lens, lens_root, fault, felt, heading, known, white, huber,
-                    there, turned, own, off, spare[0], spare[1], spare[2], spare[3], spare[4], spare[5],
-                    spare[6], pixel[:0],
-                )  # fmt: skip
-                if again or not found - cost > 12:
-                    break
-                # Errors of sites take up what is left of second order.
-                there, turned, own, off = stepped(still, spare[2], spare[3], centre, there, turned, own, off)
-            growth = 1e-9 if math.isnan(found) else max((found - cost) / 4, 1e-9)
-            square = 0.0
-            for i in range(3):
-                along = 0.0
-                for j in range(3):
-                    along += axes[j, i] * (there[j] - position[j] - move[j])
-                square += along**2 / max(size[i], 1e-15 * size[most])
-            bent = max(bent, growth, 1 / growth, 1 + square)
-        hpl = flat * _widest(spread)
-        vpl = high * math.sqrt(max(spread[2, 2], 0.0))
-        none = np.zeros((6, 6))
-        columns = np.zeros((GLOBAL, 6))
-        for part in range(parts):
-            columns[:] = 0
-            if part < bars:
-                for i in range(GLOBAL):
-                    for j in range(6):
-                        columns[i, j] = info[part, i, j] if free[i] else 0.0
-                value, freed, added, unseen = tested(
-                    info[part, :6, :6].copy(), columns, right[part, :6].copy(), spread, none, least
-                )
-            elif part == bars:
-                own, mean = np.zeros((1, 1)), np.zeros(1)
-                for b in range(bars):
-                    mean[0] += right[b, FAULT]
-                    own[0, 0] += info[b, FAULT, FAULT]
-                    for i in range(GLOBAL):
-                        columns[i, 0] += info[b, i, FAULT] if free[i] else 0.0
-                value, freed, added, unseen = tested(
-                    own, columns[:, :1].copy(), mean, spread, np.ones((1, 1)), least
-                )
-            else:
-                first = 2 if part == bars + 2 else 0
-                bound = _attitude_bound(white, known, attitude_fault)
-                for i in range(GLOBAL):
-                    for j in range(first, known):
-                        columns[i, j - first] = rows[j, i] if free[i] else 0.0
-                value, freed, added, unseen = tested(
-                    np.eye(known - first),
-                    columns[:, : known - first].copy(),
-                    miss[first:known].copy(),
-                    spread,
-                    bound[first:, first:].copy(),
-                    least,
-                )
-            values[part], freedom[part] = value, freed
-            if part < bars + 2:
-                limit = limits[freed]
-                for i in range(3):
-                    for j in range(3):
-                        added[i, j] += spread[i, j]
-                hpl = max(hpl, math.sqrt(limit) * _widest(unseen) + flat * _widest(added))
-                vpl = max(
-                    vpl,
-                    math.sqrt(limit * max(unseen[2, 2], 0.0)) + high * math.sqrt(max(added[2, 2], 0.0)),
-                )
-        for i in range(3):
-            for j in range(7):
-                by_camera[i, j] = -spread[i, LENS + j]
-            for a in range(known):
-                value = 0.0
-                for j in range(GLOBAL):
-                    value += spread[i, j] * rows[a, j]
-                for j in range(4):
-                    by_attitude[i, j] += value * said[a, j]
-            for b in range(bars):
-                for k in range(7):
-                    for j in range(GLOBAL):
-                        by_bar[b, i, k] += spread[i, j] * gain[b, k + 2, j]
-        for b in range(bars):
-            by_pixel = np.zeros((3, GLOBAL))
-            for i in range(3):
-                for k in range(GLOBAL):
-                    for j in range(GLOBAL):
-                        by_pixel[i, j] += spread[i, k] * pixel[b, k, j]
-            for i in range(3):
-                for j in range(3):
-                    for k in range(GLOBAL):
-                        slow[i, j] += by_pixel[i, k] * spread[j, k]
-        rest = np.zeros((3, 3))
-        for i in range(3):
-            for j in range(3):
-                rest[i, j] = spread[i, j] - (slow[i, j] + slow[j, i]) / 2
-                for k in range(7):
-                    rest[i, j] -= by_camera[i, k] * by_camera[j, k]
-                    for b in range(bars):
-                        rest[i, j] -= by_bar[b, i, k] * by_bar[b, j, k]
-                for k in range(4):
-                    rest[i, j] -= by_attitude[i, k] * by_attitude[j, k]
-        # What Huber's weights leave of the points' share may be less than nothing.
-        eigen(rest, size, axes)
-        for i in range(3):
-            for j in range(3):
-                for k in range(3):
-                    noise[i, j] += axes[i, k] * max(size[k], 1e-12) * axes[j, k]
-        if known > 0 and turns:
-            doubted(spread, rows[:known].copy(), miss[:known].copy(), rarely, larger, doubt)
+        bent = _bent(given, point, gain, step, cost, spread, size, axes)
+        levels = _parts(
+            info, right, rows, miss, white, known, free, turns, spread,
+            attitude_fault, limits, least, flat, high, values, freedom,
+        )  # fmt: skip
+        _causes(spread, rows, known, said, gain, pixel, by_camera, by_attitude, by_bar, noise, slow)
+        if turns:
+            doubted(spread, rows[:known, :n].copy(), miss[:known].copy(), rarely, larger, doubt)
     return (
-        regular, wide, bent, spread, values, freedom, hpl, vpl,
+        regular, wide, bent, spread, values, freedom, levels[0], levels[1],
         doubt, noise, slow, by_camera, by_attitude, by_bar,
     )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _bent(
+    given: tuple[Any, ...], point: tuple[Any, ...], gain: Array, step: Array, cost: float,
+    spread: Array, size: Array, axes: Array,
+) -> float:  # fmt: skip
+    """How far the cost is from its parabola, and the way from its axis, two sigmas away: see `weighed`."""
+    points, position = given[0], point[0]
+    bars = len(gain)
+    most = int(np.argmax(size))
+    wide = math.sqrt(size[most])
+    info, right, bar_cost = np.zeros((bars, GLOBAL, GLOBAL)), np.zeros((bars, GLOBAL)), np.zeros(bars)
+    gain_there, step_there = np.zeros((bars, LOCAL, GLOBAL)), np.zeros((bars, LOCAL))
+    rows, miss, pixel = np.zeros((3, GLOBAL)), np.zeros(3), np.zeros((0, GLOBAL, GLOBAL))
+    move, still, centre = np.zeros(GLOBAL), np.zeros(GLOBAL), np.zeros(3)
+    for i in range(3):
+        centre[i] = points[:, i].mean()
+    bent = 1.0
+    for way in (-2 / wide, 2 / wide):
+        for i in range(len(spread)):
+            move[i] = 0
+            for j in range(3):
+                move[i] += way * spread[i, j] * axes[j, most]
+        there = stepped(move, gain, step, centre, *point)
+        found = 0.0
+        for again in range(2):
+            found = normal(  # type: ignore[call-arg]
+                *given, *there, info, right, gain_there, step_there, bar_cost, rows, miss, pixel
+            )
+            if again or not found - cost > 12:
+                break
+            # Errors of sites take up what is left of second order.
+            there = stepped(still, gain_there, step_there, centre, *there)
+        growth = 1e-9 if math.isnan(found) else max((found - cost) / 4, 1e-9)
+        square = 0.0
+        for i in range(3):
+            along = 0.0
+            for j in range(3):
+                along += axes[j, i] * (there[0][j] - position[j] - move[j])
+            square += along**2 / max(size[i], 1e-15 * size[most])
+        bent = max(bent, growth, 1 / growth, 1 + square)
+    return bent
+
+
+@njit(cache=True, nogil=True)
+def _parts(
+    info: Array, right: Array, rows: Array, miss: Array, white: Array, known: int, free: Array, turns: bool,
+    spread: Array, attitude_fault: float, limits: Array, least: float, flat: float, high: float,
+    values: Array, freedom: Array,
+) -> tuple[float, float]:  # fmt: skip
+    """Each part's test, `values` and `freedom` (parts,), and both protection levels: see `weighed`."""
+    bars, n = len(info), len(spread)
+    hpl, vpl = flat * _widest(spread), high * math.sqrt(max(spread[2, 2], 0.0))
+    own, none, columns, mean = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((n, 6)), np.zeros(6)
+    for part in range(bars):
+        for j in range(6):
+            mean[j] = right[part, j]
+            for i in range(n):
+                columns[i, j] = info[part, i, j] if free[i] else 0.0
+            for i in range(6):
+                own[i, j] = info[part, i, j]
+        found = tested(own, columns, mean, spread, none, least)
+        values[part], freedom[part] = found[0], found[1]
+        hpl, vpl = _widened(hpl, vpl, found[2], found[3], spread, limits[found[1]], flat, high)
+    one, by_one, off = np.zeros((1, 1)), np.zeros((n, 1)), np.zeros(1)
+    for b in range(bars):
+        off[0] += right[b, FAULT]
+        one[0, 0] += info[b, FAULT, FAULT]
+        for i in range(n):
+            by_one[i, 0] += info[b, i, FAULT] if free[i] else 0.0
+    found = tested(one, by_one, off, spread, np.ones((1, 1)), least)
+    values[bars], freedom[bars] = found[0], found[1]
+    hpl, vpl = _widened(hpl, vpl, found[2], found[3], spread, limits[found[1]], flat, high)
+    if turns:
+        bound = _attitude_bound(white, known, attitude_fault)
+        for part in range(bars + 1, len(values)):
+            first = 2 if part == bars + 2 else 0
+            angles = np.zeros((n, known - first))
+            for i in range(n):
+                for j in range(first, known):
+                    angles[i, j - first] = rows[j, i] if free[i] else 0.0
+            alone = np.eye(known - first)
+            found = tested(
+                alone, angles, miss[first:known].copy(), spread, bound[first:, first:].copy(), least
+            )
+            values[part], freedom[part] = found[0], found[1]
+            # A heading that is off is an attitude that is.
+            if not first:
+                hpl, vpl = _widened(hpl, vpl, found[2], found[3], spread, limits[found[1]], flat, high)
+    return hpl, vpl
+
+
+@njit(cache=True, nogil=True)
+def _widened(
+    hpl: float, vpl: float, added: Array, unseen: Array, spread: Array, limit: float, flat: float, high: float
+) -> tuple[float, float]:
+    """Protection levels that hold with one fault more, whose test just passed."""
+    for i in range(3):
+        for j in range(3):
+            added[i, j] += spread[i, j]
+    level = math.sqrt(limit) * _widest(unseen) + flat * _widest(added)
+    height = math.sqrt(limit * max(unseen[2, 2], 0.0)) + high * math.sqrt(max(added[2, 2], 0.0))
+    return max(hpl, level), max(vpl, height)
+
+
+@njit(cache=True, nogil=True)
+def _causes(
+    spread: Array, rows: Array, known: int, said: Array, gain: Array, pixel: Array,
+    by_camera: Array, by_attitude: Array, by_bar: Array, noise: Array, slow: Array,
+) -> None:  # fmt: skip
+    """What the position's covariance is made of: see `weighed`."""
+    bars, n = len(gain), len(spread)
+    for i in range(3):
+        for j in range(LENS, n):
+            by_camera[i, j - LENS] = -spread[i, j]
+        for a in range(known):
+            value = 0.0
+            for j in range(n):
+                value += spread[i, j] * rows[a, j]
+            for j in range(4):
+                by_attitude[i, j] += value * said[a, j]
+        for b in range(bars):
+            for k in range(7):
+                for j in range(n):
+                    by_bar[b, i, k] += spread[i, j] * gain[b, k + 2, j]
+    by_pixel = np.zeros((3, n))
+    for b in range(bars):
+        by_pixel[:] = 0
+        for i in range(3):
+            for k in range(n):
+                share = spread[i, k]
+                for j in range(n):
+                    by_pixel[i, j] += share * pixel[b, k, j]
+        for i in range(3):
+            for j in range(3):
+                for k in range(n):
+                    slow[i, j] += by_pixel[i, k] * spread[j, k]
+    rest, size, axes = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            rest[i, j] = spread[i, j] - (slow[i, j] + slow[j, i]) / 2
+            for k in range(7):
+                rest[i, j] -= by_camera[i, k] * by_camera[j, k]
+                for b in range(bars):
+                    rest[i, j] -= by_bar[b, i, k] * by_bar[b, j, k]
+            for k in range(4):
+                rest[i, j] -= by_attitude[i, k] * by_attitude[j, k]
+    # What Huber's weights leave of the points' share may be less than nothing.
+    eigen(rest, size, axes)
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                noise[i, j] += axes[i, k] * max(size[k], 1e-12) * axes[j, k]
 
 
 @njit(cache=True, nogil=True)
@@ -921,6 +1028,44 @@ def whitening(causes: Array, least: float, out: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
+def sights(flat: Array, out: Array) -> int:
+    """Unit vectors towards directions (n, 2): `out` (n, 3); NaN of NaN; how many are none."""
+    found = 0
+    for i in range(len(flat)):
+        size = math.sqrt(flat[i, 0] ** 2 + flat[i, 1] ** 2 + 1)
+        out[i, 0], out[i, 1], out[i, 2] = flat[i, 0] / size, flat[i, 1] / size, 1 / size
+        found += math.isfinite(size)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def halved(points: Array, bar: Array, out: Array, out_bar: Array) -> int:
+    """Means of the halves of each bar's points, as precise as they are together: `out` (2 bars, 10)."""
+    at = found = 0
+    while at < len(bar):
+        count = 0
+        while at + count < len(bar) and bar[at + count] == bar[at]:
+            count += 1
+        for begin, end in ((at, at + count // 2), (at + count // 2, at + count)):
+            if begin == end:
+                continue
+            total = 0.0
+            out[found] = 0
+            for i in range(begin, end):
+                weight = points[i, 8] ** 2
+                total += weight
+                for j in range(8):
+                    out[found, j] += weight * points[i, j]
+            for j in range(8):
+                out[found, j] /= total
+            out[found, 8] = math.sqrt(total)
+            out_bar[found] = bar[at]
+            found += 1
+        at += count
+    return found
+
+
+@njit(cache=True, nogil=True)
 def halves(points: Array, bar: Array, sights: Array, enu: Array, mean: Array) -> int:
     """Mean places and sights of the halves of each bar, `enu` and `mean` (2 bars, 3), and how many.
 
@@ -958,18 +1103,23 @@ def nearest_to_sights(enu: Array, sights: Array, rotations: Array, positions: Ar
     large where lines lead there from behind, infinite where it is not determined.
     """
     n = len(enu)
+    here, a, right = np.zeros((n, 3)), np.zeros((3, 3)), np.zeros(3)
     for r in range(len(rotations)):
-        sights_here = sights @ rotations[r].T
-        a = np.zeros((3, 3))
-        right = np.zeros(3)
+        a[:] = 0
+        right[:] = 0
         for i in range(n):
-            s = sights_here[i]
-            along = s[0] * enu[i, 0] + s[1] * enu[i, 1] + s[2] * enu[i, 2]
             for j in range(3):
-                right[j] += enu[i, j] - s[j] * along
+                here[i, j] = (
+                    rotations[r, j, 0] * sights[i, 0]
+                    + rotations[r, j, 1] * sights[i, 1]
+                    + rotations[r, j, 2] * sights[i, 2]
+                )
+            along = here[i, 0] * enu[i, 0] + here[i, 1] * enu[i, 1] + here[i, 2] * enu[i, 2]
+            for j in range(3):
+                right[j] += enu[i, j] - here[i, j] * along
                 a[j, j] += 1
                 for k in range(3):
-                    a[j, k] -= s[j] * s[k]
+                    a[j, k] -= here[i, j] * here[i, k]
         c0 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
         c1 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
         c2 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
@@ -989,6 +1139,163 @@ def nearest_to_sights(enu: Array, sights: Array, rotations: Array, positions: Ar
         for i in range(n):
             dx, dy, dz = enu[i, 0] - x, enu[i, 1] - y, enu[i, 2] - z
             far = max(math.sqrt(dx * dx + dy * dy + dz * dz), 1e-9)
-            s = sights_here[i]
-            cost += 1 - (dx * s[0] + dy * s[1] + dz * s[2]) / far
+            cost += 1 - (dx * here[i, 0] + dy * here[i, 1] + dz * here[i, 2]) / far
         costs[r] = cost
+
+
+@njit(cache=True, nogil=True)
+def level_starts(
+    enu: Array, sights: Array, level: Array, headings: int, positions: Array, rotations: Array
+) -> int:
+    """Places by gravity alone: `positions` (m, 3) and `rotations` (m, 3, 3), the likeliest first; how many.
+
+    The nearest points for so many headings, evenly apart; a start from each valley of what they miss.
+    """
+    turned, places, costs = np.zeros((headings, 3, 3)), np.zeros((headings, 3)), np.zeros(headings)
+    step = 2 * math.pi / headings
+    for r in range(headings):
+        _turned(level, r * step, turned[r])
+    nearest_to_sights(enu, sights, turned, places, costs)
+    found = 0
+    for r in np.argsort(costs):
+        low = costs[r] <= costs[r - 1] and costs[r] <= costs[(r + 1) % headings] and costs[r] < np.inf
+        if not low or found == len(positions):
+            continue
+        # The golden section of the valley.
+        near, far = (r - 1) * step, (r + 1) * step
+        place, cost = np.zeros((2, 3)), np.zeros(2)
+        both = np.zeros((2, 3, 3))
+        for _ in range(_HALVINGS):
+            one, two = far - _GOLDEN * (far - near), near + _GOLDEN * (far - near)
+            _turned(level, one, both[0])
+            _turned(level, two, both[1])
+            nearest_to_sights(enu, sights, both, place, cost)
+            if cost[0] < cost[1]:
+                far = two
+            else:
+                near = one
+        best = 0 if cost[0] < cost[1] else 1
+        if cost[best] < costs[r]:
+            positions[found], rotations[found] = place[best], both[best]
+        else:
+            positions[found], rotations[found] = places[r], turned[r]
+        found += 1
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _turned(level: Array, angle: float, out: Array) -> None:
+    """Axes (3, 3) turned about up."""
+    c, s = math.cos(angle), math.sin(angle)
+    for j in range(3):
+        out[0, j] = c * level[0, j] - s * level[1, j]
+        out[1, j] = s * level[0, j] + c * level[1, j]
+        out[2, j] = level[2, j]
+
+
+@njit(cache=True, nogil=True)
+def widest_three(points: Array, bar: Array, sights: Array, bars: int, enu: Array, mean: Array) -> None:
+    """Centres of the three bars that span the largest triangle, `enu` (3, 3), and sights of them, `mean`."""
+    centres, seen, count = np.zeros((bars, 3)), np.zeros((bars, 3)), np.zeros(bars)
+    for i in range(len(bar)):
+        count[bar[i]] += 1
+        for j in range(3):
+            centres[bar[i], j] += points[i, j]
+            if math.isfinite(sights[i, j]):
+                seen[bar[i], j] += sights[i, j]
+    for b in range(bars):
+        centres[b] /= count[b]
+        seen[b] /= max(math.sqrt((seen[b] ** 2).sum()), 1e-12)
+    largest = -1.0
+    for i in range(bars):
+        for j in range(i + 1, bars):
+            for k in range(j + 1, bars):
+                area = np.cross(centres[j] - centres[i], centres[k] - centres[i])
+                size = (area**2).sum()
+                if size > largest:
+                    largest = size
+                    for row, b in enumerate((i, j, k)):
+                        enu[row], mean[row] = centres[b], seen[b]
+
+
+@njit(cache=True, nogil=True)
+def three_points(p: Array, sights: Array, positions: Array, rotations: Array) -> int:
+    """Grunert's solutions: `positions` (4, 3) and `rotations` (4, 3, 3), and how many there are.
+
+    In the notation of Haralick et al., IJCV 13 (1994), 331. Complex roots, as noise makes of double ones,
+    count with their real part.
+
+    Args:
+        p: The points, m, (3, 3).
+        sights: Unit vectors towards them in the camera's axes, (3, 3).
+        positions: Where the camera is, m.
+        rotations: Its axes as columns in ENU.
+    """
+    a2, b2, c2 = ((p[1] - p[2]) ** 2).sum(), ((p[0] - p[2]) ** 2).sum(), ((p[0] - p[1]) ** 2).sum()
+    ca, cb, cg = (sights[1] * sights[2]).sum(), (sights[0] * sights[2]).sum(), (sights[0] * sights[1]).sum()
+    q, r, s = (a2 - c2) / b2, (a2 + c2) / b2, c2 / b2
+    quartic = np.array([
+        (q - 1) ** 2 - 4 * s * ca**2,
+        4 * (q * (1 - q) * cb - (1 - r) * ca * cg + 2 * s * ca**2 * cb),
+        2 * (q**2 - 1 + 2 * q**2 * cb**2 + 2 * (b2 - c2) / b2 * ca**2 - 4 * r * ca * cb * cg
+             + 2 * (b2 - a2) / b2 * cg**2),
+        4 * (-q * (1 + q) * cb + 2 * a2 / b2 * cg**2 * cb - (1 - r) * ca * cg),
+        (1 + q) ** 2 - 4 * a2 / b2 * cg**2,
+    ])  # fmt: skip
+    stands, seen, there = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    _triad(p, stands)
+    found = 0
+    for root in np.roots(quartic + 0j):
+        # Of a conjugate pair, the real part counts once.
+        if root.imag < -1e-9 * abs(root):
+            continue
+        v = root.real
+        bottom = 2 * (cg - v * ca)
+        if v <= 0 or abs(bottom) < 1e-15:
+            continue
+        u = ((-1 + q) * v**2 - 2 * q * cb * v + 1 + q) / bottom
+        square = 1 + v * v - 2 * v * cb
+        if u <= 0 or square <= 0 or found == len(positions):
+            continue
+        first = math.sqrt(b2 / square)
+        there[0], there[1], there[2] = first * sights[0], u * first * sights[1], v * first * sights[2]
+        _triad(there, seen)
+        # Turns the triangle as it is seen onto the one that stands there.
+        for i in range(3):
+            for j in range(3):
+                rotations[found, i, j] = (stands[:, i] * seen[:, j]).sum()
+        for i in range(3):
+            positions[found, i] = 0
+            for k in range(3):
+                positions[found, i] += p[k, i] / 3
+                for j in range(3):
+                    positions[found, i] -= rotations[found, i, j] * there[k, j] / 3
+        found += 1
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _triad(points: Array, out: Array) -> None:
+    """Axes of a triangle (3, 3), as rows: along its first side, across that in its plane, and upright."""
+    one, two = points[1] - points[0], points[2] - points[0]
+    out[0] = one / max(math.sqrt((one**2).sum()), 1e-300)
+    upright = np.cross(one, two)
+    out[2] = upright / max(math.sqrt((upright**2).sum()), 1e-300)
+    out[1] = np.cross(out[2], out[0])
+
+
+@njit(cache=True, nogil=True)
+def missed(points: Array, sights: Array, positions: Array, rotations: Array, costs: Array) -> None:
+    """The sum of squares of the angles between the points and where they are seen, for each place."""
+    for r in range(len(costs)):
+        costs[r] = 0
+        for i in range(len(points)):
+            if not math.isfinite(sights[i, 0]):
+                continue
+            along = far = 0.0
+            for j in range(3):
+                away = points[i, j] - positions[r, j]
+                far += away * away
+                for k in range(3):
+                    along += away * rotations[r, j, k] * sights[i, k]
+            costs[r] += max(2 - 2 * along / math.sqrt(max(far, 1e-18)), 0.0)

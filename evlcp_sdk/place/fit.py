@@ -1,5 +1,6 @@
 """The weighted least-squares fit of a pose, and of every error that is shared, to all observations."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,7 +32,8 @@ class Fit:
         local: Each bar's own errors in their sigmas: shift of the image, length, place, turn, float64 (bars,
             9).
         lens: The camera's errors, by the root of their covariance, float64 (7,).
-        cost: Twice the robust cost.
+        cost: Twice the cost.
+        settled: Whether a fit ended here.
     """
 
     position: Floats
@@ -39,20 +41,39 @@ class Fit:
     local: Floats
     lens: Floats
     cost: float
+    settled: bool = False
+
+    @classmethod
+    def at(cls, problem: Problem, position: Floats, rotation: Floats) -> "Fit":
+        """A place and axes, and no other error; what it costs is not known."""
+        here = (np.ascontiguousarray(position), np.ascontiguousarray(rotation))
+        return cls(*here, np.zeros((len(problem.transmitters), _kernels.LOCAL)), np.zeros(7), math.nan)
 
 
-def fit_pose(problem: Problem, position: Floats, rotation: Floats, steps: int = STEPS) -> Fit | None:
-    """Levenberg-Marquardt with Huber's weights; None where it leaves the view or does not settle."""
-    bars = len(problem.transmitters)
-    here = (np.ascontiguousarray(position), np.ascontiguousarray(rotation))
-    still = (np.zeros((bars, _kernels.LOCAL)), np.zeros(7))
-    found: tuple[Any, ...] = _kernels.fitted(*data(problem), problem.free, steps, *here, *still)  # type: ignore[call-arg]
+def fit_pose(
+    problem: Problem, start: Fit, steps: int = STEPS, *, robust: bool = True, hopeless: float = math.inf
+) -> Fit:
+    """Levenberg-Marquardt, with Huber's weights if robust.
+
+    Args:
+        problem: What is seen and known.
+        start: Where to begin; its cost does not matter.
+        steps: At most so many.
+        robust: Else plain least squares.
+        hopeless: A cost above which it counts as settled where four steps in a row hardly lower it.
+
+    Returns:
+        Where it ends; its cost is NaN where the start has a point behind the camera.
+    """
+    point = (start.position, start.rotation, start.local, start.lens)
+    given = data(problem) if robust else (*data(problem)[:-1], math.inf)
+    found: tuple[Any, ...] = _kernels.fitted(*given, problem.free, steps, hopeless, *point)  # type: ignore[call-arg]
     settled, cost, place, turned, local, lens = found
-    return Fit(place, turned, local, lens, cost) if settled else None
+    return Fit(place, turned, local, lens, cost, settled)
 
 
 def data(problem: Problem) -> tuple[Any, ...]:
-    """What all kernels of the fit take first."""
+    """What all kernels of the fit take first, how robust it is at its end."""
     return (
         problem.points,
         problem.bar,

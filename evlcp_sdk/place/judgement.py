@@ -127,7 +127,8 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
     if len(problem.transmitters) == 1:
         first, last = problem.points[0, :3] - fit.position, problem.points[-1, :3] - fit.position
         axis, sight = last - first, first + last
-        sine = math.sqrt(_square(np.cross(axis, sight)) / _square(axis) / _square(sight))
+        cosine = float(axis @ sight) / math.sqrt(float(axis @ axis) * float(sight @ sight))
+        sine = math.sqrt(max(1 - cosine**2, 0.0))
         if sine < math.sin(math.radians(spec.min_view_deg)):
             return Refusal(
                 "end-on", f"the bar is seen {math.degrees(math.asin(sine)):.0f} degrees from its axis"
@@ -138,7 +139,7 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
     # A fit of what does not fit need not be at the least cost.
     if bent > _MOST_BEND and not amiss:
         return Refusal("uncertain", f"by {wide:.2f} m along a curve: an ellipse would mislead")
-    freedom = _freedom(problem)
+    freedom = problem.freedom
     doubt, tests = "", {}
     worst = 1.0
     if amiss:
@@ -149,7 +150,7 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
             if value / limits[tested] > worst:
                 worst = value / limits[tested]
                 doubt = f"{name} does not fit the rest: {math.sqrt(value):.1f} sigmas"
-    if np.trace(doubted[:3, :3]) < _LITTLE * np.trace(spread[:3, :3]):
+    if sum(doubted[i, i] for i in range(3)) < _LITTLE * sum(spread[i, i] for i in range(3)):
         doubted = np.zeros((6, 6))
     most = spec.max_protection_m
     pose = Pose(
@@ -170,13 +171,7 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
 
 def misfits(problem: Problem, fit: Fit) -> bool:
     """Whether the sum of the squared misses is more than chance makes it."""
-    return fit.cost > chi_square(problem.spec.false_alarm / 2, _freedom(problem))
-
-
-def _freedom(problem: Problem) -> int:
-    # Every shared error has an observation of its own, that it is about 0; an angle that is exact is no
-    # unknown.
-    return max(2 * len(problem.points) + problem.angles - 6, 1)
+    return fit.cost > chi_square(problem.spec.false_alarm / 2, problem.freedom)
 
 
 def _parts(problem: Problem) -> list[str]:
@@ -218,7 +213,3 @@ def _standing(
             # Its length, by which it also looks too long; place and turn where these have a sigma.
             standing[f"bar {number}"] = moves if any(sigma[1:3]) else moves[:, :1].copy()
     return standing
-
-
-def _square(vector: Floats) -> float:
-    return float(vector @ vector)

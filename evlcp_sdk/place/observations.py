@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,15 +127,6 @@ class Problem:
             return Refusal(
                 "too-few-clusters", f"{most} whole clusters of a bar seen, {spec.min_points} needed"
             )
-        compass = attitude is not None and attitude.heading_deg is not None
-        if not compass and len(kept) == 1:
-            return Refusal("heading-unknown", "one bar gives a position only with the camera's heading known")
-        if attitude is None:
-            centres = np.array([v.enu_m[s].mean(0) for v, s, _ in kept])
-            extent = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
-            if len(kept) < 3 or extent[1] < _INLINE * extent[0]:
-                many = "two bars give" if len(kept) == 2 else "bars in line give"
-                return Refusal("gravity-unknown", f"{many} a position only with gravity known")
         points = np.empty((sum(number for *_, number in kept), 10))
         bar = np.empty(len(points), np.int64)
         at = 0
@@ -143,55 +135,104 @@ class Problem:
             given = view.enu_m, view.points_px, view.sigma_px, seen, spec.pixel_sigma_px
             _kernels.gathered(*given, i, points[rows], bar[rows])
             at = rows.stop
-        felt, angles, white = np.zeros(3), 0, np.eye(3)
-        free = np.ones(14, np.bool_)
-        free[6] = False
-        free[7:] = sigma.known
-        heading = 0.0
-        if attitude is not None:
-            felt, angles = attitude.rotation()[2].copy(), 3 if compass else 2
-            heading = math.radians(attitude.heading_deg or 0.0)
-            white = _whitening(attitude, angles)
-            if attitude.gravity_sigma_deg == attitude.white_sigma_deg == attitude.time_sigma_us == 0:
-                free[3:5] = False
-                free[5] = not compass or attitude.heading_sigma_deg > 0
+        told = _told(attitude, points, bar, len(kept))
+        if isinstance(told, Refusal):
+            return told
+        free = np.empty(14, np.bool_)
+        free[3:6], free[:3], free[6], free[7:] = told.pop("turns"), True, False, sigma.known
         return cls(
-            camera,
-            attitude,
-            spec,
-            points,
-            bar,
-            np.array([shared_sigmas(view, seen, spec) for view, seen, _ in kept]),
-            tuple(view.transmitter for view, *_ in kept),
-            np.array(
+            camera=camera,
+            attitude=attitude,
+            spec=spec,
+            points=points,
+            bar=bar,
+            bar_sigma=np.array([shared_sigmas(view, seen, spec) for view, seen, _ in kept]),
+            transmitters=tuple(view.transmitter for view, *_ in kept),
+            lens=np.array(
                 [camera.focal_px, *camera.centre_px, camera.k1, camera.k2, camera.p1, camera.p2, camera.k3]
             ),
-            sigma.root(camera) if sigma.known else np.zeros((7, 7)),
-            felt,
-            heading,
-            angles,
-            white,
-            free,
+            lens_root=sigma.root(camera) if sigma.known else np.zeros((7, 7)),
+            free=free,
+            **told,
         )
 
-    def centres_m(self) -> Floats:
-        """Mean of each bar's clusters that are seen, m, float64 (bars, 3)."""
-        count = np.bincount(self.bar)
-        return np.stack([np.bincount(self.bar, self.points[:, i]) / count for i in range(3)], 1)
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom.
 
-    def sights(self) -> Floats:
-        """Unit vectors towards the points in the camera's axes, float64 (n, 3); NaN beyond the lens."""
-        flat = self.camera.undistort(self.points[:, 6:8])
-        ray = np.ones((len(flat), 3))
-        ray[:, :2] = flat
-        return np.asarray(ray / np.sqrt((ray * ray).sum(1))[:, None])
+        Every shared error has an observation of its own, that it is about 0; an angle that is exact is no
+        unknown.
+        """
+        return max(2 * len(self.points) + self.angles - 6, 1)
+
+    def told(self, attitude: Attitude | None) -> "Problem | Refusal":
+        """The same where this is known of the attitude, or why that is too little."""
+        told = _told(attitude, self.points, self.bar, len(self.transmitters))
+        if isinstance(told, Refusal):
+            return told
+        free = self.free.copy()
+        free[3:6] = told.pop("turns")
+        return replace(self, attitude=attitude, free=free, **told)
+
+    def without(self, bar: int) -> "Problem | Refusal":
+        """The same without a bar, by its place among `transmitters`, or why the others are too few."""
+        kept = self.bar != bar
+        others = self.bar[kept]
+        fewer = replace(
+            self,
+            points=self.points[kept],
+            bar=others - (others > bar),
+            bar_sigma=np.delete(self.bar_sigma, bar, 0),
+            transmitters=self.transmitters[:bar] + self.transmitters[bar + 1 :],
+        )
+        return fewer.told(self.attitude)
+
+    def seen_by(self, sigma: CameraSigma) -> "Problem":
+        """The same through a camera that is so surely known."""
+        free = self.free.copy()
+        free[7:] = sigma.known
+        return replace(self, lens_root=sigma.root(self.camera), free=free)
+
+    def halved(self) -> "Problem":
+        """The same by the means of the halves of each bar: a few points that say nearly as much."""
+        bars = len(self.transmitters)
+        points, bar = np.empty((2 * bars, 10)), np.empty(2 * bars, np.int64)
+        count = _kernels.halved(self.points, self.bar, points, bar)
+        return replace(self, points=points[:count], bar=bar[:count])
+
+
+def _told(attitude: Attitude | None, points: Floats, bar: NDArray[np.int64], bars: int) -> Any:
+    """What an attitude says to a `Problem`, and which of the turns are free; or why it is too little."""
+    compass = attitude is not None and attitude.heading_deg is not None
+    if not compass and bars == 1:
+        return Refusal("heading-unknown", "one bar gives a position only with the camera's heading known")
+    if attitude is None:
+        count = np.bincount(bar)
+        centres = np.stack([np.bincount(bar, points[:, i]) / count for i in range(3)], 1)
+        extent = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
+        if bars < 3 or extent[1] < _INLINE * extent[0]:
+            many = "two bars give" if bars == 2 else "bars in line give"
+            return Refusal("gravity-unknown", f"{many} a position only with gravity known")
+        nothing = {"felt": np.zeros(3), "heading_rad": 0.0, "angles": 0, "white": np.eye(3)}
+        return {**nothing, "turns": True}
+    turns = (True, True, True)
+    if attitude.gravity_sigma_deg == attitude.white_sigma_deg == attitude.time_sigma_us == 0:
+        turns = (False, False, not compass or attitude.heading_sigma_deg > 0)
+    angles = 3 if compass else 2
+    return {
+        "felt": attitude.rotation()[2].copy(),
+        "heading_rad": math.radians(attitude.heading_deg or 0.0),
+        "angles": angles,
+        "white": _whitening(attitude, angles),
+        "turns": turns,
+    }
 
 
 def shared_sigmas(view: BarView, seen: NDArray[np.bool_], spec: PositionSpec) -> tuple[float, ...]:
     """Of a bar: its image's shift, px; its place, m, turn, radians, and length, a share."""
-    rows = np.flatnonzero(seen)
-    across = view.points_px[rows[-1]] - view.points_px[rows[0]]
-    length_px = math.hypot(across[0], across[1]) * len(view.points_px) / (rows[-1] - rows[0])
+    first, last = int(seen.argmax()), len(seen) - 1 - int(seen[::-1].argmax())
+    (x, y), (x_end, y_end) = view.points_px[first].tolist(), view.points_px[last].tolist()
+    length_px = math.hypot(x_end - x, y_end - y) * len(seen) / (last - first)
     place, turn, length = view.survey
     shift = math.hypot(spec.shared_sigma_px, spec.shared_share * length_px)
     return shift, place, turn, math.hypot(length, spec.stretch_share)

@@ -15,24 +15,18 @@ from itertools import combinations
 import numpy as np
 
 from evlcp_sdk.link.sections import PositionSpec
-from evlcp_sdk.place.fit import STEPS, Fit, fit_pose
+from evlcp_sdk.place.fit import Fit, fit_pose
 from evlcp_sdk.place.judgement import FOCAL, Judged, Pose, judged, misfits
 from evlcp_sdk.place.observations import BarView, Problem
 from evlcp_sdk.place.refusals import Candidate, Refusal
-from evlcp_sdk.place.starts import closed_form_starts
+from evlcp_sdk.place.starts import ODDS, is_hopeless, likely_starts
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
 __all__ = ["fitting_focal_mm", "solve_pose"]
 
-_ODDS = 18.4
-"""Square sums that differ by less are not told apart: beyond, one solution is 10 000 times likelier."""
-
 _APART_SIGMAS = 6.0
 """Solutions nearer to each other, in sigmas of the position, are one."""
-
-_OTHER_STEPS = 15
-"""Steps of a fit from another start, once there is one that the tests let pass."""
 
 _HOPELESS = 0.02
 """Share of the largest test value below which a part explains nothing of a misfit."""
@@ -73,7 +67,10 @@ def solve_pose(
     """
     spec = PositionSpec() if spec is None else spec
     sigma = CameraSigma() if sigma is None else sigma
-    found = _plain(views, camera, attitude, spec, sigma)
+    problem = Problem.of(views, camera, attitude, spec, sigma)
+    if isinstance(problem, Refusal):
+        return problem
+    found = _plain(problem)
     if isinstance(found, Judged):
         if not found.doubt:
             return found.pose
@@ -85,13 +82,13 @@ def solve_pose(
     fits: list[tuple[str, Pose]] = []
     unsure = []
     most = max(tests.values(), default=0.0)
-    for name, fewer, other, looser in _without(views, camera, attitude, sigma):
+    for name, other in _without(problem, sigma):
         if tests.get(name, most) < _HOPELESS * most and most > _FAR:
             continue
-        again = _plain(fewer, camera, other, spec, looser)
-        if isinstance(again, Judged) and not again.doubt:
-            fits.append((name, again.pose))
-        elif isinstance(again, Refusal):
+        again = other if isinstance(other, Refusal) else _explained(other)
+        if isinstance(again, Pose):
+            fits.append((name, again))
+        elif again is not None:
             # It may be this part; without it there is no position that would tell.
             unsure.append(name)
     names = [name for name, _ in fits]
@@ -99,11 +96,11 @@ def solve_pose(
         fits = [fit for fit in fits if fit[0] != "attitude"]
     if len(fits) == 1:
         name, pose = fits[0]
-        rivals = [n for n in unsure if tests.get(name, 0.0) - tests.get(n, 0.0) < _ODDS and n in tests]
+        rivals = [n for n in unsure if tests.get(name, 0.0) - tests.get(n, 0.0) < ODDS and n in tests]
         if not rivals and tests:
             for mix, mixed in _exchanged(views):
-                again = _plain(mixed, camera, attitude, spec, sigma)
-                if isinstance(again, Judged) and not again.doubt:
+                swapped = Problem.of(mixed, camera, attitude, spec, sigma)
+                if isinstance(swapped, Problem) and isinstance(_explained(swapped), Pose):
                     rivals.append(mix)
             if not rivals:
                 return replace(pose, excluded=(name,))
@@ -133,7 +130,8 @@ def fitting_focal_mm(
         other = replace(camera, focal_mm=focal_mm)
         # Free within a step, so that none is stepped over.
         step_mm = float(np.hypot(sigma.focal_mm, _FREE_FOCAL * focal_mm))
-        found = _plain(views, other, attitude, spec, replace(sigma, focal_mm=step_mm, correlation=()))
+        given = Problem.of(views, other, attitude, spec, replace(sigma, focal_mm=step_mm, correlation=()))
+        found = given if isinstance(given, Refusal) else _plain(given)
         return found if isinstance(found, Judged) else None
 
     def best(lengths_mm: np.ndarray) -> tuple[float, Judged | None]:
@@ -161,52 +159,61 @@ def _exchanged(views: Sequence[BarView]) -> Iterator[tuple[str, list[BarView]]]:
         yield f"bar {one.transmitter} at the site of bar {two.transmitter} and the reverse", mixed
 
 
-def _without(
-    views: Sequence[BarView], camera: CameraModel, attitude: Attitude | None, sigma: CameraSigma
-) -> Iterator[tuple[str, Sequence[BarView], Attitude | None, CameraSigma]]:
+def _without(problem: Problem, sigma: CameraSigma) -> Iterator[tuple[str, Problem | Refusal]]:
     """The same without each part that may be at fault, and its name."""
-    for i, view in enumerate(views):
-        if len(views) > 1:
-            yield f"bar {view.transmitter}", [*views[:i], *views[i + 1 :]], attitude, sigma
-    if attitude is not None and attitude.heading_deg is not None and len(views) > 1:
-        yield "heading", views, replace(attitude, heading_deg=None), sigma
-    if attitude is not None and len(views) > 2:
-        yield "attitude", views, None, sigma
-    focal_mm = float(np.hypot(sigma.focal_mm, _FREE_FOCAL * camera.focal_mm))
-    yield FOCAL, views, attitude, replace(sigma, focal_mm=focal_mm, correlation=())
+    bars, attitude = problem.transmitters, problem.attitude
+    if len(bars) > 1:
+        for i, number in enumerate(bars):
+            yield f"bar {number}", problem.without(i)
+        if attitude is not None and attitude.heading_deg is not None:
+            yield "heading", problem.told(replace(attitude, heading_deg=None))
+    if attitude is not None and len(bars) > 2:
+        yield "attitude", problem.told(None)
+    focal_mm = math.hypot(sigma.focal_mm, _FREE_FOCAL * problem.camera.focal_mm)
+    yield FOCAL, problem.seen_by(replace(sigma, focal_mm=focal_mm, correlation=()))
 
 
-def _plain(
-    views: Sequence[BarView],
-    camera: CameraModel,
-    attitude: Attitude | None,
-    spec: PositionSpec,
-    sigma: CameraSigma,
-) -> Judged | Refusal:
+def _plain(problem: Problem) -> Judged | Refusal:
     """The pose by all that is given, whether it is to be believed or not."""
-    problem = Problem.of(views, camera, attitude, spec, sigma)
-    if isinstance(problem, Refusal):
-        return problem
-    starts = closed_form_starts(problem)
+    starts = likely_starts(problem)
     if not starts:
         return Refusal("not-determined", "no place from which the bars would be seen so")
-    fits: list[Fit] = []
-    enough = False
-    for start in starts:
-        # Where one start has led to a fit that explains everything, a second solution is one that is near.
-        fit = fit_pose(problem, *start, _OTHER_STEPS if enough else STEPS)
-        if fit is not None:
-            fits.append(fit)
-            enough = enough or not misfits(problem, fit)
+    first = fit_pose(problem, starts[0])
+    if is_hopeless(problem, starts[0]) and misfits(problem, first):
+        # What is off matters, not where exactly the fit would end, nor how surely it is there.
+        found = judged(problem, first)
+        return (
+            found if isinstance(found, Judged) else Refusal("not-determined", "nothing explains what is seen")
+        )
+    fits = [fit for fit in (first, *(fit_pose(problem, start) for start in starts[1:])) if fit.settled]
     if not fits:
         return Refusal("not-determined", "the fit does not settle: the bars do not determine a position")
+    return _settled(problem, fits)
+
+
+def _explained(problem: Problem) -> Pose | Refusal | None:
+    """The pose by all that is given; None where that does not fit together."""
+    starts = likely_starts(problem)
+    if not starts or is_hopeless(problem, starts[0]):
+        return None
+    fits = [fit for start in starts if (fit := fit_pose(problem, start)).settled]
+    if not fits or all(misfits(problem, fit) for fit in fits):
+        return None
+    found = _settled(problem, fits)
+    if isinstance(found, Refusal):
+        return found
+    return None if found.doubt else found.pose
+
+
+def _settled(problem: Problem, fits: Sequence[Fit]) -> Judged | Refusal:
+    """The likeliest of some fits, judged; refused where another one is as likely."""
     best = min(fits, key=lambda fit: fit.cost)
     found = judged(problem, best)
     if isinstance(found, Refusal):
         return found
     known = [best]
     for other in sorted(fits, key=lambda fit: fit.cost):
-        if other.cost - best.cost < _ODDS and _apart(other, known, found.pose):
+        if other.cost - best.cost < ODDS and _apart(other, known, found.pose):
             known.append(other)
     if len(known) > 1:
         apart_m = float(np.linalg.norm(known[1].position - best.position))

@@ -16,6 +16,7 @@ from evlcp_sdk.place import _kernels
 from evlcp_sdk.place.fit import FOCAL_FAULT, Fit, data, fit_pose
 from evlcp_sdk.place.judgement import Judged, judged
 from evlcp_sdk.place.observations import BarView, Problem, project_bars
+from evlcp_sdk.place.starts import likely_starts
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
@@ -190,8 +191,8 @@ def test_the_fit_is_that_of_scipy() -> None:
     far = p.points.copy()
     far[4, 6] += 4.0
     p = dataclasses.replace(p, points=far)
-    fit = fit_pose(p, position + np.array([0.5, -0.4, 0.2]), rotation)
-    assert fit is not None
+    fit = fit_pose(p, Fit.at(p, position + np.array([0.5, -0.4, 0.2]), rotation))
+    assert fit.settled
     start = Fit(position, rotation, np.zeros((2, 9)), np.zeros(7), 0.0)
 
     def cost(x: Floats) -> Floats:
@@ -361,8 +362,8 @@ def test_halves_of_bars() -> None:
 def test_a_fit_is_judged_as_by_numpy(bars: int) -> None:
     """Covariance, causes, tests of each part and protection levels, written out anew."""
     p, position, rotation = problem(np.random.default_rng(12), bars, noise=1.0)
-    fit = fit_pose(p, position, rotation)
-    assert fit is not None
+    fit = fit_pose(p, Fit.at(p, position, rotation))
+    assert fit.settled
     found = judged(p, fit)
     assert isinstance(found, Judged)
     normal, pose = normal_equations(p, fit), found.pose
@@ -435,3 +436,97 @@ def test_a_doubt_is_the_mean_over_both_hypotheses(off: float) -> None:
     _kernels.doubted(spread, angles, seen[30:] - angles @ at, rarely, larger, out)
     np.testing.assert_allclose(out, want, rtol=1e-3, atol=1e-6)
     assert (np.trace(out) > 0.1 * np.trace(spread[:6, :6])) == (off > 5)
+
+
+def test_halves_are_weighted_means() -> None:
+    p, _, _ = problem(np.random.default_rng(14), bars=3)
+    few = p.halved()
+    assert few.bar.tolist() == [0, 0, 1, 1, 2, 2]
+    for i in range(6):
+        rows = p.points[8 * i : 8 * i + 8]
+        weight = rows[:, 8] ** 2
+        np.testing.assert_allclose(few.points[i, :8], weight @ rows[:, :8] / weight.sum())
+        assert few.points[i, 8] == pytest.approx(math.sqrt(weight.sum()))
+
+
+def test_sights_are_unit_vectors() -> None:
+    flat, out = np.random.default_rng(15).normal(size=(5, 2)), np.zeros((5, 3))
+    flat[2] = np.nan
+    assert _kernels.sights(flat, out) == 4
+    want = np.column_stack([flat, np.ones(5)])
+    np.testing.assert_allclose(
+        out[[0, 1, 3, 4]], (want / np.linalg.norm(want, axis=1)[:, None])[[0, 1, 3, 4]]
+    )
+    assert np.isnan(out[2, :2]).all()
+
+
+def test_headings_are_tried_to_a_fraction_of_a_degree() -> None:
+    """Against SciPy's search in each valley; the true heading is among them."""
+    rng = np.random.default_rng(16)
+    level = Attitude(5.0, -3.0, 0.0).rotation()
+    true = Rotation.from_rotvec([0, 0, 0.777]).as_matrix() @ level
+    enu = true @ (rng.uniform(-1, 1, (3, 4)) * [[4], [2], [5]] + [[0], [0], [40]])
+    sights = (enu / np.linalg.norm(enu, axis=0)).T @ true
+    places, turned = np.zeros((4, 3)), np.zeros((4, 3, 3))
+    found = _kernels.level_starts(enu.T.copy(), sights, level, 72, places, turned)
+    assert 1 <= found <= 4
+    assert Rotation.from_matrix(turned[0].T @ true).magnitude() < math.radians(0.05)
+    assert np.linalg.norm(places[0]) < 0.05
+    upright = turned[:found, 2]
+    np.testing.assert_allclose(upright, np.tile(level[2], (found, 1)), atol=1e-12)
+
+
+def test_the_widest_triangle_of_bars() -> None:
+    rng = np.random.default_rng(17)
+    corners = np.array([[0.0, 0, 0], [8, 0, 0], [0, 9, 0], [1, 1, 0]])
+    points, bar = np.repeat(corners, 3, 0), np.repeat(np.arange(4), 3)
+    seen = rng.normal(size=(12, 3))
+    seen[4] = np.nan
+    enu, mean = np.zeros((3, 3)), np.zeros((3, 3))
+    _kernels.widest_three(points, bar, seen, 4, enu, mean)
+    np.testing.assert_allclose(enu, corners[:3])
+    for i in range(3):
+        total = np.nansum(seen[bar == i], 0)
+        np.testing.assert_allclose(mean[i], total / np.linalg.norm(total))
+
+
+def test_what_is_missed_are_squares_of_angles() -> None:
+    rng = np.random.default_rng(18)
+    points = rng.normal(size=(6, 3)) + np.array([0, 0, 20])
+    seen = rng.normal(size=(6, 3)) * 0.02 + np.array([0, 0, 1])
+    seen /= np.linalg.norm(seen, axis=1)[:, None]
+    seen[3] = np.nan
+    places, turns = rng.normal(size=(2, 3)), Rotation.random(2, random_state=rng).as_matrix()
+    costs = np.zeros(2)
+    _kernels.missed(points, seen, places, turns, costs)
+    for place, turn, cost in zip(places, turns, costs, strict=True):
+        away = (points - place) @ turn
+        away /= np.linalg.norm(away, axis=1)[:, None]
+        assert cost == pytest.approx(np.nansum((away - seen) ** 2))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_starts_lead_to_where_all_points_do(seed: int) -> None:
+    """The fit to a few points is within what noise makes of the one to all; nothing far off is hidden."""
+    p, position, _ = problem(np.random.default_rng(20 + seed), bars=3, noise=1.0)
+    for told in (p, p.told(dataclasses.replace(p.attitude, heading_deg=None)), p.told(None)):
+        assert isinstance(told, Problem)
+        starts = likely_starts(told)
+        fit = fit_pose(told, starts[0])
+        sigma = np.sqrt(np.diag(np.linalg.inv(normal_equations(told, fit).whole))[:3])
+        assert fit.settled
+        assert np.abs((starts[0].position - fit.position) / sigma).max() < 1.0
+        assert np.abs((position - fit.position) / sigma).max() < 5
+
+
+def test_a_fit_that_stalls_far_off_ends() -> None:
+    """A site that is metres off: hopeless from the start of the search, and after few steps."""
+    p, position, rotation = problem(np.random.default_rng(30), bars=2, noise=1.0)
+    wrong = p.points.copy()
+    wrong[p.bar == 1, 0] += 30.0
+    p = dataclasses.replace(p, points=wrong)
+    start = Fit.at(p, position, rotation)
+    whole, short = fit_pose(p, start, robust=False), fit_pose(p, start, robust=False, hopeless=1000.0)
+    assert short.settled
+    assert short.cost > 1000
+    assert whole.cost <= short.cost < 3 * whole.cost
