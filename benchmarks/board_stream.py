@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.link.resolve import load_link
 from firmware_host.board.bank import random_symbols
 from firmware_host.board.board import Board
@@ -52,7 +51,7 @@ def measure(latency_s: float, ahead: int, pause_s: float, packets: int = PACKETS
 
 def starts_of(chips: np.ndarray, ticks: np.ndarray, packets: int, packet_chips: int) -> list[int]:
     """Tick of each packet's first chip; between packets there may be the idle pattern."""
-    preamble = chips_of_values(load_link().codebook.preamble)
+    preamble = load_link().codebook.preamble
     found, at = [], 0
     while len(found) < packets:
         while not (chips[at : at + len(preamble)] == preamble[:, None]).all():

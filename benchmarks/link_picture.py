@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import evlcp_sdk as evlcp
-from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.results.figures import cluster_colours
 
@@ -86,7 +85,7 @@ def drawing() -> str:
     """The whole drawing."""
     link = load_link()
     symbols = evlcp.compose(link, text=TEXT, sequence=0)[0, 0]
-    pilots, words = (chips_of_values(v) for v in (link.codebook.pilots, link.codebook.codewords))
+    pilots, words = (link.codebook.pilots, link.codebook.codewords)
     chips = np.concatenate([pilots, words[symbols]], axis=1)[:, :18]
     edges = np.diff(chips.astype(int), axis=1)
     rgb = np.round(255 * cluster_colours(len(symbols))).astype(int)

@@ -1,7 +1,8 @@
 """The codebook: preamble, pilots and codewords that transmitter and receiver share.
 
-All codes are bipolar values (-1, +1); a value b goes on air as the chip pair (-b, +b). See the air interface
-(version 1) and arXiv 2510.17203, section III.
+All codes are chips, 1 = LED on. Those of air interface 1 are pair codes: a bipolar value b goes on air as the
+chips (-b, +b), so that every value has an edge in its middle (arXiv 2510.17203, section III). Others are of
+any chips: what a camera sees of them are their edges.
 """
 
 import hashlib
@@ -16,15 +17,34 @@ from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.errors import CodebookMismatchError, ConfigError
 
-__all__ = ["AIR_INTERFACE", "BARKER13", "Codebook", "chips_of_values", "hadamard", "word_of_values"]
+__all__ = [
+    "AIR_INTERFACE",
+    "BARKER13",
+    "Codebook",
+    "are_pairs",
+    "chips_of_values",
+    "edges_of_chips",
+    "hadamard",
+    "word_of_chips",
+]
 
 AIR_INTERFACE = 1
-"""Version of the air interface that this SDK speaks."""
+"""Version of the built-in air interface: all codes are pair codes."""
+
+_OF_CHIPS = 2
+"""Version that a codebook states whose codes are of any chips."""
 
 BARKER13 = (1, 1, 1, 1, 1, -1, -1, 1, 1, -1, 1, -1, 1)
 """The Barker code of length 13: all its aperiodic autocorrelation sidelobes are at most 1."""
 
+_LONGEST_OF_PAIRS = 4
+"""Chips from rise to rise in a pair code: 01 10 01 at the most."""
+
+_NEIGHBOURS = 256
+"""Codewords that each is put before to look for long times: all of most modulations."""
+
 Values = NDArray[np.int8]
+Chips = NDArray[np.uint8]
 
 
 def hadamard(order: int) -> Values:
@@ -44,7 +64,7 @@ def hadamard(order: int) -> Values:
     return matrix
 
 
-def chips_of_values(values: ArrayLike) -> NDArray[np.uint8]:
+def chips_of_values(values: ArrayLike) -> Chips:
     """Chips (1 = LED on) of bipolar values along the last axis: b becomes the pair (-b, +b).
 
     >>> chips_of_values([1, -1]).tolist()
@@ -55,53 +75,103 @@ def chips_of_values(values: ArrayLike) -> NDArray[np.uint8]:
     return pairs.reshape(*v.shape[:-1], -1).astype(np.uint8)
 
 
-def word_of_values(values: ArrayLike) -> int:
+def are_pairs(chips: ArrayLike) -> bool:
+    """Whether chips, along the last axis, are pairs of an off and an on one, in either order.
+
+    >>> are_pairs([0, 1, 1, 0]), are_pairs([0, 1, 0, 0])
+    (True, False)
+    """
+    c = np.asarray(chips)
+    return c.shape[-1] % 2 == 0 and bool((c[..., 0::2] != c[..., 1::2]).all())
+
+
+def edges_of_chips(chips: ArrayLike) -> Values:
+    """Edges from each chip to the next along the last axis: 1 on, -1 off, 0 none; int8, one fewer than chips.
+
+    The edge before the first chip depends on what was sent before it.
+
+    >>> edges_of_chips([0, 1, 1, 0]).tolist()
+    [1, 0, -1]
+    """
+    c = np.asarray(chips, np.int8)
+    edges: Values = c[..., 1:] - c[..., :-1]
+    return edges
+
+
+def word_of_chips(chips: ArrayLike) -> int:
     """Chips of one code as an integer whose most significant bit goes on air first.
 
-    >>> f"{word_of_values([1] * 8):04x}"
+    >>> f"{word_of_chips(chips_of_values([1] * 8)):04x}"
     '5555'
     """
-    return int("".join(map(str, chips_of_values(values).tolist())), 2)
+    return int("".join(map(str, np.asarray(chips, np.uint8).tolist())), 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Codebook:
-    """The shared table of codes.
+    """The shared table of codes, in chips.
 
     Attributes:
         profile: Name of the info-segment profile, e.g. `wh4x2`.
-        preamble: Barker code that finds time, int8 (P,).
-        pilots: One code a cluster, int8 (K, N).
-        codewords: One code a symbol, int8 (2**m, M).
+        preamble: The code that finds time, uint8 (P,).
+        pilots: One code a cluster, uint8 (K, N); N is 0 where none are sent.
+        codewords: One code a symbol, uint8 (S, M).
 
     Raises:
-        ConfigError: A code has other values than -1 and +1, two rows are equal, or the number of codewords
-            is not a power of two.
+        ConfigError: A code has other chips than 0 and 1, or two rows have the same edges, so that no camera
+            could tell them apart.
 
     Two codebooks are equal when their digests are.
+
+    >>> book = Codebook.of_values("demo", [1, -1], hadamard(2), hadamard(4))
+    >>> book.pilots.tolist(), book.pilot_edges.tolist()
+    ([[0, 1, 0, 1], [0, 1, 1, 0]], [[1, 1], [1, -1]])
     """
 
     profile: str
-    preamble: Values
-    pilots: Values
-    codewords: Values
+    preamble: Chips
+    pilots: Chips
+    codewords: Chips
 
     def __post_init__(self) -> None:
         for name, ndim in (("preamble", 1), ("pilots", 2), ("codewords", 2)):
             try:
-                code = np.array(getattr(self, name), np.int8)
+                given = np.asarray(getattr(self, name))
             except (TypeError, ValueError, OverflowError):
                 # Of no shape that is expected below.
-                code = np.empty(0, np.int8)
-            if code.ndim != ndim or code.size == 0 or not np.isin(code, (-1, 1)).all():
-                raise ConfigError(f"codebook {name}: expected a {ndim}-D array of -1 and +1")
-            if ndim == 2 and len(np.unique(code, axis=0)) != len(code):
-                raise ConfigError(f"codebook {name}: two rows are equal")
+                given = np.empty(0)
+            allowed = given.ndim == ndim and given.dtype.kind in "bui" and np.isin(given, (0, 1)).all()
+            if not allowed or (given.size == 0 and (name != "pilots" or not len(given))):
+                hint = ""
+                if given.size and given.dtype.kind == "i" and np.isin(given, (-1, 1)).all():
+                    hint = "; values of -1 and +1 become chips by chips_of_values"
+                raise ConfigError(f"codebook {name}: expected a {ndim}-D array of chips 0 and 1{hint}")
+            code = given.astype(np.uint8)
             code.setflags(write=False)
             object.__setattr__(self, name, code)
-        n = len(self.codewords)
-        if n & (n - 1):
-            raise ConfigError(f"codebook codewords: {n} rows, expected a power of two")
+            if ndim == 2 and code.shape[1]:
+                edges = edges_of_chips(code)
+                _, first = np.unique(edges, axis=0, return_index=True)
+                if len(first) != len(code):
+                    again = next(row for row in range(len(code)) if row not in first)
+                    like = int(np.flatnonzero((edges == edges[again]).all(1))[0])
+                    what = "are equal" if (code[like] == code[again]).all() else "have the same edges"
+                    raise ConfigError(f"codebook {name}: rows {like} and {again} {what}")
+
+    @classmethod
+    def of_values(cls, profile: str, preamble: ArrayLike, pilots: ArrayLike, codewords: ArrayLike) -> Self:
+        """The codebook of pair codes: bipolar values, -1 and +1, of two chips each.
+
+        Raises:
+            ConfigError: A value is another one.
+        """
+        codes = []
+        for name, code in (("preamble", preamble), ("pilots", pilots), ("codewords", codewords)):
+            values = np.asarray(code)
+            if values.dtype.kind != "i" or not np.isin(values, (-1, 1)).all():
+                raise ConfigError(f"codebook {name}: expected values of -1 and +1")
+            codes.append(chips_of_values(values))
+        return cls(profile, *codes)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Codebook) and self.digest == other.digest
@@ -116,8 +186,86 @@ class Codebook:
 
     @property
     def bits_per_symbol(self) -> int:
-        """Bits m that one symbol carries."""
+        """Bits m that one symbol carries: symbol s < 2**m carries those of s; others carry none."""
         return len(self.codewords).bit_length() - 1
+
+    @cached_property
+    def pairs(self) -> bool:
+        """Whether all codes are pair codes."""
+        return all(are_pairs(code) for code in (self.preamble, self.pilots, self.codewords))
+
+    def require_pairs(self, role: str, name: str, other: str) -> None:
+        """Refuse codes that an algorithm cannot read, which takes pair codes only.
+
+        Args:
+            role: Its role.
+            name: Its id.
+            other: Id of one that takes any.
+
+        Raises:
+            ConfigError: A code is none.
+        """
+        for code, chips in (
+            ("preamble", self.preamble),
+            ("pilots", self.pilots),
+            ("codewords", self.codewords),
+        ):
+            if not are_pairs(chips):
+                raise ConfigError(
+                    f"{role} '{name}' reads pair codes, chips 01 or 10 each, and the {code} are others; try"
+                    f" {role}.id = '{other}'"
+                )
+
+    @property
+    def edge_every(self) -> int:
+        """Chips from one edge that tells codes apart to the next; the first comes after one chip."""
+        return 2 if self.pairs else 1
+
+    @cached_property
+    def pilot_edges(self) -> Values:
+        """What pixels of each cluster see in a pilot, 1 on, -1 off, 0 nothing, int8 (K, n).
+
+        Of a pair code these are its values: the edges in the middle of each pair. Those between two pairs
+        follow from them.
+        """
+        return self._edges(self.pilots)
+
+    @cached_property
+    def codeword_edges(self) -> Values:
+        """The same of each symbol, int8 (S, n)."""
+        return self._edges(self.codewords)
+
+    @cached_property
+    def longest_gap_chips(self) -> int:
+        """The longest time from one rise to the next while packets are sent, chips.
+
+        Four in any pair code; of others, as codewords follow one another and pilots.
+        """
+        if self.pairs:
+            return _LONGEST_OF_PAIRS
+        words = len(self.codewords)
+        runs = [self.preamble]
+        for pilot in self.pilots:
+            runs += [pilot, self.codewords[0]]
+        for apart in range(min(words, _NEIGHBOURS)):
+            following = (np.arange(words) + apart) % words
+            runs.append(np.concatenate([self.codewords, self.codewords[following]], axis=1).ravel())
+        rises = np.flatnonzero(np.diff(np.concatenate(runs).astype(np.int8)) > 0)
+        return int(np.diff(rises).max(initial=2))
+
+    @cached_property
+    def least_activity(self) -> float:
+        """Edges a chip of the codeword with the fewest, over those of the pilots; half in pair codes."""
+        if self.pairs:
+            return 0.5
+        fewest = float(np.abs(edges_of_chips(self.codewords)).mean(1).min())
+        pilots = float(np.abs(edges_of_chips(self.pilots)).mean()) if self.pilots.shape[1] > 1 else fewest
+        return fewest / pilots if pilots else 1.0
+
+    def _edges(self, chips: Chips) -> Values:
+        edges = np.ascontiguousarray(edges_of_chips(chips)[..., :: self.edge_every])
+        edges.setflags(write=False)
+        return edges
 
     @cached_property
     def digest(self) -> str:
@@ -126,14 +274,23 @@ class Codebook:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def to_dict(self) -> dict[str, Any]:
-        """The codebook as plain lists."""
+        """The codebook as plain lists: of values for pair codes, else of strings of chips."""
+        if self.pairs:
+            codes = (code[..., 1::2].astype(int) * 2 - 1 for code in self._codes())
+            listed: list[Any] = [code.tolist() for code in codes]
+        else:
+            preamble, pilots, codewords = self._codes()
+            listed = [_text(preamble), [_text(row) for row in pilots], [_text(row) for row in codewords]]
         return {
-            "air_interface": AIR_INTERFACE,
+            "air_interface": AIR_INTERFACE if self.pairs else _OF_CHIPS,
             "profile": self.profile,
-            "preamble": self.preamble.tolist(),
-            "pilots": self.pilots.tolist(),
-            "codewords": self.codewords.tolist(),
+            "preamble": listed[0],
+            "pilots": listed[1],
+            "codewords": listed[2],
         }
+
+    def _codes(self) -> tuple[Chips, Chips, Chips]:
+        return self.preamble, self.pilots, self.codewords
 
     def to_json(self) -> str:
         """The codebook as JSON text, with its digest."""
@@ -149,16 +306,16 @@ class Codebook:
         """
         try:
             table = json.loads(text)
-            if table["air_interface"] != AIR_INTERFACE:
+            version = table["air_interface"]
+            if version not in (AIR_INTERFACE, _OF_CHIPS):
                 raise CodebookMismatchError(
-                    f"{source}: air_interface {table['air_interface']}, expected {AIR_INTERFACE}"
+                    f"{source}: air_interface {version}, expected {AIR_INTERFACE} or {_OF_CHIPS}"
                 )
-            book = cls(
-                table["profile"],
-                np.array(table["preamble"], np.int8),
-                np.array(table["pilots"], np.int8),
-                np.array(table["codewords"], np.int8),
-            )
+            profile, *codes = (table[name] for name in ("profile", "preamble", "pilots", "codewords"))
+            if version == AIR_INTERFACE:
+                book = cls.of_values(profile, *codes)
+            else:
+                book = cls(profile, _chips(codes[0]), *(np.array([*map(_chips, c)]) for c in codes[1:]))
             digest = table["digest"]
         except (ValueError, TypeError, OverflowError, RecursionError) as fault:
             raise ConfigError(f"{source}: not a codebook: {fault}") from fault
@@ -175,15 +332,14 @@ class Codebook:
             ConfigError: Pilot or codeword do not fit the board's 16-chip words.
         """
         for name, code in (("pilots", self.pilots), ("codewords", self.codewords)):
-            if code.shape[1] != 8:
-                raise ConfigError(f"codebook {name}: {2 * code.shape[1]} chips, the board's words have 16")
+            if code.shape[1] != 16:
+                raise ConfigError(f"codebook {name}: {code.shape[1]} chips, the board's words have 16")
 
-        def table(codes: Values) -> str:
-            words = [f"0x{word_of_values(row):04x}u" for row in codes]
+        def table(codes: Chips) -> str:
+            words = [f"0x{word_of_chips(row):04x}u" for row in codes]
             rows = [", ".join(words[i : i + 8]) for i in range(0, len(words), 8)]
             return ",\n    ".join(rows)
 
-        chips = chips_of_values(self.preamble)
         digest = ", ".join(f"0x{b:02x}u" for b in bytes.fromhex(self.digest))
         return "\n".join(
             [
@@ -193,11 +349,11 @@ class Codebook:
                 "#define EVLCP_CODEBOOK_H",
                 "#include <stdint.h>",
                 f"#define EVLCP_CLUSTERS {self.clusters}u",
-                f"#define EVLCP_PREAMBLE_CHIPS {len(chips)}u",
+                f"#define EVLCP_PREAMBLE_CHIPS {len(self.preamble)}u",
                 f"#define EVLCP_BITS_PER_SYMBOL {self.bits_per_symbol}u",
                 f"#define EVLCP_CODEWORDS {len(self.codewords)}u",
                 "/* First chip on air is the most significant of the EVLCP_PREAMBLE_CHIPS bits. */",
-                f"static const uint32_t evlcp_preamble = 0x{word_of_values(self.preamble):08x}u;",
+                f"static const uint32_t evlcp_preamble = 0x{word_of_chips(self.preamble):08x}u;",
                 f"static const uint16_t evlcp_pilots[{self.clusters}] = {{\n    {table(self.pilots)}}};",
                 f"static const uint16_t evlcp_codewords[{len(self.codewords)}] = {{",
                 f"    {table(self.codewords)}}};",
@@ -206,3 +362,13 @@ class Codebook:
                 "",
             ]
         )
+
+
+def _text(chips: Chips) -> str:
+    return "".join(map(str, chips.tolist()))
+
+
+def _chips(text: Any) -> Chips:
+    if not isinstance(text, str) or set(text) - {"0", "1"}:
+        raise ValueError(f"{text!r:.40}: expected a string of chips, 0 and 1")
+    return np.array([*map(int, text)], np.uint8)

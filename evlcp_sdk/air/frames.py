@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evlcp_sdk.air.codebook import Codebook, chips_of_values
+from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 
 __all__ = ["PacketFormat", "bits_of_symbols", "info_words", "packet_chips", "pilot_words", "symbols_of_bits"]
@@ -21,7 +21,7 @@ class PacketFormat:
     """Lengths of a packet's parts in chips, and the chip rate.
 
     >>> from evlcp_sdk.air.codebook import Codebook, hadamard
-    >>> book = Codebook("demo", hadamard(2)[1], hadamard(8), hadamard(8))
+    >>> book = Codebook.of_values("demo", hadamard(2)[1], hadamard(8), hadamard(8))
     >>> PacketFormat.of(book, frames=10).frame_chips
     32
     >>> PacketFormat.of(book, frames=10, pilot_every=4).packet_chips
@@ -45,9 +45,9 @@ class PacketFormat:
     ) -> "PacketFormat":
         """The format that a codebook's code lengths imply."""
         return cls(
-            preamble_chips=2 * len(codebook.preamble),
-            pilot_chips=2 * codebook.pilots.shape[1],
-            info_chips=2 * codebook.codewords.shape[1],
+            preamble_chips=len(codebook.preamble),
+            pilot_chips=codebook.pilots.shape[1],
+            info_chips=codebook.codewords.shape[1],
             frames=frames,
             chip_rate_hz=chip_rate_hz,
             pilot_every=pilot_every,
@@ -121,9 +121,8 @@ def packet_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -
         ConfigError: Symbols of another shape or outside the codebook.
     """
     s = _checked(symbols, codebook)
-    preamble = np.repeat(chips_of_values(codebook.preamble)[:, None], codebook.clusters, axis=1)
-    pilot = chips_of_values(codebook.pilots).T
-    info = chips_of_values(codebook.codewords)
+    preamble = np.repeat(codebook.preamble[:, None], codebook.clusters, axis=1)
+    pilot, info = codebook.pilots.T, codebook.codewords
     parts = [preamble]
     for frame, row in enumerate(s):
         parts += [pilot, info[row].T] if frame % pilot_every == 0 else [info[row].T]
@@ -140,7 +139,7 @@ def _words(chips: NDArray[np.uint8]) -> NDArray[np.uint16]:
 
 def pilot_words(codebook: Codebook) -> NDArray[np.uint16]:
     """The pilots as driver-board words, uint16 (K,); most significant bit first on air."""
-    return _words(chips_of_values(codebook.pilots))
+    return _words(codebook.pilots)
 
 
 def info_words(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.uint16]:
@@ -149,7 +148,7 @@ def info_words(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.uint16]:
     Raises:
         ConfigError: Symbols of another shape or outside the codebook, or codes of another length.
     """
-    words = _words(chips_of_values(codebook.codewords))
+    words = _words(codebook.codewords)
     found: NDArray[np.uint16] = words[_checked(symbols, codebook)]
     return found
 

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, overload
 
-from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.codebook import Codebook, are_pairs
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, PluginError, UnknownAlgorithmError
@@ -257,7 +257,7 @@ def resolve(
         if section in _SPECS:
             cls = _SPECS[section]
         else:
-            head["id"] = name = keys.pop("id", ROLES[section].default_for(built.get("bar")))
+            head["id"] = name = keys.pop("id", ROLES[section].default_for(built.get("bar"), _pairs(built)))
             if not isinstance(name, str):
                 fault(section, "id", f" = {name!r}: expected a string")
                 continue
@@ -343,6 +343,19 @@ def _assembled(
         digest=_digest(table, codebook, revisions),
         kinds=kinds,
     )
+
+
+def _pairs(built: Mapping[str, Any]) -> bool:
+    """Whether pilots and codewords are pair codes, as far as they are known and good."""
+    if not {"bar", "pilots", "modulation"} <= set(built):
+        return True
+    try:
+        pilots = built["pilots"]
+        codes = pilots.preamble(), pilots.codes(built["bar"].clusters), built["modulation"].codewords()
+        return all(are_pairs(code) for code in codes)
+    except (Exception, SystemExit):
+        # What is wrong with them is said where the codebook is made.
+        return True
 
 
 @contextmanager

@@ -58,7 +58,11 @@ class Decode(Protocol):
     """What `Decoding.compile` returns."""
 
     def __call__(self, presence: PresenceMap, sums: NDArray[np.int16], /) -> SoftSymbols:
-        """Presence and a frame's polarity sums, pilot then info, int16 (chips, height, width) -> symbols."""
+        """Presence and a frame's polarity sums, pilot then info, int16 (chips, height, width) -> symbols.
+
+        For codes that are no pair codes a third argument follows: the chip that each cluster sent before the
+        info segment, int8 (K,), -1 where it is not known. In a pair code the first edge says nothing new.
+        """
 
 
 class Measure(Protocol):
@@ -72,12 +76,12 @@ class Pilots(ABC):
     """Codes that find time and tell clusters apart."""
 
     @abstractmethod
-    def preamble(self) -> NDArray[np.int8]:
-        """The code that finds time, int8 (P,)."""
+    def preamble(self) -> NDArray[np.uint8]:
+        """The code that finds time, chips, uint8 (P,)."""
 
     @abstractmethod
-    def codes(self, clusters: int) -> NDArray[np.int8]:
-        """One code a cluster, int8 (clusters, N).
+    def codes(self, clusters: int) -> NDArray[np.uint8]:
+        """One code a cluster, chips, uint8 (clusters, N).
 
         Raises:
             ConfigError: The family has fewer codes.
@@ -88,8 +92,12 @@ class Modulation(ABC):
     """Bits to codewords."""
 
     @abstractmethod
-    def codewords(self) -> NDArray[np.int8]:
-        """One bipolar codeword a symbol, int8 (2**m, M); row s carries the m bits of s, msb first."""
+    def codewords(self) -> NDArray[np.uint8]:
+        """One codeword a symbol, chips, uint8 (S, M).
+
+        With m the whole part of log2 S, row s < 2**m carries the m bits of s, msb first; rows beyond are
+        symbols that messages do not use.
+        """
 
 
 class Synchronizer(Protocol):
@@ -259,6 +267,8 @@ class Role:
         verb: What it does, in one line.
         default_elsewhere: Ids of it, of several clusters and of one, for bars that are not one even column of
             three clusters or more, which the default refuses; None where that one takes every bar.
+        default_of_chips: Id of it for codes that are not pair codes, which the default refuses; None where
+            that one takes all codes.
     """
 
     name: str
@@ -266,18 +276,25 @@ class Role:
     default: str
     verb: str
     default_elsewhere: tuple[str, str] | None = None
+    default_of_chips: str | None = None
 
-    def default_for(self, bar: BarLayout | None) -> str:
+    def default_for(self, bar: BarLayout | None, pairs: bool = True) -> str:
         """Id of the algorithm where the link names none, for its bar; None for one that is not known.
+
+        Args:
+            bar: The link's.
+            pairs: Whether its codes are pair codes.
 
         >>> from evlcp_sdk.scene.bar import BarLayout, LedGrid
         >>> [ROLES["ranging"].default_for(BarLayout(LedGrid(96, columns))) for columns in (1, 2)]
         ['joint-scale', 'poc']
         """
-        if bar is None or not self.default_elsewhere or (bar.clusters >= 3 and bar.column_pitch_m > 0):
-            return self.default
-        many, one = self.default_elsewhere
-        return one if bar.clusters == 1 else many
+        column = bar is None or (bar.clusters >= 3 and bar.column_pitch_m > 0)
+        if not column and self.default_elsewhere is not None:
+            assert bar is not None
+            many, one = self.default_elsewhere
+            return one if bar.clusters == 1 else many
+        return self.default if pairs or self.default_of_chips is None else self.default_of_chips
 
 
 ROLES: Mapping[str, Role] = MappingProxyType(
@@ -287,9 +304,28 @@ ROLES: Mapping[str, Role] = MappingProxyType(
             Role("pilots", Pilots, "wh", "codes that find time and tell clusters apart"),
             Role("modulation", Modulation, "wh4x2", "bits of a symbol <-> its codeword"),
             Role("synchronization", Synchronization, "barker", "a region's events -> packet timing"),
-            Role("separation", Separation, "wh-correlation", "a pilot's image -> where each cluster is"),
-            Role("decoding", Decoding, "motion-feedback", "a frame's image -> soft symbols"),
-            Role("ranging", Ranging, "joint-scale", "a decoded frame's image -> distance", ("poc", "none")),
+            Role(
+                "separation",
+                Separation,
+                "wh-correlation",
+                "a pilot's image -> where each cluster is",
+                default_of_chips="edges",
+            ),
+            Role(
+                "decoding",
+                Decoding,
+                "motion-feedback",
+                "a frame's image -> soft symbols",
+                default_of_chips="edges",
+            ),
+            Role(
+                "ranging",
+                Ranging,
+                "joint-scale",
+                "a decoded frame's image -> distance",
+                ("poc", "none"),
+                "poc",
+            ),
             Role("tracking", Tracking, "none", "distance and image position over time"),
             Role("error-correction", ErrorCorrection, "polar", "message bits <-> coded bits, soft input"),
         )

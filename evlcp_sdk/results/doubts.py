@@ -137,7 +137,7 @@ class Seen:
             number, us.
         readout: Events in each millisecond; None where they were not counted.
         losses: Events and words that the source could not use.
-        others: Codewords of other modulations by id, int8 (symbols, values); asked where it matters.
+        others: Codewords of other modulations by id, uint8 (symbols, chips); asked where it matters.
     """
 
     first_us: float = math.nan
@@ -145,7 +145,7 @@ class Seen:
     lit_us: Mapping[int, tuple[float, float]] | None = None
     readout: ReadoutTally | None = None
     losses: int = 0
-    others: Callable[[], Mapping[str, NDArray[np.int8]]] = dict
+    others: Callable[[], Mapping[str, NDArray[np.uint8]]] = dict
 
     @property
     def duration_us(self) -> float:
@@ -245,8 +245,8 @@ def notes_of(
     return found
 
 
-def other_codewords(link: Link, registry: Registry) -> dict[str, NDArray[np.int8]]:
-    """Codewords of the other modulations that are installed, by id, int8 (symbols, values)."""
+def other_codewords(link: Link, registry: Registry) -> dict[str, NDArray[np.uint8]]:
+    """Codewords of the other modulations that are installed, by id, uint8 (symbols, chips)."""
     found = {}
     for installed in registry.installed("modulation"):
         name = installed.algorithm.id
@@ -545,12 +545,12 @@ def _unsure(number: int, one: TransmitterTally, link: Link, seen: Seen) -> Itera
     )
 
 
-def _among(words: NDArray[np.int8], others: NDArray[np.int8]) -> NDArray[np.bool_]:
+def _among(words: NDArray[np.uint8], others: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Which words are others, too, bool (symbols,); none where they are of another length."""
     if words.shape[1] != others.shape[1]:
         return np.zeros(len(words), np.bool_)
-    known = {row.tobytes() for row in np.ascontiguousarray(others, np.int8)}
-    return np.array([row.tobytes() in known for row in np.ascontiguousarray(words, np.int8)])
+    known = {row.tobytes() for row in np.ascontiguousarray(others)}
+    return np.array([row.tobytes() in known for row in np.ascontiguousarray(words)])
 
 
 def codewords_never(one: TransmitterTally, link: Link) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import Codebook, chips_of_values
+from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.values import Frame, FrameView, PresenceMap
 
@@ -79,7 +79,7 @@ class Motion:
         seen = [(k, float(r.mean())) for k, r in enumerate(rows) if len(r)]
         return {
             "chips": chips,
-            "pilot": 2 * codebook.pilots.shape[1],
+            "pilot": codebook.pilots.shape[1],
             "width": width,
             "height": height,
             "chip_ms": chip_us * 1e-3,
@@ -167,9 +167,9 @@ def sent_chips(frame: Frame, codebook: Codebook) -> NDArray[np.int8]:
         1 for light, 0 for none, -1 where the symbol is not given; int8 (K, chips).
     """
     symbols = frame.soft.symbols
-    info = chips_of_values(codebook.codewords)[np.maximum(symbols, 0)].astype(np.int8)
+    info = codebook.codewords[np.maximum(symbols, 0)].astype(np.int8)
     info[symbols < 0] = -1
-    return np.concatenate([chips_of_values(codebook.pilots).astype(np.int8), info], axis=1)
+    return np.concatenate([codebook.pilots.astype(np.int8), info], axis=1)
 
 
 def _pixels(motion: Motion) -> int:

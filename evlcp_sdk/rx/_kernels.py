@@ -689,10 +689,11 @@ def block_prior(places: Array, unit: complex, spacing: float, grid: int, out: Ar
 
 
 @njit(cache=True, nogil=True)
-def pilot_light(sums: Array, codes: Array, prior: Array, grid: int, out: Array) -> None:
+def pilot_light(sums: Array, codes: Array, every: int, prior: Array, grid: int, out: Array) -> None:
     """How far the pixels in each cluster's place follow its pilot, -1 to 1, `out` (K,); 0 without a place.
 
-    A pixel's value is the sign of its second chip's sum, or else the opposite of its first's, or 0.
+    `codes` are edges, (K, n), `every` so many chips. A pixel's value is the sign of the sum of the chip
+    behind one, or 0; where edges are in the middle of pairs, else the opposite of that of the chip before.
     """
     clusters, rows, columns = prior.shape
     length = codes.shape[1]
@@ -701,9 +702,14 @@ def pilot_light(sums: Array, codes: Array, prior: Array, grid: int, out: Array) 
     for i in range(length):
         for v in range(height):
             for u in range(width):
-                first, second = sums[2 * i, v, u], sums[2 * i + 1, v, u]
+                first, second = sums[every * i, v, u], sums[every * i + 1, v, u]
+                if every == 1:
+                    first = 0
                 values[i, v, u] = (second > 0) - (second < 0) + (second == 0) * ((first < 0) - (first > 0))
     for k in range(clusters):
+        edges = 0
+        for i in range(length):
+            edges += abs(codes[k, i])
         total, place = 0.0, 0.0
         for r in range(rows):
             for c in range(columns):
@@ -717,7 +723,7 @@ def pilot_light(sums: Array, codes: Array, prior: Array, grid: int, out: Array) 
                         for i in range(length):
                             agree += codes[k, i] * values[i, v, u]
                 total += weight * agree
-        out[k] = total / (length * place) if place > 0 else 0.0
+        out[k] = total / (edges * place) if place > 0 and edges > 0 else 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -734,11 +740,10 @@ def spread_between(
 ) -> None:
     """Count answers of the pixels on the way from a cluster to its neighbour to the neighbour's edges.
 
-    Chips of a value are off and on, or on and off: between two values a cluster stays as it is if they
-    differ, and switches if they are alike. `out` (2, 2, 3): the first of the pair stays on, or off; answers
-    and edges; before the share `first` of the way, up to `last`, beyond.
+    Those that come while the cluster itself stays as it is. `codes` are chips. `out` (2, 2, 3): the first of
+    the pair stays on, or off; answers and edges; before the share `first` of the way, up to `last`, beyond.
     """
-    values = codes.shape[1]
+    chips = codes.shape[1]
     _, height, width = sums.shape
     for pair in range(len(pairs)):
         a, b = pairs[pair]
@@ -754,24 +759,33 @@ def spread_between(
                 if abs(off.imag) > half or off.real < 0 or off.real >= length:
                     continue
                 zone = int(off.real >= first * length) + int(off.real >= last * length)
-                for i in range(values - 1):
-                    if codes[a, i] == codes[a, i + 1] or codes[b, i] != codes[b, i + 1]:
+                for i in range(1, chips):
+                    edge = codes[b, i] - codes[b, i - 1]
+                    if edge == 0 or codes[a, i] != codes[a, i - 1]:
                         continue
-                    dark = int(codes[a, i] < 0)
-                    out[dark, 0, zone] += int(sums[2 * i + 2, v, u] * codes[b, i] < 0)
+                    dark = 1 - codes[a, i]
+                    out[dark, 0, zone] += int(sums[i, v, u] * edge > 0)
                     out[dark, 1, zone] += 1
 
 
 @njit(cache=True, nogil=True)
 def spread_across(
-    sums: Array, codes: Array, places: Array, seen: Array, way: complex, along: float, out: Array
+    sums: Array,
+    codes: Array,
+    every: int,
+    places: Array,
+    seen: Array,
+    way: complex,
+    along: float,
+    out: Array,
 ) -> None:
-    """Count answers of the pixels beside the middle of clusters to the edge within each of their values.
+    """Count answers of the pixels beside the middle of clusters to the edges that tell them apart.
 
-    `way` is the direction of the line, of size 1; `along`, how far from a middle pixels may lie on it; `out`
-    (2, 2 n + 1): answers and edges by column, n to either side.
+    `codes` are chips, edges come behind the first and every so many; `way` is the direction of the line, of
+    size 1; `along`, how far from a middle pixels may lie on it; `out` (2, 2 n + 1): answers and edges by
+    column, n to either side.
     """
-    values = codes.shape[1]
+    chips = codes.shape[1]
     _, height, width = sums.shape
     most = out.shape[1] // 2
     reach = along + most + 1
@@ -787,11 +801,10 @@ def spread_across(
                 column = int(np.floor(off.imag + 0.5)) + most
                 if column < 0 or column > 2 * most:
                     continue
-                answers = 0
-                for i in range(values):
-                    answers += int(sums[2 * i + 1, v, u] * codes[k, i] > 0)
-                out[0, column] += answers
-                out[1, column] += values
+                for i in range(1, chips, every):
+                    edge = codes[k, i] - codes[k, i - 1]
+                    out[0, column] += int(sums[i, v, u] * edge > 0)
+                    out[1, column] += abs(edge)
 
 
 @njit(cache=True, nogil=True)

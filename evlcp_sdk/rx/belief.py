@@ -27,12 +27,13 @@ _LEAST_SURE = 0.6
 and of those that are less sure, half or more are wrong in recordings."""
 
 
-_LEAST_EVENTS = 0.25
-"""Share of a pilot's chips with events that an info segment has at the least: a codeword has half as many
-edges as another, and as much again may be chance."""
+_LEAST_EVENTS = 0.5
+"""Share of the events due, by the edges of the codeword with the fewest, that may be missing by chance."""
 
 
-def still_lit(sums: NDArray[np.int16], presence: PresenceMap, pilot_chips: int) -> NDArray[np.bool_]:
+def still_lit(
+    sums: NDArray[np.int16], presence: PresenceMap, pilot_chips: int, least_activity: float = 0.5
+) -> NDArray[np.bool_]:
     """Which clusters have events in a frame's info segment as they have in its pilot, bool (K,).
 
     Where a stream has a gap, or a pole passes, silence is not what a cluster says.
@@ -41,9 +42,12 @@ def still_lit(sums: NDArray[np.int16], presence: PresenceMap, pilot_chips: int) 
         sums: Polarity sums of pilot and info segment, int16 (chips, height, width).
         presence: Where the clusters are.
         pilot_chips: Chips of the pilot.
+        least_activity: Edges a chip of the codeword with the fewest, over those of a pilot; half of them in
+            pair codes.
     """
     over = np.empty(len(presence.probability))
-    _kernels.info_activity(sums, presence.probability, presence.grid_px, pilot_chips, _LEAST_EVENTS, over)
+    least = _LEAST_EVENTS * least_activity
+    _kernels.info_activity(sums, presence.probability, presence.grid_px, pilot_chips, least, over)
     return over > 0
 
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.late import Late
 from evlcp_sdk.values import Events, SyncLock, changed
 
@@ -72,11 +71,11 @@ class RowDelays:
     """Measures the delay by row at each preamble that is heard.
 
     Args:
-        preamble: The code that finds time, int8 (P,).
+        preamble: The code that finds time, chips, uint8 (P,).
     """
 
-    def __init__(self, preamble: NDArray[np.int8]) -> None:
-        self._chips = 2.0 * chips_of_values(preamble) - 1
+    def __init__(self, preamble: NDArray[np.uint8]) -> None:
+        self._chips = 2.0 * preamble - 1
 
     def hear(
         self,

@@ -31,8 +31,8 @@ SAME_PX = 5.0
 _CELL_SHIFT = 2
 """Cells of 4 x 4 px: no larger than the gap at which two bars are two, and few enough to label each step."""
 
-_MEASURE_CHIPS = 6
-"""A blinking pixel rises at least once in four chips; half of that again allows for a late event."""
+_MEASURE_GAPS = 1.5
+"""A blinking pixel rises once in the longest time of the code; half of that again allows for a late event."""
 
 _AGE_CHIPS = 5
 """Age of a measured centre. A moving bar's leading end counts once its pixels have risen in rhythm twice,
@@ -247,6 +247,7 @@ class RegionFollower:
         keep_us: How long events of the whole image are kept, so that a region may turn out to be larger than
             it was taken for, us.
         limits: How much is held.
+        gap_chips: The longest time from rise to rise in the codes; 4 in pair codes.
 
     Attributes:
         alive: The regions that are followed.
@@ -261,16 +262,17 @@ class RegionFollower:
         position: Filter | None = None,
         keep_us: float = 0.0,
         limits: Limits = LIMITS,
+        gap_chips: int = 4,
     ) -> None:
         self._spec = spec
         self._limits = limits
         self._keep_us = keep_us
         self._position = position
         self._camera = camera
-        self._measure_us = round(_MEASURE_CHIPS * chip_us)
+        self._measure_us = round(_MEASURE_GAPS * gap_chips * chip_us)
         self._age_us = _AGE_CHIPS * chip_us
         shape = (camera.height, camera.width)
-        self._rhythm = Rhythm(camera.width, camera.height, chip_us, spec.min_score)
+        self._rhythm = Rhythm(camera.width, camera.height, chip_us, spec.min_score, gap_chips)
         self._hits = np.zeros([(n - 1 >> _CELL_SHIFT) + 1 for n in shape], np.int32)
         self._fresh: list[Box] = []
         steps = math.ceil(min(keep_us, _LONGEST_US) / spec.step_us)

@@ -105,10 +105,11 @@ class PacketFraming:
             link.packet,
             link.regions,
             centres_m,
-            link.codebook.pilots,
+            link.codebook,
             self._steps.separate,
             (link.camera.width, link.camera.height),
         )
+        self._codebook = link.codebook
         self._rows = RowDelays(link.codebook.preamble)
         self._find_points = points_finder(layout_of(centres_m))
         self._echoes = judged.echoes
@@ -210,8 +211,9 @@ class PacketFraming:
             self._regions.drop(transmitter.region)
             self._let_go(transmitter.region)
             return "frames_rejected"
-        read = self._steps.decode(look.presence, look.sums)
-        lit = still_lit(look.sums, look.presence, self._packet.pilot_chips)
+        read = self._steps.decode(look.presence, look.sums, self._before(transmitter, due))
+        transmitter.said = due.number, read.symbols
+        lit = still_lit(look.sums, look.presence, self._packet.pilot_chips, self._codebook.least_activity)
         soft = believed(read, look.placement.seen & lit)
         distance, points, centre_px, sight = _NO_RANGE, _NO_POINTS, look.centre_px, BarSight()
         if due.has_pilot:
@@ -249,6 +251,16 @@ class PacketFraming:
         )
         self._announcer.total("frame", frame)
         return Sighting.of(frame, look)
+
+    def _before(self, transmitter: Transmitter, due: DueFrame) -> NDArray[np.int8]:
+        """The chip that each cluster sent before a frame's info segment, int8 (K,); -1 if not known."""
+        book = self._codebook
+        if due.has_pilot:
+            return book.pilots[:, -1].astype(np.int8)
+        number, symbols = transmitter.said
+        if number != due.number - 1 or due.index == 0:
+            return np.full(book.clusters, -1, np.int8)
+        return np.where(symbols >= 0, book.codewords[symbols, -1].astype(np.int8), np.int8(-1))
 
     def _sight(self, points: tuple[NDArray[np.float64], NDArray[np.float64]], t_us: float) -> BarSight:
         """Where a bar is seen, and how it leans; a panel has no direction, and counts as level."""

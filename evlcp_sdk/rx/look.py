@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import RegionSpec
@@ -88,7 +89,7 @@ class Looker:
         packet: Lengths of a packet's parts.
         spec: Length of a time step, seam, and least share of the clusters.
         centres_m: Cluster centres of the layout, m, float64 (K, 2).
-        pilots: The clusters' pilot codes, (K, values), +1 and -1.
+        codebook: The codes of the clusters' pilots.
         separate: From a pilot's polarity sums to where the clusters are.
         sensor_px: Columns and rows of the sensor: no image is larger, but for the seam.
     """
@@ -98,7 +99,7 @@ class Looker:
         packet: PacketFormat,
         spec: RegionSpec,
         centres_m: NDArray[np.float64],
-        pilots: NDArray[np.int8],
+        codebook: Codebook,
         separate: Callable[[NDArray[np.int16]], PresenceMap],
         sensor_px: tuple[int, int],
     ) -> None:
@@ -106,7 +107,9 @@ class Looker:
         self._spec = spec
         self._layout = layout_of(centres_m)
         self._pairs = neighbours(self._layout)
-        self._pilots = pilots.astype(np.int64)
+        self._pilots = codebook.pilots.astype(np.int64)
+        self._edges = codebook.pilot_edges.astype(np.int64)
+        self._every = codebook.edge_every
         self._separate = separate
         self._sensor_px = sensor_px
 
@@ -142,18 +145,18 @@ class Looker:
             if not found:
                 return None, pilot
             presence = masked(presence, self._layout, found[0])
-            presence, placement = lit(heard, self._pilots, presence, found[0])
+            presence, placement = lit(heard, self._edges, self._every, presence, found[0])
             if not placement.seen.any():
                 return None, pilot
-            spread = Spread.of(heard, self._pilots, self._layout, self._pairs, placement)
+            spread = Spread.of(heard, self._pilots, self._every, self._layout, self._pairs, placement)
             pilot = Pilot(due.number, size, heard, moved, presence, placement, tuple(found[1:]))
         else:
             assert pilot is not None
             sums = np.concatenate([pilot.sums, sums])
             offset_px = np.concatenate([pilot.offset_px, offset_px], axis=1)
-        # The image shows the pilot's mean, read from each value's second chip, whose events follow the edge
-        # at its start; the bar's centre at the instant is that of its region.
-        rest_px = pilot.offset_px[:, 1::2].mean(1)
+        # The image shows the pilot's mean, read from the chips behind edges that tell codes apart; the bar's
+        # centre at the instant is that of its region.
+        rest_px = pilot.offset_px[:, 1 :: self._every].mean(1)
         corner_px = (
             float(x[middle]) - (size[0] - 1) / 2 - float(rest_px[0]),
             float(y[middle]) - (size[1] - 1) / 2 - float(rest_px[1]),

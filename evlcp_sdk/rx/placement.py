@@ -226,7 +226,11 @@ def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> Prese
 
 
 def lit(
-    sums: NDArray[np.int16], pilots: NDArray[np.int64], presence: PresenceMap, placement: Placement
+    sums: NDArray[np.int16],
+    edges: NDArray[np.int64],
+    every: int,
+    presence: PresenceMap,
+    placement: Placement,
 ) -> tuple[PresenceMap, Placement]:
     """Leave out the clusters whose light is not in their place: behind a cover, or out of the image.
 
@@ -234,14 +238,15 @@ def lit(
 
     Args:
         sums: Polarity sums of the pilot, int16 (chips, height, width).
-        pilots: The codes, int64 (K, values).
+        edges: Those of the pilots, int64 (K, n).
+        every: Chips from one of them to the next.
         presence: As from `masked`.
         placement: Of the same image.
     """
     if presence.prior is None:
         return presence, placement
-    light = np.empty(len(pilots))
-    _kernels.pilot_light(sums, pilots, presence.prior, presence.grid_px, light)
+    light = np.empty(len(edges))
+    _kernels.pilot_light(sums, edges, every, presence.prior, presence.grid_px, light)
     others = [v for v, in_place in zip(light.tolist(), placement.seen.tolist(), strict=True) if in_place]
     seen = light >= max(_LEAST_LIGHT * median(others) if others else 0.0, 1e-9)
     placed = placement

@@ -63,6 +63,7 @@ class Receiver:
             steps.position,
             LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us,
             limits,
+            link.codebook.longest_gap_chips,
         )
         self._judged = EchoQueue(Echoes(link.packet, len(link.codebook.codewords)))
         self._framing = PacketFraming(

@@ -1,12 +1,13 @@
 """Which pixels blink in the rhythm of the chips.
 
-The rhythm is judged per pixel, from rise to rise: the times at which it starts to get brighter. In a code
-of the air interface rises come two, three or four chips apart, and where events go missing a few chips
-more, but whole chips always. So a rise two to four whole chips after the one before raises a pixel's score
-by two, one after five to twelve by one. A rise off the chips, as of a lamp with pulse width modulation of 4
-kHz (two and a half chips) or of a moving texture, lowers it by three: more than the two that chance, which
-is on the chips in six cases of ten, would bring. One after the very same number of chips as before lowers
-it by two from five chips on: a lamp of 1 or 2 kHz repeats its period, a code with missing events does not.
+The rhythm is judged per pixel, from rise to rise: the times at which it starts to get brighter. In a pair
+code rises come two, three or four chips apart, and where events go missing a few chips more, but whole
+chips always. So a rise two to four whole chips after the one before raises a pixel's score by two, one after
+five to twelve by one; of other codes, up to the longest time that there is in them, and up to three times
+that. A rise off the chips, as of a lamp with pulse width modulation of 4 kHz (two and a half chips) or of a
+moving texture, lowers it by three: more than the two that chance, which is on the chips in six cases of ten,
+would bring. One after the very same number of chips as before lowers it by two from five chips on: a lamp of
+1 or 2 kHz repeats its period, a code with missing events does not.
 A lamp whose period is two, three or four whole chips is in rhythm, too, as far as a score tells; but its time
 comes again and again, which one of a code does not for long: before a frame shows where the bar is, such
 pixels are not listened to. Falls are not looked at: they come later or sooner than rises by the light,
@@ -40,8 +41,8 @@ _MOST_SCORE = 40
 _SOON_CHIPS = 1.5
 """Rises come no sooner in any code; what does is more events of the same rise."""
 
-_LATE_CHIPS = 12.5
-"""A time beyond says nothing."""
+_MOST_CHIPS = 15
+"""A longer time says nothing, nor one of three times the longest of the code: events were missed."""
 
 _STRAY_CHIPS = 0.3
 """Jitter and latencies that differ from rise to rise put one off the chips by so much."""
@@ -74,15 +75,16 @@ class Rhythm:
         height: Its rows.
         chip_us: Nominal length of a chip, us.
         min_score: Score at which a pixel is a candidate; half of it is enough inside a region.
+        gap_chips: The longest time from rise to rise in the codes; 4 in pair codes.
     """
 
-    def __init__(self, width: int, height: int, chip_us: float, min_score: int) -> None:
-        late_us = _LATE_CHIPS * chip_us
+    def __init__(self, width: int, height: int, chip_us: float, min_score: int, gap_chips: int = 4) -> None:
+        late_us = (min(3 * gap_chips, _MOST_CHIPS) + 0.5) * chip_us
         self._shift = max(math.ceil(math.log2(late_us / _LONGEST_TICKS)), 0)
         tick_us = 1 << self._shift
         self._soon = int(_SOON_CHIPS * chip_us) >> self._shift
-        self._kinds = _kinds(chip_us, tick_us)
-        self._lows = _lows()
+        self._kinds = _kinds(chip_us, late_us, tick_us)
+        self._lows = _lows(gap_chips)
         self._min_score = min_score
         self._pixels = np.zeros((height, width), np.uint32)
         self._labels = np.zeros([(n - 1 >> _LABEL_SHIFT) + 1 for n in (height, width)], np.int16)
@@ -196,19 +198,19 @@ class Rhythm:
         self._row = (self._row + many) % height
 
 
-def _kinds(chip_us: float, tick_us: int) -> NDArray[np.uint8]:
+def _kinds(chip_us: float, late_us: float, tick_us: int) -> NDArray[np.uint8]:
     """Kind of a time between rises by its ticks, the last for all beyond."""
-    run_us = np.arange(int(_LATE_CHIPS * chip_us) // tick_us + 2) * float(tick_us)
+    run_us = np.arange(int(late_us) // tick_us + 2) * float(tick_us)
     chips = np.floor(run_us / chip_us + 0.5)
     kinds = chips + _OFF * (np.abs(run_us - chips * chip_us) > _STRAY_CHIPS * chip_us)
-    kinds[run_us > _LATE_CHIPS * chip_us] = _LATE
+    kinds[run_us > late_us] = _LATE
     return np.asarray(kinds, np.uint8)
 
 
-def _lows() -> NDArray[np.uint16]:
+def _lows(gap_chips: int) -> NDArray[np.uint16]:
     """Chips and score of a pixel after a rise, by the kind of its time and by chips and score before it."""
     kind, before, score = np.meshgrid(np.arange(2 * _OFF), np.arange(16), np.arange(64), indexing="ij")
-    change = np.where(kind <= 4, 2, np.where(kind == before, -2, 1))
+    change = np.where(kind <= gap_chips, 2, np.where(kind == before, -2, 1))
     change[kind >= _OFF] = -3
     change[kind == _LATE] = -1
     return np.asarray(kind % _OFF << 6 | np.clip(score + change, 0, _MOST_SCORE), np.uint16).ravel()

@@ -100,6 +100,7 @@ class Spread:
         cls,
         sums: NDArray[np.int16],
         pilots: NDArray[np.int64],
+        every: int,
         layout: Layout,
         pairs: NDArray[np.int64],
         placement: Placement,
@@ -108,7 +109,8 @@ class Spread:
 
         Args:
             sums: Polarity sums of the pilot, int16 (chips, height, width).
-            pilots: The clusters' codes, int64 (K, values).
+            pilots: Chips of the clusters' codes, int64 (K, chips).
+            every: Chips from one edge that tells them apart to the next.
             layout: What is shown.
             pairs: Its neighbours, int64 (n, 2).
             placement: Where it is shown.
@@ -121,7 +123,7 @@ class Spread:
             _kernels.spread_between(sums, pilots, places, seen, pairs, _AXIS_PX, _FROM, _TO, between)
             if layout.line:
                 way = placement.scale / abs(placement.scale) * layout.way
-                _kernels.spread_across(sums, pilots, places, seen, way, spacing_px / 4, across)
+                _kernels.spread_across(sums, pilots, every, places, seen, way, spacing_px / 4, across)
         return cls(between, across, spacing_px)
 
     def __add__(self, other: "Spread") -> "Spread":

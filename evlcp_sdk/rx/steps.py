@@ -122,7 +122,7 @@ class Steps:
             self._separate = link.algorithm("separation").compile(link.codebook)
             guards["separation"].expect_compiled(self._separate)
         with guards["decoding"]:
-            self._decode = link.algorithm("decoding").compile(link.codebook)
+            self._decode: Callable[..., SoftSymbols] = link.algorithm("decoding").compile(link.codebook)
             guards["decoding"].expect_compiled(self._decode)
         with guards["ranging"]:
             self._measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
@@ -167,11 +167,15 @@ class Steps:
         self._announcer.lap("separation", presence)
         return presence
 
-    def decode(self, presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
-        """What the clusters say, from the polarity sums of pilot and info, int16 (chips, height, width)."""
+    def decode(self, presence: PresenceMap, sums: NDArray[np.int16], before: NDArray[np.int8]) -> SoftSymbols:
+        """What the clusters say, from the polarity sums of pilot and info, int16 (chips, height, width).
+
+        The chips sent before the info segment matter to codes that are no pair codes.
+        """
         guard = self._guards["decoding"]
+        more = () if self._codebook.pairs else (before,)
         with guard:
-            soft: SoftSymbols = self._decode(presence, sums)
+            soft = self._decode(presence, sums, *more)
         guard.expect_symbols(soft, self._codebook)
         self._announcer.lap("decoding", soft)
         return soft

@@ -4,6 +4,9 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.delays import LONGEST_ROW_US, RowDelay
 from evlcp_sdk.rx.detection import Followed
@@ -39,6 +42,7 @@ class Transmitter:
         first: Number of the first packet on the grid that had a frame, None before.
         rows: How late the rows of its bar are read.
         pilot: The newest pilot, None where it showed no bar.
+        said: Number of the newest frame that was decoded, on the grid, and its symbols.
         lit_us: When the first frame was due in which its light was there, camera clock, us; None before.
     """
 
@@ -51,6 +55,7 @@ class Transmitter:
     first: int | None = None
     rows: RowDelay = field(default_factory=RowDelay)
     pilot: Pilot | None = None
+    said: tuple[int, NDArray[np.int64]] = (-1, np.empty(0, np.int64))
     lit_us: float | None = None
 
 

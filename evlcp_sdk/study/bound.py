@@ -264,8 +264,8 @@ def _spacing_m(bar: BarLayout) -> float:
 
 def _codes(codebook: Codebook, symbols: NDArray[np.int64]) -> Array:
     """What each cluster sends in a frame, pilot and info, float64 (K, values)."""
-    said = codebook.codewords[symbols]
-    return np.concatenate([codebook.pilots, said], axis=1).astype(np.float64)
+    said = codebook.codeword_edges[symbols]
+    return np.concatenate([codebook.pilot_edges, said], axis=1).astype(np.float64)
 
 
 def _rows(height: int) -> Array:

@@ -11,6 +11,7 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.link.blocks import packet_bits
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, compiled
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.testing.views import ideal_presence, ideal_sums, ideal_view
@@ -80,7 +81,19 @@ def link_of(subject: Subject, **air: Any) -> Link:
     if subject.role == "pilots":
         compiled(lambda: subject.algorithm.codes(link.bar.clusters))
     link = link.with_algorithm(subject.role, subject.algorithm, id=subject.id)
+    if not link.codebook.pairs:
+        link = _of_chips(link, subject.role)
     return link.with_air(**air) if air else link
+
+
+def _of_chips(link: Link, kept: str) -> Link:
+    """The link with the defaults for codes of any chips where it has those for pair codes."""
+    registry = Registry.load()
+    for name, role in ROLES.items():
+        other = role.default_of_chips
+        if other is not None and name != kept and link.table[name]["id"] == role.default:
+            link = link.with_algorithm(name, registry.load_class(name, other)(), id=other)
+    return link
 
 
 def expect_column(link: Link) -> None:
@@ -119,8 +132,8 @@ def compiled_subject(subject: Subject) -> Any:
 
 
 def symbols_of(codebook: Codebook, seed: int = 0) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Random symbols of one frame, int64 (K,)."""
-    return np.random.default_rng(seed).integers(0, len(codebook.codewords), codebook.clusters)
+    """Random symbols of one frame that carry bits, int64 (K,)."""
+    return np.random.default_rng(seed).integers(0, 2**codebook.bits_per_symbol, codebook.clusters)
 
 
 def filters_of(subject: Subject) -> list[tuple[str, Any, int]]:

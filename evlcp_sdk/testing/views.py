@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evlcp_sdk.air.codebook import Codebook, chips_of_values
+from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
 __all__ = ["GRID_PX", "ideal_presence", "ideal_soft", "ideal_sums", "ideal_view"]
@@ -50,7 +50,7 @@ def ideal_sums(
         seed: Of the missing events.
     """
     words = codebook.codewords[np.asarray(symbols, np.int64)]
-    chips = np.concatenate([chips_of_values(codebook.pilots), chips_of_values(words)], axis=1)
+    chips = np.concatenate([codebook.pilots, words], axis=1)
     edges = np.diff(chips.astype(np.int16), axis=1, prepend=0)
     # Row K is dark: what pixels of no cluster, -1, show.
     edges = np.concatenate([edges, np.zeros((1, edges.shape[1]), np.int16)])

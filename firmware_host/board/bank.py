@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evlcp_sdk.air.codebook import Codebook, word_of_values
+from evlcp_sdk.air.codebook import Codebook, word_of_chips
 from evlcp_sdk.air.frames import PacketFormat, info_words, packet_chips, pilot_words
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import read_numbers
@@ -174,7 +174,7 @@ class Bank:
             words = np.frombuffer(self.content, "<u2").reshape(-1, CLUSTERS)
             pilots = -(-packet.frames // packet.pilot_every)
             own = pilots * np.bitwise_count(pilot_words(book)).astype(np.int64)
-            own += word_of_values(book.preamble).bit_count()
+            own += word_of_chips(book.preamble).bit_count()
             on = int((np.bitwise_count(words).sum(0, dtype=np.int64) + self.packets * own).max())
         else:
             rows = np.frombuffer(self.content, np.uint8, offset=self.table_bytes).reshape(chips, -1)

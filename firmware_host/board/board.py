@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evlcp_sdk.air.codebook import word_of_values
+from evlcp_sdk.air.codebook import word_of_chips
 from evlcp_sdk.air.frames import pilot_words
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
@@ -284,7 +284,7 @@ class Board:
             return
         book = bank.composed.codebook
         pilots = tuple(int(w) for w in pilot_words(book))
-        preamble = (bank.composed.packet.preamble_chips, word_of_values(book.preamble))
+        preamble = (bank.composed.packet.preamble_chips, word_of_chips(book.preamble))
         self.session.call(CodebookRequest(*preamble, pilots, digest), CodebookReply)
 
     def _hold(self, bank: Bank) -> int:

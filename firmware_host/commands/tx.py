@@ -66,12 +66,12 @@ def frames(
     echo(_FORMS[form](table, link))
 
 
-def _words(codes: "NDArray[np.int8]") -> list[str]:
+def _words(codes: "NDArray[np.uint8]") -> list[str]:
     """Codes as words in hex, the last chip the least significant bit."""
-    from evlcp_sdk.air.codebook import word_of_values
+    from evlcp_sdk.air.codebook import word_of_chips
 
-    width = -(-2 * codes.shape[1] // 4)
-    return [f"{word_of_values(code):0{width}x}" for code in codes]
+    width = -(-codes.shape[1] // 4)
+    return [f"{word_of_chips(code):0{width}x}" for code in codes]
 
 
 def _table(symbols: "NDArray[np.int64]", link: "Link") -> str:

@@ -39,15 +39,17 @@ def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, known: Arra
 
 
 @njit(cache=True, nogil=True)
-def correlate(counts: Array, chips: Array, steps: int, min_events: int, rho: Array) -> float:
+def correlate(counts: Array, chips: Array, due: Array, steps: int, min_events: int, rho: Array) -> float:
     """Normalised correlation of signed counts in windows of one chip (`steps` bins) with chips (-1, +1).
 
     The lesser of two norms: by the number of events, which is small unless all clusters blink in phase, and
     by the length of the vector of chips (a cosine), which is small where few chips hold all events, as in
-    a flash. Lags at which fewer than `min_events` were counted get 0. Returns the largest.
+    a flash. In chips that are not `due`, without an edge, late events agree with the chip and say nothing;
+    others count against it. Lags at which fewer than `min_events` were counted get 0. Returns the largest.
     """
     bins = counts.shape[1]
     top = 0.0
+    many = due.sum()
     signed = np.empty(bins + 1)
     total = np.empty(bins + 1)
     signed[0] = 0.0
@@ -65,10 +67,10 @@ def correlate(counts: Array, chips: Array, steps: int, min_events: int, rho: Arr
         for c in range(chips.size):
             at = lag + steps * c
             chip = signed[at + steps] - signed[at]
-            fit += chips[c] * chip
+            fit += chips[c] * chip if due[c] else min(chips[c] * chip, 0.0)
             power += chip * chip
         if fit > 0:
-            rho[lag] = min(fit / seen, fit / np.sqrt(chips.size * power))
+            rho[lag] = min(fit / seen, fit / np.sqrt(many * power))
         top = max(top, rho[lag])
     return top
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import BARKER13
+from evlcp_sdk.air.codebook import BARKER13, chips_of_values
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Pilots
 
@@ -18,17 +18,17 @@ class Barker13Pilots(Pilots):
 
     Two shifts correlate by 1 of 13, so 26 clusters are distinguished with pilots of 26 chips.
 
-    >>> codes = Barker13Pilots().codes(13)
-    >>> sorted(set((codes.astype(int) @ codes.T).ravel().tolist()))
+    >>> values = Barker13Pilots().codes(13)[:, 1::2].astype(int) * 2 - 1
+    >>> sorted(set((values @ values.T).ravel().tolist()))
     [1, 13]
     """
 
-    def preamble(self) -> NDArray[np.int8]:
-        """Barker-13, int8 (13,)."""
-        return np.array(BARKER13, np.int8)
+    def preamble(self) -> NDArray[np.uint8]:
+        """Barker-13 in pairs of chips, uint8 (26,)."""
+        return chips_of_values(BARKER13)
 
-    def codes(self, clusters: int) -> NDArray[np.int8]:
-        """int8 (clusters, 13).
+    def codes(self, clusters: int) -> NDArray[np.uint8]:
+        """uint8 (clusters, 26).
 
         Raises:
             ConfigError: More than 26 clusters.
@@ -37,4 +37,4 @@ class Barker13Pilots(Pilots):
             raise ConfigError(f"pilots 'barker13': {clusters} clusters, expected at most 26")
         word = np.array(BARKER13, np.int8)
         shifts = np.stack([np.roll(word, k) for k in range(13)])
-        return np.concatenate([shifts, -shifts])[:clusters]
+        return chips_of_values(np.concatenate([shifts, -shifts])[:clusters])

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from evlcp_sdk.air.codebook import Codebook, chips_of_values
+from evlcp_sdk.air.codebook import Codebook, are_pairs, edges_of_chips
 from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Synchronization
 from evlcp_sdk.values import SyncLock
@@ -167,9 +168,16 @@ class BarkerSynchronizer:
     def __init__(self, spec: BarkerSync, codebook: Codebook, packet: PacketFormat) -> None:
         self._spec = spec
         self._packet = packet
-        self._chips = 2.0 * chips_of_values(codebook.preamble) - 1
+        # Events come behind edges, and late ones agree with the chip that they come in.
+        self._chips = 2.0 * codebook.preamble - 1
+        self._pair = 2 if are_pairs(codebook.preamble) else 1
+        self._due = np.ones(len(self._chips), np.bool_)
+        if self._pair == 1:
+            self._due[1:] = edges_of_chips(codebook.preamble) != 0
         self._bin_us = packet.chip_us / spec.steps_per_chip
         self._rising = np.flatnonzero(np.diff(self._chips) > 0) + 1
+        if not len(self._rising):
+            raise ConfigError("synchronization 'barker': a preamble without a rise finds no time")
 
     def init(self) -> SyncState:
         """State before the first event."""
@@ -199,7 +207,7 @@ class BarkerSynchronizer:
         lo = state.next_bin - state.first_bin
         if lags - guard > lo:
             rho = np.empty(lags)
-            top = _kernels.correlate(counts[:, :bins], self._chips, n, self._spec.min_events, rho)
+            top = _kernels.correlate(counts[:, :bins], self._chips, self._due, n, self._spec.min_events, rho)
             enough = np.empty(lags - guard - lo)
             # Half of a packet's correlations are positive.
             memory = n * self._packet.packet_chips // 2
@@ -233,8 +241,8 @@ class BarkerSynchronizer:
         def centre(count: NDArray[np.float64], sign: float) -> tuple[float, float]:
             running = np.concatenate([[0.0], np.cumsum(count)])
             values = sign * self._chips * np.diff(running[bounds], axis=1)
-            # Without each value in turn, a pair of chips, it says how sure it is.
-            values = values.reshape(len(bounds), -1, 2).sum(2)
+            # Without each in turn, a pair of chips of pair codes, it says how sure it is.
+            values = values.reshape(len(bounds), -1, self._pair).sum(2)
             found = _middles(values.sum(1)[None])[0]
             return start + found, _jackknife(_middles(values.sum(1) - values.T))
 

@@ -123,7 +123,8 @@ class JointScaleRanging(Ranging):
                 "ranging 'joint-scale' needs one even column of three clusters or more; " + _instead(clusters)
             )
         least = min(self.min_boundaries, clusters - 1)
-        pilots, words = codebook.pilots.astype(np.float64), codebook.codewords.astype(np.float64)
+        codebook.require_pairs("ranging", "joint-scale", "poc")
+        pilots, words = codebook.pilot_edges.astype(np.float64), codebook.codeword_edges.astype(np.float64)
         boundaries = np.arange(1.0, clusters) - clusters / 2
         uneven = np.sign(np.diff(pilots, axis=0)).sum(1)
 

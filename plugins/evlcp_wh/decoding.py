@@ -28,8 +28,9 @@ class WhTransform(Decoding):
 
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's codewords."""
-        words = np.ascontiguousarray(codebook.codewords.T, np.float64)
-        pilot_chips = 2 * codebook.pilots.shape[1]
+        codebook.require_pairs("decoding", "wh-transform", "edges")
+        words = np.ascontiguousarray(codebook.codeword_edges.T, np.float64)
+        pilot_chips = codebook.pilots.shape[1]
         length, m = len(words), codebook.bits_per_symbol
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:

@@ -77,8 +77,9 @@ class MlSoft(Decoding):
 
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's pilots and codewords."""
-        words = codebook.codewords.astype(np.float64)
-        pilots = codebook.pilots.astype(np.int64)
+        codebook.require_pairs("decoding", "ml-soft", "edges")
+        words = codebook.codeword_edges.astype(np.float64)
+        pilots = codebook.pilot_edges.astype(np.int64)
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             presence = presence.informed()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import hadamard
+from evlcp_sdk.air.codebook import chips_of_values, hadamard
 from evlcp_sdk.plugin.roles import Modulation
 
 __all__ = ["Raw8", "Wh4x2", "Wh8"]
@@ -21,22 +21,22 @@ class Wh4x2(Modulation):
     """Two words of H_4, 3 bits (sign, row) each: 6 bits a symbol.
 
     >>> Wh4x2().codewords()[0b100_011].tolist()
-    [-1, -1, -1, -1, 1, -1, -1, 1]
+    [1, 0, 1, 0, 1, 0, 1, 0, 0, 1, 1, 0, 1, 0, 0, 1]
     """
 
-    def codewords(self) -> NDArray[np.int8]:
-        """int8 (64, 8)."""
+    def codewords(self) -> NDArray[np.uint8]:
+        """uint8 (64, 16)."""
         words = _signed_rows(4)
-        return np.concatenate([np.repeat(words, 8, axis=0), np.tile(words, (8, 1))], axis=1)
+        return chips_of_values(np.concatenate([np.repeat(words, 8, axis=0), np.tile(words, (8, 1))], axis=1))
 
 
 @dataclass(frozen=True)
 class Wh8(Modulation):
     """One word of H_8: 4 bits (sign, row) a symbol; the robust profile."""
 
-    def codewords(self) -> NDArray[np.int8]:
-        """int8 (16, 8)."""
-        return _signed_rows(8)
+    def codewords(self) -> NDArray[np.uint8]:
+        """uint8 (16, 16)."""
+        return chips_of_values(_signed_rows(8))
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ class Raw8(Modulation):
     """Eight plain values: 8 bits a symbol; the fast profile.
 
     >>> Raw8().codewords()[0b10000001].tolist()
-    [1, -1, -1, -1, -1, -1, -1, 1]
+    [0, 1, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 0, 1]
     """
 
-    def codewords(self) -> NDArray[np.int8]:
-        """int8 (256, 8)."""
+    def codewords(self) -> NDArray[np.uint8]:
+        """uint8 (256, 16)."""
         bits = np.arange(256)[:, None] >> np.arange(7, -1, -1) & 1
-        return (2 * bits - 1).astype(np.int8)
+        return chips_of_values(2 * bits - 1)

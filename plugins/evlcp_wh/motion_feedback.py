@@ -73,8 +73,9 @@ class MotionFeedback(Decoding):
 
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's pilots and codewords."""
-        words = codebook.codewords.astype(np.float64)
-        pilots = codebook.pilots.astype(np.int64)
+        codebook.require_pairs("decoding", "motion-feedback", "edges")
+        words = codebook.codeword_edges.astype(np.float64)
+        pilots = codebook.pilot_edges.astype(np.int64)
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             presence = presence.informed()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import BARKER13, hadamard
+from evlcp_sdk.air.codebook import BARKER13, chips_of_values, hadamard
 from evlcp_sdk.plugin.roles import Pilots
 
 __all__ = ["WhPilots"]
@@ -18,17 +18,17 @@ class WhPilots(Pilots):
     The order is 8, as on air, for up to 16 clusters; above, the next power of two that is long enough.
 
     >>> WhPilots().codes(16)[9].tolist()
-    [-1, 1, -1, 1, -1, 1, -1, 1]
+    [1, 0, 0, 1, 1, 0, 0, 1, 1, 0, 0, 1, 1, 0, 0, 1]
     """
 
-    def preamble(self) -> NDArray[np.int8]:
-        """Barker-13, int8 (13,)."""
-        return np.array(BARKER13, np.int8)
+    def preamble(self) -> NDArray[np.uint8]:
+        """Barker-13 in pairs of chips, uint8 (26,)."""
+        return chips_of_values(BARKER13)
 
-    def codes(self, clusters: int) -> NDArray[np.int8]:
-        """int8 (clusters, N), N = 8 for up to 16 clusters."""
+    def codes(self, clusters: int) -> NDArray[np.uint8]:
+        """uint8 (clusters, N), N = 16 for up to 16 clusters."""
         order = 8
         while 2 * order < clusters:
             order *= 2
         rows = hadamard(order)
-        return np.concatenate([rows, -rows])[:clusters]
+        return chips_of_values(np.concatenate([rows, -rows])[:clusters])

@@ -45,7 +45,8 @@ class WhCorrelation(Separation):
 
     def compile(self, codebook: Codebook) -> Separate:
         """Precompute for a codebook's pilots."""
-        codes = codebook.pilots.astype(np.int64)
+        codebook.require_pairs("separation", "wh-correlation", "edges")
+        codes = codebook.pilot_edges.astype(np.int64)
         agree, disagree = log((1 - self.value_error) / 0.5), log(self.value_error / 0.5)
 
         def separate(sums: NDArray[np.int16]) -> PresenceMap:

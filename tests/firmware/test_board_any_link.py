@@ -50,7 +50,7 @@ def book_of(clusters: int, values: int) -> Codebook:
     codes = np.unique(rng.choice(np.array([-1, 1], np.int8), (4 * clusters + 64, values)), axis=0)
     codes = rng.permutation(codes)
     preamble = rng.choice(np.array([-1, 1], np.int8), 40)
-    return Codebook("drawn", preamble, codes[:clusters], codes[clusters : clusters + 16])
+    return Codebook.of_values("drawn", preamble, codes[:clusters], codes[clusters : clusters + 16])
 
 
 BOOK = book_of(10, 12)

@@ -12,7 +12,6 @@ from board_lines import Native
 
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Block, Kind, Message, joined
-from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.air.signing import TrustedKey, TrustedKeys
 from evlcp_sdk.link.resolve import Link, load_link
@@ -39,7 +38,7 @@ def site(tmp_path: Path) -> Path:
 
 def symbols_of(chips: np.ndarray, link: Link) -> np.ndarray:
     """Symbols (packets, frames, clusters) of chips that begin with a packet."""
-    words = chips_of_values(link.codebook.codewords)
+    words = link.codebook.codewords
     whole = chips[: len(chips) // link.packet.packet_chips * link.packet.packet_chips]
     found = []
     for packet in whole.reshape(-1, link.packet.packet_chips, link.codebook.clusters):

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, load_link
@@ -50,7 +49,7 @@ def board_on(line: SimulatedLine) -> Board:
 def played(device: SimulatedBoard, link: Link) -> tuple[list[bytes], int]:
     """The packets that were shown, as chips, and how many chips of the idle pattern stood between them."""
     chips = device.records().played().chips()
-    preamble = chips_of_values(link.codebook.preamble)
+    preamble = link.codebook.preamble
     length = link.packet.packet_chips
     found, at, idle = [], 0, 0
     while at + length <= len(chips):

@@ -26,10 +26,9 @@ LINK = load_link()
 
 def packets_on(leds: Path) -> np.ndarray:
     """Symbols of the packets that a board showed; what is between them is left out."""
-    from evlcp_sdk.air.codebook import chips_of_values
 
     chips = LedRecord.read(leds).played().chips()
-    preamble = chips_of_values(LINK.codebook.preamble)[:, None]
+    preamble = LINK.codebook.preamble[:, None]
     found, at = [], 0
     while at + LINK.packet.packet_chips <= len(chips):
         if (chips[at : at + len(preamble)] == preamble).all():

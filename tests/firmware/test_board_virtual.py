@@ -143,7 +143,7 @@ def test_masks_play_as_they_are(device: SimulatedBoard, board: Board, book: Code
 @pytest.mark.parametrize("name", ["barker5", "wh8"])
 def test_a_codebook_of_ones_own(name: str, device: SimulatedBoard, board: Board) -> None:
     rows = hadamard(8)
-    book = Codebook(name, np.array([1, 1, 1, -1, 1], np.int8), np.concatenate([-rows, rows]), rows)
+    book = Codebook.of_values(name, np.array([1, 1, 1, -1, 1], np.int8), np.concatenate([-rows, rows]), rows)
     symbols = random_symbols(2, 3, book, np.random.default_rng(0))
     bank = Bank.of_symbols(symbols, book)
     assert (bank.format, profile_number(bank)) == (Format.WORDS, Profile.CUSTOM)

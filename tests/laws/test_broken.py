@@ -16,6 +16,7 @@ from evlcp_wh.pilots import WhPilots
 from evlcp_wh.separation import WhCorrelation
 from pydantic import Field
 
+from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.roles import (
@@ -191,7 +192,7 @@ def star(codes: Any) -> Any:
     """One code, and others that differ from it in one value."""
     out = np.ones((len(codes), 32), np.int8)
     out[np.arange(1, len(codes)), np.arange(1, len(codes))] = -1
-    return out
+    return chips_of_values(out)
 
 
 def twins(codes: Any) -> Any:
@@ -437,17 +438,21 @@ BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
         ("deterministic", ranging(before(lambda _: np.random.random())), "take a Generator"),  # noqa: NPY002
     ],
     "pilots": [
-        ("shapes", TamperedPilots(lambda codes: codes.astype(float)), "int8"),
+        ("shapes", TamperedPilots(lambda codes: codes.astype(float)), "uint8"),
         ("shapes", TamperedPilots(lambda codes: codes[:3]), "to have 4 rows"),
         ("pilots-apart", TamperedPilots(star), "correlate by 0.25 at most"),
-        ("sharp-preamble", TamperedPilots(change_preamble=np.abs), "sidelobes"),
+        (
+            "sharp-preamble",
+            TamperedPilots(change_preamble=lambda _: chips_of_values(np.ones(13))),
+            "sidelobes",
+        ),
         ("tells-apart", TamperedPilots(star), "of cluster 0"),
     ],
     "modulation": [
-        ("shapes", TamperedModulation(lambda words: words[:3]), "codewords, got 3"),
-        ("shapes", TamperedModulation(lambda words: 0 * words), "-1 and \\+1"),
-        ("codewords-distinct", TamperedModulation(twins), "16 different codewords, got 15"),
-        ("comes-back", TamperedModulation(twins), "two rows are equal"),
+        ("shapes", TamperedModulation(lambda words: words[:1]), "two codewords or more, got 1"),
+        ("shapes", TamperedModulation(lambda words: 2 * words), "chips 0 and 1"),
+        ("codewords-distinct", TamperedModulation(twins), "16 codewords of different edges, got 15"),
+        ("comes-back", TamperedModulation(twins), "are equal"),
     ],
     "synchronization": [
         ("shapes", locks_changed(lambda lock: replace(lock, quality=2.0)), "quality from 0 to 1"),

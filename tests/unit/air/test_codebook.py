@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evlcp_barker.pilots import Barker13Pilots
+from evlcp_edges.dimmed import DimmedPilots, DimmedWh4x2
+from evlcp_edges.modulation import Nrz, Ppm
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
 from evlcp_wh.pilots import WhPilots
 
@@ -38,8 +40,9 @@ def test_words_are_the_vectors(profile: str) -> None:
     n = len(book.codewords)
     words = info_words(np.arange(n).repeat(16).reshape(n, 16), book)[:, 0]
     assert [f"{w:04x}" for w in words] == VECTORS["info_words"][profile]
-    assert "".join(map(str, chips_of_values(book.preamble))) == VECTORS["preamble_chips"]
-    assert book.preamble.tolist() == VECTORS["barker13"]
+    assert "".join(map(str, book.preamble)) == VECTORS["preamble_chips"]
+    assert book.preamble.tolist() == chips_of_values(VECTORS["barker13"]).tolist()
+    assert book.to_dict()["preamble"] == VECTORS["barker13"]
 
 
 def test_packet_is_the_vector() -> None:
@@ -103,7 +106,7 @@ def test_a_changed_code_is_refused() -> None:
     table["pilots"][3], table["pilots"][4] = table["pilots"][4], table["pilots"][3]
     with pytest.raises(CodebookMismatchError, match="digest"):
         Codebook.from_json(json.dumps(table))
-    with pytest.raises(CodebookMismatchError, match="air_interface 9, expected 1"):
+    with pytest.raises(CodebookMismatchError, match="air_interface 9, expected 1 or 2"):
         Codebook.from_json(json.dumps(table | {"air_interface": 9}))
 
 
@@ -117,12 +120,56 @@ def test_bad_json_names_the_source(text: str, message: str) -> None:
 
 
 def test_codes_are_checked() -> None:
-    with pytest.raises(ConfigError, match="two rows are equal"):
-        Codebook("x", hadamard(2)[0], np.ones((2, 8), np.int8), hadamard(8))
-    with pytest.raises(ConfigError, match="preamble"):
-        Codebook("x", np.zeros(13, np.int8), hadamard(8), hadamard(8))
-    with pytest.raises(ConfigError, match="power of two"):
-        Codebook("x", hadamard(2)[0], hadamard(8), hadamard(8)[:3])
+    with pytest.raises(ConfigError, match="pilots: rows 0 and 1 are equal"):
+        Codebook.of_values("x", hadamard(2)[0], np.ones((2, 8), np.int8), hadamard(8))
+    with pytest.raises(ConfigError, match="preamble: expected values of -1 and"):
+        Codebook.of_values("x", np.zeros(13, np.int8), hadamard(8), hadamard(8))
+    with pytest.raises(ConfigError, match="preamble: expected a 1-D array of chips 0 and 1; values of -1"):
+        Codebook("x", hadamard(2)[1], hadamard(8), hadamard(8))
+    words = [[1, 1, 1], [0, 1, 0], [0, 0, 0]]
+    with pytest.raises(ConfigError, match="codewords: rows 0 and 2 have the same edges"):
+        Codebook("x", np.array([0, 1]), np.eye(3, dtype=int), np.array(words))
+
+
+CHIPS = Codebook("ppm", np.array([0, 1, 1]), np.array([[0, 1, 0], [1, 0, 0]]), np.eye(3, 4, dtype=int))
+
+
+def test_codes_of_any_chips() -> None:
+    assert not CHIPS.pairs
+    assert (CHIPS.bits_per_symbol, CHIPS.edge_every) == (1, 1)
+    assert CHIPS.pilot_edges.tolist() == [[1, -1], [-1, 0]]
+    assert CHIPS.to_dict()["codewords"] == ["1000", "0100", "0010"]
+    again = Codebook.from_json(CHIPS.to_json())
+    assert (again.digest, again.preamble.tolist()) == (CHIPS.digest, [0, 1, 1])
+    form = PacketFormat.of(CHIPS, 3)
+    assert (form.preamble_chips, form.pilot_chips, form.info_chips) == (3, 3, 4)
+    chips = packet_chips([[2, 0]], CHIPS)
+    assert "".join(map(str, chips[:, 0])) == "0110100010"
+    assert "".join(map(str, chips[:, 1])) == "0111001000"
+    broken = json.loads(CHIPS.to_json()) | {"preamble": [0, 1, 1]}
+    with pytest.raises(ConfigError, match=r"not a codebook: \[0, 1, 1\]: expected a string of chips"):
+        Codebook.from_json(json.dumps(broken))
+    with pytest.raises(ConfigError, match=r"decoding 'a' reads pair codes.*the preamble are others; try"):
+        CHIPS.require_pairs("decoding", "a", "b")
+
+
+@pytest.mark.parametrize("name", ["pairs", "ppm", "nrz", "dimmed"])
+def test_the_longest_time_between_rises(name: str) -> None:
+    pilots, words = {
+        "pairs": (WhPilots(), Wh4x2()),
+        "ppm": (WhPilots(), Ppm(4, 3)),
+        "nrz": (WhPilots(), Nrz()),
+        "dimmed": (DimmedPilots(), DimmedWh4x2()),
+    }[name]
+    book = Codebook(name, pilots.preamble(), pilots.codes(16), words.codewords())
+    # Every codeword behind every other, in all of 16 clusters, with a pilot now and then.
+    n = len(book.codewords)
+    pairs = np.stack([np.arange(n).repeat(n), np.tile(np.arange(n), n)], 1).ravel()
+    chips = packet_chips(np.tile(pairs[:, None], 16), book, pilot_every=64).astype(np.int8)
+    gaps = [np.diff(np.flatnonzero(np.diff(chips[:, k]) > 0)).max() for k in range(16)]
+    found = max(gaps)
+    assert book.longest_gap_chips == found
+    assert book.pairs == (name == "pairs")
 
 
 def test_c_table_holds_the_words() -> None:
@@ -135,9 +182,9 @@ def test_c_table_holds_the_words() -> None:
 
 def test_more_clusters_need_longer_pilots() -> None:
     codes = WhPilots().codes(20)
-    assert codes.shape == (20, 16)
+    assert codes.shape == (20, 32)
     assert len(np.unique(codes, axis=0)) == 20
-    assert Barker13Pilots().codes(26).shape == (26, 13)
+    assert Barker13Pilots().codes(26).shape == (26, 26)
     with pytest.raises(ConfigError, match="at most 26"):
         Barker13Pilots().codes(27)
 

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import Field
 
-from evlcp_sdk.air.codebook import BARKER13, Codebook, hadamard
+from evlcp_sdk.air.codebook import BARKER13, Codebook, chips_of_values, hadamard
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError, PluginError, UnknownAlgorithmError
 from evlcp_sdk.link.resolve import Link, load_link, resolve
@@ -42,19 +42,19 @@ from evlcp_sdk.scene.camera import CameraModel
 
 @dataclass(frozen=True)
 class FakePilots(Pilots):
-    def preamble(self) -> NDArray[np.int8]:
-        return np.array(BARKER13, np.int8)
+    def preamble(self) -> NDArray[np.uint8]:
+        return chips_of_values(BARKER13)
 
-    def codes(self, clusters: int) -> NDArray[np.int8]:
+    def codes(self, clusters: int) -> NDArray[np.uint8]:
         if clusters > 16:
             raise ConfigError(f"pilots 'wh': {clusters} clusters, expected at most 16")
-        return np.concatenate([hadamard(8), -hadamard(8)])[:clusters]
+        return chips_of_values(np.concatenate([hadamard(8), -hadamard(8)])[:clusters])
 
 
 @dataclass(frozen=True)
 class FakeModulation(Modulation):
-    def codewords(self) -> NDArray[np.int8]:
-        return np.concatenate([hadamard(8), -hadamard(8)])
+    def codewords(self) -> NDArray[np.uint8]:
+        return chips_of_values(np.concatenate([hadamard(8), -hadamard(8)]))
 
 
 @dataclass(frozen=True)
@@ -345,7 +345,7 @@ def test_sizes_that_no_memory_or_number_holds_are_refused(setting: str, says: st
 class Odd:
     """Pilots or a modulation that give something else."""
 
-    def __init__(self, codes: Any, preamble: Any = BARKER13) -> None:
+    def __init__(self, codes: Any, preamble: Any = (0, 1, 1, 0)) -> None:
         self._codes, self._preamble = codes, preamble
 
     def preamble(self) -> Any:
@@ -377,10 +377,14 @@ def exits(_: int) -> Any:
             lambda k: hadamard(8)[: k - 15],
             r"^pilots algorithm 'odd': ValueError: gave 1 codes, expected 16",
         ),
-        ("pilots", lambda k: ["a"] * k, r"^codebook pilots: expected a 2-D array of -1 and \+1"),
+        ("pilots", lambda k: ["a"] * k, r"^codebook pilots: expected a 2-D array of chips 0 and 1"),
         ("modulation", exits, r"^modulation algorithm 'odd': SystemExit: 0; try"),
-        ("modulation", lambda _: None, r"^codebook codewords: expected a 2-D array of -1 and \+1"),
-        ("modulation", lambda _: [[1, -1], [1]], r"^codebook codewords: expected a 2-D array of -1 and \+1"),
+        ("modulation", lambda _: None, r"^codebook codewords: expected a 2-D array of chips 0 and 1"),
+        (
+            "modulation",
+            lambda _: [[1, -1], [1]],
+            r"^codebook codewords: expected a 2-D array of chips 0 and 1",
+        ),
     ],
 )
 def test_codes_that_are_none_are_named(role: str, gives: Any, says: str) -> None:

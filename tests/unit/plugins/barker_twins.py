@@ -15,15 +15,15 @@ def count_bins(t_us, p, first_bin, bin_us, known, bins):
     return counts
 
 
-def correlate(counts, chips, steps, min_events, lags):
+def correlate(counts, chips, due, steps, min_events, lags):
     """The windows of each lag laid out as a table of chips."""
     rho = np.zeros(lags)
     for lag in range(lags):
         window = counts[:, lag : lag + steps * len(chips)].reshape(2, len(chips), steps).sum(2)
         signed, seen = window[1] - window[0], window.sum()
-        fit = signed @ chips
+        fit = np.where(due, signed * chips, np.minimum(signed * chips, 0)).sum()
         if seen >= min_events and fit > 0:
-            rho[lag] = min(fit / seen, fit / np.linalg.norm(signed) / np.linalg.norm(chips))
+            rho[lag] = min(fit / seen, fit / np.linalg.norm(signed) / np.sqrt(due.sum()))
     return rho
 
 

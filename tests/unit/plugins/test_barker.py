@@ -69,12 +69,12 @@ def test_the_preamble_correlates_with_nothing_but_itself():
 
 
 def test_barker_pilots_are_told_apart():
-    codes = Barker13Pilots().codes(26).astype(int)
+    codes = 2 * Barker13Pilots().codes(26)[:, 1::2].astype(int) - 1
     fit = codes @ codes.T
     assert_array_equal(np.diag(fit), np.full(26, 13))
     assert np.abs(fit[:13, :13] - 13 * np.eye(13)).max() == 1
     assert_array_equal(codes[13:], -codes[:13])
-    assert_array_equal(Barker13Pilots().codes(5), codes[:5])
+    assert_array_equal(Barker13Pilots().codes(5), chips_of_values(codes[:5]))
     with pytest.raises(ConfigError, match="27 clusters, expected at most 26"):
         Barker13Pilots().codes(27)
 
@@ -98,18 +98,19 @@ def test_counts(n, first, known, bins, frozen):
     assert_array_equal(counts, want)
 
 
-@pytest.mark.parametrize(("steps", "min_events"), [(4, 0), (10, 0), (10, 520)])
+@pytest.mark.parametrize(("steps", "min_events", "share"), [(4, 0, 1), (10, 0, 1), (10, 520, 1), (4, 0, 0.7)])
 @pytest.mark.parametrize("seed", range(4))
-def test_correlation(seed, steps, min_events):
+def test_correlation(seed, steps, min_events, share):
     rng = np.random.default_rng(seed)
+    due = rng.random(26) < share
     chips = 2.0 * chips_of_values(BARKER13) - 1
     counts = rng.poisson(rng.choice([0.1, 1, 3], (1, 90 * steps)), (2, 90 * steps)).astype(float)
     at = 20 * steps + seed
     counts[1, at : at + steps * 26] += 2 * np.repeat(chips > 0, steps)
     lags = counts.shape[1] - 26 * steps + 1
     rho = np.empty(lags)
-    top = _kernels.correlate(counts, chips, steps, min_events, rho)
-    want = twins.correlate(counts, chips, steps, min_events, lags)
+    top = _kernels.correlate(counts, chips, due, steps, min_events, rho)
+    want = twins.correlate(counts, chips, due, steps, min_events, lags)
     assert_allclose(rho, want, rtol=1e-12, atol=1e-12)
     assert top == rho.max()
     assert abs(int(rho.argmax()) - at) <= 1

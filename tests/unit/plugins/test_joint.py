@@ -15,8 +15,8 @@ from evlcp_sdk.study.bound import cramer_rao_sigma_m
 from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols
 
 LINK = load_link()
-PILOTS = LINK.codebook.pilots.astype(float)
-WORDS = LINK.codebook.codewords.astype(float)
+PILOTS = LINK.codebook.pilot_edges.astype(float)
+WORDS = LINK.codebook.codeword_edges.astype(float)
 K = 16
 
 

@@ -19,11 +19,19 @@ from evlcp_sdk.values import PresenceMap
 PROFILES = {"wh4x2": Wh4x2(), "wh8": Wh8(), "raw8": Raw8()}
 SEEDS = range(6)
 CLUSTERS = 16
-CODES = WhPilots().codes(CLUSTERS)
+
+
+def values_of(chips):
+    """Bipolar values of pair codes."""
+    return chips[..., 1::2].astype(np.int8) * 2 - 1
+
+
+CODES = values_of(WhPilots().codes(CLUSTERS))
 
 
 def book_of(profile="wh4x2", pilots=CODES):
-    return Codebook(profile, WhPilots().preamble(), pilots, PROFILES[profile].codewords())
+    preamble, codewords = WhPilots().preamble(), PROFILES[profile].codewords()
+    return Codebook(profile, preamble, chips_of_values(pilots), codewords)
 
 
 def image_of(values, where, cell_px=2, strength=3):
@@ -66,7 +74,9 @@ def test_presence_is_bayes_rule(shape, grid, density):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("pilots", [CODES, WhPilots().codes(32), WhPilots().codes(3)], ids=len)
+@pytest.mark.parametrize(
+    "pilots", [CODES, values_of(WhPilots().codes(32)), values_of(WhPilots().codes(3))], ids=len
+)
 def test_presence_of_few_and_many_clusters(seed, pilots):
     rng = np.random.default_rng(seed)
     sums = np.repeat(-(pilots[rng.integers(len(pilots), size=12)].T), 2, 0)
@@ -289,7 +299,7 @@ def test_every_symbol_comes_back(profile, silent):
     n = len(book.codewords)
     for first in range(0, n, CLUSTERS):
         symbols = np.arange(first, first + CLUSTERS) * 5 % n
-        sums = image_of(book.codewords[symbols], range(CLUSTERS))
+        sums = image_of(book.codeword_edges[symbols], range(CLUSTERS))
         if silent is not None:
             sums[silent::2] = 0
         soft = decode(presence, framed(sums))
@@ -308,7 +318,7 @@ def test_llr_is_the_brute_force_max_log(profile, seed):
     presence.probability[:, 0, 0] = 0.7
     soft = WhTransform().compile(book)(presence, framed(sums))
     values = twins.weighted_values(sums, presence.probability, 2, 0.01)
-    symbols, llr, quality = twins.llr(values, book.codewords.astype(float))
+    symbols, llr, quality = twins.llr(values, book.codeword_edges.astype(float))
     assert_array_equal(soft.symbols, symbols)
     assert_allclose(soft.llr, llr, rtol=1e-4, atol=1e-4)
     assert soft.quality == pytest.approx(quality)
@@ -317,7 +327,7 @@ def test_llr_is_the_brute_force_max_log(profile, seed):
 
 def test_a_dark_cluster_says_nothing():
     book = book_of()
-    sums = image_of(book.codewords[np.arange(CLUSTERS)], range(CLUSTERS))
+    sums = image_of(book.codeword_edges[np.arange(CLUSTERS)], range(CLUSTERS))
     presence = WhCorrelation().compile(book)(image_of(CODES, range(CLUSTERS)))
     presence.probability[5] = 0
     soft = WhTransform().compile(book)(presence, framed(sums))
@@ -338,7 +348,7 @@ def test_noise_lowers_certainty_and_quality():
     book = book_of("raw8")
     symbols = np.arange(CLUSTERS)
     presence = WhCorrelation().compile(book)(image_of(CODES, range(CLUSTERS), 4))
-    clean = image_of(book.codewords[symbols], range(CLUSTERS), 4)
+    clean = image_of(book.codeword_edges[symbols], range(CLUSTERS), 4)
     last = np.inf
     for share in (0.05, 0.2, 0.4):
         noisy = np.where(np.random.default_rng(1).random(clean.shape) < share, -clean, clean)
@@ -353,7 +363,7 @@ def test_a_dim_cluster_is_unsure():
     book = book_of()
     rng = np.random.default_rng(4)
     presence = WhCorrelation().compile(book)(image_of(CODES, range(CLUSTERS), 4))
-    sums = image_of(book.codewords[np.arange(CLUSTERS)], range(CLUSTERS), 4)
+    sums = image_of(book.codeword_edges[np.arange(CLUSTERS)], range(CLUSTERS), 4)
     sums = np.where(rng.random(sums.shape) < 0.1, -sums, sums)
     presence.probability[5] = 0
     presence.probability[5, 0, 0] = 0.02
@@ -371,7 +381,7 @@ def test_learned_likelihoods_decode_every_symbol(profile, positive_only):
     for first in range(0, n, CLUSTERS):
         symbols = np.arange(first, first + CLUSTERS) * 5 % n
         frame = np.concatenate(
-            [image_of(CODES, range(CLUSTERS), 4), image_of(book.codewords[symbols], range(CLUSTERS), 4)]
+            [image_of(CODES, range(CLUSTERS), 4), image_of(book.codeword_edges[symbols], range(CLUSTERS), 4)]
         )
         # From values to edges: events come where the light changes, not while it stays.
         light = frame > 0
@@ -434,9 +444,9 @@ def test_a_drift_within_the_frame_is_found_and_taken_back(profile, right_down, s
     assert_array_equal(soft.llr < 0, bits_of(symbols, book.bits_per_symbol) == 1)
     if right_down[1]:
         assert (MlSoft().compile(book)(presence, sums).symbols != symbols).any()
-    pilots = book.pilots.astype(np.int64)
+    pilots = book.pilot_edges.astype(np.int64)
     matches = algorithm._matches(presence, sums, learned_worth(presence, sums, pilots, 3, 1.0))
-    known = np.concatenate([pilots, book.codewords[symbols].astype(np.int64)], axis=1)
+    known = np.concatenate([pilots, book.codeword_edges[symbols].astype(np.int64)], axis=1)
     assert_array_equal(algorithm._path(matches, known), path)
     # Blind to what the clusters say, it is found as well.
     assert_array_equal(algorithm._path(matches, pilots), path)

@@ -182,14 +182,16 @@ def copy_near(pixels, places, unit, along_px, across_px):
     return np.where((np.abs(along) <= along_px) & (np.abs(across) <= across_px), pixels, 0)
 
 
-def pilot_light(sums, codes, prior, grid):
-    first, second = sums[0::2].astype(int), sums[1::2].astype(int)
-    values = np.where(second != 0, np.sign(second), -np.sign(first))
+def pilot_light(sums, codes, every, prior, grid):
+    values = np.sign(sums[1::every].astype(int))
+    if every == 2:
+        values = np.where(values != 0, values, -np.sign(sums[0::2].astype(int)))
     weight = prior.repeat(grid, 1).repeat(grid, 2)
     values = values[:, : weight.shape[1], : weight.shape[2]]
     agree = np.einsum("khw,ihw,ki->k", weight, values, codes)
     place = weight.sum((1, 2))
-    return np.where(place > 0, agree / (codes.shape[1] * np.maximum(place, 1e-9)), 0)
+    edges = np.maximum(np.abs(codes).sum(1), 1)
+    return np.where(place > 0, agree / (edges * np.maximum(place, 1e-9)), 0)
 
 
 def info_activity(sums, weight, grid, pilot_chips, least):
@@ -301,23 +303,23 @@ def spread_between(sums, codes, places, seen, pairs, half, first, last):
         share = off.real / abs(way)
         near = (np.abs(off.imag) <= half) & (share >= 0) & (share < 1)
         zones = np.digitize(share, [first, last])
-        stays, switches = codes[a, :-1] != codes[a, 1:], codes[b, :-1] == codes[b, 1:]
-        for i in np.flatnonzero(stays & switches):
-            # Of a value +1 the second chip is on; of the value after it, if it is alike, the first is off.
-            answers = sums[2 * i + 2] * -codes[b, i] > 0
+        own, others = np.diff(codes[a]), np.diff(codes[b])
+        for i in np.flatnonzero((own == 0) & (others != 0)):
+            answers = sums[i + 1] * others[i] > 0
             for zone in range(3):
                 here = near & (zones == zone)
-                out[int(codes[a, i] < 0), :, zone] += [(answers & here).sum(), here.sum()]
+                out[1 - codes[a, i], :, zone] += [(answers & here).sum(), here.sum()]
     return out
 
 
-def spread_across(sums, codes, places, seen, way, along, most):
+def spread_across(sums, codes, every, places, seen, way, along, most):
     out = np.zeros((2, 2 * most + 1), int)
     v, u = np.indices(sums.shape[1:])
     for place, code in zip(places[seen], codes[seen], strict=True):
         off = (u + 1j * v - place) / way
         for column in range(-most, most + 1):
             here = (np.abs(off.real) <= along) & (np.floor(off.imag + 0.5) == column)
-            answers = (sums[1::2] * code[:, None, None] > 0) & here
-            out[:, column + most] += [answers.sum(), here.sum() * len(code)]
+            edges = np.diff(code)[::every]
+            answers = (sums[1::every] * edges[:, None, None] > 0) & here
+            out[:, column + most] += [answers.sum(), here.sum() * np.abs(edges).sum()]
     return out

@@ -8,6 +8,7 @@ import rx_twins as twins
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
+from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.lean import BarSight, foreshortening
@@ -392,25 +393,26 @@ def test_the_mean_length_of_a_leaning_bar(seed):
         assert found == pytest.approx((mean, spread), rel=1e-6)
 
 
-@pytest.mark.parametrize("grid", [1, 2])
+@pytest.mark.parametrize(("grid", "every"), [(1, 2), (2, 2), (2, 1)])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_light_in_step_with_the_pilot(seed, grid):
+def test_light_in_step_with_the_pilot(seed, grid, every):
     rng = np.random.default_rng(seed)
-    codes = rng.choice([-1, 1], (5, 8))
+    codes = rng.choice([-1, 1], (5, 8)) if every == 2 else rng.integers(-1, 2, (5, 15))
     sums = rng.integers(-2, 3, (16, 12, 9)).astype(np.int16)
     prior = np.where(rng.random((5, 12 // grid, 9 // grid)) < 0.3, rng.random(), 0).astype(np.float32)
     prior[2] = 0
     out = np.empty(5)
-    _kernels.pilot_light(sums, codes, prior, grid, out)
-    assert_allclose(out, twins.pilot_light(sums, codes, prior, grid), rtol=1e-6, atol=1e-9)
+    _kernels.pilot_light(sums, codes, every, prior, grid, out)
+    assert_allclose(out, twins.pilot_light(sums, codes, every, prior, grid), rtol=1e-6, atol=1e-9)
     assert out[2] == 0
 
 
-@pytest.mark.parametrize("turn", [1j, 1, np.exp(1.4j)])
+@pytest.mark.parametrize(("turn", "every"), [(1j, 2), (1, 2), (np.exp(1.4j), 2), (1j, 1)])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_answers_between_and_across_clusters(seed, turn):
+def test_answers_between_and_across_clusters(seed, turn, every):
     rng = np.random.default_rng(seed)
-    codes = rng.choice([-1, 1], (4, 8))
+    chips = chips_of_values(rng.choice([-1, 1], (4, 8))) if every == 2 else rng.integers(0, 2, (4, 16))
+    codes = chips.astype(np.int64)
     sums = rng.integers(-2, 3, (16, 26, 24)).astype(np.int16)
     # One cluster lies beyond the image.
     places = 11.3 + 9.1j + turn * np.array([-4.2, 0.9, 6.1, 17.0])
@@ -418,8 +420,8 @@ def test_answers_between_and_across_clusters(seed, turn):
     between, across = np.zeros((2, 2, 3), int), np.zeros((2, 11), int)
     _kernels.spread_between(sums, codes, places, seen, pairs, 0.8, 0.2, 0.75, between)
     assert_array_equal(between, twins.spread_between(sums, codes, places, seen, pairs, 0.8, 0.2, 0.75))
-    _kernels.spread_across(sums, codes, places, seen, turn, 1.3, across)
-    assert_array_equal(across, twins.spread_across(sums, codes, places, seen, turn, 1.3, 5))
+    _kernels.spread_across(sums, codes, every, places, seen, turn, 1.3, across)
+    assert_array_equal(across, twins.spread_across(sums, codes, every, places, seen, turn, 1.3, 5))
 
 
 @pytest.mark.parametrize("apart", [0j, 0.5 + 0.5j, -0.9j])

@@ -33,7 +33,7 @@ def test_the_bound_follows_noise_and_distance() -> None:
 def test_the_bound_is_that_of_boundaries_by_themselves(blur_px: float) -> None:
     # Where blur smooths the pixel grid, a boundary with a step of 2 has the information
     # sum of (2 gain pdf)^2 = 2 gain^2 / (sqrt(pi) blur) a column and value, wherever it lies.
-    codes = np.concatenate([LINK.codebook.pilots, LINK.codebook.codewords[np.arange(K)]], axis=1)
+    codes = np.concatenate([LINK.codebook.pilot_edges, LINK.codebook.codeword_edges[np.arange(K)]], axis=1)
     steps = np.diff(codes.astype(float), axis=0)
     values = codes.shape[1]
     each = 0.8**2 * steps**2 / (2 * np.sqrt(np.pi) * blur_px) * 5 / 0.3**2
@@ -61,7 +61,7 @@ def test_the_bound_of_the_lean_follows_noise_and_distance() -> None:
 @pytest.mark.parametrize("distance_m", [15.0, 50.0, 90.0])
 def test_the_bound_of_the_lean_is_that_of_boundaries_by_themselves(distance_m: float) -> None:
     """Boundaries of a leaning bar where a pinhole sees them, derived numerically; each as sure as above."""
-    codes = np.concatenate([LINK.codebook.pilots, LINK.codebook.codewords[np.arange(K)]], axis=1)
+    codes = np.concatenate([LINK.codebook.pilot_edges, LINK.codebook.codeword_edges[np.arange(K)]], axis=1)
     steps = np.diff(codes.astype(float), axis=0)
     each = 0.8**2 * steps**2 / (2 * np.sqrt(np.pi) * 0.9) * 5 / 0.3**2
     along_m = 0.06 * (np.arange(1, K) - K / 2)
@@ -94,7 +94,9 @@ def view_of(
     spacing = LINK.camera.focal_px * 0.06 / distance_m
     height, width = 2 * int(spacing * K / 2 + 8), 20
     symbols = rng.integers(0, 64, K)
-    codes = np.concatenate([LINK.codebook.pilots, LINK.codebook.codewords[symbols]], axis=1).astype(float)
+    codes = np.concatenate([LINK.codebook.pilot_edges, LINK.codebook.codeword_edges[symbols]], axis=1).astype(
+        float
+    )
     codes[list(dark)] = 0
     shift = rng.uniform(-0.5, 0.5)
     rows = np.arange(height) - (height - 1) / 2 - shift

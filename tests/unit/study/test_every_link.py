@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import hadamard
+from evlcp_sdk.air.codebook import chips_of_values, hadamard
 from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Modulation
@@ -30,8 +30,8 @@ Settings = dict[str, Any]
 class Four(Modulation):
     """Two bits a symbol: a modulation of somebody else's."""
 
-    def codewords(self) -> NDArray[np.int8]:
-        return np.repeat(hadamard(4), 2, axis=1)
+    def codewords(self) -> NDArray[np.uint8]:
+        return chips_of_values(np.repeat(hadamard(4), 2, axis=1))
 
 
 class Stranger:
@@ -154,7 +154,7 @@ def told_all(events: Events, truth: Truth, delay_us: float) -> float:
         chip = np.clip(t_us[first:last] / chip_us - start, 0, form.info_chips - 1).astype(int)
         sums = np.zeros((book.clusters, form.info_chips))
         np.add.at(sums, (cluster[first:last], chip), sign[first:last])
-        said = (sums[:, 1::2] @ book.codewords.T).argmax(1)
+        said = (sums[:, 1::2] @ book.codeword_edges.T).argmax(1)
         wrong += sum(bit.bit_count() for bit in (said ^ bar.symbols[q, f]).tolist())
         bits += bar.bits_per_symbol * book.clusters
     return wrong / bits

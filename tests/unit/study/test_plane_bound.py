@@ -21,7 +21,7 @@ FOCAL_PX = RING.camera.focal_px
 # Light far below the background's, so that values follow it in proportion, and LEDs far smaller than the
 # blur, which covers pixels: sums over pixels are then integrals of Gaussians.
 FAINT, BLUR_PX, NOISE = 1e3, 1.5, 1e-4
-VALUES = RING.codebook.pilots.shape[1] + RING.codebook.codewords.shape[1]
+VALUES = RING.codebook.pilot_edges.shape[1] + RING.codebook.codeword_edges.shape[1]
 
 
 def one_led_information(side_px: float, gain: float = 0.8) -> float:
@@ -111,7 +111,9 @@ def view_of(layout: BarLayout, distance_m: float, noise: float, seed: int) -> Fr
     """A frame of a layout whose values are the model's, with noise, as sums of three events."""
     rng = np.random.default_rng(seed)
     symbols = rng.integers(0, len(RING.codebook.codewords), layout.clusters)
-    codes = np.concatenate([RING.codebook.pilots, RING.codebook.codewords[symbols]], 1).astype(np.float64)
+    codes = np.concatenate([RING.codebook.pilot_edges, RING.codebook.codeword_edges[symbols]], 1).astype(
+        np.float64
+    )
     columns, rows = np.arange(50.0) - 24.5, np.arange(52.0) - 25.5
     fit = {"x_px": 0.3, "y_px": -0.2, "scale": math.log(FOCAL_PX / distance_m), "turn": 0.05}
     lens = {"gain": 0.7, "dark": math.log(0.1), "blur": math.log(0.5)}

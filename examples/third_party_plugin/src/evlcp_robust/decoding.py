@@ -28,8 +28,9 @@ class Majority(evlcp.Decoding):
 
     def compile(self, codebook: evlcp.Codebook) -> evlcp.Decode:
         """Precompute which codewords have a 0 in each bit."""
-        words = codebook.codewords.astype(np.int64)
-        pilots = codebook.pilots.astype(np.int64)
+        codebook.require_pairs("decoding", "robust", "edges")
+        words = codebook.codeword_edges.astype(np.int64)
+        pilots = codebook.pilot_edges.astype(np.int64)
         m = codebook.bits_per_symbol
         zero = (np.arange(len(words)) >> np.arange(m - 1, -1, -1)[:, None] & 1) == 0
 

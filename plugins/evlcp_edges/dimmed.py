@@ -1,0 +1,77 @@
+"""Walsh-Hadamard codes that are lit for less than half of the time."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from evlcp_sdk.air.codebook import BARKER13, hadamard
+from evlcp_sdk.plugin.roles import Modulation, Pilots
+
+__all__ = ["DimmedPilots", "DimmedWh4x2", "dimmed_chips"]
+
+Slots = Annotated[
+    int,
+    Field(
+        ge=4,
+        le=16,
+        multiple_of=2,
+        description="Chips of a value, one of them lit; 4: a quarter of the light.",
+    ),
+]
+
+
+def dimmed_chips(values: ArrayLike, slots: int) -> NDArray[np.uint8]:
+    """Chips of bipolar values along the last axis, one of `slots` lit each.
+
+    It is the last of all for +1, the last of the first half for -1: every value starts dark, so that the rise
+    of its pulse is its own. Two slots are a pair code.
+
+    >>> dimmed_chips([1, -1], 4).tolist()
+    [0, 0, 0, 1, 0, 1, 0, 0]
+    """
+    v = np.asarray(values)
+    chips = np.zeros((*v.shape, slots), np.uint8)
+    chips[..., slots - 1] = v > 0
+    chips[..., slots // 2 - 1] = v < 0
+    return chips.reshape(*v.shape[:-1], -1)
+
+
+@dataclass(frozen=True)
+class DimmedPilots(Pilots):
+    """Rows of a Hadamard matrix and the same inverted, each value a pulse in one half of its time.
+
+    >>> DimmedPilots().codes(2).shape, float(DimmedPilots().codes(2).mean())
+    ((2, 32), 0.25)
+    """
+
+    slots: Slots = 4
+
+    def preamble(self) -> NDArray[np.uint8]:
+        """Barker-13 of pulses, uint8 (13 * slots,)."""
+        return dimmed_chips(BARKER13, self.slots)
+
+    def codes(self, clusters: int) -> NDArray[np.uint8]:
+        """uint8 (clusters, N), N = 8 * slots for up to 16 clusters."""
+        order = 8
+        while 2 * order < clusters:
+            order *= 2
+        rows = hadamard(order)
+        return dimmed_chips(np.concatenate([rows, -rows])[:clusters], self.slots)
+
+
+@dataclass(frozen=True)
+class DimmedWh4x2(Modulation):
+    """Two words of H_4, 3 bits each, each value a pulse in one half of its time: 6 bits a symbol."""
+
+    slots: Slots = 4
+
+    def codewords(self) -> NDArray[np.uint8]:
+        """uint8 (64, 8 * slots)."""
+        rows = hadamard(4)
+        words = np.concatenate([rows, -rows])
+        return dimmed_chips(
+            np.concatenate([np.repeat(words, 8, axis=0), np.tile(words, (8, 1))], axis=1), self.slots
+        )
