@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["Spread", "neighbours", "sharper"]
+__all__ = ["Spread", "expected_lengths", "length_errors", "neighbours", "sharper"]
 
 Floats = NDArray[np.float64]
 
@@ -177,6 +177,12 @@ def neighbours(layout: Layout) -> NDArray[np.int64]:
     return np.argwhere(beside).astype(np.int64)
 
 
+def length_errors(frames: int) -> Floats:
+    """Standard deviations of the three lengths after so many frames, px, float64 (3,)."""
+    error: Floats = np.hypot(_ERRORS_PX / math.sqrt(frames), _KEPT_PX)
+    return error
+
+
 def sharper(one: Spread, other: Spread) -> float | None:
     """Log odds of the first being sharper and brighter against the second being so; None if unknown."""
     here, there = one.lengths(), other.lengths()
@@ -184,7 +190,7 @@ def sharper(one: Spread, other: Spread) -> float | None:
         return None
     spacing_px = (one.spacing_px + other.spacing_px) / (one.frames + other.frames)
     expected = _expected(round(math.log(spacing_px) * _STEPS_PER_E))
-    error = np.hypot(_ERRORS_PX / math.sqrt(min(one.frames, other.frames)), _KEPT_PX)
+    error = length_errors(min(one.frames, other.frames))
     fits: Floats = np.zeros((len(expected), len(expected)))
     for k in np.flatnonzero(~np.isnan(here + there)):
         off_here, off_there = here[k] - expected[:, k], there[k] - expected[:, k]
@@ -192,9 +198,9 @@ def sharper(one: Spread, other: Spread) -> float | None:
         apart = (off_here[:, None] - off_there) ** 2 / (2 * error[k] ** 2)
         mean = ((off_here[:, None] + off_there) / 2) ** 2 / (_COMMON_PX[k] ** 2 + error[k] ** 2 / 2)
         fits -= (apart + mean) / 2
-    likely = np.exp(fits - fits.max())
     first = _no_sharper()
-    return math.log(float((likely * first).sum()) / float((likely * first.T).sum()))
+    # What is clear is beyond the smallest number that is not 0.
+    return float(np.logaddexp.reduce(fits[first]) - np.logaddexp.reduce(fits.T[first]))
 
 
 @lru_cache(maxsize=1)

@@ -143,3 +143,12 @@ def test_a_blurred_image_in_a_window_is_not_the_bar() -> None:
     own = np.abs([f.x_px for f in frames] - bar_px) < 20
     assert 8 <= own.sum() <= len(own) - 8
     assert [f.echo_of is None for f in frames] == own.tolist()
+
+
+def test_what_is_clear_for_long_stays_clear() -> None:
+    """After minutes the other hypothesis is less likely than the smallest number that is not 0."""
+    (bar,) = expected_lengths(25.0, np.zeros(1), [0.004])
+    (image,) = expected_lengths(25.0, np.zeros(1), [0.3])
+    odds = sharper(answering(bar, 25.0, 10_000), answering(image, 25.0, 10_000))
+    assert odds is not None
+    assert 745 < odds < math.inf
