@@ -35,7 +35,7 @@ def test_fuzzer_finds_no_fault(tmp_path: Path, needs) -> None:
     probe.write_text("int LLVMFuzzerTestOneInput(const char *d, unsigned long n) { return d && n > 9; }")
     if run("clang", "-fsanitize=fuzzer", str(probe), "-o", str(tmp_path / "probe")).returncode:
         pytest.skip("clang has no libFuzzer: sh firmware_host/firmware/install-toolchain.sh installs it")
-    done = make(tmp_path, "fuzz", "FUZZ_SECONDS=3")
+    done = make(tmp_path, "fuzz", "FUZZ_SECONDS=60", "FUZZ_RUNS=12000")
     assert done.returncode == 0, done.stderr[-2000:]
     executed = re.search(r"number_of_executed_units: (\d+)", done.stderr)
     assert executed
