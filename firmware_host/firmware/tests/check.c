@@ -932,7 +932,8 @@ static void test_random_strings(void)
             bytes[k] = (uint8_t)(next_random() >> 9);
         native_input(board, bytes, length);
         /* And well-formed datagrams of random content, which reach further. */
-        const struct evlcp_datagram d = {.type = (uint8_t)(next_random() % 24u),
+        uint8_t type = (uint8_t)(next_random() % 24u);
+        const struct evlcp_datagram d = {.type = type == 0u ? (uint8_t)EVLCP_TYPE_CHIPS : type,
                                          .sequence = (uint16_t)(h.sequence + i),
                                          .session = h.session,
                                          .payload = bytes,
