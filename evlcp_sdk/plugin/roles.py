@@ -9,7 +9,7 @@ synchronization keeps state, and that state is explicit.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
@@ -265,18 +265,18 @@ class Role:
         abstract: The class that its algorithms derive from.
         default: Id of the algorithm where the link names none.
         verb: What it does, in one line.
-        default_elsewhere: Ids of it, of several clusters and of one, for bars that are not one even column of
-            three clusters or more, which the default refuses; None where that one takes every bar.
         default_of_chips: Id of it for codes that are not pair codes, which the default refuses; None where
             that one takes all codes.
+        by_layout: Id of it for a known bar, and whether its codes are pair codes; None where that does not
+            depend on the bar.
     """
 
     name: str
     abstract: type[ABC]
     default: str
     verb: str
-    default_elsewhere: tuple[str, str] | None = None
     default_of_chips: str | None = None
+    by_layout: Callable[[BarLayout, bool], str] | None = None
 
     def default_for(self, bar: BarLayout | None, pairs: bool = True) -> str:
         """Id of the algorithm where the link names none, for its bar; None for one that is not known.
@@ -289,12 +289,18 @@ class Role:
         >>> [ROLES["ranging"].default_for(BarLayout(LedGrid(96, columns))) for columns in (1, 2)]
         ['joint-scale', 'poc']
         """
-        column = bar is None or (bar.clusters >= 3 and bar.column_pitch_m > 0)
-        if not column and self.default_elsewhere is not None:
-            assert bar is not None
-            many, one = self.default_elsewhere
-            return one if bar.clusters == 1 else many
+        if bar is not None and self.by_layout is not None:
+            return self.by_layout(bar, pairs)
         return self.default if pairs or self.default_of_chips is None else self.default_of_chips
+
+
+def _ranging_of(bar: BarLayout, pairs: bool) -> str:
+    """Id of the ranging that fits a layout best."""
+    if bar.clusters >= 3 and bar.column_pitch_m > 0 and pairs:
+        return "joint-scale"
+    if bar.clusters >= 2 and bar.alike:
+        return "poc"
+    return "centroid" if bar.clusters >= 3 else "none"
 
 
 ROLES: Mapping[str, Role] = MappingProxyType(
@@ -309,22 +315,11 @@ ROLES: Mapping[str, Role] = MappingProxyType(
                 Separation,
                 "wh-correlation",
                 "a pilot's image -> where each cluster is",
-                default_of_chips="edges",
+                "edges",
             ),
+            Role("decoding", Decoding, "motion-feedback", "a frame's image -> soft symbols", "edges"),
             Role(
-                "decoding",
-                Decoding,
-                "motion-feedback",
-                "a frame's image -> soft symbols",
-                default_of_chips="edges",
-            ),
-            Role(
-                "ranging",
-                Ranging,
-                "joint-scale",
-                "a decoded frame's image -> distance",
-                ("poc", "none"),
-                "poc",
+                "ranging", Ranging, "joint-scale", "a decoded frame's image -> distance", "poc", _ranging_of
             ),
             Role("tracking", Tracking, "none", "distance and image position over time"),
             Role("error-correction", ErrorCorrection, "polar", "message bits <-> coded bits, soft input"),

@@ -511,7 +511,7 @@ def best_similarity(
         for j in range(i, i + 1 if known else proposers):
             s = scale
             if not known:
-                if cluster[i] == cluster[j]:
+                if cluster[i] == cluster[j] or layout[cluster[i]] == layout[cluster[j]]:
                     continue
                 s = (at[j] - at[i]) / (layout[cluster[j]] - layout[cluster[i]])
             gap = abs(s) * spacing

@@ -267,9 +267,23 @@ class BarLayout:
         """Cluster centres (x right, y down) as one looks at them from the front, m, float64 (K, 2)."""
         return self.cluster_positions_m()[:, :2]
 
+    @cached_property
+    def alike(self) -> bool:
+        """Whether all clusters have the same LEDs about their centres, to the micrometre."""
+        place, which = self._leds
+        off = np.round((place - self.cluster_positions_m()[which]) * 1e6)
+        count = np.bincount(which)
+        if (count != count[0]).any():
+            return False
+        order = np.lexsort((*off.T, which))
+        forms = off[order].reshape(len(count), count[0], 3)
+        return bool((np.abs(forms - forms[0]) <= 1).all())
+
     @property
     def column_pitch_m(self) -> float:
         """From cluster to cluster of one even column, the first at its top, m; NaN for another layout.
+
+        Clusters of an even column are alike.
 
         >>> round(BarLayout().column_pitch_m, 9)
         0.06
@@ -279,7 +293,7 @@ class BarLayout:
         if len(steps) == 0 or np.abs(steps[:, [0, 2]]).max() > _SAME_M:
             return math.nan
         even = steps[:, 1].min() > 0 and np.ptp(steps[:, 1]) < 1e-6 * steps[0, 1]
-        return float(steps[0, 1]) if even else math.nan
+        return float(steps[0, 1]) if even and self.alike else math.nan
 
 
 def read_leds(path: Path | str) -> list[list[float | int]]:

@@ -10,5 +10,5 @@ __all__ = ["evlcp_algorithms"]
 @hookimpl
 def evlcp_algorithms() -> Iterator[Algorithm]:
     """The algorithms of this package."""
-    yield Algorithm("ranging", "centroid", "evlcp_centroid.ranging:CentroidRanging", 1, "centres of gravity")
+    yield Algorithm("ranging", "centroid", "evlcp_centroid.ranging:CentroidRanging", 2, "centres of gravity")
     yield Algorithm("ranging", "none", "evlcp_centroid.none:NoRanging", 1, "no distance, of any layout")

@@ -22,14 +22,20 @@ _NONE = Range(float("nan"), float("nan"), 0)
 class CentroidRanging(Ranging):
     """Similarity (shift, turn, scale) that brings the layout to the centres of gravity best.
 
-    Each cluster's centre is the mean of its map. From a start by medians, clusters far from the fit, by more
-    than three times the median, are left out. Sigma is that of the least squares.
+    Each cluster's centre is the mean of its map, whatever its LEDs. From a start by medians, clusters far
+    from the fit, by more than three times the median, are left out. Sigma is that of the least squares.
     """
 
     skip_outer: Annotated[
-        int, Field(ge=0, description="Seen clusters left out at each end: an outer edge has no neighbour.")
+        int,
+        Field(
+            ge=0,
+            description="Seen clusters left out at each end of a line: an outer edge has no neighbour.",
+        ),
     ] = 1
-    min_clusters: Annotated[int, Field(ge=3, description="Clusters that must be seen.")] = 5
+    min_clusters: Annotated[
+        int, Field(ge=3, description="Clusters that must be seen, or all of a smaller layout.")
+    ] = 5
 
     def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
         """Precompute the layout as complex numbers, right + 1j * down.
@@ -38,12 +44,17 @@ class CentroidRanging(Ranging):
             ConfigError: Fewer clusters are left than a distance needs.
         """
         centres = bar.cluster_centres_m()
-        left = bar.clusters - 2 * self.skip_outer
-        if left < self.min_clusters:
+        in_line = np.linalg.matrix_rank(centres - centres.mean(0), tol=1e-9) < 2
+        skip = self.skip_outer if in_line else 0
+        left = bar.clusters - 2 * skip
+        least = max(min(self.min_clusters, left), 3)
+        if left < least:
             raise ConfigError(
                 f"ranging 'centroid' uses {max(left, 0)} of {bar.clusters} clusters (skip_outer ="
-                f" {self.skip_outer}), expected at least min_clusters = {self.min_clusters}"
+                f" {skip}), expected at least min_clusters = {least}"
             )
+        if not np.ptp(centres, 0).any():
+            raise ConfigError("ranging 'centroid' needs clusters apart: use 'none' for this layout")
         layout = centres[:, 0] + 1j * centres[:, 1]
         i, j = np.triu_indices(bar.clusters, 1)
         apart = layout[j] - layout[i]
@@ -53,8 +64,8 @@ class CentroidRanging(Ranging):
             weight = maps.sum((1, 2))
             # The outermost of what is seen may be cut off by what hides the others.
             seen = np.flatnonzero(weight > 0)
-            seen = seen[self.skip_outer : len(seen) - self.skip_outer]
-            if len(seen) < self.min_clusters:
+            seen = seen[skip : len(seen) - skip]
+            if len(seen) < least:
                 return _NONE
             down = maps.sum(2)[seen] @ np.arange(maps.shape[1]) / weight[seen]
             right = maps.sum(1)[seen] @ np.arange(maps.shape[2]) / weight[seen]
@@ -62,7 +73,8 @@ class CentroidRanging(Ranging):
             # The start is robust: medians of pairs half of what is seen apart, and of what they leave.
             at = np.full(bar.clusters, np.nan, np.complex128)
             at[seen] = image
-            step = (at[j] - at[i]) / apart
+            step = np.full(len(apart), np.nan, np.complex128)
+            np.divide(at[j] - at[i], apart, out=step, where=apart != 0)
             both = np.isfinite(step)
             both &= np.abs(apart) >= 0.5 * np.abs(apart[both]).max()
             scale = complex(np.median(step[both].real), np.median(step[both].imag))
@@ -71,7 +83,7 @@ class CentroidRanging(Ranging):
             for _ in range(2):
                 off = np.abs(image - shift - scale * place)
                 keep = off <= 3 * np.median(off) + 1e-9
-                if keep.sum() < self.min_clusters:
+                if keep.sum() < least:
                     return _NONE
                 spread = place[keep] - place[keep].mean()
                 power = float((np.abs(spread) ** 2).sum())

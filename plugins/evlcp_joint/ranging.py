@@ -13,7 +13,7 @@ from scipy import special
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.late import Late
-from evlcp_sdk.plugin.roles import Measure, Ranging
+from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Bend, FrameView, PresenceMap, Range
@@ -120,7 +120,7 @@ class JointScaleRanging(Ranging):
         clusters, spacing_m = bar.clusters, bar.column_pitch_m
         if not spacing_m > 0 or clusters < 3:
             raise ConfigError(
-                "ranging 'joint-scale' needs one even column of three clusters or more; " + _instead(clusters)
+                "ranging 'joint-scale' needs one even column of three clusters or more; " + _instead(bar)
             )
         least = min(self.min_boundaries, clusters - 1)
         codebook.require_pairs("ranging", "joint-scale", "poc")
@@ -252,12 +252,11 @@ def _when(n: int) -> Floats:
     return (np.arange(n) + 0.5) / n - 0.5
 
 
-def _instead(clusters: int) -> str:
+def _instead(bar: BarLayout) -> str:
     """The ranging for a layout that this one refuses, if any is."""
-    if clusters < 2:
+    if bar.clusters < 2:
         return "no ranging measures the distance of one cluster: use 'none' for this layout"
-    # Of few clusters, `poc` must not leave out the outermost.
-    return "use 'poc' for this layout" + (", with ranging.skip_outer = 0" if clusters < 4 else "")
+    return f"use '{ROLES['ranging'].default_for(bar)}' for this layout"
 
 
 @dataclass(frozen=True, eq=False)

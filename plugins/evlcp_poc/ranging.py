@@ -11,7 +11,7 @@ from scipy import fft
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.plugin.roles import Measure, Ranging
+from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, Range
@@ -83,7 +83,7 @@ class PocRanging(Ranging):
         int,
         Field(
             ge=0,
-            description="Seen clusters left out at each end: an outer edge has no neighbour to bound it.",
+            description="Seen clusters left out at each end, of four or more: edges have no neighbour.",
         ),
     ] = 1
     min_spacing: Annotated[
@@ -118,24 +118,29 @@ class PocRanging(Ranging):
         """Precompute the pairs of a bar.
 
         Raises:
-            ConfigError: Fewer than two clusters are left to pair.
+            ConfigError: Fewer than two clusters are left to pair, or clusters are not alike.
         """
         used = self._used(bar.clusters)
         if not self.clusters:
             # Which are outermost is told by what is seen.
             used = np.arange(bar.clusters)
-        skip = 0 if self.clusters else self.skip_outer
+        skip = 0 if self.clusters else self._skip(bar.clusters)
         centres = bar.cluster_centres_m()
         a, b = np.triu_indices(len(used), 1)
         all_first, all_second = used[a], used[b]
         all_spacing = np.hypot(*(centres[all_second] - centres[all_first]).T)
         most_pairs = _far(all_spacing, self.min_spacing, *_inner(all_first, all_second, used, skip))
-        neighbour = float(np.min(np.hypot(*(centres[1:] - centres[:-1]).T)))
-
         # The scale that all clusters agree on shows which ones are out of place.
         every = np.arange(bar.clusters)
         i, j = np.triu_indices(bar.clusters, 1)
         apart = np.hypot(*(centres[j] - centres[i]).T)
+        if not bar.alike or not apart.max() > 0:
+            instead = ROLES["ranging"].default_for(bar) if apart.max() > 0 else "none"
+            raise ConfigError(
+                "ranging 'poc' compares images of clusters, which have to be alike and apart: use"
+                f" '{instead}' for this layout"
+            )
+        neighbour = float(apart[apart > 0].min())
 
         def measure(view: FrameView) -> Range:
             from evlcp_poc import _kernels
@@ -182,8 +187,13 @@ class PocRanging(Ranging):
 
         return measure
 
+    def _skip(self, clusters: int) -> int:
+        """How many are left out at each end: of three or fewer, none could be."""
+        return self.skip_outer if clusters > 3 else 0
+
     def _used(self, clusters: int) -> NDArray[np.int64]:
-        used = np.array(self.clusters or range(self.skip_outer, clusters - self.skip_outer), np.int64)
+        skip = self._skip(clusters)
+        used = np.array(self.clusters or range(skip, clusters - skip), np.int64)
         if clusters < 2:
             raise ConfigError(
                 "ranging 'poc' needs two clusters; no ranging measures the distance of one: use 'none' for"

@@ -16,6 +16,13 @@ LAYOUTS = {
     "4x4 panel": PANEL,
     "two columns": ("bar.rows=96", "bar.columns=2", "bar.cluster_rows=12"),
     "one row of two": ("bar.rows=1", "bar.columns=2", "bar.cluster_rows=1"),
+    "ring": ("bar.shape=ring",),
+    "apart": ("bar.shape=columns",),
+    "not alike": (
+        "bar.shape=table",
+        "bar.leds=[[0, 0, 0, 0], [0, 0.1, 0, 0], [0.3, 0, 0, 1], [0, 0.4, 0, 2], [1, 1, 0, 3]]",
+    ),
+    "three LEDs": ("bar.shape=table", "bar.leds=[[0, 0, 0, 0], [0.3, 0, 0, 1], [0, 0.2, 0, 2]]"),
 }
 RANGINGS = [entry.algorithm.id for entry in Registry.load().installed("ranging")]
 
@@ -24,12 +31,13 @@ def link_with(layout: str, *overrides: str) -> Link:
     return load_link(overrides=[*LAYOUTS[layout], *overrides])
 
 
-@pytest.mark.parametrize(
-    "layout", [name for name in LAYOUTS if name not in ("1 clusters", "2 clusters", "one row of two")]
-)
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_link_that_names_no_ranging_measures_its_bar(layout: str) -> None:
     link = link_with(layout)
-    assert link.table["ranging"]["id"] == ("joint-scale" if "clusters" in layout else "poc")
+    wanted = {"1 clusters": "none", "2 clusters": "poc", "not alike": "centroid"}.get(
+        layout, "joint-scale" if "clusters" in layout else "poc"
+    )
+    assert link.table["ranging"]["id"] == wanted
     link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
 
 
@@ -72,9 +80,9 @@ def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name: str
             "1 clusters",
             "needs one even column of three clusters or more; .* of one cluster: use 'none' for this layout$",
         ),
-        ("2 clusters", "needs .* or more; use 'poc' for this layout, with ranging.skip_outer = 0$"),
+        ("2 clusters", "needs .* or more; use 'poc' for this layout$"),
         ("4x4 panel", "needs .* or more; use 'poc' for this layout$"),
-        ("one row of two", "needs .* or more; use 'poc' for this layout, with ranging.skip_outer = 0$"),
+        ("one row of two", "needs .* or more; use 'poc' for this layout$"),
     ],
 )
 def test_joint_scale_says_what_works_instead(layout: str, said: str) -> None:

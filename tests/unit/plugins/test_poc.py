@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.scene.bar import BarLayout, LedGrid
+from evlcp_sdk.scene.bar import BarLayout, LedGrid, LedTable
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
@@ -474,7 +474,8 @@ def test_clusters_that_the_bar_has_not_are_refused(clusters):
     [
         (BAR, 8, "skip_outer = 8: leaves 0 of 16"),
         (BAR, 20, "set ranging.skip_outer = 7$"),
-        (BarLayout(LedGrid(rows=12)), 1, "set ranging.skip_outer = 0$"),
+        (BarLayout(LedGrid(rows=24)), 2, "set ranging.skip_outer = 1$"),
+        (BarLayout(LedTable(((1, 0, 0, 0), (-1, 0, 0, 0), (0, 1, 0, 1), (0, -1, 0, 1)))), 0, "apart"),
         (BarLayout(LedGrid(rows=6)), 0, "needs two clusters"),
     ],
 )
