@@ -52,6 +52,7 @@ pictures: $(VENV)/.installed  ## Draw the pictures of the docs again
 	$(BIN)/evlcp video examples/recordings/night-50m-30kmh-cut.raw -o docs/images/film.webp \
 	  --for-ms 10 --size 420
 	$(BIN)/python benchmarks/link_picture.py docs/images/link.svg
+	$(BIN)/python benchmarks/packet_picture.py docs/images/packet.svg
 	$(BIN)/evlcp simulate examples/scenes/gate.toml -o demo-out/gate.raw
 	$(BIN)/evlcp receive demo-out/gate.raw -o demo-out/gate --sites demo-out/gate.site.toml \
 	  --attitude demo-out/gate.attitude.csv --figures --report

@@ -69,8 +69,10 @@ LINKS: dict[str, Settings] = {
     "barker13": {"pilots.id": "barker13"},
     "few pilots": {"air.pilot_every": 4, "air.frames_per_packet": 20},
     "a stranger's modulation": {"modulation.id": "four"},
+    "no pair code": {"modulation.id": "nrz"},
+    "a quarter of the light": {"modulation.id": "wh4x2-dimmed", "pilots.id": "wh-dimmed"},
 }
-DURATIONS_S = {"5 kchip/s": 0.12, "20 kchip/s": 0.06, "a panel": 0.07}
+DURATIONS_S = {"5 kchip/s": 0.12, "20 kchip/s": 0.06, "a panel": 0.07, "a quarter of the light": 0.13}
 DISTANCE_M, DURATION_S, SEED = 40.0, 0.09, 2
 
 
