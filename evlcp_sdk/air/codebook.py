@@ -236,6 +236,13 @@ class Codebook:
         return self._edges(self.codewords)
 
     @cached_property
+    def edge_chips(self) -> NDArray[np.int64]:
+        """Chips of a frame, pilot and info segment, behind the edges that tell codes apart, int64 (n,)."""
+        pilot, info = self.pilots.shape[1], self.codewords.shape[1]
+        behind = (np.arange(1, pilot, self.edge_every), np.arange(pilot + 1, pilot + info, self.edge_every))
+        return np.concatenate(behind)
+
+    @cached_property
     def longest_gap_chips(self) -> int:
         """The longest time from one rise to the next while packets are sent, chips.
 

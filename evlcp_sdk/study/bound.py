@@ -203,7 +203,8 @@ def frame_bound(
         if place is None:
             return _NONE
         upright, at_row, seen, width = place
-        sums, offset = view.sums, view.offset_px.reshape(2, -1, 2).mean(2)
+        behind = codebook.edge_chips
+        sums, offset = view.sums[behind], (view.offset_px[:, behind - 1] + view.offset_px[:, behind]) / 2
         light = view.presence.pixels.sum(0)
         if not upright:
             # A bar that lies across the image: exchange rows and columns.
@@ -244,10 +245,10 @@ def frame_bound(
 def _row_values(
     sums: NDArray[np.int16], tilt: float, left: float, half_width: float, full_events: float
 ) -> tuple[Array, float]:
-    """Mean of each row's clipped sums in every value's second chip (values, rows); columns of a row."""
+    """Mean of each row's clipped sums in the chips behind edges (edges, rows); columns of a row."""
     row, column = np.ogrid[: sums.shape[1], : sums.shape[2]]
     inside = np.abs(column - (left + tilt * row)) < half_width
-    clipped: Array = np.clip(sums[1::2].astype(np.float64) / full_events, -1.0, 1.0)
+    clipped: Array = np.clip(sums.astype(np.float64) / full_events, -1.0, 1.0)
     number = inside.sum(1)
     values: Array = np.where(inside, clipped, 0.0).sum(2) / np.maximum(number, 1)
     return values, float(number.mean())

@@ -256,7 +256,7 @@ def plane_frame_bound(
         if start is None:
             return _NONE
         scale, shift, seen = start
-        values = np.clip(view.sums[1::2].astype(np.float64) / full_events, -1.0, 1.0)
+        values = np.clip(view.sums[codebook.edge_chips].astype(np.float64) / full_events, -1.0, 1.0)
         height, width = values.shape[1:]
         symbols = np.where(view.soft.symbols < 0, 0, view.soft.symbols)
         columns, rows = (np.arange(n) - (n - 1) / 2 for n in (width, height))
