@@ -61,7 +61,7 @@ def banks() -> dict[str, Bank]:
     found = {"words": Bank.of_symbols(symbols, book)}
     for clusters in (1, 10, 16, 88, 96):
         leds = np.arange(96) * clusters // 96
-        drawn = np.random.default_rng(1).choice(np.array([-1, 1], np.int8), (clusters + 2, 24))
+        drawn = np.random.default_rng(1).integers(0, 2, (clusters + 2, 48), dtype=np.uint8)
         own = Codebook("drawn", book.preamble, drawn[:-2], drawn[-2:])
         row = -(-clusters // 8)
         most = (40_960 - (12 * clusters if row < 12 else 0)) // row

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from firmware_host import build
@@ -149,12 +149,12 @@ def test_in_qemu(needs: Callable[..., None], tmp_path: Path) -> None:
     with Session(start_qemu(leds)) as session:
         board = Board(session)
         provision(board, a_bank(), Settings())
-        while board.status().chips_sent < 400:
+        while board.status().chips_sent < 250:
             pass
         board.stop()
         board.wait_dark()
     rows = LedRecord.read(leds).played().chips(None)
-    assert len(rows) >= 400
+    assert len(rows) >= 250
     assert (rows == np.resize(EXPECTED, rows.shape)).all()
 
 
@@ -191,6 +191,43 @@ def test_every_led_for_itself(device: SimulatedBoard, board: Board) -> None:
     seen = shown(device)
     assert (seen[:400, :87] == rows).all()
     assert not seen[:, 87:].any()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "form"),
+    [
+        (["modulation.id=nrz"], None),
+        (["modulation.id=ppm"], None),
+        (["modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed"], None),
+        (["bar.rows=1", "bar.cluster_rows=1", "ranging.id=none", "modulation.id=nrz"], Format.CLUSTERS),
+    ],
+    ids=["nrz", "ppm", "dimmed", "one LED"],
+)
+def test_the_codes_that_are_installed(
+    device: SimulatedBoard, board: Board, overrides: list[str], form: Format | None
+) -> None:
+    link = load_link(overrides=["separation.id=edges", "decoding.id=edges", *overrides])
+    symbols = random_symbols(2, link.packet.frames, link.codebook, np.random.default_rng(1))
+    bank = bank_of(symbols, link)
+    assert form in (None, bank.format)
+    chips = leds_of(
+        np.concatenate([packet_chips(one, link.codebook, link.packet.pilot_every) for one in symbols]),
+        link.bar.led_clusters(),
+    )
+    share = np.ceil(1000 * chips.mean(0).max() - 1e-9) / 1000
+    provision(board, bank, Settings(duty_limit=share))
+    device.run(200_000)
+    rows = shown(device)
+    assert len(rows) >= 1900
+    assert (rows == np.resize(chips, rows.shape)).all()
+    # a stream, whose idle pattern is no brighter, keeps to the same limit
+    with board.stream(link) as stream:
+        stream.wait(0.1)
+        for packet in symbols:
+            stream.send(packet)
+    rows = shown(device)
+    assert (rows[-len(chips) :] == chips).all()
+    assert board.status().faults == 0
 
 
 def test_packets_that_come_one_by_one(device: SimulatedBoard, board: Board) -> None:
