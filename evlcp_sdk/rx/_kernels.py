@@ -260,11 +260,24 @@ def select_box(
 
 
 @njit(cache=True, nogil=True)
-def _wanted(x: int, y: int, box: Array, filtered: bool, pixels: Array, least: int, same: int) -> bool:
-    """Whether an event lies in a box (left, top, right, bottom), and its pixel is one that is listened to."""
-    if not (box[0] <= x < box[2] and box[1] <= y < box[3]):
-        return False
-    return not filtered or _listened(pixels[y, x], least, same)
+def label_boxes(boxes: Array, cell_shift: int, labels: Array, alone: Array) -> None:
+    """Label the cells of 2^cell_shift px that boxes (n, 4) touch, k + 1, but of those that touch others'.
+
+    `alone` (n,) says which boxes were labelled, the first of those that touch the same cell.
+    """
+    for k in range(len(boxes)):
+        left, top = boxes[k, 0] >> cell_shift, boxes[k, 1] >> cell_shift
+        right, bottom = (boxes[k, 2] - 1 >> cell_shift) + 1, (boxes[k, 3] - 1 >> cell_shift) + 1
+        if boxes[k, 0] >= boxes[k, 2]:
+            right = left
+        alone[k] = True
+        for v in range(top, bottom):
+            for u in range(left, right):
+                alone[k] &= labels[v, u] == 0
+        if alone[k]:
+            for v in range(top, bottom):
+                for u in range(left, right):
+                    labels[v, u] = k + 1
 
 
 @njit(cache=True, nogil=True)
@@ -282,63 +295,39 @@ def select_boxes(
     labels: Array,
     begins: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Events inside boxes (n, 4) of (left, top, right, bottom), one box after the other.
+    """Events inside labelled boxes (n, 4), see `label_boxes`, one box after the other.
 
     Those of a box begin at `begins` (n + 1,). Of one that is `filtered` (n,), they are events that
-    `in_rhythm` marks. `labels` are of cells of 2^cell_shift px, 0 before and after. An event costs the same
-    however many boxes there are, but where they overlap.
+    `in_rhythm` marks. An event costs the same however many boxes there are.
     """
     shift = np.uint64(cell_shift)
-    several = np.int16(-1)
-    for k in range(len(boxes)):
-        if boxes[k, 0] < boxes[k, 2]:
-            for v in range(boxes[k, 1] >> cell_shift, (boxes[k, 3] - 1 >> cell_shift) + 1):
-                for u in range(boxes[k, 0] >> cell_shift, (boxes[k, 2] - 1 >> cell_shift) + 1):
-                    labels[v, u] = several if labels[v, u] else np.int16(k + 1)
-    near = np.empty(t_us.size + 1, np.uint32)
+    which, of = np.empty(t_us.size + 1, np.uint32), np.empty(t_us.size + 1, np.int16)
     n = np.uint64(0)
     for i in range(t_us.size):
-        near[n] = i
-        n += np.uint64(labels[np.uint64(y[i]) >> shift, np.uint64(x[i]) >> shift] != 0)
-    of, m = np.empty(n, np.int16), np.uint64(0)
+        label = labels[np.uint64(y[i]) >> shift, np.uint64(x[i]) >> shift]
+        which[n], of[n] = i, label
+        n += np.uint64(label != 0)
+    m = np.uint64(0)
     begins[:] = 0
     for j in range(n):
-        i = near[j]
-        u, v = int(x[i]), int(y[i])
-        label = int(labels[np.uint64(y[i]) >> shift, np.uint64(x[i]) >> shift])
-        if label > 0:
-            k = label - 1
-            wanted = _wanted(u, v, boxes[k], filtered[k], pixels, least, same)
-            near[m], of[m] = i, label
-            begins[k + 1] += wanted
-            m += np.uint64(wanted)
-        else:
-            some = 0
-            for k in range(len(boxes)):
-                wanted = _wanted(u, v, boxes[k], filtered[k], pixels, least, same)
-                begins[k + 1] += wanted
-                some += wanted
-            near[m], of[m] = i, label
-            m += np.uint64(some > 0)
-    for k in range(len(boxes)):
-        begins[k + 1] += begins[k]
-    total = begins[-1]
-    out_t, out_p = np.empty(total, np.int64), np.empty(total, np.uint8)
-    out_x, out_y = np.empty(total, np.uint16), np.empty(total, np.uint16)
+        i, k = which[j], np.uint64(of[j] - 1)
+        u, v = np.int64(x[i]), np.int64(y[i])
+        wanted = (boxes[k, 0] <= u) & (u < boxes[k, 2]) & (boxes[k, 1] <= v) & (v < boxes[k, 3])
+        if filtered[k]:
+            wanted &= _listened(pixels[v, u], least, same)
+        which[m], of[m] = i, k
+        begins[k + np.uint64(1)] += np.int64(wanted)
+        m += np.uint64(wanted)
+    for b in range(len(boxes)):
+        begins[b + 1] += begins[b]
+    out_t, out_p = np.empty(m, np.int64), np.empty(m, np.uint8)
+    out_x, out_y = np.empty(m, np.uint16), np.empty(m, np.uint16)
     place = begins[:-1].copy()
     for j in range(m):
-        i, label = near[j], int(of[j])
-        first, last = (label - 1, label) if label > 0 else (0, len(boxes))
-        for k in range(first, last):
-            if label > 0 or _wanted(x[i], y[i], boxes[k], filtered[k], pixels, least, same):
-                at = np.uint64(place[k])
-                out_t[at], out_x[at], out_y[at], out_p[at] = t_us[i], x[i], y[i], p[i]
-                place[k] += 1
-    for k in range(len(boxes)):
-        if boxes[k, 0] < boxes[k, 2]:
-            for v in range(boxes[k, 1] >> cell_shift, (boxes[k, 3] - 1 >> cell_shift) + 1):
-                for u in range(boxes[k, 0] >> cell_shift, (boxes[k, 2] - 1 >> cell_shift) + 1):
-                    labels[v, u] = 0
+        i, k = which[j], np.uint64(of[j])
+        at = np.uint64(place[k])
+        place[k] += 1
+        out_t[at], out_x[at], out_y[at], out_p[at] = t_us[i], x[i], y[i], p[i]
     return out_t, out_x, out_y, out_p
 
 

@@ -14,7 +14,7 @@ from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.plugin.roles import Filter
 from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
-from evlcp_sdk.rx.rhythm import Rhythm
+from evlcp_sdk.rx.rhythm import Rhythm, select
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region, changed
 
@@ -70,6 +70,9 @@ _MIN_PIXELS = 4
 
 _CENTRE_SIGMA_PX = 0.25
 """Error of a measured centre: the edge of a row of pixels, a third of one, at the top and at the bottom."""
+
+_FEW = 3
+"""Boxes up to which looking at all events for each takes less than looking up which boxes are near."""
 
 _BACKFILL_STEPS = 12
 """Steps kept from before a region was found: a pixel needs about 1 ms to score, a region two steps."""
@@ -156,7 +159,7 @@ class Followed:
         ahead = min(ahead, 1.0)
         x = last.x_px + ahead * (last.x_px - before.x_px)
         y = last.y_px + ahead * (last.y_px - before.y_px)
-        return Region(last.id, t_us, x, y, last.width_px, last.height_px)
+        return _region(last.id, t_us, x, y, last.width_px, last.height_px)
 
     def at(self, t_us: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Centre (column, row) at times, interpolated; straight on for a little before and after, px."""
@@ -319,8 +322,8 @@ class RegionFollower:
 
     def _select(self, events: Events, boxes: list[Box]) -> list[Events]:
         """The events of a step inside the box of each region; those that it listens to."""
-        if not boxes or (len(boxes) == 1 and self.alive[0].size_px):
-            return _select(events, boxes)
+        if len(boxes) <= _FEW and all(followed.size_px for followed in self.alive):
+            return [select(events, box) for box in boxes]
         unknown = np.array([followed.size_px is None for followed in self.alive])
         return self._rhythm.select(events, np.array(boxes, np.int64), unknown)
 
@@ -425,7 +428,7 @@ class RegionFollower:
         x, y = followed.at(np.array([start + step_us / 2 for start, _ in kept]))
         for (start, events), x_px, y_px in zip(kept, x.tolist(), y.tolist(), strict=True):
             box = self._reach(Region(last.id, last.t_us, x_px, y_px, last.width_px, last.height_px))
-            gathered[start] = _select(events, [box])[0]
+            gathered[start] = select(events, box)
         followed.hold(deque((start, gathered.get(start, events)) for start, events in followed.pieces))
         self._make_room()
 
@@ -527,7 +530,7 @@ class RegionFollower:
             slack_px = abs(excess_px) / 2
             y_px = measured.y_px + min(max(expected_px - measured.y_px, -slack_px), slack_px)
         size_px = known or (measured.width_px, height_px + min(max(excess_px, 0.0), _STRAY_PX))
-        return Region(measured.id, measured.t_us, measured.x_px, y_px, *size_px)
+        return _region(measured.id, measured.t_us, measured.x_px, y_px, *size_px)
 
     def _filtered(self, followed: Followed, measured: Region) -> Region:
         if self._position is None:
@@ -544,12 +547,12 @@ class RegionFollower:
         m = self._spec.margin_px
         half_w, half_h = region.width_px / 2 + m, region.height_px / 2 + m
         width, height = self._camera.width, self._camera.height
-        return (
-            min(max(int(region.x_px - half_w), 0), width),
-            min(max(int(region.y_px - half_h), 0), height),
-            min(max(int(region.x_px + half_w) + 1, 0), width),
-            min(max(int(region.y_px + half_h) + 1, 0), height),
-        )
+        left, top = int(region.x_px - half_w), int(region.y_px - half_h)
+        right, bottom = int(region.x_px + half_w) + 1, int(region.y_px + half_h) + 1
+        if left < 0 or top < 0 or right > width or bottom > height:
+            left, right = min(max(left, 0), width), min(max(right, 0), width)
+            top, bottom = min(max(top, 0), height), min(max(bottom, 0), height)
+        return left, top, right, bottom
 
     def _measure(
         self, id: int, box: Box, end_us: int, rows: NDArray[np.int64], width_px: float = math.inf
@@ -564,13 +567,8 @@ class RegionFollower:
         )
         if total < _MIN_PIXELS:
             return None
-        return Region(
-            id=id,
-            t_us=end_us - self._age_us,
-            x_px=column,
-            y_px=(upper + lower - 1) / 2,
-            width_px=right - left + 1.0,
-            height_px=lower - upper,
+        return _region(
+            id, end_us - self._age_us, column, (upper + lower - 1) / 2, right - left + 1.0, lower - upper
         )
 
     def _open(self, end_us: int, rises: int) -> None:
@@ -582,7 +580,7 @@ class RegionFollower:
         """
         hits = self._hits
         merge = self._spec.merge_px
-        for followed in self.alive:
+        for followed in self.alive if rises >= self._spec.min_rises else ():
             reach = self._reach(followed.latest)
             rises -= _cleared(hits, reach if followed.size_px else _grown(reach, merge))
             if followed.outgrown is not None and end_us > followed.outgrown[4]:
@@ -641,7 +639,7 @@ class RegionFollower:
                 self.alive.append(followed)
                 return
         recent = list(self._recent)[-_BACKFILL_STEPS:]
-        pieces = deque((start, self._rhythmic(_select(events, [reach])[0])) for start, events in recent)
+        pieces = deque((start, self._rhythmic(select(events, reach))) for start, events in recent)
         state = self._position.init() if self._position else None
         self.alive.append(
             Followed(region.id, deque([region]), pieces[0][0], pieces, filter=state, opened_us=end_us)
@@ -683,24 +681,6 @@ def _region(id: int, t_us: float, x_px: float, y_px: float, width_px: float, hei
     region = object.__new__(Region)
     vars(region).update(id=id, t_us=t_us, x_px=x_px, y_px=y_px, width_px=width_px, height_px=height_px)
     return region
-
-
-def _select(events: Events, boxes: list[Box]) -> list[Events]:
-    """The events inside each box, in no more memory than twice what they need."""
-    room = len(events) + 1
-    found = []
-    into: tuple[NDArray[Any], ...] = ()
-    for box in boxes:
-        if not into:
-            into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
-        n = _kernels.select_box(events.t_us, events.x, events.y, events.p, box, *into)
-        part = [column[:n] for column in into]
-        if 2 * n < room:
-            part = [column.copy() for column in part]
-        else:
-            into = ()
-        found.append(Events.as_is(*part))
-    return found
 
 
 def _clear(box: Box, others: list[Box]) -> Box:

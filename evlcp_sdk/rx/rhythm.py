@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["Rhythm"]
+__all__ = ["Rhythm", "select"]
 
 _MOST_SCORE = 40
 """Scores rise no further: what has blinked in rhythm for long is forgotten after so many rises off it."""
@@ -135,6 +135,9 @@ class Rhythm:
             boxes: (left, top, right, bottom) of each, int64 (n, 4), px.
             filtered: Of which boxes only candidates that are no lamps are meant, bool (n,).
         """
+        self._labels[:] = 0
+        alone = np.empty(len(boxes), np.bool_)
+        _kernels.label_boxes(boxes, _LABEL_SHIFT, self._labels, alone)
         begins = np.empty(len(boxes) + 1, np.int64)
         columns = _kernels.select_boxes(
             events.t_us,
@@ -151,8 +154,11 @@ class Rhythm:
             begins,
         )
         total, found = len(columns[0]), []
-        ends = begins.tolist()
-        for begin, end in pairwise(ends):
+        for k, (begin, end) in enumerate(pairwise(begins.tolist())):
+            if not alone[k]:
+                inside = select(events, tuple(boxes[k].tolist()))
+                found.append(self.of(inside) if filtered[k] else inside)
+                continue
             part = [column[begin:end] for column in columns]
             if 2 * (end - begin) < total:
                 part = [column.copy() for column in part]
@@ -196,6 +202,15 @@ class Rhythm:
         many = -(-height * passed // self._turn)
         _kernels.grow_old(self._pixels, self._row, many, now, 2 * self._turn, 2 * self._turn)
         self._row = (self._row + many) % height
+
+
+def select(events: Events, box: tuple[int, int, int, int]) -> Events:
+    """Those inside a box (left, top, right, bottom), in no more memory than twice what they need."""
+    room = len(events) + 1
+    into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
+    n = _kernels.select_box(events.t_us, events.x, events.y, events.p, box, *into)
+    part = [column[:n] for column in into]
+    return Events.as_is(*(column.copy() for column in part) if 2 * n < room else part)
 
 
 def _kinds(chip_us: float, late_us: float, tick_us: int) -> NDArray[np.uint8]:

@@ -17,9 +17,10 @@ _STRIDE = 16
 @njit(cache=True, nogil=True)
 def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, known: Array, counts: Array) -> None:
     """Add events to `known` counts: by polarity (row) and time (column, `bin_us` each from `first_bin`)."""
-    bins, before = counts.shape[1], known.shape[1]
+    bins = counts.shape[1]
+    before = min(known.shape[1], bins)
     for row in range(2):
-        counts[row, :before] = known[row]
+        counts[row, :before] = known[row, :before]
         counts[row, before:] = 0.0
     i = np.searchsorted(t_us, first_bin * bin_us)
     # Time never runs backward, so each bin goes on where the last one ended.

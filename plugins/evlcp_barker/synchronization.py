@@ -197,13 +197,18 @@ class BarkerSynchronizer:
             state = replace(state, first_bin=first, next_bin=first)
         assert state.first_bin is not None
         bins = max(until_bin - state.first_bin, state.counts.shape[1] - 1)
+        lags = bins - span + 1
+        if not len(t_us) and lags - guard > state.next_bin - state.first_bin and not state.counts.any():
+            # Silence correlates with nothing, and most regions that are no bar are silent.
+            first = max(state.first_bin + lags - 2 * guard, state.first_bin)
+            counts = np.zeros((2, state.first_bin + bins + 1 - first))
+            return replace(state, first_bin=first, counts=counts, next_bin=state.first_bin + lags - guard), []
         # The last bin is still open: its events count, but it is not correlated yet.
         counts = np.empty((2, bins + 1))
         _kernels.count_bins(t_us, p, state.first_bin, self._bin_us, state.counts, counts)
 
         locks: list[SyncLock] = []
         power, known, clock, stray = state.power, state.known, state.clock, state.stray
-        lags = bins - span + 1
         lo = state.next_bin - state.first_bin
         if lags - guard > lo:
             rho = np.empty(lags)

@@ -248,17 +248,15 @@ def test_events_in_many_boxes_at_once(seed, many):
     boxes = np.stack([left, top, right, np.minimum(top + rng.integers(1, 9, many), HEIGHT)], 1)
     boxes[1::7] = boxes[::7][: len(boxes[1::7])]
     filtered = rng.random(many) < 0.5
-    labels, begins = np.zeros((2, 3), np.int16), np.empty(many + 1, np.int64)
-    columns = _kernels.select_boxes(
-        events.t_us, events.x, events.y, events.p, boxes, filtered, pixels, 20, 5, 3, labels, begins
-    )
-    assert not labels.any()
+    rhythm = Rhythm(WIDTH, HEIGHT, CHIP_US, 20)
+    rhythm._pixels[:] = pixels
+    found = rhythm.select(events, boxes, filtered)
     listened = ((score >= 20) & (same < 5))[events.y, events.x]
-    for k, (box, only) in enumerate(zip(boxes.tolist(), filtered, strict=True)):
+    assert len(found) == many
+    for got, box, only in zip(found, boxes.tolist(), filtered, strict=True):
         want = twins.select_box(events[listened] if only else events, tuple(box))
-        for got, name in zip(columns, ("t_us", "x", "y", "p"), strict=True):
-            assert_array_equal(got[begins[k] : begins[k + 1]], getattr(want, name))
-    assert begins[-1] == len(columns[0])
+        for name in ("t_us", "x", "y", "p"):
+            assert_array_equal(getattr(got, name), getattr(want, name))
 
 
 @pytest.mark.parametrize("freeze", [1, 2])
