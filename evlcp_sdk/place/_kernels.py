@@ -485,7 +485,8 @@ def fitted(
     """Levenberg-Marquardt from a point; whether it settled, twice the cost, and the point.
 
     The damping follows how much of what the equations promise a step wins (Nielsen 1999). A cost above
-    `hopeless` that four steps in a row hardly lower is one where it has settled.
+    `hopeless` that four steps in a row hardly lower, and that a step without damping would leave above it, is
+    one where it has settled.
     """
     bars = len(bar_sigma)
     info, right, cost = np.zeros((bars, GLOBAL, GLOBAL)), np.zeros((bars, GLOBAL)), np.zeros(bars)
@@ -549,7 +550,12 @@ def fitted(
                 # No step is an improvement any more: rounding decides.
                 return promise < 1e-3, best, position, rotation, local, error
         if stalled == 4 and best > hopeless:
-            return True, best, position, rotation, local, error
+            stalled, least = 0, best
+            if solved(whole, side, 1e-9, move[:n]):
+                for i in range(n):
+                    least -= side[i] * move[i]
+            if least > hopeless:
+                return True, best, position, rotation, local, error
     return False, best, position, rotation, local, error
 
 

@@ -60,7 +60,7 @@ def fit_pose(
         start: Where to begin; its cost does not matter.
         steps: At most so many.
         robust: Else plain least squares.
-        hopeless: A cost above which it counts as settled where four steps in a row hardly lower it.
+        hopeless: A cost above which it counts as settled where steps hardly lower it, nor promise to.
 
     Returns:
         Where it ends; its cost is NaN where the start has a point behind the camera.

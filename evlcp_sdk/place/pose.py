@@ -192,12 +192,16 @@ def _plain(problem: Problem) -> Judged | Refusal:
 
 
 def _explained(problem: Problem) -> Pose | Refusal | None:
-    """The pose by all that is given; None where that does not fit together."""
+    """The pose by all that is given; None where that does not fit together; a refusal: it may do."""
     starts = likely_starts(problem)
-    if not starts or is_hopeless(problem, starts[0]):
-        return None
+    if not starts:
+        return Refusal("not-determined", "no place from which the bars would be seen so")
+    if is_hopeless(problem, starts[0]):
+        return None if starts[0].settled else Refusal("not-determined", "the fit does not settle")
     fits = [fit for start in starts if (fit := fit_pose(problem, start)).settled]
-    if not fits or all(misfits(problem, fit) for fit in fits):
+    if not fits:
+        return Refusal("not-determined", "the fit does not settle")
+    if all(misfits(problem, fit) for fit in fits):
         return None
     found = _settled(problem, fits)
     if isinstance(found, Refusal):

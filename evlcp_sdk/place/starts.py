@@ -44,18 +44,19 @@ def likely_starts(problem: Problem) -> list[Fit]:
     much faster than to all points and as robust against a poor start. What ends at the same place counts
     once; what fits far worse than another is left out.
     """
-    few, limit = problem.halved(), _hopeless(problem)
+    few, limit, usual = problem.halved(), _hopeless(problem), _usual(problem)
     fits: list[Fit] = []
     unsettled: list[Fit] = []
     for position, rotation in _closed_form_starts(problem):
-        steps = STEPS if all(fit.cost > limit for fit in fits) else _OTHER_STEPS
+        steps = STEPS if all(fit.cost > usual for fit in fits) else _OTHER_STEPS
         start = Fit.at(problem, position, rotation)
         fit = fit_pose(few, start, steps, robust=False, hopeless=limit)
         if not fit.settled and not math.isnan(fit.cost):
             unsettled.append(fit)
         elif fit.settled and not any(_same(problem, fit, other) for other in fits):
             fits.append(fit)
-    fits = fits or unsettled
+    if all(fit.cost > usual for fit in fits):
+        fits += unsettled
     fits.sort(key=lambda fit: fit.cost)
     return [fit for fit in fits if fit.cost < fits[0].cost + ODDS + _ROUGHLY]
 
@@ -67,7 +68,12 @@ def is_hopeless(problem: Problem, start: Fit) -> bool:
 
 def _hopeless(problem: Problem) -> float:
     """A robust square sum within its limit holds that of the means to about the same, and never to this."""
-    return 100 + 4 * chi_square(problem.spec.false_alarm / 2, problem.freedom)
+    return 100 + 4 * _usual(problem)
+
+
+def _usual(problem: Problem) -> float:
+    """What a square sum is not above where all is as said."""
+    return chi_square(problem.spec.false_alarm / 2, problem.freedom)
 
 
 def _same(problem: Problem, one: Fit, two: Fit) -> bool:
