@@ -16,6 +16,9 @@ __all__ = ["check", "register"]
 
 _STYLES = {"ok": "green", "failed": "bold red", "skipped": "dim", "excused": "yellow"}
 
+_WIDTH = 18
+"""Of a law's name, where laws are shown as they are judged: the longest is `codewords-distinct`."""
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -23,8 +26,12 @@ def register(app: typer.Typer) -> None:
 
 
 def check(
-    role: Annotated[str, typer.Argument(metavar="ROLE", help="What the algorithm does, e.g. ranging.")],
-    id: Annotated[str, typer.Argument(metavar="ID", help="Its id, as `evlcp plugins` lists it.")],
+    role: Annotated[
+        str | None, typer.Argument(metavar="[ROLE", help="What the algorithm does, e.g. ranging.")
+    ] = None,
+    id: Annotated[
+        str | None, typer.Argument(metavar="ID]", help="Its id, as `evlcp plugins` lists it.")
+    ] = None,
     link_file: LinkFile = None,
     overrides: Annotated[
         list[str] | None,
@@ -39,12 +46,12 @@ def check(
         typer.Option(
             "--excuse",
             metavar="LAW=REASON",
-            help="A law that is known to be broken, and why; may be repeated.",
+            help="A law of the algorithm that is known to be broken, and why; may be repeated.",
         ),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Hold an installed algorithm, yours or ours, against the laws of its role.
+    """Hold an installed algorithm, yours or ours, against the laws of its role; or all algorithms of a link.
 
     A built-in one:      [bold]evlcp check ranging poc[/]
 
@@ -52,12 +59,62 @@ def check(
 
     On another link:     [bold]evlcp check ranging poc -c link.toml --set bar.rows=24[/]
 
+    A whole link:        [bold]evlcp check -c link.toml[/]
+
     For a script:        [bold]evlcp check decoding ml-soft --json[/]
 
     `-c` and `--set TABLE.KEY` say what the rest of the link is; without them it is the default.
     One line per law: ok, failed (what was expected), skipped (why it does not apply), excused (by you).
     An excused law that holds is a failure. Exit code 0: no failure, 1: a law is broken.
     """
+    from evlcp_sdk.errors import ConfigError
+
+    if role is None:
+        if excuses:
+            raise ConfigError("--excuse: expected ROLE and ID, whose law it is")
+        _check_link(link_file, overrides or [], as_json)
+    elif id is None:
+        raise ConfigError(f"check {role}: expected ROLE and ID, or neither for a whole link")
+    else:
+        _check_one(role, id, link_file, overrides or [], excuses or [], as_json)
+
+
+def _check_link(link_file: str | None, overrides: Sequence[str], as_json: bool) -> None:
+    import json
+
+    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.testing.suite import check_link
+
+    link = load_link(link_file, overrides)
+    found: list[tuple[str, Verdict]] = []
+    for role, outcome in check_link(link):
+        if not as_json and role not in [other for other, _ in found]:
+            head = "the link" if role == "link" else f"{role} '{link.table[role]['id']}'"
+            console().print(head, style="bold")
+        found.append((role, outcome))
+        if not as_json:
+            _show([outcome], _WIDTH)
+    outcomes = [outcome for _, outcome in found]
+    failed = sum(outcome.status == "failed" for outcome in outcomes)
+    if as_json:
+        laws = [
+            {"role": role, "id": None if role == "link" else link.table[role]["id"]} | _law(outcome)
+            for role, outcome in found
+        ]
+        echo(json.dumps({"link": link.digest, "failed": failed, "laws": laws}, indent=2))
+    else:
+        console().print(f"{link_file or 'the default link'}: {_counted(outcomes)}")
+    raise typer.Exit(1 if failed else 0)
+
+
+def _check_one(
+    role: str,
+    id: str,
+    link_file: str | None,
+    overrides: Sequence[str],
+    excuses: Sequence[str],
+    as_json: bool,
+) -> None:
     import json
 
     from evlcp_sdk.errors import ConfigError
@@ -69,12 +126,12 @@ def check(
     registry = Registry.load()
     entry = registry.find(role, id)
     reasons = {}
-    for text in excuses or []:
+    for text in excuses:
         law, equals, reason = text.partition("=")
         if not equals:
             raise ConfigError(f"--excuse {text}: expected LAW=REASON")
         reasons[law.strip()] = reason.strip()
-    link = _link(role, id, link_file, overrides or [], registry)
+    link = _link(role, id, link_file, overrides, registry)
     outcomes = hold(role, link.algorithm(role), reasons, link)
     failed = sum(outcome.status == "failed" for outcome in outcomes)
     if as_json:
@@ -88,19 +145,24 @@ def check(
                     "link": link.digest,
                     "parameters": {k: v for k, v in link.table[role].items() if k != "id"},
                     "failed": failed,
-                    "laws": [
-                        {"law": o.law.name, "says": o.law.says, "status": o.status, "detail": o.detail}
-                        for o in outcomes
-                    ],
+                    "laws": [_law(outcome) for outcome in outcomes],
                 },
                 indent=2,
             )
         )
     else:
-        _show(outcomes)
-        counts = [f"{n} {s}" for s in _STYLES if (n := sum(o.status == s for o in outcomes))]
-        console().print(f"{role} '{id}' of {entry.distribution} {entry.version}: {', '.join(counts)}")
+        _show(outcomes, max(len(o.law.name) for o in outcomes))
+        console().print(f"{role} '{id}' of {entry.distribution} {entry.version}: {_counted(outcomes)}")
     raise typer.Exit(1 if failed else 0)
+
+
+def _law(outcome: "Verdict") -> dict[str, str]:
+    law = outcome.law
+    return {"law": law.name, "says": law.says, "status": outcome.status, "detail": outcome.detail}
+
+
+def _counted(outcomes: "Sequence[Verdict]") -> str:
+    return ", ".join(f"{n} {s}" for s in _STYLES if (n := sum(o.status == s for o in outcomes)))
 
 
 def _link(
@@ -131,11 +193,10 @@ def _link(
     )
 
 
-def _show(outcomes: "list[Verdict]") -> None:
+def _show(outcomes: "Sequence[Verdict]", width: int) -> None:
     from rich.text import Text
 
     out = console()
-    width = max(len(o.law.name) for o in outcomes)
     for o in outcomes:
         text = o.law.says if o.status == "ok" else " ".join(o.detail.split())
         out.print(Text.assemble((f"{o.status:<7}", _STYLES[o.status]), f"  {o.law.name:<{width}}  {text}"))

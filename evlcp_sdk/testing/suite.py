@@ -1,6 +1,6 @@
 """All laws of a role; an algorithm held against them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from evlcp_sdk.errors import ConfigError
@@ -15,7 +15,7 @@ from evlcp_sdk.testing.law import Law, Verdict, judge
 from evlcp_sdk.testing.links import LINK
 from evlcp_sdk.testing.streams import SYNCHRONIZATION, TRACKING
 
-__all__ = ["check", "checked_excuses", "laws_of"]
+__all__ = ["check", "check_link", "checked_excuses", "laws_of"]
 
 
 _EVERY = DESCRIPTION + FUNCTION + RESULT
@@ -82,3 +82,23 @@ def check(
     known = checked_excuses(role, excuses or {})
     subject = subject_of(role, algorithm, link)
     return [judge(law, subject, known) for law in laws_of(role)]
+
+
+def check_link(link: Link) -> Iterator[tuple[str, Verdict]]:
+    """Hold all algorithms of a link against the laws of their roles on it, and the link against its own.
+
+    Yields:
+        The role, or `link`, and what became of one of its laws. Laws of the whole link come once, last.
+
+    >>> from evlcp_sdk.link.resolve import load_link
+    >>> next(check_link(load_link()))[0]
+    'pilots'
+    """
+    for role in ROLES:
+        subject = subject_of(role, link.algorithm(role), link)
+        for law in laws_of(role):
+            if law not in LINK:
+                yield role, judge(law, subject, {})
+    whole = subject_of("decoding", link.algorithm("decoding"), link)
+    for law in LINK:
+        yield "link", judge(law, whole, {})

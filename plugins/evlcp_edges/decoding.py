@@ -93,19 +93,13 @@ class EdgeDecoding(Decoding):
             for chip in range(1, len(code)):
                 seen = pilot[chip][pixels.v[shown], pixels.u[shown]]
                 counts[code[chip - 1] + 1, code[chip] + 1] += np.bincount(seen, share, side)
-        of_edge = self._log_shares(counts.sum(0))
-        of_both = self._log_shares(counts.reshape(9, side)).reshape(3, 3, side)
+        # What comes with all alike is worth the same: each histogram's prior is as large as it is itself.
+        prior = self.prior_count * 9 / max(float(counts.sum()), 1e-9)
+        of_edge = _log_shares(counts.sum(0), prior)
+        of_both = _log_shares(counts.reshape(9, side), prior).reshape(3, 3, side)
         # A kind that no pilot has is like all of its edge.
         of_both = np.where(counts.sum(-1, keepdims=True) > 0, of_both, of_edge)
         return np.concatenate([np.zeros((1, side)), of_edge, of_both.reshape(9, side)])
-
-    def _log_shares(self, counts: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Log of each histogram's shares, those seen most often worth the prior."""
-        # To each as it is frequent, so that what comes with all alike is worth the same.
-        many = counts.sum(1, keepdims=True)
-        prior = self.prior_count * np.where(many > 0, many / max(float(many.mean()), 1e-9), 1.0)
-        shares: NDArray[np.float64] = np.log((counts + prior) / (many + counts.shape[1] * prior))
-        return shares
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +109,14 @@ class _Pixels:
     v: NDArray[np.int64]
     u: NDArray[np.int64]
     share: NDArray[np.float64]
+
+
+def _log_shares(counts: NDArray[np.float64], prior: float) -> NDArray[np.float64]:
+    """Log of each histogram's shares, with a prior in every cell, as a share of the histogram."""
+    many = counts.sum(1, keepdims=True)
+    each = prior * np.where(many > 0, many, 1.0)
+    shares: NDArray[np.float64] = np.log((counts + each) / (many + counts.shape[1] * each))
+    return shares
 
 
 def _kinds(words: NDArray[np.int64], before: int) -> NDArray[np.int64]:

@@ -14,8 +14,9 @@ from evlcp_centroid.ranging import CentroidRanging
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.roles import ROLES, Filter, Ranging, Tracker, Tracking
-from evlcp_sdk.testing import check, laws_of
-from evlcp_sdk.testing.law import Subject
+from evlcp_sdk.testing import check, laws_of, suite
+from evlcp_sdk.testing.law import Law, Subject, Verdict
+from evlcp_sdk.testing.links import LINK
 from evlcp_sdk.testing.trees import difference
 
 Evlcp = Callable[..., Any]
@@ -187,6 +188,8 @@ def test_the_command_takes_excuses(evlcp: Evlcp) -> None:
         (("ranging", "poc", "--set", ".foo=1"), "--set .foo=1: expected KEY=VALUE or TABLE.KEY=VALUE"),
         (("ranging", "poc", "-c", "nowhere.toml"), "nowhere.toml: cannot be read"),
         (("ranging", "poc", "--excuse", "exact"), "expected LAW=REASON"),
+        (("ranging",), "check ranging: expected ROLE and ID, or neither for a whole link"),
+        (("--excuse", "exact=no"), "--excuse: expected ROLE and ID"),
         (("ranging", "poc", "--excuse", "exakt=no"), "no ranging law named 'exakt'"),
     ],
 )
@@ -195,6 +198,27 @@ def test_what_is_unknown_ends_with_2(evlcp: Evlcp, given: tuple[str, ...], said:
     assert done.code == 2
     assert said in done.err
     assert not done.out
+
+
+def test_a_whole_link(evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[tuple[str, Law]] = []
+
+    def hold(law: Law, subject: Subject, _: object) -> Verdict:
+        shown.append((subject.role, law))
+        bad = (subject.role, law.name) == ("decoding", "inverts")
+        return Verdict(law, "failed" if bad else "ok", "symbol 3, got 4" if bad else "")
+
+    monkeypatch.setattr(suite, "judge", hold)
+    done = evlcp("check", "--set", "modulation.id=wh8")
+    assert done.code == 1
+    assert "modulation 'wh8'" in done.out
+    assert "failed   inverts             symbol 3, got 4" in done.out
+    assert {role for role, _ in shown} == set(ROLES)
+    # Those of the link once only.
+    assert [law for _, law in shown if law in LINK] == list(LINK)
+    table = json.loads(evlcp("check", "--set", "modulation.id=wh8", "--json").out)
+    assert (table["failed"], len(table["laws"])) == (1, len(shown) // 2)
+    assert {law["id"] for law in table["laws"] if law["role"] == "link"} == {None}
 
 
 @dataclass(frozen=True)

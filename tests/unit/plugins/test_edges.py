@@ -132,15 +132,16 @@ def test_decoding_is_the_likeliest_word(seed: int) -> None:
                 counts[clip[chip, v, u] + 2] += 0.9
     single = {e: [sum(c[i] for key, c in both.items() if key[1] == e) for i in range(5)] for e in (-1, 0, 1)}
 
-    def logs(tables: dict, rows: int) -> dict:  # type: ignore[type-arg]
-        mean = sum(sum(c) for c in tables.values()) / rows
+    total = sum(map(sum, both.values()))
+
+    def logs(tables: dict) -> dict:  # type: ignore[type-arg]
         out = {}
         for key, counts in tables.items():
-            prior = sum(counts) / mean
+            prior = sum(counts) * 9 / total
             out[key] = [math.log((c + prior) / (sum(counts) + 5 * prior)) for c in counts]
         return out
 
-    of_both, of_edge = logs(both, 9), logs(single, 3)
+    of_both, of_edge = logs(both), logs(single)
     for k in range(3):
         fits = []
         for word in words.tolist():
