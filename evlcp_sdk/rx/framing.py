@@ -41,6 +41,10 @@ clusters place it less well than all."""
 _DARK = 0.25
 """Share of a pilot's events below which a bar that was seen before is out of sight, or hidden."""
 
+_MOST_ENDED, _PART_PX = 64, 16.0
+"""Regions that ended without a frame that are remembered, and how far outside of a bar they may have been
+parts of it: pieces of a near bar are followed before the whole of it is known, and the image moves."""
+
 _MOST_LIT = 1024
 """Transmitters of which is known when their light was there."""
 
@@ -52,6 +56,7 @@ _COUNTS = (
     "preambles",
     "frames",
     "frames_rejected",
+    "frames_of_parts",
     "frames_dark",
     "frames_unread",
     "frames_askew",
@@ -115,6 +120,7 @@ class PacketFraming:
         self._echoes = judged.echoes
         self._judged = judged
         self._joined: set[int] = set()
+        self._ended: deque[tuple[tuple[float, float], int]] = deque(maxlen=_MOST_ENDED)
         self._due: deque[Followed] = deque()
         self.counts = dict.fromkeys(_COUNTS, 0)
         self.lit_us: dict[int, tuple[float, float]] = {}
@@ -186,6 +192,7 @@ class PacketFraming:
                 self._lit_in(transmitter, due)
             if isinstance(found, str):
                 self.counts[found] += 1
+                transmitter.rejected += found == "frames_rejected"
                 continue
             self.counts["frames"] += 1
             self._judged.add(transmitter.packets, due, found)
@@ -228,6 +235,8 @@ class PacketFraming:
         ):
             # What says nothing is no transmitter, and of one that is known its distance may still be of use.
             return "frames_unread"
+        if transmitter.number is None:
+            self._find_parts(transmitter.region, due.start_us)
         number = self._transmitters.number(transmitter)
         transmitter.distance, distance, filtered = self._steps.follow(
             transmitter.distance, due.start_us, due.lock.chip_us, distance, sight
@@ -325,15 +334,44 @@ class PacketFraming:
         """Forget a region that has become a part of another."""
         self._joined.add(region.id)
         if region in self._transmitters:
+            transmitter = self._transmitters[region]
             self.counts["regions_released"] += 1
-            self._judged.end(self._transmitters[region].packets)
-            self._transmitters.release(self._transmitters[region])
+            self._was_part(transmitter.rejected)
+            self._judged.end(transmitter.packets)
+            self._transmitters.release(transmitter)
+
+    def _was_part(self, rejected: int) -> None:
+        """Count the frames that a part of a bar could not show apart from those that no bar shows."""
+        self.counts["frames_rejected"] -= rejected
+        self.counts["frames_of_parts"] += rejected
+
+    def _find_parts(self, region: Followed, t_us: float) -> None:
+        """Look among the regions that ended for parts of a bar whose first frame is read."""
+        for one in list(self._ended):
+            place_px, rejected = one
+            if _is_part(region, t_us, place_px):
+                self._ended.remove(one)
+                self._was_part(rejected)
 
     def _end(self, transmitter: Transmitter, now_us: float) -> None:
         """Decode what a region that has ended still shows; its last packet is over."""
         seen_us = transmitter.region.latest.t_us + self._step_us
         self._decode_due(transmitter, min(now_us - self._tail_us, seen_us))
+        if transmitter.number is None and transmitter.rejected:
+            place_px = transmitter.region.place_at(seen_us)
+            bars = [one for one in self._regions.alive if one is not transmitter.region and one.size_px]
+            if any(_is_part(bar, seen_us, place_px) for bar in bars):
+                self._was_part(transmitter.rejected)
+            else:
+                self._ended.append((place_px, transmitter.rejected))
         self._judged.end(transmitter.packets)
+
+
+def _is_part(bar: Followed, t_us: float, place_px: tuple[float, float]) -> bool:
+    """Whether what was seen somewhere may have been a part of a bar."""
+    (x, y), (width, height) = bar.place_at(t_us), bar.size_at(t_us)
+    right, down = abs(place_px[0] - x), abs(place_px[1] - y)
+    return right <= width / 2 + _PART_PX and down <= height / 2 + _PART_PX
 
 
 def _went_dark(transmitter: Transmitter, due: DueFrame, packet: PacketFormat) -> bool:

@@ -43,6 +43,7 @@ class Transmitter:
         rows: How late the rows of its bar are read.
         pilot: The newest pilot, None where it showed no bar.
         said: Number of the newest frame that was decoded, on the grid, and its symbols.
+        rejected: Frames due that were rejected.
         lit_us: When the first frame was due in which its light was there, camera clock, us; None before.
     """
 
@@ -56,6 +57,7 @@ class Transmitter:
     rows: RowDelay = field(default_factory=RowDelay)
     pilot: Pilot | None = None
     said: tuple[int, NDArray[np.int64]] = (-1, np.empty(0, np.int64))
+    rejected: int = 0
     lit_us: float | None = None
 
 

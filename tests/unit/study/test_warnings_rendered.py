@@ -44,6 +44,17 @@ def test_nothing_is_wrong(changes: Keys) -> None:
     assert warned(duration_s=0.2, **changes) == []
 
 
+def test_parts_of_a_near_bar_are_no_frames_of_another() -> None:
+    """Pieces of a bar of 480 rows are followed before the whole of it is known."""
+    near = {"motion.distance_m": 15.0, "motion.speed_mps": 0.0, "motion.vib_rate_rad_s": 0.0}
+    day = {"background.light_w_m2": 1.0, "bars.0.led_w_m2": None, "sensor.hold": True, "sensor.refr_us": 20.0}
+    summary = receive_to_folder(rendered((), 0.045, {**near, **day, "bars.0.x_m": -0.9}), None)
+    counts = summary["counts"]
+    assert counts["frames"] == 9
+    assert (counts["frames_rejected"], counts["frames_of_parts"] >= 10) == (0, True)
+    assert summary["warnings"] == []
+
+
 @pytest.mark.parametrize(
     ("codes", "sent", "read", "says"),
     [
