@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from evlcp_robust.decoding import Majority
+from evlcp_robust.modulation import ReturnToZero
 from evlcp_robust.ranging import MedianPairs
 
 import evlcp_sdk as evlcp
@@ -20,6 +21,11 @@ def test_ranging(check):
 
 @conformance("decoding", Majority())
 def test_decoding(check):
+    check()
+
+
+@conformance("modulation", ReturnToZero())
+def test_modulation(check):
     check()
 
 

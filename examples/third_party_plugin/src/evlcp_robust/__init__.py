@@ -1,4 +1,4 @@
-"""Ranging and decoding that a few bad pixels cannot sway."""
+"""Ranging and decoding that a few bad pixels cannot sway, and a modulation that is no pair code."""
 
 from collections.abc import Iterator
 
@@ -15,4 +15,7 @@ def evlcp_algorithms() -> Iterator[evlcp.Algorithm]:
     )
     yield evlcp.Algorithm(
         "decoding", "majority", "evlcp_robust.decoding:Majority", 1, "one vote a cell, odds from the pilots"
+    )
+    yield evlcp.Algorithm(
+        "modulation", "rz", "evlcp_robust.modulation:ReturnToZero", 1, "return to zero: a pulse for a one"
     )
