@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from evlcp_sdk.errors import EvlcpError
+from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.doubts import codewords_never
@@ -153,7 +153,11 @@ def better_links(
             other = _with(start.link, name, value, registry)
             if other is None or other.digest == start.link.digest:
                 continue
-            trial = try_link(other, events, tuple({**dict(start.changes), name: value}.items()))
+            try:
+                trial = try_link(other, events, tuple({**dict(start.changes), name: value}.items()))
+            except ConfigError:
+                # Codes that the link's own steps do not read.
+                continue
             yield trial
             first = trial.frames >= _FEW_FRAMES > best.frames
             if trial.rank > best.rank and (counts or trial.fits or first or trial.share > best.share + _GAIN):
