@@ -113,7 +113,9 @@ def receive(
     gnss: Annotated[
         Path | None,
         typer.Option(
-            "--gnss", metavar="FILE.csv", help="Fixes of satellites, with sigmas, which enter the track."
+            "--gnss",
+            metavar="FILE",
+            help="Fixes of satellites, with sigmas, which enter the track: CSV, or .nmea with --clock-zero.",
         ),
     ] = None,
     heading_deg: Annotated[
@@ -215,7 +217,8 @@ def receive(
         gravity_sigma_deg = 0.5 if attitude_file is None else 0.1
     sigmas = (gravity_sigma_deg, heading_sigma_deg, white_sigma_deg, time_sigma_us)
     attitude = _attitude(attitude_file, angles, sigmas)
-    plan, zero = _position_plan(sites, gnss, mcap), _clock_zero(clock_zero)
+    zero = _clock_zero(clock_zero)
+    plan = _position_plan(sites, gnss, link, zero, mcap=mcap)
     short = {"figures": figures, "report": report, "parquet": parquet, "mcap": mcap}
     asked = tuple(dict.fromkeys([*(name for name, given in short.items() if given), *(sinks or [])]))
     load_sinks(choose_sinks(registry, asked, positions=plan is not None))
@@ -325,7 +328,9 @@ def _attitude(
     return Attitude(pitch, roll, heading, *sigmas) if pitch is not None and roll is not None else None
 
 
-def _position_plan(sites: Path | None, gnss: Path | None, mcap: bool) -> "PositionPlan | None":
+def _position_plan(
+    sites: Path | None, gnss: Path | None, link: "Link", zero: "datetime | None", *, mcap: bool
+) -> "PositionPlan | None":
     """What the options say of positions; None without sites."""
     if sites is None:
         for name, given in (("--mcap", mcap), ("--gnss", gnss is not None)):
@@ -336,7 +341,8 @@ def _position_plan(sites: Path | None, gnss: Path | None, mcap: bool) -> "Positi
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.scene.sites import load_sites
 
-    return PositionPlan(load_sites(sites), None if gnss is None else GnssLog.read(gnss))
+    log = None if gnss is None else GnssLog.read(gnss, zero, link.position.gnss_sigma_m)
+    return PositionPlan(load_sites(sites), log)
 
 
 def _clock_zero(text: str | None) -> "datetime | None":

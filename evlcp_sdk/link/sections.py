@@ -172,6 +172,14 @@ class PositionSpec:
     gnss_s: Annotated[float, Field(gt=0, description="Time in which most of a GNSS fix's error changes.")] = (
         30.0
     )
+    gnss_sigma_m: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=1e4,
+            description="Sigma of east and north of a fix in NMEA without GST, of up twice that; 0: none.",
+        ),
+    ] = 0.0
     gnss_white_share: Annotated[
         float, Field(gt=0, le=1, description="Share of its variance that is new with every fix.")
     ] = 0.1

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import csv_number, read_csv
 from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.nmea import read_nmea
 from evlcp_sdk.place.poses import PLACE
 from evlcp_sdk.place.trajectory import GNSS
 from evlcp_sdk.scene.attitude import Attitude
@@ -47,17 +49,26 @@ class GnssLog:
     covariance_m2: Floats
 
     @classmethod
-    def read(cls, path: Path | str) -> "GnssLog":
-        """Read a CSV whose columns are named as those of `fixes.csv`.
+    def read(
+        cls, path: Path | str, clock_zero: datetime | None = None, usual_sigma_m: float = 0.0
+    ) -> "GnssLog":
+        """Read a CSV whose columns are named as those of `fixes.csv`, or a `.nmea` with GGA and GST.
 
         t_us, latitude_deg, longitude_deg, height_m, sigma_east_m, sigma_north_m, sigma_up_m; optional
         cov_east_north_m2, cov_east_up_m2, cov_north_up_m2.
 
+        Args:
+            path: The file.
+            clock_zero: UTC of the camera clock's 0, which NMEA needs.
+            usual_sigma_m: Of east and north where NMEA has no GST, of up twice that; 0: none.
+
         Raises:
             InputError: The file cannot be read.
             ConfigError: A column is missing, a value is not a number or is out of range, times do not rise,
-                or a covariance is none.
+                a covariance is none, or NMEA lacks what it needs.
         """
+        if Path(path).suffix.lower() == ".nmea":
+            return cls._of_nmea(path, clock_zero, usual_sigma_m)
         names, rows = read_csv(path)
         needed = ("t_us", *PLACE, *_SIGMAS)
         missing = [name for name in needed if name not in names]
@@ -71,11 +82,7 @@ class GnssLog:
         for i, (line, row) in enumerate(rows):
             value = partial(csv_number, path, line)
             t_us[i] = value("t_us", row["t_us"])
-            if i and not t_us[i] > t_us[i - 1]:
-                raise ConfigError(
-                    f"{path}: line {line}: t_us = {t_us[i]:.16g}: expected more than the line before,"
-                    f" {t_us[i - 1]:.16g}: rising t_us"
-                )
+            _check_rising(path, line, t_us[: i + 1])
             place[i] = [value(name, row[name], within) for name, within in PLACE.items()]
             spread[i] = np.diag([value(name, row[name], _SIGMA_M) ** 2 for name in _SIGMAS])
             for name, (a, b) in _CROSSED.items():
@@ -84,6 +91,32 @@ class GnssLog:
             if not np.linalg.eigvalsh(spread[i])[0] > 0:
                 raise ConfigError(f"{path}: line {line}: sigmas and covariances: expected a covariance")
         return cls(t_us, place, spread)
+
+    @classmethod
+    def _of_nmea(cls, path: Path | str, zero: datetime | None, usual_sigma_m: float) -> "GnssLog":
+        if zero is None:
+            raise ConfigError(
+                f"{path}: NMEA tells UTC: expected --clock-zero, the UTC of the camera clock's 0, as `evlcp"
+                " receive` takes it, or a CSV file"
+            )
+        found = read_nmea(path, zero, usual_sigma_m)
+        if not found:
+            raise ConfigError(f"{path}: expected a GGA with a fix or more")
+        t_us = np.array([(fix.utc - zero).total_seconds() * 1e6 for fix in found])
+        for i, fix in enumerate(found):
+            _check_rising(path, fix.line, t_us[: i + 1])
+        return cls(
+            t_us, np.array([fix.place for fix in found]), np.array([fix.covariance_m2 for fix in found])
+        )
+
+
+def _check_rising(path: Path | str, line: int, t_us: Floats) -> None:
+    """Whether the last of some times is later than the one before."""
+    if len(t_us) > 1 and not t_us[-1] > t_us[-2]:
+        raise ConfigError(
+            f"{path}: line {line}: t_us = {t_us[-1]:.16g}: expected more than the line before,"
+            f" {t_us[-2]:.16g}: rising t_us"
+        )
 
 
 def gnss_fix(

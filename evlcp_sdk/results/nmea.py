@@ -8,18 +8,18 @@ GST is the root of the misfit, in sigmas, as bars give no ranges; its ellipse an
 
 import math
 from datetime import UTC, datetime, timedelta
-from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.place.navigator import Place
+from evlcp_sdk.place.nmea import checksum
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.text import sigmas
 from evlcp_sdk.values import Fix
 
-__all__ = ["Nmea", "checksum", "gga", "gst", "rmc", "txt"]
+__all__ = ["Nmea", "gga", "gst", "rmc", "txt"]
 
 _KNOTS_PER_M_S = 3600 / 1852
 
@@ -55,15 +55,6 @@ def _in_words(fix: Fix, alarm: str) -> str:
     if alarm == "contradicted":
         return f"{fix.source.upper()} CONTRADICTED BY {' '.join(fix.contradicted).upper()}"
     return "NO PROTECTION LEVEL" if alarm == "unavailable" else alarm.upper()
-
-
-def checksum(body: str) -> str:
-    """Exclusive or of a sentence's characters between `$` and `*`, two hex digits.
-
-    >>> checksum("GPGLL,4916.45,N,12311.12,W,225444,A,")
-    '1D'
-    """
-    return f"{reduce(lambda a, b: a ^ b, body.encode('ascii'), 0):02X}"
 
 
 def gga(

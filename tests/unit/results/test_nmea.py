@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evlcp_sdk.results.nmea import checksum, gga, rmc
+from evlcp_sdk.place.nmea import checksum
+from evlcp_sdk.results.nmea import gga, rmc
 
 ZERO = datetime(2026, 3, 1, 23, 59, 58, tzinfo=UTC)
 
