@@ -3,6 +3,7 @@
 It imports nothing that takes time before it can be interrupted.
 """
 
+import os
 import sys
 
 from evlcp_sdk.cli._complain import complain
@@ -16,6 +17,8 @@ _INTERRUPTED = 130
 def main() -> None:
     """Run the command line; whatever goes wrong becomes one line per fault on stderr and its exit code."""
     code: object = 0
+    # Our matrices are of a dozen rows: a thread a core only spins on them. NumPy reads it when it is loaded.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         from signal import SIGHUP, SIGTERM
 
@@ -56,7 +59,6 @@ def _told(fault: BaseException) -> int:
 def _stdout_took_all() -> bool:
     """Whether all that was printed has been written; says so if not, but for a reader who has left."""
     import errno
-    import os
     from contextlib import suppress
 
     try:
