@@ -790,10 +790,13 @@ def spread_across(
                 column = int(np.floor(off.imag + 0.5)) + most
                 if column < 0 or column > 2 * most:
                     continue
+                answers, edges = 0, 0
                 for i in range(1, chips, every):
                     edge = codes[k, i] - codes[k, i - 1]
-                    out[0, column] += int(sums[i, v, u] * edge > 0)
-                    out[1, column] += abs(edge)
+                    answers += int(sums[i, v, u] * edge > 0)
+                    edges += abs(edge)
+                out[0, column] += answers
+                out[1, column] += edges
 
 
 @njit(cache=True, nogil=True)
