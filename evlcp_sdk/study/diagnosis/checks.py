@@ -58,6 +58,9 @@ _MIN_RISES, _LEAST_RATE, _SLENDER = 500, 0.25, 4.0
 how many times longer than wide it is. Leaves and edges that pass look like a code of some hundred chips a
 second, a lamp whose periods are missed like one of some thousand."""
 
+_GLOW_PX = 32
+"""Gap up to which light beside a bar is its own."""
+
 _SOME = 0.02
 """Share of all events below which what blinks is not worth a word where nothing sends chips."""
 
@@ -310,6 +313,7 @@ def _unread(facts: Facts) -> Check | None:
     """Light of a code where no frame is read, beside one that is; None where there is none."""
     link_hz = facts.link.packet.chip_rate_hz
     places = [one.last_px for one in facts.tally.transmitters.values()]
+    read = [one.box_px for one in facts.sources if any(_gap_px(one.box_px, (*at, *at)) <= 0 for at in places)]
     for source in facts.sources:
         left, top, right, bottom = source.box_px
         code = source.kind == "code" and source.rises >= _MIN_RISES
@@ -318,7 +322,8 @@ def _unread(facts: Facts) -> Check | None:
         likely = source.rate_hz >= _LEAST_RATE * link_hz and long_px >= _SLENDER * wide_px
         if not code or not (same or likely):
             continue
-        if any(left <= x <= right and top <= y <= bottom for x, y in places):
+        # A bar's own glow may stand a little apart.
+        if any(_gap_px(source.box_px, other) < _GLOW_PX for other in read):
             continue
         return Check(
             "light",
@@ -332,6 +337,11 @@ def _unread(facts: Facts) -> Check | None:
             f"{float(f'{source.rate_hz:.2g}'):g}; or light that is too weak for its chips",
         )
     return None
+
+
+def _gap_px(one: tuple[float, ...], other: tuple[float, ...]) -> float:
+    """How far two boxes (left, top, right, bottom) are apart, across or down; 0 or less where they meet."""
+    return max(one[0] - other[2], other[0] - one[2], one[1] - other[3], other[1] - one[3])
 
 
 def _is_lamp(source: LightSource, facts: Facts) -> bool:
@@ -583,7 +593,7 @@ def _codewords(facts: Facts) -> Check:
     better = facts.better
     name = dict(better.changes).get("modulation.id") if better is not None else None
     unsure = f"mean quality of {frames} frames {quality:.2f}: their symbols are not sure"
-    if not never and name is None and facts.trials:
+    if not never and name is None and (facts.trials or facts.at_edge):
         return Check("codewords", "doubt", "noisy", unsure, _BRIGHTER)
     return Check(
         "codewords",

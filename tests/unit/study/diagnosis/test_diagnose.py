@@ -152,6 +152,7 @@ def test_a_bar_that_is_not_read_beside_one_that_is() -> None:
     assert judged(BAR, replace(other, rises=300), frames=40) == ""
     assert judged(BAR, replace(other, rate_hz=5000.0, intervals=HALF), frames=40) == "unread"
     assert judged(BAR, replace(other, rate_hz=4000.0, intervals=HALF, high_px=8.0), frames=40) == ""
+    assert judged(BAR, replace(BAR, box_px=(400, 460, 424, 480)), frames=40) == ""
     # Leaves and their edges.
     assert judged(BAR, replace(other, rate_hz=737.0, intervals=HALF), frames=40) == ""
 
