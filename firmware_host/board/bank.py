@@ -143,6 +143,23 @@ class Bank:
         rows = rows_of_chips(c, led_clusters)
         return replace(like, format=Format.MASKS, packets=packets, content=rows.tobytes())
 
+    def chip_by_chip(self) -> "Bank":
+        """The same with every chip in the bank, where the board would compose packets."""
+        if self.composed is None or self.format != Format.WORDS:
+            return replace(self, composed=None)
+        book, packet = self.composed.codebook, self.composed.packet
+        words = np.frombuffer(self.content, "<u2").astype(">u2").view(np.uint8)
+        info = np.unpackbits(words).reshape(self.packets, packet.frames, CLUSTERS, WORD_CHIPS)
+        preamble = np.repeat(book.preamble[:, None], CLUSTERS, axis=1)
+        parts = [masks_of_clusters(self.led_clusters).tobytes()]
+        for one in info:
+            parts.append(_bits_of_chips(preamble))
+            for frame, codes in enumerate(one):
+                if packet.has_pilot(frame):
+                    parts.append(_bits_of_chips(book.pilots.T))
+                parts.append(_bits_of_chips(codes.T))
+        return replace(self, format=Format.CLUSTERS, content=b"".join(parts), composed=None)
+
     @property
     def clusters(self) -> int:
         """Clusters."""

@@ -255,7 +255,7 @@ class Board:
             status = self.status()
             if status.active_bank != NO_BANK:
                 self.check_duty("what is programmed", status.duty, duty)
-        self._configure(bank, level_ma or 0, 0 if duty is None else round(1000 * duty))
+        self._configure(self.fitted(bank), level_ma or 0, 0 if duty is None else round(1000 * duty))
 
     def check_duty(self, what: str, permille: int, limit: float) -> None:
         """Raise RefusedError if something has a LED on for a larger share of time than a limit."""
@@ -298,6 +298,15 @@ class Board:
                 if rate * hold >= about.chip_rate_min_hz and about.tick_hz % (rate * hold) == 0:
                     return hold
         return 1
+
+    def fitted(self, bank: Bank) -> Bank:
+        """A bank as this board can play it.
+
+        Chip by chip where it would compose packets, but has no chips as long as theirs and so shows each
+        several times.
+        """
+        slow = bank.composed is not None and bank.chip_rate_hz < self.about.chip_rate_min_hz
+        return bank.chip_by_chip() if slow else bank
 
     def _configure(self, bank: Bank, level_limit_ma: int = 0, duty_limit: int = 0) -> None:
         about, rate = self.about, bank.chip_rate_hz * self._hold(bank)
@@ -350,6 +359,7 @@ class Board:
             VerifyError: The bank does not hold what was sent.
             LineError: The line fails; what was active stays so.
         """
+        content = self.fitted(content)
         self.check_fits(content)
         before = self.session.client.retries
         total = len(content.content)
@@ -401,7 +411,7 @@ class Board:
         """
         if ahead < 2:
             raise ConfigError(f"ahead = {ahead}, expected 2 or more packets: one plays, the next waits")
-        like = queue_of(link)
+        like = self.fitted(queue_of(link))
         if not self.about.capabilities & Capability.STREAM:
             raise IncompatibleError(f"{self.session.name}: its firmware has no streams; update the firmware")
         self.check_fits(like)
@@ -466,7 +476,7 @@ class Board:
             IncompatibleError: It is of another codebook or chip rate.
             VerifyError: It holds something else.
         """
-        s, name = self.status(), self.session.name
+        bank, s, name = self.fitted(bank), self.status(), self.session.name
         again = "'evlcp board program' brings it there"
         if s.active_bank == NO_BANK:
             raise VerifyError(f"{name}: nothing is programmed; {again}")
@@ -650,6 +660,7 @@ def provision(
         BoardError: See `Board.limit`, `Board.program` and `Board.level`.
         ConfigError: The bank does not fit the board.
     """
+    bank = board.fitted(bank)
     board.check_fits(bank)
     before = status = board.status()
     most_ma, duty = settings.level_limit_ma, settings.duty_limit

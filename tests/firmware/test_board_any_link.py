@@ -529,3 +529,31 @@ def test_a_fleet_of_several_links(evlcp, tmp_path: Path) -> None:
     assert "programmed" in lines["b"]
     assert "FAILED (2): a link of 256 LEDs, native: has 96: HELLO says so" in lines["c"]
     assert "programmed 788 of 788 bytes" in lines["d"]  # 8 clusters, 692 chips
+
+
+@pytest.mark.parametrize("pilot_every", [1, 4])
+def test_what_a_board_composes_is_sent_chip_by_chip_where_it_is_too_slow(
+    device: SimulatedBoard, board: Board, pilot_every: int
+) -> None:
+    object.__setattr__(board.about, "chip_rate_min_hz", 1282)
+    link = load_link(overrides=["air.chip_rate_hz=1000.0", f"air.pilot_every={pilot_every}"])
+    symbols = random_symbols(2, 10, link.codebook, np.random.default_rng(6))
+    chips = symbol_chips(symbols, link.codebook, pilot_every)
+    bank = bank_of(symbols, link)
+    assert bank.format == Format.WORDS
+    assert bank.chip_by_chip().duty == bank.duty
+    provision(board, bank, Settings(duty_limit=0.6))
+    device.run(800_000)
+    rows = shown(device)
+    wanted = np.repeat(np.repeat(chips, 6, axis=1), 2, axis=0)  # 2000 chips/s
+    assert (rows == np.resize(wanted, rows.shape)).all()
+    assert board.verify(bank) == 0
+    assert not board.program(bank).swapped
+    with board.stream(link) as stream:
+        stream.send(symbols[0])
+    rows = shown(device)
+    packet = 2 * link.packet.packet_chips
+    assert (rows[-packet:] == wanted[:packet]).all()
+    masks = Bank.of_chips(chips, link.codebook, link.packet)
+    provision(board, masks, Settings())
+    assert board.status().hold == 2
