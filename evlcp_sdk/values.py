@@ -31,6 +31,7 @@ __all__ = [
     "Fix",
     "Frame",
     "FrameView",
+    "Heard",
     "Packet",
     "PresenceMap",
     "Range",
@@ -400,6 +401,27 @@ class Frame:
     def __repr__(self) -> str:
         place = f"{_who(self.transmitter, self.echo_of)}, packet {self.packet}, frame {self.frame}"
         return f"Frame({place}, {self.t_us / 1e3:.1f} ms, {_symbols(self.soft)}, {_distance(self.range)})"
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """A frame that a framing heard in a region's events.
+
+    Attributes:
+        packet: Number of its packet in the region, from 0.
+        frame: Its number in the packet.
+        packet_t_us: Start of the packet's first preamble chip, us.
+        t_us: Start of the frame's first chip, us.
+        chip_us: Length of a chip, us.
+        soft: What it says.
+    """
+
+    packet: int
+    frame: int
+    packet_t_us: float
+    t_us: float
+    chip_us: float
+    soft: SoftSymbols
 
 
 Trust = Literal["verified", "unverified", "forged"]

@@ -171,7 +171,9 @@ def _link(
     """The link with the algorithm in its role."""
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.link.resolve import load_link, resolve
+    from evlcp_sdk.plugin.roles import STEPS
     from evlcp_sdk.specs import parse_value
+    from evlcp_sdk.testing.exercises import ONE_CLUSTER
 
     own: dict[str, object] = {}
     rest = []
@@ -186,11 +188,19 @@ def _link(
             rest.append(override)
     link = load_link(link_file, rest, registry)
     # Parameters in the file are of the algorithm that the file selects.
-    keys = link.table[role] if link.table[role]["id"] == id else {"id": id}
+    keys = link.table.get(role, {"id": id})
+    keys = keys if keys["id"] == id else {"id": id}
     changed = {**link.table, role: {**keys, **own}}
-    return resolve(
-        changed, registry, source=link_file or "", overridden=frozenset((role, key) for key in own)
-    )
+    overridden = frozenset((role, key) for key in own)
+    if role == "framing" and link.table[role]["id"] != id:
+        # The steps of another framing are none of its own, and the default bar may be none for it.
+        changed = {name: values for name, values in changed.items() if name not in STEPS}
+        if link_file is None and not any(name.startswith("bar.") for name in rest):
+            try:
+                return resolve(changed, registry, overridden=overridden)
+            except ConfigError:
+                changed["bar"] = dict(ONE_CLUSTER)
+    return resolve(changed, registry, source=link_file or "", overridden=overridden)
 
 
 def _show(outcomes: "Sequence[Verdict]", width: int) -> None:

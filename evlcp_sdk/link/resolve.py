@@ -23,8 +23,11 @@ from evlcp_sdk.plugin.records import message_kinds
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import (
     ROLES,
+    STEPS,
     Decoding,
+    Detection,
     ErrorCorrection,
+    Framing,
     Modulation,
     Pilots,
     Ranging,
@@ -62,7 +65,7 @@ class Link:
         regions: Parameters of the region detector.
         position: Parameters of the positions.
         messages: How messages are read.
-        algorithms: Role to algorithm, one of each role.
+        algorithms: Role to algorithm, one of each role but for those that are no step of its framing.
         revisions: Role to the algorithm's revision.
         codebook: The codes that both ends share.
         packet: Lengths of a packet's parts.
@@ -100,6 +103,10 @@ class Link:
         return f"Link({codes}, {self.air.chip_rate_hz:g} chips/s, digest {self.digest[:12]})"
 
     @overload
+    def algorithm(self, role: Literal["detection"]) -> Detection: ...
+    @overload
+    def algorithm(self, role: Literal["framing"]) -> Framing: ...
+    @overload
     def algorithm(self, role: Literal["pilots"]) -> Pilots: ...
     @overload
     def algorithm(self, role: Literal["modulation"]) -> Modulation: ...
@@ -118,7 +125,13 @@ class Link:
     @overload
     def algorithm(self, role: str) -> Any: ...
     def algorithm(self, role: str) -> Any:
-        """The algorithm of a role, e.g. `link.algorithm("ranging")`."""
+        """The algorithm of a role, e.g. `link.algorithm("ranging")`.
+
+        Raises:
+            ConfigError: It is no step of the link's framing.
+        """
+        if role in STEPS and role not in self.algorithms:
+            raise ConfigError(f"{role}{_unused(self.table['framing']['id'])}")
         return self.algorithms[role]
 
     def with_algorithm(
@@ -141,11 +154,24 @@ class Link:
         """
         if role not in ROLES:
             raise ConfigError(f"no role named '{role}'{nearest(role, list(ROLES))}")
+        if role != "framing":
+            # Says so where it is no step of the link's framing.
+            self.algorithm(role)
         parts = self._parts() | {role: algorithm}
         described = is_dataclass(algorithm) and not isinstance(algorithm, type)
         parameters = asdict(algorithm) if described else {}
         keys = {"id": id or type(algorithm).__name__} | json.loads(json.dumps(parameters, default=str))
         table, revisions = {**self.table, role: keys}, {**self.revisions, role: revision}
+        if role == "framing":
+            unused = STEPS - algorithm.roles
+            if missing := sorted(STEPS - unused - set(parts)):
+                raise ConfigError(
+                    f"framing '{keys['id']}' needs {', '.join(missing)}, which the link has not"
+                )
+            parts, table, revisions = (
+                {name: value for name, value in each.items() if name not in unused}
+                for each in (parts, table, revisions)
+            )
         return _assembled(parts, table, revisions, self.kinds)
 
     def with_air(self, **changes: Any) -> "Link":
@@ -252,6 +278,12 @@ def resolve(
         keys = table.get(section, {})
         if not isinstance(keys, Mapping):
             continue
+        framing = built.get("framing")
+        if section in STEPS and framing is not None and section not in framing.roles:
+            if section in table:
+                set_key = next((key for key in keys if (section, key) in overridden), None)
+                fault(section, set_key, _unused(resolved["framing"]["id"]))
+            continue
         keys = dict(keys)
         head: dict[str, Any] = {}
         if section in _SPECS:
@@ -325,17 +357,15 @@ def _assembled(
 ) -> Link:
     """The link of checked parts, and the table that describes them."""
     bar, air = parts["bar"], parts["air"]
-    pilots, modulation = parts["pilots"], parts["modulation"]
-    with _named("pilots", table):
-        preamble, codes = pilots.preamble(), pilots.codes(bar.clusters)
-        if len(codes) != bar.clusters:
-            raise ValueError(f"gave {len(codes)} codes, expected {bar.clusters}")
-    with _named("modulation", table):
-        codewords = modulation.codewords()
-    codebook = Codebook(table["modulation"]["id"], preamble, codes, codewords)
+    with _named("framing", table):
+        codebook = parts["framing"].codebook(bar.clusters)
+        if codebook is not None and codebook.clusters != bar.clusters:
+            raise ValueError(f"gave codes of {codebook.clusters} clusters, expected {bar.clusters}")
+    if codebook is None:
+        codebook = _codes_of_roles(parts, table)
     return Link(
         **{section: parts[section] for section in _SPECS},
-        algorithms={role: parts[role] for role in ROLES},
+        algorithms={role: parts[role] for role in ROLES if role in parts},
         revisions=revisions,
         codebook=codebook,
         packet=PacketFormat.of(codebook, air.frames_per_packet, air.chip_rate_hz, air.pilot_every),
@@ -343,6 +373,23 @@ def _assembled(
         digest=_digest(table, codebook, revisions),
         kinds=kinds,
     )
+
+
+def _codes_of_roles(parts: Mapping[str, Any], table: Mapping[str, Mapping[str, Any]]) -> Codebook:
+    """The codes that the roles `pilots` and `modulation` give."""
+    pilots, modulation, clusters = parts["pilots"], parts["modulation"], parts["bar"].clusters
+    with _named("pilots", table):
+        preamble, codes = pilots.preamble(), pilots.codes(clusters)
+        if len(codes) != clusters:
+            raise ValueError(f"gave {len(codes)} codes, expected {clusters}")
+    with _named("modulation", table):
+        codewords = modulation.codewords()
+    return Codebook(table["modulation"]["id"], preamble, codes, codewords)
+
+
+def _unused(framing: str) -> str:
+    """What is said of a role that is no step of a framing."""
+    return f": no step of framing '{framing}', which has its own; leave it out"
 
 
 def _pairs(built: Mapping[str, Any]) -> bool:

@@ -49,6 +49,9 @@ def _differences(sent: Link, received: Link, messages: bool) -> Iterator[str]:
 def _codes(sent: Link, received: Link) -> Iterator[str]:
     """Why the codebooks differ; more clusters of one family show in the layout."""
     ours, theirs = sent.codebook, received.codebook
+    if framing := _section(sent, received, "framing"):
+        yield from framing
+        return
     both = min(ours.clusters, theirs.clusters)
     if not (
         np.array_equal(ours.preamble, theirs.preamble)
@@ -61,6 +64,7 @@ def _codes(sent: Link, received: Link) -> Iterator[str]:
 
 def _other_codes(sent: Link, received: Link, role: str) -> str:
     """Codes that differ although all settings are the same."""
+    role = role if role in sent.table else "framing"
     name, a, b = sent.table[role]["id"], sent.revisions[role], received.revisions[role]
     which = f"revision {a}, received with revision {b}" if a != b else "other codes than those received with"
     return f"{role}.id = {shown(name)}: sent with {which}"
@@ -89,6 +93,8 @@ def _same_correction(sent: Link, received: Link) -> bool:
 
 def _section(sent: Link, received: Link, role: str) -> list[str]:
     """Where the settings of a role differ: its algorithm, or else that one's parameters."""
+    if role not in sent.table or role not in received.table:
+        return []
     found = list(_keys(sent, received, role, "id"))
     return found or list(_keys(sent, received, role, *sent.table[role]))
 

@@ -23,16 +23,21 @@ if TYPE_CHECKING:
     from evlcp_sdk.air.frames import PacketFormat
     from evlcp_sdk.scene.bar import BarLayout
     from evlcp_sdk.scene.camera import CameraModel
-    from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols, SyncLock
+    from evlcp_sdk.values import Events, FrameView, Heard, PresenceMap, Range, Region, SoftSymbols, SyncLock
 
 __all__ = [
     "ROLES",
+    "STEPS",
     "Code",
     "Corrected",
     "Decode",
     "Decoding",
+    "Deframer",
+    "Detection",
+    "Detector",
     "ErrorCorrection",
     "Filter",
+    "Framing",
     "Measure",
     "Modulation",
     "Pilots",
@@ -70,6 +75,81 @@ class Measure(Protocol):
 
     def __call__(self, view: FrameView, /) -> Range:
         """A decoded frame's image -> distance."""
+
+
+class Detector(Protocol):
+    """What `Detection.compile` returns: a step function over explicit state."""
+
+    def init(self) -> Any:
+        """State before the first event."""
+
+    def step(self, state: Any, start_us: int, events: Events) -> tuple[Any, list[Region]]:
+        """Take the events of a time step; give where transmitters are at its end.
+
+        Args:
+            state: What `init` or the last `step` gave; not changed.
+            start_us: Start of the step, us; steps without events are left out while there is no region.
+            events: Those of the whole image.
+
+        Returns:
+            The new state, and a region for each transmitter, with the same `id` as long as it is the same;
+            one that is not given any more has ended.
+        """
+
+
+class Detection(ABC):
+    """Events of the image to regions that blink, followed."""
+
+    @abstractmethod
+    def compile(self, camera: CameraModel, codebook: Codebook, packet: PacketFormat) -> Detector | None:
+        """Precompute for a camera and a link's codes; None for the receiver's own tracker of regions."""
+
+
+class Deframer(Protocol):
+    """What `Framing.compile` returns: a step function over explicit state."""
+
+    def init(self) -> Any:
+        """State before a region's first event."""
+
+    def step(self, state: Any, events: Events, until_us: int) -> tuple[Any, list[Heard]]:
+        """Take a region's events up to `until_us`; give the frames that are certain by then, in order.
+
+        Args:
+            state: What `init` or the last `step` gave; not changed.
+            events: Those of the region, in order.
+            until_us: All events before this time have been given.
+        """
+
+    def close(self, state: Any) -> tuple[Any, list[Heard]]:
+        """End the region: give the new state and the frames that are left."""
+
+    def counts(self, state: Any) -> Mapping[str, int]:
+        """What was found and doubted so far, by name."""
+
+
+class Framing(ABC):
+    """What a packet is on air, and a region's events to packets.
+
+    A packet is a preamble and frames; a frame is a pilot and a codeword of each cluster. Any of these codes
+    may have any length, the pilots none at all.
+
+    Attributes:
+        roles: The roles that do its steps; a link has tables of these only, of those in `STEPS`.
+    """
+
+    roles: ClassVar[frozenset[str]] = frozenset()
+
+    @abstractmethod
+    def codebook(self, clusters: int) -> Codebook | None:
+        """The codes on air; None where the roles `pilots` and `modulation` give them.
+
+        Raises:
+            ConfigError: It has no codes for so many clusters.
+        """
+
+    @abstractmethod
+    def compile(self, codebook: Codebook, packet: PacketFormat) -> Deframer | None:
+        """Precompute for codes and a packet format; None where the receiver reads packets by the roles."""
 
 
 class Pilots(ABC):
@@ -307,6 +387,8 @@ ROLES: Mapping[str, Role] = MappingProxyType(
     {
         role.name: role
         for role in (
+            Role("detection", Detection, "rhythm", "events -> regions that blink, followed"),
+            Role("framing", Framing, "packets", "what a packet is on air; a region's events -> packets"),
             Role("pilots", Pilots, "wh", "codes that find time and tell clusters apart"),
             Role("modulation", Modulation, "wh4x2", "bits of a symbol <-> its codeword"),
             Role("synchronization", Synchronization, "barker", "a region's events -> packet timing"),
@@ -327,3 +409,6 @@ ROLES: Mapping[str, Role] = MappingProxyType(
     }
 )
 """Every role by its name, in the order of the signal's flow."""
+
+STEPS = frozenset({"pilots", "modulation", "synchronization", "separation", "decoding", "ranging"})
+"""Roles that are steps of a framing: those of the built-in one."""

@@ -247,7 +247,9 @@ def notes_of(
 
 def other_codewords(link: Link, registry: Registry) -> dict[str, NDArray[np.uint8]]:
     """Codewords of the other modulations that are installed, by id, uint8 (symbols, chips)."""
-    found = {}
+    found: dict[str, NDArray[np.uint8]] = {}
+    if "modulation" not in link.table:
+        return found
     for installed in registry.installed("modulation"):
         name = installed.algorithm.id
         if name == link.table["modulation"]["id"]:
@@ -466,7 +468,11 @@ def _transmitter(
     yield from _codewords(number, one, link, counts, seen)
     yield from _unsure(number, one, link, seen)
     own = (one.frames - one.echoes) / link.packet.pilot_every
-    if link.algorithm("ranging").measures and one.ranged < _RANGED_SHARE * own:
+    if (
+        "ranging" in link.algorithms
+        and link.algorithm("ranging").measures
+        and one.ranged < _RANGED_SHARE * own
+    ):
         yield Doubt(
             "few-distances",
             f"{one.ranged} of {own:.0f} frames have a distance: too few boundaries between clusters are seen,"

@@ -12,6 +12,7 @@ from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.belief import believed, still_lit
 from evlcp_sdk.rx.delays import RowDelays
+from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.detection import SAME_PX, Followed, RegionFollower
 from evlcp_sdk.rx.echoes import EchoQueue, Sighting
 from evlcp_sdk.rx.grid import DueFrame
@@ -86,7 +87,7 @@ class PacketFraming:
         self,
         link: Link,
         steps: Steps,
-        regions: RegionFollower,
+        regions: RegionFollower | DetectedRegions,
         judged: EchoQueue,
         clock: CameraClock,
         announcer: Announcer,

@@ -6,12 +6,16 @@ import pluggy
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.roles import Tracker
+from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.detection import RegionFollower
 from evlcp_sdk.rx.echoes import Echoes, EchoQueue
+from evlcp_sdk.rx.framed import HeardFraming
 from evlcp_sdk.rx.framing import PacketFraming
+from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.limits import LIMITS, Limits
-from evlcp_sdk.rx.steps import Announcer, Steps, on_camera
+from evlcp_sdk.rx.steps import Announcer, Steps, on_camera, tracker_of
 from evlcp_sdk.rx.timeline import Timeline, TimeStep
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
@@ -55,27 +59,26 @@ class Receiver:
         self._timeline = Timeline(link.regions.step_us, link.camera.width, link.camera.height, limits)
         self._clock = self._timeline.clock
         self._announcer = Announcer(hook, self._clock.camera_us)
-        steps = Steps(link, self._announcer)
-        self._regions = RegionFollower(
-            link.regions,
-            link.camera,
-            link.packet.chip_us,
-            steps.position,
-            LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us,
-            limits,
-            link.codebook.longest_gap_chips,
-        )
+        tracker = tracker_of(link)
+        self._regions = _regions_of(link, tracker, limits)
         self._judged = EchoQueue(Echoes(link.packet, len(link.codebook.codewords)))
-        self._framing = PacketFraming(
-            link,
-            steps,
-            self._regions,
-            self._judged,
-            self._clock,
-            self._announcer,
-            attitude_source(attitude),
-            limits,
-        )
+        guard = Guard(link, "framing", may_refuse=True)
+        with guard:
+            deframer = link.algorithm("framing").compile(link.codebook, link.packet)
+        self._framing: PacketFraming | HeardFraming
+        if deframer is None:
+            self._framing = PacketFraming(
+                link,
+                Steps(link, self._announcer, tracker),
+                self._regions,
+                self._judged,
+                self._clock,
+                self._announcer,
+                attitude_source(attitude),
+                limits,
+            )
+        else:
+            self._framing = HeardFraming(link, deframer, self._judged, self._clock, self._announcer)
         self._messages = MessageAssembler.of(link, clock_zero)
         self._closed = False
         self._given = {"frames_reflected": 0, "packets": 0}
@@ -156,3 +159,20 @@ class Receiver:
         """A packet with the times of the camera's clock."""
         frames = tuple(on_camera(frame, self._clock.camera_us) for frame in packet.frames)
         return changed(packet, t_us=self._clock.camera_us(packet.t_us), frames=frames)
+
+
+def _regions_of(link: Link, tracker: Tracker, limits: Limits) -> RegionFollower | DetectedRegions:
+    """What finds and follows the regions of a stream."""
+    with Guard(link, "detection", may_refuse=True):
+        detector = link.algorithm("detection").compile(link.camera, link.codebook, link.packet)
+    if detector is not None:
+        return DetectedRegions(link, detector, limits)
+    return RegionFollower(
+        link.regions,
+        link.camera,
+        link.packet.chip_us,
+        tracker.position,
+        LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us,
+        limits,
+        link.codebook.longest_gap_chips,
+    )

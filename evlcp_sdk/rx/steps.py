@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import EvlcpError, PluginError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.plugin.roles import ROLES, Filter, Synchronizer, Tracker
+from evlcp_sdk.plugin.roles import STEPS, Filter, Synchronizer, Tracker
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
 from evlcp_sdk.scene.lean import BarSight
@@ -29,7 +29,7 @@ from evlcp_sdk.values import (
     changed,
 )
 
-__all__ = ["Announcer", "Steps", "on_camera"]
+__all__ = ["Announcer", "Steps", "on_camera", "tracker_of"]
 
 
 def on_camera(value: Any, camera_us: Callable[[float], float]) -> Any:
@@ -95,24 +95,35 @@ class Announcer:
             raise PluginError(f"evlcp_stage_finished() of a plugin: {what} ({where})") from fault
 
 
+def tracker_of(link: Link) -> Tracker:
+    """The filters of a link's tracking, whose faults are named."""
+    guard = Guard(link, "tracking", may_refuse=True)
+    with guard:
+        tracker: Tracker = link.algorithm("tracking").compile()
+        guard.expect(tracker, Tracker)
+        for filter_ in (tracker.position, tracker.distance):
+            if filter_ is not None:
+                guard.expect_compiled(filter_, "init", "step", "predict")
+    guard = Guard(link, "tracking")
+    return Tracker(_guarded(tracker.position, guard), _guarded(tracker.distance, guard))
+
+
 class Steps:
     """The five roles of the receiver; it keeps no state of a stream.
 
     Args:
         link: The resolved configuration.
         announcer: Hears of every result but the filters'.
-
-    Attributes:
-        position: Filter of a region's centre; None for centres as measured.
+        tracker: The filters of its tracking, as `tracker_of` gives them.
     """
 
-    def __init__(self, link: Link, announcer: Announcer) -> None:
+    def __init__(self, link: Link, announcer: Announcer, tracker: Tracker) -> None:
         self._codebook = link.codebook
         self._packet = link.packet
         self._keeper = RangeKeeper()
         self._announcer = announcer
-        self._guards = {role: Guard(link, role) for role in ROLES}
-        guards = {role: Guard(link, role, may_refuse=True) for role in ROLES}
+        self._guards = {role: Guard(link, role) for role in STEPS}
+        guards = {role: Guard(link, role, may_refuse=True) for role in STEPS}
         with guards["synchronization"]:
             self._synchronizer: Synchronizer = link.algorithm("synchronization").compile(
                 link.codebook, link.packet
@@ -127,15 +138,7 @@ class Steps:
         with guards["ranging"]:
             self._measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
             guards["ranging"].expect_compiled(self._measure)
-        with guards["tracking"]:
-            tracker: Tracker = link.algorithm("tracking").compile()
-            guards["tracking"].expect(tracker, Tracker)
-            position, distance = tracker.position, tracker.distance
-            for filter_ in (position, distance):
-                if filter_ is not None:
-                    guards["tracking"].expect_compiled(filter_, "init", "step", "predict")
-        self.position = _guarded(position, self._guards["tracking"])
-        self._distance = _guarded(distance, self._guards["tracking"])
+        self._distance = tracker.distance
 
     def sync_init(self) -> Any:
         """State of a region's synchronization before its first event."""

@@ -1,6 +1,6 @@
 """One plain task a role: what the laws of form give an algorithm to do."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -8,15 +8,18 @@ from typing import Any
 import numpy as np
 
 from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.blocks import packet_bits
-from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, compiled
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.testing.views import ideal_presence, ideal_sums, ideal_view
+from evlcp_sdk.values import Events, Heard
 
 __all__ = [
+    "ONE_CLUSTER",
     "Exercise",
     "arguments_of",
     "base_link_of",
@@ -24,10 +27,15 @@ __all__ = [
     "exercise_of",
     "expect_column",
     "filters_of",
+    "heard_of",
     "link_of",
     "subject_of",
     "symbols_of",
 ]
+
+
+ONE_CLUSTER = {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
+"""A bar for what sends with one cluster only."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +70,11 @@ def subject_of(role: str, algorithm: Any, link: Link | None = None) -> Subject:
 
 
 @cache
+def _of_one_cluster() -> Link:
+    return resolve({"bar": ONE_CLUSTER})
+
+
+@cache
 def _default_link() -> Link:
     return load_link()
 
@@ -78,6 +91,11 @@ def link_of(subject: Subject, **air: Any) -> Link:
         InapplicableLawError: The subject has no code for the link's bar.
     """
     link = base_link_of(subject)
+    if subject.role == "framing" and subject.link is None:
+        try:
+            subject.algorithm.codebook(link.bar.clusters)
+        except ConfigError:
+            link = _of_one_cluster()
     if subject.role == "pilots":
         compiled(lambda: subject.algorithm.codes(link.bar.clusters))
     link = link.with_algorithm(subject.role, subject.algorithm, id=subject.id)
@@ -91,7 +109,7 @@ def _of_chips(link: Link, kept: str) -> Link:
     registry = Registry.load()
     for name, role in ROLES.items():
         other = role.default_of_chips
-        if other is not None and name != kept and link.table[name]["id"] == role.default:
+        if other is not None and name != kept and link.table.get(name, {}).get("id") == role.default:
             link = link.with_algorithm(name, registry.load_class(name, other)(), id=other)
     return link
 
@@ -107,6 +125,8 @@ def expect_column(link: Link) -> None:
 
 
 _ARGUMENTS: dict[str, Callable[[Link], tuple[Any, ...]]] = {
+    "detection": lambda link: (link.camera, link.codebook, link.packet),
+    "framing": lambda link: (link.codebook, link.packet),
     "synchronization": lambda link: (link.codebook, link.packet),
     "separation": lambda link: (link.codebook,),
     "decoding": lambda link: (link.codebook,),
@@ -153,6 +173,47 @@ def filters_of(subject: Subject) -> list[tuple[str, Any, int]]:
 def exercise_of(subject: Subject) -> Exercise:
     """The task of the subject's role, on its link."""
     return _EXERCISES[subject.role](subject)
+
+
+def _detection(subject: Subject) -> Exercise:
+    link = link_of(subject)
+    events = ideal_events(link, IdealBar(random_symbols(link, 1)))
+
+    def detect() -> Callable[[tuple[Any, ...]], Any]:
+        detector = compiled_subject(subject)
+        if detector is None:
+            return lambda _: ()
+        return lambda given: detector.step(detector.init(), 0, given[0])[1]
+
+    return Exercise((events,), detect)
+
+
+def _framing(subject: Subject) -> Exercise:
+    link = link_of(subject)
+    events = ideal_events(link, IdealBar(random_symbols(link, 2)))
+    until_us = int(events.t_us[-1]) + 1
+
+    def frame() -> Callable[[tuple[Any, ...]], Any]:
+        deframer = compiled_subject(subject)
+        if deframer is None:
+            return lambda _: ()
+        return lambda given: heard_of(deframer, given[0], [until_us])
+
+    return Exercise((events,), frame)
+
+
+def heard_of(deframer: Any, events: Events, until_us: Sequence[int]) -> list[Heard]:
+    """Frames of a recording that is cut at times, those at its end, too."""
+    state = deframer.init()
+    heard: list[Heard] = []
+    begin = 0
+    for until in until_us:
+        end = int(np.searchsorted(events.t_us, until))
+        state, found = deframer.step(state, events[begin:end], until)
+        heard += found
+        begin = end
+    heard += deframer.close(state)[1]
+    return heard
 
 
 def _pilots(subject: Subject) -> Exercise:
@@ -219,6 +280,8 @@ def _error_correction(subject: Subject) -> Exercise:
 
 
 _EXERCISES: dict[str, Callable[[Subject], Exercise]] = {
+    "detection": _detection,
+    "framing": _framing,
     "pilots": _pilots,
     "modulation": _modulation,
     "synchronization": _synchronization,

@@ -10,6 +10,7 @@ from evlcp_sdk.testing.codes import MODULATION, PILOTS
 from evlcp_sdk.testing.corrections import ERROR_CORRECTION
 from evlcp_sdk.testing.exercises import subject_of
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
+from evlcp_sdk.testing.framings import DETECTION, FRAMING
 from evlcp_sdk.testing.images import DECODING, RANGING, SEPARATION
 from evlcp_sdk.testing.law import Law, Verdict, judge
 from evlcp_sdk.testing.links import LINK
@@ -20,6 +21,8 @@ __all__ = ["check", "check_link", "checked_excuses", "laws_of"]
 
 _EVERY = DESCRIPTION + FUNCTION + RESULT
 _LAWS: dict[str, tuple[Law, ...]] = {
+    "detection": _EVERY + DETECTION,
+    "framing": _EVERY + FRAMING,
     "pilots": DESCRIPTION + RESULT + PILOTS + LINK,
     "modulation": DESCRIPTION + RESULT + MODULATION + LINK,
     "synchronization": _EVERY + SYNCHRONIZATION + LINK,
@@ -92,13 +95,16 @@ def check_link(link: Link) -> Iterator[tuple[str, Verdict]]:
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> next(check_link(load_link()))[0]
-    'pilots'
+    'detection'
     """
-    for role in ROLES:
+    for role in link.algorithms:
         subject = subject_of(role, link.algorithm(role), link)
         for law in laws_of(role):
             if law not in LINK:
                 yield role, judge(law, subject, {})
+    if "decoding" not in link.algorithms:
+        # The framing has its own; its laws are those of the whole link.
+        return
     whole = subject_of("decoding", link.algorithm("decoding"), link)
     for law in LINK:
         yield "link", judge(law, whole, {})

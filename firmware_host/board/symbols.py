@@ -20,7 +20,7 @@ from firmware_host.errors import IncompatibleError
 
 __all__ = ["read_symbols", "symbols_of", "symbols_table"]
 
-ON_AIR = ("air", "bar", "pilots", "modulation")
+ON_AIR = ("air", "bar", "framing", "pilots", "modulation")
 """Tables of a link that symbols and chips follow from; blocks follow from the error correction, too."""
 
 _CORRECTION = "error-correction"
@@ -38,7 +38,7 @@ def symbols_table(symbols: Symbols, link: Link, *, messages: bool = False) -> di
     """
     tables = (*ON_AIR, _CORRECTION) if messages else ON_AIR
     return {
-        "link": {name: dict(link.table[name]) for name in tables},
+        "link": {name: dict(link.table[name]) for name in tables if name in link.table},
         "codebook": link.codebook.digest,
         "symbols": symbols.tolist(),
     }

@@ -10,6 +10,8 @@ from evlcp_barker.synchronization import BarkerSync
 from evlcp_centroid.ranging import CentroidRanging
 from evlcp_kalman.tracking import KalmanTracking
 from evlcp_polar.correction import Polar
+from evlcp_regions.detection import Whole
+from evlcp_uart.framing import Uart
 from evlcp_wh.decoding import WhTransform
 from evlcp_wh.modulation import Wh8
 from evlcp_wh.pilots import WhPilots
@@ -22,7 +24,9 @@ from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.roles import (
     ROLES,
     Decoding,
+    Detection,
     ErrorCorrection,
+    Framing,
     Modulation,
     Pilots,
     Ranging,
@@ -416,6 +420,106 @@ class Uncorrected(ErrorCorrection):
         return TamperedCode(inner, lambda x: x, lambda x: x, found, inner.message_bits, inner.coded_bits)
 
 
+@dataclass(frozen=True)
+class BrokenDetector:
+    """A detector of the whole image with a step of its own."""
+
+    inner: Any
+    change: Callable[..., Any]
+
+    def init(self) -> Any:
+        return [self.inner.init()]
+
+    def step(self, state: Any, start_us: int, events: Any) -> Any:
+        return self.change(self.inner, state, start_us, events)
+
+
+@dataclass(frozen=True)
+class BrokenDetection(Detection):
+    """The whole image, spoilt."""
+
+    change: Any = None
+
+    def compile(self, *given: Any) -> Any:
+        return BrokenDetector(Whole().compile(*given), self.change)
+
+
+def detecting(change: Callable[..., Any]) -> BrokenDetection:
+    def fresh(inner: Any, state: Any, start_us: int, events: Any) -> Any:
+        found, regions = inner.step(state[0], start_us, events)
+        return [found], change(regions)
+
+    return BrokenDetection(fresh)
+
+
+def grown(inner: Any, state: list[Any], start_us: int, events: Any) -> Any:
+    found, regions = inner.step(state[0], start_us, events)
+    state[0] = replace(found, number=found.number + 1)
+    return state, regions
+
+
+@dataclass(frozen=True)
+class BrokenDeframer:
+    """The reader of characters with a step of its own."""
+
+    inner: Any
+    change: Callable[..., Any]
+
+    def init(self) -> Any:
+        return [self.inner.init(), b""]
+
+    def step(self, state: Any, events: Any, until_us: int) -> Any:
+        return self.change(self.inner, state, events, until_us)
+
+    def close(self, state: Any) -> Any:
+        found, heard = self.inner.close(state[0])
+        return [found, state[1]], heard
+
+    def counts(self, state: Any) -> Any:
+        return self.inner.counts(state[0])
+
+
+@dataclass(frozen=True)
+class BrokenFraming(Framing):
+    """Characters, spoilt."""
+
+    change: Any = None
+
+    def codebook(self, clusters: int) -> Any:
+        return Uart().codebook(clusters)
+
+    def compile(self, *given: Any) -> Any:
+        return BrokenDeframer(Uart().compile(*given), self.change)
+
+
+def framing(change: Callable[..., Any]) -> BrokenFraming:
+    """Characters whose frames are changed."""
+
+    def step(inner: Any, state: Any, events: Any, until_us: int) -> Any:
+        found, heard = inner.step(state[0], events, until_us)
+        return [found, state[1]], change(heard)
+
+    return BrokenFraming(step)
+
+
+def forgetful_framing(inner: Any, state: Any, events: Any, until_us: int) -> Any:
+    """Every step but those of many events is forgotten."""
+    if len(events) < 200:
+        return state, []
+    found, heard = inner.step(state[0], events, until_us)
+    return [found, b""], heard
+
+
+def spoiling_framing(inner: Any, state: Any, events: Any, until_us: int) -> Any:
+    state[0], heard = inner.step(state[0], events, until_us)
+    return state, heard
+
+
+def growing_framing(inner: Any, state: Any, events: Any, until_us: int) -> Any:
+    found, heard = inner.step(state[0], events, until_us)
+    return [found, state[1] + bytes(1 << 17)], heard
+
+
 BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
     "form": [
         ("defaults", NoDefault(focus_m=1.0), "a default of field 'focus_m'"),
@@ -453,6 +557,18 @@ BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
         ("shapes", TamperedModulation(lambda words: 2 * words), "chips 0 and 1"),
         ("codewords-distinct", TamperedModulation(twins), "16 codewords of different edges, got 15"),
         ("comes-back", TamperedModulation(twins), "are equal"),
+    ],
+    "detection": [
+        ("shapes", detecting(lambda regions: [*regions, *regions]), "regions of different ids"),
+        ("shapes", detecting(lambda regions: []), "a region in a recording"),
+        ("state-kept", BrokenDetection(grown), "not to change what follows"),
+    ],
+    "framing": [
+        ("clean", framing(lambda heard: []), "got 0"),
+        ("clean", framing(lambda heard: [replace(h, t_us=h.t_us + 200) for h in heard]), "chips off"),
+        ("any-split", BrokenFraming(forgetful_framing), "the same frames from events fed"),
+        ("state-kept", BrokenFraming(spoiling_framing), "not to change the state"),
+        ("bounded", BrokenFraming(growing_framing), "a state of at most"),
     ],
     "synchronization": [
         ("shapes", locks_changed(lambda lock: replace(lock, quality=2.0)), "quality from 0 to 1"),

@@ -89,10 +89,10 @@ RX = (
     {"limits", "rhythm"},
     {"guard", "trust"},
     {"belief", "delays", "detection", "grid", "inbox", "packets", "placement", "ranges", "timeline"},
-    {"points", "spread", "steps"},
+    {"detected", "points", "spread", "steps"},
     {"look"},
     {"echoes", "transmitters"},
-    {"framing"},
+    {"framed", "framing"},
     {"receiver"},
 )
 """The receiver from its stages up to what joins them: a module imports from below its own row only."""

@@ -72,7 +72,7 @@ class Series:
         """Clusters that its distances are measured from; None where the link does not say."""
         try:
             table = self.link["table"]
-            chosen = table["ranging"].get("clusters")
+            chosen = table.get("ranging", {}).get("clusters")
             return len(chosen) if chosen else BarLayout.of_table(table["bar"]).clusters
         except (TypeError, KeyError, AttributeError, ValueError, ConfigError):
             # An identity is whatever its link was when it was kept.

@@ -5,7 +5,7 @@ import pickle
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import pytest
@@ -21,10 +21,13 @@ from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import (
     ROLES,
+    STEPS,
     Code,
     Decode,
     Decoding,
+    Detection,
     ErrorCorrection,
+    Framing,
     Measure,
     Modulation,
     Pilots,
@@ -91,6 +94,23 @@ class FakeRanging(Ranging):
 
 
 @dataclass(frozen=True)
+class FakeDetection(Detection):
+    def compile(self, camera: CameraModel, codebook: Codebook, packet: PacketFormat) -> None:
+        return None
+
+
+@dataclass(frozen=True)
+class FakeFraming(Framing):
+    roles: ClassVar[frozenset[str]] = STEPS
+
+    def codebook(self, clusters: int) -> None:
+        return None
+
+    def compile(self, codebook: Codebook, packet: PacketFormat) -> None:
+        return None
+
+
+@dataclass(frozen=True)
 class FakeTracking(Tracking):
     def compile(self) -> Tracker:
         raise NotImplementedError
@@ -133,6 +153,7 @@ def test_defaults_are_all_written_out(registry: Registry) -> None:
     link = load_link(None, (), registry)
     assert list(link.table) == [
         *("camera", "camera_sigma", "bar", "air", "regions", "messages", "position"),
+        *("detection", "framing"),
         *("pilots", "modulation", "synchronization", "separation", "decoding", "ranging", "tracking"),
         "error-correction",
     ]
@@ -209,11 +230,13 @@ def test_every_fault_of_a_file_is_told(registry: Registry, tmp_path: Path) -> No
     """
     assert faults_of(registry, text, tmp_path, "bar.led_pitch_m=-1", "lamp.on=1") == [
         "link.toml: camra: unknown table; did you mean 'camera'? (known: camera, camera_sigma, bar, air,"
-        " regions, messages, position, pilots, modulation, synchronization, separation, decoding, ranging,"
-        " tracking, error-correction)",
+        " regions, messages, position, detection, framing, pilots, modulation, synchronization,"
+        " separation, decoding,"
+        " ranging, tracking, error-correction)",
         "link.toml: decoding = 4: expected a table",
         "--set: lamp.on: unknown table (known: camera, camera_sigma, bar, air, regions, messages, position,"
-        " pilots, modulation, synchronization, separation, decoding, ranging, tracking, error-correction)",
+        " detection, framing, pilots, modulation, synchronization, separation, decoding, ranging, tracking,"
+        " error-correction)",
         "link.toml: camera.width = 0: expected greater than 0",
         'link.toml: camera.focal_mm = "35": expected a valid number',
         "--set: bar.led_pitch_m = -1: expected greater than or equal to 0.000001",

@@ -112,7 +112,7 @@ BROKEN: dict[str, tuple[Callable[[], object], str]] = {
     "exit": (quits, "cannot be imported: SystemExit: not on this machine"),
     "role": (
         lambda: Brings(ranging("mine"), Algorithm("rangin", "x", "a:B", 1, "")),
-        "algorithm 'x' has role 'rangin', expected one of pilots, modulation, ",
+        "algorithm 'x' has role 'rangin', expected one of detection, framing, pilots, ",
     ),
     "record": (lambda: Brings(ranging("mine"), "poc"), "evlcp_algorithms() gave 'poc', expected an Alg"),
     "twice": (

@@ -1,0 +1,122 @@
+"""Regions that an algorithm of the role `detection` gives, followed as the receiver's own are."""
+
+from collections import deque
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.roles import Detector
+from evlcp_sdk.rx.detection import Followed
+from evlcp_sdk.rx.guard import Guard
+from evlcp_sdk.rx.limits import LIMITS, Limits
+from evlcp_sdk.values import Events, Region
+
+__all__ = ["DetectedRegions"]
+
+
+class DetectedRegions:
+    """Holds the events of the regions that a detector gives; a framing may not move them.
+
+    Args:
+        link: The resolved configuration.
+        detector: What its detection compiled to.
+        limits: How much is held.
+
+    Attributes:
+        alive: The regions that are followed.
+        counts: What was left out for want of room.
+    """
+
+    def __init__(self, link: Link, detector: Detector, limits: Limits = LIMITS) -> None:
+        self._guard = Guard(link, "detection")
+        self._guard.expect_compiled(detector, "init", "step")
+        self._detector = detector
+        self._limits = limits
+        self._step_us = link.regions.step_us
+        with self._guard:
+            self._state: Any = detector.init()
+        self.alive: list[Followed] = []
+        self.counts = {"regions_left_out": 0, "dropped_no_room": 0}
+
+    def step(self, start_us: int, events: Events) -> list[Followed]:
+        """Take the events of one time step; return the regions that are alive or ended in it."""
+        with self._guard:
+            self._state, found = self._detector.step(self._state, start_us, events)
+        self._guard.expect(found, list)
+        places: dict[int, Region] = {}
+        for region in found:
+            self._guard.expect(region, Region)
+            for name in ("x_px", "y_px", "width_px", "height_px"):
+                self._guard.expect_number(getattr(region, name), name, -1e6, 1e6)
+            places[region.id] = replace(region, t_us=start_us + self._step_us / 2)
+        known = {followed.id: followed for followed in self.alive}
+        for followed in self.alive:
+            followed.released |= followed.id not in places
+        for id, place in places.items():
+            if id in known:
+                known[id].positions.append(place)
+            elif len(self.alive) < self._limits.regions:
+                known[id] = Followed(id, deque([place]), start_us, opened_us=start_us + self._step_us)
+                self.alive.append(known[id])
+            else:
+                self.counts["regions_left_out"] += 1
+        for followed in self.alive:
+            followed.add(start_us, _inside(events, followed.latest))
+        self._make_room()
+        seen = list(self.alive)
+        self.alive = [followed for followed in self.alive if not followed.released]
+        return seen
+
+    def _make_room(self) -> None:
+        """Forget the oldest events where all together take too much."""
+        while sum(f.held_bytes for f in self.alive) > self._limits.region_bytes:
+            held = [followed for followed in self.alive if len(followed.pieces) > 1]
+            if not held:
+                return
+            oldest = min(held, key=lambda followed: followed.pieces[0][0])
+            start_us, many = oldest.forget()
+            self.counts["dropped_no_room"] += many
+            oldest.cut_us = oldest.first_us = start_us + self._step_us
+
+    def skip(self) -> None:
+        """Pass over a gap in time, with no region alive."""
+
+    def close(self) -> None:
+        """End the stream: forget all events."""
+        self.alive = []
+
+    def has_room(self) -> bool:
+        """Whether a framing may open another region: a detector says itself what there is."""
+        return False
+
+    def drop(self, followed: Followed) -> None:
+        """Let a region go at once."""
+        followed.released = True
+        self.alive = [other for other in self.alive if other is not followed]
+
+    def shape(
+        self, followed: Followed, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]
+    ) -> float:
+        """Note how large a bar is that a frame showed; the region stays where the detector has it."""
+        followed.size_px = size_px
+        return 0.0
+
+    def gather(self, followed: Followed, from_us: float = -np.inf, until_us: float = np.inf) -> None:
+        """Take a region's events once more: they are those that it has."""
+
+    def unite(self, followed: Followed, other: Followed) -> None:
+        """Take another region into one: the detector says what is one."""
+
+    def beside(
+        self, like: Followed, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]
+    ) -> Followed:
+        """Never asked for, as there is no room."""
+        return like
+
+
+def _inside(events: Events, region: Region) -> Events:
+    """The events inside a region."""
+    across = np.abs(events.x.astype(np.float64) - region.x_px) <= region.width_px / 2
+    return events[across & (np.abs(events.y.astype(np.float64) - region.y_px) <= region.height_px / 2)]

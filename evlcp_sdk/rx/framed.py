@@ -1,0 +1,177 @@
+"""Frames of an algorithm of the role `framing`, from the events of regions to the frames of the receiver."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from evlcp_sdk.clock import CameraClock
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.roles import Deframer
+from evlcp_sdk.rx.detection import Followed
+from evlcp_sdk.rx.echoes import EchoQueue, Sighting
+from evlcp_sdk.rx.grid import DueFrame
+from evlcp_sdk.rx.guard import Guard
+from evlcp_sdk.rx.packets import PacketAssembler
+from evlcp_sdk.rx.steps import Announcer
+from evlcp_sdk.rx.timeline import TimeStep
+from evlcp_sdk.values import Frame, Heard, Range, SyncLock
+
+__all__ = ["HeardFraming"]
+
+_NO_RANGE = Range(math.nan, math.nan, 0)
+
+_LOOKBACK_FRAMES = 96
+"""Frames for which the places of a region are kept: a framing may give a frame so late."""
+
+_MOST_LIT = 1024
+
+
+@dataclass
+class _Listener:
+    """What is known of one region.
+
+    Attributes:
+        region: Where it is, and its events.
+        state: Of the framing.
+        packets: Collects its frames.
+        number: Transmitter number, None before the first frame.
+        counts: What the framing counted so far.
+        events: Events of the region since its last frame.
+    """
+
+    region: Followed
+    state: Any
+    packets: PacketAssembler
+    number: int | None = None
+    counts: dict[str, int] | None = None
+    events: int = 0
+
+
+class HeardFraming:
+    """Lets a framing listen to the regions of a stream, and puts its frames on the way of all frames.
+
+    Args:
+        link: The resolved configuration.
+        deframer: What its framing compiled to.
+        judged: Where frames go.
+        clock: The stream's.
+        announcer: Hears of every frame.
+
+    Attributes:
+        counts: What was found so far.
+        lit_us: See `Receiver`.
+    """
+
+    def __init__(
+        self, link: Link, deframer: Deframer, judged: EchoQueue, clock: CameraClock, announcer: Announcer
+    ) -> None:
+        self._guard = Guard(link, "framing")
+        self._guard.expect_compiled(deframer, "init", "step", "close", "counts")
+        self._deframer = deframer
+        self._codebook, self._packet = link.codebook, link.packet
+        self._step_us = link.regions.step_us
+        self._judged = judged
+        self._echoes = judged.echoes
+        self._camera_us: Callable[[float], float] = clock.camera_us
+        self._announcer = announcer
+        self._listeners: dict[int, _Listener] = {}
+        self._numbered = 0
+        frames_us = _LOOKBACK_FRAMES * link.packet.info_chips * link.packet.chip_us
+        self._keep_us = max(2 * link.packet.packet_chips * link.packet.chip_us, frames_us)
+        self.counts = dict.fromkeys(("events_in_regions", "regions_opened", "regions_released", "frames"), 0)
+        self.lit_us: dict[int, tuple[float, float]] = {}
+
+    def step(self, regions: list[Followed], step: TimeStep) -> None:
+        """Hear what the regions of a time step send."""
+        for region in regions:
+            listener = self._listeners.get(region.id)
+            pieces = [region.pieces[-1]] if listener is not None and region.pieces else list(region.pieces)
+            if listener is None:
+                self.counts["regions_opened"] += 1
+                with self._guard:
+                    state = self._deframer.init()
+                listener = _Listener(region, state, PacketAssembler(self._packet.frames))
+                self._listeners[region.id] = listener
+            for start_us, events in pieces:
+                self.counts["events_in_regions"] += len(events)
+                listener.events += len(events)
+                until_us = min(start_us + self._step_us, step.end_us)
+                with self._guard:
+                    listener.state, heard = self._deframer.step(listener.state, events, until_us)
+                self._take(listener, heard)
+            region.forget_before(math.inf, self._step_us, step.end_us - self._keep_us)
+            if region.released:
+                self.counts["regions_released"] += 1
+                self._end(listener)
+                del self._listeners[region.id]
+
+    def close(self) -> None:
+        """End the stream: give what the regions still say."""
+        for listener in self._listeners.values():
+            self._end(listener)
+        self._listeners = {}
+
+    def _end(self, listener: _Listener) -> None:
+        with self._guard:
+            listener.state, heard = self._deframer.close(listener.state)
+        self._take(listener, heard)
+        self._judged.end(listener.packets)
+
+    def _take(self, listener: _Listener, heard: list[Heard]) -> None:
+        """Number a region's frames, say where they were seen, and hand them on."""
+        self._guard.expect(heard, list)
+        self._count(listener)
+        for one in heard:
+            self._guard.expect(one, Heard)
+            self._guard.expect_symbols(one.soft, self._codebook)
+            self._guard.expect_number(one.frame, "frame", 0, self._packet.frames - 1)
+            for name in ("t_us", "packet_t_us", "chip_us"):
+                self._guard.expect_number(getattr(one, name), name, -1e18, 1e18)
+            if listener.number is None:
+                listener.number = self._numbered
+                self._numbered += 1
+            chips = self._packet.info_chips + self._packet.has_pilot(one.frame) * self._packet.pilot_chips
+            end_us = one.t_us + chips * one.chip_us
+            x, y = listener.region.at(np.array([(one.t_us + end_us) / 2]))
+            frame = Frame(
+                transmitter=listener.number,
+                packet=one.packet,
+                frame=one.frame,
+                t_us=one.t_us,
+                soft=one.soft,
+                range=_NO_RANGE,
+                filtered=None,
+                x_px=float(x[0]),
+                y_px=float(y[0]),
+                echo_of=self._echoes.echo_of(listener.number),
+            )
+            self.counts["frames"] += 1
+            self._announcer.total("frame", frame)
+            self._lit(listener.number, self._camera_us(one.t_us))
+            lock = SyncLock(one.packet_t_us, one.chip_us, 0.0, 0.0, 1.0)
+            number = one.packet * self._packet.frames + one.frame
+            due = DueFrame(
+                number, one.packet, one.frame, chips, False, one.packet_t_us, one.t_us, end_us, lock
+            )
+            light = listener.events / len(heard)
+            self._judged.add(listener.packets, due, Sighting(frame, light, self._codebook.clusters, False))
+        if heard:
+            listener.events = 0
+
+    def _lit(self, number: int, start_us: float) -> None:
+        first_us, _ = self.lit_us.pop(number, (start_us, start_us))
+        self.lit_us[number] = (first_us, start_us)
+        while len(self.lit_us) > _MOST_LIT:
+            del self.lit_us[next(iter(self.lit_us))]
+
+    def _count(self, listener: _Listener) -> None:
+        """Add what a framing has counted since it was asked last."""
+        with self._guard:
+            now = dict(self._deframer.counts(listener.state))
+        before = listener.counts or {}
+        for name, many in now.items():
+            self.counts[name] = self.counts.get(name, 0) + many - before.get(name, 0)
+        listener.counts = now

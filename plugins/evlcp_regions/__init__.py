@@ -1,0 +1,15 @@
+"""What counts as a transmitter in the image: what blinks in the rhythm of the chips, or all of it."""
+
+from collections.abc import Iterator
+
+from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
+
+__all__ = ["evlcp_algorithms"]
+
+
+@hookimpl
+def evlcp_algorithms() -> Iterator[Algorithm]:
+    """The algorithms of this package."""
+    path = "evlcp_regions.detection"
+    yield Algorithm("detection", "rhythm", f"{path}:Rhythmic", 1, "what blinks in the rhythm of the chips")
+    yield Algorithm("detection", "whole", f"{path}:Whole", 1, "the whole image is one region")

@@ -1,0 +1,328 @@
+"""Characters of one LED, against a generator of events that shares nothing with the receiver."""
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evlcp_uart import _kernels
+from evlcp_uart.characters import Characters, Parity
+from evlcp_uart.framing import Uart, read_characters
+
+from evlcp_sdk.air.frames import packet_chips
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.compose import compose
+from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.values import Events, Packet
+
+BAR = {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
+CHARACTERS = Characters(7, "even", 2)
+
+
+def levels_of(values: np.ndarray, data_bits: int, parity: Parity, stop_bits: int) -> list[int]:
+    """Bits on air of characters, by the textbook."""
+    out = []
+    for value in values.tolist():
+        data = [int(c) for c in reversed(f"{value:0{data_bits}b}")]
+        ones = sum(data) % 2
+        check = {"none": [], "even": [ones], "odd": [1 - ones]}[parity]
+        out += [0, *data, *check, *[1] * stop_bits]
+    return out
+
+
+def seen(
+    rng: np.random.Generator,
+    levels: list[int],
+    bit_us: float,
+    *,
+    mark_on: bool = True,
+    events: tuple[float, float] = (80.0, 50.0),
+    late_us: tuple[float, float] = (60.0, 110.0),
+    noise_hz: float = 300.0,
+    unseen: float = 0.0,
+    start_us: float = 20_000.0,
+    cut_bits: float = 0.0,
+) -> Events:
+    """What pixels make of the edges: Poisson bursts, log-normally late, noise, edges without a burst."""
+    times, polarities = [], []
+    before = 1
+    for k, level in enumerate(levels):
+        if level != before and rng.random() >= unseen:
+            on = (level == 1) == mark_on
+            many = rng.poisson((events[0] if on else events[1]) * rng.gamma(8) / 8)
+            late = (late_us[0] if on else late_us[1]) * np.exp(0.5 * rng.standard_normal(many))
+            times.append(start_us + k * bit_us + late)
+            polarities.append(np.full(many, on))
+        before = level
+    end_us = start_us + (len(levels) + 30) * bit_us
+    for on in (False, True):
+        many = rng.poisson(noise_hz * end_us * 1e-6)
+        times.append(rng.uniform(0, end_us, many))
+        polarities.append(np.full(many, on))
+    t, p = np.concatenate(times), np.concatenate(polarities)
+    order = np.argsort(t)
+    t, p = t[order], p[order]
+    kept = t >= start_us + cut_bits * bit_us if cut_bits else np.ones(len(t), np.bool_)
+    n = int(kept.sum())
+    return Events.of(np.floor(t[kept]), np.zeros(n), np.zeros(n), p[kept])
+
+
+def wrong_bits(found: list[int], sent: list[int], data_bits: int) -> float:
+    return sum((a ^ b).bit_count() for a, b in zip(found, sent, strict=True)) / (data_bits * len(sent))
+
+
+@pytest.mark.parametrize(
+    ("bit_hz", "clock", "mark_on", "late_us"),
+    [
+        (3125.0, 0.01, True, (60.0, 110.0)),
+        (3125.0, -0.02, False, (60.0, 350.0)),
+        (504.0, 0.02, True, (200.0, 600.0)),
+        (10_000.0, -0.01, True, (40.0, 60.0)),
+    ],
+)
+def test_bright_light_is_read_without_an_error(
+    bit_hz: float, clock: float, mark_on: bool, late_us: tuple[float, float]
+) -> None:
+    rng = np.random.default_rng(3)
+    sent = rng.integers(0, 128, 150)
+    bit_us = 1e6 / bit_hz * (1 + clock)
+    events = seen(
+        rng,
+        levels_of(sent, 7, "even", 2),
+        bit_us,
+        mark_on=mark_on,
+        late_us=late_us,
+        noise_hz=bit_hz / 10,
+        cut_bits=4.4,
+    )
+    uart = Uart(7, "even", 2, idle="on" if mark_on else "off")
+    found = read_characters(events.t_us, events.p, bit_hz, uart)
+    # The first one is cut.
+    assert [c.value for c in found] == sent[1:].tolist()
+    assert found[-1].bit_us == pytest.approx(bit_us, rel=2e-3)
+    assert not any(c.wrong_parity for c in found)
+    apart = np.diff([c.t_us for c in found])
+    np.testing.assert_allclose(apart, 11 * bit_us, atol=bit_us / 5)
+
+
+@pytest.mark.parametrize(
+    ("data_bits", "parity", "stop_bits"), [(5, "none", 1), (8, "none", 1), (8, "odd", 1), (9, "even", 2)]
+)
+def test_any_format_is_read(data_bits: int, parity: Parity, stop_bits: int) -> None:
+    rng = np.random.default_rng(data_bits)
+    sent = rng.integers(0, 1 << data_bits, 80)
+    levels = levels_of(sent, data_bits, parity, stop_bits)
+    uart = Uart(data_bits, parity, stop_bits)
+    book = uart.codebook(1)
+    np.testing.assert_array_equal(book.codewords[sent].ravel(), levels)
+    events = seen(rng, [1] * 20 + levels, 320.0)
+    found = read_characters(events.t_us, events.p, 3125.0, uart)
+    assert [c.value for c in found] == sent.tolist()
+
+
+@pytest.mark.parametrize(("events", "unseen"), [((2.5, 2.0), 0.0), ((4.0, 3.0), 0.03), ((8.0, 6.0), 0.01)])
+def test_errors_are_those_of_a_receiver_that_knows_the_light(
+    events: tuple[float, float], unseen: float
+) -> None:
+    """Beside one that is told when each character starts, how late events are, and how many come."""
+    rng = np.random.default_rng(17)
+    sent = rng.integers(0, 128, 300)
+    bit_us = 323.2
+    levels = levels_of(sent, 7, "even", 2)
+    light = seen(rng, levels, bit_us, events=events, unseen=unseen)
+    found = read_characters(light.t_us, light.p, 3125.0, Uart(7, "even", 2))
+    assert len(found) >= 298
+    starts = np.array([c.t_us for c in found])
+    nearest = [int(np.abs(starts - (20_000 + 40 + 11 * k * bit_us)).argmin()) for k in range(300)]
+    ours = wrong_bits([found[k].value for k in nearest], sent.tolist(), 7)
+
+    # The ideal one: likelihoods of all words from the densities that made the events.
+    def density(after_us: np.ndarray, late_us: float) -> np.ndarray:
+        safe = np.maximum(after_us, 1e-9)
+        spread = np.exp(-0.5 * (np.log(safe / late_us) / 0.5) ** 2) / (safe * 0.5 * math.sqrt(2 * math.pi))
+        return np.where(after_us > 0, spread, 0.0)
+
+    strengths = np.random.default_rng(0).gamma(8, 1 / 8, 32)
+
+    def evidence(at_us: float, on: bool) -> float:
+        inside = (light.t_us + 0.5 > at_us) & (light.t_us + 0.5 < at_us + 4 * bit_us) & (light.p == on)
+        shape = density(light.t_us[inside] + 0.5 - at_us, (60.0, 110.0)[not on])
+        means = (events[0] if on else events[1]) * strengths
+        logs = np.log1p(means[:, None] * shape / 300e-6).sum(1) - means
+        burst = logs.max() + math.log(np.exp(logs - logs.max()).mean())
+        return float(np.logaddexp(math.log(max(unseen, 1e-9)), math.log(1 - unseen) + burst))
+
+    words = np.array([levels_of(np.array([w]), 7, "even", 2) for w in range(128)])
+    steps = np.diff(np.pad(words, ((0, 0), (1, 0)), constant_values=1), axis=1)
+    ideal = []
+    for k in range(300):
+        begin_us = 20_000 + 11 * k * bit_us
+        fall = np.array([evidence(begin_us + j * bit_us, False) for j in range(11)])
+        rise = np.array([evidence(begin_us + j * bit_us, True) for j in range(11)])
+        ideal.append(int(((steps < 0) @ fall + (steps > 0) @ rise).argmax()))
+    best = wrong_bits(ideal, sent.tolist(), 7)
+    # Three standard deviations of the difference, at two wrong bits a wrong character.
+    assert ours <= 1.15 * best + 3 * math.sqrt(4 * best / 2100)
+
+
+def test_llrs_tell_the_truth() -> None:
+    rng = np.random.default_rng(5)
+    sent = rng.integers(0, 128, 500)
+    events = seen(rng, levels_of(sent, 7, "even", 2), 320.0, events=(4.0, 3.0), unseen=0.03)
+    found = read_characters(events.t_us, events.p, 3125.0, Uart(7, "even", 2))
+    assert len(found) == 500
+    right = np.array([c.value for c in found]) == sent
+    quality = np.array([c.quality for c in found])
+    assert quality.mean() == pytest.approx(right.mean(), abs=0.05)
+    assert quality[~right].mean() < 0.75
+    wrong = np.array([c.wrong_parity for c in found])
+    assert right[wrong].mean() < right[~wrong].mean()
+
+
+@pytest.mark.parametrize("parity", ["none", "odd", "even"])
+def test_scores_of_characters_are_those_of_all_words(parity: Parity) -> None:
+    characters = Characters(5, parity, 1)
+    rng = np.random.default_rng(1)
+    falls, rises = rng.normal(0, 5, (2, 60))
+    places = np.arange(characters.edges) * 4
+    for likeliest in (False, True):
+        out = np.empty(60 - places[-1])
+        code = ("none", "odd", "even").index(parity)
+        _kernels.character_scores(falls, rises, places, 5, code, likeliest, out)
+        at = np.arange(len(out))[:, None] + places
+        every = []
+        for value in range(32):
+            word = [1, *levels_of(np.array([value]), 5, parity, 1)]
+            steps = np.diff(word)[: characters.edges]
+            every.append((falls[at] * (steps < 0) + rises[at] * (steps > 0)).sum(1))
+        wanted = np.max(every, 0) if likeliest else np.logaddexp.reduce(every, 0)
+        np.testing.assert_allclose(out, wanted - 5 * math.log(2), atol=1e-9)
+        np.testing.assert_allclose(characters.likelihoods(falls[at], rises[at]), np.array(every).T)
+
+
+def test_evidence_of_an_edge_is_the_likelihood_of_its_counts() -> None:
+    rng = np.random.default_rng(2)
+    counts = rng.poisson(0.4, 50).astype(np.int32)
+    kernel = rng.dirichlet(np.ones(8))
+    strengths, shares, noise, unseen = np.array([1.0, 4.0]), np.array([0.3, 0.7]), 0.1, 0.02
+    out = np.empty(50 - 8 + 1)
+    gains = np.log1p(strengths[:, None] * kernel / noise)
+    _kernels.edge_evidence(counts, gains, strengths, shares, unseen, out)
+    for s in range(len(out)):
+        burst = 0.0
+        for mean, share in zip(strengths, shares, strict=True):
+            ratio = 1.0
+            for m in range(8):
+                there, without = noise + mean * kernel[m], noise
+                n = int(counts[s + m])
+                ratio *= there**n * math.exp(-there) / (without**n * math.exp(-without))
+            burst += share * ratio
+        assert out[s] == pytest.approx(math.log(unseen + (1 - unseen) * burst))
+
+
+def test_the_best_path_is_the_best_of_all() -> None:
+    rng = np.random.default_rng(4)
+    scores = rng.normal(4, 6, 14)
+    starts, worth = _kernels.best_path(scores, 4, 0, 1, 5.0, 1.0, 0.5)
+
+    def cost(path: tuple[int, ...]) -> float:
+        total = 0.0
+        for k, s in enumerate(path):
+            off = s - path[k - 1] - 4 if k else 99
+            if off < -1:
+                return -math.inf
+            joined = 1.0 + 0.5 * abs(off) if off <= 1 else math.inf
+            total += scores[s] - min(joined, 5.0 if off >= 0 else math.inf)
+        return total
+
+    every = [p for n in range(6) for p in itertools.combinations(range(14), n)]
+    best = max(every, key=cost)
+    assert worth == pytest.approx(cost(best))
+    assert tuple(starts.tolist()) == best
+
+
+def _link(**air: float) -> Link:
+    return resolve(
+        {
+            "bar": BAR,
+            "air": {"chip_rate_hz": 3125.0, "frames_per_packet": 100} | air,
+            "framing": {"id": "uart", "data_bits": 7, "parity": "even", "stop_bits": 2},
+            "detection": {"id": "whole"},
+        }
+    )
+
+
+def _received(link: Link, events: Events, size: int) -> tuple[list[Packet], dict[str, int]]:
+    receiver = Receiver(link)
+    packets = [p for k in range(0, len(events), size) for p in receiver.feed(events[k : k + size])]
+    return packets + receiver.close(), receiver.counts
+
+
+def test_a_text_comes_through_the_receiver_in_any_pieces() -> None:
+    link = _link()
+    symbols = compose(link, text="Works ahead", transmitter_id=7, sequence=3)
+    chips = np.concatenate([packet_chips(one, link.codebook)[:, 0] for one in symbols] * 2)
+    events = seen(np.random.default_rng(1), chips.tolist(), 323.0)
+    packets, counts = _received(link, events, 4000)
+    (message,) = [m for p in packets for m in p.messages]
+    assert message.value == "Works ahead"
+    assert [len(p.frames) for p in packets] == [100, 100]
+    assert [p.packet for p in packets] == [0, 1]
+    assert counts["characters"] == counts["frames"] == 200
+    for packet in packets:
+        assert [int(f.soft.symbols[0]) for f in packet.frames] == symbols[0][:, 0].tolist()
+        assert all(math.isnan(f.range.distance_m) for f in packet.frames)
+    again, _ = _received(link, events, 777)
+    assert [repr(p) for p in again] == [repr(p) for p in packets]
+
+
+def test_characters_of_a_packet_that_is_joined_late_are_in_their_places() -> None:
+    link = _link(frames_per_packet=30)
+    rng = np.random.default_rng(8)
+    symbols = rng.integers(0, 128, (4, 30, 1))
+    chips = np.concatenate([packet_chips(one, link.codebook)[:, 0] for one in symbols])
+    events = seen(rng, chips.tolist(), 320.0, cut_bits=16 + 11 * 12.5)
+    packets, _ = _received(link, events, 1 << 16)
+    assert [[f.frame for f in p.frames] for p in packets] == [list(range(13, 30)), *[list(range(30))] * 3]
+    for packet, sent in zip(packets, symbols, strict=True):
+        assert [int(f.soft.symbols[0]) for f in packet.frames] == sent[packet.frames[0].frame :, 0].tolist()
+
+
+def test_a_list_without_places_is_received_by_the_command(tmp_path: Path) -> None:
+    from evlcp_sdk.io.open import open_source
+
+    rng = np.random.default_rng(9)
+    sent = rng.integers(32, 127, 60)
+    events = seen(rng, levels_of(sent, 7, "even", 2), 1e6 / 504, late_us=(200.0, 500.0), noise_hz=50.0)
+    rows = "".join(
+        f"{t * 1e-6:.6f},{p}\n" for t, p in zip(events.t_us.tolist(), events.p.tolist(), strict=True)
+    )
+    (tmp_path / "list.csv").write_text("t,p\n" + rows)
+    with open_source(tmp_path / "list.csv") as source:
+        packets, _ = _received(_link(chip_rate_hz=504.0, frames_per_packet=20), source.read()[0], 1 << 16)
+    assert [int(f.soft.symbols[0]) for p in packets for f in p.frames] == sent.tolist()
+
+
+def test_noise_says_nothing() -> None:
+    rng = np.random.default_rng(0)
+    t_us = np.sort(rng.integers(0, 600_000, 4000))
+    assert read_characters(t_us, rng.integers(0, 2, 4000).astype(np.uint8), 3125.0, Uart(7, "even", 2)) == []
+
+
+def test_a_bar_of_clusters_is_refused() -> None:
+    with pytest.raises(ConfigError, match="framing 'uart': a bar of 16 clusters, expected one"):
+        resolve({"framing": {"id": "uart"}})
+
+
+def test_tables_of_steps_that_it_has_not_are_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"^pilots: no step of framing 'uart', which has its own; leave it out$"
+    ):
+        resolve({"bar": BAR, "framing": {"id": "uart"}, "pilots": {"id": "wh"}})
+    link = resolve({"bar": BAR, "framing": {"id": "uart"}})
+    assert "pilots" not in link.table
+    assert resolve(link.table) == link
+    with pytest.raises(ConfigError, match=r"^ranging: no step of framing 'uart'"):
+        link.algorithm("ranging")
