@@ -44,6 +44,8 @@ def _near_us(packet: PacketFormat) -> float:
     that it is not more than half of that, either.
     """
     chips = packet.pilot_chips if packet.pilot_every == 1 else min(packet.pilot_chips, packet.info_chips)
+    # Without pilots, frames are info segments.
+    chips = chips or packet.info_chips
     return chips / 2 * packet.chip_us
 
 

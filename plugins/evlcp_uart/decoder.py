@@ -36,6 +36,13 @@ _STRENGTHS = np.array([0.25, 0.5, 1.0, 2.0])
 _SHARES = np.array([0.15, 0.3, 0.4, 0.15])
 """Bursts are unlike in strength: by their mean, and how likely each is."""
 
+_ENOUGH = 30.0
+"""Events of a burst that tell all that it says: of more, each counts less, as pixels share light and motion,
+and the tail of a burst is no Poisson noise."""
+
+_LEFT = 0.3
+"""Share of the events after an edge that may be taken for what bursts leave behind."""
+
 _AFTER_IDLE, _AFTER_ONE, _JITTER, _NEAR = 12.0, 1.0, 0.7, 2
 """What a character costs after a pause and at once after another, and a tick early or late."""
 
@@ -287,6 +294,8 @@ class Decoder:
         for polarity in (0, 1):
             means = light.events[polarity] * _STRENGTHS
             gains = np.log1p(means[:, None] * light.kernels[polarity] / light.noise[polarity])
+            share = min(1.0, _ENOUGH / float(light.events[polarity]))
+            gains, means = gains * share, means * share
             _kernels.edge_evidence(counts[polarity], gains, means, _SHARES, light.unseen, found[polarity])
         # Whether there was an edge before the first event, or behind the last, nothing tells.
         found[:, : max(stretch.seen - _EARLY, 0)] = 0
@@ -378,7 +387,9 @@ class Decoder:
             between = away[starts[0] : starts[-1] + self._length]
             quiet = counts[polarity][starts[0] : starts[-1] + self._length][between]
             if len(quiet) >= _REACH:
-                level = float(quiet.mean())
+                # What a burst leaves behind for long is noise to the edges after it.
+                left = min(float(found[-_REACH // 4 :].mean()), _LEFT * float(found.mean())) / len(at)
+                level = max(float(quiet.mean()), left)
                 noise[polarity] += (level - noise[polarity]) * len(quiet) / (len(quiet) + weight * TICKS)
             noise[polarity] = max(noise[polarity], 1e-4, 1e-4 * events[polarity])
             burst = np.maximum(found - noise[polarity] * len(at), 0.0)

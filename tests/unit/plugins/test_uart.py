@@ -3,6 +3,7 @@
 import itertools
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -326,3 +327,26 @@ def test_tables_of_steps_that_it_has_not_are_refused() -> None:
     assert resolve(link.table) == link
     with pytest.raises(ConfigError, match=r"^ranging: no step of framing 'uart'"):
         link.algorithm("ranging")
+
+
+def test_of_an_image_events_count_at_which_a_pixel_turns() -> None:
+    """Beside a plain loop; pixels go on firing for long after an edge."""
+    rng = np.random.default_rng(6)
+    link = _link(frames_per_packet=30)
+    n = 4000
+    events = Events.of(
+        np.sort(rng.integers(0, 50_000, n)),
+        rng.integers(0, 9, n),
+        rng.integers(0, 9, n),
+        rng.integers(0, 2, n),
+    )
+    last: dict[tuple[int, int], int] = {}
+    wanted = []
+    for x, y, p in zip(events.x.tolist(), events.y.tolist(), events.p.tolist(), strict=True):
+        wanted.append((x, y) == (0, 0) or last.get((x, y)) != p)
+        last[x, y] = p
+    reader: Any = link.algorithm("framing").compile(link.codebook, link.packet)
+    state = reader.init()
+    for k in range(0, n, 700):
+        state, _ = reader.step(state, events[k : k + 700], int(events.t_us[min(k + 700, n) - 1]))
+    assert int(state.decoder.counts.sum()) == sum(wanted)
