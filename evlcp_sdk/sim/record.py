@@ -162,7 +162,7 @@ def _others(simulation: Simulation, position: Floats, attitude: Floats) -> list[
         for j, reflection in enumerate(reflections_of(simulation.scene, i)):
             images = light.images[j * columns : (j + 1) * columns]
             # The middle of the columns' middles is the bar's.
-            strips = [replace(one, strip=replace(one.strip, clusters=2)) for one in images]
+            strips = [replace(one, strip=replace(one.strip, cuts=(-0.5, 0.0, 0.5))) for one in images]
             place = np.mean([simulation.seen(one, position, attitude)[0][:, 1] for one in strips], 0)
             found.append(
                 {

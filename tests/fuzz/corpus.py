@@ -160,6 +160,6 @@ def kinds(folder: Path, store: bytes) -> list[Kind]:
         Kind("campaign", "a.toml", (EXAMPLES / "campaigns" / "rates.toml").read_bytes(), plan_of),
         Kind("results", "a.sqlite", store, _store),
         Kind("symbols", "a.json", json.dumps({"symbols": symbols}).encode(), lambda p: read_symbols(p, None)),
-        Kind("masks", "a.npy", masks.read_bytes(), lambda p: read_masks(p, link.codebook, packet)),
+        Kind("masks", "a.npy", masks.read_bytes(), lambda p: read_masks(p, link)),
         Kind("inventory", "a.toml", INVENTORY, read_inventory),
     ]

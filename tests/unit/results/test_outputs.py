@@ -41,7 +41,7 @@ LINK = Link(
     regions=RegionSpec(),
     messages=MessageSpec(decode=False),
     position=PositionSpec(),
-    algorithms={"tracking": NoTracking()},
+    algorithms={"tracking": NoTracking(), "ranging": load_link().algorithm("ranging")},
     revisions={"ranging": 1},
     codebook=BOOK,
     packet=PacketFormat.of(BOOK, 3),

@@ -167,7 +167,7 @@ def test_a_hidden_cluster_is_not_lit_by_its_neighbours() -> None:
     sums = np.zeros((16, *light.shape[1:]), np.int16)
     sums[1::2] = 2 * np.einsum("ki,khw->ihw", codes, light)
     presence = masked(covered(whole, [5, 6]), LINE, placements(covered(whole, [5, 6]), LINE)[0])
-    only, placement = lit(sums, codes, presence, placements(whole, LINE)[0])
+    only, placement = lit(sums, codes, 2, presence, placements(whole, LINE)[0])
     assert np.flatnonzero(~placement.seen).tolist() == [5, 6]
     assert not only.probability[[5, 6]].any()
     assert not only.selected[[5, 6]].any()

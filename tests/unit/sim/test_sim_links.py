@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import hadamard
+from evlcp_sdk.air.codebook import chips_of_values, hadamard
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
@@ -49,8 +49,8 @@ STILL = MotionSpec(distance_m=30.0, speed_mps=0.0, vib_rate_rad_s=0.0)
 class Four(Modulation):
     """Two bits a symbol: a modulation of somebody else's."""
 
-    def codewords(self) -> NDArray[np.int8]:
-        return np.repeat(hadamard(4), 2, axis=1)
+    def codewords(self) -> NDArray[np.uint8]:
+        return chips_of_values(np.repeat(hadamard(4), 2, axis=1))
 
 
 class Stranger:

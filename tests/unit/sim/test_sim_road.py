@@ -39,6 +39,7 @@ from evlcp_sdk.sim._kernels import COLUMN_BITS, read_out, texture_at
 from evlcp_sdk.sim.light import BarLight, wiper_switches
 from evlcp_sdk.sim.motion import pothole_angle_rad
 from evlcp_sdk.sim.optics import blur_of
+from evlcp_sdk.sim.scene import LensSpec
 from evlcp_sdk.sim.validation import pixel_events
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.study.score import Score
@@ -128,7 +129,7 @@ def test_covers_put_out_clusters_and_only_those() -> None:
         "covered": (3,), "cover_s": ((0.0012, 0.0033, 6, 8),), "pole_s": ((0.004, 0.0041),)
     }  # fmt: skip
     plain, hidden = (
-        BarLight(BarSpec(start_chip=2.3, **more), link, 1.0, 7, reflections=[ReflectionSpec()])
+        BarLight(BarSpec(start_chip=2.3, **more), link, LensSpec(), 7, reflections=[ReflectionSpec()])
         for more in ({}, covers)
     )
 
