@@ -1,16 +1,27 @@
 """Warnings of recordings that the simulator renders: of each fault the one that is meant, of none none."""
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import evlcp_sdk as evlcp
+from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.io import write_events
 from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.plugin.roles import Measure, Ranging
 from evlcp_sdk.plugin.source import EventSource
+from evlcp_sdk.results.doubts import warnings_of
+from evlcp_sdk.results.tallies import RunTally
 from evlcp_sdk.run import receive_to_folder
+from evlcp_sdk.rx.limits import LIMITS
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import load_scene
 from evlcp_sdk.simulated import simulate
+from evlcp_sdk.values import FrameView, Range
 
 Keys = dict[str, Any]
 
@@ -98,3 +109,54 @@ def test_a_picture_that_is_upside_down(tmp_path: Path) -> None:
     write_events(tmp_path / "turned.npz", turned, 1280, 720)
     summary = receive_to_folder(tmp_path / "turned.npz", None)
     assert [one["code"] for one in summary["warnings"]] == ["turned"]
+
+
+def test_events_that_are_of_no_pixel(tmp_path: Path) -> None:
+    """One event in a hundred lies beyond the sensor, as of another camera's or of a broken line."""
+    with rendered((), 0.12, {}) as source:
+        events, _ = source.read()
+    x = events.x.copy()
+    x[::100] += 1280
+    write_events(tmp_path / "beside.npz", type(events)(events.t_us, x, events.y, events.p), 2560, 720)
+    link = load_link()
+    with evlcp.open(tmp_path / "beside.npz") as beside:
+        receiver, tally = Receiver(link), RunTally(link.packet)
+        for packet in [*(p for e in beside.chunks() for p in receiver.feed(e)), *receiver.close()]:
+            tally.add(packet)
+    (one,) = warnings_of(tally, receiver.counts, link)
+    assert (one.code, "off sensor" in one.text) == ("dropped", True)
+
+
+def test_clusters_that_are_hidden() -> None:
+    (one,) = warned(**{"bars.0.covered": [4, 5]})
+    assert (one["code"], one["text"]) == ("clusters-hidden", "clusters never seen: 4, 5")
+
+
+@dataclass(frozen=True)
+class TooLong(Ranging):
+    """Distances a tenth too long."""
+
+    def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
+        measure = load_link().algorithm("ranging").compile(camera, bar, codebook)
+
+        def too_long(view: FrameView) -> Range:
+            found = measure(view)
+            return replace(found, distance_m=1.1 * found.distance_m)
+
+        return too_long
+
+
+def test_distances_that_are_not_those_of_the_bar() -> None:
+    link = load_link().with_algorithm("ranging", TooLong())
+    (one,) = receive_to_folder(rendered((), 0.12, {}), None, link)["warnings"]
+    assert (one["code"], "10% too long" in one["text"]) == ("size", True)
+
+
+def test_more_than_there_is_room_for() -> None:
+    link = load_link()
+    receiver, tally = Receiver(link, limits=replace(LIMITS, region_bytes=1 << 18)), RunTally(link.packet)
+    with rendered((), 0.12, {}) as source:
+        for packet in [*(p for e in source.chunks() for p in receiver.feed(e)), *receiver.close()]:
+            tally.add(packet)
+    found = {one.code: one for one in warnings_of(tally, receiver.counts, link)}
+    assert "events of regions forgotten early" in found["no-room"].text
