@@ -156,7 +156,7 @@ def count(into: Count, packets: list[Packet], truth: Truth, told: Told) -> None:
     link = told.link
     positioner = Positioner(
         link.camera,
-        link.bar.clusters,
+        link.bar,
         link.packet.packet_chips * link.packet.chip_us,
         told.sites,
         told.attitude_at,

@@ -521,6 +521,10 @@ def calibrate(
     """
     registry = Registry.load() if registry is None else registry
     link = link if isinstance(link, Link) else load_link(link, registry=registry)
+    if not link.bar.in_even_line or link.bar.clusters < 2:
+        raise ConfigError(
+            "a survey is of bars whose clusters stand evenly in line; write a site.toml by hand"
+        )
     _check_names(recordings, poses, name)
     axes = LocalAxes.of(sites)
     views: list[CalibrationView] = []
@@ -561,7 +565,7 @@ def _views(
         for number, found in points.items():
             if number in stands_at:
                 site = stands_at[number]
-                enu = site.cluster_positions_m(link.bar.clusters, axes)
+                enu = site.layout_positions_m(link.bar, axes)
                 bars.append(BarView(site.transmitter_id, enu, *found, site.survey))
         views.append(_view(pose, bars, axes))
     return views
@@ -630,6 +634,10 @@ def survey(
     """
     registry = Registry.load() if registry is None else registry
     link = link if isinstance(link, Link) else load_link(link, registry=registry)
+    if not link.bar.in_even_line or link.bar.clusters < 2:
+        raise ConfigError(
+            "a survey is of bars whose clusters stand evenly in line; write a site.toml by hand"
+        )
     _check_names(recordings, poses, name)
     listed = {site.transmitter_id for site in known}
     first = poses[0]

@@ -131,7 +131,7 @@ class Navigator:
         self._spec = link.position
         self.positioner = Positioner(
             link.camera,
-            link.bar.clusters,
+            link.bar,
             link.packet.packet_chips * link.packet.chip_us,
             plan.sites,
             attitude_source(attitude),

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.observations import BarView
 from evlcp_sdk.place.points import points_at
@@ -13,6 +14,7 @@ from evlcp_sdk.place.pose import fitting_focal_mm, solve_pose
 from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.place.whereabouts import Whereabouts
 from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Alternative, Fix, Frame, Packet
@@ -30,7 +32,7 @@ class Positioner:
 
     Args:
         camera: The receiving camera.
-        clusters: Clusters of a bar.
+        bar: Which layout they are of.
         packet_us: Length of a packet, us.
         sites: Where the bars stand; may be empty where beacons are believed.
         attitude_at: What is known of the camera's attitude at a time, us; None for nothing.
@@ -41,7 +43,7 @@ class Positioner:
     def __init__(
         self,
         camera: CameraModel,
-        clusters: int,
+        bar: BarLayout,
         packet_us: float,
         sites: Sequence[BarSite],
         attitude_at: Callable[[float], Attitude | None],
@@ -51,7 +53,8 @@ class Positioner:
         self.axes: LocalAxes | None = LocalAxes.of(sites) if sites else None
         self._camera = camera
         self._camera_sigma = camera_sigma
-        self._clusters = clusters
+        self._bar = bar
+        self._clusters = bar.clusters
         self._packet_us = packet_us
         self._attitude_at = attitude_at
         self._spec = PositionSpec() if spec is None else spec
@@ -137,7 +140,7 @@ class Positioner:
         return fixes
 
     def _fix(self, t_us: float) -> Fix | None:
-        views, sited = [], []
+        views, sited, unplaced = [], [], []
         here: LocalAxes | None = None
         for number, frames in sorted(self._frames.items()):
             points = points_at(frames, t_us, self._packet_us, self._clusters, self._spec)
@@ -150,11 +153,17 @@ class Positioner:
             if self.axes is None:
                 self.axes = LocalAxes.of([site])
             # Gravity and north are those of here, which may be far from the origin of the trajectory.
+            try:
+                enu = site.layout_positions_m(self._bar, LocalAxes.of([site]) if here is None else here)
+            except ConfigError as fault:
+                unplaced.append(str(fault))
+                continue
             here = LocalAxes.of([site]) if here is None else here
-            enu = site.cluster_positions_m(self._clusters, here)
             sited.append(BarView(number, enu, *points, site.survey))
         if not views:
             return None
+        if here is None and unplaced:
+            return Fix.refused(t_us, tuple(views), "no-facing", "; ".join(unplaced))
         if here is None or self.axes is None:
             how = [text for number in views if (text := self._bars.contradiction(number))]
             if how:

@@ -9,6 +9,7 @@ __all__ = ["REFUSALS", "Candidate", "Refusal"]
 
 REFUSALS = {
     "no-site": "no bar in view stands at a known place",
+    "no-facing": "the clusters are not in line, and no site says where its LEDs face",
     "site-contradicted": "the bars' own beacons say other places or lengths than their sites",
     "too-few-clusters": "no bar shows as many clusters as a position needs",
     "heading-unknown": "one bar alone, and the camera's heading is not known",

@@ -280,6 +280,12 @@ class BarLayout:
         return bool((np.abs(forms - forms[0]) <= 1).all())
 
     @property
+    def in_even_line(self) -> bool:
+        """Whether the clusters stand in one straight line, in order and evenly; one cluster does."""
+        steps = np.diff(self.cluster_positions_m(), axis=0)
+        return len(steps) == 0 or bool(np.abs(steps - steps[0]).max() <= 1e-6 * np.abs(steps[0]).max())
+
+    @property
     def column_pitch_m(self) -> float:
         """From cluster to cluster of one even column, the first at its top, m; NaN for another layout.
 

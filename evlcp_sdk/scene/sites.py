@@ -15,10 +15,18 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.specs import SpecError, build, read_toml
 from evlcp_sdk.spelling import nearest
 
 __all__ = ["BarSite", "LocalAxes", "load_sites", "resolve_sites", "site_of_transmitter", "to_toml"]
+
+
+_LEAST_UPRIGHT = 0.1
+"""Sine of an axis' elevation below which it lies: LEDs then face level, whatever they are turned about it."""
+
+_LEAST_FACING = 0.01
+"""Sine of the angle between a bar's axis and where it faces, below which the latter says nothing."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +55,12 @@ class BarSite:
         float, Field(ge=0, le=180, description="Of its axis from the vertical; 90: lying, 180: upside down.")
     ] = 0.0
     length_m: Annotated[
-        float, Field(gt=0, le=100, description="From its first to its last LED's outer edge.")
+        float,
+        Field(
+            gt=0,
+            le=100,
+            description="From its first to its last LED's outer edge; of clusters not in line, its height.",
+        ),
     ] = 0.96
     transmitter: Annotated[
         int | None,
@@ -61,6 +74,14 @@ class BarSite:
         float, Field(ge=0, le=180, description="Of a turn of the bar about each axis; 0: exact.")
     ] = 0.0
     length_sigma_m: Annotated[float, Field(ge=0, le=10, description="Of its length; 0: exact.")] = 0.0
+    facing_deg: Annotated[
+        float | None,
+        Field(
+            ge=0,
+            lt=360,
+            description="Where its LEDs shine to, clockwise from north; for clusters that are not in line.",
+        ),
+    ] = None
 
     @property
     def survey(self) -> tuple[float, float, float]:
@@ -81,10 +102,44 @@ class BarSite:
             clusters: How many equal parts the bar is cut into.
             axes: The local axes.
         """
+        along = (0.5 - (np.arange(clusters) + 0.5) / clusters) * self.length_m
+        return self._in_axes(along[:, None] * self.axis_enu(), axes)
+
+    def layout_positions_m(self, bar: BarLayout, axes: "LocalAxes") -> NDArray[np.float64]:
+        """Centres of the clusters of a layout in local axes, m, float64 (K, 3).
+
+        Clusters evenly in line stand along the axis, from its top; others about the centre, as one who looks
+        at the front sees them, as large as `length_m` says.
+
+        Args:
+            bar: The layout.
+            axes: The local axes.
+
+        Raises:
+            ConfigError: The clusters are not in line, and the site does not say where the LEDs face.
+        """
+        if bar.in_even_line:
+            return self.cluster_positions_m(bar.clusters, axes)
+        name = f"site of id {self.transmitter_id}"
+        if self.facing_deg is None:
+            raise ConfigError(f"{name}: facing_deg: missing; expected where the LEDs shine to")
+        up, facing = self.axis_enu(), math.radians(self.facing_deg)
+        towards = np.array([math.sin(facing), math.cos(facing), 0.0])
+        if abs(up[2]) >= _LEAST_UPRIGHT:
+            # Square to the axis, and over the horizon where it says.
+            towards[2] = -(towards @ up) / up[2]
+        else:
+            towards -= (towards @ up) * up
+        if np.linalg.norm(towards) < _LEAST_FACING:
+            raise ConfigError(f"{name}: facing_deg = {self.facing_deg:g}: its axis points there")
+        towards /= np.linalg.norm(towards)
+        x, y, z = bar.cluster_positions_m().T[:, :, None] * (self.length_m / bar.length_m)
+        return self._in_axes(x * np.cross(up, towards) - y * up + z * towards, axes)
+
+    def _in_axes(self, offset: NDArray[np.float64], axes: "LocalAxes") -> NDArray[np.float64]:
+        """Points that lie so far from its centre, east, north and up there, in local axes, m, (n, 3)."""
         import pymap3d
 
-        along = (0.5 - (np.arange(clusters) + 0.5) / clusters) * self.length_m
-        offset = along[:, None] * self.axis_enu()
         here = (self.latitude_deg, self.longitude_deg, self.height_m)
         ecef = pymap3d.enu2ecef(*offset.T, *here)
         return np.stack(pymap3d.ecef2enu(*ecef, *axes.origin), -1)

@@ -91,9 +91,16 @@ def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, .
                 tilt_deg=math.degrees(math.atan2(lean, up)),
                 length_m=link.bar.length_m,
                 position_sigma_m=0.0,
+                facing_deg=None if link.bar.in_even_line else _azimuth(bar, world.heading_deg),
             )
         )
     return tuple(sites)
+
+
+def _azimuth(bar: BarSpec, heading_deg: float) -> float:
+    """Where a bar's LEDs shine to, clockwise from north, degrees."""
+    east, north, _ = scene_to_enu(np.array(bar_towards(bar)), heading_deg)
+    return math.degrees(math.atan2(east, north)) % 360
 
 
 def camera_on_earth(scene: Scene, position_m: Floats, attitude_rad: Floats) -> dict[str, Any]:

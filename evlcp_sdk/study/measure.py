@@ -182,7 +182,7 @@ def position_tallies(
     sites = sites_seen(packets, truth)
     positioner = Positioner(
         link.camera,
-        link.bar.clusters,
+        link.bar,
         link.packet.packet_chips * link.packet.chip_us,
         sites,
         attitude_source(attitude),

@@ -19,6 +19,7 @@ from evlcp_sdk.place.positioner import Positioner, _alternatives
 from evlcp_sdk.place.refusals import Candidate, Refusal
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
+from evlcp_sdk.scene.bar import BarLayout, LedRing
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.sim import Simulation
@@ -44,9 +45,10 @@ def camera_at(t_us: float) -> NDArray[np.float64]:
 
 def packets_of(bar: BarSite, transmitter: int, count: int, start_us: float = 5000.0,
                messages: dict[int, tuple[ReceivedMessage, ...]] | None = None,
-               attitude: Attitude = EXACT, dark: tuple[int, ...] = ()) -> list[Packet]:  # fmt: skip
+               attitude: Attitude = EXACT, dark: tuple[int, ...] = (),
+               enu: NDArray[np.float64] | None = None) -> list[Packet]:  # fmt: skip
     """What a receiver of a bar gives while the camera drives, without noise."""
-    enu, found = bar.cluster_positions_m(16, ORIGIN), []
+    enu, found = bar.cluster_positions_m(16, ORIGIN) if enu is None else enu, []
     for n in range(count):
         start = start_us + n * PACKET_US
         frames = []
@@ -68,7 +70,32 @@ def merged(*streams: list[Packet]) -> list[Packet]:
 
 
 def positioner(sites: list[BarSite], attitude: Attitude | None = EXACT, **spec: object) -> Positioner:
-    return Positioner(CAMERA, 16, PACKET_US, sites, lambda _t: attitude, PositionSpec(**spec))  # type: ignore[arg-type]
+    return Positioner(CAMERA, BarLayout(), PACKET_US, sites, lambda _t: attitude, PositionSpec(**spec))  # type: ignore[arg-type]
+
+
+RING = BarLayout(LedRing(leds=16, radius_m=0.45))
+
+
+def test_a_ring_gives_a_fix_where_its_site_says_how_it_faces() -> None:
+    ring = dataclasses.replace(LEFT, length_m=RING.length_m, facing_deg=180.0)
+    enu = ring.layout_positions_m(RING, ORIGIN)
+    # The camera stands in the south: what it sees to the right is in the east.
+    assert enu[4] - enu[12] == pytest.approx([0.9, 0, 0], abs=1e-6)
+    assert enu[0] - enu[8] == pytest.approx([0, 0, 0.9], abs=1e-6)
+    packets = packets_of(ring, 0, 8, enu=enu)
+    whole = Positioner(CAMERA, RING, PACKET_US, [ring], lambda _t: EXACT, PositionSpec())
+    assert_right(whole.feed(packets) + whole.close(), 5e-3)
+    unknown = Positioner(
+        CAMERA,
+        RING,
+        PACKET_US,
+        [dataclasses.replace(ring, facing_deg=None)],
+        lambda _t: EXACT,
+        PositionSpec(),
+    )
+    fixes = unknown.feed(packets) + unknown.close()
+    assert {f.refusal for f in fixes} == {"no-facing"}
+    assert fixes[0].detail == "site of id 7: facing_deg: missing; expected where the LEDs shine to"
 
 
 def assert_right(fixes: list[Fix], most_m: float = 2e-3) -> None:
@@ -258,7 +285,10 @@ def test_a_beacon_whose_key_runs_out_is_believed_no_longer() -> None:
 def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
     """From behind two bars the image of swapped ones is the same; what they say of themselves tells."""
     gravity = Attitude(4.0, 1.0, None, 0.0, 0.0)
-    swapped = [dataclasses.replace(LEFT, transmitter_id=9), dataclasses.replace(RIGHT, transmitter_id=7)]
+    swapped = [
+        dataclasses.replace(LEFT, transmitter_id=9),
+        dataclasses.replace(RIGHT, transmitter_id=7),
+    ]
     stream = merged(
         packets_of(LEFT, 0, 6, messages={0: (heard(LEFT, "unverified", 0),)}),
         packets_of(RIGHT, 1, 6, messages={0: (heard(RIGHT, "unverified", 0),)}),
@@ -368,7 +398,7 @@ def test_a_simulated_drive_on_a_wet_road() -> None:
         return Attitude(math.degrees(pitch), math.degrees(roll), 30 + math.degrees(yaw), 0.0, 0.01)
 
     (site,) = sites_of(scene)
-    p = Positioner(link.camera, 16, link.packet.packet_chips * link.packet.chip_us, [site], attitude_at)
+    p = Positioner(link.camera, link.bar, link.packet.packet_chips * link.packet.chip_us, [site], attitude_at)
     fixes = p.feed(packets) + p.close()
     given = [f for f in fixes if not f.refusal]
     assert len(given) >= 3
@@ -405,7 +435,7 @@ def test_a_simulated_drive_past_two_bars() -> None:
         _, ((_yaw, pitch, roll),) = simulation.path.at([t_us])
         return Attitude(math.degrees(pitch), math.degrees(roll), None, 0.0)
 
-    p = Positioner(link.camera, 16, link.packet.packet_chips * link.packet.chip_us, sites, attitude_at)
+    p = Positioner(link.camera, link.bar, link.packet.packet_chips * link.packet.chip_us, sites, attitude_at)
     fixes = p.feed(packets) + p.close()
     given = [f for f in fixes if not f.refusal]
     assert len(given) >= 4

@@ -11,7 +11,7 @@ from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import LocalAxes, load_sites, to_toml
 from evlcp_sdk.sim import Simulation, load_scene, resolve_scene, sites_of, truth_of
 from evlcp_sdk.sim.motion import project
-from evlcp_sdk.sim.world import attitude_log
+from evlcp_sdk.sim.world import attitude_log, scene_to_enu
 
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 137.2, "height_m": 40.0, "heading_deg": 30.0}
 SCENE = resolve_scene(
@@ -58,6 +58,21 @@ def test_sites_and_camera_say_what_the_image_shows() -> None:
             places, _ = project(ends, position, attitude, camera)
             # A level plane is level at its origin only: 50 m away the earth has turned by 8 urad.
             np.testing.assert_allclose(seen, places[0], atol=0.15)
+
+
+@pytest.mark.parametrize(
+    "layout", [{"shape": "ring", "leds": 8}, {"rows": 4, "columns": 4, "cluster_rows": 1}]
+)
+def test_clusters_that_are_not_in_line_stand_where_their_light_is(layout: dict[str, object]) -> None:
+    bar = {"x_m": -2.0, "y_m": -0.5, "lean_deg": 10.0, "tilt_deg": 20.0, "link": {"bar": layout}}
+    scene = resolve_scene({"world": WORLD, "motion": {"distance_m": 50.0}, "bars": [bar]})
+    (site,), (light,) = sites_of(scene), Simulation(scene).bars
+    found = site.layout_positions_m(light.link.bar, LocalAxes(35.1, 137.2, 40.0))
+    for strip in light.strips:
+        cuts = strip.strip.cuts_m()
+        for k, middle in zip(strip.clusters, (cuts[1:] + cuts[:-1]) / 2, strict=True):
+            if k >= 0:
+                np.testing.assert_allclose(found[k], scene_to_enu(middle, 30.0), atol=1e-5)
 
 
 def test_the_origin_is_the_worlds() -> None:
