@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from evlcp_uart.characters import Characters
 
-__all__ = ["Character", "Decoder", "Light", "State"]
+__all__ = ["Character", "CharacterDecoder", "CharacterState", "Light"]
 
 TICKS = 16
 """Ticks of a bit."""
@@ -114,7 +114,7 @@ class Character:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class CharacterState:
     """What a decoder knows of a stream.
 
     Attributes:
@@ -158,7 +158,7 @@ class Stretch:
 
 
 @dataclass(frozen=True)
-class Decoder:
+class CharacterDecoder:
     """Reads characters from times and polarities, step by step.
 
     Args:
@@ -171,13 +171,13 @@ class Decoder:
     bit_us: float
     mark_on: bool = True
 
-    def init(self) -> State:
+    def init(self) -> CharacterState:
         """State before the first event."""
-        return State()
+        return CharacterState()
 
     def step(
-        self, state: State, t_us: NDArray[np.int64], p: NDArray[np.uint8], until_us: float
-    ) -> tuple[State, list[Character]]:
+        self, state: CharacterState, t_us: NDArray[np.int64], p: NDArray[np.uint8], until_us: float
+    ) -> tuple[CharacterState, list[Character]]:
         """Take the events up to a time; give the characters that are certain by then.
 
         Args:
@@ -193,7 +193,7 @@ class Decoder:
             found += more
         return state, found
 
-    def close(self, state: State) -> tuple[State, list[Character]]:
+    def close(self, state: CharacterState) -> tuple[CharacterState, list[Character]]:
         """End the stream: give the characters that are left."""
         n = state.counts.shape[1]
         if state.first is None or not n:
@@ -212,7 +212,9 @@ class Decoder:
     def _ahead(self) -> int:
         return _AHEAD * self._length + _REACH
 
-    def _take(self, state: State, t_us: NDArray[np.int64], p: NDArray[np.uint8], until_us: float) -> State:
+    def _take(
+        self, state: CharacterState, t_us: NDArray[np.int64], p: NDArray[np.uint8], until_us: float
+    ) -> CharacterState:
         """Count events by tick, on a grid that stands still."""
         first = state.first
         tick_us = self.bit_us / TICKS
@@ -233,7 +235,9 @@ class Decoder:
         np.add.at(counts, (p[inside].astype(np.int64), ticks[inside]), 1)
         return replace(state, first=first, counts=counts)
 
-    def _decode(self, state: State, due: int, last: bool = False) -> tuple[State, list[Character]]:
+    def _decode(
+        self, state: CharacterState, due: int, last: bool = False
+    ) -> tuple[CharacterState, list[Character]]:
         """Decode the first `due` ticks, with the help of some behind; nothing comes behind the last ones."""
         assert state.first is not None
         first, light = state.first, state.light
@@ -277,7 +281,7 @@ class Decoder:
                     light, dark = None, 0
         # A copy, so that what is done is not held.
         rest = state.counts[:, due:].copy()
-        return State(first + due, rest, first + start, state.seen, light, dark, tried, given), found
+        return CharacterState(first + due, rest, first + start, state.seen, light, dark, tried, given), found
 
     def _places(self, light: Light) -> NDArray[np.int64]:
         """Ticks from a character's start to each place of an edge."""

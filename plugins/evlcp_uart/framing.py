@@ -15,7 +15,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Deframer, Framing
 from evlcp_sdk.values import Events, Heard, SoftSymbols
 from evlcp_uart.characters import Characters, Parity
-from evlcp_uart.decoder import Character, Decoder, State
+from evlcp_uart.decoder import Character, CharacterDecoder, CharacterState
 
 __all__ = ["Uart", "read_characters"]
 
@@ -64,9 +64,9 @@ class Uart(Framing):
         pause = np.full(self.pause_bits, mark, np.uint8)
         return Codebook(profile, pause, np.empty((1, 0), np.uint8), levels if mark else 1 - levels)
 
-    def decoder(self, bit_rate_hz: float) -> Decoder:
+    def decoder(self, bit_rate_hz: float) -> CharacterDecoder:
         """What reads characters from events."""
-        return Decoder(self.characters, 1e6 / bit_rate_hz, self.idle == "on")
+        return CharacterDecoder(self.characters, 1e6 / bit_rate_hz, self.idle == "on")
 
     def compile(self, codebook: Codebook, packet: PacketFormat) -> Deframer:
         """For the packet's length and the rate of its chips."""
@@ -108,7 +108,7 @@ class _Grid:
 class _Heard:
     """State of the decoder, grid of packets, characters that wait for one, and what each pixel said last."""
 
-    decoder: State
+    decoder: CharacterState
     grid: _Grid | None = None
     waiting: tuple[Character, ...] = ()
     said: NDArray[np.uint8] = field(default_factory=lambda: np.full(_PIXELS, _NOTHING, np.uint8))
@@ -119,7 +119,7 @@ class _Heard:
 class _Packets:
     """Numbers characters by packets: some follow one another, then there is a pause."""
 
-    decoder: Decoder
+    decoder: CharacterDecoder
     packet: PacketFormat
 
     def init(self) -> _Heard:
