@@ -181,7 +181,7 @@ def test_the_command_takes_excuses(evlcp: Evlcp) -> None:
     ("given", "said"),
     [
         (("ranging", "pco"), "did you mean 'poc'?"),
-        (("rangin", "poc"), "no role named 'rangin' (known: pilots,"),
+        (("rangin", "poc"), "no role named 'rangin' (known: detection,"),
         (("ranging", "poc", "--set", "foo=3"), "ranging.foo = 3: unknown key"),
         (("ranging", "poc", "--set", "air.foo=3"), "--set: air.foo = 3: unknown key"),
         (("ranging", "poc", "--set", "foo"), "--set foo: expected KEY=VALUE or TABLE.KEY=VALUE"),

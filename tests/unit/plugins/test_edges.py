@@ -183,5 +183,5 @@ def test_other_codes_at_50_m_at_night(name: str) -> None:
     read = np.array([frame.symbols for frame, _ in pairs])
     true = sent.symbols[[number for _, number in pairs]]
     # Between pilots the bar's motion is known less well.
-    assert ((read != true) & (read >= 0)).mean() <= (0.01 if link.packet.pilot_every > 1 else 0)
+    assert ((read != true) & (read >= 0)).mean() <= (0.02 if link.packet.pilot_every > 1 else 0)
     assert (read >= 0).mean() >= 0.98
