@@ -274,6 +274,7 @@ def resolve(
     built: dict[str, Any] = {}
     resolved: dict[str, dict[str, Any]] = {}
     revisions: dict[str, int] = {}
+    pairs = True
     for section in known:
         keys = table.get(section, {})
         if not isinstance(keys, Mapping):
@@ -289,7 +290,7 @@ def resolve(
         if section in _SPECS:
             cls = _SPECS[section]
         else:
-            head["id"] = name = keys.pop("id", ROLES[section].default_for(built.get("bar"), _pairs(built)))
+            head["id"] = name = keys.pop("id", ROLES[section].default_for(built.get("bar"), pairs))
             if not isinstance(name, str):
                 fault(section, "id", f" = {name!r}: expected a string")
                 continue
@@ -308,6 +309,8 @@ def resolve(
                 built[section] = build(cls, keys)
                 plain = head | asdict(built[section])
             resolved[section] = json.loads(json.dumps(plain))
+            if section == "modulation":
+                pairs = _pairs(built)
         except SpecError as refused:
             for path, text in refused.faults:
                 fault(section, path[0], "".join(f".{part}" for part in path[1:]) + text)

@@ -347,8 +347,8 @@ class Role:
         verb: What it does, in one line.
         default_of_chips: Id of it for codes that are not pair codes, which the default refuses; None where
             that one takes all codes.
-        by_layout: Id of it for a known bar, and whether its codes are pair codes; None where that does not
-            depend on the bar.
+        by_layout: Id of it for a known bar, and whether its codes are pair codes, in place of both; None
+            where that does not depend on the bar.
     """
 
     name: str
@@ -401,7 +401,11 @@ ROLES: Mapping[str, Role] = MappingProxyType(
             ),
             Role("decoding", Decoding, "motion-feedback", "a frame's image -> soft symbols", "edges"),
             Role(
-                "ranging", Ranging, "joint-scale", "a decoded frame's image -> distance", "poc", _ranging_of
+                "ranging",
+                Ranging,
+                "joint-scale",
+                "a decoded frame's image -> distance",
+                by_layout=_ranging_of,
             ),
             Role("tracking", Tracking, "none", "distance and image position over time"),
             Role("error-correction", ErrorCorrection, "polar", "message bits <-> coded bits, soft input"),

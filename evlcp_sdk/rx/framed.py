@@ -14,6 +14,7 @@ from evlcp_sdk.rx.detection import Followed
 from evlcp_sdk.rx.echoes import EchoQueue, Sighting
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.guard import Guard
+from evlcp_sdk.rx.lit import LitTimes
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.steps import Announcer
 from evlcp_sdk.rx.timeline import TimeStep
@@ -25,8 +26,6 @@ _NO_RANGE = Range(math.nan, math.nan, 0)
 
 _LOOKBACK_FRAMES = 96
 """Frames for which the places of a region are kept: a framing may give a frame so late."""
-
-_MOST_LIT = 1024
 
 
 @dataclass
@@ -62,7 +61,7 @@ class HeardFraming:
 
     Attributes:
         counts: What was found so far.
-        lit_us: See `Receiver`.
+        lit: When the light of its transmitters was there.
     """
 
     def __init__(
@@ -82,7 +81,7 @@ class HeardFraming:
         frames_us = _LOOKBACK_FRAMES * link.packet.info_chips * link.packet.chip_us
         self._keep_us = max(2 * link.packet.packet_chips * link.packet.chip_us, frames_us)
         self.counts = dict.fromkeys(("events_in_regions", "regions_opened", "regions_released", "frames"), 0)
-        self.lit_us: dict[int, tuple[float, float]] = {}
+        self.lit = LitTimes()
 
     def step(self, regions: list[Followed], step: TimeStep) -> None:
         """Hear what the regions of a time step send."""
@@ -150,7 +149,8 @@ class HeardFraming:
             )
             self.counts["frames"] += 1
             self._announcer.total("frame", frame)
-            self._lit(listener.number, self._camera_us(one.t_us))
+            start_us = self._camera_us(one.t_us)
+            self.lit.note(listener.number, start_us, start_us)
             lock = SyncLock(one.packet_t_us, one.chip_us, 0.0, 0.0, 1.0)
             number = one.packet * self._packet.frames + one.frame
             due = DueFrame(
@@ -160,12 +160,6 @@ class HeardFraming:
             self._judged.add(listener.packets, due, Sighting(frame, light, self._codebook.clusters, False))
         if heard:
             listener.events = 0
-
-    def _lit(self, number: int, start_us: float) -> None:
-        first_us, _ = self.lit_us.pop(number, (start_us, start_us))
-        self.lit_us[number] = (first_us, start_us)
-        while len(self.lit_us) > _MOST_LIT:
-            del self.lit_us[next(iter(self.lit_us))]
 
     def _count(self, listener: _Listener) -> None:
         """Add what a framing has counted since it was asked last."""

@@ -17,6 +17,7 @@ from evlcp_sdk.rx.detection import SAME_PX, Followed, RegionFollower
 from evlcp_sdk.rx.echoes import EchoQueue, Sighting
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.limits import LIMITS, Limits
+from evlcp_sdk.rx.lit import LitTimes
 from evlcp_sdk.rx.look import Look, Looker
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
@@ -45,9 +46,6 @@ _DARK = 0.25
 _MOST_ENDED, _PART_PX = 64, 16.0
 """Regions that ended without a frame that are remembered, and how far outside of a bar they may have been
 parts of it: pieces of a near bar are followed before the whole of it is known, and the image moves."""
-
-_MOST_LIT = 1024
-"""Transmitters of which is known when their light was there."""
 
 _COUNTS = (
     "events_in_regions",
@@ -80,7 +78,7 @@ class PacketFraming:
 
     Attributes:
         counts: What was found and dropped so far.
-        lit_us: See `Receiver`.
+        lit: When the light of its transmitters was there.
     """
 
     def __init__(
@@ -116,6 +114,8 @@ class PacketFraming:
             (link.camera.width, link.camera.height),
         )
         self._codebook = link.codebook
+        self._unknown = np.full(link.codebook.clusters, -1, np.int8)
+        self._unknown.setflags(write=False)
         self._rows = RowDelays(link.codebook.preamble)
         self._find_points = points_finder(layout_of(centres_m))
         self._echoes = judged.echoes
@@ -124,7 +124,7 @@ class PacketFraming:
         self._ended: deque[tuple[tuple[float, float], int]] = deque(maxlen=_MOST_ENDED)
         self._due: deque[Followed] = deque()
         self.counts = dict.fromkeys(_COUNTS, 0)
-        self.lit_us: dict[int, tuple[float, float]] = {}
+        self.lit = LitTimes()
 
     def step(self, regions: list[Followed], step: TimeStep) -> None:
         """Hear, and decode, what the regions of a time step send."""
@@ -203,10 +203,7 @@ class PacketFraming:
         start_us = self._clock.camera_us(due.start_us)
         transmitter.lit_us = start_us if transmitter.lit_us is None else transmitter.lit_us
         if transmitter.number is not None:
-            first_us, _ = self.lit_us.pop(transmitter.number, (transmitter.lit_us, start_us))
-            self.lit_us[transmitter.number] = (first_us, start_us)
-            while len(self.lit_us) > _MOST_LIT:
-                del self.lit_us[next(iter(self.lit_us))]
+            self.lit.note(transmitter.number, transmitter.lit_us, start_us)
 
     def _decode(self, transmitter: Transmitter, due: DueFrame) -> Sighting | str:
         """Read a frame; of one that is not given, the count that it belongs to."""
@@ -263,13 +260,18 @@ class PacketFraming:
         return Sighting.of(frame, look)
 
     def _before(self, transmitter: Transmitter, due: DueFrame) -> NDArray[np.int8]:
-        """The chip that each cluster sent before a frame's info segment, int8 (K,); -1 if not known."""
+        """The chip that each cluster sent before a frame's info segment, int8 (K,); -1 if not known.
+
+        In a pair code it says nothing new, and is not looked up.
+        """
         book = self._codebook
+        if book.pairs:
+            return self._unknown
         if due.has_pilot:
             return book.pilots[:, -1].astype(np.int8)
         number, symbols = transmitter.said
         if number != due.number - 1 or due.index == 0:
-            return np.full(book.clusters, -1, np.int8)
+            return self._unknown
         return np.where(symbols >= 0, book.codewords[symbols, -1].astype(np.int8), np.int8(-1))
 
     def _sight(self, points: tuple[NDArray[np.float64], NDArray[np.float64]], t_us: float) -> BarSight:

@@ -89,7 +89,7 @@ class Receiver:
 
         Starts of the first and the last frame that was due while it was, given or not, camera clock, us.
         """
-        return self._framing.lit_us
+        return self._framing.lit.by_number
 
     @property
     def counts(self) -> dict[str, int]:

@@ -108,8 +108,8 @@ def _of_chips(link: Link, kept: str) -> Link:
     """The link with the defaults for codes of any chips where it has those for pair codes."""
     registry = Registry.load()
     for name, role in ROLES.items():
-        other = role.default_of_chips
-        if other is not None and name != kept and link.table.get(name, {}).get("id") == role.default:
+        usual, other = role.default_for(link.bar), role.default_for(link.bar, pairs=False)
+        if usual != other and name != kept and link.table.get(name, {}).get("id") == usual:
             link = link.with_algorithm(name, registry.load_class(name, other)(), id=other)
     return link
 
