@@ -9,7 +9,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test ready lint kernels fuzz sbom format pictures clean
+.PHONY: help demo test ready lint kernels docs fuzz sbom format pictures clean
 
 help:  ## Show this list
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -35,6 +35,10 @@ kernels: $(VENV)/.dev
 	  $(BIN)/evlcp receive examples/recordings/night-50m-30kmh-cut.raw -o $$folder/out >/dev/null 2>&1; \
 	  $(BIN)/evlcp simulate --preset night --set duration_s=0.01 -o $$folder/night.raw >/dev/null 2>&1; \
 	  rm -rf $$folder
+
+docs: $(VENV)/.dev  ## Build the documentation site; site/index.html
+	$(BIN)/python -m sphinx -q -W --keep-going -d .sphinx docs site
+	@echo "open site/index.html"
 
 MINUTES ?= 5
 fuzz: $(VENV)/.dev  ## Damage files of every kind and read them, for MINUTES
@@ -62,7 +66,7 @@ pictures: $(VENV)/.installed  ## Draw the pictures of the docs again
 	$(BIN)/python benchmarks/polar.py curves --figure docs/images/error-correction.png
 
 clean:  ## Remove .venv and everything that was generated
-	rm -rf $(VENV) demo-out loop-out quickstart-out .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo-out loop-out quickstart-out .mypy_cache .pytest_cache .ruff_cache .hypothesis site .sphinx
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Without it the firmware's tests would be skipped: CI takes that for a failure, a developer may go on.
@@ -98,5 +102,5 @@ $(VENV)/.installed: pyproject.toml $(VENV)/.pip
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.pip
-	$(BIN)/python -m pip install -q -e '.[faery,parquet,pandas,cluster,report,mcap,sign,mp4]' --group dev
+	$(BIN)/python -m pip install -q -e '.[faery,parquet,pandas,cluster,report,mcap,sign,mp4,docs,notebook]' --group dev
 	@touch $@ $(VENV)/.installed

@@ -331,9 +331,3 @@ def test_the_tree_of_contributing_goes_from_the_ground_up() -> None:
     rooms = re.findall(r"^evlcp_sdk/(\w+?)(?:/|\.py) ", text, re.MULTILINE)
     layers = [layer_of(room) for room in rooms if room != "__init__"]
     assert layers == sorted(layers)
-
-
-def test_nothing_public_is_without_a_doc_page() -> None:
-    index = (ROOT / "docs" / "index.md").read_text()
-    for page in (ROOT / "docs").glob("*.md"):
-        assert page.name == "index.md" or f"({page.name})" in index, f"docs/index.md leaves out {page.name}"

@@ -1,0 +1,60 @@
+"""The documentation site: it is built without a warning, asks no other server, and can be searched."""
+
+import re
+import shutil
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from tests.unit.study.campaign.browser import CHROMIUM, Browser
+
+ROOT = Path(__file__).parents[2]
+
+pytestmark = pytest.mark.skipif(
+    any(find_spec(name) is None for name in ("sphinx", "furo", "myst_parser")),
+    reason="the extra docs is not installed",
+)
+
+
+def build(out: Path) -> None:
+    """The site, every page written; what was read for an earlier one is taken from .sphinx/."""
+    read = ROOT / ".sphinx"
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-d", read, ROOT / "docs", out]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        shutil.rmtree(read, ignore_errors=True)  # or else what it warns of is not read again
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_site_is_whole_and_asks_no_other_server(tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    build(site)
+    for page in site.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        fetched = re.findall(r"<(?:script|img|iframe|source)\b[^>]*?\bsrc=\"([^\"]*)\"", text)
+        fetched += re.findall(
+            r"<link\b(?![^>]*rel=\"(?:canonical|author|search)\")[^>]*?href=\"([^\"]*)\"", text
+        )
+        for name in fetched:
+            path = name.partition("?")[0].partition("#")[0]
+            assert (page.parent / path).exists(), f"{page.name} asks for {name}"
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium (Debian: apt-get install chromium)")
+    with Browser(tmp_path / "profile") as browser:
+        for width, dark in ((1280, False), (390, True)):
+            browser.dress(width, dark=dark)
+            browser.open(site / "index.html")
+            assert browser.value("document.documentElement.scrollWidth") <= width
+            shown = "getComputedStyle(document.body).backgroundColor.match(/\\d+/)[0] < 128"
+            assert browser.value(shown) is dark
+            asked = [m["params"] for m in browser.heard if m.get("method") == "Network.requestWillBeSent"]
+            assert len(asked) > 5
+            assert all(a["request"]["url"].startswith(("file:", "data:")) for a in asked)
+        browser.say("Page.navigate", url=(site / "search.html").as_uri() + "?q=lean")
+        found = """new Promise(done => { const look = () => {
+            const links = [...document.querySelectorAll('#search-results li a')].map(a => a.href);
+            links.length > 2 ? done(links) : setTimeout(look, 50); }; look(); })"""
+        assert any("receiver.html" in link for link in browser.value(found))
