@@ -24,7 +24,10 @@ myst_heading_slug_func = "evlcp_docs.slug_of"
 
 default_role = "literal"
 autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
 napoleon_use_ivar = True
+napoleon_attr_annotations = False
+python_use_unqualified_type_names = True
 
 html_theme = "furo"
 html_title = f"EVLCP SDK {release}"

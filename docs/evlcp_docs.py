@@ -1,13 +1,20 @@
 """What the site needs beside Sphinx: pages that are files of the repository, formulas without a script."""
 
+import dataclasses
+import importlib
+import inspect
 import os
+import pkgutil
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
+from pydantic.fields import FieldInfo
 from sphinx.application import Sphinx
+
+import evlcp_sdk
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -49,12 +56,97 @@ def on_site(text: str, path: Path) -> str:
     return re.sub(r"\]\((?!\w+:|#)([^)\s]+)\)", moved, text)
 
 
+def with_reference(text: str) -> str:
+    """Markdown with its lines `{names} NAME ...` and `{modules} PACKAGE` as directives of autodoc."""
+    text = re.sub(r"^\{names\} (.+)$", lambda line: _names(line[1].split()), text, flags=re.MULTILINE)
+    return re.sub(r"^\{modules\} (\S+)$", lambda line: _modules(line[1]), text, flags=re.MULTILINE)
+
+
+def _names(names: list[str]) -> str:
+    """Names of the public face."""
+    parts = []
+    for name in names:
+        thing = getattr(evlcp_sdk, name)
+        kind = "function" if inspect.isroutine(thing) else "class" if isinstance(thing, type) else "data"
+        if kind == "class" and issubclass(thing, BaseException):
+            kind = "exception"
+        members = "   :members:\n" if kind == "class" else ""
+        parts.append(f".. auto{kind}:: evlcp_sdk.{name}\n{members}")
+    return "```{eval-rst}\n" + "\n".join(parts) + "```"
+
+
+def _modules(package: str) -> str:
+    """The public modules of a package, or one module."""
+    paths = getattr(importlib.import_module(package), "__path__", None)
+    found = [package] if paths is None else []
+    for one in pkgutil.walk_packages(paths or [], f"{package}."):
+        if not one.ispkg and not any(part.startswith("_") for part in one.name.split(".")):
+            found.append(one.name)
+    return "\n\n".join(
+        f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n```" for name in found
+    )
+
+
 def _read(app: Sphinx, page: str, source: list[str]) -> None:
     """Take a page from where its text is."""
     path = ROOT / PAGES[page] if page in PAGES else Path(app.env.doc2path(page))
     if path.suffix == ".md":
         app.env.note_dependency(path)
-        source[0] = on_site(path.read_text(encoding="utf-8"), path)
+        app.env.note_dependency(__file__)
+        source[0] = with_reference(on_site(path.read_text(encoding="utf-8"), path))
+
+
+def _described(thing: Any) -> dict[str, str]:
+    """What the fields of a specification mean, where they say it themselves."""
+    if not (isinstance(thing, type) and dataclasses.is_dataclass(thing)):
+        return {}
+    try:
+        hints = get_type_hints(thing, include_extras=True)
+    except NameError:  # a type that is imported for the type checker only
+        return {}
+    return {
+        field.name: note.description
+        for field in dataclasses.fields(thing)
+        for note in getattr(hints[field.name], "__metadata__", ())
+        if isinstance(note, FieldInfo) and note.description
+    }
+
+
+def _docstring(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Fenced blocks of a docstring as literal ones, and what the fields of a specification mean."""
+    text, fenced = [], False
+    for line in lines:
+        if line.strip().startswith("```"):
+            fenced = not fenced
+            text += ["::", ""] if fenced else [""]
+        else:
+            text.append(f"    {line}" if fenced else line)
+    if (meanings := _described(thing)) and "Attributes:" not in lines:
+        text += ["", "Attributes:", *(f"    {field}: {meaning}" for field, meaning in meanings.items()), ""]
+    lines[:] = text
+
+
+_ARRAY = re.compile(
+    r"~?(?:numpy\.)?ndarray\[tuple\[.*?\.\.\.\], ~?(?:numpy\.)?dtype\[~?(?:numpy\.)?(.+?)\]\]"
+)
+
+
+_LIKE = re.compile(r"~?(?:\w+\.)*_?Buffer \| .*? \| ~?(?:\w+\.)*_NestedSequence\[complex \| bytes \| str\]")
+
+
+def _signature(
+    app: Sphinx, what: str, name: str, thing: Any, options: Any, signature: str | None, returned: str | None
+) -> tuple[str | None, str | None]:
+    """Arrays by their type alone, as their shapes are in the text; of a specification names and defaults."""
+    if _described(thing):
+        parameters = inspect.signature(thing).parameters.values()
+        plain = [p.replace(annotation=p.empty) for p in parameters]
+        signature = str(inspect.Signature(plain)).replace("<factory>", "...")
+
+    def short(text: str | None) -> str | None:
+        return text and _LIKE.sub("ArrayLike", _ARRAY.sub(r"NDArray[\1]", text))
+
+    return short(signature), short(returned)
 
 
 def _inline_math(writer: Any, node: nodes.math) -> None:
@@ -73,4 +165,6 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """Register with Sphinx."""
     app.add_html_math_renderer("mathml", (_inline_math, None), (_block_math, None))
     app.connect("source-read", _read)
+    app.connect("autodoc-process-docstring", _docstring, priority=100)
+    app.connect("autodoc-process-signature", _signature)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

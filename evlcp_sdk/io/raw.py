@@ -67,7 +67,8 @@ class RawHeader:
 def parse_header(data: bytes, path: Path | str) -> RawHeader:
     """Read the header at the start of `data`, the first bytes of the file `path` (64 KiB suffice).
 
-    The header ends behind the line `% end`, or else before the first line that does not start with `% `.
+    The header ends behind the line `% end`, or else before the first line that does not start with `%`
+    and a space.
 
     Raises:
         RawFormatError: There is no header, or it does not say the encoding, names one that is not EVT2 or

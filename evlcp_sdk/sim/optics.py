@@ -50,8 +50,8 @@ def _defocus_px(depth_m: float, lens: LensSpec, camera: CameraModel) -> float:
 def blur_sigma_px(depth_m: float, lens: LensSpec, camera: CameraModel) -> float:
     """Sigma of the Gaussian nearest to the blur without its wings, px: diffraction, defocus, what is left.
 
-    Diffraction: 0.42 lambda N. Defocus: a disk of diameter f^2 / N |1 / depth - 1 / focus| (thin lens, far
-    objects), with the sigma of a uniform disk, a quarter of it.
+    Diffraction: 0.42 lambda N. Defocus: a disk of diameter `f^2 / N |1 / depth - 1 / focus|` (thin lens,
+    far objects), with the sigma of a uniform disk, a quarter of it.
 
     >>> round(blur_sigma_px(50.0, LensSpec(), CameraModel()), 3)
     0.376
@@ -91,7 +91,7 @@ def strip_table(blur: Blur, strip_px: float, scale_px: float, nodes: int) -> Flo
     """Share of a pixel lit by a strip that begins at an edge across it and never ends.
 
     It is sampled ever more thinly from the edge and the middle outward, as the light changes ever more
-    slowly: a distance z stands at z / (|z| + scale_px).
+    slowly: a distance z stands at `z / (|z| + scale_px)`.
 
     Args:
         blur: The image of a point.

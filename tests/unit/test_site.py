@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import evlcp_sdk
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
 
 ROOT = Path(__file__).parents[2]
@@ -27,6 +28,16 @@ def build(out: Path) -> None:
     if done.returncode:
         shutil.rmtree(read, ignore_errors=True)  # or else what it warns of is not read again
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_reference_has_every_name_of_the_face_once() -> None:
+    named = [
+        name
+        for page in sorted((ROOT / "docs" / "api").glob("*.md"))
+        for line in re.findall(r"^\{names\} (.+)$", page.read_text(), re.MULTILINE)
+        for name in line.split()
+    ]
+    assert sorted(named) == sorted(evlcp_sdk.__all__)
 
 
 def test_the_site_is_whole_and_asks_no_other_server(tmp_path: Path) -> None:
