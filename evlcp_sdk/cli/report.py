@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.study.campaign.summary import Summary
     from evlcp_sdk.study.tally import Tally
 
-__all__ = ["register", "report", "show_paper", "show_series"]
+__all__ = ["register", "report", "show_paper", "show_positions", "show_series"]
 
 _PIPE_WIDTH = 200
 
@@ -76,6 +76,7 @@ def report(
         if summary.done < summary.tasks:
             console().print(f"{summary.done} of {summary.tasks} tasks are done", style="yellow")
         show_series(summary)
+        show_positions(summary)
         show_paper(summary)
         if out is not None:
             console().print(f"written: {out}, {folder}/*.png, *.svg", style="dim")
@@ -84,6 +85,14 @@ def report(
 def show_series(summary: "Summary") -> None:
     """Print BER, RMSE and gross errors of every series, a row a segment."""
     _print_table(*_series_table(summary))
+
+
+def show_positions(summary: "Summary") -> None:
+    """Print what became of positions, a row a series, where there are any."""
+    head, rows = _positions_table(summary)
+    if rows:
+        console().print()
+        _print_table(head, rows)
 
 
 def show_paper(summary: "Summary") -> None:
@@ -97,7 +106,7 @@ def show_paper(summary: "Summary") -> None:
 def as_markdown(summary: "Summary") -> str:
     """The same tables as Markdown."""
     parts = []
-    for head, rows in (_paper_table(summary), _series_table(summary)):
+    for head, rows in (_paper_table(summary), _positions_table(summary), _series_table(summary)):
         if rows:
             cells = [[cell.replace("\\", "\\\\").replace("|", "\\|") for cell in row] for row in rows]
             lines = [head, ["---"] * len(head), *cells]
@@ -143,6 +152,12 @@ def _series_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
 def _within(tally: "Tally") -> str:
     half, most = (tally.position_quantile_m(share) for share in (0.5, 0.95))
     return f"{half:.3f}, {most:.3f}" if tally.fixes else "-"
+
+
+def _positions_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
+    from evlcp_sdk.study.campaign.report import POSITION_HEAD, position_rows
+
+    return list(POSITION_HEAD), [list(row) for row in position_rows(summary)]
 
 
 def _paper_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:

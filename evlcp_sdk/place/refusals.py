@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["REFUSALS", "Candidate", "Refusal"]
+__all__ = ["CONTRADICTIONS", "REFUSALS", "Candidate", "Refusal"]
 
 REFUSALS = {
     "no-site": "no bar in view stands at a known place",
@@ -21,6 +21,9 @@ REFUSALS = {
     "uncertain": "the position is less certain than `position.max_sigma_m`, or along a curve",
 }
 """Kinds of refusal, and what they mean."""
+
+CONTRADICTIONS = frozenset({"site-contradicted", "not-determined", "misfit"})
+"""Those where what is seen and what is said do not fit together; of the others, too little is known."""
 
 
 @dataclass(frozen=True, eq=False)

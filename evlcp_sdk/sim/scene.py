@@ -83,6 +83,14 @@ class BarSpec:
     transmitter_id: Annotated[
         int | None, Field(ge=0, lt=2**32, description="Its number as a site; none: 1 for the first bar.")
     ] = None
+    site_off_m: Annotated[
+        tuple[float, float, float],
+        Field(description="Its site is said to be so far to the east, north and up of it; it is not."),
+    ] = (0.0, 0.0, 0.0)
+    site_of: Annotated[
+        int | None,
+        Field(ge=0, description="Number of the bar, counted from 0, at whose place its site is said to be."),
+    ] = None
     seed: Annotated[int | None, Field(ge=0, description="Seed of its payload; none: the scene's.")] = None
     payload: Annotated[
         Literal["symbols", "data", "messages"],
@@ -255,6 +263,20 @@ class WorldSpec:
         float, Field(ge=0, le=10, description="Error of pitch and of roll, the same all through a recording.")
     ] = 0.1
     heading_sigma_deg: Annotated[float, Field(ge=0, le=30, description="The same of the heading.")] = 0.1
+    attitude_off_deg: Annotated[
+        tuple[float, float, float],
+        Field(description="By how much more than that pitch, roll and heading are off."),
+    ] = (0.0, 0.0, 0.0)
+    attitude_late_ms: Annotated[
+        float, Field(ge=0, le=1000, description="How old the attitude is that is said.")
+    ] = 0.0
+    attitude_errs: Annotated[
+        float, Field(ge=0, le=1000, description="How many times larger its errors are than its sigmas say.")
+    ] = 1.0
+    survey_sigma_m: Annotated[
+        float,
+        Field(ge=0, le=1000, description="Error of each site to the east, north and up, which it says."),
+    ] = 0.0
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ A scene's axes are x to the right, y down and z ahead, with its origin at `[worl
 """
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,8 +24,10 @@ __all__ = [
     "bar_axis",
     "bar_towards",
     "camera_on_earth",
+    "rendered",
     "scene_to_enu",
     "sites_of",
+    "sites_said",
 ]
 
 Floats = NDArray[np.float64]
@@ -97,6 +100,49 @@ def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, .
     return tuple(sites)
 
 
+def sites_said(scene: Scene, seed: int, registry: Registry | None = None) -> tuple[BarSite, ...]:
+    """The same as a survey says them: with its errors, and with what is wrong without anybody's knowledge.
+
+    Args:
+        scene: With its `[world]`.
+        seed: Of the errors.
+        registry: As in `sites_of`.
+
+    Raises:
+        ConfigError: The scene has no `[world]`, a bar's link is none, or its `site_of` is no bar.
+    """
+    world, axes = _world(scene)
+    true = sites_of(scene, registry)
+    errors = np.random.default_rng([seed, 0x517E]).normal(size=(len(true), 3)) * world.survey_sigma_m
+    said = []
+    for i, (bar, site) in enumerate(zip(scene.bars, true, strict=True)):
+        if bar.site_of is not None and bar.site_of >= len(true):
+            raise ConfigError(f"bars.{i}.site_of = {bar.site_of}: there are {len(true)} bars, counted from 0")
+        there = true[i if bar.site_of is None else bar.site_of]
+        off = np.array(bar.site_off_m) + errors[i]
+        place: dict[str, Any] = {}
+        if off.any():
+            enu = axes.to_enu(there.latitude_deg, there.longitude_deg, there.height_m) + off
+            keys = ("latitude_deg", "longitude_deg", "height_m")
+            place = dict(zip(keys, map(float, axes.to_geodetic(enu)), strict=True))
+        said.append(
+            replace(there, transmitter_id=site.transmitter_id, position_sigma_m=world.survey_sigma_m, **place)
+        )
+    return tuple(said)
+
+
+def rendered(scene: Scene) -> Scene:
+    """The scene without what is only said of it: scenes for which this is the same look the same."""
+    bars = tuple(replace(bar, site_off_m=(0.0, 0.0, 0.0), site_of=None) for bar in scene.bars)
+    if scene.world is not None:
+        here = {name: getattr(scene.world, name) for name in _WHERE}
+        return replace(scene, bars=bars, world=WorldSpec(**here))
+    return replace(scene, bars=bars)
+
+
+_WHERE = ("latitude_deg", "longitude_deg", "height_m", "heading_deg")
+
+
 def _azimuth(bar: BarSpec, heading_deg: float) -> float:
     """Where a bar's LEDs shine to, clockwise from north, degrees."""
     east, north, _ = scene_to_enu(np.array(bar_towards(bar)), heading_deg)
@@ -132,7 +178,8 @@ def camera_on_earth(scene: Scene, position_m: Floats, attitude_rad: Floats) -> d
 
 
 def attitude_log(scene: Scene, seed: int, path: CameraPath) -> AttitudeLog | None:
-    """What an IMU measures of the camera's attitude, every millisecond: the truth and one error a recording.
+    """What an IMU says of the camera's attitude, every millisecond: the truth and one error a recording, and
+    what is wrong without anybody's knowledge.
 
     Args:
         scene: With its `[world]`.
@@ -149,13 +196,14 @@ def attitude_log(scene: Scene, seed: int, path: CameraPath) -> AttitudeLog | Non
     if world.attitude == "none":
         return None
     t_us = np.append(np.arange(0.0, scene.duration_s * 1e6, 1000.0), scene.duration_s * 1e6)
-    yaw, pitch, roll = np.degrees(path.at(t_us)[1]).T
-    error = np.random.default_rng([seed, 0xA77]).normal(size=3)
-    heading = world.heading_deg + yaw + error[2] * world.heading_sigma_deg
+    yaw, pitch, roll = np.degrees(path.at(np.maximum(t_us - world.attitude_late_ms * 1e3, 0.0))[1]).T
+    error = np.random.default_rng([seed, 0xA77]).normal(size=3) * world.attitude_errs
+    off = np.array(world.attitude_off_deg)
+    heading = world.heading_deg + yaw + error[2] * world.heading_sigma_deg + off[2]
     return AttitudeLog(
         t_us + scene.t0_us,
-        pitch + error[0] * world.gravity_sigma_deg,
-        roll + error[1] * world.gravity_sigma_deg,
+        pitch + error[0] * world.gravity_sigma_deg + off[0],
+        roll + error[1] * world.gravity_sigma_deg + off[1],
         heading if world.attitude == "heading" else None,
         np.full(len(t_us), world.gravity_sigma_deg),
         np.full(len(t_us), world.heading_sigma_deg),

@@ -8,8 +8,9 @@ import numpy as np
 
 from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.place.positioner import Positioner
-from evlcp_sdk.scene.attitude import AttitudeLog, attitude_source
+from evlcp_sdk.place.navigator import Navigator, PositionPlan
+from evlcp_sdk.place.refusals import CONTRADICTIONS
+from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.sim.truth import Truth
 from evlcp_sdk.study.frames import GivenFrame
@@ -151,9 +152,17 @@ def message_tallies(packets: Iterable[Packet], truth: Truth, coder: BlockCoder) 
     return tallies
 
 
-def sites_seen(packets: Sequence[Packet], truth: Truth) -> list[BarSite]:
-    """The sites of the truth, each with the number that the receiver gave to its transmitter."""
-    sites = list(truth.sites)
+def sites_seen(
+    packets: Sequence[Packet], truth: Truth, sites: Sequence[BarSite] | None = None
+) -> list[BarSite]:
+    """Sites of a truth's bars, each with the number that the receiver gave to its transmitter.
+
+    Args:
+        packets: The received packets.
+        truth: What was sent.
+        sites: What is said of the bars' places, in their order; None for the truth.
+    """
+    said = list(truth.sites if sites is None else sites)
     first: dict[int, Frame] = {}
     for packet in packets:
         for frame in packet.frames:
@@ -161,15 +170,19 @@ def sites_seen(packets: Sequence[Packet], truth: Truth) -> list[BarSite]:
                 first.setdefault(packet.transmitter, frame)
     for number, frame in first.items():
         nearest = nearest_bar(truth.bars, truth, frame.t_us - truth.t0_us, frame)
-        if nearest is not None and nearest[1] <= NEAREST_PX and sites[nearest[0]].transmitter is None:
-            sites[nearest[0]] = replace(sites[nearest[0]], transmitter=number)
-    return sites
+        if nearest is not None and nearest[1] <= NEAREST_PX and said[nearest[0]].transmitter is None:
+            said[nearest[0]] = replace(said[nearest[0]], transmitter=number)
+    return said
 
 
 def position_tallies(
-    packets: Sequence[Packet], truth: Truth, link: Link, attitude: AttitudeLog | None
+    packets: Sequence[Packet],
+    truth: Truth,
+    link: Link,
+    attitude: AttitudeLog | None,
+    sites: Sequence[BarSite] | None = None,
 ) -> list[tuple[int, Tally]]:
-    """Hold the positions that follow from packets against the truth: one tally a time, by the nearest bar.
+    """Hold positions and track that follow from packets against the truth, tallies a time by the nearest bar.
 
     Which transmitter stands where is what the image shows, so that no beacon is needed.
 
@@ -177,31 +190,45 @@ def position_tallies(
         packets: The received packets.
         truth: What was sent, with its `sites`.
         link: The link they were received with.
-        attitude: What is known of the camera's attitude; None for nothing.
+        attitude: What is said of the camera's attitude; None for nothing.
+        sites: What is said of the bars' places, in their order; None for the truth.
     """
-    sites = sites_seen(packets, truth)
-    positioner = Positioner(
-        link.camera,
-        link.bar,
-        link.packet.packet_chips * link.packet.chip_us,
-        sites,
-        attitude_source(attitude),
-        link.position,
-    )
-    axes = positioner.axes
-    assert axes is not None
-    path = truth.camera_path
+    navigator = Navigator(link, PositionPlan(tuple(sites_seen(packets, truth, sites))), attitude)
+    placed = navigator.feed(packets)
+    rest, settled = navigator.close()
+    placed += rest
+    axes, path, times = navigator.positioner.axes, truth.camera_path, truth.t_us
+
+    def at(t_us: float) -> tuple[int, np.ndarray]:
+        since = t_us - truth.t0_us
+        segment = segment_of(min(float(np.interp(since, times, bar.distance_m)) for bar in truth.bars))
+        keys = ("latitude_deg", "longitude_deg", "height_m")
+        assert axes is not None
+        return segment, axes.to_enu(*(np.interp(since, times, path[key]) for key in keys))
+
     tallies = []
-    for fix in [*positioner.feed(packets), *positioner.close()]:
-        at = fix.t_us - truth.t0_us
-        segment = segment_of(min(float(np.interp(at, truth.t_us, bar.distance_m)) for bar in truth.bars))
+    for fix in (one.fix for one in placed):
+        segment, true_m = at(fix.t_us)
         if fix.refusal:
-            tallies.append((segment, Tally(fixes_refused=1)))
+            contradicted = fix.refusal in CONTRADICTIONS
+            tallies.append((segment, Tally(fixes_refused=1, fixes_contradicted=int(contradicted))))
             continue
-        place = (
-            np.interp(at, truth.t_us, path[key]) for key in ("latitude_deg", "longitude_deg", "height_m")
+        error = fix.enu_m - true_m
+        one = Tally.fix(
+            *_off(error, fix.covariance_m2),
+            excluded=bool(fix.excluded),
+            protected=math.isfinite(fix.hpl_m) and math.isfinite(fix.vpl_m),
+            beyond=math.hypot(error[0], error[1]) > fix.hpl_m or abs(error[2]) > fix.vpl_m,
         )
-        error = fix.enu_m - axes.to_enu(*place)
-        nees = float(error @ np.linalg.solve(fix.covariance_m2, error))
-        tallies.append((segment, Tally.fix(float(np.linalg.norm(error)), nees)))
+        tallies.append((segment, one))
+    for point in (*(p for one in placed for p in one.settled), *settled):
+        segment, true_m = at(point.fix.t_us)
+        both = (point.filtered, point.smoothed)
+        found = (v for place in both for v in _off(place.enu_m - true_m, place.covariance_m2))
+        tallies.append((segment, Tally.tracked(*found)))
     return tallies
+
+
+def _off(error_m: np.ndarray, covariance_m2: np.ndarray) -> tuple[float, float]:
+    """An error in space, m, and squared in its own sigmas."""
+    return float(np.linalg.norm(error_m)), float(error_m @ np.linalg.solve(covariance_m2, error_m))

@@ -17,6 +17,7 @@ __all__ = [
     "HALF_METRE_M",
     "POSITION_BIN_M",
     "SEGMENT_M",
+    "SILENT_NEES",
     "Statistics",
     "Tally",
     "in_nm",
@@ -34,6 +35,9 @@ POSITION_BIN_M = 0.005
 
 HALF_METRE_M = 0.5
 """Distance error from which on an error counts as gross, m."""
+
+SILENT_NEES = 14.156
+"""An error squared in its own sigmas is larger once in 370 fixes by chance: chi-square of three, 99.73 %."""
 
 _FARTHEST_BIN = 150
 _FARTHEST_POSITION_BIN = 1000
@@ -99,8 +103,20 @@ class Tally:
         messages_wrong: Messages that were read and not sent so: undetected errors.
         fixes: Positions that were given.
         fixes_refused: Times at which a bar was in view, and no position was given.
+        fixes_contradicted: Those of them at which parts contradicted one another; at others, what was in view
+            does not determine a position.
+        fixes_excluded: Positions that were given without a part that the rest contradicts.
+        fixes_protected: Those with both protection levels.
+        fixes_beyond: Those of these whose error is beyond one of them.
+        fixes_silent: Positions whose error is beyond the 99.73 % bound of their own covariance.
+        fixes_uncovered: Those of them that have no protection level, or are beyond it.
         position_squares_nm2: Sum of the squares of the positions' errors in space, nm^2.
         position_nees_micro: Sum of these errors squared in their own sigmas, millionths; 3 each is ideal.
+        track: Points of the track, one a position that was given.
+        track_squares_nm2: Sum of the squares of their errors in space, nm^2, as filtered.
+        track_nees_micro: Sum of these errors squared in their own sigmas, millionths.
+        smoothed_squares_nm2: The same as smoothed, nm^2.
+        smoothed_nees_micro: The same as smoothed, millionths.
         histogram: (bin, count) in order of the bin; bin b holds errors from `b * BIN_M` up to the next, the
             outermost ones also everything beyond.
         position_histogram: The same of the positions' errors, in bins of `POSITION_BIN_M` from 0.
@@ -129,8 +145,19 @@ class Tally:
     messages_wrong: Count = 0
     fixes: Count = 0
     fixes_refused: Count = 0
+    fixes_contradicted: Count = 0
+    fixes_excluded: Count = 0
+    fixes_protected: Count = 0
+    fixes_beyond: Count = 0
+    fixes_silent: Count = 0
+    fixes_uncovered: Count = 0
     position_squares_nm2: Sum = 0
     position_nees_micro: Sum = 0
+    track: Count = 0
+    track_squares_nm2: Sum = 0
+    track_nees_micro: Sum = 0
+    smoothed_squares_nm2: Sum = 0
+    smoothed_nees_micro: Sum = 0
     histogram: tuple[Bin, ...] = ()
     position_histogram: tuple[Bin, ...] = ()
 
@@ -159,8 +186,23 @@ class Tally:
         )
 
     @classmethod
-    def fix(cls, error_m: float, nees: float) -> Self:
-        """One position that was given, its error in space and that squared in its own sigmas.
+    def fix(
+        cls,
+        error_m: float,
+        nees: float,
+        *,
+        excluded: bool = False,
+        protected: bool = False,
+        beyond: bool = False,
+    ) -> Self:
+        """One position that was given.
+
+        Args:
+            error_m: Its error in space, m.
+            nees: That squared in its own sigmas.
+            excluded: A part was left out.
+            protected: It has both protection levels.
+            beyond: Its error is beyond one of these.
 
         >>> Tally.fix(0.012, 2.5).position_histogram
         ((2, 1),)
@@ -169,9 +211,25 @@ class Tally:
         bin = min(_FARTHEST_POSITION_BIN, error_nm // in_nm(POSITION_BIN_M))
         return cls(
             fixes=1,
+            fixes_excluded=int(excluded),
+            fixes_protected=int(protected),
+            fixes_beyond=int(protected and beyond),
+            fixes_silent=int(nees > SILENT_NEES),
+            fixes_uncovered=int(nees > SILENT_NEES and (beyond or not protected)),
             position_squares_nm2=error_nm**2,
             position_nees_micro=_nees_micro(nees),
             position_histogram=((bin, 1),),
+        )
+
+    @classmethod
+    def tracked(cls, filtered_m: float, nees: float, smoothed_m: float, smoothed_nees: float) -> Self:
+        """One point of the track: its errors in space, m, and these squared in their own sigmas."""
+        return cls(
+            track=1,
+            track_squares_nm2=in_nm(filtered_m) ** 2,
+            track_nees_micro=_nees_micro(nees),
+            smoothed_squares_nm2=in_nm(smoothed_m) ** 2,
+            smoothed_nees_micro=_nees_micro(smoothed_nees),
         )
 
     @classmethod
@@ -249,6 +307,31 @@ class Tally:
     def position_nees(self) -> float:
         """Mean of the positions' errors squared in their own sigmas, ideally 3; NaN without any."""
         return _ratio(self.position_nees_micro, self.fixes) * 1e-6
+
+    @property
+    def kept_share(self) -> float:
+        """Share of the positions that what is in view determines which are given; NaN without any."""
+        return _ratio(self.fixes, self.fixes + self.fixes_contradicted)
+
+    @property
+    def track_rmse_m(self) -> float:
+        """Root mean square of the filtered track's errors in space, m; NaN without any."""
+        return _rms_m(self.track_squares_nm2, self.track)
+
+    @property
+    def track_nees(self) -> float:
+        """Mean of the filtered track's errors squared in their own sigmas, ideally 3; NaN without any."""
+        return _ratio(self.track_nees_micro, self.track) * 1e-6
+
+    @property
+    def smoothed_rmse_m(self) -> float:
+        """Root mean square of the smoothed track's errors in space, m; NaN without any."""
+        return _rms_m(self.smoothed_squares_nm2, self.track)
+
+    @property
+    def smoothed_nees(self) -> float:
+        """Mean of the smoothed track's errors squared in their own sigmas, ideally 3; NaN without any."""
+        return _ratio(self.smoothed_nees_micro, self.track) * 1e-6
 
     def position_quantile_m(self, share: float) -> float:
         """Error in space that a share of the positions stays below, to a bin, m; NaN without any.
@@ -358,12 +441,19 @@ class Statistics:
                 raise ConfigError(f"segments.{start:.20}: expected the keys of a tally")
             bins = {name: _pairs(values[name]) for name in _HISTOGRAMS}
             tally = build(Tally, {**values, **bins})
-            for part, whole in (("bit_errors", "bits"), ("erased", "visible"), ("gross", "ranged")):
+            for part, whole in _PARTS:
                 if getattr(tally, part) > getattr(tally, whole):
                     raise ConfigError(f"segments.{start}.{part}: more than {whole}")
             tallies.append((_whole(start), tally))
         return cls.of(tallies, **{name: getattr(kept, name) for name in _COUNTS})
 
+
+_PARTS = (
+    *(("bit_errors", "bits"), ("erased", "visible"), ("gross", "ranged")),
+    *(("fixes_contradicted", "fixes_refused"), ("fixes_protected", "fixes"), ("fixes_excluded", "fixes")),
+    *(("fixes_beyond", "fixes_protected"), ("fixes_silent", "fixes"), ("fixes_uncovered", "fixes_silent")),
+)
+"""Counts, and what each is a part of."""
 
 _TALLIED = {f.name for f in fields(Tally)}
 

@@ -85,11 +85,13 @@ class Task:
     Attributes:
         id: SHA-256 of everything that determines its result, 64 hex digits.
         point: Number of its point.
-        link: The link's value, as `Case.value` has it.
+        scene: The scene's value, as `Case.value` has it.
+        link: The link's value, likewise.
     """
 
     id: str
     point: int
+    scene: Any
     link: Any
 
 
@@ -98,9 +100,9 @@ class Job:
     """A scene with a seed, and the tasks that receive its rendering.
 
     Attributes:
-        scene: The scene's value, as `Case.value` has it.
+        scene: The scene's value, as `Case.value` has it: the first one's of those that look the same.
         seed: The seed of everything random in it.
-        tasks: One a link.
+        tasks: One a link and scene that looks the same.
         environment: What the tasks' ids say of the code and its versions.
     """
 
@@ -139,7 +141,7 @@ class Plan:
         scenes: The scenes.
         links: The links.
         points: Every scene with every link.
-        jobs: What there is to do: the first seed of every scene, then the second, and so on.
+        jobs: What there is to do: the first seed of every rendering, then the second, and so on.
         environment: Code and versions that the results come from.
     """
 
@@ -295,6 +297,7 @@ def make_plan(
     merge: Sequence[str] = (),
     environment: Mapping[str, Any] | None = None,
     share: Callable[[Case], Any] = lambda _: None,
+    look: Callable[[Case], Any] | None = None,
 ) -> Plan:
     """Every scene with every link and every seed.
 
@@ -307,6 +310,7 @@ def make_plan(
         merge: Labels over which a report adds points up.
         environment: Code and versions, part of every task's id.
         share: Links for which it gives the same receive the same rendering of a scene.
+        look: Scenes for which it gives the same have the same rendering; None: no two of them.
     """
     environment = dict(environment or {})
 
@@ -322,16 +326,18 @@ def make_plan(
     together: dict[Any, list[int]] = {}
     for k, link in enumerate(links):
         together.setdefault(share(link), []).append(k)
+    alike: dict[Any, list[int]] = {}
+    for s, scene in enumerate(scenes):
+        alike.setdefault(s if look is None else look(scene), []).append(s)
     jobs = []
-    for (n, seed), (s, scene), some in itertools.product(
-        enumerate(seeds), enumerate(scenes), together.values()
-    ):
-        # Links that differ in name only are one task.
+    for (n, seed), these, some in itertools.product(enumerate(seeds), alike.values(), together.values()):
+        # Scenes or links that differ in name only are one task.
         tasks_of = {
-            points[p].tasks[n]: Task(points[p].tasks[n], p, links[points[p].link].value)
-            for p in (s * len(links) + k for k in some)
+            points[p].tasks[n]: Task(points[p].tasks[n], p, scenes[s].value, links[k].value)
+            for s, k in itertools.product(these, some)
+            for p in (s * len(links) + k,)
         }
-        jobs.append(Job(scene.value, seed, tuple(tasks_of.values()), environment))
+        jobs.append(Job(scenes[these[0]].value, seed, tuple(tasks_of.values()), environment))
     return Plan(
         name,
         rule,
@@ -385,6 +391,7 @@ def load_plan(
     environment: Mapping[str, Any],
     overrides: Sequence[str] = (),
     share: Callable[[Case], Any] = lambda _: None,
+    look: Callable[[Case], Any] | None = None,
 ) -> Plan:
     """Read a campaign file and lay out its points.
 
@@ -395,6 +402,7 @@ def load_plan(
         environment: Code and versions, part of every task's id.
         overrides: What `--set` takes, e.g. `"campaign.seeds=2"`; the value is TOML, or else plain text.
         share: Links for which it gives the same receive the same rendering of a scene.
+        look: Scenes for which it gives the same have the same rendering; None: no two of them.
 
     Raises:
         ConfigError: All faults of the file, one line each.
@@ -437,6 +445,7 @@ def load_plan(
         merge=merge,
         environment=environment,
         share=share,
+        look=look,
     )
 
 

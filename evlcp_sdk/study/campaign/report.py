@@ -19,7 +19,7 @@ from evlcp_sdk.study.intervals import INTERVALS, Figure, measure
 from evlcp_sdk.study.markup import Markup, details, document, escape, table, tiles
 from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
-__all__ = ["comparison_rows", "page", "title_of"]
+__all__ = ["POSITION_HEAD", "comparison_rows", "page", "position_rows", "title_of"]
 
 
 def page(summary: Summary) -> str:
@@ -42,7 +42,12 @@ def page(summary: Summary) -> str:
         body.append(Markup('<h2>{}</h2><div class="chart" id="{}"></div>').format(chart.title, chart.id))
         body.append(_legend(chart))
         body.append(Markup('<p class="note">{}</p>').format(chart.note))
-    body += [_paper_table(beside), _figures_table(summary), _configuration(summary)]
+    body += [
+        _paper_table(beside),
+        _positions_table(summary),
+        _figures_table(summary),
+        _configuration(summary),
+    ]
     drawn = {chart.id: _plotly(chart) for chart in charts}
     return document(title, body, (get_plotlyjs(), _SCRIPT), {_DATA: drawn}, _STYLE)
 
@@ -311,6 +316,61 @@ def comparison_rows(comparisons: Iterable[PaperComparison]) -> list[tuple[str, .
             )
         )
     return rows
+
+
+POSITION_HEAD = (
+    *("series", "positions", "contradicted", "kept", "left out", "half, 95 % within, m", "NEES"),
+    *("silent", "not covered", "protected", "beyond", "track, m", "NEES", "smoothed, m", "NEES"),
+)
+
+
+def position_rows(summary: Summary) -> list[tuple[str, ...]]:
+    """What became of positions and tracks, a row a series, all distances together, as text."""
+    rows: list[tuple[str, ...]] = []
+    for one in summary.series:
+        t = one.statistics.total()
+        if not t.fixes + t.fixes_refused:
+            continue
+        given = (
+            (
+                f"{t.kept_share:.1%}",
+                f"{t.fixes_excluded}",
+                f"{t.position_quantile_m(0.5):.3f}, {t.position_quantile_m(0.95):.3f}",
+                f"{t.position_nees:.3g}",
+                f"{t.fixes_silent}",
+                f"{t.fixes_uncovered}",
+                f"{t.fixes_protected}",
+                f"{t.fixes_beyond}",
+                f"{t.track_rmse_m:.3f}",
+                f"{t.track_nees:.3g}",
+                f"{t.smoothed_rmse_m:.3f}",
+                f"{t.smoothed_nees:.3g}",
+            )
+            if t.fixes
+            else (f"{t.kept_share:.1%}" if t.fixes_contradicted else "-", "0", *10 * ("-",))
+        )
+        rows.append(
+            (one.name, f"{t.fixes} of {t.fixes + t.fixes_refused}", f"{t.fixes_contradicted}", *given)
+        )
+    return rows
+
+
+_POSITIONS_SAID = (
+    "Contradicted: refused as parts contradict one another; kept: given, of those and of what is given. Left"
+    " out: given without a part, which is named. NEES: the mean of the squared error in its own sigmas,"
+    " ideally 3. Silent: given with an error beyond the 99.73 % bound of its own covariance, as chance makes"
+    " 1 in 370; not covered: silent, and without a protection level or beyond it. Beyond: protected, and"
+    " beyond a level."
+)
+
+
+def _positions_table(summary: Summary) -> Markup:
+    rows = position_rows(summary)
+    if not rows:
+        return Markup("")
+    return Markup('<h2>Positions</h2><p class="note">{}</p>{}').format(
+        _POSITIONS_SAID, table(POSITION_HEAD, rows)
+    )
 
 
 def _figures_table(summary: Summary) -> Markup:

@@ -22,7 +22,7 @@ from evlcp_sdk.study.tally import Statistics
 
 __all__ = ["Store"]
 
-SCHEMA = 2
+SCHEMA = 3
 
 _TABLES = """
 CREATE TABLE IF NOT EXISTS plan (

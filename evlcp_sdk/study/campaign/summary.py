@@ -165,7 +165,9 @@ def _figures(recordings: Sequence[Tally]) -> dict[str, Any]:
     kinds = ("ber", "rmse_m", "gross_share", "found_share", "lost_share", "wrong_share", "position_rmse_m")
     names = (
         *("frames_sent", "frames_found", "bits", "bit_errors", "ranged", "gross"),
-        *("messages_sent", "messages_found", "messages_wrong", "fixes", "fixes_refused"),
+        *("messages_sent", "messages_found", "messages_wrong", "fixes", "fixes_refused", "track"),
+        *("fixes_contradicted", "fixes_excluded", "fixes_protected", "fixes_beyond", "fixes_silent"),
+        "fixes_uncovered",
     )
     counts = {name: getattr(tally, name) for name in names}
     others = {
@@ -178,6 +180,11 @@ def _figures(recordings: Sequence[Tally]) -> dict[str, Any]:
         "position_median_m": tally.position_quantile_m(0.5),
         "position_95_m": tally.position_quantile_m(0.95),
         "position_nees": tally.position_nees,
+        "kept_share": tally.kept_share,
+        "track_rmse_m": tally.track_rmse_m,
+        "track_nees": tally.track_nees,
+        "smoothed_rmse_m": tally.smoothed_rmse_m,
+        "smoothed_nees": tally.smoothed_nees,
     }
     return _plain(counts | others) | {kind: _plain(asdict(measure(recordings, kind))) for kind in kinds}
 

@@ -14,7 +14,7 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene, Simulation, load_scene, truth_of
 from evlcp_sdk.sim.truth import Truth
-from evlcp_sdk.sim.world import attitude_log
+from evlcp_sdk.sim.world import attitude_log, rendered, sites_said
 from evlcp_sdk.study.campaign.plan import Case, Job, Plan, digest_of, load_plan
 from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.match import check_link
@@ -27,6 +27,9 @@ __all__ = ["environment_of", "plan_of", "run_job"]
 _PACKAGES = ("air", "link", "place", "plugin", "rx", "scene", "sim")
 _ON_AIR = ("air", "bar", "pilots", "modulation", "error-correction")
 """Sections of a link that say what a bar sends, and from where."""
+
+_OF_POSITIONS = ("position", "camera_sigma")
+"""Sections of a link that a receiver does not read."""
 
 _STUDY = ("frames.py", "match.py", "measure.py", "tally.py", "campaign/task.py")
 
@@ -60,7 +63,7 @@ def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
         }
         return (table, link.digest), json.loads(json.dumps(identity))
 
-    return load_plan(path, scene_of, link_of, environment_of(registry), overrides, _air_of)
+    return load_plan(path, scene_of, link_of, environment_of(registry), overrides, _air_of, _look_of)
 
 
 def _air_of(link: Case) -> str:
@@ -69,6 +72,11 @@ def _air_of(link: Case) -> str:
     sections = {section: said["table"][section] for section in _ON_AIR}
     revisions = {role: said["revisions"][role] for role in _ON_AIR if role in said["revisions"]}
     return digest_of([sections, revisions, said["codebook"]])
+
+
+def _look_of(scene: Case) -> str:
+    """Digest of what is seen of a scene: what is only said of it is left out."""
+    return digest_of(_identity(rendered(scene.value)))
 
 
 def _sending(scene: Scene, table: Mapping[str, Any]) -> Scene:
@@ -126,29 +134,39 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
     scene = _sending(job.scene, job.tasks[0].link[0])
     simulation = Simulation(scene, job.seed, registry=registry)
     truth = truth_of(simulation, registry=registry)
-    attitude = attitude_log(scene, job.seed, simulation.path) if scene.world is not None else None
-    links, receivers = [], []
+    links, heard = [], []
+    received: dict[str, tuple[Receiver, list[Packet]]] = {}
+    attitudes = []
     for task in job.tasks:
         table, digest = task.link
         link = resolve(table, registry)
         if link.digest != digest:
             raise ConfigError(f"link {digest[:12]} resolves to {link.digest[:12]} here")
         check_link(truth, link, "the scene", messages=True)
+        world = task.scene.world
+        attitude = None if world is None else attitude_log(task.scene, job.seed, simulation.path)
         links.append(link)
-        receivers.append(Receiver(link, attitude=attitude))
-    packets: list[list[Packet]] = [[] for _ in receivers]
+        attitudes.append(attitude)
+        # What is said of sites, and what is made of it, makes no difference to what is received.
+        read = {section: dict(keys) for section, keys in link.table.items() if section not in _OF_POSITIONS}
+        key = digest_of([read, None if world is None else asdict(replace(world, survey_sigma_m=0.0))])
+        if key not in received:
+            received[key] = Receiver(link, attitude=attitude), []
+        heard.append(received[key][1])
     number = 0
     for events in simulation.stream():
         number += len(events)
-        for receiver, found in zip(receivers, packets, strict=True):
-            found += receiver.feed(events)
+        for receiver, packets in received.values():
+            packets += receiver.feed(events)
+    for receiver, packets in received.values():
+        packets += receiver.close()
     results = []
-    for task, link, receiver, found in zip(job.tasks, links, receivers, packets, strict=True):
-        found += receiver.close()
-        others = message_tallies(found, truth, link.block_coder()) if _sends_messages(truth) else []
+    for task, link, attitude, packets in zip(job.tasks, links, attitudes, heard, strict=True):
+        others = message_tallies(packets, truth, link.block_coder()) if _sends_messages(truth) else []
         if scene.world is not None:
-            others += position_tallies(found, truth, link, attitude)
-        counted = statistics_of(frames_of(found), truth, events=number, packets=len(found), others=others)
+            said = sites_said(_sending(task.scene, task.link[0]), job.seed, registry)
+            others += position_tallies(packets, truth, link, attitude, said)
+        counted = statistics_of(frames_of(packets), truth, events=number, packets=len(packets), others=others)
         results.append((task.id, counted))
     return results
 

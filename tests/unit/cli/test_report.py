@@ -8,14 +8,15 @@ from typing import Any
 
 import pytest
 
+from evlcp_sdk.cli.report import as_markdown
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.jobs.inline import Inline
 from evlcp_sdk.study.campaign.charts import charts_of, save_charts
 from evlcp_sdk.study.campaign.collect import collect
 from evlcp_sdk.study.campaign.paper import PAPER
-from evlcp_sdk.study.campaign.plan import Case, Plan, make_plan
-from evlcp_sdk.study.campaign.report import page, title_of
+from evlcp_sdk.study.campaign.plan import Case, Job, Plan, make_plan
+from evlcp_sdk.study.campaign.report import POSITION_HEAD, page, position_rows, title_of
 from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.campaign.summary import Series, Summary, beside_paper, summarize, verdict_of
 from evlcp_sdk.study.compare.campaigns import of_campaign
@@ -221,6 +222,31 @@ def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) ->
             rooms = browser.value(f"{bars}.filter(e => e.checkVisibility()).map(e => e.clientWidth)")
             assert min(rooms) > 100
             assert len(rooms) < browser.value(f"{bars}.length"), "bars of a scene are not folded"
+
+
+def test_what_became_of_positions_is_a_table_of_its_own(summary: Summary, tmp_path: Path) -> None:
+    assert position_rows(summary) == []
+    assert "<h2>Positions</h2>" not in page(summary)
+    plan = make_plan("p", [Case((("variant", v),), v, v) for v in ("right", "off")], [Case((), 0, {})], [0])
+    fixes = [Tally.fix(0.1, 2.0, protected=True), Tally.fix(0.3, 20.0, excluded=True)]
+    tallies = {
+        "right": [*fixes, Tally.tracked(0.2, 3.0, 0.1, 6.0)],
+        "off": [Tally(fixes_refused=3, fixes_contradicted=2)],
+    }
+
+    def run(job: Job) -> list[tuple[str, Statistics]]:
+        return [(task.id, Statistics.of((40, t) for t in tallies[task.scene])) for task in job.tasks]
+
+    with Store(tmp_path / "p.sqlite", create=True) as store:
+        collect(plan, store, Inline(), run)
+        found = summarize(store)
+    right, off = position_rows(found)
+    assert len(right) == len(off) == len(POSITION_HEAD)
+    assert right[1:8] == ("2 of 2", "0", "100.0%", "1", "0.105, 0.305", "11", "1")
+    assert right[8:] == ("1", "1", "0", "0.200", "3", "0.100", "6")
+    assert off[1:5] == ("0 of 3", "2", "0.0%", "0")
+    assert "<h2>Positions</h2>" in page(found)
+    assert "| right | 2 of 2 | 0 | 100.0% |" in as_markdown(found)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")

@@ -1,5 +1,6 @@
 """Scenes on earth: bars as sites, the camera's path, against the image itself."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import LocalAxes, load_sites, to_toml
 from evlcp_sdk.sim import Simulation, load_scene, resolve_scene, sites_of, truth_of
 from evlcp_sdk.sim.motion import project
-from evlcp_sdk.sim.world import attitude_log, scene_to_enu
+from evlcp_sdk.sim.world import attitude_log, rendered, scene_to_enu, sites_said
 
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 137.2, "height_m": 40.0, "heading_deg": 30.0}
 SCENE = resolve_scene(
@@ -138,3 +139,65 @@ def test_sites_come_back_from_their_file(tmp_path: Path) -> None:
     file = tmp_path / "site.toml"
     file.write_text(to_toml(sites_of(SCENE)))
     assert load_sites(file) == sites_of(SCENE)
+
+
+def test_what_is_said_of_sites_is_wrong_as_told() -> None:
+    assert sites_said(SCENE, 5) == sites_of(SCENE)
+    one, two, three = SCENE.bars
+    swapped = (replace(one, site_of=1), replace(two, site_of=0, site_off_m=(0.3, -0.4, 1.2)), three)
+    wrong = replace(SCENE, bars=swapped)
+    true, said = sites_of(wrong), sites_said(wrong, 5)
+    assert true == sites_of(SCENE)
+    assert [s.transmitter_id for s in said] == [1, 77, 3]
+    assert replace(said[0], transmitter_id=77) == true[1]
+    assert said[2] == true[2]
+    here = true[0].latitude_deg, true[0].longitude_deg, true[0].height_m
+    off = pymap3d.geodetic2enu(said[1].latitude_deg, said[1].longitude_deg, said[1].height_m, *here)
+    np.testing.assert_allclose(off, [0.3, -0.4, 1.2], atol=1e-5)
+    with pytest.raises(ConfigError, match=r"bars\.2\.site_of = 3: there are 3 bars"):
+        sites_said(replace(wrong, bars=(one, two, replace(three, site_of=3))), 5)
+
+
+def test_a_survey_errs_by_what_it_says() -> None:
+    assert SCENE.world is not None
+    scene = replace(SCENE, world=replace(SCENE.world, survey_sigma_m=0.2))
+    true, errors = sites_of(scene), []
+    for seed in range(100):
+        for site, said in zip(true, sites_said(scene, seed), strict=True):
+            assert said.position_sigma_m == 0.2
+            here = site.latitude_deg, site.longitude_deg, site.height_m
+            errors.append(pymap3d.geodetic2enu(said.latitude_deg, said.longitude_deg, said.height_m, *here))
+    # 300 draws: the spread is known to 4 %.
+    np.testing.assert_allclose(np.std(errors, 0), 0.2, rtol=0.16)
+
+
+def test_what_is_said_of_the_attitude_is_wrong_as_told() -> None:
+    assert SCENE.world is not None
+    scene = replace(SCENE, duration_s=0.1, motion=replace(SCENE.motion, vib_rate_rad_s=0.2))
+    simulation = Simulation(scene)
+
+    def said(**wrong: object) -> AttitudeLog:
+        log = attitude_log(replace(scene, world=replace(scene.world, **wrong)), 3, simulation.path)  # type: ignore[type-var]
+        assert log is not None
+        return log
+
+    right, off = said(), said(attitude_off_deg=(1.0, -2.0, 3.0))
+    np.testing.assert_allclose(off.pitch_deg - right.pitch_deg, 1.0)
+    np.testing.assert_allclose(off.roll_deg - right.roll_deg, -2.0)
+    assert off.heading_deg is not None
+    assert right.heading_deg is not None
+    np.testing.assert_allclose(off.heading_deg - right.heading_deg, 3.0)
+    late = said(attitude_late_ms=10.0)
+    np.testing.assert_allclose(late.pitch_deg[10:], right.pitch_deg[:-10])
+    assert np.ptp(right.pitch_deg) > 0.01
+    true = np.degrees(simulation.path.at(right.t_us)[1][:, 1])
+    np.testing.assert_allclose(said(attitude_errs=2.0).pitch_deg - true, 2 * (right.pitch_deg - true))
+    assert set(said(attitude_errs=2.0).gravity_sigma_deg) == {0.1}
+
+
+def test_what_is_only_said_changes_no_light() -> None:
+    assert SCENE.world is not None
+    world = replace(SCENE.world, attitude="gravity", attitude_late_ms=5.0, survey_sigma_m=1.0)
+    wrong = replace(SCENE, world=world, bars=tuple(replace(bar, site_of=1) for bar in SCENE.bars))
+    assert rendered(wrong) == rendered(SCENE) != wrong
+    assert rendered(replace(SCENE, world=replace(world, heading_deg=31.0))) != rendered(SCENE)

@@ -1,6 +1,7 @@
 """Statistics of decoded frames, beside the independent scorer's figures on its recordings."""
 
 import importlib.util
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from evlcp_sdk.sim import (
     truth_from_table,
     truth_of,
 )
-from evlcp_sdk.sim.world import attitude_log
+from evlcp_sdk.sim.world import attitude_log, sites_said
 from evlcp_sdk.study.frames import frames_of, given
 from evlcp_sdk.study.measure import position_tallies, statistics_of
 from evlcp_sdk.study.tally import Statistics, Tally
@@ -206,3 +207,31 @@ def test_positions_are_held_beside_the_cameras_path(attitude: str) -> None:
     total = Tally.together(tally for _, tally in position_tallies(packets, moved, load_link(), log))
     assert total.position_rmse_m == pytest.approx(0.111, abs=0.003)
     assert total.position_nees > 20
+    assert total.track_rmse_m == pytest.approx(0.111, abs=0.003)
+    assert total.fixes_silent == total.fixes
+
+
+def test_faults_of_what_is_said_are_told_by_positions() -> None:
+    scene = resolve_scene(GATE)
+    simulation = Simulation(scene)
+    truth = truth_of(simulation)
+    packets = seen(truth)
+
+    def positions(off_m: Sequence[tuple[float, float, float]] = (), **world: Any) -> Tally:
+        bars = [replace(bar, site_off_m=off) for bar, off in zip(scene.bars, off_m, strict=False)]
+        assert scene.world is not None
+        said = replace(scene, bars=(*bars, *scene.bars[len(bars) :]), world=replace(scene.world, **world))
+        log = attitude_log(said, 0, simulation.path)
+        tallies = position_tallies(packets, truth, load_link(), log, sites_said(said, 0))
+        return Tally.together(tally for _, tally in tallies)
+
+    right, up = positions(), positions([(0.0, 0.0, 0.5)])
+    assert right.fixes >= 2
+    assert (right.fixes_contradicted, right.fixes_silent, right.fixes_protected) == (0, 0, right.fixes)
+    # One of two bars: which one, nothing tells.
+    assert (up.fixes, up.fixes_contradicted) == (0, right.fixes)
+    # All together are another world: nothing in view contradicts it, and no level covers it.
+    moved = positions([(0.0, 0.0, 9.0)] * 2)
+    assert moved.fixes == moved.fixes_silent == moved.fixes_uncovered == moved.fixes_beyond == right.fixes
+    # Survey errors that are stated are in the covariance.
+    assert positions(survey_sigma_m=0.05).position_nees < 14.2

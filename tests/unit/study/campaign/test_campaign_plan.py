@@ -113,6 +113,21 @@ def test_links_that_differ_in_name_only_are_one_task() -> None:
     assert plan.points[0].tasks == plan.points[1].tasks
 
 
+def test_scenes_that_look_the_same_are_one_job() -> None:
+    scenes = [Case((("variant", name),), name, name) for name in ("a", "b", "other")]
+    links = [Case((("variant", n),), n, n) for n in (0, 1)]
+    plan = make_plan("x", scenes, links, [0, 1], look=lambda case: case.value == "other")
+    found = [(job.scene, job.seed, [(task.scene, task.link) for task in job.tasks]) for job in plan.jobs]
+    both = [("a", 0), ("a", 1), ("b", 0), ("b", 1)]
+    other = [("other", 0), ("other", 1)]
+    assert found == [("a", 0, both), ("other", 0, other), ("a", 1, both), ("other", 1, other)]
+    for job in plan.jobs:
+        for task in job.tasks:
+            point = plan.points[task.point]
+            assert plan.scenes[point.scene].value == task.scene
+            assert task.id in point.tasks
+
+
 def test_an_override_takes_the_place_of_an_axis(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, overrides=["scene.distance_m=45", "campaign.seeds=1"])
     assert len(plan.points) == 4

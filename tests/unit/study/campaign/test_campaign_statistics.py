@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.study.intervals import proportion_interval, rms_interval
 from evlcp_sdk.study.tally import Statistics, Tally, segment_of
 
@@ -95,3 +96,30 @@ def test_positions_have_quantiles() -> None:
         assert 0 <= total.position_quantile_m(share) - true <= 0.005 + 1e-9
     assert math.isnan(Tally().position_quantile_m(0.5))
     assert Statistics.from_dict(Statistics.of([(40, total)], tasks=1).to_dict()).total() == total
+
+
+def test_what_is_silent_and_not_covered_is_counted() -> None:
+    flags = [
+        (14.1, {}),
+        (14.2, {}),
+        (99.0, {"protected": True}),
+        (99.0, {"protected": True, "beyond": True, "excluded": True}),
+        (1.0, {"protected": True, "beyond": True}),
+    ]
+    total = sum((Tally.fix(0.1, nees, **kinds) for nees, kinds in flags), Tally(fixes_refused=9))
+    assert (total.fixes, total.fixes_silent, total.fixes_uncovered) == (5, 3, 2)
+    assert (total.fixes_excluded, total.fixes_protected, total.fixes_beyond) == (1, 3, 2)
+    assert total.kept_share == 1.0
+    assert (total + Tally(fixes_refused=5, fixes_contradicted=5)).kept_share == 0.5
+    table = Statistics.of([(40, total)]).to_dict()
+    table["segments"]["40"]["fixes_uncovered"] = 4
+    with pytest.raises(ConfigError, match="fixes_uncovered: more than fixes_silent"):
+        Statistics.from_dict(table)
+
+
+def test_a_track_has_errors_as_filtered_and_as_smoothed() -> None:
+    total = Tally.tracked(0.3, 4.0, 0.1, 2.0) + Tally.tracked(0.4, 2.0, 0.1, 4.0)
+    assert total.track_rmse_m == pytest.approx(math.sqrt((0.09 + 0.16) / 2))
+    assert (total.track_nees, total.smoothed_nees) == pytest.approx((3.0, 3.0))
+    assert total.smoothed_rmse_m == pytest.approx(0.1)
+    assert math.isnan(Tally().track_nees)
