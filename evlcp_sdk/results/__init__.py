@@ -75,6 +75,13 @@ def evlcp_sinks() -> Iterator[SinkRecord]:
         positions=True,
     )
     yield SinkRecord(
+        "kml",
+        f"{here}.kml:Kml",
+        ("fixes.kml",),
+        "positions, bars and track for Google Earth",
+        positions=True,
+    )
+    yield SinkRecord(
         "mcap",
         f"{here}.mcap:Mcap",
         ("fixes.mcap",),

@@ -1,9 +1,11 @@
 """`fixes.nmea`: NMEA-0183 sentences of a fix, GGA, RMC and GST, and TXT for alarms.
 
 Talker `IN`, integrated navigation; quality 6 and mode E, estimated, as nothing here is a satellite's. The
-altitude is that above the WGS-84 ellipsoid; the geoid's height is not known and left empty. The number of
-satellites is that of bars, the dilution of precision the horizontal sigma in metres. The first value of a
-GST is the root of the misfit, in sigmas, as bars give no ranges; its ellipse and sigmas are in metres.
+altitude is that above the sea's level, the geoid of EGM96, whose height above the WGS-84 ellipsoid is
+beside it: their sum is the fix's height, whatever the geoid. The number of satellites is that of bars. The
+dilution of precision is empty: it would be a factor without a unit, which bars do not have; how precise a
+fix is says its GST. The first value of that is the root of the misfit, in sigmas, as bars give no ranges;
+its ellipse and sigmas are in metres.
 """
 
 import math
@@ -12,6 +14,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.place.geoid import geoid_m
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.place.nmea import checksum
 from evlcp_sdk.results.folder import ResultFolder
@@ -19,7 +22,7 @@ from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.text import sigmas
 from evlcp_sdk.values import Fix
 
-__all__ = ["Nmea", "gga", "gst", "rmc", "txt"]
+__all__ = ["Nmea", "gga", "gst", "rmc", "sentences", "txt"]
 
 _KNOTS_PER_M_S = 3600 / 1852
 
@@ -34,19 +37,30 @@ class Nmea(Sink):
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write its sentences; those of a refused fix have no place."""
-        zero = self._zero
-        for number, alarm in enumerate(fix.alarms, 1):
-            self._file.write(txt(len(fix.alarms), number, _in_words(fix, alarm)))
-        if filtered is None:
-            self._file.write(gga(fix.t_us, zero, None, 0, 0.0) + rmc(fix.t_us, zero, None, None))
-            return
-        place = (filtered.latitude_deg, filtered.longitude_deg, filtered.height_m)
-        way = None if filtered.starts else (filtered.speed_m_s, filtered.course_deg)
-        east, north, _ = sigmas(filtered.covariance_m2)
-        bars = len(fix.transmitters)
-        self._file.write(gga(fix.t_us, zero, place, bars, math.hypot(east, north)))
-        self._file.write(rmc(fix.t_us, zero, place, way))
-        self._file.write(gst(fix.t_us, zero, math.sqrt(fix.misfit), filtered.covariance_m2))
+        self._file.write(sentences(fix, filtered, self._zero))
+
+
+def sentences(fix: Fix, filtered: Place | None, zero: datetime | None) -> str:
+    """What NMEA says of a fix: a TXT for each alarm, then GGA, RMC and, where there is a place, GST.
+
+    Args:
+        fix: The fix, given or refused.
+        filtered: The filtered place at its time; None for a refused one.
+        zero: UTC of the camera clock's 0; None: the clock itself is written as time of day.
+    """
+    alarms = [txt(len(fix.alarms), n, _in_words(fix, alarm)) for n, alarm in enumerate(fix.alarms, 1)]
+    if filtered is None:
+        return "".join([*alarms, gga(fix.t_us, zero, None, 0), rmc(fix.t_us, zero, None, None)])
+    place = (filtered.latitude_deg, filtered.longitude_deg, filtered.height_m)
+    way = None if filtered.starts else (filtered.speed_m_s, filtered.course_deg)
+    return "".join(
+        [
+            *alarms,
+            gga(fix.t_us, zero, place, len(fix.transmitters)),
+            rmc(fix.t_us, zero, place, way),
+            gst(fix.t_us, zero, math.sqrt(fix.misfit), filtered.covariance_m2),
+        ]
+    )
 
 
 def _in_words(fix: Fix, alarm: str) -> str:
@@ -57,28 +71,22 @@ def _in_words(fix: Fix, alarm: str) -> str:
     return "NO PROTECTION LEVEL" if alarm == "unavailable" else alarm.upper()
 
 
-def gga(
-    t_us: float,
-    zero: datetime | None,
-    place: tuple[float, float, float] | None,
-    bars: int,
-    sigma_m: float,
-) -> str:
+def gga(t_us: float, zero: datetime | None, place: tuple[float, float, float] | None, bars: int) -> str:
     """A GGA sentence, with its line end.
 
     Args:
         t_us: Camera clock, us.
         zero: UTC of the camera clock's 0; None: the clock itself is written as time of day.
-        place: Latitude and longitude, degrees, and height, m; None where there is no fix.
+        place: Latitude and longitude, degrees, and height above the ellipsoid, m; None where there is no fix.
         bars: Bars that count.
-        sigma_m: Horizontal standard deviation, m.
     """
     clock, _ = _time(t_us, zero)
     if place is None:
         return _sentence(f"INGGA,{clock},,,,,0,{bars:02d},,,M,,M,,")
     latitude, longitude, height = place
     where = f"{_angle(latitude, 2, 'NS')},{_angle(longitude, 3, 'EW')}"
-    return _sentence(f"INGGA,{clock},{where},6,{bars:02d},{sigma_m:.3f},{height:.3f},M,,M,,")
+    sea = geoid_m(latitude, longitude)
+    return _sentence(f"INGGA,{clock},{where},6,{bars:02d},,{height - sea:.3f},M,{sea:.1f},M,,")
 
 
 def rmc(

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pynmea2
@@ -18,6 +19,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import STAGE_PREFIX
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place import navigator
+from evlcp_sdk.place.geoid import geoid_m
 from evlcp_sdk.place.gnss import GnssLog
 from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan
 from evlcp_sdk.place.observations import project_bars
@@ -362,6 +364,32 @@ def test_a_run_that_breaks_off_leaves_nothing(tmp_path: Path) -> None:
         results.write(packets(5))
         assert list(tmp_path.glob(f"{STAGE_PREFIX}*/fixes.csv"))
     assert not list(tmp_path.iterdir())
+
+
+def test_kml_is_read_back(tmp_path: Path) -> None:
+    write(tmp_path, packets(6), PositionPlan((SITE,)), ["kml"], zero=ZERO)
+    names = {"k": "http://www.opengis.net/kml/2.2"}
+    placemarks = ElementTree.parse(tmp_path / "fixes.kml").getroot().findall("k:Document/k:Placemark", names)
+
+    sea_m = geoid_m(35.0, 137.0)
+    assert 37 < sea_m < 39
+    points = [mark for mark in placemarks if mark.find("k:Point", names) is not None]
+    fixes = rows(tmp_path / "fixes.csv")
+    assert len(points) == len(fixes) + 1
+    for row, mark in zip(fixes, points, strict=False):
+        where = mark.findtext("k:Point/k:coordinates", "", names).split(",")
+        assert float(where[0]) == pytest.approx(float(row["longitude_deg"]), abs=1e-8)
+        assert float(where[1]) == pytest.approx(float(row["latitude_deg"]), abs=1e-8)
+        assert float(where[2]) == pytest.approx(float(row["height_m"]) - sea_m, abs=0.11)
+        at = datetime.fromisoformat(mark.findtext("k:TimeStamp/k:when", "", names))
+        assert abs((at - ZERO).total_seconds() * 1e6 - float(row["t_us"])) <= 1000
+    assert points[-1].findtext("k:name", "", names) == "bar 0, id 7"
+    (line,) = (mark.findtext("k:LineString/k:coordinates", "", names) for mark in placemarks[len(fixes) : -1])
+    track = [[float(part) for part in place.split(",")] for place in line.split()]
+    for row, (longitude, latitude, _) in zip(rows(tmp_path / "track.csv"), track, strict=True):
+        assert (longitude, latitude) == pytest.approx(
+            (float(row["longitude_deg"]), float(row["latitude_deg"])), abs=1e-8
+        )
 
 
 def test_mcap_is_read_back(tmp_path: Path) -> None:

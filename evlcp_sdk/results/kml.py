@@ -1,0 +1,94 @@
+"""`fixes.kml`: fixes and bars as points, the smoothed trajectory as lines, for Google Earth and GIS programs.
+
+Altitudes of KML are those above the sea's level, the geoid of EGM96.
+"""
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, timedelta
+from typing import Any
+from xml.sax.saxutils import escape
+
+from evlcp_sdk.place.geoid import geoid_m
+from evlcp_sdk.place.navigator import Place, Settled
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.geojson import cut
+from evlcp_sdk.results.sink import Run, Sink
+from evlcp_sdk.results.text import sigmas
+from evlcp_sdk.values import Fix
+
+__all__ = ["Kml"]
+
+_HEAD = """<?xml version="1.0" encoding="UTF-8"?>
+<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>{name}</name>
+<Style id="fix"><IconStyle><color>ff30a0ff</color><scale>0.4</scale></IconStyle>\
+<LabelStyle><scale>0</scale></LabelStyle></Style>
+<Style id="track"><LineStyle><color>ffff8030</color><width>3</width></LineStyle></Style>
+"""
+
+
+class Kml(Sink):
+    """Writes `fixes.kml`."""
+
+    def __init__(self, folder: ResultFolder, run: Run) -> None:
+        super().__init__(folder, run)
+        self._file = folder.open("fixes.kml")
+        self._file.write(_HEAD.format(name=escape(run.name)))
+        self._line_end: list[list[float]] = []
+
+    def fix(self, fix: Fix, filtered: Place | None) -> None:
+        """Write a fix that is given as a point, with its time where UTC is known."""
+        if filtered is None:
+            return
+        east, north, up = sigmas(fix.covariance_m2)
+        zero = self.run.clock_zero
+        when = ""
+        if zero is not None:
+            at = zero.astimezone(UTC) + timedelta(microseconds=round(fix.t_us))
+            when = f"<TimeStamp><when>{at:%Y-%m-%dT%H:%M:%S}.{at.microsecond // 1000:03d}Z</when></TimeStamp>"
+        said = f"{fix.t_us / 1e3:.1f} ms, &#177; {east:.3f} E {north:.3f} N {up:.3f} U m"
+        where = _point(fix.longitude_deg, fix.latitude_deg, fix.height_m)
+        self._placemark(f"{when}<styleUrl>#fix</styleUrl><description>{said}</description>{where}")
+
+    def settle(self, settled: Sequence[Settled]) -> None:
+        """Write the smoothed places as a line, one per trajectory."""
+        line = self._line_end
+        for one in settled:
+            if one.filtered.starts and line:
+                self._line(line)
+                line = []
+            place = one.smoothed
+            line.append([place.longitude_deg, place.latitude_deg, place.height_m])
+        self._line(line)
+        # The next line starts where this one ends.
+        self._line_end = line[-1:]
+
+    def finish(self) -> Mapping[str, Any]:
+        """Write the bars, and end the file."""
+        assert self.run.navigator is not None
+        for number, site in self.run.navigator.positioner.stands_at.items():
+            where = _point(site.longitude_deg, site.latitude_deg, site.height_m)
+            self._placemark(f"<name>bar {number}, id {site.transmitter_id}</name>{where}")
+        self._file.write("</Document></kml>\n")
+        return {}
+
+    def _line(self, line: list[list[float]]) -> None:
+        for piece in cut(line):
+            if len(piece) > 1:
+                where = " ".join(_coordinates(*place) for place in piece)
+                self._placemark(
+                    "<styleUrl>#track</styleUrl><LineString><altitudeMode>absolute</altitudeMode>"
+                    f"<coordinates>{where}</coordinates></LineString>"
+                )
+
+    def _placemark(self, content: str) -> None:
+        self._file.write(f"<Placemark>{content}</Placemark>\n")
+
+
+def _point(longitude_deg: float, latitude_deg: float, height_m: float) -> str:
+    where = _coordinates(longitude_deg, latitude_deg, height_m)
+    return f"<Point><altitudeMode>absolute</altitudeMode><coordinates>{where}</coordinates></Point>"
+
+
+def _coordinates(longitude_deg: float, latitude_deg: float, height_m: float) -> str:
+    sea = geoid_m(latitude_deg, longitude_deg)
+    return f"{longitude_deg:.9f},{latitude_deg:.9f},{height_m - sea:.3f}"
