@@ -41,6 +41,7 @@ __all__ = [
     "read_numbers",
     "read_secret",
     "read_whole",
+    "shipped",
     "write_new",
 ]
 
@@ -513,3 +514,16 @@ def read_json(path: Path | str) -> Any:
     if value == _UNFINISHED:
         raise InputError(f"{path}: unfinished: {value['error']}; write them again")
     return value
+
+
+def shipped(folder: str, name: str) -> Path:
+    """A file that comes with the SDK: in the wheel, or in a checkout's `examples/`.
+
+    Raises:
+        FileNotFoundError: It is not there.
+    """
+    package = Path(__file__).parent
+    for path in (package / "data" / name, package.parent / "examples" / folder / name):
+        if path.exists():
+            return path
+    raise FileNotFoundError(f"{name}: missing from the installation")

@@ -1,6 +1,6 @@
 """The use cases: what a program does with a recording, and what the commands parse and print."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from datetime import datetime
 from html import escape
@@ -13,10 +13,15 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import Outputs
-from evlcp_sdk.io import EventSource, Loss, open_source
+from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source
 from evlcp_sdk.io.open import STDIN
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.live.budget import Budget
+from evlcp_sdk.live.loop import FrameEar, LiveLoop
+from evlcp_sdk.live.outlet import Outlet
+from evlcp_sdk.live.pictures import PictureSlot
+from evlcp_sdk.live.warm import warm_up
 from evlcp_sdk.pace import Stopwatch, times_real_time
 from evlcp_sdk.place.calibration import Calibrated, CalibrationView
 from evlcp_sdk.place.calibration import calibrate as fit_camera
@@ -37,7 +42,7 @@ from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.signals import Stopped, stop_on_request
 from evlcp_sdk.study.diagnosis.diagnose import Diagnosis, diagnosis_of
-from evlcp_sdk.values import Frame, Packet
+from evlcp_sdk.values import Events, Frame, Packet
 
 if TYPE_CHECKING:
     import pandas
@@ -50,6 +55,7 @@ __all__ = [
     "calibrate",
     "diagnose",
     "film",
+    "live",
     "receive",
     "receive_to_folder",
     "stop_on_request",
@@ -59,6 +65,11 @@ __all__ = [
 
 Advance = Callable[[int, int | None], None]
 """Called after each piece with the bytes that are done, and of how many if that is known."""
+
+
+def _say_nothing(_done: int, _of: int | None) -> None:
+    """Who asks for no progress."""
+
 
 DEGRADED_SHARE, DEGRADED_LEAST = 0.01, 100
 """Share, and number, of events and words dropped from which on a result is `degraded`."""
@@ -255,7 +266,98 @@ def receive_to_folder(
             lines=lines,
         ) as writer:
             receiver = Receiver(link, registry.hook, attitude=attitude, clock_zero=clock_zero)
-            return _run(opened, url, receiver, writer, advance, stopped)
+            pieces = ((events, receiver.feed(events)) for events in opened.chunks())
+            return _run(opened, url, receiver, writer, pieces, receiver.close, advance, stopped)
+
+
+def live(
+    source: EventSource | str | Path,
+    folder: Path | None = None,
+    link: Link | Path | str | None = None,
+    *,
+    registry: Registry | None = None,
+    plan: PositionPlan | None = None,
+    attitude: Attitude | AttitudeLog | None = None,
+    clock_zero: datetime | None = None,
+    sinks: Sequence[str] = (),
+    lines: Callable[[str], None] | None = None,
+    outlet: Outlet | None = None,
+    pictures: PictureSlot | None = None,
+    budget: Budget | None = None,
+    warm: bool = True,
+    stopped: Stopped = lambda: False,
+) -> dict[str, Any]:
+    """Receive in real time: results to listeners as they come, delays measured, what is too much left out.
+
+    See `evlcp_sdk.live` for how to listen. A recording that has no pace of its own is replayed at that of its
+    clock.
+
+    Args:
+        source: What to open, plugins asked first; or a source that is open, which is read on and closed.
+        folder: Where a result goes as `receive_to_folder` writes it; None: nothing is written.
+        link: The configuration, or a `link.toml`; None for all defaults.
+        registry: The plugins; None for all that are installed.
+        plan: What positions are computed from; None for none.
+        attitude: What is known of the camera's attitude; None for nothing.
+        clock_zero: UTC of the camera clock's 0; None if it is not known.
+        sinks: Output formats beside the default ones, by name.
+        lines: Takes a line of JSON for each frame, message and fix as it comes; None for nobody.
+        outlet: Where listeners subscribe; None for nobody. It is closed at the end.
+        pictures: Where pictures of events are drawn when they are asked for; None for none.
+        budget: When what is left out.
+        warm: Load all kernels before the source is opened: nothing waits for one later.
+        stopped: Ends the run.
+
+    Returns:
+        The summary, as of `receive_to_folder`, with `live`: delays by stage, and what was shed.
+
+    Raises:
+        InputError: The source cannot be opened.
+        ConfigError: The sensor is not the link's, or a sink cannot be used.
+        PluginError: A plugin's code fails.
+    """
+    registry = Registry.load() if registry is None else registry
+    link = link if isinstance(link, Link) else load_link(link, registry=registry)
+    outlet = Outlet() if outlet is None else outlet
+    if warm:
+        warm_up(link)
+    url = str(source.path if isinstance(source, EventSource) else source)
+    ear = FrameEar()
+    try:
+        opened = source if isinstance(source, EventSource) else open_source(source, registry)
+        if not opened.live and opened.size_bytes is not None:
+            opened = ReplaySource(opened)
+        with opened:
+            url = str(opened.path) if url == STDIN else url
+            check_sensor(opened, url, link.camera)
+            name = Path(url).name
+            kept: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock_zero}
+            loop: LiveLoop
+            with (
+                ResultWriter(
+                    folder,
+                    link,
+                    registry,
+                    name=name,
+                    **kept,
+                    sinks=sinks,
+                    lines=lines,
+                    fixed=lambda fix: loop.fix(fix),
+                ) as writer,
+                registry.joined(ear),
+            ):
+                receiver = Receiver(link, registry.hook, attitude=attitude, clock_zero=clock_zero)
+                loop = LiveLoop(opened, receiver, link.packet, ear, outlet, pictures, budget)
+                pieces = loop.run(stopped)
+                table = _run(
+                    opened, url, receiver, writer, pieces, loop.close, _say_nothing, stopped, loop.summary
+                )
+        outlet.publish("end", float(table["recording"]["last_us"] or 0), table)
+        return table
+    finally:
+        outlet.close()
+        if pictures is not None:
+            pictures.close()
 
 
 def _run(
@@ -263,28 +365,34 @@ def _run(
     url: str,
     receiver: Receiver,
     writer: ResultWriter,
+    pieces: Iterable[tuple[Events, list[Packet]]],
+    close: Callable[[], list[Packet]],
     advance: Advance,
     stopped: Stopped,
+    live: Callable[[], dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """Read a source to its end, or until it is stopped or fails; return the summary."""
+    """Receive a source to its end, or until it is stopped or fails; return the summary."""
     status: Status = "complete"
     error = None
     first_us = last_us = None
     watch = Stopwatch()
     with watch.running():
         try:
-            for events in source.chunks():
-                first_us = int(events.t_us[0]) if first_us is None else first_us
-                last_us = int(events.t_us[-1])
-                writer.events(events)
-                writer.write(receiver.feed(events))
+            for events, packets in pieces:
+                if len(events):
+                    first_us = int(events.t_us[0]) if first_us is None else first_us
+                    last_us = int(events.t_us[-1])
+                    writer.events(events)
+                writer.write(packets)
                 advance(source.position_bytes, source.size_bytes)
                 if stopped():
                     status = "interrupted"
                     break
         except InputError as fault:
             status, error = "failed", str(fault)
-        writer.write(receiver.close())
+        if live is not None and stopped():
+            status = "interrupted"
+        writer.write(close())
     if status == "complete" and (told := _much_dropped(source, receiver)):
         status, error = "degraded", f"{url}: {told}"
     read = source.counts["events"]
@@ -316,6 +424,7 @@ def _run(
         losses={kind: asdict(loss) for kind, loss in source.losses.items()},
         error=error,
         lit_us=receiver.lit_us,
+        live=None if live is None else live(),
     )
 
 

@@ -62,6 +62,7 @@ def make_app() -> typer.Typer:
         demo,
         diagnose,
         info,
+        live,
         plugins,
         receive,
         report,
@@ -81,7 +82,7 @@ def make_app() -> typer.Typer:
         help=HELP,
     )
     app.callback()(_root)
-    first = (receive, video, info, diagnose, compare, simulate, score, sweep, report, demo)
+    first = (receive, live, video, info, diagnose, compare, simulate, score, sweep, report, demo)
     for module in (*first, calibrate, survey, config, plugins, check):
         module.register(app)
     return app

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from evlcp_sdk.cli._common import Json, Workers, complain, console, echo
+from evlcp_sdk.files import shipped
 from evlcp_sdk.plugin.hooks import hookimpl
 
 if TYPE_CHECKING:
@@ -30,23 +31,13 @@ def demo_files() -> tuple[Path, Path]:
     """The demo's recording and its truth: in the wheel, or in a checkout's `examples/recordings`."""
     from evlcp_sdk.sim.truth import truth_path
 
-    raw = _shipped("recordings", f"{DEMO_NAME}.raw")
+    raw = shipped("recordings", f"{DEMO_NAME}.raw")
     return raw, truth_path(raw)
 
 
 def demo_campaign() -> Path:
     """The demo's campaign: in the wheel, or in a checkout's `examples/campaigns`."""
-    return _shipped("campaigns", f"{CAMPAIGN_NAME}.toml")
-
-
-def _shipped(folder: str, name: str) -> Path:
-    import evlcp_sdk
-
-    package = Path(evlcp_sdk.__file__).parent
-    for path in (package / "data" / name, package.parent / "examples" / folder / name):
-        if path.exists():
-            return path
-    raise FileNotFoundError(f"{name}: missing from the installation")
+    return shipped("campaigns", f"{CAMPAIGN_NAME}.toml")
 
 
 def demo(

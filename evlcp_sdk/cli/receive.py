@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 
-__all__ = ["register"]
+__all__ = ["attitude_of", "clock_zero_of", "json_lines_of", "position_plan_of", "register"]
 
 
 class LinkMode(StrEnum):
@@ -205,7 +205,7 @@ def receive(
     from evlcp_sdk.results.sinks import load_sinks
     from evlcp_sdk.run import stop_on_request
 
-    lines = _json_lines(json_lines, recordings, as_json=as_json)
+    lines = json_lines_of(json_lines, recordings, as_json=as_json)
     jobs = _jobs(recordings, out, lines)
     registry = Registry.load()
     link = load_link(link_file, overrides or [], registry)
@@ -216,9 +216,9 @@ def receive(
         # An IMU's samples follow a camera that sways; angles by hand hold for a whole drive.
         gravity_sigma_deg = 0.5 if attitude_file is None else 0.1
     sigmas = (gravity_sigma_deg, heading_sigma_deg, white_sigma_deg, time_sigma_us)
-    attitude = _attitude(attitude_file, angles, sigmas)
-    zero = _clock_zero(clock_zero)
-    plan = _position_plan(sites, gnss, link, zero, mcap=mcap)
+    attitude = attitude_of(attitude_file, angles, sigmas)
+    zero = clock_zero_of(clock_zero)
+    plan = position_plan_of(sites, gnss, link, zero, mcap=mcap)
     short = {"figures": figures, "report": report, "parquet": parquet, "mcap": mcap}
     asked = tuple(dict.fromkeys([*(name for name, given in short.items() if given), *(sinks or [])]))
     load_sinks(choose_sinks(registry, asked, positions=plan is not None))
@@ -299,7 +299,7 @@ def _fitted(job: ReceiveJob, link: "Link", registry: "Registry") -> ReceiveJob:
     return replace(job, link=best.link)
 
 
-def _attitude(
+def attitude_of(
     file: Path | None,
     angles: tuple[float | None, float | None, float | None],
     sigmas: tuple[float, float, float, float],
@@ -328,7 +328,7 @@ def _attitude(
     return Attitude(pitch, roll, heading, *sigmas) if pitch is not None and roll is not None else None
 
 
-def _position_plan(
+def position_plan_of(
     sites: Path | None, gnss: Path | None, link: "Link", zero: "datetime | None", *, mcap: bool
 ) -> "PositionPlan | None":
     """What the options say of positions; None without sites."""
@@ -345,7 +345,7 @@ def _position_plan(
     return PositionPlan(load_sites(sites), log)
 
 
-def _clock_zero(text: str | None) -> "datetime | None":
+def clock_zero_of(text: str | None) -> "datetime | None":
     """UTC of the camera clock's 0; None if it is not given."""
     from datetime import UTC, datetime
 
@@ -420,7 +420,8 @@ class _Lines:
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
-def _json_lines(where: str | None, recordings: Sequence[str], *, as_json: bool) -> _Lines | None:
+def json_lines_of(where: str | None, recordings: Sequence[str], *, as_json: bool) -> _Lines | None:
+    """What prints lines as they come; None where nobody asked."""
     from evlcp_sdk.io.open import STDIN
 
     if where is None:

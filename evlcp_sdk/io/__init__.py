@@ -3,7 +3,8 @@
 from evlcp_sdk.io.faery import FaerySource
 from evlcp_sdk.io.open import open_source, open_writer, read_events, write_events
 from evlcp_sdk.io.raw import RawHeader, RawSource, RawWriter
-from evlcp_sdk.io.replay import ReplaySource
+from evlcp_sdk.io.replay import LoopSource, ReplaySource
+from evlcp_sdk.io.streams import StreamSource
 from evlcp_sdk.io.tables import CsvSource, CsvWriter, NpzSource, NpzWriter
 from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.plugin.source import DEFAULT_MAX_EVENTS, EventSource, Loss
@@ -15,6 +16,7 @@ __all__ = [
     "EventSource",
     "EventWriter",
     "FaerySource",
+    "LoopSource",
     "Loss",
     "NpzSource",
     "NpzWriter",
@@ -22,6 +24,7 @@ __all__ = [
     "RawSource",
     "RawWriter",
     "ReplaySource",
+    "StreamSource",
     "open_source",
     "open_writer",
     "read_events",

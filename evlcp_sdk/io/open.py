@@ -11,7 +11,10 @@ from evlcp_sdk.files import Outputs, is_there
 from evlcp_sdk.io.faery import FORMATS, FaerySource
 from evlcp_sdk.io.lists import ListSource, is_list
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
+from evlcp_sdk.io.replay import LoopSource, ReplaySource
+from evlcp_sdk.io.streams import SCHEMES, open_stream
 from evlcp_sdk.io.tables import CSV_HEADER, CsvSource, CsvWriter, NpzSource, NpzWriter
+from evlcp_sdk.io.urls import flag, positive, split_options
 from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
@@ -24,18 +27,23 @@ WRITABLE: Final = {".raw": "EVT3", ".npz": "NPZ", ".csv": "CSV", ".csv.gz": "CSV
 STDIN: Final = "-"
 """What is opened as standard input."""
 
+OWN: Final = ("file", "replay", *SCHEMES)
+"""Schemes that are opened without a plugin."""
+
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 
 
 def open_source(url: Path | str, registry: Registry | None = None) -> EventSource:
-    """Open a recording, a camera or whatever else a plugin knows, as an event source: a context manager.
+    """Open a recording, a stream, a camera or what a plugin knows, as an event source: a context manager.
 
     Plugins are asked first, by the hook `evlcp_open_events`; one that fails is left out, with a
     `PluginWarning`. Of a file the content says the format, or else the suffix of its name; `file:` before its
     name does no harm.
 
     Args:
-        url: A file, or what a plugin opens, e.g. `cam:0`; `-` for RAW words on standard input.
+        url: A file, or what a plugin opens, e.g. `cam:0`; `-` for RAW words on standard input, `tcp://HOST:PORT`,
+            `udp://HOST:PORT` or `unix:PATH` for those of another program; `replay:REC?speed=1&loop=1` for a
+            recording at the pace of its own clock, again and again.
         registry: The plugins that are asked; None for all that are installed.
 
     Raises:
@@ -52,10 +60,15 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
         return _open_file(url)
     if scheme[1].lower() == "file":
         return _open_file(unquote(str(url)[len(scheme[0]) :].removeprefix("//")))
+    if scheme[1].lower() == "replay":
+        return _open_replay(str(url), registry)
+    if scheme[1].lower() in SCHEMES:
+        return open_stream(str(url))
     asked = sorted(registry.plugins("evlcp_open_events"))
     broken = "".join(f"; {plugin}" for plugin in registry.broken)
     raise InputError(
-        f"{url}: scheme '{scheme[1]}', expected file: or one that a plugin opens"
+        f"{url}: scheme '{scheme[1]}', expected {', '.join(f'{one}:' for one in OWN)}"
+        " or one that a plugin opens"
         f" (asked: {', '.join(asked) or 'no plugin that opens sources is installed'}){broken}"
     )
 
@@ -89,6 +102,29 @@ def _open_stdin() -> EventSource:
     if file.isatty():
         raise InputError(f"{name} is a terminal, expected a recording: evlcp receive - < REC.raw")
     return RawSource(name, file=file)
+
+
+def _open_replay(url: str, registry: Registry) -> EventSource:
+    """A recording at its own pace: `replay:REC`, with `?speed=`, `loop=` and `for_s=`."""
+    name, options = split_options(url, {"speed": positive, "loop": flag, "for_s": positive})
+    inner = name.partition(":")[2]
+    if not inner or inner == STDIN:
+        raise InputError(f"{url}: expected replay:REC, the name of a recording")
+
+    def opened() -> EventSource:
+        return open_source(inner, registry)
+
+    for_s = options.get("for_s")
+    again = (
+        LoopSource(opened, for_us=None if for_s is None else for_s * 1e6) if options.get("loop") else opened()
+    )
+    if again.live:
+        again.close()
+        raise InputError(f"{url}: {inner} has a pace of its own, expected a recording")
+    if for_s is not None and not options.get("loop"):
+        again.close()
+        raise InputError(f"{url}: for_s = {for_s:g}: only with loop=1")
+    return ReplaySource(again, options.get("speed", 1.0))
 
 
 def _open_file(path: Path | str) -> EventSource:

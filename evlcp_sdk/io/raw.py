@@ -1,12 +1,13 @@
 """Prophesee RAW files: a header of text lines, then the words of EVT2 or EVT3."""
 
-import io
 import os
+import select
 import stat
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -27,8 +28,8 @@ CODECS: Final = {codec.name: codec for codec in (EVT2, EVT3)}
 
 MAX_HEADER_BYTES = 1 << 16
 BUFFER_BYTES = 1 << 20
-PIPE_BYTES = 1 << 17
-"""Bytes of a pipe that are waited for first: a header, and words enough to tell their encoding."""
+PIPE_BYTES, PIPE_WAIT_S = 1 << 17, 0.1
+"""Bytes of a pipe that are waited for first, and for how long: words enough to tell their encoding."""
 WRITE_WORDS = 1 << 15
 MIN_READ, MAX_READ = 1 << 20, 1 << 27
 
@@ -41,6 +42,19 @@ RESERVED_LEAST = 16
 
 # A camera sends a TIME_HIGH at least every 4096 us, in which its bus (1.6 Gbit/s) carries less than 1 MB.
 TIMELESS_BYTES = 1 << 24
+
+
+class RawBytes(Protocol):
+    """What a `RawSource` reads: a file, a pipe, a socket."""
+
+    def fileno(self) -> int:
+        """Its number in this process."""
+
+    def readinto(self, room: memoryview, /) -> int | None:
+        """Wait for bytes, put them to the front; how many, 0 at the end."""
+
+    def close(self) -> None:
+        """Read no more."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +214,7 @@ class RawSource(EventSource):
     """
 
     def __init__(
-        self, path: Path | str, buffer_bytes: int = BUFFER_BYTES, file: io.FileIO | None = None
+        self, path: Path | str, buffer_bytes: int = BUFFER_BYTES, file: RawBytes | None = None
     ) -> None:
         self._path = Path(path)
         self._buffer = np.empty(max(buffer_bytes, 2 * _words.LOOK_BYTES), np.uint8)
@@ -208,13 +222,13 @@ class RawSource(EventSource):
         self._start = self._end = 0  # the bytes of the buffer not decoded
         self._exhausted = False
         try:
-            self._file = self._path.open("rb", buffering=0) if file is None else file
+            self._file: RawBytes = self._path.open("rb", buffering=0) if file is None else file
             status = os.fstat(self._file.fileno())
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}") from error
         self._is_pipe = not stat.S_ISREG(status.st_mode)
         try:
-            self._fill(PIPE_BYTES)
+            self._fill_header()
             header = parse_header(self._buffer[: self._end].tobytes(), self._path)
             size = None if self._is_pipe else status.st_size
             super().__init__(self._path, header.codec.name, header.width, header.height, header.fields, size)
@@ -225,10 +239,38 @@ class RawSource(EventSource):
             self._start = self._position = self._data_start = header.size_bytes
             if not self._is_pipe:
                 self._fill()
+            elif not self._exhausted:
+                self._wait_a_little()
             self._probe()
         except BaseException:
             self._file.close()
             raise
+
+    def _fill_header(self) -> None:
+        """Read until the header is there; of a file all that there is room for."""
+        if not self._is_pipe:
+            self._fill()
+            return
+        while not self._exhausted and self._end < MAX_HEADER_BYTES:
+            self._fill()
+            start = self._buffer[: self._end].tobytes()
+            lines = start.split(b"\n")
+            # Where the last line is whole, another line of the header may come.
+            if b"% end" in (line.rstrip(b"\r") for line in lines[:-1]) or any(
+                len(line) > 1 and not line.startswith(b"% ") for line in lines
+            ):
+                return
+
+    def _wait_a_little(self) -> None:
+        """Read what of a pipe comes soon, enough to tell its encoding: in the dark little comes."""
+        until_s = time.monotonic() + PIPE_WAIT_S
+        ready = select.poll()
+        ready.register(self._file.fileno(), select.POLLIN)
+        while not self._exhausted and self._end - self._start < PIPE_BYTES:
+            left_s = until_s - time.monotonic()
+            if left_s <= 0 or not ready.poll(left_s * 1e3):
+                return
+            self._fill()
 
     def _probe(self) -> None:
         """Raise RawFormatError if the first words look like another encoding."""

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,7 +10,86 @@ from evlcp_sdk.errors import StreamError
 from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["ReplaySource"]
+__all__ = ["LoopSource", "ReplaySource"]
+
+SEAM_US = 500_000
+"""Dark time between a recording's end and its next pass: what was seen is forgotten, no clock leaps."""
+
+
+class LoopSource(EventSource):
+    """A recording again and again, its clock going on.
+
+    Args:
+        opened: Opens the recording.
+        seam_us: Time between the last event of a pass and the first of the next one, us.
+        for_us: Ends with the pass in which so much time is over, us; None: never.
+
+    Attributes:
+        passes: How many have begun.
+    """
+
+    def __init__(
+        self, opened: Callable[[], EventSource], seam_us: int = SEAM_US, for_us: float | None = None
+    ) -> None:
+        self._opened = opened
+        self._source = source = opened()
+        super().__init__(source.path, source.format, source.width, source.height, source.header)
+        self.live = source.live
+        self.passes = 1
+        self._seam_us = seam_us
+        self._for_us = for_us
+        self._shift_us = 0
+        self._start_us: int | None = None
+        self._last_us: int | None = None
+        self._begins = True
+        self._lost: dict[str, Loss] = {}
+
+    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
+        """As of the recording, with the times of this pass."""
+        piece = next(self._source.stream(max_events), None)
+        while piece is None:
+            if self._last_us is None or self._start_us is None:
+                return None  # It is empty.
+            if self._for_us is not None and self._last_us - self._start_us >= self._for_us:
+                return None
+            self._lost = self.losses
+            self._source.close()
+            self._source = self._opened()
+            self.passes += 1
+            self._begins = True
+            piece = next(self._source.stream(max_events), None)
+        events, triggers = piece
+        columns = [column for column in (events.t_us, triggers.t_us) if len(column)]
+        first_us = min(int(column[0]) for column in columns)
+        if self._begins:
+            self._begins = False
+            if self._last_us is None:
+                self._start_us = first_us
+            else:
+                self._shift_us = self._last_us + self._seam_us - first_us
+        self._last_us = max(int(column[-1]) for column in columns) + self._shift_us
+        if not self._shift_us:
+            return piece
+        return (
+            Events(events.t_us + self._shift_us, events.x, events.y, events.p),
+            Triggers(triggers.t_us + self._shift_us, triggers.channel, triggers.value),
+        )
+
+    @property
+    def losses(self) -> dict[str, Loss]:
+        """As the recording's, of all passes."""
+        now = self._source.losses
+        both = {name: now.get(name) or self._lost[name] for name in (*self._lost, *now)}
+        return {
+            name: replace(one, count=one.count + self._lost[name].count)
+            if name in now and name in self._lost
+            else one
+            for name, one in both.items()
+        }
+
+    def close(self) -> None:
+        """Close the recording."""
+        self._source.close()
 
 
 class ReplaySource(EventSource):
@@ -28,6 +108,8 @@ class ReplaySource(EventSource):
     Raises:
         StreamError: `speed` or `slice_us` is not positive.
     """
+
+    live = True
 
     def __init__(
         self,
@@ -78,6 +160,13 @@ class ReplaySource(EventSource):
     def close(self) -> None:
         """Close the recording."""
         self._source.close()
+
+    def clock_s(self, t_us: float) -> float | None:
+        """When a time of the recording is due, by the clock given; None before the first piece."""
+        if self._origin is None:
+            return None
+        start_us, start_s = self._origin
+        return start_s + (t_us - start_us) * self._s_per_us
 
     @property
     def position_bytes(self) -> int:

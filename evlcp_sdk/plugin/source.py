@@ -58,6 +58,9 @@ class EventSource(ABC):
         size_bytes: Size of the file, or None for a live source.
     """
 
+    live = False
+    """Whether its time goes on by itself, as a camera's: what is not taken soon is late."""
+
     def __init__(
         self,
         path: Path,
@@ -94,6 +97,10 @@ class EventSource(ABC):
     def position_bytes(self) -> int:
         """How much of `size_bytes` is done; 0 for a live source."""
         return 0
+
+    def clock_s(self, t_us: float) -> float | None:
+        """When a time of the camera's clock was, by `time.monotonic()`, s; None if it is not known."""
+        return None
 
     @property
     def losses(self) -> dict[str, Loss]:

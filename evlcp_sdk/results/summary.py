@@ -33,6 +33,7 @@ def summary_of(
     error: str | None = None,
     positions: Mapping[str, Any] | None = None,
     sinks: Mapping[str, Mapping[str, Any]] | None = None,
+    live: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The content of `summary.json`.
 
@@ -49,6 +50,7 @@ def summary_of(
         error: The message, when `status` is `failed` or `degraded`.
         positions: Figures of the positions, where they were computed.
         sinks: What sinks say, by name; those that say nothing are left out.
+        live: Delays, and what was shed, of a live run; None for others.
     """
     off = _messages_off(link)
     warnings = warnings_of(tally, counts, link, seen=seen, reads_messages=off is None, positions=positions)
@@ -73,6 +75,7 @@ def summary_of(
         "versions": dict(versions),
         **({"positions": dict(positions)} if positions is not None else {}),
         **({"sinks": {name: dict(part) for name, part in sinks.items()}} if sinks else {}),
+        **({"live": dict(live)} if live is not None else {}),
     }
 
 

@@ -23,7 +23,7 @@ from evlcp_sdk.results.sinks import Sinks, load_sinks
 from evlcp_sdk.results.summary import Status, summary_of, write_summary
 from evlcp_sdk.results.tallies import PositionTally, RunTally
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
-from evlcp_sdk.values import Events, Packet
+from evlcp_sdk.values import Events, Fix, Packet
 
 __all__ = ["ResultWriter"]
 
@@ -43,6 +43,7 @@ class ResultWriter:
         clock_zero: UTC of the camera clock's 0; None if it is not known.
         sinks: Output formats beside the default ones, by name; none without a folder.
         lines: Takes frames, messages and fixes as lines of JSON as they come; None for nobody.
+        fixed: Takes fixes as they come; None for nobody.
 
     Raises:
         OutputError: The folder cannot be written.
@@ -62,7 +63,9 @@ class ResultWriter:
         clock_zero: datetime | None = None,
         sinks: Sequence[str] = (),
         lines: Callable[[str], None] | None = None,
+        fixed: Callable[[Fix], None] | None = None,
     ) -> None:
+        self._fixed = fixed
         self._registry = Registry.load() if registry is None else registry
         self._link = link
         self._tally, self._positions = RunTally(link.packet), PositionTally()
@@ -114,6 +117,7 @@ class ResultWriter:
         losses: Mapping[str, Mapping[str, Any]],
         error: str | None = None,
         lit_us: Mapping[int, tuple[float, float]] | None = None,
+        live: Mapping[str, Any] | None = None,
     ) -> dict[str, Any]:
         """End the sinks, move all files into place, the summary last, and drop what an earlier run left.
 
@@ -125,6 +129,7 @@ class ResultWriter:
             losses: What the reader skipped, by kind, with byte offsets.
             error: The message, when `status` is `failed` or `degraded`.
             lit_us: From when until when the light of each transmitter was there, us; None if it is not known.
+            live: Delays, and what was shed, of a live run; None for others.
 
         Returns:
             The content of `summary.json`.
@@ -162,6 +167,7 @@ class ResultWriter:
             error=error,
             positions=positions,
             sinks={} if self._sinks is None else self._sinks.finish(),
+            live=live,
         )
         table["files"] = {}
         if self._sinks is not None and self._folder is not None:
@@ -178,6 +184,8 @@ class ResultWriter:
                 self._sinks.placed(placed)
             if self._lines is not None:
                 self._lines.fix(placed.fix)
+            if self._fixed is not None:
+                self._fixed(placed.fix)
 
     def __enter__(self) -> Self:
         return self

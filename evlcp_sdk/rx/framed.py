@@ -62,6 +62,7 @@ class HeardFraming:
     Attributes:
         counts: What was found so far.
         lit: When the light of its transmitters was there.
+        ranging_every: Of no effect: frames that a framing hears have no distance.
     """
 
     def __init__(
@@ -82,6 +83,7 @@ class HeardFraming:
         self._keep_us = max(2 * link.packet.packet_chips * link.packet.chip_us, frames_us)
         self.counts = dict.fromkeys(("events_in_regions", "regions_opened", "regions_released", "frames"), 0)
         self.lit = LitTimes()
+        self.ranging_every = 1
 
     def step(self, regions: list[Followed], step: TimeStep) -> None:
         """Hear what the regions of a time step send."""

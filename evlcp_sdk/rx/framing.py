@@ -60,6 +60,7 @@ _COUNTS = (
     "frames_unread",
     "frames_askew",
     "frames_cut",
+    "frames_not_ranged",
 )
 
 
@@ -79,6 +80,7 @@ class PacketFraming:
     Attributes:
         counts: What was found and dropped so far.
         lit: When the light of its transmitters was there.
+        ranging_every: See `Receiver`.
     """
 
     def __init__(
@@ -125,6 +127,8 @@ class PacketFraming:
         self._due: deque[Followed] = deque()
         self.counts = dict.fromkeys(_COUNTS, 0)
         self.lit = LitTimes()
+        self.ranging_every = 1
+        self._measurable = 0
 
     def step(self, regions: list[Followed], step: TimeStep) -> None:
         """Hear, and decode, what the regions of a time step send."""
@@ -223,7 +227,7 @@ class PacketFraming:
         distance, points, centre_px, sight = _NO_RANGE, _NO_POINTS, look.centre_px, BarSight()
         if due.has_pilot:
             # Another distance of the same pilot, or other points, would say nothing new.
-            distance = self._steps.measure(FrameView(look.sums, look.offset_px, look.presence, read))
+            distance = self._measured(FrameView(look.sums, look.offset_px, look.presence, read))
             points_px, sigma_px = self._find_points(look.presence, look.placement)
             points = points_px + look.corner_px, sigma_px
             centre_px = self._looker.centre(look, points[0])
@@ -258,6 +262,14 @@ class PacketFraming:
         )
         self._announcer.total("frame", frame)
         return Sighting.of(frame, look)
+
+    def _measured(self, view: FrameView) -> Range:
+        """How far a bar is, where this frame's turn has come."""
+        self._measurable += 1
+        if self._measurable % self.ranging_every:
+            self.counts["frames_not_ranged"] += 1
+            return _NO_RANGE
+        return self._steps.measure(view)
 
     def _before(self, transmitter: Transmitter, due: DueFrame) -> NDArray[np.int8]:
         """The chip that each cluster sent before a frame's info segment, int8 (K,); -1 if not known.

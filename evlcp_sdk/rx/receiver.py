@@ -19,7 +19,7 @@ from evlcp_sdk.rx.steps import Announcer, Steps, on_camera, tracker_of
 from evlcp_sdk.rx.timeline import Timeline, TimeStep
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
-from evlcp_sdk.values import Events, Packet, changed
+from evlcp_sdk.values import Events, Packet, Region, changed
 
 __all__ = ["Receiver"]
 
@@ -90,6 +90,20 @@ class Receiver:
         Starts of the first and the last frame that was due while it was, given or not, camera clock, us.
         """
         return self._framing.lit.by_number
+
+    @property
+    def regions(self) -> tuple[Region, ...]:
+        """Where the regions that are followed were seen last, on the camera's clock."""
+        return tuple(on_camera(one.latest, self._clock.camera_us) for one in self._regions.alive)
+
+    @property
+    def ranging_every(self) -> int:
+        """The distance of every n-th frame with a pilot is measured, 1: of all; for when time is short."""
+        return self._framing.ranging_every
+
+    @ranging_every.setter
+    def ranging_every(self, every: int) -> None:
+        self._framing.ranging_every = every
 
     @property
     def counts(self) -> dict[str, int]:

@@ -15,7 +15,7 @@ LAYERS = (
     {"plugin"},
     {"link"},
     {"io", "rx", "place", "sim"},
-    {"results", "jobs", "study"},
+    {"results", "jobs", "study", "live"},
     {"run", "simulated"},
     {"testing"},
     {"cli"},

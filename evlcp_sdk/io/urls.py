@@ -1,0 +1,66 @@
+"""What stands behind the `?` of a source's name, checked."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+from urllib.parse import parse_qsl
+
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.spelling import nearest
+
+__all__ = ["flag", "positive", "split_options"]
+
+
+def split_options(url: str, kinds: Mapping[str, Callable[[str], Any]]) -> tuple[str, dict[str, Any]]:
+    """Return what stands before the last `?` of a name, and the options behind it.
+
+    Args:
+        url: The name.
+        kinds: What makes the value of each option; raises ValueError with what it expects.
+
+    Raises:
+        InputError: An option is not known, given twice, or its value is not as expected.
+
+    >>> split_options("replay:REC.raw?speed=2", {"speed": positive})
+    ('replay:REC.raw', {'speed': 2.0})
+    """
+    name, mark, query = url.rpartition("?")
+    if not mark:
+        return url, {}
+    values: dict[str, Any] = {}
+    for key, text in parse_qsl(query, keep_blank_values=True) or [(query, "")]:
+        if key not in kinds:
+            raise InputError(f"{url}: option {key!r}{nearest(key, list(kinds))}")
+        if key in values:
+            raise InputError(f"{url}: option {key!r} is given twice")
+        try:
+            values[key] = kinds[key](text)
+        except ValueError as fault:
+            raise InputError(f"{url}: {key} = {text!r}: expected {fault}") from fault
+    return name, values
+
+
+def positive(text: str) -> float:
+    """A number above 0.
+
+    Raises:
+        ValueError: It is none; says what is expected.
+    """
+    expected = "a number above 0"
+    try:
+        value = float(text)
+    except ValueError as fault:
+        raise ValueError(expected) from fault
+    if not 0 < value < 1e9:
+        raise ValueError(expected)
+    return value
+
+
+def flag(text: str) -> bool:
+    """0 or 1.
+
+    Raises:
+        ValueError: It is neither; says what is expected.
+    """
+    if text not in ("0", "1"):
+        raise ValueError("0 or 1")
+    return text == "1"

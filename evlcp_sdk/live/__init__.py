@@ -1,0 +1,54 @@
+"""Receiving in real time: a source read in slices, a budget of time, and results for whoever listens.
+
+```
+source --reader (a thread)--> slices --LiveLoop--> receiver --> Outlet --> Subscription, Subscription, ...
+                                          +-> PictureSlot (a picture when one is asked for, the newest only)
+```
+
+How a viewer, a server or a recorder joins, from threads of its own:
+
+```
+outlet, pictures = Outlet(), PictureSlot()
+mine = outlet.subscribe({"frame", "message", "fix", "status"}, most=1000, wake=wake_my_loop)
+threading.Thread(target=run.live, args=("replay:REC.raw",), kwargs={"outlet": outlet, "pictures": pictures})
+for news in mine.take(timeout_s=1.0):     # [] after the time-out; mine.ended once all is said
+    news.kind, news.t_us, news.value, news.late_ms
+picture = pictures.take(timeout_s=0.5)    # asks for one, and waits for it; None after the time-out
+```
+
+The loop never waits for a subscriber: of a queue that is full the oldest go, counted in
+`Subscription.dropped`. `run.live` may as well have the main thread, and listeners threads of their own;
+`wake` is called in the loop's thread and must return at once, as `loop.call_soon_threadsafe` does.
+What is published:
+
+| kind | value | when |
+|---|---|---|
+| `frame` | `Frame` | as soon as it is decoded, with `late_ms` after its last chip |
+| `packet` | `Packet` | when it is complete; its frames came before |
+| `message` | `ReceivedMessage` | when a packet completes it |
+| `fix` | `Fix` | when it is computed, given or refused |
+| `events` | `Events` | each piece of the source, before anything is shed: for a recorder |
+| `triggers` | `Triggers` | each piece's, where there are any |
+| `status` | `LiveStatus` | every 0.2 s, and at the end: rate, regions, delays, losses, what is shed |
+| `end` | the summary, a `dict` | last |
+"""
+
+from evlcp_sdk.live.budget import Budget, Shedder
+from evlcp_sdk.live.delays import DelayTally
+from evlcp_sdk.live.loop import LiveLoop, LiveStatus
+from evlcp_sdk.live.outlet import KINDS, News, Outlet, Subscription
+from evlcp_sdk.live.pictures import Picture, PictureSlot
+
+__all__ = [
+    "KINDS",
+    "Budget",
+    "DelayTally",
+    "LiveLoop",
+    "LiveStatus",
+    "News",
+    "Outlet",
+    "Picture",
+    "PictureSlot",
+    "Shedder",
+    "Subscription",
+]

@@ -1,0 +1,121 @@
+"""Real time as a budget: what is left out, in which order, when the receiver cannot keep up."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.values import Events, Region
+
+__all__ = ["LEVELS", "Budget", "Shedder"]
+
+LEVELS: Final = (
+    "all",
+    "rows outside of regions are shed",
+    "and distances of most frames",
+    "and all outside of regions",
+    "and the oldest slices whole",
+)
+"""What each level of shedding says."""
+
+_MARGIN_PX: Final = 16
+"""Around a region, which moves, and may be less than its bar."""
+
+_SWEEP_US: Final = 100_000
+_WHOLE_US: Final = 20_000
+"""At the first levels, so much of each `_SWEEP_US` is left whole, in which new bars are found."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long slices may wait before something is shed.
+
+    Attributes:
+        waiting_ms: Of the oldest slice that waits, from which on rows outside of regions are shed; from twice
+            that on distances, from four times on all outside of regions.
+        most_ms: The same from which on the oldest slices are dropped whole: no result is later by more.
+        ranging_every: Under pressure, distances are measured of every n-th frame.
+
+    Raises:
+        ConfigError: A value is not positive, or `most_ms` is less than four times `waiting_ms`.
+    """
+
+    waiting_ms: float = 20.0
+    most_ms: float = 200.0
+    ranging_every: int = 4
+
+    def __post_init__(self) -> None:
+        if not self.waiting_ms > 0 or self.ranging_every < 1 or not self.most_ms >= 4 * self.waiting_ms:
+            raise ConfigError(
+                f"a budget of {self.waiting_ms:g} ms, {self.most_ms:g} ms at the most, every"
+                f" {self.ranging_every} frames: expected all positive, the most at least four times the first"
+            )
+
+    def level(self, waiting_ms: float, before: int) -> int:
+        """The level of shedding for how long the oldest slice waits; it falls only at half of what raised it.
+
+        >>> [Budget().level(ms, 0) for ms in (1, 25, 45, 90, 300)], Budget().level(25, 2)
+        ([0, 1, 2, 3, 4], 2)
+        """
+        limits_ms = (self.waiting_ms, 2 * self.waiting_ms, 4 * self.waiting_ms, self.most_ms)
+        level = sum(waiting_ms > limit_ms for limit_ms in limits_ms)
+        while level < before and waiting_ms > limits_ms[level] / 2:
+            level += 1
+        return level
+
+
+class Shedder:
+    """Leaves events out, as a level says, and counts them.
+
+    Args:
+        width: Columns of the sensor.
+        height: Its rows.
+
+    Attributes:
+        counts: Events left out so far: of `rows_outside_regions`, of `empty_areas`, and `too_late`.
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        self._size = width, height
+        self.counts = {"rows_outside_regions": 0, "empty_areas": 0, "too_late": 0}
+
+    def shed(self, events: Events, level: int, regions: Sequence[Region]) -> Events:
+        """The events that are left; all where there is no region, as one must be found first."""
+        if not level or not regions or not len(events):
+            return events
+        if level < 3:
+            if int(events.t_us[0]) % _SWEEP_US < _WHOLE_US:
+                return events
+            name, kept = "rows_outside_regions", self._rows(regions)[np.minimum(events.y, self._size[1] - 1)]
+        else:
+            name, kept = "empty_areas", self._inside(events, regions)
+        self.counts[name] += len(events) - int(np.count_nonzero(kept))
+        return events[kept]
+
+    def drop(self, events: Events) -> None:
+        """Count events that are dropped whole."""
+        self.counts["too_late"] += len(events)
+
+    def _rows(self, regions: Sequence[Region]) -> NDArray[np.bool_]:
+        rows = np.zeros(self._size[1], np.bool_)
+        for region in regions:
+            top, bottom = _reach(region.y_px, region.height_px, self._size[1])
+            rows[top:bottom] = True
+        return rows
+
+    def _inside(self, events: Events, regions: Sequence[Region]) -> NDArray[np.bool_]:
+        kept = np.zeros(len(events), np.bool_)
+        for region in regions:
+            left, right = _reach(region.x_px, region.width_px, self._size[0])
+            top, bottom = _reach(region.y_px, region.height_px, self._size[1])
+            kept |= (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
+        return kept
+
+
+def _reach(centre_px: float, size_px: float, most: int) -> tuple[int, int]:
+    """First and last but one row or column of a region, with its margin."""
+    first, last = centre_px - size_px / 2 - _MARGIN_PX, centre_px + size_px / 2 + _MARGIN_PX + 1
+    return min(max(int(first), 0), most), min(max(int(last), 0), most)

@@ -1,0 +1,59 @@
+"""How long results take, as quantiles in constant memory."""
+
+import itertools
+import math
+from typing import Final
+
+__all__ = ["DelayTally"]
+
+_FINEST_MS: Final = 1e-3
+_CELLS_PER_E: Final = 50
+"""Cells a factor of e: 2 % each."""
+_CELLS: Final = round(_CELLS_PER_E * math.log(1e9))
+
+
+class DelayTally:
+    """Delays counted in cells of 2 %, from 1 us to a million ms.
+
+    Attributes:
+        count: How many there were.
+        max_ms: The longest, ms; 0 before the first.
+
+    >>> tally = DelayTally()
+    >>> for delay_ms in (1.0, 2.0, 3.0, 40.0):
+    ...     tally.add(delay_ms)
+    >>> round(tally.quantile_ms(0.5), 1), tally.to_dict()["max_ms"]
+    (2.0, 40.0)
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.max_ms = 0.0
+        self._cells = [0] * (_CELLS + 1)
+
+    def add(self, delay_ms: float) -> None:
+        """Count a delay; one that is not positive counts as the shortest."""
+        self.count += 1
+        self.max_ms = max(self.max_ms, delay_ms)
+        cell = int(math.log(delay_ms / _FINEST_MS) * _CELLS_PER_E) + 1 if delay_ms > _FINEST_MS else 0
+        self._cells[min(cell, _CELLS)] += 1
+
+    def quantile_ms(self, share: float) -> float:
+        """The delay that this share of all does not exceed, ms, to 2 %; NaN where there are none."""
+        if not self.count:
+            return math.nan
+        due = math.ceil(share * self.count)
+        reached = itertools.accumulate(self._cells)
+        cell = next(cell for cell, many in enumerate(reached) if many >= due)
+        return min(_FINEST_MS * math.exp(cell / _CELLS_PER_E), self.max_ms)
+
+    def to_dict(self) -> dict[str, float | int | None]:
+        """Count, p50, p99 and maximum, ms, as JSON values."""
+        if not self.count:
+            return {"count": 0, "p50_ms": None, "p99_ms": None, "max_ms": None}
+        return {
+            "count": self.count,
+            "p50_ms": round(self.quantile_ms(0.5), 3),
+            "p99_ms": round(self.quantile_ms(0.99), 3),
+            "max_ms": round(self.max_ms, 3),
+        }

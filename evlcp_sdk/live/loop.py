@@ -1,0 +1,285 @@
+"""The loop of a live run: slices in, packets out, results to listeners, in bounded time."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.live.budget import LEVELS, Budget, Shedder
+from evlcp_sdk.live.delays import DelayTally
+from evlcp_sdk.live.outlet import Outlet
+from evlcp_sdk.live.pictures import PictureSlot
+from evlcp_sdk.live.reader import Reader, Slice
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.plugin.source import EventSource, Loss
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.signals import Stopped
+from evlcp_sdk.values import Events, Fix, Frame, Packet, Region
+
+__all__ = ["STAGES", "FrameEar", "LiveLoop", "LiveStatus"]
+
+STAGES: Final = ("gather", "queue", "compute", "total")
+"""Of a frame's delay: from its last chip until the slice with which it could be decoded was there; until that
+was taken; until the frame was decoded; and all of these."""
+
+_STATUS_EVERY_S: Final = 0.2
+_IDLE_S: Final = 0.05
+_TURN_EVENTS: Final = 1 << 16
+_TURN_US: Final = 8_000
+"""How much is taken at once where slices wait."""
+
+
+@dataclass(frozen=True, eq=False)
+class LiveStatus:
+    """How a live run goes.
+
+    Attributes:
+        t_us: Newest event, camera clock, us.
+        elapsed_s: Since the start, s.
+        events: Events so far, those shed too.
+        events_per_s: In the time since the last status.
+        waiting_ms: How long the oldest slice waits, ms.
+        waiting_events: Events that wait.
+        level: What is shed, a number of `LEVELS`.
+        level_text: The same in words.
+        shed: Events left out so far, by reason, and frames without a distance.
+        delays: Of all frames so far, by stage: count, p50, p99 and maximum, ms.
+        recent: The same since the last status.
+        counts: As of the receiver.
+        losses: As of the source.
+        regions: The regions that are followed.
+    """
+
+    t_us: float
+    elapsed_s: float
+    events: int
+    events_per_s: float
+    waiting_ms: float
+    waiting_events: int
+    level: int
+    level_text: str
+    shed: Mapping[str, int]
+    delays: Mapping[str, Mapping[str, float | int | None]]
+    recent: Mapping[str, Mapping[str, float | int | None]]
+    counts: Mapping[str, int]
+    losses: Mapping[str, Loss]
+    regions: tuple[Region, ...]
+
+
+class FrameEar:
+    """Hears of each frame as soon as it is decoded; joins the registry before the receiver is made."""
+
+    def __init__(self) -> None:
+        self.tell: Callable[[Frame], None] = lambda _frame: None
+
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str, value: Any, elapsed_s: float) -> None:
+        """Pass a frame on."""
+        if stage == "frame":
+            self.tell(value)
+
+
+class LiveLoop:
+    """Reads a source in real time, feeds the receiver, and tells listeners what it finds.
+
+    Args:
+        source: What is read; not closed.
+        receiver: What decodes it.
+        packet: Lengths of its link's frames.
+        ear: Hears the receiver's frames.
+        outlet: Where results go.
+        pictures: Where pictures are drawn; None for none.
+        budget: When what is shed.
+        clock: Gives the time, s.
+
+    Attributes:
+        delays: Of frames, by stage.
+        shed: What was left out so far.
+    """
+
+    def __init__(
+        self,
+        source: EventSource,
+        receiver: Receiver,
+        packet: PacketFormat,
+        ear: FrameEar,
+        outlet: Outlet,
+        pictures: PictureSlot | None = None,
+        budget: Budget | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._source, self._receiver, self._packet = source, receiver, packet
+        self._outlet, self._pictures = outlet, pictures
+        self._budget = Budget() if budget is None else budget
+        self._clock = clock
+        self._reader = Reader(source, clock)
+        self._size = source.width or 1280, source.height or 720
+        self._shedder = Shedder(*self._size)
+        self.delays = {stage: DelayTally() for stage in STAGES}
+        self._recent = {stage: DelayTally() for stage in STAGES}
+        self._level = 0
+        self._levels_s = [0.0] * len(LEVELS)
+        self._events = 0
+        self._last_us = 0.0
+        self._arrived_s = self._taken_s = self._start_s = self._status_s = clock()
+        self._status_events = 0
+        ear.tell = self._frame
+
+    def run(self, stopped: Stopped) -> Iterator[tuple[Events, list[Packet]]]:
+        """Yield what is received, piece by piece: the events that the receiver got, and its packets.
+
+        The listeners have had the frames, packets and messages by then. Ends where the source ends, or when
+        `stopped`; what waits then is still received where the source has ended.
+
+        Raises:
+            InputError: The source cannot be read on.
+        """
+        self._start_s = self._status_s = self._taken_s = self._clock()
+        self._reader.start()
+        try:
+            while not stopped():
+                piece = self._reader.take(_IDLE_S)
+                if piece is not None:
+                    yield self._turn(piece)
+                elif self._reader.ended:
+                    break
+                self._tell_status()
+        finally:
+            self._reader.stop()
+        if self._reader.fault is not None and not stopped():
+            raise self._reader.fault
+
+    def close(self) -> list[Packet]:
+        """End the stream; return the packets that were still incomplete."""
+        self._arrived_s = self._taken_s = float("nan")
+        packets = self._receiver.close()
+        self._tell(packets)
+        self._tell_status(now=True)
+        return packets
+
+    def fix(self, fix: Fix) -> None:
+        """Tell listeners of a fix."""
+        self._outlet.publish("fix", fix.t_us, fix)
+
+    def summary(self) -> dict[str, Any]:
+        """Delays by stage, what was shed, and for how long, as JSON values."""
+        return {
+            "delays": {stage: tally.to_dict() for stage, tally in self.delays.items()},
+            "shed": self.shed,
+            "levels_s": {text: round(s, 3) for text, s in zip(LEVELS, self._levels_s, strict=True)},
+        }
+
+    @property
+    def shed(self) -> dict[str, int]:
+        """Events left out so far, by reason, and frames without a distance."""
+        counts = dict(self._shedder.counts)
+        counts["too_late"] += self._reader.dropped
+        return counts | {"frames_not_ranged": self._receiver.counts.get("frames_not_ranged", 0)}
+
+    def _turn(self, piece: Slice) -> tuple[Events, list[Packet]]:
+        """Take a slice, and those that wait behind it, as far as they are few."""
+        taken_s = self._clock()
+        self._levels_s[self._level] += taken_s - self._taken_s
+        self._level = self._budget.level((taken_s - piece.arrived_s) * 1e3, self._level)
+        pieces = [piece]
+        while self._level == len(LEVELS) - 1 and taken_s - piece.arrived_s > self._budget.waiting_ms * 1e-3:
+            # All but the newest is too late.
+            newer = self._reader.take_nowait()
+            if newer is None:
+                break
+            self._publish_raw(piece)
+            self._shedder.drop(piece.events)
+            piece, pieces = newer, [newer]
+        events = len(piece.events)
+        while events < _TURN_EVENTS and taken_s - piece.arrived_s > 1e-3 * _TURN_US / 8:
+            more = self._reader.take_nowait()
+            if more is None:
+                break
+            pieces.append(more)
+            events += len(more.events)
+            if _span_us(pieces) > _TURN_US:
+                break
+        self._arrived_s, self._taken_s = pieces[-1].arrived_s, taken_s
+        regions = self._receiver.regions
+        self._receiver.ranging_every = self._budget.ranging_every if self._level >= 2 else 1
+        for one in pieces:
+            self._publish_raw(one)
+            if self._pictures is not None:
+                self._pictures.add(one.events, *self._size, regions)
+        whole = pieces[0].events if len(pieces) == 1 else Events.concat(one.events for one in pieces)
+        if len(whole):
+            self._last_us = float(whole.t_us[-1])
+        kept = self._shedder.shed(whole, self._level, regions)
+        packets = self._receiver.feed(kept)
+        self._tell(packets)
+        return kept, packets
+
+    def _publish_raw(self, piece: Slice) -> None:
+        self._events += len(piece.events)
+        if len(piece.events):
+            self._outlet.publish("events", float(piece.events.t_us[0]), piece.events)
+        if len(piece.triggers):
+            self._outlet.publish("triggers", float(piece.triggers.t_us[0]), piece.triggers)
+
+    def _frame(self, frame: Frame) -> None:
+        """Tell listeners of a frame, and count how long it took."""
+        now = self._clock()
+        last_us = frame.t_us + self._frame_chips(frame) * self._packet.chip_us
+        shone_s = self._source.clock_s(last_us)
+        if shone_s is None:
+            shone_s = self._reader.arrivals.at_s(last_us)
+        late_ms = None
+        if self._arrived_s == self._arrived_s:  # not at the end, whose time says nothing
+            parts_s = self._arrived_s - shone_s, self._taken_s - self._arrived_s, now - self._taken_s
+            late_ms = (now - shone_s) * 1e3
+            for stage, part_s in zip(STAGES, (*parts_s, now - shone_s), strict=True):
+                self.delays[stage].add(part_s * 1e3)
+                self._recent[stage].add(part_s * 1e3)
+        self._outlet.publish("frame", frame.t_us, frame, late_ms)
+
+    def _frame_chips(self, frame: Frame) -> int:
+        packet = self._packet
+        return packet.frame_chips if packet.has_pilot(frame.frame) else packet.info_chips
+
+    def _tell(self, packets: list[Packet]) -> None:
+        for packet in packets:
+            self._outlet.publish("packet", packet.t_us, packet)
+            for message in packet.messages:
+                self._outlet.publish("message", packet.t_us, message)
+
+    def _tell_status(self, *, now: bool = False) -> None:
+        """Say how it goes, where it is time for that."""
+        at_s = self._clock()
+        since_s = at_s - self._status_s
+        if since_s < _STATUS_EVERY_S and not now:
+            return
+        if self._outlet.wanted("status"):
+            self._outlet.publish("status", self._last_us, self._status(at_s, since_s))
+        self._status_s, self._status_events = at_s, self._events
+        self._recent = {stage: DelayTally() for stage in STAGES}
+
+    def _status(self, at_s: float, since_s: float) -> LiveStatus:
+        waiting, oldest_s = self._reader.waiting
+        return LiveStatus(
+            t_us=self._last_us,
+            elapsed_s=at_s - self._start_s,
+            events=self._events,
+            events_per_s=(self._events - self._status_events) / since_s if since_s > 0 else 0.0,
+            waiting_ms=max(at_s - oldest_s, 0.0) * 1e3,
+            waiting_events=waiting,
+            level=self._level,
+            level_text=LEVELS[self._level],
+            shed=self.shed,
+            delays={stage: tally.to_dict() for stage, tally in self.delays.items()},
+            recent={stage: tally.to_dict() for stage, tally in self._recent.items()},
+            counts=self._receiver.counts,
+            losses=self._source.losses,
+            regions=self._receiver.regions,
+        )
+
+
+def _span_us(pieces: list[Slice]) -> int:
+    """From the first event of some slices to their last, us."""
+    some = [one.events.t_us for one in pieces if len(one.events)]
+    return int(some[-1][-1] - some[0][0]) if some else 0

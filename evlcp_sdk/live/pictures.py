@@ -1,0 +1,101 @@
+"""Pictures of events, made when somebody asks for one."""
+
+import threading
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.late import Late
+from evlcp_sdk.values import Events, Region
+
+if TYPE_CHECKING:
+    from evlcp_sdk.live import _kernels
+else:
+    _kernels = Late("evlcp_sdk.live._kernels")
+
+__all__ = ["Picture", "PictureSlot"]
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """The events of a short time, and the regions in it.
+
+    Attributes:
+        t_us: Its end on the camera's clock, us.
+        window_us: How much time it shows, us.
+        cells: What each pixel showed, uint8 (height, width): 0 nothing, 1 OFF, 2 ON, 3 both.
+        regions: The regions that are followed.
+        number: Counted from 0.
+    """
+
+    t_us: int
+    window_us: int
+    cells: NDArray[np.uint8]
+    regions: tuple[Region, ...]
+    number: int
+
+
+class PictureSlot:
+    """Holds the newest picture, drawn only when it was asked for.
+
+    Args:
+        window_us: How much time a picture shows, us.
+    """
+
+    def __init__(self, window_us: int = 10_000) -> None:
+        self.window_us = window_us
+        self._recent: deque[Events] = deque()
+        self._asked = False
+        self._picture: Picture | None = None
+        self._drawn = threading.Condition()
+        self._number = 0
+        self._over = False
+
+    def ask(self) -> None:
+        """Have a picture drawn with the next slice."""
+        self._asked = True
+
+    def take(self, timeout_s: float | None = None) -> Picture | None:
+        """Ask for a picture, and wait for it; None after the time-out, or when the run is over."""
+        with self._drawn:
+            self._picture = None
+            self._asked = True
+            self._drawn.wait_for(lambda: self._picture is not None or self._over, timeout_s)
+            return self._picture
+
+    @property
+    def newest(self) -> Picture | None:
+        """The last picture that was drawn."""
+        return self._picture
+
+    def add(self, events: Events, width: int, height: int, regions: Sequence[Region]) -> None:
+        """Take the next slice; draw where a picture was asked for. Called by the loop."""
+        if not len(events):
+            return
+        self._recent.append(events)
+        end_us = int(events.t_us[-1])
+        while int(self._recent[0].t_us[-1]) <= end_us - self.window_us:
+            self._recent.popleft()
+        if not self._asked:
+            return
+        self._asked = False
+        cells = np.zeros((height, width), np.uint8)
+        for piece in self._recent:
+            first = int(np.searchsorted(piece.t_us, end_us - self.window_us, "right"))
+            _kernels.paint(cells, piece.x[first:], piece.y[first:], piece.p[first:])
+        picture = Picture(end_us, self.window_us, cells, tuple(regions), self._number)
+        self._number += 1
+        with self._drawn:
+            self._picture = picture
+            self._drawn.notify_all()
+
+    def close(self) -> None:
+        """Draw nothing more."""
+        with self._drawn:
+            self._over = True
+            self._recent.clear()
+            self._drawn.notify_all()

@@ -1,0 +1,169 @@
+"""Reads a source in a thread of its own, so that what waits is seen, and can be left out."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from evlcp_sdk.plugin.source import EventSource
+from evlcp_sdk.values import Events, Triggers
+
+__all__ = ["ArrivalClock", "Reader", "Slice"]
+
+_MOST_EVENTS: Final = 1 << 24
+"""Events that wait at the most, half a second of the most that a camera gives: the oldest go."""
+
+_BUCKET_S: Final = 1.0
+_BUCKETS: Final = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Slice:
+    """A piece of the stream as it came.
+
+    Attributes:
+        events: Its events.
+        triggers: Its triggers.
+        arrived_s: When it was there, s.
+    """
+
+    events: Events
+    triggers: Triggers
+    arrived_s: float
+
+
+class ArrivalClock:
+    """When a camera time was on our own clock, by the slices that came soonest after their last event.
+
+    The least delay of the last seconds counts as none: what camera and cable take cannot be seen.
+
+    >>> clock = ArrivalClock()
+    >>> clock.arrived(1_000, 7.0021)
+    >>> clock.arrived(2_000, 7.0030)
+    >>> round(clock.at_s(3_000), 6)
+    7.004
+    """
+
+    def __init__(self) -> None:
+        self._least: deque[tuple[float, float]] = deque()
+
+    def arrived(self, t_us: float, arrived_s: float) -> None:
+        """Take a slice's last time and when it was there."""
+        offset_s = arrived_s - t_us * 1e-6
+        if not self._least or arrived_s >= self._least[-1][0] + _BUCKET_S:
+            self._least.append((arrived_s, offset_s))
+            while len(self._least) > _BUCKETS:
+                self._least.popleft()
+        elif offset_s < self._least[-1][1]:
+            self._least[-1] = self._least[-1][0], offset_s
+        if self._least and offset_s < min(least_s for _, least_s in self._least) - 1.0:
+            # The camera's clock has leaped ahead.
+            self._least = deque([(arrived_s, offset_s)])
+
+    def at_s(self, t_us: float) -> float:
+        """When a camera time was, s."""
+        return t_us * 1e-6 + min((offset_s for _, offset_s in self._least), default=0.0)
+
+
+class Reader:
+    """The slices of a source, read ahead by a thread.
+
+    Of a live source what is not taken in time is dropped, the oldest first, beyond `_MOST_EVENTS`; any other
+    waits.
+
+    Args:
+        source: What is read; not closed.
+        clock: Gives the time, s.
+        most_events: Events that wait at the most.
+
+    Attributes:
+        dropped: Events that were dropped so, so far.
+        fault: What ended the reading, where that was a fault.
+        ended: Nothing more will come, and nothing waits.
+    """
+
+    def __init__(
+        self,
+        source: EventSource,
+        clock: Callable[[], float] = time.monotonic,
+        most_events: int = _MOST_EVENTS,
+    ) -> None:
+        self._source = source
+        self._clock = clock
+        self._most = most_events
+        self._waiting: deque[Slice] = deque()
+        self._events = 0
+        self._changed = threading.Condition()
+        self._over = self._left = False
+        self.arrivals = ArrivalClock()
+        self.dropped = 0
+        self.fault: BaseException | None = None
+        self._thread = threading.Thread(target=self._read, name="evlcp-reader", daemon=True)
+
+    def start(self) -> None:
+        """Begin to read."""
+        self._thread.start()
+
+    @property
+    def ended(self) -> bool:
+        """Nothing more will come, and nothing waits."""
+        return self._over and not self._waiting
+
+    @property
+    def waiting(self) -> tuple[int, float]:
+        """How many events wait, and since when the oldest does, s; now where nothing waits."""
+        with self._changed:
+            return self._events, self._waiting[0].arrived_s if self._waiting else self._clock()
+
+    def take(self, timeout_s: float) -> Slice | None:
+        """The next slice; None after the time-out, or at the end."""
+        with self._changed:
+            if not self._waiting and not self._over:
+                self._changed.wait_for(lambda: self._waiting or self._over, timeout_s)
+            if not self._waiting:
+                return None
+            piece = self._waiting.popleft()
+            self._events -= len(piece.events)
+            if not self._source.live:
+                self._changed.notify_all()
+            return piece
+
+    def take_nowait(self) -> Slice | None:
+        """The next slice if one waits."""
+        return self.take(0.0) if self._waiting else None
+
+    def stop(self, timeout_s: float = 1.0) -> bool:
+        """Read no more; whether the thread has ended: a source that waits for a camera may not."""
+        with self._changed:
+            self._left = True
+            self._changed.notify_all()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _read(self) -> None:
+        try:
+            for events, triggers in self._source.stream():
+                if not self._put(Slice(events, triggers, self._clock())):
+                    break
+        except BaseException as fault:
+            self.fault = fault
+        with self._changed:
+            self._over = True
+            self._changed.notify_all()
+
+    def _put(self, piece: Slice) -> bool:
+        if len(piece.events):
+            self.arrivals.arrived(float(piece.events.t_us[-1]), piece.arrived_s)
+        with self._changed:
+            if not self._source.live:
+                self._changed.wait_for(lambda: self._events < self._most or self._left)
+            self._waiting.append(piece)
+            self._events += len(piece.events)
+            while self._source.live and self._events > self._most and len(self._waiting) > 1:
+                old = self._waiting.popleft()
+                self._events -= len(old.events)
+                self.dropped += len(old.events)
+            self._changed.notify_all()
+            return not self._left

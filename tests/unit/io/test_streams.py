@@ -1,0 +1,181 @@
+"""Streams from sockets, and recordings again and again, give what is in the file."""
+
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.io import LoopSource, open_source, write_events
+from evlcp_sdk.values import Events, Triggers
+
+EVENTS = Events.of(np.arange(3000) * 7, np.arange(3000) % 640, np.arange(3000) % 480, np.arange(3000) % 2)
+
+
+@pytest.fixture(params=["EVT2", "EVT3"])
+def recording(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    path = tmp_path / f"{request.param}.raw"
+    write_events(path, EVENTS, 640, 480, format=request.param)
+    return path
+
+
+@contextmanager
+def sent(listening: socket.socket, data: bytes) -> Iterator[None]:
+    """One who connects is sent some bytes, in odd pieces."""
+
+    def send() -> None:
+        connection, _ = listening.accept()
+        with connection:
+            for at in range(0, len(data), 1001):
+                connection.sendall(data[at : at + 1001])
+
+    thread = threading.Thread(target=send, daemon=True)
+    thread.start()
+    with listening:
+        yield
+        thread.join(5)
+
+
+def same(events: Events) -> bool:
+    return all((getattr(events, name) == getattr(EVENTS, name)).all() for name in ("t_us", "x", "y", "p"))
+
+
+@pytest.mark.parametrize("scheme", ["tcp", "unix"])
+def test_a_stream_gives_what_is_in_the_file(scheme: str, recording: Path, tmp_path: Path) -> None:
+    if scheme == "tcp":
+        listening = socket.create_server(("localhost", 0))
+        url = f"tcp://localhost:{listening.getsockname()[1]}"
+    else:
+        listening = socket.socket(socket.AF_UNIX)
+        listening.bind(str(tmp_path / "s"))
+        listening.listen()
+        url = f"unix:{tmp_path / 's'}"
+    with sent(listening, recording.read_bytes()), open_source(url) as source:
+        assert (source.live, source.format, source.width) == (True, recording.stem, 640)
+        assert same(source.read()[0])
+        assert source.losses == {}
+
+
+def test_a_stream_without_a_header_is_what_its_name_says(recording: Path) -> None:
+    words = recording.read_bytes().partition(b"% end\n")[2]
+    listening = socket.create_server(("localhost", 0))
+    port = listening.getsockname()[1]
+    url = f"tcp://localhost:{port}?evt={recording.stem[-1]}&size=640x480"
+    with sent(listening, words), open_source(url) as source:
+        assert (source.format, source.width, source.height) == (recording.stem, 640, 480)
+        assert same(source.read()[0])
+
+
+def test_datagrams_are_read_as_they_come(recording: Path) -> None:
+    header, _, words = recording.read_bytes().partition(b"% end\n")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("localhost", 0))
+        port = probe.getsockname()[1]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        ready = threading.Event()
+
+        def send() -> None:
+            # A header before every second piece, for whoever begins to listen later.
+            ready.wait(5)
+            for n, at in enumerate(range(0, len(words), 1400)):
+                if n % 2 == 0:
+                    sender.sendto(header + b"% end\n", ("localhost", port))
+                sender.sendto(words[at : at + 1400], ("localhost", port))
+
+        thread = threading.Thread(target=send, daemon=True)
+        thread.start()
+        # The socket is bound before the first datagram is waited for.
+        threading.Timer(0.2, ready.set).start()
+        with open_source(f"udp://localhost:{port}") as source:
+            assert source.format == recording.stem
+            got = Events.empty()
+            for events, _ in source.stream():
+                got = Events.concat([got, events])
+                if len(got) == len(EVENTS):
+                    break
+        thread.join(5)
+    assert same(got)
+
+
+def test_a_read_ends_when_the_source_is_closed(recording: Path) -> None:
+    listening = socket.create_server(("localhost", 0))
+    url = f"tcp://localhost:{listening.getsockname()[1]}"
+    ended = threading.Event()
+
+    def send() -> None:
+        connection, _ = listening.accept()
+        with connection:
+            connection.sendall(recording.read_bytes())
+            ended.wait(9)
+
+    thread = threading.Thread(target=send, daemon=True)
+    thread.start()
+    with listening:
+        source = open_source(url)
+        threading.Timer(0.2, source.close).start()
+        assert same(Events.concat(source.chunks()))
+        ended.set()
+        thread.join(5)
+
+
+@pytest.mark.parametrize(
+    ("url", "told"),
+    [
+        ("tcp://localhost:1", "Connection refused; expected a program that sends there"),
+        ("tcp://localhost", "expected tcp://HOST:PORT"),
+        ("tcp:localhost:99", "expected tcp://HOST:PORT"),
+        ("udp://localhost:99999", "expected udp://HOST:PORT"),
+        ("udp://192.0.2.1:5600", "expected an address of this machine"),
+        ("unix:/no/such", "expected a socket that a program listens on"),
+        ("tcp://localhost:1?evt=4", "evt = '4': expected 2 or 3"),
+        ("tcp://localhost:1?size=big", "size = 'big': expected WIDTHxHEIGHT"),
+    ],
+)
+def test_what_is_wrong_with_a_stream_is_said(url: str, told: str) -> None:
+    with pytest.raises(InputError) as fault:
+        open_source(url)
+    assert str(fault.value).startswith(url)
+    assert told in str(fault.value)
+
+
+def test_a_pipe_in_the_dark_is_opened_at_once(recording: Path) -> None:
+    """The header is enough; events come when there are any."""
+    end, start = os.pipe()
+    header, mark, words = recording.read_bytes().partition(b"% end\n")
+    os.write(start, header + mark)
+    with open_source(f"/dev/fd/{end}") as source:
+        assert source.width == 640
+        os.write(start, words[:5000])
+        os.close(start)
+        assert len(source.read()[0]) > 100
+    os.close(end)
+
+
+def test_a_loop_goes_on_with_its_clock(tmp_path: Path) -> None:
+    events = Events.of([1000, 2000, 4000], [1, 2, 3], [0] * 3, [1] * 3)
+    write_events(tmp_path / "a.npz", events, 640, 480, Triggers.of([4500], [1], [1]))
+    with LoopSource(lambda: open_source(tmp_path / "a.npz"), seam_us=500, for_us=8000) as source:
+        got, triggers = source.read()
+        assert source.passes == 3
+    assert got.t_us.tolist() == [1000, 2000, 4000, 5000, 6000, 8000, 9000, 10000, 12000]
+    assert got.x.tolist() == [1, 2, 3] * 3
+    assert triggers.t_us.tolist() == [4500, 8500, 12500]
+    assert source.counts == {"events": 9, "triggers": 3}
+
+
+def test_losses_of_all_passes_add_up(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t_us,x,y,p\n10,1,1,1\n20,1,1,1\n5,1,1,1\n30,1,1,1\n")
+    with LoopSource(lambda: open_source(tmp_path / "a.csv"), for_us=600_000) as source:
+        assert len(source.read()[0]) == 9
+        assert source.losses["time_backward"].count == 3
+
+
+def test_a_loop_of_nothing_ends(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t_us,x,y,p\n")
+    with open_source(f"replay:{tmp_path / 'a.csv'}?loop=1") as source:
+        assert len(source.read()[0]) == 0

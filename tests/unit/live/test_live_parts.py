@@ -1,0 +1,223 @@
+"""Listeners, delays, pictures, the budget and the reader of a live run, one by one."""
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.errors import ConfigError, InputError, StreamError
+from evlcp_sdk.live import Budget, DelayTally, Outlet, PictureSlot, Shedder
+from evlcp_sdk.live.reader import ArrivalClock, Reader
+from evlcp_sdk.plugin.source import EventSource
+from evlcp_sdk.values import Events, Region, Triggers
+
+
+def events_at(t_us: list[int] | np.ndarray, seed: int = 0) -> Events:
+    rng = np.random.default_rng(seed)
+    n = len(t_us)
+    return Events.of(t_us, rng.integers(0, 1280, n), rng.integers(0, 720, n), rng.integers(0, 2, n))
+
+
+def test_each_listener_gets_its_kinds_and_its_queue() -> None:
+    outlet = Outlet()
+    woken = []
+    frames = outlet.subscribe({"frame"}, most=3, wake=lambda: woken.append(1))
+    everything = outlet.subscribe()
+    for number in range(5):
+        outlet.publish("frame", number, number, late_ms=0.5)
+        outlet.publish("status", number, number)
+    assert [news.value for news in frames.take()] == [2, 3, 4]
+    assert (frames.dropped, everything.dropped, len(woken)) == (2, 0, 5)
+    assert [(news.kind, news.value) for news in everything.take()][:2] == [("frame", 0), ("status", 0)]
+    assert frames.take(timeout_s=0) == []
+    outlet.leave(frames)
+    outlet.publish("frame", 9.0, 9)
+    assert frames.ended
+    assert not everything.ended
+    outlet.close()
+    assert [news.value for news in everything.take()] == [9]
+    assert everything.ended
+    assert outlet.subscribe().ended
+
+
+def test_who_waits_is_woken_by_news_and_by_the_end() -> None:
+    outlet = Outlet()
+    mine = outlet.subscribe({"status"})
+    got: list[object] = []
+
+    def listen() -> None:
+        while not mine.ended:
+            got.extend(news.value for news in mine.take())
+
+    thread = threading.Thread(target=listen)
+    thread.start()
+    outlet.publish("status", 0.0, "a")
+    outlet.close()
+    thread.join(5)
+    assert not thread.is_alive()
+    assert got == ["a"]
+
+
+def test_unknown_kinds_are_refused() -> None:
+    with pytest.raises(StreamError, match="news of kind 'frames', expected frame, packet"):
+        Outlet().subscribe({"frames"})
+    with pytest.raises(StreamError, match="a queue of 0 news"):
+        Outlet().subscribe(most=0)
+
+
+def test_quantiles_are_those_of_numpy_to_two_percent() -> None:
+    rng = np.random.default_rng(1)
+    delays_ms = rng.lognormal(0.5, 1.5, 5000)
+    tally = DelayTally()
+    for delay_ms in delays_ms:
+        tally.add(float(delay_ms))
+    for share in (0.01, 0.5, 0.99, 1.0):
+        expected = np.quantile(delays_ms, share, method="inverted_cdf")
+        assert expected * 0.999 <= tally.quantile_ms(share) <= expected * 1.021
+    told = tally.to_dict()
+    assert told["count"] == 5000
+    assert told["max_ms"] == round(float(delays_ms.max()), 3)
+    assert DelayTally().to_dict()["p50_ms"] is None
+
+
+def test_a_picture_shows_what_each_pixel_did() -> None:
+    slot = PictureSlot(window_us=1000)
+    slot.ask()
+    events = events_at(np.sort(np.random.default_rng(2).integers(0, 5000, 4000)))
+    asked_at = {3000, 5000}
+    drawn = []
+    for from_us in range(0, 5000, 500):
+        piece = events[(events.t_us >= from_us) & (events.t_us < from_us + 500)]
+        if from_us + 500 in asked_at:
+            slot.ask()
+        before = slot.newest
+        slot.add(piece, 1280, 720, [])
+        if slot.newest is not before:
+            drawn.append(slot.newest)
+    assert [picture.number for picture in drawn if picture] == [0, 1, 2]
+    for picture in drawn:
+        assert picture is not None
+        cells = np.zeros((720, 1280), np.uint8)
+        inside = (events.t_us > picture.t_us - 1000) & (events.t_us <= picture.t_us)
+        for polarity in (0, 1):
+            some = events[inside & (events.p == polarity)]
+            cells[some.y, some.x] |= 1 << polarity
+        assert (picture.cells == cells).all()
+
+
+def test_who_waits_for_a_picture_gets_a_new_one_or_none_at_the_end() -> None:
+    slot = PictureSlot()
+    assert slot.take(0.01) is None
+    threading.Timer(0.05, lambda: slot.add(events_at([5]), 1280, 720, [])).start()
+    picture = slot.take(5.0)
+    assert picture is not None
+    assert np.count_nonzero(picture.cells) == 1
+    slot.close()
+    assert slot.take(5.0) is None
+
+
+def test_what_is_shed_and_counted_is_what_lies_outside() -> None:
+    events = events_at(np.arange(50_000, 54_000))
+    regions = [Region(0, 0.0, 100.0, 200.0, 20.0, 60.0), Region(1, 0.0, 1270.0, 700.0, 20.0, 60.0)]
+    shedder = Shedder(1280, 720)
+    assert shedder.shed(events, 0, regions) is events
+    assert shedder.shed(events, 4, []) is events
+    rows = [y for y in range(720) if any(abs(y - r.y_px) <= r.height_px / 2 + 16 for r in regions)]
+    by_rows = shedder.shed(events, 1, regions)
+    assert (by_rows.t_us == events.t_us[np.isin(events.y, rows)]).all()
+    inside = np.zeros(len(events), bool)
+    for r in regions:
+        near_x = np.abs(events.x - r.x_px) <= r.width_px / 2 + 16
+        inside |= near_x & (np.abs(events.y - r.y_px) <= r.height_px / 2 + 16)
+    by_area = shedder.shed(events, 3, regions)
+    assert (by_area.t_us == events.t_us[inside]).all()
+    assert shedder.counts == {
+        "rows_outside_regions": len(events) - len(by_rows),
+        "empty_areas": len(events) - len(by_area),
+        "too_late": 0,
+    }
+    # New bars are found in times that are left whole.
+    sweep = events_at(np.arange(100_000, 101_000))
+    assert len(shedder.shed(sweep, 2, regions)) == 1000
+    assert len(shedder.shed(sweep, 3, regions)) < 1000
+
+
+def test_a_budget_rises_at_once_and_falls_at_half() -> None:
+    budget = Budget(waiting_ms=10, most_ms=100)
+    levels, level = [], 0
+    for waiting_ms in (0, 11, 6, 4, 21, 15, 9, 41, 101, 60, 49, 19, 9, 4):
+        level = budget.level(waiting_ms, level)
+        levels.append(level)
+    assert levels == [0, 1, 1, 0, 2, 2, 1, 3, 4, 4, 3, 2, 1, 0]
+    with pytest.raises(ConfigError, match="the most at least four times"):
+        Budget(waiting_ms=10, most_ms=20)
+
+
+def test_the_least_delay_of_the_last_seconds_is_none_and_drift_is_followed() -> None:
+    clock = ArrivalClock()
+    rng = np.random.default_rng(3)
+    for n in range(20_000):
+        t_us = n * 1000.0
+        # The camera's clock is 100 ppm slow; slices come up to 3 ms late.
+        arrived_s = 5.0 + t_us * 1e-6 * 1.0001 + rng.uniform(0, 3e-3)
+        clock.arrived(t_us, arrived_s)
+    assert abs(clock.at_s(20e6) - (5.0 + 20 * 1.0001)) < 0.5e-3
+    # The camera's clock leaps ahead by a minute.
+    clock.arrived(80e6, 25.1)
+    assert clock.at_s(80e6) == pytest.approx(25.1)
+
+
+class Counted(EventSource):
+    """A thousand pieces of ten events, as fast as they are taken."""
+
+    def __init__(self, live: bool, fault: Exception | None = None) -> None:
+        super().__init__(Path("counted"), "X", 1280, 720)
+        self.live = live
+        self.pieces: Iterator[int] = iter(range(1000))
+        self.fault = fault
+
+    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
+        n = next(self.pieces, None)
+        if n is None:
+            if self.fault:
+                raise self.fault
+            return None
+        return events_at([n] * 10), Triggers.empty()
+
+    def close(self) -> None:
+        pass
+
+
+def read_all(reader: Reader, wait_s: float) -> list[int]:
+    reader.start()
+    time.sleep(wait_s)
+    got = []
+    while not reader.ended:
+        piece = reader.take(0.05)
+        if piece is not None:
+            got.append(int(piece.events.t_us[0]))
+    return got
+
+
+def test_a_file_waits_for_its_reader_and_a_camera_does_not() -> None:
+    reader = Reader(Counted(live=False), most_events=50)
+    assert read_all(reader, 0.05) == list(range(1000))
+    assert (reader.dropped, reader.fault) == (0, None)
+    reader = Reader(Counted(live=True), most_events=50)
+    got = read_all(reader, 0.2)
+    assert got == list(range(1000 - len(got), 1000))
+    assert reader.dropped == 10 * (1000 - len(got)) > 0
+    fault = InputError("unplugged")
+    reader = Reader(Counted(live=True, fault=fault))
+    assert len(read_all(reader, 0.0)) == 1000
+    assert reader.fault is fault
+
+
+def test_a_reader_that_is_stopped_ends() -> None:
+    reader = Reader(Counted(live=False), most_events=50)
+    reader.start()
+    time.sleep(0.02)
+    assert reader.stop()

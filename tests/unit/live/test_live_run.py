@@ -1,0 +1,186 @@
+"""A live run gives what a run over the file gives, and leaves out what it has no time for, counted."""
+
+import json
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.io import RawSource, ReplaySource
+from evlcp_sdk.live import Budget, LiveStatus, Outlet, PictureSlot, Subscription
+from evlcp_sdk.plugin.source import EventSource
+from evlcp_sdk.run import live, receive
+from evlcp_sdk.values import Events, Frame, Triggers
+
+PATIENT = Budget(waiting_ms=1e6, most_ms=1e7)
+
+
+def key(frame: Frame) -> tuple[Any, ...]:
+    distance = frame.range.distance_m
+    return (
+        frame.transmitter,
+        frame.packet,
+        frame.frame,
+        frame.t_us,
+        frame.soft.symbols.tolist(),
+        repr(distance),
+    )
+
+
+def gathered(subscription: Subscription) -> dict[str, list[Any]]:
+    found: dict[str, list[Any]] = {}
+    for news in subscription.take():
+        found.setdefault(news.kind, []).append(news.value)
+    assert subscription.dropped == 0
+    return found
+
+
+def test_a_replay_gives_what_the_file_gives(demo_raw: Path, tmp_path: Path) -> None:
+    outlet, pictures = Outlet(), PictureSlot()
+    pictures.ask()
+    mine = outlet.subscribe(most=100_000)
+    summary = live(
+        f"replay:{demo_raw}?speed=50",
+        tmp_path / "out",
+        outlet=outlet,
+        pictures=pictures,
+        budget=PATIENT,
+        warm=False,
+    )
+    found = gathered(mine)
+    packets = list(receive(demo_raw))
+    assert [key(f) for f in found["frame"]] == [key(f) for packet in packets for f in packet.frames]
+    assert [key(p.frames[0]) for p in found["packet"]] == [key(p.frames[0]) for p in packets]
+    with RawSource(demo_raw) as source:
+        events, _ = source.read()
+    assert (Events.concat(found["events"]).t_us == events.t_us).all()
+    last: LiveStatus = found["status"][-1]
+    assert (last.events, last.level, sum(last.shed.values())) == (len(events), 0, 0)
+    assert found["end"] == [summary]
+    assert summary["status"] == "complete"
+    assert summary["live"]["delays"]["total"]["count"] > 0
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["live"] == summary["live"]
+    assert pictures.newest is not None
+
+
+class Burst(EventSource):
+    """A recording all at once, as from a camera that a stalled program comes back to."""
+
+    live = True
+
+    def __init__(self, path: Path) -> None:
+        self._source = RawSource(path)
+        super().__init__(path, "X", self._source.width, self._source.height)
+
+    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
+        return next(self._source.stream(2000), None)
+
+    def close(self) -> None:
+        self._source.close()
+
+
+def test_what_there_is_no_time_for_is_left_out_and_counted(demo_raw: Path) -> None:
+    outlet = Outlet()
+    mine = outlet.subscribe({"events", "status"}, most=100_000)
+    summary = live(Burst(demo_raw), outlet=outlet, budget=Budget(waiting_ms=0.1, most_ms=0.4), warm=False)
+    with RawSource(demo_raw) as source:
+        total = len(source.read()[0])
+    assert sum(len(events) for events in gathered(mine)["events"]) == total
+    shed = summary["live"]["shed"]
+    assert shed["too_late"] > 0
+    left_out = sum(n for name, n in shed.items() if name != "frames_not_ranged")
+    assert summary["counts"]["events"] + left_out == total
+
+
+def test_distances_are_measured_of_every_nth_frame(demo_raw: Path) -> None:
+    frames = []
+    for every in (1, 3):
+        reception = receive(demo_raw)
+        reception.receiver.ranging_every = every
+        frames.append([frame for packet in reception for frame in packet.frames if frame.points_px.size])
+        assert reception.counts["frames_not_ranged"] == len(frames[-1]) - len(frames[-1]) // every
+    measured = [[not np.isnan(frame.range.distance_m) for frame in some] for some in frames]
+    assert all(measured[0])
+    assert measured[1] == [n % 3 == 2 for n in range(len(frames[1]))]
+    assert [f.soft.symbols.tolist() for f in frames[0]] == [f.soft.symbols.tolist() for f in frames[1]]
+
+
+def test_a_listener_that_never_takes_is_not_waited_for(demo_raw: Path) -> None:
+    outlet = Outlet()
+    stalled = outlet.subscribe(most=1)
+    live(f"replay:{demo_raw}?speed=50", outlet=outlet, budget=PATIENT, warm=False)
+    assert stalled.dropped > 0
+    assert [news.kind for news in stalled.take()] == ["end"]
+
+
+def test_it_ends_when_it_is_asked_to(demo_raw: Path) -> None:
+    asked = threading.Event()
+    outlet = Outlet()
+    outlet.subscribe({"frame"}, wake=asked.set)
+    summary = live(
+        f"replay:{demo_raw}?loop=1", outlet=outlet, budget=PATIENT, warm=False, stopped=asked.is_set
+    )
+    assert summary["status"] == "interrupted"
+    assert summary["counts"]["frames"] > 0
+
+
+def test_a_recording_is_replayed_at_its_own_pace(demo_raw: Path) -> None:
+    assert live(demo_raw, budget=PATIENT, warm=False)["processing"]["elapsed_s"] > 0.05
+
+
+def test_a_source_that_fails_gives_what_came_before(demo_raw: Path) -> None:
+    class Failing(Burst):
+        def take(self, max_events: int) -> tuple[Events, Triggers] | None:
+            piece = super().take(max_events)
+            if piece is None:
+                raise InputError("cam: unplugged")
+            return piece
+
+    summary = live(Failing(demo_raw), budget=PATIENT, warm=False)
+    assert (summary["status"], summary["error"]) == ("failed", "cam: unplugged")
+    assert summary["counts"]["frames"] > 0
+
+
+def test_the_command(evlcp: Callable[..., Any], demo_raw: Path) -> None:
+    run = evlcp("live", f"replay:{demo_raw}?speed=20", "--json", "--waiting-ms", "100000")
+    assert run.code == 0
+    summary = json.loads(run.out)
+    assert summary["transmitters"]
+    assert set(summary["live"]) == {"delays", "shed", "levels_s"}
+    run = evlcp("live", f"replay:{demo_raw}?speed=20", "--json-lines", "-", "--waiting-ms", "100000")
+    lines = [json.loads(line) for line in run.out.splitlines()]
+    assert lines[-1]["line"] == "summary"
+    assert {"frame"} <= {line["line"] for line in lines}
+    run = evlcp("live", "nowhere:1")
+    assert run.code == 3
+    assert (
+        "scheme 'nowhere', expected file:, replay:, tcp:, udp:, unix: or one that a plugin opens" in run.err
+    )
+
+
+@pytest.mark.parametrize(
+    ("url", "told"),
+    [
+        ("replay:{}?speed=0", "speed = '0': expected a number above 0"),
+        ("replay:{}?sped=2", "option 'sped'; did you mean 'speed'?"),
+        ("replay:{}?loop=2", "loop = '2': expected 0 or 1"),
+        ("replay:{}?for_s=2", "for_s = 2: only with loop=1"),
+        ("replay:replay:{}", "has a pace of its own"),
+        ("replay:", "expected replay:REC"),
+    ],
+)
+def test_what_is_wrong_with_a_replay_is_said(url: str, told: str, demo_raw: Path) -> None:
+    from evlcp_sdk.io import open_source
+
+    with pytest.raises(InputError) as fault:
+        open_source(url.format(demo_raw))
+    assert told in str(fault.value)
+
+
+def test_a_replay_that_is_open_is_taken_as_it_is(demo_raw: Path) -> None:
+    summary = live(ReplaySource(RawSource(demo_raw), speed=100), budget=PATIENT, warm=False)
+    assert summary["status"] == "complete"
