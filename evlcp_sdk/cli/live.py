@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from evlcp_sdk.cli._common import LinkFile, Overrides, complain, echo
+from evlcp_sdk.cli._receiving import attitude_of, clock_zero_of, json_lines_of, position_plan_of
 from evlcp_sdk.cli._summary import show
 
 __all__ = ["register"]
@@ -78,7 +79,6 @@ def live(
     Where the receiver cannot keep up, it leaves out, in this order, and counts: rows outside of regions, the
     distances of most frames, all outside of regions, the oldest events. Ctrl-C ends it, with its summary.
     """
-    from evlcp_sdk.cli.receive import attitude_of, clock_zero_of, json_lines_of, position_plan_of
     from evlcp_sdk.errors import InputError, InterruptedRunError
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.live.budget import Budget

@@ -1,6 +1,5 @@
 """`evlcp receive`."""
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ from evlcp_sdk.cli._common import (
     hush,
     make_executor,
 )
+from evlcp_sdk.cli._receiving import LinePrinter, attitude_of, clock_zero_of, json_lines_of, position_plan_of
 from evlcp_sdk.cli._summary import show
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 
-__all__ = ["attitude_of", "clock_zero_of", "json_lines_of", "position_plan_of", "register"]
+__all__ = ["register"]
 
 
 class LinkMode(StrEnum):
@@ -299,70 +299,6 @@ def _fitted(job: ReceiveJob, link: "Link", registry: "Registry") -> ReceiveJob:
     return replace(job, link=best.link)
 
 
-def attitude_of(
-    file: Path | None,
-    angles: tuple[float | None, float | None, float | None],
-    sigmas: tuple[float, float, float, float],
-) -> "Attitude | AttitudeLog | None":
-    """What the options say of the camera's attitude; None for nothing."""
-    import math
-
-    from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
-
-    heading, pitch, roll = angles
-    if file is not None and angles != (None, None, None):
-        raise typer.BadParameter("give a file or angles, not both", param_hint="--attitude")
-    if (pitch is None) != (roll is None) or (heading is not None and pitch is None):
-        raise typer.BadParameter(
-            "gravity needs --pitch-deg and --roll-deg; a heading needs gravity", param_hint="--pitch-deg"
-        )
-    names = (
-        *("--heading-deg", "--pitch-deg", "--roll-deg"),
-        *("--gravity-sigma-deg", "--heading-sigma-deg", "--white-sigma-deg", "--time-sigma-us"),
-    )
-    for name, said in zip(names, (*angles, *sigmas), strict=True):
-        if said is not None and not math.isfinite(said):
-            raise typer.BadParameter(f"{said}: expected a finite number", param_hint=name)
-    if file is not None:
-        return AttitudeLog.read(file, Attitude(0.0, 0.0, None, *sigmas))
-    return Attitude(pitch, roll, heading, *sigmas) if pitch is not None and roll is not None else None
-
-
-def position_plan_of(
-    sites: Path | None, gnss: Path | None, link: "Link", zero: "datetime | None", *, mcap: bool
-) -> "PositionPlan | None":
-    """What the options say of positions; None without sites."""
-    if sites is None:
-        for name, given in (("--mcap", mcap), ("--gnss", gnss is not None)):
-            if given:
-                raise typer.BadParameter("needs --sites", param_hint=name)
-        return None
-    from evlcp_sdk.place.gnss import GnssLog
-    from evlcp_sdk.place.navigator import PositionPlan
-    from evlcp_sdk.scene.sites import load_sites
-
-    log = None if gnss is None else GnssLog.read(gnss, zero, link.position.gnss_sigma_m)
-    return PositionPlan(load_sites(sites), log)
-
-
-def clock_zero_of(text: str | None) -> "datetime | None":
-    """UTC of the camera clock's 0; None if it is not given."""
-    from datetime import UTC, datetime
-
-    if text is None:
-        return None
-    try:
-        zero = datetime.fromisoformat(text)
-    except ValueError as fault:
-        said = f"{text!r}: expected a time such as 2026-03-01T10:15:00Z"
-        raise typer.BadParameter(said, param_hint="--clock-zero") from fault
-    zero = zero if zero.tzinfo is not None else zero.replace(tzinfo=UTC)
-    # MCAP counts from 1970 on, and NMEA has two digits of the year.
-    if not datetime(1970, 1, 1, tzinfo=UTC) <= zero < datetime(2200, 1, 1, tzinfo=UTC):
-        raise typer.BadParameter(f"{text!r}: expected 1970 to 2199", param_hint="--clock-zero")
-    return zero
-
-
 def _decode_job(
     job: ReceiveJob,
     *,
@@ -371,7 +307,7 @@ def _decode_job(
     attitude: "Attitude | AttitudeLog | None",
     clock_zero: "datetime | None",
     sinks: tuple[str, ...],
-    lines: "_Lines | None",
+    lines: LinePrinter | None,
     stopped: Callable[[], bool] | None,
 ) -> dict[str, Any]:
     """Decode a recording here, with a bar; or, without `stopped`, quietly in a worker."""
@@ -399,50 +335,13 @@ def _until(stopped: Callable[[], bool], jobs: Sequence[ReceiveJob]) -> Iterator[
         yield job
 
 
-class _Lines:
-    """Prints lines as they come, until whoever reads them has left.
-
-    Attributes:
-        gone: The reader has left.
-    """
-
-    def __init__(self) -> None:
-        self.gone = False
-
-    def __call__(self, line: str) -> None:
-        if self.gone:
-            return
-        try:
-            echo(line)
-        except BrokenPipeError:
-            self.gone = True
-            # Or else the interpreter tries once more as it ends.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-
-
-def json_lines_of(where: str | None, recordings: Sequence[str], *, as_json: bool) -> _Lines | None:
-    """What prints lines as they come; None where nobody asked."""
-    from evlcp_sdk.io.open import STDIN
-
-    if where is None:
-        return None
-    for wrong, why in (
-        (where != STDIN, f"{where}: expected -, standard output"),
-        (as_json, "end with the summary: give one of --json and --json-lines"),
-        (len(recordings) > 1, "are those of one recording"),
-    ):
-        if wrong:
-            raise typer.BadParameter(why, param_hint="--json-lines")
-    return _Lines()
-
-
 def _named(url: str) -> str:
     from evlcp_sdk.io.open import STDIN
 
     return "standard input" if url == STDIN else Path(url).name
 
 
-def _jobs(recordings: Sequence[str], out: Path | None, lines: _Lines | None) -> list[ReceiveJob]:
+def _jobs(recordings: Sequence[str], out: Path | None, lines: LinePrinter | None) -> list[ReceiveJob]:
     from evlcp_sdk.io.open import STDIN
 
     if STDIN in recordings and len(recordings) > 1:

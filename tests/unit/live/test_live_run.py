@@ -157,9 +157,7 @@ def test_the_command(evlcp: Callable[..., Any], demo_raw: Path) -> None:
     assert {"frame"} <= {line["line"] for line in lines}
     run = evlcp("live", "nowhere:1")
     assert run.code == 3
-    assert (
-        "scheme 'nowhere', expected file:, replay:, tcp:, udp:, unix: or one that a plugin opens" in run.err
-    )
+    assert "scheme 'nowhere', expected file:, replay:, " in run.err
 
 
 @pytest.mark.parametrize(
