@@ -2,6 +2,7 @@
 
     python benchmarks/integrity.py               # the figures of docs/position.md: 100 000 fixes, minutes
     python benchmarks/integrity.py --fixes 200   # of a row
+    python benchmarks/integrity.py --bar-fault 0.5   # levels against bars off by half a metre (sigma)
 
 Bars stand 30 to 90 m ahead, anywhere in view. Every error is drawn from its stated sigma: of points, of what
 a bar's points share, of survey, camera and attitude; then one part is made wrong without anybody's
@@ -166,7 +167,7 @@ def late(imu: Scene, rng: np.random.Generator) -> None:
     )
 
 
-def row(world: World, fault: Fault | None, fixes: int, seed: int) -> dict[str, float]:
+def row(world: World, fault: Fault | None, fixes: int, seed: int, spec: PositionSpec) -> dict[str, float]:
     """The figures of a row of the table."""
     rng = np.random.default_rng(seed)
     squares, hpl, vpl = [], [], []
@@ -178,7 +179,7 @@ def row(world: World, fault: Fault | None, fixes: int, seed: int) -> dict[str, f
         if fault is not None:
             fault(here, rng)
         began = time.process_time()
-        found = solve_pose(here.views, here.camera, here.attitude, SPEC, here.sigma)
+        found = solve_pose(here.views, here.camera, here.attitude, spec, here.sigma)
         took_s += time.process_time() - began
         if isinstance(found, Refusal):
             # What the geometry does not allow has nothing to do with faults.
@@ -241,7 +242,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--fixes", type=int, default=2900, help="of a row")
     parser.add_argument("--only", default="", help="rows whose name contains this")
+    parser.add_argument("--bar-fault", type=float, default=SPEC.bar_fault_m, help="m; position.bar_fault_m")
     given = parser.parse_args()
+    spec = replace(SPEC, bar_fault_m=given.bar_fault)
     rows: list[tuple[str, World, Fault | None]] = []
     for name, world in WORLDS.items():
         stated = replace(world, survey=SURVEYED["survey"], focal=SURVEYED["focal"])  # type: ignore[arg-type]
@@ -257,11 +260,11 @@ def main() -> None:
     )  # fmt: skip
     print("| what | " + " | ".join(head) + " |")
     print("|---" * (len(head) + 1) + "|")
-    row(World(2, "gravity"), None, 5, 0)
+    row(World(2, "gravity"), None, 5, 0, spec)
     reached: dict[str, dict[str, float]] = {}
     for i, (name, world, fault) in enumerate(rows):
         if given.only in name:
-            found = reached[name] = row(world, fault, given.fixes, i)
+            found = reached[name] = row(world, fault, given.fixes, i, spec)
             texts = (
                 "-"
                 if math.isnan(found[key])

@@ -137,6 +137,14 @@ class PositionSpec:
         float,
         Field(ge=1e-12, le=0.1, description="Chance of an error beyond a protection level, with a fault."),
     ] = 1e-4
+    bar_fault_m: Annotated[
+        float,
+        Field(
+            ge=0,
+            description="How far a bar may stand from its site (sigma) without anybody's knowledge, so that"
+            " protection levels hold; 0: by any amount.",
+        ),
+    ] = 0.0
     max_protection_m: Annotated[
         float, Field(gt=0, description="Protection level above which there is none.")
     ] = 50.0

@@ -668,14 +668,16 @@ def weighed(
     points: Array, bar: Array, bar_sigma: Array, lens: Array, lens_root: Array, fault: float,
     felt: Array, heading: float, known: int, white: Array, huber: float, free: Array, said: Array,
     position: Array, rotation: Array, local: Array, error: Array, cost: float,
-    attitude_fault: float, limits: Array, least: float, most_sigma: float, flat: float, high: float,
-    rarely: float, larger: float,
+    attitude_fault: float, bar_fault: float, bar_turn: float, limits: Array, least: float,
+    most_sigma: float, flat: float, high: float, rarely: float, larger: float, little: float,
 ) -> tuple[Any, ...]:  # fmt: skip
     """What a settled fit is worth: covariance and its causes, tests of each part, protection levels.
 
     Args, beside those of `normal` and `fitted`: `said` (3, 4), what moves the angles as they are said, by its
-    sigmas; `attitude_fault`, radians; `limits` (7,) of a test by its degrees of freedom; `flat` and `high`,
-    sigmas to the risk, horizontal and vertical; `rarely` and `larger` as in `doubted`.
+    sigmas; how large a fault may be (sigma), `attitude_fault`, radians, `bar_fault`, m, 0 for any amount, and
+    `bar_turn`, radians; `limits` (7,) of a test by its degrees of freedom; `flat` and `high`, sigmas to the
+    risk, horizontal and vertical; `rarely` and `larger` as in `doubted`; `little`, a share of the position's
+    variance below which a doubt counts as none.
 
     Returns:
         Whether the equations are regular; sigma of the least certain direction, m; the larger of the ratios,
@@ -719,13 +721,19 @@ def weighed(
         wide = math.sqrt(max(size.max(), 0.0))
     if regular and wide <= most_sigma:
         bent = _bent(given, point, gain, step, cost, spread, size, axes)
+        bounds = np.zeros((bars, 6, 6))
+        if bar_fault > 0:
+            _bar_bounds(points, bar, position, bar_fault, bar_turn, bounds)
         levels = _parts(
             info, right, rows, miss, white, known, free, turns, spread,
-            attitude_fault, limits, least, flat, high, values, freedom,
+            attitude_fault, bounds, limits, least, flat, high, values, freedom,
         )  # fmt: skip
         _causes(spread, rows, known, said, gain, pixel, by_camera, by_attitude, by_bar, noise, slow)
         if turns:
             doubted(spread, rows[:known, :n].copy(), miss[:known].copy(), rarely, larger, doubt)
+            whole_of = spread[0, 0] + spread[1, 1] + spread[2, 2]
+            if doubt[0, 0] + doubt[1, 1] + doubt[2, 2] < little * whole_of:
+                doubt[:] = 0
     return (
         regular, wide, bent, spread, values, freedom, levels[0], levels[1],
         doubt, noise, slow, by_camera, by_attitude, by_bar,
@@ -778,13 +786,13 @@ def _bent(
 @njit(cache=True, nogil=True)
 def _parts(
     info: Array, right: Array, rows: Array, miss: Array, white: Array, known: int, free: Array, turns: bool,
-    spread: Array, attitude_fault: float, limits: Array, least: float, flat: float, high: float,
-    values: Array, freedom: Array,
+    spread: Array, attitude_fault: float, bounds: Array, limits: Array, least: float, flat: float,
+    high: float, values: Array, freedom: Array,
 ) -> tuple[float, float]:  # fmt: skip
     """Each part's test, `values` and `freedom` (parts,), and both protection levels: see `weighed`."""
     bars, n = len(info), len(spread)
     hpl, vpl = flat * _widest(spread), high * math.sqrt(max(spread[2, 2], 0.0))
-    own, none, columns, mean = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((n, 6)), np.zeros(6)
+    own, columns, mean = np.zeros((6, 6)), np.zeros((n, 6)), np.zeros(6)
     for part in range(bars):
         for j in range(6):
             mean[j] = right[part, j]
@@ -792,7 +800,7 @@ def _parts(
                 columns[i, j] = info[part, i, j] if free[i] else 0.0
             for i in range(6):
                 own[i, j] = info[part, i, j]
-        found = tested(own, columns, mean, spread, none, least)
+        found = tested(own, columns, mean, spread, bounds[part], least)
         values[part], freedom[part] = found[0], found[1]
         hpl, vpl = _widened(hpl, vpl, found[2], found[3], spread, limits[found[1]], flat, high)
     one, by_one, off = np.zeros((1, 1)), np.zeros((n, 1)), np.zeros(1)
@@ -951,6 +959,37 @@ def _widest(covariance: Array) -> float:
 
 
 @njit(cache=True, nogil=True)
+def _bar_bounds(points: Array, bar: Array, position: Array, place: float, turn: float, out: Array) -> None:
+    """Inverse covariance of each bar's fault, as a move and a turn of the camera that it alone sees.
+
+    A bar that is `place` off to each side, m, and turned by `turn` about its centre, radians: `out` (bars, 6,
+    6).
+    """
+    away, half = np.zeros(3), np.zeros((6, 6))
+    last = -1
+    for i in range(len(bar)):
+        b = bar[i]
+        if b == last:
+            continue
+        last = b
+        for j in range(3):
+            away[j] = points[i, j] - points[i, 3 + j] - position[j]
+        # Rows: the move to the east, north and up, and the turn about these, in their sigmas.
+        half[:] = 0
+        for j in range(3):
+            half[j, j] = 1 / place
+            half[3 + j, 3 + j] = 1 / turn
+        half[0, 4], half[0, 5] = away[2] / place, -away[1] / place
+        half[1, 3], half[1, 5] = -away[2] / place, away[0] / place
+        half[2, 3], half[2, 4] = away[1] / place, -away[0] / place
+        for j in range(6):
+            for k in range(6):
+                out[b, j, k] = 0
+                for m in range(6):
+                    out[b, j, k] += half[m, j] * half[m, k]
+
+
+@njit(cache=True, nogil=True)
 def _attitude_bound(white: Array, known: int, fault: float) -> Array:
     """Inverse covariance of the attitude's fault, as whitened, (known, known)."""
     covariance, out = np.zeros((known, known)), np.zeros((known, known))
@@ -985,6 +1024,28 @@ def whole(points_px: Array, sigma_px: Array, width: int, height: int, out: Array
         out[i] = inside and sigma_px[i] > 0 and sigma_px[i] < math.inf
         number += out[i]
     return number
+
+
+@njit(cache=True, nogil=True)
+def flatness(points: Array, bar: Array, bars: int) -> float:
+    """How far the bars' centres spread across the line that fits them best, against along it."""
+    centres, count, mean = np.zeros((bars, 3)), np.zeros(bars), np.zeros(3)
+    for i in range(len(bar)):
+        count[bar[i]] += 1
+        for j in range(3):
+            centres[bar[i], j] += points[i, j]
+    for b in range(bars):
+        for j in range(3):
+            centres[b, j] /= count[b]
+            mean[j] += centres[b, j] / bars
+    spread, values, axes = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
+    for b in range(bars):
+        for j in range(3):
+            for k in range(3):
+                spread[j, k] += (centres[b, j] - mean[j]) * (centres[b, k] - mean[k])
+    eigen(spread, values, axes)
+    values.sort()
+    return math.sqrt(max(values[1], 0.0) / values[2]) if values[2] > 0 else 0.0
 
 
 @njit(cache=True, nogil=True)

@@ -32,6 +32,9 @@ _MOST_BEND = 3.0
 _ATTITUDE_FAULT_RAD = math.radians(1.0)
 """How far an angle may be off without anybody's knowledge (sigma): the fault that protection levels cover."""
 
+_BAR_TURN_RAD = math.radians(5.0)
+"""How far a bar may be turned (sigma) where `position.bar_fault_m` says how far it may stand off."""
+
 _RARELY = 0.05
 """How rarely errors of an attitude are larger than their sigmas say."""
 
@@ -113,6 +116,8 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
         fit.lens,
         fit.cost,
         _ATTITUDE_FAULT_RAD,
+        spec.bar_fault_m,
+        _BAR_TURN_RAD,
         limits,
         _REDUNDANT,
         spec.max_sigma_m,
@@ -120,6 +125,7 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
         math.sqrt(chi_square(spec.risk, 1)),
         _RARELY,
         _LARGER,
+        _LITTLE,
     )
     regular, wide, bent, spread, values, freed, hpl, vpl, doubted, noise, slow, *moves = found
     if not regular:
@@ -150,8 +156,6 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
             if value / limits[tested] > worst:
                 worst = value / limits[tested]
                 doubt = f"{name} does not fit the rest: {math.sqrt(value):.1f} sigmas"
-    if sum(doubted[i, i] for i in range(3)) < _LITTLE * sum(spread[i, i] for i in range(3)):
-        doubted = np.zeros((6, 6))
     most = spec.max_protection_m
     pose = Pose(
         fit.position,

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -172,14 +172,13 @@ class Problem:
             return told
         free = self.free.copy()
         free[3:6] = told.pop("turns")
-        return replace(self, attitude=attitude, free=free, **told)
+        return self._but(attitude=attitude, free=free, **told)
 
     def without(self, bar: int) -> "Problem | Refusal":
         """The same without a bar, by its place among `transmitters`, or why the others are too few."""
         kept = self.bar != bar
         others = self.bar[kept]
-        fewer = replace(
-            self,
+        fewer = self._but(
             points=self.points[kept],
             bar=others - (others > bar),
             bar_sigma=np.delete(self.bar_sigma, bar, 0),
@@ -191,14 +190,20 @@ class Problem:
         """The same through a camera that is so surely known."""
         free = self.free.copy()
         free[7:] = sigma.known
-        return replace(self, lens_root=sigma.root(self.camera), free=free)
+        return self._but(lens_root=sigma.root(self.camera), free=free)
 
     def halved(self) -> "Problem":
         """The same by the means of the halves of each bar: a few points that say nearly as much."""
         bars = len(self.transmitters)
         points, bar = np.empty((2 * bars, 10)), np.empty(2 * bars, np.int64)
         count = _kernels.halved(self.points, self.bar, points, bar)
-        return replace(self, points=points[:count], bar=bar[:count])
+        return self._but(points=points[:count], bar=bar[:count])
+
+    def _but(self, **changes: Any) -> "Problem":
+        """The same with other fields, in a fifth of the time of `dataclasses.replace`."""
+        other = object.__new__(Problem)
+        vars(other).update(vars(self), **changes)
+        return other
 
 
 def _told(attitude: Attitude | None, points: Floats, bar: NDArray[np.int64], bars: int) -> Any:
@@ -207,10 +212,7 @@ def _told(attitude: Attitude | None, points: Floats, bar: NDArray[np.int64], bar
     if not compass and bars == 1:
         return Refusal("heading-unknown", "one bar gives a position only with the camera's heading known")
     if attitude is None:
-        count = np.bincount(bar)
-        centres = np.stack([np.bincount(bar, points[:, i]) / count for i in range(3)], 1)
-        extent = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
-        if bars < 3 or extent[1] < _INLINE * extent[0]:
+        if bars < 3 or _kernels.flatness(points, bar, bars) < _INLINE:
             many = "two bars give" if bars == 2 else "bars in line give"
             return Refusal("gravity-unknown", f"{many} a position only with gravity known")
         nothing = {"felt": np.zeros(3), "heading_rad": 0.0, "angles": 0, "white": np.eye(3)}

@@ -358,10 +358,35 @@ def test_halves_of_bars() -> None:
         np.testing.assert_allclose(mean[i], total / np.linalg.norm(total))
 
 
-@pytest.mark.parametrize("bars", [2, 3])
-def test_a_fit_is_judged_as_by_numpy(bars: int) -> None:
+def bar_bound(p: Problem, b: int, position: Floats, fault_m: float) -> Floats:
+    """A bar moved and turned about its centre looks as to a camera that did the reverse about it."""
+    if fault_m == 0:
+        return np.zeros((6, 6))
+    row = p.points[p.bar == b][0]
+    centre = row[:3] - row[3:6]
+    by_move = np.concatenate([-np.eye(3), np.zeros((3, 3))], 1)
+    by_turn = np.concatenate([np.cross(np.eye(3), centre - position), -np.eye(3)], 1)
+    causes = np.concatenate([fault_m * by_move, math.radians(5.0) * by_turn])
+    return np.linalg.inv(causes.T @ causes)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.1, 5.0])
+def test_how_far_bars_are_from_a_line(offset: float) -> None:
+    rng = np.random.default_rng(16)
+    bar = np.repeat([0, 1, 2, 3], [5, 7, 4, 6])
+    line = np.array([[0, 0, offset], [3, 6, 0], [6, 12, 0], [9, 18, 0]])
+    points = rng.normal(0, 0.01, (len(bar), 10))
+    points[:, :3] += line[bar]
+    centres = np.stack([points[bar == b, :3].mean(0) for b in range(4)])
+    extent = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
+    assert _kernels.flatness(points, bar, 4) == pytest.approx(extent[1] / extent[0], rel=1e-6)
+
+
+@pytest.mark.parametrize(("bars", "bar_fault_m"), [(2, 0.5), (3, 0.0)])
+def test_a_fit_is_judged_as_by_numpy(bars: int, bar_fault_m: float) -> None:
     """Covariance, causes, tests of each part and protection levels, written out anew."""
     p, position, rotation = problem(np.random.default_rng(12), bars, noise=1.0)
+    p = dataclasses.replace(p, spec=dataclasses.replace(p.spec, bar_fault_m=bar_fault_m))
     fit = fit_pose(p, Fit.at(p, position, rotation))
     assert fit.settled
     found = judged(p, fit)
@@ -387,7 +412,10 @@ def test_a_fit_is_judged_as_by_numpy(bars: int) -> None:
     focal = normal.info.sum(0)[:, [6]]
     bound = np.linalg.inv(math.radians(1.0) ** 2 * p.white @ p.white.T)
     parts = {
-        f"bar {b}": (normal.info[b, :6, :6], normal.info[b, :, :6], normal.right[b, :6], np.zeros((6, 6)))
+        f"bar {b}": (
+            *(normal.info[b, :6, :6], normal.info[b, :, :6], normal.right[b, :6]),
+            bar_bound(p, b, fit.position, bar_fault_m),
+        )
         for b in range(bars)
     }
     parts["focal length"] = focal[6:7], focal, normal.right.sum(0)[6:7], np.eye(1)
