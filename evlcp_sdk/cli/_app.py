@@ -67,6 +67,7 @@ def make_app() -> typer.Typer:
         receive,
         report,
         score,
+        serve,
         simulate,
         survey,
         sweep,
@@ -82,7 +83,7 @@ def make_app() -> typer.Typer:
         help=HELP,
     )
     app.callback()(_root)
-    first = (receive, live, video, info, diagnose, compare, simulate, score, sweep, report, demo)
+    first = (receive, live, serve, video, info, diagnose, compare, simulate, score, sweep, report, demo)
     for module in (*first, calibrate, survey, config, plugins, check):
         module.register(app)
     return app

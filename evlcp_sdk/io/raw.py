@@ -4,7 +4,7 @@ import os
 import select
 import stat
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
@@ -21,7 +21,7 @@ from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["CODECS", "RawHeader", "RawSource", "RawWriter", "format_header", "parse_header"]
+__all__ = ["CODECS", "RawEncoder", "RawHeader", "RawSource", "RawWriter", "format_header", "parse_header"]
 
 CODECS: Final = {codec.name: codec for codec in (EVT2, EVT3)}
 """The encodings that can be read and written, by name."""
@@ -392,6 +392,47 @@ class RawSource(EventSource):
         self._file.close()
 
 
+class RawEncoder:
+    """Events and triggers as RAW words, piece by piece.
+
+    Args:
+        codec: The encoding.
+        width: Columns of the sensor.
+    """
+
+    def __init__(self, codec: Codec, width: int) -> None:
+        self._columns = width
+        self._codec = codec
+        self._kernel = codec.kernel(codec.encoder)
+        self._state = np.full(3, -1, np.int64)
+        self._words = np.empty(WRITE_WORDS, codec.word)
+        self._begun = False
+
+    def encode(self, events: Events, triggers: Triggers) -> Iterator[bytes]:
+        """Yield the words of the next events and triggers, none of which is before the last ones."""
+        if not len(events) and not len(triggers):
+            return
+        if not self._begun:
+            self._begun = True
+            first = min(int(column[0]) for column in (events.t_us, triggers.t_us) if len(column))
+            words, self._state[0] = self._codec.prelude(first)
+            yield words.tobytes()
+        event_columns = [np.ascontiguousarray(c) for c in (events.t_us, events.x, events.y, events.p)]
+        trigger_columns = [np.ascontiguousarray(c) for c in (triggers.t_us, triggers.channel, triggers.value)]
+        i = j = 0
+        while i < len(events) or j < len(triggers):
+            n, i, j = self._kernel(
+                self._words,
+                self._columns,
+                self._state,
+                *event_columns,
+                i,
+                *trigger_columns,
+                j,
+            )
+            yield self._words[:n].tobytes()
+
+
 class RawWriter(EventWriter):
     """A RAW file being written.
 
@@ -426,34 +467,12 @@ class RawWriter(EventWriter):
             raise StreamError(f"{path}: sensor of {width}x{height}, expected 1 to {MAX_SIDE} each")
         super().__init__(path, width, height, outputs)
         self.channels = codec.channels
-        self._columns = width
-        self._codec = codec
-        self._kernel = codec.kernel(codec.encoder)
-        self._state = np.full(3, -1, np.int64)
-        self._words = np.empty(WRITE_WORDS, codec.word)
+        self._encoder = RawEncoder(codec, width)
         self._file.write(format_header(codec, width, height))
 
     def _write(self, events: Events, triggers: Triggers) -> None:
-        if not len(events) and not len(triggers):
-            return
-        if self._last_us is None:
-            first = min(int(column[0]) for column in (events.t_us, triggers.t_us) if len(column))
-            words, self._state[0] = self._codec.prelude(first)
-            self._file.write(words.tobytes())
-        event_columns = [np.ascontiguousarray(c) for c in (events.t_us, events.x, events.y, events.p)]
-        trigger_columns = [np.ascontiguousarray(c) for c in (triggers.t_us, triggers.channel, triggers.value)]
-        i = j = 0
-        while i < len(events) or j < len(triggers):
-            n, i, j = self._kernel(
-                self._words,
-                self._columns,
-                self._state,
-                *event_columns,
-                i,
-                *trigger_columns,
-                j,
-            )
-            self._file.write(self._words[:n].tobytes())
+        for words in self._encoder.encode(events, triggers):
+            self._file.write(words)
 
     def _finish(self) -> None:
         """Every word is in the file already."""

@@ -1,0 +1,76 @@
+"""`evlcp serve`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from evlcp_sdk.cli._common import complain
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("serve")(serve)
+
+
+def serve(
+    url: Annotated[
+        str, typer.Argument(metavar="URL", help="A recording, which is sent at its own pace, or a camera.")
+    ],
+    tcp: Annotated[
+        str | None,
+        typer.Option("--tcp", metavar="[HOST:]PORT", help="Listen there; this machine only without a host."),
+    ] = None,
+    unix: Annotated[
+        Path | None, typer.Option("--unix", metavar="PATH", help="Listen on a Unix socket, too.")
+    ] = None,
+) -> None:
+    """Send a recording or a camera to other programs, as EVT3 words over TCP or a Unix socket.
+
+    A recording, at its own pace:  [bold]evlcp serve REC.raw --tcp 5600[/]
+
+    The other end:                 [bold]evlcp live tcp://localhost:5600[/]
+
+    To other machines, too:        [bold]evlcp serve URL --tcp 0.0.0.0:5600[/]
+
+    Again and again:               [bold]evlcp serve 'replay:REC.raw?loop=1' --tcp 5600[/]
+
+    A recording begins when somebody has connected. Nothing is encrypted, and whoever can connect gets all.
+    """
+    from evlcp_sdk.errors import InputError
+    from evlcp_sdk.io.open import open_source
+    from evlcp_sdk.io.replay import ReplaySource
+    from evlcp_sdk.live.sender import Sender
+    from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.signals import stop_on_request
+
+    address = None if tcp is None else _address(tcp)
+    if address is None and unix is None:
+        raise typer.BadParameter("give --tcp PORT, or --unix PATH", param_hint="--tcp")
+    with stop_on_request() as stopped, open_source(url, Registry.load()) as opened:
+        recorded = not opened.live or isinstance(opened, ReplaySource)
+        source = opened if opened.live else ReplaySource(opened)
+        with Sender(source, address, unix) as sender:
+            if address is not None:
+                complain(f"sending {url} to whoever connects to tcp://{address[0]}:{sender.port}")
+            if unix is not None:
+                complain(f"sending {url} to whoever connects to unix:{unix}")
+            if recorded and not sender.wait(stopped):
+                return
+            try:
+                sender.run(stopped)
+            except InputError as fault:
+                complain(str(fault))
+                raise typer.Exit(fault.exit_code) from fault
+            finally:
+                if dropped := sender.counts["pieces_dropped"]:
+                    complain(f"{dropped} pieces dropped: who received them was too slow")
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not (port.isascii() and port.isdigit() and int(port) < 65536):
+        raise typer.BadParameter(f"{text!r}: expected PORT or HOST:PORT", param_hint="--tcp")
+    return host.strip("[]") or "127.0.0.1", int(port)
