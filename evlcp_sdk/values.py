@@ -382,6 +382,7 @@ class Frame:
         points_sigma_px: Their standard deviations, px, float64 (K,).
         points_t_us: That time, camera clock, us.
         echo_of: Number of the transmitter that this is a reflection of; None for a frame of its own.
+        link: Name of the link that it was sent with, of a receiver of several; empty of a receiver of one.
     """
 
     transmitter: int
@@ -397,6 +398,7 @@ class Frame:
     points_sigma_px: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     points_t_us: float = math.nan
     echo_of: int | None = None
+    link: str = ""
 
     def __repr__(self) -> str:
         place = f"{_who(self.transmitter, self.echo_of)}, packet {self.packet}, frame {self.frame}"
@@ -443,6 +445,7 @@ class ReceivedMessage:
         reason: Why it is not `verified`; where it is, when it was signed, and how long before
             it was received.
         age_s: Time from a verified beacon's signature to its reception, s; None where that is not known.
+        link: Name of the link, as in `Frame`.
     """
 
     transmitter: int
@@ -454,6 +457,7 @@ class ReceivedMessage:
     trust: Trust
     reason: str
     age_s: float | None = None
+    link: str = ""
 
     @property
     def beacon(self) -> Beacon | None:
@@ -499,6 +503,11 @@ class Packet:
     def echo_of(self) -> int | None:
         """Number of the transmitter that its frames, all of them, are a reflection of; None if of none."""
         return self.frames[-1].echo_of if self.frames else None
+
+    @property
+    def link(self) -> str:
+        """Name of the link, as in `Frame`."""
+        return self.frames[0].link if self.frames else ""
 
     def __repr__(self) -> str:
         found = f"{len(self.frames)} of {self.sent} frames"

@@ -72,6 +72,7 @@ class Link:
         table: The resolved configuration, every default written out; plain values as in TOML.
         digest: SHA-256 of table, codebook digest and revisions, 64 hex digits.
         kinds: The kinds of messages that are understood, by number; those that are installed.
+        name: What a receiver of several links calls it: its file's without `.toml`; empty without a file.
 
     Two links are equal when their digests are.
     """
@@ -90,6 +91,7 @@ class Link:
     table: Mapping[str, Mapping[str, Any]]
     digest: str
     kinds: Mapping[int, MessageKind] = field(default_factory=lambda: BUILT_IN_KINDS)
+    name: str = ""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Link) and self.digest == other.digest
@@ -172,13 +174,13 @@ class Link:
                 {name: value for name, value in each.items() if name not in unused}
                 for each in (parts, table, revisions)
             )
-        return _assembled(parts, table, revisions, self.kinds)
+        return _assembled(parts, table, revisions, self.kinds, self.name)
 
     def with_air(self, **changes: Any) -> "Link":
         """The same link with other values on air, e.g. `link.with_air(pilot_every=4)`."""
         air = replace(self.air, **changes)
         parts, table = self._parts() | {"air": air}, {**self.table, "air": asdict(air)}
-        return _assembled(parts, table, self.revisions, self.kinds)
+        return _assembled(parts, table, self.revisions, self.kinds, self.name)
 
     def block_coder(self) -> BlockCoder:
         """How packets carry blocks of messages.
@@ -224,7 +226,8 @@ def load_link(
         if (section, key) == ("bar", "leds_file"):
             keys.pop("leds", None)
         set_here.add((section, key))
-    return resolve(table, registry, source=source, overridden=frozenset(set_here))
+    link = resolve(table, registry, source=source, overridden=frozenset(set_here))
+    return replace(link, name=Path(source).stem)
 
 
 def resolve(
@@ -357,6 +360,7 @@ def _assembled(
     table: Mapping[str, Mapping[str, Any]],
     revisions: Mapping[str, int],
     kinds: Mapping[int, MessageKind],
+    name: str = "",
 ) -> Link:
     """The link of checked parts, and the table that describes them."""
     bar, air = parts["bar"], parts["air"]
@@ -375,6 +379,7 @@ def _assembled(
         table=table,
         digest=_digest(table, codebook, revisions),
         kinds=kinds,
+        name=name,
     )
 
 

@@ -1,6 +1,7 @@
 """Regions that an algorithm of the role `detection` gives, followed as the receiver's own are."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Detector
-from evlcp_sdk.rx.detection import Followed
+from evlcp_sdk.rx.detection import Followed, same_place
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.values import Events, Region
@@ -40,8 +41,11 @@ class DetectedRegions:
         self.alive: list[Followed] = []
         self.counts = {"regions_left_out": 0, "dropped_no_room": 0}
 
-    def step(self, start_us: int, events: Events) -> list[Followed]:
-        """Take the events of one time step; return the regions that are alive or ended in it."""
+    def step(self, start_us: int, events: Events, taken: Sequence[Region] = ()) -> list[Followed]:
+        """Take the events of one time step; return the regions that are alive or ended in it.
+
+        What is found in places that are `taken` by others is left out.
+        """
         with self._guard:
             self._state, found = self._detector.step(self._state, start_us, events)
         self._guard.expect(found, list)
@@ -50,7 +54,8 @@ class DetectedRegions:
             self._guard.expect(region, Region)
             for name in ("x_px", "y_px", "width_px", "height_px"):
                 self._guard.expect_number(getattr(region, name), name, -1e6, 1e6)
-            places[region.id] = replace(region, t_us=start_us + self._step_us / 2)
+            if not any(same_place(region, place) for place in taken):
+                places[region.id] = replace(region, t_us=start_us + self._step_us / 2)
         known = {followed.id: followed for followed in self.alive}
         for followed in self.alive:
             followed.released |= followed.id not in places

@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["SAME_PX", "Followed", "RegionFollower"]
+__all__ = ["SAME_PX", "Followed", "RegionFollower", "same_place"]
 
 SAME_PX = 5.0
 """How far apart centres of two regions of one image may be: before lit leaves an end is good to some px."""
@@ -251,6 +252,7 @@ class RegionFollower:
             it was taken for, us.
         limits: How much is held.
         gap_chips: The longest time from rise to rise in the codes; 4 in pair codes.
+        rhythm: Scores of the pixels, of another follower in the same rhythm; None for its own.
 
     Attributes:
         alive: The regions that are followed.
@@ -266,6 +268,7 @@ class RegionFollower:
         keep_us: float = 0.0,
         limits: Limits = LIMITS,
         gap_chips: int = 4,
+        rhythm: Rhythm | None = None,
     ) -> None:
         self._spec = spec
         self._limits = limits
@@ -275,7 +278,7 @@ class RegionFollower:
         self._measure_us = round(_MEASURE_GAPS * gap_chips * chip_us)
         self._age_us = _AGE_CHIPS * chip_us
         shape = (camera.height, camera.width)
-        self._rhythm = Rhythm(camera.width, camera.height, chip_us, spec.min_score, gap_chips)
+        self._rhythm = rhythm or Rhythm(camera.width, camera.height, chip_us, spec.min_score, gap_chips)
         self._hits = np.zeros([(n - 1 >> _CELL_SHIFT) + 1 for n in shape], np.int32)
         self._fresh: list[Box] = []
         steps = math.ceil(min(keep_us, _LONGEST_US) / spec.step_us)
@@ -286,14 +289,21 @@ class RegionFollower:
         self.alive: list[Followed] = []
         self.counts = dict.fromkeys(_COUNTS, 0)
 
-    def step(self, start_us: int, events: Events) -> list[Followed]:
-        """Take the events of one time step; return the regions that are alive or ended in it."""
+    def step(self, start_us: int, events: Events, taken: Sequence[Region] = ()) -> list[Followed]:
+        """Take the events of one time step; return the regions that are alive or ended in it.
+
+        Args:
+            start_us: Start of the step, us.
+            events: Those in it, in order.
+            taken: Places that are others': no region is opened there, nor reaches into them.
+        """
         spec = self._spec
         self._remember(start_us, events)
         rises = self._rhythm.step(start_us, events, self._hits, _CELL_SHIFT)
         end_us = start_us + spec.step_us
         expected = [self._expected(followed, start_us + spec.step_us / 2) for followed in self.alive]
         known = [_tight(e) for e, followed in zip(expected, self.alive, strict=True) if followed.size_px]
+        known += [_tight(place) for place in taken]
         boxes = [
             self._reach(e) if followed.size_px else _clear(self._reach(e), known)
             for e, followed in zip(expected, self.alive, strict=True)
@@ -308,6 +318,8 @@ class RegionFollower:
                 followed.positions.append(self._filtered(followed, measured))
         self._merge()
         self._make_room()
+        for place in taken if rises else ():
+            rises -= _cleared(self._hits, self._reach(place))
         self._open(end_us, rises)
         seen = list(self.alive)
         for followed in self.alive:
@@ -674,6 +686,12 @@ class RegionFollower:
                 if not shown or apart_px <= SAME_PX:
                     younger.released = True
         # The survivor reaches over both within a few steps, as its seam finds the other's pixels.
+
+
+def same_place(one: Region, other: Region) -> bool:
+    """Whether the centre of one of two regions lies in the other."""
+    right, down = abs(one.x_px - other.x_px), abs(one.y_px - other.y_px)
+    return any(right <= at.width_px / 2 and down <= at.height_px / 2 for at in (one, other))
 
 
 def _region(id: int, t_us: float, x_px: float, y_px: float, width_px: float, height_px: float) -> Region:

@@ -1,8 +1,9 @@
 """Frames of an algorithm of the role `framing`, from the events of regions to the frames of the receiver."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,8 @@ import numpy as np
 from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Deframer
-from evlcp_sdk.rx.detection import Followed
+from evlcp_sdk.rx.detected import DetectedRegions
+from evlcp_sdk.rx.detection import Followed, RegionFollower, same_place
 from evlcp_sdk.rx.echoes import EchoQueue, Sighting
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.guard import Guard
@@ -18,7 +20,7 @@ from evlcp_sdk.rx.lit import LitTimes
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.steps import Announcer
 from evlcp_sdk.rx.timeline import TimeStep
-from evlcp_sdk.values import Frame, Heard, Range, SyncLock
+from evlcp_sdk.values import Frame, Heard, Range, Region, SyncLock
 
 __all__ = ["HeardFraming"]
 
@@ -58,15 +60,27 @@ class HeardFraming:
         judged: Where frames go.
         clock: The stream's.
         announcer: Hears of every frame.
+        regions: The regions of the stream.
+        name: Name of the link, that its frames have; empty for none.
+        numbers: Where the numbers of transmitters come from; None for 0, 1, 2...
 
     Attributes:
         counts: What was found so far.
         lit: When the light of its transmitters was there.
         ranging_every: Of no effect: frames that a framing hears have no distance.
+        patience_us: How late a frame may be given, us.
     """
 
     def __init__(
-        self, link: Link, deframer: Deframer, judged: EchoQueue, clock: CameraClock, announcer: Announcer
+        self,
+        link: Link,
+        deframer: Deframer,
+        judged: EchoQueue,
+        clock: CameraClock,
+        announcer: Announcer,
+        regions: RegionFollower | DetectedRegions,
+        name: str = "",
+        numbers: Iterator[int] | None = None,
     ) -> None:
         self._guard = Guard(link, "framing")
         self._guard.expect_compiled(deframer, "init", "step", "close", "counts")
@@ -77,10 +91,12 @@ class HeardFraming:
         self._echoes = judged.echoes
         self._camera_us: Callable[[float], float] = clock.camera_us
         self._announcer = announcer
+        self._regions = regions
         self._listeners: dict[int, _Listener] = {}
-        self._numbered = 0
+        self._name = name
+        self._numbers = count() if numbers is None else numbers
         frames_us = _LOOKBACK_FRAMES * link.packet.info_chips * link.packet.chip_us
-        self._keep_us = max(2 * link.packet.packet_chips * link.packet.chip_us, frames_us)
+        self.patience_us = max(2 * link.packet.packet_chips * link.packet.chip_us, frames_us)
         self.counts = dict.fromkeys(("events_in_regions", "regions_opened", "regions_released", "frames"), 0)
         self.lit = LitTimes()
         self.ranging_every = 1
@@ -103,11 +119,33 @@ class HeardFraming:
                 with self._guard:
                     listener.state, heard = self._deframer.step(listener.state, events, until_us)
                 self._take(listener, heard)
-            region.forget_before(math.inf, self._step_us, step.end_us - self._keep_us)
+            region.forget_before(math.inf, self._step_us, step.end_us - self.patience_us)
             if region.released:
                 self.counts["regions_released"] += 1
                 self._end(listener)
                 del self._listeners[region.id]
+
+    @property
+    def places(self) -> dict[int, Region]:
+        """Where the transmitters are that have a number and are in sight, by number."""
+        return {one.number: one.region.latest for one in self._listeners.values() if one.number is not None}
+
+    def leave(self, taken: Sequence[Region], holding: Collection[int]) -> None:
+        """Let regions go in places that are others', but for those of transmitters that hold theirs."""
+        for region in list(self._regions.alive):
+            listener = self._listeners.get(region.id)
+            if listener is not None and listener.number in holding:
+                continue
+            if any(same_place(region.latest, place) for place in taken):
+                self._regions.drop(region)
+                if listener is not None:
+                    self.counts["regions_released"] += 1
+                    self._judged.end(listener.packets)
+                    del self._listeners[region.id]
+
+    def disclaim(self, place: Region) -> int:
+        """Nothing: a framing says what it hears, not what it rejects."""
+        return 0
 
     def close(self) -> None:
         """End the stream: give what the regions still say."""
@@ -132,8 +170,7 @@ class HeardFraming:
             for name in ("t_us", "packet_t_us", "chip_us"):
                 self._guard.expect_number(getattr(one, name), name, -1e18, 1e18)
             if listener.number is None:
-                listener.number = self._numbered
-                self._numbered += 1
+                listener.number = next(self._numbers)
             chips = self._packet.info_chips + self._packet.has_pilot(one.frame) * self._packet.pilot_chips
             end_us = one.t_us + chips * one.chip_us
             x, y = listener.region.at(np.array([(one.t_us + end_us) / 2]))
@@ -148,6 +185,7 @@ class HeardFraming:
                 x_px=float(x[0]),
                 y_px=float(y[0]),
                 echo_of=self._echoes.echo_of(listener.number),
+                link=self._name,
             )
             self.counts["frames"] += 1
             self._announcer.total("frame", frame)

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.belief import believed, still_lit
 from evlcp_sdk.rx.delays import RowDelays
 from evlcp_sdk.rx.detected import DetectedRegions
-from evlcp_sdk.rx.detection import SAME_PX, Followed, RegionFollower
+from evlcp_sdk.rx.detection import SAME_PX, Followed, RegionFollower, same_place
 from evlcp_sdk.rx.echoes import EchoQueue, Sighting
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.limits import LIMITS, Limits
@@ -23,10 +23,10 @@ from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.steps import Announcer, Steps
 from evlcp_sdk.rx.timeline import TimeStep
-from evlcp_sdk.rx.transmitters import Transmitter, Transmitters
+from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Transmitter, Transmitters
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.lean import BarSight, sight_of
-from evlcp_sdk.values import Frame, FrameView, Range, SyncLock
+from evlcp_sdk.values import Frame, FrameView, Range, Region, SyncLock, changed
 
 __all__ = ["PacketFraming"]
 
@@ -76,11 +76,14 @@ class PacketFraming:
         announcer: Hears of every frame.
         attitude_at: What is known of the camera's attitude at a time.
         limits: How much it holds at the most.
+        name: Name of the link, that its frames have; empty for none.
+        numbers: Where the numbers of transmitters come from; None for 0, 1, 2...
 
     Attributes:
         counts: What was found and dropped so far.
         lit: When the light of its transmitters was there.
         ranging_every: See `Receiver`.
+        patience_us: How late a frame may be given, us.
     """
 
     def __init__(
@@ -93,6 +96,8 @@ class PacketFraming:
         announcer: Announcer,
         attitude_at: Callable[[float], Attitude | None],
         limits: Limits = LIMITS,
+        name: str = "",
+        numbers: Iterator[int] | None = None,
     ) -> None:
         centres_m = link.bar.cluster_centres_m()
         self._camera = link.camera
@@ -106,7 +111,8 @@ class PacketFraming:
         self._announcer = announcer
         self._steps = steps
         self._regions = regions
-        self._transmitters = Transmitters(link.packet, self._step_us, limits)
+        self._name = name
+        self._transmitters = Transmitters(link.packet, self._step_us, limits, numbers)
         self._looker = Looker(
             link.packet,
             link.regions,
@@ -125,6 +131,7 @@ class PacketFraming:
         self._joined: set[int] = set()
         self._ended: deque[tuple[tuple[float, float], int]] = deque(maxlen=_MOST_ENDED)
         self._due: deque[Followed] = deque()
+        self.patience_us = LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us
         self.counts = dict.fromkeys(_COUNTS, 0)
         self.lit = LitTimes()
         self.ranging_every = 1
@@ -148,6 +155,35 @@ class PacketFraming:
                 self.counts["regions_released"] += 1
                 self._end(transmitter, step.end_us)
                 self._transmitters.release(transmitter)
+
+    @property
+    def places(self) -> dict[int, Region]:
+        """Where the transmitters are that have a number and are in sight, by number."""
+        return self._transmitters.places
+
+    def leave(self, taken: Sequence[Region], holding: Collection[int]) -> None:
+        """Let regions go in places that are others', but for those of transmitters that hold theirs."""
+        for region in list(self._regions.alive):
+            known = region in self._transmitters
+            if known and self._transmitters[region].number in holding:
+                continue
+            if any(same_place(region.latest, place) for place in taken):
+                self._regions.drop(region)
+                self._let_go(region)
+
+    def disclaim(self, place: Region) -> int:
+        """Count no frame that was rejected in a place that is another link's; return how many they were."""
+        many = 0
+        for transmitter in self._transmitters.alive:
+            if same_place(transmitter.region.latest, place):
+                many += transmitter.rejected
+                transmitter.rejected = 0
+        for one in list(self._ended):
+            if same_place(changed(place, x_px=one[0][0], y_px=one[0][1]), place):
+                self._ended.remove(one)
+                many += one[1]
+        self.counts["frames_rejected"] -= many
+        return many
 
     def close(self) -> None:
         """End the stream: decode what the regions still show."""
@@ -259,6 +295,7 @@ class PacketFraming:
             points_sigma_px=points[1],
             points_t_us=look.middle_us,
             echo_of=self._echoes.echo_of(number),
+            link=self._name,
         )
         self._announcer.total("frame", frame)
         return Sighting.of(frame, look)

@@ -294,7 +294,7 @@ class MessageAssembler:
         reason, age_s = verdict.why, None
         if verdict.trust == "verified":
             reason, age_s = signed_text(message, now_s)
-        return [ReceivedMessage(*where, message, kind, value, verdict.trust, reason, age_s)]
+        return [ReceivedMessage(*where, message, kind, value, verdict.trust, reason, age_s, packet.link)]
 
     def _undecodable(self, parts: _Parts) -> list[ReceivedMessage]:
         """Count a message whose bytes mean nothing, once."""

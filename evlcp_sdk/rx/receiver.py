@@ -1,25 +1,23 @@
 """The receiver: events in, packets out."""
 
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime
+from itertools import count
 
 import pluggy
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.plugin.roles import Tracker
-from evlcp_sdk.rx.detected import DetectedRegions
-from evlcp_sdk.rx.detection import RegionFollower
-from evlcp_sdk.rx.echoes import Echoes, EchoQueue
-from evlcp_sdk.rx.framed import HeardFraming
-from evlcp_sdk.rx.framing import PacketFraming
-from evlcp_sdk.rx.guard import Guard
-from evlcp_sdk.rx.inbox import MessageAssembler
+from evlcp_sdk.link.several import named_links
+from evlcp_sdk.rx.contest import Contest, ContestedPacket
 from evlcp_sdk.rx.limits import LIMITS, Limits
-from evlcp_sdk.rx.steps import Announcer, Steps, on_camera, tracker_of
+from evlcp_sdk.rx.listener import LinkListener
+from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.rx.timeline import Timeline, TimeStep
-from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
-from evlcp_sdk.values import Events, Packet, Region, changed
+from evlcp_sdk.values import Events, Packet, Region
 
 __all__ = ["Receiver"]
 
@@ -27,15 +25,20 @@ __all__ = ["Receiver"]
 class Receiver:
     """Decodes a stream of events, whatever pieces it comes in.
 
-    The stream is cut into time steps on a fixed grid, so that any split of it gives the same packets.
+    The stream is cut into time steps on a fixed grid, so that any split of it gives the same packets. Of
+    several links, every region is tried by each; a packet is given by the one that explains most of the light
+    there, once each had its time to answer, and names it.
 
     Args:
-        link: The resolved configuration.
+        link: The resolved configuration, or several of one camera.
         hook: Where finished stages are announced (`Registry.hook`); None for nowhere.
         attitude: What is known of the camera's attitude, the same always or over time: how plumb bars lean
             against the sensor. None for nothing.
         clock_zero: UTC of the camera clock's 0, for the age of signed beacons; None if it is not known.
         limits: How much it holds at the most.
+
+    Raises:
+        ConfigError: Links that cannot be received together, or nothing tells them apart.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> receiver = Receiver(load_link())
@@ -49,69 +52,75 @@ class Receiver:
 
     def __init__(
         self,
-        link: Link,
+        link: Link | Sequence[Link],
         hook: pluggy.HookRelay | None = None,
         *,
         attitude: Attitude | AttitudeLog | None = None,
         clock_zero: datetime | None = None,
         limits: Limits = LIMITS,
     ) -> None:
-        self._timeline = Timeline(link.regions.step_us, link.camera.width, link.camera.height, limits)
+        links = named_links(link)
+        first = next(iter(links.values()))
+        self._timeline = Timeline(first.regions.step_us, first.camera.width, first.camera.height, limits)
         self._clock = self._timeline.clock
-        self._announcer = Announcer(hook, self._clock.camera_us)
-        tracker = tracker_of(link)
-        self._regions = _regions_of(link, tracker, limits)
-        self._judged = EchoQueue(Echoes(link.packet, len(link.codebook.codewords)))
-        guard = Guard(link, "framing", may_refuse=True)
-        with guard:
-            deframer = link.algorithm("framing").compile(link.codebook, link.packet)
-        self._framing: PacketFraming | HeardFraming
-        if deframer is None:
-            self._framing = PacketFraming(
-                link,
-                Steps(link, self._announcer, tracker),
-                self._regions,
-                self._judged,
+        if len(links) > 1:
+            limits = replace(limits, region_bytes=limits.region_bytes // len(links))
+        rhythms, numbers = _rhythms(links), count()
+        self._listeners = [
+            LinkListener(
+                one,
                 self._clock,
-                self._announcer,
+                hook,
                 attitude_source(attitude),
+                clock_zero,
                 limits,
+                name if len(links) > 1 else "",
+                numbers,
+                rhythms.get(name),
             )
-        else:
-            self._framing = HeardFraming(link, deframer, self._judged, self._clock, self._announcer)
-        self._messages = MessageAssembler.of(link, clock_zero)
+            for name, one in links.items()
+        ]
+        self._contest: Contest | None = None
+        if len(links) > 1:
+            wait_us = max(listener.patience_us for listener in self._listeners)
+            self._contest = Contest(list(links.values()), wait_us, first.regions.step_us)
         self._closed = False
-        self._given = {"frames_reflected": 0, "packets": 0}
 
     @property
     def lit_us(self) -> dict[int, tuple[float, float]]:
-        """Of each transmitter, the newest thousand, by number, when its light was there.
+        """Of each transmitter, the newest thousand of a link, by number, when its light was there.
 
         Starts of the first and the last frame that was due while it was, given or not, camera clock, us.
         """
-        return self._framing.lit.by_number
+        return {number: lit for listener in self._listeners for number, lit in listener.lit_us.items()}
 
     @property
     def regions(self) -> tuple[Region, ...]:
         """Where the regions that are followed were seen last, on the camera's clock."""
-        return tuple(on_camera(one.latest, self._clock.camera_us) for one in self._regions.alive)
+        return tuple(region for listener in self._listeners for region in listener.regions)
 
     @property
     def ranging_every(self) -> int:
         """The distance of every n-th frame with a pilot is measured, 1: of all; for when time is short."""
-        return self._framing.ranging_every
+        return self._listeners[0].ranging_every
 
     @ranging_every.setter
     def ranging_every(self, every: int) -> None:
-        self._framing.ranging_every = every
+        for listener in self._listeners:
+            listener.ranging_every = every
 
     @property
     def counts(self) -> dict[str, int]:
-        """What was taken, found and dropped so far."""
-        messages = self._messages.counts if self._messages is not None else {}
-        dropped = {"dropped_crowded": self._timeline.dropped}
-        found = self._regions.counts | self._framing.counts
-        return self._clock.counts | dropped | found | self._given | messages
+        """What was taken, found and dropped so far, by all links together."""
+        total: Counter[str] = Counter()
+        for listener in self._listeners:
+            total.update(listener.counts)
+        return self._clock.counts | {"dropped_crowded": self._timeline.dropped} | dict(total)
+
+    @property
+    def link_counts(self) -> dict[str, dict[str, int]]:
+        """What each of several links found and dropped so far, by its name; nothing of a single link."""
+        return {one.name: one.counts for one in self._listeners} if self._contest is not None else {}
 
     def feed(self, events: Events) -> list[Packet]:
         """Take the next events of the stream; return the packets that are complete.
@@ -126,8 +135,7 @@ class Receiver:
             raise StreamError("the receiver is closed: make a new one for a new stream")
         if len(events) and events.p.max() > 1:
             raise StreamError(f"events with polarity {events.p.max()}, expected 0 or 1")
-        steps = self._timeline.feed(events, lambda: bool(self._regions.alive or self._judged))
-        return self._read([packet for step in steps for packet in self._run(step)])
+        return [packet for step in self._timeline.feed(events, self._waits) for packet in self._run(step)]
 
     def close(self) -> list[Packet]:
         """End the stream; return the packets that were still incomplete."""
@@ -135,58 +143,59 @@ class Receiver:
             return []
         self._closed = True
         packets = [packet for step in self._timeline.close() for packet in self._run(step)]
-        self._framing.close()
-        packets = self._read(packets + self._judged.close())
-        if self._messages is not None:
-            self._messages.close()
-        # Whoever draws or writes now needs the room.
-        self._regions.close()
+        ends = [listener.finish() for listener in self._listeners]
+        if self._contest is None:
+            packets += self._listeners[0].read(ends[0])
+        else:
+            for number, found in enumerate(ends):
+                self._contest.add(number, found, self._clock.last_us)
+            packets += self._judged(self._contest.close())
+        for listener in self._listeners:
+            listener.close()
         return packets
 
+    def _waits(self) -> bool:
+        """Whether anything waits for the next step."""
+        return any(self._listeners) or bool(self._contest)
+
     def _run(self, step: TimeStep) -> list[Packet]:
-        """Follow the regions through a time step; hear, and decode, what they send."""
-        if step.after_gap:
-            self._regions.skip()
-        self._announcer.start()
-        regions = self._regions.step(step.start_us, step.events)
-        for region in regions:
-            self._announcer.lap("regions", region.latest)
-        self._framing.step(regions, step)
-        return self._judged.step()
+        """Let each link hear a time step; give the packets that are complete, of the links that fit."""
+        contest = self._contest
+        if contest is None:
+            (listener,) = self._listeners
+            return listener.read(listener.step(step, [], set()))
+        for number, listener in enumerate(self._listeners):
+            found = listener.step(step, contest.taken(number), contest.holding)
+            contest.see(number, listener.places)
+            contest.add(number, found, step.end_us)
+        return self._judged(contest.step(step.end_us))
 
-    def _read(self, packets: list[Packet]) -> list[Packet]:
-        """Read the messages that packets carry."""
-        self._given["packets"] += len(packets)
-        self._given["frames_reflected"] += sum(len(p.frames) for p in packets if p.echo_of is not None)
-        packets = [self._on_camera(packet) for packet in packets]
-        if self._messages is None:
-            return packets
-        read = []
-        for packet in packets:
-            self._announcer.start()
-            read.append(self._messages.add(packet))
-            for message in read[-1].messages:
-                self._announcer.lap("message", message)
-        return read
-
-    def _on_camera(self, packet: Packet) -> Packet:
-        """A packet with the times of the camera's clock."""
-        frames = tuple(on_camera(frame, self._clock.camera_us) for frame in packet.frames)
-        return changed(packet, t_us=self._clock.camera_us(packet.t_us), frames=frames)
+    def _judged(self, judged: Sequence[ContestedPacket]) -> list[Packet]:
+        """Read what is given; count what is not."""
+        packets = []
+        for one in judged:
+            listener = self._listeners[one.link]
+            if not one.fits:
+                listener.refuse(one.packet)
+                continue
+            packets += listener.read([one.packet])
+            for other in self._listeners:
+                if other is not listener:
+                    other.disclaim(one.place)
+        return packets
 
 
-def _regions_of(link: Link, tracker: Tracker, limits: Limits) -> RegionFollower | DetectedRegions:
-    """What finds and follows the regions of a stream."""
-    with Guard(link, "detection", may_refuse=True):
-        detector = link.algorithm("detection").compile(link.camera, link.codebook, link.packet)
-    if detector is not None:
-        return DetectedRegions(link, detector, limits)
-    return RegionFollower(
-        link.regions,
-        link.camera,
-        link.packet.chip_us,
-        tracker.position,
-        LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us,
-        limits,
-        link.codebook.longest_gap_chips,
-    )
+def _rhythms(links: Mapping[str, Link]) -> dict[str, Rhythm]:
+    """Scores of the pixels for links whose rhythms agree, by name: one pass over the events for all."""
+    alike: dict[tuple[float, int, int], list[str]] = {}
+    for name, link in links.items():
+        key = link.packet.chip_us, link.regions.min_score, link.codebook.longest_gap_chips
+        alike.setdefault(key, []).append(name)
+    camera = next(iter(links.values())).camera
+    return {
+        name: rhythm
+        for (chip_us, min_score, gap_chips), names in alike.items()
+        if len(names) > 1
+        for rhythm in [Rhythm(camera.width, camera.height, chip_us, min_score, gap_chips, shared=True)]
+        for name in names
+    }

@@ -76,9 +76,19 @@ class Rhythm:
         chip_us: Nominal length of a chip, us.
         min_score: Score at which a pixel is a candidate; half of it is enough inside a region.
         gap_chips: The longest time from rise to rise in the codes; 4 in pair codes.
+        shared: Several followers ask for the same steps; the first one's answer is kept for the others.
     """
 
-    def __init__(self, width: int, height: int, chip_us: float, min_score: int, gap_chips: int = 4) -> None:
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        chip_us: float,
+        min_score: int,
+        gap_chips: int = 4,
+        *,
+        shared: bool = False,
+    ) -> None:
         late_us = (min(3 * gap_chips, _MOST_CHIPS) + 0.5) * chip_us
         self._shift = max(math.ceil(math.log2(late_us / _LONGEST_TICKS)), 0)
         tick_us = 1 << self._shift
@@ -91,6 +101,8 @@ class Rhythm:
         self._turn = _kernels.CLOCK_ROUND // 4
         self._row = 0
         self._seen: int | None = None
+        self._shared = shared
+        self._kept: tuple[int, int, NDArray[np.int32]] | None = None
 
     def step(self, start_us: int, events: Events, hits: NDArray[np.int32], cell_shift: int) -> int:
         """Take the events of a time step; add the rises of candidates to their cell's `hits`; how many.
@@ -101,8 +113,11 @@ class Rhythm:
             hits: Of cells of 2^cell_shift px, int32 (rows, columns).
             cell_shift: See there.
         """
+        if self._kept is not None and self._kept[0] == start_us:
+            hits[:] = self._kept[2]
+            return self._kept[1]
         self._grow_old(start_us >> self._shift)
-        return _kernels.score_rises(
+        rises: int = _kernels.score_rises(
             events.t_us,
             events.x,
             events.y,
@@ -116,6 +131,9 @@ class Rhythm:
             self._min_score,
             cell_shift,
         )
+        if self._shared:
+            self._kept = start_us, rises, hits.copy()
+        return rises
 
     def of(self, events: Events) -> Events:
         """Those of candidates that are no lamps.

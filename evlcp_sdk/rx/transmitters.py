@@ -1,7 +1,9 @@
 """The transmitters that a receiver knows: numbered at their first frame, remembered when lost from sight."""
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ from evlcp_sdk.rx.grid import PacketGrid
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.look import Pilot
 from evlcp_sdk.rx.packets import PacketAssembler
-from evlcp_sdk.values import SyncLock
+from evlcp_sdk.values import Region, SyncLock
 
 __all__ = ["LOOKBACK_PACKETS", "Transmitter", "Transmitters"]
 
@@ -68,21 +70,38 @@ class Transmitters:
         packet: What is on air.
         step_us: Length of a time step, us.
         limits: How many are remembered.
+        numbers: Where their numbers come from; None for 0, 1, 2...
     """
 
-    def __init__(self, packet: PacketFormat, step_us: int, limits: Limits = LIMITS) -> None:
+    def __init__(
+        self,
+        packet: PacketFormat,
+        step_us: int,
+        limits: Limits = LIMITS,
+        numbers: Iterator[int] | None = None,
+    ) -> None:
         self._packet = packet
         self._remembered = limits.remembered
         self._step_us = step_us
         self._alive: dict[int, Transmitter] = {}
         self._released: list[Transmitter] = []
-        self._numbered = 0
+        self._numbers = count() if numbers is None else numbers
 
     def __contains__(self, region: Followed) -> bool:
         return region.id in self._alive
 
     def __getitem__(self, region: Followed) -> Transmitter:
         return self._alive[region.id]
+
+    @property
+    def alive(self) -> list[Transmitter]:
+        """Those in sight."""
+        return list(self._alive.values())
+
+    @property
+    def places(self) -> dict[int, Region]:
+        """Where those are that have a number and are in sight, by number."""
+        return {one.number: one.region.latest for one in self._alive.values() if one.number is not None}
 
     def open(self, region: Followed, sync: Any, distance: Any) -> None:
         """Take a new region, with the first states of its synchronization and its distance filter."""
@@ -113,8 +132,7 @@ class Transmitters:
     def number(self, transmitter: Transmitter) -> int:
         """Its number: the next one, if it has none."""
         if transmitter.number is None:
-            transmitter.number = self._numbered
-            self._numbered += 1
+            transmitter.number = next(self._numbers)
         return transmitter.number
 
     def _inherit(self, transmitter: Transmitter, lock: SyncLock) -> bool:

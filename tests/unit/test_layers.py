@@ -89,10 +89,11 @@ RX = (
     {"limits", "lit", "rhythm"},
     {"guard", "trust"},
     {"belief", "delays", "detection", "grid", "inbox", "packets", "placement", "ranges", "timeline"},
-    {"detected", "points", "spread", "steps"},
+    {"contest", "detected", "points", "spread", "steps"},
     {"look"},
     {"echoes", "transmitters"},
     {"framed", "framing"},
+    {"listener"},
     {"receiver"},
 )
 """The receiver from its stages up to what joins them: a module imports from below its own row only."""

@@ -1,0 +1,206 @@
+"""One link's part of a receiver: the regions that it follows, what they send, and its messages."""
+
+from collections.abc import Callable, Iterator
+from datetime import datetime
+
+import pluggy
+
+from evlcp_sdk.clock import CameraClock
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.roles import Tracker
+from evlcp_sdk.rx.detected import DetectedRegions
+from evlcp_sdk.rx.detection import RegionFollower
+from evlcp_sdk.rx.echoes import Echoes, EchoQueue
+from evlcp_sdk.rx.framed import HeardFraming
+from evlcp_sdk.rx.framing import PacketFraming
+from evlcp_sdk.rx.guard import Guard
+from evlcp_sdk.rx.inbox import MessageAssembler
+from evlcp_sdk.rx.limits import LIMITS, Limits
+from evlcp_sdk.rx.rhythm import Rhythm
+from evlcp_sdk.rx.steps import Announcer, Steps, on_camera, tracker_of
+from evlcp_sdk.rx.timeline import TimeStep
+from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.values import Packet, Region, changed
+
+__all__ = ["LinkListener"]
+
+
+class LinkListener:
+    """Follows the regions of a stream by one link, hears and decodes what they send, reads its messages.
+
+    Args:
+        link: The resolved configuration.
+        clock: The stream's.
+        hook: Where finished stages are announced; None for nowhere.
+        attitude_at: What is known of the camera's attitude at a time.
+        clock_zero: UTC of the camera clock's 0; None if it is not known.
+        limits: How much it holds at the most.
+        name: Name of the link, that its frames have; empty for none.
+        numbers: Where the numbers of transmitters come from; None for 0, 1, 2...
+        rhythm: Scores of the pixels, of another listener in the same rhythm; None for its own.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        clock: CameraClock,
+        hook: pluggy.HookRelay | None,
+        attitude_at: Callable[[float], Attitude | None],
+        clock_zero: datetime | None = None,
+        limits: Limits = LIMITS,
+        name: str = "",
+        numbers: Iterator[int] | None = None,
+        rhythm: Rhythm | None = None,
+    ) -> None:
+        self.link, self.name = link, name
+        self._clock = clock
+        self._announcer = Announcer(hook, clock.camera_us)
+        tracker = tracker_of(link)
+        self._regions = _regions_of(link, tracker, limits, rhythm)
+        self._judged = EchoQueue(Echoes(link.packet, len(link.codebook.codewords)))
+        with Guard(link, "framing", may_refuse=True):
+            deframer = link.algorithm("framing").compile(link.codebook, link.packet)
+        self._framing: PacketFraming | HeardFraming
+        if deframer is None:
+            self._framing = PacketFraming(
+                link,
+                Steps(link, self._announcer, tracker),
+                self._regions,
+                self._judged,
+                clock,
+                self._announcer,
+                attitude_at,
+                limits,
+                name,
+                numbers,
+            )
+        else:
+            self._framing = HeardFraming(
+                link, deframer, self._judged, clock, self._announcer, self._regions, name, numbers
+            )
+        self._messages = MessageAssembler.of(link, clock_zero)
+        self._given = {"frames_reflected": 0, "packets": 0}
+        self._of_others = self._rejected_of_others = 0
+
+    @property
+    def patience_us(self) -> float:
+        """How late a frame may be given, us."""
+        return self._framing.patience_us
+
+    @property
+    def lit_us(self) -> dict[int, tuple[float, float]]:
+        """See `Receiver`."""
+        return self._framing.lit.by_number
+
+    @property
+    def regions(self) -> list[Region]:
+        """Where the regions that are followed were seen last, on the camera's clock."""
+        return [on_camera(one.latest, self._clock.camera_us) for one in self._regions.alive]
+
+    @property
+    def ranging_every(self) -> int:
+        """See `Receiver`."""
+        return self._framing.ranging_every
+
+    @ranging_every.setter
+    def ranging_every(self, every: int) -> None:
+        self._framing.ranging_every = every
+
+    @property
+    def places(self) -> dict[int, Region]:
+        """Where its transmitters are that have a number and are in sight, by number."""
+        return self._framing.places
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What was found so far, and dropped."""
+        messages = self._messages.counts if self._messages is not None else {}
+        found = self._regions.counts | self._framing.counts
+        if self.name:
+            found["frames"] -= self._of_others
+            found["frames_of_others"] = self._of_others + self._rejected_of_others
+        return found | self._given | messages
+
+    def __bool__(self) -> bool:
+        """Whether anything waits for the next step."""
+        return bool(self._regions.alive or self._judged)
+
+    def step(self, step: TimeStep, taken: list[Region], holding: set[int]) -> list[Packet]:
+        """Follow the regions through a time step; hear, and decode, what they send.
+
+        Args:
+            step: The events.
+            taken: Places that other links hold.
+            holding: Numbers of the transmitters that hold theirs.
+        """
+        if step.after_gap:
+            self._regions.skip()
+        if taken:
+            self._framing.leave(taken, holding)
+        self._announcer.start()
+        regions = self._regions.step(step.start_us, step.events, taken)
+        for region in regions:
+            self._announcer.lap("regions", region.latest)
+        self._framing.step(regions, step)
+        return self._judged.step()
+
+    def finish(self) -> list[Packet]:
+        """End the stream's events; give the packets that were still incomplete."""
+        self._framing.close()
+        return self._judged.close()
+
+    def read(self, packets: list[Packet]) -> list[Packet]:
+        """Read the messages that packets carry."""
+        self._given["packets"] += len(packets)
+        self._given["frames_reflected"] += sum(len(p.frames) for p in packets if p.echo_of is not None)
+        packets = [self._on_camera(packet) for packet in packets]
+        if self._messages is None:
+            return packets
+        read = []
+        for packet in packets:
+            self._announcer.start()
+            read.append(self._messages.add(packet))
+            for message in read[-1].messages:
+                self._announcer.lap("message", message)
+        return read
+
+    def refuse(self, packet: Packet) -> None:
+        """Count a packet that another link fits better."""
+        self._of_others += len(packet.frames)
+
+    def disclaim(self, place: Region) -> None:
+        """Count frames that were rejected in another link's place apart from those that no link reads."""
+        self._rejected_of_others += self._framing.disclaim(place)
+
+    def close(self) -> None:
+        """End the stream: what messages still lack is missing."""
+        if self._messages is not None:
+            self._messages.close()
+        # Whoever draws or writes now needs the room.
+        self._regions.close()
+
+    def _on_camera(self, packet: Packet) -> Packet:
+        """A packet with the times of the camera's clock."""
+        frames = tuple(on_camera(frame, self._clock.camera_us) for frame in packet.frames)
+        return changed(packet, t_us=self._clock.camera_us(packet.t_us), frames=frames)
+
+
+def _regions_of(
+    link: Link, tracker: Tracker, limits: Limits, rhythm: Rhythm | None
+) -> RegionFollower | DetectedRegions:
+    """What finds and follows the regions of a stream."""
+    with Guard(link, "detection", may_refuse=True):
+        detector = link.algorithm("detection").compile(link.camera, link.codebook, link.packet)
+    if detector is not None:
+        return DetectedRegions(link, detector, limits)
+    return RegionFollower(
+        link.regions,
+        link.camera,
+        link.packet.chip_us,
+        tracker.position,
+        LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us,
+        limits,
+        link.codebook.longest_gap_chips,
+        rhythm,
+    )

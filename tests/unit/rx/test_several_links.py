@@ -1,0 +1,184 @@
+"""Several links at once: every region is tried by each, the one that fits gives its packets, and no other."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import Link, load_link, resolve
+from evlcp_sdk.rx.contest import explained_us
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols
+from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols
+
+
+def named(name: str, **sections: dict[str, object]) -> Link:
+    return replace(resolve(sections), name=name)
+
+
+BAR = named("bar")
+HALF = named("half", bar={"rows": 48})
+SLOW = named("slow", air={"chip_rate_hz": 5000.0})
+WH8 = named("wh8", modulation={"id": "wh8"})
+LAMP = named(
+    "lamp",
+    bar={"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1},
+    framing={"id": "uart", "parity": "even"},
+    air={"chip_rate_hz": 5000.0},
+)
+FAST_LAMP = LAMP.with_air(chip_rate_hz=10_000.0)
+LEFT, RIGHT = 300.3, 800.7
+
+
+def at(link: Link, x_px: float, seconds: float = 0.12, start_us: float = 5000.0) -> tuple[IdealBar, Events]:
+    """A transmitter at a column for some time, and its events."""
+    packets = max(int(seconds * link.packet.chip_rate_hz / link.packet.packet_chips), 1)
+    small = {} if link.codebook.clusters == 1 else {"cluster_px": 4.0, "width_px": 2}
+    bar = IdealBar(random_symbols(link, packets, int(x_px)), x_px, start_us=start_us, **small)  # type: ignore[arg-type]
+    return bar, ideal_events(link, bar, seed=int(x_px))
+
+
+def received(
+    links: list[Link], events: Events, cuts: list[int] | None = None
+) -> tuple[Receiver, list[Packet]]:
+    receiver, packets = Receiver(links), []
+    ends = [*sorted(cuts or []), len(events)]
+    for start, end in zip([0, *ends], ends, strict=False):
+        packets += receiver.feed(events[start:end])
+    return receiver, packets + receiver.close()
+
+
+def right(packets: list[Packet], link: Link, bar: IdealBar) -> int:
+    """Frames of a bar that say what it sent; all frames in its place must, and name its link."""
+    chip_us, found = link.packet.chip_us, 0
+    starts = [link.packet.frame_start_chip(index) for index in range(link.packet.frames)]
+    for frame in (f for p in packets for f in p.frames if abs(f.x_px - bar.x_px) < 50):
+        assert frame.link == link.name
+        chip = (frame.t_us - bar.start_us) / chip_us
+        packet = int((chip - starts[frame.frame] + 5) // link.packet.packet_chips)
+        assert abs(chip - packet * link.packet.packet_chips - starts[frame.frame]) < 2
+        assert frame.soft.symbols.tolist() == bar.symbols[packet, frame.frame].tolist()
+        found += 1
+    return found
+
+
+@pytest.mark.parametrize("other", [HALF, SLOW, WH8, LAMP], ids=lambda link: link.name)
+def test_each_transmitter_is_read_by_its_own_link_and_by_no_other(other: Link) -> None:
+    one, here = at(BAR, LEFT)
+    two, there = at(other, RIGHT)
+    receiver, packets = received([BAR, other], merged(here, there))
+    assert right(packets, BAR, one) == len(one.symbols) * 10
+    # Of a character that the stream's start cuts, or whose packet's place is not told, nothing is said.
+    assert right(packets, other, two) >= (
+        len(two.symbols) * 10 - 2 if other is LAMP else len(two.symbols) * 10
+    )
+    assert {p.link for p in packets} == {"bar", other.name}
+    numbers = {p.transmitter: p.link for p in packets}
+    assert Counter(numbers.values()) == {"bar": 1, other.name: 1}
+    counts = receiver.counts
+    assert counts["frames"] == sum(len(p.frames) for p in packets)
+    # Fewer than are told in a warning: before a place is held, other links reject frames there.
+    assert counts["frames_rejected"] < 10
+    assert receiver.link_counts["bar"]["frames"] == 10 * len(one.symbols)
+
+
+def test_the_order_of_the_links_does_not_matter() -> None:
+    one, here = at(BAR, LEFT)
+    two, there = at(WH8, RIGHT)
+    packets = received([WH8, BAR], merged(here, there))[1]
+    assert right(packets, BAR, one) == len(one.symbols) * 10
+    assert right(packets, WH8, two) == len(two.symbols) * 10
+
+
+def test_what_is_heard_alone_is_the_same_with_another_link_beside() -> None:
+    events = merged(at(BAR, LEFT)[1], at(BAR, RIGHT)[1], noise_events(20_000, 120_000))
+    alone = Receiver(BAR)
+    single = alone.feed(events) + alone.close()
+    both = received([BAR, SLOW], events)[1]
+    assert [text(p) for p in single] == [text(p) for p in both]
+    assert {p.link for p in single} == {""}
+    assert {p.link for p in both} == {"bar"}
+    assert alone.link_counts == {}
+
+
+def text(packet: Packet) -> str:
+    said = [(f.t_us, f.x_px, f.soft.llr.tobytes(), repr(f.range)) for f in packet.frames]
+    return repr((packet.transmitter, packet.packet, packet.t_us, packet.chip_us, said))
+
+
+STREAM = merged(at(BAR, LEFT, 0.08)[1], at(FAST_LAMP, RIGHT, 0.08)[1])
+
+
+@settings(max_examples=2, deadline=None)
+@given(st.lists(st.integers(0, len(STREAM)), max_size=12))
+def test_any_split_gives_the_same_packets(cuts: list[int]) -> None:
+    whole, pieces = (received([BAR, WH8, FAST_LAMP], STREAM, c) for c in (None, cuts))
+    assert [(p.link, text(p)) for p in whole[1]] == [(p.link, text(p)) for p in pieces[1]]
+    assert whole[0].counts == pieces[0].counts
+    assert {p.link for p in whole[1]} == {"bar", "lamp"}
+
+
+def test_a_place_that_is_left_is_free_for_another_link() -> None:
+    one, first = at(BAR, LEFT, 0.1)
+    two, second = at(WH8, LEFT, 0.1, start_us=400_000.0)
+    packets = received([BAR, WH8], merged(first, second))[1]
+    early = [p for p in packets if p.t_us < 300_000]
+    late = [p for p in packets if p.t_us > 300_000]
+    assert right(early, BAR, one) == len(one.symbols) * 10
+    assert right(late, WH8, two) == len(two.symbols) * 10
+
+
+def test_links_share_the_room_for_events() -> None:
+    receiver = Receiver([BAR, WH8, LAMP])
+    assert {listener._regions._limits.region_bytes for listener in receiver._listeners} == {16 << 20}
+    one, other, lamp = (listener._regions._rhythm for listener in receiver._listeners)
+    assert one is other
+    assert lamp is not one
+
+
+@pytest.mark.parametrize(
+    ("links", "said"),
+    [
+        ([], "no link: expected one or more"),
+        ([BAR, replace(WH8, name="bar")], "two links are named 'bar'"),
+        ([BAR, replace(BAR, name="again")], "'bar' and 'again': they send alike"),
+        ([BAR, named("far", camera={"focal_mm": 50.0}, modulation={"id": "wh8"})], r"\[camera\] differs"),
+        (
+            [BAR, named("fine", regions={"step_us": 1000}, modulation={"id": "wh8"})],
+            "step_us = 1500 and 1000",
+        ),
+    ],
+)
+def test_links_that_cannot_be_received_together_are_refused(links: list[Link], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        Receiver(links)
+
+
+def test_a_link_is_named_after_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "beacon.toml"
+    path.write_text("[air]\nframes_per_packet = 5\n")
+    link = load_link(path)
+    assert link.name == link.with_air(pilot_every=5).name == "beacon"
+    assert link.with_algorithm("ranging", link.algorithm("ranging")).name == "beacon"
+    assert load_link().name == ""
+    # The name is no part of what is on air.
+    assert link == resolve({"air": {"frames_per_packet": 5}})
+
+
+def test_what_a_packet_explains_is_the_time_of_symbols_that_are_right() -> None:
+    form = BAR.packet
+    llr = np.zeros((16, BAR.codebook.bits_per_symbol), np.float32)
+    llr[:, :] = [30.0, -30.0, *[30.0] * (llr.shape[1] - 2)]
+    # Of one cluster a bit is as likely wrong as right; another was not seen.
+    llr[3, 0] = llr[5] = 0.0
+    symbols = np.arange(16)
+    symbols[5] = -1
+    soft = SoftSymbols(symbols, llr, 0.5)
+    frame = Frame(0, 0, 0, 0.0, soft, Range(np.nan, np.nan, 0), None, 0.0, 0.0)
+    packet = Packet(0, 0, 0.0, 100.0, (frame,), 10)
+    assert explained_us(packet, form) == pytest.approx(14.5 * form.frame_chips * 100.0)
