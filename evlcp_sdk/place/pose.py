@@ -73,7 +73,11 @@ def solve_pose(
     found = _plain(problem)
     if isinstance(found, Judged):
         if not found.doubt:
-            return found.pose
+            pose = found.pose
+            # A bar that may be off by so much only is not at another's place; two on gravity do not show it.
+            alone = spec.bar_fault_m > 0 and problem.angles == 2 == len(pose.transmitters)
+            mixed_up = alone and _mixed_up(views, camera, attitude, spec, sigma)
+            return replace(pose, hpl_m=math.inf, vpl_m=math.inf) if mixed_up else pose
         doubt, tests = found.doubt, found.tests
     else:
         if found.kind != "not-determined":
@@ -98,10 +102,7 @@ def solve_pose(
         name, pose = fits[0]
         rivals = [n for n in unsure if tests.get(name, 0.0) - tests.get(n, 0.0) < ODDS and n in tests]
         if not rivals and tests:
-            for mix, mixed in _exchanged(views):
-                swapped = Problem.of(mixed, camera, attitude, spec, sigma)
-                if isinstance(swapped, Problem) and isinstance(_explained(swapped), Pose):
-                    rivals.append(mix)
+            rivals = _mixed_up(views, camera, attitude, spec, sigma)
             if not rivals:
                 return replace(pose, excluded=(name,))
         names = [name, *rivals]
@@ -146,17 +147,27 @@ def fitting_focal_mm(
     return around if one is not None and not one.doubt else math.nan
 
 
-def _exchanged(views: Sequence[BarView]) -> Iterator[tuple[str, list[BarView]]]:
-    """The same with each two sites at each other's place, and what that is called.
+def _mixed_up(
+    views: Sequence[BarView],
+    camera: CameraModel,
+    attitude: Attitude | None,
+    spec: PositionSpec,
+    sigma: CameraSigma,
+) -> list[str]:
+    """Which two sites would explain all, too, if they stood at each other's place.
 
     From behind, two bars are seen the other way round: without a third that is in the way, they would be
     believed to be where they are not.
     """
+    names = []
     for i, j in combinations(range(len(views)), 2):
         one, two, mixed = views[i], views[j], list(views)
         mixed[i] = replace(one, enu_m=two.enu_m, survey=two.survey)
         mixed[j] = replace(two, enu_m=one.enu_m, survey=one.survey)
-        yield f"bar {one.transmitter} at the site of bar {two.transmitter} and the reverse", mixed
+        swapped = Problem.of(mixed, camera, attitude, spec, sigma)
+        if isinstance(swapped, Problem) and isinstance(_explained(swapped), Pose):
+            names.append(f"bar {one.transmitter} at the site of bar {two.transmitter} and the reverse")
+    return names
 
 
 def _without(problem: Problem, sigma: CameraSigma) -> Iterator[tuple[str, Problem | Refusal]]:

@@ -383,6 +383,26 @@ def test_a_lone_bar_has_no_protection() -> None:
     assert math.isinf(pose.vpl_m)
 
 
+def test_a_lone_bar_is_protected_from_being_off_by_so_much() -> None:
+    rng, spec = np.random.default_rng(18), PositionSpec(bar_fault_m=0.5)
+    level = Attitude(5.0, 0.0, 0.0, 0.1, 0.1)
+    for _ in range(60):
+        (seen,), told, _ = drawn(rng, POLES[:1], level, (0.0, 0.0, 0.0), 0.0)
+        moved = dataclasses.replace(seen, enu_m=seen.enu_m + rng.normal(0, 0.5, 3))
+        pose = solved(solve_pose([moved], CAMERA, told, spec))
+        assert math.hypot(*pose.enu_m[:2]) < pose.hpl_m < 6
+        assert abs(pose.enu_m[2]) < pose.vpl_m < 6
+
+
+def test_two_bars_that_may_be_mixed_up_are_not_protected() -> None:
+    """On gravity alone, two that stand alike fit from behind, too, each at the other's site."""
+    rng, spec = np.random.default_rng(19), PositionSpec(bar_fault_m=0.5)
+    for other, alike in ((POLES[1], True), ((4.0, 46.0, 5.5), False)):
+        seen = views([bar(POLES[0]), bar(other)], np.zeros(3), UP.rotation(), rng, 0.1)
+        pose = solved(solve_pose(seen, CAMERA, Attitude(5.0, 0.0, None, 0.1), spec))
+        assert math.isinf(pose.hpl_m) == alike
+
+
 def test_false_alarms_are_as_rare_as_said() -> None:
     """At a chance that can be counted: one of fifty."""
     rng, spec = np.random.default_rng(18), PositionSpec(false_alarm=0.02)
