@@ -1,13 +1,14 @@
 """The SBOM (CycloneDX 1.6) of what `make test` runs with, from the lock and pyproject.toml: `make sbom`.
 
 Without a time and a serial number, so that the same lock gives the same bytes. The hashes of the files stay
-in the lock.
+in the lock. Licences are those that packages state which are installed here in the version of the lock.
 """
 
 import json
 import re
 import sys
 import tomllib
+from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,27 @@ def locked(text: str) -> list[tuple[str, str, str]]:
     return found
 
 
+def licences(name: str, version: str) -> list[dict[str, Any]]:
+    """What an installed package says of its licence: an SPDX expression, or else names."""
+    try:
+        stated = metadata(name)
+    except PackageNotFoundError:
+        return []
+    if stated["Version"] != version:
+        return []
+    if expression := stated["License-Expression"]:
+        return [{"expression": expression}]
+    names = [
+        line.rpartition(" :: ")[2]
+        for line in stated.get_all("Classifier", [])
+        if line.startswith("License ::")
+    ]
+    said = (stated["License"] or "").strip()
+    if not names and said:
+        names = [said.splitlines()[0][:80]]
+    return [{"license": {"name": one}} for one in names]
+
+
 def sbom(lock: str, project: dict[str, Any]) -> dict[str, Any]:
     """The bill of materials as a table."""
     components = []
@@ -37,6 +59,8 @@ def sbom(lock: str, project: dict[str, Any]) -> dict[str, Any]:
             "version": version,
             "purl": purl,
         }
+        if found := licences(name, version):
+            one["licenses"] = found
         if marker:
             one["properties"] = [{"name": "python:marker", "value": marker}]
         components.append(one)

@@ -72,4 +72,6 @@ def test_the_sbom_names_every_package_of_the_lock() -> None:
     assert all(one["purl"] == f"pkg:pypi/{one['name']}@{one['version']}" for one in table["components"])
     refs = [one["bom-ref"] for one in table["components"]]
     assert len(set(refs)) == len(refs) > 50
+    licensed = {one["name"]: one["licenses"] for one in table["components"] if "licenses" in one}
+    assert licensed.keys() >= {"numpy", "scipy", "pydantic", "hatchling"}, "of those that are installed"
     assert "sbom:" in (ROOT / "Makefile").read_text()

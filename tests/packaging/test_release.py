@@ -1,0 +1,33 @@
+"""What a release consists of agrees: version, citation, changelog, sdist and wheel."""
+
+import importlib.util
+import re
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def test_citation_and_project_state_the_same_version_and_licence() -> None:
+    stated = dict(re.findall(r"^(version|license): (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE))
+    assert stated == {"version": PROJECT["version"], "license": PROJECT["license"]}
+
+
+def test_the_changelog_begins_with_what_comes_next() -> None:
+    heads = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert heads[0] in ("Unreleased", PROJECT["version"])
+    assert PROJECT["version"] in heads[:2]
+
+
+def test_a_wheel_from_the_sdist_is_the_wheel_of_the_checkout(tmp_path: Path) -> None:
+    spec = importlib.util.spec_from_file_location("release", ROOT / ".ci" / "release.py")
+    assert spec is not None
+    assert spec.loader is not None
+    release = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(release)
+    sdist, wheel = release.built(tmp_path)
+    assert sdist.name == f"evlcp_sdk-{PROJECT['version']}.tar.gz"
+    inside = release.contents(wheel)
+    assert {"evlcp_sdk/py.typed", "evlcp_sdk/data/demo.toml", "evlcp_uart/framing.py"} <= inside.keys()
+    assert not [name for name in inside if name.startswith(("tests/", "docs/", "examples/"))]
