@@ -9,7 +9,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test ready lint kernels docs fuzz sbom format pictures clean
+.PHONY: help demo test ready lint kernels docs notebooks fuzz sbom release format pictures clean
 
 help:  ## Show this list
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -40,12 +40,18 @@ docs: $(VENV)/.dev  ## Build the documentation site; site/index.html
 	$(BIN)/python -m sphinx -q -W --keep-going -d .sphinx docs site
 	@echo "open site/index.html"
 
+notebooks: $(VENV)/.dev  ## Run the notebooks of the docs and keep what they show
+	$(BIN)/python docs/run_notebooks.py
+
 MINUTES ?= 5
 fuzz: $(VENV)/.dev  ## Damage files of every kind and read them, for MINUTES
 	$(BIN)/python -m tests.fuzz --minutes $(MINUTES)
 
 sbom: $(VENV)/.dev  ## Write sbom.json, what the tests run with, from the lock
 	$(BIN)/python .ci/sbom.py > sbom.json
+
+release: $(VENV)/.dev  ## Build sdist and wheel, try the wheel on each Python 3.11 to 3.13 there is; dist/
+	$(BIN)/python .ci/release.py
 
 format: $(VENV)/.dev  ## Format the code
 	$(BIN)/ruff format
@@ -55,6 +61,7 @@ pictures: $(VENV)/.installed  ## Draw the pictures of the docs again
 	cp demo-out/presence.png demo-out/distance.png docs/images/
 	$(BIN)/evlcp video examples/recordings/night-50m-30kmh-cut.raw -o docs/images/film.webp \
 	  --for-ms 10 --size 420
+	$(BIN)/python benchmarks/how_pictures.py docs/images
 	$(BIN)/python benchmarks/link_picture.py docs/images/link.svg
 	$(BIN)/python benchmarks/packet_picture.py docs/images/packet.svg
 	$(BIN)/evlcp simulate examples/scenes/gate.toml -o demo-out/gate.raw

@@ -18,7 +18,7 @@ extensions = [
     "evlcp_docs",
 ]
 
-myst_enable_extensions = ["colon_fence", "dollarmath", "attrs_inline"]
+myst_enable_extensions = ["colon_fence", "dollarmath", "attrs_inline", "deflist"]
 myst_heading_anchors = 4
 myst_heading_slug_func = "evlcp_docs.slug_of"
 

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import inspect
+import json
 import os
 import pkgutil
 import re
@@ -11,6 +12,8 @@ from typing import Any, get_type_hints
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
+from error_index import as_markdown, messages
+from myst_parser.parsers.sphinx_ import MystParser
 from pydantic.fields import FieldInfo
 from sphinx.application import Sphinx
 
@@ -57,7 +60,12 @@ def on_site(text: str, path: Path) -> str:
 
 
 def with_reference(text: str) -> str:
-    """Markdown with its lines `{names} NAME ...` and `{modules} PACKAGE` as directives of autodoc."""
+    """Markdown with its lines `{names} NAME ...` and `{modules} PACKAGE` as directives of autodoc.
+
+    A line `{errors}` becomes the table of all messages.
+    """
+    if re.search(r"^\{errors\}$", text, re.MULTILINE):
+        text = text.replace("\n{errors}\n", as_markdown(messages()))
     text = re.sub(r"^\{names\} (.+)$", lambda line: _names(line[1].split()), text, flags=re.MULTILINE)
     return re.sub(r"^\{modules\} (\S+)$", lambda line: _modules(line[1]), text, flags=re.MULTILINE)
 
@@ -93,6 +101,8 @@ def _read(app: Sphinx, page: str, source: list[str]) -> None:
     if path.suffix == ".md":
         app.env.note_dependency(path)
         app.env.note_dependency(__file__)
+        if page == "errors":
+            app.env.note_reread()
         source[0] = with_reference(on_site(path.read_text(encoding="utf-8"), path))
 
 
@@ -149,6 +159,32 @@ def _signature(
     return short(signature), short(returned)
 
 
+class NotebookParser(MystParser):
+    """A notebook as a page: its text, its code, and what that showed when it was run last."""
+
+    supported = ("notebook",)
+
+    def parse(self, inputstring: str, document: nodes.document) -> None:
+        """See `docutils.parsers.Parser`."""
+        parts = []
+        for cell in json.loads(inputstring)["cells"]:
+            text = "".join(cell["source"])
+            parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
+            parts += filter(None, map(_shown, cell.get("outputs", ())))
+        super().parse("\n\n".join(parts) + "\n", document)
+
+
+def _shown(output: dict[str, Any]) -> str:
+    """What a cell showed: a picture, a table, or text."""
+    data = output.get("data", {})
+    if "image/png" in data:
+        return f'<img alt="What this cell draws" src="data:image/png;base64,{data["image/png"].strip()}">'
+    if "text/html" in data:
+        return "```{raw} html\n" + "".join(data["text/html"]) + "\n```"
+    text = "".join(output.get("text", data.get("text/plain", "")))
+    return f"```text\n{text.rstrip()}\n```" if text.strip() else ""
+
+
 def _inline_math(writer: Any, node: nodes.math) -> None:
     """A formula within a line."""
     writer.body.append(tex2mathml(node.astext()))
@@ -164,6 +200,8 @@ def _block_math(writer: Any, node: nodes.math_block) -> None:
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register with Sphinx."""
     app.add_html_math_renderer("mathml", (_inline_math, None), (_block_math, None))
+    app.add_source_suffix(".ipynb", "notebook")
+    app.add_source_parser(NotebookParser)
     app.connect("source-read", _read)
     app.connect("autodoc-process-docstring", _docstring, priority=100)
     app.connect("autodoc-process-signature", _signature)

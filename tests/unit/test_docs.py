@@ -48,8 +48,16 @@ PAGES = (
     "roles",
     "conformance",
     "hooks",
+    "glossary",
+    "faq",
+    "errors",
 )
-FILES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs" / f"{page}.md" for page in PAGES)]
+FILES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *(ROOT / "docs" / f"{page}.md" for page in PAGES),
+    *sorted((ROOT / "docs" / "how").glob("*.md")),
+]
 HOOKS = [name for name in vars(hookspecs) if name.startswith("evlcp_")]
 
 

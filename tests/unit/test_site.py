@@ -50,6 +50,8 @@ def test_the_site_is_whole_and_asks_no_other_server(tmp_path: Path) -> None:
             r"<link\b(?![^>]*rel=\"(?:canonical|author|search)\")[^>]*?href=\"([^\"]*)\"", text
         )
         for name in fetched:
+            if name.startswith("data:"):
+                continue
             path = name.partition("?")[0].partition("#")[0]
             assert (page.parent / path).exists(), f"{page.name} asks for {name}"
     if CHROMIUM is None:
@@ -69,3 +71,30 @@ def test_the_site_is_whole_and_asks_no_other_server(tmp_path: Path) -> None:
             const links = [...document.querySelectorAll('#search-results li a')].map(a => a.href);
             links.length > 2 ? done(links) : setTimeout(look, 50); }; look(); })"""
         assert any("receiver.html" in link for link in browser.value(found))
+
+
+def test_every_fault_that_code_raises_is_in_the_index_of_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By another way than the index itself: the words of a raise statement, line by line."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    from error_index import EXIT_CODES, as_markdown, messages
+
+    found = messages()
+    page = as_markdown(found)
+    kinds = "|".join(EXIT_CODES)
+    missed, seen = [], 0
+    for path in sorted((ROOT / "evlcp_sdk").rglob("*.py")):
+        for text in re.findall(
+            rf"raise (?:{kinds})\(\s*f?\"([^\"{{}}`|]{{12,}})\"", path.read_text(encoding="utf-8")
+        ):
+            seen += 1
+            if " ".join(text.split()) not in page:
+                missed.append(f"{path.name}: {text}")
+    assert seen > 25
+    assert not missed
+    assert len(found) > 400
+    assert sum(bool(one.cause) for one in found) > len(found) / 2
+    listed = (ROOT / "docs" / "errors.md").read_text().split("## The ones seen most")[1]
+    sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "evlcp_sdk").rglob("*.py"))
+    sources += "".join(path.read_text(encoding="utf-8") for path in (ROOT / "firmware_host").rglob("*.py"))
+    for words in re.findall(r"^\| `([^`]+)` \|", listed, re.MULTILINE):
+        assert words in sources, words

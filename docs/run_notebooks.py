@@ -1,0 +1,52 @@
+"""Run the notebooks and keep what they show: `python docs/run_notebooks.py [NAME ...]`."""
+
+import os
+import sys
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+
+FOLDER = Path(__file__).resolve().parent / "notebooks"
+
+
+def executed(path: Path) -> nbformat.NotebookNode:
+    """A notebook with what its cells show now; times and numbers of runs are left out.
+
+    Raises:
+        CellExecutionError: A cell fails.
+    """
+    notebook = nbformat.read(path, as_version=4)
+    client = NotebookClient(
+        notebook,
+        kernel_name="python3",
+        timeout=120,
+        record_timing=False,
+        # Its warning that others on this machine could listen.
+        extra_arguments=["--IPKernelApp.log_level=ERROR"],
+    )
+    client.execute(
+        cwd=str(path.parent), env=os.environ | {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}
+    )
+    for cell in notebook.cells:
+        cell.metadata.clear()
+        if cell.cell_type == "code":
+            cell.execution_count = None
+            for output in cell.outputs:
+                if "execution_count" in output:
+                    output.execution_count = None
+    return notebook
+
+
+def said(notebook: nbformat.NotebookNode) -> list[str]:
+    """What the cells of a notebook print, cell by cell."""
+    return [
+        "".join(output.text for output in cell.outputs if output.output_type == "stream")
+        for cell in notebook.cells
+        if cell.cell_type == "code"
+    ]
+
+
+if __name__ == "__main__":
+    for name in sys.argv[1:] or sorted(path.stem for path in FOLDER.glob("*.ipynb")):
+        nbformat.write(executed(FOLDER / f"{name}.ipynb"), FOLDER / f"{name}.ipynb")
