@@ -6,6 +6,7 @@ on, has a pilot; the others are the info segment alone.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,17 +54,17 @@ class PacketFormat:
             pilot_every=pilot_every,
         )
 
-    @property
+    @cached_property
     def frame_chips(self) -> int:
         """Chips of a frame with a pilot: pilot and info segment."""
         return self.pilot_chips + self.info_chips
 
-    @property
+    @cached_property
     def packet_chips(self) -> int:
         """Chips of one packet: preamble and frames."""
         return self.frame_start_chip(self.frames)
 
-    @property
+    @cached_property
     def chip_us(self) -> float:
         """Nominal length of a chip, us."""
         return 1e6 / self.chip_rate_hz

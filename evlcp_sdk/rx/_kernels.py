@@ -111,14 +111,15 @@ def all_within(values: Array, least: Any, most: Any) -> bool:
 @njit(cache=True, nogil=True)
 def grow_old(pixels: Array, first: int, many: int, now: int, least: int, age: int) -> None:
     """In so many rows from the first on, round and round, set rises of `least` ticks ago or more to `age`."""
-    then = (np.uint32(now) - np.uint32(age)) << _CLOCK
-    height, width = pixels.shape
+    then = np.uint32((np.uint32(now) - np.uint32(age)) << _CLOCK)
+    today, oldest = np.uint32(now), np.uint32(least)
+    height = len(pixels)
     for row in range(first, first + many):
-        v = row % height
-        for u in range(width):
-            state = pixels[v, u]
-            old = ((np.uint32(now) - (state >> _CLOCK)) & _ROUND) >= np.uint32(least)
-            pixels[v, u] = then | (state & _LOW) if old else state
+        line = pixels[row % height]
+        for u in range(line.size):
+            state = line[u]
+            ago = np.uint32(np.uint32(today - np.uint32(state >> _CLOCK)) & _ROUND)
+            line[u] = np.uint32(then | np.uint32(state & _LOW)) if ago >= oldest else state
 
 
 @njit(cache=True, nogil=True)
@@ -359,21 +360,44 @@ def add_polarity(
     origin = start_off_us - row_us * row_px
     apart = start_on_us - start_off_us
     rate = 1 / chip_us
-    for i in range(first, last):
-        # Arithmetic, not a branch: polarity is as good as random.
-        on = np.int64(p[i])
-        row = np.int64(y[i])
-        late = t_us[i] - origin - row_us * row - apart * on
-        if late < 0:
-            continue
-        c = np.uint64(np.int64(late * rate))
-        if c >= np.uint64(chips):
-            continue
-        # Unsigned, a pixel to the left of the image is far to its right: one comparison for both edges.
-        u = np.uint64(np.int64(x[i]) - shift_x[c])
-        v = np.uint64(row - shift_y[c])
-        if u < np.uint64(width) and v < np.uint64(height):
-            sums[c, v, u] += np.int16(2 * on - 1)
+    # Which chip, many events at a time; then into its pixel, one by one.
+    which = np.empty(_MANY, np.int32)
+    columns, rows = np.uint32(width), np.uint32(height)
+    for begin in range(first, last, _MANY):
+        end = min(begin + _MANY, last)
+        _chips_of(t_us[begin:end], y[begin:end], p[begin:end], origin, row_us, apart, rate, which)
+        for i in range(begin, end):
+            c = np.uint32(which[i - begin])
+            if c >= np.uint32(chips):
+                continue
+            # Unsigned, a pixel to the left of the image is far to its right: one comparison for both edges.
+            u = np.uint32(np.int32(x[i]) - np.int32(shift_x[c]))
+            v = np.uint32(np.int32(y[i]) - np.int32(shift_y[c]))
+            if u < columns and v < rows:
+                # Arithmetic, not a branch: polarity is as good as random.
+                sums[c, v, u] += np.int16(2 * np.int16(p[i]) - 1)
+
+
+_MANY = 512
+"""Events whose chips are found together: they stay in the fastest cache."""
+
+
+@njit(cache=True, nogil=True)
+def _chips_of(
+    t_us: Array,
+    y: Array,
+    p: Array,
+    origin: float,
+    row_us: float,
+    apart: float,
+    rate: float,
+    out: Array,
+) -> None:
+    """Number of each event's chip, `out` int32 (n,); -1 before the first."""
+    for i in range(t_us.size):
+        late = t_us[i] - origin - row_us * y[i] - apart * p[i]
+        chip = np.int32(min(late * rate, 1e9))
+        out[i] = np.int32(-1) if late < 0 else chip
 
 
 @njit(cache=True, nogil=True)
@@ -425,8 +449,9 @@ def blobs(selected: Array, at: Array, cluster: Array, cells: Array) -> int:
     stack = np.empty((rows * columns, 2), np.int64)
     n = 0
     for k in range(clusters):
-        done[:] = False
-        for r in range(rows):
+        first, last = rows_of(selected[k])
+        done[first:last] = False
+        for r in range(first, last):
             for c in range(columns):
                 if not selected[k, r, c] or done[r, c]:
                     continue
@@ -574,6 +599,19 @@ def _share(off: float, half: float, grid: float) -> float:
 
 
 @njit(cache=True, nogil=True)
+def _add_to(total: Array, part: Array) -> None:
+    for j in range(total.size):
+        total[j] += part[j]
+
+
+@njit(cache=True, nogil=True)
+def _strip(unit: complex, along: float, across: float) -> tuple[float, float]:
+    """How far to the right and down a strip reaches, so long along a direction, so wide across it."""
+    right, down = abs(unit.real), abs(unit.imag)
+    return along * right + across * down + 1e-6, along * down + across * right + 1e-6
+
+
+@njit(cache=True, nogil=True)
 def across_profile(
     probability: Array,
     seen: Array,
@@ -596,18 +634,15 @@ def across_profile(
             near[k, other] = abs(places[other] - places[k]) <= 1.5 * spacing
     every = np.zeros((rows, columns))
     for k in range(places.size):
-        for r in range(rows):
-            for c in range(columns):
-                every[r, c] += probability[k, r, c]
+        _add_to(every.reshape(-1), np.ascontiguousarray(probability[k]).reshape(-1))
     half = spacing / 2 + grid
-    # Of the box that holds the strip about a place, whatever its turn.
-    reach = np.hypot(half, hits.size)
+    wide, high = _strip(unit, half, hits.size)
     for k in range(places.size):
         if not seen[k]:
             continue
         x, y = places[k].real, places[k].imag
-        for r in range(max(int((y - reach) / grid), 0), min(int((y + reach) / grid) + 1, rows)):
-            for c in range(max(int((x - reach) / grid), 0), min(int((x + reach) / grid) + 1, columns)):
+        for r in range(max(int((y - high) / grid), 0), min(int((y + high) / grid) + 1, rows)):
+            for c in range(max(int((x - wide) / grid), 0), min(int((x + wide) / grid) + 1, columns)):
                 off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - places[k]
                 off *= unit.conjugate()
                 share = _share(off.real, spacing / 2, grid)
@@ -652,11 +687,11 @@ def core_profile(hits: Array, cells: Array, edge: float, out: Array) -> int:
 def line_prior(places: Array, unit: complex, spacing: float, grid: int, profile: Array, out: Array) -> None:
     """Probability of each cluster of a line in each cell, by its share of the cell and its distance off."""
     _, rows, columns = out.shape
-    reach = np.hypot(spacing / 2 + grid, profile.size)
+    wide, high = _strip(unit, spacing / 2 + grid, profile.size)
     for k in range(places.size):
         x, y = places[k].real, places[k].imag
-        for r in range(max(int((y - reach) / grid), 0), min(int((y + reach) / grid) + 1, rows)):
-            for c in range(max(int((x - reach) / grid), 0), min(int((x + reach) / grid) + 1, columns)):
+        for r in range(max(int((y - high) / grid), 0), min(int((y + high) / grid) + 1, rows)):
+            for c in range(max(int((x - wide) / grid), 0), min(int((x + wide) / grid) + 1, columns)):
                 off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - places[k]
                 off *= unit.conjugate()
                 if abs(off.imag) < profile.size:
@@ -684,35 +719,91 @@ def pilot_light(sums: Array, codes: Array, every: int, prior: Array, grid: int, 
     `codes` are edges, (K, n), `every` so many chips. A pixel's value is the sign of the sum of the chip
     behind one, or 0; where edges are in the middle of pairs, else the opposite of that of the chip before.
     """
-    clusters, rows, columns = prior.shape
+    clusters, _, columns = prior.shape
     length = codes.shape[1]
-    height, width = rows * grid, columns * grid
-    values = np.empty((length, height, width), np.int8)
+    _, height, width = sums.shape
+    flat = np.ascontiguousarray(sums).reshape(len(sums), height * width)
+    values = np.empty((length, height * width), np.int8)
     for i in range(length):
-        for v in range(height):
-            for u in range(width):
-                first, second = sums[every * i, v, u], sums[every * i + 1, v, u]
-                if every == 1:
-                    first = 0
-                values[i, v, u] = (second > 0) - (second < 0) + (second == 0) * ((first < 0) - (first > 0))
+        _values(flat[every * i], flat[every * i + 1], every > 1, values[i])
+    agree = np.empty(height * width, np.int16)
     for k in range(clusters):
         edges = 0
         for i in range(length):
             edges += abs(codes[k, i])
+        top, bottom = rows_of(prior[k])
+        if edges == 0 or top >= bottom:
+            out[k] = 0.0
+            continue
+        begin, end = top * grid * width, bottom * grid * width
+        agree[begin:end] = 0
+        for i in range(length):
+            if codes[k, i] != 0:
+                _add_values(agree[begin:end], values[i, begin:end], np.int8(codes[k, i]))
         total, place = 0.0, 0.0
-        for r in range(rows):
+        for r in range(top, bottom):
             for c in range(columns):
                 weight = prior[k, r, c]
                 if weight == 0:
                     continue
                 place += weight * grid * grid
-                agree = 0
+                both = 0
                 for v in range(r * grid, (r + 1) * grid):
                     for u in range(c * grid, (c + 1) * grid):
-                        for i in range(length):
-                            agree += codes[k, i] * values[i, v, u]
-                total += weight * agree
-        out[k] = total / (edges * place) if place > 0 and edges > 0 else 0.0
+                        both += agree[v * width + u]
+                total += weight * both
+        out[k] = total / (edges * place) if place > 0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def lit_clusters(
+    sums: Array,
+    codes: Array,
+    every: int,
+    prior: Array,
+    grid: int,
+    in_place: Array,
+    least: float,
+    seen: Array,
+) -> bool:
+    """Which clusters show light by `pilot_light`: `least` of the median of those in place; whether all do."""
+    light = np.empty(len(codes))
+    pilot_light(sums, codes, every, prior, grid, light)
+    others = light[in_place]
+    enough = max(least * np.median(others) if others.size else 0.0, 1e-9)
+    for k in range(light.size):
+        seen[k] = light[k] >= enough
+    return bool(np.all(seen))
+
+
+@njit(cache=True, nogil=True)
+def _values(first: Array, second: Array, pairs: bool, out: Array) -> None:
+    """Sign of the second of two sums, `out` int8 (n,); of `pairs`, if that is 0, the first's opposite."""
+    both = np.int8(pairs)
+    for j in range(out.size):
+        a, b = first[j], second[j]
+        up, down = np.int8(b > 0) - np.int8(b < 0), np.int8(a < 0) - np.int8(a > 0)
+        out[j] = up + down * np.int8(b == 0) * both
+
+
+@njit(cache=True, nogil=True)
+def _add_values(total: Array, values: Array, sign: np.int8) -> None:
+    for j in range(total.size):
+        total[j] = np.int16(total[j] + np.int8(values[j] * sign))
+
+
+@njit(cache=True, nogil=True)
+def rows_of(image: Array) -> tuple[int, int]:
+    """First row that is not 0 throughout, and the one after the last; (0, 0) without any."""
+    top, bottom = 0, 0
+    for r in range(len(image)):
+        some, row = False, image[r]
+        for c in range(row.size):
+            some |= row[c] != 0
+        if some:
+            top = r if bottom == 0 else top
+            bottom = r + 1
+    return top, bottom
 
 
 @njit(cache=True, nogil=True)
@@ -777,13 +868,13 @@ def spread_across(
     chips = codes.shape[1]
     _, height, width = sums.shape
     most = out.shape[1] // 2
-    reach = along + most + 1
+    wide, high = _strip(way, along, most + 1.0)
     for k in range(len(places)):
         if not seen[k]:
             continue
         x, y = places[k].real, places[k].imag
-        for v in range(max(int(y - reach), 0), min(int(y + reach) + 2, height)):
-            for u in range(max(int(x - reach), 0), min(int(x + reach) + 2, width)):
+        for v in range(max(int(y - high), 0), min(int(y + high) + 2, height)):
+            for u in range(max(int(x - wide), 0), min(int(x + wide) + 2, width)):
                 off = (complex(u, v) - places[k]) * way.conjugate()
                 if abs(off.real) > along:
                     continue
@@ -800,14 +891,35 @@ def spread_across(
 
 
 @njit(cache=True, nogil=True)
+def spread_about(
+    sums: Array,
+    codes: Array,
+    every: int,
+    places: Array,
+    seen: Array,
+    pairs: Array,
+    way: complex,
+    along: float,
+    zones: tuple[float, float, float],
+    between: Array,
+    across: Array,
+) -> None:
+    """Both `spread_between`, by (half, first, last), and, unless `way` is 0, `spread_across`."""
+    half, first, last = zones
+    spread_between(sums, codes, places, seen, pairs, half, first, last, between)
+    if way != 0:
+        spread_across(sums, codes, every, places, seen, way, along, across)
+
+
+@njit(cache=True, nogil=True)
 def copy_near(pixels: Array, places: Array, unit: complex, along: float, across: float, out: Array) -> None:
     """Copy what lies within reach of each cluster's place, along a direction and across it."""
     _, height, width = pixels.shape
-    reach = along + across
+    wide, high = _strip(unit, along, across)
     for k in range(places.size):
         x, y = places[k].real, places[k].imag
-        for v in range(max(int(y - reach), 0), min(int(y + reach) + 2, height)):
-            for u in range(max(int(x - reach), 0), min(int(x + reach) + 2, width)):
+        for v in range(max(int(y - high), 0), min(int(y + high) + 2, height)):
+            for u in range(max(int(x - wide), 0), min(int(x + wide) + 2, width)):
                 off = (complex(u, v) - places[k]) * unit.conjugate()
                 if abs(off.real) <= along and abs(off.imag) <= across:
                     out[k, v, u] = pixels[k, v, u]
@@ -980,7 +1092,8 @@ def info_activity(sums: Array, weight: Array, grid: int, pilot_chips: int, least
                     over[r, c] += info[u] * by_info - pilot[u] * by_pilot
     for k in range(clusters):
         total = 0.0
-        for r in range(rows):
+        top, bottom = rows_of(weight[k])
+        for r in range(top, bottom):
             for c in range(columns):
                 if weight[k, r, c] != 0:
                     total += weight[k, r, c] * over[r, c]
@@ -1212,10 +1325,11 @@ def mean_length(
 @njit(cache=True, nogil=True)
 def farthest_off(selected: Array, grid: int, on: complex, turn: complex) -> float:
     """Farthest that the middle of a cell of any cluster lies off the line through `on` along `turn`, px."""
-    clusters, rows, columns = selected.shape
+    clusters, _, columns = selected.shape
     most = 0.0
     for k in range(clusters):
-        for r in range(rows):
+        top, bottom = rows_of(selected[k])
+        for r in range(top, bottom):
             for c in range(columns):
                 if selected[k, r, c]:
                     off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - on
@@ -1224,15 +1338,24 @@ def farthest_off(selected: Array, grid: int, on: complex, turn: complex) -> floa
 
 
 @njit(cache=True, nogil=True)
+def bounds_of(places: Array) -> tuple[float, float, float, float]:
+    """Least and greatest column and row of places (K,), columns + rows * 1j."""
+    left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
+    for place in places:
+        left, right = min(left, place.real), max(right, place.real)
+        top, bottom = min(top, place.imag), max(bottom, place.imag)
+    return left, right, top, bottom
+
+
+@njit(cache=True, nogil=True)
 def keep_inside(prior: Array, probability: Array, selected: Array, out: Array, chosen: Array) -> None:
     """Probabilities, and the choice, of cells whose prior is not 0; 0 and False elsewhere."""
-    clusters, rows, columns = prior.shape
-    for k in range(clusters):
-        for r in range(rows):
-            for c in range(columns):
-                inside = prior[k, r, c] > 0
-                out[k, r, c] = probability[k, r, c] if inside else 0.0
-                chosen[k, r, c] = selected[k, r, c] and inside
+    likely, before = prior.reshape(-1), np.ascontiguousarray(probability).reshape(-1)
+    was, after, now = np.ascontiguousarray(selected).reshape(-1), out.reshape(-1), chosen.reshape(-1)
+    for j in range(likely.size):
+        inside = likely[j] > 0
+        after[j] = before[j] if inside else before.dtype.type(0)
+        now[j] = was[j] & inside
 
 
 @njit(cache=True, nogil=True)
@@ -1334,6 +1457,41 @@ def mean_off(points: Array, places: Array) -> complex | None:
             total += complex(points[k, 0], points[k, 1]) - places[k]
             n += 1
     return total / n if n else None
+
+
+@njit(cache=True, nogil=True)
+def places_at(t_us: Array, places: Array, ahead: float, centre: Array) -> None:
+    """Centre (2, m) at times (m,), on straight lines between `places` (5, n): times, columns, rows, ...
+
+    Before the first place and after the last it goes on for `ahead` times as long as to its neighbour.
+    """
+    n = places.shape[1]
+    for a in range(2):
+        at = places[a + 1]
+        j = 0
+        for i in range(t_us.size):
+            if n == 1:
+                centre[a, i] = at[0]
+                continue
+            t = t_us[i]
+            while j > 0 and places[0, j] > t:
+                j -= 1
+            while j < n - 2 and places[0, j + 1] <= t:
+                j += 1
+            # The piece of the way that holds the time: from a place to the next, or beyond the outermost.
+            from_us, until_us, here, there = places[0, j], places[0, j + 1], at[j], at[j + 1]
+            if t < from_us:
+                until_us, there = from_us, here
+                from_us -= ahead * (places[0, 1] - from_us)
+                here -= ahead * (at[1] - here)
+            elif t >= until_us:
+                from_us, here = until_us, there
+                until_us += ahead * (until_us - places[0, n - 2])
+                there += ahead * (there - at[n - 2])
+            t = min(max(t, from_us), until_us)
+            centre[a, i] = (
+                there if t == until_us else (there - here) / (until_us - from_us) * (t - from_us) + here
+            )
 
 
 @njit(cache=True, nogil=True)

@@ -1,6 +1,5 @@
 """Regions that an algorithm of the role `detection` gives, followed as the receiver's own are."""
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -12,6 +11,7 @@ from evlcp_sdk.plugin.roles import Detector
 from evlcp_sdk.rx.detection import Followed, same_place
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.limits import LIMITS, Limits
+from evlcp_sdk.rx.places import Places
 from evlcp_sdk.values import Events, Region
 
 __all__ = ["DetectedRegions"]
@@ -63,7 +63,7 @@ class DetectedRegions:
             if id in known:
                 known[id].positions.append(place)
             elif len(self.alive) < self._limits.regions:
-                known[id] = Followed(id, deque([place]), start_us, opened_us=start_us + self._step_us)
+                known[id] = Followed(id, Places([place]), start_us, opened_us=start_us + self._step_us)
                 self.alive.append(known[id])
             else:
                 self.counts["regions_left_out"] += 1

@@ -15,9 +15,10 @@ from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.plugin.roles import Filter
 from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
+from evlcp_sdk.rx.places import Places, region_of
 from evlcp_sdk.rx.rhythm import Rhythm, select
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import Events, Region, changed
+from evlcp_sdk.values import Events, Region
 
 if TYPE_CHECKING:
     from evlcp_sdk.rx import _kernels
@@ -39,9 +40,6 @@ _AGE_CHIPS = 5
 """Age of a measured centre. A moving bar's leading end counts once its pixels have risen in rhythm twice,
 some six chips late and more where events go missing; its trailing end stays for the six chips of the
 measurement. In recordings and simulated scenes the centre is 3 to 8 chips late."""
-
-_MOST_AHEAD_STEPS = 2
-"""Steps beyond the measured centres for which a region goes straight on, before a shaking camera turns."""
 
 _HEIGHTS = 9
 """Measured heights whose median is a region's: a bar ahead grows by a percent in so many steps at 80 km/h."""
@@ -105,7 +103,7 @@ class Followed:
     """
 
     id: int
-    positions: deque[Region]
+    positions: Places
     first_us: int
     pieces: deque[Piece] = field(default_factory=deque)
     released: bool = False
@@ -147,85 +145,18 @@ class Followed:
     @property
     def latest(self) -> Region:
         """The newest position."""
-        return self.positions[-1]
-
-    def expected(self, t_us: float) -> Region:
-        """Where the region should be at a time soon, if it goes on as between the two newest positions."""
-        last = self.positions[-1]
-        if len(self.positions) < 2:
-            return last
-        before = self.positions[-2]
-        ahead = (t_us - last.t_us) / (last.t_us - before.t_us)
-        # Further ahead than that, a shaking camera has turned back.
-        ahead = min(ahead, 1.0)
-        x = last.x_px + ahead * (last.x_px - before.x_px)
-        y = last.y_px + ahead * (last.y_px - before.y_px)
-        return _region(last.id, t_us, x, y, last.width_px, last.height_px)
-
-    def at(self, t_us: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centre (column, row) at times, interpolated; straight on for a little before and after, px."""
-        # Those about the times asked for, which are few of many.
-        first, last = float(t_us.min(initial=math.inf)), float(t_us.max(initial=-math.inf))
-        t: list[float] = []
-        x: list[float] = []
-        y: list[float] = []
-        before = 0
-        for place in reversed(self.positions):
-            if len(t) == 2 and place.t_us >= last:
-                # Two before the newest are at or after the last time asked for.
-                del t[0], x[0], y[0]
-            t.append(place.t_us)
-            x.append(place.x_px)
-            y.append(place.y_px)
-            before += place.t_us < first
-            if before == 2:
-                break
-        t, x, y = t[::-1], x[::-1], y[::-1]
-        if len(t) > 1:
-            # A place more at each end, on the straight line through the outermost two.
-            n = _MOST_AHEAD_STEPS
-            t, x, y = ([v[0] - n * (v[1] - v[0]), *v, v[-1] + n * (v[-1] - v[-2])] for v in (t, x, y))
-        return np.interp(t_us, t, x), np.interp(t_us, t, y)
-
-    def place_at(self, t_us: float) -> tuple[float, float]:
-        """The same as `at` for one time."""
-        positions = self.positions
-        n = len(positions)
-        last = positions[-1]
-        if n == 1:
-            return last.x_px, last.y_px
-        # The line from the place before a time to the one after it; the outermost ones go on for a little.
-        right = n - 1
-        while right > 1 and positions[right - 1].t_us > t_us:
-            right -= 1
-        one, other = positions[right - 1], positions[right]
-        long_us = other.t_us - one.t_us
-        base = other if t_us > other.t_us else one
-        after_us = min(max(t_us - base.t_us, -_MOST_AHEAD_STEPS * long_us), _MOST_AHEAD_STEPS * long_us)
-        x = base.x_px + (other.x_px - one.x_px) / long_us * after_us
-        return x, base.y_px + (other.y_px - one.y_px) / long_us * after_us
-
-    def size_at(self, t_us: float) -> tuple[float, float]:
-        """(width, height) measured nearest to a time, px."""
-        positions = self.positions
-        i = len(positions) - 1
-        while i and positions[i - 1].t_us >= t_us:
-            i -= 1
-        if i and t_us - positions[i - 1].t_us < positions[i].t_us - t_us:
-            i -= 1
-        return positions[i].width_px, positions[i].height_px
+        return self.positions.latest
 
     def covers(self, t_us: float, point_px: tuple[float, float]) -> bool:
         """Whether a point on the sensor (column, row) is inside the region at a time."""
-        x, y = self.place_at(t_us)
-        width, height = self.size_at(t_us)
+        (x, y), (width, height) = self.positions.place_at(t_us), self.positions.size_at(t_us)
         return abs(point_px[0] - x) <= width / 2 and abs(point_px[1] - y) <= height / 2
 
     def holds(self, other: "Followed", t_us: float, same_px: float) -> bool:
         """Whether another region is a part of this bar, or the same bar, its centre so near at a time."""
         mine, its = self.latest, other.latest
         when = t_us if other.size_px is not None else its.t_us
-        (x, y), (u, v) = self.place_at(when), other.place_at(when)
+        (x, y), (u, v) = self.positions.place_at(when), other.positions.place_at(when)
         right, down = abs(u - x), abs(v - y)
         if other.size_px is not None:
             return max(right, down) <= same_px
@@ -236,8 +167,7 @@ class Followed:
         """Drop events older than a time, and positions older than another: others ask where it was."""
         while self.pieces and self.pieces[0][0] + step_us <= t_us:
             self.forget()
-        while len(self.positions) > 2 and self.positions[1].t_us < places_us:
-            self.positions.popleft()
+        self.positions.forget_before(places_us)
 
 
 class RegionFollower:
@@ -301,13 +231,7 @@ class RegionFollower:
         self._remember(start_us, events)
         rises = self._rhythm.step(start_us, events, self._hits, _CELL_SHIFT)
         end_us = start_us + spec.step_us
-        expected = [self._expected(followed, start_us + spec.step_us / 2) for followed in self.alive]
-        known = [_tight(e) for e, followed in zip(expected, self.alive, strict=True) if followed.size_px]
-        known += [_tight(place) for place in taken]
-        boxes = [
-            self._reach(e) if followed.size_px else _clear(self._reach(e), known)
-            for e, followed in zip(expected, self.alive, strict=True)
-        ]
+        boxes = self._boxes(start_us + spec.step_us / 2, taken)
         for followed, box, inside in zip(self.alive, boxes, self._select(events, boxes), strict=True):
             followed.add(start_us, inside)
             rows = np.empty(box[3] - box[1], np.int64)
@@ -316,21 +240,44 @@ class RegionFollower:
             if measured is not None:
                 measured = self._whole(followed, measured, box[1], rows)
                 followed.positions.append(self._filtered(followed, measured))
-        self._merge()
+        if len(self.alive) > 1:
+            self._merge()
         self._make_room()
         for place in taken if rises else ():
-            rises -= _cleared(self._hits, self._reach(place))
+            reach = self._reach(place.x_px, place.y_px, place.width_px, place.height_px)
+            rises -= _cleared(self._hits, reach)
         self._open(end_us, rises)
         seen = list(self.alive)
-        for followed in self.alive:
+        gone = False
+        for followed in seen:
             followed.released |= end_us - followed.latest.t_us > spec.fade_us
+            gone |= followed.released
+        if gone:
+            self._let_go()
+        return seen
+
+    def _boxes(self, t_us: float, taken: Sequence[Region]) -> list[Box]:
+        """Where each region should be in the middle of a step; one of unknown size beside the others."""
+        boxes, known = [], [_box_of(place) for place in taken]
+        for followed in self.alive:
+            last = followed.latest
+            place = *self._expected(followed, t_us), last.width_px, last.height_px
+            boxes.append(self._reach(*place))
+            if followed.size_px:
+                known.append(_tight(*place))
+        return [
+            box if followed.size_px else _clear(box, known)
+            for followed, box in zip(self.alive, boxes, strict=True)
+        ]
+
+    def _let_go(self) -> None:
+        """Follow those no more that are released."""
         lost = [followed for followed in self.alive if followed.released and followed.size_px is not None]
         self.alive = [followed for followed in self.alive if not followed.released]
         for followed in self.alive:
             # A bar that was seen in what another was taken for is no halo when it is seen again.
             if any(_lies_in_outgrown(followed, gone.latest) for gone in lost):
                 followed.outgrown = None
-        return seen
 
     def _select(self, events: Events, boxes: list[Box]) -> list[Events]:
         """The events of a step inside the box of each region; those that it listens to."""
@@ -343,8 +290,9 @@ class RegionFollower:
         """Keep a step's events of the whole image, and as many before it as there is room for."""
         self._recent.append((start_us, events))
         self._recent_bytes += held_bytes(events)
+        most_bytes = self._limits.recent_bytes
         while len(self._recent) > self._most_recent or (
-            self._recent_bytes > self._limits.recent_bytes and len(self._recent) > 1
+            self._recent_bytes > most_bytes and len(self._recent) > 1
         ):
             self.counts["steps_forgotten"] += len(self._recent) <= self._most_recent
             _, forgotten = self._recent.popleft()
@@ -352,7 +300,9 @@ class RegionFollower:
 
     def _make_room(self) -> None:
         """Forget the oldest events of regions where all together take too much."""
-        spare = self._limits.region_bytes - sum(followed.held_bytes for followed in self.alive)
+        spare = self._limits.region_bytes
+        for followed in self.alive:
+            spare -= followed.held_bytes
         while spare < 0:
             held = [followed for followed in self.alive if len(followed.pieces) > 1]
             if not held:
@@ -391,7 +341,7 @@ class RegionFollower:
             centre_px: Centre (column, row) of the whole bar at that time.
             size_px: Its (width, height).
         """
-        x, y = followed.place_at(t_us)
+        x, y = followed.positions.place_at(t_us)
         off = centre_px[0] - x, centre_px[1] - y
         known = followed.size_px
         off_px = math.inf
@@ -407,15 +357,8 @@ class RegionFollower:
         followed.size_px = size_px
         # Where less of the bar was seen, or more than it, its place is not that of what was seen.
         most_px = 2 * self._spec.margin_px if known is None else math.inf
-        followed.positions = deque(
-            _region(
-                p.id,
-                p.t_us,
-                p.x_px + off[0],
-                p.y_px + off[1] if abs(p.height_px - size_px[1]) <= most_px else centre_px[1],
-                *size_px,
-            )
-            for p in followed.positions
+        followed.positions = followed.positions.moved(
+            followed.id, *off, size_px, row_px=centre_px[1], most_px=most_px
         )
         followed.filter = self._position.init() if self._position else None
         return off_px
@@ -437,9 +380,9 @@ class RegionFollower:
         ]
         last = followed.latest
         gathered = {}
-        x, y = followed.at(np.array([start + step_us / 2 for start, _ in kept]))
+        x, y = followed.positions.at(np.array([start + step_us / 2 for start, _ in kept]))
         for (start, events), x_px, y_px in zip(kept, x.tolist(), y.tolist(), strict=True):
-            box = self._reach(Region(last.id, last.t_us, x_px, y_px, last.width_px, last.height_px))
+            box = self._reach(x_px, y_px, last.width_px, last.height_px)
             gathered[start] = select(events, box)
         followed.hold(deque((start, gathered.get(start, events)) for start, events in followed.pieces))
         self._make_room()
@@ -447,13 +390,10 @@ class RegionFollower:
     def unite(self, followed: Followed, other: Followed) -> None:
         """Take another region into one: both are parts of what is not known yet, and the other one goes."""
         one, two = followed.latest, other.latest
-        left, top, right, bottom = _around([_tight(one), _tight(two)])
+        left, top, right, bottom = _around([_box_of(one), _box_of(two)])
         off_x, off_y = (left + right - 1) / 2 - one.x_px, (top + bottom - 1) / 2 - one.y_px
         width_px, height_px = float(right - left - 1), float(bottom - top - 1)
-        followed.positions = deque(
-            Region(p.id, p.t_us, p.x_px + off_x, p.y_px + off_y, width_px, height_px)
-            for p in followed.positions
-        )
+        followed.positions = followed.positions.moved(followed.id, off_x, off_y, (width_px, height_px))
         followed.heights.clear()
         followed.filter = self._position.init() if self._position else None
         since_us = min(part.pieces[0][0] for part in (followed, other) if part.pieces)
@@ -471,13 +411,12 @@ class RegionFollower:
         """Open a region for another image of a bar: it moves as the one that showed it does."""
         followed = Followed(
             self._next_id,
-            deque(like.positions),
+            like.positions.renamed(self._next_id),
             like.first_us,
             deque(like.pieces),
             filter=like.filter,
             opened_us=like.opened_us,
         )
-        followed.positions = deque(changed(p, id=followed.id) for p in followed.positions)
         self._next_id += 1
         self.alive.append(followed)
         self.shape(followed, t_us, centre_px, size_px)
@@ -502,14 +441,12 @@ class RegionFollower:
         """
         return self._rhythm.of(events)
 
-    def _expected(self, followed: Followed, t_us: float) -> Region:
-        """Where a region should be soon: by its filter, or else straight on."""
+    def _expected(self, followed: Followed, t_us: float) -> tuple[float, float]:
+        """Where a region's centre should be soon: by its filter, or else straight on."""
         expected = self._position.predict(followed.filter, t_us) if self._position else None
         if expected is None:
-            return followed.expected(t_us)
-        last = followed.latest
-        x_px, y_px = float(expected[0][0]), float(expected[0][1])
-        return Region(last.id, last.t_us, x_px, y_px, last.width_px, last.height_px)
+            return followed.positions.expected(t_us)
+        return float(expected[0][0]), float(expected[0][1])
 
     def _whole(self, followed: Followed, measured: Region, top: int, rows: NDArray[np.int64]) -> Region:
         """A region of the height that it lately had; `rows`: its pixels in each row from `top` on.
@@ -520,7 +457,7 @@ class RegionFollower:
         nearer to its place counts alone.
         """
         known = followed.size_px
-        expected_px = self._expected(followed, measured.t_us).y_px
+        _, expected_px = self._expected(followed, measured.t_us)
         if known is None or -_STRAY_PX <= measured.height_px - known[1] <= 2 * _BLUR_PX:
             followed.heights.append(measured.height_px)
         # A part of the bar says nothing of its height, once that is known.
@@ -542,7 +479,7 @@ class RegionFollower:
             slack_px = abs(excess_px) / 2
             y_px = measured.y_px + min(max(expected_px - measured.y_px, -slack_px), slack_px)
         size_px = known or (measured.width_px, height_px + min(max(excess_px, 0.0), _STRAY_PX))
-        return _region(measured.id, measured.t_us, measured.x_px, y_px, *size_px)
+        return region_of(measured.id, measured.t_us, measured.x_px, y_px, *size_px)
 
     def _filtered(self, followed: Followed, measured: Region) -> Region:
         if self._position is None:
@@ -554,13 +491,13 @@ class RegionFollower:
         x_px, y_px = float(centre[0]), float(centre[1])
         return Region(measured.id, measured.t_us, x_px, y_px, measured.width_px, measured.height_px)
 
-    def _reach(self, region: Region) -> Box:
+    def _reach(self, x_px: float, y_px: float, width_px: float, height_px: float) -> Box:
         """The box in which a region's events lie within the next step; an empty one off the sensor."""
         m = self._spec.margin_px
-        half_w, half_h = region.width_px / 2 + m, region.height_px / 2 + m
+        half_w, half_h = width_px / 2 + m, height_px / 2 + m
         width, height = self._camera.width, self._camera.height
-        left, top = int(region.x_px - half_w), int(region.y_px - half_h)
-        right, bottom = int(region.x_px + half_w) + 1, int(region.y_px + half_h) + 1
+        left, top = int(x_px - half_w), int(y_px - half_h)
+        right, bottom = int(x_px + half_w) + 1, int(y_px + half_h) + 1
         if left < 0 or top < 0 or right > width or bottom > height:
             left, right = min(max(left, 0), width), min(max(right, 0), width)
             top, bottom = min(max(top, 0), height), min(max(bottom, 0), height)
@@ -579,7 +516,7 @@ class RegionFollower:
         )
         if total < _MIN_PIXELS:
             return None
-        return _region(
+        return region_of(
             id, end_us - self._age_us, column, (upper + lower - 1) / 2, right - left + 1.0, lower - upper
         )
 
@@ -593,10 +530,11 @@ class RegionFollower:
         hits = self._hits
         merge = self._spec.merge_px
         for followed in self.alive if rises >= self._spec.min_rises else ():
-            reach = self._reach(followed.latest)
+            last = followed.latest
+            reach = self._reach(last.x_px, last.y_px, last.width_px, last.height_px)
             rises -= _cleared(hits, reach if followed.size_px else _grown(reach, merge))
             if followed.outgrown is not None and end_us > followed.outgrown[4]:
-                rises -= _cleared(hits, self._reach(_outgrown(followed)))
+                rises -= _cleared(hits, self._reach(*_outgrown(followed)))
         if rises < self._spec.min_rises:
             self._fresh = []
             if rises:
@@ -627,23 +565,20 @@ class RegionFollower:
         right = min(u.stop << _CELL_SHIFT, self._camera.width)
         bottom = min(v.stop << _CELL_SHIFT, self._camera.height)
         region = self._measure(0, (left, top, right, bottom), end_us, np.empty(bottom - top, np.int64))
-        return None if region is None else _tight(region)
+        return None if region is None else _box_of(region)
 
     def _start(self, box: Box, end_us: int) -> None:
         region = self._measure(self._next_id, box, end_us, np.empty(box[3] - box[1], np.int64))
         if region is None or not self._place_for_one(end_us):
             return
         self._next_id += 1
-        reach = self._reach(region)
+        reach = self._reach(region.x_px, region.y_px, region.width_px, region.height_px)
         for like in self.alive:
             if _left_by(like, region):
                 # It was seen as long as the one that it was taken to be a part of.
                 right, down = region.x_px - like.latest.x_px, region.y_px - like.latest.y_px
-                size = {"width_px": region.width_px, "height_px": region.height_px}
-                places = deque(
-                    changed(p, id=region.id, x_px=p.x_px + right, y_px=p.y_px + down, **size)
-                    for p in like.positions
-                )
+                size_px = region.width_px, region.height_px
+                places = like.positions.moved(region.id, right, down, size_px)
                 pieces = deque((start, Events.empty()) for start, _ in self._recent)
                 followed = Followed(region.id, places, pieces[0][0], pieces, opened_us=end_us)
                 followed.filter = self._position.init() if self._position else None
@@ -654,7 +589,7 @@ class RegionFollower:
         pieces = deque((start, self._rhythmic(select(events, reach))) for start, events in recent)
         state = self._position.init() if self._position else None
         self.alive.append(
-            Followed(region.id, deque([region]), pieces[0][0], pieces, filter=state, opened_us=end_us)
+            Followed(region.id, Places([region]), pieces[0][0], pieces, filter=state, opened_us=end_us)
         )
 
     def _place_for_one(self, now_us: int) -> bool:
@@ -679,7 +614,7 @@ class RegionFollower:
         for i, older in enumerate(self.alive):
             for younger in self.alive[i + 1 :]:
                 one, other = older.latest, younger.latest
-                if younger.released or not _overlap(_tight(one), _tight(other)):
+                if younger.released or not _overlap(_box_of(one), _box_of(other)):
                     continue
                 shown = older.size_px is not None and younger.size_px is not None
                 apart_px = max(abs(one.x_px - other.x_px), abs(one.y_px - other.y_px))
@@ -692,13 +627,6 @@ def same_place(one: Region, other: Region) -> bool:
     """Whether the centre of one of two regions lies in the other."""
     right, down = abs(one.x_px - other.x_px), abs(one.y_px - other.y_px)
     return any(right <= at.width_px / 2 and down <= at.height_px / 2 for at in (one, other))
-
-
-def _region(id: int, t_us: float, x_px: float, y_px: float, width_px: float, height_px: float) -> Region:
-    """A region, made without the calls that a frozen class makes for each field: there are dozens a frame."""
-    region = object.__new__(Region)
-    vars(region).update(id=id, t_us=t_us, x_px=x_px, y_px=y_px, width_px=width_px, height_px=height_px)
-    return region
 
 
 def _clear(box: Box, others: list[Box]) -> Box:
@@ -714,12 +642,12 @@ def _clear(box: Box, others: list[Box]) -> Box:
     return box
 
 
-def _outgrown(followed: Followed) -> Region:
-    """Where a region would be now if no frame had shown its size."""
+def _outgrown(followed: Followed) -> tuple[float, float, float, float]:
+    """Column, row, width and height that a region would have now if no frame had shown its size, px."""
     assert followed.outgrown is not None
     right, down, width, height, _ = followed.outgrown
     last = followed.latest
-    return Region(last.id, last.t_us, last.x_px + right, last.y_px + down, width, height)
+    return last.x_px + right, last.y_px + down, width, height
 
 
 def _left_by(like: Followed, region: Region) -> bool:
@@ -733,9 +661,8 @@ def _lies_in_outgrown(like: Followed, region: Region) -> bool:
     """Whether a region's centre lies in what another was taken for, at any time."""
     if like.outgrown is None:
         return False
-    whole = _outgrown(like)
-    right, down = abs(region.x_px - whole.x_px), abs(region.y_px - whole.y_px)
-    return right <= whole.width_px / 2 and down <= whole.height_px / 2
+    x_px, y_px, width_px, height_px = _outgrown(like)
+    return abs(region.x_px - x_px) <= width_px / 2 and abs(region.y_px - y_px) <= height_px / 2
 
 
 def _inside(hits: NDArray[np.int32], box: Box) -> NDArray[np.int32]:
@@ -768,13 +695,17 @@ def _around(boxes: list[Box]) -> Box:
     return min(lefts), min(tops), max(rights), max(bottoms)
 
 
-def _tight(region: Region) -> Box:
+def _tight(x_px: float, y_px: float, width_px: float, height_px: float) -> Box:
     return (
-        int(region.x_px - region.width_px / 2),
-        int(region.y_px - region.height_px / 2),
-        int(region.x_px + region.width_px / 2) + 1,
-        int(region.y_px + region.height_px / 2) + 1,
+        int(x_px - width_px / 2),
+        int(y_px - height_px / 2),
+        int(x_px + width_px / 2) + 1,
+        int(y_px + height_px / 2) + 1,
     )
+
+
+def _box_of(region: Region) -> Box:
+    return _tight(region.x_px, region.y_px, region.width_px, region.height_px)
 
 
 def _grown(box: Box, by: int) -> Box:

@@ -87,7 +87,7 @@ class Sighting:
     @classmethod
     def of(cls, frame: Frame, look: Look) -> "Sighting":
         """What a frame's image shows."""
-        placed, seen = look.placement, max(int(look.placement.seen.sum()), 1)
+        placed, seen = look.placement, max(int(np.count_nonzero(look.placement.seen)), 1)
         return cls(frame, placed.cells / seen, seen, placed.mirrored, look.spread)
 
 

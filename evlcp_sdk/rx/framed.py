@@ -173,7 +173,7 @@ class HeardFraming:
                 listener.number = next(self._numbers)
             chips = self._packet.info_chips + self._packet.has_pilot(one.frame) * self._packet.pilot_chips
             end_us = one.t_us + chips * one.chip_us
-            x, y = listener.region.at(np.array([(one.t_us + end_us) / 2]))
+            x, y = listener.region.positions.at(np.array([(one.t_us + end_us) / 2]))
             frame = Frame(
                 transmitter=listener.number,
                 packet=one.packet,

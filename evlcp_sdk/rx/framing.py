@@ -211,8 +211,8 @@ class PacketFraming:
         """A lock with what its preamble says of the rows of its bar."""
         region = transmitter.region
         middle_us = lock.packet_t_us + self._packet.preamble_chips / 2 * lock.chip_us
-        _, y = region.place_at(middle_us)
-        _, height_px = region.size_at(middle_us)
+        _, y = region.positions.place_at(middle_us)
+        _, height_px = region.positions.size_at(middle_us)
         transmitter.rows, lock = self._rows.hear(transmitter.rows, lock, region.pieces, y, height_px)
         return lock
 
@@ -268,9 +268,7 @@ class PacketFraming:
             points = points_px + look.corner_px, sigma_px
             centre_px = self._looker.centre(look, points[0])
             sight = self._sight(points, look.middle_us)
-        if not (soft.symbols >= 0).any() and (
-            transmitter.number is None or not math.isfinite(distance.distance_m)
-        ):
+        if soft.symbols.max() < 0 and (transmitter.number is None or not math.isfinite(distance.distance_m)):
             # What says nothing is no transmitter, and of one that is known its distance may still be of use.
             return "frames_unread"
         if transmitter.number is None:
@@ -410,7 +408,7 @@ class PacketFraming:
         seen_us = transmitter.region.latest.t_us + self._step_us
         self._decode_due(transmitter, min(now_us - self._tail_us, seen_us))
         if transmitter.number is None and transmitter.rejected:
-            place_px = transmitter.region.place_at(seen_us)
+            place_px = transmitter.region.positions.place_at(seen_us)
             bars = [one for one in self._regions.alive if one is not transmitter.region and one.size_px]
             if any(_is_part(bar, seen_us, place_px) for bar in bars):
                 self._was_part(transmitter.rejected)
@@ -421,7 +419,7 @@ class PacketFraming:
 
 def _is_part(bar: Followed, t_us: float, place_px: tuple[float, float]) -> bool:
     """Whether what was seen somewhere may have been a part of a bar."""
-    (x, y), (width, height) = bar.place_at(t_us), bar.size_at(t_us)
+    (x, y), (width, height) = bar.positions.place_at(t_us), bar.positions.size_at(t_us)
     right, down = abs(place_px[0] - x), abs(place_px[1] - y)
     return right <= width / 2 + _PART_PX and down <= height / 2 + _PART_PX
 

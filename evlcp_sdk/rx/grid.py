@@ -94,10 +94,12 @@ class PacketGrid:
         lock = self.lock
         if lock is None:
             return None
+        start_us = self.start_us(self.frame)
+        if start_us > until_us:
+            return None
         number, index = divmod(self.frame, self.format.frames)
         has_pilot = self.format.has_pilot(index)
         chips = self.format.frame_chips if has_pilot else self.format.info_chips
-        start_us = self.start_us(self.frame)
         late_us = max(lock.delay_on_us, lock.delay_off_us, 0.0) + lock.last_row_us
         end_us = start_us + chips * lock.chip_us + late_us
         if end_us > until_us:

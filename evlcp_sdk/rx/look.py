@@ -112,6 +112,7 @@ class Looker:
         self._every = codebook.edge_every
         self._separate = separate
         self._sensor_px = sensor_px
+        self._halves: NDArray[np.float64] = np.arange(packet.frame_chips, dtype=np.float64) + 0.5
 
     def look(self, region: Followed, due: DueFrame, pilot: Pilot | None) -> tuple[Look | None, Pilot | None]:
         """Look at a frame.
@@ -125,11 +126,11 @@ class Looker:
             The frame, None if it does not show its clusters; and the newest pilot that showed the bar.
         """
         lock, packet = due.lock, self._packet
-        middles = due.start_us + (np.arange(due.chips, dtype=np.float64) + 0.5) * lock.chip_us
-        x, y = region.at(middles)
+        middles = due.start_us + self._halves[: due.chips] * lock.chip_us
+        x, y = region.positions.at(np.asarray(middles, np.float64))
         middle = min(due.chips, packet.pilot_chips) // 2
         if due.has_pilot:
-            size = self._size(*region.size_at(middles[middle]))
+            size = self._size(*region.positions.size_at(middles[middle]))
         elif pilot is None or pilot.frame != due.number - due.index + packet.pilot_frame(due.index):
             return None, pilot
         else:
@@ -156,10 +157,10 @@ class Looker:
             offset_px = np.concatenate([pilot.offset_px, offset_px], axis=1)
         # The image shows the pilot's mean, read from the chips behind edges that tell codes apart; the bar's
         # centre at the instant is that of its region.
-        rest_px = pilot.offset_px[:, 1 :: self._every].mean(1)
+        rest_x, rest_y = pilot.offset_px[:, 1 :: self._every].mean(1).tolist()
         corner_px = (
-            float(x[middle]) - (size[0] - 1) / 2 - float(rest_px[0]),
-            float(y[middle]) - (size[1] - 1) / 2 - float(rest_px[1]),
+            float(x[middle]) - (size[0] - 1) / 2 - rest_x,
+            float(y[middle]) - (size[1] - 1) / 2 - rest_y,
         )
         middle_us = float(middles[middle]) - lock.chip_us / 2
         look = Look(
@@ -203,8 +204,8 @@ class Looker:
             places = placement.places(layout)
             right_px = along_px * abs(way.real) + across_px * abs(way.imag)
             down_px = along_px * abs(way.imag) + across_px * abs(way.real)
-        left, right = float(places.real.min()) - right_px, float(places.real.max()) + right_px
-        top, bottom = float(places.imag.min()) - down_px, float(places.imag.max()) + down_px
+        left, right, top, bottom = _kernels.bounds_of(places)
+        left, right, top, bottom = left - right_px, right + right_px, top - down_px, bottom + down_px
         x, y = look.corner_px
         return (x + (left + right) / 2, y + (top + bottom) / 2), (right - left, bottom - top)
 

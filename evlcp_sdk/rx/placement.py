@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from statistics import median
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -90,12 +89,17 @@ class Placement:
     chance: float
 
     def places(self, layout: Layout) -> NDArray[np.complex128]:
-        """Cluster centres in the image, px, complex128 (K,)."""
-        return self.scale * _turned(layout, self.mirrored) + self.shift
+        """Cluster centres in the image, px, complex128 (K,); not to be changed."""
+        # Asked for again and again in a frame.
+        known: tuple[Layout, NDArray[np.complex128]] | None = vars(self).get("_places")
+        if known is None or known[0] is not layout:
+            known = layout, self.scale * _turned(layout, self.mirrored) + self.shift
+            vars(self)["_places"] = known
+        return known[1]
 
     def moved(self, by_px: complex) -> "Placement":
         """The same in an image whose origin lies elsewhere."""
-        return changed(self, shift=self.shift + by_px)
+        return Placement(self.scale, self.shift + by_px, self.mirrored, self.seen, self.cells, self.chance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,9 +207,9 @@ def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> Prese
         unit *= layout.way
     spacing_px = abs(placement.scale) * layout.spacing_m
     places = placement.places(layout)
-    grid = presence.grid_px
-    pixels, prior = np.zeros_like(presence.pixels), np.zeros_like(presence.probability)
-    probability, selected = np.empty_like(presence.probability), np.empty_like(presence.selected)
+    grid, heard = presence.grid_px, presence.probability
+    pixels, prior = np.zeros(presence.pixels.shape, presence.pixels.dtype), np.zeros(heard.shape, heard.dtype)
+    probability, selected = np.empty(heard.shape, heard.dtype), np.empty(heard.shape, np.bool_)
     _kernels.mask(
         presence.probability,
         presence.selected,
@@ -245,13 +249,13 @@ def lit(
     """
     if presence.prior is None:
         return presence, placement
-    light = np.empty(len(edges))
-    _kernels.pilot_light(sums, edges, every, presence.prior, presence.grid_px, light)
-    others = [v for v, in_place in zip(light.tolist(), placement.seen.tolist(), strict=True) if in_place]
-    seen = light >= max(_LEAST_LIGHT * median(others) if others else 0.0, 1e-9)
+    seen = np.empty(len(edges), np.bool_)
+    whole = _kernels.lit_clusters(
+        sums, edges, every, presence.prior, presence.grid_px, placement.seen, _LEAST_LIGHT, seen
+    )
     placed = placement
     placement = Placement(placed.scale, placed.shift, placed.mirrored, seen, placed.cells, placed.chance)
-    if seen.all():
+    if whole:
         return presence, placement
     dark = ~seen
     probability, prior = presence.probability.copy(), presence.prior.copy()

@@ -16,6 +16,7 @@ from evlcp_sdk.rx.grid import PacketGrid
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.look import Pilot
 from evlcp_sdk.rx.packets import PacketAssembler
+from evlcp_sdk.rx.places import Places
 from evlcp_sdk.values import Region, SyncLock
 
 __all__ = ["LOOKBACK_PACKETS", "Transmitter", "Transmitters"]
@@ -190,7 +191,7 @@ class Transmitters:
         region = transmitter.region
         del self._alive[region.id]
         region.hold(deque())
-        region.positions = deque([region.latest])
+        region.positions = Places([region.latest])
         transmitter.sync = transmitter.pilot = None
         oldest_us = region.latest.t_us - _REMEMBER_US
         kept = [r for r in self._released if r.region.latest.t_us > oldest_us]

@@ -88,3 +88,32 @@ def mean_squares(rho: Array, power: float, known: int, memory: int, out: Array) 
             power += (rho[lag] ** 2 - power) / known
         out[lag] = power if 2 * known >= memory else np.inf
     return power, known
+
+
+@njit(cache=True, nogil=True)
+def listen(
+    t_us: Array,
+    p: Array,
+    bins: tuple[int, float, int, int],
+    known: Array,
+    chips: Array,
+    due: Array,
+    steps: int,
+    min_events: int,
+    past: tuple[float, int, int],
+    counts: Array,
+    rho: Array,
+    enough: Array,
+) -> tuple[float, float, int]:
+    """Count events, correlate all bins but the last, and follow the mean square of the correlations.
+
+    `bins` are the number of the first, its length, us, and from which to before which lag the mean squares,
+    `enough`, are wanted; `past` are `power`, `known` and `memory` of `mean_squares`. `rho` is for all lags.
+
+    Returns:
+        The largest correlation, and what `mean_squares` gives.
+    """
+    count_bins(t_us, p, bins[0], bins[1], known, counts)
+    top = correlate(counts[:, : counts.shape[1] - 1], chips, due, steps, min_events, rho)
+    power, many = mean_squares(rho[bins[2] : bins[3]], past[0], past[1], past[2], enough)
+    return top, power, many

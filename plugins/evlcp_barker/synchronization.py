@@ -1,7 +1,7 @@
 """Packet timing by sliding correlation with the preamble."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -13,7 +13,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Synchronization
-from evlcp_sdk.values import SyncLock
+from evlcp_sdk.values import SyncLock, changed
 
 if TYPE_CHECKING:
     from evlcp_barker import _kernels
@@ -194,7 +194,7 @@ class BarkerSynchronizer:
         if state.first_bin is None:
             # A preamble starts with a dark chip: the first event may already be the edge at its end.
             first = (int(t_us[0] // self._bin_us) if len(t_us) else until_bin) - guard
-            state = replace(state, first_bin=first, next_bin=first)
+            state = changed(state, first_bin=first, next_bin=first)
         assert state.first_bin is not None
         bins = max(until_bin - state.first_bin, state.counts.shape[1] - 1)
         lags = bins - span + 1
@@ -202,21 +202,30 @@ class BarkerSynchronizer:
             # Silence correlates with nothing, and most regions that are no bar are silent.
             first = max(state.first_bin + lags - 2 * guard, state.first_bin)
             counts = np.zeros((2, state.first_bin + bins + 1 - first))
-            return replace(state, first_bin=first, counts=counts, next_bin=state.first_bin + lags - guard), []
+            return changed(state, first_bin=first, counts=counts, next_bin=state.first_bin + lags - guard), []
         # The last bin is still open: its events count, but it is not correlated yet.
         counts = np.empty((2, bins + 1))
-        _kernels.count_bins(t_us, p, state.first_bin, self._bin_us, state.counts, counts)
-
         locks: list[SyncLock] = []
         power, known, clock, stray = state.power, state.known, state.clock, state.stray
         lo = state.next_bin - state.first_bin
         if lags - guard > lo:
-            rho = np.empty(lags)
-            top = _kernels.correlate(counts[:, :bins], self._chips, self._due, n, self._spec.min_events, rho)
-            enough = np.empty(lags - guard - lo)
+            rho, enough = np.empty(lags), np.empty(lags - guard - lo)
             # Half of a packet's correlations are positive.
             memory = n * self._packet.packet_chips // 2
-            power, known = _kernels.mean_squares(rho[lo : lags - guard], power, known, memory, enough)
+            top, power, known = _kernels.listen(
+                t_us,
+                p,
+                (state.first_bin, self._bin_us, lo, lags - guard),
+                state.counts,
+                self._chips,
+                self._due,
+                n,
+                self._spec.min_events,
+                (power, known, memory),
+                counts,
+                rho,
+                enough,
+            )
             if 2 * top >= self._spec.min_correlation:
                 least = _OUTSTANDS * np.sqrt(enough)
                 least = np.clip(least, self._spec.min_correlation / 2, self._spec.min_correlation)
@@ -227,9 +236,20 @@ class BarkerSynchronizer:
                         assert clock is not None
                         locks.append(self._lock(clock, found.quality))
             lo = lags - guard
+        else:
+            _kernels.count_bins(t_us, p, state.first_bin, self._bin_us, state.counts, counts)
         drop = max(lo - guard, 0)
-        first = state.first_bin + drop
-        return SyncState(first, counts[:, drop:], state.first_bin + lo, power, known, clock, stray), locks
+        state = changed(
+            state,
+            first_bin=state.first_bin + drop,
+            counts=counts[:, drop:],
+            next_bin=state.first_bin + lo,
+            power=power,
+            known=known,
+            clock=clock,
+            stray=stray,
+        )
+        return state, locks
 
     def _peaks(self, rho: NDArray[np.float64], lo: int, guard: int, least: NDArray[np.float64]) -> list[int]:
         """Lags from `lo` on that correlate enough, best within `guard` on both sides; the first of equals."""

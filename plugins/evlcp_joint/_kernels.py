@@ -24,10 +24,12 @@ def cell_medians(selected: Array, out: Array) -> None:
         by_row[:] = 0
         by_column[:] = 0
         for r in range(rows):
+            row = selected[k, r]
             for c in range(columns):
-                if selected[k, r, c]:
-                    by_row[r] += 1
-                    by_column[c] += 1
+                by_row[r] += np.int64(row[c])
+            if by_row[r]:
+                for c in range(columns):
+                    by_column[c] += np.int64(row[c])
         out[k, 0] = _middle(by_row)
         out[k, 1] = _middle(by_column)
 
@@ -158,6 +160,17 @@ def line_of_cells(selected: Array, middles: Array, line: Array, seen: Array) -> 
 
 
 @njit(cache=True, nogil=True)
+def lie_of_cells(selected: Array, line: Array, seen: Array) -> int:
+    """Whether a bar's cells lie along the image's rows, 1, across them, 2, or nowhere, 0: `line_of_cells`."""
+    middles = np.empty((len(selected), 2))
+    cell_medians(selected, middles)
+    if not lies_across(middles):
+        return 1 if line_of_cells(selected, middles, line, seen) else 0
+    turned = np.ascontiguousarray(selected.transpose(0, 2, 1))
+    return 2 if line_of_cells(turned, middles[:, ::-1].copy(), line, seen) else 0
+
+
+@njit(cache=True, nogil=True)
 def codes_said(pilots: Array, words: Array, symbols: Array, seen: Array, codes: Array, known: Array) -> None:
     """What each cluster says in a frame, `codes` (K, values), and between which it is known, (K + 1, values).
 
@@ -272,6 +285,39 @@ def dimmer(pilots: Array, seen: Array, spacing: float, centre: float, values: Ar
         if seen[k] and counts.min() > 0:
             total += levels / counts
     return float(max(-total[0], 0.0) / total[1]) if total[1] > 0 else 1.0
+
+
+@njit(cache=True, nogil=True)
+def read_bar(
+    sums: Array,
+    pilots: Array,
+    words: Array,
+    symbols: Array,
+    seen: Array,
+    place: Array,
+    full: float,
+    veil: float,
+    codes: Array,
+    known: Array,
+    moved: Array,
+    values: Array,
+) -> float:
+    """`codes_said`, `bar_values` and what `dimmer` says of them; values and motion turned if upside down.
+
+    `place` (5,) is the row of the first cluster's middle, the rows to the next, less than 0 of a bar upside
+    down, the column in row 0, columns a row, and half the width.
+    """
+    clusters, rows = len(pilots), values.shape[1]
+    codes_said(pilots, words, symbols, seen, codes, known)
+    first, spacing = place[0], place[1]
+    one, other = first - 0.5 * spacing, first + (clusters - 0.5) * spacing
+    bar_values(sums, place[2:4], place[4], one, other, full, veil, values)
+    if spacing < 0:
+        values[:] = values[:, ::-1].copy()
+        moved[:] = -moved
+        spacing, first = -spacing, rows - 1 - first
+    centre = first + spacing * (clusters - 1) / 2 - (rows - 1) / 2
+    return dimmer(pilots, seen, spacing, centre, values)
 
 
 _REACH = 12.0

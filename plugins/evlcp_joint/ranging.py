@@ -62,6 +62,9 @@ _LEAST_EXPLAINED = 0.3
 """Share of the values' energy that a fit explains at the least: fits of noise reach a tenth, and dim bars
 in a bright scene three quarters."""
 
+_ACROSS = 2
+"""What `_kernels.lie_of_cells` says of a bar that lies across the image."""
+
 Floats = NDArray[np.float64]
 
 
@@ -139,25 +142,26 @@ class JointScaleRanging(Ranging):
                 sums, offset = np.ascontiguousarray(sums.transpose(0, 2, 1)), offset[::-1]
             height, n = sums.shape[1], pilots.shape[1] + words.shape[1]
             codes, known = np.empty((clusters, n)), np.empty((clusters + 1, n), np.bool_)
-            _kernels.codes_said(pilots, words, view.soft.symbols, place.seen, codes, known)
-            values = np.empty((n, height))
-            _kernels.bar_values(
+            values, moved = np.empty((n, height)), np.ascontiguousarray(offset[1])
+            dim = _kernels.read_bar(
                 sums,
-                place.line,
-                place.half_width,
-                place.first - 0.5 * place.spacing,
-                place.first + (clusters - 0.5) * place.spacing,
+                pilots,
+                words,
+                view.soft.symbols,
+                place.seen,
+                place.lie,
                 self.full_events,
                 _VEIL,
+                codes,
+                known,
+                moved,
                 values,
             )
-            spacing, first, moved = place.spacing, place.first, np.ascontiguousarray(offset[1])
+            first, spacing, _, tilt, _ = place.lie.tolist()
             if spacing < 0:
-                # A bar upside down: mirror it.
-                values, moved = np.ascontiguousarray(values[:, ::-1]), -moved
+                # A bar upside down is mirrored.
                 spacing, first = -spacing, height - 1 - first
             centre = first + spacing * (clusters - 1) / 2 - (height - 1) / 2
-            dim = _kernels.dimmer(pilots, place.seen, spacing, centre, values)
             fit = np.array([spacing, centre, 0.0, _STARTING_GAIN, 0.0])
             fitted = self._fit(codes, known, moved, dim, values, fit, least)
             if fitted is None:
@@ -168,7 +172,7 @@ class JointScaleRanging(Ranging):
             if abs(fit[0] - spacing) * (clusters - 1) / 2 + abs(fit[1] - centre) > most_px:
                 return _NONE
             # Rows measure the bar along one axis; a tilted bar is longer by its slope.
-            stretch = math.hypot(1.0, place.line[1])
+            stretch = math.hypot(1.0, tilt)
             distance = camera.distance_m(spacing_m, float(fit[0]) * stretch)
             late_chips = (len(sums) - 2 * pilots.shape[1]) / 2
             one_px = spacing_m * float(fit[0]) * stretch / distance
@@ -264,34 +268,26 @@ class _Place:
     """How a bar lies in an image whose rows run along it.
 
     Attributes:
-        first: Row of the first cluster's middle, px.
-        spacing: Rows from one cluster to the next, px; negative for a bar upside down.
-        line: Column of its middle in row 0, px, and columns a row, float64 (2,).
-        half_width: Half its width, px.
+        lie: Row of the first cluster's middle, px; rows from one to the next, px, less than 0 for a bar
+            upside down; column of its middle in row 0, px; columns a row; half its width, px; float64 (5,).
         seen: Which clusters are seen where they are expected, bool (K,).
     """
 
-    first: float
-    spacing: float
-    line: Floats
-    half_width: float
+    lie: Floats
     seen: NDArray[np.bool_]
 
 
 def _place(presence: PresenceMap) -> tuple[_Place, bool] | None:
     """Where the bar lies by its cells, and whether it lies across the image; None with too few in line."""
     selected = presence.selected
-    middles = np.empty((len(selected), 2))
-    _kernels.cell_medians(selected, middles)
-    across = _kernels.lies_across(middles)
-    if across:
-        selected, middles = np.ascontiguousarray(selected.transpose(0, 2, 1)), middles[:, ::-1].copy()
     line, seen = np.empty(5), np.empty(len(selected), np.bool_)
-    if not _kernels.line_of_cells(selected, middles, line, seen):
+    way = _kernels.lie_of_cells(selected, line, seen)
+    if not way:
         return None
     first, spacing, left, tilt, half = line.tolist()
     grid = presence.grid_px
     middle = (grid - 1) / 2
-    at = np.array([left * grid + middle - tilt * middle, tilt])
-    # In whole cells, as many as the core has.
-    return _Place(first * grid + middle, spacing * grid, at, (half + 0.5) * grid, seen), across
+    line[:3] = first * grid + middle, spacing * grid, left * grid + middle - tilt * middle
+    # In whole cells, as wide as the core is.
+    line[4] = (half + 0.5) * grid
+    return _Place(line, seen), way == _ACROSS

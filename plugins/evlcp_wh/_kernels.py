@@ -179,6 +179,25 @@ def pixel_maps(sums: Array, codes: Array, grid: int, selected: Array, out: Array
 
 
 @njit(cache=True, nogil=True)
+def separated(
+    sums: Array,
+    codes: Array,
+    grid: int,
+    odds: tuple[float, float, int],
+    least: float,
+    probability: Array,
+    selected: Array,
+    pixels: Array,
+) -> None:
+    """`presence` by (agree, disagree, min_seen), what is `least` or more of it, and `pixel_maps` of that."""
+    presence(sums, codes, grid, odds[0], odds[1], odds[2], probability)
+    heard, chosen, enough = probability.reshape(-1), selected.reshape(-1), probability.dtype.type(least)
+    for j in range(heard.size):
+        chosen[j] = heard[j] >= enough
+    pixel_maps(sums, codes, grid, selected, pixels)
+
+
+@njit(cache=True, nogil=True)
 def weighted_values(sums: Array, probability: Array, grid: int, least: float, out: Array) -> None:
     """Presence-weighted sum of the values of the info chips, `out` (K, values)."""
     clusters, rows, columns = probability.shape
@@ -229,8 +248,12 @@ def count_pairs(sums: Array, codes: Array, probability: Array, grid: int, most: 
     _, rows, columns = probability.shape
     for k in range(clusters):
         for r in range(rows):
+            shown = probability[k, r]
+            # Most rows of a bar show another cluster.
+            if not _some_above(shown, 0.5):
+                continue
             for c in range(columns):
-                weight = probability[k, r, c]
+                weight = shown[c]
                 if weight <= 0.5:
                     continue
                 for v in range(r * grid, (r + 1) * grid):
@@ -239,6 +262,14 @@ def count_pairs(sums: Array, codes: Array, probability: Array, grid: int, most: 
                             first = min(max(sums[2 * i, v, u], -most), most) + most
                             second = min(max(sums[2 * i + 1, v, u], -most), most) + most
                             counts[(codes[k, i] + 1) // 2, first, second] += weight
+
+
+@njit(cache=True, nogil=True)
+def _some_above(values: Array, least: float) -> bool:
+    some = False
+    for j in range(values.size):
+        some |= values[j] > least
+    return some
 
 
 @njit(cache=True, nogil=True)
@@ -357,6 +388,37 @@ def sum_worth(
                             shows = weight / (1 + odds * np.exp(-fit))
                             for i in range(length):
                                 out[k, i] += shows * values[i]
+
+
+@njit(cache=True, nogil=True)
+def learn_worth(
+    sums: Array, codes: Array, probability: Array, grid: int, most: int, prior: float, out: Array
+) -> None:
+    """`log_ratio` of what `count_pairs` finds, `out` (2 most + 1, 2 most + 1)."""
+    counts = np.zeros((2, 2 * most + 1, 2 * most + 1))
+    count_pairs(sums[: 2 * codes.shape[1]], codes, probability, grid, most, counts)
+    log_ratio(counts, prior, out)
+
+
+@njit(cache=True, nogil=True)
+def read_frame(
+    sums: Array,
+    codes: Array,
+    probability: Array,
+    grid: int,
+    least: float,
+    worth: Array,
+    odds: float,
+    words: Array,
+    scale: float,
+    symbols: Array,
+    llr: Array,
+) -> tuple[float, float]:
+    """`read_words` of what `sum_worth` finds: what it gives, and the least size of an LLR."""
+    values = np.zeros((len(codes), len(sums) // 2 - codes.shape[1]))
+    sum_worth(sums, codes, probability, grid, least, len(worth) // 2, worth, odds, values)
+    quality = read_words(values, words, scale, symbols, llr)
+    return quality, np.abs(llr).min()
 
 
 @njit(cache=True, nogil=True)

@@ -24,7 +24,6 @@ __all__ = [
     "MlSoft",
     "PixelShare",
     "PriorCount",
-    "combined_values",
     "learned_worth",
     "soft_symbols",
 ]
@@ -84,8 +83,8 @@ class MlSoft(Decoding):
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             presence = presence.informed()
             worth = learned_worth(presence, sums, pilots, self.max_events, self.prior_count)
-            values = combined_values(presence, sums, pilots, worth, self.min_weight, self.pixel_share)
-            return soft_symbols(values, words, self.independent_pixels)
+            weights = self.min_weight, self.pixel_share, self.independent_pixels
+            return soft_symbols(presence, sums, pilots, words, worth, *weights)[0]
 
         return decode
 
@@ -110,52 +109,47 @@ def learned_worth(
     Returns:
         float64 (2 n + 1, 2 n + 1), by the first chip's sum and the second's.
     """
-    side = 2 * max_events + 1
-    counts, worth = np.zeros((2, side, side)), np.empty((side, side))
-    pilot = sums[: 2 * pilots.shape[1]]
-    _kernels.count_pairs(pilot, pilots, presence.probability, presence.grid_px, max_events, counts)
-    _kernels.log_ratio(counts, prior_count, worth)
+    worth = np.empty((2 * max_events + 1, 2 * max_events + 1))
+    grid = presence.grid_px
+    _kernels.learn_worth(sums, pilots, presence.probability, grid, max_events, prior_count, worth)
     return worth
 
 
-def combined_values(
+def soft_symbols(
     presence: PresenceMap,
     sums: NDArray[np.int16],
     pilots: NDArray[np.int64],
+    words: NDArray[np.float64],
     worth: NDArray[np.float64],
     min_weight: float,
     pixel_share: float,
-) -> NDArray[np.float64]:
-    """Sums of what the pixels that show a cluster say of each value of its info segment, float64 (K, values).
+    independent_pixels: float,
+) -> tuple[SoftSymbols, float]:
+    """The likeliest codewords by what all pixels that show a cluster say; the least size of an LLR.
 
     Args:
         presence: Of the frame.
         sums: The frame's polarity sums, pilot first, int16 (chips, height, width).
         pilots: The codes, int64 (K, values).
+        words: The codewords, float64 (2**m, values).
         worth: As from `learned_worth`.
         min_weight: Presence probability below which a cell is passed over.
         pixel_share: Share of the pixels in a cluster's place that show it.
-    """
-    from evlcp_wh import _kernels
-
-    values = np.zeros((len(pilots), len(sums) // 2 - pilots.shape[1]))
-    most, odds = len(worth) // 2, (1 - pixel_share) / pixel_share
-    probability, grid = presence.probability, presence.grid_px
-    _kernels.sum_worth(sums, pilots, probability, grid, min_weight, most, worth, odds, values)
-    return values
-
-
-def soft_symbols(
-    values: NDArray[np.float64], words: NDArray[np.float64], independent_pixels: float
-) -> SoftSymbols:
-    """The likeliest codewords of combined log-likelihood ratios, of which a share is independent.
-
-    Args:
-        values: Log-likelihood ratio of each value, +1 against -1, float64 (K, values).
-        words: The codewords, float64 (2**m, values).
         independent_pixels: Share of the pixels that err by themselves.
     """
-    clusters, bits = len(values), len(words).bit_length() - 1
+    clusters, bits = len(pilots), len(words).bit_length() - 1
     symbols, llr = np.empty(clusters, np.int64), np.empty((clusters, bits), np.float32)
-    quality = _kernels.read_words(values, words, independent_pixels / 2, symbols, llr)
-    return SoftSymbols(symbols, llr, quality)
+    quality, least = _kernels.read_frame(
+        sums,
+        pilots,
+        presence.probability,
+        presence.grid_px,
+        min_weight,
+        worth,
+        (1 - pixel_share) / pixel_share,
+        words,
+        independent_pixels / 2,
+        symbols,
+        llr,
+    )
+    return SoftSymbols(symbols, llr, quality), least

@@ -18,7 +18,6 @@ from evlcp_wh.ml_soft import (
     MinWeight,
     PixelShare,
     PriorCount,
-    combined_values,
     learned_worth,
     soft_symbols,
 )
@@ -80,8 +79,8 @@ class MotionFeedback(Decoding):
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             presence = presence.informed()
             worth = learned_worth(presence, sums, pilots, self.max_events, self.prior_count)
-            soft = self._decided(presence, sums, pilots, words, worth)
-            if np.abs(soft.llr).min() >= self.sure_llr:
+            soft, least = self._decided(presence, sums, pilots, words, worth)
+            if least >= self.sure_llr:
                 return soft
             matches = self._matches(presence, sums, worth)
             known, aligned = pilots, sums
@@ -93,9 +92,9 @@ class MotionFeedback(Decoding):
                 aligned, done = _taken_back(sums, path), path
                 presence = self._separated(aligned, presence, pilots)
                 worth = learned_worth(presence, aligned, pilots, self.max_events, self.prior_count)
-                soft = self._decided(presence, aligned, pilots, words, worth)
+                soft, _ = self._decided(presence, aligned, pilots, words, worth)
                 known = np.concatenate([pilots, words[soft.symbols].astype(np.int64)], axis=1)
-            return self._decided(presence, aligned, pilots, words, worth)
+            return self._decided(presence, aligned, pilots, words, worth)[0]
 
         return decode
 
@@ -106,9 +105,9 @@ class MotionFeedback(Decoding):
         pilots: NDArray[np.int64],
         words: NDArray[np.float64],
         worth: NDArray[np.float64],
-    ) -> SoftSymbols:
-        values = combined_values(presence, sums, pilots, worth, self.min_weight, self.pixel_share)
-        return soft_symbols(values, words, self.independent_pixels)
+    ) -> tuple[SoftSymbols, float]:
+        weights = self.min_weight, self.pixel_share, self.independent_pixels
+        return soft_symbols(presence, sums, pilots, words, worth, *weights)
 
     def _matches(
         self, presence: PresenceMap, sums: NDArray[np.int16], worth: NDArray[np.float64]

@@ -47,16 +47,16 @@ class WhCorrelation(Separation):
         """Precompute for a codebook's pilots."""
         codebook.require_pairs("separation", "wh-correlation", "edges")
         codes = codebook.pilot_edges.astype(np.int64)
-        agree, disagree = log((1 - self.value_error) / 0.5), log(self.value_error / 0.5)
+        odds = log((1 - self.value_error) / 0.5), log(self.value_error / 0.5), self.min_values
+        least = self.min_probability
 
         def separate(sums: NDArray[np.int16]) -> PresenceMap:
             _, height, width = sums.shape
             rows, columns = height // self.grid_px, width // self.grid_px
-            probability = np.zeros((len(codes), rows, columns), np.float32)
-            _kernels.presence(sums, codes, self.grid_px, agree, disagree, self.min_values, probability)
-            selected = probability >= self.min_probability
+            cells = len(codes), rows, columns
+            probability, selected = np.zeros(cells, np.float32), np.empty(cells, np.bool_)
             pixels = np.zeros((len(codes), height, width), np.float32)
-            _kernels.pixel_maps(sums, codes, self.grid_px, selected, pixels)
+            _kernels.separated(sums, codes, self.grid_px, odds, least, probability, selected, pixels)
             return PresenceMap(probability, self.grid_px, selected, pixels)
 
         return separate

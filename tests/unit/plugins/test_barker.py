@@ -116,6 +116,22 @@ def test_correlation(seed, steps, min_events, share):
     assert abs(int(rho.argmax()) - at) <= 1
 
 
+def test_listening_counts_correlates_and_follows_the_mean_square():
+    rng = np.random.default_rng(0)
+    t, p = np.sort(rng.integers(0, 9000, 4000)), rng.integers(0, 2, 4000).astype(np.uint8)
+    chips, due, known = 2.0 * chips_of_values(BARKER13) - 1, np.ones(26, bool), rng.random((2, 40))
+    counts, want = np.empty((2, 801)), np.empty((2, 801))
+    lags = 800 - 26 * 10 + 1
+    rho, expected, enough, squares = np.empty(lags), np.empty(lags), np.empty(500), np.empty(500)
+    bins, past = (0, 11.25, 20, 520), (0.01, 70, 100)
+    found = _kernels.listen(t, p, bins, known, chips, due, 10, 0, past, counts, rho, enough)
+    _kernels.count_bins(t, p, 0, 11.25, known, want)
+    top = _kernels.correlate(want[:, :800], chips, due, 10, 0, expected)
+    assert found == (top, *_kernels.mean_squares(expected[20:520], *past, squares))
+    for one, other in ((counts, want), (rho, expected), (enough, squares)):
+        assert_array_equal(one, other)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_mean_square_of_the_positive(seed):
     rng = np.random.default_rng(seed)

@@ -474,9 +474,15 @@ def test_the_line_of_a_bar_leaves_strays_out(tilt: float) -> None:
     assert _kernels.line_of_cells(selected, medians, line, seen)
     assert_allclose(line, [5, 3, 13, tilt, 1], atol=0.35)
     assert seen.all()
+    for way, cells in ((1, selected), (2, np.ascontiguousarray(selected.transpose(0, 2, 1)))):
+        again, also = np.empty(5), np.empty(K, np.bool_)
+        assert _kernels.lie_of_cells(cells, again, also) == way
+        np.testing.assert_array_equal(again, line)
+        np.testing.assert_array_equal(also, seen)
     selected[2:] = False
     _kernels.cell_medians(selected, medians)
     assert not _kernels.line_of_cells(selected, medians, line, seen)
+    assert _kernels.lie_of_cells(selected, line, seen) == 0
 
 
 def own_motion(shift: np.ndarray, information: np.ndarray, when: np.ndarray) -> np.ndarray:
@@ -576,6 +582,25 @@ def test_how_dim_negative_values_are(seed: int) -> None:
     want = max(-low, 0) / high if high > 0 else 1.0
     assert _kernels.dimmer(pilots, seen, spacing, centre, values) == pytest.approx(want)
     assert _kernels.dimmer(pilots, seen, spacing, centre, -np.abs(values)) == 1.0
+
+
+@pytest.mark.parametrize("spacing", [5.0, -5.0])
+def test_a_bar_is_read_upright(spacing: float) -> None:
+    rng = np.random.default_rng(2)
+    sums, seen = rng.integers(-5, 6, (32, 90, 15)).astype(np.int16), np.ones(K, np.bool_)
+    pilots, words = PILOTS.astype(np.float64), WORDS.astype(np.float64)
+    symbols, first = rng.integers(0, len(words), K), 6.0 if spacing > 0 else 83.0
+    codes, known, want = np.empty((K, 16)), np.empty((K + 1, 16), np.bool_), np.empty((16, 90))
+    moved, values = rng.normal(0, 1, 16), np.empty((16, 90))
+    before, place = moved.copy(), np.array([first, spacing, 7.0, 0.01, 2.0])
+    dim = _kernels.read_bar(sums, pilots, words, symbols, seen, place, 3.0, 0.3, codes, known, moved, values)
+    ends = first - spacing / 2, first + (K - 0.5) * spacing
+    _kernels.bar_values(sums, place[2:4], 2.0, *ends, 3.0, 0.3, want)
+    way = 1 if spacing > 0 else -1
+    np.testing.assert_array_equal(values, want[:, ::way])
+    np.testing.assert_array_equal(moved, way * before)
+    np.testing.assert_array_equal(codes[:, 8:], words[symbols])
+    assert dim == _kernels.dimmer(pilots, seen, 5.0, 6.0 + 5.0 * (K - 1) / 2 - 44.5, values)
 
 
 @pytest.mark.parametrize("dim", [0.05, 0.5, 2.0])

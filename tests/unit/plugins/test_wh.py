@@ -167,6 +167,36 @@ def test_histograms_of_pairs_and_their_worth(seed, grid, most):
     )
 
 
+def test_steps_that_are_called_as_one():
+    rng = np.random.default_rng(0)
+    sums, codes = random_sums(rng, (32, 12, 8)), rng.choice([-1, 1], (3, 8))
+    cells, odds = (3, 6, 4), (0.6, -1.6, 4)
+    probability, heard, chosen = (
+        np.zeros(cells, np.float32),
+        np.zeros(cells, np.float32),
+        np.zeros(cells, bool),
+    )
+    pixels, maps = np.zeros((2, 3, 12, 8), np.float32)
+    _kernels.separated(sums, codes, 2, odds, 0.5, heard, chosen, pixels)
+    _kernels.presence(sums, codes, 2, *odds, probability)
+    _kernels.pixel_maps(sums, codes, 2, probability >= 0.5, maps)
+    for one, other in ((heard, probability), (chosen, probability >= 0.5), (pixels, maps)):
+        assert_array_equal(one, other)
+    counts, worth, learned = np.zeros((2, 7, 7)), np.empty((7, 7)), np.empty((7, 7))
+    _kernels.count_pairs(sums[:16], codes, heard, 2, 3, counts)
+    _kernels.log_ratio(counts, 1.0, worth)
+    _kernels.learn_worth(sums, codes, heard, 2, 3, 1.0, learned)
+    assert_array_equal(learned, worth)
+    words, values = rng.choice([-1.0, 1.0], (16, 8)), np.zeros((3, 8))
+    symbols, llr = np.zeros((2, 3), int), np.zeros((2, 3, 4), np.float32)
+    _kernels.sum_worth(sums, codes, heard, 2, 0.05, 3, worth, 19.0, values)
+    quality = _kernels.read_words(values, words, 0.125, symbols[0], llr[0])
+    found = _kernels.read_frame(sums, codes, heard, 2, 0.05, worth, 19.0, words, 0.125, symbols[1], llr[1])
+    assert found == (quality, np.abs(llr[0]).min())
+    assert_array_equal(symbols[1], symbols[0])
+    assert_array_equal(llr[1], llr[0])
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("reach", [1, 3])
 def test_what_clusters_say_off_their_places(seed, reach):

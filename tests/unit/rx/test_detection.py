@@ -1,6 +1,5 @@
 """Finding and following blinking regions."""
 
-from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
@@ -11,6 +10,7 @@ import pytest
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.detection import Followed, RegionFollower, _clear
+from evlcp_sdk.rx.places import Places
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing.recordings import (
     IdealBar,
@@ -73,7 +73,7 @@ def test_a_shaking_bar_is_followed(shake_px: float, shake_hz: float) -> None:
     assert {t.id for found in by_step.values() for t in found} == {0}
     (region,) = by_step[99_000]
     at = np.arange(5000.0, 99_000.0, 500.0)
-    (x, y), (true_x, true_y) = region.at(at), bar.centre(at)
+    (x, y), (true_x, true_y) = region.positions.at(at), bar.centre(at)
     assert np.sqrt(np.mean((x - true_x + 0.5) ** 2)) < 0.6
     assert np.sqrt(np.mean((y - true_y + 0.5) ** 2)) < 0.8
 
@@ -101,11 +101,11 @@ def test_a_bar_that_leaves_the_image_fast_is_let_go(way: tuple[int, int]) -> Non
 
 def test_a_region_goes_straight_on_for_two_steps() -> None:
     positions = [Region(0, 1000.0 * n, 50 + n**2, 80 - 2 * n, 4, 100) for n in range(4)]
-    region = Followed(0, deque(positions), 0)
-    x, y = region.at(np.array([-9e9, -1000, 0, 500, 3000, 4000, 5000, 9e9]))
+    region = Followed(0, Places(positions), 0)
+    x, y = region.positions.at(np.array([-9e9, -1000, 0, 500, 3000, 4000, 5000, 9e9]))
     assert x == pytest.approx([48, 49, 50, 50.5, 59, 64, 69, 69])
     assert y == pytest.approx([84, 82, 80, 79, 74, 72, 70, 70])
-    alone = Followed(0, deque(positions[:1]), 0)
+    alone = Places(positions[:1])
     assert alone.at(np.array([-5e3, 7e3]))[0] == pytest.approx([50, 50])
 
 
@@ -239,7 +239,7 @@ def test_a_region_takes_its_bars_size_and_gathers_its_events() -> None:
     region = regions.alive[0]
     before = sum(len(e) for _, e in region.pieces)
     assert regions.shape(region, 24_000.0, (bar.x_px - 0.5, bar.y_px - 0.5), (4.0, 128.0)) == np.inf
-    x, y = region.at(np.array([24_000.0]))
+    x, y = region.positions.at(np.array([24_000.0]))
     assert (x[0], y[0]) == pytest.approx((bar.x_px - 0.5, bar.y_px - 0.5))
     old = list(region.pieces)
     regions.gather(region, 18_000.5, 21_000)
@@ -262,10 +262,12 @@ def test_another_image_moves_with_its_bar() -> None:
     for start, part in steps(ideal_events(LINK, bar), 25_000):
         regions.step(start, part)
     (region,) = regions.alive
-    (x,), (y,) = region.at(np.array([24_000.0]))
+    (x,), (y,) = region.positions.at(np.array([24_000.0]))
     other = regions.beside(region, 24_000.0, (float(x) + 60, float(y) + 10), (4.0, 128.0))
     at = np.arange(5000.0, 24_000.0, 500.0)
-    assert np.ptp(np.array(other.at(at)) - np.array(region.at(at)), axis=1) == pytest.approx([0, 0], abs=1e-9)
+    assert np.ptp(
+        np.array(other.positions.at(at)) - np.array(region.positions.at(at)), axis=1
+    ) == pytest.approx([0, 0], abs=1e-9)
     assert other in regions.alive
     assert other.covers(24_000.0, (float(x) + 60, float(y) + 10))
     assert not other.covers(24_000.0, (float(x), float(y)))
@@ -294,7 +296,7 @@ def test_what_frames_have_shown_to_be_two_stays_two() -> None:
             regions.shape(whole, t_us, (image.x_px - 0.5, image.y_px - 0.5), size)
             beside = regions.beside(whole, t_us, (bar.x_px - 0.5, bar.y_px - 0.5), size)
         elif start == 20_000:
-            whole.positions = deque(replace(p, y_px=p.y_px - 30) for p in whole.positions)
+            whole.positions = Places(replace(p, y_px=p.y_px - 30) for p in whole.positions)
         elif start == 25_000:
             # The next frame shows where it is.
             assert set(now) == {whole.id, beside.id}
@@ -331,7 +333,7 @@ def test_parts_of_a_bar_that_hear_the_same_become_one_region() -> None:
     regions.unite(lower, upper)
     assert regions.alive == [lower]
     assert upper.released
-    (x,), (y,) = lower.at(np.array([24_000.0]))
+    (x,), (y,) = lower.positions.at(np.array([24_000.0]))
     assert (x, y) == pytest.approx((bar.x_px - 0.5, bar.y_px - 0.5), abs=1.5)
     assert lower.latest.height_px == pytest.approx(128, abs=4)
     since_us = lower.pieces[0][0]

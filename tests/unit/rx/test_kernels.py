@@ -403,6 +403,11 @@ def test_light_in_step_with_the_pilot(seed, grid, every):
     _kernels.pilot_light(sums, codes, every, prior, grid, out)
     assert_allclose(out, twins.pilot_light(sums, codes, every, prior, grid), rtol=1e-6, atol=1e-9)
     assert out[2] == 0
+    in_place, seen = rng.random(5) < 0.7, np.empty(5, np.bool_)
+    enough = max(0.25 * np.median(out[in_place]) if in_place.any() else 0.0, 1e-9)
+    whole = _kernels.lit_clusters(sums, codes, every, prior, grid, in_place, 0.25, seen)
+    assert_array_equal(seen, out >= enough)
+    assert whole == seen.all()
 
 
 @pytest.mark.parametrize(("turn", "every"), [(1j, 2), (1, 2), (np.exp(1.4j), 2), (1j, 1)])
@@ -420,6 +425,12 @@ def test_answers_between_and_across_clusters(seed, turn, every):
     assert_array_equal(between, twins.spread_between(sums, codes, places, seen, pairs, 0.8, 0.2, 0.75))
     _kernels.spread_across(sums, codes, every, places, seen, turn, 1.3, across)
     assert_array_equal(across, twins.spread_across(sums, codes, every, places, seen, turn, 1.3, 5))
+    for way in (turn, 0):
+        both = np.zeros_like(between), np.zeros_like(across)
+        zones = 0.8, 0.2, 0.75
+        _kernels.spread_about(sums, codes, every, places, seen, pairs, complex(way), 1.3, zones, *both)
+        assert_array_equal(both[0], between)
+        assert_array_equal(both[1], across if way else 0)
 
 
 @pytest.mark.parametrize("apart", [0j, 0.5 + 0.5j, -0.9j])
@@ -602,3 +613,30 @@ def test_a_lamp_of_whole_chips_is_no_candidate(period_us):
     events = Events.of(t[order], x[order], np.full(len(t), 5), np.ones(len(t)))
     rhythm.step(0, events, np.zeros((4, 6), np.int32), 2)
     assert set(rhythm.of(events).x.tolist()) == {9}
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_places_are_interpolated_and_go_straight_on(seed, n):
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.choice(1000, n, replace=False)).astype(float)
+    places = np.concatenate([t[None], rng.uniform(0, 700, (4, n))])
+    asked = np.sort(np.concatenate([rng.uniform(-3000, 4000, 20), t]))
+    if seed % 2:
+        rng.shuffle(asked)
+    centre = np.empty((2, len(asked)))
+    _kernels.places_at(asked, places, 2, centre)
+    way = places[:3]
+    if n > 1:
+        before, after = way[:, 0] - 2 * (way[:, 1] - way[:, 0]), way[:, -1] + 2 * (way[:, -1] - way[:, -2])
+        way = np.column_stack([before, way, after])
+    for axis in range(2):
+        assert_allclose(centre[axis], np.interp(asked, way[0], way[axis + 1]), rtol=1e-12)
+
+
+def test_rows_that_are_not_dark_and_bounds_of_places():
+    image = np.zeros((7, 5), np.float32)
+    assert _kernels.rows_of(image) == (0, 0)
+    image[2, 4] = image[5, 0] = 0.5
+    assert _kernels.rows_of(image) == (2, 6)
+    assert _kernels.bounds_of(np.array([3 + 9j, -1 + 4j, 2 - 5j])) == (-1, 3, -5, 9)
