@@ -115,7 +115,7 @@ _MOST_PLACES = 12
 
 
 def explained(fault: BaseException) -> tuple[str, int]:
-    """What is told of anything that was raised, and the exit code: a line a fault of what was given, one line
+    """What is said of anything that was raised, and the exit code: a line a fault of what was given, one line
     that says what to report where it is our own.
     """
     if isinstance(fault, EvlcpError):

@@ -407,7 +407,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """A frame that a framing heard in a region's events.
+    """A frame that a framing found in a region's events.
 
     Attributes:
         packet: Number of its packet in the region, from 0.

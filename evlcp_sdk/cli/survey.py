@@ -35,7 +35,7 @@ def survey(
         typer.Option(
             "--sites",
             metavar="known.toml",
-            help="Bars that are known: the camera's own track tells the rest.",
+            help="Known bars; the others follow from the camera's own track.",
         ),
     ] = None,
     attitude: Annotated[

@@ -1,4 +1,4 @@
-"""What a drive tells of its own errors: the standing states of a track in their units."""
+"""What a drive shows of its own errors: the standing states of a track in their units."""
 
 import math
 from collections.abc import Mapping

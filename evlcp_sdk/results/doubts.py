@@ -85,10 +85,10 @@ _NO_ROOM = (
     ("regions_left_out", "{} time{} a region more was not followed"),
     ("regions_gave_way", "{} region{} without a bar let go for others"),
 )
-"""Counts of what there was no room for, and how they are told."""
+"""Counts of what there was no room for, and how they are stated."""
 
 _BY_CHANCE = 1e-6
-"""Probability of a finding by chance below which it is told."""
+"""Probability of a finding by chance below which it is stated."""
 
 _SUSPECTS = {
     "focal length": "camera.focal_mm, or give camera_sigma.focal_mm, and the drive shows the right one",
@@ -327,7 +327,8 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Doubt]:
         ids = f"id{_s(len(heard))} {', '.join(map(str, heard))}" if heard else "no id"
         yield Doubt(
             "no-site",
-            f"{number} position{_s(number)} refused, as no bar in view stands at a known place; heard: {ids}",
+            f"{number} position{_s(number)} refused, as no bar in view stands at a known place;"
+            f" received: {ids}",
             "compare transmitter_id in site.toml",
         )
     if number := positions["refused"].get("misfit", 0):
@@ -411,9 +412,10 @@ def _frames(counts: Mapping[str, int]) -> Iterator[Doubt]:
         regions = counts.get("regions_opened", 0)
         yield Doubt(
             "no-preamble",
-            f"something blinks, {blinking} events in {regions} region{_s(regions)}, but no preamble is heard",
+            f"something blinks, {blinking} events in {regions} region{_s(regions)},"
+            " but no preamble is detected",
             "compare air.chip_rate_hz and the preamble with the transmitter's; a panel or leaves behind a bar"
-            " may drown it; `evlcp diagnose` says what blinks, and how fast",
+            " may mask it; `evlcp diagnose` says what blinks, and how fast",
         )
     rejected, frames = counts.get("frames_rejected", 0), counts.get("frames", 0)
     share = _REJECTED_BESIDE_READ_SHARE if _read(counts) > counts.get("blocks_failed", 0) else _REJECTED_SHARE
@@ -477,7 +479,7 @@ def _transmitter(
             "few-distances",
             f"{one.ranged} of {own:.0f} frames have a distance: too few boundaries between clusters are seen,"
             " or their values do not fit the layout",
-            "another ranging.id may bear it",
+            "another ranging.id may tolerate it",
             number,
         )
     hidden = [k for k in range(link.codebook.clusters) if one.unseen[k] == one.frames]

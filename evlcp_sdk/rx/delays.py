@@ -68,7 +68,7 @@ class RowDelay:
 
 
 class RowDelays:
-    """Measures the delay by row at each preamble that is heard.
+    """Measures the delay by row at each preamble that is detected.
 
     Args:
         preamble: The code that finds time, chips, uint8 (P,).

@@ -245,7 +245,7 @@ class Watchdog(IntEnum):
     KEEP = 0
     """Go on playing."""
     IDLE = 1
-    """Idle pattern from the next packet boundary until the host is heard again."""
+    """Idle pattern from the next packet boundary until the host sends again."""
     DARK = 2
     """Dark after the packet; START plays again."""
 
@@ -289,7 +289,7 @@ class BoardFault(IntFlag):
     OVER_LIMIT = 32
     """What came next was beyond the limits of light: not shown, LEDs dark until START."""
     UNDERRUN = 64
-    """The stream is empty though its end was not told: idle pattern until the next packet."""
+    """The stream is empty though its end was not announced: idle pattern until the next packet."""
     PULSE = 256
     """No pulse came, or none that fits: the board goes on by its own clock; until the next START."""
 
@@ -796,7 +796,7 @@ class StatusReply(WireMessage):
         silence_ms: Time since the request before this one, HELLO left out.
         uptime_ms: Time since reset.
         digest: Digest of the active bank's codebook, or of the one set.
-        underruns: How often the active bank's stream was empty before its end was told.
+        underruns: How often the active bank's stream was empty before its end was announced.
         clock: The board's clock, which counts freely and wraps.
         pulses: Pulses of the pulse input since reset.
         pulse_clocks: Clocks from the pulse before to the latest; 0: unknown.
@@ -1086,7 +1086,7 @@ class PushReply(WireMessage):
         number: Number of the packet that is next: those before it are there.
         offset: Bytes of it that are there.
         begun: Packets that have begun to play.
-        underruns: How often the queue was empty before its end was told.
+        underruns: How often the queue was empty before its end was announced.
     """
 
     TYPE: ClassVar[int] = 0x19

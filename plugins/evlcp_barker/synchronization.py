@@ -73,7 +73,9 @@ class BarkerSync(Synchronization):
             " where it stands out, 6 times the rms of a packet's others.",
         ),
     ] = 0.5
-    min_events: Annotated[int, Field(ge=26, description="Events in a preamble that count as heard.")] = 100
+    min_events: Annotated[int, Field(ge=26, description="Events of a preamble that counts as detected.")] = (
+        100
+    )
     clock_tolerance_ppm: Annotated[
         float, Field(gt=0, le=10_000, description="How far apart the two clocks may be: a bound.")
     ] = 100.0

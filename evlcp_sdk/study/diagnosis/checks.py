@@ -300,7 +300,7 @@ def _light(facts: Facts) -> Check:
         first = facts.sources[0]
         if first.kind != "code" and first.events < _SOME * facts.events:
             return _dark(view)
-        said = f"{_sources_said(facts)}, but too rarely to tell a code"
+        said = f"{_sources_said(facts)}, but too rarely to recognise a code"
         long_px, wide_px = max(first.wide_px, first.high_px), min(first.wide_px, first.high_px)
         if wide_px > _BLURRED_SHARE * long_px:
             said = f"{said}: {wide_px:.0f} px wide, {long_px:.0f} px long, its light is spread"
@@ -511,11 +511,13 @@ def _preamble(facts: Facts) -> Check:
             "preamble",
             "fail",
             "no-preamble",
-            f"none heard in {regions} region{'s' * (regions != 1)}",
+            f"none detected in {regions} region{'s' * (regions != 1)}",
             "compare pilots.id, its parameters and air.chip_rate_hz with the transmitter's: `evlcp config` at"
             " both ends",
         )
-    return Check("preamble", "pass", "preamble", f"{heard} heard in {regions} region{'s' * (regions != 1)}")
+    return Check(
+        "preamble", "pass", "preamble", f"{heard} detected in {regions} region{'s' * (regions != 1)}"
+    )
 
 
 def _frames(facts: Facts) -> Check:

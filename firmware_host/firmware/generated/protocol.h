@@ -104,7 +104,7 @@ enum evlcp_state {
 /* What happens when the host falls silent. */
 enum evlcp_watchdog {
     EVLCP_WATCHDOG_KEEP = 0, /* Go on playing. */
-    EVLCP_WATCHDOG_IDLE = 1, /* Idle pattern from the next packet boundary until the host is heard again. */
+    EVLCP_WATCHDOG_IDLE = 1, /* Idle pattern from the next packet boundary until the host sends again. */
     EVLCP_WATCHDOG_DARK = 2, /* Dark after the packet; START plays again. */
 };
 
@@ -129,7 +129,7 @@ enum evlcp_fault {
     EVLCP_FAULT_CHIP_LOST = 8, /* A chip interrupt came a whole chip late, or chips stopped: LEDs dark. */
     EVLCP_FAULT_WATCHDOG = 16, /* The host fell silent and the watchdog acted; cleared by the next control request. */
     EVLCP_FAULT_OVER_LIMIT = 32, /* What came next was beyond the limits of light: not shown, LEDs dark until START. */
-    EVLCP_FAULT_UNDERRUN = 64, /* The stream is empty though its end was not told: idle pattern until the next packet. */
+    EVLCP_FAULT_UNDERRUN = 64, /* The stream is empty though its end was not announced: idle pattern until the next packet. */
     EVLCP_FAULT_PULSE = 256, /* No pulse came, or none that fits: the board goes on by its own clock; until the next START. */
 };
 
@@ -617,7 +617,7 @@ struct evlcp_status_reply {
     uint32_t silence_ms; /* Time since the request before this one, HELLO left out. */
     uint32_t uptime_ms; /* Time since reset. */
     uint8_t digest[32]; /* Digest of the active bank's codebook, or of the one set. */
-    uint32_t underruns; /* How often the active bank's stream was empty before its end was told. */
+    uint32_t underruns; /* How often the active bank's stream was empty before its end was announced. */
     uint32_t clock; /* The board's clock, which counts freely and wraps. */
     uint32_t pulses; /* Pulses of the pulse input since reset. */
     uint32_t pulse_clocks; /* Clocks from the pulse before to the latest; 0: unknown. */
@@ -882,7 +882,7 @@ struct evlcp_push_reply {
     uint32_t number; /* Number of the packet that is next: those before it are there. */
     uint16_t offset; /* Bytes of it that are there. */
     uint32_t begun; /* Packets that have begun to play. */
-    uint32_t underruns; /* How often the queue was empty before its end was told. */
+    uint32_t underruns; /* How often the queue was empty before its end was announced. */
 };
 
 static inline void evlcp_push_reply_put(uint8_t *p, const struct evlcp_push_reply *m)

@@ -260,8 +260,8 @@ def test_events_that_were_dropped() -> None:
 
 def test_bars_at_no_known_place_are_named_by_their_ids() -> None:
     for heard, says in (
-        ({"0": 9, "1": 7, "2": 9}, "heard: ids 7, 9: compare"),
-        ({}, "heard: no id: compare"),
+        ({"0": 9, "1": 7, "2": 9}, "received: ids 7, 9: compare"),
+        ({}, "received: no id: compare"),
     ):
         positions = dict(NO_POSITIONS, refused={"no-site": 4}, heard=heard)
         found = warnings_of(RunTally(LINK.packet), {}, LINK, positions=positions)
@@ -337,7 +337,7 @@ def test_a_reflection_is_not_doubted() -> None:
 def test_what_blinks_without_a_preamble() -> None:
     nothing = RunTally(LINK.packet)
     (line,) = told(nothing, events_in_regions=5_000_000, regions_opened=1)
-    assert line.startswith("something blinks, 5000000 events in 1 region, but no preamble is heard")
+    assert line.startswith("something blinks, 5000000 events in 1 region, but no preamble is detected")
     assert told(nothing, events_in_regions=5_000_000, regions_opened=2, locks=1) == []
     assert told(nothing, events_in_regions=20_000, regions_opened=3) == []
 
