@@ -109,5 +109,5 @@ $(VENV)/.installed: pyproject.toml $(VENV)/.pip
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.pip
-	$(BIN)/python -m pip install -q -e '.[faery,parquet,pandas,cluster,report,mcap,sign,mp4,docs,notebook]' --group dev
+	$(BIN)/python -m pip install -q -e '.[faery,parquet,pandas,cluster,report,mcap,live,sign,mp4,docs,notebook]' --group dev
 	@touch $@ $(VENV)/.installed

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import ndtri
 
-from evlcp_sdk.results.figures import TRANSMITTER_COLOURS, plain, titled
+from evlcp_sdk.results.colours import TRANSMITTER_COLOURS
+from evlcp_sdk.results.figures import plain, titled
 from evlcp_sdk.study.intervals import proportion_interval
 
 AIR_S = 346 * 100e-6

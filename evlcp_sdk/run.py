@@ -342,7 +342,7 @@ def live(
                     **kept,
                     sinks=sinks,
                     lines=lines,
-                    fixed=lambda fix: loop.fix(fix),
+                    placed=lambda placed: loop.placed(placed),
                 ) as writer,
                 registry.joined(ear),
             ):

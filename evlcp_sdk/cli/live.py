@@ -2,13 +2,16 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from evlcp_sdk.cli._common import LinkFile, Overrides, complain, echo
 from evlcp_sdk.cli._receiving import attitude_of, clock_zero_of, json_lines_of, position_plan_of
 from evlcp_sdk.cli._summary import show
+
+if TYPE_CHECKING:
+    from evlcp_sdk.live.services import Services
 
 __all__ = ["register"]
 
@@ -63,6 +66,43 @@ def live(
             "--waiting-ms", min=1.0, help="How long events may wait before something is left out, in ms."
         ),
     ] = 20.0,
+    view: Annotated[
+        bool, typer.Option("--view", help="Serve a page to look on in a browser; its address is printed.")
+    ] = False,
+    view_host: Annotated[
+        str,
+        typer.Option(
+            "--view-host",
+            metavar="ADDRESS",
+            help="Where the page is served: 0.0.0.0 for other machines, too, such as a phone.",
+        ),
+    ] = "127.0.0.1",
+    view_port: Annotated[
+        int,
+        typer.Option("--view-port", min=0, max=65535, metavar="PORT", help="Its port; 0: any that is free."),
+    ] = 0,
+    view_record: Annotated[
+        bool,
+        typer.Option(
+            "--view-record", help="Who looks on may start and stop recordings, into OUT or this folder."
+        ),
+    ] = False,
+    nmea_port: Annotated[
+        int | None,
+        typer.Option(
+            "--nmea-port", min=0, max=65535, metavar="PORT", help="Serve positions as NMEA-0183 by TCP."
+        ),
+    ] = None,
+    gpsd_port: Annotated[
+        int | None,
+        typer.Option(
+            "--gpsd-port",
+            min=0,
+            max=65535,
+            metavar="PORT",
+            help="Serve positions as gpsd does, whose usual port is 2947.",
+        ),
+    ] = None,
 ) -> None:
     """Receive in real time: results as they come, delays measured.
 
@@ -76,12 +116,21 @@ def live(
 
     With positions:                 [bold]evlcp live URL --sites site.toml --pitch-deg 0 --roll-deg 0[/]
 
+    In a browser:                   [bold]evlcp live URL --view[/]
+
+    On a phone in this network:     [bold]evlcp live URL --view --view-host 0.0.0.0 --view-port 8080[/]
+
+    For programs that read gpsd:    [bold]evlcp live URL --sites site.toml --gpsd-port 2947[/], then
+    [bold]cgps[/] or [bold]gpspipe -w[/]
+
     Where the receiver cannot keep up, it leaves out, in this order, and counts: rows outside of regions, the
     distances of most frames, all outside of regions, the oldest events. Ctrl-C ends it, with its summary.
     """
     from evlcp_sdk.errors import InputError, InterruptedRunError
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.live.budget import Budget
+    from evlcp_sdk.live.outlet import Outlet
+    from evlcp_sdk.live.services import Services, Serving
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import live as run_live
     from evlcp_sdk.run import stop_on_request
@@ -92,7 +141,22 @@ def live(
     attitude = attitude_of(None, (heading_deg, pitch_deg, roll_deg), (0.5, 0.5, 0.0, 0.0))
     zero = clock_zero_of(clock_zero)
     plan = position_plan_of(sites, None, link, zero, mcap=False)
-    with stop_on_request() as stopped:
+    for name, given in (("--nmea-port", nmea_port), ("--gpsd-port", gpsd_port)):
+        if given is not None and plan is None:
+            raise typer.BadParameter("needs --sites", param_hint=name)
+    record_to = (Path.cwd() if out is None else out) if view_record else None
+    serving = Serving(view, view_host, view_port, record_to, nmea_port, gpsd_port)
+    outlet = Outlet()
+    services = Services(
+        serving,
+        outlet,
+        link,
+        name=Path(url).name,
+        sites=plan.sites if plan is not None else (),
+        clock_zero=zero,
+    )
+    with stop_on_request() as stopped, services:
+        _say_where(services)
         summary = run_live(
             url,
             out,
@@ -102,6 +166,8 @@ def live(
             attitude=attitude,
             clock_zero=zero,
             lines=lines,
+            outlet=outlet,
+            pictures=services.pictures,
             budget=Budget(waiting_ms=waiting_ms, most_ms=10 * waiting_ms),
             stopped=lambda: stopped() or (out is None and lines is not None and lines.gone),
         )
@@ -116,3 +182,12 @@ def live(
         if stopped() and out is not None:
             raise InterruptedRunError(f"interrupted; what was decoded until then is in {out}")
     raise typer.Exit(InputError.exit_code if summary["status"] == "failed" else 0)
+
+
+def _say_where(services: "Services") -> None:
+    """Say on stderr where to look, and what else is served."""
+    if services.view is not None:
+        complain(f"look on at {services.view.url}")
+    for name, server in (("NMEA", services.nmea), ("gpsd's JSON", services.gpsd)):
+        if server is not None:
+            complain(f"{name} at 127.0.0.1:{server.port}")

@@ -26,7 +26,7 @@ What is published:
 | `frame` | `Frame` | as soon as it is decoded, with `late_ms` after its last chip |
 | `packet` | `Packet` | when it is complete; its frames came before |
 | `message` | `ReceivedMessage` | when a packet completes it |
-| `fix` | `Fix` | when it is computed, given or refused |
+| `fix` | `Placed` | when it is computed: the fix, given or refused, and the filtered place |
 | `events` | `Events` | each piece of the source, before anything is shed: for a recorder |
 | `triggers` | `Triggers` | each piece's, where there are any |
 | `status` | `LiveStatus` | every 0.2 s, and at the end: rate, regions, delays, losses, what is shed |

@@ -11,11 +11,12 @@ from evlcp_sdk.live.delays import DelayTally
 from evlcp_sdk.live.outlet import Outlet
 from evlcp_sdk.live.pictures import PictureSlot
 from evlcp_sdk.live.reader import Reader, Slice
+from evlcp_sdk.place.navigator import Placed
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.signals import Stopped
-from evlcp_sdk.values import Events, Fix, Frame, Packet, Region
+from evlcp_sdk.values import Events, Frame, Packet, Region
 
 __all__ = ["STAGES", "FrameEar", "LiveLoop", "LiveStatus"]
 
@@ -158,9 +159,9 @@ class LiveLoop:
         self._tell_status(now=True)
         return packets
 
-    def fix(self, fix: Fix) -> None:
+    def placed(self, placed: Placed) -> None:
         """Tell listeners of a fix."""
-        self._outlet.publish("fix", fix.t_us, fix)
+        self._outlet.publish("fix", placed.fix.t_us, placed)
 
     def summary(self) -> dict[str, Any]:
         """Delays by stage, what was shed, and for how long, as JSON values."""

@@ -4,7 +4,6 @@ A `FigureProbe` listens to the receiver's stages and keeps a bounded share of wh
 figures of a recording of any length take constant memory; `Figures` draws them in the end.
 """
 
-import colorsys
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.results.colours import TRANSMITTER_COLOURS, cluster_colours, transmitter_colour
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.plots import ellipse
 from evlcp_sdk.results.sink import Run, Sink
@@ -41,9 +41,6 @@ __all__ = [
     "plain",
     "titled",
 ]
-
-TRANSMITTER_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's colours, which colour-blind readers can distinguish, too."""
 
 _INK = "#333333"
 _DPI = 150
@@ -306,17 +303,6 @@ def _magnified(covariances_m2: Sequence[NDArray[np.float64]], places: NDArray[np
 _ELLIPSE = "#cfe5f3"
 _ELLIPSE_SHARE = 0.15
 """Length of an ellipse beside the extent of its track, at most, where it is drawn larger than it is."""
-
-
-def transmitter_colour(number: int) -> str:
-    """Colour of a transmitter, the same in every figure."""
-    return TRANSMITTER_COLOURS[number % len(TRANSMITTER_COLOURS)]
-
-
-def cluster_colours(clusters: int) -> NDArray[np.float64]:
-    """Colours of the clusters, float64 (clusters, 3): hue along the bar, neighbours bright and dark."""
-    hues = np.arange(clusters) / max(clusters, 1) * 0.85
-    return np.array([colorsys.hsv_to_rgb(h, 0.95, (0.95, 0.65)[k % 2]) for k, h in enumerate(hues)])
 
 
 def draw_regions(probe: FigureProbe, title: str) -> Figure:

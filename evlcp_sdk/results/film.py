@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.hooks import hookimpl
-from evlcp_sdk.results.figures import cluster_colours, transmitter_colour
+from evlcp_sdk.results.colours import cluster_colours, transmitter_colour
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Frame, Region
 

@@ -1,18 +1,15 @@
 """What is found, as a stream of lines of JSON: frames, messages, fixes."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from evlcp_sdk.results.columns import FILTERED_COLUMNS, FRAME_COLUMNS, frame_value
 from evlcp_sdk.results.packets_jsonl import message_line
-from evlcp_sdk.results.text import integrity, number_or_none, sigmas
+from evlcp_sdk.results.text import integrity, number_or_none, sigmas, symbol_list
 from evlcp_sdk.values import Fix, Frame, Packet
 
-__all__ = ["JsonLines"]
-
-_DIGITS = {"t_us": 2, "x_px": 3, "y_px": 3}
-"""Digits behind the point; of all else four."""
+__all__ = ["JsonLines", "fix_line", "frame_line"]
 
 
 class JsonLines:
@@ -34,33 +31,56 @@ class JsonLines:
             PluginError: A kind of messages fails.
         """
         for frame in packet.frames:
-            self._line("frame", {name: _value(frame, name) for name in self._columns})
+            self._give(json.dumps(frame_line(frame, self._columns)))
         for message in packet.messages:
-            self._line("message", json.loads(message_line(message)))
+            self._give(json.dumps({"line": "message"} | json.loads(message_line(message))))
 
     def fix(self, fix: Fix) -> None:
         """Give the line of a fix, given or refused."""
-        self._line(
-            "fix",
-            {
-                "t_us": round(fix.t_us, 1),
-                "latitude_deg": number_or_none(fix.latitude_deg, 10),
-                "longitude_deg": number_or_none(fix.longitude_deg, 10),
-                "height_m": number_or_none(fix.height_m, 4),
-                "sigma_m": [number_or_none(value, 4) for value in sigmas(fix.covariance_m2)],
-                "heading_deg": number_or_none(fix.heading_deg, 4),
-                "bars": list(fix.transmitters),
-                "verified": fix.verified,
-                "refusal": fix.refusal,
-                "detail": fix.detail,
-                **integrity(fix),
-            },
-        )
-
-    def _line(self, line: str, values: dict[str, Any]) -> None:
-        self._give(json.dumps({"line": line} | values))
+        self._give(json.dumps(fix_line(fix)))
 
 
-def _value(frame: Frame, column: str) -> Any:
-    value = frame_value(frame, column)
-    return number_or_none(value, _DIGITS.get(column, 4)) if isinstance(value, float) else value
+def frame_line(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> dict[str, Any]:
+    """What the line of a frame says, as JSON values, rounded as in `frames.csv`.
+
+    Args:
+        frame: The frame.
+        columns: `FRAME_COLUMNS`, and others behind them.
+    """
+    # Written out, as there are hundreds a second.
+    soft, found = frame.soft, frame.range
+    line = {
+        "line": "frame",
+        "transmitter": frame.transmitter,
+        "packet": frame.packet,
+        "frame": frame.frame,
+        "t_us": round(frame.t_us, 2),
+        "symbols": symbol_list(soft.symbols),
+        "quality": number_or_none(soft.quality, 4),
+        "distance_m": number_or_none(found.distance_m, 4),
+        "distance_sigma_m": number_or_none(found.sigma_m, 4),
+        "x_px": number_or_none(frame.x_px, 3),
+        "y_px": number_or_none(frame.y_px, 3),
+        "echo_of": frame.echo_of,
+    }
+    for name in columns[len(FRAME_COLUMNS) :]:
+        line[name] = number_or_none(frame_value(frame, name), 4)
+    return line
+
+
+def fix_line(fix: Fix) -> dict[str, Any]:
+    """What the line of a fix says, as JSON values."""
+    return {
+        "line": "fix",
+        "t_us": round(fix.t_us, 1),
+        "latitude_deg": number_or_none(fix.latitude_deg, 10),
+        "longitude_deg": number_or_none(fix.longitude_deg, 10),
+        "height_m": number_or_none(fix.height_m, 4),
+        "sigma_m": [number_or_none(value, 4) for value in sigmas(fix.covariance_m2)],
+        "heading_deg": number_or_none(fix.heading_deg, 4),
+        "bars": list(fix.transmitters),
+        "verified": fix.verified,
+        "refusal": fix.refusal,
+        "detail": fix.detail,
+        **integrity(fix),
+    }

@@ -1,23 +1,46 @@
-"""`fixes.mcap`: positions as MCAP with well-known schemas: `/fix`, `/pose`, `/track`, `/integrity`."""
+"""`fixes.mcap`: what a run finds as MCAP with well-known schemas, as it comes.
 
+`examples/foxglove-layout.json` is a layout of Foxglove that shows all of it.
+"""
+
+import json
 import math
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.place.navigator import Place
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.lines import frame_line
+from evlcp_sdk.results.picture import png
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.text import integrity
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.values import Fix
+from evlcp_sdk.scene.sites import BarSite
+from evlcp_sdk.values import Events, Fix, Packet, Region
 
 __all__ = ["Mcap"]
 
-FRAME_ID = "enu"
-"""Name of the local axes; camera axes in it are x right, y down, z forward."""
+FRAME_ID, CAMERA_ID = "enu", "camera"
+"""Names of the local axes, and of the camera's: x right, y down, z forward."""
+
+_PICTURE_US, _WINDOW_US = 40_000, 10_000
+"""From one picture to the next, and how much time each shows."""
+
+_WHITE, _AMBER = (1.0, 1.0, 1.0, 0.8), (1.0, 0.75, 0.2, 1.0)
+
+_FRAME = {
+    "type": "object",
+    "properties": {
+        name: {"type": "array", "items": {"type": "integer"}} if name == "symbols" else {"type": "number"}
+        for name in FRAME_COLUMNS
+    },
+}
 
 
 class Mcap(Sink):
@@ -26,16 +49,60 @@ class Mcap(Sink):
     `/fix` (foxglove.LocationFix) and `/pose` (foxglove.PoseInFrame, camera axes in ENU) hold each fix as it
     was measured, `/pose` those of bars; `/track` (foxglove.LocationFix) the filtered position at its time;
     `/integrity` (google.protobuf.Struct) protection levels, what was left out and alarms, of refused fixes,
-    too.
+    too; `/scene` (foxglove.SceneUpdate) the bars in the local axes.
+
+    Of what the camera sees, 25 times a second of its clock, `/image` (foxglove.CompressedImage, PNG) holds
+    the events of 10 ms, and `/regions` (foxglove.ImageAnnotations) the regions of that time; `/frames` (JSON,
+    as lines of `--json-lines`) each frame.
     """
 
     def __init__(self, folder: ResultFolder, run: Run) -> None:
-        from mcap_protobuf.writer import Writer
+        from mcap.writer import Writer
 
         super().__init__(folder, run)
         zero = run.clock_zero
         self._zero_us = round(zero.timestamp() * 1e6) if zero is not None else 0
         self._writer: Any = Writer(folder.open_binary("fixes.mcap"))
+        self._writer.start(library="evlcp-sdk")
+        self._channels: dict[str, int] = {}
+        camera = run.link.camera
+        self._cells = np.zeros((camera.height, camera.width), np.uint8)
+        self._picture: int | None = None
+        self._turn: int | None = None
+        self._regions: dict[int, Region] = {}
+        self._bars: dict[int, BarSite] = {}
+
+    def events(self, events: Events) -> None:
+        """Draw them, and write the pictures that are complete."""
+        number, phase_us = np.divmod(events.t_us, _PICTURE_US)
+        height, width = self._cells.shape
+        shown = (phase_us >= _PICTURE_US - _WINDOW_US) & (events.x < width) & (events.y < height)
+        number, x, y, p = number[shown], events.x[shown], events.y[shown], events.p[shown]
+        if not len(number):
+            return
+        for first, last in pairwise([0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(number)]):
+            if self._picture != number[first]:
+                self._write_picture()
+                self._picture = int(number[first])
+            for polarity, bit in ((0, 1), (1, 2)):
+                mine = slice(first, last), p[first:last] == polarity
+                self._cells[y[mine[0]][mine[1]], x[mine[0]][mine[1]]] |= bit
+
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str, value: Any) -> None:
+        """Keep the regions, and write those of a picture's time together."""
+        if stage != "regions":
+            return
+        turn = int(value.t_us // _PICTURE_US)
+        if self._turn != turn:
+            self._write_regions()
+            self._turn = turn
+        self._regions[value.id] = value
+
+    def packet(self, packet: Packet) -> None:
+        """Write its frames."""
+        for frame in packet.frames:
+            self._write_json("/frames", frame.t_us, frame_line(frame))
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write a fix that is given, and the filtered place at its time."""
@@ -43,6 +110,7 @@ class Mcap(Sink):
         from scipy.spatial.transform import Rotation
 
         self._integrity(fix)
+        self._scene(fix.t_us)
         if filtered is None:
             return
         measured = (fix.latitude_deg, fix.longitude_deg, fix.height_m)
@@ -61,7 +129,9 @@ class Mcap(Sink):
         self._write("/pose", fix.t_us, pose)
 
     def finish(self) -> Mapping[str, Any]:
-        """Write the file's index."""
+        """Write what waits, and the file's index."""
+        self._write_picture()
+        self._write_regions()
         self._writer.finish()
         return {}
 
@@ -89,9 +159,85 @@ class Mcap(Sink):
         message.update({"bars": list(fix.transmitters), "refusal": fix.refusal} | integrity(fix))
         self._write("/integrity", fix.t_us, message)
 
+    def _write_picture(self) -> None:
+        from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+
+        if self._picture is None:
+            return
+        end_us = (self._picture + 1) * _PICTURE_US
+        image = CompressedImage(frame_id=CAMERA_ID, data=png(self._cells), format="png")
+        image.timestamp.FromNanoseconds(self._at_ns(end_us))
+        self._write("/image", end_us, image)
+        self._cells[:] = 0
+        self._picture = None
+
+    def _write_regions(self) -> None:
+        from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+        from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
+
+        if self._turn is None:
+            return
+        end_us = (self._turn + 1) * _PICTURE_US
+        message = ImageAnnotations()
+        for region in self._regions.values():
+            box = message.points.add(type=PointsAnnotation.LINE_LOOP, thickness=1)
+            box.timestamp.FromNanoseconds(self._at_ns(end_us))
+            box.outline_color.r, box.outline_color.g, box.outline_color.b, box.outline_color.a = _WHITE
+            for right, down in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+                box.points.add(
+                    x=region.x_px + right * (region.width_px / 2 + 2),
+                    y=region.y_px + down * (region.height_px / 2 + 2),
+                )
+        self._write("/regions", end_us, message)
+        self._regions.clear()
+        self._turn = None
+
+    def _scene(self, t_us: float) -> None:
+        """Write the bars whose places have become known, or changed."""
+        from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+        from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+        assert self.run.navigator is not None
+        positioner = self.run.navigator.positioner
+        axes, bars = positioner.axes, dict(positioner.stands_at)
+        if axes is None or bars == self._bars:
+            return
+        message = SceneUpdate()
+        for number, site in bars.items():
+            bar = message.entities.add(frame_id=FRAME_ID, id=f"bar {number}", frame_locked=True)
+            bar.timestamp.FromNanoseconds(self._at_ns(t_us))
+            line = bar.lines.add(type=LinePrimitive.LINE_STRIP, thickness=0.05)
+            line.pose.orientation.w = 1
+            line.color.r, line.color.g, line.color.b, line.color.a = _AMBER
+            middle = axes.to_enu(site.latitude_deg, site.longitude_deg, site.height_m)
+            for end in (-0.5, 0.5):
+                east, north, up = (middle + end * site.length_m * site.axis_enu()).tolist()
+                line.points.add(x=east, y=north, z=up)
+            text = bar.texts.add(text=f"bar {number}, id {site.transmitter_id}", font_size=12)
+            text.billboard = text.scale_invariant = True
+            text.color.r, text.color.g, text.color.b, text.color.a = _AMBER
+            text.pose.orientation.w = 1
+            text.pose.position.x, text.pose.position.y, text.pose.position.z = middle.tolist()
+        self._write("/scene", t_us, message)
+        self._bars = bars
+
     def _write(self, topic: str, t_us: float, message: Any) -> None:
+        from mcap_protobuf.schema import register_schema
+
+        if topic not in self._channels:
+            schema = register_schema(self._writer, type(message))
+            self._channels[topic] = self._writer.register_channel(topic, "protobuf", schema)
+        self._add(topic, t_us, message.SerializeToString())
+
+    def _write_json(self, topic: str, t_us: float, values: dict[str, Any]) -> None:
+        if topic not in self._channels:
+            schema = self._writer.register_schema("evlcp.Frame", "jsonschema", json.dumps(_FRAME).encode())
+            self._channels[topic] = self._writer.register_channel(topic, "json", schema)
+        self._add(topic, t_us, json.dumps(values).encode())
+
+    def _add(self, topic: str, t_us: float, data: bytes) -> None:
         at_ns = self._at_ns(t_us)
-        self._writer.write_message(topic=topic, message=message, log_time=at_ns, publish_time=at_ns)
+        self._writer.add_message(self._channels[topic], log_time=at_ns, data=data, publish_time=at_ns)
 
     def _at_ns(self, t_us: float) -> int:
         return self._zero_us * 1000 + round(t_us * 1000)

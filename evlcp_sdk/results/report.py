@@ -15,8 +15,9 @@ import numpy as np
 
 from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.results.colours import cluster_colours, transmitter_colour
 from evlcp_sdk.results.doubts import Doubt
-from evlcp_sdk.results.figures import Thinned, TrackProbe, cluster_colours, transmitter_colour
+from evlcp_sdk.results.figures import Thinned, TrackProbe
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.motion import MotionProbe
 from evlcp_sdk.results.plots import PLOT_STYLE, Plot, ellipse

@@ -23,7 +23,7 @@ from evlcp_sdk.results.sinks import Sinks, load_sinks
 from evlcp_sdk.results.summary import Status, summary_of, write_summary
 from evlcp_sdk.results.tallies import PositionTally, RunTally
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
-from evlcp_sdk.values import Events, Fix, Packet
+from evlcp_sdk.values import Events, Packet
 
 __all__ = ["ResultWriter"]
 
@@ -43,7 +43,7 @@ class ResultWriter:
         clock_zero: UTC of the camera clock's 0; None if it is not known.
         sinks: Output formats beside the default ones, by name; none without a folder.
         lines: Takes frames, messages and fixes as lines of JSON as they come; None for nobody.
-        fixed: Takes fixes as they come; None for nobody.
+        placed: Takes fixes, with their filtered places, as they come; None for nobody.
 
     Raises:
         OutputError: The folder cannot be written.
@@ -63,9 +63,9 @@ class ResultWriter:
         clock_zero: datetime | None = None,
         sinks: Sequence[str] = (),
         lines: Callable[[str], None] | None = None,
-        fixed: Callable[[Fix], None] | None = None,
+        placed: Callable[[Placed], None] | None = None,
     ) -> None:
-        self._fixed = fixed
+        self._told = placed
         self._registry = Registry.load() if registry is None else registry
         self._link = link
         self._tally, self._positions = RunTally(link.packet), PositionTally()
@@ -184,8 +184,8 @@ class ResultWriter:
                 self._sinks.placed(placed)
             if self._lines is not None:
                 self._lines.fix(placed.fix)
-            if self._fixed is not None:
-                self._fixed(placed.fix)
+            if self._told is not None:
+                self._told(placed)
 
     def __enter__(self) -> Self:
         return self

@@ -76,6 +76,8 @@ def document(
     scripts: Sequence[str] = (),
     data: Mapping[str, Any] | None = None,
     style: str = "",
+    *,
+    connect: bool = False,
 ) -> str:
     """A whole page.
 
@@ -86,6 +88,7 @@ def document(
         data: What the scripts read, as JSON: name to values. The text of the script element with the id
             `name` is the JSON of its values.
         style: CSS of this page's own, after that of all pages; written by us.
+        connect: Scripts may talk to the server that the page comes from.
 
     Raises:
         ValueError: A script holds what would end its element.
@@ -106,7 +109,9 @@ def document(
     policy = (
         "default-src 'none'; img-src data: blob:; base-uri 'none'; form-action 'none';"
         # Charts style themselves.
-        " style-src 'unsafe-inline'; script-src " + (" ".join(sources) or "'none'")
+        + (" connect-src 'self';" if connect else "")
+        + " style-src 'unsafe-inline'; script-src "
+        + (" ".join(sources) or "'none'")
     )
     # The quotes of a policy are those that it is known by.
     return str(

@@ -11,7 +11,8 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from evlcp_sdk.files import Outputs, output_fault
-from evlcp_sdk.results.figures import TRANSMITTER_COLOURS, plain
+from evlcp_sdk.results.colours import TRANSMITTER_COLOURS
+from evlcp_sdk.results.figures import plain
 from evlcp_sdk.study.campaign.paper import PAPER_NAME, Measure
 from evlcp_sdk.study.campaign.summary import Series, Summary, reference_marks
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, INTERVALS, Figure, measure

@@ -9,11 +9,11 @@ import pytest
 from matplotlib.figure import Figure
 
 from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.results.colours import cluster_colours
 from evlcp_sdk.results.figures import (
     FigureProbe,
     Figures,
     Thinned,
-    cluster_colours,
     draw_distance,
     draw_presence,
     draw_regions,

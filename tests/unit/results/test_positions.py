@@ -2,9 +2,10 @@
 
 import csv
 import dataclasses
+import io
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -14,6 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pynmea2
 import pytest
+from PIL import Image
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import STAGE_PREFIX
@@ -24,6 +26,7 @@ from evlcp_sdk.place.gnss import GnssLog
 from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan
 from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.trajectory import trajectory_step
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.alternatives_csv import AlternativesCsv
 from evlcp_sdk.results.figures import TrackProbe, draw_track
 from evlcp_sdk.results.fixes_csv import FixesCsv
@@ -35,7 +38,7 @@ from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.values import Alternative, Events, Fix, Frame, Packet, Range, SoftSymbols
+from evlcp_sdk.values import Alternative, Events, Fix, Frame, Packet, Range, Region, SoftSymbols
 
 LINK = load_link()
 ZERO = datetime(2026, 3, 1, 10, 15, tzinfo=UTC)
@@ -392,16 +395,41 @@ def test_kml_is_read_back(tmp_path: Path) -> None:
         )
 
 
+class JsonDecoderFactory:
+    """Decodes channels of JSON, as `mcap.reader` asks for it."""
+
+    def decoder_for(self, encoding: str, _schema: object) -> Callable[[bytes], Any] | None:
+        return json.loads if encoding == "json" else None
+
+
 def test_mcap_is_read_back(tmp_path: Path) -> None:
     reader = pytest.importorskip("mcap.reader", reason="the extra mcap is not installed")
     from mcap_protobuf.decoder import DecoderFactory
     from scipy.spatial.transform import Rotation
 
-    write(tmp_path, packets(6), PositionPlan((SITE,)), ["mcap"], zero=ZERO)
+    stream, zero_ns = packets(6), int(ZERO.timestamp()) * 10**9
+    registry = Registry.load()
+    with ResultWriter(
+        tmp_path,
+        LINK,
+        registry,
+        plan=PositionPlan((SITE,)),
+        attitude=ATTITUDE,
+        clock_zero=ZERO,
+        sinks=["mcap"],
+    ) as results:
+        t_us = [5_000, 29_999, 30_000, 40_000, 110_000, 110_001, 110_002]
+        for one in (slice(0, 4), slice(4, 5), slice(5, 7)):
+            x, y, p = [8, 8, 7, 4, 9, 9, 1], [8, 8, 3, 4, 5, 5, 2], [1, 1, 0, 1, 1, 0, 1]
+            results.events(Events.of(t_us[one], x[one], y[one], p[one]))
+        region = Region(0, 1_000.0, 100.0, 200.0, 10.0, 20.0)
+        registry.hook.evlcp_stage_finished(stage="regions", value=region, elapsed_s=0.0)
+        results.write(stream)
+        results.finish("complete", {}, {}, {}, {})
     fixes = rows(tmp_path / "fixes.csv")
     found: dict[str, list[tuple[str, int, object]]] = {}
     with (tmp_path / "fixes.mcap").open("rb") as file:
-        source = reader.make_reader(file, decoder_factories=[DecoderFactory()])
+        source = reader.make_reader(file, decoder_factories=[DecoderFactory(), JsonDecoderFactory()])
         for schema, channel, message, decoded in source.iter_decoded_messages():
             found.setdefault(channel.topic, []).append((schema.name, message.log_time, decoded))
     assert {t: {name for name, _, _ in m} for t, m in found.items()} == {
@@ -409,7 +437,32 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
         "/track": {"foxglove.LocationFix"},
         "/pose": {"foxglove.PoseInFrame"},
         "/integrity": {"google.protobuf.Struct"},
+        "/scene": {"foxglove.SceneUpdate"},
+        "/frames": {"evlcp.Frame"},
+        "/image": {"foxglove.CompressedImage"},
+        "/regions": {"foxglove.ImageAnnotations"},
     }
+    # Two pictures of 40 ms, of which the last 10 ms are shown: a pixel OFF, then one ON and one of both.
+    shots = []
+    for _, at_ns, image in found["/image"]:
+        with Image.open(io.BytesIO(image.data)) as picture:  # type: ignore[attr-defined]
+            cells = np.array(picture)
+        shots.append((at_ns - zero_ns, {(y, x): cells[y, x] for y, x in np.argwhere(cells).tolist()}))
+    assert shots == [(40_000_000, {(3, 7): 1}), (120_000_000, {(2, 1): 2, (5, 9): 3})]
+    (_, at_ns, boxes) = found["/regions"][0]
+    assert at_ns - zero_ns == 40_000_000
+    (box,) = boxes.points  # type: ignore[attr-defined]
+    assert [(point.x, point.y) for point in box.points] == [(93, 188), (107, 188), (107, 212), (93, 212)]
+    told_frames = [frame for packet in stream for frame in packet.frames]
+    assert [line["t_us"] for _, _, line in found["/frames"]] == [  # type: ignore[index]
+        pytest.approx(frame.t_us, abs=0.01) for frame in told_frames
+    ]
+    ((_, _, scene),) = found["/scene"]
+    (bar,) = scene.entities  # type: ignore[attr-defined]
+    low, high = bar.lines[0].points
+    # 0.96 m of a bar that stands, in axes that begin at its centre.
+    assert (low.x, low.y, low.z, high.z) == pytest.approx((0, 0, -0.48, 0.48), abs=1e-6)
+    assert bar.texts[0].text == "bar 0, id 7"
     for row, (_, _, told) in zip(fixes, found["/integrity"], strict=True):
         assert told["misfit"] == pytest.approx(float(row["misfit"]), abs=1e-4)  # type: ignore[index]
         assert list(told["alarms"]) == ["unavailable"]  # type: ignore[index]

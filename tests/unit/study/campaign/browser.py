@@ -18,7 +18,7 @@ _FLAGS = (
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
-    "--host-resolver-rules=MAP * ~NOTFOUND",
+    "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
     "--window-size=1200,900",
     "--remote-debugging-pipe",
 )
@@ -78,10 +78,10 @@ class Browser:
         message: dict[str, Any] = json.loads(text)
         return message
 
-    def open(self, path: Path) -> None:
-        """Load a file and wait until it is there."""
+    def open(self, place: Path | str) -> None:
+        """Load a file, or what a server of this machine gives, and wait until it is there."""
         self.heard.clear()
-        self.say("Page.navigate", url=path.as_uri())
+        self.say("Page.navigate", url=place if isinstance(place, str) else place.as_uri())
         while not any(m.get("method") == "Page.loadEventFired" for m in self.heard):
             self.heard.append(self._read())
 

@@ -1,0 +1,125 @@
+"""What the web view costs the receiver, and how soon it shows something.
+
+    python benchmarks/live_view.py [RECORDING] [--for-s 4] [--rounds 3]
+
+The recording is received as fast as it goes, again and again until so much camera time is over, in turn
+with nobody looking on and with one who takes all that there is (a process of its own, which draws nothing);
+the best of the rounds counts. Then the command is started and timed until the first picture is there, and
+replays the recording at its own pace for pictures a second. Without a name, two bars of `../shared`.
+"""
+
+import argparse
+import json
+import re
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.live import Budget, Outlet
+from evlcp_sdk.live.services import Services, Serving
+from evlcp_sdk.run import live
+
+SHARED = Path(__file__).parents[2] / "shared" / "recordings" / "two-bars-60m-75m.raw"
+PATIENT = Budget(waiting_ms=1e6, most_ms=1e7)
+LOOK = "import sys; sys.path.insert(0, sys.argv[2]); from live_view import look; look(sys.argv[1])"
+
+
+def look(url: str, most_s: float = 1e9) -> dict[str, float]:
+    """Take all that a view gives, until it ends; pictures, results and when the first picture came."""
+    seen: dict[str, float] = {"pictures": 0, "results": 0, "dropped": 0, "first_s": 0.0}
+    began = time.monotonic()
+    with connect(url.replace("http", "ws") + "live", compression=None, max_size=None) as link:
+        try:
+            link.recv()
+            while time.monotonic() - began < most_s:
+                link.send('{"next": true}')
+                bundle = link.recv()
+                assert isinstance(bundle, bytes)
+                (size,) = struct.unpack_from("<I", bundle)
+                head = json.loads(bundle[4 : 4 + size])
+                seen["pictures"] += head["picture"] is not None
+                seen["results"] += len(head["news"])
+                seen["dropped"] = head["dropped"]
+                if seen["pictures"] == 1 and not seen["first_s"]:
+                    seen["first_s"] = time.monotonic()
+        except ConnectionClosed:
+            pass
+    seen["s"] = time.monotonic() - began
+    print(json.dumps(seen), flush=True)
+    return seen
+
+
+def received(recording: Path, for_s: float, *, viewed: bool) -> tuple[dict[str, float], dict[str, float]]:
+    """Times to receive, and what was seen of it."""
+    outlet, link = Outlet(), load_link()
+    seen: dict[str, float] = {}
+    with Services(Serving(view=viewed), outlet, link, name=recording.name) as services:
+        looker = None
+        if services.view is not None:
+            command = [sys.executable, "-c", LOOK, services.view.url, str(Path(__file__).parent)]
+            looker = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+            time.sleep(1.5)
+        summary = live(
+            f"replay:{recording}?speed=1000&loop=1&for_s={for_s}",
+            None,
+            link,
+            outlet=outlet,
+            pictures=services.pictures,
+            budget=PATIENT,
+        )
+    if looker is not None:
+        seen = json.loads(looker.communicate(timeout=20)[0])
+    return summary["processing"], seen
+
+
+def started(recording: Path, for_s: float) -> tuple[float, dict[str, float]]:
+    """Time from the command to the first picture, s, and what was seen of a paced replay."""
+    code = "from evlcp_sdk.cli.main import main; main()"
+    began = time.monotonic()
+    command = [sys.executable, "-c", code, "live", f"replay:{recording}?loop=1", "--view", "--json"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    assert process.stderr is not None
+    url = ""
+    while not url:
+        found = re.search(r"http://\S+", process.stderr.readline())
+        url = found[0] if found else ""
+    seen = look(url, for_s)
+    process.terminate()
+    process.wait(20)
+    return seen["first_s"] - began, seen
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("recording", nargs="?", type=Path, default=SHARED)
+    parser.add_argument("--for-s", type=float, default=4.0)
+    parser.add_argument("--rounds", type=int, default=3)
+    given = parser.parse_args()
+    alone, viewed = [], []
+    for _ in range(given.rounds):
+        alone.append(received(given.recording, given.for_s, viewed=False)[0])
+        times, seen = received(given.recording, given.for_s, viewed=True)
+        viewed.append(times)
+        rate = seen["pictures"] / times["elapsed_s"]
+        print(
+            f"alone {alone[-1]['elapsed_s']:.2f} s, viewed {times['elapsed_s']:.2f} s, {rate:.1f} pictures/s"
+        )
+    for name, text in (("elapsed_s", "elapsed"), ("processor_s", "processor time, view included")):
+        a, b = (min(one[name] for one in times) for times in (alone, viewed))
+        print(f"{text}, best: alone {a:.2f} s, viewed {b:.2f} s, {b / a - 1:+.1%}")
+    first_s, seen = started(given.recording, 6.0)
+    rate = seen["pictures"] / seen["s"]
+    print(
+        f"first picture {first_s:.2f} s after the command; paced: {rate:.1f} pictures/s,"
+        f" {seen['dropped']:g} results dropped"
+    )
+
+
+if __name__ == "__main__":
+    main()

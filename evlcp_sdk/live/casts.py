@@ -1,0 +1,190 @@
+"""Positions for other programs over TCP, as they come: NMEA-0183, and what gpsd says."""
+
+import asyncio
+import json
+import socket
+from collections import deque
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from typing import Any, Final
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.live.outlet import News, Outlet, Subscription
+from evlcp_sdk.results.gpsd import VERSION, answer, sky, tpv
+from evlcp_sdk.results.nmea import sentences
+
+__all__ = ["Cast"]
+
+_MOST_WAITING: Final = 1000
+"""Fixes that wait for a client; the oldest go."""
+_MOST_CLIENTS: Final = 32
+_MOST_LINE: Final = 4096
+_KERNEL_BYTES: Final = 1 << 16
+"""What the kernel holds for a client: what waits there is old."""
+_FINISH_S: Final = 1.0
+
+
+@dataclass(eq=False)
+class _Client:
+    """Who listens.
+
+    Attributes:
+        watch: What it listens to.
+        waiting: What it has not been sent, the newest.
+        dropped: How much of that was pushed out.
+        filled: Something waits.
+    """
+
+    watch: dict[str, Any]
+    waiting: deque[bytes] = field(default_factory=lambda: deque(maxlen=_MOST_WAITING))
+    dropped: int = 0
+    filled: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def put(self, data: bytes) -> None:
+        """Have something sent; of a queue that is full the oldest goes."""
+        self.dropped += len(self.waiting) == self.waiting.maxlen
+        self.waiting.append(data)
+        self.filled.set()
+
+
+class Cast:
+    """Serves positions over TCP; runs in the loop of a `Desk`.
+
+    Where the UTC of the camera's clock is not known, the computer's clock says it, once: programs that read
+    positions want a time.
+
+    Args:
+        outlet: Where fixes come from.
+        gpsd: As gpsd's JSON, to clients that say `?WATCH`; or else NMEA, to whoever connects.
+        host: Where to listen.
+        port: The same; 0 for any that is free.
+        clock_zero: UTC of the camera clock's 0; None if it is not known.
+
+    Attributes:
+        port: Where it listens, once started.
+        dropped: What clients were not sent as they did not take it, so far.
+    """
+
+    def __init__(
+        self,
+        outlet: Outlet,
+        *,
+        gpsd: bool,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        clock_zero: datetime | None = None,
+    ) -> None:
+        self._outlet, self._gpsd = outlet, gpsd
+        self._host, self.port = host, port
+        self._zero = clock_zero
+        self._clients: set[_Client] = set()
+        self._newest: dict[str, dict[str, Any]] = {}
+        self._pump: asyncio.Task[None] | None = None
+        self._left = 0
+        self._mine: Subscription | None = None
+
+    @property
+    def dropped(self) -> int:
+        """What clients were not sent as they did not take it, or as there was no time, so far."""
+        late = 0 if self._mine is None else self._mine.dropped
+        return late + self._left + sum(client.dropped for client in self._clients)
+
+    async def start(self) -> None:
+        """Listen.
+
+        Raises:
+            ConfigError: The port cannot be had.
+        """
+        loop = asyncio.get_running_loop()
+        came = asyncio.Event()
+
+        def wake() -> None:
+            # The loop may be over before the receiver is.
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(came.set)
+
+        mine = self._mine = self._outlet.subscribe({"fix", "status"}, most=_MOST_WAITING, wake=wake)
+        try:
+            server = await asyncio.start_server(self._serve, self._host, self.port, limit=_MOST_LINE)
+        except OSError as fault:
+            self._outlet.leave(mine)
+            raise ConfigError(
+                f"{self._host}:{self.port}: {fault.strerror or fault}: expected a free port, 0 for any"
+            ) from fault
+        self.port = server.sockets[0].getsockname()[1]
+
+        async def pump() -> None:
+            try:
+                while not mine.ended:
+                    await came.wait()
+                    came.clear()
+                    for news in mine.take(0):
+                        self._tell(news)
+            finally:
+                server.close()
+                self._outlet.leave(mine)
+
+        self._pump = asyncio.create_task(pump())
+
+    async def finish(self) -> None:
+        """Wait until all that was found is on its way, a moment at the most."""
+        if self._pump is not None:
+            await asyncio.wait([self._pump], timeout=_FINISH_S)
+
+    def _tell(self, news: News) -> None:
+        if self._zero is None:
+            self._zero = datetime.now(UTC) - timedelta(microseconds=news.t_us)
+        if news.kind != "fix" or not (self._clients or self._gpsd):
+            return
+        fix, place = news.value.fix, news.value.filtered
+        text = b""
+        if any(client.watch["nmea"] for client in self._clients):
+            text = sentences(fix, place, self._zero).encode("ascii", "replace")
+        told = b""
+        if self._gpsd:
+            self._newest = {"TPV": tpv(fix, place, self._zero), "SKY": sky(fix, self._zero)}
+            told = b"".join(_line(report) for report in self._newest.values())
+        for client in self._clients:
+            if client.watch["enable"]:
+                client.put((told if client.watch["json"] else b"") + (text if client.watch["nmea"] else b""))
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Serve one client until it leaves."""
+        if len(self._clients) >= _MOST_CLIENTS:
+            writer.close()
+            return
+        writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _KERNEL_BYTES)
+        client = _Client({"enable": not self._gpsd, "json": False, "nmea": not self._gpsd})
+        if self._gpsd:
+            client.put(_line(VERSION))
+        self._clients.add(client)
+        sending = asyncio.create_task(self._send(client, writer))
+        try:
+            while line := await reader.readline():
+                if self._gpsd:
+                    for request in line.decode("utf-8", "replace").split(";"):
+                        if request.strip():
+                            for said in answer(request, client.watch, self._newest):
+                                client.put(_line(said))
+        except (OSError, ValueError, asyncio.CancelledError):
+            pass  # It has gone, sends no lines, or the run is over.
+        finally:
+            sending.cancel()
+            self._clients.discard(client)
+            self._left += client.dropped
+            writer.transport.abort()
+
+    async def _send(self, client: _Client, writer: asyncio.StreamWriter) -> None:
+        try:
+            while True:
+                await client.filled.wait()
+                client.filled.clear()
+                while client.waiting:
+                    writer.write(client.waiting.popleft())
+                    await writer.drain()
+        except OSError:
+            writer.transport.abort()
+
+
+def _line(report: dict[str, Any]) -> bytes:
+    return json.dumps(report, separators=(",", ":")).encode() + b"\r\n"

@@ -1,0 +1,128 @@
+"""What a live run serves beside its results: the web view, NMEA and gpsd's JSON over TCP."""
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.live.casts import Cast
+from evlcp_sdk.live.desk import Desk
+from evlcp_sdk.live.outlet import Outlet
+from evlcp_sdk.live.pictures import PictureSlot
+from evlcp_sdk.live.recorder import Recorder
+from evlcp_sdk.live.viewer import Viewer
+from evlcp_sdk.scene.sites import BarSite
+
+__all__ = ["Services", "Serving"]
+
+
+@dataclass(frozen=True)
+class Serving:
+    """What is served, and where.
+
+    Attributes:
+        view: Whether there is a web view.
+        host: Where the web view listens: of this machine only, unless it is another address of it.
+        port: The same; 0 for any that is free.
+        record_to: Where browsers may have recordings written; None: they only look on.
+        nmea_port: Port of this machine for NMEA; None for none.
+        gpsd_port: The same for gpsd's JSON, whose usual one is 2947.
+    """
+
+    view: bool = False
+    host: str = "127.0.0.1"
+    port: int = 0
+    record_to: Path | None = None
+    nmea_port: int | None = None
+    gpsd_port: int | None = None
+
+
+class Services:
+    """The servers of a live run, in a thread of their own; a context manager around it.
+
+    Args:
+        serving: Which.
+        outlet: Where results come from.
+        link: The configuration.
+        name: Name of the source.
+        sites: Where the bars stand.
+        clock_zero: UTC of the camera clock's 0; None if it is not known.
+
+    Attributes:
+        pictures: What the run draws pictures into; None where nobody looks.
+        view: The web view; None for none.
+        nmea: The server of NMEA; None for none.
+        gpsd: That of gpsd's JSON; None for none.
+
+    Raises:
+        ConfigError: A port cannot be had, or a package is not installed.
+    """
+
+    def __init__(
+        self,
+        serving: Serving,
+        outlet: Outlet,
+        link: Link,
+        *,
+        name: str,
+        sites: Sequence[BarSite] = (),
+        clock_zero: datetime | None = None,
+    ) -> None:
+        self.pictures = PictureSlot() if serving.view else None
+        self._recorder: Recorder | None = None
+        self.view: Viewer | None = None
+        if self.pictures is not None:
+            if serving.record_to is not None:
+                camera = link.camera
+                self._recorder = Recorder(outlet, serving.record_to, camera.width, camera.height)
+            self.view = Viewer(
+                outlet,
+                self.pictures,
+                link,
+                name=name,
+                sites=sites,
+                host=serving.host,
+                port=serving.port,
+                recorder=self._recorder,
+            )
+        ports = {False: serving.nmea_port, True: serving.gpsd_port}
+        self.nmea, self.gpsd = (
+            None if port is None else Cast(outlet, gpsd=gpsd, port=port, clock_zero=clock_zero)
+            for gpsd, port in ports.items()
+        )
+        self._outlet = outlet
+        self._stack = ExitStack()
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Results that clients were not sent as they did not take them, by server."""
+        servers = {"view": self.view, "nmea": self.nmea, "gpsd": self.gpsd}
+        return {name: server.dropped for name, server in servers.items() if server is not None}
+
+    def __enter__(self) -> Self:
+        servers = [one for one in (self.view, self.nmea, self.gpsd) if one is not None]
+        with ExitStack() as stack:
+            if servers:
+                desk = stack.enter_context(Desk())
+                for server in servers:
+                    desk.call(server.start())
+                    stack.callback(_finish, desk, server)
+            stack.callback(self._outlet.close)
+            if self._recorder is not None:
+                stack.callback(self._recorder.stop)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the servers, once they have told what there is; a recording is completed."""
+        self._stack.__exit__(kind, value, trace)
+
+
+def _finish(desk: Desk, server: Viewer | Cast) -> None:
+    desk.call(server.finish())

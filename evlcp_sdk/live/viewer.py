@@ -1,0 +1,486 @@
+"""The web view of a live run: one page, and what it shows, over one WebSocket a browser.
+
+The receiver never waits for a browser. Results wait for each browser in a bounded queue, whose oldest go,
+counted; of pictures there is only the newest, drawn when a browser is ready for one. A browser is sent one
+bundle, what waits and the newest picture, for each credit that it gives, which is when it has shown the
+last one: one that stalls costs nothing.
+"""
+
+import asyncio
+import json
+import secrets
+import struct
+from collections import deque
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from email.utils import formatdate
+from http import HTTPStatus
+from importlib.resources import files
+from ipaddress import ip_address
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlsplit
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.live.budget import LEVELS
+from evlcp_sdk.live.loop import LiveStatus
+from evlcp_sdk.live.outlet import News, Outlet, Subscription
+from evlcp_sdk.live.pictures import Picture, PictureSlot
+from evlcp_sdk.live.recorder import Recorder
+from evlcp_sdk.results.colours import TRANSMITTER_COLOURS, cluster_colours
+from evlcp_sdk.results.lines import fix_line, frame_line
+from evlcp_sdk.results.packets_jsonl import message_line
+from evlcp_sdk.results.picture import png
+from evlcp_sdk.scene.sites import BarSite, LocalAxes
+from evlcp_sdk.study.markup import Markup, document
+from evlcp_sdk.values import Frame
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.http11 import Request, Response
+
+__all__ = ["Viewer", "page"]
+
+PICTURES_PER_S: Final = 25
+_MOST_WAITING: Final = 4000
+"""Results that wait for a browser, some seconds of two bars; the oldest go."""
+_MOST_BROWSERS: Final = 16
+_FINISH_S: Final = 1.0
+_MOST_SAID: Final = 4096
+"""Bytes of what a browser says."""
+_KEPT: Final = {"message": 50, "fix": 500}
+"""What a browser that comes later is shown of what was before."""
+_LATEST_US: Final = 500_000
+_MOST_BARS: Final = 64
+"""A bar is drawn as its newest frame shows it, for so long, and so many of them."""
+
+
+@dataclass(eq=False)
+class _Browser:
+    """One that looks on.
+
+    Attributes:
+        socket: Its connection.
+        waiting: Results that it has not been sent, as JSON, the newest.
+        dropped: How many of them were pushed out.
+        ready: It has shown what it was sent.
+        picture: Number of the picture that it has.
+    """
+
+    socket: "ServerConnection"
+    waiting: deque[str] = field(default_factory=lambda: deque(maxlen=_MOST_WAITING))
+    dropped: int = 0
+    ready: bool = False
+    picture: int = -1
+
+    def put(self, text: str) -> None:
+        """Have something sent; of a queue that is full the oldest goes."""
+        self.dropped += len(self.waiting) == self.waiting.maxlen
+        self.waiting.append(text)
+
+
+class Viewer:
+    """Serves the page and what it shows; runs in the loop of a `Desk`.
+
+    Args:
+        outlet: Where results come from.
+        pictures: Where pictures come from.
+        link: The configuration.
+        name: Name of the source, for the title.
+        sites: Where the bars stand, for the map.
+        host: Where to listen: of this machine only, unless it is another address of it.
+        port: The same; 0 for any that is free.
+        recorder: Starts and stops recordings as a browser asks; None: browsers only look on.
+
+    Attributes:
+        port: Where it listens, once started.
+        dropped: Results that browsers were not sent as they did not take them, so far.
+    """
+
+    def __init__(
+        self,
+        outlet: Outlet,
+        pictures: PictureSlot,
+        link: Link,
+        *,
+        name: str,
+        sites: Sequence[BarSite] = (),
+        host: str = "127.0.0.1",
+        port: int = 0,
+        recorder: Recorder | None = None,
+    ) -> None:
+        self._outlet, self._pictures, self._recorder = outlet, pictures, recorder
+        self._name, self._link, self._sites = name, link, tuple(sites)
+        self._host, self.port = host, port
+        self._token = secrets.token_urlsafe(16)
+        self._browsers: set[_Browser] = set()
+        self._kept = {kind: deque[str](maxlen=most) for kind, most in _KEPT.items()}
+        self._last: dict[str, str] = {}
+        self._bars: dict[int, Frame] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._pump: asyncio.Task[None] | None = None
+        self._body = b""
+        self._sites_told = not self._sites
+        self._left = 0
+        self._mine: Subscription | None = None
+
+    @property
+    def url(self) -> str:
+        """What to open in a browser; who has it may look on."""
+        host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(self._host, self._host)
+        return f"http://{host}:{self.port}/{self._token}/"
+
+    @property
+    def dropped(self) -> int:
+        """Results that browsers were not sent as they did not take them, or as there was no time, so far."""
+        late = 0 if self._mine is None else self._mine.dropped
+        return late + self._left + sum(browser.dropped for browser in self._browsers)
+
+    async def start(self) -> None:
+        """Listen.
+
+        Raises:
+            ConfigError: The port cannot be had, or the package `websockets` is not installed.
+        """
+        try:
+            from websockets.asyncio.server import serve
+        except ImportError as fault:
+            raise ConfigError(
+                "websockets is not installed; it comes with the extra: pip install 'evlcp-sdk[live]'"
+            ) from fault
+        self._body = page(self._name).encode()
+        kinds = {"frame", "message", "fix", "status", "end"}
+        mine = self._mine = self._outlet.subscribe(kinds, most=_MOST_WAITING)
+        try:
+            server: Server = await serve(
+                self._serve,
+                self._host,
+                self.port,
+                process_request=self._answer,
+                compression=None,
+                max_size=_MOST_SAID,
+                server_header=None,
+            )
+        except OSError as fault:
+            self._outlet.leave(mine)
+            raise ConfigError(
+                f"{self._host}:{self.port}: {fault.strerror or fault}: expected a free port, 0 for any"
+            ) from fault
+        self.port = next(iter(server.sockets)).getsockname()[1]
+
+        async def pump() -> None:
+            turn_s = asyncio.get_running_loop().time()
+            try:
+                while not mine.ended:
+                    # At even times, unless they are over already.
+                    now_s = asyncio.get_running_loop().time()
+                    turn_s = max(turn_s + 1 / PICTURES_PER_S, now_s)
+                    await asyncio.sleep(turn_s - now_s)
+                    for news in mine.take(0):
+                        self._tell(news)
+                    await self._send_all()
+                # The last words.
+                await asyncio.sleep(2 / PICTURES_PER_S)
+                await self._send_all()
+            finally:
+                self._outlet.leave(mine)
+                server.close()
+
+        self._pump = asyncio.create_task(pump())
+
+    async def finish(self) -> None:
+        """Wait until browsers have had the last words, a moment at the most."""
+        if self._pump is not None:
+            await asyncio.wait([self._pump], timeout=_FINISH_S)
+
+    def _keep(self, task: "asyncio.Task[None]") -> None:
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    # What browsers ask for
+
+    def _answer(self, connection: "ServerConnection", request: "Request") -> "Response | None":
+        """Give the page, let a WebSocket through, or refuse."""
+        hosts, path = request.headers.get_all("Host"), urlsplit(request.path).path
+        if len(hosts) != 1 or not self._is_ours(hosts[0]):
+            return self._refused(connection, "this server is known by another name")
+        origins = request.headers.get_all("Origin")
+        if origins not in ([], [f"http://{hosts[0]}"]):
+            return self._refused(connection, "the page of another server may not look on")
+        given, _, rest = path.removeprefix("/").partition("/")
+        if not secrets.compare_digest(given.encode(), self._token.encode()):
+            return self._refused(connection, "expected the address that the run has printed, with its key")
+        if rest == "live":
+            if len(self._browsers) >= _MOST_BROWSERS:
+                return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many browsers look on\n")
+            return None
+        if rest:
+            return connection.respond(HTTPStatus.NOT_FOUND, "nothing is here\n")
+        return self._page()
+
+    def _is_ours(self, host: str) -> bool:
+        """Whether a request was meant for this server: names of others may point to our address."""
+        try:
+            parts = urlsplit(f"//{host}")
+            name, port = parts.hostname or "", parts.port or 80
+        except ValueError:
+            return False
+        if port != self.port or parts.username is not None:
+            return False
+        if name in ("localhost", self._host):
+            return True
+        try:
+            return ip_address(name).is_loopback or self._host in ("0.0.0.0", "::")
+        except ValueError:
+            return False
+
+    def _refused(self, connection: "ServerConnection", why: str) -> "Response":
+        return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
+
+    def _page(self) -> "Response":
+        from websockets.datastructures import Headers
+        from websockets.http11 import Response
+
+        headers = Headers(
+            {
+                "Date": formatdate(usegmt=True),
+                "Content-Type": "text/html; charset=utf-8",
+                "Content-Length": str(len(self._body)),
+                "Connection": "close",
+                "Cache-Control": "no-store",
+                "Content-Security-Policy": "frame-ancestors 'none'",
+                "Cross-Origin-Resource-Policy": "same-origin",
+                "Referrer-Policy": "no-referrer",
+                "X-Content-Type-Options": "nosniff",
+            }
+        )
+        return Response(200, "OK", headers, self._body)
+
+    async def _serve(self, socket: "ServerConnection") -> None:
+        """Serve one browser until it leaves."""
+        from websockets.exceptions import ConnectionClosed
+
+        browser = _Browser(socket)
+        for texts in (self._kept["message"], self._kept["fix"], self._last.values()):
+            browser.waiting.extend(texts)
+        self._browsers.add(browser)
+        try:
+            await socket.send(json.dumps(self._about()))
+            async for said in socket:
+                if not self._heard(browser, said):
+                    await socket.close(1008, "not understood")
+        except ConnectionClosed:
+            pass  # It has gone.
+        except asyncio.CancelledError:
+            socket.transport.abort()
+            raise
+        finally:
+            self._browsers.discard(browser)
+            self._left += browser.dropped
+
+    def _heard(self, browser: _Browser, said: str | bytes) -> bool:
+        """Do what a browser says, if it may; whether that was understood."""
+        try:
+            asked = json.loads(said)
+        except ValueError:
+            return False
+        if asked == {"next": True}:
+            browser.ready = True
+            return True
+        if self._recorder is None or not isinstance(asked, dict) or list(asked) != ["record"]:
+            return False
+        if asked["record"] is True:
+            self._recorder.start()
+        elif asked["record"] is False:
+            # Its end waits for the disk.
+            self._keep(asyncio.create_task(asyncio.to_thread(self._recorder.stop)))
+        else:
+            return False
+        return True
+
+    def _about(self) -> dict[str, Any]:
+        """What a browser is told first."""
+        book = self._link.codebook
+        colours = cluster_colours(book.clusters)
+        return {
+            "about": {
+                "name": self._name,
+                "run": self._token[:6],
+                "clusters": book.clusters,
+                "symbols": 2**book.bits_per_symbol,
+                "cluster_colours": [
+                    f"#{round(r * 255):02x}{round(g * 255):02x}{round(b * 255):02x}"
+                    for r, g, b in colours.tolist()
+                ],
+                "colours": list(TRANSMITTER_COLOURS),
+                "width": self._link.camera.width,
+                "height": self._link.camera.height,
+                "levels": list(LEVELS),
+                "sites": len(self._sites),
+                "may_record": self._recorder is not None,
+            }
+        }
+
+    # What browsers are sent
+
+    def _tell(self, news: News) -> None:
+        """Have all browsers told, and remember what later ones are told."""
+        kind = news.kind
+        if kind == "frame":
+            frame: Frame = news.value
+            self._bars[frame.transmitter] = frame
+            if len(self._bars) > _MOST_BARS:
+                del self._bars[min(self._bars, key=lambda number: self._bars[number].t_us)]
+            text = json.dumps(frame_line(frame) | {"late_ms": _rounded(news.late_ms)})
+        elif kind == "message":
+            text = json.dumps({"line": "message"} | json.loads(message_line(news.value)))
+        elif kind == "fix":
+            text = json.dumps(fix_line(news.value.fix) | self._on_the_map(news.value))
+        elif kind == "status":
+            text = json.dumps({"line": "status"} | _status(news.value))
+        else:
+            text = json.dumps(
+                {"line": "end"} | {key: news.value.get(key) for key in ("status", "error", "result")}
+            )
+        if kind in self._kept:
+            self._kept[kind].append(text)
+        elif kind != "frame":
+            self._last[kind] = text
+        for browser in self._browsers:
+            browser.put(text)
+
+    def _on_the_map(self, placed: Any) -> dict[str, Any]:
+        """A fix in local metres; with the first one that is given, the bars."""
+        fix, place = placed.fix, placed.filtered
+        if place is None:
+            return {}
+        shown: dict[str, Any] = {
+            "enu_m": [round(v, 3) for v in fix.enu_m.tolist()],
+            "covariance_m2": [float(f"{v:.4g}") for v in fix.covariance_m2[:2, :2].ravel().tolist()],
+            "track_m": [round(v, 3) for v in place.enu_m.tolist()],
+            "starts": place.starts,
+            "speed_m_s": None if place.starts else round(place.speed_m_s, 2),
+        }
+        if not self._sites_told:
+            # The axes of a fix turn by 0.009 degrees a kilometre: nothing on a map.
+            here = LocalAxes(fix.latitude_deg, fix.longitude_deg, fix.height_m)
+            bars = [
+                [
+                    one.transmitter_id,
+                    *(here.to_enu(one.latitude_deg, one.longitude_deg, one.height_m) + fix.enu_m),
+                ]
+                for one in self._sites
+            ]
+            text = json.dumps(
+                {"line": "bars", "bars": [[i, *(round(v, 3) for v in place)] for i, *place in bars]}
+            )
+            self._last["bars"], self._sites_told = text, True
+            for browser in self._browsers:
+                browser.put(text)
+        return shown
+
+    async def _send_all(self) -> None:
+        """Send a bundle to each browser that is ready for one."""
+        ready = [browser for browser in self._browsers if browser.ready]
+        if not ready:
+            return
+        picture = self._pictures.newest
+        self._pictures.ask()
+        data = b""
+        if picture is not None and any(one.picture != picture.number for one in ready):
+            data = await asyncio.to_thread(png, picture.cells)
+        now_us = picture.t_us if picture is not None else 0
+        bars = [_bar(frame) for frame in self._bars.values() if frame.t_us > now_us - _LATEST_US]
+        late = 0 if self._mine is None else self._mine.dropped
+        for browser in ready:
+            new = picture is not None and browser.picture != picture.number
+            if not (new or browser.waiting):
+                continue
+            told = None
+            if picture is not None and new:
+                browser.picture = picture.number
+                told = _told(picture)
+            head = json.dumps(
+                {
+                    "dropped": browser.dropped + late,
+                    "picture": told,
+                    "bars": bars if new else None,
+                    "record": None if self._recorder is None else self._recorder.state,
+                }
+            )
+            text = f'{{"news":[{",".join(browser.waiting)}],{head[1:]}'.encode()
+            browser.waiting.clear()
+            browser.ready = False
+            self._keep(asyncio.create_task(_sent(browser, struct.pack("<I", len(text)) + text + data * new)))
+
+
+async def _sent(browser: _Browser, bundle: bytes) -> None:
+    from websockets.exceptions import ConnectionClosed
+
+    # Its other half sees that it has gone, too.
+    with suppress(ConnectionClosed):
+        await browser.socket.send(bundle)
+
+
+def _told(picture: Picture) -> dict[str, Any]:
+    return {
+        "number": picture.number,
+        "t_us": picture.t_us,
+        "window_us": picture.window_us,
+        "regions": [
+            [one.id, *(round(v, 1) for v in (one.x_px, one.y_px, one.width_px, one.height_px))]
+            for one in picture.regions
+        ],
+    }
+
+
+def _bar(frame: Frame) -> dict[str, Any]:
+    """Where a bar's clusters are, and what they said last."""
+    points = [[round(x, 2), round(y, 2)] if x == x and y == y else None for x, y in frame.points_px.tolist()]
+    return {
+        "transmitter": frame.transmitter,
+        "echo_of": frame.echo_of,
+        "x_px": round(frame.x_px, 2),
+        "y_px": round(frame.y_px, 2),
+        "points": points,
+        "symbols": frame.soft.symbols.tolist(),
+    }
+
+
+def _status(status: LiveStatus) -> dict[str, Any]:
+    return {
+        "t_us": status.t_us,
+        "elapsed_s": round(status.elapsed_s, 3),
+        "events": status.events,
+        "events_per_s": round(status.events_per_s),
+        "waiting_ms": round(status.waiting_ms, 3),
+        "level": status.level,
+        "level_text": status.level_text,
+        "shed": dict(status.shed),
+        "delays": {stage: dict(told) for stage, told in status.delays.items()},
+        "recent": {stage: dict(told) for stage, told in status.recent.items()},
+        "counts": dict(status.counts),
+        "losses": {kind: asdict(loss) for kind, loss in status.losses.items()},
+    }
+
+
+def _rounded(late_ms: float | None) -> float | None:
+    return None if late_ms is None else round(late_ms, 3)
+
+
+def page(name: str) -> str:
+    """The page: HTML with all that it needs in it."""
+    here = files("evlcp_sdk.live")
+    read: Mapping[str, str] = {
+        part: here.joinpath(*part.split("/")).read_text("utf-8")
+        for part in ("page.html", "page.js", "page.css", "uplot/uPlot.js", "uplot/uPlot.css")
+    }
+    body = Markup(read["page.html"]).replace("{name}", Markup.escape(name))
+    return document(
+        f"{name} - live",
+        [body],
+        scripts=[read["uplot/uPlot.js"], read["page.js"]],
+        style=read["uplot/uPlot.css"] + read["page.css"],
+        connect=True,
+    )

@@ -1,0 +1,348 @@
+"""The web view: who may look on, what a browser gets and when, and what it shows."""
+
+import base64
+import csv
+import http.client
+import io
+import json
+import math
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.io.open import open_source
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.live import Budget, Outlet
+from evlcp_sdk.live.services import Services, Serving
+from evlcp_sdk.live.viewer import page
+from evlcp_sdk.place.navigator import Place, Placed
+from evlcp_sdk.results.picture import png
+from evlcp_sdk.run import live
+from evlcp_sdk.scene.sites import LocalAxes
+from evlcp_sdk.values import Events, Fix
+from tests.unit.results.test_positions import SITE, packets
+from tests.unit.study.campaign.browser import CHROMIUM, Browser
+from tests.unit.study.test_markup import HOSTILE
+
+websockets = pytest.importorskip("websockets", reason="the extra live is not installed")
+from websockets.exceptions import ConnectionClosedError, InvalidStatus  # noqa: E402
+from websockets.sync.client import ClientConnection, connect  # noqa: E402
+
+LINK = load_link()
+FRAMES = [frame for packet in packets(3) for frame in packet.frames]
+
+
+@dataclass
+class Stage:
+    """A run that a test makes up, and its view."""
+
+    outlet: Outlet
+    services: Services
+
+    @property
+    def url(self) -> str:
+        assert self.services.view is not None
+        return self.services.view.url
+
+    @property
+    def port(self) -> int:
+        assert self.services.view is not None
+        return self.services.view.port
+
+    def connect(self, **given: Any) -> ClientConnection:
+        return connect(self.url.replace("http", "ws") + "live", compression=None, **given)
+
+    def ask(self, path: str, **headers: str) -> tuple[int, dict[str, str], str]:
+        link = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
+        link.putrequest("GET", path, skip_host="Host" in headers)
+        for name, value in headers.items():
+            link.putheader(name, value)
+        link.endheaders()
+        answer = link.getresponse()
+        found = answer.status, dict(answer.getheaders()), answer.read().decode()
+        link.close()
+        return found
+
+    def frame(self, n: int) -> None:
+        frame = FRAMES[n % len(FRAMES)]
+        self.outlet.publish("frame", frame.t_us, frame, 2.5)
+
+    def picture(self, t_us: int) -> None:
+        """A slice with one event, at column 5 of row 7, as the loop gives it."""
+        assert self.services.pictures is not None
+        events = Events.of([t_us - 1, t_us], [5, 5], [7, 7], [1, 1])
+        self.services.pictures.add(events, 1280, 720, ())
+
+
+@pytest.fixture
+def stage() -> Iterator[Stage]:
+    outlet = Outlet()
+    with Services(Serving(view=True), outlet, LINK, name="a name", sites=(SITE,)) as services:
+        yield Stage(outlet, services)
+        outlet.close()
+
+
+def unpacked(bundle: str | bytes) -> tuple[dict[str, Any], bytes]:
+    assert isinstance(bundle, bytes)
+    (size,) = struct.unpack_from("<I", bundle)
+    return json.loads(bundle[4 : 4 + size]), bundle[4 + size :]
+
+
+def next_of(link: ClientConnection, timeout_s: float = 5.0) -> tuple[dict[str, Any], bytes]:
+    link.send('{"next": true}')
+    return unpacked(link.recv(timeout_s))
+
+
+@pytest.mark.parametrize("size", [(5, 4), (3, 7), (16, 1), (1, 2)])
+def test_png_is_read_back(size: tuple[int, int]) -> None:
+    cells = np.random.default_rng(1).integers(0, 4, size).astype(np.uint8)
+    with Image.open(io.BytesIO(png(cells))) as picture:
+        picture.load()
+        assert picture.mode == "P"
+        assert (np.array(picture) == cells).all()
+        assert picture.getpalette()[:12] == [16, 16, 20, 70, 150, 255, 255, 205, 70, 235, 235, 235]
+
+
+def test_the_page_needs_nothing_else_and_names_cannot_write_it() -> None:
+    text = page(HOSTILE)
+    assert HOSTILE not in text
+    assert "default-src 'none'" in text
+    assert "connect-src 'self'" in text
+    assert "unsafe-eval" not in text
+    assert not [part for part in ('<link rel="stylesheet', 'src="http', "@import") if part in text]
+
+
+def test_who_may_look_on(stage: Stage) -> None:
+    path = stage.url.split(str(stage.port), 1)[1]
+    status, headers, body = stage.ask(path)
+    assert (status, headers["Content-Type"]) == (200, "text/html; charset=utf-8")
+    assert (headers["Referrer-Policy"], headers["Cache-Control"]) == ("no-referrer", "no-store")
+    assert "a name" in body
+    own = f"127.0.0.1:{stage.port}"
+    assert stage.ask(path, Host=f"localhost:{stage.port}")[0] == 200
+    for host in (
+        "evil.example",
+        f"evil.example:{stage.port}",
+        "127.0.0.1",
+        "127.0.0.1:1",
+        f"u@{own}",
+        "[",
+        "",
+    ):
+        assert stage.ask(path, Host=host)[0] == 403, host
+    assert stage.ask(path, Origin="http://evil.example")[0] == 403
+    assert stage.ask(path, Origin="null")[0] == 403
+    assert stage.ask("/")[0] == 403
+    assert stage.ask("/wrong/")[0] == 403
+    assert stage.ask(path[:-2] + "/")[0] == 403
+    assert stage.ask(path + "else")[0] == 404
+    with pytest.raises(InvalidStatus, match="403"):
+        stage.connect(origin="http://evil.example")
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(f"ws://{own}/wrong/live")
+    with stage.connect(origin=f"http://{own}") as link:
+        assert json.loads(link.recv(5))["about"]["name"] == "a name"
+
+
+def test_a_credit_a_bundle(stage: Stage) -> None:
+    with stage.connect() as link:
+        about = json.loads(link.recv(5))["about"]
+        assert (about["clusters"], about["symbols"], about["may_record"]) == (16, 64, False)
+        stage.frame(0)
+        with pytest.raises(TimeoutError):
+            link.recv(0.2)
+        head, picture = next_of(link)
+        (told,) = head["news"]
+        assert (told["line"], told["t_us"], told["late_ms"]) == ("frame", FRAMES[0].t_us, 2.5)
+        assert told["symbols"] == FRAMES[0].soft.symbols.tolist()
+        assert (head["picture"], picture) == (None, b"")
+        link.send('{"next": true}')
+        time.sleep(0.15)  # A picture is drawn once one is asked for.
+        stage.picture(20_000)
+        head, picture = unpacked(link.recv(5))
+        assert (head["news"], head["picture"]["t_us"]) == ([], 20_000)
+        with Image.open(io.BytesIO(picture)) as shown:
+            assert np.argwhere(np.array(shown)).tolist() == [[7, 5]]
+        (bar,) = head["bars"]
+        assert bar["points"][0] == pytest.approx(FRAMES[0].points_px[0].tolist(), abs=0.01)
+
+
+def test_one_that_stalls_costs_the_others_nothing(stage: Stage) -> None:
+    with stage.connect() as stalled, stage.connect() as quick:
+        stalled.recv(5)
+        quick.recv(5)
+        began = time.monotonic()
+        seen = 0
+        for n in range(6000):
+            stage.frame(n)
+            if n % 1000 == 999:
+                head, _ = next_of(quick)
+                seen += len(head["news"])
+                assert head["dropped"] == 0
+        while seen < 6000:
+            seen += len(next_of(quick)[0]["news"])
+        assert time.monotonic() - began < 10
+        head, _ = next_of(stalled)
+        # The newest, and how many there were before them.
+        assert (len(head["news"]), head["dropped"]) == (4000, 2000)
+        assert stage.services.dropped == {"view": 2000}
+
+
+def test_what_was_before_is_told_to_who_comes_later(stage: Stage) -> None:
+    axes = LocalAxes.of([SITE])
+    fix = Fix.refused(5e3, (0,), "misfit", "why")
+    stage.outlet.publish("fix", fix.t_us, Placed(fix, None))
+    enu_m, unit = np.array([3.0, -20.0, -1.0]), np.eye(3)
+    where = [float(v) for v in axes.to_geodetic(enu_m)]
+    given = Fix(6e3, *where, enu_m, unit, unit, 0.0, 0.0, 0.0, 1.0, (0,), verified=False)
+    filtered = Place(6e3, *where, enu_m, unit, 1.0, 0.0, left_out=False, starts=True)
+    stage.outlet.publish("fix", given.t_us, Placed(given, filtered))
+    time.sleep(0.2)
+    with stage.connect() as link:
+        link.recv(5)
+        lines = {(line["line"], line.get("refusal")): line for line in next_of(link)[0]["news"]}
+    assert lines["fix", "misfit"]["latitude_deg"] is None
+    assert lines["fix", ""]["track_m"] == [3.0, -20.0, -1.0]
+    # The bar is at the origin of its own axes.
+    ((number, *bar),) = lines["bars", None]["bars"]
+    assert number == 7
+    assert bar == pytest.approx([0, 0, 0], abs=2e-3)
+
+
+def test_browsers_only_look_on(stage: Stage) -> None:
+    for said in ('{"record": true}', "{", '{"next": 2}', "[]", "x" * 5000):
+        with stage.connect() as link:
+            link.recv(5)
+            link.send(said)
+            with pytest.raises(ConnectionClosedError, match=r"1008|1009"):
+                link.recv(5)
+
+
+def test_a_recording_is_what_came(tmp_path: Path) -> None:
+    outlet = Outlet()
+    serving = Serving(view=True, record_to=tmp_path)
+    with Services(serving, outlet, LINK, name="x") as services:
+        stage = Stage(outlet, services)
+        with stage.connect() as link:
+            link.recv(5)
+            publish(outlet, 1_000)
+            link.send('{"record": true}')
+            _until(lambda: outlet.wanted("events"))
+            publish(outlet, 2_000)
+            publish(outlet, 3_000)
+            link.send('{"record": false}')
+            _until(lambda: not outlet.wanted("events"))
+            publish(outlet, 4_000)
+            _until(lambda: any(tmp_path.glob("live-*.raw")))
+            stage.frame(0)
+            assert next_of(link)[0]["record"]["events"] == 20
+        (path,) = tmp_path.iterdir()
+        outlet.close()
+    with open_source(path) as source:
+        events, _ = source.read()
+    assert events.t_us.tolist() == [*range(2_000, 2_010), *range(3_000, 3_010)]
+
+
+def publish(outlet: Outlet, t_us: int) -> None:
+    t = np.arange(t_us, t_us + 10)
+    outlet.publish("events", t_us, Events.of(t, t % 1280, t % 720, t % 2))
+
+
+def _until(true: Callable[[], bool], most_s: float = 10.0) -> None:
+    until = time.monotonic() + most_s
+    while not true():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+def test_a_port_that_is_taken_is_one_line(stage: Stage) -> None:
+    with (
+        pytest.raises(ConfigError, match=rf"127.0.0.1:{stage.port}: .*expected a free port, 0 for any"),
+        Services(Serving(view=True, port=stage.port), Outlet(), LINK, name="x"),
+    ):
+        pass
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def test_browsers_show_what_the_files_say(demo_raw: Path, tmp_path: Path) -> None:
+    """Two browsers and one that stalls: pictures change, numbers are those of frames.csv, links come back."""
+    outlet, summary = Outlet(), {}
+    with (
+        Services(Serving(view=True), outlet, LINK, name=demo_raw.name) as services,
+        Browser(tmp_path / "a") as first,
+        Browser(tmp_path / "b") as second,
+        Stage(outlet, services).connect(),  # which never says that it is ready
+    ):
+        stage = Stage(outlet, services)
+        for browser, wide in ((first, 1280), (second, 390)):
+            browser.dress(wide, dark=wide == 390)
+            browser.open(stage.url)
+            _until(lambda browser=browser: browser.value("shown.connects") == 1)
+
+        def run() -> None:
+            summary.update(
+                live(
+                    f"replay:{demo_raw}?speed=0.05",
+                    tmp_path / "out",
+                    LINK,
+                    outlet=outlet,
+                    pictures=services.pictures,
+                    budget=Budget(waiting_ms=1e6, most_ms=1e7),
+                )
+            )
+
+        runner = threading.Thread(target=run)
+        runner.start()
+        images = set()
+        for _ in range(3):
+            before = first.value("shown.pictures")
+            _until(lambda before=before: first.value("shown.pictures") > before, 30)
+            images.add(first.value("document.querySelector('#image canvas').toDataURL()"))
+        assert len(images) == 3
+        # A link that is lost comes back.
+        first.value("socket.close()")
+        _until(lambda: first.value("shown.connects") == 2)
+        runner.join(60)
+        with (tmp_path / "out" / "frames.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        assert summary["status"] == "complete"
+        assert summary["live"]["shed"]["too_late"] == 0
+        _until(lambda: second.value("shown.frames") == len(rows))
+        time.sleep(0.3)
+        told = second.value("shown.last")
+        for row, frame in zip(rows, told, strict=True):
+            for name in ("transmitter", "packet", "frame"):
+                assert int(row[name]) == frame[name]
+            assert float(row["t_us"]) == pytest.approx(frame["t_us"], abs=0.011)
+            symbols = " ".join("-" if s is None else str(s) for s in frame["symbols"])
+            assert row["symbols"] == symbols
+            distance = math.nan if frame["distance_m"] is None else frame["distance_m"]
+            assert float(row["distance_m"] or "nan") == pytest.approx(distance, abs=1e-4, nan_ok=True)
+        row = "[...document.querySelector('#frames tr').cells]"
+        newest = second.value(f"{row}.map((cell) => cell.textContent).join(' ')").split()
+        last = rows[-1]
+        assert newest[1:4] == [last["transmitter"], last["packet"], last["frame"]]
+        assert newest[6:] == last["symbols"].split()
+        assert second.value("document.documentElement.scrollWidth") <= 390
+        assert "complete" in second.value("document.getElementById('alarm').innerText")
+        faults = [m for b in (first, second) for m in b.heard if m["method"] == "Runtime.exceptionThrown"]
+        assert not faults
+        asked = [
+            m["params"]["request"]["url"]
+            for b in (first, second)
+            for m in b.heard
+            if m["method"] == "Network.requestWillBeSent"
+        ]
+        assert {url.split("/")[2] for url in asked if not url.startswith("data:")} <= {
+            f"127.0.0.1:{stage.port}"
+        }
+        assert base64.b64decode(second.screenshot()).startswith(b"\x89PNG")
