@@ -89,6 +89,14 @@ toolchain: | $(BIN)/python
 	  command -v chromium >/dev/null || { \
 	    echo "make: chromium is not installed; the test of the report's page is skipped"; [ -z "$$CI" ]; }; }
 
+	@/usr/bin/python3 -c 'import gi; gi.require_version("UMockdev", "1.0")' 2>/dev/null || { \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then echo "installing umockdev"; \
+	    apt-get update -qq >/dev/null 2>&1; \
+	    DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
+	      umockdev gir1.2-umockdev-1.0 python3-gi >/dev/null; fi; \
+	  /usr/bin/python3 -c 'import gi; gi.require_version("UMockdev", "1.0")' 2>/dev/null || { \
+	    echo "make: umockdev is not installed; the tests of the emulated camera are skipped"; [ -z "$$CI" ]; }; }
+
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 	  echo "make: Python 3.11 or later is needed, found: $$($(PYTHON) --version 2>&1)."; \
@@ -109,5 +117,5 @@ $(VENV)/.installed: pyproject.toml $(VENV)/.pip
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.pip
-	$(BIN)/python -m pip install -q -e '.[faery,parquet,pandas,cluster,report,mcap,live,sign,mp4,docs,notebook]' --group dev
+	$(BIN)/python -m pip install -q -e '.[faery,parquet,pandas,cluster,report,mcap,live,sign,mp4,camera,docs,notebook]' --group dev
 	@touch $@ $(VENV)/.installed

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         RawFormatError,
         StreamError,
         UnknownAlgorithmError,
+        UnpluggedError,
     )
     from evlcp_sdk.io.open import open_source as open
     from evlcp_sdk.io.open import read_events, write_events
@@ -169,6 +170,7 @@ __all__ = [
     "Tracking",
     "Triggers",
     "UnknownAlgorithmError",
+    "UnpluggedError",
     "compose",
     "diagnose",
     "frames_table",
@@ -201,6 +203,7 @@ _HOMES = {
         "RawFormatError",
         "StreamError",
         "UnknownAlgorithmError",
+        "UnpluggedError",
     ),
     "io.open": ("open_source", "read_events", "write_events"),
     "io.replay": ("ReplaySource",),

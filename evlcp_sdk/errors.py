@@ -8,7 +8,8 @@ EvlcpError                     1   anything the SDK raises on purpose
 ├── PluginError                2   a plugin whose algorithm cannot be used or fails, or two of one (role, id)
 ├── OutputError                1   a file or folder that cannot be written
 ├── InputError                 3   a file or stream that cannot be read
-│   └── RawFormatError         3   a RAW file's header or words; names byte offset, found, expected
+│   ├── RawFormatError         3   a RAW file's header or words; names byte offset, found, expected
+│   └── UnpluggedError         5   a camera that went away while it was read
 ├── InterruptedRunError      130   the user stopped the run; what was done until then is kept
 └── StreamError                1   events fed in an order or shape the receiver cannot take
 ```
@@ -33,6 +34,7 @@ __all__ = [
     "RawFormatError",
     "StreamError",
     "UnknownAlgorithmError",
+    "UnpluggedError",
 ]
 
 
@@ -92,6 +94,12 @@ class RawFormatError(InputError):
         self.found = found
         self.expected = expected
         super().__init__(f"{path}: at byte {offset}: found {found}, expected {expected}")
+
+
+class UnpluggedError(InputError):
+    """A camera that went away while it was read; what was received until then is kept."""
+
+    exit_code = 5
 
 
 class StreamError(EvlcpError):

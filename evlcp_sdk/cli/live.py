@@ -1,6 +1,7 @@
 """`evlcp live`."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,8 +27,8 @@ def live(
         str,
         typer.Argument(
             metavar="URL",
-            help="replay:REC, tcp://HOST:PORT, udp://HOST:PORT, unix:PATH, - for standard input, or what a"
-            " plugin can open; a recording is replayed at its own pace.",
+            help="camera:, replay:REC, tcp://HOST:PORT, udp://HOST:PORT, unix:PATH, - for standard input, or"
+            " what a plugin can open; a recording is replayed at its own pace.",
         ),
     ],
     out: Annotated[
@@ -60,6 +61,10 @@ def live(
         str | None,
         typer.Option("--clock-zero", metavar="UTC", help="UTC of the camera clock's 0."),
     ] = None,
+    reconnect: Annotated[
+        bool,
+        typer.Option("--reconnect", help="Go on when a camera that was unplugged, or a stream, is back."),
+    ] = False,
     waiting_ms: Annotated[
         float,
         typer.Option(
@@ -112,6 +117,10 @@ def live(
 
     From another machine:           [bold]evlcp live tcp://192.168.1.7:5600[/]
 
+    A camera:                       [bold]evlcp live camera:[/]
+
+    Some rows of it, its biases:    [bold]evlcp live 'camera:?diff_on=20&area=0,200,1280,240'[/]
+
     From another program:           [bold]CAMERA | evlcp live - --json-lines -[/]
 
     With positions:                 [bold]evlcp live URL --sites site.toml --pitch-deg 0 --roll-deg 0[/]
@@ -126,7 +135,9 @@ def live(
     Where the receiver cannot keep up, it leaves out, in this order, and counts: rows outside of regions, the
     distances of most frames, all outside of regions, the oldest events. Ctrl-C ends it, with its summary.
     """
-    from evlcp_sdk.errors import InputError, InterruptedRunError
+    from evlcp_sdk.errors import InputError, InterruptedRunError, UnpluggedError
+    from evlcp_sdk.io.open import open_source
+    from evlcp_sdk.io.reconnect import ReconnectingSource
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.live.budget import Budget
     from evlcp_sdk.live.outlet import Outlet
@@ -157,8 +168,9 @@ def live(
     )
     with stop_on_request() as stopped, services:
         _say_where(services)
+        source = ReconnectingSource(partial(open_source, url, registry), stopped) if reconnect else url
         summary = run_live(
-            url,
+            source,
             out,
             link,
             registry=registry,
@@ -191,3 +203,5 @@ def _say_where(services: "Services") -> None:
     for name, server in (("NMEA", services.nmea), ("gpsd's JSON", services.gpsd)):
         if server is not None:
             complain(f"{name} at 127.0.0.1:{server.port}")
+    fault = UnpluggedError if summary["live"]["unplugged"] else InputError
+    raise typer.Exit(fault.exit_code if summary["status"] == "failed" else 0)

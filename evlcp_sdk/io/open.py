@@ -8,6 +8,7 @@ from urllib.parse import unquote
 
 from evlcp_sdk.errors import EvlcpError, InputError, StreamError
 from evlcp_sdk.files import Outputs, is_there
+from evlcp_sdk.io.camera import open_camera
 from evlcp_sdk.io.faery import FORMATS, FaerySource
 from evlcp_sdk.io.lists import ListSource, is_list
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
@@ -27,7 +28,7 @@ WRITABLE: Final = {".raw": "EVT3", ".npz": "NPZ", ".csv": "CSV", ".csv.gz": "CSV
 STDIN: Final = "-"
 """What is opened as standard input."""
 
-OWN: Final = ("file", "replay", *SCHEMES)
+OWN: Final = ("file", "replay", "camera", *SCHEMES)
 """Schemes that are opened without a plugin."""
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
@@ -41,9 +42,10 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
     name does no harm.
 
     Args:
-        url: A file, or what a plugin opens, e.g. `cam:0`; `-` for RAW words on standard input, `tcp://HOST:PORT`,
-            `udp://HOST:PORT` or `unix:PATH` for those of another program; `replay:REC?speed=1&loop=1` for a
-            recording at the pace of its own clock, again and again.
+        url: A file, or what a plugin opens, e.g. `cam:0`; `-` for RAW words on standard input,
+            `tcp://HOST:PORT`, `udp://HOST:PORT` or `unix:PATH` for those of another program;
+            `replay:REC?speed=1&loop=1` for a recording at the pace of its own clock, again and again;
+            `camera:` for a camera by the extra `camera`.
         registry: The plugins that are asked; None for all that are installed.
 
     Raises:
@@ -62,6 +64,8 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
         return _open_file(unquote(str(url)[len(scheme[0]) :].removeprefix("//")))
     if scheme[1].lower() == "replay":
         return _open_replay(str(url), registry)
+    if scheme[1].lower() == "camera":
+        return open_camera(str(url))
     if scheme[1].lower() in SCHEMES:
         return open_stream(str(url))
     asked = sorted(registry.plugins("evlcp_open_events"))

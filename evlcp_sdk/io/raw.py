@@ -45,10 +45,7 @@ TIMELESS_BYTES = 1 << 24
 
 
 class RawBytes(Protocol):
-    """What a `RawSource` reads: a file, a pipe, a socket."""
-
-    def fileno(self) -> int:
-        """Its number in this process."""
+    """What a `RawSource` reads: a file, a pipe, a socket; one without `fileno` is waited for as a pipe."""
 
     def readinto(self, room: memoryview, /) -> int | None:
         """Wait for bytes, put them to the front; how many, 0 at the end."""
@@ -223,14 +220,15 @@ class RawSource(EventSource):
         self._exhausted = False
         try:
             self._file: RawBytes = self._path.open("rb", buffering=0) if file is None else file
-            status = os.fstat(self._file.fileno())
+            self._number: int | None = getattr(self._file, "fileno", lambda: None)()
+            status = None if self._number is None else os.fstat(self._number)
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}") from error
-        self._is_pipe = not stat.S_ISREG(status.st_mode)
+        self._is_pipe = status is None or not stat.S_ISREG(status.st_mode)
         try:
             self._fill_header()
             header = parse_header(self._buffer[: self._end].tobytes(), self._path)
-            size = None if self._is_pipe else status.st_size
+            size = None if status is None or self._is_pipe else status.st_size
             super().__init__(self._path, header.codec.name, header.width, header.height, header.fields, size)
             self._codec = header.codec
             self._decoder = Decoder(header.codec, header.width, header.height)
@@ -239,8 +237,8 @@ class RawSource(EventSource):
             self._start = self._position = self._data_start = header.size_bytes
             if not self._is_pipe:
                 self._fill()
-            elif not self._exhausted:
-                self._wait_a_little()
+            elif not self._exhausted and self._number is not None:
+                self._wait_a_little(self._number)
             self._probe()
         except BaseException:
             self._file.close()
@@ -261,11 +259,11 @@ class RawSource(EventSource):
             ):
                 return
 
-    def _wait_a_little(self) -> None:
+    def _wait_a_little(self, number: int) -> None:
         """Read what of a pipe comes soon, enough to tell its encoding: in the dark little comes."""
         until_s = time.monotonic() + PIPE_WAIT_S
         ready = select.poll()
-        ready.register(self._file.fileno(), select.POLLIN)
+        ready.register(number, select.POLLIN)
         while not self._exhausted and self._end - self._start < PIPE_BYTES:
             left_s = until_s - time.monotonic()
             if left_s <= 0 or not ready.poll(left_s * 1e3):

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -78,14 +77,7 @@ class LoopSource(EventSource):
     @property
     def losses(self) -> dict[str, Loss]:
         """As the recording's, of all passes."""
-        now = self._source.losses
-        both = {name: now.get(name) or self._lost[name] for name in (*self._lost, *now)}
-        return {
-            name: replace(one, count=one.count + self._lost[name].count)
-            if name in now and name in self._lost
-            else one
-            for name, one in both.items()
-        }
+        return Loss.added(self._lost, self._source.losses)
 
     def close(self) -> None:
         """Close the recording."""

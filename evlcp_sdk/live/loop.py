@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.errors import UnpluggedError
 from evlcp_sdk.live.budget import LEVELS, Budget, Shedder
 from evlcp_sdk.live.delays import DelayTally
 from evlcp_sdk.live.outlet import Outlet
@@ -50,6 +51,7 @@ class LiveStatus:
         counts: As of the receiver.
         losses: As of the source.
         regions: The regions that are followed.
+        health: What the camera says of itself.
     """
 
     t_us: float
@@ -66,6 +68,7 @@ class LiveStatus:
     counts: Mapping[str, int]
     losses: Mapping[str, Loss]
     regions: tuple[Region, ...]
+    health: Mapping[str, float | int | str]
 
 
 class FrameEar:
@@ -168,6 +171,8 @@ class LiveLoop:
         return {
             "delays": {stage: tally.to_dict() for stage, tally in self.delays.items()},
             "shed": self.shed,
+            "health": dict(self._source.health),
+            "unplugged": isinstance(self._reader.fault, UnpluggedError),
             "levels_s": {text: round(s, 3) for text, s in zip(LEVELS, self._levels_s, strict=True)},
         }
 
@@ -277,6 +282,7 @@ class LiveLoop:
             counts=self._receiver.counts,
             losses=self._source.losses,
             regions=self._receiver.regions,
+            health=self._source.health,
         )
 
 

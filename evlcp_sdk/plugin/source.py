@@ -3,7 +3,7 @@
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -35,6 +35,14 @@ class Loss:
     first: int
     unit: str
     meaning: str
+
+    @staticmethod
+    def added(before: "Mapping[str, Loss]", after: "Mapping[str, Loss]") -> "dict[str, Loss]":
+        """Losses of two parts of a stream together; the first place is the earlier part's."""
+        out = dict(before)
+        for kind, loss in after.items():
+            out[kind] = replace(out[kind], count=out[kind].count + loss.count) if kind in out else loss
+        return out
 
     def __str__(self) -> str:
         return f"{self.count} {self.meaning} (first at {self.unit} {self.first})"
@@ -101,6 +109,11 @@ class EventSource(ABC):
     def clock_s(self, t_us: float) -> float | None:
         """When a time of the camera's clock was, by `time.monotonic()`, s; None if it is not known."""
         return None
+
+    @property
+    def health(self) -> Mapping[str, float | int | str]:
+        """What a camera says of itself, such as `temperature_c`, by name; nothing of most sources."""
+        return {}
 
     @property
     def losses(self) -> dict[str, Loss]:

@@ -95,6 +95,7 @@ NAMES = [
     "Tracking",
     "Triggers",
     "UnknownAlgorithmError",
+    "UnpluggedError",
     "compose",
     "diagnose",
     "frames_table",

@@ -1,0 +1,322 @@
+"""Cameras by the driver `neuromorphic-drivers`: the EVK4, others with its chip's bus, and the EVK3 HD."""
+
+import contextlib
+import dataclasses
+import importlib
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from evlcp_sdk.errors import ConfigError, InputError, UnpluggedError
+from evlcp_sdk.io.evt3 import EVT3
+from evlcp_sdk.io.raw import RawSource, format_header
+from evlcp_sdk.io.urls import flag, positive, split_options
+from evlcp_sdk.plugin.source import Loss
+from evlcp_sdk.spelling import nearest
+
+__all__ = ["CameraSource", "open_camera"]
+
+_KINDS: Final = {"PROPHESEE_EVK4": "prophesee_evk4", "PROPHESEE_EVK3_HD": "prophesee_evk3_hd"}
+"""Of the driver's names those that send EVT3, and the module that configures each."""
+
+_WAIT_S: Final = 0.05
+"""How long a read waits for the driver before it looks whether it was closed."""
+
+_PERIOD_US: Final = 200
+"""The event-rate limit counts in periods so long."""
+
+_MOST_PER_PERIOD: Final = (1 << 22) - 1
+
+_RING_PACKETS: Final = 1024
+"""USB packets that the driver holds at the most, of 128 KB each: a second of the most that a camera sends."""
+
+_HEALTH_EVERY_S: Final = 5.0
+
+_MOST_FAULTS: Final = 8
+
+_UNPLUGGED: Final = ("NoDevice", "No such device", "Rusb(Io", "Input/output", "Pipe")
+_NEXT_STEPS: Final = (
+    (
+        ("no device found", "device not found", "NotFound", "Entity not found"),
+        "no camera was found: plug it into a USB 3 port by its own cable, see that it is lit, and that lsusb"
+        " lists it (04b4:00f4, 04b4:00f5 or 31f7:0003)",
+    ),
+    (("with serial",), "no camera of that serial was found: ndls lists those that are there"),
+    (
+        ("Access", "ermission", "insufficient"),
+        "this user may not open it: sudo neuromorphic-drivers-install-udev-rules, then plug it in anew",
+    ),
+    (("Busy", "already used"), "another program uses it: end that one"),
+    (
+        ("Mismatch", "mismatch", "ShortResponse", "short response", "Timeout", "timed out"),
+        "it does not answer as it should: unplug it for some seconds, and use a port that gives enough power",
+    ),
+    (("Other error",), "this machine has no USB bus that can be read, as in a container without one"),
+)
+
+
+def open_camera(url: str) -> "CameraSource":
+    """Open `camera:`, or `camera:SERIAL`, with options as `camera:?diff_on=20&events_per_s=2e7`.
+
+    Biases by the driver's names are relative to the camera's own, of an EVK4; `events_per_s` limits the rate
+    on the chip; `area=X,Y,W,H` (more of them apart by `;`) masks all rows and columns outside; `trigger=0`
+    turns its trigger input off.
+
+    Raises:
+        ConfigError: The extra is not installed, or an option is not known or out of its bounds.
+        InputError: There is no such camera, or it cannot be opened.
+    """
+    try:
+        driver: Any = importlib.import_module("neuromorphic_drivers")
+    except ImportError as fault:
+        raise ConfigError(
+            f"{url}: needs the driver, which comes with the extra: pip install 'evlcp-sdk[camera]'"
+        ) from fault
+    named, options = split_options(url, _OptionKinds())
+    serial = named.partition(":")[2].removeprefix("//") or None
+    with _explained(url, InputError):
+        listed = [one for one in driver.list_devices() if serial in (None, one.serial)]
+    known = [one for one in listed if one.name.name in _KINDS]
+    for one in listed:
+        if one.error is not None and not any(other.error is None for other in known):
+            raise _fault(url, str(one.error), InputError)
+    if not known:
+        others = ", ".join(one.name.value for one in listed)
+        if others:
+            raise InputError(f"{url}: found {others}, expected an EVK4, or another camera with EVT3 words")
+        raise _fault(url, "with serial" if serial else "no device found", InputError)
+    kind = getattr(driver, _KINDS[known[0].name.name])
+    configuration = _configured(url, kind, options)
+    with _explained(url, InputError):
+        plain = dataclasses.replace(configuration, biases=kind.Biases())
+        device = driver.open(
+            plain,
+            raw=True,
+            iterator_timeout=_WAIT_S,
+            serial=serial or known[0].serial,
+            ring_configuration=kind.RingConfiguration(ring_length=_RING_PACKETS),
+        )
+    try:
+        _set_biases(url, kind, device, configuration)
+        properties = device.properties()
+        return CameraSource(url, device, int(properties.width), int(properties.height))
+    except BaseException:
+        device.close()
+        raise
+
+
+class CameraSource(RawSource):
+    """A camera, opened by `open_camera`; its words are decoded as those of a file.
+
+    What its driver had to drop is the loss `camera_overflow`. Unplugged, a read raises `UnpluggedError`.
+    """
+
+    live = True
+
+    def __init__(self, url: str, device: Any, width: int, height: int) -> None:
+        self._bytes = _CameraBytes(url, device, format_header(EVT3, width, height))
+        super().__init__(url, file=self._bytes)
+        self.format = str(device.name().value)
+
+    @property
+    def losses(self) -> dict[str, Loss]:
+        """As `EventSource.losses`, with what the driver dropped."""
+        dropped, first = self._bytes.dropped, self._bytes.first_dropped
+        if not dropped:
+            return super().losses
+        what = "USB packets that the driver had no room for; the program was too slow"
+        return super().losses | {"camera_overflow": Loss(dropped, first, "byte", what)}
+
+    @property
+    def health(self) -> Mapping[str, float | int | str]:
+        """As `EventSource.health`: `temperature_c`, `backlog` (USB packets that wait), `dropped`."""
+        return dict(self._bytes.health)
+
+
+class _CameraBytes:
+    """What the camera sends, as `RawSource` reads it, behind a header that says what it is.
+
+    Attributes:
+        dropped: USB packets that the driver dropped so far.
+        first_dropped: At which byte it dropped first.
+        health: As of the source.
+    """
+
+    def __init__(self, url: str, device: Any, header: bytes) -> None:
+        self._url = url
+        self._device = device
+        self._ready = memoryview(header)
+        self._lock = threading.Lock()
+        self._closed = False
+        self._bytes = 0
+        self._asked_s = -_HEALTH_EVERY_S
+        self.dropped = self.first_dropped = 0
+        self._dropped_before = 0
+        self._faults: list[Exception] = []
+        self.health: dict[str, float | int | str] = {}
+
+    def readinto(self, room: memoryview, /) -> int:
+        """Wait for bytes; 0 once it is closed.
+
+        Raises:
+            UnpluggedError: The camera is gone.
+        """
+        while not len(self._ready):
+            with self._lock:
+                if self._closed:
+                    return 0
+                try:
+                    status, data = next(self._device)
+                except (RuntimeError, StopIteration) as fault:
+                    # The driver says so before it gives what it still holds, and may say it twice.
+                    self._faults.append(fault)
+                    if len(self._faults) <= _MOST_FAULTS:
+                        continue
+                    status = data = None
+                if data is None and self._faults:
+                    raise _fault(self._url, str(self._faults[0]), UnpluggedError) from self._faults[0]
+                self._look(status)
+            self._ready = memoryview(data or b"")
+        size = min(len(room), len(self._ready))
+        room[:size] = self._ready[:size]
+        self._ready = self._ready[size:]
+        self._bytes += size
+        return size
+
+    def _look(self, status: Any) -> None:
+        """Take note of what the driver says of itself, and now and then of the camera."""
+        now_s = time.monotonic()
+        if now_s >= self._asked_s + _HEALTH_EVERY_S:
+            self._asked_s = now_s
+            # It may have no thermometer, and a measurement may fail.
+            with contextlib.suppress(RuntimeError, AttributeError):
+                self.health["temperature_c"] = round(float(self._device.temperature_celsius()), 1)
+        if status.ring is None:
+            return
+        total = int(status.ring.dropped_packets)
+        if total != self._dropped_before:
+            if not self.dropped:
+                self.first_dropped = self._bytes
+            self.dropped += max(total - self._dropped_before, 0)
+            self._dropped_before = total
+        self.health["backlog"] = int(status.ring.backlog)
+        self.health["dropped"] = self.dropped
+
+    def close(self) -> None:
+        """Let the camera go; a read in another thread ends soon."""
+        self._closed = True
+        with self._lock, contextlib.suppress(RuntimeError):
+            self._device.close()
+
+
+class _OptionKinds(dict[str, Any]):
+    """What makes the values of options: those here; any other is taken for a bias, and checked later."""
+
+    def __init__(self) -> None:
+        super().__init__(events_per_s=_rate, area=_areas, trigger=flag)
+
+    def __contains__(self, name: object) -> bool:
+        return isinstance(name, str) and name != ""
+
+    def __missing__(self, name: str) -> Any:
+        return _whole
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError as fault:
+        raise ValueError("a whole number") from fault
+
+
+def _rate(text: str) -> float:
+    rate = positive(text)
+    if not 1 <= rate * _PERIOD_US * 1e-6 <= _MOST_PER_PERIOD:
+        raise ValueError(f"{1e6 / _PERIOD_US:g} to {_MOST_PER_PERIOD * 1e6 / _PERIOD_US:.3g} events a second")
+    return rate
+
+
+def _areas(text: str) -> list[tuple[int, int, int, int]]:
+    areas = []
+    for one in text.split(";"):
+        sides = [int(side) for side in one.split(",") if side.isascii() and side.isdigit()]
+        if len(sides) != 4 or one.count(",") != 3 or not (sides[2] and sides[3]):
+            raise ValueError("X,Y,WIDTH,HEIGHT in pixels")
+        areas.append((sides[0], sides[1], sides[2], sides[3]))
+    return areas
+
+
+def _configured(url: str, kind: Any, options: Mapping[str, Any]) -> Any:
+    """The driver's configuration of a camera."""
+    names = [field.name for field in dataclasses.fields(kind.Biases)]
+    biases = {
+        name: value for name, value in options.items() if name not in ("events_per_s", "area", "trigger")
+    }
+    for name in biases:
+        if name not in names:
+            raise InputError(
+                f"{url}: option {name!r}{nearest(name, ['events_per_s', 'area', 'trigger', *names])}"
+            )
+    chosen: dict[str, Any] = {"biases": dataclasses.replace(kind.Biases(), **biases)}
+    if "trigger" in options:
+        chosen["enable_external_trigger"] = options["trigger"]
+    if "events_per_s" in options:
+        per_period = round(options["events_per_s"] * _PERIOD_US * 1e-6)
+        chosen["rate_limiter"] = kind.RateLimiter(_PERIOD_US, per_period)
+    if "area" in options:
+        chosen |= _masks(url, kind, options["area"])
+    return kind.Configuration(**chosen)
+
+
+def _masks(url: str, kind: Any, areas: Sequence[tuple[int, int, int, int]]) -> dict[str, Any]:
+    """Masks of all columns and rows that no area has."""
+    width, height = int(kind.Properties().width), int(kind.Properties().height)
+    mask = kind.RowColumnMask(set=True)
+    for x, y, wide, high in areas:
+        if x + wide > width or y + high > height:
+            raise InputError(f"{url}: area {x},{y},{wide},{high}: expected within {width} x {height} pixels")
+        mask.clear_x_range(x, x + wide, 1)
+        # The driver counts rows from below.
+        mask.clear_y_range(height - y - high, height - y, 1)
+    return {"x_mask": mask.x_mask(), "y_mask": mask.y_mask()}
+
+
+def _set_biases(url: str, kind: Any, device: Any, configuration: Any) -> None:
+    """Set biases after they are found within the camera's bounds: the driver takes any."""
+    if configuration.biases == kind.Biases():
+        return
+    with _explained(url, InputError):
+        bounds = device.biases_bounds()
+    for field in dataclasses.fields(configuration.biases):
+        value, default = (getattr(some, field.name) for some in (configuration.biases, kind.Biases()))
+        limits = getattr(bounds, field.name)
+        if value != default and not int(limits.minimum) <= value <= int(limits.maximum):
+            raise ConfigError(
+                f"{url}: {field.name} = {value}: expected {int(limits.minimum)} to {int(limits.maximum)}"
+            )
+    whole = {f.name: np.int16(getattr(configuration.biases, f.name)) for f in dataclasses.fields(kind.Biases)}
+    with _explained(url, InputError):
+        device.update_configuration(dataclasses.replace(configuration, biases=kind.Biases(**whole)))
+
+
+@contextlib.contextmanager
+def _explained(url: str, otherwise: type[InputError]) -> Any:
+    """Turn the driver's faults, plain RuntimeErrors, into one line with the next step."""
+    try:
+        yield
+    except RuntimeError as fault:
+        raise _fault(url, str(fault), otherwise) from fault
+
+
+def _fault(url: str, said: str, otherwise: type[InputError]) -> InputError:
+    if otherwise is UnpluggedError or any(word in said for word in _UNPLUGGED):
+        return UnpluggedError(
+            f"{url}: the camera is gone ({said}): see its cable and port; --reconnect goes on when it is back"
+        )
+    for words, step in _NEXT_STEPS:
+        if any(word in said for word in words):
+            return otherwise(f"{url}: {step}")
+    return otherwise(f"{url}: the driver says: {said}")
