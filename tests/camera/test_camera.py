@@ -70,7 +70,7 @@ class Emulator:
 
     def wait(self, what: str) -> None:
         while not self.seen or not self.seen[-1].startswith(what):
-            self.seen.append(self.lines.get(timeout=40))
+            self.seen.append(self.lines.get(timeout=120))
 
     def run(self, command: list[str], **more: Any) -> "subprocess.Popen[str]":
         preload = {"LD_PRELOAD": "libumockdev-preload.so.0", "UMOCKDEV_DIR": self.folder}
@@ -102,7 +102,7 @@ def test_symbols_are_those_of_the_file_and_unplugged_it_ends_whole(demo_raw: Pat
     with emulator(demo_raw, tmp_path, "--rate", "2e7", "--then", "unplug", *told) as camera:
         command = [*COMMAND, "live", url, "-o", str(tmp_path / "out"), "--json", "--waiting-ms", "10000"]
         process = camera.run(command)
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=150)
         camera.wait("unplugged")
         registers = dict(line.split()[1:] for line in camera.seen if line.startswith("register"))
     assert process.returncode == UnpluggedError.exit_code == 5
@@ -144,7 +144,7 @@ def test_it_goes_on_when_the_camera_is_back(demo_raw: Path, tmp_path: Path) -> N
         camera.wait("sent")
         threading.Event().wait(1.0)
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=30)
+        out, err = process.communicate(timeout=90)
     summary = json.loads(out)
     assert summary["status"] == "interrupted", err
     assert summary["recording"]["counts"]["reconnects"] == 1
@@ -166,7 +166,7 @@ def test_what_the_driver_drops_is_counted(demo_raw: Path, tmp_path: Path) -> Non
     )
     with emulator(demo_raw, tmp_path, "--chunk", "400", "--then", "unplug") as camera:
         process = camera.run([sys.executable, "-c", program])
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=150)
     assert process.returncode == 0, err
     events, dropped = map(int, out.split())
     with RawSource(demo_raw) as source:
@@ -185,7 +185,7 @@ def test_what_is_wrong_is_said_before_anything_is_read(demo_raw: Path, tmp_path:
     )
     with emulator(demo_raw, tmp_path) as camera:
         process = camera.run([sys.executable, "-c", program])
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=150)
     assert err == ""
     serial, bias, area, bounds = out.splitlines()
     assert "camera:99: no camera of that serial was found: ndls lists" in serial
