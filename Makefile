@@ -117,5 +117,5 @@ $(VENV)/.installed: pyproject.toml $(VENV)/.pip
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.pip
-	$(BIN)/python -m pip install -q -e '.[faery,parquet,pandas,cluster,report,mcap,live,sign,mp4,camera,docs,notebook]' --group dev
+	$(BIN)/python -m pip install -q -e '.[faery,parquet,pandas,cluster,report,mcap,live,sign,mp4,camera,ros,hdf5,docs,notebook]' --group dev
 	@touch $@ $(VENV)/.installed

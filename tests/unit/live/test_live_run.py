@@ -150,7 +150,7 @@ def test_the_command(evlcp: Callable[..., Any], demo_raw: Path) -> None:
     assert run.code == 0
     summary = json.loads(run.out)
     assert summary["transmitters"]
-    assert set(summary["live"]) == {"delays", "shed", "levels_s"}
+    assert set(summary["live"]) == {"delays", "shed", "levels_s", "health", "unplugged"}
     run = evlcp("live", f"replay:{demo_raw}?speed=20", "--json-lines", "-", "--waiting-ms", "100000")
     lines = [json.loads(line) for line in run.out.splitlines()]
     assert lines[-1]["line"] == "summary"
