@@ -193,7 +193,8 @@ def live(
             complain(summary["error"])
         if stopped() and out is not None:
             raise InterruptedRunError(f"interrupted; what was decoded until then is in {out}")
-    raise typer.Exit(InputError.exit_code if summary["status"] == "failed" else 0)
+    fault = UnpluggedError if summary["live"]["unplugged"] else InputError
+    raise typer.Exit(fault.exit_code if summary["status"] == "failed" else 0)
 
 
 def _say_where(services: "Services") -> None:
@@ -203,5 +204,3 @@ def _say_where(services: "Services") -> None:
     for name, server in (("NMEA", services.nmea), ("gpsd's JSON", services.gpsd)):
         if server is not None:
             complain(f"{name} at 127.0.0.1:{server.port}")
-    fault = UnpluggedError if summary["live"]["unplugged"] else InputError
-    raise typer.Exit(fault.exit_code if summary["status"] == "failed" else 0)
