@@ -332,6 +332,8 @@ class Viewer:
             self._bars[frame.transmitter] = frame
             if len(self._bars) > _MOST_BARS:
                 del self._bars[min(self._bars, key=lambda number: self._bars[number].t_us)]
+            if not self._browsers:
+                return
             text = json.dumps(frame_line(frame) | {"late_ms": _rounded(news.late_ms)})
         elif kind == "message":
             text = json.dumps({"line": "message"} | json.loads(message_line(news.value)))
