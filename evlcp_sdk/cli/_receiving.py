@@ -1,4 +1,4 @@
-"""What `receive` and `live` both read from their options."""
+"""What `receive`, `live` and `survey` read from their options."""
 
 import os
 from collections.abc import Sequence

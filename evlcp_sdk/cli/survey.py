@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, echo
+from evlcp_sdk.cli._receiving import clock_zero_of, position_plan_of
 from evlcp_sdk.spelling import counted
 
 if TYPE_CHECKING:
@@ -44,7 +45,15 @@ def survey(
     ] = None,
     gnss: Annotated[
         Path | None,
-        typer.Option("--gnss", metavar="FILE.csv", help="With --sites: fixes of satellites, with sigmas."),
+        typer.Option(
+            "--gnss",
+            metavar="FILE",
+            help="With --sites: fixes of satellites, with sigmas: CSV, or .nmea with --clock-zero.",
+        ),
+    ] = None,
+    clock_zero: Annotated[
+        str | None,
+        typer.Option("--clock-zero", metavar="UTC", help="UTC of the camera clock's 0, for NMEA."),
     ] = None,
     link_file: LinkFile = None,
     overrides: Overrides = None,
@@ -68,25 +77,23 @@ def survey(
     from evlcp_sdk import run
     from evlcp_sdk.files import Outputs
     from evlcp_sdk.link.resolve import load_link
-    from evlcp_sdk.place.gnss import GnssLog
-    from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.place.poses import read_poses
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import AttitudeLog
-    from evlcp_sdk.scene.sites import load_sites, to_toml
+    from evlcp_sdk.scene.sites import to_toml
 
     if (poses is None) == (sites is None):
         raise typer.BadParameter("give --poses, or --sites of known bars", param_hint="--poses")
     registry = Registry.load()
     link = load_link(link_file, overrides or [], registry)
     if poses is not None:
-        for name, given in (("--attitude", attitude), ("--gnss", gnss)):
+        for name, given in (("--attitude", attitude), ("--gnss", gnss), ("--clock-zero", clock_zero)):
             if given is not None:
                 raise typer.BadParameter("needs --sites", param_hint=name)
         found = run.survey(recordings, read_poses(poses), link, registry=registry, name=str(poses))
     else:
-        assert sites is not None
-        plan = PositionPlan(load_sites(sites), None if gnss is None else GnssLog.read(gnss))
+        plan = position_plan_of(sites, gnss, link, clock_zero_of(clock_zero), mcap=False)
+        assert plan is not None
         known = None if attitude is None else AttitudeLog.read(attitude)
         found = run.survey_on_the_way(recordings, plan, link, attitude=known, registry=registry)
     with Outputs() as outputs:

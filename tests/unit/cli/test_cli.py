@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import pytest
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource, open_source, write_events
+from evlcp_sdk.place.nmea import checksum
 from evlcp_sdk.scene.sites import LocalAxes, load_sites, to_toml
 from evlcp_sdk.values import Events, Triggers
 
@@ -624,7 +625,10 @@ def test_a_car_surveys_a_new_bar_on_its_way(evlcp: Evlcp, street: Path, tmp_path
     imu.write_text("\n".join(lines) + "\n")
     bars = load_sites(street / "site.toml")
     one.write_text(to_toml([dataclasses.replace(bars[0], position_sigma_m=0.01)]))
-    done = evlcp("survey", street / "rec.raw", "--sites", one, "--attitude", imu, "-o", new, "--json")
+    nmea = nmea_of(path, (40, 80, 120), tmp_path / "gnss.nmea")
+    survey = ("survey", street / "rec.raw", "--sites", one, "--attitude", imu, "-o", new, "--gnss", nmea)
+    assert "expected --clock-zero" in " ".join(evlcp(*survey).err.split())
+    done = evlcp(*survey, "--clock-zero", "2026-03-01T12:00:00Z", "--json")
     assert done.code == 0, done.err
     (bar,), (told,) = load_sites(new), json.loads(done.out)["bars"]
     assert bar.transmitter_id == bars[1].transmitter_id
@@ -633,6 +637,49 @@ def test_a_car_surveys_a_new_bar_on_its_way(evlcp: Evlcp, street: Path, tmp_path
     assert 0.01 < bar.position_sigma_m < 0.5
     for given in ((), ("--poses", "x.csv", "--sites", one), ("--poses", "x.csv", "--gnss", "x.csv")):
         assert evlcp("survey", street / "rec.raw", "-o", new, *given).code == 2
+
+
+def nmea_of(path: dict[str, list[float]], at_ms: Sequence[int], file: Path) -> Path:
+    """GGA and GST of a camera's path from noon on, 0.1 m precise."""
+
+    def angle(degrees: float, digits: int) -> str:
+        whole = int(degrees)
+        return f"{whole:0{digits}d}{(degrees - whole) * 60:010.7f}"
+
+    lines = []
+    for ms in at_ms:
+        latitude, longitude, height = (
+            path[f"{key}"][ms] for key in ("latitude_deg", "longitude_deg", "height_m")
+        )
+        clock = f"120000.{ms // 10:02d}"
+        lines.append(
+            f"GPGGA,{clock},{angle(latitude, 2)},N,{angle(longitude, 3)},E,1,9,1,{height - 30},M,30,M,,"
+        )
+        lines.append(f"GPGST,{clock},,,,,0.1,0.1,0.1")
+    file.write_text("".join(f"${line}*{checksum(line)}\r\n" for line in lines))
+    return file
+
+
+def test_satellites_by_nmea_are_in_the_track(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
+    path = json.loads((street / "rec.truth.json").read_text())["camera_path"]
+    nmea = nmea_of(path, (40, 120), tmp_path / "gnss.nmea")
+    angles = ("--pitch-deg", "4", "--roll-deg", "0", "--heading-deg", "0")
+    receive = ("receive", street / "rec.raw", "--sites", street / "site.toml", *angles, "--gnss", nmea)
+    assert evlcp(*receive, "-o", tmp_path / "none").code == 2
+    done = evlcp(*receive, "-o", tmp_path / "out", "--clock-zero", "2026-03-01T12:00:00Z")
+    assert done.code == 0, done.err
+    with (tmp_path / "out" / "fixes.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["source"] == "gnss"]
+    assert [float(row["t_us"]) for row in rows] == [40_000, 120_000]
+    for row, ms in zip(rows, (40, 120), strict=True):
+        for key in ("latitude_deg", "longitude_deg"):
+            assert float(row[key]) == pytest.approx(path[key][ms], abs=1e-8)
+        assert float(row["height_m"]) == pytest.approx(path["height_m"][ms], abs=1e-3)
+        assert float(row["sigma_east_m"]) == pytest.approx(0.1)
+    # An hour off: none of them is within the recording.
+    done = evlcp(*receive, "-o", tmp_path / "late", "--clock-zero", "2026-03-01T11:00:00Z")
+    summary = json.loads((tmp_path / "late" / "summary.json").read_text())
+    assert summary["positions"]["gnss_outside"] == 2
 
 
 def test_calibrate_finds_the_focal_length(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
