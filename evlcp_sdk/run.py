@@ -17,6 +17,7 @@ from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source
 from evlcp_sdk.io.open import STDIN
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.link.several import load_links
 from evlcp_sdk.live.budget import Budget
 from evlcp_sdk.live.loop import FrameEar, LiveLoop
 from evlcp_sdk.live.outlet import Outlet
@@ -77,7 +78,7 @@ DEGRADED_SHARE, DEGRADED_LEAST = 0.01, 100
 
 def receive(
     source: EventSource | str | Path,
-    link: Link | Path | str | None = None,
+    link: Link | Path | str | Sequence[Link | Path | str] | None = None,
     *,
     registry: Registry | None = None,
     attitude: Attitude | AttitudeLog | None = None,
@@ -89,7 +90,7 @@ def receive(
 
     Args:
         source: What to open, plugins asked first; or a source that is open, which is read on and closed.
-        link: The configuration, or a `link.toml`; None for all defaults.
+        link: The configuration, or a `link.toml`, or several of these; None for all defaults.
         registry: Plugins whose hooks are called; None for all that are installed.
         attitude: What is known of the camera's attitude, the same always or over time: how plumb bars lean
             against the sensor. None for nothing.
@@ -100,12 +101,12 @@ def receive(
         ConfigError: The file does not describe a link, or the recording's sensor is not the link's.
     """
     registry = Registry.load() if registry is None else registry
-    link = link if isinstance(link, Link) else load_link(link, registry=registry)
+    links = load_links(link, registry=registry)
     opened = source if isinstance(source, EventSource) else open_source(source, registry)
     try:
-        check_sensor(opened, opened.path if isinstance(source, EventSource) else source, link.camera)
-        receiver = Receiver(link, registry.hook, attitude=attitude, clock_zero=clock_zero)
-        return Reception(opened, receiver, link)
+        check_sensor(opened, opened.path if isinstance(source, EventSource) else source, links[0].camera)
+        receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero)
+        return Reception(opened, receiver, links[0])
     except BaseException:
         opened.close()
         raise
@@ -120,7 +121,7 @@ class Reception(Iterator[Packet]):
     Attributes:
         source: What is read.
         receiver: What decodes it.
-        link: The configuration.
+        link: The configuration; the first of several.
     """
 
     def __init__(self, source: EventSource, receiver: Receiver, link: Link) -> None:
@@ -208,7 +209,7 @@ class Reception(Iterator[Packet]):
 def receive_to_folder(
     source: EventSource | str | Path,
     folder: Path | None,
-    link: Link | Path | str | None = None,
+    link: Link | Path | str | Sequence[Link | Path | str] | None = None,
     *,
     registry: Registry | None = None,
     plan: PositionPlan | None = None,
@@ -225,7 +226,7 @@ def receive_to_folder(
         source: What to open, plugins asked first; or a source that is open, which is read on and closed.
         folder: Where the result goes; made if need be. An earlier result is replaced when the new one is
             complete. None: nothing is written.
-        link: The configuration, or a `link.toml`; None for all defaults.
+        link: The configuration, or a `link.toml`, or several of these; None for all defaults.
         registry: The plugins; None for all that are installed.
         plan: What positions are computed from; None for none.
         attitude: What is known of the camera's attitude, the same always or over time, for distances and
@@ -248,15 +249,15 @@ def receive_to_folder(
         PluginError: A plugin's code fails; nothing is written.
     """
     registry = Registry.load() if registry is None else registry
-    link = link if isinstance(link, Link) else load_link(link, registry=registry)
+    links = load_links(link, registry=registry)
     url = str(source.path if isinstance(source, EventSource) else source)
     with source if isinstance(source, EventSource) else open_source(source, registry) as opened:
         url = str(opened.path) if url == STDIN else url
-        check_sensor(opened, url, link.camera)
+        check_sensor(opened, url, links[0].camera)
         name = Path(url).name
         with ResultWriter(
             folder,
-            link,
+            links,
             registry,
             name=name,
             plan=plan,
@@ -265,7 +266,7 @@ def receive_to_folder(
             sinks=sinks,
             lines=lines,
         ) as writer:
-            receiver = Receiver(link, registry.hook, attitude=attitude, clock_zero=clock_zero)
+            receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero)
             pieces = ((events, receiver.feed(events)) for events in opened.chunks())
             return _run(opened, url, receiver, writer, pieces, receiver.close, advance, stopped)
 
@@ -424,6 +425,7 @@ def _run(
         losses={kind: asdict(loss) for kind, loss in source.losses.items()},
         error=error,
         lit_us=receiver.lit_us,
+        link_counts=receiver.link_counts,
         live=None if live is None else live(),
     )
 

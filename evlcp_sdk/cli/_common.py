@@ -23,6 +23,7 @@ __all__ = [
     "Dask",
     "Json",
     "LinkFile",
+    "LinkFiles",
     "Overrides",
     "Workers",
     "bytes_bar",
@@ -36,6 +37,15 @@ __all__ = [
 
 LinkFile = Annotated[
     str | None, typer.Option("-c", "--config", metavar="link.toml", help="The link; all defaults without it.")
+]
+LinkFiles = Annotated[
+    list[str] | None,
+    typer.Option(
+        "-c",
+        "--config",
+        metavar="link.toml",
+        help="The link; all defaults without it. Give another for another kind of transmitter in view.",
+    ),
 ]
 Overrides = Annotated[
     list[str] | None,

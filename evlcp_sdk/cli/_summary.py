@@ -24,11 +24,13 @@ def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) 
     out.print(Text.assemble((Path(recording["path"]).name, "bold"), f": {summary['result']}"))
     if summary["transmitters"]:
         table = Table(box=None, pad_edge=False, header_style="dim")
-        for name in ("transmitter", "frames", "not seen", "quality", "clock", "distance"):
+        several = ("link",) if "links" in summary else ()
+        for name in ("transmitter", *several, "frames", "not seen", "quality", "clock", "distance"):
             table.add_column(name, justify="right")
         for t in summary["transmitters"]:
             table.add_row(
                 _who(t),
+                *([t["link"]] if several else []),
                 f"{t['frames_found']} of {t['frames_expected']}",
                 _erased(t),
                 _or_dash(t["quality"], "{:.2f}"),

@@ -12,7 +12,7 @@ import typer
 
 from evlcp_sdk.cli._common import (
     Dask,
-    LinkFile,
+    LinkFiles,
     Overrides,
     bytes_bar,
     complain,
@@ -68,7 +68,7 @@ def receive(
         Path | None,
         typer.Option("-o", "--out", metavar="OUT", help="Folder of the result; made if need be."),
     ] = None,
-    link_file: LinkFile = None,
+    link_files: LinkFiles = None,
     overrides: Overrides = None,
     link_mode: Annotated[
         LinkMode,
@@ -175,6 +175,8 @@ def receive(
 
     Your own link:       [bold]evlcp receive REC.raw -o out -c link.toml[/]
 
+    Several at once:     [bold]evlcp receive REC.raw -o out -c bar.toml -c beacon.toml[/]
+
     As it comes:         [bold]CAMERA | evlcp receive - --json-lines -[/]
 
     Several recordings:  [bold]evlcp receive a.raw b.raw -o out[/] writes out/a and out/b
@@ -199,7 +201,7 @@ def receive(
     import json
 
     from evlcp_sdk.jobs.processes import stop_workers
-    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.link.several import load_links, named_links, placing_link
     from evlcp_sdk.plugin.records import choose_sinks
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.results.sinks import load_sinks
@@ -208,9 +210,11 @@ def receive(
     lines = json_lines_of(json_lines, recordings, as_json=as_json)
     jobs = _jobs(recordings, out, lines)
     registry = Registry.load()
-    link = load_link(link_file, overrides or [], registry)
+    links = load_links(link_files, overrides or [], registry)
     if link_mode is LinkMode.AUTO:
-        jobs = [_fitted(job, link, registry) for job in jobs]
+        if len(links) > 1:
+            raise typer.BadParameter("varies one link: give one -c, or none", param_hint="--link")
+        jobs = [_fitted(job, links[0], registry) for job in jobs]
     angles = (heading_deg, pitch_deg, roll_deg)
     if gravity_sigma_deg is None:
         # An IMU's samples follow a camera that sways; angles by hand hold for a whole drive.
@@ -218,7 +222,9 @@ def receive(
     sigmas = (gravity_sigma_deg, heading_sigma_deg, white_sigma_deg, time_sigma_us)
     attitude = attitude_of(attitude_file, angles, sigmas)
     zero = clock_zero_of(clock_zero)
-    plan = position_plan_of(sites, gnss, link, zero, mcap=mcap)
+    named = named_links(links)
+    placing = named[placing_link(named)] if sites is not None else links[0]
+    plan = position_plan_of(sites, gnss, placing, zero, mcap=mcap)
     short = {"figures": figures, "report": report, "parquet": parquet, "mcap": mcap}
     asked = tuple(dict.fromkeys([*(name for name, given in short.items() if given), *(sinks or [])]))
     load_sinks(choose_sinks(registry, asked, positions=plan is not None))
@@ -238,7 +244,7 @@ def receive(
     ):
         run = partial(
             _decode_job,
-            link=link,
+            links=links,
             plan=plan,
             attitude=attitude,
             clock_zero=zero,
@@ -302,7 +308,7 @@ def _fitted(job: ReceiveJob, link: "Link", registry: "Registry") -> ReceiveJob:
 def _decode_job(
     job: ReceiveJob,
     *,
-    link: "Link",
+    links: "tuple[Link, ...]",
     plan: "PositionPlan | None",
     attitude: "Attitude | AttitudeLog | None",
     clock_zero: "datetime | None",
@@ -314,7 +320,7 @@ def _decode_job(
     from evlcp_sdk.run import receive_to_folder, stop_on_request
 
     known: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock_zero}
-    decode = partial(receive_to_folder, job.url, job.folder, job.link or link, **known, sinks=sinks)
+    decode = partial(receive_to_folder, job.url, job.folder, job.link or links, **known, sinks=sinks)
     if stopped is not None:
 
         def ended() -> bool:

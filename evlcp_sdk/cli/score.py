@@ -37,19 +37,19 @@ def score(
     from evlcp_sdk.sim.truth import read_truth
     from evlcp_sdk.study.frames import read_frames
     from evlcp_sdk.study.match import check_link
-    from evlcp_sdk.study.score import link_of_result, score_frames
+    from evlcp_sdk.study.score import links_of_result, score_frames
 
     registry = Registry.load()
-    link = link_of_result(folder, registry)
+    links = links_of_result(folder, registry)
     frames = read_frames(folder)
     truth = read_truth(truth_file, registry)
-    if link is None:
+    if not links:
         complain(f"{folder}/summary.json: not there, so nothing says with which link it was received")
     else:
-        check_link(truth, link, str(folder))
+        check_link(truth, links, str(folder))
     for warning in truth.warnings:
         complain(warning)
-    found = score_frames(frames, truth)
+    found = score_frames(frames, truth, links if len(links) > 1 else None)
     if as_json:
         echo(json.dumps(found))
         return
@@ -57,7 +57,7 @@ def score(
     screen.print(f"rows {found['rows']}, matching no true frame {found['unmatched']}")
     for i, bar in enumerate(found["bars"]):
         screen.print(
-            f"bar {i}: frames {bar['frames_found']}/{bar['frames_sent']}  BER {bar['ber']}"
+            f"bar {i}{_sender(bar)}: frames {bar['frames_found']}/{bar['frames_sent']}  BER {bar['ber']}"
             f"  RMSE {bar['rmse_m']} m over {bar['ranged']}  >=0.5 m: {bar['over_half_metre']}"
         )
         _show_segments(bar)
@@ -68,12 +68,17 @@ def score(
     )
     for i, bar in enumerate(road["bars"]):
         screen.print(
-            f"bar {i}: frames {bar['frames_found']}/{bar['frames_sent']}  BER {bar['ber']}"
+            f"bar {i}{_sender(bar)}: frames {bar['frames_found']}/{bar['frames_sent']}  BER {bar['ber']}"
             f"  erased {bar['erased']}  claimed {bar['claimed']}"
             f"  RMSE {bar['rmse_m']} m over {bar['ranged']}  bias {bar['bias_m']}  worst {bar['worst_m']}"
             f"  NEES {bar['nees']}  >=0.5 m: {bar['over_half_metre']}"
         )
         _show_segments(bar)
+
+
+def _sender(bar: Mapping[str, Any]) -> str:
+    """The link of a bar, where the result is of several."""
+    return f" ({bar['link']})" if "link" in bar else ""
 
 
 def _show_segments(bar: Mapping[str, Any]) -> None:

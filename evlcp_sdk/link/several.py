@@ -1,15 +1,40 @@
 """Several links of one receiver: their names, and what they must share."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.plugin.registry import Registry
 
-__all__ = ["named_links"]
+__all__ = ["load_links", "named_links", "placing_link"]
+
+LinkLike = Link | Path | str | None
+
+
+def load_links(
+    link: LinkLike | Sequence[Link | Path | str],
+    overrides: Sequence[str] = (),
+    registry: Registry | None = None,
+) -> tuple[Link, ...]:
+    """Links, or the files of some, resolved: one of all defaults where none is given.
+
+    Args:
+        link: A link, a `link.toml`, or several of these.
+        overrides: `table.key=value` texts that change those that are read from files.
+        registry: Where algorithms are found; None for all that are installed.
+
+    Raises:
+        ConfigError: A file does not describe a link, or they cannot be received together.
+    """
+    given: Sequence[LinkLike] = [link] if link is None or isinstance(link, Link | Path | str) else link
+    links = tuple(one if isinstance(one, Link) else load_link(one, overrides, registry) for one in given)
+    named_links(links)
+    return links
 
 
 def named_links(link: Link | Sequence[Link]) -> dict[str, Link]:
-    """Links by name; one without a name is called by its place, from `link-0` on.
+    """Links by name: a single one has none, of several one without a name is called by its place.
 
     Args:
         link: A link, or several.
@@ -21,10 +46,14 @@ def named_links(link: Link | Sequence[Link]) -> dict[str, Link]:
     >>> from evlcp_sdk.link.resolve import load_link
     >>> list(named_links([load_link(), load_link(overrides=["modulation.id=wh8"])]))
     ['link-0', 'link-1']
+    >>> list(named_links(load_link()))
+    ['']
     """
     given = [link] if isinstance(link, Link) else list(link)
     if not given:
         raise ConfigError("no link: expected one or more")
+    if len(given) == 1:
+        return {"": given[0]}
     links: dict[str, Link] = {}
     for place, one in enumerate(given):
         name = one.name or f"link-{place}"
@@ -34,6 +63,25 @@ def named_links(link: Link | Sequence[Link]) -> dict[str, Link]:
             _check(other_name, other, name, one)
         links[name] = one
     return links
+
+
+def placing_link(links: Mapping[str, Link]) -> str:
+    """Name of the link whose bars positions are computed from: the one that shows more than one cluster.
+
+    Args:
+        links: As `named_links` gives them.
+
+    Raises:
+        ConfigError: Of several links, none has such bars, or more than one.
+    """
+    if len(links) == 1:
+        return next(iter(links))
+    # What a framing hears by itself has no points in the image.
+    bars = [n for n, one in links.items() if one.bar.clusters > 1 and "separation" in one.algorithms]
+    if len(bars) != 1:
+        what = f"{' and '.join(map(repr, bars))} have some" if bars else "no link has any"
+        raise ConfigError(f"positions are computed from the bars of one link: {what}; leave out the others")
+    return bars[0]
 
 
 def _check(name: str, one: Link, other_name: str, other: Link) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 from evlcp_sdk.results.text import symbol_list
 from evlcp_sdk.values import Frame
 
-__all__ = ["FILTERED_COLUMNS", "FRAME_COLUMNS", "frame_value"]
+__all__ = ["FILTERED_COLUMNS", "FRAME_COLUMNS", "LINK_COLUMN", "frame_columns", "frame_value"]
 
 FRAME_COLUMNS = (
     "transmitter",
@@ -25,6 +25,19 @@ FRAME_COLUMNS = (
 
 FILTERED_COLUMNS = ("distance_filtered_m", "distance_filtered_sigma_m")
 """Columns that follow where a tracking algorithm filters the distance."""
+
+LINK_COLUMN = "link"
+"""The last column where there are several links: the name of the one."""
+
+
+def frame_columns(*, filtered: bool, links: bool) -> tuple[str, ...]:
+    """The columns of a run.
+
+    Args:
+        filtered: A tracking algorithm filters the distance.
+        links: There are several links.
+    """
+    return FRAME_COLUMNS + FILTERED_COLUMNS * filtered + (LINK_COLUMN,) * links
 
 
 def frame_value(frame: Frame, column: str) -> Any:

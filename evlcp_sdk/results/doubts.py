@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,17 @@ from evlcp_sdk.results.readout import ReadoutTally
 from evlcp_sdk.results.tallies import RunTally, TransmitterTally
 from evlcp_sdk.spelling import counted
 
-__all__ = ["Doubt", "Seen", "codewords_never", "notes_of", "other_codewords", "saturation", "warnings_of"]
+__all__ = [
+    "Doubt",
+    "LinkPart",
+    "Seen",
+    "codewords_never",
+    "notes_of",
+    "other_codewords",
+    "saturation",
+    "warnings_of",
+    "warnings_of_links",
+]
 
 _TOLD_SIGMAS = 3.0
 """Sigmas beyond which what a drive tells is hinted at."""
@@ -107,6 +117,7 @@ class Doubt:
         text: The same in words, with the counts that say so.
         next_step: What to try; empty where there is nothing to do.
         transmitter: Number of the transmitter that it is about; None for all of the recording.
+        link: Where there are several links, name of the one that it is about; empty for none of them.
 
     >>> print(Doubt("clock", "its clock is 900 ppm off", "try another rate", 0))
     transmitter 0: its clock is 900 ppm off: try another rate
@@ -116,14 +127,34 @@ class Doubt:
     text: str
     next_step: str = ""
     transmitter: int | None = None
+    link: str = ""
 
     def __str__(self) -> str:
-        whose = "" if self.transmitter is None else f"transmitter {self.transmitter}: "
+        whose = f"link {self.link}: " if self.link else ""
+        whose += "" if self.transmitter is None else f"transmitter {self.transmitter}: "
         return f"{whose}{self.text}" + (f": {self.next_step}" if self.next_step else "")
 
     def to_dict(self) -> dict[str, Any]:
         """The same as JSON values."""
-        return asdict(self)
+        found = asdict(self)
+        return found if self.link else {key: value for key, value in found.items() if key != "link"}
+
+
+@dataclass(frozen=True)
+class LinkPart:
+    """What is known of one of several links.
+
+    Attributes:
+        link: The link.
+        counts: What it found and dropped.
+        reads_messages: Whether messages were looked for.
+        others: Codewords of other modulations by id, as in `Seen`.
+    """
+
+    link: Link
+    counts: Mapping[str, int]
+    reads_messages: bool
+    others: Callable[[], Mapping[str, NDArray[np.uint8]]] = dict
 
 
 @dataclass(frozen=True)
@@ -180,7 +211,57 @@ def warnings_of(
     """
     seen = Seen() if seen is None else seen
     found = [*saturation(seen), *_dropped(counts, seen), *_frames(counts), *_room(counts)]
-    for number, one in sorted(tally.transmitters.items()):
+    return found + _of_link(tally.transmitters, counts, link, seen, positions, reads_messages=reads_messages)
+
+
+def warnings_of_links(
+    tally: RunTally,
+    counts: Mapping[str, int],
+    links: Mapping[str, LinkPart],
+    *,
+    seen: Seen,
+    positions: Mapping[str, Any] | None = None,
+    placing: str = "",
+) -> list[Doubt]:
+    """What looks wrong in a result of several links: the recording, and then what each link has read.
+
+    Args:
+        tally: Figures of the transmitters.
+        counts: The receiver's counts, of all links together.
+        links: What is known of each link, by name.
+        seen: What else is known of the recording.
+        positions: Figures of the positions, where they were computed.
+        placing: Name of the link that they are of.
+    """
+    found = [*saturation(seen), *_dropped(counts, seen), *_room(counts)]
+    if not tally.transmitters:
+        return found + list(_frames(counts))
+    for name, part in links.items():
+        told = [doubt for doubt in _frames(part.counts) if doubt.code != "no-preamble"]
+        told += _of_link(
+            tally.of_link(name),
+            part.counts,
+            part.link,
+            replace(seen, others=part.others),
+            positions if name == placing else None,
+            reads_messages=part.reads_messages,
+        )
+        found += [replace(doubt, link=name) for doubt in told]
+    return found
+
+
+def _of_link(
+    transmitters: Mapping[int, TransmitterTally],
+    counts: Mapping[str, int],
+    link: Link,
+    seen: Seen,
+    positions: Mapping[str, Any] | None,
+    *,
+    reads_messages: bool,
+) -> list[Doubt]:
+    """What looks wrong in what a link has read."""
+    found: list[Doubt] = []
+    for number, one in sorted(transmitters.items()):
         if one.frames - one.echoes >= _FEW_FRAMES:
             found += _transmitter(number, one, link, counts, seen)
         if one.frames > one.echoes:

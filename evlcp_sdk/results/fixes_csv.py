@@ -49,7 +49,9 @@ class FixesCsv(Sink):
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
         self._rows = csv.writer(folder.open("fixes.csv"), lineterminator="\n")
-        self._rows.writerow(FIX_COLUMNS)
+        # Positions are of one link's bars.
+        self._link = [run.placing] if run.placing else []
+        self._rows.writerow([*FIX_COLUMNS, *["link"] * len(self._link)])
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write a row."""
@@ -77,5 +79,6 @@ class FixesCsv(Sink):
                 defused(fix.detail),
                 fix.source,
                 " ".join(fix.contradicted),
+                *self._link,
             ]
         )

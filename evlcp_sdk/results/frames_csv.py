@@ -3,13 +3,13 @@
 import csv
 from typing import Any
 
-from evlcp_sdk.results.columns import FILTERED_COLUMNS, FRAME_COLUMNS, frame_value
+from evlcp_sdk.results.columns import frame_columns, frame_value
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.text import text_or_empty
 from evlcp_sdk.values import Packet
 
-__all__ = ["FramesCsv", "is_filtered"]
+__all__ = ["FramesCsv"]
 
 
 class FramesCsv(Sink):
@@ -17,7 +17,7 @@ class FramesCsv(Sink):
 
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
-        self._columns = FRAME_COLUMNS + (FILTERED_COLUMNS if is_filtered(run) else ())
+        self._columns = frame_columns(filtered=run.filtered, links=bool(run.links))
         self._rows = csv.writer(folder.open("frames.csv"), lineterminator="\n")
         self._rows.writerow(self._columns)
 
@@ -25,11 +25,6 @@ class FramesCsv(Sink):
         """Write a row per frame."""
         for frame in packet.frames:
             self._rows.writerow(_text(name, frame_value(frame, name)) for name in self._columns)
-
-
-def is_filtered(run: Run) -> bool:
-    """Whether the distance is filtered, so that `FILTERED_COLUMNS` follow."""
-    return run.link.algorithm("tracking").compile().distance is not None
 
 
 _DIGITS = {"t_us": 2, "quality": 4, "x_px": 3, "y_px": 3}

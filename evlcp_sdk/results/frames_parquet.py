@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evlcp_sdk.results.columns import FILTERED_COLUMNS, FRAME_COLUMNS, frame_value
+from evlcp_sdk.results.columns import LINK_COLUMN, frame_columns, frame_value
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.frames_csv import is_filtered
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.values import Packet
 
@@ -30,8 +29,10 @@ class FramesParquet(Sink):
         super().__init__(folder, run)
         whole, real = pyarrow.int64(), pyarrow.float64()
         types = [whole, whole, whole, real, pyarrow.list_(whole), *[real] * 5, whole]
-        self._columns = FRAME_COLUMNS + (FILTERED_COLUMNS if is_filtered(run) else ())
+        self._columns = frame_columns(filtered=run.filtered, links=bool(run.links))
         types += [real] * (len(self._columns) - len(types))
+        if self._columns[-1] == LINK_COLUMN:
+            types[-1] = pyarrow.string()
         self._schema = pyarrow.schema(list(zip(self._columns, types, strict=True)))
         self._writer = pyarrow.parquet.ParquetWriter(folder.path("frames.parquet"), self._schema)
         self._waiting: list[list[Any]] = []
@@ -60,7 +61,7 @@ class FramesParquet(Sink):
 
 
 def _array(values: Sequence[Any], kind: "pyarrow.DataType") -> "pyarrow.Array":
-    """Numbers as an array of Arrow; null for None, NaN and infinity.
+    """Numbers, or texts, as an array of Arrow; null for None, NaN and infinity.
 
     Made from buffers: `pyarrow.array` imports pandas where that is installed, 50 MB of memory.
     """
@@ -72,6 +73,11 @@ def _array(values: Sequence[Any], kind: "pyarrow.DataType") -> "pyarrow.Array":
         return pyarrow.Array.from_buffers(
             kind, len(values), [None, pyarrow.py_buffer(ends)], children=[inner]
         )
+    if pyarrow.types.is_string(kind):
+        texts = [value.encode() for value in values]
+        ends = np.cumsum([0, *map(len, texts)]).astype(np.int32)
+        buffers = [None, pyarrow.py_buffer(ends), pyarrow.py_buffer(b"".join(texts))]
+        return pyarrow.Array.from_buffers(kind, len(values), buffers)
     known = np.array([value is not None and np.isfinite(value) for value in values], bool)
     filled = [value if there else 0 for value, there in zip(values, known.tolist(), strict=True)]
     numbers = np.array(filled, np.int64 if pyarrow.types.is_integer(kind) else np.float64)

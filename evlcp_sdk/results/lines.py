@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from evlcp_sdk.results.columns import FILTERED_COLUMNS, FRAME_COLUMNS, frame_value
+from evlcp_sdk.results.columns import FRAME_COLUMNS, frame_columns, frame_value
 from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.results.text import integrity, number_or_none, sigmas, symbol_list
 from evlcp_sdk.values import Fix, Frame, Packet
@@ -18,11 +18,16 @@ class JsonLines:
     Args:
         give: Takes a line, without its end.
         filtered: Whether distances are filtered, too.
+        placing: Where there are several links, name of the one whose bars positions are computed from.
+        links: There are several links.
     """
 
-    def __init__(self, give: Callable[[str], None], *, filtered: bool = False) -> None:
+    def __init__(
+        self, give: Callable[[str], None], *, filtered: bool = False, placing: str = "", links: bool = False
+    ) -> None:
         self._give = give
-        self._columns = FRAME_COLUMNS + (FILTERED_COLUMNS if filtered else ())
+        self._placing = placing
+        self._columns = frame_columns(filtered=filtered, links=links)
 
     def packet(self, packet: Packet) -> None:
         """Give the lines of a packet: its frames, and then the messages that it completes.
@@ -37,7 +42,7 @@ class JsonLines:
 
     def fix(self, fix: Fix) -> None:
         """Give the line of a fix, given or refused."""
-        self._give(json.dumps(fix_line(fix)))
+        self._give(json.dumps(fix_line(fix) | ({"link": self._placing} if self._placing else {})))
 
 
 def frame_line(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> dict[str, Any]:
@@ -64,7 +69,8 @@ def frame_line(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> dict[str
         "echo_of": frame.echo_of,
     }
     for name in columns[len(FRAME_COLUMNS) :]:
-        line[name] = number_or_none(frame_value(frame, name), 4)
+        value = frame_value(frame, name)
+        line[name] = number_or_none(value, 4) if isinstance(value, float) else value
     return line
 
 

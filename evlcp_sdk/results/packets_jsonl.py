@@ -23,7 +23,7 @@ class PacketsJsonl(Sink):
 
     def packet(self, packet: Packet) -> None:
         """Write the packet's line, and those of its messages."""
-        self._file.write(json.dumps(packet_line(packet, self.run.link.codebook)) + "\n")
+        self._file.write(json.dumps(packet_line(packet, self.run.link_of(packet.link).codebook)) + "\n")
         for message in packet.messages:
             self._file.write(message_line(message) + "\n")
 
@@ -42,6 +42,7 @@ def packet_line(packet: Packet, codebook: Codebook) -> dict[str, Any]:
     return {
         "kind": "packet",
         "transmitter": packet.transmitter,
+        **({"link": packet.link} if packet.link else {}),
         "packet": packet.packet,
         "echo_of": packet.echo_of,
         "t_us": round(packet.t_us, 2),
@@ -63,6 +64,7 @@ def message_line(received: ReceivedMessage) -> str:
     line: dict[str, Any] = {
         "kind": kind.name,
         "transmitter": received.transmitter,
+        **({"link": received.link} if received.link else {}),
         "packet": received.packet,
         "t_us": round(received.t_us, 2),
         "transmitter_id": message.transmitter_id,

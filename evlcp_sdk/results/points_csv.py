@@ -24,11 +24,11 @@ class PointsCsv(Sink):
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
         self._rows = csv.writer(folder.open("points.csv"), lineterminator="\n")
-        self._rows.writerow(POINT_COLUMNS)
+        self._rows.writerow([*POINT_COLUMNS, *["link"] * bool(run.links)])
 
     def packet(self, packet: Packet) -> None:
         """Write a row per frame that has a distance; reflections are no bars at a place."""
-        link = self.run.link
+        link = self.run.link_of(packet.link)
         for frame in packet.frames:
             found = None
             if frame.echo_of is None:
@@ -39,5 +39,6 @@ class PointsCsv(Sink):
                         *(frame.transmitter, frame.packet, frame.frame, f"{frame.t_us:.2f}"),
                         *(f"{value:.4f}" for value in found.point_m),
                         *(f"{found.covariance_m2[i, j]:.6g}" for i, j in _PAIRS),
+                        *([packet.link] if packet.link else []),
                     ]
                 )

@@ -67,12 +67,14 @@ class _Seen:
         first: The first ones, for the table.
         count: How many there were.
         echo_of: Of which transmitter it is a reflection, as the newest packet says.
+        link: Name of its link, where there are several.
     """
 
     frames: Thinned[Frame] = field(default_factory=lambda: Thinned(_MOST_POINTS))
     first: list[Frame] = field(default_factory=list)
     count: int = 0
     echo_of: int | None = None
+    link: str = ""
 
 
 class Report(Sink):
@@ -80,7 +82,7 @@ class Report(Sink):
 
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
-        self._motion = MotionProbe()
+        self._motion = MotionProbe(3 * max(len(run.links), 1))
         self._track = TrackProbe(1024)
         self._seen: dict[int, _Seen] = {}
         self._first_us: int | None = None
@@ -103,7 +105,7 @@ class Report(Sink):
         """Keep frames and messages."""
         number = packet.transmitter
         if packet.frames and (number in self._seen or len(self._seen) < _MOST_TRANSMITTERS):
-            seen = self._seen.setdefault(number, _Seen())
+            seen = self._seen.setdefault(number, _Seen(link=packet.link))
             seen.echo_of = packet.echo_of
             for frame in packet.frames:
                 seen.count += 1
@@ -133,12 +135,12 @@ class Report(Sink):
         plots: list[Plot] = []
         motions = [
             motion.to_dict(
-                self.run.link.codebook,
-                cluster_colours(self.run.link.codebook.clusters),
-                self.run.link.packet.chip_us,
-                self._ms,
+                link.codebook, cluster_colours(link.codebook.clusters), link.packet.chip_us, self._ms
             )
             for motion in self._motion.motions()
+            # What another link fitted better is not given.
+            if motion.frame.transmitter in self._seen or not self.run.links
+            for link in [self.run.link_of(motion.frame.link)]
         ]
         body = [
             Markup("<h1>{}</h1>").format(self.run.name),
@@ -169,7 +171,9 @@ class Report(Sink):
         figures = [("frames", f"{found:,}", f"of {expected:,} sent" if found else "")]
         if found:
             erased = sum(t["symbols_erased"] for t in own)
-            bits = given * self.run.link.codebook.bits_per_symbol
+            bits = sum(
+                t["symbols_given"] * self.run.link_of(t.get("link", "")).codebook.bits_per_symbol for t in own
+            )
             not_seen = f"{erased / (given + erased):.1%} of symbols not given" if erased else ""
             quality = sum(t["quality"] * t["frames_found"] for t in own) / found
             figures += [
@@ -221,7 +225,7 @@ class Report(Sink):
         )
         for number, seen in sorted(self._seen.items()):
             frames = sorted(seen.frames, key=lambda frame: frame.t_us)
-            colour, who = transmitter_colour(number), _who(number, seen.echo_of)
+            colour, who = transmitter_colour(number), _who(number, seen.echo_of, seen.link)
             t = np.array([self._ms(frame.t_us) for frame in frames]) / self._step_ms
             depth = np.array([frame.range.distance_m for frame in frames])
             sigma = np.array([frame.range.sigma_m for frame in frames])
@@ -320,9 +324,10 @@ class Report(Sink):
     def _symbols(self) -> Markup:
         """The symbols of the first frames of each transmitter, as a grid."""
         parts = []
-        most = max(len(self.run.link.codebook.codewords), 1)
         for number, seen in sorted(self._seen.items()):
             rows = []
+            book = self.run.link_of(seen.link).codebook
+            most = max(len(book.codewords), 1)
             for frame in seen.first:
                 depth = frame.range
                 found = f"{depth.distance_m:.2f} ± {depth.sigma_m:.2f}"
@@ -338,11 +343,11 @@ class Report(Sink):
                         Markup("").join(_cell(symbol, most) for symbol in frame.soft.symbols.tolist()),
                     )
                 )
-            clusters = self.run.link.codebook.clusters
+            clusters = book.clusters
             names = ("frame", "ms", "distance, m", "quality", *map(str, range(clusters)))
             head = Markup("").join(Markup("<th>{}</th>").format(name) for name in names)
             more = seen.count - len(seen.first)
-            title = f"{_who(number, seen.echo_of)}: {seen.count:,} frame{'s' * (seen.count != 1)}"
+            title = f"{_who(number, seen.echo_of, seen.link)}: {seen.count:,} frame{'s' * (seen.count != 1)}"
             title += f", the first {len(seen.first)}" * (more > 0)
             held = Markup(
                 '<p class="note">{}</p><div class="grid"><table class="symbols"><tr>{}</tr>{}</table></div>'
@@ -368,8 +373,9 @@ def _cell(symbol: int, most: int) -> Markup:
     return Markup('<td style="--hue:{}">{}</td>').format(round(300 * symbol / most), symbol)
 
 
-def _who(number: int, echo_of: int | None) -> str:
-    return f"transmitter {number}" + ("" if echo_of is None else f", reflection of {echo_of}")
+def _who(number: int, echo_of: int | None, link: str) -> str:
+    who = f"transmitter {number}" + (f" ({link})" if link else "")
+    return who + ("" if echo_of is None else f", reflection of {echo_of}")
 
 
 def _said(frame: Frame, ms: float) -> str:
@@ -425,12 +431,19 @@ def _motion(motions: Sequence[Mapping[str, Any]]) -> Markup:
 
 def _configuration(summary: Mapping[str, Any]) -> Markup:
     counts = {name: value for name, value in summary["counts"].items() if value}
+    links = summary.get("links") or {"": summary}
     parts = [
         Markup("<h2>Configuration and counts</h2>"),
-        Markup('<p class="digest">{}; SHA-256 of the configuration {}</p>').format(
-            summary["recording"]["path"], summary["digest"]
+        *(
+            Markup('<p class="digest">{}; SHA-256 of the configuration{} {}</p>').format(
+                summary["recording"]["path"], f" of {name}" if name else "", link["digest"]
+            )
+            for name, link in links.items()
         ),
-        details("configuration", summary["configuration"]),
+        *(
+            details(f"configuration of {name}" if name else "configuration", link["configuration"])
+            for name, link in links.items()
+        ),
         details("counts", counts),
         details("transmitters", summary["transmitters"]),
     ]

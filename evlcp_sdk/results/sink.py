@@ -1,7 +1,7 @@
 """What every output format is to a run: a sink that takes packets and positions as they come."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
@@ -23,6 +23,8 @@ class Run:
         plan: What positions are computed from; None where none are computed.
         navigator: Computes them; at the end it says where the bars stand. None where none are computed.
         clock_zero: UTC of the camera clock's 0; None where it is not known.
+        links: Where there are several, all of them by name; `link` is the first one then.
+        placing: Where there are several, name of the one whose bars positions are computed from.
     """
 
     name: str
@@ -30,6 +32,18 @@ class Run:
     plan: PositionPlan | None = None
     navigator: Navigator | None = None
     clock_zero: datetime | None = None
+    links: Mapping[str, Link] = field(default_factory=dict)
+    placing: str = ""
+
+    def link_of(self, name: str) -> Link:
+        """The link of a frame, a packet or a message, by the name that it gives."""
+        return self.links.get(name, self.link)
+
+    @property
+    def filtered(self) -> bool:
+        """Whether a link filters distances, so that there are columns for them."""
+        links = self.links.values() or [self.link]
+        return any(link.algorithm("tracking").compile().distance is not None for link in links)
 
 
 class Sink:

@@ -2,17 +2,18 @@
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Literal
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import output_fault
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.records import SUMMARY
-from evlcp_sdk.results.doubts import Seen, notes_of, warnings_of
+from evlcp_sdk.results.doubts import Doubt, LinkPart, Seen, notes_of, warnings_of, warnings_of_links
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.tallies import RunTally
 
-__all__ = ["Status", "summary_of", "write_summary"]
+__all__ = ["Status", "messages_off", "summary_of", "write_summary"]
 
 Status = Literal["complete", "degraded", "interrupted", "failed"]
 """How a run ended: read to the end, the same with much of it dropped, stopped by the user, or stopped by
@@ -21,7 +22,7 @@ input that cannot be read."""
 
 def summary_of(
     status: Status,
-    link: Link,
+    links: Mapping[str, LinkPart],
     tally: RunTally,
     *,
     recording: Mapping[str, Any],
@@ -34,12 +35,13 @@ def summary_of(
     positions: Mapping[str, Any] | None = None,
     sinks: Mapping[str, Mapping[str, Any]] | None = None,
     live: Mapping[str, Any] | None = None,
+    placing: str = "",
 ) -> dict[str, Any]:
     """The content of `summary.json`.
 
     Args:
         status: How the run ended.
-        link: The configuration that the receiver ran with.
+        links: The configuration that the receiver ran with; where there are several, by name.
         tally: Figures of the transmitters.
         recording: What was read: path, format, size, duration, events.
         processing: How long it took.
@@ -51,10 +53,22 @@ def summary_of(
         positions: Figures of the positions, where they were computed.
         sinks: What sinks say, by name; those that say nothing are left out.
         live: Delays, and what was shed, of a live run; None for others.
+        placing: Where there are several links, name of the one whose bars positions are computed from.
     """
-    off = _messages_off(link)
-    warnings = warnings_of(tally, counts, link, seen=seen, reads_messages=off is None, positions=positions)
-    notes = notes_of(tally, counts, seen=seen, reads_messages=off is None)
+    seen = Seen() if seen is None else seen
+    parts = list(links.values())
+    reads = any(part.reads_messages for part in parts)
+    off = None if reads else messages_off(parts[0].link)
+    notes = notes_of(tally, counts, seen=seen, reads_messages=reads)
+    if len(parts) == 1:
+        link, seen = parts[0].link, replace(seen, others=parts[0].others)
+        warnings = warnings_of(tally, counts, link, seen=seen, reads_messages=reads, positions=positions)
+        described = _described(link)
+    else:
+        warnings = warnings_of_links(tally, counts, links, seen=seen, positions=positions, placing=placing)
+        silent = [name for name in links if tally.transmitters and not tally.of_link(name)]
+        notes += [Doubt("nothing-found", "no frame of it was read", link=name) for name in silent]
+        described = {"links": {name: _described(part.link) | _told(part) for name, part in links.items()}}
     return {
         "status": status,
         "error": error,
@@ -68,15 +82,27 @@ def summary_of(
         "warnings": [warning.to_dict() for warning in warnings],
         "notes": [note.to_dict() for note in notes],
         "losses": {kind: dict(loss) for kind, loss in losses.items()},
-        "digest": link.digest,
-        "codebook": {"digest": link.codebook.digest, "profile": link.codebook.profile},
-        "revisions": dict(link.revisions),
-        "configuration": {section: dict(keys) for section, keys in link.table.items()},
+        **described,
         "versions": dict(versions),
         **({"positions": dict(positions)} if positions is not None else {}),
         **({"sinks": {name: dict(part) for name, part in sinks.items()}} if sinks else {}),
         **({"live": dict(live)} if live is not None else {}),
     }
+
+
+def _described(link: Link) -> dict[str, Any]:
+    """What a link is, so that a result can be made again."""
+    return {
+        "digest": link.digest,
+        "codebook": {"digest": link.codebook.digest, "profile": link.codebook.profile},
+        "revisions": dict(link.revisions),
+        "configuration": {section: dict(keys) for section, keys in link.table.items()},
+    }
+
+
+def _told(part: LinkPart) -> dict[str, Any]:
+    """What one of several links found, and whether its messages were read."""
+    return {"counts": dict(part.counts), "messages_off": messages_off(part.link)}
 
 
 def write_summary(table: Mapping[str, Any], folder: ResultFolder) -> None:
@@ -91,7 +117,7 @@ def write_summary(table: Mapping[str, Any], folder: ResultFolder) -> None:
         raise output_fault(folder.folder, fault) from fault
 
 
-def _messages_off(link: Link) -> str | None:
+def messages_off(link: Link) -> str | None:
     """Why messages were not read; None where they were."""
     if not link.messages.decode:
         return "messages.decode = false"

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Any, Literal
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.results.columns import FILTERED_COLUMNS, FRAME_COLUMNS, frame_value
+from evlcp_sdk.results.columns import frame_columns, frame_value
 from evlcp_sdk.values import Packet, arrow_table, pandas_frame
 
 __all__ = ["frames_table"]
@@ -28,9 +28,10 @@ def frames_table(packets: Iterable[Packet], kind: Literal["pandas", "arrow"] = "
     if kind not in ("pandas", "arrow"):
         raise ConfigError(f"kind = {kind!r}, expected 'pandas' or 'arrow'")
     frames = [frame for packet in packets for frame in packet.frames]
-    names: tuple[str, ...] = FRAME_COLUMNS
-    if any(frame.filtered is not None for frame in frames):
-        names += FILTERED_COLUMNS
+    names = frame_columns(
+        filtered=any(frame.filtered is not None for frame in frames),
+        links=any(frame.link for frame in frames),
+    )
     columns = {name: [frame_value(frame, name) for frame in frames] for name in names}
     if kind == "pandas":
         return pandas_frame(columns).astype({"echo_of": "Int64"})

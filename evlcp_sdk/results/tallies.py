@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter, OrderedDict
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -38,6 +39,7 @@ class TransmitterTally:
     Args:
         packet_frames: Frames that a packet has.
         nominal_packet_us: Length of a packet that the configuration states, us.
+        link: Name of its link, where there are several.
 
     Attributes:
         first_us: Start of its first frame, us; its last one starts at `last_us`.
@@ -75,6 +77,7 @@ class TransmitterTally:
     beacon_m: float = math.nan
     blocks: int = 0
     last_px: tuple[float, float] = (math.nan, math.nan)
+    link: str = ""
 
     def add(self, packet: Packet) -> None:
         """Count a packet and its frames."""
@@ -158,6 +161,7 @@ class TransmitterTally:
         newest frame says.
         """
         return {
+            **({"link": self.link} if self.link else {}),
             "packets": self.packets,
             "frames_found": self.frames,
             "frames_expected": self.last_frame - self.first_frame + 1 if self.frames else 0,
@@ -178,7 +182,7 @@ class RunTally:
     """Running figures of all transmitters.
 
     Args:
-        form: Lengths of a packet's parts.
+        form: Lengths of a packet's parts; where there are several links, by the name of each.
 
     Attributes:
         transmitters: Figures by number.
@@ -187,19 +191,22 @@ class RunTally:
         covered_us: Time in which frames of any transmitter were received, us; a packet counts as a whole.
     """
 
-    def __init__(self, form: PacketFormat) -> None:
+    def __init__(self, form: PacketFormat | Mapping[str, PacketFormat]) -> None:
         self.transmitters: OrderedDict[int, TransmitterTally] = OrderedDict()
         self.others = self.others_frames = 0
         self.covered_us = 0.0
         self._messages: OrderedDict[tuple[int, int, int], ReceivedMessage] = OrderedDict()
-        self._packet_us = form.packet_chips * form.chip_us
+        forms = {"": form} if isinstance(form, PacketFormat) else form
+        self._packets_us = {name: one.packet_chips * one.chip_us for name, one in forms.items()}
         self._until_us = -math.inf
 
     def add(self, packet: Packet) -> None:
         """Count a packet and its frames."""
         tally = self.transmitters.get(packet.transmitter)
+        packet_us = self._packets_us[packet.link]
         if tally is None:
-            tally = self.transmitters[packet.transmitter] = TransmitterTally(packet.sent, self._packet_us)
+            tally = TransmitterTally(packet.sent, packet_us, link=packet.link)
+            self.transmitters[packet.transmitter] = tally
         tally.add(packet)
         for message in packet.messages:
             said = message.message
@@ -209,13 +216,17 @@ class RunTally:
             self._messages[key] = message
             if len(self._messages) > MOST_MESSAGES:
                 self._messages.popitem(last=False)
-        end_us = packet.t_us + self._packet_us
-        self.covered_us += min(max(end_us - max(packet.t_us, self._until_us), 0.0), self._packet_us)
+        end_us = packet.t_us + packet_us
+        self.covered_us += min(max(end_us - max(packet.t_us, self._until_us), 0.0), packet_us)
         self._until_us = end_us
         self.transmitters.move_to_end(packet.transmitter)
         if len(self.transmitters) > _MOST_TRANSMITTERS:
             self.others += 1
             self.others_frames += self.transmitters.popitem(last=False)[1].frames
+
+    def of_link(self, name: str) -> dict[int, TransmitterTally]:
+        """Figures by number of the transmitters of a link."""
+        return {number: one for number, one in self.transmitters.items() if one.link == name}
 
     @property
     def own(self) -> list[TransmitterTally]:
@@ -250,6 +261,7 @@ class RunTally:
             {
                 "kind": one.kind.name,
                 "transmitter": one.transmitter,
+                **({"link": one.link} if one.link else {}),
                 "transmitter_id": one.message.transmitter_id,
                 "t_us": round(one.t_us, 2),
                 "trust": one.trust,

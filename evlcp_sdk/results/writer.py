@@ -10,17 +10,17 @@ from types import TracebackType
 from typing import Any, Self
 
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.link.several import named_links, placing_link
 from evlcp_sdk.place.navigator import Navigator, Placed, PositionPlan
 from evlcp_sdk.plugin.records import choose_sinks, installed_sinks
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.results.doubts import Seen, other_codewords
+from evlcp_sdk.results.doubts import LinkPart, Seen, other_codewords
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.frames_csv import is_filtered
 from evlcp_sdk.results.lines import JsonLines
 from evlcp_sdk.results.readout import ReadoutTally
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.sinks import Sinks, load_sinks
-from evlcp_sdk.results.summary import Status, summary_of, write_summary
+from evlcp_sdk.results.summary import Status, messages_off, summary_of, write_summary
 from evlcp_sdk.results.tallies import PositionTally, RunTally
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 from evlcp_sdk.values import Events, Packet
@@ -35,7 +35,7 @@ class ResultWriter:
 
     Args:
         folder: Made if need be; an earlier result in it is replaced by `finish`. None: nothing is written.
-        link: The configuration that the receiver runs with.
+        link: The configuration that the receiver runs with, or several.
         registry: Where sinks are found; None for all that are installed.
         name: Name of the recording, for titles.
         plan: What positions are computed from; None for none.
@@ -54,7 +54,7 @@ class ResultWriter:
     def __init__(
         self,
         folder: Path | None,
-        link: Link,
+        link: Link | Sequence[Link],
         registry: Registry | None = None,
         *,
         name: str = "",
@@ -67,12 +67,18 @@ class ResultWriter:
     ) -> None:
         self._told = placed
         self._registry = Registry.load() if registry is None else registry
-        self._link = link
-        self._tally, self._positions = RunTally(link.packet), PositionTally()
+        self._links = named_links(link)
+        first = next(iter(self._links.values()))
+        self._placing = placing_link(self._links) if plan is not None else ""
+        self._tally = RunTally({name: one.packet for name, one in self._links.items()})
+        self._positions = PositionTally()
         self._readout = ReadoutTally()
-        self._navigator = Navigator(link, plan, attitude) if plan is not None else None
-        run = Run(name, link, plan, self._navigator, clock_zero)
-        self._lines = None if lines is None else JsonLines(lines, filtered=is_filtered(run))
+        self._navigator = Navigator(self._links[self._placing], plan, attitude) if plan is not None else None
+        several = self._links if len(self._links) > 1 else {}
+        run = Run(name, first, plan, self._navigator, clock_zero, several, self._placing)
+        self._lines = None
+        if lines is not None:
+            self._lines = JsonLines(lines, filtered=run.filtered, placing=self._placing, links=bool(several))
         self._folder: ResultFolder | None = None
         self._sinks: Sinks | None = None
         with ExitStack() as stack:
@@ -105,7 +111,7 @@ class ResultWriter:
                 self._sinks.packet(packet)
             if self._lines is not None:
                 self._lines.packet(packet)
-            if self._navigator is not None:
+            if self._navigator is not None and packet.link == self._placing:
                 self._place(self._navigator.feed([packet]))
 
     def finish(
@@ -118,6 +124,7 @@ class ResultWriter:
         error: str | None = None,
         lit_us: Mapping[int, tuple[float, float]] | None = None,
         live: Mapping[str, Any] | None = None,
+        link_counts: Mapping[str, Mapping[str, int]] | None = None,
     ) -> dict[str, Any]:
         """End the sinks, move all files into place, the summary last, and drop what an earlier run left.
 
@@ -130,6 +137,7 @@ class ResultWriter:
             error: The message, when `status` is `failed` or `degraded`.
             lit_us: From when until when the light of each transmitter was there, us; None if it is not known.
             live: Delays, and what was shed, of a live run; None for others.
+            link_counts: The receiver's counts of each of several links, by name.
 
         Returns:
             The content of `summary.json`.
@@ -152,11 +160,19 @@ class ResultWriter:
             lit_us,
             self._readout,
             sum(loss["count"] for loss in losses.values()),
-            partial(other_codewords, self._link, self._registry),
         )
+        parts = {
+            name: LinkPart(
+                link,
+                (link_counts or {}).get(name, counts),
+                messages_off(link) is None,
+                partial(other_codewords, link, self._registry),
+            )
+            for name, link in self._links.items()
+        }
         table = summary_of(
             status,
-            self._link,
+            parts,
             self._tally,
             recording=recording,
             processing=processing,
@@ -168,6 +184,7 @@ class ResultWriter:
             positions=positions,
             sinks={} if self._sinks is None else self._sinks.finish(),
             live=live,
+            placing=self._placing,
         )
         table["files"] = {}
         if self._sinks is not None and self._folder is not None:

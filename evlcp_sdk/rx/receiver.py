@@ -74,7 +74,7 @@ class Receiver:
                 attitude_source(attitude),
                 clock_zero,
                 limits,
-                name if len(links) > 1 else "",
+                name,
                 numbers,
                 rhythms.get(name),
             )

@@ -27,6 +27,7 @@ class GivenFrame:
         x_px: Column of the bar's centre, px.
         y_px: Row of the same, px.
         echo_of: Transmitter whose reflection this is said to be; None for a frame of its own.
+        link: Name of the link, where a receiver has several; empty where it has one.
     """
 
     transmitter: int
@@ -38,6 +39,7 @@ class GivenFrame:
     x_px: float
     y_px: float
     echo_of: int | None = None
+    link: str = ""
 
 
 def given(frame: Frame) -> GivenFrame:
@@ -52,6 +54,7 @@ def given(frame: Frame) -> GivenFrame:
         x_px=frame.x_px,
         y_px=frame.y_px,
         echo_of=frame.echo_of,
+        link=frame.link,
     )
 
 
@@ -72,7 +75,7 @@ def read_frames(folder: Path | str) -> list[GivenFrame]:
     """The rows of a result's `frames.csv`.
 
     Needed are the columns transmitter, t_us, symbols, distance_m, x_px and y_px; distance_sigma_m,
-    distance_filtered_m and echo_of are read where they are there.
+    distance_filtered_m, echo_of and link are read where they are there.
 
     Raises:
         InputError: It is not there, it is not the file that `summary.json` beside it speaks of, a column is
@@ -119,4 +122,5 @@ def _row(row: Mapping[str, str | None], place: str) -> GivenFrame:
         x_px=number("x_px"),
         y_px=number("y_px"),
         echo_of=whole("echo_of", echo) if echo else None,
+        link=row.get("link") or "",
     )

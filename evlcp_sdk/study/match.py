@@ -4,7 +4,7 @@ A frame is put beside the true one that started nearest in time, on the bar whos
 image. Every length follows from the link that the bar sends with.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -184,31 +184,44 @@ class Matched:
     echoes: int
 
 
-def match(frames: Iterable[GivenFrame], truth: Truth, *, road: bool = True) -> Matched:
+def match(
+    frames: Iterable[GivenFrame],
+    truth: Truth,
+    *,
+    road: bool = True,
+    links: Mapping[str, Link] | None = None,
+) -> Matched:
     """Put each decoded frame beside the sent one.
 
-    A frame that is cut by an end of the recording, or by something that hides all of the bar, is neither
-    found nor unmatched, unless the sent frame nearest to it was found before.
+    A frame that names its link is put beside those of bars that send with it. A frame that is cut by an end
+    of the recording, or by something that hides all of the bar, is neither found nor unmatched, unless the
+    sent frame nearest to it was found before.
 
     Args:
         frames: The decoded frames, in their order: of two beside the same sent one, the first is it.
         truth: What was sent.
         road: Mind what a road adds: leave out what is said to be a reflection, and mind what hides clusters.
+        links: The receiver's links by name, where it has several; None for one.
     """
     bars = tuple(BarFrames.of(bar, truth, covers=road) for bar in truth.bars if bar.lit)
     pairs: tuple[list[tuple[GivenFrame, int]], ...] = tuple([] for _ in bars)
     found: tuple[set[int], ...] = tuple(set() for _ in bars)
     unmatched = echoes = 0
+    senders = {
+        name: [i for i, one in enumerate(bars) if not differences(one.bar.link, link)]
+        for name, link in (links or {}).items()
+    }
     for frame in frames:
         if road and frame.echo_of is not None:
             echoes += 1
             continue
         t_us = frame.t_us - truth.t0_us
-        nearest = nearest_bar([one.bar for one in bars], truth, t_us, frame)
+        among = senders.get(frame.link, range(len(bars)))
+        nearest = nearest_bar([bars[i].bar for i in among], truth, t_us, frame)
         if nearest is None:
             unmatched += 1
             continue
-        i, away_px = nearest
+        i, away_px = among[nearest[0]], nearest[1]
         number = bars[i].number(t_us)
         if away_px <= NEAREST_PX and number is not None and number not in found[i]:
             found[i].add(number)
@@ -261,12 +274,14 @@ class BarPackets:
         return _at(self.start_us, t_us, _near_us(self.bar.link.packet))
 
 
-def check_link(truth: Truth, link: Link, name: str, *, messages: bool = False) -> None:
+def check_link(truth: Truth, link: Link | Mapping[str, Link], name: str, *, messages: bool = False) -> None:
     """Refuse a link that a bar of the truth does not send with: a mismatch is an error, never a wrong answer.
+
+    Of several links, each bar has to send with one.
 
     Args:
         truth: What was sent.
-        link: The link that it is received with.
+        link: The link that it is received with; several by name.
         name: What a fault names as its place, e.g. the recording.
         messages: Also hold bars that send messages to the link's error correction.
 
@@ -275,6 +290,11 @@ def check_link(truth: Truth, link: Link, name: str, *, messages: bool = False) -
     """
     for i, bar in enumerate(truth.bars):
         if bar.lit and bar.sends_frames:
-            found = differences(bar.link, link, messages=messages and bar.payload != "symbols")
-            if found:
-                raise ConfigError(f"{name}: bar {i} was sent with another link: {'; '.join(found)}")
+            found = [
+                differences(bar.link, one, messages=messages and bar.payload != "symbols")
+                for one in ([link] if isinstance(link, Link) else link.values())
+            ]
+            if all(found):
+                # Of several, by the one that is most alike.
+                told = "; ".join(min(found, key=lambda texts: len(texts)))
+                raise ConfigError(f"{name}: bar {i} was sent with another link: {told}")

@@ -6,13 +6,14 @@ that is not given is erased and no error, and one of a hidden cluster is claimed
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.link.shared import differences
 from evlcp_sdk.plugin.records import SUMMARY
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.folder import read_summary
@@ -22,7 +23,7 @@ from evlcp_sdk.study.match import match
 from evlcp_sdk.study.measure import bar_tallies
 from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
 
-__all__ = ["Score", "link_of_result", "score_frames"]
+__all__ = ["Score", "links_of_result", "score_frames"]
 
 _FARTHEST_M = 200
 """Segments from here on are not written."""
@@ -45,16 +46,24 @@ class Score:
     bars: tuple[Statistics, ...]
 
     @classmethod
-    def of(cls, frames: Iterable[GivenFrame], truth: Truth, *, road: bool) -> "Score":
+    def of(
+        cls,
+        frames: Iterable[GivenFrame],
+        truth: Truth,
+        *,
+        road: bool,
+        links: Mapping[str, Link] | None = None,
+    ) -> "Score":
         """Score decoded frames.
 
         Args:
             frames: The decoded frames.
             truth: What was sent.
             road: The road score, not the plain one.
+            links: The receiver's links by name, where it has several; None for one.
         """
         frames = list(frames)
-        found = match(frames, truth, road=road)
+        found = match(frames, truth, road=road, links=links)
         bars = (Statistics.of(bar_tallies(*one)) for one in zip(found.bars, found.pairs, strict=True))
         return cls(len(frames), found.unmatched, found.echoes, tuple(bars))
 
@@ -72,16 +81,25 @@ class Score:
         }
 
 
-def score_frames(frames: Iterable[GivenFrame], truth: Truth) -> dict[str, Any]:
+def score_frames(
+    frames: Iterable[GivenFrame], truth: Truth, links: Mapping[str, Link] | None = None
+) -> dict[str, Any]:
     """Both scores as JSON values: the plain one's keys, and the road score under `road`.
 
     Args:
         frames: The decoded frames.
         truth: What was sent.
+        links: The receiver's links by name, where it has several: each bar's row names its; None for one.
     """
     frames = list(frames)
-    plain, road = (Score.of(frames, truth, road=road) for road in (False, True))
-    return plain.to_plain() | {"road": road.to_road()}
+    plain, road = (Score.of(frames, truth, road=road, links=links) for road in (False, True))
+    found = plain.to_plain() | {"road": road.to_road()}
+    if links:
+        lit = [bar for bar in truth.bars if bar.lit]
+        for rows in (found["bars"], found["road"]["bars"]):
+            for bar, row in zip(lit, rows, strict=True):
+                row["link"] = next((n for n, one in links.items() if not differences(bar.link, one)), None)
+    return found
 
 
 def _rounded(value: float, digits: int) -> float | None:
@@ -136,8 +154,10 @@ def _road(bar: Statistics) -> dict[str, Any]:
     }
 
 
-def link_of_result(folder: Path | str, registry: Registry | None = None) -> Link | None:
-    """The link that a result was received with, from its `summary.json`; None without that file.
+def links_of_result(folder: Path | str, registry: Registry | None = None) -> dict[str, Link]:
+    """The links that a result was received with, from its `summary.json`; none without that file.
+
+    Of one link, the name is empty.
 
     Args:
         folder: What `evlcp receive -o` wrote.
@@ -149,10 +169,17 @@ def link_of_result(folder: Path | str, registry: Registry | None = None) -> Link
     """
     summary = read_summary(folder)
     if summary is None:
-        return None
-    path, table = Path(folder) / SUMMARY, summary.get("configuration")
+        return {}
+    path, several = Path(folder) / SUMMARY, summary.get("links")
+    if not isinstance(several, dict):
+        return {"": _link_of(path, "", summary, registry)}
+    return {name: _link_of(path, f"links.{name}.", part, registry) for name, part in several.items()}
+
+
+def _link_of(path: Path, where: str, part: Any, registry: Registry | None) -> Link:
+    table = part.get("configuration") if isinstance(part, dict) else None
     if not isinstance(table, dict):
-        raise InputError(f"{path}: configuration: expected a table")
+        raise InputError(f"{path}: {where}configuration: expected a table")
     try:
         return resolve(table, registry, source=str(path))
     except ConfigError as fault:
