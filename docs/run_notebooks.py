@@ -3,6 +3,7 @@
 import os
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import nbformat
 from nbclient import NotebookClient
@@ -25,9 +26,9 @@ def executed(path: Path) -> nbformat.NotebookNode:
         # Its warning that others on this machine could listen.
         extra_arguments=["--IPKernelApp.log_level=ERROR"],
     )
-    client.execute(
-        cwd=str(path.parent), env=os.environ | {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}
-    )
+    with TemporaryDirectory() as scratch:
+        settings = {"MPLBACKEND": "module://matplotlib_inline.backend_inline", "IPYTHONDIR": scratch}
+        client.execute(cwd=str(path.parent), env=os.environ | settings)
     for cell in notebook.cells:
         cell.metadata.clear()
         if cell.cell_type == "code":

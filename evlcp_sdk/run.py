@@ -181,7 +181,7 @@ class Reception(Iterator[Packet]):
         return self.source.losses
 
     def close(self) -> None:
-        """Leave, where need be before the end: packets that are not complete are given up."""
+        """Close the source, before its end if need be; packets that are not complete are dropped."""
         self._packets = iter(())
         self.source.close()
 

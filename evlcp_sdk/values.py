@@ -280,7 +280,7 @@ class PresenceMap:
 
 @dataclass(frozen=True, eq=False)
 class SoftSymbols:
-    """What one frame says, with how sure.
+    """What one frame carries, and how certain that is.
 
     Attributes:
         symbols: Most likely symbol of each cluster, int64 (K,); -1 where it is not given: the cluster was not
@@ -432,7 +432,7 @@ Trust = Literal["verified", "unverified", "forged"]
 
 @dataclass(frozen=True)
 class ReceivedMessage:
-    """A message that is complete, and how far it may be believed.
+    """A complete message, and how far it can be trusted.
 
     Attributes:
         transmitter: Number of the transmitter, as in `Packet`.
@@ -654,7 +654,7 @@ class Fix:
 
     @classmethod
     def refused(cls, t_us: float, transmitters: tuple[int, ...], refusal: str, detail: str) -> Self:
-        """A fix that is not given."""
+        """A refused fix: a time without a position, and the reason."""
         place, spread = np.full(3, math.nan), np.full((3, 3), math.nan)
         geodetic = angles = (math.nan, math.nan, math.nan)
         return cls(

@@ -35,7 +35,7 @@ _GRAVITY_RAD = math.radians(10.0)
 
 @dataclass(frozen=True, eq=False)
 class GnssLog:
-    """Fixes of a receiver of satellites at rising times.
+    """Fixes of a GNSS receiver, in order of time.
 
     Attributes:
         t_us: Camera clock, us, float64 (n,), rising.

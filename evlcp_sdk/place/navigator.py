@@ -41,7 +41,7 @@ _STANDS_US = 10e6
 
 @dataclass(frozen=True)
 class PositionPlan:
-    """What positions are computed from beside what the camera sees and how it is turned.
+    """What positions are computed from, beside the image and the camera's attitude.
 
     Attributes:
         sites: Where the bars stand.

@@ -189,7 +189,7 @@ class Synchronizer(Protocol):
     def step(
         self, state: Any, t_us: NDArray[np.int64], p: NDArray[np.uint8], until_us: int
     ) -> tuple[Any, list[SyncLock]]:
-        """Take a region's events up to `until_us`; give one lock for each packet whose preamble was heard.
+        """Take a region's events up to `until_us`; give one lock for each packet whose preamble was detected.
 
         Args:
             state: What `init` or the last `step` gave; not changed.

@@ -15,7 +15,7 @@ __all__ = ["Run", "Sink"]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a sink may know of the run that it writes down.
+    """What a sink may know of the run whose results it writes.
 
     Attributes:
         name: Name of the recording, for titles.

@@ -33,7 +33,7 @@ _MOST_KNOTS = 4096
 
 @dataclass(frozen=True)
 class Attitude:
-    """How the camera is turned, and how surely that is known: a compass and gravity.
+    """How the camera is turned, and how certain that is: a compass and gravity.
 
     From looking level to the north it is first turned to the right, then up, then rolled.
 
