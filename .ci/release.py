@@ -1,7 +1,8 @@
 """Is this ready for release? `make release`: builds sdist and wheel, tries the wheel on each Python found.
 
 The wheel built from the sdist holds what the wheel of the checkout does, byte by byte. It is installed
-into a clean environment of each Python from 3.11 to 3.13 that is found, its dependencies by pip; there
+into a clean environment of each Python from 3.11 to 3.13 that is found (or of those named, e.g. 3.12), its
+dependencies by pip; there
 `evlcp --version`, `evlcp plugins` and `evlcp demo --recording` must work. What was built stays in dist/.
 """
 
@@ -66,10 +67,13 @@ def built(out: Path) -> tuple[Path, Path]:
 
 
 def python_of(minor: int) -> str | None:
-    """A Python of a minor version: on the path, or of pyenv."""
-    found = shutil.which(f"python3.{minor}")
+    """A Python of a minor version that runs: on the path, or of pyenv, whose names on the path may not."""
     pyenv = sorted((Path.home() / ".pyenv" / "versions").glob(f"3.{minor}.*/bin/python"))
-    return found or (str(pyenv[-1]) if pyenv else None)
+    for python in (shutil.which(f"python3.{minor}"), *map(str, reversed(pyenv))):
+        command = (python, "-c", "import sys; print(sys.version_info[1])") if python else ("false",)
+        if subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip() == str(minor):
+            return python
+    return None
 
 
 def tried(python: str, wheel: Path) -> str:
@@ -94,7 +98,7 @@ def main() -> None:
     for path in built(out):
         sys.stdout.write(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB\n")
     (wheel,) = out.glob("*.whl")
-    for minor in MINORS:
+    for minor in [int(name.removeprefix("3.")) for name in sys.argv[1:]] or MINORS:
         python = python_of(minor)
         what = tried(python, wheel) if python else "not found, not tried"
         sys.stdout.write(f"Python 3.{minor}: {what}\n")

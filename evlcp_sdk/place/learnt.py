@@ -18,7 +18,7 @@ __all__ = ["Learnt", "focal_share", "learnt"]
 Floats = NDArray[np.float64]
 
 _TOLD_SHARE = 0.9
-"""Share of its stated sigma below which an error counts as told by the drive."""
+"""Share of its stated sigma below which an error counts as determined by the drive."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Learnt:
     stated_sigma: float
 
     @property
-    def told(self) -> bool:
+    def determined(self) -> bool:
         """Whether the drive says anything of it; else it keeps the sigma that was stated."""
         return self.sigma < _TOLD_SHARE * self.stated_sigma
 

@@ -39,7 +39,7 @@ frame or two."""
 
 _REJECTED_BESIDE_READ_SHARE = 0.3
 """The same of rejected frames where most blocks are read, so that the link is right: a false lock costs a
-packet; of three bars, one of another layout is still told."""
+packet; of three bars, one of another layout is still named."""
 
 _ASKEW_SHARE = 0.5
 """Of frames that contradict the attitude: fewer are one bar of several that is mounted askew."""
@@ -442,7 +442,7 @@ def _misfit(number: int, suspects: Mapping[str, int], lens: str) -> Doubt:
 def _learnt(rows: Sequence[Mapping[str, Any]], link: Link) -> Iterator[Doubt]:
     for row in rows:
         off, sigma, stated = row["correction"], row["sigma"], row["stated_sigma"]
-        if not row["told"]:
+        if not row["determined"]:
             continue
         if abs(off) > _TOLD_SIGMAS * stated:
             yield Doubt(

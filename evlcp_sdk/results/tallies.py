@@ -346,5 +346,5 @@ def _learnt_row(one: Learnt) -> dict[str, Any]:
         "part": one.part,
         "what": one.what,
         **{name: float(f"{value:.6g}") for name, value in numbers.items()},
-        "told": one.told,
+        "determined": one.determined,
     }

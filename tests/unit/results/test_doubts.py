@@ -367,7 +367,7 @@ def test_what_a_drive_tells_of_its_errors(
     part: str, what: str, off: float, sigma: float, hint: str | None
 ) -> None:
     row = {"part": part, "what": what, "correction": off, "sigma": sigma, "stated_sigma": 0.2}
-    row["told"] = sigma < 0.18
+    row["determined"] = sigma < 0.18
     positions = dict(NO_POSITIONS, fixes=1, learnt=[row])
     link = load_link(overrides=["camera_sigma.focal_mm=0.2"])
     found = [str(doubt) for doubt in warnings_of(RunTally(link.packet), {}, link, positions=positions)]
