@@ -8,8 +8,10 @@ from urllib.parse import unquote
 
 from evlcp_sdk.errors import EvlcpError, InputError, StreamError
 from evlcp_sdk.files import Outputs, is_there
+from evlcp_sdk.io.bags import is_bag, open_bag
 from evlcp_sdk.io.camera import open_camera
 from evlcp_sdk.io.faery import FORMATS, FaerySource
+from evlcp_sdk.io.hdf5 import MAGIC, Hdf5Source
 from evlcp_sdk.io.lists import ListSource, is_list
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
 from evlcp_sdk.io.replay import LoopSource, ReplaySource
@@ -28,7 +30,7 @@ WRITABLE: Final = {".raw": "EVT3", ".npz": "NPZ", ".csv": "CSV", ".csv.gz": "CSV
 STDIN: Final = "-"
 """What is opened as standard input."""
 
-OWN: Final = ("file", "replay", "camera", *SCHEMES)
+OWN: Final = ("file", "replay", "bag", "camera", *SCHEMES)
 """Schemes that are opened without a plugin."""
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
@@ -64,6 +66,8 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
         return _open_file(unquote(str(url)[len(scheme[0]) :].removeprefix("//")))
     if scheme[1].lower() == "replay":
         return _open_replay(str(url), registry)
+    if scheme[1].lower() == "bag":
+        return open_bag(str(url))
     if scheme[1].lower() == "camera":
         return open_camera(str(url))
     if scheme[1].lower() in SCHEMES:
@@ -135,12 +139,18 @@ def _open_file(path: Path | str) -> EventSource:
     target = Path(path)
     if target.suffix.lower() in FORMATS:
         return FaerySource(path)
+    if target.is_dir() and is_bag(target, b""):
+        return open_bag(target)
     try:
         special = target.exists() and not target.is_file() and not target.is_dir()
         start = b"% " if special else _first_bytes(target)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from error
     suffix = _suffix(target)
+    if is_bag(target, start):
+        return open_bag(target)
+    if start.startswith(MAGIC):
+        return Hdf5Source(path)
     if start.startswith(b"% "):
         return RawSource(path)
     if start.startswith(b"PK\x03\x04") or suffix == ".npz":

@@ -1,0 +1,302 @@
+"""ROS bags with `event_camera_msgs/EventPacket`, EVT3 inside: ROS 1, and ROS 2 in SQLite or MCAP."""
+
+import importlib
+import sqlite3
+import struct
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.io.evt3 import EVT3
+from evlcp_sdk.io.raw import RawSource, format_header
+from evlcp_sdk.io.urls import split_options
+from evlcp_sdk.plugin.source import Loss
+
+__all__ = ["BagSource", "EventPacket", "is_bag", "open_bag"]
+
+TYPES: Final = ("event_camera_msgs/msg/EventPacket", "event_camera_msgs/EventPacket")
+
+_MAGICS: Final = {b"#ROSBAG V2.0": "ROS 1", b"SQLite format 3": "SQLite", b"\x89MCAP0\r\n": "MCAP"}
+
+
+@dataclass(frozen=True)
+class EventPacket:
+    """What of a message matters: its sensor, its number, its words.
+
+    Attributes:
+        width: Columns of the sensor.
+        height: Its rows.
+        seq: Number of the packet, which tells of lost ones.
+        encoding: Of its words, `evt3`.
+        data: The words.
+    """
+
+    width: int
+    height: int
+    seq: int
+    encoding: str
+    data: memoryview
+
+
+def is_bag(path: Path, start: bytes) -> bool:
+    """Whether a file, by its first bytes, or a folder is a bag."""
+    return (path.is_dir() and (path / "metadata.yaml").is_file()) or start.startswith(tuple(_MAGICS))
+
+
+def open_bag(url: Path | str) -> "BagSource":
+    """Open `bag:PATH`, or `bag:PATH?topic=NAME`: a file of any kind, or a folder of ROS 2.
+
+    Raises:
+        InputError: It is no bag, has no such topic, or other words than EVT3; or the extra `ros` is needed.
+    """
+    named, options = (
+        split_options(str(url), {"topic": str}) if str(url).startswith("bag:") else (str(url), {})
+    )
+    return BagSource(named.removeprefix("bag:"), options.get("topic"))
+
+
+class BagSource(RawSource):
+    """The events of a bag's topic, its packets decoded one after another as one stream of words.
+
+    Packets that are missing, by their numbers, are the loss `packets_lost`.
+
+    Args:
+        path: The bag.
+        topic: Which; None for the only one.
+    """
+
+    def __init__(self, path: Path | str, topic: str | None = None) -> None:
+        target = Path(path)
+        self._stack = ExitStack()
+        try:
+            self._packets = _BagBytes(target, _messages(target, topic, self._stack))
+            super().__init__(target, file=self._packets)
+        except BaseException:
+            self._stack.close()
+            raise
+        self.format = "BAG"
+        self.size_bytes = sum(file.stat().st_size for file in _files_of(target))
+
+    @property
+    def losses(self) -> dict[str, Loss]:
+        """As `EventSource.losses`, with the packets that are missing."""
+        lost, first = self._packets.lost, self._packets.first_lost
+        if not lost:
+            return super().losses
+        return super().losses | {"packets_lost": Loss(lost, first, "byte", "packets missing in the bag")}
+
+    def close(self) -> None:
+        """Close the bag."""
+        super().close()
+        self._stack.close()
+
+
+class _BagBytes:
+    """The words of a bag's packets, as `RawSource` reads them, behind a header that says what they are."""
+
+    def __init__(self, path: Path, packets: Iterator[EventPacket]) -> None:
+        self._path = path
+        self._iterator = packets
+        self._next_seq: int | None = None
+        self._bytes = 0
+        self.lost = self.first_lost = 0
+        first = next(packets, None)
+        if first is None:
+            raise InputError(f"{path}: no packets on its topic")
+        self._encoding_of(first)
+        self._ready = memoryview(format_header(EVT3, first.width, first.height))
+        self._waiting: EventPacket | None = first
+
+    def readinto(self, room: memoryview, /) -> int:
+        """Give bytes; 0 at the end."""
+        while not len(self._ready):
+            packet = self._waiting or next(self._iterator, None)
+            self._waiting = None
+            if packet is None:
+                return 0
+            self._encoding_of(packet)
+            if self._next_seq is not None and packet.seq > self._next_seq:
+                if not self.lost:
+                    self.first_lost = self._bytes
+                self.lost += packet.seq - self._next_seq
+            self._next_seq = packet.seq + 1
+            self._ready = packet.data
+        size = min(len(room), len(self._ready))
+        room[:size] = self._ready[:size]
+        self._ready = self._ready[size:]
+        self._bytes += size
+        return size
+
+    def _encoding_of(self, packet: EventPacket) -> None:
+        if packet.encoding != "evt3":
+            raise InputError(
+                f"{self._path}: packets of encoding {packet.encoding!r}, expected 'evt3', as metavision_driver"
+                " records them; event_camera_tools convert others"
+            )
+
+    def close(self) -> None:
+        """Give no more."""
+        self._iterator, self._waiting = iter(()), None
+        self._ready = memoryview(b"")
+
+
+def _files_of(path: Path) -> list[Path]:
+    """The files of a bag: itself, or those of its folder, in order of their names."""
+    if not path.is_dir():
+        return [path]
+    return sorted(one for one in path.iterdir() if one.suffix in (".db3", ".mcap"))
+
+
+def _messages(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
+    """The packets of a bag, file by file."""
+    if not path.exists():
+        raise InputError(f"{path}: No such file or directory")
+    files = _files_of(path)
+    if not files:
+        raise InputError(f"{path}: a folder without .db3 or .mcap files, expected a bag")
+    parts = []
+    for file in files:
+        with file.open("rb") as opened:
+            start = opened.read(16)
+        kind = next((kind for magic, kind in _MAGICS.items() if start.startswith(magic)), None)
+        if kind is None:
+            raise InputError(
+                f"{file}: starts with {start[:8].hex(' ')}, expected a bag of ROS 1, SQLite or MCAP"
+            )
+        parts.append({"ROS 1": _ros1, "SQLite": _sqlite, "MCAP": _mcap}[kind](file, topic, stack))
+    return (packet for part in parts for packet in part)
+
+
+def _chosen(path: Path, topics: dict[str, str], topic: str | None) -> str:
+    """The topic to read, of those with their types."""
+    fitting = [name for name, kind in topics.items() if kind in TYPES]
+    told = ", ".join(f"{name} ({kind})" for name, kind in sorted(topics.items())) or "none"
+    if topic is not None:
+        if topic not in fitting:
+            raise InputError(f"{path}: topic {topic!r}, expected one of type EventPacket (topics: {told})")
+        return topic
+    if len(fitting) != 1:
+        what = "no topic" if not fitting else f"{len(fitting)} topics"
+        hint = "" if not fitting else "; choose one by ?topic=NAME"
+        raise InputError(f"{path}: {what} of type event_camera_msgs/EventPacket (topics: {told}){hint}")
+    return fitting[0]
+
+
+def _sqlite(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
+    try:
+        base = stack.enter_context(closing(sqlite3.connect(f"file:{path.resolve()}?mode=ro", uri=True)))
+        rows = base.execute("SELECT name, id, type FROM topics").fetchall()
+        number = {name: number for name, number, _ in rows}
+        chosen = _chosen(path, {name: kind for name, _, kind in rows}, topic)
+        found = base.execute(
+            "SELECT data FROM messages WHERE topic_id = ? ORDER BY timestamp, id", (number[chosen],)
+        )
+    except sqlite3.Error as fault:
+        raise InputError(f"{path}: {fault}") from fault
+
+    def packets() -> Iterator[EventPacket]:
+        try:
+            for (data,) in found:
+                yield _of_cdr(path, data)
+        except sqlite3.Error as fault:
+            raise InputError(f"{path}: {fault}") from fault
+
+    return packets()
+
+
+def _mcap(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
+    reader = _needed(path, "mcap.reader")
+    file = stack.enter_context(path.open("rb"))
+
+    def packets() -> Iterator[EventPacket]:
+        try:
+            made = reader.make_reader(file)
+            summary = made.get_summary()
+            schemas = summary.schemas if summary is not None else {}
+            channels = summary.channels.values() if summary is not None else ()
+            topics = {one.topic: schemas[one.schema_id].name for one in channels if one.schema_id in schemas}
+            chosen = _chosen(path, topics, topic)
+            for _, _, message in made.iter_messages([chosen]):
+                yield _of_cdr(path, message.data)
+        except InputError:
+            raise
+        except Exception as fault:
+            raise InputError(f"{path}: {type(fault).__name__}: {fault}") from fault
+
+    return packets()
+
+
+def _ros1(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
+    rosbag1 = _needed(path, "rosbags.rosbag1")
+
+    def packets() -> Iterator[EventPacket]:
+        try:
+            made = stack.enter_context(rosbag1.Reader(path))
+            chosen = _chosen(path, {one.topic: one.msgtype for one in made.connections}, topic)
+            wanted = [one for one in made.connections if one.topic == chosen]
+            for _, _, data in made.messages(wanted):
+                yield _of_ros1(path, data)
+        except InputError:
+            raise
+        except Exception as fault:
+            raise InputError(f"{path}: {type(fault).__name__}: {fault}") from fault
+
+    return packets()
+
+
+def _needed(path: Path, module: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError as fault:
+        raise InputError(f"{path}: needs the extra: pip install 'evlcp-sdk[ros]'") from fault
+
+
+class _Fields:
+    """Reads the fields of a message one after another."""
+
+    def __init__(self, path: Path, data: bytes, order: str, start: int, *, aligned: bool) -> None:
+        self._path, self._data, self._order = path, memoryview(data), order
+        self._start = self._at = start
+        self._aligned = aligned
+
+    def number(self, code: str) -> int:
+        size = struct.calcsize(code)
+        if self._aligned:
+            self._at += -(self._at - self._start) % size
+        (value,) = struct.unpack(self._order + code, self.raw(size))
+        return int(value)
+
+    def raw(self, size: int) -> memoryview:
+        piece = self._data[self._at : self._at + size]
+        if len(piece) < size:
+            raise InputError(f"{self._path}: a message of {len(self._data)} bytes, expected more: it is cut")
+        self._at += size
+        return piece
+
+    def text(self) -> str:
+        return bytes(self.raw(self.number("I"))).rstrip(b"\0").decode("utf-8", "replace")
+
+
+def _of_cdr(path: Path, data: bytes) -> EventPacket:
+    """A message of ROS 2: fields at multiples of their size, behind four bytes that say the byte order."""
+    fields = _Fields(path, data, "<" if data[1:2] == b"\x01" else ">", 4, aligned=True)
+    fields.number("i"), fields.number("I"), fields.text()
+    return _body(fields)
+
+
+def _of_ros1(path: Path, data: bytes) -> EventPacket:
+    """A message of ROS 1: fields stand one behind another, and a header has a number of its own."""
+    fields = _Fields(path, data, "<", 0, aligned=False)
+    fields.number("I"), fields.number("I"), fields.number("I"), fields.text()
+    return _body(fields)
+
+
+def _body(fields: _Fields) -> EventPacket:
+    height, width, seq = fields.number("I"), fields.number("I"), fields.number("Q")
+    fields.number("Q")
+    encoding = fields.text()
+    fields.number("B")
+    return EventPacket(width, height, seq, encoding, fields.raw(fields.number("I")))
