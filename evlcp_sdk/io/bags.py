@@ -95,7 +95,7 @@ class BagSource(RawSource):
 
 
 class _BagBytes:
-    """The words of a bag's packets, as `RawSource` reads them, behind a header that says what they are."""
+    """The words of a bag's packets, as `RawSource` reads them, behind a header of their sensor."""
 
     def __init__(self, path: Path, packets: Iterator[EventPacket]) -> None:
         self._path = path
@@ -134,7 +134,7 @@ class _BagBytes:
         if packet.encoding != "evt3":
             raise InputError(
                 f"{self._path}: packets of encoding {packet.encoding!r}, expected 'evt3', as metavision_driver"
-                " records them; event_camera_tools convert others"
+                " records"
             )
 
     def close(self) -> None:

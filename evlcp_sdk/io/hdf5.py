@@ -27,7 +27,7 @@ _NAMES: Final = {
 
 
 class Hdf5Source(EventSource):
-    """An HDF5 file by `h5py`: a dataset with the fields x, y, p and t, or a group of four columns; times in us.
+    """An HDF5 file by `h5py`: records with fields x, y, p and t, or a group of four columns; times in us.
 
     Args:
         path: The file.
