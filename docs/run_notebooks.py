@@ -1,4 +1,7 @@
-"""Run the notebooks and keep what they show: `python docs/run_notebooks.py [NAME ...]`."""
+"""Run the notebooks and keep what they show: `python docs/run_notebooks.py [--check] [NAME ...]`.
+
+With `--check` nothing is kept: a cell that prints something else than it shows ends it with 1.
+"""
 
 import os
 import sys
@@ -48,6 +51,20 @@ def said(notebook: nbformat.NotebookNode) -> list[str]:
     ]
 
 
+def main(names: list[str]) -> None:
+    """Run the notebooks of these names, or all."""
+    check = "--check" in names
+    wanted = [name for name in names if name != "--check"]
+    for name in wanted or sorted(path.stem for path in FOLDER.glob("*.ipynb")):
+        path = FOLDER / f"{name}.ipynb"
+        now = executed(path)
+        if not check:
+            nbformat.write(now, path)
+            continue
+        for shown, printed in zip(said(nbformat.read(path, as_version=4)), said(now), strict=True):
+            if shown != printed:
+                sys.exit(f"{path.name} shows:\n{shown}\nand prints:\n{printed}\n`make notebooks` keeps that")
+
+
 if __name__ == "__main__":
-    for name in sys.argv[1:] or sorted(path.stem for path in FOLDER.glob("*.ipynb")):
-        nbformat.write(executed(FOLDER / f"{name}.ipynb"), FOLDER / f"{name}.ipynb")
+    main(sys.argv[1:])
