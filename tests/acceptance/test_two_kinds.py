@@ -1,0 +1,79 @@
+"""Two kinds of transmitter in one recording, at 50 m by night: each is read by its link, without an error."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.results.folder import read_summary
+from evlcp_sdk.run import receive, receive_to_folder
+from evlcp_sdk.sim.truth import read_truth
+from evlcp_sdk.simulated import simulate
+from evlcp_sdk.study.frames import frames_of, read_frames
+from evlcp_sdk.study.match import check_link
+from evlcp_sdk.study.score import links_of_result, score_frames
+
+LAMP = """
+[bar]
+rows = 6
+columns = 1
+cluster_rows = 6
+cluster_columns = 1
+[framing]
+id = "uart"
+parity = "even"
+[air]
+chip_rate_hz = 10000.0
+"""
+OTHERS = {"lamp": LAMP, "far": '[modulation]\nid = "wh8"\n', "slow": "[air]\nchip_rate_hz = 5000.0\n"}
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_bar_and_another_kind(other: str, tmp_path: Path) -> None:
+    (tmp_path / "bar.toml").write_text("")
+    (tmp_path / f"{other}.toml").write_text(OTHERS[other])
+    (tmp_path / "scene.toml").write_text(
+        "duration_s = 0.12\n[background]\nlight_w_m2 = 1e-3\n[motion]\ndistance_m = 50.0\n"
+        f'[[bars]]\nlink = "bar.toml"\n[[bars]]\nx_m = 1.5\nlink = "{other}.toml"\n'
+    )
+    simulate(tmp_path / "scene.toml", 1).save(tmp_path / "two.raw")
+    links = [tmp_path / "bar.toml", tmp_path / f"{other}.toml"]
+    lines: list[str] = []
+    sinks = ("report", "parquet", "points")
+    table = receive_to_folder(tmp_path / "two.raw", tmp_path / "out", links, sinks=sinks, lines=lines.append)
+    assert table["warnings"] == []
+    assert {one["link"] for one in table["transmitters"]} == {"bar", other}
+    assert len(table["transmitters"]) == 2
+    assert set(table["links"]) == {"bar", other}
+    assert "configuration" not in table
+
+    truth = read_truth(tmp_path / "two.truth.json")
+    by_name = links_of_result(tmp_path / "out")
+    check_link(truth, by_name, "out")
+    found = score_frames(read_frames(tmp_path / "out"), truth, by_name)
+    assert found["unmatched"] == 0
+    assert [bar["link"] for bar in found["bars"]] == ["bar", other]
+    for bar in found["bars"]:
+        assert bar["bit_errors"] == 0
+        assert bar["frames_found"] == bar["frames_sent"] > 0
+
+    with (tmp_path / "out" / "frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    names = {row["transmitter"]: row["link"] for row in rows}
+    assert sorted(names.values()) == sorted(["bar", other])
+    packets = [json.loads(line) for line in (tmp_path / "out" / "packets.jsonl").read_text().splitlines()]
+    assert {line["link"] for line in packets} == {"bar", other}
+    assert {told["link"] for told in map(json.loads, lines) if told["line"] == "frame"} == {"bar", other}
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert f"({other})" in page
+    parquet = pytest.importorskip("pyarrow.parquet").read_table(tmp_path / "out" / "frames.parquet")
+    assert parquet.column("link").to_pylist() == [row["link"] for row in rows]
+
+    with receive(tmp_path / "two.raw", links) as packets_again:
+        assert len(frames_of(packets_again)) == len(rows)
+    with pytest.raises(ConfigError, match="bar 1 was sent with another link"):
+        check_link(truth, load_link(), "out")
+    assert read_summary(tmp_path / "out") is not None
