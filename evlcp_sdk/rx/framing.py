@@ -268,7 +268,9 @@ class PacketFraming:
             points = points_px + look.corner_px, sigma_px
             centre_px = self._looker.centre(look, points[0])
             sight = self._sight(points, look.middle_us)
-        if soft.symbols.max() < 0 and (transmitter.number is None or not math.isfinite(distance.distance_m)):
+        if max(soft.symbols.tolist()) < 0 and (
+            transmitter.number is None or not math.isfinite(distance.distance_m)
+        ):
             # What says nothing is no transmitter, and of one that is known its distance may still be of use.
             return "frames_unread"
         if transmitter.number is None:

@@ -193,7 +193,8 @@ class Guard:
         self.expect_array(soft.symbols, "symbols", (codebook.clusters,), "iu")
         self.expect_array(soft.llr, "llr", (codebook.clusters, codebook.bits_per_symbol), "f")
         top = len(codebook.codewords) - 1
-        least, most = soft.symbols.min(), soft.symbols.max()
+        symbols = soft.symbols.tolist()
+        least, most = min(symbols), max(symbols)
         if least < -1 or most > top:
             self.refuse(f"symbol {least if least < -1 else most}", f"0 to {top}, or -1 for one not given")
         if not math.isfinite(soft.llr.sum()):

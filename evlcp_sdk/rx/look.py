@@ -147,7 +147,7 @@ class Looker:
                 return None, pilot
             presence = masked(presence, self._layout, found[0])
             presence, placement = lit(heard, self._edges, self._every, presence, found[0])
-            if not placement.seen.any():
+            if not np.count_nonzero(placement.seen):
                 return None, pilot
             spread = Spread.of(heard, self._pilots, self._every, self._layout, self._pairs, placement)
             pilot = Pilot(due.number, size, heard, moved, presence, placement, tuple(found[1:]))
@@ -157,7 +157,8 @@ class Looker:
             offset_px = np.concatenate([pilot.offset_px, offset_px], axis=1)
         # The image shows the pilot's mean, read from the chips behind edges that tell codes apart; the bar's
         # centre at the instant is that of its region.
-        rest_x, rest_y = pilot.offset_px[:, 1 :: self._every].mean(1).tolist()
+        told = pilot.offset_px[:, 1 :: self._every]
+        rest_x, rest_y = (np.add.reduce(told, 1) / told.shape[1]).tolist()
         corner_px = (
             float(x[middle]) - (size[0] - 1) / 2 - rest_x,
             float(y[middle]) - (size[1] - 1) / 2 - rest_y,

@@ -112,8 +112,12 @@ class RangeKeeper:
             return state, measured
         t_s, late_s = t_us * 1e-6, measured.late_chips * chip_us * 1e-6
         sigma_m = max(sigma_m, _LEAST_SIGMA * abs(distance_m))
-        past = np.concatenate([state.past, [[t_s, distance_m, sigma_m**2]]])
-        past = past[past[:, 0] > t_s - _MEMORY_S]
+        n = len(state.past)
+        past = np.empty((n + 1, 3))
+        past[:n] = state.past
+        past[n] = t_s, distance_m, sigma_m**2
+        if past[0, 0] <= t_s - _MEMORY_S:
+            past = past[past[:, 0] > t_s - _MEMORY_S]
         speed_m_s, speed_variance, variance = _smooth(past)
         distance_m -= speed_m_s * late_s
         variance += speed_variance * late_s**2
@@ -162,7 +166,8 @@ def _smooth(past: Floats) -> tuple[float, float, float]:
 def _add(state: Ranges, t_s: float, bend: Bend, sine: float | None) -> Floats:
     """Sums with a frame's bend, without that of the lean that is told; older ones fade."""
     off = bend.off if sine is None else bend.off - sine * bend.place**2
-    new = np.stack([bend.weight * off, bend.weight])
+    new = np.empty((2, len(off)))
+    new[0], new[1] = bend.weight * off, bend.weight
     if state.bend.shape != new.shape or state.told != (sine is not None):
         return new
     return np.asarray(new + state.bend * math.exp(-max(t_s - state.bend_s, 0.0) / _TILT_MEMORY_S))

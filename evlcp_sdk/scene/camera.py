@@ -129,6 +129,14 @@ class CameraModel:
         away = np.abs(self.distort(found) - points_px).max(-1, keepdims=True)
         return np.where(away < 1e-6, found, np.nan)
 
+    def direction(self, x_px: float, y_px: float) -> tuple[float, float]:
+        """The same as `undistort` of one point (column, row), px."""
+        if self.k1 == self.k2 == self.p1 == self.p2 == self.k3 == 0:
+            (centre_x_px, centre_y_px), focal_px = self.centre_px, self.focal_px
+            return (x_px - centre_x_px) / focal_px, (y_px - centre_y_px) / focal_px
+        u, v = self.undistort(np.array([x_px, y_px])).tolist()
+        return u, v
+
     def distance_m(self, spacing_m: float, spacing_px: float) -> float:
         """Depth along the optical axis of two points parallel to the sensor: L = f S / (l' a).
 

@@ -13,8 +13,6 @@ __all__ = ["BarSight", "foreshortening", "sight_of"]
 
 Floats = NDArray[np.float64]
 
-_ONES = np.ones(2)
-
 _PLUMB_DEG = 0.1
 """How far bars stand off the vertical (sigma), each way: 1.7 mm in a metre, as by a spirit level."""
 
@@ -81,12 +79,12 @@ def sight_of(
         sigma_px: Their standard deviations, px, float64 (K,).
         attitude: What is known of the camera's attitude; None for nothing.
     """
-    # One that is unseen has no finite sum.
-    seen = np.flatnonzero(np.isfinite(points_px @ _ONES))
+    points = points_px.tolist()
+    seen = [k for k, (x, y) in enumerate(points) if math.isfinite(x) and math.isfinite(y)]
     if len(seen) < 2:
         return BarSight()
-    first, last = int(seen[0]), int(seen[-1])
-    (u0, v0), (u1, v1) = camera.undistort(points_px[[first, last]]).tolist()
+    first, last = seen[0], seen[-1]
+    (u0, v0), (u1, v1) = camera.direction(*points[first]), camera.direction(*points[last])
     length = math.hypot(u1 - u0, v1 - v0)
     if not length > 0:
         return BarSight()

@@ -49,6 +49,11 @@ def test_undistort_is_the_numerical_inverse(x: float, y: float) -> None:
     np.testing.assert_allclose(BENT.distort(found), pixel, atol=1e-6)
 
 
+@pytest.mark.parametrize("camera", [CameraModel(), CameraModel(centre_x_px=611.5, centre_y_px=350.25), BENT])
+def test_a_direction_is_that_of_undistort(camera: CameraModel) -> None:
+    assert camera.direction(701.3, 88.8) == tuple(camera.undistort(np.array([701.3, 88.8])).tolist())
+
+
 @given(st.floats(-0.25, -0.01), st.floats(0, 0.55))
 def test_undistort_of_one_radial_term_is_the_root_of_a_cubic(k1: float, u: float) -> None:
     camera = CameraModel(focal_mm=4.0, k1=k1)
