@@ -611,11 +611,13 @@ class RegionFollower:
         Of bars that frames have shown, each stays as large as it is: where a jolt brings one region over
         another, both are followed, until they follow the same.
         """
+        boxes = [_box_of(followed.latest) for followed in self.alive]
         for i, older in enumerate(self.alive):
-            for younger in self.alive[i + 1 :]:
-                one, other = older.latest, younger.latest
-                if younger.released or not _overlap(_box_of(one), _box_of(other)):
+            for k in range(i + 1, len(boxes)):
+                younger = self.alive[k]
+                if not _overlap(boxes[i], boxes[k]) or younger.released:
                     continue
+                one, other = older.latest, younger.latest
                 shown = older.size_px is not None and younger.size_px is not None
                 apart_px = max(abs(one.x_px - other.x_px), abs(one.y_px - other.y_px))
                 if not shown or apart_px <= SAME_PX:
