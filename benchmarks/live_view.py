@@ -1,6 +1,6 @@
 """What the web view costs the receiver, and how soon it shows something.
 
-    python benchmarks/live_view.py [RECORDING] [--for-s 4] [--rounds 3]
+    python benchmarks/live_view.py [RECORDING] [--for-s 4] [--rounds 3] [--apart]
 
 The recording is received as fast as it goes, again and again until so much camera time is over, in turn
 with nobody looking on and with one who takes all that there is (a process of its own, which draws nothing);
@@ -55,11 +55,13 @@ def look(url: str, most_s: float = 1e9) -> dict[str, float]:
     return seen
 
 
-def received(recording: Path, for_s: float, *, viewed: bool) -> tuple[dict[str, float], dict[str, float]]:
+def received(
+    recording: Path, for_s: float, *, viewed: bool, apart: bool
+) -> tuple[dict[str, float], dict[str, float]]:
     """Times to receive, and what was seen of it."""
     outlet, link = Outlet(), load_link()
     seen: dict[str, float] = {}
-    with Services(Serving(view=viewed), outlet, link, name=recording.name) as services:
+    with Services(Serving(view=viewed, apart=apart), outlet, link, name=recording.name) as services:
         looker = None
         if services.view is not None:
             command = [sys.executable, "-c", LOOK, services.view.url, str(Path(__file__).parent)]
@@ -100,17 +102,18 @@ def main() -> None:
     parser.add_argument("recording", nargs="?", type=Path, default=SHARED)
     parser.add_argument("--for-s", type=float, default=4.0)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--apart", action="store_true", help="the view in a process of its own")
     given = parser.parse_args()
     alone, viewed = [], []
     for _ in range(given.rounds):
-        alone.append(received(given.recording, given.for_s, viewed=False)[0])
-        times, seen = received(given.recording, given.for_s, viewed=True)
+        alone.append(received(given.recording, given.for_s, viewed=False, apart=False)[0])
+        times, seen = received(given.recording, given.for_s, viewed=True, apart=given.apart)
         viewed.append(times)
         rate = seen["pictures"] / times["elapsed_s"]
         print(
             f"alone {alone[-1]['elapsed_s']:.2f} s, viewed {times['elapsed_s']:.2f} s, {rate:.1f} pictures/s"
         )
-    for name, text in (("elapsed_s", "elapsed"), ("processor_s", "processor time, view included")):
+    for name, text in (("elapsed_s", "elapsed"), ("processor_s", "processor time of this process")):
         a, b = (min(one[name] for one in times) for times in (alone, viewed))
         print(f"{text}, best: alone {a:.2f} s, viewed {b:.2f} s, {b / a - 1:+.1%}")
     first_s, seen = started(given.recording, 6.0)

@@ -86,6 +86,12 @@ def live(
         int,
         typer.Option("--view-port", min=0, max=65535, metavar="PORT", help="Its port; 0: any that is free."),
     ] = 0,
+    view_apart: Annotated[
+        bool,
+        typer.Option(
+            "--view-apart", help="The page is served by a process of its own, which costs the receiver less."
+        ),
+    ] = False,
     view_record: Annotated[
         bool,
         typer.Option(
@@ -156,7 +162,7 @@ def live(
         if given is not None and plan is None:
             raise typer.BadParameter("needs --sites", param_hint=name)
     record_to = (Path.cwd() if out is None else out) if view_record else None
-    serving = Serving(view, view_host, view_port, record_to, nmea_port, gpsd_port)
+    serving = Serving(view, view_apart, view_host, view_port, record_to, nmea_port, gpsd_port)
     outlet = Outlet()
     services = Services(
         serving,

@@ -18,7 +18,7 @@ from email.utils import formatdate
 from http import HTTPStatus
 from importlib.resources import files
 from ipaddress import ip_address
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 from urllib.parse import urlsplit
 
 from evlcp_sdk.errors import ConfigError
@@ -26,8 +26,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.budget import LEVELS
 from evlcp_sdk.live.loop import LiveStatus
 from evlcp_sdk.live.outlet import News, Outlet, Subscription
-from evlcp_sdk.live.pictures import Picture, PictureSlot
-from evlcp_sdk.live.recorder import Recorder
+from evlcp_sdk.live.pictures import Picture
 from evlcp_sdk.results.colours import TRANSMITTER_COLOURS, cluster_colours
 from evlcp_sdk.results.lines import fix_line, frame_line
 from evlcp_sdk.results.packets_jsonl import message_line
@@ -40,10 +39,11 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
     from websockets.http11 import Request, Response
 
-__all__ = ["Viewer", "page"]
+__all__ = ["PictureGiver", "RecordKeeper", "Viewer", "page"]
 
 PICTURES_PER_S: Final = 25
-_MOST_WAITING: Final = 4000
+KINDS_SHOWN: Final = frozenset({"frame", "message", "fix", "status", "end"})
+MOST_WAITING: Final = 4000
 """Results that wait for a browser, some seconds of two bars; the oldest go."""
 _MOST_BROWSERS: Final = 16
 _FINISH_S: Final = 1.0
@@ -69,7 +69,7 @@ class _Browser:
     """
 
     socket: "ServerConnection"
-    waiting: deque[str] = field(default_factory=lambda: deque(maxlen=_MOST_WAITING))
+    waiting: deque[str] = field(default_factory=lambda: deque(maxlen=MOST_WAITING))
     dropped: int = 0
     ready: bool = False
     picture: int = -1
@@ -78,6 +78,31 @@ class _Browser:
         """Have something sent; of a queue that is full the oldest goes."""
         self.dropped += len(self.waiting) == self.waiting.maxlen
         self.waiting.append(text)
+
+
+class PictureGiver(Protocol):
+    """Where a view has pictures from: a `PictureSlot`, or one of another process."""
+
+    def ask(self) -> None:
+        """Have a picture drawn."""
+
+    @property
+    def newest(self) -> Picture | None:
+        """The last picture that was drawn."""
+
+
+class RecordKeeper(Protocol):
+    """What records as browsers ask: a `Recorder`, or one of another process."""
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """As of `Recorder`."""
+
+    def start(self) -> None:
+        """Begin a file."""
+
+    def stop(self) -> None:
+        """End the file."""
 
 
 class Viewer:
@@ -101,14 +126,14 @@ class Viewer:
     def __init__(
         self,
         outlet: Outlet,
-        pictures: PictureSlot,
+        pictures: PictureGiver,
         link: Link,
         *,
         name: str,
         sites: Sequence[BarSite] = (),
         host: str = "127.0.0.1",
         port: int = 0,
-        recorder: Recorder | None = None,
+        recorder: RecordKeeper | None = None,
     ) -> None:
         self._outlet, self._pictures, self._recorder = outlet, pictures, recorder
         self._name, self._link, self._sites = name, link, tuple(sites)
@@ -150,8 +175,7 @@ class Viewer:
                 "websockets is not installed; it comes with the extra: pip install 'evlcp-sdk[live]'"
             ) from fault
         self._body = page(self._name).encode()
-        kinds = {"frame", "message", "fix", "status", "end"}
-        mine = self._mine = self._outlet.subscribe(kinds, most=_MOST_WAITING)
+        mine = self._mine = self._outlet.subscribe(KINDS_SHOWN, most=MOST_WAITING)
         try:
             server: Server = await serve(
                 self._serve,
