@@ -296,5 +296,5 @@ def check_link(truth: Truth, link: Link | Mapping[str, Link], name: str, *, mess
             ]
             if all(found):
                 # Of several, by the one that is most alike.
-                told = "; ".join(min(found, key=lambda texts: len(texts)))
-                raise ConfigError(f"{name}: bar {i} was sent with another link: {told}")
+                nearest = min(found, key=len)
+                raise ConfigError(f"{name}: bar {i} was sent with another link: {'; '.join(nearest)}")
