@@ -36,6 +36,7 @@ from evlcp_sdk.place.pose import solve_pose
 from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
+from evlcp_sdk.study.tally import SILENT_NEES
 
 Floats = NDArray[np.float64]
 
@@ -43,9 +44,6 @@ CAMERA = CameraModel()
 SPEC = PositionSpec()
 POINT_PX = math.hypot(0.05, SPEC.pixel_sigma_px)
 ALONG = (0.5 - (np.arange(16) + 0.5) / 16) * 0.96
-BOUND = 14.156
-"""99.73 % of chi squared with 3 degrees of freedom."""
-
 CHANCE = 0.0027
 """What is beyond it by chance. For .001, covariances are 16.27 / 14.16 times as large, and NEES is 2.6."""
 
@@ -188,7 +186,7 @@ def row(world: World, fault: Fault | None, fixes: int, seed: int, spec: Position
         allowed += 1
         left_out += bool(found.excluded)
         squares.append(square(found))
-        hidden = squares[-1] > BOUND
+        hidden = squares[-1] > SILENT_NEES
         if math.isfinite(found.hpl_m) and math.isfinite(found.vpl_m):
             protected += 1
             hpl.append(found.hpl_m)
@@ -198,7 +196,7 @@ def row(world: World, fault: Fault | None, fixes: int, seed: int, spec: Position
             beyond += outside
             covered += hidden and not outside
     given = max(len(squares), 1)
-    silent = int((np.array(squares) > BOUND).sum())
+    silent = int((np.array(squares) > SILENT_NEES).sum())
     return {
         "NEES": float(np.mean(squares)) if squares else math.nan,
         "kept": len(squares) / max(allowed, 1),
