@@ -133,8 +133,8 @@ class _BagBytes:
     def _encoding_of(self, packet: EventPacket) -> None:
         if packet.encoding != "evt3":
             raise InputError(
-                f"{self._path}: packets of encoding {packet.encoding!r}, expected 'evt3', as metavision_driver"
-                " records"
+                f"{self._path}: packets of encoding {packet.encoding!r}, expected 'evt3', as"
+                " metavision_driver records"
             )
 
     def close(self) -> None:
