@@ -9,7 +9,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test ready lint kernels docs notebooks fuzz sbom release format pictures clean
+.PHONY: help demo test ready lint kernels docs notebooks fuzz sbom wheel release format pictures clean
 
 help:  ## Show this list
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -31,14 +31,7 @@ lint: $(VENV)/.dev  ## Format, lint and types only
 
 # What the tests' workers would each compile at once. Whether it works is theirs to find.
 kernels: $(VENV)/.dev
-	@folder=$$(mktemp -d); \
-	  $(BIN)/evlcp receive examples/recordings/night-50m-30kmh-cut.raw -o $$folder/out >/dev/null 2>&1; \
-	  $(BIN)/evlcp simulate --preset night --set duration_s=0.01 -o $$folder/night.raw >/dev/null 2>&1; \
-	  rm -rf $$folder
-
-docs: $(VENV)/.dev  ## Build the documentation site; site/index.html
-	$(BIN)/python -m sphinx -q -W --keep-going -d .sphinx docs site
-	@echo "open site/index.html"
+	@$(BIN)/evlcp warm-up >/dev/null 2>&1 || true
 
 notebooks: $(VENV)/.dev  ## Run the notebooks of the docs and keep what they show
 	$(BIN)/python docs/run_notebooks.py
@@ -46,6 +39,10 @@ notebooks: $(VENV)/.dev  ## Run the notebooks of the docs and keep what they sho
 MINUTES ?= 5
 fuzz: $(VENV)/.dev  ## Damage files of every kind and read them, for MINUTES
 	$(BIN)/python -m tests.fuzz --minutes $(MINUTES)
+
+wheel: $(VENV)/.dev  ## Build dist/*.whl with kernels compiled for x86-64-v3
+	$(BIN)/python .ci/kernels.py
+	EVLCP_KERNELS=build/kernels $(BIN)/python -m hatchling build -t wheel
 
 sbom: $(VENV)/.dev  ## Write sbom.json, what the tests run with, from the lock
 	$(BIN)/python .ci/sbom.py > sbom.json

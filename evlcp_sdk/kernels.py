@@ -1,32 +1,47 @@
-"""What every kernel is compiled with: numba, its cache where there can be one, and a process to compile in.
+"""What every kernel is compiled with: numba, its cache where there can be one, a process to compile in.
+
+A wheel may hold compiled kernels (`pack`): they are taken where Numba, Python and the processor are those
+that they were made for and their source is the same; else they are compiled, as they are without.
 
 LLVM keeps most of what it took to compile, some 300 MB for all kernels of the receiver. A kernel that goes
 into the cache is therefore compiled by a child, which ends when it has grown, and loaded from there.
 """
 
+import fcntl
 import gc
+import hashlib
 import importlib
 import logging
 import os
+import pickle
+import platform
 import signal
 import sys
 import threading
 import time
 import warnings
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cached_property, wraps
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NoReturn, TypeVar
 
+import llvmlite
+import llvmlite.binding
 import numba
+import numpy as np
 from numba.core.caching import FunctionCache
+from numba.core.compiler import CompileResult
 from numba.core.event import Event, Listener, register, trigger_event
+from numba.core.serialize import dumps
 from numba.core.sigutils import normalize_signature
 
 from evlcp_sdk.signals import ENDING
 
-__all__ = ["njit"]
+__all__ = ["njit", "pack"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -39,50 +54,272 @@ _LONG_S = 2.0
 _IDLE_S = 5.0
 """How long a child waits for another kernel."""
 
+_FEATURES = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "popcnt", "xsave")
+"""What a processor of level x86-64-v3 has, for which kernels are packed."""
+
 
 def njit(*, cache: bool = False, **options: Any) -> Callable[[F], F]:
     """As `numba.njit`, but a cache that cannot be written or read does not matter.
 
     Where the package is installed read-only and there is no home, or on a full disk, kernels are compiled in
-    each process. Where they can be kept, a child of it compiles them, unless it has threads.
+    each process. Where they can be kept, a child of it compiles them, unless it has threads; of several
+    processes one compiles a kernel, and the others wait for it.
+
+    A name with an underscore is called by kernels alone, never from Python: what that takes is left out, as
+    what calls from C would take.
     """
 
     def compile_(function: F) -> F:
-        kernel = numba.njit(**options)(function)
-        # numba says so by a RuntimeError where it finds no folder.
-        with suppress(RuntimeError, OSError):
-            if cache:
-                kernel._cache = _Cache(function)
+        inner = function.__name__.startswith("_")
+        all_options: dict[str, Any] = options | {"no_cfunc_wrapper": True, "no_cpython_wrapper": inner}
+        kernel = numba.njit(**all_options)(function)
+        if cache:
+            kernel._cache = kept = _Cache(function)
+            kernel.compile = kept.guarded(kernel.compile)
+        if inner:
+            # Numba would call what there is not.
+            kernel._insert = lambda *_, **__: None
+            kernel._compile_for_args = _refuse
         compiled: F = kernel
         return compiled
 
     return compile_
 
 
-class _Cache(FunctionCache):
-    """A cache whose files may be refused at any time, and that has kernels compiled that are not in it."""
+def _refuse(*_: object, **__: object) -> NoReturn:
+    raise TypeError("a kernel whose name has an underscore is called by kernels alone")
+
+
+def pack(folder: Path) -> Path:
+    """Write what is kept of the kernels that this process has imported into a file, and return its path.
+
+    It is for a wheel's `evlcp_sdk/data/kernels`. All is to be compiled for the processor's level, with
+    `NUMBA_CPU_NAME=x86-64-v3` and `NUMBA_CPU_FEATURES=+avx2`.
+    """
+    places: dict[tuple[str, str, str], tuple[int, int]] = {}
+    sources: dict[str, bytes] = {}
+    parts: list[bytes] = []
+    at = 0
+    for module in [m for name, m in sorted(sys.modules.items()) if name.endswith("_kernels")]:
+        for name, kernel in sorted(vars(module).items()):
+            if kernel is None or not isinstance(getattr(kernel, "_cache", None), _Cache):
+                continue
+            if kernel.py_func.__module__ != module.__name__:
+                continue
+            for args, state in kernel._cache.kept(kernel.targetctx):
+                # What it says of types names this machine's files.
+                state = (*state[:6], "", *state[7:])
+                part = zlib.compress(dumps(state), 9)  # type: ignore[no-untyped-call]
+                places[module.__name__, name, str(args)] = (at, len(part))
+                parts.append(part)
+                at += len(part)
+            sources[module.__name__] = _digest(module)
+    head = pickle.dumps((places, sources))
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / _name_of_pack()
+    path.write_bytes(len(head).to_bytes(8, "little") + head + b"".join(parts))
+    return path
+
+
+def _name_of_pack() -> str:
+    """File of packed kernels for this Python, Numba and NumPy."""
+    return (
+        f"{sys.implementation.cache_tag}-numba{numba.__version__}-llvmlite{llvmlite.__version__}"
+        f"-numpy{np.__version__.split('.')[0]}-x86-64-v3.bin"
+    )
+
+
+def _digest(module: ModuleType) -> bytes:
+    """Of its source."""
+    assert module.__file__ is not None
+    return hashlib.sha256(Path(module.__file__).read_bytes()).digest()
+
+
+class _Packed:
+    """The kernels that came with the package, if there are any for this machine; read when one is needed."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._places: dict[tuple[str, str, str], tuple[int, int]] | None = None
+        self._sources: dict[str, bytes] = {}
+        self._same: dict[str, bool] = {}
+        self._file = -1
+        self._begin = 0
+
+    def find(self, module: str, name: str, args: Any, target_context: Any) -> Any:
+        """A kernel for argument types, or None."""
+        try:
+            if self._places is None:
+                self._places = self._read()
+            place = self._places.get((module, name, str(args)))
+            if place is None or not self._is_same(module):
+                return None
+            part = os.pread(self._file, place[1], self._begin + place[0])
+            state = pickle.loads(zlib.decompress(part))
+            target_context.refresh()
+            return CompileResult._rebuild(target_context, *state)  # type: ignore[no-untyped-call]
+        except Exception:
+            # Whatever is wrong with the file: kernels are compiled as if it were not there.
+            self._places = {}
+            return None
+
+    def _read(self) -> dict[tuple[str, str, str], tuple[int, int]]:
+        path = self._folder / _name_of_pack()
+        if not (path.exists() and _is_usual()):
+            return {}
+        self._file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        size = int.from_bytes(os.pread(self._file, 8, 0), "little")
+        places, self._sources = pickle.loads(os.pread(self._file, size, 8))
+        self._begin = 8 + size
+        found: dict[tuple[str, str, str], tuple[int, int]] = places
+        return found
+
+    def _is_same(self, module: str) -> bool:
+        if module not in self._same:
+            self._same[module] = self._sources[module] == _digest(sys.modules[module])
+        return self._same[module]
+
+
+def _is_usual() -> bool:
+    """Whether this processor runs packed kernels, and nobody wants them compiled in another way."""
+    if sys.platform != "linux" or platform.machine() != "x86_64":
+        return False
+    own = {"NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS"}
+    if any(name.startswith("NUMBA_") and name not in own for name in os.environ):
+        return False
+    has = llvmlite.binding.get_host_cpu_features()
+    return all(has.get(feature, False) for feature in _FEATURES)
+
+
+_PACKED = _Packed(Path(__file__).parent / "data" / "kernels")
+
+
+class _Cache:
+    """Where a kernel is looked for: among those of the package, in a folder, by having it compiled.
+
+    Args:
+        function: What is to be compiled.
+    """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        super().__init__(function)  # type: ignore[no-untyped-call]
         self._place = (function.__module__, function.__qualname__)
+        self._function = function
+        self._locked: list[tuple[int, int]] = []
+
+    @cached_property
+    def _folder(self) -> "_Folder | None":
+        """Found when a kernel is used: Numba tries to write into it."""
+        # numba says so by a RuntimeError where it finds no folder.
+        with suppress(RuntimeError, OSError):
+            return _Folder(self._function)  # type: ignore[no-untyped-call]
+        return None
+
+    @property
+    def cache_path(self) -> str | None:
+        """Folder of what is kept."""
+        return None if self._folder is None else self._folder.cache_path
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The kernel for a signature; None where it is to be compiled here."""
-        found = self._kept(sig, target_context)
-        if found is None and self._enabled and _COMPILER.is_ready():
+        args, _ = normalize_signature(sig)  # type: ignore[no-untyped-call]
+        found = _PACKED.find(*self._place, args, target_context)
+        if found is not None or self._folder is None:
+            return found
+        found = self._folder.load_overload(sig, target_context)
+        if found is None and _COMPILER.is_ready():
             with trigger_event("numba:compile"):
                 compiled = _COMPILER.compile(*self._place, sig)
-            found = self._kept(sig, target_context) if compiled else None
+            found = self._folder.load_overload(sig, target_context) if compiled else None
+        if found is None and self._lock():
+            found = self._folder.load_overload(sig, target_context)
         return found
 
-    def _kept(self, sig: Any, target_context: Any) -> Any:
-        """What the cache has for a signature.
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep a kernel that was compiled here."""
+        if self._folder is not None:
+            self._folder.save_overload(sig, data)  # type: ignore[no-untyped-call]
+
+    def kept(self, target_context: Any) -> Iterator[tuple[Any, tuple[Any, ...]]]:
+        """Argument types and state of all that the folder has of the kernel for this processor."""
+        if self._folder is not None:
+            yield from self._folder.states(target_context)
+
+    def guarded(self, compile_: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """A kernel's `compile`, after which others may compile it."""
+
+        @wraps(compile_)
+        def guarded(sig: Any) -> Any:
+            held = len(self._locked)
+            try:
+                return compile_(sig)
+            finally:
+                while len(self._locked) > held:
+                    _LOCKS.let_go(*self._locked.pop())
+
+        return guarded
+
+    def _lock(self) -> bool:
+        """Wait until no other process compiles this kernel; False where that cannot be known."""
+        assert self._folder is not None
+        held = _LOCKS.take(self._folder.cache_path, self._place[1])
+        if held is not None:
+            self._locked.append(held)
+        return held is not None
+
+
+class _Locks:
+    """A byte for each kernel in one file a folder, locked by the process that compiles it.
+
+    A process that ends lets go. Kernels that call one another in a circle there are none, so nobody waits for
+    whoever waits for them; where two share a byte the system says so, and both compile.
+    """
+
+    def __init__(self) -> None:
+        self._files: dict[str, int] = {}
+        self._home = os.getpid()
+
+    def take(self, folder: str, name: str) -> tuple[int, int] | None:
+        """Wait for a kernel's byte; None where files cannot be locked."""
+        if self._home != os.getpid():
+            # Locks are not inherited, but closing a file of the parent's lets none of its locks go either.
+            self._files, self._home = {}, os.getpid()
+        try:
+            if folder not in self._files:
+                flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
+                self._files[folder] = os.open(f"{folder}/kernels.lock", flags, 0o644)
+            file, at = self._files[folder], zlib.crc32(name.encode())
+            fcntl.lockf(file, fcntl.LOCK_EX, 1, at)
+        except OSError:
+            return None
+        return file, at
+
+    def let_go(self, file: int, at: int) -> None:
+        """Let others have it."""
+        with suppress(OSError):
+            fcntl.lockf(file, fcntl.LOCK_UN, 1, at)
+
+
+_LOCKS = _Locks()
+
+
+class _Folder(FunctionCache):
+    """A kernel's files, which may be refused at any time."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """What the folder has for a signature.
 
         Two processes that keep a kernel at the same time may take the same file for two signatures.
         """
         found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         wanted, _ = normalize_signature(sig)  # type: ignore[no-untyped-call]
         return None if found is None or tuple(found.signature.args) != tuple(wanted) else found
+
+    def states(self, target_context: Any) -> Iterator[tuple[Any, tuple[Any, ...]]]:
+        """Argument types and state of each kernel in it for this processor."""
+        for key, name in self._cache_file._load_index().items():  # type: ignore[no-untyped-call]
+            args, _ = normalize_signature(key[0])  # type: ignore[no-untyped-call]
+            if key == self._index_key(key[0], target_context.codegen()):  # type: ignore[no-untyped-call]
+                yield args, self._cache_file._load_data(name)  # type: ignore[no-untyped-call]
 
     @contextmanager
     def _guard_against_spurious_io_errors(self) -> Iterator[None]:
@@ -115,7 +352,7 @@ class _Patience(Listener):
     def _tell(self) -> None:
         if self._spent_s > _LONG_S and not self._told:
             self._told = True
-            logging.getLogger(__name__).info("compiling kernels, once on a machine; half a minute in all")
+            logging.getLogger(__name__).info("compiling kernels, once on a machine; up to a minute in all")
 
 
 class _Compiler:

@@ -73,6 +73,7 @@ def make_app() -> typer.Typer:
         survey,
         sweep,
         video,
+        warm_up,
     )
 
     app = typer.Typer(
@@ -85,7 +86,7 @@ def make_app() -> typer.Typer:
     )
     app.callback()(_root)
     first = (receive, live, serve, video, info, diagnose, compare, simulate, score, sweep, report, demo)
-    for module in (*first, calibrate, survey, config, plugins, check):
+    for module in (*first, calibrate, survey, config, plugins, check, warm_up):
         module.register(app)
     return app
 

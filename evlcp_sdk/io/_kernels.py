@@ -218,7 +218,7 @@ def _unlevel(
 @njit(cache=True, nogil=True)
 def _realign(shift: Integer, here: Integer, state: Column, tally: Column) -> None:
     """Pass over bytes; what follows has no time before the next TIME_HIGH."""
-    _note(tally, REALIGNED, here)
+    _note(tally, int64(REALIGNED), here)
     tally[REALIGNED, 0] += shift - 1
     state[ASKEW] = shift
     state[DOUBT] = 1
@@ -260,7 +260,7 @@ def _pack_evt3(
             left = max(left - 1, 0) if size == 12 else 0
         elif kind == EVT3_VECT_BASE_X:
             if left:
-                _note(tally, VECTOR_CUT, vector_at)
+                _note(tally, int64(VECTOR_CUT), vector_at)
             column = w & 0x7FF
             polarity = (w >> 11) & 1
             left = 3
@@ -346,7 +346,7 @@ def _sift(
         first = at
         if tally[row, 0] == 0:
             first += 2 * _word_of_event(words, word, k - start)
-        _note(tally, row, first)
+        _note(tally, int64(row), int64(first))
     return n
 
 
@@ -375,9 +375,9 @@ def _word_of_event(words: Column, word: Integer, event: Integer) -> Integer:
 def _note_other(kind: Integer, at: Integer, tally: Column) -> None:
     """Take note of an EVT3 word that brings neither event nor time."""
     if kind in (EVT3_OTHERS, EVT3_CONTINUED_4, EVT3_CONTINUED_12):
-        _note(tally, OTHER_WORDS, at)
+        _note(tally, int64(OTHER_WORDS), at)
     else:
-        _note(tally, RESERVED, at)
+        _note(tally, int64(RESERVED), at)
 
 
 @njit(cache=True, nogil=True)
@@ -428,7 +428,7 @@ def decode_evt3(
     i = 0
     if state[BASE] < 0:
         while i < len(words) and words[i] >> 12 != EVT3_TIME_HIGH:
-            _note(tally, BEFORE_TIME, at + 2 * i)
+            _note(tally, int64(BEFORE_TIME), at + 2 * i)
             i += 1
         if i < len(words):
             state[BASE] = 0
@@ -440,7 +440,7 @@ def decode_evt3(
             start = i
             i, count = _pack_evt3(words, i, i + 1, at, state, tally, packed)
             for _ in range(count):
-                _note(tally, TIME_DOUBTFUL, at + 2 * start)
+                _note(tally, int64(TIME_DOUBTFUL), at + 2 * start)
             if i == start:
                 kind = words[i] >> 12
                 if not (EVT3_TYPES >> kind) & 1:
@@ -448,7 +448,7 @@ def decode_evt3(
                     if askew:
                         break
                 if kind == EVT3_EXT_TRIGGER:
-                    _note(tally, TIME_DOUBTFUL, at + 2 * i)
+                    _note(tally, int64(TIME_DOUBTFUL), at + 2 * i)
                 else:
                     _note_other(kind, at + 2 * i, tally)
                 i += 1
@@ -481,13 +481,13 @@ def decode_evt3(
                 break
             state[DOUBT] = int64(verdict == 0)
             if verdict != 1:
-                _note(tally, TIME_GLITCH, here)
+                _note(tally, int64(TIME_GLITCH), here)
             if verdict:
                 if verdict == 1 and high < before:
-                    _note(tally, ROLLOVERS, here)
+                    _note(tally, int64(ROLLOVERS), here)
                     state[BASE] += 1 << 24
                 if verdict == 1 and (high - before) & 0xFFF > 1:
-                    _note(tally, TIME_GAPS, here)
+                    _note(tally, int64(TIME_GAPS), here)
                 if verdict == 2 and high > before:
                     state[BASE] -= 1 << 24
                 if high != before:
@@ -495,7 +495,7 @@ def decode_evt3(
         elif kind == EVT3_EXT_TRIGGER:
             clock = state[BASE] + (state[PACKED] >> PACKED_LOW)
             if clock < state[LAST]:
-                _note(tally, TIME_BACKWARD, here)
+                _note(tally, int64(TIME_BACKWARD), here)
             else:
                 trigger_t[m], channel[m], value[m] = clock, (w >> 8) & 0xF, w & 1
                 state[LAST] = clock
@@ -562,42 +562,42 @@ def decode_evt2(
                 break
             doubt = int64(verdict == 0)
             if verdict != 1:
-                _note(tally, TIME_GLITCH, here)
+                _note(tally, int64(TIME_GLITCH), here)
             if verdict:
                 if verdict == 1 and high < before:
-                    _note(tally, ROLLOVERS, here)
+                    _note(tally, int64(ROLLOVERS), here)
                     base += 1 << 34
                 if verdict == 2 and high > before:
                     base -= 1 << 34
                 base += (high - before) << 6
         elif base < 0:
-            _note(tally, BEFORE_TIME, here)
+            _note(tally, int64(BEFORE_TIME), here)
         elif doubt and (kind <= EVT2_CD_ON or kind == EVT2_EXT_TRIGGER):
-            _note(tally, TIME_DOUBTFUL, here)
+            _note(tally, int64(TIME_DOUBTFUL), here)
         elif kind <= EVT2_CD_ON:
             if column >= width or row >= height:
-                _note(tally, OUTSIDE_SENSOR, here)
+                _note(tally, int64(OUTSIDE_SENSOR), here)
             elif clock < last:
-                _note(tally, TIME_BACKWARD, here)
+                _note(tally, int64(TIME_BACKWARD), here)
             else:
                 t[n], x[n], y[n], p[n] = clock, column, row, kind
                 last = clock
                 n += 1
         elif kind == EVT2_EXT_TRIGGER:
             if clock < last:
-                _note(tally, TIME_BACKWARD, here)
+                _note(tally, int64(TIME_BACKWARD), here)
             else:
                 trigger_t[m], channel[m], value[m] = clock, (w >> 8) & 0x1F, w & 1
                 last = clock
                 m += 1
         elif kind in (EVT2_OTHERS, EVT2_CONTINUED):
-            _note(tally, OTHER_WORDS, here)
+            _note(tally, int64(OTHER_WORDS), here)
         else:
             askew = _unlevel(words, i - 1, at, 4, EVT2_TYPES, 6, state, final)
             if askew:
                 i -= 1
                 break
-            _note(tally, RESERVED, here)
+            _note(tally, int64(RESERVED), here)
     state[BASE], state[LAST], state[DOUBT] = base, last, doubt
     if askew > 0:
         _realign(askew, at + 4 * i, state, tally)

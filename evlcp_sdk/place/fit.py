@@ -2,13 +2,18 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.place import _kernels
+from evlcp_sdk.late import Late
 from evlcp_sdk.place.observations import Problem
+
+if TYPE_CHECKING:
+    from evlcp_sdk.place import _kernels
+else:
+    _kernels = Late("evlcp_sdk.place._kernels")
 
 __all__ = ["FOCAL_FAULT", "STEPS", "Fit", "data", "fit_pose"]
 

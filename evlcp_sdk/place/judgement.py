@@ -8,16 +8,21 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.place import _kernels
+from evlcp_sdk.late import Late
 from evlcp_sdk.place.chances import chi_square
 from evlcp_sdk.place.fit import Fit, data
 from evlcp_sdk.place.observations import Problem
 from evlcp_sdk.place.refusals import Refusal
+
+if TYPE_CHECKING:
+    from evlcp_sdk.place import _kernels
+else:
+    _kernels = Late("evlcp_sdk.place._kernels")
 
 __all__ = ["FOCAL", "Judged", "Pose", "judged", "misfits"]
 

@@ -3,16 +3,21 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import PositionSpec
-from evlcp_sdk.place import _kernels
 from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
+
+if TYPE_CHECKING:
+    from evlcp_sdk.place import _kernels
+else:
+    _kernels = Late("evlcp_sdk.place._kernels")
 
 __all__ = ["EXACT_RAD", "BarView", "Problem", "project_bars", "shared_sigmas"]
 

@@ -1,14 +1,20 @@
 """Positions and attitudes to fit from: in closed form, then fitted to a few points."""
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.place import _kernels
+from evlcp_sdk.late import Late
 from evlcp_sdk.place.chances import chi_square
 from evlcp_sdk.place.fit import STEPS, Fit, fit_pose
 from evlcp_sdk.place.observations import Problem
+
+if TYPE_CHECKING:
+    from evlcp_sdk.place import _kernels
+else:
+    _kernels = Late("evlcp_sdk.place._kernels")
 
 __all__ = ["ODDS", "is_hopeless", "likely_starts", "three_point_poses"]
 

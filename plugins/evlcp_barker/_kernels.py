@@ -20,9 +20,16 @@ def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, known: Arra
     bins = counts.shape[1]
     before = min(known.shape[1], bins)
     for row in range(2):
-        counts[row, :before] = known[row, :before]
-        counts[row, before:] = 0.0
-    i = np.searchsorted(t_us, first_bin * bin_us)
+        for b in range(bins):
+            counts[row, b] = known[row, b] if b < before else 0.0
+    first_us = first_bin * bin_us
+    i, after = 0, t_us.size
+    while i < after:
+        middle = (i + after) // 2
+        if t_us[middle] < first_us:
+            i = middle + 1
+        else:
+            after = middle
     # Time never runs backward, so each bin goes on where the last one ended.
     for b in range(bins):
         if i == t_us.size:

@@ -21,8 +21,10 @@ def cell_medians(selected: Array, out: Array) -> None:
     by_row = np.empty(rows, np.int64)
     by_column = np.empty(columns, np.int64)
     for k in range(clusters):
-        by_row[:] = 0
-        by_column[:] = 0
+        for r in range(rows):
+            by_row[r] = 0
+        for c in range(columns):
+            by_column[c] = 0
         for r in range(rows):
             row = selected[k, r]
             for c in range(columns):
@@ -37,7 +39,10 @@ def cell_medians(selected: Array, out: Array) -> None:
 @njit(cache=True, nogil=True)
 def _middle(counts: Array) -> float:
     """Median of the numbers 0, 1, ... that occur `counts` times; NaN of none."""
-    half = counts.sum() / 2
+    many = 0
+    for i in range(counts.size):
+        many += counts[i]
+    half = many / 2
     if half == 0:
         return np.nan
     total = 0.0
@@ -66,7 +71,8 @@ def cells_in_place(
     first, spacing, left, tilt = line
     clusters, rows, columns = selected.shape
     half = across.size // 2
-    across[:] = 0
+    for i in range(across.size):
+        across[i] = 0
     for k in range(clusters):
         expected = first + k * spacing
         top, bottom = max(int(np.ceil(expected - reach)), 0), min(int(expected + reach), rows - 1)
@@ -87,15 +93,45 @@ def cells_in_place(
 def straight(x: Array, y: Array) -> tuple[float, float]:
     """Slope and intercept of the line through the medians (Theil-Sen), robust against outliers."""
     n = x.size
-    slopes = np.empty(n * (n - 1) // 2)
+    values = np.empty(max(n * (n - 1) // 2, n))
     m = 0
     for i in range(n):
         for j in range(i + 1, n):
             if abs(x[j] - x[i]) > 1e-9:
-                slopes[m] = (y[j] - y[i]) / (x[j] - x[i])
+                values[m] = (y[j] - y[i]) / (x[j] - x[i])
                 m += 1
-    slope = np.median(slopes[:m]) if m else 0.0
-    return slope, np.median(y - slope * x)
+    slope = _median(values, m) if m else 0.0
+    for i in range(n):
+        values[i] = y[i] - slope * x[i]
+    return slope, _median(values, n)
+
+
+@njit(cache=True, nogil=True)
+def _median(values: Array, n: int) -> float:
+    """Median of the first n values, which it reorders (Hoare's selection)."""
+    middle = n // 2
+    low, high = 0, n - 1
+    while low < high:
+        pivot, i, j = values[middle], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if j < middle:
+            low = i
+        if middle < i:
+            high = j
+    if n % 2:
+        return float(values[middle])
+    below = values[0]
+    for i in range(1, middle):
+        below = max(below, values[i])
+    return float((below + values[middle]) / 2)
 
 
 @njit(cache=True, nogil=True)
@@ -105,7 +141,10 @@ def core_of(counts: Array) -> tuple[float, float]:
     The middle is given from that of `counts`. Stray cells beside a bar, and the dimmer ones of its
     reflection, are fewer or apart.
     """
-    peak = np.argmax(counts)
+    peak = 0
+    for i in range(1, counts.size):
+        if counts[i] > counts[peak]:
+            peak = i
     low, high = peak, peak
     while low > 0 and counts[low - 1] >= 0.3 * counts[peak]:
         low -= 1
@@ -117,13 +156,16 @@ def core_of(counts: Array) -> tuple[float, float]:
 @njit(cache=True, nogil=True)
 def lies_across(middles: Array) -> bool:
     """Whether middles (row, column) spread over more columns than rows; NaN are passed over."""
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for k in range(len(middles)):
-        for a in range(2):
+    extent_of_rows = 0.0
+    for a in range(2):
+        low, high = np.inf, -np.inf
+        for k in range(len(middles)):
             if not np.isnan(middles[k, a]):
-                low[a] = min(low[a], middles[k, a])
-                high[a] = max(high[a], middles[k, a])
-    return bool(high[1] - low[1] > high[0] - low[0])
+                low = min(low, middles[k, a])
+                high = max(high, middles[k, a])
+        if a == 0:
+            extent_of_rows = high - low
+    return bool(high - low > extent_of_rows)
 
 
 @njit(cache=True, nogil=True)
@@ -135,26 +177,28 @@ def line_of_cells(selected: Array, middles: Array, line: Array, seen: Array) -> 
     `seen` (K,) says which clusters have cells in their place.
     """
     clusters = len(selected)
-    known = np.flatnonzero(~np.isnan(middles[:, 0]))
-    if known.size < 3:
+    places, by_row, by_column = np.empty(clusters), np.empty(clusters), np.empty(clusters)
+    n = _known(middles, places, by_row, by_column)
+    if n < 3:
         return False
-    spacing, first = straight(known, middles[known, 0])
-    tilt, left = straight(middles[known, 0], middles[known, 1])
+    spacing, first = straight(places[:n], by_row[:n])
+    tilt, left = straight(by_row[:n], by_column[:n])
     # Cells as wide as the bar is long are looked at: it is narrower.
-    counts = np.zeros(2 * int(abs(spacing) * clusters / 2) + 3, np.int64)
+    counts = np.empty(2 * int(abs(spacing) * clusters / 2) + 3, np.int64)
     found = np.empty((clusters, 2))
     # A cluster is as long as the spacing; half of it and a cell of blur.
     reach = abs(spacing) / 2 + 1
     cells_in_place(selected, (first, spacing, left, tilt), reach, counts, found)
     shift, half = core_of(counts)
-    counts = np.zeros(2 * int(half + 1) + 1, np.int64)
+    counts = np.empty(2 * int(half + 1) + 1, np.int64)
     cells_in_place(selected, (first, spacing, left + shift, tilt), reach, counts, found)
-    seen[:] = ~np.isnan(found[:, 0])
-    known = np.flatnonzero(seen)
-    if known.size < 3:
+    for k in range(clusters):
+        seen[k] = not np.isnan(found[k, 0])
+    n = _known(found, places, by_row, by_column)
+    if n < 3:
         return False
-    line[1], line[0] = straight(known, found[known, 0])
-    line[3], line[2] = straight(found[known, 0], found[known, 1])
+    line[1], line[0] = straight(places[:n], by_row[:n])
+    line[3], line[2] = straight(by_row[:n], by_column[:n])
     line[4] = half
     return True
 
@@ -171,19 +215,36 @@ def lie_of_cells(selected: Array, line: Array, seen: Array) -> int:
 
 
 @njit(cache=True, nogil=True)
+def _known(middles: Array, places: Array, by_row: Array, by_column: Array) -> int:
+    """How many clusters have a middle; which, and its row and column, come first in the others."""
+    n = 0
+    for k in range(len(middles)):
+        if not np.isnan(middles[k, 0]):
+            places[n], by_row[n], by_column[n] = k, middles[k, 0], middles[k, 1]
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
 def codes_said(pilots: Array, words: Array, symbols: Array, seen: Array, codes: Array, known: Array) -> None:
     """What each cluster says in a frame, `codes` (K, values), and between which it is known, (K + 1, values).
 
     A boundary lies between clusters that are seen; in info values, those whose symbol is known, too.
     """
     clusters, first = pilots.shape
-    known[:] = False
+    boundaries, values = known.shape
+    for k in range(boundaries):
+        for i in range(values):
+            known[k, i] = False
     for k in range(clusters):
-        codes[k, :first] = pilots[k]
-        codes[k, first:] = words[max(symbols[k], 0)]
+        for i in range(first):
+            codes[k, i] = pilots[k, i]
+        for i in range(first, values):
+            codes[k, i] = words[max(symbols[k], 0), i - first]
         if k > 0 and seen[k] and seen[k - 1]:
-            known[k, :first] = True
-            known[k, first:] = symbols[k] >= 0 and symbols[k - 1] >= 0
+            said = symbols[k] >= 0 and symbols[k - 1] >= 0
+            for i in range(values):
+                known[k, i] = i < first or said
 
 
 @njit(cache=True, nogil=True)
@@ -195,7 +256,8 @@ def column_light(sums: Array, line: Array, top: int, bottom: int, full: float, o
     """
     chips, _, width = sums.shape
     half, share = out.size // 2, 1 / full
-    out[:] = 0.0
+    for u in range(out.size):
+        out[u] = 0.0
     for v in range(top, bottom + 1):
         centre = int(np.rint(line[0] + line[1] * v))
         first, last = max(centre - half, 0), min(centre + half, width - 1)
@@ -207,7 +269,8 @@ def column_light(sums: Array, line: Array, top: int, bottom: int, full: float, o
             row = sums[i, v, first : last + 1]
             for u in range(row.size):
                 light[u] += min(abs(row[u]) * share, 1.0)
-    out /= max((bottom - top + 1) * (chips // 2), 1)
+    for u in range(out.size):
+        out[u] /= max((bottom - top + 1) * (chips // 2), 1)
 
 
 @njit(cache=True, nogil=True)
@@ -258,7 +321,12 @@ def bar_values(
     top, bottom = max(int(min(one_end, other_end)), 0), min(int(max(one_end, other_end)), rows - 1)
     light = np.empty(2 * int(half_width) + 3)
     column_light(sums, line, top, bottom, full, light)
-    row_values(sums, line, np.maximum(light - veil * light.max(), 0), full, out)
+    most = light[0]
+    for u in range(1, light.size):
+        most = max(most, light[u])
+    for u in range(light.size):
+        light[u] = max(light[u] - veil * most, 0.0)
+    row_values(sums, line, light, full, out)
 
 
 @njit(cache=True, nogil=True)
@@ -271,20 +339,24 @@ def dimmer(pilots: Array, seen: Array, spacing: float, centre: float, values: Ar
     """
     clusters, first = pilots.shape
     rows = values.shape[1]
-    total = np.zeros(2)
+    below, above = 0.0, 0.0
     for k in range(clusters):
         middle = (rows - 1) / 2 + centre + spacing * (k - (clusters - 1) / 2)
         top = max(int(np.ceil(middle - spacing / 4)), 0)
         bottom = min(int(np.floor(middle + spacing / 4)), rows - 1)
-        levels, counts = np.zeros(2), np.zeros(2)
+        low, high, lows, highs = 0.0, 0.0, 0, 0
         for i in range(first):
-            sign = int(pilots[k, i] > 0)
             for v in range(top, bottom + 1):
-                levels[sign] += values[i, v]
-                counts[sign] += 1
-        if seen[k] and counts.min() > 0:
-            total += levels / counts
-    return float(max(-total[0], 0.0) / total[1]) if total[1] > 0 else 1.0
+                if pilots[k, i] > 0:
+                    high += values[i, v]
+                    highs += 1
+                else:
+                    low += values[i, v]
+                    lows += 1
+        if seen[k] and lows > 0 and highs > 0:
+            below += low / lows
+            above += high / highs
+    return float(max(-below, 0.0) / above) if above > 0 else 1.0
 
 
 @njit(cache=True, nogil=True)
@@ -388,8 +460,10 @@ def equations(
     spacing, centre, drift, gain = fit[0], fit[1], fit[2], fit[3]
     width = blur * exp(fit[4])
     scale, steepest = (profile.shape[1] - 1) / (_REACH * width), 0.5 * gain / width
-    normal[:] = 0.0
-    right[:] = 0.0
+    for a in range(5):
+        right[a] = 0.0
+        for c in range(5):
+            normal[a, c] = 0.0
     cost = 0.0
     for i in range(values):
         middle = (rows - 1) / 2 + offset[i] + centre + drift * when[i]
@@ -474,9 +548,14 @@ def leftovers(
     spacing, centre, drift, gain = fit[0], fit[1], fit[2], fit[3]
     width = blur * exp(fit[4])
     scale = (profile.shape[1] - 1) / (_REACH * width)
-    by_boundary[:] = 0.0
-    by_value[:] = 0.0
-    scores[:] = 0.0
+    for a in range(2):
+        for b in range(clusters + 1):
+            by_boundary[a, b] = 0.0
+        for i in range(values):
+            by_value[a, i] = 0.0
+    for v in range(rows):
+        for a in range(5):
+            scores[v, a] = 0.0
     noise, spent, all_squares, count = 0.0, 0.0, 0.0, 0
     for i in range(values):
         middle = (rows - 1) / 2 + offset[i] + centre + drift * when[i]
@@ -574,7 +653,7 @@ def solve(
     rows = seen_values.shape[1]
     rows_felt(known, offset, when, _REACH * blur * exp(fit[4]), fit, rows, first, last)
     right, new_normal, new_right = np.empty(5), np.empty((5, 5)), np.empty(5)
-    factor, move = np.zeros((5, 5)), np.empty(5)
+    factor, move, new_fit = np.empty((5, 5)), np.empty(5), np.empty(5)
     cost = equations(
         codes, first, last, offset, when, profile, blur, dim, huber, prior, seen_values, fit, normal, right
     )
@@ -583,9 +662,10 @@ def solve(
     for _ in range(steps):
         if not _damped_step(normal, right, damping, factor, move):
             return False
-        new_fit = fit + move
-        if not np.all(np.isfinite(new_fit)):
-            return False
+        for a in range(5):
+            new_fit[a] = fit[a] + move[a]
+            if not np.isfinite(new_fit[a]):
+                return False
         # A spacing below a pixel, or a boundary seven times as wide as a lens makes it, is none; a long step
         # may lead there where a shorter one does not.
         outside = new_fit[0] < 1 or abs(new_fit[4]) > 2
@@ -608,9 +688,10 @@ def solve(
                 new_right,
             )
         if new_cost <= cost:
-            fit[:] = new_fit
-            normal[:] = new_normal
-            right[:] = new_right
+            for a in range(5):
+                fit[a], right[a] = new_fit[a], new_right[a]
+                for c in range(5):
+                    normal[a, c] = new_normal[a, c]
             cost = new_cost
             damping /= 10
             if abs(move[0]) < tolerance * fit[0]:
@@ -627,14 +708,27 @@ def own_motion(shift: Array, information: Array, when: Array, out: Array) -> Non
     The shifts' variance beyond that of noise weighs each against the expectation of no motion (empirical
     Bayes).
     """
-    weight = np.maximum(information, 1e-12)
-    total = weight.sum()
-    off = shift - (weight * shift).sum() / total
-    lever = when - (weight * when).sum() / total
-    beyond = off - lever * ((weight * lever * off).sum() / (weight * lever * lever).sum())
-    variance = ((weight * beyond * beyond).sum() - (shift.size - 2)) / total
+    total, sum_shift, sum_when = 0.0, 0.0, 0.0
     for i in range(shift.size):
-        out[i] = beyond[i] * variance / (variance + 1 / weight[i]) if variance > 0 else 0.0
+        weight = max(information[i], 1e-12)
+        total += weight
+        sum_shift += weight * shift[i]
+        sum_when += weight * when[i]
+    mean_shift, mean_when = sum_shift / total, sum_when / total
+    together, spread = 0.0, 0.0
+    for i in range(shift.size):
+        weight, lever = max(information[i], 1e-12), when[i] - mean_when
+        together += weight * lever * (shift[i] - mean_shift)
+        spread += weight * lever * lever
+    slope, squares = together / spread, 0.0
+    for i in range(shift.size):
+        beyond = shift[i] - mean_shift - (when[i] - mean_when) * slope
+        squares += max(information[i], 1e-12) * beyond * beyond
+    variance = (squares - (shift.size - 2)) / total
+    for i in range(shift.size):
+        beyond = shift[i] - mean_shift - (when[i] - mean_when) * slope
+        noise = 1 / max(information[i], 1e-12)
+        out[i] = beyond * variance / (variance + noise) if variance > 0 else 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -668,16 +762,22 @@ def fit_bar(
     steps, rounds, close, exact = search
     least, outlier, least_outlier, least_explained = limits
     boundaries, values = known.shape
-    known = known.copy()
+    counted = np.empty((boundaries, values), np.bool_)
+    for b in range(boundaries):
+        for i in range(values):
+            counted[b, i] = known[b, i]
+    sizes, shift, information = np.empty(boundaries), np.empty(values), np.empty(values)
     first, last = np.empty((boundaries, values), np.int64), np.empty((boundaries, values), np.int64)
     by_value, scores, normal = np.empty((2, values)), np.empty((seen_values.shape[1], 5)), np.empty((5, 5))
-    moved, own = offset.copy(), np.zeros(values)
+    moved, own = np.empty(values), np.empty(values)
+    for i in range(values):
+        moved[i], own[i] = offset[i], 0.0
     spent, squares = 0.0, 0.0
     for left in range(rounds, -1, -1):
         tolerance = close if left else exact
         if not solve(
             codes,
-            known,
+            counted,
             moved,
             when,
             profile,
@@ -710,23 +810,32 @@ def fit_bar(
             by_value,
             scores,
         )
-        used = by_boundary[1] > 0
-        if used.sum() < least:
+        used = 0
+        for b in range(boundaries):
+            if by_boundary[1, b] > 0:
+                sizes[used] = abs(by_boundary[0, b])
+                used += 1
+        if used < least:
             return np.nan
         if left:
-            sizes = np.abs(by_boundary[0])
-            most = max(outlier * 1.4826 * np.median(sizes[used]), least_outlier)
+            most = max(outlier * 1.4826 * _median(sizes, used), least_outlier)
             for b in range(boundaries):
-                if sizes[b] > most:
-                    known[b] = False
-            own_motion(by_value[0] + own, by_value[1] / max(noise, 1e-12), when, own)
-            moved[:] = offset + own
+                if abs(by_boundary[0, b]) > most:
+                    for i in range(values):
+                        counted[b, i] = False
+            for i in range(values):
+                shift[i] = by_value[0, i] + own[i]
+                information[i] = by_value[1, i] / max(noise, 1e-12)
+            own_motion(shift, information, when, own)
+            for i in range(values):
+                moved[i] = offset[i] + own[i]
     if spent > (1 - least_explained) * squares:
         return np.nan
     # The spacing's row of the inverse: one column of it, as that is symmetric.
-    unit, inverse = np.zeros(5), np.empty(5)
-    unit[0] = 1.0
-    if not _damped_step(normal, unit, 0.0, np.zeros((5, 5)), inverse):
+    unit, inverse, factor = np.empty(5), np.empty(5), np.empty((5, 5))
+    for a in range(5):
+        unit[a] = 1.0 if a == 0 else 0.0
+    if not _damped_step(normal, unit, 0.0, factor, inverse):
         return np.nan
     by_row, rows = 0.0, 0
     for v in range(len(scores)):

@@ -230,7 +230,8 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
     beta = np.empty((size, n), np.uint8)
     alpha_row = np.zeros((size, stages + 1), np.int64)
     beta_row = np.zeros((size, stages + 1), np.int64)
-    alpha[0, n:] = llr
+    for i in range(n):
+        alpha[0, n + i] = llr[i]
     alive = np.zeros(size, np.bool_)
     alive[0] = True
     count = 1
@@ -240,7 +241,8 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
     which = np.empty(2 * size, np.int64)
     origin = np.empty(size, np.int64)
     weakest = np.empty((size, size), np.int64)
-    metric[:] = 0.0
+    for path in range(size):
+        metric[path] = 0.0
     for node in range(len(nodes)):
         first, stage, kind = nodes[node, 0], nodes[node, 1], nodes[node, 2]
         length = 1 << stage
@@ -283,8 +285,9 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
             count = _fork(metric, zero, one, limit, alive, bit, origin, cost, which)
             for path in range(size):
                 if alive[path] and origin[path] != path:
-                    alpha_row[path] = alpha_row[origin[path]]
-                    beta_row[path] = beta_row[origin[path]]
+                    for s in range(stages + 1):
+                        alpha_row[path, s] = alpha_row[origin[path], s]
+                        beta_row[path, s] = beta_row[origin[path], s]
         else:
             # Of `size` paths none goes against more than the `size - 1` weakest signs of such a node.
             splits = min(size - 1, length)
@@ -303,10 +306,14 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
                 count = _fork(metric, zero, one, limit, alive, bit, origin, cost, which)
                 for path in range(size):
                     if alive[path] and origin[path] != path:
-                        alpha_row[path] = alpha_row[origin[path]]
-                        beta_row[path] = beta_row[origin[path]]
-                        weakest[path] = weakest[origin[path]]
-                        codewords[path, :length] = codewords[origin[path], :length]
+                        other = origin[path]
+                        for s in range(stages + 1):
+                            alpha_row[path, s] = alpha_row[other, s]
+                            beta_row[path, s] = beta_row[other, s]
+                        for s in range(size):
+                            weakest[path, s] = weakest[other, s]
+                        for i in range(length):
+                            codewords[path, i] = codewords[other, i]
                 for path in range(size):
                     if alive[path] and bit[path]:
                         codewords[path, weakest[path, split]] ^= 1
@@ -316,7 +323,8 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
             if not alive[path]:
                 continue
             if kind != FREE:
-                codewords[path, :length] = bit[path]
+                for i in range(length):
+                    codewords[path, i] = bit[path]
             s = stage
             while first >> s & 1:
                 half = 1 << s
@@ -332,7 +340,8 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
     at = 0
     for path in range(size):
         if alive[path]:
-            codewords[at] = codewords[path]
+            for i in range(n):
+                codewords[at, i] = codewords[path, i]
             metric[at] = metric[path]
             at += 1
     return at

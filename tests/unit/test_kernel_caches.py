@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evlcp_sdk.kernels import njit
+from evlcp_sdk.kernels import _is_usual, njit
 
 SDK = Path(__file__).parents[2]
 
@@ -66,6 +66,21 @@ def test_a_cache_that_breaks_is_left_alone(
 
     monkeypatch.setattr(f"numba.core.caching.IndexDataCacheFile.{refuses}", refuse)
     np.testing.assert_array_equal(thrice(np.arange(3)), [0, 3, 6])
+
+
+def test_a_kernel_with_an_underscore_is_called_by_kernels_alone() -> None:
+    @njit(nogil=True)
+    def _third(x: float) -> float:
+        return x / 3
+
+    @njit(nogil=True)
+    def ninth(x: float) -> float:
+        return _third(_third(x))
+
+    assert ninth(18.0) == 2.0
+    for _ in range(2):
+        with pytest.raises(TypeError, match="by kernels alone"):
+            _third(18.0)
 
 
 KERNEL = """
@@ -222,3 +237,115 @@ def test_compiling_is_said_when_it_takes_long(caplog: pytest.LogCaptureFixture) 
             patience.on_end(None)  # type: ignore[arg-type]
             assert len(caplog.messages) == said
     assert caplog.messages[0].startswith("compiling kernels")
+
+
+PACKS = """
+import sys
+from pathlib import Path
+import mine_kernels
+mine_kernels.twice(2)
+mine_kernels.twice(2.5)
+from evlcp_sdk.kernels import pack
+print(pack(Path(sys.argv[1])).name)
+"""
+
+TAKES = """
+import sys
+from pathlib import Path
+from numba.core.event import install_timer
+from evlcp_sdk import kernels
+kernels._PACKED = kernels._Packed(Path(sys.argv[1]))
+{before}
+import mine_kernels
+compiled = []
+with install_timer("numba:compile", compiled.append):
+    said = mine_kernels.twice(2), mine_kernels.twice(1.5)
+print(*said, len(compiled))
+"""
+
+FORGED = """
+path = next(Path(sys.argv[1]).iterdir())
+path.write_bytes(path.read_bytes()[:-200])
+"""
+
+
+def told(folder: Path, code: str, **environment: str) -> list[str]:
+    """Words that Python prints that finds `mine_kernels` in a folder and keeps kernels nowhere else."""
+    paths = f"{folder}:{os.environ.get('PYTHONPATH', SDK)}"
+    own = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    return subprocess.run(
+        [sys.executable, "-c", code, str(folder / "packed")],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=own | {"PYTHONPATH": paths} | environment,
+    ).stdout.split()
+
+
+@pytest.mark.skipif(not _is_usual(), reason="packed kernels are for other processors")
+def test_packed_kernels_are_taken_where_they_fit_and_else_compiled(tmp_path: Path) -> None:
+    source = tmp_path / "mine_kernels.py"
+    source.write_text(KERNEL)
+    level = {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": "+avx2"}
+    (name,) = told(tmp_path, PACKS, NUMBA_CACHE_DIR=str(tmp_path / "cache"), **level)
+    assert name.endswith("x86-64-v3.bin")
+    result = ["4.0", "3.0"]
+    # As in a read-only installation without a home.
+    nowhere = "kernels.FunctionCache._impl_class._locator_classes = []"
+    assert told(tmp_path, TAKES.format(before=nowhere)) == [*result, "0"]
+    assert told(tmp_path, TAKES.format(before="")) == [*result, "0"]
+    assert not list((tmp_path / "__pycache__").glob("*.nb?"))
+    others = (
+        "kernels._FEATURES += ('none-has-this',)",
+        "kernels.numba.__version__ = '0.0'",
+        "kernels.platform.machine = lambda: 'aarch64'",
+    )
+    for other in others:
+        assert told(tmp_path, TAKES.format(before=f"{nowhere}; {other}"))[:2] == result
+        assert int(told(tmp_path, TAKES.format(before=f"{nowhere}; {other}"))[2]) > 0
+
+
+AT_ONCE = """
+import sys, time
+from pathlib import Path
+from numba.core.event import Listener, register
+class Counts(Listener):
+    def on_start(self, event):
+        if event.data:
+            print(event.data["dispatcher"].__name__, flush=True)
+    def on_end(self, event):
+        pass
+register("numba:compile", Counts())
+from evlcp_sdk import kernels
+kernels._COMPILER.is_ready = lambda: False
+save = kernels._Folder.save_overload
+kernels._Folder.save_overload = lambda *of: (time.sleep(0.3), save(*of))
+import mine
+print("imported", flush=True)
+sys.stdin.readline()
+print(mine.twice(2))
+"""
+
+
+def test_of_two_processes_one_compiles_a_kernel_and_the_other_waits(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(KERNEL)
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', SDK)}"}
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-c", AT_ONCE],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        for _ in range(2)
+    ]
+    for one in both:
+        assert one.stdout is not None
+        assert one.stdout.readline() == "imported\n"
+    for one in both:
+        assert one.stdin is not None
+        one.stdin.write("\n")
+        one.stdin.flush()
+    said = [word for one in both for word in one.communicate()[0].split()]
+    assert sorted(said) == ["4.0", "4.0", "half", "twice"]

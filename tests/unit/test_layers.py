@@ -16,7 +16,7 @@ LAYERS = (
     {"link"},
     {"io", "rx", "place", "sim"},
     {"results", "jobs", "study", "live"},
-    {"run", "simulated"},
+    {"run", "simulated", "warming"},
     {"testing"},
     {"cli"},
 )

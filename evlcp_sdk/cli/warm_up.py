@@ -1,0 +1,56 @@
+"""`evlcp warm-up`."""
+
+import typer
+
+from evlcp_sdk.cli._common import Json, console, echo
+
+__all__ = ["register", "warm_up"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("warm-up")(warm_up)
+
+
+def warm_up(as_json: Json = False) -> None:
+    """Compile the kernels now, so that no later command waits for them.
+
+    They are kept beside the package, or in your home where that cannot be written. It takes a minute or two,
+    or a few seconds where all have been compiled or came with the package.
+
+    In an image, before workers start:  [bold]evlcp warm-up[/]
+    """
+    import json
+    from dataclasses import asdict
+
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from evlcp_sdk.spelling import counted
+    from evlcp_sdk.warming import STEPS
+    from evlcp_sdk.warming import warm_up as warm
+
+    err = console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    # A thread that draws by itself would keep kernels from being compiled by a child, which spares memory.
+    with Progress(
+        *columns, console=err, transient=True, auto_refresh=False, disable=not err.is_terminal
+    ) as bar:
+        task = bar.add_task("", total=len(STEPS))
+
+        def advance(step: str) -> None:
+            bar.update(task, description=step, completed=STEPS.index(step), refresh=True)
+
+        warmth = warm(advance)
+    if as_json:
+        echo(json.dumps(asdict(warmth) | {"kept_in": warmth.kept_in and str(warmth.kept_in)}))
+        return
+    if not warmth.compiled:
+        console().print(f"nothing to compile; tried in {warmth.elapsed_s:.1f} s")
+        return
+    console().print(f"{counted(warmth.compiled, 'kernel')} compiled in {warmth.elapsed_s:.0f} s")
+    if warmth.kept_in is None:
+        console().print(
+            "they cannot be kept, so each process compiles them again: give it a home, or a folder by"
+            " NUMBA_CACHE_DIR",
+            style="yellow",
+        )
