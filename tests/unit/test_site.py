@@ -37,7 +37,11 @@ def test_the_reference_has_every_name_of_the_face_once() -> None:
         for line in re.findall(r"^\{names\} (.+)$", page.read_text(), re.MULTILINE)
         for name in line.split()
     ]
-    assert sorted(named) == sorted(evlcp_sdk.__all__)
+    differ = sorted(set(named) ^ set(evlcp_sdk.__all__))
+    assert not differ, (
+        f"{', '.join(differ)}: in a line {{names}} of docs/api/*.md, or in the face, not in both"
+    )
+    assert len(set(named)) == len(named)
 
 
 def test_the_site_is_whole_and_asks_no_other_server(tmp_path: Path) -> None:
