@@ -29,7 +29,7 @@ def spent_s(checkout: Path, cache: Path, *arguments: str) -> float:
         "NUMBA_CACHE_DIR": str(cache),
     }
     silence = os.open(os.devnull, os.O_RDWR)
-    command = [sys.executable, "-c", code, *arguments]
+    command = [sys.executable, "-P", "-c", code, *arguments]
     files = [(os.POSIX_SPAWN_DUP2, silence, 1), (os.POSIX_SPAWN_DUP2, silence, 2)]
     first = os.posix_spawn(command[0], command, environment, file_actions=files)
     os.close(silence)
