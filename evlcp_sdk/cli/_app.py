@@ -39,6 +39,28 @@ class _Commands(TyperGroup):
         with _printable_faults():
             return super().invoke(ctx)
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        found = super().resolve_command(ctx, args)
+        if found[1] is not None:
+            _expect_once(ctx, *found)
+        return found
+
+
+def _expect_once(ctx: Any, name: str | None, command: Any, args: list[str]) -> None:
+    """Refuse an option that takes one value and is given two, of which all but the last would be ignored."""
+    with command.context_class(command, info_name=name, parent=ctx) as inner:
+        try:
+            *_, order = command.make_parser(inner).parse_args(list(args))
+        except Exception:
+            # The command itself says what is wrong with them.
+            return
+        for option in order:
+            takes_one = option.param_type_name == "option" and not (
+                option.multiple or option.is_flag or option.count
+            )
+            if takes_one and order.count(option) > 1:
+                inner.fail(f"{option.opts[-1]} is given {order.count(option)} times, expected once")
+
 
 @contextmanager
 def _printable_faults() -> Iterator[None]:

@@ -288,6 +288,7 @@ def test_the_quickstart_is_the_example(capsys: pytest.CaptureFixture[str], workp
         "examples/third_party_formats/src/evlcp_roadside/speed_limits.py",
         "examples/third_party_plugin/src/evlcp_robust/__init__.py",
         "examples/third_party_plugin/src/evlcp_robust/decoding.py",
+        "examples/third_party_plugin/src/evlcp_robust/framing.py",
         "examples/third_party_plugin/src/evlcp_robust/ranging.py",
     ],
 )

@@ -4,11 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 from evlcp_robust.decoding import Majority
+from evlcp_robust.framing import FlashPosition
 from evlcp_robust.modulation import ReturnToZero
 from evlcp_robust.ranging import MedianPairs
 
 import evlcp_sdk as evlcp
-from evlcp_sdk.testing import conformance, ideal_presence, ideal_sums, ideal_view
+from evlcp_sdk.testing import (
+    IdealBar,
+    conformance,
+    ideal_events,
+    ideal_presence,
+    ideal_sums,
+    ideal_view,
+)
 
 LINK = evlcp.load_link()
 SYMBOLS = np.random.default_rng(7).integers(0, len(LINK.codebook.codewords), LINK.bar.clusters)
@@ -27,6 +35,34 @@ def test_decoding(check):
 @conformance("modulation", ReturnToZero())
 def test_modulation(check):
     check()
+
+
+@conformance("framing", FlashPosition(), FlashPosition(bits=5))
+def test_framing(check):
+    check()
+
+
+def test_flashes_are_read_in_noise_and_with_events_missing():
+    link = evlcp.load_link(overrides=["bar.cluster_rows=96", "air.frames_per_packet=20"])
+    link = link.with_algorithm("framing", FlashPosition(), id="flash-position")
+    symbols = np.random.default_rng(2).integers(0, 8, (5, 20, 1))
+    events = ideal_events(link, IdealBar(symbols, ppm=300.0), missing=0.5)
+    rng = np.random.default_rng(4)
+    n, end_us = 300, int(events.t_us[-1])
+    noise = evlcp.Events.of(
+        np.sort(rng.integers(0, end_us, n)),
+        rng.integers(0, 99, n),
+        rng.integers(0, 99, n),
+        rng.integers(0, 2, n),
+    )
+    deframer = FlashPosition().compile(link.codebook, link.packet)
+    both = evlcp.Events.concat([events, noise])
+    both = both[np.argsort(both.t_us, kind="stable")]
+    state, heard = deframer.step(deframer.init(), both, end_us)
+    heard += deframer.close(state)[1]
+    assert len(heard) == symbols.size
+    assert all(one.soft.symbols[0] == symbols[one.packet, one.frame, 0] for one in heard)
+    assert deframer.counts(state) == {"preambles": 5, "frames_dark": 0}
 
 
 def test_three_clusters_out_of_place_do_not_move_the_distance():

@@ -187,6 +187,7 @@ def test_of_several_recordings_the_others_are_decoded(
             "recorded with 1280 x 720 pixels, but the link's camera has 640 x 720",
         ),
         (["--figuers"], "No such option"),
+        (["-o", "other"], "--out is given 2 times, expected once"),
     ],
 )
 def test_usage_and_configuration_end_with_2(

@@ -1,4 +1,4 @@
-"""Ranging and decoding that a few bad pixels cannot sway, and a modulation that is no pair code."""
+"""Ranging and decoding that a few bad pixels cannot sway, a modulation of no pair code, and a framing."""
 
 from collections.abc import Iterator
 
@@ -18,4 +18,7 @@ def evlcp_algorithms() -> Iterator[evlcp.Algorithm]:
     )
     yield evlcp.Algorithm(
         "modulation", "rz", "evlcp_robust.modulation:ReturnToZero", 1, "return to zero: a pulse for a one"
+    )
+    yield evlcp.Algorithm(
+        "framing", "flash-position", "evlcp_robust.framing:FlashPosition", 1, "one flash a frame, of one LED"
     )
