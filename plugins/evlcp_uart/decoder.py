@@ -123,7 +123,12 @@ class CharacterState:
     tried: int = 0
     blocks: int = 1
     given: dict[str, int] = field(
-        default_factory=lambda: {"characters": 0, "characters_wrong_parity": 0, "stretches_without_light": 0}
+        default_factory=lambda: {
+            "characters": 0,
+            "characters_by_chance": 0,
+            "characters_wrong_parity": 0,
+            "stretches_without_light": 0,
+        }
     )
 
 
@@ -260,13 +265,16 @@ class CharacterDecoder:
                 kept &= starts + (self.characters.bits - self.characters.stop_bits) * TICKS < end
             ahead = starts[starts < due]
             found = list(self._given(first, starts[kept], evidence, light))
+            by_chance = 0
             if state.light is None:
-                found = _without_chance(found)
+                by_chance, found = len(found), _without_chance(found)
+                by_chance -= len(found)
             sure = float(np.mean([one.quality for one in found])) if found else 1.0
             if state.light is None and sure < _SURE and state.blocks == 1 and not last:
                 return replace(state, blocks=_MORE), []
             blocks = 1 if sure >= _SURE else _MORE
             given["characters"] += len(found)
+            given["characters_by_chance"] += by_chance
             given["characters_wrong_parity"] += sum(c.wrong_parity for c in found)
             if len(ahead):
                 start = int(ahead[-1]) + round(self._length * light.rate) - _NEAR
