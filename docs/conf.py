@@ -25,6 +25,7 @@ myst_heading_slug_func = "evlcp_docs.slug_of"
 default_role = "literal"
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
+napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 napoleon_attr_annotations = False
 python_use_unqualified_type_names = True

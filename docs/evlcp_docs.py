@@ -133,6 +133,8 @@ def _docstring(app: Sphinx, what: str, name: str, thing: Any, options: Any, line
             text.append(f"    {line}" if fenced else line)
     if (meanings := _described(thing)) and "Attributes:" not in lines:
         text += ["", "Attributes:", *(f"    {field}: {meaning}" for field, meaning in meanings.items()), ""]
+    if what in ("attribute", "property", "data") and text and ":" in text[0]:
+        text[0] = f": {text[0]}"  # Napoleon takes what stands before the first colon for a type
     lines[:] = text
 
 
