@@ -12,9 +12,9 @@ Array = NDArray[Any]
 
 @njit(cache=True, nogil=True)
 def take_in(heard: Array, prior: Array, out: Array) -> None:
-    """Probability of each cluster in each cell by Bayes' rule, from what was heard and from the place alone.
+    """Probability of each cluster in each cell by Bayes' rule, from its evidence and from the place alone.
 
-    All are (K, rows, columns). Without a cluster, what was heard is as likely as each with equal priors, and
+    All are (K, rows, columns). Without a cluster, the evidence is as likely as each with equal priors, and
     not even a cell that fits a code in all its values is sure to show a cluster, nor a place.
     """
     clusters, rows, columns = prior.shape

@@ -59,7 +59,7 @@ _UNFINISHED = {
 
 
 def output_fault(path: Path | str, fault: OSError) -> OutputError:
-    """What is told of an output that the system refuses."""
+    """What is said of an output that the system refuses."""
     return OutputError(f"{path}: cannot be written: {fault.strerror or fault}")
 
 

@@ -588,7 +588,7 @@ def film(
 
 
 _FILM_LATE_PACKETS = 3
-"""Packets after which the frames of a time are told."""
+"""Packets after which the frames of a time are given."""
 
 
 def _film_frames(

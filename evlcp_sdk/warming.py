@@ -85,7 +85,7 @@ def warm_up(advance: Callable[[str], None] = lambda _step: None) -> Warmth:
     kernels instead of compiling them twice.
 
     Args:
-        advance: Told the name of a step of `STEPS` when it begins.
+        advance: Called with the name of a step of `STEPS` when it begins.
     """
     from evlcp_sdk import _kernels
 

@@ -24,7 +24,7 @@ def main() -> None:
 
         from evlcp_sdk.signals import heard_by, interrupt
 
-        # Python itself hears Ctrl-C.
+        # Python itself handles Ctrl-C.
         with heard_by(interrupt, SIGTERM, SIGHUP):
             if sys.argv[1:] == ["--version"]:
                 # What the command line says, without all that it is made of.

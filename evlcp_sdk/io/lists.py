@@ -30,7 +30,7 @@ _WORDS: Final = ((b"true", b"1"), (b"false", b"0"))
 
 PIECE_BYTES: Final = 1 << 20
 LOOKED_AT: Final = 1 << 14
-"""Times of the start by which the unit is told."""
+"""Times at the start from which the unit is recognized."""
 
 LEAST_RATE_HZ: Final = 20.0
 MOST_RATE_HZ: Final = 5e7

@@ -76,7 +76,7 @@ def placing_link(links: Mapping[str, Link]) -> str:
     """
     if len(links) == 1:
         return next(iter(links))
-    # What a framing hears by itself has no points in the image.
+    # What a framing receives by itself has no points in the image.
     bars = [n for n, one in links.items() if one.bar.clusters > 1 and "separation" in one.algorithms]
     if len(bars) != 1:
         what = f"{' and '.join(map(repr, bars))} have some" if bars else "no link has any"

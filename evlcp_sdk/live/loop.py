@@ -76,7 +76,7 @@ class LiveStatus:
 
 
 class FrameEar:
-    """Hears of each frame as soon as it is decoded; joins the registry before the receiver is made."""
+    """Gets each frame as soon as it is decoded; joins the registry before the receiver is made."""
 
     def __init__(self) -> None:
         self.tell: Callable[[Frame], None] = lambda _frame: None
@@ -95,7 +95,7 @@ class LiveLoop:
         source: What is read; not closed.
         receiver: What decodes it.
         packet: Lengths of its link's frames.
-        ear: Hears the receiver's frames.
+        ear: Gets the receiver's frames.
         outlet: Where results go.
         pictures: Where pictures are drawn; None for none.
         budget: When what is shed.

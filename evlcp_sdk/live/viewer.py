@@ -324,7 +324,7 @@ class Viewer:
         return True
 
     def _about(self) -> dict[str, Any]:
-        """What a browser is told first."""
+        """What a browser is sent first."""
         book = self._link.codebook
         colours = cluster_colours(book.clusters)
         return {
@@ -349,7 +349,7 @@ class Viewer:
     # What browsers are sent
 
     def _tell(self, news: News) -> None:
-        """Have all browsers told, and remember what later ones are told."""
+        """Send something to all browsers, and keep what later ones are sent."""
         kind = news.kind
         if kind == "frame":
             frame: Frame = news.value

@@ -30,7 +30,7 @@ _SIGMA_M = (1e-4, 1e4)
 _CROSSED = {"cov_east_north_m2": (0, 1), "cov_east_up_m2": (0, 2), "cov_north_up_m2": (1, 2)}
 
 _GRAVITY_RAD = math.radians(10.0)
-"""Sigma of pitch and roll where nothing tells them, for where the antenna is."""
+"""Sigma of pitch and roll where nothing measures them, for where the antenna is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +170,7 @@ def gnss_fix(
 
 
 def attitude_of(known: Attitude | None, heading: Callable[[], tuple[float, float] | None]) -> Attitude | None:
-    """An attitude with a heading: its own, or the track's; gravity is level where nothing tells it."""
+    """An attitude with a heading: its own, or the track's; level where nothing measures gravity."""
     if known is not None and known.heading_deg is not None:
         return known
     found = heading()

@@ -67,7 +67,7 @@ class Place:
         course_deg: Where it moves to, clockwise from north.
         left_out: The fix at this time was beyond the gate, or failed its test, and does not count.
         starts: A trajectory starts here; nothing is known of its speed, unless it is smoothed.
-        focal_share: By what share the focal length is longer than stated, as far as the track tells; NaN
+        focal_share: By what share the focal length is longer than stated, as the track has it; NaN
             where it was stated exactly.
         focal_share_sigma: Of it.
     """
@@ -160,9 +160,9 @@ class Navigator:
         return self._counts | {"gnss_outside": given - used}
 
     def seen(self, first_us: float, last_us: float) -> None:
-        """Be told that the recording has events from one time to another: fixes of satellites count in it.
+        """Take note that the recording has events from one time to another: fixes of satellites count in it.
 
-        Without being told, those from the first fix of bars to the last one count.
+        Without it, those from the first fix of bars to the last one count.
         """
         self._span = (first_us if self._span is None else self._span[0], last_us)
 
@@ -207,7 +207,7 @@ class Navigator:
         return None if self._state is None else heading_at(self._state, t_us, self._imu)
 
     def learnt(self) -> list[Learnt]:
-        """What the drive tells so far of standing errors: of the camera, the attitude, the IMU, the sites."""
+        """What the drive says so far of standing errors: of the camera, the attitude, the IMU, the sites."""
         link, sites = self._link, self.positioner.stands_at
         return learnt(self._standing, link.camera, link.camera_sigma, self._attitude, sites, link.position)
 

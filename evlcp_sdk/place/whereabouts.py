@@ -18,7 +18,7 @@ _LENGTH_SHARE = 0.01
 """Share by which a beacon's length may differ from its site's: a lone bar's distance is wrong by as much."""
 
 _MOST_TRANSMITTERS = 1024
-"""Transmitters whose beacons are remembered; the one not heard for longest makes way."""
+"""Transmitters whose beacons are remembered; the one not received for longest makes way."""
 
 _BELIEVED = {"none": (), "verified": ("verified",), "any": ("verified", "lapsed", "unverified")}
 """Trust that `position.beacons` asks for."""
@@ -109,7 +109,7 @@ class Whereabouts:
         return self._said[number].trust == "verified"
 
     def site(self, number: int) -> BarSite | None:
-        """Where a transmitter that was heard stands; None if that is not known, or not believed."""
+        """Where a transmitter that was received stands; None if that is not known, or not believed."""
         said = self._said[number]
         if said.trust == "forged" or self.contradiction(number):
             return None

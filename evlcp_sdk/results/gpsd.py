@@ -16,7 +16,7 @@ DEVICE: Final = "evlcp"
 """Name of the only device."""
 
 VERSION: Final = {"class": "VERSION", "release": "3.22", "rev": "evlcp", "proto_major": 3, "proto_minor": 14}
-"""What a client is told first: the release whose protocol this is."""
+"""What a client is sent first: the release whose protocol this is."""
 
 
 def tpv(fix: Fix, filtered: Place | None, zero: datetime | None) -> dict[str, Any]:

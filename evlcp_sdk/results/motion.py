@@ -97,7 +97,7 @@ class Motion:
 
 
 class MotionProbe:
-    """Keeps the first frame that is read, and the largest one, of some transmitters; hears the stages.
+    """Keeps the first frame that is read, and the largest one, of some transmitters; listens to the stages.
 
     Args:
         most: Transmitters of which frames are kept: the first ones.

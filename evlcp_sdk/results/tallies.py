@@ -21,7 +21,7 @@ _FARTHEST_M = 1_000.0
 """Medians know no distance beyond: a hundred thousand cells are enough."""
 
 _MOST_TRANSMITTERS = 1024
-"""Transmitters with figures of their own; of more, those not heard for longest are only counted."""
+"""Transmitters with figures of their own; of more, those not received for longest are only counted."""
 
 _MOST_CLOCK_ERROR = 0.01
 

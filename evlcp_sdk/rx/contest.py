@@ -136,7 +136,7 @@ class Contest:
         ]
 
     def see(self, link: int, places: Mapping[int, Region]) -> None:
-        """Be told where the transmitters of a link are now, by their numbers."""
+        """Take where the transmitters of a link are now, by their numbers."""
         self._places[link] = places
         for number, place in places.items():
             self._known.pop(number, None)

@@ -85,7 +85,7 @@ class RowDelays:
         centre_px: float,
         height_px: float,
     ) -> tuple[RowDelay, SyncLock]:
-        """Look at the preamble that a lock was heard in; give what is known now, and the lock with it.
+        """Look at the preamble that a lock was found in; give what is known now, and the lock with it.
 
         Args:
             known: What was known before.

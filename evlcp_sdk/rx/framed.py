@@ -59,7 +59,7 @@ class HeardFraming:
         deframer: What its framing compiled to.
         judged: Where frames go.
         clock: The stream's.
-        announcer: Hears of every frame.
+        announcer: Gets every frame.
         regions: The regions of the stream.
         name: Name of the link, that its frames have; empty for none.
         numbers: Where the numbers of transmitters come from; None for 0, 1, 2...
@@ -67,7 +67,7 @@ class HeardFraming:
     Attributes:
         counts: What was found so far.
         lit: When the light of its transmitters was there.
-        ranging_every: Of no effect: frames that a framing hears have no distance.
+        ranging_every: Of no effect: frames that a framing gives have no distance.
         patience_us: How late a frame may be given, us.
     """
 
@@ -102,7 +102,7 @@ class HeardFraming:
         self.ranging_every = 1
 
     def step(self, regions: list[Followed], step: TimeStep) -> None:
-        """Hear what the regions of a time step send."""
+        """Receive what the regions of a time step send."""
         for region in regions:
             listener = self._listeners.get(region.id)
             pieces = [region.pieces[-1]] if listener is not None and region.pieces else list(region.pieces)
@@ -144,7 +144,7 @@ class HeardFraming:
                     del self._listeners[region.id]
 
     def disclaim(self, place: Region) -> int:
-        """Nothing: a framing says what it hears, not what it rejects."""
+        """Nothing: a framing says what it receives, not what it rejects."""
         return 0
 
     def close(self) -> None:

@@ -65,7 +65,7 @@ _COUNTS = (
 
 
 class PacketFraming:
-    """Hears the packets of the regions of a stream, decodes their frames, and sets the regions right by them.
+    """Finds the packets of the regions of a stream, decodes their frames, and sets the regions right by them.
 
     Args:
         link: The resolved configuration.
@@ -73,7 +73,7 @@ class PacketFraming:
         regions: The regions of the stream.
         judged: Where decoded frames go.
         clock: The stream's.
-        announcer: Hears of every frame.
+        announcer: Gets every frame.
         attitude_at: What is known of the camera's attitude at a time.
         limits: How much it holds at the most.
         name: Name of the link, that its frames have; empty for none.
@@ -138,9 +138,9 @@ class PacketFraming:
         self._measurable = 0
 
     def step(self, regions: list[Followed], step: TimeStep) -> None:
-        """Hear, and decode, what the regions of a time step send."""
+        """Receive and decode what the regions of a time step send."""
         self._joined.clear()
-        # A frame may show another image of its bar: that is a region, too, and heard at once.
+        # A frame may show another image of its bar: that is a region, too, and received at once.
         self._due = deque(regions)
         while self._due:
             region = self._due.popleft()
@@ -373,7 +373,7 @@ class PacketFraming:
         return True
 
     def _put_together(self, transmitter: Transmitter) -> bool:
-        """Unite a region that shows too little of a bar with others that hear the same, if there are any."""
+        """Unite a region that shows too little of a bar with others in step with it, if there are any."""
         parts = self._transmitters.in_step(transmitter)
         if transmitter.region.id in self._joined or not parts:
             return False

@@ -28,7 +28,7 @@ else:
 __all__ = ["Guard"]
 
 _FAR_PACKETS = 64
-"""Packets between a lock and the time when it is heard; the grid of its packets is counted from it."""
+"""Packets between a lock and the time when it is found; the grid of its packets is counted from it."""
 
 _FARTHEST_M = 1e15
 """Distance that a pixel's fraction of a billionth shows; beyond is no number of a measurement."""
@@ -134,7 +134,7 @@ class Guard:
             )
 
     def expect_locks(self, locks: object) -> None:
-        """Check that a synchronization heard no more packets in a step than there is time for.
+        """Check that a synchronization found no more packets in a step than there is time for.
 
         Raises:
             PluginError: It is no list, or a longer one.
@@ -145,7 +145,7 @@ class Guard:
             self.refuse(f"{len(locks)} locks in a step", f"at most {_MOST_LOCKS}")
 
     def expect_lock(self, lock: SyncLock, until_us: float, packet: PacketFormat) -> None:
-        """Check what a synchronization heard until a time, us.
+        """Check what a synchronization found until a time, us.
 
         Raises:
             PluginError: It is no `SyncLock`, or its times are not those of such packets.

@@ -26,7 +26,7 @@ _SAME_BLOCK_SIGMA = 6.0
 """Agreement of two packets' soft bits from which on they carry one block: by chance once in 1e9 pairs."""
 
 _MOST_TRANSMITTERS = 16
-"""Transmitters whose messages are collected; the one not heard for longest makes way."""
+"""Transmitters whose messages are collected; the one not received for longest makes way."""
 
 _MOST_MESSAGES = 8
 """Messages of a transmitter that are collected at a time, and that are remembered when complete."""

@@ -27,7 +27,7 @@ __all__ = ["LinkListener"]
 
 
 class LinkListener:
-    """Follows the regions of a stream by one link, hears and decodes what they send, reads its messages.
+    """Follows the regions of a stream by one link, receives and decodes what they send, reads its messages.
 
     Args:
         link: The resolved configuration.
@@ -127,7 +127,7 @@ class LinkListener:
         return bool(self._regions.alive or self._judged)
 
     def step(self, step: TimeStep, taken: list[Region], holding: set[int]) -> list[Packet]:
-        """Follow the regions through a time step; hear, and decode, what they send.
+        """Follow the regions through a time step; receive and decode what they send.
 
         Args:
             step: The events.

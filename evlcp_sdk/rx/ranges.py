@@ -68,7 +68,7 @@ class Ranges:
         bend: Sum of the boundaries' bends, beyond what the attitude explains, and of their weights, float64
             (2, n); empty without any.
         bend_s: When that was, s.
-        told: The attitude said how the bar leans then.
+        told: The attitude gave how the bar leans then.
     """
 
     past: Floats = field(default_factory=lambda: np.empty((0, 3)))
@@ -164,7 +164,7 @@ def _smooth(past: Floats) -> tuple[float, float, float]:
 
 
 def _add(state: Ranges, t_s: float, bend: Bend, sine: float | None) -> Floats:
-    """Sums with a frame's bend, without that of the lean that is told; older ones fade."""
+    """Sums with a frame's bend, without that of the known lean; older ones fade."""
     off = bend.off if sine is None else bend.off - sine * bend.place**2
     new = np.empty((2, len(off)))
     new[0], new[1] = bend.weight * off, bend.weight

@@ -159,7 +159,7 @@ class Receiver:
         return any(self._listeners) or bool(self._contest)
 
     def _run(self, step: TimeStep) -> list[Packet]:
-        """Let each link hear a time step; give the packets that are complete, of the links that fit."""
+        """Give each link a time step; give the packets that are complete, of the links that fit."""
         contest = self._contest
         if contest is None:
             (listener,) = self._listeners

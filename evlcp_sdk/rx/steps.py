@@ -113,7 +113,7 @@ class Steps:
 
     Args:
         link: The resolved configuration.
-        announcer: Hears of every result but the filters'.
+        announcer: Gets every result but the filters'.
         tracker: The filters of its tracking, as `tracker_of` gives them.
     """
 
@@ -150,7 +150,7 @@ class Steps:
         return Ranges(), None if self._distance is None else self._distance.init()
 
     def synchronize(self, state: Any, events: Events, until_us: int) -> tuple[Any, list[SyncLock]]:
-        """Take a region's events up to a time; give the new state and the packets that were heard."""
+        """Take a region's events up to a time; give the new state and the packets that were found."""
         guard = self._guards["synchronization"]
         self._announcer.start()
         with guard:
@@ -198,7 +198,7 @@ class Steps:
     ) -> tuple[tuple[Ranges, Any], Range, Range | None]:
         """Take a frame's distance as the ranging gave it; the new state, the distance, and that filtered.
 
-        The sight says where its bar is seen, and what the attitude tells of its lean. The filtered one is
+        The sight says where its bar is seen, and what the attitude says of its lean. The filtered one is
         the prediction where a frame allows no distance, None without tracking.
         """
         ranges, distance = self._keeper.step(state[0], t_us, chip_us, measured, sight)

@@ -22,7 +22,7 @@ from evlcp_sdk.values import Region, SyncLock
 __all__ = ["LOOKBACK_PACKETS", "Transmitter", "Transmitters"]
 
 LOOKBACK_PACKETS = 2
-"""Packets of events kept while there is no lock: one to hear a preamble in, one to look back on."""
+"""Packets of events kept while there is no lock: one to find a preamble in, one to look back on."""
 
 _REMEMBER_US = 1e6
 """How long a transmitter lost from sight is remembered: clocks 100 ppm apart drift by a chip in it."""
@@ -113,7 +113,7 @@ class Transmitters:
         """Take a new lock; frames go on where they were, or start with the first whole one of the region.
 
         Args:
-            transmitter: Whose preamble was heard.
+            transmitter: Whose preamble was found.
             lock: How.
 
         Returns:

@@ -18,7 +18,7 @@ from evlcp_sdk.values import Trust
 __all__ = ["BeaconJudge", "Standing", "signed_text"]
 
 _MOST_VERIFIED = 4096
-"""Transmitter ids whose last verified beacon is remembered; the one not heard for longest makes way."""
+"""Transmitter ids whose last verified beacon is remembered; the one not received for longest makes way."""
 
 _CLOCKS_APART_S = 300.0
 """How far the clocks of a transmitter and of a receiver may be apart."""

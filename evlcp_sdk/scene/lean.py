@@ -29,7 +29,7 @@ class BarSight:
             direction in the image, from its first cluster to its last.
         across: The same at a right angle to it.
         sine: Of the lean that a plumb bar has; positive: its last cluster is nearer than its first. None
-            where no attitude tells.
+            without an attitude.
         sigma: Standard deviation of that sine.
         askew: The attitude is known, but the image shows that the bar does not stand plumb.
 

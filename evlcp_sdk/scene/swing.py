@@ -19,7 +19,7 @@ class Swing:
         turn_rad: By how much the heading has changed since the first time, clockwise, radians, float64 (k,).
         gyro: The turn is that of a gyroscope, which has a bias and a noise that grows.
         push_m_s2: Acceleration without gravity, to the camera's right, forward, both level, and up, m/s2,
-            float64 (k, 3); None where no accelerometer tells.
+            float64 (k, 3); None without an accelerometer.
     """
 
     t_s: Floats

@@ -222,7 +222,7 @@ def scene_of_truth(truth: Truth | Mapping[str, Any]) -> Scene:
             "seed": told["seed"],
             "flicker_lamps": told["flicker_lamps"],
             "camera": {key: camera[key] for key in ("width", "height", "focal_mm", "pitch_um")},
-            # Its blur is told as one sigma: a Gaussian without wings.
+            # Its blur is stated as one sigma: a Gaussian without wings.
             "lens": {key: told[key] for key in ("f_number", "focus_m", "halo")}
             | {"wings": False}
             | {key: told[key] for key in ("bloom", "bloom_px") if key in told},

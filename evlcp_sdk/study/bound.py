@@ -101,7 +101,7 @@ def lean_sigma_deg(
     gain: float = 0.8,
     shift_px: float = 0.0,
 ) -> float:
-    """Smallest standard deviation of the lean that one frame tells, degrees, of a bar that hardly leans.
+    """Smallest standard deviation of the lean by one frame, degrees, of a bar that hardly leans.
 
     A lean of sine s moves the boundary at place b, in spacings from the bar's middle, by b^2 s times
     spacing_px * spacing_m / distance_m pixels: a parabola, which spacing, position, drift and gain, unknown

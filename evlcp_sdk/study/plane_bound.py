@@ -199,7 +199,7 @@ class _Image:
             when = np.arange(values) / values - 0.5
             return (self.slope(fit, axis).reshape(values, -1) * when[:, None]).ravel()
         if name in _LEAN:
-            # A lean is told by its perspective, which is weak.
+            # A lean shows by its perspective, which is weak.
             step *= self.distance_m
         low, high = ({**fit, name: fit.get(name, 0.0) + by} for by in (-step, step))
         return ((self.values(high) - self.values(low)) / (2 * step)).ravel()

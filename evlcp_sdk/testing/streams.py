@@ -70,7 +70,7 @@ def finds_time(subject: Subject) -> None:
     for ppm, start_us in ((0.0, 5000.0), (60.0, 3333.0), (-60.0, 7777.0)):
         events = _recording(link, ppm, start_us)
         locks = _locks(synchronizer, events, _steps(events))
-        # The first packet's beginning is the recording's: it may be heard or not.
+        # The first packet's beginning is the recording's: it may be found or not.
         expect(
             _PACKETS - 1 <= len(locks) <= _PACKETS,
             f"one lock a packet of {_PACKETS}, or all but the first; got {len(locks)}",

@@ -335,7 +335,7 @@ def dimmer(pilots: Array, seen: Array, spacing: float, centre: float, values: Ar
 
     A camera may miss more events of one polarity. The half spacing of rows about each cluster's middle tells
     both levels in its pilot, which comes first; clusters that say one of them only do not count. 1 where
-    nothing is told.
+    nothing is known.
     """
     clusters, first = pilots.shape
     rows = values.shape[1]

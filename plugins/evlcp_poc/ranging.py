@@ -122,7 +122,7 @@ class PocRanging(Ranging):
         """
         used = self._used(bar.clusters)
         if not self.clusters:
-            # Which are outermost is told by what is seen.
+            # Which are outermost follows from what is seen.
             used = np.arange(bar.clusters)
         skip = 0 if self.clusters else self._skip(bar.clusters)
         centres = bar.cluster_centres_m()

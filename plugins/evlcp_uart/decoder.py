@@ -45,7 +45,7 @@ _RATES = np.linspace(-0.012, 0.012, 13)
 """Clocks that are tried about the one that is known."""
 
 _LEAST_SPACINGS = 6
-"""Characters that follow another at once by which the clock is told."""
+"""Characters that follow another at once, from which the clock is measured."""
 
 _LEAST_EVENTS = 24
 _LEAST_CHARACTERS = 3
@@ -326,7 +326,7 @@ class CharacterDecoder:
     def _steadied(
         self, starts: NDArray[np.int64], scores: NDArray[np.float64], light: Light
     ) -> NDArray[np.int64]:
-        """Starts as the characters around each tell them, where these follow one another at once."""
+        """Starts by the characters around each, where these follow one another at once."""
         found = starts.copy()
         length = self._length * light.rate
         breaks = np.flatnonzero(np.abs(np.diff(starts) - length) > _NEAR + 1) + 1

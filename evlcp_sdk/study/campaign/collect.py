@@ -152,7 +152,7 @@ def collect(
         store: Where results are kept, and those of earlier runs are found.
         executor: Where jobs run.
         run: What runs a job.
-        watch: Hears how far it is, at first and after each job.
+        watch: Gets how far it is, at first and after each job.
 
     Returns:
         How far it came; its `faults` say which jobs failed. They are tried again by the next run.
