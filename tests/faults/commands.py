@@ -197,6 +197,7 @@ class StandIn:
     def __init__(self, *_: object) -> None:
         self.counts: dict[str, int] = {}
         self.lit_us: dict[int, tuple[float, float]] = {}
+        self.link_counts: dict[str, dict[str, int]] = {}
 
     def feed(self, _events: Events) -> list[Packet]:
         return []

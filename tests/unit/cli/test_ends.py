@@ -99,7 +99,7 @@ def test_the_entry_point_can_be_interrupted_from_the_start() -> None:
 
 
 def test_without_a_home_libraries_say_nothing() -> None:
-    code = f"import sys; sys.argv = ['evlcp', '--version']\ntry: {MAIN}\nexcept SystemExit: pass\n"
+    code = f"import sys; sys.argv = ['evlcp', '--help']\ntry: {MAIN}\nexcept SystemExit: pass\n"
     code += "import matplotlib; matplotlib.get_cachedir()"
     nowhere = dict.fromkeys(("HOME", "MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME"), "/dev/null/none")
     done = subprocess.run(
