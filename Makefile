@@ -33,6 +33,10 @@ lint: $(VENV)/.dev  ## Format, lint and types only
 kernels: $(VENV)/.dev
 	@$(BIN)/evlcp warm-up >/dev/null 2>&1 || true
 
+docs: $(VENV)/.dev  ## Build the documentation site; site/index.html
+	$(BIN)/python -m sphinx -q -W --keep-going -d .sphinx docs site
+	@echo "open site/index.html"
+
 notebooks: $(VENV)/.dev  ## Run the notebooks of the docs and keep what they show
 	$(BIN)/python docs/run_notebooks.py
 
