@@ -1,18 +1,17 @@
 """`fixes.geojson`: fixes and bars as points, the smoothed trajectory as lines."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any
 
 from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.text import integrity, number_or_none, sigmas
+from evlcp_sdk.results.trail import Trail
 from evlcp_sdk.values import Fix
 
-__all__ = ["GeoJson", "cut"]
+__all__ = ["GeoJson"]
 
 
 class GeoJson(Sink):
@@ -23,7 +22,7 @@ class GeoJson(Sink):
         self._file = folder.open("fixes.geojson")
         self._file.write('{"type": "FeatureCollection", "features": [')
         self._features = 0
-        self._line_end: list[list[float]] = []
+        self._trail = Trail()
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write a fix that is given as a point; one that is refused with an alarm has no place."""
@@ -48,18 +47,8 @@ class GeoJson(Sink):
 
     def settle(self, settled: Sequence[Settled]) -> None:
         """Write the smoothed places as a line, one per trajectory."""
-        line = self._line_end
-        for one in settled:
-            if one.filtered.starts and line:
-                self._line(line)
-                line = []
-            place = one.smoothed
-            line.append(
-                [round(place.longitude_deg, 9), round(place.latitude_deg, 9), round(place.height_m, 4)]
-            )
-        self._line(line)
-        # The next line starts where this one ends.
-        self._line_end = line[-1:]
+        for line in self._trail.lines(settled):
+            self._feature("LineString", line, {"track": "smoothed"})
 
     def finish(self) -> Mapping[str, Any]:
         """Write the bars, and end the file."""
@@ -73,29 +62,8 @@ class GeoJson(Sink):
         self._file.write("]}\n")
         return {}
 
-    def _line(self, line: list[list[float]]) -> None:
-        for piece in cut(line):
-            # A line of GeoJSON has two points or more.
-            if len(piece) > 1:
-                self._feature("LineString", piece, {"track": "smoothed"})
-
     def _feature(self, kind: str | None, coordinates: list[Any], properties: dict[str, Any]) -> None:
         shape = None if kind is None else {"type": kind, "coordinates": coordinates}
         feature = {"type": "Feature", "geometry": shape, "properties": properties}
         self._file.write(("," if self._features else "") + "\n" + json.dumps(feature))
         self._features += 1
-
-
-def cut(line: list[list[float]]) -> list[list[list[float]]]:
-    """A line in pieces that do not cross the 180th meridian (RFC 7946, 3.1.9)."""
-    pieces = [line[:1]]
-    for here, there in pairwise(line):
-        turn = there[0] - here[0]
-        if abs(turn) > 180:
-            edge = math.copysign(180.0, here[0])
-            share = (edge - here[0]) / (turn - math.copysign(360.0, turn))
-            at = [round(a + share * (b - a), 9) for a, b in zip(here[1:], there[1:], strict=True)]
-            pieces[-1].append([edge, *at])
-            pieces.append([[-edge, *at]])
-        pieces[-1].append(there)
-    return pieces

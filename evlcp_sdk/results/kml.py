@@ -11,9 +11,9 @@ from xml.sax.saxutils import escape
 from evlcp_sdk.place.geoid import geoid_m
 from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.geojson import cut
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.text import sigmas
+from evlcp_sdk.results.trail import Trail
 from evlcp_sdk.values import Fix
 
 __all__ = ["Kml"]
@@ -33,7 +33,7 @@ class Kml(Sink):
         super().__init__(folder, run)
         self._file = folder.open("fixes.kml")
         self._file.write(_HEAD.format(name=escape(run.name)))
-        self._line_end: list[list[float]] = []
+        self._trail = Trail()
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write a fix that is given as a point, with its time where UTC is known."""
@@ -51,16 +51,12 @@ class Kml(Sink):
 
     def settle(self, settled: Sequence[Settled]) -> None:
         """Write the smoothed places as a line, one per trajectory."""
-        line = self._line_end
-        for one in settled:
-            if one.filtered.starts and line:
-                self._line(line)
-                line = []
-            place = one.smoothed
-            line.append([place.longitude_deg, place.latitude_deg, place.height_m])
-        self._line(line)
-        # The next line starts where this one ends.
-        self._line_end = line[-1:]
+        for line in self._trail.lines(settled):
+            where = " ".join(_coordinates(*place) for place in line)
+            self._placemark(
+                "<styleUrl>#track</styleUrl><LineString><altitudeMode>absolute</altitudeMode>"
+                f"<coordinates>{where}</coordinates></LineString>"
+            )
 
     def finish(self) -> Mapping[str, Any]:
         """Write the bars, and end the file."""
@@ -70,15 +66,6 @@ class Kml(Sink):
             self._placemark(f"<name>bar {number}, id {site.transmitter_id}</name>{where}")
         self._file.write("</Document></kml>\n")
         return {}
-
-    def _line(self, line: list[list[float]]) -> None:
-        for piece in cut(line):
-            if len(piece) > 1:
-                where = " ".join(_coordinates(*place) for place in piece)
-                self._placemark(
-                    "<styleUrl>#track</styleUrl><LineString><altitudeMode>absolute</altitudeMode>"
-                    f"<coordinates>{where}</coordinates></LineString>"
-                )
 
     def _placemark(self, content: str) -> None:
         self._file.write(f"<Placemark>{content}</Placemark>\n")

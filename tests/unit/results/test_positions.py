@@ -31,10 +31,11 @@ from evlcp_sdk.results.alternatives_csv import AlternativesCsv
 from evlcp_sdk.results.figures import TrackProbe, draw_track
 from evlcp_sdk.results.fixes_csv import FixesCsv
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.geojson import GeoJson, cut
+from evlcp_sdk.results.geojson import GeoJson
 from evlcp_sdk.results.nmea import Nmea
 from evlcp_sdk.results.points_csv import PointsCsv
 from evlcp_sdk.results.sink import Run
+from evlcp_sdk.results.trail import cut
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
