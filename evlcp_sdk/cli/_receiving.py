@@ -3,7 +3,7 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,7 +16,27 @@ if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 
-__all__ = ["LinePrinter", "attitude_of", "clock_zero_of", "json_lines_of", "position_plan_of"]
+__all__ = [
+    "HeadingDeg",
+    "LinePrinter",
+    "PitchDeg",
+    "RollDeg",
+    "Sites",
+    "attitude_of",
+    "clock_zero_of",
+    "json_lines_of",
+    "position_plan_of",
+]
+
+Sites = Annotated[
+    Path | None,
+    typer.Option("--sites", metavar="site.toml", help="Where the bars stand: compute positions."),
+]
+HeadingDeg = Annotated[
+    float | None, typer.Option("--heading-deg", help="Its heading, clockwise from north, if known.")
+]
+PitchDeg = Annotated[float | None, typer.Option("--pitch-deg", help="Its pitch, up.")]
+RollDeg = Annotated[float | None, typer.Option("--roll-deg", help="Its roll, top to the right.")]
 
 
 def attitude_of(

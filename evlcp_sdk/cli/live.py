@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._common import LinkFile, Overrides, complain, echo
-from evlcp_sdk.cli._receiving import attitude_of, clock_zero_of, json_lines_of, position_plan_of
+from evlcp_sdk.cli._receiving import (
+    HeadingDeg,
+    PitchDeg,
+    RollDeg,
+    Sites,
+    attitude_of,
+    clock_zero_of,
+    json_lines_of,
+    position_plan_of,
+)
 from evlcp_sdk.cli._summary import show
 
 if TYPE_CHECKING:
@@ -48,15 +57,10 @@ def live(
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The summary as one line of JSON.")] = False,
-    sites: Annotated[
-        Path | None,
-        typer.Option("--sites", metavar="site.toml", help="Where the bars stand: compute positions."),
-    ] = None,
-    heading_deg: Annotated[
-        float | None, typer.Option("--heading-deg", help="Its heading, clockwise from north, if known.")
-    ] = None,
-    pitch_deg: Annotated[float | None, typer.Option("--pitch-deg", help="Its pitch, up.")] = None,
-    roll_deg: Annotated[float | None, typer.Option("--roll-deg", help="Its roll, top to the right.")] = None,
+    sites: Sites = None,
+    heading_deg: HeadingDeg = None,
+    pitch_deg: PitchDeg = None,
+    roll_deg: RollDeg = None,
     clock_zero: Annotated[
         str | None,
         typer.Option("--clock-zero", metavar="UTC", help="UTC of the camera clock's 0."),

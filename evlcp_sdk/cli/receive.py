@@ -21,7 +21,17 @@ from evlcp_sdk.cli._common import (
     hush,
     make_executor,
 )
-from evlcp_sdk.cli._receiving import LinePrinter, attitude_of, clock_zero_of, json_lines_of, position_plan_of
+from evlcp_sdk.cli._receiving import (
+    HeadingDeg,
+    LinePrinter,
+    PitchDeg,
+    RollDeg,
+    Sites,
+    attitude_of,
+    clock_zero_of,
+    json_lines_of,
+    position_plan_of,
+)
 from evlcp_sdk.cli._summary import show
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
 
@@ -98,10 +108,7 @@ def receive(
         int, typer.Option("--workers", min=0, metavar="N", help="Processes for many recordings; 0: this one.")
     ] = 0,
     dask: Dask = None,
-    sites: Annotated[
-        Path | None,
-        typer.Option("--sites", metavar="site.toml", help="Where the bars stand: compute positions."),
-    ] = None,
+    sites: Sites = None,
     attitude_file: Annotated[
         Path | None,
         typer.Option(
@@ -118,11 +125,9 @@ def receive(
             help="Fixes of satellites, with sigmas, which enter the track: CSV, or .nmea with --clock-zero.",
         ),
     ] = None,
-    heading_deg: Annotated[
-        float | None, typer.Option("--heading-deg", help="Its heading, clockwise from north, if known.")
-    ] = None,
-    pitch_deg: Annotated[float | None, typer.Option("--pitch-deg", help="Its pitch, up.")] = None,
-    roll_deg: Annotated[float | None, typer.Option("--roll-deg", help="Its roll, top to the right.")] = None,
+    heading_deg: HeadingDeg = None,
+    pitch_deg: PitchDeg = None,
+    roll_deg: RollDeg = None,
     heading_sigma_deg: Annotated[
         float,
         typer.Option(
