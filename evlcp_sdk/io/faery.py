@@ -8,7 +8,7 @@ import numpy as np
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io._sieve import Sieve
-from evlcp_sdk.plugin.source import EventSource, Loss
+from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["FORMATS", "FaerySource"]
@@ -49,9 +49,9 @@ class FaerySource(EventSource):
         except Exception as error:
             raise InputError(f"{path}: found no {name} file, expected one ({error})") from error
         width, height = (None, None) if size == UNKNOWN_SIZE else size
-        super().__init__(target, name, width, height, None, target.stat().st_size)
-        self._packets: Iterator[Any] = iter(stream)
         self._sieve = Sieve("row", width, height)
+        super().__init__(target, name, width, height, None, target.stat().st_size, self._sieve)
+        self._packets: Iterator[Any] = iter(stream)
         self._row = 1
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
@@ -72,16 +72,6 @@ class FaerySource(EventSource):
         columns = (packet["t"], packet["x"], packet["y"], packet["on"])
         events = Events.of(*(np.array(column) for column in columns))  # copies: faery may reuse the packet
         return self._sieve.sift(events, first), Triggers.empty()
-
-    @property
-    def losses(self) -> dict[str, Loss]:
-        """As `EventSource.losses`, with the numbers of the events."""
-        return self._sieve.losses
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """As `EventSource.counts`, with `clock_restarts` where there were any."""
-        return super().counts | self._sieve.counts
 
     def close(self) -> None:
         """Close the file."""

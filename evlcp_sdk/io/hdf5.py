@@ -7,7 +7,7 @@ import numpy as np
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io._sieve import Sieve
-from evlcp_sdk.plugin.source import EventSource, Loss
+from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["Hdf5Source"]
@@ -53,10 +53,10 @@ class Hdf5Source(EventSource):
         except BaseException:
             self._file.close()
             raise
-        super().__init__(target, "HDF5", width, height, None, target.stat().st_size)
+        self._sieve = Sieve("row", width, height)
+        super().__init__(target, "HDF5", width, height, None, target.stat().st_size, self._sieve)
         self._rows = min(len(column) for column in self._columns.values())
         self._row = 0
-        self._sieve = Sieve("row", width, height)
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
         """As `EventSource.take`.
@@ -81,16 +81,6 @@ class Hdf5Source(EventSource):
     def position_bytes(self) -> int:
         """How much of the file is read."""
         return round((self.size_bytes or 0) * (self._row / self._rows if self._rows else 1))
-
-    @property
-    def losses(self) -> dict[str, Loss]:
-        """As `EventSource.losses`, with row numbers."""
-        return self._sieve.losses
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """As `EventSource.counts`, with `clock_restarts` where there were any."""
-        return super().counts | self._sieve.counts
 
     def close(self) -> None:
         """Close the file."""

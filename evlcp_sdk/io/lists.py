@@ -17,7 +17,7 @@ from evlcp_sdk.errors import InputError
 from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.io.tables import DAMAGE, NpzColumn, said, show
 from evlcp_sdk.io.writers import LAST_TIME_US
-from evlcp_sdk.plugin.source import EventSource, Loss
+from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["ListColumns", "ListSource", "TimeUnit", "columns_of", "is_list", "time_unit"]
@@ -184,7 +184,8 @@ class ListSource(EventSource):
             times = np.empty(0, np.int64) if first is None else first[0][:LOOKED_AT]
             self._unit = time_unit(times, self._unit_of)
             header = {"pixels": "none given: x = y = 0", "time": f"in {self._unit.name}, {self._unit.why}"}
-            super().__init__(target, "NPZ" if is_npz else "CSV", header=header, size_bytes=size)
+            kind = "NPZ" if is_npz else "CSV"
+            super().__init__(target, kind, header=header, size_bytes=size, ledger=self._sieve)
             self._stack = stack.pop_all()
 
     def _csv(self, target: Path, stack: ExitStack) -> Iterator[Piece]:
@@ -274,16 +275,6 @@ class ListSource(EventSource):
     def position_bytes(self) -> int:
         """How much of the file is read."""
         return min(self._position, self.size_bytes or 0)
-
-    @property
-    def losses(self) -> dict[str, Loss]:
-        """As `EventSource.losses`, with lines or rows."""
-        return self._sieve.losses
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """As `EventSource.counts`, with `clock_restarts` where there were any."""
-        return super().counts | self._sieve.counts
 
     def close(self) -> None:
         """Close the file."""

@@ -18,7 +18,7 @@ from evlcp_sdk.io._codec import MAX_SIDE, Codec, Columns, Decoder
 from evlcp_sdk.io.evt2 import EVT2
 from evlcp_sdk.io.evt3 import EVT3
 from evlcp_sdk.io.writers import EventWriter
-from evlcp_sdk.plugin.source import EventSource, Loss
+from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["CODECS", "RawEncoder", "RawHeader", "RawSource", "RawWriter", "format_header", "parse_header"]
@@ -229,9 +229,10 @@ class RawSource(EventSource):
             self._fill_header()
             header = parse_header(self._buffer[: self._end].tobytes(), self._path)
             size = None if status is None or self._is_pipe else status.st_size
-            super().__init__(self._path, header.codec.name, header.width, header.height, header.fields, size)
             self._codec = header.codec
             self._decoder = Decoder(header.codec, header.width, header.height)
+            shape = header.width, header.height
+            super().__init__(self._path, header.codec.name, *shape, header.fields, size, self._decoder)
             if not header.closed:
                 self._decoder.note(_words.HEADER_OPEN, header.size_bytes)
             self._start = self._position = self._data_start = header.size_bytes
@@ -374,16 +375,6 @@ class RawSource(EventSource):
     def position_bytes(self) -> int:
         """How much of the file is decoded."""
         return self._position
-
-    @property
-    def losses(self) -> dict[str, Loss]:
-        """As `EventSource.losses`, with byte offsets."""
-        return self._decoder.losses
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """`events`, `triggers`, `rollovers`, `time_gaps` and `other_words`."""
-        return super().counts | self._decoder.counts
 
     def close(self) -> None:
         """Close the file."""

@@ -18,7 +18,7 @@ from evlcp_sdk.errors import InputError, OutputError, StreamError
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.io.writers import LAST_TIME_US, EventWriter
-from evlcp_sdk.plugin.source import EventSource, Loss
+from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["CsvSource", "CsvWriter", "NpzColumn", "NpzSource", "NpzWriter", "said", "show"]
@@ -195,8 +195,8 @@ class NpzSource(EventSource):
                     self._trigger_columns = columns
             except DAMAGE as error:
                 raise InputError(f"{path}: damaged NPZ file: {said(error)}") from error
-            super().__init__(target, "NPZ", width, height, None, target.stat().st_size)
             self._sieve = Sieve("row", width, height)
+            super().__init__(target, "NPZ", width, height, None, target.stat().st_size, self._sieve)
             self._events, self._triggers = Events.empty(), Triggers.empty()
             self._stack = stack.pop_all()
 
@@ -241,16 +241,6 @@ class NpzSource(EventSource):
         """How much of the file is read."""
         column = self._columns[0]
         return round((self.size_bytes or 0) * (column.row / column.rows if column.rows else 1))
-
-    @property
-    def losses(self) -> dict[str, Loss]:
-        """As `EventSource.losses`, with row numbers."""
-        return self._sieve.losses
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """As `EventSource.counts`, with `clock_restarts` where there were any."""
-        return super().counts | self._sieve.counts
 
     def close(self) -> None:
         """Close the file."""
@@ -341,11 +331,11 @@ class CsvSource(EventSource):
         is_gzip = self._raw.read(2) == b"\x1f\x8b"
         self._raw.seek(0)
         self._file: BufferedIOBase = gzip.GzipFile(fileobj=self._raw) if is_gzip else self._raw
-        super().__init__(target, "CSV", size_bytes=target.stat().st_size)
+        self._sieve = Sieve("line", None, None)
+        super().__init__(target, "CSV", size_bytes=target.stat().st_size, ledger=self._sieve)
         self._text = b""
         self._line = 1
         self._exhausted = False
-        self._sieve = Sieve("line", None, None)
         try:
             header = self._more(4096).partition(b"\n")
         except InputError:
@@ -398,16 +388,6 @@ class CsvSource(EventSource):
     def position_bytes(self) -> int:
         """How much of the file is read."""
         return self._raw.tell() if not self._raw.closed else self.size_bytes or 0
-
-    @property
-    def losses(self) -> dict[str, Loss]:
-        """As `EventSource.losses`, with line numbers."""
-        return self._sieve.losses
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """As `EventSource.counts`, with `clock_restarts` where there were any."""
-        return super().counts | self._sieve.counts
 
     def close(self) -> None:
         """Close the file."""

@@ -6,12 +6,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
 from evlcp_sdk.errors import EvlcpError, PluginError, StreamError
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["DEFAULT_MAX_EVENTS", "EventSource", "Loss"]
+__all__ = ["DEFAULT_MAX_EVENTS", "EventSource", "Ledger", "Loss"]
 
 DEFAULT_MAX_EVENTS = 1 << 16
 """Events of a piece unless asked otherwise: under 1 MB, so that it is still in the cache when it is used."""
@@ -48,6 +48,18 @@ class Loss:
         return f"{self.count} {self.meaning} (first at {self.unit} {self.first})"
 
 
+class Ledger(Protocol):
+    """What decodes or checks a source's events, and counts what it drops."""
+
+    @property
+    def losses(self) -> dict[str, Loss]:
+        """What has been lost so far, by kind."""
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What else it counts, by name."""
+
+
 class EventSource(ABC):
     """A recording or a camera, read once from front to back; a context manager.
 
@@ -64,6 +76,7 @@ class EventSource(ABC):
         height: Rows of the sensor, or None.
         header: The recording's own header lines, by key.
         size_bytes: Size of the file, or None for a live source.
+        ledger: Whose losses and counts are this source's; None where nothing is ever lost.
     """
 
     live = False
@@ -77,6 +90,7 @@ class EventSource(ABC):
         height: int | None = None,
         header: Mapping[str, str] | None = None,
         size_bytes: int | None = None,
+        ledger: Ledger | None = None,
     ) -> None:
         self.path = path
         self.format = format
@@ -84,6 +98,7 @@ class EventSource(ABC):
         self.height = height
         self.header: Mapping[str, str] = header or {}
         self.size_bytes = size_bytes
+        self._ledger = ledger
         self._given = {"events": 0, "triggers": 0}
         self._rest = (Events.empty(), Triggers.empty())
 
@@ -118,12 +133,12 @@ class EventSource(ABC):
     @property
     def losses(self) -> dict[str, Loss]:
         """What has been lost so far, by kind; a kind that did not occur is left out."""
-        return {}
+        return {} if self._ledger is None else self._ledger.losses
 
     @property
     def counts(self) -> dict[str, int]:
         """What has been given out so far, `events` and `triggers`, and what else the format counts."""
-        return dict(self._given)
+        return self._given | ({} if self._ledger is None else self._ledger.counts)
 
     def stream(self, max_events: int = DEFAULT_MAX_EVENTS) -> Iterator[tuple[Events, Triggers]]:
         """Yield what follows, in pieces of at most `max_events` events and as many triggers.
