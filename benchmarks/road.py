@@ -355,7 +355,7 @@ def links_of(args: argparse.Namespace) -> dict[str, Make]:
         return load_link(file, [f"modulation.id={profile}", *sets])
 
     def with_settings(text: str, profile: str) -> Link:
-        return load_variants([text], args.link, [f"modulation.id={profile}", *args.set])[0].link
+        return load_variants([text], args.link, [f"modulation.id={profile}", *args.set])[0].links[""]
 
     links: dict[str, Make] = {
         args.link.stem if args.link else "link" if args.set else "default": partial(

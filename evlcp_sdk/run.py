@@ -17,7 +17,7 @@ from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source
 from evlcp_sdk.io.open import STDIN
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
-from evlcp_sdk.link.several import load_links
+from evlcp_sdk.link.several import load_links, named_links
 from evlcp_sdk.live.budget import Budget
 from evlcp_sdk.live.loop import FrameEar, LiveLoop
 from evlcp_sdk.live.outlet import Outlet
@@ -469,7 +469,7 @@ def diagnose(
 def film(
     recording: Path | str,
     out: Path,
-    link: Link | Path | str | None = None,
+    link: Link | Path | str | Sequence[Link | Path | str] | None = None,
     *,
     registry: Registry | None = None,
     from_ms: float | None = None,
@@ -486,7 +486,7 @@ def film(
     Args:
         recording: What to open, plugins asked first.
         out: An animated picture, `.webp` or `.gif`, or a film, `.mp4`.
-        link: The configuration, or a `link.toml`; None for all defaults.
+        link: The configuration, or a `link.toml`, or several of these; None for all defaults.
         registry: The plugins; None for all that are installed.
         from_ms: Where it starts, ms after the first event; None for the first frame that is decoded, or the
             start where there is none.
@@ -531,25 +531,33 @@ def film(
             "a film needs a file: it reads the recording twice, and standard input gives it once"
         )
     registry = Registry.load() if registry is None else registry
-    link = link if isinstance(link, Link) else load_link(link, registry=registry)
+    links = named_links(load_links(link, registry=registry))
+    camera = next(iter(links.values())).camera
     probe = FilmProbe()
     frames: list[Frame] = []
+    sent_with: dict[int, str] = {}
     start_us: float | None = None
     first_us = last_us = None
-    late_us = _FILM_LATE_PACKETS * link.packet.packet_chips * link.packet.chip_us
+    longest_us = max(one.packet.packet_chips * one.packet.chip_us for one in links.values())
+    # Of several links, what one has read waits for the others.
+    late_us = _FILM_LATE_PACKETS * min(len(links), 2) * longest_us
     with open_source(recording, registry) as source, registry.joined(probe):
-        check_sensor(source, recording, link.camera)
-        receiver = Receiver(link, registry.hook)
+        check_sensor(source, recording, camera)
+        receiver = Receiver([*links.values()], registry.hook)
         for events in source.chunks():
             first_us = int(events.t_us[0]) if first_us is None else first_us
             last_us = int(events.t_us[-1])
             if from_ms is not None:
                 start_us = first_us + from_ms * 1e3
-            start_us = _film_frames(receiver.feed(events), frames, start_us, for_ms * 1e3)
+            packets = receiver.feed(events)
+            sent_with |= {packet.transmitter: packet.link for packet in packets}
+            start_us = _film_frames(packets, frames, start_us, for_ms * 1e3)
             advance(source.position_bytes, source.size_bytes)
             if start_us is not None and last_us > start_us + for_ms * 1e3 + late_us:
                 break
-        start_us = _film_frames(receiver.close(), frames, start_us, for_ms * 1e3)
+        packets = receiver.close()
+        sent_with |= {packet.transmitter: packet.link for packet in packets}
+        start_us = _film_frames(packets, frames, start_us, for_ms * 1e3)
     if first_us is None or last_us is None:
         raise InputError(f"{recording}: no events")
     start_us = first_us if start_us is None else start_us
@@ -560,7 +568,7 @@ def film(
         )
     until_us = start_us + for_ms * 1e3
     regions = [region for region in probe.regions if start_us - 1e4 <= region.t_us <= until_us]
-    plan = plan_film(start_us, for_ms * 1e3, slow, frames, regions, link.camera, longest_px, whole=whole)
+    plan = plan_film(start_us, for_ms * 1e3, slow, frames, regions, camera, longest_px, whole=whole)
     width, height = plan.size_px
     if (megapixels := pictures * width * height * 1e-6) > MOST_MEGAPIXELS:
         raise ConfigError(
@@ -568,7 +576,7 @@ def film(
             f" {MOST_MEGAPIXELS}: smaller, shorter, or faster"
         )
     with open_source(recording, registry) as source:
-        drawn = list(draw_film(plan, source.chunks(), frames, regions, link))
+        drawn = list(draw_film(plan, source.chunks(), frames, regions, links, sent_with))
     with Outputs() as outputs:
         with outputs.told(out):
             save_film(drawn, outputs.path(out), kind)

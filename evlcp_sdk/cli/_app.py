@@ -59,7 +59,10 @@ def _expect_once(ctx: Any, name: str | None, command: Any, args: list[str]) -> N
                 option.multiple or option.is_flag or option.count
             )
             if takes_one and order.count(option) > 1:
-                inner.fail(f"{option.opts[-1]} is given {order.count(option)} times, expected once")
+                said = f"{option.opts[-1]} is given {order.count(option)} times, expected once"
+                if "--config" in option.opts:
+                    said += f": {name} goes by one link; run it once for each"
+                inner.fail(said)
 
 
 @contextmanager

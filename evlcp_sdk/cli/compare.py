@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, complain, console, echo, make_executor
+from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, complain, console, echo, make_executor
 from evlcp_sdk.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def compare(
             help="A variant; repeat it. NAME: alone is the link as it is.",
         ),
     ] = None,
-    link_file: LinkFile = None,
+    link_files: LinkFiles = None,
     overrides: Overrides = None,
     out: Annotated[
         list[Path] | None,
@@ -93,14 +93,14 @@ def compare(
             raise OutputError(f"{path}: cannot be written: no folder {path.parent}")
         check_output(path, regular=False)
     if any(map(_is_campaign, recordings)):
-        if variants or link_file or overrides or len(recordings) > 1:
+        if variants or link_files or overrides or len(recordings) > 1:
             raise typer.BadParameter(
                 "results of a campaign stand alone: their variants are the campaign's links",
                 param_hint="REC...",
             )
         code, comparison = 0, _of_results(Path(recordings[0]))
     else:
-        code, comparison = _of_recordings(recordings, variants or [], link_file, overrides or [], jobs)
+        code, comparison = _of_recordings(recordings, variants or [], link_files, overrides or [], jobs)
     if comparison.tables:
         _write(comparison, out or [])
         if as_json:
@@ -136,7 +136,11 @@ def _of_results(path: Path) -> "Comparison":
 
 
 def _of_recordings(
-    urls: Sequence[str], texts: Sequence[str], link_file: str | None, overrides: Sequence[str], workers: int
+    urls: Sequence[str],
+    texts: Sequence[str],
+    link_files: Sequence[str] | None,
+    overrides: Sequence[str],
+    workers: int,
 ) -> tuple[int, "Comparison"]:
     from evlcp_sdk.errors import InterruptedRunError
     from evlcp_sdk.plugin.registry import Registry
@@ -148,7 +152,7 @@ def _of_recordings(
     if twice := {url for url in urls if urls.count(url) > 1}:
         raise typer.BadParameter(f"{min(twice)} is named twice", param_hint="REC...")
     registry = Registry.load()
-    variants = load_variants(texts, link_file, overrides, registry)
+    variants = load_variants(texts, link_files, overrides, registry)
     here = not workers or len(urls) == 1
     executor = make_executor(0 if here else workers, None)
     tables: dict[str, Table] = {}

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, bytes_bar, console, echo
+from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, bytes_bar, console, echo
 
 __all__ = ["register"]
 
@@ -25,7 +25,7 @@ def video(
             "-o", "--out", metavar="FILM", help="Where the film goes: NAME.webp, NAME.gif or NAME.mp4."
         ),
     ],
-    link_file: LinkFile = None,
+    link_files: LinkFiles = None,
     overrides: Overrides = None,
     from_ms: Annotated[
         float | None,
@@ -63,17 +63,17 @@ def video(
     """
     import json
 
-    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.link.several import load_links
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import film
 
     registry = Registry.load()
-    link = load_link(link_file, overrides or [], registry)
+    links = load_links(link_files, overrides or [], registry)
     with bytes_bar(Path(recording).name) as advance:
         told = film(
             recording,
             out,
-            link,
+            links,
             registry=registry,
             from_ms=from_ms,
             for_ms=for_ms,

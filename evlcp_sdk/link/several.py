@@ -21,16 +21,39 @@ def load_links(
 
     Args:
         link: A link, a `link.toml`, or several of these.
-        overrides: `table.key=value` texts that change those that are read from files.
+        overrides: `table.key=value` texts that change those that are read from files; of several,
+            `name.table.key=value` changes the one of that name.
         registry: Where algorithms are found; None for all that are installed.
 
     Raises:
         ConfigError: A file does not describe a link, or they cannot be received together.
     """
     given: Sequence[LinkLike] = [link] if link is None or isinstance(link, Link | Path | str) else link
-    links = tuple(one if isinstance(one, Link) else load_link(one, overrides, registry) for one in given)
+    names = [one.name if isinstance(one, Link) else Path(one).stem if one else "" for one in given]
+    links = tuple(
+        one if isinstance(one, Link) else load_link(one, _overrides_of(name, names, overrides), registry)
+        for one, name in zip(given, names, strict=True)
+    )
     named_links(links)
     return links
+
+
+def _overrides_of(name: str, names: Sequence[str], overrides: Sequence[str]) -> list[str]:
+    """The overrides that one of several links takes: those of all links, and those that name it."""
+    if len(names) == 1:
+        return list(overrides)
+    taken = []
+    for text in overrides:
+        key = text.partition("=")[0]
+        if key.count(".") < 2:
+            taken.append(text)
+            continue
+        which = key.partition(".")[0].strip()
+        if which not in names:
+            raise ConfigError(f"--set {text}: no link is named '{which}': expected one of {', '.join(names)}")
+        if which == name:
+            taken.append(text.partition(".")[2])
+    return taken
 
 
 def named_links(link: Link | Sequence[Link]) -> dict[str, Link]:

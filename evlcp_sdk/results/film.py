@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.hooks import hookimpl
@@ -163,15 +164,30 @@ def plan_film(
 
 
 def draw_film(
-    film: Film, events: Iterable[Events], frames: Sequence[Frame], regions: Sequence[Region], link: Link
+    film: Film,
+    events: Iterable[Events],
+    frames: Sequence[Frame],
+    regions: Sequence[Region],
+    links: Mapping[str, Link],
+    sent_with: Mapping[int, str],
 ) -> Iterator[Image.Image]:
-    """Draw the pictures one after another; reads no further than to the last one's events."""
-    overlay = _Overlay(film, frames, regions, link)
+    """Draw the pictures one after another; reads no further than to the last one's events.
+
+    Args:
+        film: What is shown.
+        events: Those of the recording.
+        frames: Frames of that time.
+        regions: Regions of that time.
+        links: The receiver's, by name.
+        sent_with: Name of the link of each transmitter.
+    """
+    overlay = _Overlay(film, frames, regions, links, sent_with)
+    chip_us = min(link.packet.chip_us for link in links.values())
     lit = np.zeros((2, film.rows, film.columns), np.float32)
     # What blinks would be white all over, were a picture exposed for longer than a chip.
-    open_from = 1 - min(link.packet.chip_us / film.picture_us, 1.0)
+    open_from = 1 - min(chip_us / film.picture_us, 1.0)
     # In one of less than a chip, what the chip has shown before stays.
-    stays = 0.0 if open_from else 0.5 ** (film.picture_us / link.packet.chip_us)
+    stays = 0.0 if open_from else 0.5 ** (film.picture_us / chip_us)
     number = 0
     for piece in events:
         if number == film.pictures:
@@ -275,16 +291,26 @@ class _Overlay:
         film: What is shown.
         frames: Frames of that time.
         regions: Regions of that time.
-        link: Lengths of frames, number of clusters.
+        links: Lengths of frames, number of clusters.
+        sent_with: Name of the link of each transmitter.
     """
 
-    def __init__(self, film: Film, frames: Sequence[Frame], regions: Sequence[Region], link: Link) -> None:
+    def __init__(
+        self,
+        film: Film,
+        frames: Sequence[Frame],
+        regions: Sequence[Region],
+        links: Mapping[str, Link],
+        sent_with: Mapping[int, str],
+    ) -> None:
         self._film = film
         self._frames = sorted(frames, key=lambda frame: frame.t_us)
         self._regions = sorted(regions, key=lambda region: region.t_us)
-        self._packet = link.packet
-        self._step_us = link.regions.step_us
-        colours = (255 * cluster_colours(link.codebook.clusters)).astype(int)
+        self._packets = {name: link.packet for name, link in links.items()}
+        self._sent_with = sent_with
+        self._step_us = next(iter(links.values())).regions.step_us
+        most = max(link.codebook.clusters for link in links.values())
+        colours = (255 * cluster_colours(most)).astype(int)
         # On a dark ground, dark ones are lifted.
         self._colours = [tuple(int(90 + v * 165 / 255) for v in colour) for colour in colours]
         self._font = ImageFont.load_default(_TEXT_PX)
@@ -321,23 +347,28 @@ class _Overlay:
             pen.rectangle((*self._at(x0 - 1, y0 - 1), *self._at(x1 + 1, y1 + 1)), outline=(90, 90, 90))
 
     def _draw_frames(self, pen: ImageDraw.ImageDraw, t_us: float) -> None:
-        packet = self._packet
         newest: dict[int, Frame] = {}
         for frame in self._frames:
             if frame.t_us > t_us:
                 break
+            packet = self._packet_of(frame)
             if frame.t_us > t_us - packet.packet_chips * packet.chip_us:
                 newest[frame.transmitter] = frame
         for frame in newest.values():
+            packet = self._packet_of(frame)
             chips = packet.frame_chips if packet.has_pilot(frame.frame) else packet.info_chips
             (left, top), (right, _) = _box_of_frame(frame)
             self._name(pen, frame, self._at(left, top))
             if t_us < frame.t_us + chips * packet.chip_us:
                 self._symbols(pen, frame, right)
 
+    def _packet_of(self, frame: Frame) -> PacketFormat:
+        return self._packets[self._sent_with[frame.transmitter]]
+
     def _name(self, pen: ImageDraw.ImageDraw, frame: Frame, corner: tuple[float, float]) -> None:
         distance = frame.range
-        text = f"{frame.transmitter}"
+        link = self._sent_with[frame.transmitter]
+        text = f"{frame.transmitter} ({link})" if link else f"{frame.transmitter}"
         if frame.echo_of is not None:
             text += f", reflection of {frame.echo_of}"
         if math.isfinite(distance.distance_m):

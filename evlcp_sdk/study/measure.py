@@ -1,7 +1,7 @@
 """Counting: decoded frames, messages and positions beside the truth, as tallies that add."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -77,6 +77,7 @@ def statistics_of(
     events: int = 0,
     packets: int = 0,
     others: Iterable[tuple[int, Tally]] = (),
+    links: Mapping[str, Link] | None = None,
 ) -> Statistics:
     """Hold decoded frames against the truth.
 
@@ -86,9 +87,10 @@ def statistics_of(
         events: Events that the sensor sent.
         packets: Decoded packets.
         others: What `message_tallies` and `position_tallies` gave.
+        links: The receiver's links by name, where it has several; None for one.
     """
     frames = list(frames)
-    matched = match(frames, truth)
+    matched = match(frames, truth, links=links)
     tallies = [
         tally
         for sent, pairs in zip(matched.bars, matched.pairs, strict=True)

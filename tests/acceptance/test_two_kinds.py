@@ -3,15 +3,18 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.results.folder import read_summary
-from evlcp_sdk.run import receive, receive_to_folder
+from evlcp_sdk.run import film, receive, receive_to_folder
 from evlcp_sdk.sim.truth import read_truth
 from evlcp_sdk.simulated import simulate
+from evlcp_sdk.study.compare.recordings import compare_recording
+from evlcp_sdk.study.compare.variants import load_variants
 from evlcp_sdk.study.frames import frames_of, read_frames
 from evlcp_sdk.study.match import check_link
 from evlcp_sdk.study.score import links_of_result, score_frames
@@ -29,6 +32,22 @@ parity = "even"
 chip_rate_hz = 10000.0
 """
 OTHERS = {"lamp": LAMP, "far": '[modulation]\nid = "wh8"\n', "slow": "[air]\nchip_rate_hz = 5000.0\n"}
+
+
+def compare_and_film(folder: Path, links: list[Path], score: dict[str, Any]) -> None:
+    """The other commands that take several links say the same of them."""
+    variants = load_variants(["a:", "b:far.ranging.id=centroid"], links)
+    assert variants[1].links["far"].table["ranging"]["id"] == "centroid"
+    assert variants[0].links["bar"].digest == variants[1].links["bar"].digest
+    assert set(variants[0].to_dict()["links"]) == {"bar", "far"}
+    table = compare_recording(str(folder / "two.raw"), variants)
+    for row in table.rows:
+        total = row.measured.statistics.total()
+        assert total.frames_found == sum(bar["frames_found"] for bar in score["bars"])
+        assert (total.bit_errors, row.measured.statistics.unmatched) == (0, 0)
+    assert table.bound_m.count == 0
+    told = film(folder / "two.raw", folder / "two.webp", links, for_ms=2.0, longest_px=200)
+    assert len(told["transmitters"]) == 2
 
 
 @pytest.mark.parametrize("other", OTHERS)
@@ -72,6 +91,8 @@ def test_bar_and_another_kind(other: str, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet").read_table(tmp_path / "out" / "frames.parquet")
     assert parquet.column("link").to_pylist() == [row["link"] for row in rows]
 
+    if other == "far":
+        compare_and_film(tmp_path, links, found)
     with receive(tmp_path / "two.raw", links) as packets_again:
         assert len(frames_of(packets_again)) == len(rows)
     with pytest.raises(ConfigError, match="bar 1 was sent with another link"):

@@ -37,8 +37,8 @@ def compare_recording(
     def opened() -> EventSource:
         source = open_source(url, registry)
         try:
-            for variant in variants:
-                check_sensor(source, url, variant.link.camera)
+            for link in (link for variant in variants for link in variant.links.values()):
+                check_sensor(source, url, link.camera)
         except ConfigError:
             source.close()
             raise

@@ -5,7 +5,7 @@ the same and time is measured in one run. What comes out is counted as the road 
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -85,10 +85,11 @@ class _Bound:
 class _Lane:
     """One variant's receiver, its frames and its time."""
 
-    def __init__(self, link: Link, bound: _Bound | None = None) -> None:
+    def __init__(self, links: Mapping[str, Link], bound: _Bound | None = None) -> None:
         self.watch = _Watch()
+        self.links = links
         others = [] if bound is None else [bound]
-        self.receiver = Receiver(link, Registry.load(self.watch, *others).hook)
+        self.receiver = Receiver([*links.values()], Registry.load(self.watch, *others).hook)
         self.frames: list[GivenFrame] = []
         self.packets = 0
         self.spent = Stopwatch()
@@ -111,7 +112,8 @@ def measure_recording(
     """Receive a recording with every variant, and compare what came out with the truth.
 
     Its first packets are read and received once before, so that no kernel is loaded or compiled while time
-    runs. The bound is of the frames as the first variant decodes them; a bar of several columns has none.
+    runs. The bound is of the frames as the first variant decodes them; a bar of several columns has none,
+    nor have several links.
 
     Args:
         name: Of the table.
@@ -126,11 +128,11 @@ def measure_recording(
     """
     if truth is not None:
         for variant in variants:
-            check_link(truth, variant.link, f"{name}: --variant {variant.name}")
+            check_link(truth, variant.links, f"{name}: --variant {variant.name}")
     with open_source() as source:
         _warm(source, variants)
-    bound = _bound_of(variants[0].link)
-    lanes = [_Lane(variant.link, None if n else bound) for n, variant in enumerate(variants)]
+    bound = _bound_of(variants[0].links)
+    lanes = [_Lane(variant.links, None if n else bound) for n, variant in enumerate(variants)]
     first_us = last_us = None
     reading = Stopwatch()
     with open_source() as source:
@@ -169,8 +171,8 @@ def _timed(pieces: Iterator[Events], watch: Stopwatch) -> Iterator[Events]:
 
 def _warm(source: EventSource, variants: Sequence[Variant]) -> None:
     """Receive the first packets with every variant."""
-    lanes = [_Lane(variant.link) for variant in variants]
-    packets = [variant.link.packet for variant in variants]
+    lanes = [_Lane(variant.links) for variant in variants]
+    packets = [link.packet for variant in variants for link in variant.links.values()]
     enough_us = _WARM_PACKETS * max(packet.packet_chips * packet.chip_us for packet in packets)
     first_us = None
     for events in source.chunks():
@@ -183,8 +185,11 @@ def _warm(source: EventSource, variants: Sequence[Variant]) -> None:
         lane.feed(None)
 
 
-def _bound_of(link: Link) -> _Bound | None:
-    """What gives the bound of each frame; None where the bound's model does not hold."""
+def _bound_of(links: Mapping[str, Link]) -> _Bound | None:
+    """What gives the bound of each frame; None where the bound's model does not hold, or not for all."""
+    if len(links) > 1:
+        return None
+    (link,) = links.values()
     try:
         return _Bound(frame_bound(link.camera, link.bar, link.codebook))
     except ConfigError:
@@ -200,5 +205,6 @@ def _measured(name: str, lane: _Lane, truth: Truth | None, recorded_s: float, re
     )
     if truth is None:
         return Measured(without_truth(lane.frames, lane.packets), times)
-    counted = statistics_of(lane.frames, truth, packets=lane.packets)
+    several = lane.links if len(lane.links) > 1 else None
+    counted = statistics_of(lane.frames, truth, packets=lane.packets, links=several)
     return Measured(counted, times, {name: counted.total()})

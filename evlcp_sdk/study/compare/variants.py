@@ -1,19 +1,21 @@
 """Named variants of a link."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.link.several import load_links, named_links
 from evlcp_sdk.plugin.registry import Registry
 
 __all__ = ["Variant", "load_variants"]
 
-_SETTING = re.compile(r"[\w-]+\s*\.\s*[\w-]+\s*=.*", re.DOTALL)
-_AT_SETTING = re.compile(r",(?=\s*[\w-]+\s*\.\s*[\w-]+\s*=)")
+_KEY = r"[\w-]+\s*\.\s*[\w-]+\s*(?:\.\s*[\w-]+\s*)?="
+_SETTING = re.compile(rf"{_KEY}.*", re.DOTALL)
+_AT_SETTING = re.compile(rf",(?=\s*{_KEY})")
 """A comma is part of a value, as in `[1, 14]`, unless another setting follows it."""
 
 
@@ -24,25 +26,28 @@ class Variant:
     Attributes:
         name: As the user calls it.
         settings: What sets it apart, e.g. `ranging.id=centroid`.
-        link: The resolved configuration.
+        links: The resolved configuration by name, which is empty for a single link.
     """
 
     name: str
     settings: tuple[str, ...]
-    link: Link
+    links: Mapping[str, Link]
 
     def to_dict(self) -> dict[str, Any]:
-        """Settings, digest and resolved table as JSON values."""
-        return {
-            "settings": list(self.settings),
-            "digest": self.link.digest,
-            "configuration": {section: dict(keys) for section, keys in self.link.table.items()},
+        """Settings, digest and resolved table as JSON values; of several links under `links`, by name."""
+        described = {
+            name: {
+                "digest": link.digest,
+                "configuration": {section: dict(keys) for section, keys in link.table.items()},
+            }
+            for name, link in self.links.items()
         }
+        return {"settings": list(self.settings)} | described.get("", {"links": described})
 
 
 def load_variants(
     texts: Sequence[str],
-    path: Path | str | None = None,
+    path: Path | str | Sequence[Path | str] | None = None,
     overrides: Sequence[str] = (),
     registry: Registry | None = None,
 ) -> tuple[Variant, ...]:
@@ -50,7 +55,7 @@ def load_variants(
 
     Args:
         texts: What `--variant` takes.
-        path: The `link.toml` that they share; None for all defaults.
+        path: The `link.toml` that they share, or several; None for all defaults.
         overrides: What `--set` takes; holds for all, and yields to a variant's own settings.
         registry: Where algorithms are found; None for all that are installed.
 
@@ -78,7 +83,8 @@ def load_variants(
             faults.append(f"--variant {text}: the name '{name}' is taken by another variant")
             continue
         try:
-            found.append(Variant(name, settings, load_link(path, [*overrides, *settings], registry)))
+            links = load_links(path, [*overrides, *settings], registry)
+            found.append(Variant(name, settings, named_links(links)))
         except ConfigError as fault:
             for line in str(fault).splitlines():
                 here = line.removeprefix("--set: ")
@@ -91,4 +97,6 @@ def load_variants(
 def _is_about(fault: str, settings: Iterable[str]) -> bool:
     """Whether a fault is one of these settings: it starts with the key, or names the unknown id."""
     pairs = [[part.strip() for part in setting.split("=", 1)] for setting in settings]
+    # What names a link first names it for that link alone.
+    pairs = [[".".join(key.split(".")[-2:]), value] for key, value in pairs]
     return any(fault.startswith(key) or f"named '{value}'" in fault for key, value in pairs)

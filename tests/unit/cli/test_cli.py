@@ -200,6 +200,12 @@ def test_usage_and_configuration_end_with_2(
     assert "Traceback" not in done.err
 
 
+def test_what_goes_by_one_link_refuses_another(evlcp: Evlcp) -> None:
+    done = evlcp("diagnose", "never-read.raw", "-c", "a.toml", "-c", "b.toml")
+    assert done.code == 2
+    assert "--config is given 2 times, expected once: diagnose goes by one link" in " ".join(done.err.split())
+
+
 def test_every_fault_of_a_link_is_one_line(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:
     (tmp_path / "link.toml").write_text("[camera]\nwidht = 3\n[air]\nchip_rate_hz = 0\n")
     done = evlcp("receive", demo_raw, "-o", tmp_path / "out", "-c", tmp_path / "link.toml")

@@ -19,6 +19,7 @@ from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Frame, Range, Region, SoftSymbols
 
 LINK = load_link()
+LINKS = {"": LINK}
 HEAD_PX = 20
 SOFT = SoftSymbols(np.arange(16), np.zeros((16, 6), np.float32), 1.0)
 
@@ -50,7 +51,7 @@ def test_a_picture_shows_the_last_chip_before_it(pieces: int) -> None:
     events = random_events(900)
     shown = Film(1000.0, 400.0, 8, 5, 3, 30, 20, 2.0, 100.0)
     cuts = np.array_split(np.arange(len(events)), pieces)
-    pictures = list(draw_film(shown, (events[c] for c in cuts), [], [], LINK))
+    pictures = list(draw_film(shown, (events[c] for c in cuts), [], [], LINKS, {}))
     assert len(pictures) == 8
     for n, picture in enumerate(pictures):
         net = np.zeros((20, 30), int)
@@ -68,9 +69,11 @@ def test_a_film_reads_no_further_than_it_shows() -> None:
             assert n < 5, "read on"
             yield Events.of([100 * n], [7], [7], [1])
 
-    assert len(list(draw_film(Film(0.0, 100.0, 3, 0, 0, 9, 9, 1.0, 400.0), endless(), [], [], LINK))) == 3
+    assert (
+        len(list(draw_film(Film(0.0, 100.0, 3, 0, 0, 9, 9, 1.0, 400.0), endless(), [], [], LINKS, {}))) == 3
+    )
     # Pictures after the last event are dark.
-    dark = list(draw_film(Film(0.0, 100.0, 3, 0, 0, 9, 9, 1.0, 400.0), [], [], [], LINK))
+    dark = list(draw_film(Film(0.0, 100.0, 3, 0, 0, 9, 9, 1.0, 400.0), [], [], [], LINKS, {}))
     assert [np.abs(kinds(p)).sum() for p in dark] == [0, 0, 0]
 
 
@@ -100,7 +103,7 @@ def test_what_is_shown_holds_the_bars_and_stays_in_the_image() -> None:
 def test_events_of_a_small_picture_are_not_lost() -> None:
     shown = Film(0.0, 100.0, 1, 0, 0, 1280, 720, 0.5, 400.0)
     events = Events.of([1, 2, 3], [0, 641, 1279], [0, 301, 719], [1, 0, 1])
-    (picture,) = draw_film(shown, [events, Events.of([100], [0], [0], [0])], [], [], LINK)
+    (picture,) = draw_film(shown, [events, Events.of([100], [0], [0], [0])], [], [], LINKS, {})
     found = np.argwhere(kinds(picture)[:, :600])
     assert [0, 0] in found.tolist()
     assert [150, 320] in found.tolist()
@@ -138,7 +141,7 @@ def test_a_film_for_programs_that_play_no_pictures(tmp_path: Path) -> None:
     """Read again, each of its pictures is near the one that was drawn; an odd side gets one more."""
     av = pytest.importorskip("av")
     shown = Film(1000.0, 400.0, 8, 5, 3, 31, 21, 3.0, 100.0)
-    drawn = list(draw_film(shown, [random_events(900)], [], [], LINK))
+    drawn = list(draw_film(shown, [random_events(900)], [], [], LINKS, {}))
     save_film(drawn, tmp_path / "a.mp4", "MP4")
     with av.open(tmp_path / "a.mp4") as file:
         (stream,) = file.streams

@@ -290,10 +290,10 @@ def test_variants_share_what_is_set_for_all() -> None:
         ["base:", "other: decoding.min_weight=0.3,ranging.clusters=[1, 3, 14] , ranging.skip_outer=0"],
         overrides=["decoding.min_weight=0.2", "ranging.id=poc", "ranging.min_pixels=7"],
     )
-    assert base.link.table["decoding"]["min_weight"] == 0.2
-    assert other.link.table["decoding"]["min_weight"] == 0.3
-    assert other.link.table["ranging"]["clusters"] == [1, 3, 14]
-    assert other.link.table["ranging"]["min_pixels"] == 7
+    assert base.links[""].table["decoding"]["min_weight"] == 0.2
+    assert other.links[""].table["decoding"]["min_weight"] == 0.3
+    assert other.links[""].table["ranging"]["clusters"] == [1, 3, 14]
+    assert other.links[""].table["ranging"]["min_pixels"] == 7
     assert base.to_dict()["digest"] != other.to_dict()["digest"]
     with pytest.raises(ConfigError) as fault:
         load_variants(["a:", "b:ranging.id=poc"], overrides=["bar.rows=x"])
