@@ -61,7 +61,7 @@ def received(
     """Times to receive, and what was seen of it."""
     outlet, link = Outlet(), load_link()
     seen: dict[str, float] = {}
-    with Services(Serving(view=viewed, apart=apart), outlet, link, name=recording.name) as services:
+    with Services(Serving(view=viewed, apart=apart), outlet, {"": link}, name=recording.name) as services:
         looker = None
         if services.view is not None:
             command = [sys.executable, "-c", LOOK, services.view.url, str(Path(__file__).parent)]

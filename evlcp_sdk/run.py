@@ -274,7 +274,7 @@ def receive_to_folder(
 def live(
     source: EventSource | str | Path,
     folder: Path | None = None,
-    link: Link | Path | str | None = None,
+    link: Link | Path | str | Sequence[Link | Path | str] | None = None,
     *,
     registry: Registry | None = None,
     plan: PositionPlan | None = None,
@@ -296,7 +296,7 @@ def live(
     Args:
         source: What to open, plugins asked first; or a source that is open, which is read on and closed.
         folder: Where a result goes as `receive_to_folder` writes it; None: nothing is written.
-        link: The configuration, or a `link.toml`; None for all defaults.
+        link: The configuration, or a `link.toml`, or several of these; None for all defaults.
         registry: The plugins; None for all that are installed.
         plan: What positions are computed from; None for none.
         attitude: What is known of the camera's attitude; None for nothing.
@@ -318,10 +318,10 @@ def live(
         PluginError: A plugin's code fails.
     """
     registry = Registry.load() if registry is None else registry
-    link = link if isinstance(link, Link) else load_link(link, registry=registry)
+    links = load_links(link, registry=registry)
     outlet = Outlet() if outlet is None else outlet
     if warm:
-        warm_up(link)
+        warm_up(links)
     url = str(source.path if isinstance(source, EventSource) else source)
     ear = FrameEar()
     try:
@@ -330,14 +330,14 @@ def live(
             opened = ReplaySource(opened)
         with opened:
             url = str(opened.path) if url == STDIN else url
-            check_sensor(opened, url, link.camera)
+            check_sensor(opened, url, links[0].camera)
             name = Path(url).name
             kept: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock_zero}
             loop: LiveLoop
             with (
                 ResultWriter(
                     folder,
-                    link,
+                    links,
                     registry,
                     name=name,
                     **kept,
@@ -347,8 +347,8 @@ def live(
                 ) as writer,
                 registry.joined(ear),
             ):
-                receiver = Receiver(link, registry.hook, attitude=attitude, clock_zero=clock_zero)
-                loop = LiveLoop(opened, receiver, link.packet, ear, outlet, pictures, budget)
+                receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero)
+                loop = LiveLoop(opened, receiver, links, ear, outlet, pictures, budget)
                 pieces = loop.run(stopped)
                 table = _run(
                     opened, url, receiver, writer, pieces, loop.close, _say_nothing, stopped, loop.summary

@@ -1,7 +1,7 @@
 """What `receive`, `live` and `survey` read from their options."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,18 +14,33 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.link.resolve import Link
     from evlcp_sdk.place.navigator import PositionPlan
+    from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 
 __all__ = [
+    "AttitudeFile",
+    "ClockZero",
+    "Figures",
+    "Gnss",
+    "GravitySigmaDeg",
     "HeadingDeg",
+    "HeadingSigmaDeg",
     "LinePrinter",
+    "Mcap",
+    "Parquet",
     "PitchDeg",
+    "Report",
     "RollDeg",
+    "SinkNames",
     "Sites",
+    "TimeSigmaUs",
+    "WhiteSigmaDeg",
     "attitude_of",
     "clock_zero_of",
     "json_lines_of",
+    "plan_of",
     "position_plan_of",
+    "sinks_of",
 ]
 
 Sites = Annotated[
@@ -37,18 +52,89 @@ HeadingDeg = Annotated[
 ]
 PitchDeg = Annotated[float | None, typer.Option("--pitch-deg", help="Its pitch, up.")]
 RollDeg = Annotated[float | None, typer.Option("--roll-deg", help="Its roll, top to the right.")]
+AttitudeFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--attitude",
+        metavar="FILE.csv",
+        help="The camera's attitude over time, for distances and positions.",
+    ),
+]
+HeadingSigmaDeg = Annotated[
+    float,
+    typer.Option(
+        "--heading-sigma-deg", min=0, help="Standard deviation of the heading, unless a file has it."
+    ),
+]
+GravitySigmaDeg = Annotated[
+    float | None,
+    typer.Option(
+        "--gravity-sigma-deg",
+        min=0,
+        help="The same of pitch and roll.  [default: 0.1 with a file, 0.5 with angles]",
+    ),
+]
+WhiteSigmaDeg = Annotated[
+    float,
+    typer.Option(
+        "--white-sigma-deg", min=0, help="Of what is new in each angle with every line of the file."
+    ),
+]
+TimeSigmaUs = Annotated[
+    float,
+    typer.Option("--time-sigma-us", min=0, help="Of the offset of the file's times from the camera's."),
+]
+Gnss = Annotated[
+    Path | None,
+    typer.Option(
+        "--gnss",
+        metavar="FILE",
+        help="Fixes of satellites, with sigmas, which enter the track: CSV, or .nmea with --clock-zero.",
+    ),
+]
+ClockZero = Annotated[
+    str | None,
+    typer.Option(
+        "--clock-zero",
+        metavar="UTC",
+        help="UTC of the camera clock's 0, for the age of signed beacons, NMEA and MCAP.",
+    ),
+]
+Figures = Annotated[
+    bool, typer.Option("--figures", help="Draw regions.png, presence.png, distance.png, track.png.")
+]
+Report = Annotated[
+    bool, typer.Option("--report", help="Write report.html: the recording on one page, to look at.")
+]
+Parquet = Annotated[bool, typer.Option("--parquet", help="Also write frames.parquet.")]
+Mcap = Annotated[bool, typer.Option("--mcap", help="Also write fixes.mcap, for Foxglove.")]
+SinkNames = Annotated[
+    list[str] | None,
+    typer.Option("--sink", metavar="NAME", help="Also write this format; may be repeated."),
+]
 
 
 def attitude_of(
     file: Path | None,
     angles: tuple[float | None, float | None, float | None],
-    sigmas: tuple[float, float, float, float],
+    sigmas: tuple[float | None, float, float, float],
 ) -> "Attitude | AttitudeLog | None":
-    """What the options say of the camera's attitude; None for nothing."""
+    """What the options say of the camera's attitude; None for nothing.
+
+    Args:
+        file: Of a log.
+        angles: Heading, pitch and roll, degrees.
+        sigmas: Of gravity, of the heading and of what is new in each line, degrees, and of time, us.
+    """
     import math
 
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 
+    gravity_deg, heading_deg, white_deg, time_us = sigmas
+    if gravity_deg is None:
+        # An IMU's samples follow a camera that sways; angles by hand hold for a whole drive.
+        gravity_deg = 0.5 if file is None else 0.1
+    told = gravity_deg, heading_deg, white_deg, time_us
     heading, pitch, roll = angles
     if file is not None and angles != (None, None, None):
         raise typer.BadParameter("give a file or angles, not both", param_hint="--attitude")
@@ -60,12 +146,47 @@ def attitude_of(
         *("--heading-deg", "--pitch-deg", "--roll-deg"),
         *("--gravity-sigma-deg", "--heading-sigma-deg", "--white-sigma-deg", "--time-sigma-us"),
     )
-    for name, said in zip(names, (*angles, *sigmas), strict=True):
+    for name, said in zip(names, (*angles, *told), strict=True):
         if said is not None and not math.isfinite(said):
             raise typer.BadParameter(f"{said}: expected a finite number", param_hint=name)
     if file is not None:
-        return AttitudeLog.read(file, Attitude(0.0, 0.0, None, *sigmas))
-    return Attitude(pitch, roll, heading, *sigmas) if pitch is not None and roll is not None else None
+        return AttitudeLog.read(file, Attitude(0.0, 0.0, None, *told))
+    return Attitude(pitch, roll, heading, *told) if pitch is not None and roll is not None else None
+
+
+def plan_of(
+    sites: Path | None,
+    gnss: Path | None,
+    links: "Sequence[Link]",
+    zero: "datetime | None",
+    *,
+    mcap: bool,
+) -> "PositionPlan | None":
+    """What the options say of positions, of the one of several links that they are computed from."""
+    from evlcp_sdk.link.several import named_links, placing_link
+
+    named = named_links(links)
+    placing = named[placing_link(named)] if sites is not None else links[0]
+    return position_plan_of(sites, gnss, placing, zero, mcap=mcap)
+
+
+def sinks_of(
+    registry: "Registry",
+    short: Mapping[str, bool],
+    sinks: Sequence[str] | None,
+    out: Path | None,
+    *,
+    positions: bool,
+) -> tuple[str, ...]:
+    """Names of the formats that are asked for, those with an option of their own first; all can be loaded."""
+    from evlcp_sdk.plugin.records import choose_sinks
+    from evlcp_sdk.results.sinks import load_sinks
+
+    asked = tuple(dict.fromkeys([*(name for name, given in short.items() if given), *(sinks or [])]))
+    load_sinks(choose_sinks(registry, asked, positions=positions))
+    if asked and out is None:
+        raise typer.BadParameter(f"{', '.join(asked)} goes into a folder: give -o OUT", param_hint="--out")
+    return asked
 
 
 def position_plan_of(

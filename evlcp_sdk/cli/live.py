@@ -7,16 +7,29 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import LinkFile, Overrides, complain, echo
+from evlcp_sdk.cli._common import LinkFiles, Overrides, complain, echo
 from evlcp_sdk.cli._receiving import (
+    AttitudeFile,
+    ClockZero,
+    Figures,
+    Gnss,
+    GravitySigmaDeg,
     HeadingDeg,
+    HeadingSigmaDeg,
+    Mcap,
+    Parquet,
     PitchDeg,
+    Report,
     RollDeg,
+    SinkNames,
     Sites,
+    TimeSigmaUs,
+    WhiteSigmaDeg,
     attitude_of,
     clock_zero_of,
     json_lines_of,
-    position_plan_of,
+    plan_of,
+    sinks_of,
 )
 from evlcp_sdk.cli._summary import show
 
@@ -46,7 +59,7 @@ def live(
             "-o", "--out", metavar="OUT", help="Also write a result, as receive does, into a folder."
         ),
     ] = None,
-    link_file: LinkFile = None,
+    link_files: LinkFiles = None,
     overrides: Overrides = None,
     json_lines: Annotated[
         str | None,
@@ -57,14 +70,22 @@ def live(
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The summary as one line of JSON.")] = False,
+    figures: Figures = False,
+    report: Report = False,
+    parquet: Parquet = False,
     sites: Sites = None,
+    attitude_file: AttitudeFile = None,
+    gnss: Gnss = None,
     heading_deg: HeadingDeg = None,
     pitch_deg: PitchDeg = None,
     roll_deg: RollDeg = None,
-    clock_zero: Annotated[
-        str | None,
-        typer.Option("--clock-zero", metavar="UTC", help="UTC of the camera clock's 0."),
-    ] = None,
+    heading_sigma_deg: HeadingSigmaDeg = 0.5,
+    gravity_sigma_deg: GravitySigmaDeg = None,
+    white_sigma_deg: WhiteSigmaDeg = 0.0,
+    time_sigma_us: TimeSigmaUs = 0.0,
+    clock_zero: ClockZero = None,
+    mcap: Mcap = False,
+    sinks: SinkNames = None,
     reconnect: Annotated[
         bool,
         typer.Option("--reconnect", help="Go on when a camera that was unplugged, or a stream, is back."),
@@ -133,7 +154,12 @@ def live(
 
     From another program:           [bold]CAMERA | evlcp live - --json-lines -[/]
 
+    Several kinds of transmitters:  [bold]evlcp live URL -c bar.toml -c beacon.toml[/]
+
     With positions:                 [bold]evlcp live URL --sites site.toml --pitch-deg 0 --roll-deg 0[/]
+
+    For Foxglove, written as it comes: [bold]evlcp live URL -o out --sites site.toml --attitude imu.csv
+    --mcap[/]
 
     In a browser:                   [bold]evlcp live URL --view[/]
 
@@ -148,7 +174,7 @@ def live(
     from evlcp_sdk.errors import InputError, InterruptedRunError, UnpluggedError
     from evlcp_sdk.io.open import open_source
     from evlcp_sdk.io.reconnect import ReconnectingSource
-    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.link.several import load_links, named_links
     from evlcp_sdk.live.budget import Budget
     from evlcp_sdk.live.outlet import Outlet
     from evlcp_sdk.live.services import Services, Serving
@@ -158,10 +184,13 @@ def live(
 
     lines = json_lines_of(json_lines, [url], as_json=as_json)
     registry = Registry.load()
-    link = load_link(link_file, overrides or [], registry)
-    attitude = attitude_of(None, (heading_deg, pitch_deg, roll_deg), (0.5, 0.5, 0.0, 0.0))
+    links = load_links(link_files, overrides or [], registry)
+    sigmas = (gravity_sigma_deg, heading_sigma_deg, white_sigma_deg, time_sigma_us)
+    attitude = attitude_of(attitude_file, (heading_deg, pitch_deg, roll_deg), sigmas)
     zero = clock_zero_of(clock_zero)
-    plan = position_plan_of(sites, None, link, zero, mcap=False)
+    plan = plan_of(sites, gnss, links, zero, mcap=mcap)
+    short = {"figures": figures, "report": report, "parquet": parquet, "mcap": mcap}
+    asked = sinks_of(registry, short, sinks, out, positions=plan is not None)
     for name, given in (("--nmea-port", nmea_port), ("--gpsd-port", gpsd_port)):
         if given is not None and plan is None:
             raise typer.BadParameter("needs --sites", param_hint=name)
@@ -171,7 +200,7 @@ def live(
     services = Services(
         serving,
         outlet,
-        link,
+        named_links(links),
         name=Path(url).name,
         sites=plan.sites if plan is not None else (),
         clock_zero=zero,
@@ -182,11 +211,12 @@ def live(
         summary = run_live(
             source,
             out,
-            link,
+            links,
             registry=registry,
             plan=plan,
             attitude=attitude,
             clock_zero=zero,
+            sinks=asked,
             lines=lines,
             outlet=outlet,
             pictures=services.pictures,

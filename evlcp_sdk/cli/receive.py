@@ -22,15 +22,28 @@ from evlcp_sdk.cli._common import (
     make_executor,
 )
 from evlcp_sdk.cli._receiving import (
+    AttitudeFile,
+    ClockZero,
+    Figures,
+    Gnss,
+    GravitySigmaDeg,
     HeadingDeg,
+    HeadingSigmaDeg,
     LinePrinter,
+    Mcap,
+    Parquet,
     PitchDeg,
+    Report,
     RollDeg,
+    SinkNames,
     Sites,
+    TimeSigmaUs,
+    WhiteSigmaDeg,
     attitude_of,
     clock_zero_of,
     json_lines_of,
-    position_plan_of,
+    plan_of,
+    sinks_of,
 )
 from evlcp_sdk.cli._summary import show
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
@@ -97,74 +110,26 @@ def receive(
             help="Frames, messages and fixes as lines of JSON on stdout as they come; OUT may be left out.",
         ),
     ] = None,
-    figures: Annotated[
-        bool, typer.Option("--figures", help="Draw regions.png, presence.png, distance.png, track.png.")
-    ] = False,
-    report: Annotated[
-        bool, typer.Option("--report", help="Write report.html: the recording on one page, to look at.")
-    ] = False,
-    parquet: Annotated[bool, typer.Option("--parquet", help="Also write frames.parquet.")] = False,
+    figures: Figures = False,
+    report: Report = False,
+    parquet: Parquet = False,
     workers: Annotated[
         int, typer.Option("--workers", min=0, metavar="N", help="Processes for many recordings; 0: this one.")
     ] = 0,
     dask: Dask = None,
     sites: Sites = None,
-    attitude_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--attitude",
-            metavar="FILE.csv",
-            help="The camera's attitude over time, for distances and positions.",
-        ),
-    ] = None,
-    gnss: Annotated[
-        Path | None,
-        typer.Option(
-            "--gnss",
-            metavar="FILE",
-            help="Fixes of satellites, with sigmas, which enter the track: CSV, or .nmea with --clock-zero.",
-        ),
-    ] = None,
+    attitude_file: AttitudeFile = None,
+    gnss: Gnss = None,
     heading_deg: HeadingDeg = None,
     pitch_deg: PitchDeg = None,
     roll_deg: RollDeg = None,
-    heading_sigma_deg: Annotated[
-        float,
-        typer.Option(
-            "--heading-sigma-deg", min=0, help="Standard deviation of the heading, unless a file has it."
-        ),
-    ] = 0.5,
-    gravity_sigma_deg: Annotated[
-        float | None,
-        typer.Option(
-            "--gravity-sigma-deg",
-            min=0,
-            help="The same of pitch and roll.  [default: 0.1 with a file, 0.5 with angles]",
-        ),
-    ] = None,
-    white_sigma_deg: Annotated[
-        float,
-        typer.Option(
-            "--white-sigma-deg", min=0, help="Of what is new in each angle with every line of the file."
-        ),
-    ] = 0.0,
-    time_sigma_us: Annotated[
-        float,
-        typer.Option("--time-sigma-us", min=0, help="Of the offset of the file's times from the camera's."),
-    ] = 0.0,
-    clock_zero: Annotated[
-        str | None,
-        typer.Option(
-            "--clock-zero",
-            metavar="UTC",
-            help="UTC of the camera clock's 0, for the age of signed beacons, NMEA and MCAP.",
-        ),
-    ] = None,
-    mcap: Annotated[bool, typer.Option("--mcap", help="Also write fixes.mcap, for Foxglove.")] = False,
-    sinks: Annotated[
-        list[str] | None,
-        typer.Option("--sink", metavar="NAME", help="Also write this format; may be repeated."),
-    ] = None,
+    heading_sigma_deg: HeadingSigmaDeg = 0.5,
+    gravity_sigma_deg: GravitySigmaDeg = None,
+    white_sigma_deg: WhiteSigmaDeg = 0.0,
+    time_sigma_us: TimeSigmaUs = 0.0,
+    clock_zero: ClockZero = None,
+    mcap: Mcap = False,
+    sinks: SinkNames = None,
 ) -> None:
     """Decode recordings: symbols and distances into OUT.
 
@@ -206,10 +171,8 @@ def receive(
     import json
 
     from evlcp_sdk.jobs.processes import stop_workers
-    from evlcp_sdk.link.several import load_links, named_links, placing_link
-    from evlcp_sdk.plugin.records import choose_sinks
+    from evlcp_sdk.link.several import load_links
     from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.results.sinks import load_sinks
     from evlcp_sdk.run import stop_on_request
 
     lines = json_lines_of(json_lines, recordings, as_json=as_json)
@@ -220,21 +183,12 @@ def receive(
         if len(links) > 1:
             raise typer.BadParameter("varies one link: give one -c, or none", param_hint="--link")
         jobs = [_fitted(job, links[0], registry) for job in jobs]
-    angles = (heading_deg, pitch_deg, roll_deg)
-    if gravity_sigma_deg is None:
-        # An IMU's samples follow a camera that sways; angles by hand hold for a whole drive.
-        gravity_sigma_deg = 0.5 if attitude_file is None else 0.1
     sigmas = (gravity_sigma_deg, heading_sigma_deg, white_sigma_deg, time_sigma_us)
-    attitude = attitude_of(attitude_file, angles, sigmas)
+    attitude = attitude_of(attitude_file, (heading_deg, pitch_deg, roll_deg), sigmas)
     zero = clock_zero_of(clock_zero)
-    named = named_links(links)
-    placing = named[placing_link(named)] if sites is not None else links[0]
-    plan = position_plan_of(sites, gnss, placing, zero, mcap=mcap)
+    plan = plan_of(sites, gnss, links, zero, mcap=mcap)
     short = {"figures": figures, "report": report, "parquet": parquet, "mcap": mcap}
-    asked = tuple(dict.fromkeys([*(name for name, given in short.items() if given), *(sinks or [])]))
-    load_sinks(choose_sinks(registry, asked, positions=plan is not None))
-    if asked and out is None:
-        raise typer.BadParameter(f"{', '.join(asked)} goes into a folder: give -o OUT", param_hint="--out")
+    asked = sinks_of(registry, short, sinks, out, positions=plan is not None)
     here = dask is None and (not workers or len(jobs) == 1)
     if lines is not None and not here:
         raise typer.BadParameter("are given by this process only", param_hint="--json-lines")

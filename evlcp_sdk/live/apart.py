@@ -6,7 +6,7 @@ import multiprocessing
 import signal
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 from urllib.parse import urlsplit
 
@@ -40,7 +40,7 @@ class ViewerApart:
         self,
         outlet: Outlet,
         pictures: PictureSlot,
-        link: Link,
+        links: Mapping[str, Link],
         *,
         name: str,
         sites: Sequence[BarSite] = (),
@@ -49,7 +49,7 @@ class ViewerApart:
         recorder: Recorder | None = None,
     ) -> None:
         self._outlet, self._pictures, self._recorder = outlet, pictures, recorder
-        self._given = (link, name, tuple(sites), host, port, recorder is not None)
+        self._given = (dict(links), name, tuple(sites), host, port, recorder is not None)
         self._mine = outlet.subscribe(KINDS_SHOWN, most=MOST_WAITING)
         self._told = 0
         self.url = ""
@@ -180,14 +180,20 @@ class _FarRecorder:
 
 
 def _serve(
-    pipe: Any, link: Link, name: str, sites: tuple[BarSite, ...], host: str, port: int, may_record: bool
+    pipe: Any,
+    links: Mapping[str, Link],
+    name: str,
+    sites: tuple[BarSite, ...],
+    host: str,
+    port: int,
+    may_record: bool,
 ) -> None:
     """Serve the view in this process until all is said, or the receiver's process has gone."""
     # Ctrl-C is for the receiver, which ends this.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     wire, outlet = _Wire(pipe), Outlet()
     pictures, recorder = _FarPictures(wire), _FarRecorder(wire) if may_record else None
-    viewer = Viewer(outlet, pictures, link, name=name, sites=sites, host=host, port=port, recorder=recorder)
+    viewer = Viewer(outlet, pictures, links, name=name, sites=sites, host=host, port=port, recorder=recorder)
     with Desk() as desk:
         try:
             desk.call(viewer.start())

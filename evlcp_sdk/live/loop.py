@@ -1,12 +1,13 @@
 """The loop of a live run: slices in, packets out, results to listeners, in bounded time."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import UnpluggedError
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.link.several import named_links
 from evlcp_sdk.live.budget import LEVELS, Budget, Shedder
 from evlcp_sdk.live.delays import DelayTally
 from evlcp_sdk.live.outlet import Outlet
@@ -94,7 +95,7 @@ class LiveLoop:
     Args:
         source: What is read; not closed.
         receiver: What decodes it.
-        packet: Lengths of its link's frames.
+        links: What it decodes. Frames of several come with their packet: by then it is clear which fits.
         ear: Gets the receiver's frames.
         outlet: Where results go.
         pictures: Where pictures are drawn; None for none.
@@ -110,14 +111,15 @@ class LiveLoop:
         self,
         source: EventSource,
         receiver: Receiver,
-        packet: PacketFormat,
+        links: Sequence[Link],
         ear: FrameEar,
         outlet: Outlet,
         pictures: PictureSlot | None = None,
         budget: Budget | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._source, self._receiver, self._packet = source, receiver, packet
+        self._source, self._receiver = source, receiver
+        self._forms = {name: link.packet for name, link in named_links(links).items()}
         self._outlet, self._pictures = outlet, pictures
         self._budget = Budget() if budget is None else budget
         self._clock = clock
@@ -132,7 +134,8 @@ class LiveLoop:
         self._last_us = 0.0
         self._arrived_s = self._taken_s = self._start_s = self._status_s = clock()
         self._status_events = 0
-        ear.tell = self._frame
+        if len(self._forms) == 1:
+            ear.tell = self._frame
 
     def run(self, stopped: Stopped) -> Iterator[tuple[Events, list[Packet]]]:
         """Yield what is received: the events that the receiver got, some pieces together, and its packets.
@@ -245,7 +248,9 @@ class LiveLoop:
     def _frame(self, frame: Frame) -> None:
         """Tell listeners of a frame, and count how long it took."""
         now = self._clock()
-        last_us = frame.t_us + self._frame_chips(frame) * self._packet.chip_us
+        form = self._forms[frame.link]
+        chips = form.frame_chips if form.has_pilot(frame.frame) else form.info_chips
+        last_us = frame.t_us + chips * form.chip_us
         shone_s = self._source.clock_s(last_us)
         if shone_s is None:
             shone_s = self._reader.arrivals.at_s(last_us)
@@ -258,12 +263,11 @@ class LiveLoop:
                 self._recent[stage].add(part_s * 1e3)
         self._outlet.publish("frame", frame.t_us, frame, late_ms)
 
-    def _frame_chips(self, frame: Frame) -> int:
-        packet = self._packet
-        return packet.frame_chips if packet.has_pilot(frame.frame) else packet.info_chips
-
     def _tell(self, packets: list[Packet]) -> None:
         for packet in packets:
+            if len(self._forms) > 1:
+                for frame in packet.frames:
+                    self._frame(frame)
             self._outlet.publish("packet", packet.t_us, packet)
             for message in packet.messages:
                 self._outlet.publish("message", packet.t_us, message)

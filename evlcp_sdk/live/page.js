@@ -93,7 +93,7 @@ function dots(pen, bar, scale, left, top) {
     pen.beginPath();
     pen.arc(x, y, Math.max(2, Math.min(6, scale * 0.7)), 0, 7);
     // Whose pilot is seen there; hollow where its symbol is not given.
-    pen.strokeStyle = pen.fillStyle = about.cluster_colours[k];
+    pen.strokeStyle = pen.fillStyle = about.links[bar.link].cluster_colours[k];
     pen.lineWidth = 1.5;
     if (bar.symbols[k] >= 0) pen.fill(); else pen.stroke();
   });
@@ -316,7 +316,7 @@ function drawWords() {
   const near = [...distances].filter(([, news]) => news.echo_of === null && news.t_us > newest - 1e6);
   for (const [bar, news] of near.sort((a, b) => a[0] - b[0]).slice(-6)) {
     const sigma = news.ranged ? digits(news.ranged.distance_sigma_m, 2) : "-";
-    tiles.push(tile(`bar ${bar}`, meters(news, 2), "m", `± ${sigma} m, quality ${news.quality.toFixed(2)}`));
+    tiles.push(tile(news.link ? `bar ${bar}, ${news.link}` : `bar ${bar}`, meters(news, 2), "m", `± ${sigma} m, quality ${news.quality.toFixed(2)}`));
   }
   by("tiles").replaceChildren(...tiles);
 
@@ -339,7 +339,7 @@ function drawWords() {
       const i = document.createElement("i");
       i.textContent = symbol === null ? "-" : symbol;
       if (symbol === null) i.className = "none";
-      else i.style.setProperty("--hue", Math.round(300 * symbol / Math.max(about.symbols - 1, 1)));
+      else i.style.setProperty("--hue", Math.round(300 * symbol / Math.max(about.links[news.link || ""].symbols - 1, 1)));
       td.append(i, " ");
     }
     frames.append(row);

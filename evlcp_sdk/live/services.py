@@ -1,6 +1,6 @@
 """What a live run serves beside its results: the web view, NMEA and gpsd's JSON over TCP."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import datetime
@@ -50,7 +50,7 @@ class Services:
     Args:
         serving: Which.
         outlet: Where results come from.
-        link: The configuration.
+        links: The configurations by name, as `named_links` gives them.
         name: Name of the source.
         sites: Where the bars stand.
         clock_zero: UTC of the camera clock's 0; None if it is not known.
@@ -69,7 +69,7 @@ class Services:
         self,
         serving: Serving,
         outlet: Outlet,
-        link: Link,
+        links: Mapping[str, Link],
         *,
         name: str,
         sites: Sequence[BarSite] = (),
@@ -80,12 +80,12 @@ class Services:
         self.view: Viewer | ViewerApart | None = None
         if self.pictures is not None:
             if serving.record_to is not None:
-                camera = link.camera
+                camera = next(iter(links.values())).camera
                 self._recorder = Recorder(outlet, serving.record_to, camera.width, camera.height)
             self.view = (ViewerApart if serving.apart else Viewer)(
                 outlet,
                 self.pictures,
-                link,
+                links,
                 name=name,
                 sites=sites,
                 host=serving.host,

@@ -28,6 +28,7 @@ from evlcp_sdk.live.loop import LiveStatus
 from evlcp_sdk.live.outlet import News, Outlet, Subscription
 from evlcp_sdk.live.pictures import Picture
 from evlcp_sdk.results.colours import TRANSMITTER_COLOURS, cluster_colours
+from evlcp_sdk.results.columns import frame_columns
 from evlcp_sdk.results.lines import fix_line, frame_line
 from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.results.picture import png
@@ -111,7 +112,7 @@ class Viewer:
     Args:
         outlet: Where results come from.
         pictures: Where pictures come from.
-        link: The configuration.
+        links: The configurations by name, as `named_links` gives them.
         name: Name of the source, for the title.
         sites: Where the bars stand, for the map.
         host: Where to listen: of this machine only, unless it is another address of it.
@@ -127,7 +128,7 @@ class Viewer:
         self,
         outlet: Outlet,
         pictures: PictureGiver,
-        link: Link,
+        links: Mapping[str, Link],
         *,
         name: str,
         sites: Sequence[BarSite] = (),
@@ -136,7 +137,8 @@ class Viewer:
         recorder: RecordKeeper | None = None,
     ) -> None:
         self._outlet, self._pictures, self._recorder = outlet, pictures, recorder
-        self._name, self._link, self._sites = name, link, tuple(sites)
+        self._name, self._links, self._sites = name, links, tuple(sites)
+        self._columns = frame_columns(filtered=False, links=len(links) > 1)
         self._host, self.port = host, port
         self._token = secrets.token_urlsafe(16)
         self._browsers: set[_Browser] = set()
@@ -325,21 +327,15 @@ class Viewer:
 
     def _about(self) -> dict[str, Any]:
         """What a browser is sent first."""
-        book = self._link.codebook
-        colours = cluster_colours(book.clusters)
+        camera = next(iter(self._links.values())).camera
         return {
             "about": {
                 "name": self._name,
                 "run": self._token[:6],
-                "clusters": book.clusters,
-                "symbols": 2**book.bits_per_symbol,
-                "cluster_colours": [
-                    f"#{round(r * 255):02x}{round(g * 255):02x}{round(b * 255):02x}"
-                    for r, g, b in colours.tolist()
-                ],
+                "links": {name: _shown(link) for name, link in self._links.items()},
                 "colours": list(TRANSMITTER_COLOURS),
-                "width": self._link.camera.width,
-                "height": self._link.camera.height,
+                "width": camera.width,
+                "height": camera.height,
                 "levels": list(LEVELS),
                 "sites": len(self._sites),
                 "may_record": self._recorder is not None,
@@ -358,7 +354,7 @@ class Viewer:
                 del self._bars[min(self._bars, key=lambda number: self._bars[number].t_us)]
             if not self._browsers:
                 return
-            text = json.dumps(frame_line(frame) | {"late_ms": _rounded(news.late_ms)})
+            text = json.dumps(frame_line(frame, self._columns) | {"late_ms": _rounded(news.late_ms)})
         elif kind == "message":
             text = json.dumps({"line": "message"} | json.loads(message_line(news.value)))
         elif kind == "fix":
@@ -441,6 +437,18 @@ class Viewer:
             self._keep(asyncio.create_task(_sent(browser, struct.pack("<I", len(text)) + text + data * new)))
 
 
+def _shown(link: Link) -> dict[str, Any]:
+    """What the page must know of a link: how many symbols there are, and the clusters' colours."""
+    book = link.codebook
+    return {
+        "symbols": 2**book.bits_per_symbol,
+        "cluster_colours": [
+            f"#{round(r * 255):02x}{round(g * 255):02x}{round(b * 255):02x}"
+            for r, g, b in cluster_colours(book.clusters).tolist()
+        ],
+    }
+
+
 async def _sent(browser: _Browser, bundle: bytes) -> None:
     from websockets.exceptions import ConnectionClosed
 
@@ -466,6 +474,7 @@ def _bar(frame: Frame) -> dict[str, Any]:
     points = [[round(x, 2), round(y, 2)] if x == x and y == y else None for x, y in frame.points_px.tolist()]
     return {
         "transmitter": frame.transmitter,
+        "link": frame.link,
         "echo_of": frame.echo_of,
         "x_px": round(frame.x_px, 2),
         "y_px": round(frame.y_px, 2),

@@ -689,6 +689,32 @@ def test_satellites_by_nmea_are_in_the_track(evlcp: Evlcp, street: Path, tmp_pat
     assert summary["positions"]["gnss_outside"] == 2
 
 
+def test_live_takes_what_receive_takes(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
+    """Attitude, satellites and MCAP: the files of a live run are those of `receive`."""
+    reader = pytest.importorskip("mcap.reader", reason="the extra mcap is not installed")
+    path = json.loads((street / "rec.truth.json").read_text())["camera_path"]
+    nmea, imu = nmea_of(path, (40, 120), tmp_path / "gnss.nmea"), tmp_path / "imu.csv"
+    imu.write_text("t_us,pitch_deg,roll_deg,heading_deg\n0,4,0,0\n200000,4,0,0\n")
+    given = ("--sites", street / "site.toml", "--attitude", imu, "--gnss", nmea, "--mcap")
+    given = (*given, "--clock-zero", "2026-03-01T12:00:00Z", "--json", "-o")
+    done = evlcp("receive", street / "rec.raw", *given, tmp_path / "file")
+    assert done.code == 0, done.err
+    recording = f"replay:{street / 'rec.raw'}?speed=50"
+    done = evlcp("live", recording, "--waiting-ms", "100000", *given, tmp_path / "live")
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["positions"]["fixes"] > 2
+    for name in ("frames.csv", "packets.jsonl", "fixes.csv", "track.csv"):
+        assert (tmp_path / "live" / name).read_text() == (tmp_path / "file" / name).read_text(), name
+    told = []
+    for name in ("file", "live"):
+        with (tmp_path / name / "fixes.mcap").open("rb") as file:
+            messages = [(c.topic, m.log_time, m.data) for _, c, m in reader.make_reader(file).iter_messages()]
+        told.append(sorted(messages))
+    assert {topic for topic, _, _ in told[0]} >= {"/image", "/regions", "/frames", "/fix", "/scene"}
+    assert told[0] == told[1]
+    assert evlcp("live", recording, "--mcap").code == 2
+
+
 def test_calibrate_finds_the_focal_length(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
     truth = json.loads((street / "rec.truth.json").read_text())
     path = truth["camera_path"]

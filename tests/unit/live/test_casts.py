@@ -14,19 +14,20 @@ import pynmea2
 import pytest
 
 from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.link.several import named_links
 from evlcp_sdk.live import Outlet
 from evlcp_sdk.live.services import Services, Serving
 from evlcp_sdk.place.navigator import Place, Placed
 from evlcp_sdk.values import Fix
 
-LINK = load_link()
+LINKS = named_links(load_link())
 GPSPIPE = shutil.which("gpspipe")
 
 
 @pytest.fixture
 def served() -> Iterator[tuple[Outlet, Services]]:
     outlet = Outlet()
-    with Services(Serving(nmea_port=0, gpsd_port=0), outlet, LINK, name="x") as services:
+    with Services(Serving(nmea_port=0, gpsd_port=0), outlet, LINKS, name="x") as services:
         yield outlet, services
         outlet.close()
 

@@ -11,6 +11,7 @@ import pytest
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import RawSource, ReplaySource
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.live import Budget, LiveStatus, Outlet, PictureSlot, Subscription
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.run import live, receive
@@ -65,6 +66,17 @@ def test_a_replay_gives_what_the_file_gives(demo_raw: Path, tmp_path: Path) -> N
     assert summary["live"]["delays"]["total"]["count"] > 0
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["live"] == summary["live"]
     assert pictures.newest is not None
+
+
+def test_frames_of_several_links_name_theirs(demo_raw: Path) -> None:
+    links = [load_link(), load_link(overrides=["modulation.id=wh8"])]
+    outlet = Outlet()
+    mine = outlet.subscribe({"frame", "packet"}, most=100_000)
+    live(f"replay:{demo_raw}?speed=50", None, links, outlet=outlet, budget=PATIENT, warm=False)
+    found = gathered(mine)
+    packets = list(receive(demo_raw, links))
+    assert [key(f) for f in found["frame"]] == [key(f) for packet in packets for f in packet.frames]
+    assert {frame.link for frame in found["frame"]} == {packet.link for packet in packets} == {"link-0"}
 
 
 class Burst(EventSource):

@@ -21,6 +21,7 @@ from PIL import Image
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io.open import open_source
 from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.link.several import named_links
 from evlcp_sdk.live import Budget, Outlet
 from evlcp_sdk.live.services import Services, Serving
 from evlcp_sdk.live.viewer import page
@@ -37,7 +38,7 @@ websockets = pytest.importorskip("websockets", reason="the extra live is not ins
 from websockets.exceptions import ConnectionClosedError, InvalidStatus  # noqa: E402
 from websockets.sync.client import ClientConnection, connect  # noqa: E402
 
-LINK = load_link()
+LINKS = named_links(load_link())
 FRAMES = [frame for packet in packets(3) for frame in packet.frames]
 
 
@@ -86,7 +87,7 @@ class Stage:
 @pytest.fixture
 def stage() -> Iterator[Stage]:
     outlet = Outlet()
-    with Services(Serving(view=True), outlet, LINK, name="a name", sites=(SITE,)) as services:
+    with Services(Serving(view=True), outlet, LINKS, name="a name", sites=(SITE,)) as services:
         yield Stage(outlet, services)
         outlet.close()
 
@@ -156,7 +157,8 @@ def test_who_may_look_on(stage: Stage) -> None:
 def test_a_credit_a_bundle(stage: Stage) -> None:
     with stage.connect() as link:
         about = json.loads(link.recv(5))["about"]
-        assert (about["clusters"], about["symbols"], about["may_record"]) == (16, 64, False)
+        assert (about["links"][""]["symbols"], about["may_record"]) == (64, False)
+        assert len(about["links"][""]["cluster_colours"]) == 16
         stage.frame(0)
         with pytest.raises(TimeoutError):
             link.recv(0.2)
@@ -230,7 +232,7 @@ def test_browsers_only_look_on(stage: Stage) -> None:
 def test_a_recording_is_what_came(tmp_path: Path) -> None:
     outlet = Outlet()
     serving = Serving(view=True, record_to=tmp_path)
-    with Services(serving, outlet, LINK, name="x") as services:
+    with Services(serving, outlet, LINKS, name="x") as services:
         stage = Stage(outlet, services)
         with stage.connect() as link:
             link.recv(5)
@@ -267,13 +269,13 @@ def _until(true: Callable[[], bool], most_s: float = 10.0) -> None:
 def test_a_process_of_its_own_shows_the_same(tmp_path: Path) -> None:
     outlet = Outlet()
     serving = Serving(view=True, apart=True, record_to=tmp_path)
-    with Services(serving, outlet, LINK, name="apart") as services:
+    with Services(serving, outlet, LINKS, name="apart") as services:
         stage = Stage(outlet, services)
         assert stage.ask("/")[0] == 403
         assert stage.ask("/" + stage.url.split("/", 3)[3])[0] == 200
         with (
             pytest.raises(ConfigError, match="expected a free port"),
-            Services(Serving(view=True, apart=True, port=stage.port), Outlet(), LINK, name="x"),
+            Services(Serving(view=True, apart=True, port=stage.port), Outlet(), LINKS, name="x"),
         ):
             pass
         with stage.connect() as link:
@@ -309,7 +311,7 @@ def test_a_process_of_its_own_shows_the_same(tmp_path: Path) -> None:
 def test_a_port_that_is_taken_is_one_line(stage: Stage) -> None:
     with (
         pytest.raises(ConfigError, match=rf"127.0.0.1:{stage.port}: .*expected a free port, 0 for any"),
-        Services(Serving(view=True, port=stage.port), Outlet(), LINK, name="x"),
+        Services(Serving(view=True, port=stage.port), Outlet(), LINKS, name="x"),
     ):
         pass
 
@@ -319,7 +321,7 @@ def test_browsers_show_what_the_files_say(demo_raw: Path, tmp_path: Path) -> Non
     """Two browsers and one that stalls: pictures change, numbers are those of frames.csv, links come back."""
     outlet, summary = Outlet(), {}
     with (
-        Services(Serving(view=True), outlet, LINK, name=demo_raw.name) as services,
+        Services(Serving(view=True), outlet, LINKS, name=demo_raw.name) as services,
         Browser(tmp_path / "a") as first,
         Browser(tmp_path / "b") as second,
         Stage(outlet, services).connect(),  # which never says that it is ready
@@ -335,7 +337,7 @@ def test_browsers_show_what_the_files_say(demo_raw: Path, tmp_path: Path) -> Non
                 live(
                     f"replay:{demo_raw}?speed=0.05",
                     tmp_path / "out",
-                    LINK,
+                    list(LINKS.values()),
                     outlet=outlet,
                     pictures=services.pictures,
                     budget=Budget(waiting_ms=1e6, most_ms=1e7),
