@@ -367,16 +367,22 @@ class Role:
 
         >>> from evlcp_sdk.scene.bar import BarLayout, LedGrid
         >>> [ROLES["ranging"].default_for(BarLayout(LedGrid(96, columns))) for columns in (1, 2)]
-        ['joint-scale', 'poc']
+        ['joint-scale', 'joint-scale']
         """
         if bar is not None and self.by_layout is not None:
             return self.by_layout(bar, pairs)
         return self.default if pairs or self.default_of_chips is None else self.default_of_chips
 
 
+_WIDEST = 2.0
+"""Widths of a layout, in heights of its columns, up to which these tell the distance better."""
+
+
 def _ranging_of(bar: BarLayout, pairs: bool) -> str:
     """Id of the ranging that fits a layout best."""
-    if bar.clusters >= 3 and bar.column_pitch_m > 0 and pairs:
+    # From side to side `joint-scale` measures nothing: of low columns far apart, that is what counts.
+    high_m = max((len(clusters) * pitch_m for clusters, pitch_m in bar.even_columns), default=0.0)
+    if pairs and high_m > 0 and bar.width_m <= _WIDEST * high_m:
         return "joint-scale"
     if bar.clusters >= 2 and bar.alike:
         return "poc"

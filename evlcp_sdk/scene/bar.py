@@ -294,12 +294,34 @@ class BarLayout:
         >>> round(BarLayout().column_pitch_m, 9)
         0.06
         """
-        centres = self.cluster_positions_m()
-        steps = np.diff(centres, axis=0)
+        return self._pitch_m(np.arange(self.clusters)) if self.alike else math.nan
+
+    @cached_property
+    def even_columns(self) -> tuple[tuple[NDArray[np.int64], float], ...]:
+        """Columns of three clusters or more, evenly one below another: clusters from the top, and pitch, m.
+
+        None unless all clusters are alike.
+
+        >>> [(ids.tolist(), round(m, 9)) for ids, m in BarLayout(LedGrid(12, 2, 0.01, 3)).even_columns]
+        [([0, 2, 4, 6], 0.03), ([1, 3, 5, 7], 0.03)]
+        """
+        if not self.alike:
+            return ()
+        across = np.round(self.cluster_positions_m()[:, [0, 2]] / _SAME_M)
+        columns: dict[tuple[float, ...], list[int]] = {}
+        for k in np.argsort(self.cluster_positions_m()[:, 1], kind="stable").tolist():
+            columns.setdefault(tuple(across[k]), []).append(k)
+        lines = (np.array(columns[at], np.int64) for at in sorted(columns))
+        found = ((ids, self._pitch_m(ids)) for ids in lines if len(ids) >= 3)
+        return tuple((ids, pitch_m) for ids, pitch_m in found if pitch_m > 0)
+
+    def _pitch_m(self, clusters: NDArray[np.int64]) -> float:
+        """From one to the next of clusters that stand evenly one below another, m; NaN of others."""
+        steps = np.diff(self.cluster_positions_m()[clusters], axis=0)
         if len(steps) == 0 or np.abs(steps[:, [0, 2]]).max() > _SAME_M:
             return math.nan
         even = steps[:, 1].min() > 0 and np.ptp(steps[:, 1]) < 1e-6 * steps[0, 1]
-        return float(steps[0, 1]) if even and self.alike else math.nan
+        return float(steps[0, 1]) if even else math.nan
 
 
 def read_leds(path: Path | str) -> list[list[float | int]]:

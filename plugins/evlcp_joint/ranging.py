@@ -1,6 +1,7 @@
 """Distance from all boundaries between neighbouring clusters at once."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Annotated
@@ -16,7 +17,7 @@ from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import Bend, FrameView, PresenceMap, Range
+from evlcp_sdk.values import Bend, FrameView, PresenceMap, Range, changed
 
 if TYPE_CHECKING:
     from evlcp_joint import _kernels
@@ -88,6 +89,10 @@ class JointScaleRanging(Ranging):
     whose symbol is not known are left out. There is no distance where the fit leaves the cells, or does not
     explain the values.
 
+    Of a layout of several even columns, each gives a distance, and these are averaged by their boundaries;
+    where they differ by more than their sigmas say, sigma is as much larger. From side to side nothing is
+    measured: a panel that is turned away looks narrower, but not lower.
+
     Sigma is the mean of two estimates, which see different errors: one takes each row as an observation
     (sandwich estimator), as a row's values share one pixel phase; the other is the scatter of the boundaries.
     """
@@ -115,19 +120,34 @@ class JointScaleRanging(Ranging):
     ] = 6
 
     def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
-        """Precompute for a bar of one column.
+        """Precompute for a bar of one column or more.
 
         Raises:
-            ConfigError: The layout is not one even column of clusters, or has fewer than three.
+            ConfigError: The layout has no even column of three clusters or more.
         """
-        clusters, spacing_m = bar.clusters, bar.column_pitch_m
-        if not spacing_m > 0 or clusters < 3:
+        if not bar.even_columns:
             raise ConfigError(
-                "ranging 'joint-scale' needs one even column of three clusters or more; " + _instead(bar)
+                "ranging 'joint-scale' needs an even column of three clusters or more; " + _instead(bar)
             )
-        least = min(self.min_boundaries, clusters - 1)
         codebook.require_pairs("ranging", "joint-scale", "poc")
-        pilots, words = codebook.pilot_edges.astype(np.float64), codebook.codeword_edges.astype(np.float64)
+        measures = [self._of_column(camera, codebook, *column) for column in bar.even_columns]
+        if len(measures) == 1 and len(bar.even_columns[0][0]) == bar.clusters:
+            return measures[0]
+        columns = [ids for ids, _ in bar.even_columns]
+
+        def measure(view: FrameView) -> Range:
+            parts = [one(_part(view, ids)) for one, ids in zip(measures, columns, strict=True)]
+            return _together([part for part in parts if part.sigma_m > 0])
+
+        return measure
+
+    def _of_column(
+        self, camera: CameraModel, codebook: Codebook, column: NDArray[np.int64], spacing_m: float
+    ) -> Measure:
+        """What measures one column by the views of its clusters alone."""
+        clusters, least = len(column), min(self.min_boundaries, len(column) - 1)
+        pilots = codebook.pilot_edges[column].astype(np.float64)
+        words = codebook.codeword_edges.astype(np.float64)
         boundaries = np.arange(1.0, clusters) - clusters / 2
         uneven = np.sign(np.diff(pilots, axis=0)).sum(1)
 
@@ -254,6 +274,33 @@ def _profile(core_share: float) -> Floats:
 def _when(n: int) -> Floats:
     """Times of the values, in frames, from the middle of the frame."""
     return (np.arange(n) + 0.5) / n - 0.5
+
+
+def _part(view: FrameView, clusters: NDArray[np.int64]) -> FrameView:
+    """What a view shows of some of the clusters, the first of them first."""
+    presence, soft = view.presence, view.soft
+    return changed(
+        view,
+        presence=changed(presence, selected=presence.selected[clusters]),
+        soft=changed(soft, symbols=soft.symbols[clusters]),
+    )
+
+
+def _together(parts: Sequence[Range]) -> Range:
+    """The mean of columns' distances by their boundaries; sigma is the larger by as much as they differ.
+
+    What n even boundaries tell grows with the cube of n. A column's own sigma, from the scatter of a few, is
+    too unsure to weigh by; all of them together say what a boundary is worth.
+    """
+    if not parts:
+        return _NONE
+    distance, sigma, pairs = np.array([(part.distance_m, part.sigma_m, part.pairs) for part in parts]).T
+    told = pairs**3
+    weight = told / np.mean(sigma**2 * told)
+    mean = float(weight @ distance / weight.sum())
+    spread = float(weight @ (distance - mean) ** 2) / max(len(parts) - 1, 1)
+    sigma_m = math.sqrt(max(spread, 1.0) / float(weight.sum()))
+    return Range(mean, sigma_m, int(pairs.sum()), parts[0].late_chips)
 
 
 def _instead(bar: BarLayout) -> str:

@@ -35,7 +35,7 @@ def link_with(layout: str, *overrides: str) -> Link:
 def test_a_link_that_names_no_ranging_measures_its_bar(layout: str) -> None:
     link = link_with(layout)
     wanted = {"1 clusters": "none", "2 clusters": "poc", "not alike": "centroid"}.get(
-        layout, "joint-scale" if "clusters" in layout else "poc"
+        layout, "poc" if layout in ("one row of two", "ring", "three LEDs") else "joint-scale"
     )
     assert link.table["ranging"]["id"] == wanted
     link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
@@ -78,10 +78,10 @@ def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name: str
     [
         (
             "1 clusters",
-            "needs one even column of three clusters or more; .* of one cluster: use 'none' for this layout$",
+            "needs an even column of three clusters or more; .* of one cluster: use 'none' for this layout$",
         ),
         ("2 clusters", "needs .* or more; use 'poc' for this layout$"),
-        ("4x4 panel", "needs .* or more; use 'poc' for this layout$"),
+        ("ring", "needs .* or more; use 'poc' for this layout$"),
         ("one row of two", "needs .* or more; use 'poc' for this layout$"),
     ],
 )

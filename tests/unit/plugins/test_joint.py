@@ -1,15 +1,17 @@
 """The joint fit of all boundaries: kernels against twins, ideal images at known distances, damaged ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from evlcp_joint import _kernels
-from evlcp_joint.ranging import JointScaleRanging, _profile
+from evlcp_joint.ranging import JointScaleRanging, _profile, _together
 from numpy.testing import assert_allclose
 from scipy.stats import norm, theilslopes
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.scene.bar import BarLayout, LedGrid
+from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedRing
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.study.bound import cramer_rao_sigma_m
 from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols
@@ -188,10 +190,60 @@ def test_too_few_clusters_give_no_distance() -> None:
     assert found.pairs == 0
 
 
-def test_panels_are_refused() -> None:
-    panel = BarLayout(LedGrid(rows=16, columns=16, cluster_rows=4, cluster_columns=4))
-    with pytest.raises(ConfigError, match="one even column"):
-        JointScaleRanging().compile(CameraModel(), panel, LINK.codebook)
+def test_rings_are_refused() -> None:
+    with pytest.raises(ConfigError, match="needs an even column"):
+        JointScaleRanging().compile(CameraModel(), BarLayout(LedRing()), LINK.codebook)
+
+
+def side_by_side(view: FrameView) -> FrameView:
+    """The lower half of a bar, moved beside the upper one."""
+    _, height, _ = view.sums.shape
+    # The row of the middle boundary, in whole cells: what is cut off belongs to no pair of neighbours.
+    half = height // 4 * 2
+
+    def moved(image: np.ndarray, rows: int) -> np.ndarray:
+        return np.concatenate([image[:, :rows], image[:, rows : 2 * rows]], axis=2)
+
+    seen, dark = view.presence, np.zeros((K // 2, half // 2, view.sums.shape[2] // 2), np.bool_)
+    upper = np.concatenate([seen.selected[: K // 2, : half // 2], dark], axis=2)
+    lower = np.concatenate([dark, seen.selected[K // 2 :, half // 2 : half]], axis=2)
+    selected = np.concatenate([upper, lower])
+    sums = moved(view.sums, half)
+    pixels = np.zeros((K, *sums.shape[1:]), np.float32)
+    presence = PresenceMap(selected.astype(np.float32), 2, selected, pixels)
+    return replace(view, sums=sums, presence=presence)
+
+
+def test_two_columns_give_the_distance_of_both_and_its_sigma() -> None:
+    bar = BarLayout(LedColumns(columns=2, rows=48))
+    measure = JointScaleRanging().compile(LINK.camera, bar, LINK.codebook)
+    errors, sigmas = [], []
+    for seed in range(24):
+        found = measure(side_by_side(view_of(50.0, noise=1.0, shift_px=0.2 * (seed % 4), seed=seed)))
+        assert found.pairs == 14
+        errors.append(found.distance_m - 50)
+        sigmas.append(found.sigma_m)
+    assert abs(np.mean(errors)) < 0.05
+    assert 0.5 < np.mean(np.square(errors) / np.square(sigmas)) < 1.8
+    one = measure(side_by_side(view_of(50.0, noise=1.0, dark=(8, 9, 10, 11, 12))))
+    assert one.pairs == 7
+    # What is hidden is left out, a column that shows too little whole.
+    assert measure(side_by_side(view_of(50.0, dark=tuple(range(16))))).pairs == 0
+
+
+def test_columns_that_disagree_are_as_unsure_as_they_differ() -> None:
+    parts = [Range(50.0, 0.1, 7, 0.5), Range(51.0, 0.1, 7, 0.5), Range(50.5, 0.2, 3, 0.5)]
+    found = _together(parts)
+    # Three boundaries tell a distance (3 / 7)^3 as well as seven.
+    one_m2 = (0.1**2 * 7**3 + 0.1**2 * 7**3 + 0.2**2 * 3**3) / 3
+    weights = np.array([7**3, 7**3, 3**3]) / one_m2
+    mean = np.average([50.0, 51.0, 50.5], weights=weights)
+    misfit = weights @ (np.array([50.0, 51.0, 50.5]) - mean) ** 2 / 2
+    assert found.distance_m == pytest.approx(mean)
+    assert found.sigma_m == pytest.approx(np.sqrt(misfit / weights.sum()))
+    assert (found.pairs, found.late_chips) == (17, 0.5)
+    assert _together(parts[:1]) == parts[0]
+    assert np.isnan(_together([]).distance_m)
 
 
 BLUR, SHARE = 0.2, 0.4

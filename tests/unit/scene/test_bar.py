@@ -88,6 +88,23 @@ def test_the_default_ranging_fits_the_layout() -> None:
     assert chosen == {"grid": "poc", "columns": "poc", "ring": "centroid", "table": "none", "one": "none"}
     assert ROLES["ranging"].default_for(BarLayout(LedRing())) == "poc"
     assert ROLES["ranging"].default_for(BarLayout()) == "joint-scale"
+    assert ROLES["ranging"].default_for(BarLayout(LedColumns())) == "joint-scale"
+    assert ROLES["ranging"].default_for(BarLayout(LedColumns(apart_m=1.2))) == "poc"
+
+
+def test_even_columns_are_found_in_any_order() -> None:
+    assert [(ids.tolist(), m) for ids, m in BarLayout().even_columns] == [(list(range(16)), 0.06)]
+    # Two columns upside down beside a lone LED, and one whose steps are not even.
+    leds = [
+        [x, y, 0.0, k] for k, (x, y) in enumerate([(0, 2), (1, 4), (0, 1), (1, 2), (0, 0), (1, 0), (2, 0)])
+    ]
+    layout = BarLayout.of_table({"shape": "table", "leds": leds})
+    assert [(ids.tolist(), m) for ids, m in layout.even_columns] == [([4, 2, 0], 1.0), ([5, 3, 1], 2.0)]
+    leds[0][1] = 2.5
+    layout = BarLayout.of_table({"shape": "table", "leds": leds})
+    assert [ids.tolist() for ids, _ in layout.even_columns] == [[5, 3, 1]]
+    assert BarLayout(LedRing()).even_columns == ()
+    assert BarLayout(LedGrid(6, 4, cluster_rows=3)).even_columns == ()
 
 
 def test_a_csv_file_is_read_into_the_table(tmp_path: Path) -> None:

@@ -144,6 +144,7 @@ UNEVEN = [
 ANY_LAYOUT: dict[str, tuple[list[str], float]] = {
     "ring": (["shape=ring", "leds=12", "radius_m=0.25"], 0.15),
     "apart": (["shape=columns", "apart_m=1.2", "rows=24"], 0.12),
+    "lamps": (["shape=columns"], 0.1),
     "uneven": (["shape=table", f"leds={UNEVEN}"], 0.4),
 }
 
