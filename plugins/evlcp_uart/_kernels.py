@@ -1,4 +1,4 @@
-"""Kernels: evidence of an edge and of a character at every tick, and the best path through them."""
+"""Kernels: evidence of a bit and of a character at every tick, and the best path through them."""
 
 import math
 from typing import Any
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.kernels import njit
 
-__all__ = ["best_path", "character_scores", "edge_evidence"]
+__all__ = ["best_path", "bit_evidence", "character_scores"]
 
 Column = NDArray[Any]
 
@@ -18,95 +18,124 @@ def _log_sum(a: float, b: float) -> float:
     """The logarithm of the sum of two numbers, from their logarithms."""
     if a < b:
         a, b = b, a
-    if b == -np.inf:
+    if b < a - 40 or b == -np.inf:
         return a
     return a + math.log1p(math.exp(b - a))
 
 
 @njit(cache=True, nogil=True)
-def edge_evidence(
-    counts: Column, gains: Column, means: Column, shares: Column, unseen: float, out: Column
+def bit_evidence(
+    counts: Column, logs: Column, gains: Column, means: Column, share: float, doubt: float, out: Column
 ) -> None:
-    """Log-likelihood ratio of an edge at every tick against none, from the counts of one polarity.
+    """Log-likelihood of the window behind every tick for each context of a bit, less that of the last one.
 
     Args:
-        counts: Events of each tick, int32 (n,).
-        gains: What an event at each tick after an edge says, for each strength of a burst, float64 (J, K).
-        means: Events of a burst of each strength, float64 (J,).
-        shares: How likely each strength is, float64 (J,).
-        unseen: Probability that an edge has no burst.
-        out: Of each tick that has K of them before the end, float64 (n - K + 1,).
+        counts: Events of each tick, OFF and ON, int32 (2, n).
+        logs: Logarithm of the mean events of each tick of a window, by context, float64 (C, 2, W).
+        gains: Logarithms of the gains that a window may have, float64 (J,).
+        means: What a window costs by context and gain: its mean events, each counted as `share`, less the
+            logarithm of the gain's share, float64 (C, J).
+        share: What an event counts.
+        doubt: Probability that a window is of no context.
+        out: Of each tick that has W of them before the end, float64 (n - W + 1, C).
     """
-    strengths, length = gains.shape
-    said = np.empty(strengths)
+    contexts, _, width = logs.shape
+    strengths = len(gains)
+    alike = np.empty(contexts)
+    said = np.empty((contexts, strengths))
     for s in range(len(out)):
-        said[:] = 0.0
-        for m in range(length):
-            c = counts[s + m]
-            if c:
-                for j in range(strengths):
-                    said[j] += c * gains[j, m]
-        burst = -np.inf
-        for j in range(strengths):
-            burst = _log_sum(burst, said[j] - means[j] + math.log(shares[j]))
-        out[s] = _log_sum(math.log(unseen), math.log(1 - unseen) + burst)
+        alike[:] = 0.0
+        events = 0
+        for polarity in range(2):
+            for m in range(width):
+                k = counts[polarity, s + m]
+                if k:
+                    events += k
+                    for c in range(contexts):
+                        alike[c] += k * logs[c, polarity, m]
+        for c in range(contexts):
+            for j in range(strengths):
+                said[c, j] = share * (alike[c] + events * gains[j]) - means[c, j]
+        top = said[0, 0]
+        for c in range(contexts):
+            for j in range(strengths):
+                top = max(top, said[c, j])
+        largest = 0.0
+        for c in range(contexts):
+            total = 0.0
+            for j in range(strengths):
+                total += math.exp(said[c, j] - top)
+            out[s, c] = total
+            largest = max(largest, total)
+        for c in range(contexts):
+            out[s, c] = math.log((1 - doubt) * out[s, c] / largest + doubt)
+        last = out[s, contexts - 1]
+        for c in range(contexts):
+            out[s, c] -= last
 
 
 @njit(cache=True, nogil=True)
 def character_scores(
-    falls: Column, rises: Column, places: Column, bits: int, parity: int, likeliest: bool, out: Column
+    evidence: Column, places: Column, bits: int, parity: int, likeliest: bool, out: Column
 ) -> None:
-    """Log-likelihood ratio of a character that starts at a tick, of any bits, against no edge at all.
+    """Log-likelihood ratio of a character that starts at a tick, of any bits, against mark throughout.
 
     Args:
-        falls: Evidence of an edge from mark to space at every tick, float64 (n,).
-        rises: The same from space to mark.
-        places: Ticks from the start of a character to that of each bit, the start bit's and the first stop
-            bit's included, int64 (bits + 2 or 3,).
+        evidence: Of every tick and context, whose binary digits are the bits before and that of the window,
+            float64 (n, C).
+        places: Ticks from the start of a character to each of its bits, int64 (bits on air,).
         bits: Data bits.
         parity: 0 none, 1 odd, 2 even: the parity bit makes the number of ones so.
         likeliest: Take the likeliest bits alone instead of the mean over all.
-        out: Of every tick whose last edge is within n, float64 (m,).
+        out: Of every tick, float64 (m,), with m + the last place <= n.
     """
-    # A state is the level of the last bit and the parity of the ones so far.
-    here, then = np.empty((2, 2)), np.empty((2, 2))
     fair = -bits * math.log(2.0)
+    states = np.empty((2, evidence.shape[1] // 2, 2))
     for s in range(len(out)):
-        here[:] = -np.inf
-        here[0, 0] = falls[s]
-        for b in range(bits):
-            fall, rise = falls[s + places[b + 1]], rises[s + places[b + 1]]
-            for odd in range(2):
-                zero0, zero1 = here[0, odd], here[1, odd] + fall
-                one0, one1 = here[0, 1 - odd] + rise, here[1, 1 - odd]
-                if likeliest:
-                    then[0, odd], then[1, odd] = max(zero0, zero1), max(one0, one1)
-                else:
-                    then[0, odd], then[1, odd] = _log_sum(zero0, zero1), _log_sum(one0, one1)
-            here, then = then, here
-        stop = places[bits + 1]
-        if parity:
-            fall, rise = falls[s + stop], rises[s + stop]
-            for odd in range(2):
-                one = odd if parity == 2 else 1 - odd
-                if one:
-                    up0, up1 = here[0, odd] + rise, here[1, odd]
-                    then[1, odd] = max(up0, up1) if likeliest else _log_sum(up0, up1)
-                    then[0, odd] = -np.inf
-                else:
-                    down0, down1 = here[0, odd], here[1, odd] + fall
-                    then[0, odd] = max(down0, down1) if likeliest else _log_sum(down0, down1)
-                    then[1, odd] = -np.inf
-            here, then = then, here
-            stop = places[bits + 2]
-        rise = rises[s + stop]
-        total = -np.inf
-        for odd in range(2):
-            if likeliest:
-                total = max(total, here[0, odd] + rise, here[1, odd])
-            else:
-                total = _log_sum(total, _log_sum(here[0, odd] + rise, here[1, odd]))
+        total = _character_score(evidence, places, bits, parity, True, s, states)
+        # The mean over all words matters only where a character may be.
+        if not likeliest and total > 0:
+            total = _character_score(evidence, places, bits, parity, False, s, states)
         out[s] = total + fair
+
+
+@njit(cache=True, nogil=True)
+def _character_score(
+    evidence: Column, places: Column, bits: int, parity: int, likeliest: bool, s: int, states: Column
+) -> float:
+    """The likeliest word, or the sum over all, at one tick; `states` is room to work in."""
+    # A state is the last bits and the parity of the ones so far; before the start bit there was mark.
+    known_bits = states.shape[1]
+    states[:] = -np.inf
+    states[0, known_bits - 2, 0] = evidence[s, 2 * known_bits - 2]
+    now = 0
+    for b in range(1, len(places)):
+        at = s + places[b]
+        is_data = b <= bits
+        is_parity = parity > 0 and b == bits + 1
+        for state in range(known_bits):
+            for odd in range(2):
+                states[1 - now, state, odd] = -np.inf
+        for state in range(known_bits):
+            for odd in range(2):
+                before = states[now, state, odd]
+                if before == -np.inf:
+                    continue
+                for bit in range(2):
+                    if not is_data and bit != (((odd + parity) & 1) if is_parity else 1):
+                        continue
+                    context = 2 * state + bit
+                    value = before + evidence[at, context]
+                    to, ones = context & (known_bits - 1), (odd ^ bit) if is_data else odd
+                    known = states[1 - now, to, ones]
+                    states[1 - now, to, ones] = max(known, value) if likeliest else _log_sum(known, value)
+        now = 1 - now
+    total = -np.inf
+    for state in range(known_bits):
+        for odd in range(2):
+            value = states[now, state, odd]
+            total = max(total, value) if likeliest else _log_sum(total, value)
+    return total
 
 
 @njit(cache=True, nogil=True)

@@ -7,6 +7,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_uart.light import BEFORE
+
 __all__ = ["Characters", "Parity"]
 
 Parity = Literal["none", "even", "odd"]
@@ -29,11 +31,6 @@ class Characters:
         """Bits on air of a character, start and stop bits included."""
         return 1 + self.data_bits + (self.parity != "none") + self.stop_bits
 
-    @property
-    def edges(self) -> int:
-        """Places at which a character may have an edge: before every bit up to the first stop bit."""
-        return self.bits - self.stop_bits + 1
-
     def levels(self) -> NDArray[np.uint8]:
         """Every character, 1 for mark, uint8 (2**data_bits, bits)."""
         values = np.arange(1 << self.data_bits)
@@ -46,38 +43,26 @@ class Characters:
         return found
 
     @cached_property
-    def falling(self) -> NDArray[np.float64]:
-        """1 where each character falls from mark to space, float64 (2**data_bits, edges)."""
-        return self._edges(self.levels())[0]
+    def contexts(self) -> NDArray[np.int64]:
+        """Context of each bit of every character, int64 (2**data_bits, bits); before it there was mark."""
+        return _contexts(self.levels())
 
-    @cached_property
-    def rising(self) -> NDArray[np.float64]:
-        """1 where each rises from space to mark, float64 (2**data_bits, edges)."""
-        return self._edges(self.levels())[1]
-
-    def _edges(self, levels: NDArray[np.uint8]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        steps = np.diff(np.pad(levels[:, : self.edges], ((0, 0), (1, 0)), constant_values=1).astype(np.int64))
-        return (steps < 0).astype(np.float64), (steps > 0).astype(np.float64)
-
-    def likelihoods(self, falls: NDArray[np.float64], rises: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Log-likelihood of every character against no edge, float64 (n, 2**data_bits).
+    def likelihoods(self, evidence: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Log-likelihood of every character, float64 (n, 2**data_bits).
 
         Args:
-            falls: Evidence of a fall at each of its places, float64 (n, edges).
-            rises: The same of a rise.
+            evidence: Log-likelihood of each context at each bit, float64 (n, bits, C).
         """
-        found: NDArray[np.float64] = falls @ self.falling.T + rises @ self.rising.T
-        return found
+        return _likelihoods(evidence, self.contexts)
 
-    def wrong_parity(self, falls: NDArray[np.float64], rises: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def wrong_parity(self, evidence: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether the bits that are likeliest by themselves have the wrong parity, bool (n,)."""
         if self.parity == "none":
-            return np.zeros(len(falls), np.bool_)
+            return np.zeros(len(evidence), np.bool_)
         other = self.levels()
         other[:, 1 + self.data_bits] ^= 1
-        fell, rose = self._edges(other)
-        right = self.likelihoods(falls, rises).max(1, initial=-np.inf)
-        wrong: NDArray[np.bool_] = (falls @ fell.T + rises @ rose.T).max(1, initial=-np.inf) > right
+        right = self.likelihoods(evidence).max(1, initial=-np.inf)
+        wrong: NDArray[np.bool_] = _likelihoods(evidence, _contexts(other)).max(1, initial=-np.inf) > right
         return wrong
 
     def soft(
@@ -98,3 +83,18 @@ class Characters:
         llr = np.log(np.maximum(total[:, None] - of_one, least)) - np.log(np.maximum(of_one, least))
         best = likelihoods.argmax(1)
         return best, llr.astype(np.float32), 1 / total
+
+
+def _contexts(levels: NDArray[np.uint8]) -> NDArray[np.int64]:
+    known = np.pad(levels.astype(np.int64), ((0, 0), (BEFORE, 0)), constant_values=1)
+    bits = levels.shape[1]
+    found = np.zeros(levels.shape, np.int64)
+    for k in range(BEFORE + 1):
+        found = 2 * found + known[:, k : k + bits]
+    return found
+
+
+def _likelihoods(evidence: NDArray[np.float64], contexts: NDArray[np.int64]) -> NDArray[np.float64]:
+    bits = np.arange(contexts.shape[1])
+    found: NDArray[np.float64] = evidence[:, bits, contexts].sum(2)
+    return found

@@ -1,10 +1,11 @@
 """Characters from the events of a group of pixels: a maximum-likelihood receiver that learns its light.
 
-An edge of the light wakes a burst of events of one polarity, late by a latency that is different for each and
-has a tail. What is learned from the stream itself, without training: how late, and how many, events of either
-polarity come, how many there are without an edge, and how far the clock is off. With that every tick of the
-stream, a sixteenth of a bit, has a log-likelihood ratio for a rise and one for a fall; a character is worth
-what its edges say, and the best sequence of characters and pauses is found as a whole.
+An edge of the light wakes a burst of events of one polarity, late and with a tail; a light that moves or
+shimmers wakes events of both as long as it is on. What is learned from the stream itself, without training:
+how many events of either polarity come in each sixteenth of a bit, by the bit and the three before it; how
+unlike in strength bits are; how far the clock is off, and how often characters pause. With that every tick of
+the stream has a log-likelihood of each context of a bit; a character is worth what its bits say, and the best
+sequence of characters and pauses is found as a whole.
 """
 
 from collections.abc import Iterator
@@ -14,37 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_uart.characters import Characters
+from evlcp_uart.light import CONTEXTS, DOUBT, EARLY, LOG_GAINS, TICKS, Light, guesses
 
-__all__ = ["Character", "CharacterDecoder", "CharacterState", "Light"]
-
-TICKS = 16
-"""Ticks of a bit."""
-
-_REACH = 2 * TICKS
-"""Ticks after an edge in which its events come: rises are two bits apart at the least, and so are falls."""
-
-_EARLY = 3
-"""Tick after an edge at which the first events come: where an edge is, only events tell."""
+__all__ = ["Character", "CharacterDecoder", "CharacterState"]
 
 _BLOCK = 32
 """Characters of a stretch that is decoded at once, if they follow one another."""
 
+_TAIL = 2 * TICKS
+"""Ticks behind a character that its bits' windows may need."""
+
+_MORE, _SURE = 4, 0.95
+"""Blocks of a stretch where the characters of one are not that sure on the average: dim light takes long to
+learn."""
+
 _AHEAD = 4
 """Characters that are looked ahead: where one starts is known only by those after it."""
 
-_STRENGTHS = np.array([0.25, 0.5, 1.0, 2.0])
-_SHARES = np.array([0.15, 0.3, 0.4, 0.15])
-"""Bursts are unlike in strength: by their mean, and how likely each is."""
-
-_ENOUGH = 30.0
-"""Events of a burst that tell all that it says: of more, each counts less, as pixels share light and motion,
-and the tail of a burst is no Poisson noise."""
-
-_LEFT = 0.3
-"""Share of the events after an edge that may be taken for what bursts leave behind."""
-
-_AFTER_IDLE, _AFTER_ONE, _JITTER, _NEAR = 12.0, 1.0, 0.7, 2
-"""What a character costs after a pause and at once after another, and a tick early or late."""
+_JITTER, _NEAR = 0.7, 2
+"""What a tick early or late costs a character that follows another at once, and how many that may be."""
 
 _CLOCK = 0.025
 """Share by which the clock may be off."""
@@ -53,43 +42,35 @@ _RATES = np.linspace(-0.012, 0.012, 13)
 """Clocks that are tried about the one that is known."""
 
 _LEAST_SPACINGS = 6
-"""Characters that follow another at once by which the clock is told."""
+"""Characters that follow another at once, from which the clock is measured."""
 
 _LEAST_EVENTS = 24
 _LEAST_CHARACTERS = 3
-_LEAST_WORTH = 6.0
-"""Events of a stretch in which light is looked for; characters that it must show, and what each is worth."""
+_LEAST_WORTH = 0.5
+"""Events of a stretch in which light is looked for; characters that half of it must show; and by how much
+each is to be likelier than without."""
 
-_MEMORY = 0.8
-"""Weight of what was learned before against a stretch that is as full."""
+DOUBTFUL = 0.85
+"""How sure the first characters are on the average, where they are fewer than that before a pause."""
+
+_TRIED, _ROUNDS = 4, 5
+"""Guesses of the light that are followed, and how often each is learned anew."""
+
+_SHIFTS, _TOLD = range(-14, 15, 2), 0.01
+"""Ticks by which bits are tried to begin elsewhere, as a burst should be within its bit's window: the latest
+that tells as much, but for a share."""
+
+_STEADY = 6
+"""Characters before and behind one that tell when it starts, where they follow one another at once."""
+
+_MEMORY = 0.97
+"""Weight of what was learned before, after a block."""
 
 _SELDOM = 8
 """Stretches in one of which light is looked for where there is none."""
 
 _LOST = 8
 """Stretches with events and without a character after which the light is learned anew."""
-
-
-@dataclass(frozen=True, eq=False)
-class Light:
-    """What is known of the light and of the pixels that see it.
-
-    Attributes:
-        kernels: How many of a burst's events come at each tick after an edge, rows for OFF and ON, float64
-            (2, ticks); each sums up to 1.
-        events: Events of a burst, OFF and ON, float64 (2,).
-        noise: Events a tick without an edge, OFF and ON, float64 (2,).
-        rate: Length of a bit against the nominal one.
-        unseen: Share of edges without a burst.
-        learned: Edges that it was learned from, with those long ago counting less.
-    """
-
-    kernels: NDArray[np.float64]
-    events: NDArray[np.float64]
-    noise: NDArray[np.float64]
-    rate: float = 1.0
-    unseen: float = 0.02
-    learned: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +106,7 @@ class CharacterState:
         light: What is known of the light; None before that.
         dark: Stretches with events and without a character since the last one.
         tried: Stretches with events in which light was looked for, or might have been, in vain.
+        blocks: Blocks of the next stretch.
         given: What was counted so far.
     """
 
@@ -135,8 +117,14 @@ class CharacterState:
     light: Light | None = None
     dark: int = 0
     tried: int = 0
+    blocks: int = 1
     given: dict[str, int] = field(
-        default_factory=lambda: {"characters": 0, "characters_wrong_parity": 0, "stretches_without_light": 0}
+        default_factory=lambda: {
+            "characters": 0,
+            "characters_by_chance": 0,
+            "characters_wrong_parity": 0,
+            "stretches_without_light": 0,
+        }
     )
 
 
@@ -188,8 +176,8 @@ class CharacterDecoder:
         """
         state = self._take(state, t_us, p, until_us)
         found: list[Character] = []
-        while state.counts.shape[1] >= self._block + self._ahead:
-            state, more = self._decode(state, self._block)
+        while state.counts.shape[1] >= state.blocks * self._block + self._ahead:
+            state, more = self._decode(state, state.blocks * self._block)
             found += more
         return state, found
 
@@ -210,7 +198,7 @@ class CharacterDecoder:
 
     @property
     def _ahead(self) -> int:
-        return _AHEAD * self._length + _REACH
+        return _AHEAD * self._length + _TAIL
 
     def _take(
         self, state: CharacterState, t_us: NDArray[np.int64], p: NDArray[np.uint8], until_us: float
@@ -243,9 +231,9 @@ class CharacterDecoder:
         first, light = state.first, state.light
         # No more than that, however much there is: any split of the stream gives the same.
         counts = state.counts[:, : due + self._ahead]
-        end = counts.shape[1] - (TICKS if last else _REACH)
+        end = counts.shape[1] - (TICKS if last else _TAIL)
         # A character may go on behind what is known.
-        counts = np.pad(counts, ((0, 0), (0, self._length + 2 * _REACH)))
+        counts = np.pad(counts, ((0, 0), (0, self._length + 2 * _TAIL)))
         events = int(counts[:, :due].sum())
         given = dict(state.given)
         found: list[Character] = []
@@ -256,21 +244,33 @@ class CharacterDecoder:
             # Looking takes long: the less often, the longer there was none.
             if tried & (tried - 1) == 0 or tried % _SELDOM == 0:
                 light = self._acquire(stretch)
+            if light is None and state.blocks == 1 and not last:
+                return replace(state, blocks=_MORE), []
             tried = 0 if light is not None else tried + 1
+        blocks = state.blocks
         if light is None:
             given["stretches_without_light"] += events >= _LEAST_EVENTS
         else:
             # Where a stretch tells much of the light, it is read by that.
-            starts, values = self._read(stretch, light)[:2]
-            light = self._learned(stretch, light, starts, values)
-            starts, _, falls, rises = self._read(stretch, light)
-            kept = (starts < due) & (starts + _EARLY >= stretch.seen)
+            starts, evidence, _ = self._path(stretch, light, False)
+            light = self._learned(stretch, light, starts, evidence, _MEMORY ** (due / self._block))
+            starts, evidence, _ = self._path(stretch, light, False)
+            kept = (starts < due) & (starts + EARLY >= stretch.seen)
             if last:
-                kept &= starts + (self.characters.edges - 1) * TICKS < end
+                # Its last edge may be that before the first stop bit.
+                kept &= starts + (self.characters.bits - self.characters.stop_bits) * TICKS < end
             ahead = starts[starts < due]
-            starts, falls, rises = starts[kept], falls[kept], rises[kept]
-            found = list(self._given(first, starts, falls, rises, light))
+            found = list(self._given(first, starts[kept], evidence, light))
+            by_chance = 0
+            if state.light is None:
+                by_chance, found = len(found), _without_chance(found)
+                by_chance -= len(found)
+            sure = float(np.mean([one.quality for one in found])) if found else 1.0
+            if state.light is None and sure < _SURE and state.blocks == 1 and not last:
+                return replace(state, blocks=_MORE), []
+            blocks = 1 if sure >= _SURE else _MORE
             given["characters"] += len(found)
+            given["characters_by_chance"] += by_chance
             given["characters_wrong_parity"] += sum(c.wrong_parity for c in found)
             if len(ahead):
                 start = int(ahead[-1]) + round(self._length * light.rate) - _NEAR
@@ -281,153 +281,149 @@ class CharacterDecoder:
                     light, dark = None, 0
         # A copy, so that what is done is not held.
         rest = state.counts[:, due:].copy()
-        return CharacterState(first + due, rest, first + start, state.seen, light, dark, tried, given), found
+        return CharacterState(
+            first + due, rest, first + start, state.seen, light, dark, tried, blocks, given
+        ), found
 
     def _places(self, light: Light) -> NDArray[np.int64]:
-        """Ticks from a character's start to each place of an edge."""
-        places = np.arange(self.characters.edges) * (TICKS * light.rate)
-        ticks: NDArray[np.int64] = np.rint(places).astype(np.int64)
+        """Ticks from a character's start to each of its bits."""
+        ticks: NDArray[np.int64] = np.rint(np.arange(self.characters.bits) * (TICKS * light.rate)).astype(
+            np.int64
+        )
         return ticks
 
-    def _evidence(self, stretch: "Stretch", light: Light) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Evidence of a fall from mark and of a rise to it at every tick, float64 (n,) each."""
+    def _evidence(self, stretch: "Stretch", light: Light) -> NDArray[np.float64]:
+        """Log-likelihood of each context of a bit at every tick, float64 (n, C), 0 for mark throughout."""
         from evlcp_uart import _kernels
 
         counts = stretch.counts
-        found = np.empty((2, counts.shape[1] - _REACH + 1))
-        for polarity in (0, 1):
-            means = light.events[polarity] * _STRENGTHS
-            gains = np.log1p(means[:, None] * light.kernels[polarity] / light.noise[polarity])
-            share = min(1.0, _ENOUGH / float(light.events[polarity]))
-            gains, means = gains * share, means * share
-            _kernels.edge_evidence(counts[polarity], gains, means, _SHARES, light.unseen, found[polarity])
-        # Whether there was an edge before the first event, or behind the last, nothing tells.
-        found[:, : max(stretch.seen - _EARLY, 0)] = 0
-        found[:, max(stretch.end, 0) :] = 0
-        off, on = found
-        return (off, on) if self.mark_on else (on, off)
-
-    def _read(
-        self, stretch: "Stretch", light: Light, *, likeliest: bool = False
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-        """Starts of characters, their values, and the evidence at their places."""
-        starts, falls, rises, _ = self._path(stretch, light, likeliest)
-        at = starts[:, None] + self._places(light)
-        fell, rose = falls[at], rises[at]
-        values = self.characters.likelihoods(fell, rose).argmax(1) if len(starts) else np.empty(0, np.int64)
-        return starts, values, fell, rose
+        found = np.empty((counts.shape[1] - TICKS + 1, CONTEXTS))
+        _kernels.bit_evidence(counts, light.logs, LOG_GAINS, light.means, light.share, DOUBT, found)
+        # What there was before the first event, or behind the last, nothing tells.
+        found[: max(stretch.seen - EARLY, 0)] = 0
+        found[max(stretch.end, 0) :] = 0
+        return found
 
     def _path(
         self, stretch: "Stretch", light: Light, likeliest: bool
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], float]:
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], float]:
+        """Starts of the characters, the evidence at every tick, and what the path is worth."""
         from evlcp_uart import _kernels
 
-        falls, rises = self._evidence(stretch, light)
+        evidence = self._evidence(stretch, light)
         places = self._places(light)
-        scores = np.empty(max(len(falls) - int(places[-1]), 0))
+        scores = np.empty(max(len(evidence) - int(places[-1]), 0))
         parity = ("none", "odd", "even").index(self.characters.parity)
-        _kernels.character_scores(falls, rises, places, self.characters.data_bits, parity, likeliest, scores)
+        _kernels.character_scores(evidence, places, self.characters.data_bits, parity, likeliest, scores)
         length = round(self._length * light.rate)
-        starts, worth = _kernels.best_path(
-            scores, length, stretch.start, _NEAR, _AFTER_IDLE, _AFTER_ONE, _JITTER
-        )
-        return starts, falls, rises, worth
+        starts, worth = _kernels.best_path(scores, length, stretch.start, _NEAR, *light.costs, _JITTER)
+        return self._steadied(stretch, light, starts, evidence), evidence, worth
+
+    def _steadied(
+        self, stretch: "Stretch", light: Light, starts: NDArray[np.int64], evidence: NDArray[np.float64]
+    ) -> NDArray[np.int64]:
+        """Starts as their events and those of the characters around tell them, where these follow at once.
+
+        The evidence of a bit knows its word, and hardly when it begins: it is bounded by what else may come.
+        """
+        if not len(starts):
+            return starts
+        length = self._length * light.rate
+        most = stretch.counts.shape[1] - TICKS - 1
+        places = self._places(light)
+        values = self.characters.likelihoods(evidence[starts[:, None] + places]).argmax(1)
+        logs = light.logs - np.log(light.rates.mean((0, 2)))[None, :, None]
+        logs = logs[self.characters.contexts[values]]
+        found = starts.copy()
+        breaks = np.flatnonzero(np.abs(np.diff(starts) - length) > _NEAR + 1) + 1
+        shifts = np.arange(-_NEAR - 1, _NEAR + 2)
+        for run in np.split(np.arange(len(starts)), breaks):
+            begun = starts[run] - length * np.arange(len(run))
+            mean = _around(begun[:, None])[:, 0] / _around(np.ones((len(run), 1)))[:, 0]
+            at = np.rint(mean + length * np.arange(len(run))).astype(np.int64)[:, None] + shifts
+            windows = np.clip(at[:, :, None] + places, 0, most)[..., None] + np.arange(TICKS)
+            told = np.einsum("pnsbt,nbpt->ns", stretch.counts[:, windows], logs[run], optimize=True)
+            best = at[np.arange(len(run)), _around(told).argmax(1)]
+            found[run] = np.clip(best, 0, len(evidence) - 1 - int(places[-1]))
+        return found
 
     def _given(
-        self,
-        first: int,
-        starts: NDArray[np.int64],
-        falls: NDArray[np.float64],
-        rises: NDArray[np.float64],
-        light: Light,
+        self, first: int, starts: NDArray[np.int64], evidence: NDArray[np.float64], light: Light
     ) -> Iterator[Character]:
-        likelihoods = self.characters.likelihoods(falls, rises)
-        values, llr, quality = self.characters.soft(likelihoods)
-        wrong = self.characters.wrong_parity(falls, rises)
+        at = evidence[starts[:, None] + self._places(light)]
+        values, llr, quality = self.characters.soft(self.characters.likelihoods(at))
+        wrong = self.characters.wrong_parity(at)
         tick_us = self.bit_us / TICKS
         for k, start in enumerate(starts.tolist()):
-            t_us = (first + start + _EARLY) * tick_us
+            t_us = (first + start + EARLY) * tick_us
             yield Character(
                 t_us, int(values[k]), llr[k], float(quality[k]), bool(wrong[k]), self.bit_us * light.rate
             )
-
-    def _edges_of(
-        self, starts: NDArray[np.int64], values: NDArray[np.int64], light: Light
-    ) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64]], tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Of OFF and ON edges of characters: their ticks, and the number of their place, int64 (m,) each."""
-        at = starts[:, None] + self._places(light)
-        place = np.broadcast_to(np.arange(at.shape[1]), at.shape)
-        fell, rose = self.characters.falling[values] > 0, self.characters.rising[values] > 0
-        down, up = (at[fell], place[fell]), (at[rose], place[rose])
-        return (down, up) if self.mark_on else (up, down)
 
     def _learned(
         self,
         stretch: "Stretch",
         light: Light,
         starts: NDArray[np.int64],
-        values: NDArray[np.int64],
-        memory: float = _MEMORY,
+        evidence: NDArray[np.float64],
+        memory: float,
     ) -> Light:
         """What characters that were read teach of the light."""
         if len(starts) < _LEAST_CHARACTERS:
             return light
-        counts = stretch.counts
-        n = counts.shape[1]
-        weight = memory * light.learned
-        kernels, events, noise = light.kernels.copy(), light.events.copy(), light.noise.copy()
-        edges = self._edges_of(starts, values, light)
-        seen = blank = 0
-        for polarity, (at, place) in enumerate(edges):
-            inside = at + _REACH <= n
-            at, place = at[inside], place[inside]
-            if not len(at):
-                continue
-            windows = counts[polarity][at[:, None] + np.arange(_REACH)]
-            found = windows.sum(0).astype(np.float64)
-            away = np.ones(n, np.bool_)
-            away[(at[:, None] + np.arange(_REACH)).ravel()] = False
-            # Outside the characters there may be no light at all: noise is that of the pauses within them.
-            between = away[starts[0] : starts[-1] + self._length]
-            quiet = counts[polarity][starts[0] : starts[-1] + self._length][between]
-            if len(quiet) >= _REACH:
-                # What a burst leaves behind for long is noise to the edges after it.
-                left = min(float(found[-_REACH // 4 :].mean()), _LEFT * float(found.mean())) / len(at)
-                level = max(float(quiet.mean()), left)
-                noise[polarity] += (level - noise[polarity]) * len(quiet) / (len(quiet) + weight * TICKS)
-            noise[polarity] = max(noise[polarity], 1e-4, 1e-4 * events[polarity])
-            burst = np.maximum(found - noise[polarity] * len(at), 0.0)
-            total = float(burst.sum())
-            share = len(at) / (len(at) + weight)
-            events[polarity] += (max(total / len(at), 0.5) - events[polarity]) * share
-            if total > 0:
-                shape = np.convolve(np.pad(burst, 1, mode="edge"), (0.25, 0.5, 0.25), "valid")
-                shape = shape + 0.01 * shape.sum() / _REACH
-                kernels[polarity] += (shape / shape.sum() - kernels[polarity]) * share
-                kernels[polarity] /= kernels[polarity].sum()
-            strong = windows.sum(1)
-            seen += len(at)
-            blank += int((strong <= 0.05 * events[polarity] + 2 * noise[polarity] * _REACH).sum())
-        unseen = (blank + 0.02 * 50 + light.unseen * weight) / (seen + 50 + weight)
-        light = replace(light, rate=self._rate(stretch, light, starts, values, weight))
-        return replace(
-            light,
-            kernels=kernels,
-            events=events,
-            noise=noise,
-            unseen=float(np.clip(unseen, 1e-3, 0.3)),
-            learned=weight + seen,
-        )
+        rate = self._rate(light, starts, evidence, memory)
+        windows, contexts = self._bits(stretch, light, starts, evidence)
+        light = light.learn(windows, contexts, memory, rate)
+        apart = np.diff(starts) - self._length * light.rate
+        late = apart[(np.abs(apart) > _NEAR + 1) & (apart < 2 * self._length)]
+        paused = len(late), float(late.sum()), len(apart)
+        sums = [memory * old + new for old, new in zip(light.paused, paused, strict=True)]
+        return replace(light, paused=(sums[0], sums[1], sums[2]))
 
-    def _rate(
+    def _bits(
         self,
         stretch: "Stretch",
         light: Light,
         starts: NDArray[np.int64],
-        values: NDArray[np.int64],
-        weight: float,
+        evidence: NDArray[np.float64],
+        shift: int = 0,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The bits of characters that were read, `shift` ticks later than they were.
+
+        Returns:
+            Their events, float64 (n, 2, TICKS), and how likely each is of each context, float64 (n, C).
+        """
+        places = starts[:, None] + self._places(light)
+        likelihoods = self.characters.likelihoods(evidence[places])
+        weights = np.exp(likelihoods - likelihoods.max(1, keepdims=True))
+        weights /= weights.sum(1, keepdims=True)
+        of_words = self.characters.contexts
+        contexts = np.stack([weights @ (of_words == context) for context in range(CONTEXTS)], 2)
+        at = (places + shift).ravel()
+        inside = (at >= 0) & (at + TICKS <= stretch.end) & (at + EARLY >= stretch.seen)
+        windows = stretch.counts[:, at[inside, None] + np.arange(TICKS)].transpose(1, 0, 2).astype(np.float64)
+        return windows, contexts.reshape(-1, CONTEXTS)[inside]
+
+    def _begun(
+        self, stretch: "Stretch", light: Light, starts: NDArray[np.int64], evidence: NDArray[np.float64]
+    ) -> Light:
+        """The light where bits begin so that events tell most of them: a burst is in its bit's window."""
+        if len(starts) < _LEAST_CHARACTERS:
+            return light
+        found = []
+        for shift in _SHIFTS:
+            windows, contexts = self._bits(stretch, light, starts, evidence, shift)
+            learned = light.learn(windows, contexts, 0.0, light.rate)
+            found.append((learned.told(windows, contexts), learned))
+        most = max(told for told, _ in found)
+        most -= _TOLD * abs(most)
+        return [learned for told, learned in found if told >= most][-1]
+
+    def _rate(
+        self, light: Light, starts: NDArray[np.int64], evidence: NDArray[np.float64], memory: float
     ) -> float:
         """The length of a bit by which the characters that were read are likeliest."""
+        weight = memory * light.learned
         apart = np.diff(starts)
         at_once = np.abs(apart - self._length * light.rate) <= _NEAR + 1
         if (many := int(at_once.sum())) >= _LEAST_SPACINGS:
@@ -438,19 +434,21 @@ class CharacterDecoder:
                 for run in (r[np.abs(r - self._length * light.rate) <= _NEAR + 1] for r in runs)
             ]
             rate = sum(m * span for m, span in spans) / (sum(m * m for m, _ in spans) * self._length)
-            gain = 4 * many / (4 * many + weight / 4)
+            gain = 4 * many / (4 * many + weight / 12)
             return float(np.clip(light.rate + gain * (rate - light.rate), 1 - _CLOCK, 1 + _CLOCK))
-        falls, rises = self._evidence(stretch, light)
-        fell, rose = self.characters.falling[values], self.characters.rising[values]
-        gain = 8 * len(starts) / (8 * len(starts) + weight)
+        contexts = self.characters.contexts
+        at = np.clip(starts[:, None] + self._places(light), 0, len(evidence) - 1)
+        values = self.characters.likelihoods(evidence[at]).argmax(1)
+        bits = self.characters.bits
+        gain = bits * len(starts) / (bits * len(starts) + weight)
         rates = light.rate + _RATES * (1.0 if gain > 0.5 else 0.3)
         worth = []
         for rate in rates:
             places = self._places(replace(light, rate=float(rate)))
             best = np.full(len(starts), -np.inf)
             for early in (-1, 0, 1):
-                at = np.clip(starts[:, None] + places + early, 0, len(falls) - 1)
-                best = np.maximum(best, (falls[at] * fell + rises[at] * rose).sum(1))
+                at = np.clip(starts[:, None] + places + early, 0, len(evidence) - 1)
+                best = np.maximum(best, evidence[at, contexts[values]].sum(1))
             worth.append(float(best.sum()))
         top = int(np.argmax(worth))
         rate = float(rates[top])
@@ -462,50 +460,81 @@ class CharacterDecoder:
 
     def _acquire(self, stretch: "Stretch") -> Light | None:
         """Learn the light from a stretch of which nothing is known; None where it shows no characters."""
-        tried: list[tuple[float, Light]] = []
-        for light in _guesses(stretch.counts):
-            worth = self._path(stretch, light, True)[3]
-            tried.append((worth, light))
+        tried = []
+        for light in guesses(stretch.counts, self.mark_on):
+            starts = self._path(stretch, light, True)[0]
+            tried.append((self._explained(stretch, light, starts), light))
         tried.sort(key=lambda one: -one[0])
-        best, best_worth = None, 0.0
-        for _, light in tried[:4]:
-            for _ in range(5):
-                starts, values = self._read(stretch, light, likeliest=True)[:2]
-                light = self._learned(stretch, _centred(light), starts, values, 0.0)
-            starts, _, _, worth = self._path(stretch, light, False)
-            if len(starts) >= _LEAST_CHARACTERS and worth > max(best_worth, _LEAST_WORTH * len(starts)):
-                best, best_worth = light, worth
-        return best
+        learned = []
+        for _, light in tried[:_TRIED]:
+            for turn in range(_ROUNDS):
+                starts, evidence, _ = self._path(stretch, light, True)
+                if turn in (0, 2):
+                    light = self._begun(stretch, light, starts, evidence)
+                    starts, evidence, _ = self._path(stretch, light, True)
+                light = self._learned(stretch, light, starts, evidence, 0.0)
+            starts, _, worth = self._path(stretch, light, False)
+            if worth > 0 and self._told(stretch, light) > 0:
+                learned.append((light, starts))
+        # Beside one another only where an event counts the same.
+        least = min((light.share for light, _ in learned), default=0.0)
+        explained = [
+            self._explained(stretch, replace(light, most=least), starts) for light, starts in learned
+        ]
+        return learned[int(np.argmax(explained))][0] if learned else None
+
+    def _told(self, stretch: "Stretch", light: Light) -> float:
+        """How much of each half of a stretch the light explains that the other one teaches."""
+        starts, evidence, _ = self._path(stretch, light, False)
+        half = len(starts) // 2
+        if half < _LEAST_CHARACTERS:
+            return -np.inf
+        middle = int(starts[half])
+        total = -_LEAST_WORTH * len(starts)
+        for known, begin, end in (
+            (starts[:half], middle, stretch.end),
+            (starts[half:], stretch.start, middle),
+        ):
+            learned = self._learned(stretch, light, known, evidence, 0.0)
+            part = Stretch(stretch.counts, begin, stretch.seen, end)
+            total += self._explained(part, learned, self._path(part, learned, False)[0])
+        return total
+
+    def _explained(self, stretch: "Stretch", light: Light, starts: NDArray[np.int64]) -> float:
+        """How much likelier the events are with the characters that start there than with no bits at all."""
+        bits, begin = self.characters.bits, max(stretch.start, stretch.seen)
+        starts = starts[starts + bits * TICKS <= stretch.end]
+        marks = np.arange(begin, stretch.end - TICKS, TICKS)
+        before = np.searchsorted(starts, marks + TICKS) - 1
+        if len(starts):
+            marks = marks[(before < 0) | (marks >= starts[before] + self._length * light.rate)]
+        places = (starts[:, None] + self._places(light)).ravel()
+        at = np.concatenate([places, marks])
+        windows = stretch.counts[:, at[:, None] + np.arange(TICKS)].transpose(1, 0, 2).astype(np.float64)
+        beside = np.logaddexp(light.beside_mean(windows), np.log(DOUBT))
+        words = beside[: len(places)].reshape(len(starts), bits, CONTEXTS)
+        told = np.logaddexp.reduce(
+            self.characters.likelihoods(words), 1
+        ) - self.characters.data_bits * np.log(2)
+        return float(told.sum() + beside[len(places) :, -1].sum())
 
 
-def _guesses(counts: NDArray[np.int32]) -> Iterator[Light]:
-    """What the light may be like, before anything is known."""
-    n = counts.shape[1]
-    ticks = np.arange(_REACH)
-    total = counts.sum(1) + 1.0
-    # A rise in four bits or so.
-    events = np.maximum(total / (n / TICKS / 4), 1.0)
-    noise = np.maximum(0.2 * total / n, 1e-3)
-    for width in (0.12, 0.5):
-        for later in (-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75):
-            kernels = []
-            for shift in (max(-later, 0.0), max(later, 0.0)):
-                after = (ticks - _EARLY) / TICKS - shift
-                shape = np.where(after >= 0, np.exp(-np.maximum(after, 0) / width), np.exp(after / 0.05))
-                kernels.append(shape / shape.sum())
-            for off in (-0.02, -0.01, 0.0, 0.01, 0.02):
-                yield Light(np.array(kernels), events, noise, 1 + off)
+def _around(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sums of rows and of those near them, float64 (n, m)."""
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, 0)])
+    k = np.arange(len(values))
+    found: NDArray[np.float64] = (
+        total[np.minimum(k + _STEADY + 1, len(values))] - total[np.maximum(k - _STEADY, 0)]
+    )
+    return found
 
 
-def _centred(light: Light) -> Light:
-    """The light with its events as early after an edge as they may come: only events tell where edges are."""
-    first = min(int(np.searchsorted(np.cumsum(kernel), 0.03)) for kernel in light.kernels)
-    shift = first - _EARLY
-    if not shift:
-        return light
-    kernels = np.roll(light.kernels, -shift, 1)
-    if shift > 0:
-        kernels[:, -shift:] = kernels.min()
-    else:
-        kernels[:, :-shift] = kernels.min()
-    return replace(light, kernels=kernels / kernels.sum(1, keepdims=True))
+def _without_chance(found: list[Character]) -> list[Character]:
+    """Characters without those at the start that are few and not sure before a pause: noise, too."""
+    apart = np.diff([one.t_us for one in found])
+    length = float(np.median(apart)) if len(apart) else np.inf
+    paused = np.flatnonzero(apart > 1.5 * length) + 1
+    if len(paused) and (few := int(paused[0])) < _LEAST_CHARACTERS:
+        sure = float(np.mean([one.quality for one in found[:few]]))
+        return found[few:] if sure < DOUBTFUL else found
+    return found

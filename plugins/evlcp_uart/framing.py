@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -18,9 +18,6 @@ from evlcp_uart.characters import Characters, Parity
 from evlcp_uart.decoder import Character, CharacterDecoder, CharacterState
 
 __all__ = ["Uart", "read_characters"]
-
-_PIXELS, _NOTHING = 1 << 16, 2
-"""Pixels whose last polarity is known: those of a region of 256 x 256."""
 
 _PIECE = 1 << 16
 """Events that are taken at once from an array."""
@@ -106,13 +103,12 @@ class _Grid:
 
 @dataclass(frozen=True, eq=False)
 class _Heard:
-    """State of the decoder, grid of packets, characters that wait for one, and what each pixel said last."""
+    """State of the decoder, grid of packets, characters that wait for one, and the last one's place."""
 
     decoder: CharacterState
     grid: _Grid | None = None
     waiting: tuple[Character, ...] = ()
-    said: NDArray[np.uint8] = field(default_factory=lambda: np.full(_PIXELS, _NOTHING, np.uint8))
-    last: tuple[int, int] = field(default=(-1, -1))
+    last: tuple[int, int] = (-1, -1)
 
 
 @dataclass(frozen=True)
@@ -126,10 +122,8 @@ class _Packets:
         return _Heard(self.decoder.init())
 
     def step(self, state: _Heard, events: Events, until_us: int) -> tuple[_Heard, list[Heard]]:
-        turned, said = _turned(events, state.said)
-        t_us, p = events.t_us[turned], events.p[turned]
-        decoder, found = self.decoder.step(state.decoder, t_us, p, until_us)
-        return self._number(replace(state, decoder=decoder, said=said), found)
+        decoder, found = self.decoder.step(state.decoder, events.t_us, events.p, until_us)
+        return self._number(replace(state, decoder=decoder), found)
 
     def close(self, state: _Heard) -> tuple[_Heard, list[Heard]]:
         decoder, found = self.decoder.close(state.decoder)
@@ -198,26 +192,3 @@ class _Packets:
         soft = SoftSymbols(np.array([one.value]), one.llr[None], one.quality)
         start_us = first_us - self.packet.preamble_chips * one.bit_us
         return Heard(packet, frame, start_us, one.t_us, one.bit_us, soft)
-
-
-def _turned(events: Events, said: NDArray[np.uint8]) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
-    """Which events are of another polarity than their pixel's last one, and the last ones behind them.
-
-    Dim pixels and those that a moving light passes go on for long after an edge: what tells of one is where
-    they turn. A list without places says nothing of that: events of pixel (0, 0) all count.
-    """
-    pixel = (events.y.astype(np.int64) & 255) << 8 | (events.x.astype(np.int64) & 255)
-    order = np.argsort(pixel, kind="stable")
-    of, p = pixel[order], events.p[order]
-    first = np.ones(len(of), np.bool_)
-    first[1:] = of[1:] != of[:-1]
-    before = np.empty_like(p)
-    before[1:] = p[:-1]
-    before[first] = said[of[first]]
-    turned = np.empty(len(of), np.bool_)
-    turned[order] = (before != p) | ((events.x == 0) & (events.y == 0))[order]
-    after = said.copy()
-    last = np.ones(len(of), np.bool_)
-    last[:-1] = first[1:]
-    after[of[last]] = p[last]
-    return turned, after

@@ -3,13 +3,13 @@
 import itertools
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from evlcp_uart import _kernels
 from evlcp_uart.characters import Characters, Parity
 from evlcp_uart.framing import Uart, read_characters
+from evlcp_uart.light import BEFORE, CONTEXTS, GAINS, TICKS, Light
 
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
@@ -186,41 +186,72 @@ def test_llrs_tell_the_truth() -> None:
 def test_scores_of_characters_are_those_of_all_words(parity: Parity) -> None:
     characters = Characters(5, parity, 1)
     rng = np.random.default_rng(1)
-    falls, rises = rng.normal(0, 5, (2, 60))
-    places = np.arange(characters.edges) * 4
+    evidence = rng.normal(0, 5, (60, CONTEXTS))
+    places = np.arange(characters.bits) * 4
     for likeliest in (False, True):
         out = np.empty(60 - places[-1])
         code = ("none", "odd", "even").index(parity)
-        _kernels.character_scores(falls, rises, places, 5, code, likeliest, out)
+        _kernels.character_scores(evidence, places, 5, code, likeliest, out)
         at = np.arange(len(out))[:, None] + places
         every = []
         for value in range(32):
-            word = [1, *levels_of(np.array([value]), 5, parity, 1)]
-            steps = np.diff(word)[: characters.edges]
-            every.append((falls[at] * (steps < 0) + rises[at] * (steps > 0)).sum(1))
+            word = [1] * BEFORE + levels_of(np.array([value]), 5, parity, 1)
+            contexts = [int("".join(map(str, word[k : k + BEFORE + 1])), 2) for k in range(characters.bits)]
+            every.append(evidence[at, contexts].sum(1))
+        np.testing.assert_allclose(characters.likelihoods(evidence[at]), np.array(every).T)
         wanted = np.max(every, 0) if likeliest else np.logaddexp.reduce(every, 0)
+        # Where a character is unlikely, its likeliest word stands for all.
+        bound = np.max(every, 0)
+        wanted = np.where(bound > 0, wanted, bound)
         np.testing.assert_allclose(out, wanted - 5 * math.log(2), atol=1e-9)
-        np.testing.assert_allclose(characters.likelihoods(falls[at], rises[at]), np.array(every).T)
 
 
-def test_evidence_of_an_edge_is_the_likelihood_of_its_counts() -> None:
+def test_evidence_of_a_bit_is_the_likelihood_of_its_counts() -> None:
     rng = np.random.default_rng(2)
-    counts = rng.poisson(0.4, 50).astype(np.int32)
-    kernel = rng.dirichlet(np.ones(8))
-    strengths, shares, noise, unseen = np.array([1.0, 4.0]), np.array([0.3, 0.7]), 0.1, 0.02
-    out = np.empty(50 - 8 + 1)
-    gains = np.log1p(strengths[:, None] * kernel / noise)
-    _kernels.edge_evidence(counts, gains, strengths, shares, unseen, out)
+    counts = rng.poisson(0.4, (2, 50)).astype(np.int32)
+    rates = rng.gamma(1.0, 0.3, (3, 2, 8))
+    gains, shares, doubt = np.array([0.5, 2.0]), np.array([0.3, 0.7]), 0.01
+    costs = rates.sum((1, 2))[:, None] * gains - np.log(shares)
+    out = np.empty((50 - 8 + 1, 3))
+    _kernels.bit_evidence(counts, np.log(rates), np.log(gains), costs, 1.0, doubt, out)
     for s in range(len(out)):
-        burst = 0.0
-        for mean, share in zip(strengths, shares, strict=True):
-            ratio = 1.0
-            for m in range(8):
-                there, without = noise + mean * kernel[m], noise
-                n = int(counts[s + m])
-                ratio *= there**n * math.exp(-there) / (without**n * math.exp(-without))
-            burst += share * ratio
-        assert out[s] == pytest.approx(math.log(unseen + (1 - unseen) * burst))
+        window = counts[:, s : s + 8]
+        likely = np.zeros(3)
+        for context in range(3):
+            for gain, share in zip(gains, shares, strict=True):
+                mean = gain * rates[context]
+                likely[context] += share * np.prod(mean**window * np.exp(-mean))
+        said = np.log((1 - doubt) * likely / likely.max() + doubt)
+        np.testing.assert_allclose(out[s], said - said[-1], atol=1e-9)
+
+
+def test_light_is_learned_as_it_is() -> None:
+    """From bits whose contexts are told; beside the rates and strengths that made their events."""
+    rng = np.random.default_rng(7)
+    rates = rng.gamma(0.5, 0.5, (CONTEXTS, 2, TICKS)) + 0.1
+    of = rng.integers(0, CONTEXTS, 20_000)
+    strong = rng.choice([0.5, 2.0], 20_000)
+    windows = rng.poisson(rates[of] * strong[:, None, None]).astype(np.float64)
+    known = np.eye(CONTEXTS)[of]
+    ones = np.ones(CONTEXTS)
+    light = Light(np.full_like(rates, windows.mean()), ones, np.ones((CONTEXTS, len(GAINS))))
+    for _ in range(12):
+        light = light.learn(windows, known, 0.0, 1.0)
+    mean = np.einsum("nc,npt->cpt", known, windows) / known.sum(0)[:, None, None]
+    # A tick is known to two bars of four ticks, one over the other.
+    bar = np.full(4, 0.25)
+    wide = np.pad(mean, ((0, 0), (0, 0), (3, 3)), mode="edge")
+    mean = np.apply_along_axis(np.convolve, 2, wide, np.convolve(bar, bar), "valid")
+    gains = light.gains / light.gains.sum(1, keepdims=True) @ GAINS
+    np.testing.assert_allclose(light.rates * gains[:, None, None], mean, atol=0.05, rtol=0.12)
+    said = light.said(windows[:5])
+    shares = light.gains + 12 * np.array([0.02, 0.12, 0.2, 0.4, 0.2, 0.06])
+    for k, context, j in itertools.product(range(5), range(CONTEXTS), range(len(GAINS))):
+        rate = GAINS[j] * light.rates[context]
+        poisson = float((windows[k] * np.log(rate) - rate).sum())
+        gain = math.log(shares[context, j] / shares[context].sum())
+        assert said[k, context, j] == pytest.approx(light.share * poisson + gain)
+    assert light.told(windows, known) > light.told(windows, np.roll(known, 1, 1))
 
 
 def test_the_best_path_is_the_best_of_all() -> None:
@@ -327,26 +358,3 @@ def test_tables_of_steps_that_it_has_not_are_refused() -> None:
     assert resolve(link.table) == link
     with pytest.raises(ConfigError, match=r"^ranging: no step of framing 'uart'"):
         link.algorithm("ranging")
-
-
-def test_of_an_image_events_count_at_which_a_pixel_turns() -> None:
-    """Beside a plain loop; pixels go on firing for long after an edge."""
-    rng = np.random.default_rng(6)
-    link = _link(frames_per_packet=30)
-    n = 4000
-    events = Events.of(
-        np.sort(rng.integers(0, 50_000, n)),
-        rng.integers(0, 9, n),
-        rng.integers(0, 9, n),
-        rng.integers(0, 2, n),
-    )
-    last: dict[tuple[int, int], int] = {}
-    wanted = []
-    for x, y, p in zip(events.x.tolist(), events.y.tolist(), events.p.tolist(), strict=True):
-        wanted.append((x, y) == (0, 0) or last.get((x, y)) != p)
-        last[x, y] = p
-    reader: Any = link.algorithm("framing").compile(link.codebook, link.packet)
-    state = reader.init()
-    for k in range(0, n, 700):
-        state, _ = reader.step(state, events[k : k + 700], int(events.t_us[min(k + 700, n) - 1]))
-    assert int(state.decoder.counts.sum()) == sum(wanted)

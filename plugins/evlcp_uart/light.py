@@ -1,0 +1,231 @@
+"""What a decoder knows of the light and of the pixels that see it: events by the bits around them."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["BEFORE", "CONTEXTS", "DOUBT", "EARLY", "GAINS", "TICKS", "Light", "guesses"]
+
+TICKS = 16
+"""Ticks of a bit."""
+
+BEFORE = 3
+"""Bits before one that its events depend on."""
+
+CONTEXTS = 2 << BEFORE
+"""Contexts of a bit: the number whose binary digits are those before it and the bit itself, 1 for mark."""
+
+EARLY = 3
+"""Tick of a bit at which the first events of its edge come: where an edge is, only events tell."""
+
+GAINS = np.array([0.02, 0.25, 0.5, 1.0, 2.0, 4.0])
+LOG_GAINS = np.log(GAINS)
+_SHARES = np.array([0.02, 0.12, 0.2, 0.4, 0.2, 0.06])
+"""Windows of a context are unlike in strength: by its mean, and how likely each is before any are seen."""
+
+DOUBT = 2e-3
+"""Probability that the events of a bit are of something else."""
+
+_PRIOR_WINDOWS, _PRIOR_GAINS = 3.0, 12.0
+"""Windows of a context for which those with the same last bits stand, and for which the shares do."""
+
+_ENOUGH = 30.0
+"""Events of a window that tell all that it says: of more, each counts less, as pixels share the light."""
+
+_COUNTED = 0.85
+"""What an event counts at most: light is learned from the very bits that are read by it, and a pixel's events
+hang together."""
+
+_FLOOR = 0.004
+"""Share of the mean events of a tick that may come in any."""
+
+_BLUR = np.array([1.0, 2.0, 3.0, 4.0, 3.0, 2.0, 1.0]) / 16
+"""What is learned of a tick tells of those beside it: cameras read events out in bursts, and a character's
+start is known to a tick or two. Without it bits would be told apart by when their events were read out."""
+
+_PAUSES = 6.0
+"""Characters for which a stream without pauses stands."""
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """What is known, as sums over the bits that were read, those long ago counting less.
+
+    Attributes:
+        events: Events of each context, by polarity and tick, OFF and ON, float64 (C, 2, TICKS).
+        windows: Bits of each context, each by its gain, float64 (C,).
+        gains: Bits of each context and gain, float64 (C, J).
+        rate: Length of a bit against the nominal one.
+        paused: Characters behind a pause, their ticks of pause in all, and characters.
+        most: What an event counts at most.
+    """
+
+    events: NDArray[np.float64]
+    windows: NDArray[np.float64]
+    gains: NDArray[np.float64]
+    rate: float = 1.0
+    paused: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    most: float = _COUNTED
+
+    @property
+    def learned(self) -> float:
+        """Bits that it was learned from."""
+        return float(self.windows.sum())
+
+    @cached_property
+    def rates(self) -> NDArray[np.float64]:
+        """Mean events of each context, by polarity and tick, at a gain of one, float64 (C, 2, TICKS)."""
+        mean = self.events.sum(0) / max(float(self.windows.sum()), 1.0)
+        found = mean[None]
+        for depth in range(1, BEFORE + 2):
+            # Those with one more bit before, where there are too few of them stand those without.
+            events = self.events.reshape(-1, 1 << depth, 2, TICKS).sum(0)
+            windows = self.windows.reshape(-1, 1 << depth).sum(0)
+            prior = np.tile(found, (2, 1, 1))
+            found = (events + _PRIOR_WINDOWS * prior) / (windows + _PRIOR_WINDOWS)[:, None, None]
+        floor = _FLOOR * float(mean.mean()) + 1e-5
+        rates: NDArray[np.float64] = _smooth(found) + floor
+        return rates
+
+    @cached_property
+    def share(self) -> float:
+        """What an event counts."""
+        return min(self.most, _ENOUGH / float(self.rates.sum((1, 2)).max()))
+
+    @cached_property
+    def logs(self) -> NDArray[np.float64]:
+        """Logarithm of the rates, float64 (C, 2, TICKS)."""
+        found: NDArray[np.float64] = np.log(self.rates)
+        return found
+
+    @cached_property
+    def means(self) -> NDArray[np.float64]:
+        """What a window costs by context and gain: its mean events, by what they count, and the gain.
+
+        float64 (C, J).
+        """
+        shares = self.gains + _PRIOR_GAINS * _SHARES
+        shares /= shares.sum(1, keepdims=True)
+        found: NDArray[np.float64] = self.rates.sum((1, 2))[:, None] * GAINS * self.share - np.log(shares)
+        return found
+
+    @property
+    def costs(self) -> tuple[float, float]:
+        """What a character costs after a pause and at once after another."""
+        paused, ticks, many = self.paused
+        share = (paused + 0.02) / (many + _PAUSES)
+        length = (ticks + 4 * TICKS) / (paused + 1)
+        after_idle = float(np.clip(np.log(length / share), 10.0, 12.0))
+        return after_idle, float(np.clip(-np.log(1 - share), 0.1, 3.0)) if many else 1.0
+
+    def said(self, windows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Log-likelihood of windows, float64 (..., 2, TICKS), by context and gain, float64 (..., C, J)."""
+        alike = np.einsum("...pt,cpt->...c", windows, self.logs)
+        events = windows.sum((-2, -1))
+        found: NDArray[np.float64] = (alike[..., None] + events[..., None, None] * LOG_GAINS) * self.share
+        return found - self.means
+
+    def beside_mean(self, windows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Log-likelihood of windows, float64 (n, 2, TICKS), of each context beside steady events, (n, C)."""
+        share = self.windows / self.windows.sum()
+        mean = np.einsum("c,cpt->p", share, self.rates)[:, None] / TICKS * np.ones(TICKS)
+        gains = self.gains.sum(0) + _PRIOR_GAINS * _SHARES
+        costs = mean.sum() * GAINS * self.share - np.log(gains / gains.sum())
+        alike = np.einsum("npt,pt->n", windows, np.log(mean))
+        said = self.share * (alike[:, None] + windows.sum((1, 2))[:, None] * LOG_GAINS) - costs
+        found: NDArray[np.float64] = np.logaddexp.reduce(self.said(windows), 2)
+        steady: NDArray[np.float64] = np.logaddexp.reduce(said, 1)
+        return found - steady[:, None]
+
+    def told(self, windows: NDArray[np.float64], contexts: NDArray[np.float64]) -> float:
+        """How much the events of bits tell of their contexts, in all: their mutual information.
+
+        Args:
+            windows: Events of each bit, float64 (n, 2, TICKS).
+            contexts: How likely each is of each context, float64 (n, C).
+        """
+        said = self.said(windows)
+        top = said.max((1, 2))
+        likely = np.exp(said - top[:, None, None]).sum(2)
+        any_of = likely @ contexts.mean(0)
+        told: float = (contexts * np.log(likely + 1e-300)).sum() - np.log(any_of + 1e-300).sum()
+        return told
+
+    def learn(
+        self, windows: NDArray[np.float64], contexts: NDArray[np.float64], memory: float, rate: float
+    ) -> "Light":
+        """With what more bits teach.
+
+        Args:
+            windows: Events of each bit, float64 (n, 2, TICKS).
+            contexts: How likely each is of each context, float64 (n, C).
+            memory: What all before counts.
+            rate: Length of a bit against the nominal one.
+        """
+        said = self.said(windows)
+        gains = np.exp(said - said.max((1, 2))[:, None, None])
+        likely = gains.sum(2)
+        # What is rather something else than a bit of that context teaches nothing of it.
+        fits = (1 - DOUBT) * likely / likely.max(1, keepdims=True)
+        contexts = contexts * fits / (fits + DOUBT)
+        gains *= (contexts / np.maximum(likely, 1e-300))[:, :, None]
+        return Light(
+            memory * self.events + np.einsum("nc,npt->cpt", contexts, windows),
+            memory * self.windows + (gains @ GAINS).sum(0),
+            memory * self.gains + gains.sum(0),
+            rate,
+            self.paused,
+        )
+
+
+def guesses(counts: NDArray[np.int32], mark_on: bool) -> Iterator[Light]:
+    """What the light may be like, before anything is known.
+
+    Args:
+        counts: Events of each tick, OFF and ON, int32 (2, n).
+        mark_on: The light is on for a mark.
+    """
+    n = counts.shape[1]
+    ticks = np.arange(2 * TICKS)
+    total = counts.sum(1) + 1.0
+    # A rise in four bits or so.
+    events = np.maximum(total / (n / TICKS / 4), 1.0)
+    noise = np.maximum(0.2 * total / n, 1e-3)
+    shares = np.tile(2 * _SHARES, (CONTEXTS, 1))
+    for glow, trail, lates in (
+        (0.0, 0.0, (-1.0, -0.5, 0.0, 0.5, 1.0)),
+        (0.4, 0.0, (-0.5, 0.0, 0.5)),
+        (0.0, 0.25, (-0.5, 0.0, 0.5)),
+    ):
+        for width in (0.12, 0.5):
+            for later in lates:
+                rates = np.empty((CONTEXTS, 2, TICKS))
+                for on, shift in enumerate((max(-later, 0.0), max(later, 0.0))):
+                    after = (ticks - EARLY) / TICKS - shift
+                    burst = np.where(after >= 0, np.exp(-np.maximum(after, 0) / width), 0.02)
+                    burst *= events[on] / burst.sum()
+                    for context in range(CONTEXTS):
+                        bits = [
+                            bit if mark_on else 1 - bit
+                            for bit in (context >> 2, context >> 1 & 1, context & 1)
+                        ]
+                        rates[context, on] = noise[on]
+                        if bits[2] == on and bits[1] != on:
+                            rates[context, on] += burst[:TICKS]
+                        elif bits == [1 - on, on, on]:
+                            rates[context, on] += burst[TICKS:]
+                        # A light that moves, or shimmers, wakes events of both polarities while it is on.
+                        rates[context, on] += glow * bits[2] * events[on] / TICKS
+                        # Bright pixels go on and on after an edge.
+                        rates[context, on] += trail * (bits[2] == bits[1] == on) * events[on] / TICKS
+                for off in (-0.015, 0.0, 0.015):
+                    yield Light(2 * rates, np.full(CONTEXTS, 2.0), shares, 1 + off)
+
+
+def _smooth(rates: NDArray[np.float64]) -> NDArray[np.float64]:
+    padded = np.pad(rates, ((0, 0), (0, 0), (len(_BLUR) // 2,) * 2), mode="edge")
+    found: NDArray[np.float64] = np.lib.stride_tricks.sliding_window_view(padded, len(_BLUR), 2) @ _BLUR
+    return found
