@@ -24,7 +24,7 @@ class FramesCsv(Sink):
     def packet(self, packet: Packet) -> None:
         """Write a row per frame."""
         for frame in packet.frames:
-            self._rows.writerow(_text(name, frame_value(frame, name)) for name in self._columns)
+            self._rows.writerow([_text(name, frame_value(frame, name)) for name in self._columns])
 
 
 _DIGITS = {"t_us": 2, "quality": 4, "x_px": 3, "y_px": 3}
@@ -33,8 +33,8 @@ _DIGITS = {"t_us": 2, "quality": 4, "x_px": 3, "y_px": 3}
 
 def _text(column: str, value: Any) -> str:
     """A value as text; empty where there is none, `-` for a symbol not given."""
-    if isinstance(value, list):
-        return " ".join("-" if symbol is None else str(symbol) for symbol in value)
     if isinstance(value, float):
         return text_or_empty(value, _DIGITS.get(column, 4))
+    if isinstance(value, list):
+        return " ".join(["-" if symbol is None else str(symbol) for symbol in value])
     return "" if value is None else str(value)

@@ -4,7 +4,6 @@ import json
 from typing import Any
 
 from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.errors import PluginError
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
@@ -31,14 +30,12 @@ class PacketsJsonl(Sink):
 def packet_line(packet: Packet, codebook: Codebook) -> dict[str, Any]:
     """A packet's line, as JSON values; null and `?` for what was not received."""
     symbols: list[list[int | None] | None] = [None] * packet.sent
-    bits = ["?" * (codebook.clusters * codebook.bits_per_symbol)] * packet.sent
+    each = codebook.bits_per_symbol
+    unknown, ones = "?" * each, (1 << each) - 1
+    bits = [unknown * codebook.clusters] * packet.sent
     for frame in packet.frames:
-        given = frame.soft.symbols >= 0
-        symbols[frame.frame] = symbol_list(frame.soft.symbols)
-        one = bits_of_symbols(frame.soft.symbols[None] * given, codebook.bits_per_symbol)
-        text = (one + ord("0")).reshape(len(given), -1)
-        text[~given] = ord("?")
-        bits[frame.frame] = text.tobytes().decode("ascii")
+        said = symbols[frame.frame] = symbol_list(frame.soft.symbols)
+        bits[frame.frame] = "".join([unknown if s is None else f"{s & ones:0{each}b}" for s in said])
     return {
         "kind": "packet",
         "transmitter": packet.transmitter,

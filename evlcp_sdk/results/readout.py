@@ -1,6 +1,8 @@
 """Events in each millisecond, and whether the readout was at its limit, counted in constant memory."""
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +24,16 @@ _BIN = 0.005
 _MOST = 1e9
 """Events of a millisecond that have a bin."""
 
+_TOGETHER = 1000
+"""Milliseconds that are put into bins together."""
+
 
 class ReadoutTally:
     """Counts the milliseconds that had so many events."""
 
     def __init__(self) -> None:
-        self._hist = np.zeros(1 + _bins(np.array([_MOST]))[0], np.int64)
+        self._hist = np.zeros(1 + _bins([_MOST])[0], np.int64)
+        self._new: list[int] = []
         self._ms = (0, 0)
 
     def add(self, events: Events) -> None:
@@ -37,26 +43,29 @@ class ReadoutTally:
             return
         first, last = int(t_us[0]) // 1000, int(t_us[-1]) // 1000
         if 0 <= last - first < len(t_us) // 8:
-            edges = np.searchsorted(t_us, np.arange(first, last + 1) * 1000)
+            found = np.searchsorted(t_us, np.arange(first, last + 1) * 1000).tolist()
             # Milliseconds without events, and what a restart of the clock leaves out of order.
-            edges = np.unique(np.concatenate([[0], edges[edges < len(t_us)]]))
+            edges = sorted({0, *found} - {len(t_us)})
         else:
             ms = t_us // 1000
-            edges = np.flatnonzero(np.diff(ms, prepend=ms[0] - 1))
-        many = np.diff(edges, append=len(t_us))
+            edges = np.flatnonzero(np.diff(ms, prepend=ms[0] - 1)).tolist()
+        many = [after - begin for begin, after in pairwise([*edges, len(t_us)])]
         now, before = self._ms
         if first == now:
             many[0] += before
         elif before:
-            self._note(np.array([before]))
-        self._note(many[:-1])
-        self._ms = last, int(many[-1])
+            self._new.append(before)
+        self._ms = last, many.pop()
+        self._new += many
+        if len(self._new) >= _TOGETHER:
+            self._note()
 
     def capped(self) -> tuple[float, float]:
         """Share of the milliseconds with events that are within half a percent of the fullest; its events.
 
         Light that sends data varies by more from millisecond to millisecond; a readout at its limit does not.
         """
+        self._note()
         many = int(self._hist.sum())
         if not many:
             return 0.0, 0.0
@@ -65,11 +74,13 @@ class ReadoutTally:
     @property
     def at_limit(self) -> bool:
         """Whether the readout was at its limit."""
-        return int(self._hist.sum()) >= _LEAST_MS and self.capped()[0] >= _CAPPED_SHARE
+        share, _ = self.capped()
+        return int(self._hist.sum()) >= _LEAST_MS and share >= _CAPPED_SHARE
 
     @property
     def capped_ms(self) -> int:
         """How many milliseconds these are."""
+        self._note()
         return int(self._hist[max(self._top - 1, 0) :].sum())
 
     @property
@@ -77,10 +88,12 @@ class ReadoutTally:
         filled = np.flatnonzero(self._hist)
         return int(filled[-1]) if len(filled) else 0
 
-    def _note(self, many: NDArray[np.int64]) -> None:
-        np.add.at(self._hist, _bins(many), 1)
+    def _note(self) -> None:
+        """Put what is new into bins."""
+        np.add.at(self._hist, _bins(self._new), 1)
+        self._new = []
 
 
-def _bins(many: NDArray[np.generic]) -> NDArray[np.int64]:
+def _bins(many: Sequence[float]) -> NDArray[np.int64]:
     size = np.clip(np.asarray(many, np.float64), 1, _MOST)
     return np.round(np.log(size) / math.log1p(_BIN)).astype(np.int64)

@@ -628,10 +628,12 @@ def across_profile(
     middle lies; its two neighbours may show in it, too.
     """
     _, rows, columns = probability.shape
-    near = np.zeros((places.size, places.size), np.bool_)
+    near, many = np.empty((places.size, places.size), np.int64), np.zeros(places.size, np.int64)
     for k in range(places.size):
         for other in range(places.size):
-            near[k, other] = abs(places[other] - places[k]) <= 1.5 * spacing
+            if abs(places[other] - places[k]) <= 1.5 * spacing:
+                near[k, many[k]] = other
+                many[k] += 1
     every = np.zeros((rows, columns))
     for k in range(places.size):
         _add_to(every.reshape(-1), np.ascontiguousarray(probability[k]).reshape(-1))
@@ -650,9 +652,8 @@ def across_profile(
                     i = int(abs(off.imag))
                     cells[i] += share * share
                     far = every[r, c]
-                    for other in range(places.size):
-                        if near[k, other]:
-                            far -= probability[other, r, c]
+                    for i_near in range(many[k]):
+                        far -= probability[near[k, i_near], r, c]
                     hits[i] += share * probability[k, r, c] - share * share * far
 
 
@@ -825,12 +826,21 @@ def spread_between(
     """
     chips = codes.shape[1]
     _, height, width = sums.shape
+    # Chips behind the neighbour's edges, those first in which the cluster stays on, and which way they go.
+    behind, edge = np.empty(chips, np.int64), np.empty(chips, np.int64)
     for pair in range(len(pairs)):
         a, b = pairs[pair]
         way = places[b] - places[a]
         length = abs(way)
         if not (seen[a] and seen[b]) or length == 0:
             continue
+        edges, lit = 0, 0
+        for on in (1, 0):
+            for i in range(1, chips):
+                if codes[b, i] != codes[b, i - 1] and codes[a, i] == codes[a, i - 1] == on:
+                    behind[edges], edge[edges] = i, codes[b, i] - codes[b, i - 1]
+                    edges += 1
+            lit = edges if on else lit
         left, right = min(places[a].real, places[b].real) - half, max(places[a].real, places[b].real) + half
         top, bottom = min(places[a].imag, places[b].imag) - half, max(places[a].imag, places[b].imag) + half
         for v in range(max(int(top), 0), min(int(bottom) + 2, height)):
@@ -839,13 +849,13 @@ def spread_between(
                 if abs(off.imag) > half or off.real < 0 or off.real >= length:
                     continue
                 zone = int(off.real >= first * length) + int(off.real >= last * length)
-                for i in range(1, chips):
-                    edge = codes[b, i] - codes[b, i - 1]
-                    if edge == 0 or codes[a, i] != codes[a, i - 1]:
-                        continue
-                    dark = 1 - codes[a, i]
-                    out[dark, 0, zone] += int(sums[i, v, u] * edge > 0)
-                    out[dark, 1, zone] += 1
+                for dark in range(2):
+                    begin, end = (lit, edges) if dark else (0, lit)
+                    answers = 0
+                    for i in range(begin, end):
+                        answers += int(sums[behind[i], v, u] * edge[i] > 0)
+                    out[dark, 0, zone] += answers
+                    out[dark, 1, zone] += end - begin
 
 
 @njit(cache=True, nogil=True)
@@ -869,9 +879,14 @@ def spread_across(
     _, height, width = sums.shape
     most = out.shape[1] // 2
     wide, high = _strip(way, along, most + 1.0)
+    edge = np.empty(chips, np.int64)
     for k in range(len(places)):
         if not seen[k]:
             continue
+        edges = 0
+        for i in range(1, chips, every):
+            edge[i] = codes[k, i] - codes[k, i - 1]
+            edges += abs(edge[i])
         x, y = places[k].real, places[k].imag
         for v in range(max(int(y - high), 0), min(int(y + high) + 2, height)):
             for u in range(max(int(x - wide), 0), min(int(x + wide) + 2, width)):
@@ -881,11 +896,9 @@ def spread_across(
                 column = int(np.floor(off.imag + 0.5)) + most
                 if column < 0 or column > 2 * most:
                     continue
-                answers, edges = 0, 0
+                answers = 0
                 for i in range(1, chips, every):
-                    edge = codes[k, i] - codes[k, i - 1]
-                    answers += int(sums[i, v, u] * edge > 0)
-                    edges += abs(edge)
+                    answers += int(sums[i, v, u] * edge[i] > 0)
                 out[0, column] += answers
                 out[1, column] += edges
 

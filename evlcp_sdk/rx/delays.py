@@ -110,9 +110,10 @@ class RowDelays:
         step_us = lock.chip_us / _STEPS
         top_px = centre_px - (height_px - 1) / 2
         start_us = np.array([lock.delay_off_us, lock.delay_on_us]) + lock.packet_t_us - reach * step_us
+        first_us = float(start_us.min())
         counts = np.zeros((2, blocks, len(self._chips) * _STEPS + 2 * reach))
         for _, e in pieces:
-            if len(e) and e.t_us[-1] >= start_us.min():
+            if len(e) and int(e.t_us[-1]) >= first_us:
                 _kernels.count_rows(
                     e.t_us, e.y, e.p, start_us, step_us, top_px - 0.5, height_px / blocks, counts
                 )

@@ -2,9 +2,8 @@
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -258,13 +257,15 @@ class RegionFollower:
 
     def _boxes(self, t_us: float, taken: Sequence[Region]) -> list[Box]:
         """Where each region should be in the middle of a step; one of unknown size beside the others."""
-        boxes, known = [], [_box_of(place) for place in taken]
+        places = []
         for followed in self.alive:
-            last = followed.latest
-            place = *self._expected(followed, t_us), last.width_px, last.height_px
-            boxes.append(self._reach(*place))
-            if followed.size_px:
-                known.append(_tight(*place))
+            last = followed.positions.latest
+            places.append((*self._expected(followed, t_us), last.width_px, last.height_px))
+        boxes = [self._reach(*place) for place in places]
+        if all(followed.size_px for followed in self.alive):
+            return boxes
+        known = [_box_of(place) for place in taken]
+        known += [_tight(*place) for place, one in zip(places, self.alive, strict=True) if one.size_px]
         return [
             box if followed.size_px else _clear(box, known)
             for followed, box in zip(self.alive, boxes, strict=True)
@@ -351,7 +352,8 @@ class RegionFollower:
             until_us = last.t_us + _LEFT_STEPS * self._spec.step_us
             followed.outgrown = -off[0], -off[1], last.width_px, last.height_px, until_us
         else:
-            off_px = max(abs(v) for v in (*off, size_px[0] - known[0], size_px[1] - known[1]))
+            wider, higher = size_px[0] - known[0], size_px[1] - known[1]
+            off_px = max(abs(off[0]), abs(off[1]), abs(wider), abs(higher))
             if off_px < _RESHAPE_PX:
                 return 0.0
         followed.size_px = size_px
@@ -461,7 +463,7 @@ class RegionFollower:
         if known is None or -_STRAY_PX <= measured.height_px - known[1] <= 2 * _BLUR_PX:
             followed.heights.append(measured.height_px)
         # A part of the bar says nothing of its height, once that is known.
-        height_px = median(followed.heights) if followed.heights else (known or (0, measured.height_px))[1]
+        height_px = _median(followed.heights) if followed.heights else (known or (0, measured.height_px))[1]
         excess_px = measured.height_px - height_px
         if excess_px > _STRAY_PX:
             n = min(round(height_px), len(rows))
@@ -708,6 +710,12 @@ def _tight(x_px: float, y_px: float, width_px: float, height_px: float) -> Box:
 
 def _box_of(region: Region) -> Box:
     return _tight(region.x_px, region.y_px, region.width_px, region.height_px)
+
+
+def _median(values: Iterable[float]) -> float:
+    ordered = sorted(values)
+    many = len(ordered)
+    return ordered[many // 2] if many % 2 else (ordered[many // 2 - 1] + ordered[many // 2]) / 2
 
 
 def _grown(box: Box, by: int) -> Box:

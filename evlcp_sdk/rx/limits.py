@@ -48,4 +48,4 @@ LIMITS: Final = Limits()
 
 def held_bytes(events: Events) -> int:
     """Bytes that some events take."""
-    return PIECE_BYTES + EVENT_BYTES * len(events)
+    return PIECE_BYTES + EVENT_BYTES * len(events.t_us)

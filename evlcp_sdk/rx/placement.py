@@ -253,8 +253,7 @@ def lit(
     whole = _kernels.lit_clusters(
         sums, edges, every, presence.prior, presence.grid_px, placement.seen, _LEAST_LIGHT, seen
     )
-    placed = placement
-    placement = Placement(placed.scale, placed.shift, placed.mirrored, seen, placed.cells, placed.chance)
+    placement = changed(placement, seen=seen)
     if whole:
         return presence, placement
     dark = ~seen
@@ -335,7 +334,9 @@ def _judged(
     if layout.line:
         way = scale * layout.way
         mirrored = way.real + way.imag < 0
-    return Placement(scale, shift, mirrored, seen, cells, chance)
+    placement = Placement(scale, shift, mirrored, seen, cells, chance)
+    vars(placement)["_places"] = layout, places
+    return placement
 
 
 def _at_least(hits: int, of: int, odds: float) -> float:

@@ -99,12 +99,14 @@ class Timeline:
 
     def _keep(self, events: Events) -> None:
         """Add events to the step that is open, as far as it has room."""
-        taken = events[: self._most - self._waiting]
-        self.dropped += len(events) - len(taken)
-        if not len(taken):
+        many, room = len(events.t_us), self._most - self._waiting
+        if many > room:
+            self.dropped += many - room
+            events, many = events[:room], room
+        if not many:
             return
-        self._waiting += len(taken)
-        self._pending.append(taken)
+        self._waiting += many
+        self._pending.append(events)
         if len(self._pending) > _MOST_PIECES + self._waiting // _WHOLE_EVENTS:
             self._pending = [Events.concat(self._pending)]
 

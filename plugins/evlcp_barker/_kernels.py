@@ -65,21 +65,21 @@ def correlate(counts: Array, chips: Array, due: Array, steps: int, min_events: i
     for b in range(bins):
         signed[b + 1] = signed[b] + counts[1, b] - counts[0, b]
         total[b + 1] = total[b] + counts[1, b] + counts[0, b]
+    # Chip by chip for all lags side by side: sums of whole numbers are the same in any order.
+    fit, power = np.zeros(rho.size), np.zeros(rho.size)
+    for c in range(chips.size):
+        begin, end = signed[steps * c :], signed[steps * (c + 1) :]
+        sign, least = chips[c], np.inf if due[c] else 0.0
+        for lag in range(rho.size):
+            chip = end[lag] - begin[lag]
+            fit[lag] += min(sign * chip, least)
+            power[lag] += chip * chip
     for lag in range(rho.size):
         rho[lag] = 0.0
         seen = total[lag + steps * chips.size] - total[lag]
-        if seen < min_events:
-            continue
-        fit = 0.0
-        power = 0.0
-        for c in range(chips.size):
-            at = lag + steps * c
-            chip = signed[at + steps] - signed[at]
-            fit += chips[c] * chip if due[c] else min(chips[c] * chip, 0.0)
-            power += chip * chip
-        if fit > 0:
-            rho[lag] = min(fit / seen, fit / np.sqrt(many * power))
-        top = max(top, rho[lag])
+        if seen >= min_events and fit[lag] > 0:
+            rho[lag] = min(fit[lag] / seen, fit[lag] / np.sqrt(many * power[lag]))
+            top = max(top, rho[lag])
     return top
 
 

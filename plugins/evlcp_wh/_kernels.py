@@ -134,11 +134,11 @@ def presence(
         norm[j] = none[seen[which[j]], most[j] + length]
     for k in range(clusters):
         _add_odds(most, fits[k], beside, norm)
+    by_cell = out.reshape(clusters, n)
     for k in range(clusters):
         _share(most, fits[k], beside, norm, share)
         for j in range(m):
-            r = which[j] // columns
-            out[k, r, which[j] - r * columns] = share[j]
+            by_cell[k, which[j]] = share[j]
 
 
 @njit(cache=True, nogil=True)
@@ -246,6 +246,8 @@ def count_pairs(sums: Array, codes: Array, probability: Array, grid: int, most: 
     """
     clusters, length = codes.shape
     _, rows, columns = probability.shape
+    width = sums.shape[2]
+    pairs, by_pair = _pairs_of(sums, most, length), counts.reshape(2, -1)
     for k in range(clusters):
         for r in range(rows):
             shown = probability[k, r]
@@ -259,9 +261,29 @@ def count_pairs(sums: Array, codes: Array, probability: Array, grid: int, most: 
                 for v in range(r * grid, (r + 1) * grid):
                     for u in range(c * grid, (c + 1) * grid):
                         for i in range(length):
-                            first = min(max(sums[2 * i, v, u], -most), most) + most
-                            second = min(max(sums[2 * i + 1, v, u], -most), most) + most
-                            counts[(codes[k, i] + 1) // 2, first, second] += weight
+                            by_pair[(codes[k, i] + 1) // 2, pairs[i, v * width + u]] += weight
+
+
+@njit(cache=True, nogil=True)
+def _pairs_of(sums: Array, most: int, values: int) -> Array:
+    """Which pair of sums, clipped to -most to most, each value has in each pixel, uint16 (values, pixels)."""
+    chips, height, width = sums.shape
+    flat = np.ascontiguousarray(sums).reshape(chips, height * width)
+    least, greatest, side = np.int16(-most), np.int16(most), np.int16(2 * most + 1)
+    out = np.empty((values, height * width), np.uint16)
+    for i in range(values):
+        _pair_up(flat[2 * i], flat[2 * i + 1], least, greatest, side, out[i])
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _pair_up(
+    first: Array, second: Array, least: np.int16, most: np.int16, side: np.int16, out: Array
+) -> None:
+    for j in range(out.size):
+        a = np.int16(min(max(first[j], least), most) - least)
+        b = np.int16(min(max(second[j], least), most) - least)
+        out[j] = np.uint16(np.int16(a * side) + b)
 
 
 @njit(cache=True, nogil=True)
@@ -363,28 +385,23 @@ def sum_worth(
     for k in range(clusters):
         for i in range(known):
             signs[k, i] = (codes[k, i] + 1) // 2
-    flat = worth.reshape(-1)
-    pairs, values = np.empty(known, np.uint64), np.empty(length)
+    flat, width = worth.reshape(-1), sums.shape[2]
+    pairs, values = _pairs_of(sums, most, known + length), np.empty(length)
     for r in range(rows):
         for c in range(columns):
             if top[r, c] < least:
                 continue
             for v in range(r * grid, (r + 1) * grid):
                 for u in range(c * grid, (c + 1) * grid):
-                    for i in range(known + length):
-                        first = min(max(sums[2 * i, v, u], -most), most) + most
-                        second = min(max(sums[2 * i + 1, v, u], -most), most) + most
-                        pair = np.uint64(first * side + second)
-                        if i < known:
-                            pairs[i] = pair
-                        else:
-                            values[i - known] = flat[pair]
+                    at = v * width + u
+                    for i in range(length):
+                        values[i] = flat[pairs[known + i, at]]
                     for k in range(clusters):
                         weight = probability[k, r, c]
                         if weight >= least:
                             fit = 0.0
                             for i in range(known):
-                                fit += fits[signs[k, i], pairs[i]]
+                                fit += fits[signs[k, i], pairs[i, at]]
                             shows = weight / (1 + odds * np.exp(-fit))
                             for i in range(length):
                                 out[k, i] += shows * values[i]
