@@ -3,6 +3,7 @@
     python benchmarks/integrity.py               # the figures of docs/position.md: 100 000 fixes, minutes
     python benchmarks/integrity.py --fixes 200   # of a row
     python benchmarks/integrity.py --bar-fault 0.5   # levels against bars off by half a metre (sigma)
+    python benchmarks/integrity.py --floor       # what no test can find, in closed form: seconds
 
 Bars stand 30 to 90 m ahead, anywhere in view. Every error is drawn from its stated sigma: of points, of what
 a bar's points share, of survey, camera and attitude; then one part is made wrong without anybody's
@@ -28,6 +29,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
+from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.judgement import Pose
@@ -75,6 +78,7 @@ class Scene:
     attitude: Attitude | None
     camera: CameraModel
     sigma: CameraSigma
+    rotation: Floats
 
 
 def scene(world: World, rng: np.random.Generator) -> Scene:
@@ -110,7 +114,7 @@ def scene(world: World, rng: np.random.Generator) -> Scene:
         "heading": Attitude(pitch + off[0], roll + off[1], (heading + off[2]) % 360, known, known),
     }[world.told]
     sigma = CameraSigma(focal_mm=world.focal * CAMERA.focal_mm)
-    return Scene(views, told, CAMERA, sigma)
+    return Scene(views, told, CAMERA, sigma, rotation)
 
 
 Fault = Callable[[Scene, np.random.Generator], None]
@@ -136,33 +140,115 @@ def refocused(lens: Scene, rng: np.random.Generator) -> None:
     lens.camera = replace(lens.camera, focal_mm=lens.camera.focal_mm * share)
 
 
-def turned(angle_deg: float) -> Fault:
-    """One of the attitude's angles is off by so much."""
+Off = Callable[[int, np.random.Generator], Floats]
+"""By how much as many angles as are known - pitch, roll, heading - are off, degrees, float64 (3,)."""
+
+
+def turned(known: int, rng: np.random.Generator) -> Floats:
+    """One of the attitude's angles is off by 1 degree."""
+    off = np.zeros(3)
+    off[int(rng.integers(known))] = rng.choice([-1.0, 1.0])
+    return off
+
+
+def late(_known: int, rng: np.random.Generator) -> Floats:
+    """The attitude is 10 ms old: a car's pitch and heading change by up to 20 and 45 degrees a second."""
+    return np.asarray(rng.uniform(-1, 1, 3) * np.array([0.2, 0.2, 0.45]))
+
+
+def askew(by: Off) -> Fault:
+    """The attitude is off."""
 
     def turn(imu: Scene, rng: np.random.Generator) -> None:
         if (told := imu.attitude) is None:
             return
-        which = int(rng.integers(2 if told.heading_deg is None else 3))
-        off = angle_deg * rng.choice([-1, 1])
-        if which == 0:
-            imu.attitude = replace(told, pitch_deg=told.pitch_deg + off)
-        elif which == 1:
-            imu.attitude = replace(told, roll_deg=told.roll_deg + off)
-        else:
-            imu.attitude = replace(told, heading_deg=((told.heading_deg or 0) + off) % 360)
+        off = by(2 if told.heading_deg is None else 3, rng)
+        heading = None if told.heading_deg is None else (told.heading_deg + off[2]) % 360
+        imu.attitude = replace(
+            told, pitch_deg=told.pitch_deg + off[0], roll_deg=told.roll_deg + off[1], heading_deg=heading
+        )
 
     return turn
 
 
-def late(imu: Scene, rng: np.random.Generator) -> None:
-    """The attitude is 10 ms old: a car's pitch and heading change by up to 20 and 45 degrees a second."""
-    if (told := imu.attitude) is None:
-        return
-    off = rng.uniform(-1, 1, 3) * [0.2, 0.2, 0.45]
-    heading = None if told.heading_deg is None else (told.heading_deg + off[2]) % 360
-    imu.attitude = replace(
-        told, pitch_deg=told.pitch_deg + off[0], roll_deg=told.roll_deg + off[1], heading_deg=heading
-    )
+def known_by_points(seen: Scene) -> Floats:
+    """Information of all points on the camera's place, m, and turn, radians, float64 (6, 6).
+
+    Written out with every shared error as an unknown of sigma 1, which are then eliminated.
+    """
+    parts = []
+    shared = 1 + 9 * len(seen.views)
+    for b, view in enumerate(seen.views):
+        points, slope = project_bars(view.enu_m, np.zeros(3), seen.rotation, seen.camera)
+        weight = 1 / view.sigma_px[:, None, None]
+        arm, by = view.enu_m - view.enu_m.mean(0), -slope[:, :, :3]
+        length_px = float(np.linalg.norm(view.points_px[-1] - view.points_px[0])) * 16 / 15
+        place, turn, length = view.survey
+        rows = np.zeros((len(points), 2, 6 + shared))
+        rows[:, :, :6] = slope
+        rows[:, :, 6] = (
+            (points - np.array(seen.camera.centre_px)) * seen.sigma.focal_mm / seen.camera.focal_mm
+        )
+        own = rows[:, :, 7 + 9 * b : 16 + 9 * b]
+        own[:, :, :2] = math.hypot(SPEC.shared_sigma_px, SPEC.shared_share * length_px) * np.eye(2)
+        own[:, :, 2] = math.hypot(length, SPEC.stretch_share) * np.einsum("nij,nj->ni", by, arm)
+        own[:, :, 3:6] = place * by
+        own[:, :, 6:] = turn * np.cross(arm[:, None], by)
+        parts.append((rows * weight).reshape(-1, 6 + shared))
+    rows = np.concatenate(parts)
+    whole = rows.T @ rows
+    whole[6:, 6:] += np.eye(shared)
+    return np.asarray(whole[:6, :6] - whole[:6, 6:] @ np.linalg.solve(whole[6:, 6:], whole[6:, :6]))
+
+
+def floor(seen: Scene, off_deg: Floats, world: World, alarms: tuple[float, ...]) -> list[float]:
+    """Chances that no test finds an attitude that is off, and that the fix is silent, too: at least so much.
+
+    Neyman and Pearson: of all tests with a chance of a false alarm, the one for the very angles, sign and
+    size that are off finds it most often. What an error does to the residuals is normal with a mean of `much`
+    sigmas, and independent of the position's error, which is off by `moved`. Both for each of `alarms`.
+    """
+    known = 3 if world.told == "heading" else 2
+    step, by_turn = 1e-5, np.zeros((known, 6))
+    for k, axis in enumerate(np.eye(3) * step):
+        one, two = (
+            Attitude.of_rotation(Rotation.from_rotvec(way).as_matrix() @ seen.rotation)
+            for way in (axis, -axis)
+        )
+        change = [one.pitch_deg - two.pitch_deg, one.roll_deg - two.roll_deg]
+        change.append(((one.heading_deg or 0) - (two.heading_deg or 0) + 180) % 360 - 180)
+        by_turn[:, 3 + k] = np.radians(change)[:known] / (2 * step) / math.radians(world.attitude_deg)
+    off = off_deg[:known] / world.attitude_deg
+    spread = np.linalg.inv(known_by_points(seen) + by_turn.T @ by_turn)
+    follow = spread @ by_turn.T
+    much = math.sqrt(max(float(off @ (off - by_turn @ follow @ off)), 0.0))
+    moved = (follow @ off)[:3]
+    away = float(moved @ np.linalg.solve(spread[:3, :3], moved))
+    beyond = 1 - float(special.chndtr(SILENT_NEES, 3, away))
+    found = []
+    for alarm in alarms:
+        not_found = float(special.ndtr(-special.ndtri(alarm) - much))
+        found += [not_found, not_found * beyond]
+    return found
+
+
+def floors(fixes: int) -> None:
+    """Print what no test of an attitude that is off can be below, at the default false alarm and at 1 %."""
+    print("| what | not found | silent | not found, 1 % false alarms | silent |")
+    print("|---|---|---|---|---|")
+    for what, by in ATTITUDES.items():
+        for name, world in WORLDS.items():
+            if world.told == "none":
+                continue
+            rng = np.random.default_rng(0)
+            known = 3 if world.told == "heading" else 2
+            found = []
+            for _ in range(fixes):
+                seen = scene(world, rng)
+                off = by(known, rng)
+                found.append(floor(seen, off, world, (SPEC.false_alarm, 0.01)))
+            texts = (f"{value:.2g}" for value in np.mean(found, 0))
+            print(f"| {name}; {what} | " + " | ".join(texts) + " |", flush=True)
 
 
 def row(world: World, fault: Fault | None, fixes: int, seed: int, spec: PositionSpec) -> dict[str, float]:
@@ -226,12 +312,12 @@ WORLDS = {
     "3 bars, gravity": World(3, "gravity"),
     "3 bars, heading": World(3, "heading"),
 }
+ATTITUDES: dict[str, Off] = {"attitude 1 degree off": turned, "attitude 10 ms late": late}
 FAULTS: dict[str, Fault] = {
     "bar .5 m off": moved,
     "sites swapped": swapped,
     "focal length .5 % off": refocused,
-    "attitude 1 degree off": turned(1.0),
-    "attitude 10 ms late": late,
+    **{what: askew(by) for what, by in ATTITUDES.items()},
 }
 
 
@@ -241,8 +327,15 @@ def main() -> None:
     parser.add_argument("--fixes", type=int, default=2900, help="of a row")
     parser.add_argument("--only", default="", help="rows whose name contains this")
     parser.add_argument("--bar-fault", type=float, default=SPEC.bar_fault_m, help="m; position.bar_fault_m")
+    parser.add_argument(
+        "--max-protection", type=float, default=SPEC.max_protection_m, help="m; position.max_protection_m"
+    )
+    parser.add_argument("--floor", action="store_true", help="what no test can find, in closed form")
     given = parser.parse_args()
-    spec = replace(SPEC, bar_fault_m=given.bar_fault)
+    if given.floor:
+        floors(given.fixes)
+        return
+    spec = replace(SPEC, bar_fault_m=given.bar_fault, max_protection_m=given.max_protection)
     rows: list[tuple[str, World, Fault | None]] = []
     for name, world in WORLDS.items():
         stated = replace(world, survey=SURVEYED["survey"], focal=SURVEYED["focal"])  # type: ignore[arg-type]
@@ -260,9 +353,9 @@ def main() -> None:
     print("|---" * (len(head) + 1) + "|")
     row(World(2, "gravity"), None, 5, 0, spec)
     reached: dict[str, dict[str, float]] = {}
-    for i, (name, world, fault) in enumerate(rows):
+    for i, (name, world, wrong) in enumerate(rows):
         if given.only in name:
-            found = reached[name] = row(world, fault, given.fixes, i, spec)
+            found = reached[name] = row(world, wrong, given.fixes, i, spec)
             texts = (
                 "-"
                 if math.isnan(found[key])

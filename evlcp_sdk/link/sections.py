@@ -145,6 +145,23 @@ class PositionSpec:
             " protection levels hold; 0: by any amount.",
         ),
     ] = 0.0
+    attitude_fault_deg: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=90,
+            description="How far an angle of the attitude may be off (sigma) without anybody's knowledge,"
+            " so that protection levels hold; 0: by any amount.",
+        ),
+    ] = 1.0
+    focal_fault: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=1,
+            description="The same of the focal length, as a share of it; 0: by any amount.",
+        ),
+    ] = 0.005
     max_protection_m: Annotated[
         float, Field(gt=0, description="Protection level above which there is none.")
     ] = 50.0

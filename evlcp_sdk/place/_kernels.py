@@ -668,14 +668,15 @@ def weighed(
     points: Array, bar: Array, bar_sigma: Array, lens: Array, lens_root: Array, fault: float,
     felt: Array, heading: float, known: int, white: Array, huber: float, free: Array, said: Array,
     position: Array, rotation: Array, local: Array, error: Array, cost: float,
-    attitude_fault: float, bar_fault: float, bar_turn: float, limits: Array, least: float,
+    attitude_fault: float, focal_bound: float, bar_fault: float, bar_turn: float, limits: Array, least: float,
     most_sigma: float, flat: float, high: float, rarely: float, larger: float, little: float,
 ) -> tuple[Any, ...]:  # fmt: skip
     """What a settled fit is worth: covariance and its causes, tests of each part, protection levels.
 
     Args, beside those of `normal` and `fitted`: `said` (3, 4), what moves the angles as they are said, by its
-    sigmas; how large a fault may be (sigma), `attitude_fault`, radians, `bar_fault`, m, 0 for any amount, and
-    `bar_turn`, radians; `limits` (7,) of a test by its degrees of freedom; `flat` and `high`, sigmas to the
+    sigmas; how large a fault may be (sigma), `attitude_fault`, radians, and `bar_fault`, m, 0 for any amount,
+    with `bar_turn`, radians, and of the focal length the inverse square of that, in units of `fault`,
+    `focal_bound`; `limits` (7,) of a test by its degrees of freedom; `flat` and `high`, sigmas to the
     risk, horizontal and vertical; `rarely` and `larger` as in `doubted`; `little`, a share of the position's
     variance below which a doubt counts as none.
 
@@ -726,7 +727,7 @@ def weighed(
             _bar_bounds(points, bar, position, bar_fault, bar_turn, bounds)
         levels = _parts(
             info, right, rows, miss, white, known, free, turns, spread,
-            attitude_fault, bounds, limits, least, flat, high, values, freedom,
+            attitude_fault, focal_bound, bounds, limits, least, flat, high, values, freedom,
         )  # fmt: skip
         _causes(spread, rows, known, said, gain, pixel, by_camera, by_attitude, by_bar, noise, slow)
         if turns:
@@ -786,8 +787,8 @@ def _bent(
 @njit(cache=True, nogil=True)
 def _parts(
     info: Array, right: Array, rows: Array, miss: Array, white: Array, known: int, free: Array, turns: bool,
-    spread: Array, attitude_fault: float, bounds: Array, limits: Array, least: float, flat: float,
-    high: float, values: Array, freedom: Array,
+    spread: Array, attitude_fault: float, focal_bound: float, bounds: Array, limits: Array, least: float,
+    flat: float, high: float, values: Array, freedom: Array,
 ) -> tuple[float, float]:  # fmt: skip
     """Each part's test, `values` and `freedom` (parts,), and both protection levels: see `weighed`."""
     bars, n = len(info), len(spread)
@@ -809,7 +810,7 @@ def _parts(
         one[0, 0] += info[b, FAULT, FAULT]
         for i in range(n):
             by_one[i, 0] += info[b, i, FAULT] if free[i] else 0.0
-    found = tested(one, by_one, off, spread, np.ones((1, 1)), least)
+    found = tested(one, by_one, off, spread, np.full((1, 1), focal_bound), least)
     values[bars], freedom[bars] = found[0], found[1]
     hpl, vpl = _widened(hpl, vpl, found[2], found[3], spread, limits[found[1]], flat, high)
     if turns:
@@ -991,8 +992,10 @@ def _bar_bounds(points: Array, bar: Array, position: Array, place: float, turn: 
 
 @njit(cache=True, nogil=True)
 def _attitude_bound(white: Array, known: int, fault: float) -> Array:
-    """Inverse covariance of the attitude's fault, as whitened, (known, known)."""
+    """Inverse covariance of the attitude's fault, as whitened, (known, known); 0 where it is of any size."""
     covariance, out = np.zeros((known, known)), np.zeros((known, known))
+    if fault == 0:
+        return out
     for i in range(known):
         for j in range(known):
             for k in range(known):

@@ -15,16 +15,15 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.place._kernels")
 
-__all__ = ["FOCAL_FAULT", "STEPS", "Fit", "data", "fit_pose"]
+__all__ = ["FOCAL_UNIT", "STEPS", "Fit", "data", "fit_pose"]
 
 Floats = NDArray[np.float64]
 
 STEPS = 50
 """Levenberg-Marquardt steps; from a closed-form start, five to ten arrive."""
 
-FOCAL_FAULT = 0.005
-"""Share by which a focal length may be other than said without anybody's knowledge (sigma): the fault that
-protection levels cover."""
+FOCAL_UNIT = 0.005
+"""Share of the focal length in which a fault of it is counted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +84,7 @@ def data(problem: Problem) -> tuple[Any, ...]:
         problem.bar_sigma,
         problem.lens,
         problem.lens_root,
-        FOCAL_FAULT,
+        FOCAL_UNIT,
         problem.felt,
         problem.heading_rad,
         problem.angles,

@@ -6,7 +6,7 @@ length - a test of whether the rest contradicts it, and how far the position may
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.late import Late
+from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.chances import chi_square
-from evlcp_sdk.place.fit import Fit, data
+from evlcp_sdk.place.fit import FOCAL_UNIT, Fit, data
 from evlcp_sdk.place.observations import Problem
 from evlcp_sdk.place.refusals import Refusal
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.place._kernels")
 
-__all__ = ["FOCAL", "Judged", "Pose", "judged", "misfits"]
+__all__ = ["FOCAL", "Judged", "Pose", "covering", "judged", "misfits"]
 
 Floats = NDArray[np.float64]
 
@@ -33,9 +34,6 @@ FOCAL = "focal length"
 
 _MOST_BEND = 3.0
 """Ratio of the cost two sigmas away to its parabola's, beyond which an ellipse does not describe it."""
-
-_ATTITUDE_FAULT_RAD = math.radians(1.0)
-"""How far an angle may be off without anybody's knowledge (sigma): the fault that protection levels cover."""
 
 _BAR_TURN_RAD = math.radians(5.0)
 """How far a bar may be turned (sigma) where `position.bar_fault_m` says how far it may stand off."""
@@ -120,7 +118,8 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
         fit.local,
         fit.lens,
         fit.cost,
-        _ATTITUDE_FAULT_RAD,
+        math.radians(spec.attitude_fault_deg),
+        (FOCAL_UNIT / spec.focal_fault) ** 2 if spec.focal_fault else 0.0,
         spec.bar_fault_m,
         _BAR_TURN_RAD,
         limits,
@@ -161,7 +160,6 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
             if value / limits[tested] > worst:
                 worst = value / limits[tested]
                 doubt = f"{name} does not fit the rest: {math.sqrt(value):.1f} sigmas"
-    most = spec.max_protection_m
     pose = Pose(
         fit.position,
         fit.rotation,
@@ -172,10 +170,24 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
         fit.cost / freedom,
         freedom,
         problem.transmitters,
-        hpl if hpl <= most else math.inf,
-        vpl if vpl <= most else math.inf,
+        _level(hpl, spec),
+        _level(vpl, spec),
     )
     return Judged(pose, doubt, tests)
+
+
+def covering(pose: Pose, other: Pose, spec: PositionSpec) -> Pose:
+    """A pose with levels that reach to where the camera is by another solution, with that one's error."""
+    east, north, up = np.abs(other.enu_m - pose.enu_m).tolist()
+    wide = np.linalg.eigvalsh(other.covariance[:2, :2])[-1]
+    hpl = math.hypot(east, north) + math.sqrt(chi_square(spec.risk, 2) * wide)
+    vpl = up + math.sqrt(chi_square(spec.risk, 1) * other.covariance[2, 2])
+    return replace(pose, hpl_m=_level(max(pose.hpl_m, hpl), spec), vpl_m=_level(max(pose.vpl_m, vpl), spec))
+
+
+def _level(level_m: float, spec: PositionSpec) -> float:
+    """A level as it is given: none above the highest."""
+    return level_m if level_m <= spec.max_protection_m else math.inf
 
 
 def misfits(problem: Problem, fit: Fit) -> bool:

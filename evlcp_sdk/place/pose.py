@@ -16,7 +16,7 @@ import numpy as np
 
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.fit import Fit, fit_pose
-from evlcp_sdk.place.judgement import FOCAL, Judged, Pose, judged, misfits
+from evlcp_sdk.place.judgement import FOCAL, Judged, Pose, covering, judged, misfits
 from evlcp_sdk.place.observations import BarView, Problem
 from evlcp_sdk.place.refusals import Candidate, Refusal
 from evlcp_sdk.place.starts import ODDS, is_hopeless, likely_starts
@@ -74,10 +74,11 @@ def solve_pose(
     if isinstance(found, Judged):
         if not found.doubt:
             pose = found.pose
-            # A bar that may be off by so much only is not at another's place; two on gravity do not show it.
-            alone = spec.bar_fault_m > 0 and problem.angles == 2 == len(pose.transmitters)
-            mixed_up = alone and _mixed_up(views, camera, attitude, spec, sigma)
-            return replace(pose, hpl_m=math.inf, vpl_m=math.inf) if mixed_up else pose
+            # Two bars on gravity do not show which is which.
+            if problem.angles == 2 == len(pose.transmitters) and math.isfinite(pose.hpl_m + pose.vpl_m):
+                for _, behind in _mixed_up(views, camera, attitude, spec, sigma):
+                    pose = covering(pose, behind, spec)
+            return pose
         doubt, tests = found.doubt, found.tests
     else:
         if found.kind != "not-determined":
@@ -102,7 +103,7 @@ def solve_pose(
         name, pose = fits[0]
         rivals = [n for n in unsure if tests.get(name, 0.0) - tests.get(n, 0.0) < ODDS and n in tests]
         if not rivals and tests:
-            rivals = _mixed_up(views, camera, attitude, spec, sigma)
+            rivals = [name for name, _ in _mixed_up(views, camera, attitude, spec, sigma)]
             if not rivals:
                 return replace(pose, excluded=(name,))
         names = [name, *rivals]
@@ -153,21 +154,23 @@ def _mixed_up(
     attitude: Attitude | None,
     spec: PositionSpec,
     sigma: CameraSigma,
-) -> list[str]:
-    """Which two sites would explain all, too, if they stood at each other's place.
+) -> list[tuple[str, Pose]]:
+    """Which two sites would explain all, too, if they stood at each other's place, and the pose by that.
 
     From behind, two bars are seen the other way round: without a third that is in the way, they would be
     believed to be where they are not.
     """
-    names = []
+    found = []
     for i, j in combinations(range(len(views)), 2):
         one, two, mixed = views[i], views[j], list(views)
         mixed[i] = replace(one, enu_m=two.enu_m, survey=two.survey)
         mixed[j] = replace(two, enu_m=one.enu_m, survey=one.survey)
         swapped = Problem.of(mixed, camera, attitude, spec, sigma)
-        if isinstance(swapped, Problem) and isinstance(_explained(swapped), Pose):
-            names.append(f"bar {one.transmitter} at the site of bar {two.transmitter} and the reverse")
-    return names
+        pose = _explained(swapped) if isinstance(swapped, Problem) else None
+        if isinstance(pose, Pose):
+            name = f"bar {one.transmitter} at the site of bar {two.transmitter} and the reverse"
+            found.append((name, pose))
+    return found
 
 
 def _without(problem: Problem, sigma: CameraSigma) -> Iterator[tuple[str, Problem | Refusal]]:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place import _kernels
-from evlcp_sdk.place.fit import FOCAL_FAULT, Fit, data, fit_pose
+from evlcp_sdk.place.fit import FOCAL_UNIT, Fit, data, fit_pose
 from evlcp_sdk.place.judgement import Judged, judged
 from evlcp_sdk.place.observations import BarView, Problem, project_bars
 from evlcp_sdk.place.starts import likely_starts
@@ -117,7 +117,7 @@ def misses(p: Problem, at: Fit, change: Floats) -> Floats:
         stands = rows[:, :3] + place * own[3:6] + np.cross(lean * own[6:9], arm) + length * own[2] * arm
         points, _ = project_bars(stands, position, rotation, camera)
         centre = np.array(camera.centre_px)
-        points = centre + (points - centre) * (1 + FOCAL_FAULT * change[6]) + p.bar_sigma[b, 0] * own[:2]
+        points = centre + (points - centre) * (1 + FOCAL_UNIT * change[6]) + p.bar_sigma[b, 0] * own[:2]
         found.append(((rows[:, 6:8] - points) * rows[:, 8:9]).ravel())
         found.append(-own)
     found.append(-z)

@@ -394,13 +394,49 @@ def test_a_lone_bar_is_protected_from_being_off_by_so_much() -> None:
         assert abs(pose.enu_m[2]) < pose.vpl_m < 6
 
 
-def test_two_bars_that_may_be_mixed_up_are_not_protected() -> None:
-    """On gravity alone, two that stand alike fit from behind, too, each at the other's site."""
+def test_two_bars_that_may_be_mixed_up_are_protected_as_far_as_behind_them() -> None:
+    """On gravity alone, two that stand alike fit from behind, too, each at the other's site: 100 m away."""
     rng, spec = np.random.default_rng(19), PositionSpec(bar_fault_m=0.5)
     for other, alike in ((POLES[1], True), ((4.0, 46.0, 5.5), False)):
         seen = views([bar(POLES[0]), bar(other)], np.zeros(3), UP.rotation(), rng, 0.1)
-        pose = solved(solve_pose(seen, CAMERA, Attitude(5.0, 0.0, None, 0.1), spec))
+        level = Attitude(5.0, 0.0, None, 0.1)
+        pose = solved(solve_pose(seen, CAMERA, level, spec))
         assert math.isinf(pose.hpl_m) == alike
+        if alike:
+            mixed = [dataclasses.replace(v, enu_m=w.enu_m) for v, w in zip(seen, seen[::-1], strict=True)]
+            behind = solved(solve_pose(mixed, CAMERA, level, spec))
+            apart = np.hypot(*(behind.enu_m - pose.enu_m)[:2])
+            reach = solved(solve_pose(seen, CAMERA, level, dataclasses.replace(spec, max_protection_m=300.0)))
+            sigma = np.linalg.eigvalsh(behind.covariance[:2, :2])[-1] ** 0.5
+            assert reach.hpl_m == pytest.approx(apart + stats.chi2.isf(1e-4, 2) ** 0.5 * sigma, rel=1e-6)
+
+
+@pytest.mark.parametrize("what", ["attitude", "focal length"])
+def test_levels_hold_for_faults_of_the_size_that_is_stated(what: str) -> None:
+    """A lone bar, which shows neither: five times as large a fault is covered where it is stated only."""
+    rng, level = np.random.default_rng(20), Attitude(5.0, 0.0, 0.0, 0.1, 0.1)
+    usual = PositionSpec(bar_fault_m=0.01, attitude_fault_deg=0.1)
+    if what == "attitude":
+        stated = dataclasses.replace(usual, attitude_fault_deg=5.0)
+        spared = dataclasses.replace(usual, attitude_fault_deg=0.0)
+    else:
+        stated = dataclasses.replace(usual, focal_fault=0.025)
+        spared = dataclasses.replace(usual, focal_fault=0.0)
+    outside = 0
+    for trial in range(40):
+        (seen,), told, _ = drawn(rng, POLES[:1], level, (0.0, 0.0, 0.0), 0.0)
+        assert told is not None
+        camera, off = CAMERA, (-1) ** trial * 2.0
+        if what == "attitude":
+            told = dataclasses.replace(told, heading_deg=(told.heading_deg or 0.0) + 5 * off)
+        else:
+            camera = dataclasses.replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + 0.025 * off))
+        pose, other = (solved(solve_pose([seen], camera, told, spec)) for spec in (stated, usual))
+        assert math.hypot(*pose.enu_m[:2]) < pose.hpl_m
+        assert abs(pose.enu_m[2]) < pose.vpl_m
+        outside += math.hypot(*other.enu_m[:2]) > other.hpl_m
+        assert math.isinf(solved(solve_pose([seen], camera, told, spared)).hpl_m)
+    assert outside > 20
 
 
 def test_false_alarms_are_as_rare_as_said() -> None:
