@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError, InputError, UnpluggedError
 from evlcp_sdk.files import Outputs
-from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source
+from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source, open_writer
 from evlcp_sdk.io.open import STDIN
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
@@ -43,6 +43,7 @@ from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.signals import Stopped, stop_on_request
 from evlcp_sdk.study.diagnosis.diagnose import Diagnosis, diagnosis_of
+from evlcp_sdk.utc import ClockZero, PulseClock
 from evlcp_sdk.values import Events, Frame, Packet
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ __all__ = [
     "Reception",
     "Stopped",
     "calibrate",
+    "convert",
     "diagnose",
     "film",
     "live",
@@ -279,7 +281,7 @@ def live(
     registry: Registry | None = None,
     plan: PositionPlan | None = None,
     attitude: Attitude | AttitudeLog | None = None,
-    clock_zero: datetime | None = None,
+    clock_zero: ClockZero = None,
     sinks: Sequence[str] = (),
     lines: Callable[[str], None] | None = None,
     outlet: Outlet | None = None,
@@ -300,7 +302,8 @@ def live(
         registry: The plugins; None for all that are installed.
         plan: What positions are computed from; None for none.
         attitude: What is known of the camera's attitude; None for nothing.
-        clock_zero: UTC of the camera clock's 0; None if it is not known.
+        clock_zero: UTC of the camera clock's 0, or pulses on its trigger input that say it; None if it is not
+            known.
         sinks: Output formats beside the default ones, by name.
         lines: Takes a line of JSON for each frame, message and fix as it comes; None for nobody.
         outlet: Where listeners subscribe; None for nobody. It is closed at the end.
@@ -348,7 +351,8 @@ def live(
                 registry.joined(ear),
             ):
                 receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero)
-                loop = LiveLoop(opened, receiver, links, ear, outlet, pictures, budget)
+                pulses = clock_zero if isinstance(clock_zero, PulseClock) else None
+                loop = LiveLoop(opened, receiver, links, ear, outlet, pictures, budget, pulses=pulses)
                 pieces = loop.run(stopped)
                 table = _run(
                     opened, url, receiver, writer, pieces, loop.close, _say_nothing, stopped, loop.summary
@@ -359,6 +363,61 @@ def live(
         outlet.close()
         if pictures is not None:
             pictures.close()
+
+
+def convert(
+    source: EventSource | str | Path,
+    out: Path,
+    *,
+    registry: Registry | None = None,
+    size: tuple[int, int] | None = None,
+    format: str | None = None,
+    advance: Advance = _say_nothing,
+    stopped: Stopped = lambda: False,
+) -> dict[str, Any]:
+    """Write events and triggers of a source into a recording, in constant memory.
+
+    Args:
+        source: What to open, plugins asked first; or a source that is open, which is read on and closed.
+        out: The recording; its suffix says the format, as for `open_writer`.
+        registry: The plugins; None for all that are installed.
+        size: Columns and rows of the sensor, where the source does not say them.
+        format: As for `open_writer`.
+        advance: Says how far the reading is.
+        stopped: Ends the run early; what was read until then is written.
+
+    Returns:
+        Counts of what was written, losses of the source, `error`: what ended the reading early, or None, and
+        whether a camera was unplugged.
+
+    Raises:
+        InputError: The source cannot be opened.
+        OutputError: The recording cannot be written.
+        StreamError: The format is unknown, or has no place for a value.
+    """
+    registry = Registry.load() if registry is None else registry
+    error: InputError | None = None
+    counts = {"events": 0, "triggers": 0}
+    with source if isinstance(source, EventSource) else open_source(source, registry) as opened:
+        width, height = size or (opened.width, opened.height)
+        with open_writer(out, width, height, format) as writer:
+            try:
+                for events, triggers in opened.stream():
+                    writer.write(events, triggers)
+                    counts["events"] += len(events)
+                    counts["triggers"] += len(triggers)
+                    advance(opened.position_bytes, opened.size_bytes)
+                    if stopped():
+                        break
+            except InputError as fault:
+                error = fault
+        losses = {kind: asdict(loss) for kind, loss in opened.losses.items()}
+    return {
+        "counts": counts,
+        "losses": losses,
+        "error": None if error is None else str(error),
+        "unplugged": isinstance(error, UnpluggedError),
+    }
 
 
 def _run(

@@ -85,6 +85,7 @@ def make_app() -> typer.Typer:
         check,
         compare,
         config,
+        convert,
         demo,
         diagnose,
         info,
@@ -110,7 +111,21 @@ def make_app() -> typer.Typer:
         help=HELP,
     )
     app.callback()(_root)
-    first = (receive, live, serve, video, info, diagnose, compare, simulate, score, sweep, report, demo)
+    first = (
+        receive,
+        live,
+        serve,
+        convert,
+        video,
+        info,
+        diagnose,
+        compare,
+        simulate,
+        score,
+        sweep,
+        report,
+        demo,
+    )
     for module in (*first, calibrate, survey, config, plugins, check, warm_up):
         module.register(app)
     return app

@@ -84,6 +84,16 @@ def live(
     white_sigma_deg: WhiteSigmaDeg = 0.0,
     time_sigma_us: TimeSigmaUs = 0.0,
     clock_zero: ClockZero = None,
+    pps: Annotated[
+        int | None,
+        typer.Option(
+            "--pps",
+            min=0,
+            max=255,
+            metavar="CHANNEL",
+            help="This trigger input gets a pulse each second of UTC (PPS), and outputs have that time.",
+        ),
+    ] = None,
     mcap: Mcap = False,
     sinks: SinkNames = None,
     reconnect: Annotated[
@@ -165,6 +175,8 @@ def live(
 
     On a phone in this network:     [bold]evlcp live URL --view --view-host 0.0.0.0 --view-port 8080[/]
 
+    With UTC by a pulse each second: [bold]evlcp live camera: --sites site.toml --pps 0 --nmea-port 10110[/]
+
     For programs that read gpsd:    [bold]evlcp live URL --sites site.toml --gpsd-port 2947[/], then
     [bold]cgps[/] or [bold]gpspipe -w[/]
 
@@ -181,6 +193,7 @@ def live(
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import live as run_live
     from evlcp_sdk.run import stop_on_request
+    from evlcp_sdk.utc import PulseClock
 
     lines = json_lines_of(json_lines, [url], as_json=as_json)
     registry = Registry.load()
@@ -188,6 +201,7 @@ def live(
     sigmas = (gravity_sigma_deg, heading_sigma_deg, white_sigma_deg, time_sigma_us)
     attitude = attitude_of(attitude_file, (heading_deg, pitch_deg, roll_deg), sigmas)
     zero = clock_zero_of(clock_zero)
+    clock = zero if pps is None else PulseClock(pps, zero)
     plan = plan_of(sites, gnss, links, zero, mcap=mcap)
     short = {"figures": figures, "report": report, "parquet": parquet, "mcap": mcap}
     asked = sinks_of(registry, short, sinks, out, positions=plan is not None)
@@ -203,7 +217,7 @@ def live(
         named_links(links),
         name=Path(url).name,
         sites=plan.sites if plan is not None else (),
-        clock_zero=zero,
+        clock_zero=clock,
     )
     with stop_on_request() as stopped, services:
         _say_where(services)
@@ -215,7 +229,7 @@ def live(
             registry=registry,
             plan=plan,
             attitude=attitude,
-            clock_zero=zero,
+            clock_zero=clock,
             sinks=asked,
             lines=lines,
             outlet=outlet,

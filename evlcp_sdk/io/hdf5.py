@@ -1,4 +1,4 @@
-"""HDF5 files in plain layout: columns x, y, p and t under `/events`, `/raw_events` or `/CD/events`."""
+"""HDF5 files in plain layout: x, y, p and t under `/events`, `/raw_events` or `/CD/events`."""
 
 from pathlib import Path
 from typing import Any, Final
@@ -7,10 +7,11 @@ import numpy as np
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io._sieve import Sieve
+from evlcp_sdk.io.urls import flag, split_options
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["Hdf5Source"]
+__all__ = ["Hdf5Source", "open_hdf5"]
 
 PLACES: Final = ("events", "raw_events", "CD/events")
 MAGIC: Final = b"\x89HDF\r\n\x1a\n"
@@ -26,17 +27,37 @@ _NAMES: Final = {
 }
 
 
+def open_hdf5(url: str) -> "Hdf5Source":
+    """Open `hdf5:PATH`, with `?columns=txyp` for a table without names, and `swapped=1` where x is the row.
+
+    Raises:
+        InputError: As for `Hdf5Source`, or an option is wrong.
+    """
+    name, options = split_options(url, {"columns": _order, "swapped": flag})
+    return Hdf5Source(
+        name.partition(":")[2], columns=options.get("columns"), swapped=options.get("swapped", False)
+    )
+
+
+def _order(text: str) -> str:
+    if sorted(text) != sorted(_NAMES):
+        raise ValueError("the letters t, x, y and p in the order of the table's columns, such as txyp")
+    return text
+
+
 class Hdf5Source(EventSource):
     """An HDF5 file by `h5py`: records with fields x, y, p and t, or a group of four columns; times in us.
 
     Args:
         path: The file.
+        columns: Of a table without names, (n, 4) or (4, n), what its columns, or rows, are, e.g. `txyp`.
+        swapped: x is the row and y the column.
 
     Raises:
         InputError: `h5py` is not installed, the file has no such layout, or is compressed by ECF.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, *, columns: str | None = None, swapped: bool = False) -> None:
         target = Path(path)
         try:
             import h5py
@@ -47,7 +68,9 @@ class Hdf5Source(EventSource):
         except OSError as fault:
             raise InputError(f"{path}: found no HDF5 file, expected one ({fault})") from fault
         try:
-            self._columns = _columns_of(target, self._file)
+            self._columns = _columns_of(target, self._file, columns)
+            if swapped:
+                self._columns |= {"x": self._columns["y"], "y": self._columns["x"]}
             size = [self._file.attrs.get(name) for name in ("width", "height")]
             width, height = (int(side) if side is not None else None for side in size)
         except BaseException:
@@ -87,6 +110,19 @@ class Hdf5Source(EventSource):
         self._file.close()
 
 
+class _Part:
+    """One column of a table without names, or one row of it where it lies on its side."""
+
+    def __init__(self, dataset: Any, place: int, *, on_its_side: bool) -> None:
+        self._dataset, self._place, self._on_its_side = dataset, place, on_its_side
+
+    def __len__(self) -> int:
+        return int(self._dataset.shape[1 if self._on_its_side else 0])
+
+    def __getitem__(self, rows: slice) -> Any:
+        return self._dataset[self._place, rows] if self._on_its_side else self._dataset[rows, self._place]
+
+
 class _Field:
     """One field of a dataset of records, read as a column."""
 
@@ -100,7 +136,7 @@ class _Field:
         return self._dataset[rows][self._name]
 
 
-def _columns_of(path: Path, file: Any) -> dict[str, Any]:
+def _columns_of(path: Path, file: Any, order: str | None) -> dict[str, Any]:
     place = next((place for place in PLACES if place in file), None)
     if place is None:
         found = ", ".join(sorted(file)) or "nothing"
@@ -108,8 +144,22 @@ def _columns_of(path: Path, file: Any) -> dict[str, Any]:
     node = file[place]
     is_group = hasattr(node, "keys")
     names = list(node) if is_group else list(node.dtype.names or ())
+    nameless = not names and not is_group and len(node.shape) == 2 and 4 in node.shape
+    if nameless and order is None:
+        raise InputError(
+            f"{path}: /{place} is a table of {' x '.join(map(str, node.shape))} without names: expected to be"
+            " told what its columns are, as by hdf5:PATH?columns=txyp"
+        )
+    if order is not None and not nameless:
+        raise InputError(
+            f"{path}: /{place} has {', '.join(names) or 'no fields'}: columns = {order!r} is for tables"
+            " without names"
+        )
     columns: dict[str, Any] = {}
     for column, spellings in _NAMES.items():
+        if nameless and order is not None:
+            columns[column] = _Part(node, order.index(column), on_its_side=node.shape[1] != 4)
+            continue
         name = next((name for name in spellings if name in names), None)
         if name is None:
             raise InputError(

@@ -11,10 +11,11 @@ from evlcp_sdk.files import Outputs, is_there
 from evlcp_sdk.io.bags import is_bag, open_bag
 from evlcp_sdk.io.camera import open_camera
 from evlcp_sdk.io.faery import FORMATS, FaerySource
-from evlcp_sdk.io.hdf5 import MAGIC, Hdf5Source
+from evlcp_sdk.io.hdf5 import MAGIC, Hdf5Source, open_hdf5
 from evlcp_sdk.io.lists import ListSource, is_list
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
 from evlcp_sdk.io.replay import LoopSource, ReplaySource
+from evlcp_sdk.io.ros import EventBagWriter
 from evlcp_sdk.io.streams import SCHEMES, open_stream
 from evlcp_sdk.io.tables import CSV_HEADER, CsvSource, CsvWriter, NpzSource, NpzWriter
 from evlcp_sdk.io.urls import flag, positive, split_options
@@ -25,12 +26,12 @@ from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["STDIN", "open_source", "open_writer", "read_events", "write_events"]
 
-WRITABLE: Final = {".raw": "EVT3", ".npz": "NPZ", ".csv": "CSV", ".csv.gz": "CSV"}
+WRITABLE: Final = {".raw": "EVT3", ".mcap": "BAG", ".npz": "NPZ", ".csv": "CSV", ".csv.gz": "CSV"}
 
 STDIN: Final = "-"
 """What is opened as standard input."""
 
-OWN: Final = ("file", "replay", "bag", "camera", *SCHEMES)
+OWN: Final = ("file", "replay", "bag", "hdf5", "camera", *SCHEMES)
 """Schemes that are opened without a plugin."""
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
@@ -68,6 +69,8 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
         return _open_replay(str(url), registry)
     if scheme[1].lower() == "bag":
         return open_bag(str(url))
+    if scheme[1].lower() == "hdf5":
+        return open_hdf5(str(url))
     if scheme[1].lower() == "camera":
         return open_camera(str(url))
     if scheme[1].lower() in SCHEMES:
@@ -189,26 +192,32 @@ def open_writer(
     """Create a recording to write piece by piece, a context manager.
 
     Args:
-        path: The file; `.raw`, `.npz`, `.csv` or `.csv.gz` decides the format.
-        width: Columns of the sensor; RAW needs it, the tables do not.
+        path: The file; `.raw`, `.mcap`, `.npz`, `.csv` or `.csv.gz` decides the format.
+        width: Columns of the sensor; RAW and bags need it, the tables do not.
         height: Rows of the sensor, likewise.
-        format: `EVT3` (the default for `.raw`), `EVT2`, `NPZ` or `CSV`, whatever the file's name.
+        format: `EVT3` (the default for `.raw`), `EVT2`, `BAG` (of ROS 2, by the extra `ros`), `NPZ` or `CSV`,
+            whatever the file's name.
         outputs: The files that it comes into place with; None for alone, as soon as it is closed.
 
     Raises:
+        ConfigError: A package that a bag needs is not installed.
         OutputError: The file cannot be written.
-        StreamError: The format is unknown, or width and height are missing for RAW.
+        StreamError: The format is unknown, or width and height are missing for RAW or a bag.
     """
     name = (format or WRITABLE.get(_suffix(Path(path)), "")).upper()
     if name == "NPZ":
         return NpzWriter(path, width, height, outputs)
     if name == "CSV":
         return CsvWriter(path, width, height, outputs)
-    if name not in CODECS:
+    if name != "BAG" and name not in CODECS:
         found = f"format {format!r}" if format else f"suffix {_suffix(Path(path))!r}"
-        raise StreamError(f"{path}: {found}, expected {', '.join(WRITABLE)} or format EVT2, EVT3, NPZ, CSV")
+        raise StreamError(
+            f"{path}: {found}, expected {', '.join(WRITABLE)} or format EVT2, EVT3, BAG, NPZ, CSV"
+        )
     if width is None or height is None:
         raise StreamError(f"{path}: sensor of {width}x{height}, expected a width and a height for {name}")
+    if name == "BAG":
+        return EventBagWriter(path, width, height, outputs)
     return RawWriter(path, width, height, CODECS[name], outputs)
 
 

@@ -8,9 +8,8 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io._codec import MAX_SIDE
 from evlcp_sdk.io.raw import CODECS, RawSource, format_header
-from evlcp_sdk.io.urls import split_options
+from evlcp_sdk.io.urls import sides, split_options
 from evlcp_sdk.plugin.source import EventSource
 
 __all__ = ["SCHEMES", "SocketBytes", "StreamSource", "open_stream"]
@@ -32,13 +31,6 @@ def _encoding(text: str) -> str:
     if text.lower() not in named:
         raise ValueError("2 or 3")
     return named[text.lower()]
-
-
-def _size(text: str) -> tuple[int, int]:
-    sides = [int(side) for side in text.split("x") if side.isascii() and side.isdigit()]
-    if len(sides) != 2 or text.count("x") != 1 or not all(1 <= side <= MAX_SIDE for side in sides):
-        raise ValueError(f"WIDTHxHEIGHT, each from 1 to {MAX_SIDE}")
-    return sides[0], sides[1]
 
 
 class SocketBytes:
@@ -120,7 +112,7 @@ def open_stream(url: str) -> EventSource:
     Raises:
         InputError: Nobody is there, the name is not of this kind, or what comes is not RAW.
     """
-    named, options = split_options(url, {"evt": _encoding, "size": _size})
+    named, options = split_options(url, {"evt": _encoding, "size": sides})
     scheme = named.partition(":")[0].lower()
     header = None
     if options or scheme == "udp":

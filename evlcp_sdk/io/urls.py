@@ -5,9 +5,10 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from evlcp_sdk.errors import InputError
+from evlcp_sdk.io._codec import MAX_SIDE
 from evlcp_sdk.spelling import nearest
 
-__all__ = ["flag", "positive", "split_options"]
+__all__ = ["flag", "positive", "sides", "split_options"]
 
 
 def split_options(url: str, kinds: Mapping[str, Callable[[str], Any]]) -> tuple[str, dict[str, Any]]:
@@ -64,3 +65,18 @@ def flag(text: str) -> bool:
     if text not in ("0", "1"):
         raise ValueError("0 or 1")
     return text == "1"
+
+
+def sides(text: str) -> tuple[int, int]:
+    """Columns and rows of a sensor.
+
+    Raises:
+        ValueError: It is none; says what is expected.
+
+    >>> sides("1280x720")
+    (1280, 720)
+    """
+    found = [int(side) for side in text.split("x") if side.isascii() and side.isdigit()]
+    if len(found) != 2 or text.count("x") != 1 or not all(1 <= side <= MAX_SIDE for side in found):
+        raise ValueError(f"WIDTHxHEIGHT, each from 1 to {MAX_SIDE}")
+    return found[0], found[1]

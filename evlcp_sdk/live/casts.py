@@ -12,6 +12,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.live.outlet import News, Outlet, Subscription
 from evlcp_sdk.results.gpsd import VERSION, answer, sky, tpv
 from evlcp_sdk.results.nmea import sentences
+from evlcp_sdk.utc import ClockZero, zero_at
 
 __all__ = ["Cast"]
 
@@ -72,7 +73,7 @@ class Cast:
         gpsd: bool,
         host: str = "127.0.0.1",
         port: int = 0,
-        clock_zero: datetime | None = None,
+        clock_zero: ClockZero = None,
     ) -> None:
         self._outlet, self._gpsd = outlet, gpsd
         self._host, self.port = host, port
@@ -137,12 +138,13 @@ class Cast:
         if news.kind != "fix" or not (self._clients or self._gpsd):
             return
         fix, place = news.value.fix, news.value.filtered
+        zero = zero_at(self._zero, fix.t_us)
         text = b""
         if any(client.watch["nmea"] for client in self._clients):
-            text = sentences(fix, place, self._zero).encode("ascii", "replace")
+            text = sentences(fix, place, zero).encode("ascii", "replace")
         told = b""
         if self._gpsd:
-            self._newest = {"TPV": tpv(fix, place, self._zero), "SKY": sky(fix, self._zero)}
+            self._newest = {"TPV": tpv(fix, place, zero), "SKY": sky(fix, zero)}
             told = b"".join(_line(report) for report in self._newest.values())
         for client in self._clients:
             if client.watch["enable"]:

@@ -18,6 +18,7 @@ from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.signals import Stopped
+from evlcp_sdk.utc import PulseClock
 from evlcp_sdk.values import Events, Frame, Packet, Region
 
 __all__ = ["STAGES", "FrameEar", "LiveLoop", "LiveStatus"]
@@ -101,6 +102,7 @@ class LiveLoop:
         pictures: Where pictures are drawn; None for none.
         budget: When what is shed.
         clock: Gives the time, s.
+        pulses: Is told of triggers, which say the UTC of the camera's clock; None for nobody.
 
     Attributes:
         delays: Of frames, by stage.
@@ -117,7 +119,9 @@ class LiveLoop:
         pictures: PictureSlot | None = None,
         budget: Budget | None = None,
         clock: Callable[[], float] = time.monotonic,
+        pulses: PulseClock | None = None,
     ) -> None:
+        self._pulses = pulses
         self._source, self._receiver = source, receiver
         self._forms = {name: link.packet for name, link in named_links(links).items()}
         self._outlet, self._pictures = outlet, pictures
@@ -190,6 +194,7 @@ class LiveLoop:
             "shed": self.shed,
             "health": dict(self._source.health),
             "unplugged": isinstance(self._reader.fault, UnpluggedError),
+            **({} if self._pulses is None else {"pps": self._pulses.to_dict()}),
             "levels_s": {text: round(s, 3) for text, s in zip(LEVELS, self._levels_s, strict=True)},
         }
 
@@ -239,6 +244,11 @@ class LiveLoop:
         return kept, packets
 
     def _publish_raw(self, piece: Slice) -> None:
+        if self._pulses is not None:
+            columns = [column for column in (piece.events.t_us, piece.triggers.t_us) if len(column)]
+            if columns:
+                came_s = time.time() - (self._clock() - piece.arrived_s)
+                self._pulses.add(piece.triggers, came_s, max(float(column[-1]) for column in columns))
         self._events += len(piece.events)
         if len(piece.events):
             self._outlet.publish("events", float(piece.events.t_us[0]), piece.events)

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -17,6 +16,7 @@ from evlcp_sdk.live.pictures import PictureSlot
 from evlcp_sdk.live.recorder import Recorder
 from evlcp_sdk.live.viewer import Viewer
 from evlcp_sdk.scene.sites import BarSite
+from evlcp_sdk.utc import ClockZero
 
 __all__ = ["Services", "Serving"]
 
@@ -73,7 +73,7 @@ class Services:
         *,
         name: str,
         sites: Sequence[BarSite] = (),
-        clock_zero: datetime | None = None,
+        clock_zero: ClockZero = None,
     ) -> None:
         self.pictures = PictureSlot() if serving.view else None
         self._recorder: Recorder | None = None

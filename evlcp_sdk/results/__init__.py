@@ -82,6 +82,15 @@ def evlcp_sinks() -> Iterator[SinkRecord]:
         positions=True,
     )
     yield SinkRecord(
+        "navsat",
+        f"{here}.navsat:NavSat",
+        ("navsat.mcap",),
+        "positions as a bag of ROS 2",
+        positions=True,
+        packages=("mcap", "rosbags"),
+        extra="evlcp-sdk[ros]",
+    )
+    yield SinkRecord(
         "mcap",
         f"{here}.mcap:Mcap",
         ("fixes.mcap",),

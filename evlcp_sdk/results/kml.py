@@ -14,6 +14,7 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.text import sigmas
 from evlcp_sdk.results.trail import Trail
+from evlcp_sdk.utc import zero_at
 from evlcp_sdk.values import Fix
 
 __all__ = ["Kml"]
@@ -40,7 +41,7 @@ class Kml(Sink):
         if filtered is None:
             return
         east, north, up = sigmas(fix.covariance_m2)
-        zero = self.run.clock_zero
+        zero = zero_at(self.run.clock_zero, fix.t_us)
         when = ""
         if zero is not None:
             at = zero.astimezone(UTC) + timedelta(microseconds=round(fix.t_us))

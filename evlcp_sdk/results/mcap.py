@@ -22,6 +22,7 @@ from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.text import integrity
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite
+from evlcp_sdk.utc import at_ns
 from evlcp_sdk.values import Events, Fix, Packet, Region
 
 __all__ = ["Mcap"]
@@ -60,8 +61,6 @@ class Mcap(Sink):
         from mcap.writer import Writer
 
         super().__init__(folder, run)
-        zero = run.clock_zero
-        self._zero_us = round(zero.timestamp() * 1e6) if zero is not None else 0
         self._writer: Any = Writer(folder.open_binary("fixes.mcap"))
         self._writer.start(library="evlcp-sdk")
         self._channels: dict[str, int] = {}
@@ -236,8 +235,8 @@ class Mcap(Sink):
         self._add(topic, t_us, json.dumps(values).encode())
 
     def _add(self, topic: str, t_us: float, data: bytes) -> None:
-        at_ns = self._at_ns(t_us)
-        self._writer.add_message(self._channels[topic], log_time=at_ns, data=data, publish_time=at_ns)
+        log_ns = self._at_ns(t_us)
+        self._writer.add_message(self._channels[topic], log_time=log_ns, data=data, publish_time=log_ns)
 
     def _at_ns(self, t_us: float) -> int:
-        return self._zero_us * 1000 + round(t_us * 1000)
+        return at_ns(self.run.clock_zero, t_us)

@@ -20,6 +20,7 @@ from evlcp_sdk.place.nmea import checksum
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.text import sigmas
+from evlcp_sdk.utc import zero_at
 from evlcp_sdk.values import Fix
 
 __all__ = ["Nmea", "gga", "gst", "rmc", "sentences", "txt"]
@@ -33,11 +34,10 @@ class Nmea(Sink):
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
         self._file = folder.open("fixes.nmea")
-        self._zero = run.clock_zero
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write its sentences; those of a refused fix have no place."""
-        self._file.write(sentences(fix, filtered, self._zero))
+        self._file.write(sentences(fix, filtered, zero_at(self.run.clock_zero, fix.t_us)))
 
 
 def sentences(fix: Fix, filtered: Place | None, zero: datetime | None) -> str:

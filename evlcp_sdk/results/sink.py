@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
 from typing import Any
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan, Settled
 from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Events, Fix, Packet
 
 __all__ = ["Run", "Sink"]
@@ -22,7 +22,8 @@ class Run:
         link: The configuration that the receiver runs with.
         plan: What positions are computed from; None where none are computed.
         navigator: Computes them; at the end it says where the bars stand. None where none are computed.
-        clock_zero: UTC of the camera clock's 0; None where it is not known.
+        clock_zero: UTC of the camera clock's 0, or pulses that say it: `utc.zero_at` of a time. None where it
+            is not known.
         links: Where there are several, all of them by name; `link` is the first one then.
         placing: Where there are several, name of the one whose bars positions are computed from.
     """
@@ -31,7 +32,7 @@ class Run:
     link: Link
     plan: PositionPlan | None = None
     navigator: Navigator | None = None
-    clock_zero: datetime | None = None
+    clock_zero: ClockZero = None
     links: Mapping[str, Link] = field(default_factory=dict)
     placing: str = ""
 

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -23,6 +22,7 @@ from evlcp_sdk.results.sinks import Sinks, load_sinks
 from evlcp_sdk.results.summary import Status, messages_off, summary_of, write_summary
 from evlcp_sdk.results.tallies import PositionTally, RunTally
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
+from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Events, Packet
 
 __all__ = ["ResultWriter"]
@@ -60,7 +60,7 @@ class ResultWriter:
         name: str = "",
         plan: PositionPlan | None = None,
         attitude: Attitude | AttitudeLog | None = None,
-        clock_zero: datetime | None = None,
+        clock_zero: ClockZero = None,
         sinks: Sequence[str] = (),
         lines: Callable[[str], None] | None = None,
         placed: Callable[[Placed], None] | None = None,

@@ -4,7 +4,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from datetime import datetime
 from typing import Self, TypeVar
 
 import numpy as np
@@ -18,6 +17,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.sections import MessageSpec
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.trust import BeaconJudge, Standing, signed_text
+from evlcp_sdk.utc import ClockZero, zero_at
 from evlcp_sdk.values import Packet, ReceivedMessage, changed
 
 __all__ = ["MessageAssembler"]
@@ -104,7 +104,7 @@ class MessageAssembler:
         spec: MessageSpec,
         kinds: Mapping[int, MessageKind] = BUILT_IN_KINDS,
         guard: Guard | None = None,
-        clock_zero: datetime | None = None,
+        clock_zero: ClockZero = None,
     ) -> None:
         self._coder = coder
         self._guard: AbstractContextManager[None] = guard or nullcontext()
@@ -112,7 +112,7 @@ class MessageAssembler:
         self._spec = spec
         self._room = coder.block_bytes - HEADER_BYTES
         self._beacons = BeaconJudge(spec, coder.digest)
-        self._zero_s = None if clock_zero is None else clock_zero.timestamp()
+        self._clock_zero = clock_zero
         self._inboxes: OrderedDict[int, _Inbox] = OrderedDict()
         self._counts = dict.fromkeys(
             (
@@ -139,7 +139,7 @@ class MessageAssembler:
         )
 
     @classmethod
-    def of(cls, link: Link, clock_zero: datetime | None = None) -> Self | None:
+    def of(cls, link: Link, clock_zero: ClockZero = None) -> Self | None:
         """What reads a link's messages; None where that is turned off, or packets are too short for them.
 
         Args:
@@ -277,7 +277,8 @@ class MessageAssembler:
         beacon = value if message.kind == Kind.BEACON else None
         verdict, now_s = Standing("unverified", "not signed"), None
         if beacon is not None:
-            now_s = None if self._zero_s is None else self._zero_s + packet.t_us * 1e-6
+            zero = zero_at(self._clock_zero, packet.t_us)
+            now_s = None if zero is None else zero.timestamp() + packet.t_us * 1e-6
             signed = inbox.done.get((transmitter_id, Kind.SIGNATURE, sequence))
             signature = None
             if signed is not None:

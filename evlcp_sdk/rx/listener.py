@@ -1,7 +1,6 @@
 """One link's part of a receiver: the regions that it follows, what they send, and its messages."""
 
 from collections.abc import Callable, Iterator
-from datetime import datetime
 
 import pluggy
 
@@ -21,6 +20,7 @@ from evlcp_sdk.rx.steps import Announcer, Steps, on_camera, tracker_of
 from evlcp_sdk.rx.timeline import TimeStep
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
 from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Packet, Region, changed
 
 __all__ = ["LinkListener"]
@@ -47,7 +47,7 @@ class LinkListener:
         clock: CameraClock,
         hook: pluggy.HookRelay | None,
         attitude_at: Callable[[float], Attitude | None],
-        clock_zero: datetime | None = None,
+        clock_zero: ClockZero = None,
         limits: Limits = LIMITS,
         name: str = "",
         numbers: Iterator[int] | None = None,

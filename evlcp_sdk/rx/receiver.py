@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from datetime import datetime
 from itertools import count
 
 import pluggy
@@ -17,6 +16,7 @@ from evlcp_sdk.rx.listener import LinkListener
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.rx.timeline import Timeline, TimeStep
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
+from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Events, Packet, Region
 
 __all__ = ["Receiver"]
@@ -56,7 +56,7 @@ class Receiver:
         hook: pluggy.HookRelay | None = None,
         *,
         attitude: Attitude | AttitudeLog | None = None,
-        clock_zero: datetime | None = None,
+        clock_zero: ClockZero = None,
         limits: Limits = LIMITS,
     ) -> None:
         links = named_links(link)

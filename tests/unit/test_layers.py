@@ -11,7 +11,7 @@ SDK = Path(__file__).parents[2] / "evlcp_sdk"
 LAYERS = (
     {"errors", "files", "kernels", "late", "pace", "printable", "signals", "specs", "spelling"},
     {"air"},
-    {"values", "scene", "clock", "_kernels"},
+    {"values", "scene", "clock", "utc", "_kernels"},
     {"plugin"},
     {"link"},
     {"io", "rx", "place", "sim"},

@@ -47,7 +47,8 @@ def names_in(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-COMMANDS = ["receive", "info", "sweep", "report", "demo", "loop", "calibrate", "survey", "config", "plugins"]
+COMMANDS = ["receive", "live", "serve", "convert", "info", "sweep", "report", "demo", "loop"]
+COMMANDS += ["calibrate", "survey", "config", "plugins"]
 
 
 def test_help_lists_commands_and_exit_codes(evlcp: Evlcp) -> None:

@@ -1,15 +1,19 @@
 """Bags of real cameras, and files of HDF5, give the events that are in them."""
 
+import json
+import re
 import sqlite3
 import struct
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io import open_source
-from evlcp_sdk.values import Events
+from evlcp_sdk.io import open_source, open_writer, read_events
+from evlcp_sdk.values import Events, Triggers
 
 BAGS = Path(__file__).parents[3].parent / "shared" / "recordings" / "bags"
 shared = pytest.mark.skipif(not BAGS.is_dir(), reason="needs ../shared/recordings, which users do not have")
@@ -115,6 +119,77 @@ def test_what_is_wrong_with_a_bag_is_said(tmp_path: Path) -> None:
         assert told in str(fault.value)
 
 
+def test_a_bag_that_is_written_is_read_back(
+    demo_raw: Path, tmp_path: Path, evlcp: Callable[..., Any]
+) -> None:
+    """By our reader; by `rosbags`, which knows ROS 2's own packing; and by `mcap`, word for word."""
+    pytest.importorskip("mcap"), pytest.importorskip("rosbags")
+    path = tmp_path / "a.mcap"
+    edges = Triggers.of([5, 12_345, 70_000], [0, 0, 1], [1, 0, 1])
+    with open_source(demo_raw) as source, open_writer(path, 1280, 720) as writer:
+        told, _ = source.read()
+        cut = len(told) // 3
+        edge = int(np.searchsorted(edges.t_us, told.t_us[cut]))
+        for events, triggers in ((told[:cut], edges[:edge]), (told[cut:], edges[edge:])):
+            writer.write(events, triggers)
+    with open_source(path) as source:
+        got, ticks = source.read()
+        assert (source.format, source.width, source.height, source.losses) == ("BAG", 1280, 720, {})
+    for name in ("t_us", "x", "y", "p"):
+        assert (getattr(got, name) == getattr(told, name)).all()
+    assert ticks.t_us.tolist() == edges.t_us.tolist()
+
+    from mcap.reader import make_reader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    words, seqs = b"", []
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None
+            assert (schema.name, schema.encoding) == ("event_camera_msgs/msg/EventPacket", "ros2msg")
+            assert (channel.topic, channel.message_encoding) == ("/event_camera/events", "cdr")
+            if not seqs:
+                # What the file says its messages are, and not what we think.
+                text = schema.data.decode().split("=" * 80)[0]
+                store.register(get_types_from_msg(text, schema.name))
+            packet: Any = store.deserialize_cdr(message.data, schema.name)
+            stamp = packet.header.stamp
+            assert stamp.sec * 10**9 + stamp.nanosec == message.log_time
+            assert (packet.encoding, packet.width, packet.height) == ("evt3", 1280, 720)
+            words, seqs = words + packet.events.tobytes(), [*seqs, packet.seq]
+    assert seqs == list(range(len(seqs)))
+    assert len(seqs) >= 8
+    (tmp_path / "words.raw").write_bytes(b"% evt 3.0\n% geometry 1280x720\n% end\n" + words)
+    assert (read_events(tmp_path / "words.raw").t_us == told.t_us).all()
+
+    done = evlcp("convert", path, "-o", tmp_path / "back.raw", "--json")
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["counts"] == {"events": len(told), "triggers": 3}
+    assert (read_events(tmp_path / "back.raw").x == told.x).all()
+
+
+def test_a_command_that_converts_says_what_is_wrong(
+    demo_raw: Path, tmp_path: Path, evlcp: Callable[..., Any]
+) -> None:
+    done = evlcp("convert", demo_raw, "-o", tmp_path / "a.npz")
+    assert (done.code, done.out) == (0, f"{tmp_path / 'a.npz'}: 764,142 events, 0 triggers\n")
+    for arguments, code, told in (
+        ([demo_raw, "-o", tmp_path / "a.txt"], 1, "suffix '.txt', expected .raw, .mcap,"),
+        ([tmp_path / "a.npz", "-o", tmp_path / "a.raw"], 0, ""),
+        ([tmp_path / "a.npz", "-o", tmp_path / "a.raw", "--size", "9"], 2, "'9': expected WIDTHxHEIGHT"),
+        ([tmp_path / "none.raw", "-o", tmp_path / "a.raw"], 3, "none.raw: No such file"),
+    ):
+        done = evlcp("convert", *arguments)
+        assert (done.code, told in done.err) == (code, True), done.err
+    cut = tmp_path / "cut.csv"
+    cut.write_text("t_us,x,y,p\n1,2,3,1\n2,3,what,0\n")
+    done = evlcp("convert", cut, "--size", "1280x720", "-o", tmp_path / "cut.raw")
+    assert done.code == 3
+    assert "line 3" in done.err
+    assert (tmp_path / "cut.raw").exists()
+
+
 EVENTS = Events.of(np.arange(900) * 3, np.arange(900) % 640, np.arange(900) % 480, np.arange(900) % 2)
 
 
@@ -140,6 +215,30 @@ def test_hdf5_in_plain_layout(layout: str, tmp_path: Path) -> None:
         assert source.position_bytes == source.size_bytes
     for name in ("t_us", "x", "y", "p"):
         assert (getattr(got, name) == getattr(EVENTS, name)).all()
+
+
+@pytest.mark.parametrize("on_its_side", [False, True])
+@pytest.mark.parametrize("order", ["txyp", "xypt", "ptyx"])
+def test_hdf5_tables_without_names(order: str, on_its_side: bool, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    columns = {"t": EVENTS.t_us, "x": EVENTS.x, "y": EVENTS.y, "p": EVENTS.p}
+    table = np.stack([columns[name].astype(np.int64) for name in order], axis=0 if on_its_side else 1)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["events"] = table
+    with open_source(f"hdf5:{tmp_path / 'a.h5'}?columns={order}") as source:
+        got, _ = source.read()
+    for name in ("t_us", "x", "y", "p"):
+        assert (getattr(got, name) == getattr(EVENTS, name)).all()
+    with open_source(f"hdf5:{tmp_path / 'a.h5'}?columns={order}&swapped=1") as source:
+        got, _ = source.read()
+    assert (got.x == EVENTS.y).all()
+    assert (got.y == EVENTS.x).all()
+    for name, told in (
+        (str(tmp_path / "a.h5"), "without names: expected to be told what its columns are"),
+        (f"hdf5:{tmp_path / 'a.h5'}?columns=txy", "columns = 'txy': expected the letters t, x, y and p"),
+    ):
+        with pytest.raises(InputError, match=re.escape(told)):
+            open_source(name)
 
 
 def test_what_is_wrong_with_hdf5_is_said(tmp_path: Path) -> None:

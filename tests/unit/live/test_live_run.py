@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io import RawSource, ReplaySource
+from evlcp_sdk.io import RawSource, ReplaySource, write_events
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.live import Budget, LiveStatus, Outlet, PictureSlot, Subscription
 from evlcp_sdk.plugin.source import EventSource
@@ -77,6 +77,20 @@ def test_frames_of_several_links_name_theirs(demo_raw: Path) -> None:
     packets = list(receive(demo_raw, links))
     assert [key(f) for f in found["frame"]] == [key(f) for packet in packets for f in packet.frames]
     assert {frame.link for frame in found["frame"]} == {packet.link for packet in packets} == {"link-0"}
+
+
+def test_pulses_of_a_recording_say_what_utc_it_is(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+    """A clock 25 ppm too fast, with a stray edge; the falling edges are none."""
+    pulses = 200_000 + np.arange(4) * 1_000_025
+    t_us = np.sort(np.concatenate([pulses, pulses + 50_000, [1_700_000]]))
+    triggers = Triggers.of(t_us, np.zeros(9, int), ~np.isin(t_us, pulses + 50_000))
+    few = np.arange(100, 3_400_000, 500)
+    events = Events.of(few, np.full(len(few), 3), np.full(len(few), 4), np.arange(len(few)) % 2)
+    write_events(tmp_path / "pps.raw", events, 1280, 720, triggers)
+    given = ("--pps", "0", "--clock-zero", "2026-03-01T12:00:00Z", "--waiting-ms", "100000", "--json")
+    done = evlcp("live", f"replay:{tmp_path / 'pps.raw'}?speed=20", *given)
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["live"]["pps"] == {"pulses": 4, "pulses_rejected": 1, "rate_ppm": 25.0}
 
 
 class Burst(EventSource):

@@ -39,7 +39,18 @@ from evlcp_sdk.results.trail import cut
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.values import Alternative, Events, Fix, Frame, Packet, Range, Region, SoftSymbols
+from evlcp_sdk.utc import ClockZero, PulseClock
+from evlcp_sdk.values import (
+    Alternative,
+    Events,
+    Fix,
+    Frame,
+    Packet,
+    Range,
+    Region,
+    SoftSymbols,
+    Triggers,
+)
 
 LINK = load_link()
 ZERO = datetime(2026, 3, 1, 10, 15, tzinfo=UTC)
@@ -82,7 +93,7 @@ def write(
     plan: PositionPlan,
     sinks: Sequence[str] = (),
     attitude: Attitude = ATTITUDE,
-    zero: datetime | None = None,
+    zero: ClockZero = None,
     span_us: tuple[int, int] | None = None,
 ) -> dict[str, Any]:
     known = {"plan": plan, "attitude": attitude, "clock_zero": zero}
@@ -478,6 +489,54 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
         heading = math.degrees(math.atan2(forward[0], forward[1])) % 360
         assert abs((heading - float(row["heading_deg"]) + 180) % 360 - 180) < 1e-3
         assert pose.pose.position.z == pytest.approx(float(row["height_m"]) - 54, abs=2e-3)  # type: ignore[attr-defined]
+
+
+def test_navsat_is_read_back(tmp_path: Path) -> None:
+    """By `mcap` and the types of ROS 2 that `rosbags` brings."""
+    reader = pytest.importorskip("mcap.reader", reason="the extra ros is not installed")
+    typesys = pytest.importorskip("rosbags.typesys", reason="the extra ros is not installed")
+    write(tmp_path, packets(6), PositionPlan((SITE,)), ["navsat"], zero=ZERO)
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    with (tmp_path / "navsat.mcap").open("rb") as file:
+        source = reader.make_reader(file)
+        assert source.get_header().profile == "ros2"
+        told = [
+            (schema.name, channel.topic, message.log_time, store.deserialize_cdr(message.data, schema.name))
+            for schema, channel, message in source.iter_messages()
+        ]
+    fixes = rows(tmp_path / "fixes.csv")
+    sentences = [pynmea2.parse(line) for line in (tmp_path / "fixes.nmea").read_text().splitlines()]
+    places = [one for one in sentences if one.sentence_type == "GGA"]
+    assert {(name, topic) for name, topic, _, _ in told} == {("sensor_msgs/msg/NavSatFix", "/evlcp/fix")}
+    assert len(told) == len(fixes) > 2
+    for row, place, (_, _, at_ns, message) in zip(fixes, places, told, strict=True):
+        assert at_ns == int(ZERO.timestamp()) * 10**9 + round(float(row["t_us"]) * 1000)
+        assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == at_ns
+        assert message.status.status == 0
+        assert (message.latitude, message.longitude) == pytest.approx(
+            (place.latitude, place.longitude), abs=1e-7
+        )
+        assert message.altitude == pytest.approx(place.altitude + float(place.geo_sep), abs=0.1)
+        assert message.position_covariance_type == 3
+        assert message.position_covariance.reshape(3, 3).diagonal().min() > 0
+
+
+def test_times_by_pulses(tmp_path: Path) -> None:
+    """A second of UTC begins a tenth of a second after the camera's clock."""
+    pulses = PulseClock(near=ZERO)
+    t_us = [100_000 + round(k * 1_000_040) for k in range(3)]
+    pulses.add(Triggers.of(t_us, [0, 0, 0], [1, 1, 1]), 0.0, 0.0)
+    write(tmp_path, packets(6), PositionPlan((SITE,)), ["kml", "mcap", "navsat"], zero=pulses)
+    fixes = rows(tmp_path / "fixes.csv")
+    sentences = [pynmea2.parse(line) for line in (tmp_path / "fixes.nmea").read_text().splitlines()]
+    told = [datetime.combine(s.datestamp, s.timestamp) for s in sentences if s.sentence_type == "RMC"]
+    assert len(told) == len(fixes) > 2
+    called_us = [float(row["t_us"]) for row in fixes]
+    assert min(called_us) < t_us[0] < max(called_us) < t_us[1]
+    for at_us, at in zip(called_us, told, strict=True):
+        # The pulse began a second of UTC; before it, what is known beforehand holds.
+        after_s = (at_us - t_us[0] * (at_us >= t_us[0])) * 1e-6
+        assert (at.replace(tzinfo=UTC) - ZERO).total_seconds() == pytest.approx(after_s, abs=1.1e-3)
 
 
 def test_mcap_without_the_extra_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

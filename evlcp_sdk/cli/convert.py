@@ -1,0 +1,75 @@
+"""`evlcp convert`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from evlcp_sdk.cli._common import Json, bytes_bar, complain, echo
+from evlcp_sdk.spelling import counted
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("convert")(convert)
+
+
+def convert(
+    url: Annotated[
+        str, typer.Argument(metavar="SOURCE", help="A recording, a stream, a camera, or what a plugin opens.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Option("-o", "--out", metavar="OUT", help="By its suffix .raw, .mcap, .npz, .csv or .csv.gz."),
+    ],
+    size: Annotated[
+        str | None,
+        typer.Option(
+            "--size",
+            metavar="WIDTHxHEIGHT",
+            help="Of the sensor, where SOURCE does not say it.",
+        ),
+    ] = None,
+    format: Annotated[
+        str | None,
+        typer.Option("--format", metavar="NAME", help="EVT2, EVT3, BAG, NPZ or CSV, whatever the suffix."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write the events and triggers of any source into a recording of another format.
+
+    A bag of ROS 2:           [bold]evlcp convert REC.raw -o drive.mcap[/]
+
+    From one:                 [bold]evlcp convert bag:drive -o drive.raw[/]
+
+    From HDF5:                [bold]evlcp convert REC.hdf5 --size 1280x720 -o REC.raw[/]
+
+    A camera, until Ctrl-C:   [bold]evlcp convert camera: -o REC.raw[/]
+    """
+    import json
+
+    from evlcp_sdk.errors import InputError, UnpluggedError
+    from evlcp_sdk.io.urls import sides
+    from evlcp_sdk.run import convert as run_convert
+    from evlcp_sdk.run import stop_on_request
+
+    given = None
+    if size is not None:
+        try:
+            given = sides(size)
+        except ValueError as fault:
+            raise typer.BadParameter(f"{size!r}: expected {fault}", param_hint="--size") from fault
+    with stop_on_request() as stopped, bytes_bar(Path(url).name) as advance:
+        told = run_convert(url, out, size=given, format=format, advance=advance, stopped=stopped)
+    if as_json:
+        echo(json.dumps({"out": str(out)} | told))
+    else:
+        counts = told["counts"]
+        lost = [f"{one['count']} {one['meaning']}" for one in told["losses"].values()]
+        what = [counted(counts["events"], "event"), counted(counts["triggers"], "trigger"), *lost]
+        echo(f"{out}: {', '.join(what)}")
+    if told["error"] is not None:
+        complain(told["error"])
+        raise typer.Exit((UnpluggedError if told["unplugged"] else InputError).exit_code)

@@ -1,0 +1,144 @@
+"""Bags of ROS 2, written without ROS: one MCAP file, its messages packed by `rosbags`."""
+
+import importlib
+from pathlib import Path
+from typing import IO, Any, Final
+
+import numpy as np
+
+from evlcp_sdk.errors import ConfigError, StreamError
+from evlcp_sdk.files import Outputs
+from evlcp_sdk.io._codec import MAX_SIDE
+from evlcp_sdk.io.evt3 import EVT3
+from evlcp_sdk.io.raw import RawEncoder, RawWriter
+from evlcp_sdk.io.writers import EventWriter
+from evlcp_sdk.values import Events, Triggers
+
+__all__ = ["EVENT_PACKET", "EventBagWriter", "RosBag"]
+
+EVENT_PACKET: Final = "event_camera_msgs/msg/EventPacket"
+
+_DEFINITIONS: Final = {
+    EVENT_PACKET: "std_msgs/Header header\nuint32 height\nuint32 width\nuint64 seq\nuint64 time_base\n"
+    "string encoding\nbool is_bigendian\nuint8[] events\n"
+}
+"""Of the types that are not ROS 2's own."""
+
+_PACKET_US: Final = 10_000
+"""How much time a packet of events has at the most."""
+
+
+class RosBag:
+    """Messages of ROS 2 written into one MCAP file, as `ros2 bag play` reads it.
+
+    Args:
+        file: Where it goes; not closed.
+
+    Raises:
+        ConfigError: `mcap` or `rosbags` is not installed.
+    """
+
+    def __init__(self, file: IO[bytes]) -> None:
+        try:
+            writer, typesys = (importlib.import_module(name) for name in ("mcap.writer", "rosbags.typesys"))
+        except ImportError as fault:
+            raise ConfigError("a bag of ROS 2 needs the extra: pip install 'evlcp-sdk[ros]'") from fault
+        self._store: Any = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        for kind, text in _DEFINITIONS.items():
+            self._store.register(typesys.get_types_from_msg(text, kind))
+        self._writer: Any = writer.Writer(file)
+        self._writer.start(profile="ros2", library="evlcp-sdk")
+        self._channels: dict[str, int] = {}
+
+    def make(self, kind: str, **values: Any) -> Any:
+        """A message, or a part of one, of a type."""
+        return self._store.types[kind](**values)
+
+    def header(self, at_ns: int, frame_id: str) -> Any:
+        """The header of a message."""
+        stamp = self.make("builtin_interfaces/msg/Time", sec=at_ns // 10**9, nanosec=at_ns % 10**9)
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+
+    def write(self, topic: str, message: Any, at_ns: int) -> None:
+        """Write a message; the topic is of its type from the first one on."""
+        kind = message.__msgtype__
+        if topic not in self._channels:
+            text, _ = self._store.generate_msgdef(kind, ros_version=2)
+            schema = self._writer.register_schema(kind, "ros2msg", text.encode())
+            self._channels[topic] = self._writer.register_channel(
+                topic, "cdr", schema, {"offered_qos_profiles": ""}
+            )
+        data = bytes(self._store.serialize_cdr(message, kind))
+        self._writer.add_message(self._channels[topic], log_time=at_ns, data=data, publish_time=at_ns)
+
+    def finish(self) -> None:
+        """Write the file's index."""
+        self._writer.finish()
+
+
+class EventBagWriter(EventWriter):
+    """A bag of `event_camera_msgs/EventPacket`, EVT3 inside, being written: a message each 10 ms.
+
+    Messages are stamped by the camera's clock. What is read back is what was written.
+
+    Args:
+        path: The file.
+        width: Columns of the sensor.
+        height: Rows of the sensor.
+        outputs: See `EventWriter`.
+
+    Raises:
+        ConfigError: `mcap` or `rosbags` is not installed.
+        OutputError: The file cannot be written.
+        StreamError: The sensor is larger than the words can address.
+    """
+
+    times_us = RawWriter.times_us
+    channels = EVT3.channels
+    topic = "/event_camera/events"
+
+    def __init__(self, path: Path | str, width: int, height: int, outputs: Outputs | None = None) -> None:
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+            raise StreamError(f"{path}: sensor of {width}x{height}, expected 1 to {MAX_SIDE} each")
+        super().__init__(path, width, height, outputs)
+        self._size = width, height
+        self._encoder = RawEncoder(EVT3, width)
+        self._seq = 0
+        try:
+            self._bag = RosBag(self._file)
+        except ConfigError as fault:
+            self.discard()
+            raise ConfigError(f"{path}: {fault}") from fault
+
+    def _write(self, events: Events, triggers: Triggers) -> None:
+        turns = [np.unique(column // _PACKET_US) for column in (events.t_us, triggers.t_us)]
+        ends_us = (np.union1d(*turns) + 1) * _PACKET_US
+        i = j = 0
+        for end_us, n, m in zip(
+            ends_us.tolist(),
+            np.searchsorted(events.t_us, ends_us).tolist(),
+            np.searchsorted(triggers.t_us, ends_us).tolist(),
+            strict=True,
+        ):
+            self._packet(events[i:n], triggers[j:m], end_us)
+            i, j = n, m
+
+    def _packet(self, events: Events, triggers: Triggers, end_us: int) -> None:
+        words = b"".join(self._encoder.encode(events, triggers))
+        width, height = self._size
+        message = self._bag.make(
+            EVENT_PACKET,
+            header=self._bag.header(end_us * 1000, "camera"),
+            height=height,
+            width=width,
+            seq=self._seq,
+            time_base=0,
+            encoding="evt3",
+            is_bigendian=False,
+            events=np.frombuffer(words, np.uint8),
+        )
+        self._bag.write(self.topic, message, end_us * 1000)
+        self._seq += 1
+
+    def _finish(self) -> None:
+        self._bag.finish()
