@@ -616,6 +616,11 @@ def tested(
             one = shared[k, i]
             for j in range(i, rank):
                 left[i, j] -= one * follow[k, j]
+    for i in range(rank):
+        for j in range(i):
+            left[i, j] = left[j, i]
+    if _above(left, least):
+        return _redundant(left, basis, follow, side, bound)
     eigen(left, share, turn)
     turned, moved, along = np.zeros((m, rank)), np.zeros((3, rank)), np.zeros(rank)
     for k in range(rank):
@@ -661,6 +666,71 @@ def tested(
                 added[i, j] += moves[i, k] * moved[j, k]
                 unseen[i, j] += moves[i, k] * share[k] * moves[j, k]
     return value, freedom, added, unseen
+
+
+@njit(cache=True, nogil=True)
+def _above(matrix: Array, least: float) -> bool:
+    """Whether all eigenvalues are above `least`: what is left without it has a root."""
+    n = len(matrix)
+    low = np.zeros((n, n))
+    for i in range(n):
+        for j in range(i + 1):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= low[i, k] * low[j, k]
+            if i == j:
+                value -= least
+                if not value > 0:
+                    return False
+                low[i, i] = math.sqrt(value)
+            else:
+                low[i, j] = value / low[j, j]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _redundant(
+    left: Array, basis: Array, follow: Array, side: Array, bound: Array
+) -> tuple[float, int, Array, Array]:
+    """`tested` where each direction is redundant enough, `left` (rank, rank): by inverses, without axes."""
+    m, rank = len(side), len(left)
+    added, unseen = np.zeros((3, 3)), np.zeros((3, 3))
+    inverse, along = np.zeros((rank, rank)), np.zeros(rank)
+    inverted(left, inverse)
+    value = 0.0
+    for i in range(rank):
+        for k in range(m):
+            along[i] += basis[k, i] * side[k]
+        for j in range(i):
+            value += 2 * along[i] * inverse[i, j] * along[j]
+        value += along[i] ** 2 * inverse[i, i]
+    if bound.any():
+        known, half = left.copy(), np.zeros((m, rank))
+        for k in range(m):
+            for p in range(m):
+                one = bound[k, p]
+                for j in range(rank):
+                    half[k, j] += one * basis[p, j]
+        for k in range(m):
+            for i in range(rank):
+                for j in range(rank):
+                    known[i, j] += basis[k, i] * half[k, j]
+        if not inverted(known, inverse):
+            return 0.0, 0, added + math.inf, unseen + math.inf
+    moves, spare = np.zeros((3, rank)), np.zeros((3, rank))
+    for i in range(3):
+        for k in range(rank):
+            for j in range(rank):
+                moves[i, j] += follow[i, k] * inverse[k, j]
+        for k in range(rank):
+            for j in range(rank):
+                spare[i, j] += moves[i, k] * left[k, j]
+    for i in range(3):
+        for j in range(3):
+            for k in range(rank):
+                added[i, j] += moves[i, k] * follow[j, k]
+                unseen[i, j] += spare[i, k] * moves[j, k]
+    return value, rank, added, unseen
 
 
 @njit(cache=True, nogil=True)
@@ -1053,15 +1123,24 @@ def flatness(points: Array, bar: Array, bars: int) -> float:
 
 @njit(cache=True, nogil=True)
 def gathered(
-    enu_m: Array, points_px: Array, sigma_px: Array, seen: Array, pixel_sigma: float, number: int,
-    points: Array, bar: Array,
-) -> None:  # fmt: skip
-    """A bar's clusters that are `seen` (K,) as rows of a `Problem`: `points` (n, 10) and `bar` (n,)."""
+    enu_m: Array, points_px: Array, sigma_px: Array, width: int, height: int, usual: Array, least: int,
+    number: int, at: int, points: Array, bar: Array, sigma: Array,
+) -> int:  # fmt: skip
+    """A bar's whole clusters as rows of a `Problem`, where they are `least` or more; how many they are.
+
+    From row `at`, `points` (n, 10) and `bar` (n,). `usual` (4,) are the sigma of a point that its pixel
+    leaves, px, of the image's shift, px, the same as a share of its length, and by how much a bar looks too
+    long, a share; `sigma` (4,) as of `shared`.
+    """
     count = len(enu_m)
+    seen = np.zeros(count, np.bool_)
+    many = whole(points_px, sigma_px, width, height, seen)
+    if many < least:
+        return many
+    shared(points_px, seen, usual, sigma)
     x = y = z = 0.0
     for i in range(count):
         x, y, z = x + enu_m[i, 0] / count, y + enu_m[i, 1] / count, z + enu_m[i, 2] / count
-    at = 0
     for i in range(count):
         if seen[i]:
             points[at, 0], points[at, 1], points[at, 2] = enu_m[i, 0], enu_m[i, 1], enu_m[i, 2]
@@ -1069,9 +1148,27 @@ def gathered(
             points[at, 3], points[at, 4], points[at, 5] = enu_m[i, 0] - x, enu_m[i, 1] - y, enu_m[i, 2] - z
             points[at, 6], points[at, 7] = points_px[i, 0], points_px[i, 1]
             points[at, 8] = 1 / sigma_px[i]
-            points[at, 9] = min((pixel_sigma / sigma_px[i]) ** 2, 1.0)
+            points[at, 9] = min((usual[0] / sigma_px[i]) ** 2, 1.0)
             bar[at] = number
             at += 1
+    return many
+
+
+@njit(cache=True, nogil=True)
+def shared(points_px: Array, seen: Array, usual: Array, sigma: Array) -> None:
+    """What a bar's points share, by those `seen` (K,): `sigma` (4,), of the image's shift, px, to length.
+
+    The last three are its survey's, and by how much it looks too long is added to the length's.
+    """
+    first = last = -1
+    for i in range(len(seen)):
+        if seen[i]:
+            first = i if first < 0 else first
+            last = i
+    dx, dy = points_px[last, 0] - points_px[first, 0], points_px[last, 1] - points_px[first, 1]
+    length_px = math.hypot(dx, dy) * len(seen) / (last - first)
+    sigma[0] = math.hypot(usual[1], usual[2] * length_px)
+    sigma[3] = math.hypot(sigma[3], usual[3])
 
 
 @njit(cache=True, nogil=True)

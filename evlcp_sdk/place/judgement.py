@@ -107,12 +107,13 @@ class Judged:
 def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
     """The pose with its covariance and tests, or why it cannot be trusted."""
     spec = problem.spec
-    names = _parts(problem)
+    turns = bool(problem.free[3:6].any())
+    names = _parts(problem.transmitters, problem.angles if turns else 0)
     limits = _limits(spec.false_alarm / 2 / len(names))
     found: tuple[Any, ...] = _kernels.weighed(  # type: ignore[call-arg]
         *data(problem),
         problem.free,
-        _said(problem),
+        problem.said,
         fit.position,
         fit.rotation,
         fit.local,
@@ -195,25 +196,17 @@ def misfits(problem: Problem, fit: Fit) -> bool:
     return fit.cost > chi_square(problem.spec.false_alarm / 2, problem.freedom)
 
 
-def _parts(problem: Problem) -> list[str]:
-    """What may be at fault, in the order of `_kernels.weighed`."""
-    names = [*(f"bar {number}" for number in problem.transmitters), FOCAL]
-    if problem.angles and problem.free[3:6].any():
-        names += ["attitude", "heading"][: problem.angles - 1]
-    return names
+@lru_cache(maxsize=256)
+def _parts(transmitters: tuple[int, ...], angles: int) -> tuple[str, ...]:
+    """What may be at fault, in the order of `_kernels.weighed`; `angles` that are known, and free."""
+    names = *(f"bar {number}" for number in transmitters), FOCAL
+    return (*names, *("attitude", "heading")[: angles - 1]) if angles else names
 
 
 @lru_cache(maxsize=256)
 def _limits(chance: float) -> Floats:
     """What a test exceeds by this chance, by its degrees of freedom, float64 (7,)."""
     return np.array([0.0, *(chi_square(chance, freedom) for freedom in range(1, 7))])
-
-
-def _said(problem: Problem) -> Floats:
-    """What moves the angles as they are said, whitened, by its sigmas, float64 (3, 4)."""
-    if problem.attitude is None:
-        return np.zeros((3, 4))
-    return np.asarray(problem.white @ problem.attitude.standing())
 
 
 def _standing(

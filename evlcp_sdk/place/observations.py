@@ -89,10 +89,13 @@ class Problem:
         transmitters: Number of each bar.
         lens: Focal length, px, principal point, px, k1, k2, p1, p2, k3, float64 (8,).
         lens_root: A lower root of the covariance of the first seven, float64 (7, 7).
-        felt: Up in the camera's axes by the attitude, float64 (3,).
+        level: The camera's axes as columns in ENU by the attitude, north where no heading is known, float64
+            (3, 3).
+        felt: Up in the camera's axes by that, float64 (3,).
         heading_rad: By the attitude; 0 where it is not known.
         angles: How many of pitch, roll and heading are known: 0, 2 or 3.
         white: What whitens the errors of these, float64 (3, 3).
+        said: What moves these as they are said, whitened, by its sigmas, float64 (3, 4).
         free: Which unknowns of the fit there are, bool (14,): see `_kernels`.
     """
 
@@ -105,10 +108,12 @@ class Problem:
     transmitters: tuple[int, ...]
     lens: Floats
     lens_root: Floats
+    level: Floats
     felt: Floats
     heading_rad: float
     angles: int
     white: Floats
+    said: Floats
     free: NDArray[np.bool_]
 
     @classmethod
@@ -121,42 +126,45 @@ class Problem:
         sigma: CameraSigma,
     ) -> "Problem | Refusal":
         """What the views give, or why that is too little for a position."""
-        kept, most = [], 0
+        count = sum([len(view.sigma_px) for view in views])
+        points, bar, bar_sigma = np.empty((count, 10)), np.empty(count, np.int64), np.empty((len(views), 4))
+        usual, width, height = _usual(spec), camera.width, camera.height
+        kept: list[int] = []
+        at = most = 0
         for view in views:
-            seen = np.zeros(len(view.sigma_px), np.bool_)
-            number = _kernels.whole(view.points_px, view.sigma_px, camera.width, camera.height, seen)
+            own = bar_sigma[len(kept)]
+            own[1:] = view.survey
+            number = _kernels.gathered(
+                view.enu_m, view.points_px, view.sigma_px, width, height, usual, spec.min_points, len(kept),
+                at, points, bar, own,
+            )  # fmt: skip
             most = max(most, number)
             if number >= spec.min_points:
-                kept.append((view, seen, number))
+                kept.append(view.transmitter)
+                at += number
         if not kept:
             return Refusal(
                 "too-few-clusters", f"{most} whole clusters of a bar seen, {spec.min_points} needed"
             )
-        points = np.empty((sum(number for *_, number in kept), 10))
-        bar = np.empty(len(points), np.int64)
-        at = 0
-        for i, (view, seen, number) in enumerate(kept):
-            rows = slice(at, at + number)
-            given = view.enu_m, view.points_px, view.sigma_px, seen, spec.pixel_sigma_px
-            _kernels.gathered(*given, i, points[rows], bar[rows])
-            at = rows.stop
+        points, bar = points[:at], bar[:at]
         told = _told(attitude, points, bar, len(kept))
         if isinstance(told, Refusal):
             return told
+        known = sigma.known
         free = np.empty(14, np.bool_)
-        free[3:6], free[:3], free[6], free[7:] = told.pop("turns"), True, False, sigma.known
+        free[3:6], free[:3], free[6], free[7:] = told.pop("turns"), True, False, known
         return cls(
             camera=camera,
             attitude=attitude,
             spec=spec,
             points=points,
             bar=bar,
-            bar_sigma=np.array([shared_sigmas(view, seen, spec) for view, seen, _ in kept]),
-            transmitters=tuple(view.transmitter for view, *_ in kept),
+            bar_sigma=bar_sigma[: len(kept)],
+            transmitters=tuple(kept),
             lens=np.array(
                 [camera.focal_px, *camera.centre_px, camera.k1, camera.k2, camera.p1, camera.p2, camera.k3]
             ),
-            lens_root=sigma.root(camera) if sigma.known else np.zeros((7, 7)),
+            lens_root=sigma.root(camera) if known else np.zeros((7, 7)),
             free=free,
             **told,
         )
@@ -220,36 +228,52 @@ def _told(attitude: Attitude | None, points: Floats, bar: NDArray[np.int64], bar
         if bars < 3 or _kernels.flatness(points, bar, bars) < _INLINE:
             many = "two bars give" if bars == 2 else "bars in line give"
             return Refusal("gravity-unknown", f"{many} a position only with gravity known")
-        nothing = {"felt": np.zeros(3), "heading_rad": 0.0, "angles": 0, "white": np.eye(3)}
-        return {**nothing, "turns": True}
+        return {
+            "level": np.eye(3),
+            "felt": np.zeros(3),
+            "heading_rad": 0.0,
+            "angles": 0,
+            "white": np.eye(3),
+            "said": np.zeros((3, 4)),
+            "turns": True,
+        }
     turns = (True, True, True)
     if attitude.gravity_sigma_deg == attitude.white_sigma_deg == attitude.time_sigma_us == 0:
         turns = (False, False, not compass or attitude.heading_sigma_deg > 0)
     angles = 3 if compass else 2
+    level = attitude.rotation()
+    causes = attitude.standing()
+    white = _whitening(attitude, causes, angles)
     return {
-        "felt": attitude.rotation()[2].copy(),
+        "level": level,
+        "felt": level[2],
         "heading_rad": math.radians(attitude.heading_deg or 0.0),
         "angles": angles,
-        "white": _whitening(attitude, angles),
+        "white": white,
+        "said": white @ causes,
         "turns": turns,
     }
 
 
 def shared_sigmas(view: BarView, seen: NDArray[np.bool_], spec: PositionSpec) -> tuple[float, ...]:
     """Of a bar: its image's shift, px; its place, m, turn, radians, and length, a share."""
-    first, last = int(seen.argmax()), len(seen) - 1 - int(seen[::-1].argmax())
-    (x, y), (x_end, y_end) = view.points_px[first].tolist(), view.points_px[last].tolist()
-    length_px = math.hypot(x_end - x, y_end - y) * len(seen) / (last - first)
-    place, turn, length = view.survey
-    shift = math.hypot(spec.shared_sigma_px, spec.shared_share * length_px)
-    return shift, place, turn, math.hypot(length, spec.stretch_share)
+    found = np.array([0.0, *view.survey])
+    _kernels.shared(view.points_px, seen, _usual(spec), found)
+    return tuple(found.tolist())
 
 
-def _whitening(attitude: Attitude, angles: int) -> Floats:
-    """What makes errors of pitch, roll and heading independent and of sigma 1, float64 (3, 3)."""
+def _usual(spec: PositionSpec) -> Floats:
+    """What kernels take of it, float64 (4,): see `_kernels.gathered`."""
+    return np.array(
+        [spec.pixel_sigma_px, spec.shared_sigma_px, spec.shared_share, spec.stretch_share], np.float64
+    )
+
+
+def _whitening(attitude: Attitude, causes: Floats, angles: int) -> Floats:
+    """What makes errors of pitch, roll and heading, `causes` (3, 4), independent and of sigma 1: (3, 3)."""
     white = np.zeros((3, 3))
     least = math.radians(attitude.white_sigma_deg) ** 2 + EXACT_RAD**2
-    _kernels.whitening(attitude.standing(), least, white)
+    _kernels.whitening(causes, least, white)
     if angles < 3:
         white[2] = (0.0, 0.0, 1.0)
     return white

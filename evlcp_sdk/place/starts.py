@@ -112,7 +112,7 @@ def _closed_form_starts(problem: Problem) -> list[tuple[Floats, Floats]]:
     enu, mean = np.empty((2 * bars, 3)), np.empty((2 * bars, 3))
     count = _kernels.halves(problem.points, problem.bar, seen, enu, mean)
     enu, mean = enu[:count], mean[:count]
-    known = problem.attitude.rotation()
+    known = problem.level
     if problem.angles == 3:
         costs = np.empty(1)
         _kernels.nearest_to_sights(enu, mean, known[None], positions, costs)

@@ -74,10 +74,9 @@ class Attitude:
         """Camera axes (x right, y down, z forward) as columns in ENU, float64 (3, 3); north if unknown."""
         h, p, r = (math.radians(v) for v in (self.heading_deg or 0.0, self.pitch_deg, self.roll_deg))
         (sh, ch), (sp, cp), (sr, cr) = ((math.sin(v), math.cos(v)) for v in (h, p, r))
-        level, down, forward = (ch, -sh, 0.0), (sp * sh, sp * ch, -cp), (cp * sh, cp * ch, sp)
-        return np.array(
-            [[a * cr + b * sr, b * cr - a * sr, c] for a, b, c in zip(level, down, forward, strict=True)]
-        )
+        # Each a row to the right and one down, not rolled, and one ahead.
+        rows = (ch, sp * sh, cp * sh), (-sh, sp * ch, cp * ch), (0.0, -cp, sp)
+        return np.array([(a * cr + b * sr, b * cr - a * sr, c) for a, b, c in rows])
 
     @classmethod
     def of_rotation(cls, rotation: NDArray[np.float64]) -> "Attitude":

@@ -337,8 +337,16 @@ def test_clusters_that_count_and_their_rows() -> None:
     seen = np.zeros(8, np.bool_)
     assert _kernels.whole(points, sigma, 1280, 720, seen) == 3
     assert seen.nonzero()[0].tolist() == [1, 2, 7]
-    out, bar = np.zeros((3, 10)), np.zeros(3, np.int64)
-    _kernels.gathered(enu, points, sigma, seen, 0.05, 4, out, bar)
+    out, bar = np.zeros((5, 10)), np.zeros(5, np.int64)
+    own, usual = np.array([0.0, 0.3, 0.2, 0.03]), np.array([0.05, 0.06, 0.001, 0.04])
+    given = (enu, points, sigma, 1280, 720, usual)
+    assert _kernels.gathered(*given, 4, 4, 1, out, bar, own.copy()) == 3
+    assert not out.any()
+    assert _kernels.gathered(*given, 3, 4, 1, out, bar, own) == 3
+    # Six of eight clusters, 12 px apart.
+    np.testing.assert_allclose(own, [math.hypot(0.06, 0.001 * 72 * 8 / 6), 0.3, 0.2, 0.05])
+    assert not out[[0, 4]].any()
+    out, bar = out[1:4], bar[1:4]
     arm, sharp = enu - enu.mean(0), 1 / sigma[seen]
     want = np.column_stack([enu[seen], arm[seen], points[seen], sharp, np.minimum((0.05 * sharp) ** 2, 1)])
     np.testing.assert_allclose(out, want)
