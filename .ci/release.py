@@ -1,6 +1,7 @@
 """Is this ready for release? `make release`: builds sdist and wheel, tries the wheel on each Python found.
 
-The wheel built from the sdist holds what the wheel of the checkout does, byte by byte. It is installed
+It holds kernels compiled for this Python and processors of level x86-64-v3. The wheel built from the sdist
+holds what the wheel of the checkout does, byte by byte. It is installed
 into a clean environment of each Python from 3.11 to 3.13 that is found (or of those named, e.g. 3.12), its
 dependencies by pip; there
 `evlcp --version`, `evlcp plugins` and `evlcp demo --recording` must work. What was built stays in dist/.
@@ -29,21 +30,22 @@ def contents(wheel: Path) -> dict[str, str]:
         }
 
 
-def run(*command: str | Path, cwd: Path) -> str:
-    """What a command prints; it must succeed."""
+def run(*command: str | Path, cwd: Path, **more: str) -> str:
+    """What a command prints, with more variables in its environment; it must succeed."""
     clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
     done = subprocess.run(
-        command, cwd=cwd, env=clean | {"NO_COLOR": "1"}, capture_output=True, text=True, check=False
+        command, cwd=cwd, env=clean | {"NO_COLOR": "1"} | more, capture_output=True, text=True, check=False
     )
     if done.returncode:
         sys.exit(f"{' '.join(map(str, command))}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
     return done.stdout
 
 
-def built(out: Path) -> tuple[Path, Path]:
-    """The sdist and the wheel of the checkout, whose wheel from the sdist is the same."""
+def built(out: Path, kernels: Path | None = None) -> tuple[Path, Path]:
+    """The sdist and the wheel of the checkout, kernels and all; the wheel from the sdist is the same."""
+    more = {"EVLCP_KERNELS": str(kernels)} if kernels else {}
     for target in ("sdist", "wheel"):
-        run(sys.executable, "-m", "hatchling", "build", "-t", target, "-d", out, cwd=ROOT)
+        run(sys.executable, "-m", "hatchling", "build", "-t", target, "-d", out, cwd=ROOT, **more)
     (sdist,), (wheel,) = out.glob("*.tar.gz"), out.glob("*.whl")
     with tempfile.TemporaryDirectory() as folder:
         shutil.unpack_archive(sdist, folder, filter="data")
@@ -58,6 +60,7 @@ def built(out: Path) -> tuple[Path, Path]:
             "-d",
             Path(folder) / "again",
             cwd=unpacked,
+            **more,
         )
         (again,) = (Path(folder) / "again").glob("*.whl")
         ours, theirs = contents(wheel), contents(again)
@@ -95,7 +98,8 @@ def main() -> None:
     out = ROOT / "dist"
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir()
-    for path in built(out):
+    sys.stdout.write(run(sys.executable, ROOT / ".ci" / "kernels.py", cwd=ROOT))
+    for path in built(out, ROOT / "build" / "kernels"):
         sys.stdout.write(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB\n")
     (wheel,) = out.glob("*.whl")
     for minor in [int(name.removeprefix("3.")) for name in sys.argv[1:]] or MINORS:

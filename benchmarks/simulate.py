@@ -3,15 +3,17 @@
     python benchmarks/simulate.py [--seconds 0.25] [--rounds 3] [--memory 60]
 
 Whole scenes, kernels warm, one thread, processor time, the best of the rounds: a bar at 30, 50 and 90 m,
-rendered to sorted events. Then the same pixels' worth of work three ways, in events a second: the closed
-form; a compiled loop that steps one pixel through the same light by 1 us and by 10 ns (what it takes to be
-as exact); and whole frames in NumPy, all pixels of the sensor, 1 us a step. `--memory` renders a drive of
-so many seconds and prints the peak of the resident memory.
+rendered to sorted events; beside it how much longer one thread takes than two, by the clock, the median of
+rounds in turn, for which nothing else may run. Then the same pixels' worth of work three ways, in events a
+second: the closed form; a compiled loop that steps one pixel through the same light by 1 us and by 10 ns
+(what it takes to be as exact); and whole frames in NumPy, all pixels of the sensor, 1 us a step. `--memory`
+renders a drive of so many seconds and prints the peak of the resident memory.
 """
 
 import argparse
 import math
 import resource
+import statistics
 import time
 from collections.abc import Callable
 
@@ -32,12 +34,21 @@ def best(work: Callable[[], int], rounds: int) -> float:
     return max(rates)
 
 
-def scene_rate(distance_m: float, seconds: float, rounds: int) -> float:
+def scene_rate(distance_m: float, seconds: float, rounds: int) -> tuple[float, float]:
+    """Events a second of processor time in millions, and the time of one thread in times of two's."""
     scene = load_scene(
         "drive-30kmh",
         {"motion.distance_m": distance_m, "duration_s": seconds, "background.light_w_m2": 0.05},
     )
-    return best(lambda: sum(map(len, Simulation(scene).stream())), rounds)
+
+    def took(threads: int) -> float:
+        began = time.perf_counter()
+        for _ in Simulation(scene, threads=threads).stream():
+            pass
+        return time.perf_counter() - began
+
+    ratio = statistics.median(took(1) / took(2) for _ in range(rounds))
+    return best(lambda: sum(map(len, Simulation(scene).stream())), rounds), ratio
 
 
 @njit
@@ -89,8 +100,12 @@ def main() -> None:
     for _ in Simulation(load_scene("drive-30kmh", ["duration_s=0.004"])).stream():
         pass
     for distance_m in (30.0, 50.0, 90.0):
-        rate = scene_rate(distance_m, args.seconds, args.rounds)
-        print(f"scene at {distance_m:.0f} m, one core       {rate:8.2f} Mev/s", flush=True)
+        rate, ratio = scene_rate(distance_m, args.seconds, args.rounds)
+        print(
+            f"scene at {distance_m:.0f} m, one core       {rate:8.2f} Mev/s, two threads {ratio:.2f} times"
+            " as quick",
+            flush=True,
+        )
 
     spec = SensorSpec(noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0)
     sensor, table = sensor_vector(spec), quantile_table()

@@ -29,6 +29,10 @@ LIGHT_STEP = 1e-3
 COLUMN_BITS = 12
 """A request's code is (row << COLUMN_BITS | column) << 1 | polarity."""
 
+_PLACES = np.empty(64, np.int64)
+"""Place of the only bit of a word, by the upper bits of its product with a de Bruijn sequence."""
+_PLACES[[(0x03F79D71B4CB0A89 << k & (1 << 64) - 1) >> 58 for k in range(64)]] = np.arange(64)
+
 NOISE_LIMIT = 4.0
 """Where the normal distribution of every draw is cut off, standard deviations."""
 
@@ -41,11 +45,16 @@ def _mix(z: Any) -> Any:
     return z ^ (z >> np.uint64(31))
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _key_of(seed: Any, pixel: int) -> Any:
+    """Key of a pixel's random numbers."""
+    return _mix(seed + np.uint64(pixel) * np.uint64(0x9E3779B97F4A7C15))
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def hash_uniform(seed: Any, pixel: int, draw: int, purpose: int) -> float:
     """Uniform number in [0, 1) of one (seed, pixel, draw, purpose)."""
-    z = _mix(seed + np.uint64(pixel) * np.uint64(0x9E3779B97F4A7C15))
-    z = _mix(z + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03) + np.uint64(purpose))
+    z = _mix(_key_of(seed, pixel) + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03) + np.uint64(purpose))
     return float(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
@@ -54,7 +63,9 @@ def _table_at(table: Array, share: float) -> float:
     """Linear interpolation in a table of quantiles, `share` in [0, 1)."""
     z = share * (table.size - 1)
     i = int(z)
-    return float(table[i] + (z - i) * (table[i + 1] - table[i]))
+    # An index without a sign is not looked at for being negative.
+    k = np.uint64(i)
+    return float(table[k] + (z - i) * (table[k + np.uint64(1)] - table[k]))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -67,87 +78,6 @@ def hash_normal(seed: Any, pixel: int, draw: int, purpose: int, quantiles: Array
 def _receptor(u_base: float, rest: float, ages: float) -> float:
     """Receptor after so many time constants; at rest after 60, when nothing of the difference is left."""
     return rest if ages > 60.0 else rest + (u_base - rest) * math.exp(-ages)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _run_piece(
-    until: float,
-    light: float,
-    u_base: float,
-    t_base: float,
-    reference: float,
-    t_ready: float,
-    t_last_out: float,
-    armed: int,
-    draw: int,
-    on_factor: float,
-    off_factor: float,
-    code: int,
-    key: Any,
-    quantiles: Array,
-    shifts: Array,
-    sensor: Array,
-    out_t: Array,
-    out_code: Array,
-    out_cross: Array,
-    n: int,
-) -> tuple[float, float, float, float, int, int, int]:
-    """Let one pixel see constant light from `t_base` to `until`; write its events.
-
-    With u = exp(-y) the receptor is u(t) = 1/I + (u0 - 1/I) exp(-I t / Q), which is monotonic; so a threshold
-    is crossed in the piece when u at its end lies beyond, and the time follows from one logarithm. `shifts`
-    are the quantiles of the factor by which noise moves both thresholds. One word of random bits a draw, from
-    the pixel's `key`: the upper half decides on the noise, the lower on whether the event goes missing.
-    """
-    charge, refractory = sensor[0], sensor[1]
-    delay_on, delay_off, jitter = sensor[2], sensor[3], sensor[4]
-    miss_on, miss_off = sensor[5], sensor[6]
-    rest = 1.0 / light
-    rate = light / charge
-    u_end = _receptor(u_base, rest, rate * (until - t_base))
-    widest_on = on_factor * sensor[8]
-    widest_off = off_factor / sensor[8]
-    while True:
-        if armed == 0:
-            if t_ready >= until:
-                break
-            # An event's delay may outlast a piece, never the order of pieces: t_ready is not before t_base.
-            reference = _receptor(u_base, rest, rate * (t_ready - t_base))
-            armed = 1
-            draw += 1
-        if u_end > reference * widest_on and u_end < reference * widest_off:
-            break
-        word = _mix(key + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03))
-        shift = _table_at(shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10)
-        low = reference * on_factor * shift
-        high = reference * off_factor * shift
-        t = max(t_base, t_ready)
-        if u_end <= low:
-            on = 1
-            if u_base > low:
-                t = max(t, t_base + math.log((u_base - rest) / (low - rest)) / rate)
-        elif u_end >= high:
-            on = 0
-            if u_base < high:
-                t = max(t, t_base + math.log((rest - u_base) / (rest - high)) / rate)
-        else:
-            break
-        t = min(t, until)
-        armed = 0
-        t_ready = t + refractory
-        late = delay_on if on else delay_off
-        if jitter > 0.0:
-            late = max(0.0, late + jitter * hash_normal(key, 0, draw, 2, quantiles))
-        request = max(t + late, t_last_out + refractory)
-        t_last_out = request
-        if float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10 < (miss_on if on else miss_off):
-            continue
-        out_t[n] = request
-        out_code[n] = code + on
-        if out_cross.size:
-            out_cross[n] = t
-        n += 1
-    return u_end, reference, t_ready, t_last_out, armed, draw, n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -181,7 +111,7 @@ def _run_piece_followed(
     out_cross: Array,
     n: int,
 ) -> tuple[float, float, float, float, float, int, int, int]:
-    """Do as `_run_piece`, with a low-pass filter of the log signal between receptor and comparator.
+    """Do as `_run_pieces` in one piece, with a low-pass filter between receptor and comparator.
 
     The receptor is exact; between its values, as near to one another as they must be for a ramp to hit the
     middle between them to 0.002, the filter is solved for ramps. `reference` and `z` are log signals.
@@ -272,12 +202,183 @@ def _run_piece_followed(
     return u_end, z, reference, t_ready, t_last_out, armed, draw, n
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _decay(ages: Array, bits: Array, out: Array, n: int) -> None:
+    """Write exp(-age) for the first `n` ages, 0 beyond 60, so that the loop is one of vector instructions.
+
+    `bits` is an int64 view of `out`. Accurate to some units of the last place.
+    """
+    # Adding this puts the nearest integer into the lowest bits of a float64.
+    magic = 6755399441055744.0
+    for i in range(n):
+        out[i] = min(ages[i], 700.0) * 1.4426950408889634 + magic
+    for i in range(n):
+        age = min(ages[i], 700.0)
+        k = out[i] - magic
+        r = (k * 0.693147180369123816490 - age) + k * 1.90821492927058770002e-10
+        p = 1.0 / 6227020800.0
+        p = p * r + 1.0 / 479001600.0
+        p = p * r + 1.0 / 39916800.0
+        p = p * r + 1.0 / 3628800.0
+        p = p * r + 1.0 / 362880.0
+        p = p * r + 1.0 / 40320.0
+        p = p * r + 1.0 / 5040.0
+        p = p * r + 1.0 / 720.0
+        p = p * r + 1.0 / 120.0
+        p = p * r + 1.0 / 24.0
+        p = p * r + 1.0 / 6.0
+        p = p * r + 0.5
+        p = p * r + 1.0
+        p = p * r + 1.0
+        ages[i] = p if age <= 60.0 else 0.0
+    for i in range(n):
+        bits[i] = (1023 << 52) - (bits[i] << 52)
+    for i in range(n):
+        out[i] *= ages[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _run_pieces(
+    pieces: int,
+    t_us: Array,
+    light: Array,
+    draws: Array,
+    room: Array,
+    room_bits: Array,
+    s: Array,
+    c: Array,
+    code: int,
+    key: Any,
+    quantiles: Array,
+    shifts: Array,
+    sensor: Array,
+    out_t: Array,
+    out_code: Array,
+    out_cross: Array,
+    n: int,
+) -> int:
+    """Let one pixel see light[i] from t_us[i] to t_us[i + 1]; write its events, return how many there are.
+
+    With u = exp(-y) the receptor is u(t) = 1/I + (u0 - 1/I) exp(-I t / Q), which is monotonic; so a threshold
+    is crossed in a piece when u at its end lies beyond, and the time follows from one logarithm. `shifts`
+    are the quantiles of the factor by which noise moves both thresholds. One word of random bits a draw, from
+    the pixel's `key`: the upper half decides on the noise, the lower on whether the event goes missing.
+    `draws[i]` draws pass as piece i begins. `room` float64 (3, pieces or more) is overwritten, `room_bits` is
+    its int64 view; `s` and `c` are the pixel's state and counters.
+    """
+    charge, refractory = sensor[0], sensor[1]
+    delay_on, delay_off, jitter = sensor[2], sensor[3], sensor[4]
+    miss_on, miss_off = sensor[5], sensor[6]
+    on_factor, off_factor = s[ON_FACTOR], s[OFF_FACTOR]
+    widest_on = on_factor * sensor[8]
+    widest_off = off_factor / sensor[8]
+    u_base, reference = s[U_BASE], s[REFERENCE]
+    t_ready, t_last_out = s[T_READY], s[T_LAST_OUT]
+    draw, armed = c[DRAW], c[ARMED]
+    if sensor[12] > 0.0:
+        z = s[FOLLOWER]
+        for i in range(pieces):
+            draw += draws[i]
+            if t_us[i + 1] > t_us[i]:
+                u_base, z, reference, t_ready, t_last_out, armed, draw, n = _run_piece_followed(
+                    t_us[i + 1], light[i], u_base, t_us[i], z, reference, t_ready, t_last_out, armed, draw,
+                    on_factor, off_factor, code, key, quantiles, shifts, sensor, out_t, out_code,
+                    out_cross, n,
+                )  # fmt: skip
+        s[FOLLOWER] = z
+        pieces = 0
+    per_charge = 1.0 / charge
+    ages, kept = room[0], room[1]
+    for i in range(pieces):
+        ages[i] = light[i] * per_charge * (t_us[i + 1] - t_us[i])
+    _decay(ages, room_bits[1], kept, pieces)
+    rests = room[2]
+    for i in range(pieces):
+        rests[i] = 1.0 / light[i]
+    for i in range(pieces):
+        rest = rests[i]
+        draw += draws[i]
+        u_end = rest + (u_base - rest) * kept[i]
+        if armed != 0 and u_end > reference * widest_on and u_end < reference * widest_off:
+            u_base = u_end
+            continue
+        t_base, until = t_us[i], t_us[i + 1]
+        tau = charge * rest
+        blind = u_event = -1.0
+        while until > t_base:
+            if armed == 0:
+                if t_ready >= until:
+                    break
+                # An event's delay may outlast a piece, never their order: t_ready is not before t_base.
+                if u_event >= 0.0:
+                    if blind < 0.0:
+                        blind = math.exp(-min(refractory / tau, 700.0))
+                    reference = rest + (u_event - rest) * blind
+                else:
+                    ages_ready = (t_ready - t_base) / tau
+                    reference = rest if ages_ready > 60.0 else rest + (u_base - rest) * math.exp(-ages_ready)
+                armed = 1
+                draw += 1
+            if u_end > reference * widest_on and u_end < reference * widest_off:
+                break
+            word = _mix(key + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03))
+            shift = _table_at(shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10)
+            low = reference * on_factor * shift
+            high = reference * off_factor * shift
+            t = max(t_base, t_ready)
+            level = -1.0
+            if u_end <= low:
+                on = 1
+                if u_base > low:
+                    level = low
+            elif u_end >= high:
+                on = 0
+                if u_base < high:
+                    level = high
+            else:
+                break
+            u_event = -1.0
+            if level >= 0.0:
+                crossed = t_base + math.log((u_base - rest) / (level - rest)) * tau
+                if crossed >= t:
+                    t = crossed
+                    u_event = level
+            t = min(t, until)
+            armed = 0
+            t_ready = t + refractory
+            late = delay_on if on else delay_off
+            if jitter > 0.0:
+                late = max(0.0, late + jitter * hash_normal(key, 0, draw, 2, quantiles))
+            request = max(t + late, t_last_out + refractory)
+            t_last_out = request
+            # What is missed is written over; that is quicker than a branch which cannot be foreseen.
+            out_t[n] = request
+            out_code[n] = code + on
+            if out_cross.size:
+                out_cross[n] = t
+            missed = float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10
+            n += int(missed >= (miss_on if on else miss_off))
+        u_base = u_end
+    s[U_BASE], s[REFERENCE] = u_base, reference
+    s[T_READY], s[T_LAST_OUT] = t_ready, t_last_out
+    c[DRAW], c[ARMED] = draw, armed
+    return n
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def pixel_factors(seed: Any, pixel: int, sensor: Array, quantiles: Array) -> tuple[float, float]:
     """exp(-threshold) for ON and exp(threshold) for OFF of one pixel, with its spread."""
     on = sensor[9] * (1.0 + sensor[11] * hash_normal(seed, pixel, 0, 3, quantiles))
     off = sensor[10] * (1.0 + sensor[11] * hash_normal(seed, pixel, 0, 4, quantiles))
     return math.exp(-on), math.exp(off)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _rest(light: float, t_us: float, followed: bool, s: Array, c: Array) -> None:
+    """Put a pixel at rest in a light, armed."""
+    s[U_BASE], s[LIGHT], s[FOLLOWER], s[T_READY] = 1.0 / light, light, math.log(light), t_us
+    s[REFERENCE] = s[FOLLOWER] if followed else s[U_BASE]
+    c[ARMED] = 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -295,35 +396,23 @@ def run_given_light(
     out_cross: Array,
 ) -> int:
     """Run one pixel, at rest in light[0], through light[i] from edge_us[i] on; return how many events."""
-    on_factor, off_factor = pixel_factors(seed, pixel, sensor, quantiles)
-    key = _mix(seed + np.uint64(pixel) * np.uint64(0x9E3779B97F4A7C15))
-    u_base = 1.0 / light[0]
-    t_base = edge_us[0]
-    followed = sensor[12] > 0.0
-    z = math.log(light[0])
-    reference = z if followed else u_base
-    t_ready = t_base
-    t_last_out = -1e18
-    armed = 1
-    draw = 1
-    n = 0
-    for i in range(light.size):
-        until = edge_us[i + 1] if i + 1 < light.size else end_us
-        if i:
-            draw += 1
-        if followed:
-            u_base, z, reference, t_ready, t_last_out, armed, draw, n = _run_piece_followed(
-                until, light[i], u_base, t_base, z, reference, t_ready, t_last_out, armed, draw, on_factor,
-                off_factor, 0, key, quantiles, shifts, sensor, out_t, out_code, out_cross, n,
-            )  # fmt: skip
-            t_base = until
-            continue
-        u_base, reference, t_ready, t_last_out, armed, draw, n = _run_piece(
-            until, light[i], u_base, t_base, reference, t_ready, t_last_out, armed, draw, on_factor,
-            off_factor, 0, key, quantiles, shifts, sensor, out_t, out_code, out_cross, n,
-        )  # fmt: skip
-        t_base = until
-    return n
+    pieces = light.size
+    s, c = np.empty(9), np.zeros(3, np.int64)
+    s[ON_FACTOR], s[OFF_FACTOR] = pixel_factors(seed, pixel, sensor, quantiles)
+    _rest(light[0], edge_us[0], sensor[12] > 0.0, s, c)
+    s[T_LAST_OUT] = -1e18
+    key = _key_of(seed, pixel)
+    t_us = np.empty(pieces + 1)
+    t_us[:pieces] = edge_us[:pieces]
+    t_us[pieces] = end_us
+    draws = np.ones(pieces, np.int64)
+    room = np.empty((3, pieces))
+    return int(
+        _run_pieces(
+            pieces, t_us, light, draws, room, room.view(np.int64), s, c, 0, key, quantiles, shifts, sensor,
+            out_t, out_code, out_cross, 0,
+        )
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -340,14 +429,20 @@ def _step(table: Array, per_px: float, z: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _beside(table: Array, row: int, between: float, scale: float, z: float) -> float:
-    """Share of a pixel lit by a strip's part beyond an edge, `z` px before the pixel; see `strip_table`."""
-    half = 0.5 * (table.shape[1] - 1)
+def _beside(tables: Array, row: Any, columns: Any, between: float, scale: float, z: float) -> float:
+    """Share of a pixel lit by a strip's part beyond an edge, `z` px before the pixel; see `strip_table`.
+
+    `row` is where in `tables` a row of so many columns begins, `between` the way to the next.
+    """
+    nodes: Any = np.int64(columns)
+    half = 0.5 * (nodes - 1)
     at = half + half * z / (abs(z) + scale)
-    i = min(int(at), table.shape[1] - 2)
+    i = min(int(at), nodes - 2)
     part = at - i
-    low = table[row, i] + part * (table[row, i + 1] - table[row, i])
-    high = table[row + 1, i] + part * (table[row + 1, i + 1] - table[row + 1, i])
+    k = row + np.uint64(i)
+    low = tables[k] + part * (tables[k + np.uint64(1)] - tables[k])
+    k += columns
+    high = tables[k] + part * (tables[k + np.uint64(1)] - tables[k])
     return float(low + between * (high - low))
 
 
@@ -433,8 +528,16 @@ def run_pixels(
     halfway = origin.shape[0] // 2
     followed = sensor[12] > 0.0
     none = np.empty(0)
-    most_clusters = levels.shape[1]
-    weight = np.zeros((sources, most_clusters))
+    # As in `_table_at`.
+    most_clusters = np.uint64(levels.shape[1])
+    all_levels = levels.reshape(-1)
+    rows, columns = np.uint64(near_tables.shape[1]), np.uint64(near_tables.shape[2])
+    nears = near_tables.reshape(-1)
+    grids = np.uint64(halo.shape[2])
+    all_halo = halo.reshape(-1)
+    halo_rows = np.uint64(halo.shape[1])
+    beside = np.empty(levels.shape[1] + 1)
+    weight = np.zeros((sources, levels.shape[1]))
     weights = np.zeros(sources, np.int64)
     weight_first = np.zeros(sources, np.int64)
     near_gain = gain * near_share
@@ -443,6 +546,11 @@ def run_pixels(
     between = np.zeros((halos, sources))
     row = np.zeros(sources, np.int64)
     part = np.zeros(sources)
+    lit = np.zeros(sources, np.int64)
+    room = np.empty((3, line_t.size + 2))
+    room_bits = room.view(np.int64)
+    t_us, light = np.empty(line_t.size + 2), np.empty(line_t.size + 2)
+    draws = np.empty(line_t.size + 2, np.int64)
     n = 0
     for j in range(first, last):
         if n + most_events > out_t.size:
@@ -459,16 +567,17 @@ def run_pixels(
         if new and s[ON_FACTOR] == 0.0:
             s[ON_FACTOR], s[OFF_FACTOR] = pixel_factors(seed, pixel, sensor, quantiles)
             s[T_LAST_OUT] = -1e18
-        on_factor, off_factor = s[ON_FACTOR], s[OFF_FACTOR]
-        key = _mix(seed + np.uint64(pixel) * np.uint64(0x9E3779B97F4A7C15))
-        u_base, t_base, reference = s[U_BASE], s[T_BASE], s[REFERENCE]
-        t_ready, t_last_out, light, z = s[T_READY], s[T_LAST_OUT], s[LIGHT], s[FOLLOWER]
-        draw, armed = c[DRAW], c[ARMED]
         around = 0.0
         passing = shade[0]
+        shining = 0
         for g in range(sources):
             row[g] = first_rows[g]
-            part[g] = 0.0
+            if (mask >> np.uint64(g)) & np.uint64(1):
+                lit[shining] = g
+                shining += 1
+        # The pieces of time in which its light stays as it is.
+        piece = 0
+        t_us[0], light[0], draws[0] = begin_us, s[LIGHT], 0
         for e in range(-1, line_t.size):
             source = line_source[e] if e >= 0 else POSE
             if source >= 0 and not (mask >> np.uint64(source)) & np.uint64(1):
@@ -482,9 +591,8 @@ def run_pixels(
                     if pose != 0 and (halo_every[q] == 0 or pose % halo_every[q] != 0):
                         continue
                     seen = halfway if halo_every[q] == 0 else pose
-                    for g in range(sources):
-                        if not (mask >> np.uint64(g)) & np.uint64(1):
-                            continue
+                    for a in range(shining):
+                        g = lit[a]
                         dx, dy = x - origin[seen, g, 0], y - origin[seen, g, 1]
                         ax, ay = axis[seen, g, 0], axis[seen, g, 1]
                         across = dx * ay - dy * ax
@@ -505,19 +613,18 @@ def run_pixels(
                     around = background[1] + background[0] * texture_at(
                         field, x + turn_px[pose, 0], y + turn_px[pose, 1]
                     )
-                for g in range(sources):
-                    if not (mask >> np.uint64(g)) & np.uint64(1):
-                        continue
+                for a in range(shining):
+                    g = lit[a]
                     dx, dy = x - origin[pose, g, 0], y - origin[pose, g, 1]
                     ax, ay = axis[pose, g, 0], axis[pose, g, 1]
                     along = dx * ax + dy * ay
-                    across = dx * ay - dy * ax
+                    across = abs(dx * ay - dy * ax)
                     weights[g] = 0
                     reach = near_reach[g]
-                    if abs(across) < reach + 0.5 * strip_px[pose, g]:
-                        table, scale = near_tables[g], near_scale[g]
-                        side = (table.shape[0] - 1) * abs(across) / (abs(across) + scale)
-                        i = min(int(side), table.shape[0] - 2)
+                    if across < reach + 0.5 * strip_px[pose, g]:
+                        scale = near_scale[g]
+                        side = (near_tables.shape[1] - 1) * across / (across + scale)
+                        i = min(int(side), near_tables.shape[1] - 2)
                         side -= i
                         edges = bounds[pose, g]
                         k = weight_first[g]
@@ -526,32 +633,34 @@ def run_pixels(
                         while k < clusters[g] and edges[k + 1] <= along - reach:
                             k += 1
                         weight_first[g] = k
-                        before = _beside(table, i, side, scale, along - edges[k]) if k < clusters[g] else 0.0
                         m = 0
-                        while k < clusters[g] and edges[k] < along + reach:
-                            behind = _beside(table, i, side, scale, along - edges[k + 1])
-                            weight[g, m] = near_gain[g] * (before - behind)
-                            before = behind
+                        while k + m < clusters[g] and edges[k + m] < along + reach:
                             m += 1
-                            k += 1
                         weights[g] = m
+                        if m > 0:
+                            at_row = (np.uint64(g) * rows + np.uint64(i)) * columns
+                            for b in range(m + 1):
+                                beside[b] = _beside(nears, at_row, columns, side, scale, along - edges[k + b])
+                            for b in range(m):
+                                weight[g, b] = near_gain[g] * (beside[b] - beside[b + 1])
             moved = source == POSE
             total = around
-            for g in range(sources):
-                if not (mask >> np.uint64(g)) & np.uint64(1):
-                    continue
+            for a in range(shining):
+                g = lit[a]
                 if moved or source == g:
-                    if source == g:
+                    if not moved:
                         row[g] = line_row[e]
-                    r = row[g]
-                    core = 0.0
-                    for m in range(weights[g]):
-                        core += weight[g, m] * levels[r, weight_first[g] + m]
-                    now = core
+                    now = 0.0
+                    at_level = np.uint64(row[g]) * most_clusters + np.uint64(weight_first[g])
+                    for b in range(weights[g]):
+                        now += weight[g, b] * all_levels[at_level + np.uint64(b)]
                     for q in range(halos):
-                        k = grid[q, g]
+                        at_halo = (np.uint64(q) * halo_rows + np.uint64(row[g])) * grids + np.uint64(
+                            grid[q, g]
+                        )
                         now += far[q, g] * (
-                            halo[q, r, k] + between[q, g] * (halo[q, r, k + 1] - halo[q, r, k])
+                            all_halo[at_halo]
+                            + between[q, g] * (all_halo[at_halo + np.uint64(1)] - all_halo[at_halo])
                         )
                     part[g] = now
                 total += part[g]
@@ -559,43 +668,23 @@ def run_pixels(
                 total = background[1] + passing * (total - background[1])
             if new:
                 new = False
-                light = total
-                u_base, t_base = 1.0 / light, t
-                z = math.log(light)
-                reference, t_ready, armed = (z if followed else u_base), t, 1
-                draw += 1
+                _rest(total, t, followed, s, c)
+                light[0], draws[0] = total, 1
                 continue
-            if abs(total - light) <= LIGHT_STEP * light:
+            if abs(total - light[piece]) <= LIGHT_STEP * light[piece]:
                 continue
-            if followed and t > t_base:
-                u_base, z, reference, t_ready, t_last_out, armed, draw, n = _run_piece_followed(
-                    t, light, u_base, t_base, z, reference, t_ready, t_last_out, armed, draw, on_factor,
-                    off_factor, code, key, quantiles, shifts, sensor, out_t, out_code, none, n,
-                )  # fmt: skip
-                t_base = t
-            elif t > t_base:
-                u_base, reference, t_ready, t_last_out, armed, draw, n = _run_piece(
-                    t, light, u_base, t_base, reference, t_ready, t_last_out, armed, draw, on_factor,
-                    off_factor, code, key, quantiles, shifts, sensor, out_t, out_code, none, n,
-                )  # fmt: skip
-                t_base = t
-            light = total
+            if t > t_us[piece]:
+                piece += 1
+                t_us[piece], draws[piece] = t, 0
+            light[piece] = total
             if source >= 0:
-                draw += 1
-        if followed:
-            u_base, z, reference, t_ready, t_last_out, armed, draw, n = _run_piece_followed(
-                end_us, light, u_base, t_base, z, reference, t_ready, t_last_out, armed, draw, on_factor,
-                off_factor, code, key, quantiles, shifts, sensor, out_t, out_code, none, n,
-            )  # fmt: skip
-        else:
-            u_base, reference, t_ready, t_last_out, armed, draw, n = _run_piece(
-                end_us, light, u_base, t_base, reference, t_ready, t_last_out, armed, draw, on_factor,
-                off_factor, code, key, quantiles, shifts, sensor, out_t, out_code, none, n,
-            )  # fmt: skip
-        s[U_BASE], s[T_BASE], s[REFERENCE] = u_base, end_us, reference
-        s[T_READY], s[T_LAST_OUT], s[LIGHT] = t_ready, t_last_out, light
-        s[FOLLOWER] = z
-        c[DRAW], c[ARMED] = draw, armed
+                draws[piece] += 1
+        t_us[piece + 1] = end_us
+        n = _run_pieces(
+            piece + 1, t_us, light, draws, room, room_bits, s, c, code, _key_of(seed, pixel), quantiles,
+            shifts, sensor, out_t, out_code, none, n,
+        )  # fmt: skip
+        s[T_BASE], s[LIGHT] = end_us, light[piece]
     return last, n
 
 
@@ -651,29 +740,40 @@ def find_hot_pixels(pixels: int, share: float, seed: Any, out: Array) -> int:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def sort_events(t: Array, code: Array, out_t: Array, out_code: Array) -> None:
-    """Sort by (time, pixel): buckets of 1/8 us, then insertion within."""
+    """Sort by (time, pixel): by 22 bits of the time in two rounds, then insertion of what is left."""
     n = t.size
     if n == 0:
         return
-    per_us = 8.0
     first = t[0]
     last = t[0]
     for i in range(n):
         first = min(first, t[i])
         last = max(last, t[i])
-    buckets = int((last - first) * per_us) + 1
-    place = np.zeros(buckets + 1, np.int64)
+    scale = 4194303.0 / max(last - first, 1e-9)
+    low = np.zeros(2049, np.int64)
+    high = np.zeros(2049, np.int64)
     for i in range(n):
-        place[int((t[i] - first) * per_us) + 1] += 1
-    for b in range(buckets):
-        place[b + 1] += place[b]
+        key = int((t[i] - first) * scale)
+        low[(key & 2047) + 1] += 1
+        high[(key >> 11) + 1] += 1
+    for b in range(2047):
+        low[b + 1] += low[b]
+        high[b + 1] += high[b]
+    half_t, half_code = np.empty(n, t.dtype), np.empty(n, code.dtype)
     for i in range(n):
-        b = int((t[i] - first) * per_us)
-        out_t[place[b]] = t[i]
-        out_code[place[b]] = code[i]
-        place[b] += 1
+        b = int((t[i] - first) * scale) & 2047
+        half_t[low[b]] = t[i]
+        half_code[low[b]] = code[i]
+        low[b] += 1
+    for i in range(n):
+        b = int((half_t[i] - first) * scale) >> 11
+        out_t[high[b]] = half_t[i]
+        out_code[high[b]] = half_code[i]
+        high[b] += 1
     for i in range(1, n):
         when, what = out_t[i], out_code[i]
+        if out_t[i - 1] < when:
+            continue
         j = i
         while j > 0 and (out_t[j - 1] > when or (out_t[j - 1] == when and out_code[j - 1] > what)):
             out_t[j] = out_t[j - 1]
@@ -729,7 +829,8 @@ def read_out(
     tail = np.full(height, -1, np.int64)
     follow = np.full(t.size, -1, np.int64)
     served = np.zeros(t.size, np.bool_)
-    group = np.zeros((height >> 4) + 1, np.int64)
+    # One bit a row that waits.
+    waits = np.zeros((height >> 6) + 1, np.uint64)
     free, at_row = memory[0], int(memory[1])
     window, used = int(memory[2]), int(memory[3])
     window_end = (window + 1) * cap_window_us
@@ -757,19 +858,20 @@ def read_out(
                 pending[y, x] = True
             if head[y] < 0:
                 head[y] = i
-                group[y >> 4] += 1
+                waits[y >> 6] |= np.uint64(1) << np.uint64(y & 63)
             else:
                 follow[tail[y]] = i
             tail[y] = i
             waiting += 1
             i += 1
         at_row += 1
-        while True:
-            if at_row >= height:
-                at_row = 0
-            if head[at_row] >= 0:
-                break
-            at_row = at_row + 1 if group[at_row >> 4] else ((at_row >> 4) + 1) << 4
+        word = at_row >> 6
+        bits = waits[word] >> np.uint64(at_row & 63) << np.uint64(at_row & 63)
+        while bits == np.uint64(0):
+            word = word + 1 if word + 1 < waits.size else 0
+            bits = waits[word]
+        lowest = bits & (~bits + np.uint64(1))
+        at_row = word << 6 | _PLACES[(lowest * np.uint64(0x03F79D71B4CB0A89)) >> np.uint64(58)]
         free += row_us
         stamp = math.floor(free)
         if stamp >= window_end:
@@ -779,7 +881,7 @@ def read_out(
         begin = n
         k = head[at_row]
         head[at_row] = -1
-        group[at_row >> 4] -= 1
+        waits[word] ^= lowest
         while k >= 0:
             waiting -= 1
             served[k] = True

@@ -1,9 +1,10 @@
 """The simulator: a scene in, events out, block by block of time in constant memory."""
 
 import math
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -25,6 +26,9 @@ __all__ = ["ACTIVITY_FLOOR", "MOTION_STEP_PX", "Simulation", "quantile_table", "
 
 Floats = NDArray[np.float64]
 
+_Requests = tuple[Floats, NDArray[np.int32]]
+"""Requests of pixels to be read out: their times, us, and their codes."""
+
 ACTIVITY_FLOOR = 0.1
 """Log signal by which a source must be able to move a pixel for the pixel to be simulated, ln units."""
 
@@ -41,6 +45,7 @@ _NEAR_NODES = 64
 _NEAR_SCALE = 5.0
 _WIDE_NODES = 1025
 _ROOM = 1 << 17
+_PARTS = 4  # a thread, of the pixels of a block
 _TEXTURE_SIZE = 512
 _MASK64 = 2**64 - 1
 
@@ -194,9 +199,6 @@ class Simulation:
         self._near_share = 1 - sum(halo.share for halo in self._halos)
         self._wide_reach = max(halo.reach_px for halo in self._halos)
         self._counts = dict.fromkeys(("events", "signal_events", "dropped_by_rate_cap", "dropped_blind"), 0)
-        self._pending = np.zeros(
-            (scene.camera.height, scene.camera.width) if scene.sensor.hold else (0, 0), bool
-        )
         self._done_us = 0.0
 
     def _check_ahead(self) -> None:
@@ -222,69 +224,53 @@ class Simulation:
         """How much of the scene is rendered, s."""
         return self._done_us * 1e-6
 
+    def count(self, what: str, more: int) -> None:
+        """Add to one of the counts."""
+        self._counts[what] += more
+
     def stream(self) -> Iterator[Events]:
         """Yield the events in order of time, in pieces of up to a block."""
-        scene = self.scene
-        sensor, camera = scene.sensor, scene.camera
-        end_us = scene.duration_s * 1e6
-        early_us = min(sensor.dly_on_us, sensor.dly_off_us)
-        if sensor.jitter_us > 0:
-            early_us = max(0.0, early_us - _kernels.NOISE_LIMIT * sensor.jitter_us)
-        later: list[tuple[Floats, NDArray[np.int32]]] = []
-        queue = (np.empty(0), np.empty(0, np.int32))
-        last_us = np.full(camera.width * camera.height, -1e18)
-        memory = np.array([-1e18, -1.0, -1.0, 0.0])
-        noise_from = 0.0
+        end_us = self.scene.duration_s * 1e6
+        spans = [
+            (number, number * _BLOCK_US, min((number + 1) * _BLOCK_US, end_us))
+            for number in range(math.ceil(end_us / _BLOCK_US))
+        ]
+        served = _Served(self)
+        if self._threads == 1:
+            for number, begin, end in spans:
+                signal = [
+                    part
+                    for job in self._jobs(number, self._prepare(begin, end), begin, end)
+                    for part in job()
+                ]
+                yield from self._given(served.of(number, end, signal), end)
+            return
+        # While the pixels of a block run, the next is prepared and the last one's events are read out.
         with ThreadPoolExecutor(self._threads) as pool:
-            for number in range(math.ceil(end_us / _BLOCK_US)):
-                begin, end = number * _BLOCK_US, min((number + 1) * _BLOCK_US, end_us)
-                signal = self._run(number, begin, end, pool)
-                over = end == end_us
-                noise_to = end if over else end + early_us
-                noise = self._noise(number, noise_from, min(noise_to, end_us))
-                noise_from = noise_to
-                self._counts["signal_events"] += sum(len(t) for t, _ in signal)
-                parts = [*later, *signal, noise]
-                t, code = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
-                out_t, out_code = np.empty_like(t), np.empty_like(code)
-                _kernels.sort_events(t, code, out_t, out_code)
-                safe = math.inf if over else end + early_us
-                cut = len(out_t) if over else int(np.searchsorted(out_t, safe))
-                later = [(out_t[cut:].copy(), out_code[cut:].copy())]
-                kept = _kernels.drop_blind(out_t[:cut], out_code[:cut], last_us, camera.width, sensor.refr_us)
-                self._counts["dropped_blind"] += cut - kept
-                queue = (
-                    np.concatenate([queue[0], out_t[:kept]]),
-                    np.concatenate([queue[1], out_code[:kept]]),
-                )
-                events, queue = self._read_out(queue, safe, memory)
-                self._done_us = end
-                if len(events):
-                    yield events
+            ahead = pool.submit(self._prepare, *spans[0][1:])
+            behind: Future[Events] | None = None
+            for number, begin, end in spans:
+                block = ahead.result()
+                if end < end_us:
+                    ahead = pool.submit(self._prepare, *spans[number + 1][1:])
+                running = [pool.submit(job) for job in self._jobs(number, block, begin, end)]
+                signal = [part for one in running for part in one.result()]
+                last = behind
+                if last is not None:
+                    last.result()
+                behind = pool.submit(served.of, number, end, signal)
+                if last is not None:
+                    yield from self._given(last.result(), begin)
+            if behind is not None:
+                yield from self._given(behind.result(), end_us)
 
-    def _read_out(
-        self, queue: tuple[Floats, NDArray[np.int32]], safe_us: float, memory: Floats
-    ) -> tuple[Events, tuple[Floats, NDArray[np.int32]]]:
-        camera, sensor = self.scene.camera, self.scene.sensor
-        t, code = queue
-        n = len(t)
-        columns = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
-        cap = round(sensor.cap_mev_s * sensor.cap_window_us)
-        cap = max(cap, 1) if sensor.cap_mev_s > 0 else 0
-        written, dropped, held, left = _kernels.read_out(
-            t, code, camera.height, sensor.t_row_us, safe_us, cap, sensor.cap_window_us, memory,
-            self._pending, *columns,
-        )  # fmt: skip
-        self._counts["dropped_blind"] += held
-        self._counts["events"] += written
-        self._counts["dropped_by_rate_cap"] += dropped
-        columns[0][:written] += self.scene.t0_us
-        events = Events(
-            columns[0][:written], columns[1][:written], columns[2][:written], columns[3][:written]
-        )
-        return events, (t[:left].copy(), code[:left].copy())
+    def _given(self, events: Events, end_us: float) -> Iterator[Events]:
+        """The events up to `end_us`, if there are any."""
+        self._done_us = end_us
+        if len(events):
+            yield events
 
-    def _noise(self, number: int, begin_us: float, end_us: float) -> tuple[Floats, NDArray[np.int32]]:
+    def noise(self, number: int, begin_us: float, end_us: float) -> tuple[Floats, NDArray[np.int32]]:
         """Background activity and hot pixels from `begin_us` to `end_us`."""
         camera, sensor = self.scene.camera, self.scene.sensor
         size = camera.width * camera.height
@@ -308,17 +294,17 @@ class Simulation:
         )
         return t[:n], code[:n]
 
-    def _run(
-        self, number: int, begin_us: float, end_us: float, pool: ThreadPoolExecutor
-    ) -> list[tuple[Floats, NDArray[np.int32]]]:
-        """Run the active pixels through a block; return their events' requests, unsorted."""
-        block = self._prepare(begin_us, end_us)
+    def _jobs(
+        self, number: int, block: "_Block | None", begin_us: float, end_us: float
+    ) -> list[Callable[[], list[_Requests]]]:
+        """What runs the active pixels through a block, in parts; each returns their requests, unsorted."""
         if block is None:
             return []
         most = int((end_us - begin_us) / self.scene.sensor.refr_us) + 8
-        cuts = np.linspace(0, len(block.pixels), self._threads + 1).astype(int)
+        parts = 1 if self._threads == 1 else _PARTS * self._threads
+        cuts = np.linspace(0, len(block.pixels), parts + 1).astype(int)
 
-        def run(first: int, last: int) -> list[tuple[Floats, NDArray[np.int32]]]:
+        def run(first: int, last: int) -> list[_Requests]:
             found = []
             while first < last:
                 t, code = np.empty(max(_ROOM, most)), np.empty(max(_ROOM, most), np.int32)
@@ -337,10 +323,7 @@ class Simulation:
                 found.append((t[:n], code[:n]))
             return found
 
-        if self._threads == 1:
-            return run(0, len(block.pixels))
-        jobs = [pool.submit(run, int(a), int(b)) for a, b in pairwise(cuts)]
-        return [part for job in jobs for part in job.result()]
+        return [partial(run, int(a), int(b)) for a, b in pairwise(cuts) if a < b]
 
     def _moves(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
         """When the image has moved by a step: starts and middles of the poses, us, float64 (n,)."""
@@ -527,6 +510,63 @@ class Simulation:
         inside &= (s >= -reach_along - wander_along) & (s <= length + reach_along + wander_along)
         found: NDArray[np.int64] = (y * width + x)[inside]
         return found
+
+
+class _Served:
+    """What the readout makes of the pixels' requests, block by block of time.
+
+    Args:
+        simulation: Whose scene, noise and counts they are.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        sensor, camera = simulation.scene.sensor, simulation.scene.camera
+        early_us = min(sensor.dly_on_us, sensor.dly_off_us)
+        if sensor.jitter_us > 0:
+            early_us = max(0.0, early_us - _kernels.NOISE_LIMIT * sensor.jitter_us)
+        self._early_us = early_us
+        self._later: list[_Requests] = []
+        self._queue: _Requests = (np.empty(0), np.empty(0, np.int32))
+        self._last_us = np.full(camera.width * camera.height, -1e18)
+        self._memory = np.array([-1e18, -1.0, -1.0, 0.0])
+        self._pending = np.zeros((camera.height, camera.width) if sensor.hold else (0, 0), bool)
+        self._noise_from_us = 0.0
+
+    def of(self, number: int, end_us: float, signal: list[_Requests]) -> Events:
+        """Events that are certain when the block that ends then has given these requests."""
+        simulation = self._simulation
+        sensor, camera = simulation.scene.sensor, simulation.scene.camera
+        scene_end_us = simulation.scene.duration_s * 1e6
+        over = end_us == scene_end_us
+        safe = math.inf if over else end_us + self._early_us
+        noise_to = min(end_us if over else safe, scene_end_us)
+        noise = simulation.noise(number, self._noise_from_us, noise_to)
+        self._noise_from_us = end_us if over else safe
+        simulation.count("signal_events", sum(len(t) for t, _ in signal))
+        parts = [*self._later, *signal, noise]
+        t, code = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+        out_t, out_code = np.empty_like(t), np.empty_like(code)
+        _kernels.sort_events(t, code, out_t, out_code)
+        cut = len(out_t) if over else int(np.searchsorted(out_t, safe))
+        self._later = [(out_t[cut:].copy(), out_code[cut:].copy())]
+        kept = _kernels.drop_blind(out_t[:cut], out_code[:cut], self._last_us, camera.width, sensor.refr_us)
+        t = np.concatenate([self._queue[0], out_t[:kept]])
+        code = np.concatenate([self._queue[1], out_code[:kept]])
+        n = len(t)
+        columns = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
+        cap = round(sensor.cap_mev_s * sensor.cap_window_us)
+        cap = max(cap, 1) if sensor.cap_mev_s > 0 else 0
+        written, dropped, held, left = _kernels.read_out(
+            t, code, camera.height, sensor.t_row_us, safe, cap, sensor.cap_window_us, self._memory,
+            self._pending, *columns,
+        )  # fmt: skip
+        self._queue = (t[:left].copy(), code[:left].copy())
+        simulation.count("dropped_blind", cut - kept + held)
+        simulation.count("events", written)
+        simulation.count("dropped_by_rate_cap", dropped)
+        columns[0][:written] += simulation.scene.t0_us
+        return Events(columns[0][:written], columns[1][:written], columns[2][:written], columns[3][:written])
 
 
 def simulate(

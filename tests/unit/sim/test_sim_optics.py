@@ -136,7 +136,8 @@ def test_the_kernel_looks_up_what_the_table_says() -> None:
     expected = table_at(table, 1.9, across, along)
     for n, z, value in zip(np.abs(across), along, expected, strict=True):
         at = 64 * n / (n + 1.9)
-        assert _kernels._beside.py_func(table, int(at), at - int(at), 1.9, z) == pytest.approx(
+        row, columns = np.uint64(int(at) * table.shape[1]), np.uint64(table.shape[1])
+        assert _kernels._beside.py_func(table.ravel(), row, columns, at - int(at), 1.9, z) == pytest.approx(
             value, abs=1e-12
         )
 
