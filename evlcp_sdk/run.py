@@ -19,7 +19,7 @@ from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.several import load_links, named_links
 from evlcp_sdk.live.budget import Budget
-from evlcp_sdk.live.loop import FrameEar, LiveLoop
+from evlcp_sdk.live.loop import LiveLoop
 from evlcp_sdk.live.outlet import Outlet
 from evlcp_sdk.live.pictures import PictureSlot
 from evlcp_sdk.live.warm import warm_up
@@ -326,7 +326,6 @@ def live(
     if warm:
         warm_up(links)
     url = str(source.path if isinstance(source, EventSource) else source)
-    ear = FrameEar()
     try:
         opened = source if isinstance(source, EventSource) else open_source(source, registry)
         if not opened.live and opened.size_bytes is not None:
@@ -337,22 +336,25 @@ def live(
             name = Path(url).name
             kept: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock_zero}
             loop: LiveLoop
-            with (
-                ResultWriter(
-                    folder,
+            with ResultWriter(
+                folder,
+                links,
+                registry,
+                name=name,
+                **kept,
+                sinks=sinks,
+                lines=lines,
+                placed=lambda placed: loop.placed(placed),
+            ) as writer:
+                receiver = Receiver(
                     links,
-                    registry,
-                    name=name,
-                    **kept,
-                    sinks=sinks,
-                    lines=lines,
-                    placed=lambda placed: loop.placed(placed),
-                ) as writer,
-                registry.joined(ear),
-            ):
-                receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero)
+                    registry.hook,
+                    attitude=attitude,
+                    clock_zero=clock_zero,
+                    on_frame=lambda frame: loop.frame(frame),
+                )
                 pulses = clock_zero if isinstance(clock_zero, PulseClock) else None
-                loop = LiveLoop(opened, receiver, links, ear, outlet, pictures, budget, pulses=pulses)
+                loop = LiveLoop(opened, receiver, links, outlet, pictures, budget, pulses=pulses)
                 pieces = loop.run(stopped)
                 table = _run(
                     opened, url, receiver, writer, pieces, loop.close, _say_nothing, stopped, loop.summary

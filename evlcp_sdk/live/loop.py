@@ -14,14 +14,13 @@ from evlcp_sdk.live.outlet import Outlet
 from evlcp_sdk.live.pictures import PictureSlot
 from evlcp_sdk.live.reader import Reader, Slice
 from evlcp_sdk.place.navigator import Placed
-from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.signals import Stopped
 from evlcp_sdk.utc import PulseClock
 from evlcp_sdk.values import Events, Frame, Packet, Region
 
-__all__ = ["STAGES", "FrameEar", "LiveLoop", "LiveStatus"]
+__all__ = ["STAGES", "LiveLoop", "LiveStatus"]
 
 STAGES: Final = ("gather", "queue", "compute", "total")
 """Of a frame's delay: from its last chip until the slice with which it could be decoded was there; until that
@@ -77,27 +76,13 @@ class LiveStatus:
     health: Mapping[str, float | int | str]
 
 
-class FrameEar:
-    """Gets each frame as soon as it is decoded; joins the registry before the receiver is made."""
-
-    def __init__(self) -> None:
-        self.tell: Callable[[Frame], None] = lambda _frame: None
-
-    @hookimpl
-    def evlcp_stage_finished(self, stage: str, value: Any, elapsed_s: float) -> None:
-        """Pass a frame on."""
-        if stage == "frame":
-            self.tell(value)
-
-
 class LiveLoop:
     """Reads a source in real time, feeds the receiver, and tells listeners what it finds.
 
     Args:
         source: What is read; not closed.
-        receiver: What decodes it.
-        links: What it decodes. Frames of several come with their packet: by then it is clear which fits.
-        ear: Gets the receiver's frames.
+        receiver: What decodes it; it gives each frame to `frame`.
+        links: What it decodes.
         outlet: Where results go.
         pictures: Where pictures are drawn; None for none.
         budget: When what is shed.
@@ -114,7 +99,6 @@ class LiveLoop:
         source: EventSource,
         receiver: Receiver,
         links: Sequence[Link],
-        ear: FrameEar,
         outlet: Outlet,
         pictures: PictureSlot | None = None,
         budget: Budget | None = None,
@@ -138,8 +122,6 @@ class LiveLoop:
         self._last_us = 0.0
         self._arrived_s = self._taken_s = self._start_s = self._status_s = clock()
         self._status_events = 0
-        if len(self._forms) == 1:
-            ear.tell = self._frame
 
     def run(self, stopped: Stopped) -> Iterator[tuple[Events, list[Packet]]]:
         """Yield what is received: the events that the receiver got, some pieces together, and its packets.
@@ -182,6 +164,24 @@ class LiveLoop:
         self._tell(packets)
         self._tell_status(now=True)
         return packets
+
+    def frame(self, frame: Frame) -> None:
+        """Tell listeners of a frame, and count how long it took."""
+        now = self._clock()
+        form = self._forms[frame.link]
+        chips = form.frame_chips if form.has_pilot(frame.frame) else form.info_chips
+        last_us = frame.t_us + chips * form.chip_us
+        shone_s = self._source.clock_s(last_us)
+        if shone_s is None:
+            shone_s = self._reader.arrivals.at_s(last_us)
+        late_ms = None
+        if self._arrived_s == self._arrived_s:  # not at the end, whose time says nothing
+            parts_s = self._arrived_s - shone_s, self._taken_s - self._arrived_s, now - self._taken_s
+            late_ms = (now - shone_s) * 1e3
+            for stage, part_s in zip(STAGES, (*parts_s, now - shone_s), strict=True):
+                self.delays[stage].add(part_s * 1e3)
+                self._recent[stage].add(part_s * 1e3)
+        self._outlet.publish("frame", frame.t_us, frame, late_ms)
 
     def placed(self, placed: Placed) -> None:
         """Tell listeners of a fix."""
@@ -255,29 +255,8 @@ class LiveLoop:
         if len(piece.triggers):
             self._outlet.publish("triggers", float(piece.triggers.t_us[0]), piece.triggers)
 
-    def _frame(self, frame: Frame) -> None:
-        """Tell listeners of a frame, and count how long it took."""
-        now = self._clock()
-        form = self._forms[frame.link]
-        chips = form.frame_chips if form.has_pilot(frame.frame) else form.info_chips
-        last_us = frame.t_us + chips * form.chip_us
-        shone_s = self._source.clock_s(last_us)
-        if shone_s is None:
-            shone_s = self._reader.arrivals.at_s(last_us)
-        late_ms = None
-        if self._arrived_s == self._arrived_s:  # not at the end, whose time says nothing
-            parts_s = self._arrived_s - shone_s, self._taken_s - self._arrived_s, now - self._taken_s
-            late_ms = (now - shone_s) * 1e3
-            for stage, part_s in zip(STAGES, (*parts_s, now - shone_s), strict=True):
-                self.delays[stage].add(part_s * 1e3)
-                self._recent[stage].add(part_s * 1e3)
-        self._outlet.publish("frame", frame.t_us, frame, late_ms)
-
     def _tell(self, packets: list[Packet]) -> None:
         for packet in packets:
-            if len(self._forms) > 1:
-                for frame in packet.frames:
-                    self._frame(frame)
             self._outlet.publish("packet", packet.t_us, packet)
             for message in packet.messages:
                 self._outlet.publish("message", packet.t_us, message)

@@ -2,7 +2,8 @@
 
 import math
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -133,6 +134,10 @@ class Followed:
         self.held_bytes -= held_bytes(events)
         return start_us, len(events)
 
+    def take_back(self) -> None:
+        """Drop the newest events, as if they had not been added."""
+        self.held_bytes -= held_bytes(self.pieces.pop()[1])
+
     def events_between(self, from_us: float, until_us: float) -> int:
         """How many of its events there are from one time to before another."""
         return sum(
@@ -238,7 +243,8 @@ class RegionFollower:
             measured = self._measure(followed.id, box, end_us, rows, width_px)
             if measured is not None:
                 measured = self._whole(followed, measured, box[1], rows)
-                followed.positions.append(self._filtered(followed, measured))
+                followed.filter, place = self._filtered(followed, measured)
+                followed.positions.append(place)
         if len(self.alive) > 1:
             self._merge()
         self._make_room()
@@ -254,6 +260,50 @@ class RegionFollower:
         if gone:
             self._let_go()
         return seen
+
+    @contextmanager
+    def ahead(self, start_us: int, until_us: int, events: Events, meant: Collection[int]) -> Iterator[None]:
+        """Let some regions have what there is so far of a time step, and their places by that.
+
+        Behind it, all is as if the step had not begun, but for what frames showed in the meantime.
+
+        Args:
+            start_us: Start of the step, us.
+            until_us: Before this all events are there, us.
+            events: Those in it, in order; they come again with the whole step.
+            meant: Numbers of regions that are alive, of known size.
+        """
+        self._rhythm.step(start_us, events, self._hits, _CELL_SHIFT)
+        late = 2 * (until_us - start_us) >= self._spec.step_us
+        boxes = self._boxes(start_us + self._spec.step_us / 2, ())
+        seen_us = until_us - self._age_us
+        for followed, box in zip(self.alive, boxes, strict=True):
+            if followed.id not in meant:
+                continue
+            followed.add(start_us, select(events, box))
+            # Nearer to the place before it, another says little of where the region goes.
+            if late and (place := self._glance(followed, box, until_us)):
+                followed.positions.append(place)
+        self._recent.append((start_us, events))
+        yield
+        self._recent.pop()
+        for followed in self.alive:
+            if followed.pieces and followed.pieces[-1][0] == start_us:
+                followed.take_back()
+            if followed.latest.t_us == seen_us:
+                followed.positions.take_back()
+
+    def _glance(self, followed: Followed, box: Box, now_us: int) -> Region | None:
+        """Where a region of known size is in the middle of a step."""
+        rows = np.empty(box[3] - box[1], np.int64)
+        width_px = followed.size_px[0] if followed.size_px else math.inf
+        measured = self._measure(followed.id, box, now_us, rows, width_px)
+        if measured is None:
+            return None
+        heights = followed.heights.copy()
+        measured = self._whole(followed, measured, box[1], rows)
+        followed.heights = heights
+        return self._filtered(followed, measured)[1]
 
     def _boxes(self, t_us: float, taken: Sequence[Region]) -> list[Box]:
         """Where each region should be in the middle of a step; one of unknown size beside the others."""
@@ -483,15 +533,14 @@ class RegionFollower:
         size_px = known or (measured.width_px, height_px + min(max(excess_px, 0.0), _STRAY_PX))
         return region_of(measured.id, measured.t_us, measured.x_px, y_px, *size_px)
 
-    def _filtered(self, followed: Followed, measured: Region) -> Region:
+    def _filtered(self, followed: Followed, measured: Region) -> tuple[Any, Region]:
+        """State of a region's filter after a measurement, and its place by it."""
         if self._position is None:
-            return measured
+            return followed.filter, measured
         centre = np.array([measured.x_px, measured.y_px])
-        followed.filter, centre, _ = self._position.step(
-            followed.filter, measured.t_us, centre, _CENTRE_SIGMA_PX
-        )
+        state, centre, _ = self._position.step(followed.filter, measured.t_us, centre, _CENTRE_SIGMA_PX)
         x_px, y_px = float(centre[0]), float(centre[1])
-        return Region(measured.id, measured.t_us, x_px, y_px, measured.width_px, measured.height_px)
+        return state, Region(measured.id, measured.t_us, x_px, y_px, measured.width_px, measured.height_px)
 
     def _reach(self, x_px: float, y_px: float, width_px: float, height_px: float) -> Box:
         """The box in which a region's events lie within the next step; an empty one off the sensor."""

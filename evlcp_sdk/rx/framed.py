@@ -126,6 +126,14 @@ class HeardFraming:
                 del self._listeners[region.id]
 
     @property
+    def due_us(self) -> float:
+        """When the next frame can be decoded: not before the end of a time step."""
+        return math.inf
+
+    def ahead(self, step: TimeStep) -> None:
+        """Nothing: a framing says itself when a frame is certain."""
+
+    @property
     def places(self) -> dict[int, Region]:
         """Where the transmitters are that have a number and are in sight, by number."""
         return {one.number: one.region.latest for one in self._listeners.values() if one.number is not None}
@@ -188,7 +196,7 @@ class HeardFraming:
                 link=self._name,
             )
             self.counts["frames"] += 1
-            self._announcer.total("frame", frame)
+            self._announcer.frame(frame)
             start_us = self._camera_us(one.t_us)
             self.lit.note(listener.number, start_us, start_us)
             lock = SyncLock(one.packet_t_us, one.chip_us, 0.0, 0.0, 1.0)

@@ -33,8 +33,8 @@ __all__ = ["PacketFraming"]
 _NO_RANGE = Range(math.nan, math.nan, 0)
 _NO_POINTS = (np.empty((0, 2)), np.empty(0))
 
-_TAIL_CHIPS = 2
-"""A frame is whole if the stream goes on for this long after it: its last events come late."""
+_TAIL_CHIPS = 0.5
+"""A frame is whole if the stream goes on for this long after its last edge's events: some come later."""
 
 _LOOKS = 3
 """Looks at a region's first frame: at what was found of a bar, at the whole of it, and once more, as few
@@ -157,6 +157,27 @@ class PacketFraming:
                 self._transmitters.release(transmitter)
 
     @property
+    def due_us(self) -> float:
+        """When the next frame can be decoded, us; infinite where that waits for the end of a time step."""
+        if isinstance(self._regions, DetectedRegions):
+            return math.inf
+        dues = [one.grid.due_us for one in self._transmitters.alive if _in_time(one)]
+        return min(dues, default=math.inf) + self._tail_us
+
+    def ahead(self, step: TimeStep) -> None:
+        """Decode the frames that are due in the part so far of a time step."""
+        if isinstance(self._regions, DetectedRegions):
+            return
+        self._joined.clear()
+        self._due.clear()
+        until_us = step.end_us - self._tail_us
+        due = [one for one in self._transmitters.alive if _in_time(one) and one.grid.due_us <= until_us]
+        meant = {one.region.id for one in due}
+        with self._regions.ahead(step.start_us, step.end_us, step.events, meant):
+            for transmitter in due:
+                self._decode_ahead(transmitter, until_us)
+
+    @property
     def places(self) -> dict[int, Region]:
         """Where the transmitters are that have a number and are in sight, by number."""
         return self._transmitters.places
@@ -216,6 +237,22 @@ class PacketFraming:
         transmitter.rows, lock = self._rows.hear(transmitter.rows, lock, region.pieces, y, height_px)
         return lock
 
+    def _decode_ahead(self, transmitter: Transmitter, until_us: float) -> None:
+        """Decode the next frame before its time step is over.
+
+        One that cannot be given is left to the step's end: by then a lock may say that the transmitter has
+        begun anew.
+        """
+        due = transmitter.grid.due(until_us)
+        if due is None or transmitter.region.id in self._joined:
+            return
+        pilot, said = transmitter.pilot, transmitter.said
+        found = self._decode(transmitter, due)
+        if isinstance(found, str):
+            transmitter.pilot, transmitter.said, transmitter.tried = pilot, said, due.number
+            return
+        self._take(transmitter, due, found)
+
     def _decode_due(self, transmitter: Transmitter, until_us: float) -> None:
         """Decode the frames that lie before a time, with the events after their last edge."""
         cut_us = transmitter.region.cut_us
@@ -225,18 +262,25 @@ class PacketFraming:
             found = self._decode(transmitter, due)
             if found == "frames_rejected" and self._put_together(transmitter):
                 continue
-            transmitter.grid.frame += 1
             if transmitter.region.id in self._joined:
                 # Another region shows the frame.
+                transmitter.grid.frame += 1
                 return
-            if found != "frames_dark":
-                self._lit_in(transmitter, due)
             if isinstance(found, str):
+                transmitter.grid.frame += 1
+                if found != "frames_dark":
+                    self._lit_in(transmitter, due)
                 self.counts[found] += 1
                 transmitter.rejected += found == "frames_rejected"
                 continue
-            self.counts["frames"] += 1
-            self._judged.add(transmitter.packets, due, found)
+            self._take(transmitter, due, found)
+
+    def _take(self, transmitter: Transmitter, due: DueFrame, found: Sighting) -> None:
+        """Hand a frame on."""
+        transmitter.grid.frame += 1
+        self._lit_in(transmitter, due)
+        self.counts["frames"] += 1
+        self._judged.add(transmitter.packets, due, found)
 
     def _lit_in(self, transmitter: Transmitter, due: DueFrame) -> None:
         """Note that a transmitter's light is there in a frame that is due."""
@@ -297,7 +341,7 @@ class PacketFraming:
             echo_of=self._echoes.echo_of(number),
             link=self._name,
         )
-        self._announcer.total("frame", frame)
+        self._announcer.frame(frame)
         return Sighting.of(frame, look)
 
     def _measured(self, view: FrameView) -> Range:
@@ -417,6 +461,12 @@ class PacketFraming:
             else:
                 self._ended.append((place_px, transmitter.rejected))
         self._judged.end(transmitter.packets)
+
+
+def _in_time(transmitter: Transmitter) -> bool:
+    """Whether a transmitter's next frame is decoded when it is due: not before one has shown the bar."""
+    known = transmitter.number is not None and transmitter.region.size_px is not None
+    return known and transmitter.tried != transmitter.grid.frame
 
 
 def _is_part(bar: Followed, t_us: float, place_px: tuple[float, float]) -> bool:

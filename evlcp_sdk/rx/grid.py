@@ -89,6 +89,14 @@ class PacketGrid:
         chips = (number - self.packet) * self.format.packet_chips + self.format.frame_start_chip(index)
         return lock.packet_t_us + chips * lock.chip_us
 
+    @property
+    def due_us(self) -> float:
+        """When the events of the next frame's last edge end, us; infinite before a lock."""
+        if self.lock is None:
+            return math.inf
+        has_pilot = self.format.has_pilot(self.frame % self.format.frames)
+        return self._end_us(self.lock, self.start_us(self.frame), self._chips(has_pilot))
+
     def due(self, until_us: float) -> DueFrame | None:
         """The next frame, if it lies before a time with the events after its last edge."""
         lock = self.lock
@@ -99,13 +107,20 @@ class PacketGrid:
             return None
         number, index = divmod(self.frame, self.format.frames)
         has_pilot = self.format.has_pilot(index)
-        chips = self.format.frame_chips if has_pilot else self.format.info_chips
-        late_us = max(lock.delay_on_us, lock.delay_off_us, 0.0) + lock.last_row_us
-        end_us = start_us + chips * lock.chip_us + late_us
+        chips = self._chips(has_pilot)
+        end_us = self._end_us(lock, start_us, chips)
         if end_us > until_us:
             return None
         packet_us = start_us - self.format.frame_start_chip(index) * lock.chip_us
         return DueFrame(self.frame, number, index, chips, has_pilot, packet_us, start_us, end_us, lock)
+
+    def _chips(self, has_pilot: bool) -> int:
+        return self.format.frame_chips if has_pilot else self.format.info_chips
+
+    @staticmethod
+    def _end_us(lock: SyncLock, start_us: float, chips: int) -> float:
+        late_us = max(lock.delay_on_us, lock.delay_off_us, 0.0) + lock.last_row_us
+        return start_us + chips * lock.chip_us + late_us
 
     def _period_us(self, lock: SyncLock) -> float:
         return self.format.packet_chips * lock.chip_us

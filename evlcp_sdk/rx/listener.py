@@ -21,7 +21,7 @@ from evlcp_sdk.rx.timeline import TimeStep
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.utc import ClockZero
-from evlcp_sdk.values import Packet, Region, changed
+from evlcp_sdk.values import Frame, Packet, Region, changed
 
 __all__ = ["LinkListener"]
 
@@ -39,6 +39,7 @@ class LinkListener:
         name: Name of the link, that its frames have; empty for none.
         numbers: Where the numbers of transmitters come from; None for 0, 1, 2...
         rhythm: Scores of the pixels, of another listener in the same rhythm; None for its own.
+        on_frame: Gets each frame as soon as it is decoded; None for nobody.
     """
 
     def __init__(
@@ -52,10 +53,11 @@ class LinkListener:
         name: str = "",
         numbers: Iterator[int] | None = None,
         rhythm: Rhythm | None = None,
+        on_frame: Callable[[Frame], None] | None = None,
     ) -> None:
         self.link, self.name = link, name
         self._clock = clock
-        self._announcer = Announcer(hook, clock.camera_us)
+        self._announcer = Announcer(hook, clock.camera_us, on_frame)
         tracker = tracker_of(link)
         self._regions = _regions_of(link, tracker, limits, rhythm)
         self._judged = EchoQueue(Echoes(link.packet, len(link.codebook.codewords)))
@@ -125,6 +127,15 @@ class LinkListener:
     def __bool__(self) -> bool:
         """Whether anything waits for the next step."""
         return bool(self._regions.alive or self._judged)
+
+    @property
+    def due_us(self) -> float:
+        """When the next frame can be decoded before the end of its time step, us; infinite for none."""
+        return self._framing.due_us
+
+    def ahead(self, step: TimeStep) -> None:
+        """Decode the frames that are due in the part so far of a time step."""
+        self._framing.ahead(step)
 
     def step(self, step: TimeStep, taken: list[Region], holding: set[int]) -> list[Packet]:
         """Follow the regions through a time step; receive and decode what they send.

@@ -66,6 +66,11 @@ class Places:
         self._end = end + 1
         self.latest = region
 
+    def take_back(self) -> None:
+        """Drop the newest, as if it had not been taken."""
+        self._end -= 1
+        self.latest = region_of(self.latest.id, *self._columns[:, self._end - 1].tolist())
+
     def forget_before(self, t_us: float) -> None:
         """Drop those older than a time but for the newest of them, and two in any case."""
         t = self._columns[0]

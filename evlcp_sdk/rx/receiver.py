@@ -1,7 +1,7 @@
 """The receiver: events in, packets out."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import count
 
@@ -17,7 +17,7 @@ from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.rx.timeline import Timeline, TimeStep
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.utc import ClockZero
-from evlcp_sdk.values import Events, Packet, Region
+from evlcp_sdk.values import Events, Frame, Packet, Region
 
 __all__ = ["Receiver"]
 
@@ -29,6 +29,9 @@ class Receiver:
     several links, every region is tried by each; a packet is given by the one that explains most of the light
     there, once each had its time to answer, and names it.
 
+    Packets come when they are complete. A frame is decoded as soon as its last events are there, before its
+    time step is over, and told at once.
+
     Args:
         link: The resolved configuration, or several of one camera.
         hook: Where finished stages are announced (`Registry.hook`); None for nowhere.
@@ -36,6 +39,9 @@ class Receiver:
             against the sensor. None for nothing.
         clock_zero: UTC of the camera clock's 0, for the age of signed beacons; None if it is not known.
         limits: How much it holds at the most.
+        on_frame: Gets each frame as soon as it is decoded, within `feed` or `close`, in order of a
+            transmitter's frames. Its packet has the same later; only `echo_of` is by what is known then. Of
+            several links, frames come with their packet. None for nobody.
 
     Raises:
         ConfigError: Links that cannot be received together, or nothing tells them apart.
@@ -58,6 +64,7 @@ class Receiver:
         attitude: Attitude | AttitudeLog | None = None,
         clock_zero: ClockZero = None,
         limits: Limits = LIMITS,
+        on_frame: Callable[[Frame], None] | None = None,
     ) -> None:
         links = named_links(link)
         first = next(iter(links.values()))
@@ -77,9 +84,11 @@ class Receiver:
                 name,
                 numbers,
                 rhythms.get(name),
+                on_frame if len(links) == 1 else None,
             )
             for name, one in links.items()
         ]
+        self._on_frame = on_frame
         self._contest: Contest | None = None
         if len(links) > 1:
             wait_us = max(listener.patience_us for listener in self._listeners)
@@ -135,7 +144,11 @@ class Receiver:
             raise StreamError("the receiver is closed: make a new one for a new stream")
         if len(events) and events.p.max() > 1:
             raise StreamError(f"events with polarity {events.p.max()}, expected 0 or 1")
-        return [packet for step in self._timeline.feed(events, self._waits) for packet in self._run(step)]
+        return [
+            packet
+            for step in self._timeline.feed(events, self._waits, self._due_us)
+            for packet in self._run(step)
+        ]
 
     def close(self) -> list[Packet]:
         """End the stream; return the packets that were still incomplete."""
@@ -158,8 +171,16 @@ class Receiver:
         """Whether anything waits for the next step."""
         return any(self._listeners) or bool(self._contest)
 
+    def _due_us(self) -> float:
+        """When the next frame can be decoded, us."""
+        return min(listener.due_us for listener in self._listeners)
+
     def _run(self, step: TimeStep) -> list[Packet]:
         """Give each link a time step; give the packets that are complete, of the links that fit."""
+        if not step.whole:
+            for listener in self._listeners:
+                listener.ahead(step)
+            return []
         contest = self._contest
         if contest is None:
             (listener,) = self._listeners
@@ -178,7 +199,11 @@ class Receiver:
             if not one.fits:
                 listener.refuse(one.packet)
                 continue
-            packets += listener.read([one.packet])
+            given = listener.read([one.packet])
+            if self._on_frame is not None:
+                for frame in given[0].frames:
+                    self._on_frame(frame)
+            packets += given
             for other in self._listeners:
                 if other is not listener:
                     other.disclaim(one.place)

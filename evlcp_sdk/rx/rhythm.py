@@ -101,27 +101,30 @@ class Rhythm:
         self._turn = _kernels.CLOCK_ROUND // 4
         self._row = 0
         self._seen: int | None = None
+        self._open_us, self._taken, self._rises = -1, 0, 0
         self._shared = shared
-        self._kept: tuple[int, int, NDArray[np.int32]] | None = None
+        self._kept: tuple[tuple[int, int], int, NDArray[np.int32]] | None = None
 
     def step(self, start_us: int, events: Events, hits: NDArray[np.int32], cell_shift: int) -> int:
         """Take the events of a time step; add the rises of candidates to their cell's `hits`; how many.
 
         Args:
             start_us: Start of the step, us.
-            events: Those in it, in order.
+            events: Those in it, in order; a part of a step comes again with the rest, and counts once.
             hits: Of cells of 2^cell_shift px, int32 (rows, columns).
             cell_shift: See there.
         """
-        if self._kept is not None and self._kept[0] == start_us:
+        if self._kept is not None and self._kept[0] == (start_us, len(events)):
             hits[:] = self._kept[2]
             return self._kept[1]
-        self._grow_old(start_us >> self._shift)
-        rises: int = _kernels.score_rises(
-            events.t_us,
-            events.x,
-            events.y,
-            events.p,
+        if start_us != self._open_us:
+            self._open_us, self._taken, self._rises = start_us, 0, 0
+            self._grow_old(start_us >> self._shift)
+        self._rises += _kernels.score_rises(
+            events.t_us[self._taken :],
+            events.x[self._taken :],
+            events.y[self._taken :],
+            events.p[self._taken :],
             self._pixels,
             hits,
             self._kinds,
@@ -131,9 +134,10 @@ class Rhythm:
             self._min_score,
             cell_shift,
         )
+        self._taken = len(events)
         if self._shared:
-            self._kept = start_us, rises, hits.copy()
-        return rises
+            self._kept = (start_us, len(events)), self._rises, hits.copy()
+        return self._rises
 
     def of(self, events: Events) -> Events:
         """Those of candidates that are no lamps.

@@ -51,12 +51,17 @@ class Announcer:
     Args:
         hook: Where that is heard (`Registry.hook`); None for nowhere.
         camera_us: Gives the camera clock's time of a time inside.
+        on_frame: Gets each frame; None for nobody.
     """
 
     def __init__(
-        self, hook: pluggy.HookRelay | None = None, camera_us: Callable[[float], float] = lambda t_us: t_us
+        self,
+        hook: pluggy.HookRelay | None = None,
+        camera_us: Callable[[float], float] = lambda t_us: t_us,
+        on_frame: Callable[[Frame], None] | None = None,
     ) -> None:
         self._camera_us = camera_us
+        self._on_frame = on_frame
         self._hook: Callable[..., Any] | None = None
         if hook is not None and hook.evlcp_stage_finished.get_hookimpls():
             self._hook = hook.evlcp_stage_finished
@@ -76,11 +81,12 @@ class Announcer:
         elapsed_s, self._lap_s = now - self._lap_s, now
         self._say(stage, value, elapsed_s)
 
-    def total(self, stage: str, value: object) -> None:
-        """Announce what took all laps since the start together."""
-        if self._hook is None:
-            return
-        self._say(stage, value, self._lap_s - self._start_s)
+    def frame(self, frame: Frame) -> None:
+        """Announce a frame, which took all laps since the start together."""
+        if self._on_frame is not None:
+            self._on_frame(on_camera(frame, self._camera_us))
+        if self._hook is not None:
+            self._say("frame", frame, self._lap_s - self._start_s)
 
     def _say(self, stage: str, value: object, elapsed_s: float) -> None:
         assert self._hook is not None

@@ -1,9 +1,11 @@
 """The clock's side of a stream: its grid of time steps, its gaps."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.rx.limits import LIMITS, Limits
@@ -19,28 +21,41 @@ more memory than their events."""
 _WHOLE_EVENTS = 4096
 
 
+_LATER_US = 1 << 62
+"""When what is due later than in the open step is due."""
+
+
 @dataclass(frozen=True, eq=False)
 class TimeStep:
-    """The events of one time step.
+    """The events of one time step, or of its part so far.
 
     Attributes:
         start_us: A multiple of the step's length after the stream's first event, us.
-        end_us: Start of the next step, or the last event of a stream that ends in this one, us.
+        end_us: Start of the next step, or the last event of a stream that ends in this one, us; of a part,
+            the time before which all of its events are.
         events: Those in it, in order.
         after_gap: Steps in which nothing could happen were left out before it.
+        whole: It is no part: its events do not come again.
     """
 
     start_us: int
     end_us: int
     events: Events
     after_gap: bool
+    whole: bool = True
+
+
+def _never() -> float:
+    return math.inf
 
 
 class Timeline:
     """Cuts a stream into time steps on a fixed grid, whatever pieces it comes in.
 
     A step is given once an event after it has been seen. Empty steps are given as long as somebody waits for
-    them, and left out in a gap. Times are those inside: see `CameraClock`.
+    them, and left out in a gap. The part of a step before a time at which something is due is given as soon
+    as an event after that has been seen in the step, and once more with the whole step. Times are those
+    inside: see `CameraClock`.
 
     Args:
         step_us: Length of a step, us.
@@ -69,23 +84,35 @@ class Timeline:
         self._start_us: int | None = None
         self._pending: list[Events] = []
         self._after_gap = False
+        self._part_us = 0
+        self._due_us: int | None = None
 
-    def feed(self, events: Events, waiting: Callable[[], bool]) -> Iterator[TimeStep]:
+    def feed(
+        self, events: Events, waiting: Callable[[], bool], due_us: Callable[[], float] = _never
+    ) -> Iterator[TimeStep]:
         """Take the next events of the stream; give the steps that they complete.
 
         Args:
             events: Those that the clock drops are in no step.
             waiting: Says after a step whether the next one matters even if it is empty.
+            due_us: Says after a step, or a part, when something is due next, us; what it says changes with
+                these only.
         """
         for kept in self.clock.take(events):
-            yield from self._cut(kept, waiting)
+            yield from self._cut(kept, waiting, due_us)
 
-    def _cut(self, events: Events, waiting: Callable[[], bool]) -> Iterator[TimeStep]:
+    def _cut(
+        self, events: Events, waiting: Callable[[], bool], due_us: Callable[[], float]
+    ) -> Iterator[TimeStep]:
         """Cut events that are in order and not none."""
         if self._start_us is None:
             self._start_us = 0
         done = 0
         for end in self._bounds(events, self._start_us):
+            for part in self._parts(events.t_us[:end], due_us):
+                self._keep(events[done:part])
+                done = part
+                yield self._so_far()
             self._keep(events[done:end])
             done = end
             yield self._next()
@@ -94,8 +121,33 @@ class Timeline:
                 yield self._next()
             if self._start_us < next_us:
                 self._start_us, self._after_gap = next_us, True
+        for part in self._parts(events.t_us, due_us):
+            self._keep(events[done:part])
+            done = part
+            yield self._so_far()
         if done < len(events):
             self._keep(events[done:])
+
+    def _parts(self, t_us: NDArray[np.int64], due_us: Callable[[], float]) -> Iterator[int]:
+        """Where parts of the open step end among the times of its events; all that come before are kept."""
+        assert self._start_us is not None
+        while True:
+            if self._due_us is None:
+                due = due_us()
+                within = max(self._start_us, self._part_us) < due < self._start_us + self._step_us
+                self._due_us = math.ceil(due) if within else _LATER_US
+            end = int(np.searchsorted(t_us, self._due_us))
+            if end == len(t_us):
+                return
+            self._part_us, self._due_us = self._due_us, None
+            yield end
+
+    def _so_far(self) -> TimeStep:
+        """The part of the open step whose end is due."""
+        assert self._start_us is not None
+        self._pending = [Events.concat(self._pending)] if len(self._pending) > 1 else self._pending
+        events = self._pending[0] if self._pending else Events.empty()
+        return TimeStep(self._start_us, self._part_us, events, self._after_gap, whole=False)
 
     def _keep(self, events: Events) -> None:
         """Add events to the step that is open, as far as it has room."""
@@ -124,7 +176,7 @@ class Timeline:
         assert self._start_us is not None
         events = self._pending[0] if len(self._pending) == 1 else Events.concat(self._pending)
         start_us, after_gap = self._start_us, self._after_gap
-        self._pending, self._waiting, self._after_gap = [], 0, False
+        self._pending, self._waiting, self._after_gap, self._due_us = [], 0, False, None
         self._start_us += self._step_us
         return TimeStep(start_us, self._start_us if end_us is None else end_us, events, after_gap)
 

@@ -102,6 +102,52 @@ def test_any_split_of_the_stream_gives_the_same_steps(seed: int, cuts: list[int]
     assert other.clock.counts == timeline.clock.counts
 
 
+def parts_of(events: Events, cuts: list[int], dues_us: list[int]) -> list[TimeStep]:
+    """Steps and parts of a stream in pieces, where something is due at times inside."""
+    timeline = Timeline(STEP_US, WIDTH, HEIGHT)
+    steps: list[TimeStep] = []
+
+    def due_us() -> float:
+        now_us = steps[-1].end_us if steps else 0
+        return min((due - 0.5 for due in dues_us if due > now_us), default=float("inf"))
+
+    for a, b in pairwise([0, *cuts, len(events)]):
+        for step in timeline.feed(events[a:b], lambda: False, due_us):
+            steps.append(step)
+    return steps + list(timeline.close())
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 20), st.lists(st.integers(0, 300), max_size=40), st.sets(st.integers(1, 20_000)))
+def test_a_part_of_a_step_comes_when_it_is_due(seed: int, cuts: list[int], dues: set[int]) -> None:
+    events = stream(seed)
+    starts_us = {step.start_us for step in steps_of(events, [], waits=0)[0]}
+    # Nothing is due in a gap, in which nobody waits.
+    dues_us = sorted(due for due in dues if due // STEP_US * STEP_US in starts_us)
+    given_ = parts_of(events, sorted(cuts), dues_us)
+    assert plain([s for s in given_ if s.whole]) == plain(steps_of(events, [], waits=0)[0])
+    found = [(s.start_us, s.end_us, rows(s.events)) for s in given_ if not s.whole]
+    # One by one: the last step ends with the stream, and may have parts, too.
+    want = []
+    for step in (s for s in given_ if s.whole):
+        within = rows(step.events)
+        for due in dues_us:
+            if step.start_us < due < step.start_us + STEP_US and any(t >= due for t, *_ in within):
+                want.append((step.start_us, due, [row for row in within if row[0] < due]))
+    assert found == want
+
+
+def test_a_part_comes_with_the_event_behind_it() -> None:
+    timeline = Timeline(STEP_US, WIDTH, HEIGHT)
+    assert not list(
+        timeline.feed(Events.of([1000, 1029], [1] * 2, [1] * 2, [1] * 2), lambda: False, lambda: 30)
+    )
+    (part,) = timeline.feed(Events.of([1030], [1], [1], [1]), lambda: False, lambda: 30)
+    assert (part.start_us, part.end_us, part.events.t_us.tolist(), part.whole) == (0, 30, [0, 29], False)
+    (whole,) = timeline.close()
+    assert whole.events.t_us.tolist() == [0, 29, 30]
+
+
 def test_a_stream_without_events_has_no_steps() -> None:
     off = Events.of([5, 6], [WIDTH, 0], [0, HEIGHT], [1, 1])
     steps, timeline = steps_of(Events.concat([Events.empty(), off]), [0, 1], waits=1)
