@@ -3,7 +3,8 @@
     python benchmarks/integrity.py               # the figures of docs/position.md: 100 000 fixes, minutes
     python benchmarks/integrity.py --fixes 200   # of a row
     python benchmarks/integrity.py --bar-fault 0.5   # levels against bars off by half a metre (sigma)
-    python benchmarks/integrity.py --floor       # what no test can find, in closed form: seconds
+    python benchmarks/integrity.py --floor       # what no test can find, in closed form: minutes
+    python benchmarks/integrity.py --track       # the same covariances over drives, filtered and smoothed
 
 Bars stand 30 to 90 m ahead, anywhere in view. Every error is drawn from its stated sigma: of points, of what
 a bar's points share, of survey, camera and attitude; then one part is made wrong without anybody's
@@ -37,9 +38,11 @@ from evlcp_sdk.place.judgement import Pose
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.place.pose import solve_pose
 from evlcp_sdk.place.refusals import Refusal
+from evlcp_sdk.place.trajectory import filter_fixes, smooth_trajectory
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.study.tally import SILENT_NEES
+from evlcp_sdk.values import Fix
 
 Floats = NDArray[np.float64]
 
@@ -312,6 +315,95 @@ WORLDS = {
     "3 bars, gravity": World(3, "gravity"),
     "3 bars, heading": World(3, "heading"),
 }
+STEPS, STEP_S, SPEED_M_S = 20, 0.036, 11.0
+"""Fixes of a drive, their distance in time, and the speed at first: 8 m."""
+
+
+def drive(world: World, rng: np.random.Generator, spec: PositionSpec) -> tuple[list[Fix], Floats]:
+    """Fixes past bars with errors of the sigmas and of the persistence that are stated, and the true places.
+
+    Bars are 50 to 90 m ahead at first; the motion is what the track takes it for, white acceleration.
+    """
+    pitch, roll, heading = rng.uniform(0, 6), rng.normal(0, 1), rng.uniform(0, 360)
+    rotation = Attitude(pitch, roll, heading).rotation()
+    true = replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + world.focal * rng.normal()))
+    off, known = rng.normal(0, world.attitude_deg, 3), world.attitude_deg
+    told = {
+        "none": None,
+        "gravity": Attitude(pitch + off[0], roll + off[1], None, known, known),
+        "heading": Attitude(pitch + off[0], roll + off[1], (heading + off[2]) % 360, known, known),
+    }[world.told]
+    depth, (place, turn, length) = rng.uniform(50, 90), world.survey
+    bars = []
+    for slot in rng.permutation(3)[: world.bars]:
+        sight = np.array([(slot - 1) * 0.055 + rng.uniform(-0.02, 0.02), rng.uniform(-0.025, 0.025), 1.0])
+        axis = np.array([*rng.normal(0, 0.02, 2), 1.0])
+        arm = ALONG[:, None] * axis / np.linalg.norm(axis)
+        stands = rotation @ (sight * depth * rng.uniform(0.8, 1.0)) + arm
+        said = stands + rng.normal(0, place, 3) + np.cross(rng.normal(0, turn, 3), arm)
+        said = said + rng.normal(0, math.hypot(length, spec.stretch_share)) * arm
+        # What the place in a pixel makes of each point changes slowly.
+        bars.append((stands, said, rng.normal(0, spec.pixel_sigma_px, (16, 2))))
+    fade = math.exp(-STEP_S / spec.slow_s)
+    ahead = np.array([math.sin(math.radians(heading)), math.cos(math.radians(heading)), 0.0])
+    state = np.concatenate([np.zeros(3), SPEED_M_S * ahead])
+    power = spec.acceleration_m2_s3 * np.array([[STEP_S**3 / 3, STEP_S**2 / 2], [STEP_S**2 / 2, STEP_S]])
+    root, sigma = np.linalg.cholesky(power), CameraSigma(focal_mm=world.focal * CAMERA.focal_mm)
+    fixes, places = [], []
+    for step in range(STEPS):
+        views = []
+        for number, (stands, said, slow) in enumerate(bars):
+            slow[:] = fade * slow + math.sqrt(1 - fade**2) * rng.normal(0, spec.pixel_sigma_px, (16, 2))
+            points, _ = project_bars(stands, state[:3], rotation, true)
+            length_px = float(np.linalg.norm(points[-1] - points[0])) * 16 / 15
+            points = points + slow + rng.normal(0, 0.05, points.shape)
+            points = points + rng.normal(
+                0, math.hypot(spec.shared_sigma_px, spec.shared_share * length_px), 2
+            )
+            views.append(BarView(number, said, points, np.full(16, POINT_PX), world.survey))
+        found = solve_pose(views, CAMERA, told, spec, sigma)
+        if isinstance(found, Pose):
+            fixes.append(
+                replace(
+                    Fix.refused(step * STEP_S * 1e6, found.transmitters, "", ""),
+                    enu_m=found.enu_m,
+                    covariance_m2=found.covariance[:3, :3],
+                    noise_m2=found.noise,
+                    slow_m2=found.slow,
+                    standing=found.standing,
+                    heading_deg=Attitude.of_rotation(found.rotation).heading_deg or 0.0,
+                )
+            )
+            places.append(state[:3].copy())
+        kick = root @ rng.normal(size=(2, 3))
+        state[:3] += STEP_S * state[3:] + kick[0]
+        state[3:] += kick[1]
+    return fixes, np.array(places)
+
+
+def tracks(drives: int) -> None:
+    """Print NEES and errors of fixes, and of the track filtered and smoothed, for each world."""
+    print("| what | fixes | NEES | 3D RMSE, m | track: NEES | m | smoothed: NEES | m |")
+    print("|---" * 8 + "|")
+    for name, world in WORLDS.items():
+        stated = replace(world, survey=SURVEYED["survey"], focal=SURVEYED["focal"])  # type: ignore[arg-type]
+        for what, of in ((name, world), (f"{name}; survey 5 cm, focal .5 %", stated)):
+            rng = np.random.default_rng(1)
+            squares, errors = [], []
+            for _ in range(drives):
+                fixes, places = drive(of, rng, SPEC)
+                points = filter_fixes(fixes, SPEC)
+                smoothed = smooth_trajectory(points, SPEC)
+                for fix, now, later, place in zip(fixes, points, smoothed, places, strict=True):
+                    off = fix.enu_m - place, now.mean[:3] - place, later.mean[:3] - place
+                    spread = fix.covariance_m2, now.covariance_m2, later.covariance_m2
+                    squares.append([e @ np.linalg.solve(p, e) for e, p in zip(off, spread, strict=True)])
+                    errors.append([e @ e for e in off])
+            nees, rmse = np.mean(squares, 0), np.sqrt(np.mean(errors, 0))
+            pairs = " | ".join(f"{n:.2f} | {m:.3f}" for n, m in zip(nees, rmse, strict=True))
+            print(f"| {what} | {len(squares)} | {pairs} |", flush=True)
+
+
 ATTITUDES: dict[str, Off] = {"attitude 1 degree off": turned, "attitude 10 ms late": late}
 FAULTS: dict[str, Fault] = {
     "bar .5 m off": moved,
@@ -331,7 +423,11 @@ def main() -> None:
         "--max-protection", type=float, default=SPEC.max_protection_m, help="m; position.max_protection_m"
     )
     parser.add_argument("--floor", action="store_true", help="what no test can find, in closed form")
+    parser.add_argument("--track", action="store_true", help=f"drives of {STEPS} fixes, --fixes in all")
     given = parser.parse_args()
+    if given.track:
+        tracks(given.fixes // STEPS)
+        return
     if given.floor:
         floors(given.fixes)
         return
