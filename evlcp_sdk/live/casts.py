@@ -9,6 +9,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.live.desk import stop_listening
 from evlcp_sdk.live.outlet import News, Outlet, Subscription
 from evlcp_sdk.results.gpsd import VERSION, answer, sky, tpv
 from evlcp_sdk.results.nmea import sentences
@@ -122,8 +123,8 @@ class Cast:
                     for news in mine.take(0):
                         self._tell(news)
             finally:
-                server.close()
                 self._outlet.leave(mine)
+                await stop_listening(server)
 
         self._pump = asyncio.create_task(pump())
 
@@ -155,13 +156,13 @@ class Cast:
         if len(self._clients) >= _MOST_CLIENTS:
             writer.close()
             return
-        writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _KERNEL_BYTES)
         client = _Client({"enable": not self._gpsd, "json": False, "nmea": not self._gpsd})
         if self._gpsd:
             client.put(_line(VERSION))
         self._clients.add(client)
         sending = asyncio.create_task(self._send(client, writer))
         try:
+            writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _KERNEL_BYTES)
             while line := await reader.readline():
                 if self._gpsd:
                     for request in line.decode("utf-8", "replace").split(";"):

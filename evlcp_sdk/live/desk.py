@@ -2,16 +2,19 @@
 
 import asyncio
 import threading
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Iterable
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
-__all__ = ["Desk"]
+__all__ = ["Desk", "Listening", "stop_listening"]
 
 _T = TypeVar("_T")
 
 _LEAVE_S = 2.0
 """How long the end of a run waits for the servers: what a client has not taken by then is left."""
+
+_QUIET_TURNS = 5
+"""Turns of the loop without a task, in which connections are let go."""
 
 
 class Desk:
@@ -28,8 +31,6 @@ class Desk:
     def _run(self) -> None:
         asyncio.set_event_loop(self.loop)
         self.loop.run_forever()
-        for task in asyncio.all_tasks(self.loop):
-            task.cancel()
         self.loop.run_until_complete(_gone(self.loop))
         self.loop.run_until_complete(self.loop.shutdown_asyncgens())
         self.loop.run_until_complete(self.loop.shutdown_default_executor())
@@ -46,10 +47,39 @@ class Desk:
         self._thread.join(_LEAVE_S)
 
 
-async def _gone(loop: asyncio.AbstractEventLoop) -> None:
-    """Let what is cancelled end."""
-    others = [task for task in asyncio.all_tasks(loop) if task is not asyncio.current_task()]
-    await asyncio.wait_for(asyncio.gather(*others, return_exceptions=True), _LEAVE_S / 2)
-    # Their connections are let go in the turns that follow.
-    for _ in range(3):
+class Listening(Protocol):
+    """A server: of `asyncio`, or of `websockets`."""
+
+    @property
+    def sockets(self) -> Iterable[Any]:
+        """Where it listens."""
+
+    def close(self) -> None:
+        """Listen no more."""
+
+
+async def stop_listening(server: Listening) -> None:
+    """Close a server. Who is just connecting is let in first: asyncio would forget that connection, open."""
+    loop = asyncio.get_running_loop()
+    for one in server.sockets:
+        loop.remove_reader(one.fileno())
+    for _ in range(2):
         await asyncio.sleep(0)
+    server.close()
+
+
+async def _gone(loop: asyncio.AbstractEventLoop) -> None:
+    """Cancel all that runs, and let it end, a moment at the most."""
+    until_s = loop.time() + _LEAVE_S / 2
+    seen: set[asyncio.Task[Any]] = set()
+    told: set[asyncio.Task[Any]] = set()
+    quiet = 0
+    while quiet < _QUIET_TURNS and loop.time() < until_s:
+        # Who has just connected has a task that must begin, or else nothing closes its connection.
+        running = asyncio.all_tasks(loop) - {asyncio.current_task()}
+        for task in (running & seen) - told:
+            task.cancel()
+            told.add(task)
+        seen = running
+        quiet = 0 if running else quiet + 1
+        await asyncio.sleep(0 if quiet or running - told else 1e-3)

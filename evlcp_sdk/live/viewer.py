@@ -24,6 +24,7 @@ from urllib.parse import urlsplit
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.budget import LEVELS
+from evlcp_sdk.live.desk import stop_listening
 from evlcp_sdk.live.loop import LiveStatus
 from evlcp_sdk.live.outlet import News, Outlet, Subscription
 from evlcp_sdk.live.pictures import Picture
@@ -211,7 +212,7 @@ class Viewer:
                 await self._send_all()
             finally:
                 self._outlet.leave(mine)
-                server.close()
+                await stop_listening(server)
 
         self._pump = asyncio.create_task(pump())
 

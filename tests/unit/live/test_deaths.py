@@ -1,0 +1,132 @@
+"""Whoever reads results, or sends events, may die at any moment: the receiver is untouched."""
+
+import json
+import random
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.link.several import named_links
+from evlcp_sdk.live import Budget, Outlet
+from evlcp_sdk.live.services import Services, Serving
+from evlcp_sdk.run import live, receive
+from evlcp_sdk.values import Frame
+from tests.unit.live.test_casts import port_of, tell
+
+PATIENT = Budget(waiting_ms=1e6, most_ms=1e7)
+NOW = struct.pack("ii", 1, 0)
+"""A connection is not ended, but broken off (RST), as by a process that is killed."""
+
+
+def key(frame: Frame) -> tuple[Any, ...]:
+    return frame.transmitter, frame.packet, frame.frame, frame.t_us, frame.soft.symbols.tobytes()
+
+
+def dies(link: socket.socket) -> None:
+    link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, NOW)
+    link.close()
+
+
+def test_who_reads_results_may_die_at_any_moment(demo_raw: Path) -> None:
+    outlet, over, lives = Outlet(), threading.Event(), {"nmea": 0, "gpsd": 0, "view": 0}
+    serving = Serving(view=True, nmea_port=0, gpsd_port=0)
+    with Services(serving, outlet, named_links(load_link()), name="x") as services:
+        assert services.view is not None
+        url = services.view.url.replace("http", "ws") + "live"
+
+        def client(kind: str) -> None:
+            rng = random.Random(kind)
+            while not over.is_set():
+                link = socket.create_connection(("127.0.0.1", port_of(services, kind)), 5)
+                link.settimeout(rng.choice((0.001, 0.02, 0.05)))
+                with suppress(OSError):
+                    link.sendall(b'?WATCH={"enable":true,"json":true};\n' if kind == "gpsd" else b"\n")
+                    lives[kind] += bool(link.recv(rng.choice((1, 100, 5000))))
+                dies(link)
+
+        def browser() -> None:
+            rng = random.Random(7)
+            while not over.is_set():
+                with connect(url, compression=None) as link:
+                    link.recv(5)
+                    for _ in range(rng.randrange(4)):
+                        link.send('{"next": true}')
+                        with suppress(TimeoutError, ConnectionClosed):
+                            link.recv(rng.choice((0.001, 0.02, 0.1)))
+                            lives["view"] += 1
+                    # It says no farewell.
+                    link.socket.shutdown(socket.SHUT_RDWR)
+
+        def fixes() -> None:
+            while not over.wait(0.01):
+                tell(outlet, time.monotonic() * 1e6)
+
+        jobs = [(client, "nmea"), (client, "gpsd"), (browser,), (fixes,)]
+        threads = [threading.Thread(target=job, args=given) for job, *given in jobs]
+        for thread in threads:
+            thread.start()
+        mine = outlet.subscribe({"frame"}, most=100_000)
+        try:
+            replay = f"replay:{demo_raw}?speed=0.05"
+            given: dict[str, Any] = {"outlet": outlet, "pictures": services.pictures, "budget": PATIENT}
+            summary = live(replay, **given, warm=False)
+        finally:
+            over.set()
+            for thread in threads:
+                thread.join(10)
+        assert not any(thread.is_alive() for thread in threads)
+    assert summary["status"] == "complete"
+    assert not any(summary["live"]["shed"].values())
+    assert min(lives.values()) > 3, lives
+    assert [key(news.value) for news in mine.take()] == [key(f) for p in receive(demo_raw) for f in p.frames]
+
+
+@contextmanager
+def sender(data: bytes, end: Callable[[socket.socket], None]) -> Iterator[str]:
+    """Sends something to who connects, and then ends in a way."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def send() -> None:
+            link, _ = listening.accept()
+            with link:
+                link.sendall(data)
+                time.sleep(0.3)
+                end(link)
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        yield f"tcp://127.0.0.1:{listening.getsockname()[1]}"
+        thread.join(10)
+
+
+def test_who_sends_may_die_at_any_moment(demo_raw: Path, tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+    """Half a recording, and half a word, are received; where the connection broke is said in one line."""
+    data = demo_raw.read_bytes()
+    data = data[: len(data) // 2 | 1]
+    (tmp_path / "half.raw").write_bytes(data)
+    file = evlcp("receive", tmp_path / "half.raw", "--json", "-o", tmp_path / "file")
+    due = json.loads(file.out)["counts"]["frames"]
+    assert due > 3
+    given = ("--waiting-ms", "100000", "--json", "-o")
+    for name, end, status, code in (
+        ("ended", socket.socket.close, "complete", 0),
+        ("broken", dies, "failed", 3),
+    ):
+        with sender(data, end) as url:
+            done = evlcp("live", url, *given, tmp_path / name)
+        summary = json.loads(done.out)
+        assert (done.code, summary["status"]) == (code, status), done.err
+        assert summary["counts"]["frames"] == due
+        files = [(tmp_path / one / "frames.csv").read_text() for one in ("file", name)]
+        assert files[0] == files[1]
+        assert "Traceback" not in done.err
+    assert len(done.err.strip().splitlines()) == 1
