@@ -103,8 +103,8 @@ class TransmitterTally:
             self.echoes += frame.echo_of is not None
             self.echo_of = frame.echo_of
             symbols = frame.soft.symbols.tolist()
-            self.values.update(s for s in symbols if s >= 0)
-            self.unseen.update(k for k, s in enumerate(symbols) if s < 0)
+            self.values.update([s for s in symbols if s >= 0])
+            self.unseen.update([k for k, s in enumerate(symbols) if s < 0])
             distance_m = frame.range.distance_m
             if math.isfinite(distance_m):
                 self.ranged += 1

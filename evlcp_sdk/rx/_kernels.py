@@ -361,11 +361,24 @@ def add_polarity(
     apart = start_on_us - start_off_us
     rate = 1 / chip_us
     # Which chip, many events at a time; then into its pixel, one by one.
-    which = np.empty(_MANY, np.int32)
-    columns, rows = np.uint32(width), np.uint32(height)
+    which, where, flat = np.empty(_MANY, np.int32), np.empty(_MANY, np.uint32), sums.reshape(-1)
+    columns, rows, many = np.uint32(width), np.uint32(height), np.uint32(chips)
     for begin in range(first, last, _MANY):
         end = min(begin + _MANY, last)
         _chips_of(t_us[begin:end], y[begin:end], p[begin:end], origin, row_us, apart, rate, which)
+        low, high = _outermost(which[: end - begin], many)
+        still = low < many
+        for k in range(low + 1, high + 1):
+            still &= shift_x[k] == shift_x[low] and shift_y[k] == shift_y[low]
+        if still:
+            # In the chips of so few events, the image seldom moves by a pixel.
+            left, top = np.int32(shift_x[low]), np.int32(shift_y[low])
+            _pixels_of(x[begin:end], y[begin:end], which, left, top, many, rows, columns, where)
+            for i in range(begin, end):
+                at = where[i - begin]
+                if at != _NOWHERE:
+                    flat[at] += np.int16(2 * np.int16(p[i]) - 1)
+            continue
         for i in range(begin, end):
             c = np.uint32(which[i - begin])
             if c >= np.uint32(chips):
@@ -380,6 +393,9 @@ def add_polarity(
 
 _MANY = 512
 """Events whose chips are found together: they stay in the fastest cache."""
+
+_NOWHERE = np.uint32((1 << 32) - 1)
+"""Number of no pixel."""
 
 
 @njit(cache=True, nogil=True)
@@ -398,6 +414,37 @@ def _chips_of(
         late = t_us[i] - origin - row_us * y[i] - apart * p[i]
         chip = np.int32(min(late * rate, 1e9))
         out[i] = np.int32(-1) if late < 0 else chip
+
+
+@njit(cache=True, nogil=True)
+def _outermost(which: Array, chips: np.uint32) -> tuple[np.uint32, np.uint32]:
+    """The first and the last chip of those from 0 to `chips` - 1; the first is beyond where there is none."""
+    low, high = _NOWHERE, np.uint32(0)
+    for i in range(which.size):
+        c = np.uint32(which[i])
+        low = min(low, c)
+        high = max(high, c if c < chips else np.uint32(0))
+    return low, high
+
+
+@njit(cache=True, nogil=True)
+def _pixels_of(
+    x: Array,
+    y: Array,
+    which: Array,
+    left: np.int32,
+    top: np.int32,
+    chips: np.uint32,
+    rows: np.uint32,
+    columns: np.uint32,
+    out: Array,
+) -> None:
+    """Number of each event's pixel in images one after the other, `out` uint32 (n,); `_NOWHERE` outside."""
+    for i in range(x.size):
+        c = np.uint32(which[i])
+        u, v = np.uint32(np.int32(x[i]) - left), np.uint32(np.int32(y[i]) - top)
+        inside = (c < chips) & (u < columns) & (v < rows)
+        out[i] = (c * rows + v) * columns + u if inside else _NOWHERE
 
 
 @njit(cache=True, nogil=True)

@@ -279,13 +279,17 @@ class Echoes:
         for known in self._seen.values():
             while known and known[0].frame.t_us < self._now_us - self._keep_us:
                 known.popleft()
-        self._seen = {number: known for number, known in self._seen.items() if known}
-        oldest_us = self._now_us - _REMEMBER_US
-        self._pairs = {key: pair for key, pair in self._pairs.items() if pair.last_us >= oldest_us}
+        if not all(self._seen.values()):
+            self._seen = {number: known for number, known in self._seen.items() if known}
+        if self._pairs:
+            oldest_us = self._now_us - _REMEMBER_US
+            self._pairs = {key: pair for key, pair in self._pairs.items() if pair.last_us >= oldest_us}
 
     def _decide(self) -> None:
         before = set(self._echo_of.values())
         self._echo_of = {}
+        if not self._pairs:
+            return
         odds = {key: pair.odds() for key, pair in self._pairs.items() if pair.same}
         groups: list[set[int]] = []
         for key in sorted(odds):

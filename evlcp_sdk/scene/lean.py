@@ -80,7 +80,7 @@ def sight_of(
         attitude: What is known of the camera's attitude; None for nothing.
     """
     points = points_px.tolist()
-    seen = [k for k, (x, y) in enumerate(points) if math.isfinite(x) and math.isfinite(y)]
+    seen = [k for k, (x, y) in enumerate(points) if math.isfinite(x + y)]
     if len(seen) < 2:
         return BarSight()
     first, last = seen[0], seen[-1]

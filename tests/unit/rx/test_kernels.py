@@ -1,6 +1,7 @@
 """The receiver's compiled loops against their twins."""
 
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -269,15 +270,17 @@ def test_polarity_sums(seed, freeze):
     chip_us = rng.integers(8 * 60, 8 * 140) / 8
     row_us, row_px = rng.integers(-3 * 8, 3 * 8) / 8, float(rng.integers(0, 12))
     shape = (24, 9, 7)
-    shifts = rng.integers(-3, 12, (2, shape[0]))
+    moving = rng.integers(-3, 12, (2, shape[0]))
+    still = np.repeat(moving[:, :1], shape[0], axis=1)
+    jolted = np.where(np.arange(shape[0]) < 12, still, moving[:, -1:])
     sums = np.zeros(shape, np.int16)
     e = frozen(events, freeze)
-    for row in (0.0, row_us):
+    for row, shifts in product((0.0, row_us), (moving, still, jolted)):
         sums[:] = 0
         _kernels.add_polarity(e.t_us, e.x, e.y, e.p, start_on, start_off, chip_us, row, row_px, *shifts, sums)
         want = twins.polarity_sums(events, start_on, start_off, chip_us, *shifts, shape, row, row_px)
         assert_array_equal(sums, want)
-    assert sums.any()
+        assert sums.any()
 
 
 @pytest.mark.parametrize("clusters", [1, 2, 5, 16])
