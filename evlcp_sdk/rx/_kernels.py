@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk._kernels import _median
 from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
@@ -453,8 +454,8 @@ def count_rows(
 ) -> None:
     """Add events to counts (polarity, blocks of rows, steps), from `start_us` (2,) and edge `top` on."""
     _, blocks, steps = counts.shape
-    first = np.searchsorted(t_us, start_us.min())
-    last = np.searchsorted(t_us, start_us.max() + steps * step_us)
+    first = np.searchsorted(t_us, min(start_us[0], start_us[1]))
+    last = np.searchsorted(t_us, max(start_us[0], start_us[1]) + steps * step_us)
     for i in range(first, last):
         s = int(np.floor((t_us[i] - start_us[p[i]]) / step_us))
         b = int(np.floor((y[i] - top) / block))
@@ -818,7 +819,7 @@ def lit_clusters(
     light = np.empty(len(codes))
     pilot_light(sums, codes, every, prior, grid, light)
     others = light[in_place]
-    enough = max(least * np.median(others) if others.size else 0.0, 1e-9)
+    enough = max(least * _median(others, others.size) if others.size else 0.0, 1e-9)
     for k in range(light.size):
         seen[k] = light[k] >= enough
     return bool(np.all(seen))
@@ -1595,7 +1596,7 @@ def slope_of_rows(
     top = np.empty(blocks)
     for b in range(blocks):
         top[b] = fit[b].max()
-    middle = np.median(top)
+    middle = _median(top.copy(), blocks) if blocks else 0.0
     at, place = np.empty(blocks), np.empty(blocks)
     n = 0
     for b in range(blocks):
@@ -1618,8 +1619,11 @@ def slope_of_rows(
             if at[j] - at[i] > (at[n - 1] - at[0]) / 3:
                 slopes[pairs] = (place[j] - place[i]) / (at[j] - at[i])
                 pairs += 1
-    slope = np.median(slopes[:pairs])
+    if not pairs:
+        return np.nan, np.nan
+    slope = _median(slopes, pairs)
     rest = place[:n] - slope * at[:n]
-    spread = max(1.48 * np.median(np.abs(rest - np.median(rest))), least)
+    rest = np.abs(rest - _median(rest, n))
+    spread = max(1.48 * _median(rest, n), least)
     mean = at[:n].mean()
     return slope, spread / np.sqrt(((at[:n] - mean) ** 2).sum())

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk._kernels import _median
 from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
@@ -107,34 +108,6 @@ def straight(x: Array, y: Array) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True)
-def _median(values: Array, n: int) -> float:
-    """Median of the first n values, which it reorders (Hoare's selection)."""
-    middle = n // 2
-    low, high = 0, n - 1
-    while low < high:
-        pivot, i, j = values[middle], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if j < middle:
-            low = i
-        if middle < i:
-            high = j
-    if n % 2:
-        return float(values[middle])
-    below = values[0]
-    for i in range(1, middle):
-        below = max(below, values[i])
-    return float((below + values[middle]) / 2)
-
-
-@njit(cache=True, nogil=True)
 def core_of(counts: Array) -> tuple[float, float]:
     """Middle and half the extent of the cells about the fullest that have three tenths of it.
 
@@ -210,8 +183,14 @@ def lie_of_cells(selected: Array, line: Array, seen: Array) -> int:
     cell_medians(selected, middles)
     if not lies_across(middles):
         return 1 if line_of_cells(selected, middles, line, seen) else 0
-    turned = np.ascontiguousarray(selected.transpose(0, 2, 1))
-    return 2 if line_of_cells(turned, middles[:, ::-1].copy(), line, seen) else 0
+    clusters, rows, columns = selected.shape
+    turned = np.empty((clusters, columns, rows), np.bool_)
+    for k in range(clusters):
+        middles[k, 0], middles[k, 1] = middles[k, 1], middles[k, 0]
+        for c in range(columns):
+            for r in range(rows):
+                turned[k, c, r] = selected[k, r, c]
+    return 2 if line_of_cells(turned, middles, line, seen) else 0
 
 
 @njit(cache=True, nogil=True)
@@ -385,8 +364,12 @@ def read_bar(
     one, other = first - 0.5 * spacing, first + (clusters - 0.5) * spacing
     bar_values(sums, place[2:4], place[4], one, other, full, veil, values)
     if spacing < 0:
-        values[:] = values[:, ::-1].copy()
-        moved[:] = -moved
+        # Arrays as a whole take a second and a half to compile.
+        for k in range(len(moved)):
+            moved[k] = -moved[k]
+        for k in range(len(values)):
+            for r in range(rows // 2):
+                values[k, r], values[k, rows - 1 - r] = values[k, rows - 1 - r], values[k, r]
         spacing, first = -spacing, rows - 1 - first
     centre = first + spacing * (clusters - 1) / 2 - (rows - 1) / 2
     return dimmer(pilots, seen, spacing, centre, values)
