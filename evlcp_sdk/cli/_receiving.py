@@ -162,11 +162,12 @@ def plan_of(
     *,
     mcap: bool,
 ) -> "PositionPlan | None":
-    """What the options say of positions, of the one of several links that they are computed from."""
-    from evlcp_sdk.link.several import named_links, placing_link
+    """What the options say of positions, of those of several links that they are computed from."""
+    from evlcp_sdk.link.several import named_links, placing_links
 
-    named = named_links(links)
-    placing = named[placing_link(named)] if sites is not None else links[0]
+    placing = links[0]
+    if sites is not None:
+        placing = next(iter(placing_links(named_links(links)).values()))
     return position_plan_of(sites, gnss, placing, zero, mcap=mcap)
 
 

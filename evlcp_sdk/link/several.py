@@ -7,7 +7,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.registry import Registry
 
-__all__ = ["load_links", "named_links", "placing_link"]
+__all__ = ["load_links", "named_links", "placing_links"]
 
 LinkLike = Link | Path | str | None
 
@@ -88,23 +88,28 @@ def named_links(link: Link | Sequence[Link]) -> dict[str, Link]:
     return links
 
 
-def placing_link(links: Mapping[str, Link]) -> str:
-    """Name of the link whose bars positions are computed from: the one that shows more than one cluster.
+def placing_links(links: Mapping[str, Link]) -> dict[str, Link]:
+    """The links whose bars positions are computed from: of several, those that show more than one cluster.
 
     Args:
         links: As `named_links` gives them.
 
     Raises:
-        ConfigError: Of several links, none has such bars, or more than one.
+        ConfigError: Of several links, none has such bars, or these differ in `[position]`.
     """
     if len(links) == 1:
-        return next(iter(links))
+        return dict(links)
     # What a framing receives by itself has no points in the image.
-    bars = [n for n, one in links.items() if one.bar.clusters > 1 and "separation" in one.algorithms]
-    if len(bars) != 1:
-        what = f"{' and '.join(map(repr, bars))} have some" if bars else "no link has any"
-        raise ConfigError(f"positions are computed from the bars of one link: {what}; leave out the others")
-    return bars[0]
+    bars = {n: one for n, one in links.items() if one.bar.clusters > 1 and "separation" in one.algorithms}
+    if not bars:
+        raise ConfigError("positions are computed from bars of more than one cluster, and no link has any")
+    first, *others = bars
+    for name in others:
+        if bars[name].position != bars[first].position:
+            raise ConfigError(
+                f"links '{first}' and '{name}': [position] differs; expected one for all of them"
+            )
+    return bars
 
 
 def _check(name: str, one: Link, other_name: str, other: Link) -> None:

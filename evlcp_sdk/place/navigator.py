@@ -1,7 +1,7 @@
 """Packets to the camera's trajectory: fixes as they are known, filtered at once, smoothed a window later."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.gnss import GnssLog, attitude_of, gnss_fix
 from evlcp_sdk.place.learnt import Learnt, focal_share, learnt
-from evlcp_sdk.place.positioner import Positioner
+from evlcp_sdk.place.positioner import BarKind, Positioner
 from evlcp_sdk.place.trajectory import (
     GNSS,
     TrajectoryPoint,
@@ -120,19 +120,24 @@ class Navigator:
     """A recording's positions, in constant memory.
 
     Args:
-        link: The configuration that the receiver ran with.
+        links: The configuration that the receiver ran with; of several, those that show where bars are, by
+            name.
         plan: Where the bars stand.
         attitude: What is known of the camera's attitude, the same always or over time; None for nothing.
     """
 
     def __init__(
-        self, link: Link, plan: PositionPlan, attitude: Attitude | AttitudeLog | None = None
+        self,
+        links: Link | Mapping[str, Link],
+        plan: PositionPlan,
+        attitude: Attitude | AttitudeLog | None = None,
     ) -> None:
+        links = {"": links} if isinstance(links, Link) else links
+        link = next(iter(links.values()))
         self._spec = link.position
         self.positioner = Positioner(
             link.camera,
-            link.bar,
-            link.packet.packet_chips * link.packet.chip_us,
+            {name: BarKind.of(one) for name, one in links.items()},
             plan.sites,
             attitude_source(attitude),
             link.position,

@@ -1,12 +1,13 @@
 """Packets to positions: a pose at each time that bars are seen."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.observations import BarView
 from evlcp_sdk.place.points import points_at
@@ -19,21 +20,46 @@ from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Alternative, Fix, Frame, Packet
 
-__all__ = ["Positioner"]
+__all__ = ["BarKind", "Positioner"]
+
+
+@dataclass(frozen=True)
+class BarKind:
+    """One kind of bars that positions are computed from.
+
+    Attributes:
+        bar: Their layout.
+        packet_us: Length of their packets, us.
+        link: Name of the link that they send with; empty for none.
+    """
+
+    bar: BarLayout
+    packet_us: float
+    link: str = ""
+
+    @classmethod
+    def of(cls, link: Link) -> "BarKind":
+        """The bars of a link."""
+        return cls(link.bar, link.packet.packet_chips * link.packet.chip_us, link.name)
+
+
+_MOST_TRANSMITTERS = 1024
+"""Transmitters whose links are remembered; the one not received for longest makes way."""
 
 
 class Positioner:
     """Fixes on a fixed time grid, one per packet time, from the packets of a receiver.
 
-    A fix takes the bars that are seen within half a packet time before and after it. The image moves in that
+    Of several kinds of bars, the longest packets make the grid; bars of all kinds enter one fix. A fix takes
+    the bars that are seen within half a packet time of theirs before and after it. The image moves in that
     time, with the vehicle's vibration, but a bar's shape hardly changes: the shape is a straight line in
     time through all frames, the place is interpolated between the frames next to the fix. Feeding packet by
     packet or all at once gives the same fixes. Reflections are left out.
 
     Args:
         camera: The receiving camera.
-        bar: Which layout they are of.
-        packet_us: Length of a packet, us.
+        kinds: Which bars there are, by the name of the link that their packets have; packets of others are
+            left out.
         sites: Where the bars stand; may be empty where beacons are believed.
         attitude_at: What is known of the camera's attitude at a time, us; None for nothing.
         spec: Bounds and weights; None for the defaults.
@@ -43,8 +69,7 @@ class Positioner:
     def __init__(
         self,
         camera: CameraModel,
-        bar: BarLayout,
-        packet_us: float,
+        kinds: Mapping[str, BarKind],
         sites: Sequence[BarSite],
         attitude_at: Callable[[float], Attitude | None],
         spec: PositionSpec | None = None,
@@ -53,12 +78,13 @@ class Positioner:
         self.axes: LocalAxes | None = LocalAxes.of(sites) if sites else None
         self._camera = camera
         self._camera_sigma = camera_sigma
-        self._bar = bar
-        self._clusters = bar.clusters
-        self._packet_us = packet_us
+        self._kinds = dict(kinds)
+        self._packet_us = max(kind.packet_us for kind in self._kinds.values())
         self._attitude_at = attitude_at
         self._spec = PositionSpec() if spec is None else spec
-        self._bars = Whereabouts(sites, self._spec)
+        self._links: dict[int, str] = {}
+        only = next(iter(self._kinds.values())).link if len(self._kinds) == 1 else ""
+        self._bars = Whereabouts(sites, self._spec, only)
         self._frames: dict[int, list[Frame]] = {}
         self._next: int | None = None
         self._contradicts: tuple[list[BarView], Attitude | None] | None = None
@@ -95,19 +121,32 @@ class Positioner:
         """Take the next packets; return the fixes that no later packet can change."""
         fixes = []
         for packet in packets:
+            if packet.link not in self._kinds:
+                continue
             self._bars.hear(packet)
             if packet.echo_of is None:
                 self._take(packet)
             else:
                 # What was not known to be a reflection before is no bar at a place, either.
                 self._frames.pop(packet.transmitter, None)
-            # A packet of another bar that starts half a packet after a fix is complete one packet later.
-            fixes += self._until(packet.t_us / self._packet_us - 1.5)
+            # A packet of another bar that starts half a packet after a fix is complete one packet later; of
+            # longer packets than this one, some that are not have begun before it.
+            earlier = 1 - self._kinds[packet.link].packet_us / self._packet_us
+            fixes += self._until(packet.t_us / self._packet_us - 1.5 - earlier)
         return fixes
 
+    def links_of(self, fix: Fix) -> str:
+        """Names of the links of a fix's transmitters, each once."""
+        return " ".join(dict.fromkeys(self._links.get(number, "") for number in fix.transmitters))
+
     def _take(self, packet: Packet) -> None:
+        self._links.pop(packet.transmitter, None)
+        self._links[packet.transmitter] = packet.link
+        if len(self._links) > _MOST_TRANSMITTERS:
+            del self._links[next(iter(self._links))]
+        clusters = self._kinds[packet.link].bar.clusters
         for frame in packet.frames:
-            if len(frame.points_px) == self._clusters and np.isfinite(frame.points_t_us):
+            if len(frame.points_px) == clusters and np.isfinite(frame.points_t_us):
                 number = math.ceil(frame.points_t_us / self._packet_us - 0.5)
                 if self._next is None:
                     self._next = number
@@ -119,6 +158,13 @@ class Positioner:
         """End the stream; return the rest of the fixes."""
         last = max((f.points_t_us for kept in self._frames.values() for f in kept), default=-math.inf)
         return self._until(last / self._packet_us + 0.5) if math.isfinite(last) else []
+
+    def _named(self, number: int, said: int | None) -> str:
+        """A transmitter without a site, with what is known of it."""
+        if said is None:
+            return f"{number} (no id heard)"
+        other = self._bars.of_another_link(number)
+        return f"{number} (id {said}" + (f", whose site is of link '{other}')" if other else ")")
 
     def _until(self, limit: float) -> list[Fix]:
         """The fixes of the grid times up to a limit, in packet times."""
@@ -143,7 +189,8 @@ class Positioner:
         views, sited, unplaced = [], [], []
         here: LocalAxes | None = None
         for number, frames in sorted(self._frames.items()):
-            points = points_at(frames, t_us, self._packet_us, self._clusters, self._spec)
+            kind = self._kinds[self._links[number]]
+            points = points_at(frames, t_us, kind.packet_us, kind.bar.clusters, self._spec)
             if points is None:
                 continue
             views.append(number)
@@ -154,7 +201,7 @@ class Positioner:
                 self.axes = LocalAxes.of([site])
             # Gravity and north are those of here, which may be far from the origin of the trajectory.
             try:
-                enu = site.layout_positions_m(self._bar, LocalAxes.of([site]) if here is None else here)
+                enu = site.layout_positions_m(kind.bar, LocalAxes.of([site]) if here is None else here)
             except ConfigError as fault:
                 unplaced.append(str(fault))
                 continue
@@ -169,7 +216,7 @@ class Positioner:
             if how:
                 return Fix.refused(t_us, tuple(views), "site-contradicted", "; ".join(how))
             ids = self._bars.ids
-            which = ", ".join(f"{n} (id {ids[n]})" if n in ids else f"{n} (no id heard)" for n in views)
+            which = ", ".join(self._named(n, ids.get(n)) for n in views)
             return Fix.refused(t_us, tuple(views), "no-site", f"no site is known of transmitter {which}")
         attitude_now = self._attitude_at(t_us)
         pose = solve_pose(sited, self._camera, attitude_now, self._spec, self._camera_sigma)

@@ -34,12 +34,14 @@ class _Said:
         trust: How far that is believed; `forged` shuts it out until a verified one comes; `lapsed`: it was
             verified, and its key or its age has run out since.
         verified: The beacon that was verified last, None before.
+        link: Name of the link that it sends with.
     """
 
     transmitter_id: int | None = None
     beacon: BarSite | None = None
     trust: str = "unverified"
     verified: Message | None = None
+    link: str = ""
 
 
 class Whereabouts:
@@ -48,15 +50,17 @@ class Whereabouts:
     Args:
         sites: Where bars stand; may be empty where beacons are believed.
         spec: Which beacons are believed.
+        link: Name of the link of a receiver that has one only; empty for none.
 
     Attributes:
         forged: Messages so far that were forged.
     """
 
-    def __init__(self, sites: Sequence[BarSite], spec: PositionSpec) -> None:
+    def __init__(self, sites: Sequence[BarSite], spec: PositionSpec, link: str = "") -> None:
         self.forged = 0
         self._sites = tuple(sites)
         self._spec = spec
+        self._alone = link
         self._said: dict[int, _Said] = {}
 
     @property
@@ -83,6 +87,7 @@ class Whereabouts:
             self._said.pop(packet.transmitter, None)
             return
         said = self._said[packet.transmitter] = self._said.pop(packet.transmitter, _Said())
+        said.link = packet.link or self._alone
         if len(self._said) > _MOST_TRANSMITTERS:
             del self._said[next(iter(self._said))]
         for heard in packet.messages:
@@ -139,5 +144,17 @@ class Whereabouts:
 
     def _listed(self, number: int) -> BarSite | None:
         """The site of the list that a transmitter stands at."""
-        alone = len(self._said) == 1
-        return site_of_transmitter(self._sites, number, self._said[number].transmitter_id, alone=alone)
+        said = self._said[number]
+        sites = [site for site in self._sites if not said.link or site.link in (None, said.link)]
+        # Of several links, one may be the only one of its own.
+        rivals = list(self._said.values())
+        if all(site.link is not None for site in sites):
+            rivals = [other for other in rivals if other.link == said.link]
+        alone = len(rivals) == 1
+        return site_of_transmitter(sites, number, said.transmitter_id, alone=alone)
+
+    def of_another_link(self, number: int) -> str:
+        """Name of another link that has a site of a transmitter's id; empty where none has."""
+        said = self._said[number]
+        others = (s.link for s in self._sites if s.transmitter_id == said.transmitter_id and s.link)
+        return next((link for link in others if link != said.link), "")

@@ -231,7 +231,7 @@ def warnings_of_links(
         links: What is known of each link, by name.
         seen: What else is known of the recording.
         positions: Figures of the positions, where they were computed.
-        placing: Name of the link that they are of.
+        placing: Name of the link that says what is wrong with them.
     """
     found = [*saturation(seen), *_dropped(counts, seen), *_room(counts)]
     if not tally.transmitters:

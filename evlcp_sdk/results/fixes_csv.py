@@ -49,12 +49,11 @@ class FixesCsv(Sink):
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
         self._rows = csv.writer(folder.open("fixes.csv"), lineterminator="\n")
-        # Positions are of one link's bars.
-        self._link = [run.placing] if run.placing else []
-        self._rows.writerow([*FIX_COLUMNS, *["link"] * len(self._link)])
+        self._rows.writerow([*FIX_COLUMNS, *(["link"] if run.links else [])])
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write a row."""
+        navigator = self.run.navigator if self.run.links else None
         self._rows.writerow(
             [
                 f"{fix.t_us:.1f}",
@@ -79,6 +78,6 @@ class FixesCsv(Sink):
                 defused(fix.detail),
                 fix.source,
                 " ".join(fix.contradicted),
-                *self._link,
+                *([] if navigator is None else [navigator.positioner.links_of(fix)]),
             ]
         )

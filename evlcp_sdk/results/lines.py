@@ -18,15 +18,20 @@ class JsonLines:
     Args:
         give: Takes a line, without its end.
         filtered: Whether distances are filtered, too.
-        placing: Where there are several links, name of the one whose bars positions are computed from.
         links: There are several links.
+        links_of: Gives the names of those that a fix is computed from, where there are several.
     """
 
     def __init__(
-        self, give: Callable[[str], None], *, filtered: bool = False, placing: str = "", links: bool = False
+        self,
+        give: Callable[[str], None],
+        *,
+        filtered: bool = False,
+        links: bool = False,
+        links_of: Callable[[Fix], str] | None = None,
     ) -> None:
         self._give = give
-        self._placing = placing
+        self._links_of = links_of
         self._columns = frame_columns(filtered=filtered, links=links)
 
     def packet(self, packet: Packet) -> None:
@@ -42,7 +47,8 @@ class JsonLines:
 
     def fix(self, fix: Fix) -> None:
         """Give the line of a fix, given or refused."""
-        self._give(json.dumps(fix_line(fix) | ({"link": self._placing} if self._placing else {})))
+        links = {"link": self._links_of(fix)} if self._links_of is not None else {}
+        self._give(json.dumps(fix_line(fix) | links))
 
 
 def frame_line(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> dict[str, Any]:

@@ -25,7 +25,6 @@ class Run:
         clock_zero: UTC of the camera clock's 0, or pulses that say it: `utc.zero_at` of a time. None where it
             is not known.
         links: Where there are several, all of them by name; `link` is the first one then.
-        placing: Where there are several, name of the one whose bars positions are computed from.
     """
 
     name: str
@@ -34,7 +33,6 @@ class Run:
     navigator: Navigator | None = None
     clock_zero: ClockZero = None
     links: Mapping[str, Link] = field(default_factory=dict)
-    placing: str = ""
 
     def link_of(self, name: str) -> Link:
         """The link of a frame, a packet or a message, by the name that it gives."""

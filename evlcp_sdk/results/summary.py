@@ -53,7 +53,7 @@ def summary_of(
         positions: Figures of the positions, where they were computed.
         sinks: What sinks say, by name; those that say nothing are left out.
         live: Delays, and what was shed, of a live run; None for others.
-        placing: Where there are several links, name of the one whose bars positions are computed from.
+        placing: Where there are several links, name of the first whose bars positions are computed from.
     """
     seen = Seen() if seen is None else seen
     parts = list(links.values())

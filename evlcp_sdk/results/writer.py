@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.link.several import named_links, placing_link
+from evlcp_sdk.link.several import named_links, placing_links
 from evlcp_sdk.place.navigator import Navigator, Placed, PositionPlan
 from evlcp_sdk.plugin.records import choose_sinks, installed_sinks
 from evlcp_sdk.plugin.registry import Registry
@@ -69,16 +69,20 @@ class ResultWriter:
         self._registry = Registry.load() if registry is None else registry
         self._links = named_links(link)
         first = next(iter(self._links.values()))
-        self._placing = placing_link(self._links) if plan is not None else ""
+        placing = placing_links(self._links) if plan is not None else {}
+        self._placing = next(iter(placing), "")
         self._tally = RunTally({name: one.packet for name, one in self._links.items()})
         self._positions = PositionTally()
         self._readout = ReadoutTally()
-        self._navigator = Navigator(self._links[self._placing], plan, attitude) if plan is not None else None
+        self._navigator = Navigator(placing, plan, attitude) if plan is not None else None
         several = self._links if len(self._links) > 1 else {}
-        run = Run(name, first, plan, self._navigator, clock_zero, several, self._placing)
+        run = Run(name, first, plan, self._navigator, clock_zero, several)
         self._lines = None
         if lines is not None:
-            self._lines = JsonLines(lines, filtered=run.filtered, placing=self._placing, links=bool(several))
+            links_of = (
+                self._navigator.positioner.links_of if several and self._navigator is not None else None
+            )
+            self._lines = JsonLines(lines, filtered=run.filtered, links=bool(several), links_of=links_of)
         self._folder: ResultFolder | None = None
         self._sinks: Sinks | None = None
         with ExitStack() as stack:
@@ -111,7 +115,7 @@ class ResultWriter:
                 self._sinks.packet(packet)
             if self._lines is not None:
                 self._lines.packet(packet)
-            if self._navigator is not None and packet.link == self._placing:
+            if self._navigator is not None:
                 self._place(self._navigator.feed([packet]))
 
     def finish(

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.bar import BarLayout
-from evlcp_sdk.specs import SpecError, build, read_toml
+from evlcp_sdk.specs import SpecError, build, read_toml, toml_value
 from evlcp_sdk.spelling import nearest
 
 __all__ = ["BarSite", "LocalAxes", "load_sites", "resolve_sites", "site_of_transmitter", "to_toml"]
@@ -65,6 +65,10 @@ class BarSite:
     transmitter: Annotated[
         int | None,
         Field(ge=0, description="Number that the receiver gives it, where no beacon sends its id."),
+    ] = None
+    link: Annotated[
+        str | None,
+        Field(description="Name of the link that it sends with, where there are several; none: of any."),
     ] = None
     position_sigma_m: Annotated[
         float | None,
@@ -270,7 +274,11 @@ def to_toml(sites: Sequence[BarSite]) -> str:
     lines = []
     for site in sites:
         values = ((f.name, getattr(site, f.name)) for f in fields(site))
-        lines += ["[[bar]]", *(f"{name} = {value!r}" for name, value in values if value is not None), ""]
+        lines += [
+            "[[bar]]",
+            *(f"{name} = {toml_value(value)}" for name, value in values if value is not None),
+            "",
+        ]
     return "\n".join(lines)
 
 

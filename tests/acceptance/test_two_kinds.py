@@ -2,15 +2,20 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.place.navigator import PositionPlan
 from evlcp_sdk.results.folder import read_summary
 from evlcp_sdk.run import film, receive, receive_to_folder
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.sites import LocalAxes, load_sites
 from evlcp_sdk.sim.truth import read_truth
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.study.compare.recordings import compare_recording
@@ -48,6 +53,48 @@ def compare_and_film(folder: Path, links: list[Path], score: dict[str, Any]) -> 
     assert table.bound_m.count == 0
     told = film(folder / "two.raw", folder / "two.webp", links, for_ms=2.0, longest_px=200)
     assert len(told["transmitters"]) == 2
+
+
+def test_bars_of_two_links_give_one_position(tmp_path: Path) -> None:
+    """A bar and a shorter one of another alphabet: positions by gravity alone need both."""
+    (tmp_path / "bar.toml").write_text("")
+    (tmp_path / "short.toml").write_text('[modulation]\nid = "wh8"\n[bar]\nrows = 60\n')
+    (tmp_path / "scene.toml").write_text(
+        "duration_s = 0.2\n[background]\nlight_w_m2 = 1e-3\n[motion]\ndistance_m = 45.0\npitch_deg = 4.0\n"
+        "[world]\nlatitude_deg = 35.1\nlongitude_deg = 137.0\nheight_m = 50.0\nheading_deg = 30.0\n"
+        '[[bars]]\nx_m = -3.0\ny_m = -3.5\nlink = "bar.toml"\n'
+        '[[bars]]\nx_m = 3.0\ny_m = -4.0\nlink = "short.toml"\n'
+    )
+    source = simulate(tmp_path / "scene.toml", 3)
+    source.save(tmp_path / "two.raw")
+    links = [tmp_path / "bar.toml", tmp_path / "short.toml"]
+    named = zip(load_sites(tmp_path / "two.site.toml"), ("bar", "short"), strict=True)
+    sites = tuple(replace(site, link=name, transmitter=None) for site, name in named)
+    truth = read_truth(tmp_path / "two.truth.json")
+    pitch, roll = (float(np.mean(truth.camera_path[name])) for name in ("pitch_deg", "roll_deg"))
+    attitude = Attitude(pitch, roll, None, 0.3)
+    lines: list[str] = []
+    receive_to_folder(
+        tmp_path / "two.raw",
+        tmp_path / "out",
+        links,
+        plan=PositionPlan(sites),
+        attitude=attitude,
+        lines=lines.append,
+    )
+    with (tmp_path / "out" / "fixes.csv").open(newline="") as file:
+        fixes = [row for row in csv.DictReader(file) if not row["refusal"]]
+    assert len(fixes) >= 3
+    assert {" ".join(sorted(row["link"].split())) for row in fixes} == {"bar short"}
+    said = {told["link"] for told in map(json.loads, lines) if told["line"] == "fix"}
+    assert said == {row["link"] for row in fixes}
+    keys = ("latitude_deg", "longitude_deg", "height_m")
+    for row in fixes:
+        at = [np.interp(float(row["t_us"]) - truth.t0_us, truth.t_us, truth.camera_path[key]) for key in keys]
+        off = LocalAxes(*at).to_enu(*(float(row[key]) for key in keys))
+        sigmas = [float(row[f"sigma_{name}_m"]) for name in ("east", "north", "up")]
+        assert (np.abs(off) < 4 * np.array(sigmas)).all()
+        assert np.linalg.norm(off) < 1.5
 
 
 @pytest.mark.parametrize("other", OTHERS)

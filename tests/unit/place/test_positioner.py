@@ -15,11 +15,11 @@ from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.observations import project_bars
-from evlcp_sdk.place.positioner import Positioner, _alternatives
+from evlcp_sdk.place.positioner import BarKind, Positioner, _alternatives
 from evlcp_sdk.place.refusals import Candidate, Refusal
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
-from evlcp_sdk.scene.bar import BarLayout, LedRing
+from evlcp_sdk.scene.bar import BarLayout, LedGrid, LedRing
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.sim import Simulation
@@ -70,7 +70,9 @@ def merged(*streams: list[Packet]) -> list[Packet]:
 
 
 def positioner(sites: list[BarSite], attitude: Attitude | None = EXACT, **spec: object) -> Positioner:
-    return Positioner(CAMERA, BarLayout(), PACKET_US, sites, lambda _t: attitude, PositionSpec(**spec))  # type: ignore[arg-type]
+    return Positioner(
+        CAMERA, {"": BarKind(BarLayout(), PACKET_US)}, sites, lambda _t: attitude, PositionSpec(**spec)
+    )  # type: ignore[arg-type]
 
 
 RING = BarLayout(LedRing(leds=16, radius_m=0.45))
@@ -83,12 +85,11 @@ def test_a_ring_gives_a_fix_where_its_site_says_how_it_faces() -> None:
     assert enu[4] - enu[12] == pytest.approx([0.9, 0, 0], abs=1e-6)
     assert enu[0] - enu[8] == pytest.approx([0, 0, 0.9], abs=1e-6)
     packets = packets_of(ring, 0, 8, enu=enu)
-    whole = Positioner(CAMERA, RING, PACKET_US, [ring], lambda _t: EXACT, PositionSpec())
+    whole = Positioner(CAMERA, {"": BarKind(RING, PACKET_US)}, [ring], lambda _t: EXACT, PositionSpec())
     assert_right(whole.feed(packets) + whole.close(), 5e-3)
     unknown = Positioner(
         CAMERA,
-        RING,
-        PACKET_US,
+        {"": BarKind(RING, PACKET_US)},
         [dataclasses.replace(ring, facing_deg=None)],
         lambda _t: EXACT,
         PositionSpec(),
@@ -108,6 +109,60 @@ def assert_right(fixes: list[Fix], most_m: float = 2e-3) -> None:
 
 
 LEFT, RIGHT = site(7, (-2.0, 0.0, 0.0), 0), site(9, (2.0, -6.0, 0.0), 1)
+
+
+def with_link(packets: list[Packet], link: str) -> list[Packet]:
+    def named(packet: Packet) -> Packet:
+        frames = tuple(dataclasses.replace(frame, link=link) for frame in packet.frames)
+        return dataclasses.replace(packet, frames=frames)
+
+    return [named(packet) for packet in packets]
+
+
+def test_bars_of_two_links_give_one_fix() -> None:
+    """A bar of 16 clusters, and one of half the length, of eight, whose packets are longer."""
+    short = BarLayout(LedGrid(rows=48))
+    right = dataclasses.replace(RIGHT, length_m=0.48, transmitter_id=7, link="short")
+    left = dataclasses.replace(LEFT, link="long")
+    gravity = Attitude(4.0, 1.0, None, 0.0)
+    kinds = {
+        "long": BarKind(BarLayout(), PACKET_US, "long"),
+        "short": BarKind(short, 1.3 * PACKET_US, "short"),
+    }
+    one = with_link(packets_of(LEFT, 0, 8), "long")
+    other = with_link(packets_of(right, 1, 8, enu=right.cluster_positions_m(8, ORIGIN)), "short")
+    lamp = with_link(packets_of(LEFT, 2, 8), "lamp")
+
+    def fixes_of(sites: list[BarSite], *streams: list[Packet]) -> tuple[Positioner, list[Fix]]:
+        p = Positioner(CAMERA, kinds, sites, lambda _t: gravity)
+        return p, p.feed(merged(*streams)) + p.close()
+
+    p, fixes = fixes_of([right, left], one, other, lamp)
+    assert_right(fixes)
+    assert [fix.transmitters for fix in fixes] == [(0, 1)] * len(fixes)
+    assert p.links_of(fixes[0]) == "long short"
+    assert p.counts["frames_late"] == 0
+    # The longest packets make the grid.
+    assert np.diff([fix.t_us for fix in fixes]) == pytest.approx(1.3 * PACKET_US)
+    # The same fixes, packet by packet.
+    again = Positioner(CAMERA, kinds, [right, left], lambda _t: gravity)
+    pieces = [fix for packet in merged(one, other, lamp) for fix in again.feed([packet])] + again.close()
+    assert [fix.enu_m.tolist() for fix in pieces] == [fix.enu_m.tolist() for fix in fixes]
+    # Both have the number of the site, which names neither: each bar is where its own link stands.
+    _, alone = fixes_of([dataclasses.replace(left, link="short", transmitter=0)], one)
+    assert {fix.refusal for fix in alone} == {"no-site"}
+
+
+def test_a_site_of_another_link_is_named() -> None:
+    told = dataclasses.replace(LEFT, link="beacon", transmitter=None)
+    p = Positioner(CAMERA, {"": BarKind(BarLayout(), PACKET_US, "bar")}, [told], lambda _t: EXACT)
+    packets = packets_of(LEFT, 0, 4, messages={0: (heard(LEFT, "unverified", 0),)})
+    fixes = p.feed(packets) + p.close()
+    assert {fix.refusal for fix in fixes} == {"no-site"}
+    assert fixes[0].detail.endswith("0 (id 7, whose site is of link 'beacon')")
+    for link in ("", "beacon"):
+        p = Positioner(CAMERA, {"": BarKind(BarLayout(), PACKET_US, link)}, [told], lambda _t: EXACT)
+        assert_right(p.feed(packets) + p.close())
 
 
 def test_one_bar_gives_a_fix_a_packet_time() -> None:
@@ -398,7 +453,7 @@ def test_a_simulated_drive_on_a_wet_road() -> None:
         return Attitude(math.degrees(pitch), math.degrees(roll), 30 + math.degrees(yaw), 0.0, 0.01)
 
     (site,) = sites_of(scene)
-    p = Positioner(link.camera, link.bar, link.packet.packet_chips * link.packet.chip_us, [site], attitude_at)
+    p = Positioner(link.camera, {"": BarKind.of(link)}, [site], attitude_at)
     fixes = p.feed(packets) + p.close()
     given = [f for f in fixes if not f.refusal]
     assert len(given) >= 3
@@ -435,7 +490,7 @@ def test_a_simulated_drive_past_two_bars() -> None:
         _, ((_yaw, pitch, roll),) = simulation.path.at([t_us])
         return Attitude(math.degrees(pitch), math.degrees(roll), None, 0.0)
 
-    p = Positioner(link.camera, link.bar, link.packet.packet_chips * link.packet.chip_us, sites, attitude_at)
+    p = Positioner(link.camera, {"": BarKind.of(link)}, sites, attitude_at)
     fixes = p.feed(packets) + p.close()
     given = [f for f in fixes if not f.refusal]
     assert len(given) >= 4
