@@ -69,6 +69,8 @@ pictures: $(VENV)/.installed  ## Draw the pictures of the docs again
 	$(BIN)/evlcp receive demo-out/gate.raw -o demo-out/gate --sites demo-out/gate.site.toml \
 	  --attitude demo-out/gate.attitude.csv --figures --report
 	cp demo-out/gate/track.png docs/images/
+	$(BIN)/python benchmarks/live_picture.py docs/images/live.png demo-out/gate.raw \
+	  --sites demo-out/gate.site.toml --attitude demo-out/gate.attitude.csv
 	chromium --headless --hide-scrollbars --force-prefers-reduced-motion --window-size=1280,1640 \
 	  --screenshot=docs/images/report.png demo-out/gate/report.html
 	$(BIN)/python benchmarks/polar.py curves --figure docs/images/error-correction.png
