@@ -1283,7 +1283,9 @@ def newest_on_parabola(
                 right[a] += weight * terms[a] * (past[i, 1] - past[n - 1, 1])
                 for b in range(3):
                     normal[a, b] += weight * terms[a] * terms[b]
-        likely[:] = normal
+        for a in range(3):
+            for b in range(3):
+                likely[a, b] = normal[a, b]
         likely[1, 1] += speed_weight
         likely[2, 2] += bend_weight
         _inverse(likely, inverse)
@@ -1595,7 +1597,9 @@ def slope_of_rows(
     blocks, lags = fit.shape
     top = np.empty(blocks)
     for b in range(blocks):
-        top[b] = fit[b].max()
+        top[b] = fit[b, 0]
+        for lag in range(1, lags):
+            top[b] = max(top[b], fit[b, lag])
     middle = _median(top.copy(), blocks) if blocks else 0.0
     at, place = np.empty(blocks), np.empty(blocks)
     n = 0

@@ -244,7 +244,8 @@ class BarkerSynchronizer:
         state = changed(
             state,
             first_bin=state.first_bin + drop,
-            counts=counts[:, drop:],
+            # A view would have kernels compiled once more, for arrays that are not in one piece.
+            counts=counts[:, drop:].copy(),
             next_bin=state.first_bin + lo,
             power=power,
             known=known,
