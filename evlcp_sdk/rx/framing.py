@@ -36,6 +36,10 @@ _NO_POINTS = (np.empty((0, 2)), np.empty(0))
 _TAIL_CHIPS = 0.5
 """A frame is whole if the stream goes on for this long after its last edge's events: some come later."""
 
+_MOST_OLD = 2
+"""Frames decoded in a step beyond those that end in one: all that came before a first lock would take as long
+as ten steps, and other transmitters would wait."""
+
 _LOOKS = 3
 """Looks at a region's first frame: at what was found of a bar, at the whole of it, and once more, as few
 clusters place it less well than all."""
@@ -131,7 +135,12 @@ class PacketFraming:
         self._joined: set[int] = set()
         self._ended: deque[tuple[tuple[float, float], int]] = deque(maxlen=_MOST_ENDED)
         self._due: deque[Followed] = deque()
-        self.patience_us = LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us
+        # Frames that end in one step, and how long it takes to decode those before a first lock.
+        per_step = self._step_us / (link.packet.info_chips * link.packet.chip_us)
+        self._most_due = math.ceil(per_step) + _MOST_OLD
+        caught_up = math.ceil(LOOKBACK_PACKETS * link.packet.frames / (self._most_due - per_step))
+        packets_us = LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us
+        self.patience_us = packets_us + caught_up * self._step_us
         self.counts = dict.fromkeys(_COUNTS, 0)
         self.lit = LitTimes()
         self.ranging_every = 1
@@ -147,7 +156,9 @@ class PacketFraming:
             if region.id in self._joined:
                 continue
             transmitter = self._hear(region, step)
-            self._decode_due(transmitter, step.end_us - self._tail_us)
+            until_us = step.end_us - self._tail_us
+            self._decode_due(transmitter, until_us, self._most_due)
+            transmitter.behind = transmitter.grid.due_us <= until_us
             if region.id in self._joined:
                 continue
             self._transmitters.forget(transmitter, step.end_us)
@@ -253,12 +264,13 @@ class PacketFraming:
             return
         self._take(transmitter, due, found)
 
-    def _decode_due(self, transmitter: Transmitter, until_us: float) -> None:
-        """Decode the frames that lie before a time, with the events after their last edge."""
+    def _decode_due(self, transmitter: Transmitter, until_us: float, most: float = math.inf) -> None:
+        """Decode the frames that lie before a time with the events after their last edge, so many at most."""
         cut_us = transmitter.region.cut_us
         if cut_us is not None and transmitter.grid.lock is not None:
             self.counts["frames_cut"] += transmitter.grid.skip_before(cut_us)
-        while (due := transmitter.grid.due(until_us)) is not None:
+        while most > 0 and (due := transmitter.grid.due(until_us)) is not None:
+            most -= 1
             found = self._decode(transmitter, due)
             if found == "frames_rejected" and self._put_together(transmitter):
                 continue
@@ -464,9 +476,12 @@ class PacketFraming:
 
 
 def _in_time(transmitter: Transmitter) -> bool:
-    """Whether a transmitter's next frame is decoded when it is due: not before one has shown the bar."""
+    """Whether a transmitter's next frame is decoded when it is due: not before one has shown the bar.
+
+    Nor as long as older ones wait.
+    """
     known = transmitter.number is not None and transmitter.region.size_px is not None
-    return known and transmitter.tried != transmitter.grid.frame
+    return known and not transmitter.behind and transmitter.tried != transmitter.grid.frame
 
 
 def _is_part(bar: Followed, t_us: float, place_px: tuple[float, float]) -> bool:

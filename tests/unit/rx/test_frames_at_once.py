@@ -1,5 +1,6 @@
 """Frames told as soon as they are decoded: those of the packets, whatever pieces the stream comes in."""
 
+from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
 
@@ -86,6 +87,20 @@ def test_slices_tell_the_same_frames_as_soon_as_their_light_is_there() -> None:
     assert len(after) >= 36
     assert min(after) > 0
     assert max(after) < 100 + slice_us
+
+
+def test_frames_from_before_the_first_lock_come_a_few_a_step() -> None:
+    """Each step gives one frame that ends in it and two older ones, until none is left."""
+    bar = IdealBar(random_symbols(LINK, 2), start_us=-5_000)
+    events = ideal_events(LINK, bar)
+    cuts = np.searchsorted(events.t_us, np.arange(0, int(events.t_us[-1]), LINK.regions.step_us))
+    frames, packets = told(events, cuts.tolist())
+    a_slice = list(Counter(fed for _, fed in frames).values())
+    assert a_slice[:3] == [3, 3, 3]
+    # A slice may hold the end of one step and what is due in the next.
+    assert max(a_slice[3:]) <= 2
+    assert [f.frame for f, _ in frames] == [*range(1, 10), *range(10)]
+    assert [said(frame) for frame, _ in frames] == [said(f) for packet in packets for f in packet.frames]
 
 
 def test_a_part_of_a_step_leaves_no_trace_in_the_rhythm() -> None:
