@@ -330,14 +330,11 @@ class Bend:
         off: How far each lies off, along the bar, in what a lean of sine 1 moves the boundary at place 1,
             which is spacing_px * spacing_m / distance_m pixels; a lean moves others by place^2. float64 (n,).
         weight: Inverse variances of these, up to a factor that all share; 0 where unseen, float64 (n,).
-        uneven: Steps up minus steps down of each boundary in the pilots, float64 (n,): as positive and
-            negative events are not alike in number, boundaries lie off by a multiple of that.
     """
 
     place: NDArray[np.float64]
     off: NDArray[np.float64]
     weight: NDArray[np.float64]
-    uneven: NDArray[np.float64]
 
 
 @dataclass(frozen=True)

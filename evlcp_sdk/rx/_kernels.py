@@ -88,7 +88,8 @@ def score_rises(
         state = states[at]
         kind = np.uint32(kinds[runs[i]])
         low = np.uint32(lows[(kind << np.uint32(SAME_AT)) | (state & _PART)])
-        again = np.uint32(kind == ((state >> np.uint32(CHIPS_AT)) & np.uint32(15)))
+        # A lamp's period of 2.7 chips is on the chips now and then, and near three always.
+        again = np.uint32((kind & np.uint32(15)) == ((state >> np.uint32(CHIPS_AT)) & np.uint32(15)))
         same = (state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME)
         same = _SAMES[(again << np.uint32(3)) | same]
         states[at] = (state & _HIGH) | (same << np.uint32(SAME_AT)) | low
@@ -1306,49 +1307,36 @@ def newest_on_parabola(
 
 
 @njit(cache=True, nogil=True)
-def bend_of(place: Array, uneven: Array, sums: Array, least: float) -> tuple[float, float]:
+def bend_of(place: Array, sums: Array, least: float) -> tuple[float, float]:
     """Bend of a parabola through boundaries, and its variance by their scatter about it; NaN of too few.
 
-    `place` (n,) are whole or half numbers, `sums` (2, n) what lies off, weighted, and the weights; those of
-    less than `least` of the heaviest are passed over. Beside the parabola a shift is fitted that boundaries
-    of even and odd number have to both sides, and a multiple of `uneven` (n,), unless that is 0 throughout.
+    `place` (n,) are where they are, `sums` (2, n) what lies off, weighted, and the weights; those of less
+    than `least` of the heaviest are passed over.
     """
     heaviest = sums[1].max()
-    use = sums[1] > least * heaviest
-    n = int(use.sum())
-    count = 5 if np.any(uneven[use] != 0) else 4
-    # The variance of a normal variable over an estimated sigma is finite from three degrees of freedom on.
-    if n - count < 3:
-        return np.nan, np.nan
-    normal, right, inverse = np.zeros((count, count)), np.zeros(count), np.empty((count, count))
-    terms = np.empty((n, 5))
-    k = 0
+    n = 0
+    normal, right, inverse = np.zeros((3, 3)), np.zeros(3), np.empty((3, 3))
     for i in range(place.size):
-        if use[i]:
-            terms[k, 0], terms[k, 1], terms[k, 2] = place[i] ** 2, 1.0, place[i]
-            terms[k, 3] = -1.0 if np.floor(place[i]) % 2 else 1.0
-            terms[k, 4] = uneven[i]
-            for a in range(count):
-                right[a] += terms[k, a] * sums[0, i]
-                for b in range(count):
-                    normal[a, b] += sums[1, i] * terms[k, a] * terms[k, b]
-            k += 1
-    if not _inverse(normal, inverse):
+        if sums[1, i] > least * heaviest:
+            terms = place[i] ** 2, 1.0, place[i]
+            n += 1
+            for a in range(3):
+                right[a] += terms[a] * sums[0, i]
+                for b in range(3):
+                    normal[a, b] += sums[1, i] * terms[a] * terms[b]
+    # The variance of a normal variable over an estimated sigma is finite from three degrees of freedom on.
+    if n - 3 < 3 or not _inverse(normal, inverse):
         return np.nan, np.nan
-    path = np.zeros(count)
-    for a in range(count):
-        for b in range(count):
+    path = np.zeros(3)
+    for a in range(3):
+        for b in range(3):
             path[a] += inverse[a, b] * right[b]
     left = 0.0
-    k = 0
     for i in range(place.size):
-        if use[i]:
-            off = sums[0, i] / sums[1, i]
-            for a in range(count):
-                off -= path[a] * terms[k, a]
+        if sums[1, i] > least * heaviest:
+            off = sums[0, i] / sums[1, i] - path[0] * place[i] ** 2 - path[1] - path[2] * place[i]
             left += sums[1, i] * off * off
-            k += 1
-    return path[0], inverse[0, 0] * left / (n - count - 2)
+    return path[0], inverse[0, 0] * left / (n - 3 - 2)
 
 
 @njit(cache=True, nogil=True)

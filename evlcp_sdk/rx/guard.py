@@ -218,7 +218,7 @@ class Guard:
         if found.bend is not None:
             self.expect(found.bend, Bend)
             shape = np.shape(found.bend.place)
-            for name in ("place", "off", "weight", "uneven"):
+            for name in ("place", "off", "weight"):
                 self.expect_array(getattr(found.bend, name), f"bend.{name}", shape, "f")
             if len(shape) != 1:
                 self.refuse(f"bend.place of shape {shape}", "one number a boundary")

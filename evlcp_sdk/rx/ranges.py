@@ -36,11 +36,10 @@ _OUTLIER = 4.0
 _LEAST_SIGMA = 1e-6
 """Of the distance: ideal images have less, which says nothing of anything."""
 
-_LEVEL_DEG, _LEANING_DEG, _LEANING_SHARE = 0.7, 5.0, 0.03
+_LEVEL_DEG, _LEANING_DEG, _LEANING_SHARE = 0.7, 5.0, 0.1
 """What is likely of a bar's lean before it is measured: none but for a mount's error and the car's springs
-(sigma), and of three cameras in a hundred, whose mount nobody levelled, anything up to the steepest. With
-more of these, sigmas of level bars far away are too large; with fewer, those of leaning ones too small for
-longer."""
+(sigma), and of one camera in ten, whose mount nobody levelled, anything up to the steepest. With more of
+these, sigmas of level bars far away are too large; with fewer, those of leaning ones too small for longer."""
 
 _TILT_MEMORY_S = 1.0
 """A car's pitch changes within a second when it brakes."""
@@ -176,9 +175,7 @@ def _add(state: Ranges, t_s: float, bend: Bend, sine: float | None) -> Floats:
 def _parabola(bend: Bend, sums: Floats) -> tuple[float, float] | None:
     """Sine of the lean and its sigma, from the scatter of the boundaries about a parabola; None of too few.
 
-    What bends every frame alike is in the scatter, too. Pilots put boundaries off, by a hundredth of a pixel,
-    which is fitted beside: those of even and odd number to both sides, as one of them has values that repeat,
-    and those with more steps up than down, or fewer, as negative events are missed more often.
+    What puts the boundaries of every frame off alike is in the scatter, too.
     """
-    sine, variance = _kernels.bend_of(bend.place, bend.uneven, sums, _LEAST_WEIGHT)
+    sine, variance = _kernels.bend_of(bend.place, sums, _LEAST_WEIGHT)
     return None if math.isnan(sine) else (sine, math.sqrt(max(variance, 1e-12)))

@@ -8,7 +8,7 @@ that. A rise off the chips, as of a lamp with pulse width modulation of 4 kHz (t
 moving texture, lowers it by three: more than the two that chance, which is on the chips in six cases of ten,
 would bring. One after the very same number of chips as before lowers it by two from five chips on: a lamp of
 1 or 2 kHz repeats its period, a code with missing events does not.
-A lamp whose period is two, three or four whole chips is in rhythm, too, as far as a score tells; but its time
+A lamp whose period is near two, three or four chips is in rhythm, too, as far as a score tells; but its time
 comes again and again, which one of a code does not for long: before a frame shows where the bar is, such
 pixels are not listened to. Falls are not looked at: they come later or sooner than rises by the light,
 they are the first to go missing, and some cameras send none.

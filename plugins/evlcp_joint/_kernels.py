@@ -309,33 +309,32 @@ def bar_values(
 
 
 @njit(cache=True, nogil=True)
-def dimmer(pilots: Array, seen: Array, spacing: float, centre: float, values: Array) -> float:
-    """How large negative values (values, rows) are, as a share of positive ones, in the clusters' middles.
+def dimmer(sums: Array, pilots: Array, seen: Array, place: Array) -> float:
+    """How often pixels in clusters' middles answer steps down, as a share of how often they answer steps up.
 
-    A camera may miss more events of one polarity. The half spacing of rows about each cluster's middle tells
-    both levels in its pilot, which comes first; clusters that say one of them only do not count. 1 where
-    nothing is known.
+    A camera may miss more events of one polarity, and boundaries then show values of that sign smaller. Not
+    how many events an answer has: a fast step up gives few and a slow one down many, but one of a pixel at a
+    boundary, which sees a small part of the step, is one event or none. The half spacing of rows about each
+    cluster's middle is asked, in its pilot, which comes first; `place` as of `read_bar`. 1 where nothing is
+    known.
     """
-    clusters, first = pilots.shape
-    rows = values.shape[1]
-    below, above = 0.0, 0.0
-    for k in range(clusters):
-        middle = (rows - 1) / 2 + centre + spacing * (k - (clusters - 1) / 2)
-        top = max(int(np.ceil(middle - spacing / 4)), 0)
-        bottom = min(int(np.floor(middle + spacing / 4)), rows - 1)
-        low, high, lows, highs = 0.0, 0.0, 0, 0
-        for i in range(first):
-            for v in range(top, bottom + 1):
-                if pilots[k, i] > 0:
-                    high += values[i, v]
-                    highs += 1
-                else:
-                    low += values[i, v]
-                    lows += 1
-        if seen[k] and lows > 0 and highs > 0:
-            below += low / lows
-            above += high / highs
-    return float(max(-below, 0.0) / above) if above > 0 else 1.0
+    _, rows, columns = sums.shape
+    half, reach = int(place[4]), abs(place[1]) / 4
+    answers, asked = np.zeros(2), np.zeros(2)
+    for k in range(len(pilots)):
+        if not seen[k]:
+            continue
+        middle = place[0] + place[1] * k
+        for v in range(max(int(np.ceil(middle - reach)), 0), min(int(middle + reach), rows - 1) + 1):
+            centre = int(np.rint(place[2] + place[3] * v))
+            for u in range(max(centre - half, 0), min(centre + half, columns - 1) + 1):
+                for i in range(pilots.shape[1]):
+                    up = int(pilots[k, i] > 0)
+                    asked[up] += 1
+                    answers[up] += sums[2 * i + 1, v, u] > 0 if up else sums[2 * i + 1, v, u] < 0
+    if answers[1] == 0 or asked[0] == 0:
+        return 1.0
+    return float(answers[0] / asked[0] / (answers[1] / asked[1]))
 
 
 @njit(cache=True, nogil=True)
@@ -353,27 +352,32 @@ def read_bar(
     moved: Array,
     values: Array,
 ) -> float:
-    """`codes_said`, `bar_values` and what `dimmer` says of them; values and motion turned if upside down.
+    """`codes_said`, `bar_values` and `dimmer`; values and motion turned if the bar is upside down.
 
     `place` (5,) is the row of the first cluster's middle, the rows to the next, less than 0 of a bar upside
     down, the column in row 0, columns a row, and half the width.
     """
-    clusters, rows = len(pilots), values.shape[1]
+    clusters = len(pilots)
     codes_said(pilots, words, symbols, seen, codes, known)
     first, spacing = place[0], place[1]
     one, other = first - 0.5 * spacing, first + (clusters - 0.5) * spacing
     bar_values(sums, place[2:4], place[4], one, other, full, veil, values)
     if spacing < 0:
         # Arrays as a whole take a second and a half to compile.
+        rows = values.shape[1]
         for k in range(len(moved)):
             moved[k] = -moved[k]
         for k in range(len(values)):
             for r in range(rows // 2):
                 values[k, r], values[k, rows - 1 - r] = values[k, rows - 1 - r], values[k, r]
-        spacing, first = -spacing, rows - 1 - first
-    centre = first + spacing * (clusters - 1) / 2 - (rows - 1) / 2
-    return dimmer(pilots, seen, spacing, centre, values)
+    return dimmer(sums, pilots, seen, place)
 
+
+_FITTED = 7
+"""What is fitted: spacing, centre, drift, gain, width, and the two shifts of `shifts_of`."""
+
+_SHIFTING = (0, 1, 2, 5, 6)
+"""Which of these shift a boundary."""
 
 _REACH = 12.0
 """Widths of a boundary's core beyond which it is not felt: 6 of 100000 of tails thrice as wide are left."""
@@ -385,10 +389,10 @@ def rows_felt(
 ) -> None:
     """Rows within `reach` px of a boundary in a value, and nearest to it: from `first` to `last` - 1.
 
-    `fit` is (spacing, centre, drift, gain, width): boundary b between clusters b - 1 and b of K lies at
-    spacing * (b - K / 2) from a centre that is centre + drift * when[i] + offset[i] from the middle row in
-    value i. `first` and `last` are (K + 1, values), and there are none where `known`, the same, says that
-    one of the two codes is not known.
+    `fit` is (spacing, centre, drift, gain, width, by sign, by repeat): boundary b between clusters b - 1 and
+    b of K lies at spacing * (b - K / 2) from a centre that is centre + drift * when[i] + offset[i] from the
+    middle row in value i, but for what `shifts_of` says, which is less than a row. `first` and `last` are
+    (K + 1, values), and there are none where `known`, the same, says that one of the two codes is not known.
     """
     boundaries, values = known.shape
     spacing, centre, drift = fit[0], fit[1], fit[2]
@@ -401,6 +405,21 @@ def rows_felt(
                 place = middle + spacing * (b - (boundaries - 1) / 2)
                 first[b, i] = min(max(int(np.ceil(place - half)), 0), rows)
                 last[b, i] = min(max(int(np.ceil(place + half)), 0), rows)
+
+
+@njit(cache=True, nogil=True)
+def shifts_of(codes: Array, b: int, i: int) -> tuple[float, float]:
+    """What shifts boundary b in value i: whether its step is up, and which side repeats its last value.
+
+    Sums of positive and of negative events are not alike, so a step up looks shifted to one side and a step
+    down to the other. A cluster that repeats a value had another edge a chip before, whose late events, and
+    the pixels that are blind from them, make it look smaller. Nothing is known of what came before a frame.
+    """
+    side = 1.0 if codes[b, i] > codes[b - 1, i] else -1.0
+    if i == 0:
+        return side, 0.0
+    # Codes are 1 and -1, and differ across the boundary.
+    return side, 0.5 * codes[b, i] * (codes[b, i - 1] + codes[b - 1, i - 1])
 
 
 @njit(cache=True, nogil=True)
@@ -425,27 +444,27 @@ def equations(
     blur: float,
     dim: float,
     huber: float,
-    prior: float,
+    prior: Array,
     seen_values: Array,
     fit: Array,
     normal: Array,
     right: Array,
 ) -> float:
-    """Normal equations of a robust least-squares step, `normal` (5, 5), `right` (5,); the cost.
+    """Normal equations of a robust least-squares step, `normal` (7, 7), `right` (7,); the cost.
 
     Across a boundary where codes differ, a value goes from one code times the gain to the next as `profile`
     has it: that and its slope, (2, n), at n steps from 0 to `_REACH` widths; a width is blur * exp(width) px.
     Residuals beyond `huber` weigh less, so that a cluster that was decoded wrong does not bend the fit.
-    `prior` is the weight of a width of 0; negative values are `dim` times as large as positive ones.
+    `prior` (7,) are the weights of each being 0; negative values are `dim` times as large as positive ones.
     """
     clusters, values = codes.shape
     rows = seen_values.shape[1]
     spacing, centre, drift, gain = fit[0], fit[1], fit[2], fit[3]
     width = blur * exp(fit[4])
     scale, steepest = (profile.shape[1] - 1) / (_REACH * width), 0.5 * gain / width
-    for a in range(5):
+    for a in range(_FITTED):
         right[a] = 0.0
-        for c in range(5):
+        for c in range(_FITTED):
             normal[a, c] = 0.0
     cost = 0.0
     for i in range(values):
@@ -455,11 +474,13 @@ def equations(
             if step == 0:
                 continue
             place, both = b - clusters / 2, codes[b, i] + codes[b - 1, i]
-            # In a boundary's rows of one value, three of the slopes go together: sums of what they share.
+            side, again = shifts_of(codes, b, i)
+            at = middle + spacing * place + fit[5] * side + fit[6] * again
+            # In a boundary's rows of one value, five of the slopes go together: sums of what they share.
             ss, sl, sz, ll, lz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             s, by_level, by_z = 0.0, 0.0, 0.0
             for v in range(first[b, i], last[b, i]):
-                z = v - middle - spacing * place
+                z = v - at
                 beyond, density = _profile_at(profile, z, scale)
                 level = 0.5 * (both + (step if z > 0 else -step) * beyond)
                 steep = -steepest * step * density
@@ -480,24 +501,26 @@ def equations(
                 s += pull * residual
                 by_level += weight * level * residual
                 by_z += pull * z * residual
-            slope = place, 1.0, when[i]
-            for a in range(3):
+            slope = place, 1.0, when[i], 0.0, 0.0, side, again
+            for a in _SHIFTING:
                 right[a] += slope[a] * s
                 normal[3, a] += slope[a] * sl
                 normal[4, a] += slope[a] * sz
-                for c in range(a + 1):
+                for c in _SHIFTING:
                     normal[a, c] += slope[a] * slope[c] * ss
             right[3] += by_level
             right[4] += by_z
             normal[3, 3] += ll
             normal[4, 3] += lz
             normal[4, 4] += zz
-    for a in range(5):
-        for c in range(a):
-            normal[c, a] = normal[a, c]
-    normal[4, 4] += prior
-    right[4] -= prior * fit[4]
-    return float(cost + prior * fit[4] ** 2 / 2)
+    normal[3, 4] = normal[4, 3]
+    for a in _SHIFTING:
+        normal[a, 3], normal[a, 4] = normal[3, a], normal[4, a]
+    for a in range(_FITTED):
+        normal[a, a] += prior[a]
+        right[a] -= prior[a] * fit[a]
+        cost += prior[a] * fit[a] ** 2 / 2
+    return float(cost)
 
 
 @njit(cache=True, nogil=True)
@@ -520,7 +543,7 @@ def leftovers(
     """What a fit leaves: shifts of each boundary and of each value, and each row's score.
 
     `by_boundary` (2, K + 1) and `by_value` (2, values) take the shift of the centre, px, and its information,
-    in units of the variance of one value; `scores` (rows, 5) the slopes times the residuals, clipped to
+    in units of the variance of one value; `scores` (rows, 7) the slopes times the residuals, clipped to
     `huber`, over a row's values, which share one pixel phase and so one error.
 
     Returns:
@@ -537,7 +560,7 @@ def leftovers(
         for i in range(values):
             by_value[a, i] = 0.0
     for v in range(rows):
-        for a in range(5):
+        for a in range(_FITTED):
             scores[v, a] = 0.0
     noise, spent, all_squares, count = 0.0, 0.0, 0.0, 0
     for i in range(values):
@@ -547,8 +570,10 @@ def leftovers(
             if step == 0:
                 continue
             place = b - clusters / 2
+            side, again = shifts_of(codes, b, i)
+            at = middle + spacing * place + fit[5] * side + fit[6] * again
             for v in range(first[b, i], last[b, i]):
-                z = v - middle - spacing * place
+                z = v - at
                 beyond, density = _profile_at(profile, z, scale)
                 level = 0.5 * (codes[b, i] + codes[b - 1, i] + (step if z > 0 else -step) * beyond)
                 steep = 0.5 * gain * step * density / width
@@ -570,6 +595,8 @@ def leftovers(
                 scores[v, 2] -= steep * when[i] * residual
                 scores[v, 3] += level * residual
                 scores[v, 4] -= steep * z * residual
+                scores[v, 5] -= steep * side * residual
+                scores[v, 6] -= steep * again * residual
     for b in range(clusters + 1):
         by_boundary[0, b] /= max(by_boundary[1, b], 1e-12)
     for i in range(values):
@@ -618,7 +645,7 @@ def solve(
     blur: float,
     dim: float,
     huber: float,
-    prior: float,
+    prior: Array,
     seen_values: Array,
     steps: int,
     tolerance: float,
@@ -629,14 +656,14 @@ def solve(
 ) -> bool:
     """Levenberg-Marquardt from `fit`, which is changed; False where there is no fit.
 
-    It ends with a step of the spacing below `tolerance` of it, or after `steps`; `normal` (5, 5) are the
+    It ends with a step of the spacing below `tolerance` of it, or after `steps`; `normal` (7, 7) are the
     normal equations there, and `first`, `last` (K + 1, values) the rows that count: those that the start's
     boundaries are felt in.
     """
     rows = seen_values.shape[1]
     rows_felt(known, offset, when, _REACH * blur * exp(fit[4]), fit, rows, first, last)
-    right, new_normal, new_right = np.empty(5), np.empty((5, 5)), np.empty(5)
-    factor, move, new_fit = np.empty((5, 5)), np.empty(5), np.empty(5)
+    right, new_normal, new_right = np.empty(_FITTED), np.empty((_FITTED, _FITTED)), np.empty(_FITTED)
+    factor, move, new_fit = np.empty((_FITTED, _FITTED)), np.empty(_FITTED), np.empty(_FITTED)
     cost = equations(
         codes, first, last, offset, when, profile, blur, dim, huber, prior, seen_values, fit, normal, right
     )
@@ -645,7 +672,7 @@ def solve(
     for _ in range(steps):
         if not _damped_step(normal, right, damping, factor, move):
             return False
-        for a in range(5):
+        for a in range(_FITTED):
             new_fit[a] = fit[a] + move[a]
             if not np.isfinite(new_fit[a]):
                 return False
@@ -671,9 +698,9 @@ def solve(
                 new_right,
             )
         if new_cost <= cost:
-            for a in range(5):
+            for a in range(_FITTED):
                 fit[a], right[a] = new_fit[a], new_right[a]
-                for c in range(5):
+                for c in range(_FITTED):
                     normal[a, c] = new_normal[a, c]
             cost = new_cost
             damping /= 10
@@ -724,7 +751,7 @@ def fit_bar(
     blur: float,
     dim: float,
     huber: float,
-    prior: float,
+    prior: Array,
     seen_values: Array,
     search: tuple[int, int, float, float],
     limits: tuple[int, float, float, float],
@@ -751,7 +778,8 @@ def fit_bar(
             counted[b, i] = known[b, i]
     sizes, shift, information = np.empty(boundaries), np.empty(values), np.empty(values)
     first, last = np.empty((boundaries, values), np.int64), np.empty((boundaries, values), np.int64)
-    by_value, scores, normal = np.empty((2, values)), np.empty((seen_values.shape[1], 5)), np.empty((5, 5))
+    by_value, scores = np.empty((2, values)), np.empty((seen_values.shape[1], _FITTED))
+    normal = np.empty((_FITTED, _FITTED))
     moved, own = np.empty(values), np.empty(values)
     for i in range(values):
         moved[i], own[i] = offset[i], 0.0
@@ -815,15 +843,15 @@ def fit_bar(
     if spent > (1 - least_explained) * squares:
         return np.nan
     # The spacing's row of the inverse: one column of it, as that is symmetric.
-    unit, inverse, factor = np.empty(5), np.empty(5), np.empty((5, 5))
-    for a in range(5):
+    unit, inverse, factor = np.empty(_FITTED), np.empty(_FITTED), np.empty((_FITTED, _FITTED))
+    for a in range(_FITTED):
         unit[a] = 1.0 if a == 0 else 0.0
     if not _damped_step(normal, unit, 0.0, factor, inverse):
         return np.nan
     by_row, rows = 0.0, 0
     for v in range(len(scores)):
         part = 0.0
-        for a in range(5):
+        for a in range(_FITTED):
             part += scores[v, a] * inverse[a]
         by_row += part * part
         rows += scores[v, 3] != 0
@@ -840,4 +868,4 @@ def fit_bar(
         spread += by_boundary[1, b] * (b - mean) ** 2
     if spread <= 0:
         return np.nan
-    return (by_row * rows / max(rows - 5, 1) + left_over / max(n - 2, 1) / spread) / 2
+    return (by_row * rows / max(rows - _FITTED, 1) + left_over / max(n - 2, 1) / spread) / 2

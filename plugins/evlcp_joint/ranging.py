@@ -47,6 +47,12 @@ _WIDTH_SIGMA = 0.3
 _NOISE = 0.25
 """Of a row's values, in full values, when that is weighed."""
 
+_SHIFT_SIGMA_PX = 0.1
+"""How far boundaries are likely to be shifted by the sign of their step, and by values that are repeated."""
+
+_PRIOR = np.array([0, 0, 0, 0, _WIDTH_SIGMA**-2, _SHIFT_SIGMA_PX**-2, _SHIFT_SIGMA_PX**-2]) * _NOISE**2
+"""Weights with which width and shifts are 0, beside those of a row's values."""
+
 _VEIL = 0.3
 """Share of the brightest column's events that do not count: a dirty lens veils a bar with as much."""
 
@@ -81,9 +87,10 @@ class JointScaleRanging(Ranging):
     motion within the frame is known from the track, its rate is fitted, and what is neither is found value by
     value, as far as it stands out of the noise.
 
-    Cameras miss more events of one polarity than of the other, so values of that sign are smaller. How much
-    is measured in the clusters' middles, once a frame: else a boundary whose pilots step up more often than
-    down would seem shifted, and with them the scale.
+    Positive and negative events are not alike in number and time, and an edge leaves late events and blind
+    pixels to the next one a chip later. Both shift boundaries, by up to a twentieth of a pixel: those that
+    step up to one side and those that step down to the other, and into the cluster that repeats a value. As
+    pilots are the same in every frame, the scale and the bend would be off; so both shifts are fitted, too.
 
     Cells out of line with the layout, boundaries out of line with the others, and info values of clusters
     whose symbol is not known are left out. There is no distance where the fit leaves the cells, or does not
@@ -149,7 +156,6 @@ class JointScaleRanging(Ranging):
         pilots = codebook.pilot_edges[column].astype(np.float64)
         words = codebook.codeword_edges.astype(np.float64)
         boundaries = np.arange(1.0, clusters) - clusters / 2
-        uneven = np.sign(np.diff(pilots, axis=0)).sum(1)
 
         def measure(view: FrameView) -> Range:
             placed = _place(view.presence)
@@ -182,7 +188,7 @@ class JointScaleRanging(Ranging):
                 # A bar upside down is mirrored.
                 spacing, first = -spacing, height - 1 - first
             centre = first + spacing * (clusters - 1) / 2 - (height - 1) / 2
-            fit = np.array([spacing, centre, 0.0, _STARTING_GAIN, 0.0])
+            fit = np.array([spacing, centre, 0.0, _STARTING_GAIN, 0.0, 0.0, 0.0])
             fitted = self._fit(codes, known, moved, dim, values, fit, least)
             if fitted is None:
                 return _NONE
@@ -201,7 +207,7 @@ class JointScaleRanging(Ranging):
                 distance * sigma_px / float(fit[0]),
                 int(np.count_nonzero(off[1])),
                 late_chips,
-                Bend(boundaries.copy(), off[0] / one_px, off[1] * one_px**2, uneven.copy()),
+                Bend(boundaries.copy(), off[0] / one_px, off[1] * one_px**2),
             )
 
         return measure
@@ -230,7 +236,7 @@ class JointScaleRanging(Ranging):
             self.blur_px,
             dim,
             self.huber,
-            _NOISE**2 / _WIDTH_SIGMA**2,
+            _PRIOR,
             values,
             (_STEPS, _ROUNDS, _CLOSE, _EXACT),
             (least, _OUTLIER, _LEAST_OUTLIER_PX, _LEAST_EXPLAINED),

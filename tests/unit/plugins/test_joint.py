@@ -256,6 +256,7 @@ def test_profile_is_a_mixture_of_normal_distributions() -> None:
     assert_allclose(table[1], 2 * (SHARE * norm.pdf(z) + (1 - SHARE) * norm.pdf(z / 3) / 3), atol=1e-12)
 
 
+PRIOR = np.array([0, 0, 0, 0, 2.0, 5.0, 7.0])
 DIM = 0.6
 """How large negative values are, as a share of the positive ones."""
 
@@ -269,7 +270,7 @@ class Twin:
         self.known = rng.random((K + 1, 6)) > 0.1
         self.known[[0, K]] = False
         self.offset, self.when = rng.uniform(-0.5, 0.5, 6), np.linspace(-0.5, 0.5, 6)
-        self.fit = np.array([5.3, 0.2, 0.1, 0.7, 0.2])
+        self.fit = np.array([5.3, 0.2, 0.1, 0.7, 0.2, 0.07, -0.03])
         self.rows = rows
         self.first, self.last = np.empty((2, K + 1, 6), np.int64)
         reach = _kernels._REACH * BLUR * np.exp(0.2)
@@ -280,7 +281,9 @@ class Twin:
 
     def place(self, fit: np.ndarray, b: int, i: int) -> float:
         middle = (self.rows - 1) / 2 + self.offset[i] + fit[1] + fit[2] * self.when[i]
-        return float(middle + fit[0] * (b - K / 2))
+        up = np.sign(self.codes[b, i] - self.codes[b - 1, i])
+        repeats = self.codes[b - 1 : b + 1, i] == self.codes[b - 1 : b + 1, i - 1] if i else np.zeros(2)
+        return float(middle + fit[0] * (b - K / 2) + up * fit[5] + (repeats * [-1, 1]).sum() * fit[6])
 
     def cells(self, fit: np.ndarray) -> np.ndarray:
         """Boundary, value, row and expected value of each cell."""
@@ -289,7 +292,7 @@ class Twin:
             for i in range(6):
                 if self.known[b, i] and self.codes[b, i] != self.codes[b - 1, i]:
                     # Rows stay those of the fit that they were found for.
-                    at = self.place(self.fit, b, i)
+                    at = self.place(self.fit * [1, 1, 1, 1, 1, 0, 0], b, i)
                     for v in range(self.rows):
                         if at - self.reach <= v < at + self.reach:
                             z = (v - self.place(fit, b, i)) / (BLUR * np.exp(fit[4]))
@@ -299,8 +302,8 @@ class Twin:
         return np.array(out)
 
     def slopes(self) -> np.ndarray:
-        """By differences, float64 (5, cells)."""
-        step = 1e-5 * np.eye(5)
+        """By differences, float64 (7, cells)."""
+        step = 1e-5 * np.eye(7)
         return np.array(
             [(self.cells(self.fit + s)[:, 3] - self.cells(self.fit - s)[:, 3]) / 2e-5 for s in step]
         )
@@ -314,14 +317,14 @@ def test_normal_equations_are_huber_s(seed: int) -> None:
     r = twin.seen[i, v] - twin.cells(twin.fit)[:, 3]
     j = twin.slopes()
     w = np.minimum(1, 0.5 / np.abs(r))
-    normal, right = np.empty((5, 5)), np.empty(5)
-    cost = _kernels.equations(*twin.args, 0.5, 2.0, twin.seen, twin.fit, normal, right)
-    prior = np.diag([0, 0, 0, 0, 2.0])
+    normal, right = np.empty((7, 7)), np.empty(7)
+    cost = _kernels.equations(*twin.args, 0.5, PRIOR, twin.seen, twin.fit, normal, right)
+    prior = np.diag(PRIOR)
     # The profile is of straight pieces.
     assert_allclose(normal, (j * w) @ j.T + prior, rtol=1e-3, atol=0.05)
     assert_allclose(right, (j * w) @ r - prior @ twin.fit, rtol=1e-3, atol=0.02)
     want = np.where(np.abs(r) <= 0.5, r**2 / 2, 0.5 * (np.abs(r) - 0.25)).sum()
-    assert cost == pytest.approx(want + twin.fit[4] ** 2, rel=1e-4)
+    assert cost == pytest.approx(want + PRIOR @ twin.fit**2 / 2, rel=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -330,7 +333,7 @@ def test_leftovers_are_by_boundary_value_and_row(seed: int) -> None:
     b, i, v = twin.cells(twin.fit)[:, :3].astype(int).T
     r = twin.seen[i, v] - twin.cells(twin.fit)[:, 3]
     j, clipped = twin.slopes(), np.clip(r, -0.5, 0.5)
-    by_boundary, by_value, scores = np.empty((2, K + 1)), np.empty((2, 6)), np.empty((90, 5))
+    by_boundary, by_value, scores = np.empty((2, K + 1)), np.empty((2, 6)), np.empty((90, 7))
     noise, spent, squares = _kernels.leftovers(
         *twin.args, 0.5, twin.seen, twin.fit, by_boundary, by_value, scores
     )
@@ -419,13 +422,13 @@ def test_solve_leaves_no_score() -> None:
     b, i, v = cells[:, :3].astype(int).T
     seen = np.zeros((6, twin.rows))
     seen[i, v] = cells[:, 3] + rng.normal(0, 0.2, len(b))
-    fit, normal = truth * [1.004, 1, 1, 1, 1], np.empty((5, 5))
+    fit, normal = truth * [1.004, 1, 1, 1, 1, 1, 1], np.empty((7, 7))
     first, last = np.empty((2, K + 1, 6), np.int64)
     assert _kernels.solve(
-        twin.codes, twin.known, twin.offset, twin.when, _profile(SHARE), BLUR, DIM, 0.5, 2.0, seen, 50, 1e-12,
-        fit, normal, first, last,
+        twin.codes, twin.known, twin.offset, twin.when, _profile(SHARE), BLUR, DIM, 0.5, PRIOR, seen,
+        50, 1e-12, fit, normal, first, last,
     )  # fmt: skip
-    again, score = np.empty((5, 5)), np.empty(5)
+    again, score = np.empty((7, 7)), np.empty(7)
     _kernels.equations(
         twin.codes,
         first,
@@ -436,7 +439,7 @@ def test_solve_leaves_no_score() -> None:
         BLUR,
         DIM,
         0.5,
-        2.0,
+        PRIOR,
         seen,
         fit,
         again,
@@ -566,24 +569,24 @@ def test_rounds_of_fits(seed: int) -> None:
     seen[i, v] = twin.cells(twin.fit)[:, 3] + rng.normal(0, 0.1, len(b))
     # One boundary is out of line, and the bar shakes.
     seen[:, v[b == 5]] = rng.normal(0, 0.5, seen[:, v[b == 5]].shape)
-    profile, start = _profile(SHARE), twin.fit * [1.003, 1, 1, 1, 1]
+    profile, start = _profile(SHARE), twin.fit * [1.003, 1, 1, 1, 1, 1, 1]
     fit, by_boundary = start.copy(), np.empty((2, K + 1))
     variance = _kernels.fit_bar(
-        twin.codes, twin.known, twin.offset, twin.when, profile, BLUR, DIM, 0.5, 2.0, seen,
+        twin.codes, twin.known, twin.offset, twin.when, profile, BLUR, DIM, 0.5, PRIOR, seen,
         (12, 2, 1e-3, 1e-5), (6, 4.0, 0.25, 0.3), fit, by_boundary,
     )  # fmt: skip
     known, moved, want = twin.known, twin.offset, start.copy()
     by, by_value, scores, normal = (
         np.empty((2, K + 1)),
         np.empty((2, 6)),
-        np.empty((110, 5)),
-        np.empty((5, 5)),
+        np.empty((110, 7)),
+        np.empty((7, 7)),
     )
     first, last = np.empty((2, K + 1, 6), np.int64)
     for left in (2, 1, 0):
         tolerance = 1e-3 if left else 1e-5
         assert _kernels.solve(
-            twin.codes, known, moved, twin.when, profile, BLUR, DIM, 0.5, 2.0, seen, 12, tolerance,
+            twin.codes, known, moved, twin.when, profile, BLUR, DIM, 0.5, PRIOR, seen, 12, tolerance,
             want, normal, first, last,
         )  # fmt: skip
         noise, _, _ = _kernels.leftovers(
@@ -611,7 +614,7 @@ def test_rounds_of_fits(seed: int) -> None:
     assert_allclose(fit, want, rtol=1e-6)
     assert_allclose(by_boundary, by, rtol=1e-5, atol=1e-9)
     rows = int(np.count_nonzero(scores[:, 3]))
-    by_row = ((scores @ np.linalg.inv(normal)[0]) ** 2).sum() * rows / (rows - 5)
+    by_row = ((scores @ np.linalg.inv(normal)[0]) ** 2).sum() * rows / (rows - 7)
     place = np.flatnonzero(used)
     terms = np.stack([place, np.ones(len(place))])
     spread = np.linalg.inv((terms * by[1, used]) @ terms.T)[0, 0]
@@ -619,21 +622,25 @@ def test_rounds_of_fits(seed: int) -> None:
     assert variance == pytest.approx((by_row + by_scatter) / 2, rel=1e-5)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_how_dim_negative_values_are(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    seen, spacing, centre, rows = rng.random(K) > 0.2, 5.3, 0.4, 90
-    values = rng.normal(0, 1, (10, rows)) + 0.5
-    middles = (rows - 1) / 2 + centre + spacing * (np.arange(K) - (K - 1) / 2)
-    levels = []
-    for k in np.flatnonzero(seen & (np.ptp(PILOTS, axis=1) > 0)):
-        of = values[: PILOTS.shape[1], np.abs(np.arange(rows) - middles[k]) <= spacing / 4]
-        levels.append([of[PILOTS[k] < 0].mean(), of[PILOTS[k] > 0].mean()])
-    low, high = np.sum(levels, axis=0)
+@pytest.mark.parametrize("spacing", [5.3, -5.3])
+def test_how_dim_negative_values_are(spacing: float) -> None:
+    rng = np.random.default_rng(4)
+    seen, rows = rng.random(K) > 0.2, 90
+    sums = rng.choice([-3, -1, 0, 1, 2], (32, rows, 15), p=[0.1, 0.1, 0.3, 0.2, 0.3]).astype(np.int16)
+    place = np.array([4.0 if spacing > 0 else 85.0, spacing, 7.0, 0.01, 2.4])
+    answers: dict[bool, list[np.ndarray]] = {True: [], False: []}
+    for k in np.flatnonzero(seen):
+        for v in range(rows):
+            if abs(v - place[0] - k * spacing) <= abs(spacing) / 4:
+                middle = round(7 + 0.01 * v)
+                of = sums[1:16:2, v, middle - 2 : middle + 3]
+                for up in (True, False):
+                    mine = of[(PILOTS[k] > 0) == up]
+                    answers[up].append((mine > 0 if up else mine < 0).ravel())
+    shares = {up: np.concatenate(of).mean() for up, of in answers.items()}
     pilots = PILOTS.astype(np.float64)
-    want = max(-low, 0) / high if high > 0 else 1.0
-    assert _kernels.dimmer(pilots, seen, spacing, centre, values) == pytest.approx(want)
-    assert _kernels.dimmer(pilots, seen, spacing, centre, -np.abs(values)) == 1.0
+    assert _kernels.dimmer(sums, pilots, seen, place) == pytest.approx(shares[False] / shares[True])
+    assert _kernels.dimmer(-np.abs(sums), pilots, seen, place) == 1.0
 
 
 @pytest.mark.parametrize("spacing", [5.0, -5.0])
@@ -652,7 +659,7 @@ def test_a_bar_is_read_upright(spacing: float) -> None:
     np.testing.assert_array_equal(values, want[:, ::way])
     np.testing.assert_array_equal(moved, way * before)
     np.testing.assert_array_equal(codes[:, 8:], words[symbols])
-    assert dim == _kernels.dimmer(pilots, seen, 5.0, 6.0 + 5.0 * (K - 1) / 2 - 44.5, values)
+    assert dim == _kernels.dimmer(sums, pilots, seen, place)
 
 
 @pytest.mark.parametrize("dim", [0.05, 0.5, 2.0])
@@ -669,12 +676,36 @@ def test_boundaries_stay_where_one_sign_is_missed(dim: float) -> None:
     known = np.ones((K + 1, 16), np.bool_)
     known[[0, K]] = False
     joint = JointScaleRanging(huber=9.0, blur_px=0.45, core_share=1.0)
-    start = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0])
-    found_dim = _kernels.dimmer(PILOTS.astype(np.float64), np.ones(K, np.bool_), spacing, 0.0, values)
-    assert found_dim == pytest.approx(dim, rel=0.02)
-    found = joint._fit(codes, known, np.zeros(16), found_dim, values, start, 6)
+    start = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
+    found = joint._fit(codes, known, np.zeros(16), dim, values, start, 6)
     assert found is not None
     assert found[0][0] == pytest.approx(spacing, rel=2e-5)
+
+
+def test_shifts_by_sign_and_by_repeated_values_are_found() -> None:
+    """Steps up lie 0.08 px lower than steps down, and what repeats a value looks smaller by 0.05 px."""
+    rng = np.random.default_rng(7)
+    codes = np.concatenate([PILOTS, WORDS[rng.integers(0, 64, K)]], axis=1).astype(np.float64)
+    spacing, rows = 8.6, 150
+    at, boundaries = np.arange(rows) - (rows - 1) / 2, spacing * (np.arange(1, K) - K / 2)
+    values = np.empty((16, rows))
+    for i in range(16):
+        again = codes[:, i] == codes[:, i - 1] if i else np.zeros(K)
+        shift = 0.04 * np.sign(np.diff(codes[:, i])) + 0.05 * np.diff(again.astype(float))
+        share = norm.cdf((at[:, None] - boundaries - shift) / 0.45)
+        values[i] = 0.6 * (codes[0, i] + share @ np.diff(codes[:, i]))
+    known = np.ones((K + 1, 16), np.bool_)
+    known[[0, K]] = False
+    joint = JointScaleRanging(huber=9.0, blur_px=0.45, core_share=1.0)
+    start = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
+    found = joint._fit(codes, known, np.zeros(16), 1.0, values, start, 6)
+    assert found is not None
+    fit, _, (off, weight) = found
+    assert fit[0] == pytest.approx(spacing, rel=2e-5)
+    # The prior takes up to a tenth of them.
+    assert_allclose(fit[5:], [0.04, 0.05], rtol=0.12)
+    assert (weight > 0).all()
+    assert np.abs(off).max() < 0.005
 
 
 def noisy_fit(distance_m: float, noise: float, seed: int) -> tuple[float, np.ndarray]:
@@ -688,7 +719,7 @@ def noisy_fit(distance_m: float, noise: float, seed: int) -> tuple[float, np.nda
     share = norm.cdf((at[:, None] - spacing * (np.arange(1, K) - K / 2)) / 0.45)
     ideal = 0.8 * (codes[0] + share @ np.diff(codes, axis=0)).T
     values = ideal + rng.normal(0, noise / np.sqrt(5), ideal.shape)
-    start = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0])
+    start = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
     known = np.ones((K + 1, 16), np.bool_)
     known[[0, K]] = False
     # With the profile of the bound: a normal distribution.

@@ -19,7 +19,6 @@ def score_rises(events, shape, start, chip_us, min_score, cell_shift):
             whole = int(np.floor(run / chip_us + 0.5))
             again = whole == chips[v, u]
             if abs(run - whole * chip_us) > 0.3 * chip_us:
-                again = False
                 score[v, u] -= 3
             elif whole <= 4:
                 score[v, u] += 2
@@ -238,16 +237,15 @@ def newest_on_parabola(past, speed_weight, bend_weight, worth, outlier):
     return path[1], inverse[1, 1], newest / weight[-1]
 
 
-def bend_of(place, uneven, sums, least):
+def bend_of(place, sums, least):
     """By `lstsq`, weighted."""
     use = sums[1] > least * sums[1].max()
-    place, uneven, weight = place[use], uneven[use], sums[1, use]
+    place, weight = place[use], sums[1, use]
     off = sums[0, use] / weight
-    side = np.where(np.floor(place) % 2, -1.0, 1.0)
-    terms = np.stack([place**2, np.ones(len(place)), place, side, *([uneven] if uneven.any() else [])], 1)
+    terms = np.stack([place**2, np.ones(len(place)), place], 1)
     root = np.sqrt(weight)
     path = np.linalg.lstsq(terms * root[:, None], off * root)[0]
-    left = (weight * (off - terms @ path) ** 2).sum() / (len(place) - terms.shape[1] - 2)
+    left = (weight * (off - terms @ path) ** 2).sum() / (len(place) - 5)
     return path[0], np.linalg.inv((terms.T * weight) @ terms)[0, 0] * left
 
 

@@ -11,6 +11,7 @@ from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.detection import Followed, RegionFollower, _clear
 from evlcp_sdk.rx.places import Places
+from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing.recordings import (
     IdealBar,
@@ -226,6 +227,24 @@ def test_a_bar_is_found_before_a_panel_of_4_khz() -> None:
     (region,) = followed(merged(ideal_events(LINK, bar), panel[beside]), 30_000)[29_000]
     assert region.latest.width_px <= bar.width_px + 2
     assert region.latest.height_px == pytest.approx(128, abs=1.5)
+
+
+@pytest.mark.parametrize("hz", [2700, 3600, 4400])
+def test_a_lamp_near_whole_chips_is_known_by_its_steady_time(hz: int) -> None:
+    """Its rises come 3.7, 2.8 or 2.3 chips apart: with a pixel's jitter, on the chips most of the time."""
+    period_us, rng = 1e6 / hz, np.random.default_rng(hz)
+    column, row = (v.ravel() for v in np.meshgrid(np.arange(300, 320), np.arange(200, 220)))
+    t = np.arange(100, 40_000, period_us)[:, None] + rng.normal(
+        0, 12, (int(np.ceil(39_900 / period_us)), 400)
+    )
+    order = np.argsort(t, axis=None, kind="stable")
+    x, y = (np.broadcast_to(v, t.shape).ravel()[order] for v in (column, row))
+    events = Events.of(np.sort(t.ravel()).astype(np.int64), x, y, np.ones(t.size))
+    rhythm = Rhythm(1280, 720, LINK.packet.chip_us, SPEC.min_score)
+    for start, part in steps(events, 40_000):
+        rhythm.step(start, part, np.zeros((180, 320), np.int32), 2)
+        if start >= 20_000:
+            assert len(rhythm.of(part)) < 0.15 * len(part)
 
 
 def test_a_region_takes_its_bars_size_and_gathers_its_events() -> None:

@@ -28,7 +28,7 @@ def bend_of(lean_deg: float, distance_m: float, noise_px: float, rng: np.random.
     spacing_px = FOCAL_PX * SPACING_M * cosine / distance_m
     off_px = seen_px - spacing_px * PLACES + noise_px * rng.standard_normal(len(PLACES))
     one_px = spacing_px * SPACING_M / distance_m
-    return Bend(PLACES, off_px / one_px, np.full(len(PLACES), one_px**2), np.zeros(len(PLACES)))
+    return Bend(PLACES, off_px / one_px, np.full(len(PLACES), one_px**2))
 
 
 def drive(
@@ -72,7 +72,7 @@ def test_without_a_distance_nothing_changes() -> None:
 
 
 def foreshortened(
-    along: float = 0.0, about_deg: float = 0.0, sigma_deg: float = 0.7, share: float = 0.03
+    along: float = 0.0, about_deg: float = 0.0, sigma_deg: float = 0.7, share: float = 0.1
 ) -> tuple[float, float]:
     """Mean and standard deviation of the foreshortening over what is likely of a lean, by quadrature."""
     sigma, most, about = math.radians(sigma_deg), math.radians(5), math.radians(about_deg)
@@ -183,10 +183,10 @@ def test_another_layout_s_bend_starts_anew() -> None:
     keeper, rng = RangeKeeper(), np.random.default_rng(6)
     bend = bend_of(0.0, 45.0, 0.04, rng)
     state, _ = keeper.step(Ranges(), 0.0, CHIP_US, Range(45.0, 0.01, 15, 8.0, bend), AHEAD)
-    few = Bend(bend.place[:4], bend.off[:4], bend.weight[:4], bend.uneven[:4])
+    few = Bend(bend.place[:4], bend.off[:4], bend.weight[:4])
     state, found = keeper.step(state, FRAME_US, CHIP_US, Range(45.0, 0.01, 4, 8.0, few), AHEAD)
     assert state.bend.shape == (2, 4)
-    # Four boundaries say nothing of a parabola beside scale, place and the pilots' pattern.
+    # The scatter of four boundaries about a parabola says nothing of its sigma.
     assert math.isfinite(found.sigma_m)
 
 
