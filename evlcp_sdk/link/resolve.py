@@ -278,7 +278,8 @@ def resolve(
     resolved: dict[str, dict[str, Any]] = {}
     revisions: dict[str, int] = {}
     pairs = True
-    for section in known:
+    # A framing says which roles there are, and what finds its transmitters.
+    for section in sorted(known, key=lambda name: (name in ROLES, name != "framing")):
         keys = table.get(section, {})
         if not isinstance(keys, Mapping):
             continue
@@ -293,7 +294,10 @@ def resolve(
         if section in _SPECS:
             cls = _SPECS[section]
         else:
-            head["id"] = name = keys.pop("id", ROLES[section].default_for(built.get("bar"), pairs))
+            usual = ROLES[section].default_for(built.get("bar"), pairs)
+            if section == "detection" and framing is not None and framing.detection:
+                usual = framing.detection
+            head["id"] = name = keys.pop("id", usual)
             if not isinstance(name, str):
                 fault(section, "id", f" = {name!r}: expected a string")
                 continue
@@ -324,6 +328,7 @@ def resolve(
     if faults:
         raise ConfigError("\n".join(str(f) for f in faults))
 
+    resolved = {section: resolved[section] for section in known if section in resolved}
     return _assembled(built, resolved, revisions, message_kinds(registry))
 
 

@@ -135,9 +135,11 @@ class Framing(ABC):
 
     Attributes:
         roles: The roles that do its steps; a link has tables of these only, of those in `STEPS`.
+        detection: Id of the detection of a link that names none; empty for the role's default.
     """
 
     roles: ClassVar[frozenset[str]] = frozenset()
+    detection: ClassVar[str] = ""
 
     @abstractmethod
     def codebook(self, clusters: int) -> Codebook | None:

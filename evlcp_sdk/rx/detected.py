@@ -1,5 +1,6 @@
 """Regions that an algorithm of the role `detection` gives, followed as the receiver's own are."""
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -8,9 +9,9 @@ import numpy as np
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Detector
-from evlcp_sdk.rx.detection import Followed, same_place
+from evlcp_sdk.rx.detection import BACKFILL_STEPS, Followed, same_place
 from evlcp_sdk.rx.guard import Guard
-from evlcp_sdk.rx.limits import LIMITS, Limits
+from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
 from evlcp_sdk.rx.places import Places
 from evlcp_sdk.values import Events, Region
 
@@ -38,6 +39,8 @@ class DetectedRegions:
         self._step_us = link.regions.step_us
         with self._guard:
             self._state: Any = detector.init()
+        self._recent: deque[tuple[int, Events]] = deque(maxlen=BACKFILL_STEPS)
+        self._left: frozenset[int] = frozenset()
         self.alive: list[Followed] = []
         self.counts = {"regions_left_out": 0, "dropped_no_room": 0}
 
@@ -56,6 +59,9 @@ class DetectedRegions:
                 self._guard.expect_number(getattr(region, name), name, -1e6, 1e6)
             if not any(same_place(region, place) for place in taken):
                 places[region.id] = replace(region, t_us=start_us + self._step_us / 2)
+        # What was let go is not taken up again as long as the detector gives it.
+        self._left &= {region.id for region in found}
+        places = {id: place for id, place in places.items() if id not in self._left}
         known = {followed.id: followed for followed in self.alive}
         for followed in self.alive:
             followed.released |= followed.id not in places
@@ -63,16 +69,28 @@ class DetectedRegions:
             if id in known:
                 known[id].positions.append(place)
             elif len(self.alive) < self._limits.regions:
-                known[id] = Followed(id, Places([place]), start_us, opened_us=start_us + self._step_us)
+                pieces = deque((begun, _inside(before, place)) for begun, before in self._recent)
+                first_us = pieces[0][0] if pieces else start_us
+                end_us = start_us + self._step_us
+                known[id] = Followed(id, Places([place]), first_us, pieces, opened_us=end_us)
                 self.alive.append(known[id])
             else:
                 self.counts["regions_left_out"] += 1
         for followed in self.alive:
             followed.add(start_us, _inside(events, followed.latest))
+        self._remember(start_us, events)
         self._make_room()
         seen = list(self.alive)
         self.alive = [followed for followed in self.alive if not followed.released]
         return seen
+
+    def _remember(self, start_us: int, events: Events) -> None:
+        """Keep a step's events, for regions that are found later, and what is before it within the limits."""
+        while self._recent and self._recent[0][0] <= start_us - BACKFILL_STEPS * self._step_us:
+            self._recent.popleft()
+        self._recent.append((start_us, events))
+        while sum(held_bytes(held) for _, held in self._recent) > self._limits.recent_bytes:
+            self._recent.popleft()
 
     def _make_room(self) -> None:
         """Forget the oldest events where all together take too much."""
@@ -87,9 +105,11 @@ class DetectedRegions:
 
     def skip(self) -> None:
         """Pass over a gap in time, with no region alive."""
+        self._recent.clear()
 
     def close(self) -> None:
         """End the stream: forget all events."""
+        self.skip()
         self.alive = []
 
     def has_room(self) -> bool:
@@ -99,6 +119,7 @@ class DetectedRegions:
     def drop(self, followed: Followed) -> None:
         """Let a region go at once."""
         followed.released = True
+        self._left |= {followed.id}
         self.alive = [other for other in self.alive if other is not followed]
 
     def shape(

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["SAME_PX", "Followed", "RegionFollower", "same_place"]
+__all__ = ["BACKFILL_STEPS", "SAME_PX", "Followed", "RegionFollower", "same_place"]
 
 SAME_PX = 5.0
 """How far apart centres of two regions of one image may be: before lit leaves an end is good to some px."""
@@ -73,7 +73,7 @@ _CENTRE_SIGMA_PX = 0.25
 _FEW = 3
 """Boxes up to which looking at all events for each takes less than looking up which boxes are near."""
 
-_BACKFILL_STEPS = 12
+BACKFILL_STEPS = 12
 """Steps kept from before a region was found: a pixel needs about 1 ms to score, a region two steps."""
 
 _COUNTS = ("steps_forgotten", "dropped_no_room", "regions_left_out", "regions_gave_way", "areas_left_out")
@@ -217,7 +217,7 @@ class RegionFollower:
         self._fresh: list[Box] = []
         steps = math.ceil(min(keep_us, _LONGEST_US) / spec.step_us)
         self._recent: deque[Piece] = deque()
-        self._most_recent = max(steps, _BACKFILL_STEPS)
+        self._most_recent = max(steps, BACKFILL_STEPS)
         self._recent_bytes = 0
         self._next_id = 0
         self.alive: list[Followed] = []
@@ -636,7 +636,7 @@ class RegionFollower:
                 self.gather(followed)
                 self.alive.append(followed)
                 return
-        recent = list(self._recent)[-_BACKFILL_STEPS:]
+        recent = list(self._recent)[-BACKFILL_STEPS:]
         pieces = deque((start, self._rhythmic(select(events, reach))) for start, events in recent)
         state = self._position.init() if self._position else None
         self.alive.append(

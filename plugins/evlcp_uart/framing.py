@@ -31,6 +31,7 @@ class Uart(Framing):
     """
 
     roles: ClassVar[frozenset[str]] = frozenset()
+    detection: ClassVar[str] = "spots"
 
     data_bits: Annotated[int, Field(ge=5, le=9, description="Data bits of a character.")] = 8
     parity: Annotated[Parity, Field(description="The parity bit makes the number of ones so.")] = "none"

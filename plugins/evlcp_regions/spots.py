@@ -1,0 +1,286 @@
+"""The light of single LEDs: small spots from which bursts of events of one polarity come, in turn."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.plugin.roles import Detection, Detector
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.values import Events, Region
+
+__all__ = ["Spots"]
+
+_CELL_PX, _FINE_PX = 32, 8
+"""Cells in which new spots are looked for, and those in which known ones are."""
+
+_SLOTS_PER_BIT, _LONGEST_SLOT_US = 2, 500
+"""An edge wakes its burst within a slot: half a bit, or what a burst takes at the most."""
+
+_LEAST, _PURE = 6, 0.7
+"""Events of a burst, and by how much more of them are of one polarity than of the other."""
+
+_TURNS = 6
+"""Bursts of the other polarity than the one before, with no long time between, that show a spot."""
+
+_BURST_SHARE = 0.25
+"""Bursts of a spot that is known have at least so much of its usual number of events."""
+
+_AGILE_US = 4000.0
+"""Time in which the image of a light that shakes takes another speed."""
+
+_VEIL_PX, _VEIL = 128.0, 4.0
+"""How far around a light lenses scatter some of it, and how much brighter it is than what they make of it."""
+
+_MOST_GATE_PX = 64.0
+"""How far from where it should be a spot is looked for at the most."""
+
+_BLUR_PX = 4.0
+"""Half of a spot's box beyond the light that is seen: its halo, and the way it makes in a step."""
+
+
+@dataclass(frozen=True)
+class Spots(Detection):
+    """Small lights that go on and off, each followed by its bursts, and by its motion while it is on.
+
+    For one LED: rates of bits from a hundred to tens of thousands a second, dark and lit for many bits.
+    """
+
+    reach_px: Annotated[float, Field(gt=2, le=64, description="How far from its centre a light is seen.")] = (
+        12.0
+    )
+    speed_px_ms: Annotated[
+        float, Field(gt=0, le=50, description="How fast it may move in the image, px a millisecond.")
+    ] = 1.5
+    fade_us: Annotated[
+        int, Field(ge=1000, description="Time without an edge of the light after which it has ended.")
+    ] = 500_000
+    most: Annotated[int, Field(ge=1, le=256, description="Lights that are followed; the brightest.")] = 16
+
+    def compile(self, camera: CameraModel, codebook: Codebook, packet: PacketFormat) -> Detector:
+        """For the size of the sensor and the rate of the bits."""
+        chip_us = packet.chip_us
+        slot_us = min(chip_us / _SLOTS_PER_BIT, _LONGEST_SLOT_US)
+        apart_us = 2 * codebook.longest_gap_chips * chip_us
+        return _SpotDetector(self, camera.width, camera.height, slot_us, apart_us)
+
+
+@dataclass(frozen=True)
+class _Spot:
+    """A light that is followed.
+
+    Attributes:
+        id: Its number.
+        t_us: When it was seen last, us.
+        x_px: Its column at that time.
+        y_px: Its row.
+        right: Columns a us that it moves.
+        down: Rows a us.
+        size_px: Root mean square of how far from its centre events are.
+        burst: Usual events of a burst.
+        lit: The last burst was ON.
+        turned_us: When the polarity of its bursts changed last, us.
+    """
+
+    id: int
+    t_us: float
+    x_px: float
+    y_px: float
+    right: float
+    down: float
+    size_px: float
+    burst: float
+    lit: bool
+    turned_us: float
+
+
+@dataclass(frozen=True)
+class _Turns:
+    """Bursts of a cell: whether the last was ON, how often that changed, and when it did last, us."""
+
+    lit: bool
+    turns: int
+    t_us: float
+
+
+@dataclass(frozen=True)
+class _State:
+    """Lights that are followed, turns of cells by number, and the number of the next light."""
+
+    spots: tuple[_Spot, ...] = ()
+    cells: dict[int, _Turns] = field(default_factory=dict)
+    next_id: int = 0
+
+
+@dataclass(frozen=True)
+class _SpotDetector:
+    spec: Spots
+    width: int
+    height: int
+    slot_us: float
+    apart_us: float
+
+    def init(self) -> _State:
+        return _State()
+
+    def step(self, state: _State, start_us: int, events: Events) -> tuple[_State, list[Region]]:
+        now_us = float(events.t_us[-1]) if len(events) else float(start_us)
+        moved: list[_Spot] = []
+        regions: list[Region] = []
+        for spot in state.spots:
+            seen, x_px, y_px = self._followed(spot, start_us, now_us, events)
+            beside = any(_apart(x_px, y_px, other) < self.spec.reach_px for other in moved)
+            faded = now_us - seen.turned_us > self.spec.fade_us
+            if not (beside or faded or _is_veil(seen, state.spots)):
+                moved.append(seen)
+                regions.append(self._region(seen, x_px, y_px, now_us))
+        cells, new = self._turned(state.cells, start_us, events)
+        next_id = state.next_id
+        for spot in new:
+            near = any(_apart(spot.x_px, spot.y_px, other) < 2 * self.spec.reach_px for other in moved)
+            if near or _is_veil(spot, moved):
+                continue
+            if len(moved) >= self.spec.most:
+                least = min(moved, key=lambda one: one.burst)
+                if least.burst >= spot.burst:
+                    continue
+                moved.remove(least)
+                regions = [region for region in regions if region.id != least.id]
+            moved.append(replace(spot, id=next_id))
+            regions.append(self._region(moved[-1], spot.x_px, spot.y_px, now_us))
+            next_id += 1
+        return _State(tuple(moved), cells, next_id), regions
+
+    def _region(self, spot: _Spot, x_px: float, y_px: float, now_us: float) -> Region:
+        side = 2 * (min(max(2.5 * spot.size_px, _BLUR_PX), self.spec.reach_px) + _BLUR_PX) + 1
+        return Region(spot.id, now_us, x_px, y_px, side, side)
+
+    def _followed(
+        self, spot: _Spot, start_us: int, now_us: float, events: Events
+    ) -> tuple[_Spot, float, float]:
+        """A light after a step, and where it is in it: seen there, or where it should be."""
+        away_us = max(now_us - spot.t_us, 0.0)
+        straight_us = _AGILE_US * (1 - math.exp(-away_us / _AGILE_US))
+        x_px, y_px = spot.x_px + spot.right * straight_us, spot.y_px + spot.down * straight_us
+        gate_px = min(self.spec.reach_px + self.spec.speed_px_ms * away_us * 1e-3, _MOST_GATE_PX)
+        x, y = events.x.astype(np.float64), events.y.astype(np.float64)
+        near = np.flatnonzero((np.abs(x - x_px) <= gate_px) & (np.abs(y - y_px) <= gate_px))
+        if len(near) < _LEAST:
+            return spot, x_px, y_px
+        x, y, t, on = x[near], y[near], events.t_us[near], events.p[near] > 0
+        slot = np.floor((t - start_us) / self.slot_us).astype(np.int64)
+        burst = self._burst(x, y, slot, on, max(_LEAST, _BURST_SHARE * spot.burst), (x_px, y_px, gate_px))
+        if burst is not None:
+            u_px, v_px, many, lit = burst
+            usual = spot.burst + 0.2 * (many - spot.burst)
+            turned_us = now_us if lit != spot.lit else spot.turned_us
+            spot = replace(spot, burst=usual, lit=lit, turned_us=turned_us)
+        elif spot.lit:
+            u_px, v_px = x_px, y_px
+        else:
+            return spot, x_px, y_px
+        reach_px = self.spec.reach_px
+        for _ in range(2):
+            inside = (np.abs(x - u_px) <= reach_px) & (np.abs(y - v_px) <= reach_px)
+            if inside.sum() < _LEAST:
+                return spot, x_px, y_px
+            u_px, v_px = float(x[inside].mean()), float(y[inside].mean())
+        t_us = float(t[inside].mean())
+        size_px = float(np.sqrt(((x[inside] - u_px) ** 2 + (y[inside] - v_px) ** 2).mean() / 2))
+        since_us = max(t_us - spot.t_us, 1.0)
+        share = since_us / (since_us + _AGILE_US)
+        most = self.spec.speed_px_ms * 1e-3
+        right = spot.right + share * ((u_px - spot.x_px) / since_us - spot.right)
+        down = spot.down + share * ((v_px - spot.y_px) / since_us - spot.down)
+        spot = replace(
+            spot,
+            t_us=t_us,
+            x_px=u_px,
+            y_px=v_px,
+            right=min(max(right, -most), most),
+            down=min(max(down, -most), most),
+            size_px=spot.size_px + 0.1 * (size_px - spot.size_px),
+        )
+        return spot, u_px, v_px
+
+    def _burst(
+        self,
+        x: NDArray[np.float64],
+        y: NDArray[np.float64],
+        slot: NDArray[np.int64],
+        on: NDArray[np.bool_],
+        least: float,
+        gate: tuple[float, float, float],
+    ) -> tuple[float, float, float, bool] | None:
+        """The burst of the most events near a place: column, row, how many, and whether ON; None for none."""
+        x_px, y_px, gate_px = gate
+        cells = int(2 * gate_px / _FINE_PX) + 2
+        column = ((x - x_px + gate_px) / _FINE_PX).astype(np.int64)
+        row = ((y - y_px + gate_px) / _FINE_PX).astype(np.int64)
+        slots = int(slot.max()) + 1
+        index = (slot * cells + row) * cells + column
+        every = np.bincount(index, minlength=slots * cells * cells).reshape(slots, cells, cells)
+        ones = np.bincount(index[on], minlength=slots * cells * cells).reshape(slots, cells, cells)
+        every, ones = (many[:, :-1] + many[:, 1:] for many in (every, ones))
+        every, ones = (many[..., :-1] + many[..., 1:] for many in (every, ones))
+        more = np.abs(2 * ones - every)
+        more[more < _PURE * every] = 0
+        best = int(more.argmax())
+        if more.flat[best] < least:
+            return None
+        _, v, u = np.unravel_index(best, more.shape)
+        # The light is as its last burst left it.
+        last = int(np.flatnonzero(more[:, v, u] >= 0.5 * more.flat[best])[-1])
+        lit = bool(2 * ones[last, v, u] > every[last, v, u])
+        u_px, v_px = x_px - gate_px + (int(u) + 1) * _FINE_PX, y_px - gate_px + (int(v) + 1) * _FINE_PX
+        return u_px, v_px, float(more.flat[best]), lit
+
+    def _turned(
+        self, cells: dict[int, _Turns], start_us: int, events: Events
+    ) -> tuple[dict[int, _Turns], list[_Spot]]:
+        """Cells by the bursts of a step, and lights that they show."""
+        known = {cell: turns for cell, turns in cells.items() if start_us - turns.t_us <= self.apart_us}
+        if len(events) < _LEAST:
+            return known, []
+        columns = -(-self.width // _CELL_PX)
+        many = columns * -(-self.height // _CELL_PX)
+        cell = events.y.astype(np.int64) // _CELL_PX * columns + events.x.astype(np.int64) // _CELL_PX
+        slot = np.floor((events.t_us - start_us) / self.slot_us).astype(np.int64)
+        index = slot * many + cell
+        every = np.bincount(index)
+        more = np.abs(np.bincount(index, 2.0 * events.p.astype(np.float64) - 1.0))
+        bursts = np.flatnonzero((every >= _LEAST) & (more >= _PURE * every))
+        new = []
+        for at in bursts.tolist():
+            which, t_us = at % many, start_us + (at // many + 0.5) * self.slot_us
+            inside = index == at
+            lit = bool(2 * events.p[inside].sum() > every[at])
+            before = known.get(which)
+            if before is None or t_us - before.t_us > self.apart_us:
+                known[which] = _Turns(lit, 0, t_us)
+            elif before.lit != lit:
+                known[which] = _Turns(lit, before.turns + 1, t_us)
+                if before.turns + 1 >= _TURNS:
+                    x, y = events.x[inside].astype(np.float64), events.y[inside].astype(np.float64)
+                    place = float(np.median(x)), float(np.median(y))
+                    size = 2.0
+                    new.append(_Spot(-1, t_us, *place, 0.0, 0.0, size, float(every[at]), lit, t_us))
+        return known, sorted(new, key=lambda spot: -spot.burst)
+
+
+def _is_veil(spot: _Spot, others: Sequence[_Spot]) -> bool:
+    """Whether it is what the lens scatters of a much brighter light."""
+    return any(
+        other.burst > _VEIL * spot.burst and _apart(spot.x_px, spot.y_px, other) < _VEIL_PX
+        for other in others
+    )
+
+
+def _apart(x_px: float, y_px: float, spot: _Spot) -> float:
+    return max(abs(x_px - spot.x_px), abs(y_px - spot.y_px))

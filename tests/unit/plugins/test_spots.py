@@ -1,0 +1,95 @@
+"""The detection of single lights, beside places that are told."""
+
+import numpy as np
+import pytest
+from evlcp_regions.spots import Spots
+
+from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.values import Events, Region
+
+ONE = {"rows": 1, "columns": 1, "cluster_rows": 1, "cluster_columns": 1}
+STEP_US = 1500
+
+
+def link_of(rate_hz: float) -> Link:
+    return resolve({"bar": ONE, "air": {"chip_rate_hz": rate_hz}, "framing": {"id": "uart"}})
+
+
+def shaking(t_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where a light is in the image of a camera that shakes, up to 1 px a ms fast."""
+    t = t_us * 1e-6
+    return 600 + 25 * np.sin(2 * np.pi * 4 * t), 300 + 12 * np.sin(2 * np.pi * 9 * t + 1)
+
+
+def events_of(
+    rng: np.random.Generator, rate_hz: float, seconds: float, burst: int, noise_hz: float
+) -> Events:
+    """Bursts of a light of random bits with a spread of 3 px, dark for many bits, and noise all over."""
+    bits = np.repeat(rng.integers(0, 2, int(seconds * rate_hz)), rng.integers(1, 6, int(seconds * rate_hz)))
+    edges = np.flatnonzero(np.diff(bits)) + 1
+    edges = edges[edges < seconds * rate_hz]
+    late = rng.exponential(80.0, (len(edges), burst)) + 20
+    t = (edges[:, None] / rate_hz * 1e6 + late).ravel()
+    x, y = shaking(t)
+    x, y = x + 3 * rng.standard_normal(len(t)), y + 3 * rng.standard_normal(len(t))
+    p = np.repeat(bits[edges], burst)
+    n = rng.poisson(noise_hz * seconds)
+    t = np.concatenate([t, rng.uniform(0, seconds * 1e6, n)])
+    x = np.concatenate([x, rng.uniform(0, 1279, n)])
+    y = np.concatenate([y, rng.uniform(0, 719, n)])
+    p = np.concatenate([p, rng.integers(0, 2, n)])
+    order = np.argsort(t)
+    return Events.of(np.floor(t[order]), np.rint(x[order]), np.rint(y[order]), p[order])
+
+
+def regions_of(link: Link, events: Events, seconds: float) -> list[tuple[int, list[Region]]]:
+    detector = Spots().compile(link.camera, link.codebook, link.packet)
+    state, found = detector.init(), []
+    for start_us in range(0, int(seconds * 1e6), STEP_US):
+        a, b = np.searchsorted(events.t_us, (start_us, start_us + STEP_US))
+        state, regions = detector.step(state, start_us, events[a:b])
+        found.append((start_us, regions))
+    return found
+
+
+@pytest.mark.parametrize(("rate_hz", "burst"), [(500.0, 100), (500.0, 20), (3125.0, 60), (10_000.0, 60)])
+def test_a_light_is_followed_though_it_shakes_and_is_dark_for_long(rate_hz: float, burst: int) -> None:
+    link = link_of(rate_hz)
+    seconds = 0.8 if rate_hz < 1000 else 0.3
+    events = events_of(np.random.default_rng(1), rate_hz, seconds, burst, 20_000.0)
+    found = regions_of(link, events, seconds)
+    opened = next(k for k, (_, regions) in enumerate(found) if regions)
+    assert found[opened][0] <= 60 / rate_hz * 1e6 + STEP_US
+    ids = {region.id for _, regions in found for region in regions}
+    assert len(ids) == 1
+    # What counts is that the light's events are in the box.
+    inside = total = 0
+    for start_us, (region,) in found[opened:]:
+        x, y = shaking(np.array([start_us + STEP_US / 2]))
+        a, b = np.searchsorted(events.t_us, (start_us, start_us + STEP_US))
+        of_light = np.hypot(events.x[a:b] - x[0], events.y[a:b] - y[0]) < 9
+        across = np.abs(events.x[a:b] - region.x_px) <= region.width_px / 2
+        down = np.abs(events.y[a:b] - region.y_px) <= region.height_px / 2
+        total += int(of_light.sum())
+        inside += int((of_light & across & down).sum())
+    assert inside >= 0.985 * total
+
+
+def test_there_is_no_light_in_noise_or_in_what_moves() -> None:
+    rng = np.random.default_rng(2)
+    n = 20_000
+    t = np.sort(rng.uniform(0, 4e5, n))
+    # A steady edge that moves: brighter ahead of it, darker behind.
+    ahead = rng.integers(0, 2, n)
+    x, y = 200 + t * 3e-4 + np.where(ahead, 0.0, -40.0) + rng.standard_normal(n), rng.uniform(300, 330, n)
+    events = Events.of(np.floor(t), np.rint(x), np.rint(y), ahead)
+    assert not any(regions for _, regions in regions_of(link_of(500.0), events, 0.4))
+    noise = events_of(rng, 500.0, 0.2, 1, 200_000.0)
+    assert not any(regions for _, regions in regions_of(link_of(500.0), noise, 0.2))
+
+
+def test_a_framing_names_what_finds_its_lights() -> None:
+    assert link_of(500.0).table["detection"]["id"] == "spots"
+    assert resolve({}).table["detection"] == {"id": "rhythm"}
+    both = resolve({"bar": ONE, "framing": {"id": "uart"}, "detection": {"id": "whole"}})
+    assert both.table["detection"]["id"] == "whole"
