@@ -61,6 +61,7 @@ class DetectedRegions:
                 places[region.id] = replace(region, t_us=start_us + self._step_us / 2)
         # What was let go is not taken up again as long as the detector gives it.
         self._left &= {region.id for region in found}
+        self._left |= {region.id for region in found} - set(places)
         places = {id: place for id, place in places.items() if id not in self._left}
         known = {followed.id: followed for followed in self.alive}
         for followed in self.alive:

@@ -38,6 +38,12 @@ _AGILE_US = 4000.0
 _VEIL_PX, _VEIL = 128.0, 4.0
 """How far around a light lenses scatter some of it, and how much brighter it is than what they make of it."""
 
+_LARGE_PX = 64.0
+"""Three lights so near one another that none is much brighter are places of one that is larger, as a bar."""
+
+_YOUNG_US = 6000.0
+"""Age from which a light is given: until then others may show that it is a place of a larger one."""
+
 _MOST_GATE_PX = 64.0
 """How far from where it should be a spot is looked for at the most."""
 
@@ -86,6 +92,7 @@ class _Spot:
         burst: Usual events of a burst.
         lit: The last burst was ON.
         turned_us: When the polarity of its bursts changed last, us.
+        found_us: When it was found, us.
     """
 
     id: int
@@ -98,6 +105,7 @@ class _Spot:
     burst: float
     lit: bool
     turned_us: float
+    found_us: float
 
 
 @dataclass(frozen=True)
@@ -155,7 +163,12 @@ class _SpotDetector:
             moved.append(replace(spot, id=next_id))
             regions.append(self._region(moved[-1], spot.x_px, spot.y_px, now_us))
             next_id += 1
-        return _State(tuple(moved), cells, next_id), regions
+        single = [
+            region
+            for region, spot in zip(regions, moved, strict=True)
+            if now_us - spot.found_us >= _YOUNG_US and not _is_part(spot, moved)
+        ]
+        return _State(tuple(moved), cells, next_id), single
 
     def _region(self, spot: _Spot, x_px: float, y_px: float, now_us: float) -> Region:
         side = 2 * (min(max(2.5 * spot.size_px, _BLUR_PX), self.spec.reach_px) + _BLUR_PX) + 1
@@ -270,7 +283,7 @@ class _SpotDetector:
                     x, y = events.x[inside].astype(np.float64), events.y[inside].astype(np.float64)
                     place = float(np.median(x)), float(np.median(y))
                     size = 2.0
-                    new.append(_Spot(-1, t_us, *place, 0.0, 0.0, size, float(every[at]), lit, t_us))
+                    new.append(_Spot(-1, t_us, *place, 0.0, 0.0, size, float(every[at]), lit, t_us, t_us))
         return known, sorted(new, key=lambda spot: -spot.burst)
 
 
@@ -280,6 +293,19 @@ def _is_veil(spot: _Spot, others: Sequence[_Spot]) -> bool:
         other.burst > _VEIL * spot.burst and _apart(spot.x_px, spot.y_px, other) < _VEIL_PX
         for other in others
     )
+
+
+def _is_part(spot: _Spot, spots: Sequence[_Spot]) -> bool:
+    """Whether it is a place of a larger light."""
+    beside = [
+        other
+        for other in spots
+        if other.id != spot.id
+        and _apart(spot.x_px, spot.y_px, other) < _LARGE_PX
+        and other.burst < _VEIL * spot.burst
+        and spot.burst < _VEIL * other.burst
+    ]
+    return len(beside) >= 2
 
 
 def _apart(x_px: float, y_px: float, spot: _Spot) -> float:
