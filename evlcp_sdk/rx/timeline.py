@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.rx.limits import LIMITS, Limits
@@ -109,10 +108,7 @@ class Timeline:
             self._start_us = 0
         done = 0
         for end in self._bounds(events, self._start_us):
-            for part in self._parts(events.t_us[:end], due_us):
-                self._keep(events[done:part])
-                done = part
-                yield self._so_far()
+            yield from self._parts(events, done, end, due_us)
             self._keep(events[done:end])
             done = end
             yield self._next()
@@ -121,32 +117,33 @@ class Timeline:
                 yield self._next()
             if self._start_us < next_us:
                 self._start_us, self._after_gap = next_us, True
-        for part in self._parts(events.t_us, due_us):
-            self._keep(events[done:part])
-            done = part
-            yield self._so_far()
+        yield from self._parts(events, done, len(events), due_us)
         if done < len(events):
             self._keep(events[done:])
 
-    def _parts(self, t_us: NDArray[np.int64], due_us: Callable[[], float]) -> Iterator[int]:
-        """Where parts of the open step end among the times of its events; all that come before are kept."""
+    def _parts(self, events: Events, begin: int, end: int, due_us: Callable[[], float]) -> Iterator[TimeStep]:
+        """The parts of the open step that end among the next events of it, which are not kept yet."""
         assert self._start_us is not None
+        t_us = events.t_us[:end]
         while True:
             if self._due_us is None:
                 due = due_us()
                 within = max(self._start_us, self._part_us) < due < self._start_us + self._step_us
                 self._due_us = math.ceil(due) if within else _LATER_US
-            end = int(np.searchsorted(t_us, self._due_us))
-            if end == len(t_us):
+            part = int(np.searchsorted(t_us, self._due_us))
+            if part == end:
                 return
             self._part_us, self._due_us = self._due_us, None
-            yield end
+            yield self._so_far(events[begin:part])
 
-    def _so_far(self) -> TimeStep:
-        """The part of the open step whose end is due."""
+    def _so_far(self, newest: Events) -> TimeStep:
+        """The part of the open step whose end is due: what is kept of it, and what is not yet."""
         assert self._start_us is not None
-        self._pending = [Events.concat(self._pending)] if len(self._pending) > 1 else self._pending
-        events = self._pending[0] if self._pending else Events.empty()
+        if len(self._pending) > 1:
+            self._pending = [Events.concat(self._pending)]
+        # A view where it is all of one piece: the whole step is one, too.
+        newest = newest[: self._most - self._waiting]
+        events = Events.concat([*self._pending, newest]) if self._pending else newest
         return TimeStep(self._start_us, self._part_us, events, self._after_gap, whole=False)
 
     def _keep(self, events: Events) -> None:
