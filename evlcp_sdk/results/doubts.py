@@ -237,7 +237,7 @@ def warnings_of_links(
     if not tally.transmitters:
         return found + list(_frames(counts))
     for name, part in links.items():
-        told = [doubt for doubt in _frames(part.counts) if doubt.code != "no-preamble"]
+        told = [doubt for doubt in _frames(part.counts) if doubt.code not in ("no-preamble", "no-frames")]
         told += _of_link(
             tally.of_link(name),
             part.counts,
@@ -489,15 +489,23 @@ def _dropped(counts: Mapping[str, int], seen: Seen) -> Iterator[Doubt]:
 
 def _frames(counts: Mapping[str, int]) -> Iterator[Doubt]:
     blinking = counts.get("events_in_regions", 0)
-    if blinking >= _MANY_EVENTS and not counts.get("locks", 0):
+    if blinking >= _MANY_EVENTS and not counts.get("locks", counts.get("frames", 0)):
         regions = counts.get("regions_opened", 0)
-        yield Doubt(
-            "no-preamble",
-            f"something blinks, {blinking} events in {regions} region{_s(regions)},"
-            " but no preamble is detected",
-            "compare air.chip_rate_hz and the preamble with the transmitter's; a panel or leaves behind a bar"
-            " may mask it; `evlcp diagnose` says what blinks, and how fast",
-        )
+        blinks = f"something blinks, {blinking} events in {regions} region{_s(regions)}"
+        if "locks" in counts:
+            yield Doubt(
+                "no-preamble",
+                f"{blinks}, but no preamble is detected",
+                "compare air.chip_rate_hz and the preamble with the transmitter's; a panel or leaves behind a"
+                " bar may mask it; `evlcp diagnose` says what blinks, and how fast",
+            )
+        else:
+            yield Doubt(
+                "no-frames",
+                f"{blinks}, but no frame is read",
+                "compare air.chip_rate_hz and [framing] with the transmitter's; `evlcp diagnose` says what"
+                " blinks, and how fast",
+            )
     rejected, frames = counts.get("frames_rejected", 0), counts.get("frames", 0)
     share = _REJECTED_BESIDE_READ_SHARE if _read(counts) > counts.get("blocks_failed", 0) else _REJECTED_SHARE
     if rejected >= _FEW_FRAMES and rejected > share * (frames + rejected):

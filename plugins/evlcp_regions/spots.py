@@ -187,7 +187,7 @@ class _SpotDetector:
         if len(near) < _LEAST:
             return spot, x_px, y_px
         x, y, t, on = x[near], y[near], events.t_us[near], events.p[near] > 0
-        slot = np.floor((t - start_us) / self.slot_us).astype(np.int64)
+        slot = self._slots(t, start_us)
         burst = self._burst(x, y, slot, on, max(_LEAST, _BURST_SHARE * spot.burst), (x_px, y_px, gate_px))
         if burst is not None:
             u_px, v_px, many, lit = burst
@@ -254,6 +254,10 @@ class _SpotDetector:
         u_px, v_px = x_px - gate_px + (int(u) + 1) * _FINE_PX, y_px - gate_px + (int(v) + 1) * _FINE_PX
         return u_px, v_px, float(more.flat[best]), lit
 
+    def _slots(self, t_us: NDArray[np.int64], start_us: int) -> NDArray[np.int64]:
+        """In which slot of a step events are; those from before it are in its first."""
+        return np.maximum(np.floor((t_us - start_us) / self.slot_us).astype(np.int64), 0)
+
     def _turned(
         self, cells: dict[int, _Turns], start_us: int, events: Events
     ) -> tuple[dict[int, _Turns], list[_Spot]]:
@@ -264,7 +268,7 @@ class _SpotDetector:
         columns = -(-self.width // _CELL_PX)
         many = columns * -(-self.height // _CELL_PX)
         cell = events.y.astype(np.int64) // _CELL_PX * columns + events.x.astype(np.int64) // _CELL_PX
-        slot = np.floor((events.t_us - start_us) / self.slot_us).astype(np.int64)
+        slot = self._slots(events.t_us, start_us)
         index = slot * many + cell
         every = np.bincount(index)
         more = np.abs(np.bincount(index, 2.0 * events.p.astype(np.float64) - 1.0))

@@ -157,7 +157,7 @@ class Facts:
     @property
     def reads(self) -> bool:
         """Whether most frames are accepted."""
-        frames, rejected = self.counts["frames"], self.counts["frames_rejected"]
+        frames, rejected = self.counts["frames"], self.counts.get("frames_rejected", 0)
         if frames >= _FEW and frames >= ACCEPTED_SHARE * (frames + rejected):
             return True
         # What is no bar may lose its frames elsewhere in the picture.
@@ -496,6 +496,8 @@ def _focus(facts: Facts) -> Check:
 
 
 def _preamble(facts: Facts) -> Check:
+    if "preambles" not in facts.counts:
+        return Check("preamble", "skip", "preamble", "not looked for: the link's framing has none")
     heard, regions = facts.counts["preambles"], facts.counts["regions_opened"]
     packet_us = facts.link.packet.packet_chips * facts.link.packet.chip_us
     if not facts.reads and facts.seen.duration_us < 2 * packet_us:
@@ -521,7 +523,7 @@ def _preamble(facts: Facts) -> Check:
 
 
 def _frames(facts: Facts) -> Check:
-    frames, rejected = facts.counts["frames"], facts.counts["frames_rejected"]
+    frames, rejected = facts.counts["frames"], facts.counts.get("frames_rejected", 0)
     said = f"{frames} of {frames + rejected} accepted"
     if facts.reads and facts.at_edge and (unseen := _unseen_share(facts)) > _UNSEEN_SHARE:
         return Check(

@@ -17,7 +17,7 @@ from evlcp_sdk.results.tallies import RunTally
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.study.diagnosis.checks import Check, Facts, checks_of
 from evlcp_sdk.study.diagnosis.light import LightSource, LightSurvey
-from evlcp_sdk.study.diagnosis.probe import MOST_EVENTS, Trial, better_links
+from evlcp_sdk.study.diagnosis.probe import MOST_EVENTS, Trial, better_links, try_link
 from evlcp_sdk.values import Events
 
 __all__ = ["Diagnosis", "diagnosis_of", "infer_link"]
@@ -143,7 +143,8 @@ def diagnosis_of(
     )
     checks = checks_of(facts)
     trials: tuple[Trial, ...] = ()
-    if any(one.verdict == "fail" for one in checks) and sources and not facts.at_edge:
+    failed = any(one.verdict == "fail" for one in checks)
+    if failed and sources and not facts.at_edge and _has_preambles(receiver):
         trials = tuple(better_links(link, sample.events(), registry, _rates(sources, link)))
         checks = checks_of(replace(facts, trials=trials))
     reads = link.messages.decode
@@ -167,7 +168,7 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
     """Links that may have sent a recording, the best first: what `receive --link auto` takes.
 
     Tried are chip rates of what blinks, modulations, frames per packet and frames per pilot; all else is as
-    given. Reads until some packets have been seen.
+    given. A link whose framing has no preamble is taken as it is. Reads until some packets have been seen.
 
     Args:
         source: What is read; not closed.
@@ -187,8 +188,15 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
         if sample.full and sample.seen:
             break
     sources, _ = survey.found()
+    if not _has_preambles(receiver):
+        return [try_link(link, sample.events())]
     trials = better_links(link, sample.events(), registry, _rates(sources, link))
     return sorted(trials, key=lambda one: one.rank, reverse=True)
+
+
+def _has_preambles(receiver: Receiver) -> bool:
+    """Whether packets begin with a preamble: what else a link may be is tried of those only."""
+    return "preambles" in receiver.counts
 
 
 class _Sample:

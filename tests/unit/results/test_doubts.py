@@ -336,10 +336,17 @@ def test_a_reflection_is_not_doubted() -> None:
 
 def test_what_blinks_without_a_preamble() -> None:
     nothing = RunTally(LINK.packet)
-    (line,) = told(nothing, events_in_regions=5_000_000, regions_opened=1)
+    (line,) = told(nothing, events_in_regions=5_000_000, regions_opened=1, locks=0)
     assert line.startswith("something blinks, 5000000 events in 1 region, but no preamble is detected")
     assert told(nothing, events_in_regions=5_000_000, regions_opened=2, locks=1) == []
-    assert told(nothing, events_in_regions=20_000, regions_opened=3) == []
+    assert told(nothing, events_in_regions=20_000, regions_opened=3, locks=0) == []
+
+
+def test_what_blinks_and_has_no_preamble_in_any_case() -> None:
+    nothing = RunTally(LINK.packet)
+    (line,) = told(nothing, events_in_regions=5_000_000, regions_opened=1, frames=0)
+    assert line.startswith("something blinks, 5000000 events in 1 region, but no frame is read")
+    assert told(nothing, events_in_regions=5_000_000, regions_opened=1, frames=2) == []
 
 
 def test_frames_without_a_distance() -> None:

@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.rx.contest import explained_us
+from evlcp_sdk.rx.detected import DetectedRegions
+from evlcp_sdk.rx.detection import RegionFollower
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols
 from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols
@@ -136,9 +138,12 @@ def test_a_place_that_is_left_is_free_for_another_link() -> None:
 def test_links_share_the_room_for_events() -> None:
     receiver = Receiver([BAR, WH8, LAMP])
     assert {listener._regions._limits.region_bytes for listener in receiver._listeners} == {16 << 20}
-    one, other, lamp = (listener._regions._rhythm for listener in receiver._listeners)
-    assert one is other
-    assert lamp is not one
+    one, other, lamp = (listener._regions for listener in receiver._listeners)
+    assert isinstance(one, RegionFollower)
+    assert isinstance(other, RegionFollower)
+    assert one._rhythm is other._rhythm
+    # Its framing names a detection of its own.
+    assert isinstance(lamp, DetectedRegions)
 
 
 @pytest.mark.parametrize(

@@ -371,7 +371,7 @@ def test_every_link_is_received(name: str) -> None:
     heard = {
         round((frame.t_us / chip_us + bar.start_chip) * 2) / 2: frame for p in packets for frame in p.frames
     }
-    wrong = missed = sent = 0
+    wrong = erased = missed = sent = 0
     for q, packet in enumerate(bar.symbols):
         for f, symbols in enumerate(packet):
             start = q * form.packet_chips + form.frame_start_chip(f)
@@ -384,6 +384,11 @@ def test_every_link_is_received(name: str) -> None:
             sent += 1
             near = [frame for chip, frame in heard.items() if abs(chip - start) <= 2]
             missed += not near
-            wrong += sum(int((frame.soft.symbols != symbols).sum()) for frame in near)
+            for frame in near:
+                given = frame.soft.symbols >= 0
+                wrong += int((frame.soft.symbols != symbols)[given].sum())
+                erased += int((~given).sum())
     assert sent >= 10
     assert (missed, wrong) == (0, 0)
+    # Of a bar in parts, a cluster may be out of sight until all of it is known.
+    assert erased <= 0.005 * sent * link.bar.clusters

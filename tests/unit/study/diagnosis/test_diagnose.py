@@ -157,6 +157,26 @@ def test_a_bar_that_is_not_read_beside_one_that_is() -> None:
     assert judged(BAR, replace(other, rate_hz=737.0, intervals=HALF), frames=40) == ""
 
 
+LAMP = (
+    *("bar.rows=6", "bar.cluster_rows=6", "bar.columns=1", "bar.cluster_columns=1"),
+    *("framing.id=uart", "air.frames_per_packet=20", "air.chip_rate_hz=3125"),
+)
+
+
+@pytest.mark.parametrize("code", ["", "dark"])
+def test_a_framing_without_a_preamble_is_judged_by_its_frames(code: str) -> None:
+    dark = {"bars.0.led_w_m2": 0.0} if code else {}
+    link = load_link(overrides=LAMP)
+    with rendered(LAMP, 0.08, **{"motion.distance_m": 30.0, **dark}) as source:
+        diagnosis = diagnosis_of(source, link)
+    verdicts = {one.stage: one.verdict for one in diagnosis.checks}
+    assert (code_of(diagnosis), verdicts["preamble"]) == (code, "skip")
+    assert (diagnosis.counts["frames"] > 10, diagnosis.trials) == (not code, ())
+    with rendered(LAMP, 0.08, **{"motion.distance_m": 30.0, **dark}) as source:
+        (trial,) = infer_link(source, link)
+    assert (trial.changes, trial.frames > 10) == ((), not code)
+
+
 def test_rate_is_measured_without_a_link() -> None:
     survey = LightSurvey(1280, 720)
     with rendered(("air.chip_rate_hz=6250",)) as source:
