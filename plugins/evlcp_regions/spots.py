@@ -47,6 +47,15 @@ _YOUNG_US = 6000.0
 _MOST_GATE_PX = 64.0
 """How far from where it should be a spot is looked for at the most."""
 
+_SIZE_PX = 2.0
+"""Root mean square of a light's events about its centre before it is known: a lens' blur of some pixels."""
+
+_BOX_SIZES = 2.5
+"""A box reaches so far by that size: 99 of 100 events, were they spread as a normal distribution."""
+
+_LEARN_BURST, _LEARN_SIZE = 0.2, 0.1
+"""How much one burst says of the next one's events, and a step of the size: the means of five and of ten."""
+
 _BLUR_PX = 4.0
 """Half of a spot's box beyond the light that is seen: its halo, and the way it makes in a step."""
 
@@ -171,7 +180,7 @@ class _SpotDetector:
         return _State(tuple(moved), cells, next_id), single
 
     def _region(self, spot: _Spot, x_px: float, y_px: float, now_us: float) -> Region:
-        side = 2 * (min(max(2.5 * spot.size_px, _BLUR_PX), self.spec.reach_px) + _BLUR_PX) + 1
+        side = 2 * (min(max(_BOX_SIZES * spot.size_px, _BLUR_PX), self.spec.reach_px) + _BLUR_PX) + 1
         return Region(spot.id, now_us, x_px, y_px, side, side)
 
     def _followed(
@@ -191,7 +200,7 @@ class _SpotDetector:
         burst = self._burst(x, y, slot, on, max(_LEAST, _BURST_SHARE * spot.burst), (x_px, y_px, gate_px))
         if burst is not None:
             u_px, v_px, many, lit = burst
-            usual = spot.burst + 0.2 * (many - spot.burst)
+            usual = spot.burst + _LEARN_BURST * (many - spot.burst)
             turned_us = now_us if lit != spot.lit else spot.turned_us
             spot = replace(spot, burst=usual, lit=lit, turned_us=turned_us)
         elif spot.lit:
@@ -218,7 +227,7 @@ class _SpotDetector:
             y_px=v_px,
             right=min(max(right, -most), most),
             down=min(max(down, -most), most),
-            size_px=spot.size_px + 0.1 * (size_px - spot.size_px),
+            size_px=spot.size_px + _LEARN_SIZE * (size_px - spot.size_px),
         )
         return spot, u_px, v_px
 
@@ -286,8 +295,8 @@ class _SpotDetector:
                 if before.turns + 1 >= _TURNS:
                     x, y = events.x[inside].astype(np.float64), events.y[inside].astype(np.float64)
                     place = float(np.median(x)), float(np.median(y))
-                    size = 2.0
-                    new.append(_Spot(-1, t_us, *place, 0.0, 0.0, size, float(every[at]), lit, t_us, t_us))
+                    spot = _Spot(-1, t_us, *place, 0.0, 0.0, _SIZE_PX, float(every[at]), lit, t_us, t_us)
+                    new.append(spot)
         return known, sorted(new, key=lambda spot: -spot.burst)
 
 
