@@ -1,8 +1,8 @@
 """The use cases: what a program does with a recording, and what the commands parse and print."""
 
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
-from datetime import datetime
 from html import escape
 from pathlib import Path
 from types import TracebackType
@@ -84,7 +84,7 @@ def receive(
     *,
     registry: Registry | None = None,
     attitude: Attitude | AttitudeLog | None = None,
-    clock_zero: datetime | None = None,
+    clock_zero: ClockZero = None,
 ) -> "Reception":
     """Receive a recording or a camera: an iterator over its packets, in constant memory.
 
@@ -96,22 +96,52 @@ def receive(
         registry: Plugins whose hooks are called; None for all that are installed.
         attitude: What is known of the camera's attitude, the same always or over time: how plumb bars lean
             against the sensor. None for nothing.
-        clock_zero: UTC of the camera clock's 0, for the age of signed beacons; None if it is not known.
+        clock_zero: UTC of the camera clock's 0, or pulses on its trigger input that say it (a `PulseClock`
+            for each recording), for the age of signed beacons; None if it is not known.
 
     Raises:
         InputError: The source cannot be opened.
-        ConfigError: The file does not describe a link, or the recording's sensor is not the link's.
+        ConfigError: The file does not describe a link, the recording's sensor is not the link's, or nothing
+            says which second of UTC its pulses begin.
     """
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
     opened = source if isinstance(source, EventSource) else open_source(source, registry)
     try:
-        check_sensor(opened, opened.path if isinstance(source, EventSource) else source, links[0].camera)
+        url = opened.path if isinstance(source, EventSource) else source
+        check_sensor(opened, url, links[0].camera)
+        pulses = _pulses_of(clock_zero, opened, url)
         receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero)
-        return Reception(opened, receiver, links[0])
+        return Reception(opened, receiver, links[0], pulses)
     except BaseException:
         opened.close()
         raise
+
+
+def _pulses_of(clock_zero: ClockZero, source: EventSource, url: str | Path) -> PulseClock | None:
+    """What is told of a source's triggers; None for nobody.
+
+    Raises:
+        ConfigError: Nothing says which second of UTC the pulses of a recording begin.
+    """
+    if not isinstance(clock_zero, PulseClock):
+        return None
+    if not (clock_zero.dated or source.live):
+        raise ConfigError(
+            f"{url}: a pulse says when a second of UTC begins, not which one: give --clock-zero, UTC of the"
+            " camera clock's 0 to less than half a second"
+        )
+    return clock_zero
+
+
+def _events_of(source: EventSource, pulses: PulseClock | None) -> Iterator[Events]:
+    """The events of a source; its triggers go to the pulses before the events that came with them."""
+    for events, triggers in source.stream():
+        if pulses is not None and (len(events) or len(triggers)):
+            now_us = max(int(column[-1]) for column in (events.t_us, triggers.t_us) if len(column))
+            pulses.add(triggers, time.time(), now_us)
+        if len(events):
+            yield events
 
 
 class Reception(Iterator[Packet]):
@@ -126,16 +156,19 @@ class Reception(Iterator[Packet]):
         link: The configuration; the first of several.
     """
 
-    def __init__(self, source: EventSource, receiver: Receiver, link: Link) -> None:
+    def __init__(
+        self, source: EventSource, receiver: Receiver, link: Link, pulses: PulseClock | None = None
+    ) -> None:
         self.source = source
         self.receiver = receiver
         self.link = link
+        self._pulses = pulses
         self._packets = self._read()
 
     def _read(self) -> Iterator[Packet]:
         with self.source:
             try:
-                for events in self.source.chunks():
+                for events in _events_of(self.source, self._pulses):
                     yield from self.receiver.feed(events)
             except InputError:
                 yield from self.receiver.close()
@@ -216,7 +249,7 @@ def receive_to_folder(
     registry: Registry | None = None,
     plan: PositionPlan | None = None,
     attitude: Attitude | AttitudeLog | None = None,
-    clock_zero: datetime | None = None,
+    clock_zero: ClockZero = None,
     sinks: Sequence[str] = (),
     lines: Callable[[str], None] | None = None,
     advance: Advance = lambda _done, _of: None,
@@ -233,8 +266,8 @@ def receive_to_folder(
         plan: What positions are computed from; None for none.
         attitude: What is known of the camera's attitude, the same always or over time, for distances and
             positions; None for nothing.
-        clock_zero: UTC of the camera clock's 0, for the age of signed beacons, and for formats with UTC; None
-            if it is not known.
+        clock_zero: UTC of the camera clock's 0, or pulses on its trigger input that say it, for the age of
+            signed beacons, and for formats with UTC; None if it is not known.
         sinks: Output formats beside the default ones, by name, e.g. `parquet`.
         lines: Takes a line of JSON for each frame, message and fix as it comes; None for nobody.
         advance: Says how far the reading is.
@@ -246,8 +279,8 @@ def receive_to_folder(
 
     Raises:
         InputError: The recording cannot be opened; nothing is written.
-        ConfigError: The recording's sensor is not the link's, a sink cannot be used, or the folder cannot be
-            written.
+        ConfigError: The recording's sensor is not the link's, nothing says which second of UTC its pulses
+            begin, a sink cannot be used, or the folder cannot be written.
         PluginError: A plugin's code fails; nothing is written.
     """
     registry = Registry.load() if registry is None else registry
@@ -256,6 +289,7 @@ def receive_to_folder(
     with source if isinstance(source, EventSource) else open_source(source, registry) as opened:
         url = str(opened.path) if url == STDIN else url
         check_sensor(opened, url, links[0].camera)
+        pulses = _pulses_of(clock_zero, opened, url)
         name = Path(url).name
         with ResultWriter(
             folder,
@@ -269,7 +303,7 @@ def receive_to_folder(
             lines=lines,
         ) as writer:
             receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero)
-            pieces = ((events, receiver.feed(events)) for events in opened.chunks())
+            pieces = ((events, receiver.feed(events)) for events in _events_of(opened, pulses))
             return _run(opened, url, receiver, writer, pieces, receiver.close, advance, stopped)
 
 

@@ -32,6 +32,7 @@ class PulseClock:
         near: UTC of the camera clock's 0, to less than half a second; None: as the computer's clock says.
 
     Attributes:
+        dated: UTC is known beforehand; the computer's clock is not asked.
         counts: `pulses` that are believed, and `pulses_rejected`.
 
     Raises:
@@ -47,6 +48,7 @@ class PulseClock:
         if not 0 <= channel <= 255:
             raise ConfigError(f"pulses on channel {channel}: expected 0 to 255")
         self._channel = channel
+        self.dated = near is not None
         self._near_s = None if near is None else near.timestamp()
         self._approximate_s = self._near_s
         self._t_us: list[int] = []

@@ -441,7 +441,9 @@ class ReceivedMessage:
         trust: How far it may be believed. Texts and data are not signed, so they are `unverified`.
         reason: Why it is not `verified`; where it is, when it was signed, and how long before
             it was received.
-        age_s: Time from a verified beacon's signature to its reception, s; None where that is not known.
+        age_s: Time from a verified beacon's signature, which has whole seconds, to its reception, s; of a
+            message `time` from what it says to the start of that packet, below 0 where clocks disagree. None
+            where that is not known.
         link: Name of the link, as in `Frame`.
     """
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
+    from evlcp_sdk.utc import PulseClock
 
 __all__ = [
     "AttitudeFile",
@@ -29,6 +30,7 @@ __all__ = [
     "Mcap",
     "Parquet",
     "PitchDeg",
+    "Pps",
     "Report",
     "RollDeg",
     "SinkNames",
@@ -36,6 +38,7 @@ __all__ = [
     "TimeSigmaUs",
     "WhiteSigmaDeg",
     "attitude_of",
+    "clock_of",
     "clock_zero_of",
     "json_lines_of",
     "plan_of",
@@ -100,6 +103,16 @@ ClockZero = Annotated[
         help="UTC of the camera clock's 0, for the age of signed beacons, NMEA and MCAP.",
     ),
 ]
+Pps = Annotated[
+    int | None,
+    typer.Option(
+        "--pps",
+        min=0,
+        max=255,
+        metavar="CHANNEL",
+        help="This trigger input gets a pulse each second of UTC (PPS), and outputs have that time.",
+    ),
+]
 Figures = Annotated[
     bool, typer.Option("--figures", help="Draw regions.png, presence.png, distance.png, track.png.")
 ]
@@ -152,6 +165,13 @@ def attitude_of(
     if file is not None:
         return AttitudeLog.read(file, Attitude(0.0, 0.0, None, *told))
     return Attitude(pitch, roll, heading, *told) if pitch is not None and roll is not None else None
+
+
+def clock_of(pps: int | None, zero: "datetime | None") -> "datetime | PulseClock | None":
+    """What says the UTC of a camera's clock: pulses of a recording, or its zero; None for nothing."""
+    from evlcp_sdk.utc import PulseClock
+
+    return zero if pps is None else PulseClock(pps, zero)
 
 
 def plan_of(

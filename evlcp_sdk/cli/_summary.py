@@ -1,12 +1,12 @@
 """How a summary is printed."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.cli._common import console
 
-__all__ = ["show"]
+__all__ = ["delays_text", "show"]
 
 _MOST_SHOWN, _MOST_SAID = 8, 200
 """Messages that are shown, the newest, and characters of each."""
@@ -56,6 +56,8 @@ def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) 
         f" {processing['events_per_s'] / 1e6:.1f} Mev/s,"
         f" {_or_dash(processing['times_real_time'], '{:.2f}')} x real time"
     )
+    for text, style in _real_time(summary):
+        out.print(text, style=style)
     if processing["kernels_s"] > 1:
         out.print(f"kernels compiled or loaded in {processing['kernels_s']:.0f} s", style="dim")
     for loss in summary["losses"].values():
@@ -69,6 +71,34 @@ def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) 
         out.print(f"warning: {Doubt(**warning)}", style="yellow")
     if folder is not None:
         out.print(f"written: {folder}/{', '.join([*summary['files'], 'summary.json'])}", style="dim")
+
+
+def _real_time(summary: Mapping[str, Any]) -> Iterator[tuple[str, str | None]]:
+    """Delays, what was left out, and pulses, in a line each with its style, where there are any."""
+    live = summary.get("live")
+    if live is not None:
+        for stage, what in (
+            ("total", "{} frames came {} after their last chip"),
+            ("end_to_end", "{} times were read {} after they had been said, from end to end"),
+        ):
+            tally = live["delays"][stage]
+            if tally["count"]:
+                yield what.format(tally["count"], delays_text(tally)), None
+        if left := [f"{many} {name.replace('_', ' ')}" for name, many in live["shed"].items() if many]:
+            yield f"left out, as there was no time: {', '.join(left)}", "yellow"
+    pps = summary.get("pps")
+    if pps is not None:
+        rate = _or_dash(pps["rate_ppm"], "{:+.3f} ppm")
+        yield f"{pps['pulses']} pulses, {pps['pulses_rejected']} rejected: the camera's clock {rate}", None
+
+
+def delays_text(tally: Mapping[str, Any]) -> str:
+    """Quantiles of delays, in words.
+
+    >>> delays_text({"count": 3, "p50_ms": 1.98, "p99_ms": 2.4, "max_ms": 12.04})
+    '2.0 ms (p99 2.4, max 12.0)'
+    """
+    return f"{tally['p50_ms']:.1f} ms (p99 {tally['p99_ms']:.1f}, max {tally['max_ms']:.1f})"
 
 
 def _message(told: Mapping[str, Any]) -> str:

@@ -1,13 +1,15 @@
 """`evlcp live`."""
 
 import json
+import threading
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import LinkFiles, Overrides, complain, echo
+from evlcp_sdk.cli._common import LinkFiles, Overrides, complain, console, echo
 from evlcp_sdk.cli._receiving import (
     AttitudeFile,
     ClockZero,
@@ -19,6 +21,7 @@ from evlcp_sdk.cli._receiving import (
     Mcap,
     Parquet,
     PitchDeg,
+    Pps,
     Report,
     RollDeg,
     SinkNames,
@@ -26,14 +29,19 @@ from evlcp_sdk.cli._receiving import (
     TimeSigmaUs,
     WhiteSigmaDeg,
     attitude_of,
+    clock_of,
     clock_zero_of,
     json_lines_of,
     plan_of,
     sinks_of,
 )
-from evlcp_sdk.cli._summary import show
+from evlcp_sdk.cli._summary import delays_text, show
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from evlcp_sdk.live.loop import LiveStatus
+    from evlcp_sdk.live.outlet import Outlet
     from evlcp_sdk.live.services import Services
 
 __all__ = ["register"]
@@ -84,16 +92,7 @@ def live(
     white_sigma_deg: WhiteSigmaDeg = 0.0,
     time_sigma_us: TimeSigmaUs = 0.0,
     clock_zero: ClockZero = None,
-    pps: Annotated[
-        int | None,
-        typer.Option(
-            "--pps",
-            min=0,
-            max=255,
-            metavar="CHANNEL",
-            help="This trigger input gets a pulse each second of UTC (PPS), and outputs have that time.",
-        ),
-    ] = None,
+    pps: Pps = None,
     mcap: Mcap = False,
     sinks: SinkNames = None,
     reconnect: Annotated[
@@ -193,7 +192,6 @@ def live(
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import live as run_live
     from evlcp_sdk.run import stop_on_request
-    from evlcp_sdk.utc import PulseClock
 
     lines = json_lines_of(json_lines, [url], as_json=as_json)
     registry = Registry.load()
@@ -201,7 +199,7 @@ def live(
     sigmas = (gravity_sigma_deg, heading_sigma_deg, white_sigma_deg, time_sigma_us)
     attitude = attitude_of(attitude_file, (heading_deg, pitch_deg, roll_deg), sigmas)
     zero = clock_zero_of(clock_zero)
-    clock = zero if pps is None else PulseClock(pps, zero)
+    clock = clock_of(pps, zero)
     plan = plan_of(sites, gnss, links, zero, mcap=mcap)
     short = {"figures": figures, "report": report, "parquet": parquet, "mcap": mcap}
     asked = sinks_of(registry, short, sinks, out, positions=plan is not None)
@@ -219,7 +217,7 @@ def live(
         sites=plan.sites if plan is not None else (),
         clock_zero=clock,
     )
-    with stop_on_request() as stopped, services:
+    with stop_on_request() as stopped, services, _going_on(outlet, silent=lines is not None):
         _say_where(services)
         source = ReconnectingSource(partial(open_source, url, registry), stopped) if reconnect else url
         summary = run_live(
@@ -249,6 +247,46 @@ def live(
             raise InterruptedRunError(f"interrupted; what was decoded until then is in {out}")
     fault = UnpluggedError if summary["live"]["unplugged"] else InputError
     raise typer.Exit(fault.exit_code if summary["status"] == "failed" else 0)
+
+
+@contextmanager
+def _going_on(outlet: "Outlet", *, silent: bool) -> "Iterator[None]":
+    """A line on stderr that says how it goes, on a terminal only, and not between lines of JSON."""
+    from rich.live import Live
+
+    err = console(stderr=True)
+    if silent or not err.is_interactive:
+        yield
+        return
+    mine = outlet.subscribe({"status"}, most=1)
+
+    def draw() -> None:
+        with Live(console=err, transient=True, auto_refresh=False) as shown:
+            while not mine.ended:
+                for news in mine.take(timeout_s=1.0):
+                    shown.update(going_text(news.value), refresh=True)
+
+    thread = threading.Thread(target=draw, name="evlcp-line", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        outlet.leave(mine)
+        thread.join()
+
+
+def going_text(status: "LiveStatus") -> str:
+    """How a live run goes, in a line."""
+    text = f"{status.elapsed_s:.0f} s, {status.events_per_s / 1e6:.1f} Mev/s"
+    if frames := status.counts.get("frames", 0):
+        text += f", {frames} frames"
+    if messages := status.counts.get("messages", 0):
+        text += f", {messages} messages"
+    if (recent := status.recent["total"])["count"]:
+        text += f", delay {delays_text(recent)}"
+    if lost := sum(loss.count for loss in status.losses.values()):
+        text += f", {lost} lost"
+    return f"{text}; {status.level_text}" if status.level else text
 
 
 def _say_where(services: "Services") -> None:

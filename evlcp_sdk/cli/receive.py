@@ -33,6 +33,7 @@ from evlcp_sdk.cli._receiving import (
     Mcap,
     Parquet,
     PitchDeg,
+    Pps,
     Report,
     RollDeg,
     SinkNames,
@@ -40,6 +41,7 @@ from evlcp_sdk.cli._receiving import (
     TimeSigmaUs,
     WhiteSigmaDeg,
     attitude_of,
+    clock_of,
     clock_zero_of,
     json_lines_of,
     plan_of,
@@ -128,6 +130,7 @@ def receive(
     white_sigma_deg: WhiteSigmaDeg = 0.0,
     time_sigma_us: TimeSigmaUs = 0.0,
     clock_zero: ClockZero = None,
+    pps: Pps = None,
     mcap: Mcap = False,
     sinks: SinkNames = None,
 ) -> None:
@@ -207,6 +210,7 @@ def receive(
             plan=plan,
             attitude=attitude,
             clock_zero=zero,
+            pps=pps,
             sinks=asked,
             lines=lines,
             stopped=stopped if here else None,
@@ -271,6 +275,7 @@ def _decode_job(
     plan: "PositionPlan | None",
     attitude: "Attitude | AttitudeLog | None",
     clock_zero: "datetime | None",
+    pps: int | None,
     sinks: tuple[str, ...],
     lines: LinePrinter | None,
     stopped: Callable[[], bool] | None,
@@ -278,7 +283,8 @@ def _decode_job(
     """Decode a recording here, with a bar; or, without `stopped`, quietly in a worker."""
     from evlcp_sdk.run import receive_to_folder, stop_on_request
 
-    known: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock_zero}
+    clock = clock_of(pps, clock_zero)
+    known: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock}
     decode = partial(receive_to_folder, job.url, job.folder, job.link or links, **known, sinks=sinks)
     if stopped is not None:
 

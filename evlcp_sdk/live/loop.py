@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from evlcp_sdk.air.blocks import Kind
 from evlcp_sdk.errors import UnpluggedError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links
@@ -18,13 +19,16 @@ from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.signals import Stopped
 from evlcp_sdk.utc import PulseClock
-from evlcp_sdk.values import Events, Frame, Packet, Region
+from evlcp_sdk.values import Events, Frame, Packet, ReceivedMessage, Region
 
 __all__ = ["STAGES", "LiveLoop", "LiveStatus"]
 
 STAGES: Final = ("gather", "queue", "compute", "total")
 """Of a frame's delay: from its last chip until the slice with which it could be decoded was there; until that
 was taken; until the frame was decoded; and all of these."""
+
+_END_TO_END: Final = "end_to_end"
+"""Of a message `time`: from what its transmitter says, when its first chip shines, until it was read."""
 
 _STATUS_EVERY_S: Final = 0.2
 _IDLE_S: Final = 0.05
@@ -51,7 +55,8 @@ class LiveStatus:
         level: What is shed, a number of `LEVELS`.
         level_text: The same in words.
         shed: Events left out so far, by reason, and frames without a distance.
-        delays: Of all frames so far, by stage: count, p50, p99 and maximum, ms.
+        delays: Of all frames so far, by stage, and of messages `time` from end to end: count, p50, p99 and
+            maximum, ms.
         recent: The same since the last status.
         counts: As of the receiver.
         losses: As of the source.
@@ -90,7 +95,7 @@ class LiveLoop:
         pulses: Is told of triggers, which say the UTC of the camera's clock; None for nobody.
 
     Attributes:
-        delays: Of frames, by stage.
+        delays: Of frames, by stage; `end_to_end` of messages `time`.
         shed: What was left out so far.
     """
 
@@ -114,8 +119,8 @@ class LiveLoop:
         self._reader = Reader(source, clock)
         self._size = source.width or 1280, source.height or 720
         self._shedder = Shedder(*self._size)
-        self.delays = {stage: DelayTally() for stage in STAGES}
-        self._recent = {stage: DelayTally() for stage in STAGES}
+        self.delays = {stage: DelayTally() for stage in (*STAGES, _END_TO_END)}
+        self._recent = {stage: DelayTally() for stage in self.delays}
         self._level = 0
         self._levels_s = [0.0] * len(LEVELS)
         self._events = 0
@@ -171,9 +176,7 @@ class LiveLoop:
         form = self._forms[frame.link]
         chips = form.frame_chips if form.has_pilot(frame.frame) else form.info_chips
         last_us = frame.t_us + chips * form.chip_us
-        shone_s = self._source.clock_s(last_us)
-        if shone_s is None:
-            shone_s = self._reader.arrivals.at_s(last_us)
+        shone_s = self._shone_s(last_us)
         late_ms = None
         if self._arrived_s == self._arrived_s:  # not at the end, whose time says nothing
             parts_s = self._arrived_s - shone_s, self._taken_s - self._arrived_s, now - self._taken_s
@@ -182,6 +185,11 @@ class LiveLoop:
                 self.delays[stage].add(part_s * 1e3)
                 self._recent[stage].add(part_s * 1e3)
         self._outlet.publish("frame", frame.t_us, frame, late_ms)
+
+    def _shone_s(self, t_us: float) -> float:
+        """When a time of the camera's clock was, by our own clock, s."""
+        shone_s = self._source.clock_s(t_us)
+        return self._reader.arrivals.at_s(t_us) if shone_s is None else shone_s
 
     def placed(self, placed: Placed) -> None:
         """Tell listeners of a fix."""
@@ -194,7 +202,6 @@ class LiveLoop:
             "shed": self.shed,
             "health": dict(self._source.health),
             "unplugged": isinstance(self._reader.fault, UnpluggedError),
-            **({} if self._pulses is None else {"pps": self._pulses.to_dict()}),
             "levels_s": {text: round(s, 3) for text, s in zip(LEVELS, self._levels_s, strict=True)},
         }
 
@@ -259,7 +266,24 @@ class LiveLoop:
         for packet in packets:
             self._outlet.publish("packet", packet.t_us, packet)
             for message in packet.messages:
-                self._outlet.publish("message", packet.t_us, message)
+                self._outlet.publish("message", packet.t_us, message, self._end_to_end_ms(message))
+
+    def _end_to_end_ms(self, message: ReceivedMessage) -> float | None:
+        """How long after the time that it says a message `time` is read, ms; None for others, or at the end.
+
+        By the camera's UTC where that is known; else by the computer's, of a source that is not a replay.
+        """
+        if message.message.kind != Kind.TIME or self._arrived_s != self._arrived_s:
+            return None
+        if message.age_s is not None:
+            late_ms = (message.age_s + self._clock() - self._shone_s(message.t_us)) * 1e3
+        elif self._source.clock_s(message.t_us) is None and self._source.live:
+            late_ms = (time.time() - message.value) * 1e3
+        else:
+            return None
+        self.delays[_END_TO_END].add(late_ms)
+        self._recent[_END_TO_END].add(late_ms)
+        return late_ms
 
     def _tell_status(self, *, now: bool = False) -> None:
         """Say how it goes, where it is time for that."""
@@ -270,7 +294,7 @@ class LiveLoop:
         if self._outlet.wanted("status"):
             self._outlet.publish("status", self._last_us, self._status(at_s, since_s))
         self._status_s, self._status_events = at_s, self._events
-        self._recent = {stage: DelayTally() for stage in STAGES}
+        self._recent = {stage: DelayTally() for stage in self.delays}
 
     def _status(self, at_s: float, since_s: float) -> LiveStatus:
         waiting, oldest_s = self._reader.waiting

@@ -22,7 +22,8 @@ class News:
         kind: One of `KINDS`.
         t_us: Its time on the camera's clock, us.
         value: What it is.
-        late_ms: Of a frame, how long after its last chip it was there, ms; None where that is not known.
+        late_ms: Of a frame, how long after its last chip it was there, ms; of a message `time`, how long
+            after what it says. None where that is not known.
     """
 
     kind: str

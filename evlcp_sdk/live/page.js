@@ -311,6 +311,10 @@ function drawWords() {
       tile("frames", rate.toFixed(0), "/s"),
       tile("delay, now", digits(total.p50_ms, 1), "ms", `99 %: ${digits(total.p99_ms, 1)} ms`),
       tile("delay, all", digits(all.p50_ms, 1), "ms", `99 %: ${digits(all.p99_ms, 1)}, max ${digits(all.max_ms, 1)} ms`));
+    const whole = status.delays.end_to_end;
+    if (whole.count) {
+      tiles.push(tile("end to end", digits(whole.p50_ms, 1), "ms", `${whole.count} times; max ${digits(whole.max_ms, 1)} ms`));
+    }
   }
   const newest = rows.length ? rows[rows.length - 1].t_us : 0;
   const near = [...distances].filter(([, news]) => news.echo_of === null && news.t_us > newest - 1e6);

@@ -69,7 +69,7 @@ def message_line(received: ReceivedMessage) -> str:
         "verified": received.trust == "verified",
         "trust": received.trust,
         "reason": received.reason,
-        "age_s": None if received.age_s is None else round(received.age_s, 3),
+        "age_s": None if received.age_s is None else round(received.age_s, 6),
     }
     who = f"message kind '{kind.name}'"
     try:

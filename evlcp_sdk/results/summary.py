@@ -35,6 +35,7 @@ def summary_of(
     positions: Mapping[str, Any] | None = None,
     sinks: Mapping[str, Mapping[str, Any]] | None = None,
     live: Mapping[str, Any] | None = None,
+    pps: Mapping[str, Any] | None = None,
     placing: str = "",
 ) -> dict[str, Any]:
     """The content of `summary.json`.
@@ -53,6 +54,7 @@ def summary_of(
         positions: Figures of the positions, where they were computed.
         sinks: What sinks say, by name; those that say nothing are left out.
         live: Delays, and what was shed, of a live run; None for others.
+        pps: Pulses of UTC, and the rate of the camera's clock by them; None where nobody asked.
         placing: Where there are several links, name of the first whose bars positions are computed from.
     """
     seen = Seen() if seen is None else seen
@@ -86,6 +88,7 @@ def summary_of(
         "versions": dict(versions),
         **({"positions": dict(positions)} if positions is not None else {}),
         **({"sinks": {name: dict(part) for name, part in sinks.items()}} if sinks else {}),
+        **({"pps": dict(pps)} if pps is not None else {}),
         **({"live": dict(live)} if live is not None else {}),
     }
 

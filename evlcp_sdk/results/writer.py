@@ -22,7 +22,7 @@ from evlcp_sdk.results.sinks import Sinks, load_sinks
 from evlcp_sdk.results.summary import Status, messages_off, summary_of, write_summary
 from evlcp_sdk.results.tallies import PositionTally, RunTally
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
-from evlcp_sdk.utc import ClockZero
+from evlcp_sdk.utc import ClockZero, PulseClock
 from evlcp_sdk.values import Events, Packet
 
 __all__ = ["ResultWriter"]
@@ -40,7 +40,7 @@ class ResultWriter:
         name: Name of the recording, for titles.
         plan: What positions are computed from; None for none.
         attitude: What is known of the camera's attitude, for positions; None for nothing.
-        clock_zero: UTC of the camera clock's 0; None if it is not known.
+        clock_zero: UTC of the camera clock's 0, or pulses that say it; None if it is not known.
         sinks: Output formats beside the default ones, by name; none without a folder.
         lines: Takes frames, messages and fixes as lines of JSON as they come; None for nobody.
         placed: Takes fixes, with their filtered places, as they come; None for nobody.
@@ -76,6 +76,7 @@ class ResultWriter:
         self._readout = ReadoutTally()
         self._navigator = Navigator(placing, plan, attitude) if plan is not None else None
         several = self._links if len(self._links) > 1 else {}
+        self._pulses = clock_zero if isinstance(clock_zero, PulseClock) else None
         run = Run(name, first, plan, self._navigator, clock_zero, several)
         self._lines = None
         if lines is not None:
@@ -188,6 +189,7 @@ class ResultWriter:
             positions=positions,
             sinks={} if self._sinks is None else self._sinks.finish(),
             live=live,
+            pps=None if self._pulses is None else self._pulses.to_dict(),
             placing=self._placing,
         )
         table["files"] = {}

@@ -276,9 +276,10 @@ class MessageAssembler:
             return self._undecodable(parts)
         beacon = value if message.kind == Kind.BEACON else None
         verdict, now_s = Standing("unverified", "not signed"), None
-        if beacon is not None:
+        if message.kind in (Kind.BEACON, Kind.TIME):
             zero = zero_at(self._clock_zero, packet.t_us)
             now_s = None if zero is None else zero.timestamp() + packet.t_us * 1e-6
+        if beacon is not None:
             signed = inbox.done.get((transmitter_id, Kind.SIGNATURE, sequence))
             signature = None
             if signed is not None:
@@ -295,6 +296,8 @@ class MessageAssembler:
         reason, age_s = verdict.why, None
         if verdict.trust == "verified":
             reason, age_s = signed_text(message, now_s)
+        elif message.kind == Kind.TIME and now_s is not None:
+            age_s = now_s - value
         return [ReceivedMessage(*where, message, kind, value, verdict.trust, reason, age_s, packet.link)]
 
     def _undecodable(self, parts: _Parts) -> list[ReceivedMessage]:

@@ -11,6 +11,7 @@ from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links
 from evlcp_sdk.rx.contest import Contest, ContestedPacket
+from evlcp_sdk.rx.early import EarlyFrames
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.listener import LinkListener
 from evlcp_sdk.rx.rhythm import Rhythm
@@ -41,7 +42,9 @@ class Receiver:
         limits: How much it holds at the most.
         on_frame: Gets each frame as soon as it is decoded, within `feed` or `close`, in order of a
             transmitter's frames. Its packet has the same later; only `echo_of` is by what is known then. Of
-            several links, frames come with their packet. None for nobody.
+            several links, frames come with their packet until their transmitter holds its place; where
+            another link takes that from it, the count `frames_withdrawn` has those told of packets that are
+            not given. None for nobody.
 
     Raises:
         ConfigError: Links that cannot be received together, or nothing tells them apart.
@@ -84,12 +87,12 @@ class Receiver:
                 name,
                 numbers,
                 rhythms.get(name),
-                on_frame if len(links) == 1 else None,
+                on_frame if len(links) == 1 or on_frame is None else self._decoded,
             )
             for name, one in links.items()
         ]
-        self._on_frame = on_frame
         self._contest: Contest | None = None
+        self._early = EarlyFrames(on_frame)
         if len(links) > 1:
             wait_us = max(listener.patience_us for listener in self._listeners)
             self._contest = Contest(list(links.values()), wait_us, first.regions.step_us)
@@ -124,7 +127,9 @@ class Receiver:
         total: Counter[str] = Counter()
         for listener in self._listeners:
             total.update(listener.counts)
-        return self._clock.counts | {"dropped_crowded": self._timeline.dropped} | dict(total)
+        crowded = {"dropped_crowded": self._timeline.dropped}
+        withdrawn = {"frames_withdrawn": self._early.withdrawn} if self._contest is not None else {}
+        return self._clock.counts | crowded | dict(total) | withdrawn
 
     @property
     def link_counts(self) -> dict[str, dict[str, int]]:
@@ -191,6 +196,11 @@ class Receiver:
             contest.add(number, found, step.end_us)
         return self._judged(contest.step(step.end_us))
 
+    def _decoded(self, frame: Frame) -> None:
+        """Take a frame of one of several links."""
+        assert self._contest is not None
+        self._early.decoded(frame, holds=frame.transmitter in self._contest.holding)
+
     def _judged(self, judged: Sequence[ContestedPacket]) -> list[Packet]:
         """Read what is given; count what is not."""
         packets = []
@@ -198,11 +208,11 @@ class Receiver:
             listener = self._listeners[one.link]
             if not one.fits:
                 listener.refuse(one.packet)
+                self._early.refused(one.packet)
                 continue
             given = listener.read([one.packet])
-            if self._on_frame is not None:
-                for frame in given[0].frames:
-                    self._on_frame(frame)
+            assert self._contest is not None
+            self._early.given(given[0], holds=one.packet.transmitter in self._contest.holding)
             packets += given
             for other in self._listeners:
                 if other is not listener:

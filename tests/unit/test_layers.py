@@ -86,7 +86,7 @@ def test_the_middle_packages_do_not_import_one_another(package: str) -> None:
 
 
 RX = (
-    {"limits", "lit", "places", "rhythm"},
+    {"early", "limits", "lit", "places", "rhythm"},
     {"guard", "trust"},
     {"belief", "delays", "detection", "grid", "inbox", "packets", "placement", "ranges", "timeline"},
     {"contest", "detected", "points", "spread", "steps"},

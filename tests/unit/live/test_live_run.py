@@ -2,19 +2,26 @@
 
 import json
 import threading
+import time
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from evlcp_sdk.errors import InputError
-from evlcp_sdk.io import RawSource, ReplaySource, write_events
+from evlcp_sdk.cli._summary import show
+from evlcp_sdk.cli.live import going_text
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.io import RawSource, ReplaySource, open_source, write_events
+from evlcp_sdk.link.compose import compose
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.live import Budget, LiveStatus, Outlet, PictureSlot, Subscription
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.run import live, receive
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events
+from evlcp_sdk.utc import PulseClock
 from evlcp_sdk.values import Events, Frame, Triggers
 
 PATIENT = Budget(waiting_ms=1e6, most_ms=1e7)
@@ -40,7 +47,9 @@ def gathered(subscription: Subscription) -> dict[str, list[Any]]:
     return found
 
 
-def test_a_replay_gives_what_the_file_gives(demo_raw: Path, tmp_path: Path) -> None:
+def test_a_replay_gives_what_the_file_gives(
+    demo_raw: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     outlet, pictures = Outlet(), PictureSlot()
     pictures.ask()
     mine = outlet.subscribe(most=100_000)
@@ -66,6 +75,13 @@ def test_a_replay_gives_what_the_file_gives(demo_raw: Path, tmp_path: Path) -> N
     assert summary["live"]["delays"]["total"]["count"] > 0
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["live"] == summary["live"]
     assert pictures.newest is not None
+    text = going_text(last)
+    assert text.startswith(f"{last.elapsed_s:.0f} s, ")
+    assert f", {last.counts['frames']} frames" in text
+    show(summary, None)
+    total = summary["live"]["delays"]["total"]
+    told = f"{total['count']} frames came {total['p50_ms']:.1f} ms (p99 {total['p99_ms']:.1f}, max"
+    assert told in capsys.readouterr().out
 
 
 def test_frames_of_several_links_name_theirs(demo_raw: Path) -> None:
@@ -90,7 +106,43 @@ def test_pulses_of_a_recording_say_what_utc_it_is(tmp_path: Path, evlcp: Callabl
     given = ("--pps", "0", "--clock-zero", "2026-03-01T12:00:00Z", "--waiting-ms", "100000", "--json")
     done = evlcp("live", f"replay:{tmp_path / 'pps.raw'}?speed=20", *given)
     assert done.code == 0, done.err
-    assert json.loads(done.out)["live"]["pps"] == {"pulses": 4, "pulses_rejected": 1, "rate_ppm": 25.0}
+    counted = {"pulses": 4, "pulses_rejected": 1, "rate_ppm": 25.0}
+    assert json.loads(done.out)["pps"] == counted
+    # As from the file itself, for which the computer's clock says nothing.
+    done = evlcp("receive", tmp_path / "pps.raw", "-o", tmp_path / "out", *given[:4], "--json")
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["pps"] == counted
+    done = evlcp("receive", tmp_path / "pps.raw", "-o", tmp_path / "out", "--pps", "0")
+    assert done.code == 2
+    assert "a pulse says when a second of UTC begins, not which one: give --clock-zero" in done.err
+    with pytest.raises(ConfigError, match="give --clock-zero"):
+        receive(tmp_path / "pps.raw", clock_zero=PulseClock(0))
+    clock = PulseClock(0, datetime(2026, 3, 1, 12, tzinfo=UTC))
+    assert list(receive(tmp_path / "pps.raw", clock_zero=clock)) == []
+    assert clock.to_dict() == counted
+
+
+def test_a_time_that_is_sent_says_the_delay_from_end_to_end(tmp_path: Path) -> None:
+    """It says a time 2 ms before its first chip shines, as a transmitter whose clock is slow."""
+    link, said_s, start_us = load_link(), 1_800_000_000, 6_000.0
+    symbols = compose(link, other={"time": float(said_s)}, repeat=3, sequence=1)
+    write_events(tmp_path / "time.raw", ideal_events(link, IdealBar(symbols, start_us=start_us)), 1280, 720)
+    zero = datetime.fromtimestamp(said_s, UTC) + timedelta(milliseconds=2, microseconds=-start_us)
+    outlet, told_s = Outlet(), []
+    mine = outlet.subscribe({"message"}, wake=lambda: told_s.append(time.monotonic()))
+    source = ReplaySource(open_source(tmp_path / "time.raw"))
+    summary = live(source, None, link, clock_zero=zero, outlet=outlet, budget=PATIENT, warm=False)
+    (news,) = mine.take()
+    assert news.value.age_s == pytest.approx(2e-3, abs=5e-5)
+    assert summary["live"]["delays"]["end_to_end"]["max_ms"] == round(news.late_ms, 3)
+    shone_s = source.clock_s(news.t_us)
+    assert shone_s is not None
+    # All of the packet has to be seen first; it is told at once when it is read.
+    assert 2.0 + 34.6 < news.late_ms <= 2.05 + (told_s[0] - shone_s) * 1e3
+    # Without UTC, a replay says nothing of it.
+    summary = live(f"replay:{tmp_path / 'time.raw'}?speed=50", None, link, budget=PATIENT, warm=False)
+    assert summary["counts"]["messages"] == 1
+    assert summary["live"]["delays"]["end_to_end"]["count"] == 0
 
 
 class Burst(EventSource):

@@ -12,11 +12,12 @@ from evlcp_sdk.files import shipped
 from evlcp_sdk.io import read_events
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.rx.detection import RegionFollower
+from evlcp_sdk.rx.early import EarlyFrames
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols
-from evlcp_sdk.values import Events, Frame, Packet
+from evlcp_sdk.values import Events, Frame, Packet, changed
 
 LINK = load_link()
 BAR = IdealBar(random_symbols(LINK, 3), ppm=50, shake_px=6, shake_hz=12)
@@ -147,14 +148,57 @@ def test_a_look_ahead_leaves_no_trace_in_the_regions() -> None:
     assert ahead > 40
 
 
-def test_of_several_links_a_frame_comes_with_its_packet() -> None:
+def test_of_several_links_a_frame_comes_at_once_where_its_transmitter_holds_its_place() -> None:
     bar = replace(resolve({}), name="bar")
     wh8 = replace(resolve({"modulation": {"id": "wh8"}}), name="wh8")
-    left = ideal_events(bar, IdealBar(random_symbols(bar, 4), 300.3))
-    right = ideal_events(wh8, IdealBar(random_symbols(wh8, 4), 800.7), seed=1)
-    frames, packets = told(merged(left, right), [20_000, 90_000], [bar, wh8])
+    left = ideal_events(bar, IdealBar(random_symbols(bar, 7), 300.3))
+    right = ideal_events(wh8, IdealBar(random_symbols(wh8, 7), 800.7), seed=1)
+    events, slice_us = merged(left, right), 250
+    cuts = np.searchsorted(events.t_us, np.arange(0, int(events.t_us[-1]), slice_us))
+    frames, packets = told(events, cuts.tolist(), [bar, wh8])
+    given = {said(frame) for packet in packets for frame in packet.frames}
     assert {frame.link for frame, _ in frames} == {"bar", "wh8"}
-    assert [said(frame) for frame, _ in frames] == [said(f) for packet in packets for f in packet.frames]
+    assert {said(frame) for frame, _ in frames} == given
+    assert len(frames) == len(given) == 140
+    late_us: dict[int, float] = {}
+    for frame, fed in frames:
+        late = float(events.t_us[fed - 1]) - frame.t_us - LINK.packet.frame_chips * LINK.packet.chip_us
+        late_us[frame.packet] = max(late, late_us.get(frame.packet, 0.0))
+    numbers = {f.transmitter for f, _ in frames}
+    assert len(numbers) == 2
+    for number in numbers:
+        order = [(f.packet, f.frame) for f, _ in frames if f.transmitter == number]
+        assert order == sorted(order)
+    # The first packets wait for their judgement, the last ones for nothing.
+    assert late_us[0] > 60_000
+    assert late_us[4] < 100 + slice_us
+    assert late_us[5] < 100 + slice_us
+    assert [said(frame) for frame, _ in told(events, [], [bar, wh8])[0]] == [said(f) for f, _ in frames]
+
+
+def packet_of(number: int, frames: int) -> Packet:
+    """A packet of transmitter 5."""
+    one = told(BOTH, [])[1][0].frames[0]
+    mine = tuple(changed(one, transmitter=5, packet=number, frame=n) for n in range(frames))
+    return Packet(5, number, 0.0, 100.0, mine, frames)
+
+
+def test_frames_that_another_link_takes_are_counted_where_they_were_told() -> None:
+    heard: list[tuple[int, int]] = []
+    early = EarlyFrames(lambda frame: heard.append((frame.packet, frame.frame)))
+    one, two, three = (packet_of(number, 2) for number in range(3))
+    for frame in (*one.frames, *two.frames):
+        early.decoded(frame, holds=False)
+    assert heard == []
+    early.refused(one)
+    early.decoded(three.frames[0], holds=False)
+    early.given(two, holds=True)
+    assert heard == [(1, 0), (1, 1), (2, 0)]
+    early.decoded(three.frames[1], holds=True)
+    assert heard == [(1, 0), (1, 1), (2, 0), (2, 1)]
+    assert early.withdrawn == 0
+    early.refused(three)
+    assert (len(heard), early.withdrawn) == (4, 2)
 
 
 def test_a_recording_s_frames_are_those_of_its_packets() -> None:
