@@ -422,15 +422,120 @@ def shifts_of(codes: Array, b: int, i: int) -> tuple[float, float]:
     return side, 0.5 * codes[b, i] * (codes[b, i - 1] + codes[b - 1, i - 1])
 
 
+_MANY = 128
+"""Steps across boundaries that are looked at together: columns of so many, in one array one after the other,
+so that the compiler sees that none overlaps another and takes several at a time."""
+
+_FIRST, _PLACE, _WHEN, _SIDE, _AGAIN, _STEP, _ROWS, _VALUE, _BOUNDARY, _ROW = [_MANY * n for n in range(10)]
+"""Columns of a step: its first row from the middle of the bar, its boundary from there in spacings, its time,
+what shifts it, its size, how many rows it has; its value, its boundary, and its first row in the image."""
+
+_AT, _PART, _LEVEL, _STEEP, _LEFT, _COST = [_MANY * n for n in range(6)]
+_SS, _SL, _SZ, _LL, _LZ, _ZZ, _S, _BY_LEVEL, _BY_Z = [_MANY * n for n in range(6, 15)]
+"""Columns of what is computed of steps: the first six of a row, then sums over rows."""
+
+_COLUMNS = 15
+
+
 @njit(cache=True, nogil=True)
-def _profile_at(profile: Array, z: float, scale: float) -> tuple[float, float]:
-    """Share of a boundary's light beyond `z`, and its density there, by straight pieces, `scale` a px."""
-    at = min(abs(z) * scale, profile.shape[1] - 1 - 1e-9)
-    n = int(at)
-    part = at - n
-    beyond = profile[0, n] + part * (profile[0, n + 1] - profile[0, n])
-    density = profile[1, n] + part * (profile[1, n + 1] - profile[1, n])
-    return beyond, density
+def _steps_of(codes: Array, first: Array, last: Array, offset: Array, when: Array, seen_values: Array) -> Any:
+    """All steps across boundaries, where codes differ, that have rows: (blocks, columns), and their values.
+
+    Those are (blocks, rows, `_MANY`), as many rows as the longest has. Steps that are none have no rows.
+    """
+    clusters, values = codes.shape
+    rows, many, longest = seen_values.shape[1], 0, 0
+    for i in range(values):
+        for b in range(1, clusters):
+            if codes[b, i] != codes[b - 1, i] and last[b, i] > first[b, i]:
+                many += 1
+                longest = max(longest, last[b, i] - first[b, i])
+    blocks = -(-many // _MANY)
+    steps, seen = np.zeros((blocks, 10 * _MANY)), np.zeros((blocks, longest, _MANY))
+    n = 0
+    for i in range(values):
+        for b in range(1, clusters):
+            here = last[b, i] - first[b, i]
+            if codes[b, i] == codes[b - 1, i] or here <= 0:
+                continue
+            column, j = steps[n // _MANY], n % _MANY
+            side, again = shifts_of(codes, b, i)
+            column[_FIRST + j] = first[b, i] - (rows - 1) / 2 - offset[i]
+            column[_PLACE + j] = b - clusters / 2
+            column[_WHEN + j] = when[i]
+            column[_SIDE + j], column[_AGAIN + j] = side, again
+            column[_STEP + j] = 0.5 * (codes[b, i] - codes[b - 1, i])
+            column[_ROWS + j] = here
+            column[_VALUE + j], column[_BOUNDARY + j], column[_ROW + j] = i, b, first[b, i]
+            for r in range(here):
+                seen[n // _MANY, r, j] = seen_values[i, first[b, i] + r]
+            n += 1
+    return steps, seen
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _begin(column: Array, fit: Array, work: Array) -> None:
+    """How far the first row of each step lies beyond its boundary; all sums 0."""
+    spacing, centre, drift, side, again = fit[0], fit[1], fit[2], fit[5], fit[6]
+    for j in range(_MANY):
+        shift = side * column[_SIDE + j] + again * column[_AGAIN + j]
+        at = centre + drift * column[_WHEN + j] + spacing * column[_PLACE + j] + shift
+        work[_AT + j] = column[_FIRST + j] - at
+    for j in range(_COST, _COLUMNS * _MANY):
+        work[j] = 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _levels(
+    column: Array, row: float, scale: float, steepest: float, dim: float, profile: Array, work: Array
+) -> None:
+    """What each step's boundary makes of a row, counted from its first, for a gain of 1, and the slope there.
+
+    By straight pieces of the profile, `scale` a px; negative levels are `dim` times as large.
+    """
+    most = profile.shape[1] - 1 - 1e-9
+    which = np.empty(_MANY, np.int32)
+    for j in range(_MANY):
+        at = min(abs(work[_AT + j] + row) * scale, most)
+        n = np.int32(at)
+        which[j] = n
+        work[_PART + j] = at - n
+    beyond, density = profile[0], profile[1]
+    for j in range(_MANY):
+        n, part = np.uint32(which[j]), work[_PART + j]
+        after = n + np.uint32(1)
+        work[_LEVEL + j] = beyond[n] + part * (beyond[after] - beyond[n])
+        work[_STEEP + j] = density[n] + part * (density[after] - density[n])
+    for j in range(_MANY):
+        step = column[_STEP + j]
+        # Codes are 1 and -1, and differ: their mean is 0.
+        level = (step if work[_AT + j] + row > 0 else -step) * work[_LEVEL + j]
+        less = dim if level < 0 else 1.0
+        work[_LEVEL + j] = level * less
+        work[_STEEP + j] = -steepest * step * work[_STEEP + j] * less
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_row(column: Array, row: float, seen: Array, gain: float, huber: float, work: Array) -> None:
+    """Add what a row of each step has to its sums."""
+    for j in range(_MANY):
+        z, level, steep = work[_AT + j] + row, work[_LEVEL + j], work[_STEEP + j]
+        there = 1.0 if row < column[_ROWS + j] else 0.0
+        residual = seen[j] - gain * level
+        size = abs(residual)
+        weight = there * (1.0 if size <= huber else huber / size)
+        cost = residual * residual / 2 if size <= huber else huber * (size - huber / 2)
+        pull = weight * steep
+        work[_COST + j] += there * cost
+        work[_SS + j] += pull * steep
+        work[_SL + j] += pull * level
+        work[_SZ + j] += pull * steep * z
+        work[_LL + j] += weight * level * level
+        work[_LZ + j] += pull * z * level
+        work[_ZZ + j] += pull * z * steep * z
+        work[_S + j] += pull * residual
+        work[_BY_LEVEL + j] += weight * level * residual
+        work[_BY_Z + j] += pull * z * residual
 
 
 @njit(cache=True, nogil=True)
@@ -457,62 +562,64 @@ def equations(
     Residuals beyond `huber` weigh less, so that a cluster that was decoded wrong does not bend the fit.
     `prior` (7,) are the weights of each being 0; negative values are `dim` times as large as positive ones.
     """
-    clusters, values = codes.shape
-    rows = seen_values.shape[1]
-    spacing, centre, drift, gain = fit[0], fit[1], fit[2], fit[3]
-    width = blur * exp(fit[4])
-    scale, steepest = (profile.shape[1] - 1) / (_REACH * width), 0.5 * gain / width
+    steps, seen = _steps_of(codes, first, last, offset, when, seen_values)
+    work = np.empty(_COLUMNS * _MANY)
+    return _equations(steps, seen, profile, blur, dim, huber, prior, fit, normal, right, work)
+
+
+@njit(cache=True, nogil=True)
+def _equations(
+    steps: Array,
+    seen: Array,
+    profile: Array,
+    blur: float,
+    dim: float,
+    huber: float,
+    prior: Array,
+    fit: Array,
+    normal: Array,
+    right: Array,
+    work: Array,
+) -> float:
+    """`equations` of `_steps_of`."""
+    gain, width = fit[3], blur * exp(fit[4])
+    scale, steepest = (profile.shape[1] - 1) / (_REACH * width), gain / width
     for a in range(_FITTED):
         right[a] = 0.0
         for c in range(_FITTED):
             normal[a, c] = 0.0
     cost = 0.0
-    for i in range(values):
-        middle = (rows - 1) / 2 + offset[i] + centre + drift * when[i]
-        for b in range(1, clusters):
-            step = codes[b, i] - codes[b - 1, i]
-            if step == 0:
-                continue
-            place, both = b - clusters / 2, codes[b, i] + codes[b - 1, i]
-            side, again = shifts_of(codes, b, i)
-            at = middle + spacing * place + fit[5] * side + fit[6] * again
+    for block in range(len(steps)):
+        column = steps[block]
+        _begin(column, fit, work)
+        for r in range(seen.shape[1]):
+            _levels(column, float(r), scale, steepest, dim, profile, work)
+            _add_row(column, float(r), seen[block, r], gain, huber, work)
+        for j in range(_MANY):
+            if column[_ROWS + j] == 0:
+                break
             # In a boundary's rows of one value, five of the slopes go together: sums of what they share.
-            ss, sl, sz, ll, lz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            s, by_level, by_z = 0.0, 0.0, 0.0
-            for v in range(first[b, i], last[b, i]):
-                z = v - at
-                beyond, density = _profile_at(profile, z, scale)
-                level = 0.5 * (both + (step if z > 0 else -step) * beyond)
-                steep = -steepest * step * density
-                if level < 0:
-                    level *= dim
-                    steep *= dim
-                residual = seen_values[i, v] - gain * level
-                size = abs(residual)
-                weight = 1.0 if size <= huber else huber / size
-                cost += residual * residual / 2 if size <= huber else huber * (size - huber / 2)
-                pull = weight * steep
-                ss += pull * steep
-                sl += pull * level
-                sz += pull * steep * z
-                ll += weight * level * level
-                lz += pull * z * level
-                zz += pull * z * steep * z
-                s += pull * residual
-                by_level += weight * level * residual
-                by_z += pull * z * residual
-            slope = place, 1.0, when[i], 0.0, 0.0, side, again
+            slope = (
+                column[_PLACE + j],
+                1.0,
+                column[_WHEN + j],
+                0.0,
+                0.0,
+                column[_SIDE + j],
+                column[_AGAIN + j],
+            )
             for a in _SHIFTING:
-                right[a] += slope[a] * s
-                normal[3, a] += slope[a] * sl
-                normal[4, a] += slope[a] * sz
+                right[a] += slope[a] * work[_S + j]
+                normal[3, a] += slope[a] * work[_SL + j]
+                normal[4, a] += slope[a] * work[_SZ + j]
                 for c in _SHIFTING:
-                    normal[a, c] += slope[a] * slope[c] * ss
-            right[3] += by_level
-            right[4] += by_z
-            normal[3, 3] += ll
-            normal[4, 3] += lz
-            normal[4, 4] += zz
+                    normal[a, c] += slope[a] * slope[c] * work[_SS + j]
+            right[3] += work[_BY_LEVEL + j]
+            right[4] += work[_BY_Z + j]
+            normal[3, 3] += work[_LL + j]
+            normal[4, 3] += work[_LZ + j]
+            normal[4, 4] += work[_ZZ + j]
+            cost += work[_COST + j]
     normal[3, 4] = normal[4, 3]
     for a in _SHIFTING:
         normal[a, 3], normal[a, 4] = normal[3, a], normal[4, a]
@@ -550,53 +657,47 @@ def leftovers(
         Mean square of the clipped residuals, sum of the squares of residuals, and of the values.
     """
     clusters, values = codes.shape
-    rows = seen_values.shape[1]
-    spacing, centre, drift, gain = fit[0], fit[1], fit[2], fit[3]
-    width = blur * exp(fit[4])
-    scale = (profile.shape[1] - 1) / (_REACH * width)
+    gain, width = fit[3], blur * exp(fit[4])
+    scale, steepest = (profile.shape[1] - 1) / (_REACH * width), gain / width
     for a in range(2):
         for b in range(clusters + 1):
             by_boundary[a, b] = 0.0
         for i in range(values):
             by_value[a, i] = 0.0
-    for v in range(rows):
+    for v in range(seen_values.shape[1]):
         for a in range(_FITTED):
             scores[v, a] = 0.0
+    steps, seen = _steps_of(codes, first, last, offset, when, seen_values)
+    work = np.empty(_COLUMNS * _MANY)
     noise, spent, all_squares, count = 0.0, 0.0, 0.0, 0
-    for i in range(values):
-        middle = (rows - 1) / 2 + offset[i] + centre + drift * when[i]
-        for b in range(1, clusters):
-            step = codes[b, i] - codes[b - 1, i]
-            if step == 0:
-                continue
-            place = b - clusters / 2
-            side, again = shifts_of(codes, b, i)
-            at = middle + spacing * place + fit[5] * side + fit[6] * again
-            for v in range(first[b, i], last[b, i]):
-                z = v - at
-                beyond, density = _profile_at(profile, z, scale)
-                level = 0.5 * (codes[b, i] + codes[b - 1, i] + (step if z > 0 else -step) * beyond)
-                steep = 0.5 * gain * step * density / width
-                if level < 0:
-                    level *= dim
-                    steep *= dim
-                residual = seen_values[i, v] - gain * level
+    for block in range(len(steps)):
+        column = steps[block]
+        _begin(column, fit, work)
+        for r in range(seen.shape[1]):
+            _levels(column, float(r), scale, steepest, dim, profile, work)
+            for j in range(_MANY):
+                if r >= column[_ROWS + j]:
+                    continue
+                value, level, steep = seen[block, r, j], work[_LEVEL + j], work[_STEEP + j]
+                residual = value - gain * level
                 spent += residual * residual
-                all_squares += seen_values[i, v] * seen_values[i, v]
+                all_squares += value * value
                 residual = min(max(residual, -huber), huber)
                 noise += residual * residual
                 count += 1
-                by_boundary[0, b] -= steep * residual
+                i, b, v = int(column[_VALUE + j]), int(column[_BOUNDARY + j]), int(column[_ROW + j]) + r
+                pull = steep * residual
+                by_boundary[0, b] += pull
                 by_boundary[1, b] += steep * steep
-                by_value[0, i] -= steep * residual
+                by_value[0, i] += pull
                 by_value[1, i] += steep * steep
-                scores[v, 0] -= steep * place * residual
-                scores[v, 1] -= steep * residual
-                scores[v, 2] -= steep * when[i] * residual
+                scores[v, 0] += pull * column[_PLACE + j]
+                scores[v, 1] += pull
+                scores[v, 2] += pull * column[_WHEN + j]
                 scores[v, 3] += level * residual
-                scores[v, 4] -= steep * z * residual
-                scores[v, 5] -= steep * side * residual
-                scores[v, 6] -= steep * again * residual
+                scores[v, 4] += pull * (work[_AT + j] + r)
+                scores[v, 5] += pull * column[_SIDE + j]
+                scores[v, 6] += pull * column[_AGAIN + j]
     for b in range(clusters + 1):
         by_boundary[0, b] /= max(by_boundary[1, b], 1e-12)
     for i in range(values):
@@ -664,9 +765,9 @@ def solve(
     rows_felt(known, offset, when, _REACH * blur * exp(fit[4]), fit, rows, first, last)
     right, new_normal, new_right = np.empty(_FITTED), np.empty((_FITTED, _FITTED)), np.empty(_FITTED)
     factor, move, new_fit = np.empty((_FITTED, _FITTED)), np.empty(_FITTED), np.empty(_FITTED)
-    cost = equations(
-        codes, first, last, offset, when, profile, blur, dim, huber, prior, seen_values, fit, normal, right
-    )
+    all_steps, seen = _steps_of(codes, first, last, offset, when, seen_values)
+    work = np.empty(_COLUMNS * _MANY)
+    cost = _equations(all_steps, seen, profile, blur, dim, huber, prior, fit, normal, right, work)
     damping = 1e-3
     outside = False
     for _ in range(steps):
@@ -681,21 +782,8 @@ def solve(
         outside = new_fit[0] < 1 or abs(new_fit[4]) > 2
         new_cost = np.inf
         if not outside:
-            new_cost = equations(
-                codes,
-                first,
-                last,
-                offset,
-                when,
-                profile,
-                blur,
-                dim,
-                huber,
-                prior,
-                seen_values,
-                new_fit,
-                new_normal,
-                new_right,
+            new_cost = _equations(
+                all_steps, seen, profile, blur, dim, huber, prior, new_fit, new_normal, new_right, work
             )
         if new_cost <= cost:
             for a in range(_FITTED):
