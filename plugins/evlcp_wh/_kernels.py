@@ -333,13 +333,15 @@ def read_words(values: Array, words: Array, scale: float, symbols: Array, llr: A
                 fit[s] += value * column[s] * scale
         best = int(np.argmax(fit))
         symbols[k] = best
+        # A bit that is done leaves the better of the two codewords that it tells apart.
+        half = count
         for b in range(bits):
-            half = 1 << (bits - 1 - b)
+            half //= 2
             zero, one = -np.inf, -np.inf
-            for first in range(0, count, 2 * half):
-                for s in range(first, first + half):
-                    zero = max(zero, fit[s])
-                    one = max(one, fit[s + half])
+            for s in range(half):
+                zero = max(zero, fit[s])
+                one = max(one, fit[s + half])
+                fit[s] = max(fit[s], fit[s + half])
             llr[k, b] = zero - one
         for i in range(length):
             size += abs(values[k, i])
@@ -370,41 +372,45 @@ def sum_worth(
     length, known = out.shape[1], codes.shape[1]
     top = np.zeros((rows, columns), probability.dtype)
     for k in range(clusters):
-        for r in range(rows):
-            for c in range(columns):
-                top[r, c] = max(top[r, c], probability[k, r, c])
-    # Log ratio of a pair's likelihood with a value of -1, or of +1, over the mean of both.
+        _raise_to(top.reshape(-1), np.ascontiguousarray(probability[k]).reshape(-1))
+    # Mean of a pair's likelihoods with a value of -1 and with +1, over that with -1, or with +1.
     side = 2 * most + 1
-    fits = np.empty((2, side * side))
+    unlike = np.empty((2, side * side))
     for a in range(side):
         for b in range(side):
-            ratio = min(max(worth[a, b], -50.0), 50.0)
-            fits[0, a * side + b] = np.log(2 / (1 + np.exp(ratio)))
-            fits[1, a * side + b] = np.log(2 / (1 + np.exp(-ratio)))
+            ratio = np.exp(min(max(worth[a, b], -50.0), 50.0))
+            unlike[0, a * side + b] = (1 + ratio) / 2
+            unlike[1, a * side + b] = (1 + 1 / ratio) / 2
     signs = np.empty((clusters, known), np.uint64)
     for k in range(clusters):
         for i in range(known):
             signs[k, i] = (codes[k, i] + 1) // 2
     flat, width = worth.reshape(-1), sums.shape[2]
     pairs, values = _pairs_of(sums, most, known + length), np.empty(length)
+    pilot, which, weights = np.empty(known, np.uint16), np.empty(clusters, np.int64), np.empty(clusters)
     for r in range(rows):
         for c in range(columns):
             if top[r, c] < least:
                 continue
+            n = 0
+            for k in range(clusters):
+                if probability[k, r, c] >= least:
+                    which[n], weights[n] = k, probability[k, r, c]
+                    n += 1
             for v in range(r * grid, (r + 1) * grid):
                 for u in range(c * grid, (c + 1) * grid):
                     at = v * width + u
+                    for i in range(known):
+                        pilot[i] = pairs[i, at]
                     for i in range(length):
                         values[i] = flat[pairs[known + i, at]]
-                    for k in range(clusters):
-                        weight = probability[k, r, c]
-                        if weight >= least:
-                            fit = 0.0
-                            for i in range(known):
-                                fit += fits[signs[k, i], pairs[i, at]]
-                            shows = weight / (1 + odds * np.exp(-fit))
-                            for i in range(length):
-                                out[k, i] += shows * values[i]
+                    for j in range(n):
+                        k, against = which[j], odds
+                        for i in range(known):
+                            against *= unlike[signs[k, i], pilot[i]]
+                        shows = weights[j] / (1 + against)
+                        for i in range(length):
+                            out[k, i] += shows * values[i]
 
 
 @njit(cache=True, nogil=True)
@@ -556,9 +562,25 @@ def smooth_path(scores: Array, step_cost: float, place_cost: float, path: Array)
 def take_back(sums: Array, path: Array, out: Array) -> None:
     """Polarity sums with each value's shift (down, right) taken back; 0 where there was no pixel."""
     chips, height, width = sums.shape
-    out[:] = 0
+    size = height * width
     for c in range(chips):
         down, right = path[c // 2, 0], path[c // 2, 1]
-        for v in range(max(-down, 0), min(height - down, height)):
-            for u in range(max(-right, 0), min(width - right, width)):
-                out[c, v, u] = sums[c, v + down, u + right]
+        there, here = sums[c].reshape(-1), out[c].reshape(-1)
+        # As one long row, but for what that brings from the end of a row into the next, and back.
+        by = down * width + right
+        first, last = min(max(-by, 0), size), max(min(size - by, size), 0)
+        here[:first] = 0
+        if last > first:
+            _copy(there[first + by : last + by], here[first:last])
+        here[max(last, first) :] = 0
+        for v in range(height):
+            for u in range(max(width - right, 0), width):
+                here[v * width + u] = 0
+            for u in range(min(-right, width)):
+                here[v * width + u] = 0
+
+
+@njit(cache=True, nogil=True)
+def _copy(values: Array, out: Array) -> None:
+    for j in range(out.size):
+        out[j] = values[j]
