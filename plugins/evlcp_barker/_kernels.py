@@ -124,3 +124,140 @@ def listen(
     top = correlate(counts[:, : counts.shape[1] - 1], chips, due, steps, min_events, rho)
     power, many = mean_squares(rho[bins[2] : bins[3]], past[0], past[1], past[2], enough)
     return top, power, many
+
+
+@njit(cache=True, nogil=True)
+def peaks(
+    rho: Array, first: int, guard: int, enough: Array, outstands: float, least: float, found: Array
+) -> int:
+    """Lags from the first on that correlate enough, best within `guard` on both sides, `found`; how many.
+
+    The first of equals. `enough` are the mean squares up to each; what is `outstands` times their root is
+    enough, from half of `least`, and `least` is in any case.
+    """
+    n = 0
+    for i in range(enough.size):
+        lag = first + i
+        if rho[lag] < least and not rho[lag] >= max(outstands * np.sqrt(enough[i]), least / 2):
+            continue
+        best = True
+        for other in range(max(lag - guard, 0), lag):
+            best &= rho[other] < rho[lag]
+        for other in range(lag + 1, min(lag + guard + 1, rho.size)):
+            best &= rho[other] <= rho[lag]
+        if best:
+            found[n] = lag
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def refine(
+    counts: Array, lag: int, chips: Array, steps: int, pair: int, rising: Array
+) -> tuple[float, float, float, float, float, float]:
+    """Times of a preamble found at a lag, in steps, and their variances by the jackknife.
+
+    Where positive events fit best, and negative ones, NaN where none do; and where positive ones first reach
+    half of their most, over what comes all the time, after the chips that are `rising`. `pair` chips, a pair
+    of pair codes, are left out together to see how sure the first two are.
+    """
+    first, last = max(lag - steps, 0), min(lag + steps + 1, counts.shape[1] - steps * chips.size + 1)
+    on, on_noise = _centre(counts[1], 1.0, first, last, chips, steps, pair)
+    off, off_noise = _centre(counts[0], -1.0, first, last, chips, steps, pair)
+    onset, onset_noise = _onset(counts[1], lag, steps, rising)
+    return on, on_noise, off, off_noise, onset, onset_noise
+
+
+@njit(cache=True, nogil=True)
+def _centre(
+    count: Array, sign: float, first: int, last: int, chips: Array, steps: int, pair: int
+) -> tuple[float, float]:
+    """Where counts fit chips best, of the lags from the first to before the last, and its variance."""
+    lags, groups = last - first, chips.size // pair
+    running = np.empty(lags + steps * chips.size)
+    running[0] = 0.0
+    for b in range(running.size - 1):
+        running[b + 1] = running[b] + count[first + b]
+    values, whole = np.zeros((groups, lags)), np.zeros(lags)
+    for c in range(chips.size):
+        begin, end, part = running[steps * c :], running[steps * (c + 1) :], values[c // pair]
+        weight = sign * chips[c]
+        for i in range(lags):
+            value = weight * (end[i] - begin[i])
+            part[i] += value
+            whole[i] += value
+    found, without = np.empty(groups), np.empty(lags)
+    for g in range(groups):
+        for i in range(lags):
+            without[i] = whole[i] - values[g, i]
+        found[g] = _middle(without)
+    return first + _middle(whole), _jackknife(found)
+
+
+@njit(cache=True, nogil=True)
+def _middle(fit: Array) -> float:
+    """Where a correlation is best; NaN where it is positive nowhere.
+
+    The top is flat where a window holds all events of an edge: its middle is the best window.
+    """
+    top = fit[0]
+    for i in range(1, fit.size):
+        top = max(top, fit[i])
+    if not top > 0:
+        return np.nan
+    total, at = 0.0, 0.0
+    for i in range(fit.size):
+        weight = max(fit[i] - 0.9 * top, 0.0)
+        total += weight
+        at += weight * i
+    return at / total
+
+
+@njit(cache=True, nogil=True)
+def _onset(count: Array, lag: int, steps: int, rising: Array) -> tuple[float, float]:
+    """Where counts first reach half of their most, averaged over chips that rise, and its variance."""
+    edges, many = rising.size, 2 * steps
+    response, whole = np.empty((edges, many)), np.zeros(many)
+    for e in range(edges):
+        for i in range(many):
+            at = min(max(lag + steps * rising[e] + i - steps, 0), count.size - 1)
+            response[e, i] = count[at]
+            whole[i] += count[at]
+    found, without = np.empty(edges), np.empty(many)
+    for e in range(edges):
+        for i in range(many):
+            without[i] = whole[i] - response[e, i]
+        found[e] = _reached(without)
+    return lag - steps + _reached(whole), _jackknife(found)
+
+
+@njit(cache=True, nogil=True)
+def _reached(response: Array) -> float:
+    """Where counts first reach half of their most, over what comes all the time: their lower quartile."""
+    ordered = response.copy()
+    for i in range(1, ordered.size):
+        value, j = ordered[i], i
+        while j > 0 and ordered[j - 1] > value:
+            ordered[j] = ordered[j - 1]
+            j -= 1
+        ordered[j] = value
+    half = (ordered[ordered.size // 4] + ordered[ordered.size - 1]) / 2
+    k = 0
+    while response[k] < half:
+        k += 1
+    below = response[k - 1] if k > 0 else 0.0
+    return k - 0.5 + ((half - below) / (response[k] - below) if response[k] > below else 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _jackknife(without: Array) -> float:
+    """Variance of what was found of all, by what is found without each; those that say nothing left out."""
+    n, mean, squares = 0, 0.0, 0.0
+    for value in without:
+        if np.isfinite(value):
+            n += 1
+            mean += value
+    for value in without:
+        if np.isfinite(value):
+            squares += (value - mean / n) ** 2
+    return (n - 1) * squares / n if n else 0.0

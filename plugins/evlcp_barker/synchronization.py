@@ -229,9 +229,11 @@ class BarkerSynchronizer:
                 enough,
             )
             if 2 * top >= self._spec.min_correlation:
-                least = _OUTSTANDS * np.sqrt(enough)
-                least = np.clip(least, self._spec.min_correlation / 2, self._spec.min_correlation)
-                for lag in self._peaks(rho, lo, guard, least):
+                lags_found = np.empty(len(enough), np.int64)
+                many = _kernels.peaks(
+                    rho, lo, guard, enough, _OUTSTANDS, self._spec.min_correlation, lags_found
+                )
+                for lag in lags_found[:many].tolist():
                     found = self._refine(lag, counts, state.first_bin, float(rho[lag]))
                     clock, stray = self._accept(clock, stray, found)
                     if stray is None:
@@ -254,38 +256,15 @@ class BarkerSynchronizer:
         )
         return state, locks
 
-    def _peaks(self, rho: NDArray[np.float64], lo: int, guard: int, least: NDArray[np.float64]) -> list[int]:
-        """Lags from `lo` on that correlate enough, best within `guard` on both sides; the first of equals."""
-        high = lo + np.flatnonzero(rho[lo : len(rho) - guard] >= least)
-        return [lag for lag in high.tolist() if lag == _first_maximum(rho, lag - guard, lag + guard + 1)]
-
     def _refine(self, lag: int, counts: NDArray[np.float64], first_bin: int, quality: float) -> _Heard:
         """Times of one preamble, for positive and negative events apart, us."""
-        n = self._spec.steps_per_chip
-        start = max(lag - n, 0)
-        stop = min(lag + n + 1, counts.shape[1] - n * len(self._chips) + 1)
-        bounds = np.arange(start, stop)[:, None] + n * np.arange(len(self._chips) + 1)
-
-        def centre(count: NDArray[np.float64], sign: float) -> tuple[float, float]:
-            running = np.concatenate([[0.0], np.cumsum(count)])
-            values = sign * self._chips * np.diff(running[bounds], axis=1)
-            # Without each in turn, a pair of chips of pair codes, it says how sure it is.
-            values = values.reshape(len(bounds), -1, self._pair).sum(2)
-            found = _middles(values.sum(1)[None])[0]
-            return start + found, _jackknife(_middles(values.sum(1) - values.T))
-
-        off, on = counts
-        middle_on, noise_on = centre(on, 1)
-        middle_off, noise_off = centre(off, -1)
+        # Without each chip in turn, a pair of pair codes, it says how sure it is.
+        middle_on, noise_on, middle_off, noise_off, onset, noise_onset = _kernels.refine(
+            counts, lag, self._chips, self._spec.steps_per_chip, self._pair, self._rising
+        )
         if math.isnan(middle_on):
             middle_on, noise_on = middle_off, noise_off
-        # The onset of the positive events, averaged over the rising edges inside the preamble.
-        edges = lag + n * self._rising
-        steps = np.arange(-n, n)
-        response = on[np.clip(edges[:, None] + steps, 0, len(on) - 1)]
-        found = _onsets(response.sum(0)[None])[0]
-        noise_onset = _jackknife(_onsets(response.sum(0) - response))
-        at = [(first_bin + v) * self._bin_us for v in (middle_on, middle_off, lag - n + found)]
+        at = [(first_bin + v) * self._bin_us for v in (middle_on, middle_off, onset)]
         noises = [_TIMING_SIGMA_US**2 + v * self._bin_us**2 for v in (noise_on, noise_off, noise_onset)]
         return _Heard(at[0], at[1], at[2], quality, *noises)
 
@@ -387,37 +366,3 @@ class BarkerSynchronizer:
             delay_off_us=clock.apart.value - onset,
             quality=quality,
         )
-
-
-def _first_maximum(values: NDArray[np.float64], start: int, stop: int) -> int:
-    start = max(start, 0)
-    return start + int(np.argmax(values[start:stop]))
-
-
-def _middles(fits: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where each row of correlations is best, in steps; NaN where none is positive.
-
-    The top is flat where a window holds all events of an edge: its middle is the best window.
-    """
-    top = fits.max(1, keepdims=True)
-    weight = np.maximum(fits - 0.9 * top, 0)
-    total = weight.sum(1)
-    found = weight @ np.arange(fits.shape[1])
-    return np.where(top[:, 0] > 0, found / np.where(total > 0, total, 1), np.nan)
-
-
-def _onsets(responses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where each row of counts first reaches half of its most, over what comes all the time, in steps."""
-    rows = np.arange(len(responses))
-    always = np.sort(responses, axis=1)[:, responses.shape[1] // 4]
-    half = (always + responses.max(1)) / 2
-    k = (responses >= half[:, None]).argmax(1)
-    at, below = responses[rows, k], np.where(k > 0, responses[rows, k - 1], 0.0)
-    rises = at > below
-    return np.asarray(k - 0.5 + np.where(rises, (half - below) / np.where(rises, at - below, 1), 0.0))
-
-
-def _jackknife(without: NDArray[np.float64]) -> float:
-    """Variance of what was found of all, by what is found without each; parts that say nothing left out."""
-    without = without[np.isfinite(without)]
-    return float((len(without) - 1) * without.var()) if len(without) else 0.0

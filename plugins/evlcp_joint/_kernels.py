@@ -497,9 +497,8 @@ def _levels(
     which = np.empty(_MANY, np.int32)
     for j in range(_MANY):
         at = min(abs(work[_AT + j] + row) * scale, most)
-        n = np.int32(at)
-        which[j] = n
-        work[_PART + j] = at - n
+        which[j] = np.int32(at)
+        work[_PART + j] = at - which[j]
     beyond, density = profile[0], profile[1]
     for j in range(_MANY):
         n, part = np.uint32(which[j]), work[_PART + j]

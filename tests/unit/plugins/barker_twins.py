@@ -39,6 +39,53 @@ def mean_squares(rho, memory):
     return np.array(out)
 
 
+def peaks(rho, first, guard, enough, outstands, least):
+    """Lags that are enough and the first maximum of the lags about them."""
+    wanted = np.clip(outstands * np.sqrt(enough), least / 2, least)
+    high = first + np.flatnonzero(rho[first : first + len(enough)] >= wanted)
+    return [k for k in high if k == (low := max(k - guard, 0)) + np.argmax(rho[low : k + guard + 1])]
+
+
+def refine(counts, lag, chips, steps, pair, rising):
+    """All lags, and all that is left out, laid out as tables."""
+    lags = np.arange(max(lag - steps, 0), min(lag + steps + 1, counts.shape[1] - steps * len(chips) + 1))
+    bounds = lags[:, None] + steps * np.arange(len(chips) + 1)
+    found = []
+    for count, sign in ((counts[1], 1), (counts[0], -1)):
+        running = np.concatenate([[0.0], np.cumsum(count)])
+        values = sign * chips * np.diff(running[bounds], axis=1)
+        values = values.reshape(len(bounds), -1, pair).sum(2)
+        found += [lags[0] + middles(values.sum(1)[None])[0]]
+        found += [jackknife(middles(values.sum(1) - values.T))]
+    at = lag + steps * rising[:, None] + np.arange(-steps, steps)
+    response = counts[1][np.clip(at, 0, counts.shape[1] - 1)]
+    found += [lag - steps + onsets(response.sum(0)[None])[0], jackknife(onsets(response.sum(0) - response))]
+    return found
+
+
+def middles(fits):
+    top = fits.max(1, keepdims=True)
+    weight = np.maximum(fits - 0.9 * top, 0)
+    total = weight.sum(1)
+    found = weight @ np.arange(fits.shape[1])
+    return np.where(top[:, 0] > 0, found / np.where(total > 0, total, 1), np.nan)
+
+
+def onsets(responses):
+    always = np.sort(responses, axis=1)[:, responses.shape[1] // 4]
+    half = (always + responses.max(1)) / 2
+    k = (responses >= half[:, None]).argmax(1)
+    rows = np.arange(len(responses))
+    at, below = responses[rows, k], np.where(k > 0, responses[rows, k - 1], 0.0)
+    rises = at > below
+    return k - 0.5 + np.where(rises, (half - below) / np.where(rises, at - below, 1), 0.0)
+
+
+def jackknife(without):
+    without = without[np.isfinite(without)]
+    return (len(without) - 1) * without.var() if len(without) else 0.0
+
+
 def events_of(
     chips, rng, start_us=5000.0, ppm=0.0, delay_us=(20.0, 45.0), missing_off=0.0, per_edge=2, jitter_us=4.0
 ):

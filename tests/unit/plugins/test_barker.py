@@ -146,6 +146,36 @@ def test_mean_square_of_the_positive(seed):
     assert_array_equal(parts, out)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_peaks(seed):
+    rng = np.random.default_rng(seed)
+    # Few values, so that some are alike.
+    rho = rng.integers(0, 40, 400) / 50
+    enough = np.concatenate([np.full(50, np.inf), rng.uniform(0, 0.02, 300)])
+    found = np.empty(350, np.int64)
+    n = _kernels.peaks(rho, 20, 10, enough, 6.0, 0.65, found)
+    want = twins.peaks(rho, 20, 10, enough, 6.0, 0.65)
+    assert found[:n].tolist() == want
+    assert len(want) > 1
+
+
+@pytest.mark.parametrize("pair", [1, 2])
+@pytest.mark.parametrize("lag", [3, 40, 128])
+@pytest.mark.parametrize("off", [0, 1])
+def test_times_of_a_preamble(lag, pair, off):
+    rng = np.random.default_rng(lag)
+    steps, chips = 10, 2.0 * chips_of_values(BARKER13) - 1
+    counts = rng.poisson(0.3, (2, 400)).astype(float)
+    part = np.repeat(chips, steps)[: 400 - lag]
+    counts[1, lag : lag + 260] += rng.poisson(1.5 * (part > 0))
+    counts[0, lag : lag + 260] += rng.poisson(1.5 * (part < 0))
+    counts[0] *= off
+    rising = np.flatnonzero(np.diff(chips) > 0) + 1
+    found = _kernels.refine(counts, lag, chips, steps, pair, rising)
+    assert_allclose(found, twins.refine(counts, lag, chips, steps, pair, rising), rtol=1e-9, atol=1e-12)
+    assert np.isnan(found[2]) == (not off)
+
+
 # Timing
 
 
