@@ -12,11 +12,11 @@ from evlcp_sdk.kernels import njit
 Array = NDArray[Any]
 
 
-CHIPS_AT = 6
-"""Bit of a pixel's state from which its chips are held; below is its score, and from `CLOCK_AT` its clock."""
+TIME_AT = 6
+"""Bit of a pixel's state from which its newest time is held; below: its score, from `CLOCK_AT`: its clock."""
 
 SAME_AT = 10
-"""Bit from which is held how often lately the same number of chips came again, 0 to `MOST_SAME`."""
+"""Bit from which is held how often lately the same time came again, 0 to `MOST_SAME`."""
 
 MOST_SAME = 7
 
@@ -25,13 +25,13 @@ CLOCK_AT = 13
 CLOCK_ROUND = 1 << 32 - CLOCK_AT
 """Ticks after which the clock of 19 bits goes round."""
 
-SCORES = (1 << CHIPS_AT) - 1
+SCORES = (1 << TIME_AT) - 1
 
 _LOW = np.uint32((1 << CLOCK_AT) - 1)
 _HIGH = np.uint32((1 << 32) - (1 << CLOCK_AT))
 _PART = np.uint32((1 << SAME_AT) - 1)
 _SAMES = np.array([max(n - 2, 0) for n in range(8)] + [min(n + 1, MOST_SAME) for n in range(8)], np.uint32)
-"""How often the same number of chips has come again: after another number, and after the same."""
+"""How often the same time has come again: after another, and after the same."""
 _CLOCK = np.uint32(CLOCK_AT)
 _BLOCK = 32
 """Events that are looked at together: of a bar alone in the dark, every other block has no stray in it."""
@@ -58,7 +58,8 @@ def score_rises(
 
     `pixels` (height, width) are uint32, see `Rhythm`. A rise sooner than `soon` ticks after the one before is
     the same; `kinds` says what a number of ticks is, the last, 0, for all beyond, and `lows` what becomes of
-    chips and score. A tick is 2^tick_shift us. A rise beyond is no hit.
+    time and score, and in the bit above whether it is the same time again. A tick is 2^tick_shift us. A rise
+    beyond is no hit.
     """
     width, columns = np.uint32(pixels.shape[1]), np.uint32(hits.shape[1])
     states, cells = pixels.reshape(-1), hits.reshape(-1)
@@ -88,11 +89,9 @@ def score_rises(
         state = states[at]
         kind = np.uint32(kinds[runs[i]])
         low = np.uint32(lows[(kind << np.uint32(SAME_AT)) | (state & _PART)])
-        # A lamp's period of 2.7 chips is on the chips now and then, and near three always.
-        again = np.uint32((kind & np.uint32(15)) == ((state >> np.uint32(CHIPS_AT)) & np.uint32(15)))
         same = (state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME)
-        same = _SAMES[(again << np.uint32(3)) | same]
-        states[at] = (state & _HIGH) | (same << np.uint32(SAME_AT)) | low
+        same = _SAMES[(low >> np.uint32(SAME_AT) << np.uint32(3)) | same]
+        states[at] = (state & _HIGH) | (same << np.uint32(SAME_AT)) | (low & _PART)
         # One that comes after long is no blinking yet, however a pixel blinked when a bar was there.
         if (low & np.uint32(SCORES)) >= least and kind != np.uint32(0):
             row = at // width

@@ -9,9 +9,9 @@ moving texture, lowers it by three: more than the two that chance, which is on t
 would bring. One after the very same number of chips as before lowers it by two from five chips on: a lamp of
 1 or 2 kHz repeats its period, a code with missing events does not.
 A lamp whose period is near two, three or four chips is in rhythm, too, as far as a score tells; but its time
-comes again and again, which one of a code does not for long: before a frame shows where the bar is, such
-pixels are not listened to. Falls are not looked at: they come later or sooner than rises by the light,
-they are the first to go missing, and some cameras send none.
+comes again and again, to half a chip, which one of a code does not for long: before a frame shows where the
+bar is, such pixels are not listened to. Falls are not looked at: they come later or sooner than rises by the
+light, they are the first to go missing, and some cameras send none.
 
 A pixel that a bar has left keeps its score, as it hardly rises any more; but where the camera shakes, the
 veil around the bar comes nearer again, and all pixels of the trail rise once, with a chip. So a region is
@@ -59,14 +59,23 @@ _LABEL_SHIFT = 3
 """Cells of 8 x 8 px say which box is near: few, so that they stay in the cache."""
 
 _LATE, _OFF = 0, 16
-"""Kind of a time between rises: its number of whole chips, or 0 beyond; so much more where it is off them."""
+"""Kind of a time between rises: see `_TIMES`, or 0 beyond; so much more where it is off the chips."""
+
+_TIMES = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0, *map(float, range(5, 14)))
+"""Times between rises that are told apart, by their kinds from 1 on, chips, the last with all beyond. Short
+ones by halves: where many pixels switch at once, the readout puts rises off by a quarter of a chip, and a
+period of 2.3 chips is now two and now three."""
+
+_SHORT = 6
+"""Kinds up to this one are next to each other where they differ by half a chip: the same time, maybe. Those
+of a pair code are whole chips apart."""
 
 
 class Rhythm:
     """Scores of a sensor's pixels.
 
-    A pixel's state holds the time of its last rise (19 bits of the clock's ticks), how often the same time
-    came again (3 bits), the whole chips between that and the rise before (4 bits), and its score (6 bits).
+    A pixel's state holds when it last rose (19 bits of the clock's ticks), how often the same time came again
+    (3 bits), the time between that and the rise before (4 bits), and its score (6 bits).
     The clock of 19 bits goes round in half a second; rows are looked at in turn, all in a quarter of that,
     so that no old rise looks young.
 
@@ -239,15 +248,28 @@ def _kinds(chip_us: float, late_us: float, tick_us: int) -> NDArray[np.uint8]:
     """Kind of a time between rises by its ticks, the last for all beyond."""
     run_us = np.arange(int(late_us) // tick_us + 2) * float(tick_us)
     chips = np.floor(run_us / chip_us + 0.5)
-    kinds = chips + _OFF * (np.abs(run_us - chips * chip_us) > _STRAY_CHIPS * chip_us)
+    middles = np.array(_TIMES)
+    kinds = 1 + np.searchsorted((middles[1:] + middles[:-1]) / 2 * chip_us, run_us, side="right")
+    kinds += _OFF * (np.abs(run_us - chips * chip_us) > _STRAY_CHIPS * chip_us)
     kinds[run_us > late_us] = _LATE
     return np.asarray(kinds, np.uint8)
 
 
 def _lows(gap_chips: int) -> NDArray[np.uint16]:
-    """Chips and score of a pixel after a rise, by the kind of its time and by chips and score before it."""
+    """Time and score of a pixel after a rise, by the kind of its time and by time and score before it.
+
+    The bit above says whether it is the same time again.
+    """
     kind, before, score = np.meshgrid(np.arange(2 * _OFF), np.arange(16), np.arange(64), indexing="ij")
-    change = np.where(kind <= gap_chips, 2, np.where(kind == before, -2, 1))
+    time = kind % _OFF
+    chips = np.array([0.0, *_TIMES])[time]
+    change = np.where(chips < gap_chips + 1, 2, np.where(time == before, -2, 1))
     change[kind >= _OFF] = -3
     change[kind == _LATE] = -1
-    return np.asarray(kind % _OFF << 6 | np.clip(score + change, 0, _MOST_SCORE), np.uint16).ravel()
+    near = (
+        (abs(time - before) <= 1) & (np.minimum(time, before) > _LATE) & (np.maximum(time, before) <= _SHORT)
+    )
+    again = (time == before) | near
+    return np.asarray(
+        (again << 10) | (time << 6) | np.clip(score + change, 0, _MOST_SCORE), np.uint16
+    ).ravel()

@@ -1,36 +1,43 @@
 """The receiver's kernels once more, in NumPy or plain Python, as slow and plain as it gets."""
 
+from itertools import pairwise
+
 import numpy as np
 from scipy import ndimage
 
 
 def score_rises(events, shape, start, chip_us, min_score, cell_shift):
-    """Last rise, chips before it, how often these again, score of each pixel; and hits. `start`: before."""
-    (rose, chips, same, score), hits = (a.copy() for a in start), {}
+    """Last rise, time before it, how often that again, score of each pixel; and hits. `start`: before.
+
+    Times by number, 0: beyond what counts.
+    """
+    times = [1.5, 2.0, 2.5, 3.0, 3.5, 4.0, *range(5, 14)]
+    (rose, time, same, score), hits = (a.copy() for a in start), {}
     for t, u, v, p in events:
         run = t - rose[v, u]
         if not p or run < int(1.5 * chip_us):
             continue
-        whole = again = 0
+        number = 0
         if run > 12.5 * chip_us:
             score[v, u] -= 1
-            again = chips[v, u] == 0
         else:
             whole = int(np.floor(run / chip_us + 0.5))
-            again = whole == chips[v, u]
+            number = 1 + sum(run >= (a + b) / 2 * chip_us for a, b in pairwise(times))
             if abs(run - whole * chip_us) > 0.3 * chip_us:
                 score[v, u] -= 3
             elif whole <= 4:
                 score[v, u] += 2
             else:
-                score[v, u] += -2 if whole == chips[v, u] else 1
+                score[v, u] += -2 if number == time[v, u] else 1
         score[v, u] = sorted((0, score[v, u], 40))[1]
+        apart = abs(number - time[v, u])
+        again = apart == 0 or (apart == 1 and min(number, time[v, u]) > 0 and max(number, time[v, u]) <= 6)
         same[v, u] = min(same[v, u] + 1, 7) if again else max(same[v, u] - 2, 0)
-        rose[v, u], chips[v, u] = t, whole
-        if score[v, u] >= min_score and whole:
+        rose[v, u], time[v, u] = t, number
+        if score[v, u] >= min_score and number:
             cell = v >> cell_shift, u >> cell_shift
             hits[cell] = hits.get(cell, 0) + 1
-    return (rose, chips, same, score), hits
+    return (rose, time, same, score), hits
 
 
 def measure_box(lit, box, seam, reach):

@@ -229,12 +229,18 @@ def test_a_bar_is_found_before_a_panel_of_4_khz() -> None:
     assert region.latest.height_px == pytest.approx(128, abs=1.5)
 
 
+@pytest.mark.parametrize("jitter_us", [8, 16])
 @pytest.mark.parametrize("hz", [2700, 3600, 4400])
-def test_a_lamp_near_whole_chips_is_known_by_its_steady_time(hz: int) -> None:
-    """Its rises come 3.7, 2.8 or 2.3 chips apart: with a pixel's jitter, on the chips most of the time."""
+def test_a_lamp_near_whole_chips_is_known_by_its_steady_time(hz: int, jitter_us: int) -> None:
+    """Its rises come 3.7, 2.8 or 2.3 chips apart: with a pixel's jitter, on the chips most of the time.
+
+    With a readout that many pixels wait for, the number of whole chips changes, too.
+    """
     period_us, rng = 1e6 / hz, np.random.default_rng(hz)
     column, row = (v.ravel() for v in np.meshgrid(np.arange(300, 320), np.arange(200, 220)))
-    t = np.arange(100, 40_000, period_us)[:, None] + rng.normal(0, 8, (int(np.ceil(39_900 / period_us)), 400))
+    t = np.arange(100, 40_000, period_us)[:, None] + rng.normal(
+        0, jitter_us, (int(np.ceil(39_900 / period_us)), 400)
+    )
     order = np.argsort(t, axis=None, kind="stable")
     x, y = (np.broadcast_to(v, t.shape).ravel()[order] for v in (column, row))
     events = Events.of(np.sort(t.ravel()).astype(np.int64), x, y, np.ones(t.size))

@@ -37,11 +37,11 @@ def frozen(events, step=1):
 LOW = (1 << _kernels.CLOCK_AT) - 1
 
 
-def states(rose_us, chips, score, same=0):
-    """Pixels of these last rises, us, chips, scores, and how often the same again."""
+def states(rose_us, time, score, same=0):
+    """Pixels of these last rises, us, numbers of the times before, scores, and how often the same again."""
     clock = np.asarray(rose_us) % _kernels.CLOCK_ROUND << _kernels.CLOCK_AT
     again = np.asarray(same) << _kernels.SAME_AT
-    return (clock | again | np.asarray(chips) << _kernels.CHIPS_AT | score).astype(np.uint32)
+    return (clock | again | np.asarray(time) << _kernels.TIME_AT | score).astype(np.uint32)
 
 
 def rhythm_of(pixels, chip_us=CHIP_US, min_score=8):
@@ -71,8 +71,8 @@ def test_scores_of_pixels(seed, freeze):
     start = (np.full(pixels.shape, start_us), *np.zeros((3, *pixels.shape), int))
     hits = scored(frozen(events, freeze), pixels)
     rows = zip(*(c.tolist() for c in (events.t_us, events.x, events.y, events.p)), strict=True)
-    (rose, chips, same, score), want = twins.score_rises(rows, pixels.shape, start, CHIP_US, 8, 2)
-    assert_array_equal(pixels, states(rose, chips, score, same))
+    (rose, time, same, score), want = twins.score_rises(rows, pixels.shape, start, CHIP_US, 8, 2)
+    assert_array_equal(pixels, states(rose, time, score, same))
     assert {tuple(c): hits[tuple(c)] for c in np.argwhere(hits).tolist()} == want
     assert 0 <= score.min() < score.max() <= 40
 
@@ -96,8 +96,8 @@ def test_scores_of_pixels(seed, freeze):
     ],
 )
 def test_a_rise_counts_by_its_time_since_the_last(run_us, score):
-    """Seven chips lay between the two before."""
-    before = int(states(1000, 7, 10))
+    """Seven chips, the ninth of the times that are told apart, lay between the two before."""
+    before = int(states(1000, 9, 10))
     pixels = np.full((HEIGHT, WIDTH), before, np.uint32)
     assert not scored(Events.of([1000 + run_us], [3], [2], [1]), pixels, min_score=13).any()
     if score is None:
@@ -114,7 +114,7 @@ def test_times_count_alike_at_every_chip_rate(chip_us):
         pixels = np.zeros((HEIGHT, WIDTH), np.uint32)
         rhythm = rhythm_of(pixels, chip_us)
         start_us = 5_000_000_000_000
-        pixels[:] = states(start_us >> rhythm._shift, 7, 10)
+        pixels[:] = states(start_us >> rhythm._shift, 9, 10)
         rhythm._seen = start_us >> rhythm._shift
         rise = Events.of([start_us + round(chips * chip_us)], [3], [2], [1])
         rhythm.step(start_us, rise, np.zeros((4, 6), np.int32), 2)
@@ -182,14 +182,14 @@ def test_values_within_bounds(dtype):
 def test_old_rises(seed):
     rng = np.random.default_rng(seed)
     now, rose = 5_000_000, 5_000_000 - rng.integers(0, 2**19, (HEIGHT, WIDTH))
-    chips, score = rng.integers(0, 14, rose.shape), rng.integers(0, 41, rose.shape)
+    time, score = rng.integers(0, 16, rose.shape), rng.integers(0, 41, rose.shape)
     same = rng.integers(0, 8, rose.shape)
-    pixels = states(rose, chips, score, same)
+    pixels = states(rose, time, score, same)
     # Rows 10 to 15, and 0 to 4.
     _kernels.grow_old(pixels, 10, 11, now, 3000, 4000)
     looked_at = np.isin(np.arange(HEIGHT), [*range(10, 16), *range(5)])
     old = (now - rose >= 3000) & looked_at[:, None]
-    assert_array_equal(pixels, states(np.where(old, now - 4000, rose), chips, score, same))
+    assert_array_equal(pixels, states(np.where(old, now - 4000, rose), time, score, same))
     events, keep = random_events(rng, 300), np.empty(300, np.bool_)
     _kernels.in_rhythm(events.x, events.y, pixels, 20, 5, keep)
     assert_array_equal(keep, ((score >= 20) & (same < 5))[events.y, events.x])
