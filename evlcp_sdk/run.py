@@ -15,6 +15,7 @@ from evlcp_sdk.errors import ConfigError, InputError, UnpluggedError
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source, open_writer
 from evlcp_sdk.io.open import STDIN
+from evlcp_sdk.io.patience import open_until, pieces_until
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.several import load_links, named_links
@@ -134,9 +135,11 @@ def _pulses_of(clock_zero: ClockZero, source: EventSource, url: str | Path) -> P
     return clock_zero
 
 
-def _events_of(source: EventSource, pulses: PulseClock | None) -> Iterator[Events]:
+def _events_of(
+    source: EventSource, pulses: PulseClock | None, stopped: Stopped = lambda: False
+) -> Iterator[Events]:
     """The events of a source; its triggers go to the pulses before the events that came with them."""
-    for events, triggers in source.stream():
+    for events, triggers in pieces_until(source, stopped):
         if pulses is not None and (len(events) or len(triggers)):
             now_us = max(int(column[-1]) for column in (events.t_us, triggers.t_us) if len(column))
             pulses.add(triggers, time.time(), now_us)
@@ -286,7 +289,7 @@ def receive_to_folder(
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
     url = str(source.path if isinstance(source, EventSource) else source)
-    with source if isinstance(source, EventSource) else open_source(source, registry) as opened:
+    with open_until(source, registry, stopped) as opened:
         url = str(opened.path) if url == STDIN else url
         check_sensor(opened, url, links[0].camera)
         pulses = _pulses_of(clock_zero, opened, url)
@@ -303,7 +306,7 @@ def receive_to_folder(
             lines=lines,
         ) as writer:
             receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero)
-            pieces = ((events, receiver.feed(events)) for events in _events_of(opened, pulses))
+            pieces = ((events, receiver.feed(events)) for events in _events_of(opened, pulses, stopped))
             return _run(opened, url, receiver, writer, pieces, receiver.close, advance, stopped)
 
 
@@ -361,7 +364,7 @@ def live(
         warm_up(links)
     url = str(source.path if isinstance(source, EventSource) else source)
     try:
-        opened = source if isinstance(source, EventSource) else open_source(source, registry)
+        opened = open_until(source, registry, stopped)
         if not opened.live and opened.size_bytes is not None:
             opened = ReplaySource(opened)
         with opened:
@@ -434,11 +437,11 @@ def convert(
     registry = Registry.load() if registry is None else registry
     error: InputError | None = None
     counts = {"events": 0, "triggers": 0}
-    with source if isinstance(source, EventSource) else open_source(source, registry) as opened:
+    with open_until(source, registry, stopped) as opened:
         width, height = size or (opened.width, opened.height)
         with open_writer(out, width, height, format) as writer:
             try:
-                for events, triggers in opened.stream():
+                for events, triggers in pieces_until(opened, stopped):
                     writer.write(events, triggers)
                     counts["events"] += len(events)
                     counts["triggers"] += len(triggers)
@@ -486,7 +489,7 @@ def _run(
                     break
         except InputError as fault:
             status, error = "failed", str(fault)
-        if live is not None and stopped():
+        if (live is not None or source.size_bytes is None) and stopped():
             status = "interrupted"
         writer.write(close())
     if status == "complete" and (told := _much_dropped(source, receiver)):

@@ -3,10 +3,11 @@
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
 from types import FrameType
 
-__all__ = ["ENDING", "Stopped", "heard_by", "interrupt", "stop_on_request"]
+__all__ = ["ENDING", "StopRequest", "Stopped", "heard_by", "interrupt", "stop_on_request", "waiting"]
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """All are answered in the same way."""
@@ -40,8 +41,58 @@ def heard_by(handler: Handler, *numbers: signal.Signals) -> Iterator[Callable[[]
         restore()
 
 
+@dataclass
+class _Asked:
+    """What a signal has said, and whether it may end a wait."""
+
+    asked: bool = False
+    waits: bool = False
+
+
+class StopRequest:
+    """Whether a run was asked to end; made by `stop_on_request`, and called as a `Stopped`."""
+
+    def __init__(self, state: _Asked | None = None, also: Stopped = lambda: False) -> None:
+        self._state = _Asked() if state is None else state
+        self._also = also
+
+    def __call__(self) -> bool:
+        """Whether it was asked."""
+        return self._state.asked or self._also()
+
+    def or_when(self, also: Stopped) -> "StopRequest":
+        """The same request, and another reason to end."""
+        return StopRequest(self._state, lambda: self._also() or also())
+
+    def ask(self) -> None:
+        """Ask it to end, now where it waits.
+
+        Raises:
+            KeyboardInterrupt: Within `waiting`.
+        """
+        self._state.asked = True
+        if self._state.waits:
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Wait for something outside, which may never come: a request ends that at once.
+
+        Raises:
+            KeyboardInterrupt: The run was asked to end, before or within.
+        """
+        # In this order: a signal between the two ends it, too.
+        self._state.waits = True
+        try:
+            if self._state.asked:
+                raise KeyboardInterrupt
+            yield
+        finally:
+            self._state.waits = False
+
+
 @contextmanager
-def stop_on_request(pass_on: Callable[[], None] = lambda: None) -> Iterator[Stopped]:
+def stop_on_request(pass_on: Callable[[], None] = lambda: None) -> Iterator[StopRequest]:
     """Let Ctrl-C, SIGTERM or SIGHUP end a run after the piece in hand; a second one ends it at once.
 
     Gives what `receive_to_folder` takes as `stopped`. Only a main thread can listen.
@@ -49,16 +100,20 @@ def stop_on_request(pass_on: Callable[[], None] = lambda: None) -> Iterator[Stop
     Args:
         pass_on: Called at the first one, to tell others.
     """
-    asked = False
+    request = StopRequest()
 
     def ask(_number: int, _frame: FrameType | None) -> None:
-        nonlocal asked
-        asked = True
         restore()
         pass_on()
+        request.ask()
 
     with heard_by(ask, *ENDING) as restore:
-        yield lambda: asked
+        yield request
+
+
+def waiting(stopped: Stopped) -> AbstractContextManager[None]:
+    """`StopRequest.waiting` of what may be one; nothing of any other `Stopped`."""
+    return stopped.waiting() if isinstance(stopped, StopRequest) else nullcontext()
 
 
 def interrupt(_number: int, _frame: FrameType | None) -> None:

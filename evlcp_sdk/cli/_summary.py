@@ -78,27 +78,28 @@ def _real_time(summary: Mapping[str, Any]) -> Iterator[tuple[str, str | None]]:
     live = summary.get("live")
     if live is not None:
         for stage, what in (
-            ("total", "{} frames came {} after their last chip"),
-            ("end_to_end", "{} times were read {} after they had been said, from end to end"),
+            ("total", "{} frames, from their last chip"),
+            ("end_to_end", "{} times that were sent, from end to end"),
         ):
             tally = live["delays"][stage]
             if tally["count"]:
-                yield what.format(tally["count"], delays_text(tally)), None
+                yield f"delay of {what.format(tally['count'])}: {delays_text(tally)}", None
         if left := [f"{many} {name.replace('_', ' ')}" for name, many in live["shed"].items() if many]:
             yield f"left out, as there was no time: {', '.join(left)}", "yellow"
     pps = summary.get("pps")
     if pps is not None:
         rate = _or_dash(pps["rate_ppm"], "{:+.3f} ppm")
-        yield f"{pps['pulses']} pulses, {pps['pulses_rejected']} rejected: the camera's clock {rate}", None
+        text = f"{pps['pulses']} pulses of UTC, {pps['pulses_rejected']} rejected: the camera's clock {rate}"
+        yield (text, None) if pps["pulses"] else ("no pulse of UTC came on the trigger input", "yellow")
 
 
 def delays_text(tally: Mapping[str, Any]) -> str:
     """Quantiles of delays, in words.
 
     >>> delays_text({"count": 3, "p50_ms": 1.98, "p99_ms": 2.4, "max_ms": 12.04})
-    '2.0 ms (p99 2.4, max 12.0)'
+    'p50 2.0, p99 2.4, max 12.0 ms'
     """
-    return f"{tally['p50_ms']:.1f} ms (p99 {tally['p99_ms']:.1f}, max {tally['max_ms']:.1f})"
+    return f"p50 {tally['p50_ms']:.1f}, p99 {tally['p99_ms']:.1f}, max {tally['max_ms']:.1f} ms"
 
 
 def _message(told: Mapping[str, Any]) -> str:

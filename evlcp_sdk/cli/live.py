@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 
 __all__ = ["register"]
 
+_HERE = "127.0.0.1"
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -115,7 +117,7 @@ def live(
             metavar="ADDRESS",
             help="Where the page is served: 0.0.0.0 for other machines, too, such as a phone.",
         ),
-    ] = "127.0.0.1",
+    ] = _HERE,
     view_port: Annotated[
         int,
         typer.Option("--view-port", min=0, max=65535, metavar="PORT", help="Its port; 0: any that is free."),
@@ -206,6 +208,14 @@ def live(
     for name, given in (("--nmea-port", nmea_port), ("--gpsd-port", gpsd_port)):
         if given is not None and plan is None:
             raise typer.BadParameter("needs --sites", param_hint=name)
+    for name, changed in (
+        ("--view-host", view_host != _HERE),
+        ("--view-port", view_port != 0),
+        ("--view-apart", view_apart),
+        ("--view-record", view_record),
+    ):
+        if changed and not view:
+            raise typer.BadParameter("needs --view", param_hint=name)
     record_to = (Path.cwd() if out is None else out) if view_record else None
     serving = Serving(view, view_apart, view_host, view_port, record_to, nmea_port, gpsd_port)
     outlet = Outlet()
@@ -233,7 +243,7 @@ def live(
             outlet=outlet,
             pictures=services.pictures,
             budget=Budget(waiting_ms=waiting_ms, most_ms=10 * waiting_ms),
-            stopped=lambda: stopped() or (out is None and lines is not None and lines.gone),
+            stopped=stopped.or_when(lambda: out is None and lines is not None and lines.gone),
         )
         if lines is not None:
             lines(json.dumps({"line": "summary"} | summary))
@@ -295,4 +305,4 @@ def _say_where(services: "Services") -> None:
         complain(f"look on at {services.view.url}")
     for name, server in (("NMEA", services.nmea), ("gpsd's JSON", services.gpsd)):
         if server is not None:
-            complain(f"{name} at 127.0.0.1:{server.port}")
+            complain(f"{name} at {_HERE}:{server.port}")

@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
+    from evlcp_sdk.signals import StopRequest
 
 __all__ = ["register"]
 
@@ -278,7 +279,7 @@ def _decode_job(
     pps: int | None,
     sinks: tuple[str, ...],
     lines: LinePrinter | None,
-    stopped: Callable[[], bool] | None,
+    stopped: "StopRequest | None",
 ) -> dict[str, Any]:
     """Decode a recording here, with a bar; or, without `stopped`, quietly in a worker."""
     from evlcp_sdk.run import receive_to_folder, stop_on_request
@@ -287,10 +288,7 @@ def _decode_job(
     known: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock}
     decode = partial(receive_to_folder, job.url, job.folder, job.link or links, **known, sinks=sinks)
     if stopped is not None:
-
-        def ended() -> bool:
-            return stopped() or (job.folder is None and lines is not None and lines.gone)
-
+        ended = stopped.or_when(lambda: job.folder is None and lines is not None and lines.gone)
         with bytes_bar(_named(job.url)) as advance:
             return decode(lines=lines, advance=advance, stopped=ended)
     hush()

@@ -28,7 +28,7 @@ What is published:
 | `message` | `ReceivedMessage` | when a packet completes it |
 | `fix` | `Placed` | when it is computed: the fix, given or refused, and the filtered place |
 | `events` | `Events` | each piece of the source, before anything is shed: for a recorder |
-| `triggers` | `Triggers` | each piece's, where there are any |
+| `triggers` | `Triggers` | each piece's, where there are any, before its events |
 | `status` | `LiveStatus` | every 0.2 s, and at the end: rate, regions, delays, losses, what is shed |
 | `end` | the summary, a `dict` | last |
 """

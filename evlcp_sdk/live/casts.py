@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
-from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.live.desk import stop_listening
+from evlcp_sdk.live.desk import cannot_listen, stop_listening
 from evlcp_sdk.live.outlet import News, Outlet, Subscription
 from evlcp_sdk.results.gpsd import VERSION, answer, sky, tpv
 from evlcp_sdk.results.nmea import sentences
@@ -110,9 +109,7 @@ class Cast:
             server = await asyncio.start_server(self._serve, self._host, self.port, limit=_MOST_LINE)
         except OSError as fault:
             self._outlet.leave(mine)
-            raise ConfigError(
-                f"{self._host}:{self.port}: {fault.strerror or fault}: expected a free port, 0 for any"
-            ) from fault
+            raise cannot_listen(self._host, self.port, fault) from fault
         self.port = server.sockets[0].getsockname()[1]
 
         async def pump() -> None:

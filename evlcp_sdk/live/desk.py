@@ -1,12 +1,15 @@
 """A thread in which the servers of a live run have their event loop, beside the receiver's."""
 
 import asyncio
+import os
 import threading
 from collections.abc import Coroutine, Iterable
 from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
 
-__all__ = ["Desk", "Listening", "stop_listening"]
+from evlcp_sdk.errors import ConfigError
+
+__all__ = ["Desk", "Listening", "cannot_listen", "stop_listening"]
 
 _T = TypeVar("_T")
 
@@ -56,6 +59,15 @@ class Listening(Protocol):
 
     def close(self) -> None:
         """Listen no more."""
+
+
+def cannot_listen(host: str, port: int, fault: OSError) -> ConfigError:
+    """What is said where a server cannot listen."""
+    known = fault.errno is not None and fault.errno > 0
+    what = os.strerror(fault.errno or 0) if known else fault.strerror or str(fault)
+    return ConfigError(
+        f"{host}:{port}: {what}: expected an address of this machine and a port of it that is free, 0 for any"
+    )
 
 
 async def stop_listening(server: Listening) -> None:

@@ -257,10 +257,10 @@ class LiveLoop:
                 came_s = time.time() - (self._clock() - piece.arrived_s)
                 self._pulses.add(piece.triggers, came_s, max(float(column[-1]) for column in columns))
         self._events += len(piece.events)
-        if len(piece.events):
-            self._outlet.publish("events", float(piece.events.t_us[0]), piece.events)
         if len(piece.triggers):
             self._outlet.publish("triggers", float(piece.triggers.t_us[0]), piece.triggers)
+        if len(piece.events):
+            self._outlet.publish("events", float(piece.events.t_us[0]), piece.events)
 
     def _tell(self, packets: list[Packet]) -> None:
         for packet in packets:

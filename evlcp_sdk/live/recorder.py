@@ -1,26 +1,33 @@
 """A recording of what comes, started and stopped while a run goes on."""
 
+import shutil
 import threading
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from evlcp_sdk.errors import EvlcpError
+from evlcp_sdk.errors import EvlcpError, StreamError
 from evlcp_sdk.io.open import open_writer
+from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.live.outlet import Outlet, Subscription
+from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["Recorder"]
 
 _MOST_WAITING: Final = 4096
 """Pieces that wait for the disk, some seconds; the oldest go, counted."""
 
+_LEAST_FREE: Final = 100_000_000
+"""Bytes of the disk below which a recording ends, while it can still be completed: some seconds of a camera,
+and what the result of the run needs."""
+
 
 class Recorder:
-    """Writes events to a RAW file in a thread of its own, from `start` to `stop`.
+    """Writes events and triggers to a RAW file in a thread of its own, from `start` to `stop`.
 
     Args:
-        outlet: Where events come from.
-        folder: Where files go, named by the time of their start.
+        outlet: Where they come from.
+        folder: Where files go, named by the time of their start; made if need be.
         width: Columns of the sensor.
         height: Its rows.
     """
@@ -51,7 +58,7 @@ class Recorder:
             return
         self._path = self._folder / f"live-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}.raw"
         self._events, self._fault = 0, ""
-        self._mine = self._outlet.subscribe({"events"}, most=_MOST_WAITING)
+        self._mine = self._outlet.subscribe({"events", "triggers"}, most=_MOST_WAITING)
         self._thread = threading.Thread(
             target=self._write, args=(self._path, self._mine), name="evlcp-recorder", daemon=True
         )
@@ -65,12 +72,36 @@ class Recorder:
 
     def _write(self, path: Path, mine: Subscription) -> None:
         try:
+            path.parent.mkdir(parents=True, exist_ok=True)
             with open_writer(path, *self._size) as writer:
-                while not mine.ended:
-                    for news in mine.take(0.5):
-                        writer.write(news.value)
-                        self._events += len(news.value)
+                self._fill(writer, mine)
         except EvlcpError as fault:
             self._fault = str(fault)
+        except OSError as fault:
+            self._fault = f"{path.parent}: cannot be made: {fault.strerror}"
         finally:
             self._outlet.leave(mine)
+
+    def _fill(self, writer: EventWriter, mine: Subscription) -> None:
+        """Write what comes; what is written stays where no more can be."""
+        held = Triggers.empty()
+        while not mine.ended:
+            for news in mine.take(0.5):
+                if news.kind == "triggers":
+                    held = Triggers.concat([held, news.value])
+                    continue
+                # Those of the same piece stand before it in the queue.
+                try:
+                    writer.write(news.value, held)
+                except StreamError as fault:
+                    # The camera's clock has begun anew.
+                    self._fault = str(fault)
+                    return
+                self._events += len(news.value)
+                held = Triggers.empty()
+            free = shutil.disk_usage(writer.path.parent).free
+            if free < _LEAST_FREE:
+                expected = f"expected {_LEAST_FREE / 1e6:.0f}"
+                self._fault = f"{writer.path}: {free / 1e6:.0f} MB are left on the disk: {expected}"
+                return
+        writer.write(Events.empty(), held)

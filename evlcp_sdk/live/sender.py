@@ -7,6 +7,7 @@ from typing import Final
 
 from evlcp_sdk.errors import OutputError
 from evlcp_sdk.io.evt3 import EVT3
+from evlcp_sdk.io.patience import pieces_until
 from evlcp_sdk.io.raw import RawEncoder, format_header
 from evlcp_sdk.live.outlet import Outlet, Subscription
 from evlcp_sdk.plugin.source import EventSource
@@ -86,7 +87,7 @@ class Sender:
             InputError: The source cannot be read on.
         """
         try:
-            for events, triggers in self._source.stream():
+            for events, triggers in pieces_until(self._source, stopped):
                 self.counts["events"] += len(events)
                 self._outlet.publish("events", 0.0, (events, triggers))
                 if stopped():

@@ -24,7 +24,7 @@ from urllib.parse import urlsplit
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.budget import LEVELS
-from evlcp_sdk.live.desk import stop_listening
+from evlcp_sdk.live.desk import cannot_listen, stop_listening
 from evlcp_sdk.live.loop import LiveStatus
 from evlcp_sdk.live.outlet import News, Outlet, Subscription
 from evlcp_sdk.live.pictures import Picture
@@ -191,9 +191,7 @@ class Viewer:
             )
         except OSError as fault:
             self._outlet.leave(mine)
-            raise ConfigError(
-                f"{self._host}:{self.port}: {fault.strerror or fault}: expected a free port, 0 for any"
-            ) from fault
+            raise cannot_listen(self._host, self.port, fault) from fault
         self.port = next(iter(server.sockets)).getsockname()[1]
 
         async def pump() -> None:

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from evlcp_sdk.signals import ENDING, heard_by, interrupt
+from evlcp_sdk.signals import ENDING, heard_by, interrupt, stop_on_request, waiting
 
 MAIN = "from evlcp_sdk.cli.main import main; main()"
 
@@ -92,3 +93,64 @@ def test_who_heard_before_hears_again() -> None:
         assert signal.getsignal(signal.SIGTERM) is mine
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def test_a_request_ends_a_wait_and_nothing_else() -> None:
+    with stop_on_request() as stopped:
+        also = stopped.or_when(lambda: False)
+        with waiting(also):
+            pass
+        assert (stopped(), also()) == (False, False)
+        signal.raise_signal(signal.SIGTERM)
+        assert (stopped(), also()) == (True, True)
+        # It was asked before: what would be waited for may never come.
+        with pytest.raises(KeyboardInterrupt), waiting(also):
+            pytest.fail("it waits")
+    with stop_on_request() as stopped:
+        with pytest.raises(KeyboardInterrupt), waiting(stopped):
+            signal.raise_signal(signal.SIGTERM)
+        assert stopped()
+    with stop_on_request() as stopped:
+        assert stopped.or_when(lambda: True)()
+        assert not stopped()
+    with waiting(lambda: True):
+        pass
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+@pytest.mark.parametrize("command", ["receive", "live", "convert", "serve"])
+def test_a_stream_whose_sender_never_speaks_is_left_at_once(command: str, tmp_path: Path) -> None:
+    port = free_port()
+    given = {
+        "receive": ("-o", tmp_path / "o"),
+        "convert": ("-o", tmp_path / "o.raw"),
+        "serve": ("--tcp", "0"),
+    }
+    process = start(command, f"udp://127.0.0.1:{port}", *given.get(command, ()))
+    until = time.monotonic() + 60
+    listens = f" {0x0100007F:08X}:{port:04X} "
+    while listens not in Path("/proc/net/udp").read_text() and time.monotonic() < until:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=20)
+    assert (process.returncode, said) == (130, "evlcp: interrupted\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_stream_that_falls_silent_is_left_with_what_came(demo_raw: Path, tmp_path: Path) -> None:
+    pipe, out = tmp_path / "live.raw", tmp_path / "out"
+    os.mkfifo(pipe)
+    process = start("receive", pipe, "-o", out)
+    with pipe.open("wb", buffering=0) as file:
+        file.write(demo_raw.read_bytes())
+        # All is read, and there may be more.
+        time.sleep(3)
+        process.send_signal(signal.SIGTERM)
+        _, said = process.communicate(timeout=20)
+    assert said == f"evlcp: interrupted; what was decoded until then is in {out}\n"
+    assert json.loads((out / "summary.json").read_text())["transmitters"][0]["frames_found"] > 0

@@ -80,7 +80,7 @@ def test_a_replay_gives_what_the_file_gives(
     assert f", {last.counts['frames']} frames" in text
     show(summary, None)
     total = summary["live"]["delays"]["total"]
-    told = f"{total['count']} frames came {total['p50_ms']:.1f} ms (p99 {total['p99_ms']:.1f}, max"
+    told = f"delay of {total['count']} frames, from their last chip: p50 {total['p50_ms']:.1f}, p99"
     assert told in capsys.readouterr().out
 
 
@@ -255,6 +255,13 @@ def test_what_is_wrong_with_a_replay_is_said(url: str, told: str, demo_raw: Path
     with pytest.raises(InputError) as fault:
         open_source(url.format(demo_raw))
     assert told in str(fault.value)
+
+
+def test_what_the_page_is_asked_for_needs_a_page(evlcp: Callable[..., Any], demo_raw: Path) -> None:
+    for given in (["--view-record"], ["--view-apart"], ["--view-port", "8080"], ["--view-host", "0.0.0.0"]):
+        done = evlcp("live", f"replay:{demo_raw}", *given)
+        assert done.code == 2
+        assert f"Invalid value for {given[0]}: needs --view" in done.err
 
 
 def test_a_replay_that_is_open_is_taken_as_it_is(demo_raw: Path) -> None:

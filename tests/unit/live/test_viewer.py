@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,13 +24,14 @@ from evlcp_sdk.io.open import open_source
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.several import named_links
 from evlcp_sdk.live import Budget, Outlet
+from evlcp_sdk.live.recorder import Recorder
 from evlcp_sdk.live.services import Services, Serving
 from evlcp_sdk.live.viewer import page
 from evlcp_sdk.place.navigator import Place, Placed
 from evlcp_sdk.results.picture import png
 from evlcp_sdk.run import live
 from evlcp_sdk.scene.sites import LocalAxes
-from evlcp_sdk.values import Events, Fix
+from evlcp_sdk.values import Events, Fix, Triggers
 from tests.unit.results.test_positions import SITE, packets
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
 from tests.unit.study.test_markup import HOSTILE
@@ -231,7 +233,8 @@ def test_browsers_only_look_on(stage: Stage) -> None:
 
 def test_a_recording_is_what_came(tmp_path: Path) -> None:
     outlet = Outlet()
-    serving = Serving(view=True, record_to=tmp_path)
+    folder = tmp_path / "not" / "made"
+    serving = Serving(view=True, record_to=folder)
     with Services(serving, outlet, LINKS, name="x") as services:
         stage = Stage(outlet, services)
         with stage.connect() as link:
@@ -240,18 +243,47 @@ def test_a_recording_is_what_came(tmp_path: Path) -> None:
             link.send('{"record": true}')
             _until(lambda: outlet.wanted("events"))
             publish(outlet, 2_000)
+            outlet.publish("triggers", 2_500, Triggers.of([2_500, 3_004], [0, 0], [1, 0]))
             publish(outlet, 3_000)
             link.send('{"record": false}')
             _until(lambda: not outlet.wanted("events"))
             publish(outlet, 4_000)
-            _until(lambda: any(tmp_path.glob("live-*.raw")))
+            _until(lambda: any(folder.glob("live-*.raw")))
             stage.frame(0)
             assert next_of(link)[0]["record"]["events"] == 20
-        (path,) = tmp_path.iterdir()
+        (path,) = folder.iterdir()
         outlet.close()
     with open_source(path) as source:
-        events, _ = source.read()
+        events, triggers = source.read()
     assert events.t_us.tolist() == [*range(2_000, 2_010), *range(3_000, 3_010)]
+    assert (triggers.t_us.tolist(), triggers.value.tolist()) == ([2_500, 3_004], [1, 0])
+
+
+def test_where_no_folder_can_be_made_a_recording_says_so(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    recorder = Recorder(Outlet(), tmp_path / "file" / "in", 1280, 720)
+    recorder.start()
+    _until(lambda: not recorder.state["recording"])
+    assert recorder.state["fault"] == f"{tmp_path / 'file' / 'in'}: cannot be made: Not a directory"
+
+
+@pytest.mark.parametrize("why", ["disk", "clock"])
+def test_what_was_recorded_stays_where_a_recording_has_to_end(
+    why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outlet = Outlet()
+    recorder = Recorder(outlet, tmp_path, 1280, 720)
+    recorder.start()
+    publish(outlet, 2_000)
+    _until(lambda: recorder.state["events"] == 10)
+    if why == "disk":
+        monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=7_000_000))
+    publish(outlet, 3_000 if why == "disk" else 1_000)
+    _until(lambda: not recorder.state["recording"])
+    told = {"disk": "7 MB are left on the disk: expected 100", "clock": "event at 1000 us after 2009 us"}
+    assert told[why] in recorder.state["fault"]
+    with open_source(tmp_path / recorder.state["file"]) as source:
+        assert len(source.read()[0]) == (20 if why == "disk" else 10)
 
 
 def publish(outlet: Outlet, t_us: int) -> None:
@@ -274,7 +306,7 @@ def test_a_process_of_its_own_shows_the_same(tmp_path: Path) -> None:
         assert stage.ask("/")[0] == 403
         assert stage.ask("/" + stage.url.split("/", 3)[3])[0] == 200
         with (
-            pytest.raises(ConfigError, match="expected a free port"),
+            pytest.raises(ConfigError, match="a port of it that is free"),
             Services(Serving(view=True, apart=True, port=stage.port), Outlet(), LINKS, name="x"),
         ):
             pass
@@ -310,7 +342,10 @@ def test_a_process_of_its_own_shows_the_same(tmp_path: Path) -> None:
 
 def test_a_port_that_is_taken_is_one_line(stage: Stage) -> None:
     with (
-        pytest.raises(ConfigError, match=rf"127.0.0.1:{stage.port}: .*expected a free port, 0 for any"),
+        pytest.raises(
+            ConfigError,
+            match=rf"127.0.0.1:{stage.port}: .*expected an address of this machine and a port",
+        ),
         Services(Serving(view=True, port=stage.port), Outlet(), LINKS, name="x"),
     ):
         pass
