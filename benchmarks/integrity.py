@@ -372,6 +372,8 @@ def drive(world: World, rng: np.random.Generator, spec: PositionSpec) -> tuple[l
                     noise_m2=found.noise,
                     slow_m2=found.slow,
                     standing=found.standing,
+                    along=found.along,
+                    standing_slope=found.standing_slope,
                     heading_deg=Attitude.of_rotation(found.rotation).heading_deg or 0.0,
                 )
             )

@@ -1,4 +1,4 @@
-"""Loops over grid cells and over the times of events, compiled."""
+"""Loops over grid cells and over the times of events, and Cholesky's root of a few unknowns, compiled."""
 
 from typing import Any
 
@@ -164,3 +164,73 @@ def _median(values: Array, n: int) -> float:
     for i in range(1, middle):
         below = max(below, values[i])
     return float((below + values[middle]) / 2)
+
+
+@njit(cache=True, nogil=True)
+def rooted(matrix: Array, damping: float, least: float, scale: Array, low: Array) -> bool:
+    """Cholesky's root of a symmetric matrix, scaled to a diagonal of 1 + `damping`; False if there is none.
+
+    `low` (n, n) is the root, below and on its diagonal, of the matrix scaled by `scale` (n,) on both sides.
+    There is none where less than `least` of a diagonal of 1 is left: that much is rounding.
+    """
+    n = len(scale)
+    for i in range(n):
+        if not matrix[i, i] > 0:
+            return False
+        scale[i] = 1 / np.sqrt(matrix[i, i])
+    for i in range(n):
+        for j in range(i + 1):
+            value = matrix[i, j] * scale[i] * scale[j]
+            if i == j:
+                value = 1 + damping
+            for k in range(j):
+                value -= low[i, k] * low[j, k]
+            if i == j:
+                if not value > least:
+                    return False
+                low[i, i] = np.sqrt(value)
+            else:
+                low[i, j] = value / low[j, j]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def substituted(low: Array, scale: Array, side: Array, out: Array) -> None:
+    """Solve the equations whose root is `low`, as `rooted` gives it, for a right-hand side: `out` (n,)."""
+    n = len(side)
+    for i in range(n):
+        value = side[i] * scale[i]
+        for k in range(i):
+            value -= low[i, k] * out[k]
+        out[i] = value / low[i, i]
+    for i in range(n - 1, -1, -1):
+        value = out[i]
+        for k in range(i + 1, n):
+            value -= low[k, i] * out[k]
+        out[i] = value / low[i, i]
+    for i in range(n):
+        out[i] *= scale[i]
+
+
+@njit(cache=True, nogil=True)
+def inverted(matrix: Array, least: float, out: Array) -> bool:
+    """The inverse of a positive matrix; False where it is singular, see `rooted`."""
+    n = len(matrix)
+    scale, low = np.zeros(n), np.zeros((n, n))
+    if not rooted(matrix, 0.0, least, scale, low):
+        return False
+    # The root's inverse in place, then its product with itself.
+    for j in range(n):
+        low[j, j] = 1 / low[j, j]
+        for i in range(j + 1, n):
+            value = 0.0
+            for k in range(j, i):
+                value -= low[i, k] * low[k, j]
+            low[i, j] = value / low[i, i]
+    for i in range(n):
+        for j in range(i + 1):
+            value = 0.0
+            for k in range(i, n):
+                value += low[k, i] * low[k, j]
+            out[i, j] = out[j, i] = value * scale[i] * scale[j]
+    return True

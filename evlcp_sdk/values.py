@@ -599,6 +599,10 @@ class Fix:
             no attitude is given.
         alternatives: Of a fix refused as `two-solutions`, the poses that fit, the likeliest first.
         suspects: Of a fix refused as `misfit`, the parts of which one, if it were left out, would explain it.
+        along: The direction in which the position is the least certain, a unit vector, float64 (3,); 0 where
+            that is not known.
+        standing_slope: How `standing`, but for `doubt`, changes with the position along it, a metre, float64
+            (3, k).
     """
 
     t_us: float
@@ -628,6 +632,8 @@ class Fix:
     attitude_sigma_deg: float = math.nan
     alternatives: tuple[Alternative, ...] = ()
     suspects: tuple[str, ...] = ()
+    along: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    standing_slope: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     @property
     def alarms(self) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk._kernels import inverted, rooted, substituted
 from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
@@ -20,6 +21,9 @@ Array = NDArray[Any]
 POSE, FAULT, LENS, GLOBAL, LOCAL = 6, 6, 7, 14, 9
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
+
+_ROUNDING = 1e-14
+"""Share of a diagonal that rounding may leave of nothing."""
 
 _HALVINGS = 12
 """Steps of a golden section: from 10 degrees to a 30th of one."""
@@ -308,79 +312,13 @@ def summed(
 
 
 @njit(cache=True, nogil=True)
-def _factored(whole: Array, damping: float, scale: Array, low: Array) -> bool:
-    """Cholesky of the damped equations, scaled to a unit diagonal; False where they are singular."""
-    n = len(scale)
-    for i in range(n):
-        if not whole[i, i] > 0:
-            return False
-        scale[i] = 1 / math.sqrt(whole[i, i])
-    for i in range(n):
-        for j in range(i + 1):
-            value = whole[i, j] * scale[i] * scale[j]
-            if i == j:
-                value = 1 + damping
-            for k in range(j):
-                value -= low[i, k] * low[j, k]
-            if i == j:
-                # What rounding leaves of a diagonal of 1 is nothing.
-                if not value > 1e-14:
-                    return False
-                low[i, i] = math.sqrt(value)
-            else:
-                low[i, j] = value / low[j, j]
-    return True
-
-
-@njit(cache=True, nogil=True)
-def _substituted(low: Array, scale: Array, side: Array, move: Array) -> None:
-    n = len(side)
-    for i in range(n):
-        value = side[i] * scale[i]
-        for k in range(i):
-            value -= low[i, k] * move[k]
-        move[i] = value / low[i, i]
-    for i in range(n - 1, -1, -1):
-        value = move[i]
-        for k in range(i + 1, n):
-            value -= low[k, i] * move[k]
-        move[i] = value / low[i, i]
-    for i in range(n):
-        move[i] *= scale[i]
-
-
-@njit(cache=True, nogil=True)
 def solved(whole: Array, side: Array, damping: float, move: Array) -> bool:
-    """Solve the damped equations by Cholesky, scaled to a unit diagonal; False where they are singular."""
+    """Solve the damped equations; False where they are singular."""
     n = len(side)
     scale, low = np.zeros(n), np.zeros((n, n))
-    if not _factored(whole, damping, scale, low):
+    if not rooted(whole, damping, _ROUNDING, scale, low):
         return False
-    _substituted(low, scale, side, move)
-    return True
-
-
-@njit(cache=True, nogil=True)
-def inverted(whole: Array, out: Array) -> bool:
-    """The inverse of a positive matrix; False where it is singular."""
-    n = len(whole)
-    scale, low = np.zeros(n), np.zeros((n, n))
-    if not _factored(whole, 0.0, scale, low):
-        return False
-    # The root's inverse in place, then its product with itself.
-    for j in range(n):
-        low[j, j] = 1 / low[j, j]
-        for i in range(j + 1, n):
-            value = 0.0
-            for k in range(j, i):
-                value -= low[i, k] * low[k, j]
-            low[i, j] = value / low[i, i]
-    for i in range(n):
-        for j in range(i + 1):
-            value = 0.0
-            for k in range(i, n):
-                value += low[k, i] * low[k, j]
-            out[i, j] = out[j, i] = value * scale[i] * scale[j]
+    substituted(low, scale, side, move)
     return True
 
 
@@ -539,8 +477,8 @@ def fitted(
             ratio = won / hoped if hoped > 0 else 1.0
             damping = min(max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), 1e-12), 1e12)
             growth = 4.0
-            # What misses so far is refused, wherever exactly it ends.
-            near = 1e-3 if found > 20 * len(points) else 1e-7
+            # What misses so far is refused, wherever exactly it ends; what is not robust is a start only.
+            near = 1e-3 if found > 20 * len(points) else 1e-4 if math.isinf(huber) else 1e-6
             if won <= max(near, 1e-6) * (1 + found) and abs(promise) < near * (100 + found):
                 return True, best, position, rotation, local, error
         else:
@@ -650,7 +588,7 @@ def tested(
                     for p in range(m):
                         known[i, j] += turned[k, i] * bound[k, p] * turned[p, j]
             known[i, i] += share[i]
-        if not inverted(known, inverse):
+        if not inverted(known, _ROUNDING, inverse):
             return 0.0, 0, added + math.inf, unseen + math.inf
         for i in range(3):
             for k in range(rank):
@@ -696,7 +634,7 @@ def _redundant(
     m, rank = len(side), len(left)
     added, unseen = np.zeros((3, 3)), np.zeros((3, 3))
     inverse, along = np.zeros((rank, rank)), np.zeros(rank)
-    inverted(left, inverse)
+    inverted(left, _ROUNDING, inverse)
     value = 0.0
     for i in range(rank):
         for k in range(m):
@@ -715,7 +653,7 @@ def _redundant(
             for i in range(rank):
                 for j in range(rank):
                     known[i, j] += basis[k, i] * half[k, j]
-        if not inverted(known, inverse):
+        if not inverted(known, _ROUNDING, inverse):
             return 0.0, 0, added + math.inf, unseen + math.inf
     moves, spare = np.zeros((3, rank)), np.zeros((3, rank))
     for i in range(3):
@@ -760,7 +698,8 @@ def weighed(
         vertical protection level, m: for each fault, how far the solution may have moved with the test just
         passed, and how far one that does without the part may be off at the risk; what doubt adds (6, 6); the
         covariance's causes: noise and slow, (3, 3), moves by the camera (3, 7), by the attitude (3, 4), by
-        what is each bar's (bars, 3, 7).
+        what is each bar's (bars, 3, 7); the least certain direction, (3,), and how these moves change with
+        the position along it, a metre, in the same shapes: the mean slope within two sigmas.
     """
     bars = len(bar_sigma)
     info, right, bar_cost = np.zeros((bars, GLOBAL, GLOBAL)), np.zeros((bars, GLOBAL)), np.zeros(bars)
@@ -775,23 +714,22 @@ def weighed(
         parts += 2 if known == 3 else 1
     values, freedom = np.zeros(parts), np.zeros(parts, np.int64)
     by_camera, by_attitude, by_bar = np.zeros((3, 7)), np.zeros((3, 4)), np.zeros((bars, 3, 7))
-    noise, slow, doubt = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((6, 6))
+    slopes = np.zeros((3, 7)), np.zeros((3, 4)), np.zeros((bars, 3, 7))
+    noise, slow, doubt, along = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((6, 6)), np.zeros(3)
     wide, bent, levels = 0.0, math.inf, (math.inf, math.inf)
     given = (points, bar, bar_sigma, lens, lens_root, fault, felt, heading, known, white, huber)
     point = (position, rotation, local, error)
     normal(*given, *point, info, right, gain, step, bar_cost, rows, miss, pixel)
     summed(info, right, rows, miss, error, free, whole, side)
     size, axes = np.zeros(3), np.zeros((3, 3))
-    regular = inverted(whole, spread)
-    for i in range(n):
-        if not free[i]:
-            spread[i, :] = 0
-            spread[:, i] = 0
+    regular = inverted(whole, _ROUNDING, spread)
+    _hold(free, spread)
     if regular:
         eigen(spread[:3, :3].copy(), size, axes)
         wide = math.sqrt(max(size.max(), 0.0))
     if regular and wide <= most_sigma:
-        bent = _bent(given, point, gain, step, cost, spread, size, axes)
+        along[:] = axes[:, np.argmax(size)]
+        bent = _bent(given, point, free, said, gain, step, cost, spread, size, axes, *slopes)
         bounds = np.zeros((bars, 6, 6))
         if bar_fault > 0:
             _bar_bounds(points, bar, position, bar_fault, bar_turn, bounds)
@@ -799,7 +737,8 @@ def weighed(
             info, right, rows, miss, white, known, free, turns, spread,
             attitude_fault, focal_bound, bounds, limits, least, flat, high, values, freedom,
         )  # fmt: skip
-        _causes(spread, rows, known, said, gain, pixel, by_camera, by_attitude, by_bar, noise, slow)
+        _moves(spread, rows, known, said, gain, 1.0, by_camera, by_attitude, by_bar)
+        _rest(spread, pixel, by_camera, by_attitude, by_bar, noise, slow)
         if turns:
             doubted(spread, rows[:known, :n].copy(), miss[:known].copy(), rarely, larger, doubt)
             whole_of = spread[0, 0] + spread[1, 1] + spread[2, 2]
@@ -807,18 +746,22 @@ def weighed(
                 doubt[:] = 0
     return (
         regular, wide, bent, spread, values, freedom, levels[0], levels[1],
-        doubt, noise, slow, by_camera, by_attitude, by_bar,
+        doubt, noise, slow, by_camera, by_attitude, by_bar, along, slopes[0], slopes[1], slopes[2],
     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
 def _bent(
-    given: tuple[Any, ...], point: tuple[Any, ...], gain: Array, step: Array, cost: float,
-    spread: Array, size: Array, axes: Array,
+    given: tuple[Any, ...], point: tuple[Any, ...], free: Array, said: Array, gain: Array, step: Array,
+    cost: float, spread: Array, size: Array, axes: Array, by_camera: Array, by_attitude: Array, by_bar: Array,
 ) -> float:  # fmt: skip
-    """How far the cost is from its parabola, and the way from its axis, two sigmas away: see `weighed`."""
-    points, position = given[0], point[0]
-    bars = len(gain)
+    """How far the cost is from its parabola, and the way from its axis, two sigmas away: see `weighed`.
+
+    To `by_camera`, `by_attitude` and `by_bar` it adds how the moves by errors that stay change on that way.
+    """
+    points, position, known = given[0], point[0], given[8]
+    bars, n = len(gain), len(spread)
+    whole, side, spread_there = np.zeros((n, n)), np.zeros(n), np.zeros((n, n))
     most = int(np.argmax(size))
     wide = math.sqrt(size[most])
     info, right, bar_cost = np.zeros((bars, GLOBAL, GLOBAL)), np.zeros((bars, GLOBAL)), np.zeros(bars)
@@ -851,7 +794,23 @@ def _bent(
                 along += axes[j, i] * (there[0][j] - position[j] - move[j])
             square += along**2 / max(size[i], 1e-15 * size[most])
         bent = max(bent, growth, 1 / growth, 1 + square)
+        if math.isnan(found):
+            continue
+        summed(info, right, rows, miss, there[3], free, whole, side)
+        if inverted(whole, _ROUNDING, spread_there):
+            _hold(free, spread_there)
+            share = math.copysign(1 / (4 * wide), way)
+            _moves(spread_there, rows, known, said, gain_there, share, by_camera, by_attitude, by_bar)
     return bent
+
+
+@njit(cache=True, nogil=True)
+def _hold(free: Array, spread: Array) -> None:
+    """Nothing moves the unknowns that are not free."""
+    for i in range(len(spread)):
+        if not free[i]:
+            spread[i, :] = 0
+            spread[:, i] = 0
 
 
 @njit(cache=True, nogil=True)
@@ -916,25 +875,36 @@ def _widened(
 
 
 @njit(cache=True, nogil=True)
-def _causes(
-    spread: Array, rows: Array, known: int, said: Array, gain: Array, pixel: Array,
-    by_camera: Array, by_attitude: Array, by_bar: Array, noise: Array, slow: Array,
+def _moves(
+    spread: Array, rows: Array, known: int, said: Array, gain: Array, share: float,
+    by_camera: Array, by_attitude: Array, by_bar: Array,
 ) -> None:  # fmt: skip
-    """What the position's covariance is made of: see `weighed`."""
+    """Add `share` of the position's moves by the errors that stay: see `weighed`."""
     bars, n = len(gain), len(spread)
     for i in range(3):
         for j in range(LENS, n):
-            by_camera[i, j - LENS] = -spread[i, j]
+            by_camera[i, j - LENS] -= share * spread[i, j]
         for a in range(known):
             value = 0.0
             for j in range(n):
                 value += spread[i, j] * rows[a, j]
             for j in range(4):
-                by_attitude[i, j] += value * said[a, j]
+                by_attitude[i, j] += share * value * said[a, j]
         for b in range(bars):
             for k in range(7):
+                value = 0.0
                 for j in range(n):
-                    by_bar[b, i, k] += spread[i, j] * gain[b, k + 2, j]
+                    value += spread[i, j] * gain[b, k + 2, j]
+                by_bar[b, i, k] += share * value
+
+
+@njit(cache=True, nogil=True)
+def _rest(
+    spread: Array, pixel: Array, by_camera: Array, by_attitude: Array, by_bar: Array,
+    noise: Array, slow: Array,
+) -> None:  # fmt: skip
+    """What the position's covariance is made of beside the errors that stay: see `weighed`."""
+    bars, n = len(pixel), len(spread)
     by_pixel = np.zeros((3, n))
     for b in range(bars):
         by_pixel[:] = 0
@@ -998,7 +968,7 @@ def doubted(spread: Array, rows: Array, miss: Array, rarely: float, larger: floa
         for b in range(k):
             whole[a, b] = more * redundant[a, b] + (1.0 if a == b else 0.0)
     inverse, axes, values = np.zeros((k, k)), np.zeros((k, k)), np.zeros(k)
-    if not inverted(whole, inverse):
+    if not inverted(whole, _ROUNDING, inverse):
         return
     eigen(whole, values, axes)
     evidence = math.log(rarely / (1 - rarely))
@@ -1070,7 +1040,7 @@ def _attitude_bound(white: Array, known: int, fault: float) -> Array:
         for j in range(known):
             for k in range(known):
                 covariance[i, j] += fault**2 * white[i, k] * white[j, k]
-    inverted(covariance, out)
+    inverted(covariance, _ROUNDING, out)
     return out
 
 

@@ -6,7 +6,7 @@ length - a test of whether the rest contradicts it, and how far the position may
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -73,6 +73,9 @@ class Pose:
         vpl_m: The vertical one, m.
         excluded: What was left out as the rest contradicts it: `bar N`, `heading`, `attitude`, `focal
             length`.
+        along: The direction in which the position is the least certain, a unit vector, float64 (3,).
+        standing_slope: How the moves of `standing`, but for `doubt`, change with the position along it, a
+            metre, float64 (3, k).
     """
 
     enu_m: Floats
@@ -87,6 +90,8 @@ class Pose:
     hpl_m: float
     vpl_m: float
     excluded: tuple[str, ...] = ()
+    along: Floats = field(default_factory=lambda: np.zeros(3))
+    standing_slope: Mapping[str, Floats] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +137,8 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
         _LARGER,
         _LITTLE,
     )
-    regular, wide, bent, spread, values, freed, hpl, vpl, doubted, noise, slow, *moves = found
+    regular, wide, bent, spread, values, freed, hpl, vpl, doubted, noise, slow, *rest = found
+    moves, along, slopes = rest[:3], rest[3], rest[4:]
     if not regular:
         return Refusal("not-determined", "the equations are singular")
     if len(problem.transmitters) == 1:
@@ -167,12 +173,14 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
         spread[:6, :6] + doubted,
         noise,
         slow,
-        _standing(problem, doubted[:3, :3], *moves),
+        {**_doubt(doubted[:3, :3]), **_standing(problem, *moves)},
         fit.cost / freedom,
         freedom,
         problem.transmitters,
         _level(hpl, spec),
         _level(vpl, spec),
+        along=along,
+        standing_slope=_standing(problem, *slopes),
     )
     return Judged(pose, doubt, tests)
 
@@ -209,15 +217,18 @@ def _limits(chance: float) -> Floats:
     return np.array([0.0, *(chi_square(chance, freedom) for freedom in range(1, 7))])
 
 
-def _standing(
-    problem: Problem, doubted: Floats, camera: Floats, attitude: Floats, bars: Floats
-) -> dict[str, Floats]:
-    """The position's moves by what stays, by name."""
+def _doubt(doubted: Floats) -> dict[str, Floats]:
+    """The position's moves by the doubt, by its name; none where there is none."""
+    if not doubted.any():
+        return {}
+    values, axes = np.linalg.eigh(doubted)
+    # The symmetric root changes little from fix to fix.
+    return {"doubt": (axes * np.sqrt(np.maximum(values, 0))) @ axes.T}
+
+
+def _standing(problem: Problem, camera: Floats, attitude: Floats, bars: Floats) -> dict[str, Floats]:
+    """The position's moves by what stays, by name; or how they change."""
     standing = {}
-    if doubted.any():
-        values, axes = np.linalg.eigh(doubted)
-        # The symmetric root changes little from fix to fix.
-        standing["doubt"] = (axes * np.sqrt(np.maximum(values, 0))) @ axes.T
     if problem.free[7]:
         standing["camera"] = camera
     if problem.attitude is not None and problem.free[3:6].any():

@@ -254,6 +254,8 @@ class Positioner:
             vpl_m=pose.vpl_m,
             excluded=pose.excluded,
             attitude_sigma_deg=math.degrees(math.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])),
+            along=turn @ pose.along,
+            standing_slope={name: turn @ slope for name, slope in pose.standing_slope.items()},
         )
 
 

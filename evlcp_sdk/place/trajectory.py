@@ -55,6 +55,22 @@ _FIXED = 9
 _KEPT_US = 10e6
 """Time out of sight after which a bar's errors are no state any more: most bars never come back."""
 
+_COURSE_S = 0.3
+"""Memory of the course of fixes: acceleration of 3 m/s2 takes it a quarter of a metre off."""
+
+_FORESEEN = 3
+"""Fixes from which on the course foresees the next one; before, it is the line through them and that one."""
+
+_AGAIN = (4, 8, 16)
+"""Fixes after which those since a course began are taken again, each where the course has it by then."""
+
+_MOST_NOISE = 3.0
+"""Sigmas of its noise that a fix may be off its course; what is more is not noise."""
+
+_SWAYED = 1e-3
+"""Share of a fix's noise, as variance, by which what one sigma of each error that stays does to it may change
+with the noise: so much information each fix adds where there is none; a bar is seen for some hundred."""
+
 _TURN_US = 1e6
 """Longest time between fixes over which the way turns as the camera did."""
 
@@ -75,6 +91,23 @@ class Cause:
 
 
 @dataclass(frozen=True, eq=False)
+class Course:
+    """Where fixes of some bars go on to, errors that stay included: a line through the last of them.
+
+    Attributes:
+        place_m: East, north, up at the last of them, m, float64 (3,).
+        speed_m_s: The same of the speed, m/s, float64 (3,).
+        count: How many there were.
+        transmitters: Of which bars.
+    """
+
+    place_m: Floats
+    speed_m_s: Floats
+    count: int
+    transmitters: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class TrajectoryPoint:
     """Position and velocity at one time, filtered or smoothed, with what stays wrong; the filter's state,
     too.
@@ -91,6 +124,9 @@ class TrajectoryPoint:
         swing: How the camera turned from the point before to this one.
         misses: Fixes in a row that were left out, this one included; 0 where it counts.
         starts: A trajectory starts here.
+        fix: What was taken, or left out.
+        course: How the fixes of the same bars go on, with little of their noise.
+        recent: The points from the one before that course on, as long as it is short.
     """
 
     t_us: float
@@ -103,6 +139,9 @@ class TrajectoryPoint:
     swing: Swing | None = None
     misses: int = 0
     starts: bool = False
+    fix: Fix | None = None
+    course: Course | None = None
+    recent: tuple["TrajectoryPoint", ...] = ()
 
     @property
     def covariance_m2(self) -> Floats:
@@ -145,22 +184,41 @@ def trajectory_step(
     """
     if state is None:
         return _first(fix)
-    swing = _swing(state, fix, imu)
-    ahead = _joined(_ahead(state, fix.t_us, swing, spec), fix)
-    seen = _seen(ahead.causes, fix)
-    known = ahead.covariance @ seen.T
-    spread = seen @ known + fix.noise_m2
+    ahead = _joined(_ahead(state, fix.t_us, _swing(state, fix, imu), spec), fix)
+    ahead, seen = _expected(ahead, fix)
     innovation = fix.enu_m - seen @ ahead.mean
+    spread = seen @ ahead.covariance @ seen.T + fix.noise_m2
     limit = chi_square(spec.false_alarm, 3) if fix.source == GNSS else spec.gate_sigmas**2
     if innovation @ np.linalg.solve(spread, innovation) > limit:
         if state.misses + 1 > _MOST_MISSES:
             return _first(fix)
-        return replace(_faced(ahead, fix), misses=state.misses + 1)
+        return _caught_up(state, replace(_faced(ahead, fix), misses=state.misses + 1), spec)
+    return _caught_up(state, _taken(ahead, fix, seen), spec)
+
+
+def _caught_up(state: TrajectoryPoint, point: TrajectoryPoint, spec: PositionSpec) -> TrajectoryPoint:
+    """A point after a state; when a course is young, and known better, its fixes are taken again."""
+    course = point.course
+    if course is None or course.count > _AGAIN[-1] or point.fix is None:
+        return point
+    before = replace(state, recent=())
+    recent = (*state.recent, before) if course.count > 1 else (before,)
+    if course is not state.course and course.count in _AGAIN and _swayed(point.fix):
+        points = [*recent, point]
+        *recent_again, point = _again(points, _smoothed(points, spec), spec)
+        recent = tuple(recent_again)
+    return replace(point, recent=recent if course.count < _AGAIN[-1] else ())
+
+
+def _taken(ahead: TrajectoryPoint, fix: Fix, seen: Floats) -> TrajectoryPoint:
+    """A point with a fix taken that depends on the states so, float64 (3, n)."""
+    known = ahead.covariance @ seen.T
+    spread = seen @ known + fix.noise_m2
     gain = np.linalg.solve(spread, known.T).T
     # Joseph's form keeps the covariance positive.
     change = gain @ known.T
     after = ahead.covariance - change - change.T + gain @ spread @ gain.T
-    mean = ahead.mean + gain @ innovation
+    mean = ahead.mean + gain @ (fix.enu_m - seen @ ahead.mean)
     after = (after + after.T) / 2
     return replace(_faced(ahead, fix), mean=mean, covariance=after, misses=0)
 
@@ -177,7 +235,44 @@ def filter_fixes(
 
 
 def smooth_trajectory(points: Sequence[TrajectoryPoint], spec: PositionSpec) -> list[TrajectoryPoint]:
-    """Smooth filtered points with those after them (Rauch, Tung, Striebel 1965), each trajectory alone."""
+    """Smooth filtered points with those after them (Rauch, Tung, Striebel 1965), each trajectory alone.
+
+    Where noise of the fixes changes how errors that stay move them, they are filtered and smoothed once more,
+    each as it is where the smoothed track has it: the iterated smoother (Bell, SIAM J. Optim. 4 (1994), 626).
+    """
+    smoothed = _smoothed(points, spec)
+    if not any(point.fix is not None and _swayed(point.fix) for point in points):
+        return smoothed
+    return _smoothed(_again(points, smoothed, spec), spec)
+
+
+def _again(
+    points: Sequence[TrajectoryPoint], smoothed: Sequence[TrajectoryPoint], spec: PositionSpec
+) -> list[TrajectoryPoint]:
+    """Filter points again, each fix as it is where the smoothed track has it; the first one, where no
+    trajectory starts, stays.
+    """
+    again = list(points)
+    for i, (point, there) in enumerate(zip(points, smoothed, strict=True)):
+        if point.fix is None:
+            continue
+        if point.starts:
+            seen = _seen(point.causes, point.fix)
+            again[i] = replace(
+                _first(_moved(point.fix, point.fix.enu_m - seen @ _still(there))), fix=point.fix
+            )
+        elif i:
+            assert point.swing is not None
+            ahead = _joined(_ahead(again[i - 1], point.t_us, point.swing, spec), point.fix)
+            seen = _seen(ahead.causes, point.fix)
+            seen = _seen(ahead.causes, _moved(point.fix, point.fix.enu_m - seen @ _still(there)))
+            taken = _faced(ahead, point.fix) if point.misses else _taken(ahead, point.fix, seen)
+            again[i] = replace(taken, misses=point.misses, course=point.course)
+    return again
+
+
+def _smoothed(points: Sequence[TrajectoryPoint], spec: PositionSpec) -> list[TrajectoryPoint]:
+    """One pass of the smoother."""
     smoothed = list(points)
     for i in range(len(points) - 2, -1, -1):
         if points[i + 1].starts:
@@ -226,7 +321,8 @@ def _first(fix: Fix) -> TrajectoryPoint:
     covariance[:3, _MOTION:] = -moves
     covariance[_MOTION:, :3] = -moves.T
     mean = np.concatenate([fix.enu_m, np.zeros(size - 3)])
-    return _faced(TrajectoryPoint(fix.t_us, mean, covariance, causes, starts=True), fix)
+    first = TrajectoryPoint(fix.t_us, mean, covariance, causes, starts=True, course=_course(fix))
+    return _faced(first, fix)
 
 
 def _seen(causes: Sequence[Cause], fix: Fix) -> Floats:
@@ -240,6 +336,64 @@ def _seen(causes: Sequence[Cause], fix: Fix) -> Floats:
         if cause.name in fix.standing:
             seen[:, at] = fix.standing[cause.name]
     return seen
+
+
+def _expected(ahead: TrajectoryPoint, fix: Fix) -> tuple[TrajectoryPoint, Floats]:
+    """How a fix depends on the states where the course of fixes has it, float64 (3, n), and that course.
+
+    Not where it is: how errors that stay move it follows its noise there, and noise would seem to show them.
+    Two or three bars of which each is surveyed to 5 cm so make a track twice too sure.
+    """
+    last = ahead.course
+    if not fix.standing_slope:
+        return ahead, _seen(ahead.causes, fix)
+    if last is None or last.transmitters != fix.transmitters or ahead.swing is None:
+        return replace(ahead, course=_course(fix)), _seen(ahead.causes, fix)
+    dt = float(ahead.swing.t_s[-1])
+    turn = complex(*last.speed_m_s[:2]) * np.exp(-1j * float(ahead.swing.turn_rad[-1]))
+    speed = np.array([turn.real, turn.imag, last.speed_m_s[2]])
+    place = last.place_m + speed * dt
+    away, count, fade = fix.enu_m - place, last.count, math.exp(-dt / _COURSE_S)
+    # Of the line through all of so many fixes, until older ones count less: Brookner, Tracking, 1998, 1.2.10.
+    by_place = max(2 * (2 * count + 1) / ((count + 1) * (count + 2)), 1 - fade**2)
+    by_speed = max(6 / ((count + 1) * (count + 2)), (1 - fade) ** 2)
+    course = Course(
+        place + by_place * away, speed + by_speed * away / max(dt, 1e-6), count + 1, fix.transmitters
+    )
+    if count < _FORESEEN:
+        away = fix.enu_m - course.place_m
+    sigmas = math.sqrt(float(away @ np.linalg.solve(fix.noise_m2 + fix.slow_m2, away)))
+    away = away * min(1.0, _MOST_NOISE / max(sigmas, 1e-9))
+    return replace(ahead, course=course), _seen(ahead.causes, _moved(fix, away))
+
+
+def _course(fix: Fix) -> Course:
+    """A course that begins."""
+    return Course(fix.enu_m, np.zeros(3), 1, fix.transmitters)
+
+
+def _moved(fix: Fix, away_m: Floats) -> Fix:
+    """A fix with what errors that stay do to it where its noise is less by so much, float64 (3,)."""
+    along_m, slopes = float(fix.along @ away_m), fix.standing_slope
+    moves = {
+        name: moves - along_m * slopes[name] if name in slopes else moves
+        for name, moves in fix.standing.items()
+    }
+    return replace(fix, standing=moves)
+
+
+def _still(point: TrajectoryPoint) -> Floats:
+    """A point's states without what changes slowly, which is noise, float64 (n,)."""
+    states = point.mean.copy()
+    states[_SLOW] = 0
+    return states
+
+
+def _swayed(fix: Fix) -> bool:
+    """Whether its noise changes what errors that stay do to it by as much as matters in a hundred fixes."""
+    noise = fix.noise_m2 + fix.slow_m2
+    change = float(fix.along @ noise @ fix.along) * sum([(s * s).sum() for s in fix.standing_slope.values()])
+    return bool(change > _SWAYED * np.trace(noise))
 
 
 def _joined(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
@@ -273,11 +427,13 @@ def _ahead(point: TrajectoryPoint, t_us: float, swing: Swing, spec: PositionSpec
 
 
 def _faced(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
-    """A point with the heading of a fix that has one."""
+    """A point at a fix, with its heading if it has one."""
     if not math.isfinite(fix.heading_deg):
-        return point
+        return replace(point, fix=fix)
     sigma_deg = fix.heading_sigma_deg if math.isfinite(fix.heading_sigma_deg) else 0.0
-    return replace(point, heading_deg=fix.heading_deg, heading_t_us=fix.t_us, heading_sigma_deg=sigma_deg)
+    return replace(
+        point, heading_deg=fix.heading_deg, heading_t_us=fix.t_us, heading_sigma_deg=sigma_deg, fix=fix
+    )
 
 
 def _motion(

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk._kernels import _median
+from evlcp_sdk._kernels import _median, inverted
 from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
@@ -391,6 +391,9 @@ def add_polarity(
                 # Arithmetic, not a branch: polarity is as good as random.
                 sums[c, v, u] += np.int16(2 * np.int16(p[i]) - 1)
 
+
+_ROUNDING = 1e-13
+"""Share of a diagonal that rounding may leave of nothing."""
 
 _MANY = 512
 """Events whose chips are found together: they stay in the fastest cache."""
@@ -1222,41 +1225,6 @@ def believe(
 
 
 @njit(cache=True, nogil=True)
-def _inverse(matrix: Array, out: Array) -> bool:
-    """Inverse of a symmetric positive definite matrix by Cholesky; False where it is none."""
-    n = len(matrix)
-    factor = np.zeros((n, n))
-    for a in range(n):
-        for c in range(a + 1):
-            total = matrix[a, c]
-            for k in range(c):
-                total -= factor[a, k] * factor[c, k]
-            if a == c:
-                # What rounding leaves of nothing.
-                if not total > 1e-13 * matrix[a, a]:
-                    return False
-                factor[a, a] = np.sqrt(total)
-            else:
-                factor[a, c] = total / factor[c, c]
-    # The factor's own inverse, below its diagonal; its square is the inverse.
-    lower = np.zeros((n, n))
-    for c in range(n):
-        lower[c, c] = 1 / factor[c, c]
-        for a in range(c + 1, n):
-            total = 0.0
-            for k in range(c, a):
-                total -= factor[a, k] * lower[k, c]
-            lower[a, c] = total / factor[a, a]
-    for a in range(n):
-        for c in range(n):
-            total = 0.0
-            for k in range(max(a, c), n):
-                total += lower[k, a] * lower[k, c]
-            out[a, c] = total
-    return True
-
-
-@njit(cache=True, nogil=True)
 def newest_on_parabola(
     past: Array, speed_weight: float, bend_weight: float, worth: float, outlier: float
 ) -> tuple[float, float, float]:
@@ -1288,7 +1256,7 @@ def newest_on_parabola(
                 likely[a, b] = normal[a, b]
         likely[1, 1] += speed_weight
         likely[2, 2] += bend_weight
-        _inverse(likely, inverse)
+        inverted(likely, _ROUNDING, inverse)
         free, counted = float(n), 0.0
         for a in range(3):
             path[a] = 0.0
@@ -1324,7 +1292,7 @@ def bend_of(place: Array, sums: Array, least: float) -> tuple[float, float]:
                 for b in range(3):
                     normal[a, b] += sums[1, i] * terms[a] * terms[b]
     # The variance of a normal variable over an estimated sigma is finite from three degrees of freedom on.
-    if n - 3 < 3 or not _inverse(normal, inverse):
+    if n - 3 < 3 or not inverted(normal, _ROUNDING, inverse):
         return np.nan, np.nan
     path = np.zeros(3)
     for a in range(3):

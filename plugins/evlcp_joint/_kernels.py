@@ -1,12 +1,12 @@
 """Where a bar's clusters lie, the values of its rows, and the fit of its boundaries: compiled."""
 
-from math import exp, sqrt
+from math import exp
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk._kernels import _median
+from evlcp_sdk._kernels import _median, rooted, substituted
 from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
@@ -376,6 +376,9 @@ def read_bar(
 _FITTED = 7
 """What is fitted: spacing, centre, drift, gain, width, and the two shifts of `shifts_of`."""
 
+_ROUNDING = 1e-8
+"""Share of a diagonal that rounding may leave of nothing."""
+
 _SHIFTING = (0, 1, 2, 5, 6)
 """Which of these shift a boundary."""
 
@@ -705,37 +708,6 @@ def leftovers(
 
 
 @njit(cache=True, nogil=True)
-def _damped_step(normal: Array, right: Array, damping: float, factor: Array, move: Array) -> bool:
-    """Solve (normal + damping * diagonal) move = right by Cholesky; False where that is not positive."""
-    n = right.size
-    for a in range(n):
-        for c in range(a + 1):
-            total = normal[a, c]
-            if a == c:
-                total *= 1 + damping
-            for k in range(c):
-                total -= factor[a, k] * factor[c, k]
-            if a == c:
-                # A hundred-millionth of the diagonal is what rounding leaves of it.
-                if not total > 1e-8 * normal[a, a]:
-                    return False
-                factor[a, a] = sqrt(total)
-            else:
-                factor[a, c] = total / factor[c, c]
-    for a in range(n):
-        total = right[a]
-        for k in range(a):
-            total -= factor[a, k] * move[k]
-        move[a] = total / factor[a, a]
-    for a in range(n - 1, -1, -1):
-        total = move[a]
-        for k in range(a + 1, n):
-            total -= factor[k, a] * move[k]
-        move[a] = total / factor[a, a]
-    return True
-
-
-@njit(cache=True, nogil=True)
 def solve(
     codes: Array,
     known: Array,
@@ -767,11 +739,13 @@ def solve(
     all_steps, seen = _steps_of(codes, first, last, offset, when, seen_values)
     work = np.empty(_COLUMNS * _MANY)
     cost = _equations(all_steps, seen, profile, blur, dim, huber, prior, fit, normal, right, work)
+    scale = np.empty(_FITTED)
     damping = 1e-3
     outside = False
     for _ in range(steps):
-        if not _damped_step(normal, right, damping, factor, move):
+        if not rooted(normal, damping, _ROUNDING, scale, factor):
             return False
+        substituted(factor, scale, right, move)
         for a in range(_FITTED):
             new_fit[a] = fit[a] + move[a]
             if not np.isfinite(new_fit[a]):
@@ -931,10 +905,12 @@ def fit_bar(
         return np.nan
     # The spacing's row of the inverse: one column of it, as that is symmetric.
     unit, inverse, factor = np.empty(_FITTED), np.empty(_FITTED), np.empty((_FITTED, _FITTED))
+    scale = np.empty(_FITTED)
     for a in range(_FITTED):
         unit[a] = 1.0 if a == 0 else 0.0
-    if not _damped_step(normal, unit, 0.0, factor, inverse):
+    if not rooted(normal, 0.0, _ROUNDING, scale, factor):
         return np.nan
+    substituted(factor, scale, unit, inverse)
     by_row, rows = 0.0, 0
     for v in range(len(scores)):
         part = 0.0

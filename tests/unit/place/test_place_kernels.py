@@ -312,14 +312,6 @@ def test_jacobis_turns_give_the_axes_of_numpy() -> None:
         np.testing.assert_allclose((axes * values) @ axes.T, matrix, atol=1e-13 * largest)
 
 
-def test_inverses_are_those_of_numpy() -> None:
-    root, out = np.random.default_rng(8).normal(size=(14, 14)), np.zeros((14, 14))
-    matrix = root @ root.T
-    assert _kernels.inverted(matrix, out)
-    np.testing.assert_allclose(out, np.linalg.inv(matrix), rtol=1e-7, atol=1e-9)
-    assert not _kernels.inverted(np.ones((2, 2)), out[:2, :2].copy())
-
-
 def test_what_whitens_is_the_inverse_of_the_root() -> None:
     causes, out = np.random.default_rng(9).normal(size=(3, 4)), np.zeros((3, 3))
     _kernels.whitening(causes, 0.1, out)
@@ -413,6 +405,22 @@ def test_a_fit_is_judged_as_by_numpy(bars: int, bar_fault_m: float) -> None:
     for b in range(bars):
         moves = spread[:3] @ normal.gain[b, 2:].T
         np.testing.assert_allclose(pose.standing[f"bar {b}"], moves, rtol=1e-6, atol=1e-9)
+    sizes, directions = np.linalg.eigh(spread[:3, :3])
+    wide = math.sqrt(sizes[-1])
+    assert abs(directions[:, -1] @ pose.along) == pytest.approx(1)
+    by_camera, by_bar = [], []
+    for sigmas in (2.0, -2.0):
+        there = moved(p, fit, normal, spread[:, :3] @ pose.along * sigmas / wide)
+        # Errors of the sites take up what is left of second order.
+        after = normal_equations(p, moved(p, there, normal_equations(p, there), np.zeros(14)))
+        spread_there = np.zeros((14, 14))
+        spread_there[np.ix_(free, free)] = np.linalg.inv(after.whole[np.ix_(free, free)])
+        by_camera.append(-spread_there[:3, 7:])
+        by_bar.append(spread_there[:3] @ after.gain[0, 2:].T)
+    for name, (plus, minus) in (("camera", by_camera), ("bar 0", by_bar)):
+        np.testing.assert_allclose(
+            pose.standing_slope[name], (plus - minus) / (4 * wide), rtol=1e-5, atol=1e-9
+        )
     rest = spread[:3, :3] - slow - sum(m @ m.T for m in pose.standing.values())
     values, axes = np.linalg.eigh((rest + rest.T) / 2)
     np.testing.assert_allclose(pose.noise, (axes * np.maximum(values, 1e-12)) @ axes.T, atol=1e-11)

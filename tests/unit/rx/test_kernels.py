@@ -493,18 +493,6 @@ def test_bend_of_boundaries(seed, n):
     assert np.isnan(_kernels.bend_of(place[:5], sums[:, :5], 0.1)).all()
 
 
-@pytest.mark.parametrize("n", [1, 3, 4])
-def test_inverse(n):
-    rng = np.random.default_rng(n)
-    part = rng.normal(size=(n, n + 2))
-    matrix, out = part @ part.T, np.empty((n, n))
-    assert _kernels._inverse.py_func(matrix, out)
-    assert_allclose(out, np.linalg.inv(matrix), rtol=1e-9)
-    assert not _kernels._inverse.py_func(-matrix, out)
-    if n > 1:
-        assert not _kernels._inverse.py_func(np.ones((n, n)), out)
-
-
 @pytest.mark.parametrize("grid", [1, 2, 3])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_cells_beside_a_line_and_inside_a_prior(seed, grid):
