@@ -28,6 +28,7 @@ __all__ = [
     "Alternative",
     "Bend",
     "Events",
+    "FailedBar",
     "Fix",
     "Frame",
     "FrameView",
@@ -562,6 +563,34 @@ class Alternative:
 
 
 @dataclass(frozen=True, eq=False)
+class FailedBar:
+    """Where the bar that was left out of a fix stands by its image, as seen from that fix.
+
+    Attributes:
+        transmitter: Its number.
+        off_m: Where it stands relative to its site: east, north, up, m, float64 (3,).
+        covariance_m2: Of that, float64 (3, 3).
+        missed: Probability that a test misses an error of as much.
+    """
+
+    transmitter: int
+    off_m: NDArray[np.float64]
+    covariance_m2: NDArray[np.float64]
+    missed: float
+
+    @property
+    def bias_m(self) -> float:
+        """How far it is off, m."""
+        return float(np.linalg.norm(self.off_m))
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of that, m."""
+        way = self.off_m / max(self.bias_m, 1e-12)
+        return math.sqrt(max(float(way @ self.covariance_m2 @ way), 0.0))
+
+
+@dataclass(frozen=True, eq=False)
 class Fix:
     """A position at one time, or why there is none: a row of `fixes.csv`.
 
@@ -603,6 +632,9 @@ class Fix:
             that is not known.
         standing_slope: How `standing`, but for `doubt`, changes with the position along it, a metre, float64
             (3, k).
+        hidden_m: By how much one part that is wrong, and whose test just passed, moves it at the most: east,
+            north, up, m, float64 (3,); infinite where there is no protection level.
+        failed: The bar that was left out; None where none was.
     """
 
     t_us: float
@@ -634,6 +666,8 @@ class Fix:
     suspects: tuple[str, ...] = ()
     along: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     standing_slope: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    hidden_m: NDArray[np.float64] = field(default_factory=lambda: np.full(3, math.inf))
+    failed: FailedBar | None = None
 
     @property
     def alarms(self) -> tuple[str, ...]:

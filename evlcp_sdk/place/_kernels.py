@@ -699,7 +699,8 @@ def weighed(
         passed, and how far one that does without the part may be off at the risk; what doubt adds (6, 6); the
         covariance's causes: noise and slow, (3, 3), moves by the camera (3, 7), by the attitude (3, 4), by
         what is each bar's (bars, 3, 7); the least certain direction, (3,), and how these moves change with
-        the position along it, a metre, in the same shapes: the mean slope within two sigmas.
+        the position along it, a metre, in the same shapes: the mean slope within two sigmas; `hidden` of
+        `_parts`.
     """
     bars = len(bar_sigma)
     info, right, bar_cost = np.zeros((bars, GLOBAL, GLOBAL)), np.zeros((bars, GLOBAL)), np.zeros(bars)
@@ -715,7 +716,8 @@ def weighed(
     values, freedom = np.zeros(parts), np.zeros(parts, np.int64)
     by_camera, by_attitude, by_bar = np.zeros((3, 7)), np.zeros((3, 4)), np.zeros((bars, 3, 7))
     slopes = np.zeros((3, 7)), np.zeros((3, 4)), np.zeros((bars, 3, 7))
-    noise, slow, doubt, along = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((6, 6)), np.zeros(3)
+    noise, slow, doubt = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((6, 6))
+    along, hidden = np.zeros(3), np.zeros(3)
     wide, bent, levels = 0.0, math.inf, (math.inf, math.inf)
     given = (points, bar, bar_sigma, lens, lens_root, fault, felt, heading, known, white, huber)
     point = (position, rotation, local, error)
@@ -735,7 +737,7 @@ def weighed(
             _bar_bounds(points, bar, position, bar_fault, bar_turn, bounds)
         levels = _parts(
             info, right, rows, miss, white, known, free, turns, spread,
-            attitude_fault, focal_bound, bounds, limits, least, flat, high, values, freedom,
+            attitude_fault, focal_bound, bounds, limits, least, flat, high, values, freedom, hidden,
         )  # fmt: skip
         _moves(spread, rows, known, said, gain, 1.0, by_camera, by_attitude, by_bar)
         _rest(spread, pixel, by_camera, by_attitude, by_bar, noise, slow)
@@ -746,7 +748,7 @@ def weighed(
                 doubt[:] = 0
     return (
         regular, wide, bent, spread, values, freedom, levels[0], levels[1],
-        doubt, noise, slow, by_camera, by_attitude, by_bar, along, slopes[0], slopes[1], slopes[2],
+        doubt, noise, slow, by_camera, by_attitude, by_bar, along, slopes[0], slopes[1], slopes[2], hidden,
     )  # fmt: skip
 
 
@@ -817,9 +819,12 @@ def _hold(free: Array, spread: Array) -> None:
 def _parts(
     info: Array, right: Array, rows: Array, miss: Array, white: Array, known: int, free: Array, turns: bool,
     spread: Array, attitude_fault: float, focal_bound: float, bounds: Array, limits: Array, least: float,
-    flat: float, high: float, values: Array, freedom: Array,
+    flat: float, high: float, values: Array, freedom: Array, hidden: Array,
 ) -> tuple[float, float]:  # fmt: skip
-    """Each part's test, `values` and `freedom` (parts,), and both protection levels: see `weighed`."""
+    """Each part's test, `values` and `freedom` (parts,), and both protection levels: see `weighed`.
+
+    `hidden` (3,): how far east, north and up the position may have moved with the test just passed.
+    """
     bars, n = len(info), len(spread)
     hpl, vpl = flat * _widest(spread), high * math.sqrt(max(spread[2, 2], 0.0))
     own, columns, mean = np.zeros((6, 6)), np.zeros((n, 6)), np.zeros(6)
@@ -832,7 +837,7 @@ def _parts(
                 own[i, j] = info[part, i, j]
         found = tested(own, columns, mean, spread, bounds[part], least)
         values[part], freedom[part] = found[0], found[1]
-        hpl, vpl = _widened(hpl, vpl, found[2], found[3], spread, limits[found[1]], flat, high)
+        hpl, vpl = _widened(hpl, vpl, found[2], found[3], spread, limits[found[1]], flat, high, hidden)
     one, by_one, off = np.zeros((1, 1)), np.zeros((n, 1)), np.zeros(1)
     for b in range(bars):
         off[0] += right[b, FAULT]
@@ -841,7 +846,7 @@ def _parts(
             by_one[i, 0] += info[b, i, FAULT] if free[i] else 0.0
     found = tested(one, by_one, off, spread, np.full((1, 1), focal_bound), least)
     values[bars], freedom[bars] = found[0], found[1]
-    hpl, vpl = _widened(hpl, vpl, found[2], found[3], spread, limits[found[1]], flat, high)
+    hpl, vpl = _widened(hpl, vpl, found[2], found[3], spread, limits[found[1]], flat, high, hidden)
     if turns:
         bound = _attitude_bound(white, known, attitude_fault)
         for part in range(bars + 1, len(values)):
@@ -857,16 +862,20 @@ def _parts(
             values[part], freedom[part] = found[0], found[1]
             # A heading that is off is an attitude that is.
             if not first:
-                hpl, vpl = _widened(hpl, vpl, found[2], found[3], spread, limits[found[1]], flat, high)
+                hpl, vpl = _widened(
+                    hpl, vpl, found[2], found[3], spread, limits[found[1]], flat, high, hidden
+                )
     return hpl, vpl
 
 
 @njit(cache=True, nogil=True)
 def _widened(
-    hpl: float, vpl: float, added: Array, unseen: Array, spread: Array, limit: float, flat: float, high: float
-) -> tuple[float, float]:
-    """Protection levels that hold with one fault more, whose test just passed."""
+    hpl: float, vpl: float, added: Array, unseen: Array, spread: Array, limit: float,
+    flat: float, high: float, hidden: Array,
+) -> tuple[float, float]:  # fmt: skip
+    """Protection levels that hold with one fault more, whose test just passed, and what that may hide."""
     for i in range(3):
+        hidden[i] = max(hidden[i], math.sqrt(limit * max(unseen[i, i], 0.0)))
         for j in range(3):
             added[i, j] += spread[i, j]
     level = math.sqrt(limit) * _widest(unseen) + flat * _widest(added)

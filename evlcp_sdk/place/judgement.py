@@ -19,6 +19,7 @@ from evlcp_sdk.place.chances import chi_square
 from evlcp_sdk.place.fit import FOCAL_UNIT, Fit, data
 from evlcp_sdk.place.observations import Problem
 from evlcp_sdk.place.refusals import Refusal
+from evlcp_sdk.values import FailedBar
 
 if TYPE_CHECKING:
     from evlcp_sdk.place import _kernels
@@ -76,6 +77,9 @@ class Pose:
         along: The direction in which the position is the least certain, a unit vector, float64 (3,).
         standing_slope: How the moves of `standing`, but for `doubt`, change with the position along it, a
             metre, float64 (3, k).
+        hidden_m: By how much one part that is wrong, and whose test just passed, moves the position at the
+            most: east, north, up, m, float64 (3,).
+        failed: The bar that was left out; None where none was.
     """
 
     enu_m: Floats
@@ -92,6 +96,8 @@ class Pose:
     excluded: tuple[str, ...] = ()
     along: Floats = field(default_factory=lambda: np.zeros(3))
     standing_slope: Mapping[str, Floats] = field(default_factory=dict)
+    hidden_m: Floats = field(default_factory=lambda: np.full(3, math.inf))
+    failed: FailedBar | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +144,7 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
         _LITTLE,
     )
     regular, wide, bent, spread, values, freed, hpl, vpl, doubted, noise, slow, *rest = found
-    moves, along, slopes = rest[:3], rest[3], rest[4:]
+    moves, along, slopes, hidden = rest[:3], rest[3], rest[4:7], rest[7]
     if not regular:
         return Refusal("not-determined", "the equations are singular")
     if len(problem.transmitters) == 1:
@@ -181,6 +187,7 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
         _level(vpl, spec),
         along=along,
         standing_slope=_standing(problem, *slopes),
+        hidden_m=hidden,
     )
     return Judged(pose, doubt, tests)
 

@@ -8,13 +8,14 @@ that the rest contradicts is left out, and named. Frames and signs: `docs/positi
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.failed import failed_bar
 from evlcp_sdk.place.fit import Fit, fit_pose
 from evlcp_sdk.place.judgement import FOCAL, Judged, Pose, covering, judged, misfits
 from evlcp_sdk.place.observations import BarView, Problem
@@ -22,6 +23,7 @@ from evlcp_sdk.place.refusals import Candidate, Refusal
 from evlcp_sdk.place.starts import ODDS, is_hopeless, likely_starts
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
+from evlcp_sdk.values import FailedBar
 
 __all__ = ["fitting_focal_mm", "solve_pose"]
 
@@ -105,12 +107,20 @@ def solve_pose(
         if not rivals and tests:
             rivals = [name for name, _ in _mixed_up(views, camera, attitude, spec, sigma)]
             if not rivals:
-                return replace(pose, excluded=(name,))
+                return replace(pose, excluded=(name,), failed=_failed(problem, name, pose, tests))
         names = [name, *rivals]
     if isinstance(found, Refusal) and not names:
         return found
     could = f"; it may be {' or '.join(names)}" if names else ""
     return Refusal("misfit", doubt + could, suspects=tuple(names))
+
+
+def _failed(problem: Problem, name: str, pose: Pose, tests: Mapping[str, float]) -> FailedBar | None:
+    """The bar of a name; None where that is another part."""
+    for i, number in enumerate(problem.transmitters):
+        if name == f"bar {number}":
+            return failed_bar(problem, i, pose, tests[name], len(tests)) if name in tests else None
+    return None
 
 
 def fitting_focal_mm(

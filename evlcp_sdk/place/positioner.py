@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
@@ -18,7 +19,7 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.values import Alternative, Fix, Frame, Packet
+from evlcp_sdk.values import Alternative, FailedBar, Fix, Frame, Packet
 
 __all__ = ["BarKind", "Positioner"]
 
@@ -256,7 +257,16 @@ class Positioner:
             attitude_sigma_deg=math.degrees(math.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])),
             along=turn @ pose.along,
             standing_slope={name: turn @ slope for name, slope in pose.standing_slope.items()},
+            hidden_m=pose.hidden_m if math.isfinite(pose.hpl_m + pose.vpl_m) else np.full(3, math.inf),
+            failed=_turned(pose.failed, turn),
         )
+
+
+def _turned(failed: FailedBar | None, turn: NDArray[np.float64]) -> FailedBar | None:
+    """A bar that was left out, in other axes."""
+    if failed is None:
+        return None
+    return replace(failed, off_m=turn @ failed.off_m, covariance_m2=turn @ failed.covariance_m2 @ turn.T)
 
 
 def _alternatives(refusal: Refusal, here: LocalAxes, axes: LocalAxes) -> tuple[Alternative, ...]:

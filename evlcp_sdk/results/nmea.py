@@ -1,11 +1,13 @@
-"""`fixes.nmea`: NMEA-0183 sentences of a fix, GGA, RMC and GST, and TXT for alarms.
+"""`fixes.nmea`: NMEA-0183 sentences of a fix, GGA, RMC, GST and GBS, and TXT for alarms.
 
 Talker `IN`, integrated navigation; quality 6 and mode E, estimated, as nothing here is a satellite's. The
 altitude is that above the sea's level, the geoid of EGM96, whose height above the WGS-84 ellipsoid is
 beside it: their sum is the fix's height, whatever the geoid. The number of satellites is that of bars. The
 dilution of precision is empty: it would be a factor without a unit, which bars do not have; how precise a
 fix is says its GST. The first value of that is the root of the misfit, in sigmas, as bars give no ranges;
-its ellipse and sigmas are in metres.
+its ellipse and sigmas are in metres. GBS, of bars only, is what RAIM makes of satellites: by how much one
+bar, angle or focal length that is wrong, and whose test just passed, moves the fix at the most, and the bar
+that was left out.
 """
 
 import math
@@ -21,9 +23,9 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.text import sigmas
 from evlcp_sdk.utc import zero_at
-from evlcp_sdk.values import Fix
+from evlcp_sdk.values import FailedBar, Fix
 
-__all__ = ["Nmea", "gga", "gst", "rmc", "sentences", "txt"]
+__all__ = ["Nmea", "gbs", "gga", "gst", "rmc", "sentences", "txt"]
 
 _KNOTS_PER_M_S = 3600 / 1852
 
@@ -41,7 +43,7 @@ class Nmea(Sink):
 
 
 def sentences(fix: Fix, filtered: Place | None, zero: datetime | None) -> str:
-    """What NMEA says of a fix: a TXT for each alarm, then GGA, RMC and, where there is a place, GST.
+    """What NMEA says of a fix: a TXT for each alarm, GGA, RMC and, where there is a place, GST and GBS.
 
     Args:
         fix: The fix, given or refused.
@@ -59,6 +61,7 @@ def sentences(fix: Fix, filtered: Place | None, zero: datetime | None) -> str:
             gga(fix.t_us, zero, place, len(fix.transmitters)),
             rmc(fix.t_us, zero, place, way),
             gst(fix.t_us, zero, math.sqrt(fix.misfit), filtered.covariance_m2),
+            gbs(fix.t_us, zero, fix.hidden_m, fix.failed) if fix.source == "bars" else "",
         ]
     )
 
@@ -132,6 +135,29 @@ def gst(t_us: float, zero: datetime | None, misfit: float, covariance_m2: NDArra
     return _sentence(
         f"INGST,{clock},{missed},{major:.3f},{minor:.3f},{turned:.1f},{north:.3f},{east:.3f},{up:.3f}"
     )
+
+
+def gbs(
+    t_us: float, zero: datetime | None, hidden_m: NDArray[np.float64], failed: FailedBar | None = None
+) -> str:
+    """A GBS sentence, with its line end: what a fault may hide, and the bar that failed.
+
+    Args:
+        t_us: Camera clock, us.
+        zero: UTC of the camera clock's 0; None: the clock itself is written as time of day.
+        hidden_m: By how much a fault that is not found moves the fix at the most: east, north, up, m, float64
+            (3,); what is not finite is empty.
+        failed: The bar that was left out.
+
+    >>> gbs(1e6, None, np.array([0.5, 0.25, 0.125])).strip()
+    '$INGBS,000001.000,0.250,0.500,0.125,,,,*64'
+    """
+    clock, _ = _time(t_us, zero)
+    east, north, up = (f"{m:.3f}" if math.isfinite(m) else "" for m in hidden_m.tolist())
+    bar = ",,,"
+    if failed is not None:
+        bar = f"{failed.transmitter:02d},{failed.missed:.4f},{failed.bias_m:.3f},{failed.sigma_m:.3f}"
+    return _sentence(f"INGBS,{clock},{north},{east},{up},{bar}")
 
 
 def txt(count: int, number: int, text: str) -> str:

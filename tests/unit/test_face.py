@@ -41,6 +41,7 @@ NAMES = [
     "EventSource",
     "Events",
     "EvlcpError",
+    "FailedBar",
     "Filter",
     "Fix",
     "Frame",

@@ -64,13 +64,13 @@ def test_nmea_has_the_time_of_day_where_no_other_is_known(served: tuple[Outlet, 
         time.sleep(0.5)  # until it is served
         for n in range(3):
             tell(outlet, 7e9 + n * 1e6)
-        sentences = [pynmea2.parse(next(lines).strip(), check=True) for _ in range(12)]
-    assert [one.sentence_type for one in sentences[:4]] == ["TXT", "GGA", "RMC", "GST"]
-    told = [datetime.combine(one.datestamp, one.timestamp) for one in sentences[2::4]]
+        sentences = [pynmea2.parse(next(lines).strip(), check=True) for _ in range(15)]
+    assert [one.sentence_type for one in sentences[:5]] == ["TXT", "GGA", "RMC", "GST", "GBS"]
+    told = [datetime.combine(one.datestamp, one.timestamp) for one in sentences[2::5]]
     # The first fix was just now, as its camera's clock was first heard of then.
     assert abs((told[0].replace(tzinfo=UTC) - datetime.now(UTC)).total_seconds()) < 5
     assert [(at - told[0]).total_seconds() for at in told] == [0, 1, 2]
-    assert [float(one.altitude) + float(one.geo_sep) for one in sentences[1::4]] == pytest.approx([60.0] * 3)
+    assert [float(one.altitude) + float(one.geo_sep) for one in sentences[1::5]] == pytest.approx([60.0] * 3)
 
 
 def test_a_client_that_stalls_or_leaves_costs_nothing(served: tuple[Outlet, Services]) -> None:

@@ -444,6 +444,8 @@ def test_a_fit_is_judged_as_by_numpy(bars: int, bar_fault_m: float) -> None:
         assert found.tests[name] == pytest.approx(value, rel=1e-6)
         if name != "heading":
             levels.append((stats.chi2.isf(SPEC.false_alarm / 2 / len(parts), freed), added, unseen))
+    hidden = np.max([np.sqrt(limit * np.diag(unseen)) for limit, _, unseen in levels], axis=0)
+    np.testing.assert_allclose(pose.hidden_m, hidden, rtol=1e-6)
 
     def level(limit: float, added: Floats, unseen: Floats, axis: slice) -> float:
         moved_m = limit * np.linalg.eigvalsh(unseen[axis, axis])[-1]

@@ -284,12 +284,37 @@ def test_a_bar_that_disagrees_is_left_out_by_name(which: int, way: tuple[int, in
         assert found.enu_m @ np.linalg.solve(found.covariance[:3, :3], found.enu_m) < stats.chi2.isf(1e-5, 3)
 
 
+def test_a_bar_that_is_left_out_stands_where_its_image_says() -> None:
+    """As far off as it was moved, to within a covariance that holds."""
+    rng = np.random.default_rng(33)
+    squares = []
+    for _ in range(40):
+        known = Attitude(5.0, 0.0, 0.0, 0.1, 0.1)
+        seen, told, _ = drawn(rng, THREE, known, (0.01, 0.0, 0.0), 0.0)
+        moved_m = rng.normal(0, 0.5, 3)
+        seen[1] = dataclasses.replace(seen[1], enu_m=seen[1].enu_m - moved_m)
+        found = solve_pose(seen, CAMERA, told)
+        if isinstance(found, Refusal) or found.excluded != ("bar 1",):
+            continue
+        failed = found.failed
+        assert failed is not None
+        assert failed.transmitter == 1
+        assert failed.missed < 0.5
+        assert failed.bias_m == pytest.approx(float(np.linalg.norm(failed.off_m)))
+        off = failed.off_m - moved_m
+        squares.append(off @ np.linalg.solve(failed.covariance_m2, off))
+    low, high = stats.chi2.interval(0.999, 3 * len(squares)) / np.array(len(squares))
+    assert len(squares) > 25
+    assert low < np.mean(squares) < high
+
+
 def test_an_attitude_that_disagrees_is_left_out_by_name() -> None:
     rng = np.random.default_rng(14)
     seen, told, _ = drawn(rng, THREE, Attitude(5.0, 0.0, 0.0, 0.1, 0.1), (0.0, 0.0, 0.0), 0.0)
     assert told is not None
     turned = solved(solve_pose(seen, CAMERA, dataclasses.replace(told, heading_deg=3.0)))
     assert turned.excluded == ("heading",)
+    assert turned.failed is None
     assert abs(math.remainder(Attitude.of_rotation(turned.rotation).heading_deg or 0, 360)) < 0.3
     leaning = solved(solve_pose(seen, CAMERA, dataclasses.replace(told, roll_deg=2.0)))
     assert leaning.excluded == ("attitude",)

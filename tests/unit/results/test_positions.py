@@ -43,6 +43,7 @@ from evlcp_sdk.utc import ClockZero, PulseClock
 from evlcp_sdk.values import (
     Alternative,
     Events,
+    FailedBar,
     Fix,
     Frame,
     Packet,
@@ -138,13 +139,15 @@ def test_files_of_a_drive(tmp_path: Path) -> None:
     sentences = (tmp_path / "fixes.nmea").read_text().split("\n")[:-1]
     # Of a lone bar nothing is protected, and each fix says so.
     kinds = [pynmea2.parse(s.strip(), check=True).sentence_type for s in sentences]
-    assert kinds == ["TXT", "GGA", "RMC", "GST"] * 12
-    assert pynmea2.parse(sentences[-4].strip()).text == "NO PROTECTION LEVEL"
-    spread = pynmea2.parse(sentences[-1].strip(), check=True)
+    assert kinds == ["TXT", "GGA", "RMC", "GST", "GBS"] * 12
+    assert pynmea2.parse(sentences[-5].strip()).text == "NO PROTECTION LEVEL"
+    fault = pynmea2.parse(sentences[-1].strip(), check=True)
+    assert (fault.lat_err, fault.sat_prn_num_f, fault.est_bias) == ("", "", "")
+    spread = pynmea2.parse(sentences[-2].strip(), check=True)
     assert spread.std_dev_altitude == pytest.approx(
         float(rows(tmp_path / "track.csv")[-1]["filtered_sigma_up_m"]), abs=6e-4
     )
-    last = pynmea2.parse(sentences[-2].strip(), check=True)
+    last = pynmea2.parse(sentences[-3].strip(), check=True)
     assert last.spd_over_grnd * 1852 / 3600 == pytest.approx(10, abs=0.5)
     assert last.datestamp.isoformat() == "2026-03-01"
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -162,6 +165,8 @@ def test_covariance_and_integrity_are_in_every_file(tmp_path: Path) -> None:
         latitude_deg=35.0, longitude_deg=137.0, height_m=5.0, enu_m=np.zeros(3), covariance_m2=spread,
         noise_m2=spread, heading_deg=1.0, pitch_deg=2.0, roll_deg=3.0, heading_sigma_deg=0.1,
         misfit=0.64, freedom=60, hpl_m=1.25, vpl_m=math.inf, excluded=("bar 2", "heading"),
+        hidden_m=np.array([0.5, 0.25, math.inf]),
+        failed=FailedBar(2, np.array([0.3, 0.0, 0.4]), np.diag([0.01, 0.04, 0.01]), 0.0123),
     )  # fmt: skip
     wrong = Fix.refused(3e6, (0, 1), "misfit", "heading does not fit the rest")
     assert fix.alarms == ("excluded", "unavailable")
@@ -190,9 +195,9 @@ def test_covariance_and_integrity_are_in_every_file(tmp_path: Path) -> None:
     assert lost["geometry"] is None
     assert lost["properties"]["alarms"] == ["misfit"]
     texts = [pynmea2.parse(s, check=True) for s in (tmp_path / "fixes.nmea").read_text().splitlines()]
-    assert [t.sentence_type for t in texts] == ["TXT", "TXT", "GGA", "RMC", "GST", "TXT", "GGA", "RMC"]
+    assert [t.sentence_type for t in texts] == ["TXT", "TXT", "GGA", "RMC", "GST", "GBS", "TXT", "GGA", "RMC"]
     assert texts[0].text == "EXCLUDED bar 2 heading"
-    assert texts[5].text == "MISFIT"
+    assert texts[6].text == "MISFIT"
     gst = texts[4]
     major, minor = np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[::-1])
     assert (gst.rms, gst.std_dev_major, gst.std_dev_minor) == pytest.approx((0.8, major, minor), abs=1e-3)
@@ -201,6 +206,11 @@ def test_covariance_and_integrity_are_in_every_file(tmp_path: Path) -> None:
     along = np.array([math.sin(way), math.cos(way)])
     assert along @ spread[:2, :2] @ along == pytest.approx(major**2, rel=1e-4)
     assert gst.std_dev_latitude == pytest.approx(math.sqrt(spread[1, 1]), abs=1e-3)
+    gbs = texts[5]
+    assert gbs.timestamp == gst.timestamp
+    assert (gbs.lat_err, gbs.lon_err, gbs.alt_err) == ("0.250", "0.500", "")
+    assert (gbs.sat_prn_num_f, float(gbs.pro_miss)) == ("02", 0.0123)
+    assert (float(gbs.est_bias), float(gbs.est_bias_dev)) == (0.5, 0.1)
 
 
 def test_a_track_goes_on_between_bars(tmp_path: Path) -> None:
