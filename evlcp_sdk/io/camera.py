@@ -132,7 +132,11 @@ class CameraSource(RawSource):
 
     @property
     def health(self) -> Mapping[str, float | int | str]:
-        """As `EventSource.health`: `temperature_c`, `backlog` (USB packets that wait), `dropped`."""
+        """As `EventSource.health`: `temperature_c`, `backlog` (USB packets that wait), `dropped`.
+
+        `overflows`: how many times the driver's ring was full (its clutch engaged), so that it dropped packets
+        until it was read on.
+        """
         return dict(self._bytes.health)
 
 
@@ -153,7 +157,8 @@ class _CameraBytes:
         self._closed = False
         self._bytes = 0
         self._asked_s = -_HEALTH_EVERY_S
-        self.dropped = self.first_dropped = 0
+        self.dropped = self.first_dropped = self.overflows = 0
+        self._engaged = False
         self._dropped_before = 0
         self._faults: list[Exception] = []
         self.health: dict[str, float | int | str] = {}
@@ -202,8 +207,14 @@ class _CameraBytes:
                 self.first_dropped = self._bytes
             self.dropped += max(total - self._dropped_before, 0)
             self._dropped_before = total
-        self.health["backlog"] = int(status.ring.backlog)
-        self.health["dropped"] = self.dropped
+        engaged = bool(status.ring.clutch_engaged)
+        self.overflows += engaged and not self._engaged
+        self._engaged = engaged
+        self.health |= {
+            "backlog": int(status.ring.backlog),
+            "dropped": self.dropped,
+            "overflows": self.overflows,
+        }
 
     def close(self) -> None:
         """Let the camera go; a read in another thread ends soon."""

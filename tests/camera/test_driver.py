@@ -162,16 +162,20 @@ def test_what_the_driver_drops_is_counted(demo_raw: Path, tmp_path: Path) -> Non
         "try:\n"
         "    for events in source.chunks(): pass\n"
         "except evlcp.UnpluggedError: pass\n"
+        "health = source.health\n"
         "print(source.counts['events'], source.losses['camera_overflow'].count)\n"
+        "print(health['dropped'], health['overflows'])\n"
     )
     with emulator(demo_raw, tmp_path, "--chunk", "400", "--then", "unplug") as camera:
         process = camera.run([sys.executable, "-c", program])
         out, err = process.communicate(timeout=150)
     assert process.returncode == 0, err
-    events, dropped = map(int, out.split())
+    events, dropped, also, overflows = map(int, out.split())
     with RawSource(demo_raw) as source:
         total = len(source.read()[0])
-    assert 0 < dropped <= 2_500_000 // 400
+    assert 0 < dropped == also <= 2_500_000 // 400
+    # The ring was full once, as long as nobody read.
+    assert overflows == 1
     assert 0 < events < total
 
 
