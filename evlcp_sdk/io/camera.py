@@ -134,7 +134,7 @@ class CameraSource(RawSource):
     def health(self) -> Mapping[str, float | int | str]:
         """As `EventSource.health`: `temperature_c`, `backlog` (USB packets that wait), `dropped`.
 
-        `overflows`: how many times the driver's ring was full (its clutch engaged), so that it dropped packets
+        `overflows`: how many times the driver's ring was full (its clutch engaged), so that it dropped some
         until it was read on.
         """
         return dict(self._bytes.health)

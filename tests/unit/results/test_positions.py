@@ -5,6 +5,7 @@ import dataclasses
 import io
 import json
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -28,10 +29,12 @@ from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.trajectory import trajectory_step
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.alternatives_csv import AlternativesCsv
+from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.figures import TrackProbe, draw_track
 from evlcp_sdk.results.fixes_csv import FixesCsv
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.geojson import GeoJson
+from evlcp_sdk.results.mcap import FRAME_ID
 from evlcp_sdk.results.nmea import Nmea
 from evlcp_sdk.results.points_csv import PointsCsv
 from evlcp_sdk.results.sink import Run
@@ -53,6 +56,7 @@ from evlcp_sdk.values import (
     Triggers,
 )
 
+EXAMPLES = Path(__file__).parents[3] / "examples"
 LINK = load_link()
 ZERO = datetime(2026, 3, 1, 10, 15, tzinfo=UTC)
 SITE = BarSite(7, 35.0, 137.0, 54.0, length_m=0.96)
@@ -424,6 +428,19 @@ class JsonDecoderFactory:
         return json.loads if encoding == "json" else None
 
 
+TOPICS = {
+    "/fix": "foxglove.LocationFix",
+    "/track": "foxglove.LocationFix",
+    "/pose": "foxglove.PoseInFrame",
+    "/integrity": "google.protobuf.Struct",
+    "/scene": "foxglove.SceneUpdate",
+    "/frames": "evlcp.Frame",
+    "/image": "foxglove.CompressedImage",
+    "/regions": "foxglove.ImageAnnotations",
+}
+"""What `fixes.mcap` has, and as what."""
+
+
 def test_mcap_is_read_back(tmp_path: Path) -> None:
     reader = pytest.importorskip("mcap.reader", reason="the extra mcap is not installed")
     from mcap_protobuf.decoder import DecoderFactory
@@ -455,14 +472,7 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
         for schema, channel, message, decoded in source.iter_decoded_messages():
             found.setdefault(channel.topic, []).append((schema.name, message.log_time, decoded))
     assert {t: {name for name, _, _ in m} for t, m in found.items()} == {
-        "/fix": {"foxglove.LocationFix"},
-        "/track": {"foxglove.LocationFix"},
-        "/pose": {"foxglove.PoseInFrame"},
-        "/integrity": {"google.protobuf.Struct"},
-        "/scene": {"foxglove.SceneUpdate"},
-        "/frames": {"evlcp.Frame"},
-        "/image": {"foxglove.CompressedImage"},
-        "/regions": {"foxglove.ImageAnnotations"},
+        topic: {name} for topic, name in TOPICS.items()
     }
     # Two pictures of 40 ms, of which the last 10 ms are shown: a pixel OFF, then one ON and one of both.
     shots = []
@@ -499,6 +509,48 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
         heading = math.degrees(math.atan2(forward[0], forward[1])) % 360
         assert abs((heading - float(row["heading_deg"]) + 180) % 360 - 180) < 1e-3
         assert pose.pose.position.z == pytest.approx(float(row["height_m"]) - 54, abs=2e-3)  # type: ignore[attr-defined]
+
+
+def leaves(node: Any) -> list[str]:
+    """The panels of a layout, which is split in two again and again."""
+    return [node] if isinstance(node, str) else [*leaves(node["first"]), *leaves(node["second"])]
+
+
+def test_the_layout_shows_what_is_written() -> None:
+    """What a panel can show is by the schema of its topic, as Foxglove and its fork Lichtblick have it."""
+    layout = json.loads((EXAMPLES / "foxglove-layout.json").read_text())
+    panels = layout["configById"]
+    assert sorted(leaves(layout["layout"])) == sorted(panels)
+    shown = set()
+    for name, panel in panels.items():
+        match name.partition("!")[0]:
+            case "Image":
+                mode = panel["imageMode"]
+                asked = {mode["imageTopic"]: "foxglove.CompressedImage"}
+                asked |= dict.fromkeys(mode["annotations"], "foxglove.ImageAnnotations")
+            case "3D":
+                assert panel["followTf"] == FRAME_ID
+                may = ("foxglove.SceneUpdate", "foxglove.PoseInFrame")
+                asked = {topic: TOPICS[topic] for topic in panel["topics"] if TOPICS[topic] in may}
+                assert all(one["visible"] for one in panel["topics"].values())
+                assert len(asked) == len(panel["topics"])
+            case "map":
+                asked = {panel["followTopic"]: "foxglove.LocationFix"}
+            case "RawMessages":
+                asked = {panel["topicPath"]: TOPICS[panel["topicPath"]]}
+            case "Plot":
+                asked = {"/frames": "evlcp.Frame"}
+                for path in panel["paths"]:
+                    found = re.fullmatch(r"/frames\{transmitter==\d\}\.(\w+)", path["value"])
+                    assert found is not None
+                    assert found[1] in FRAME_COLUMNS
+                    assert path["enabled"]
+            case other:
+                pytest.fail(f"panel {other}")
+        assert asked == {topic: TOPICS[topic] for topic in asked}
+        shown |= set(asked)
+    # The map shows all that are places.
+    assert shown | {"/fix"} == set(TOPICS)
 
 
 def test_navsat_is_read_back(tmp_path: Path) -> None:
