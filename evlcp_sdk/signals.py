@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from types import FrameType
 
-__all__ = ["ENDING", "StopRequest", "Stopped", "heard_by", "interrupt", "stop_on_request", "waiting"]
+__all__ = ["ENDING", "EndRequest", "Stopped", "heard_by", "interrupt", "stop_on_request", "waiting"]
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """All are answered in the same way."""
@@ -49,7 +49,7 @@ class _Asked:
     waits: bool = False
 
 
-class StopRequest:
+class EndRequest:
     """Whether a run was asked to end; made by `stop_on_request`, and called as a `Stopped`."""
 
     def __init__(self, state: _Asked | None = None, also: Stopped = lambda: False) -> None:
@@ -60,9 +60,9 @@ class StopRequest:
         """Whether it was asked."""
         return self._state.asked or self._also()
 
-    def or_when(self, also: Stopped) -> "StopRequest":
+    def or_when(self, also: Stopped) -> "EndRequest":
         """The same request, and another reason to end."""
-        return StopRequest(self._state, lambda: self._also() or also())
+        return EndRequest(self._state, lambda: self._also() or also())
 
     def ask(self) -> None:
         """Ask it to end, now where it waits.
@@ -92,7 +92,7 @@ class StopRequest:
 
 
 @contextmanager
-def stop_on_request(pass_on: Callable[[], None] = lambda: None) -> Iterator[StopRequest]:
+def stop_on_request(pass_on: Callable[[], None] = lambda: None) -> Iterator[EndRequest]:
     """Let Ctrl-C, SIGTERM or SIGHUP end a run after the piece in hand; a second one ends it at once.
 
     Gives what `receive_to_folder` takes as `stopped`. Only a main thread can listen.
@@ -100,7 +100,7 @@ def stop_on_request(pass_on: Callable[[], None] = lambda: None) -> Iterator[Stop
     Args:
         pass_on: Called at the first one, to tell others.
     """
-    request = StopRequest()
+    request = EndRequest()
 
     def ask(_number: int, _frame: FrameType | None) -> None:
         restore()
@@ -112,8 +112,8 @@ def stop_on_request(pass_on: Callable[[], None] = lambda: None) -> Iterator[Stop
 
 
 def waiting(stopped: Stopped) -> AbstractContextManager[None]:
-    """`StopRequest.waiting` of what may be one; nothing of any other `Stopped`."""
-    return stopped.waiting() if isinstance(stopped, StopRequest) else nullcontext()
+    """`EndRequest.waiting` of what may be one; nothing of any other `Stopped`."""
+    return stopped.waiting() if isinstance(stopped, EndRequest) else nullcontext()
 
 
 def interrupt(_number: int, _frame: FrameType | None) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.cli._common import console
+from evlcp_sdk.spelling import counted
 
 __all__ = ["delays_text", "show"]
 
@@ -77,13 +78,13 @@ def _real_time(summary: Mapping[str, Any]) -> Iterator[tuple[str, str | None]]:
     """Delays, what was left out, and pulses, in a line each with its style, where there are any."""
     live = summary.get("live")
     if live is not None:
-        for stage, what in (
-            ("total", "{} frames, from their last chip"),
-            ("end_to_end", "{} times that were sent, from end to end"),
+        for stage, what, since in (
+            ("total", "frame", "from the last chip"),
+            ("end_to_end", "message", "from the time that it says"),
         ):
             tally = live["delays"][stage]
             if tally["count"]:
-                yield f"delay of {what.format(tally['count'])}: {delays_text(tally)}", None
+                yield f"delay of {counted(tally['count'], what)}, {since}: {delays_text(tally)}", None
         if left := [f"{many} {name.replace('_', ' ')}" for name, many in live["shed"].items() if many]:
             yield f"left out, as there was no time: {', '.join(left)}", "yellow"
     pps = summary.get("pps")

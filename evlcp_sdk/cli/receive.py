@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
-    from evlcp_sdk.signals import StopRequest
+    from evlcp_sdk.signals import EndRequest
 
 __all__ = ["register"]
 
@@ -279,7 +279,7 @@ def _decode_job(
     pps: int | None,
     sinks: tuple[str, ...],
     lines: LinePrinter | None,
-    stopped: "StopRequest | None",
+    stopped: "EndRequest | None",
 ) -> dict[str, Any]:
     """Decode a recording here, with a bar; or, without `stopped`, quietly in a worker."""
     from evlcp_sdk.run import receive_to_folder, stop_on_request

@@ -187,7 +187,9 @@ def _chosen(path: Path, topics: dict[str, str], topic: str | None) -> str:
 
 def _sqlite(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
     try:
-        base = stack.enter_context(closing(sqlite3.connect(f"file:{path.resolve()}?mode=ro", uri=True)))
+        # A live run reads in a thread of its own, what it opens in another.
+        base = sqlite3.connect(f"file:{path.resolve()}?mode=ro", uri=True, check_same_thread=False)
+        stack.enter_context(closing(base))
         rows = base.execute("SELECT name, id, type FROM topics").fetchall()
         number = {name: number for name, number, _ in rows}
         chosen = _chosen(path, {name: kind for name, _, kind in rows}, topic)

@@ -5,6 +5,7 @@ import re
 import sqlite3
 import struct
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +99,17 @@ def test_fields_stand_where_their_size_says(frame_id: str, order: str, tmp_path:
         assert events.y.tolist()[:2] == [5, 5]
         assert events.t_us.tolist()[:2] == [4096, 4097]
         assert source.losses["packets_lost"].count == 3
+
+
+def test_a_bag_is_read_by_another_thread_than_opened_it(tmp_path: Path) -> None:
+    """As a live run does."""
+    path = bag(tmp_path / "a.db3", [packed(n, WORDS) for n in range(5)])
+    with open_source(path) as source:
+        here, _ = source.read()
+    with open_source(path) as source, ThreadPoolExecutor(1) as pool:
+        there, _ = pool.submit(source.read).result(30)
+    assert len(here) > 0
+    assert there.t_us.tolist() == here.t_us.tolist()
 
 
 def test_what_is_wrong_with_a_bag_is_said(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_a_replay_gives_what_the_file_gives(
     assert f", {last.counts['frames']} frames" in text
     show(summary, None)
     total = summary["live"]["delays"]["total"]
-    told = f"delay of {total['count']} frames, from their last chip: p50 {total['p50_ms']:.1f}, p99"
+    told = f"delay of {total['count']} frames, from the last chip: p50 {total['p50_ms']:.1f}, p99"
     assert told in capsys.readouterr().out
 
 
