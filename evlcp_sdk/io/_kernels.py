@@ -79,14 +79,17 @@ uint32: Any = np.uint32
 uintp: Any = np.uintp
 ONE = uintp(1)
 
-BLOCK_WORDS = 512
+BLOCK_WORDS = 1024
 BURST = 12
+RUN_WORDS = uintp(64)
 
 # How a word of the three types that make up most of a file changes the packed event: what to keep and where
 # to put its 12 bits.
 COMMON = 1 << EVT3_ADDR_Y | 1 << EVT3_ADDR_X | 1 << EVT3_TIME_LOW
 KEEP = np.full(16, -1)
 SHIFT = np.zeros(16, int64)
+EVENTS = np.zeros(16, uintp)
+EVENTS[EVT3_ADDR_X] = 1
 KEEP[EVT3_ADDR_Y], SHIFT[EVT3_ADDR_Y] = ~(0xFFFF << PACKED_ROW), PACKED_ROW
 KEEP[EVT3_ADDR_X], SHIFT[EVT3_ADDR_X] = ~(0xFFFF << PACKED_COLUMN), PACKED_COLUMN
 KEEP[EVT3_TIME_LOW], SHIFT[EVT3_TIME_LOW] = ~(0xFFF << PACKED_LOW), PACKED_LOW
@@ -226,26 +229,56 @@ def _realign(shift: Integer, here: Integer, state: Column, tally: Column) -> Non
 
 
 @njit(cache=True, nogil=True)
+def _are_common(words: Column, start: Integer) -> Any:
+    """Whether a run of words is of the three common types alone."""
+    odd = uint16(0)
+    for k in range(RUN_WORDS):
+        w = words[start + k]
+        # Types 0, 2 and 6 are those below 8 that are even and have no bit 4 without bit 2.
+        odd |= uint16(w & uint16(0x9000)) | uint16(w & uint16(0x4000) & ~uint16(w << 1))
+    return odd == 0
+
+
+@njit(cache=True, nogil=True)
 def _pack_evt3(
-    words: Column, start: Integer, stop: Integer, at: Integer, state: Column, tally: Column, packed: Column
+    words: Column,
+    start: Integer,
+    stop: Integer,
+    at: Integer,
+    state: Column,
+    tally: Column,
+    packed: Column,
+    room: Integer,
 ) -> tuple[Integer, Integer]:
     """Decode words start..stop to packed events, unchecked, up to the first that is not of the sensor's.
 
-    Those are all but events and times that go on by one at the most. Returns where it stopped and how many
-    events there are.
+    Those are all but events and times that go on by one at the most. It stops, too, where another word may
+    bring more than `room` events in all. Returns where it stopped and how many events there are.
     """
     event, column, polarity = state[PACKED], state[COLUMN], state[POLARITY]
     left, vector_at = state[VECTOR_LEFT], state[VECTOR_AT]
     i, end, n = uintp(start), uintp(stop), uintp(0)
-    while i < end:
+    odd_until = i
+    while i < end and n + uintp(BURST) <= uintp(room):
+        if i >= odd_until and i + RUN_WORDS <= end and n + RUN_WORDS <= uintp(room):
+            # Which of the three it is cannot be predicted, so nothing branches on it: each puts its bits in
+            # the packed event and writes that, and only an ADDR_X moves on.
+            if _are_common(words, i):
+                for k in range(RUN_WORDS):
+                    w = int64(words[i + k])
+                    kind = uintp(w >> 12)
+                    event = (event & KEEP[kind]) | ((w & 0xFFF) << SHIFT[kind])
+                    packed[n] = event
+                    n += EVENTS[kind]
+                i += RUN_WORDS
+                continue
+            odd_until = i + RUN_WORDS
         w = int64(words[i])
         kind = uintp(w >> 12)
         if (COMMON >> kind) & 1:
-            # Which of the three it is cannot be predicted, so nothing branches on it: each puts its bits in
-            # the packed event and writes that, and only an ADDR_X moves on.
             event = (event & KEEP[kind]) | ((w & 0xFFF) << SHIFT[kind])
             packed[n] = event
-            n += uintp(kind == EVT3_ADDR_X)
+            n += EVENTS[kind]
         elif kind in (EVT3_VECT_12, EVT3_VECT_8):
             size = 12 if kind == EVT3_VECT_12 else 8
             mask = w & ((1 << size) - 1)
@@ -305,10 +338,11 @@ def _unpack_evt3(
         y[row + k] = (e >> PACKED_ROW) & 0x87FF
         right = max(right, x[row + k])
         bottom = max(bottom, y[row + k])
-    step = t[row] - last if count else int64(0)
+    back = t[row] - last if count else int64(0)
     for k in range(ONE, end):
-        step = min(step, t[row + k] - t[row + k - ONE])
-    return (right < width and bottom < height and step >= 0) or count == 0
+        # Its sign is set by any step back.
+        back |= t[row + k] - t[row + k - ONE]
+    return (right < width and bottom < height and back >= 0) or count == 0
 
 
 @njit(cache=True, nogil=True)
@@ -438,7 +472,7 @@ def decode_evt3(
     while i < len(words) and n <= len(t) - BURST and m < len(trigger_t):
         while state[DOUBT] and i < len(words) and words[i] >> 12 != EVT3_TIME_HIGH:
             start = i
-            i, count = _pack_evt3(words, i, i + 1, at, state, tally, packed)
+            i, count = _pack_evt3(words, i, i + 1, at, state, tally, packed, BURST)
             for _ in range(count):
                 _note(tally, int64(TIME_DOUBTFUL), at + 2 * start)
             if i == start:
@@ -457,14 +491,15 @@ def decode_evt3(
         if state[DOUBT] and uintp((int64(words[i]) & 0xFFF) - (state[PACKED] >> PACKED_HIGH)) <= ONE:
             state[DOUBT] = 0
         start, first = i, n
-        stop = i + min(len(words) - i, (len(t) - n) // BURST, BLOCK_WORDS)
-        i, count = _pack_evt3(words, start, stop, at, state, tally, packed)
+        stop = i + min(len(words) - i, BLOCK_WORDS)
+        i, count = _pack_evt3(words, start, stop, at, state, tally, packed, len(t) - n)
         n += count
+        is_full = n > len(t) - BURST
         if not _unpack_evt3(packed, count, state[BASE], t, x, y, p, first, width, height, state[LAST]):
             n = _sift(words, start, at, t, x, y, p, first, n, width, height, state[LAST], tally)
         if n > first:
             state[LAST] = t[n - 1]
-        if i == stop:
+        if i == stop or is_full:
             continue
         w = int64(words[i])
         kind = w >> 12

@@ -27,7 +27,7 @@ CODECS: Final = {codec.name: codec for codec in (EVT2, EVT3)}
 """The encodings that can be read and written, by name."""
 
 MAX_HEADER_BYTES = 1 << 16
-BUFFER_BYTES = 1 << 20
+BUFFER_BYTES = 1 << 19
 PIPE_BYTES, PIPE_WAIT_S = 1 << 17, 0.1
 """Bytes of a pipe that are waited for first, and for how long: words enough to tell their encoding."""
 WRITE_WORDS = 1 << 15
@@ -209,6 +209,8 @@ class RawSource(EventSource):
         InputError: The file cannot be opened.
         RawFormatError: Its header is not one, or its words are of another encoding than the header says.
     """
+
+    _gives_bits = True
 
     def __init__(
         self, path: Path | str, buffer_bytes: int = BUFFER_BYTES, file: RawBytes | None = None

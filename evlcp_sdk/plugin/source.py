@@ -82,6 +82,9 @@ class EventSource(ABC):
     live = False
     """Whether its time goes on by itself, as a camera's: what is not taken soon is late."""
 
+    _gives_bits = False
+    """Whether a polarity is a single bit of what it reads, so that none can be wrong."""
+
     def __init__(
         self,
         path: Path,
@@ -189,7 +192,7 @@ class EventSource(ABC):
             gave = ", ".join(type(one).__name__ for one in piece) if isinstance(piece, tuple) else None
             raise self._refused(f"gave ({gave or type(piece).__name__}), expected (Events, Triggers)")
         events, triggers = piece
-        if len(events) and events.p.max() > 1:
+        if not self._gives_bits and len(events) and events.p.max() > 1:
             raise self._refused(f"gave polarity {events.p.max()}, expected 0 or 1")
         return events, triggers
 

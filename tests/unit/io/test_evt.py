@@ -72,6 +72,25 @@ def test_kernel_equals_its_twin_for_any_words_and_splits(name, words):
     check()
 
 
+def test_runs_of_rows_columns_and_times_between_other_words_equal_the_twin():
+    rng = np.random.default_rng(5)
+    for capacity in (12, 70, 77, 90, 300, 5000):
+        # Times go on, so that most events stay; some are beyond the sensor.
+        kinds = rng.choice(
+            [0x0, 0x2, 0x2, 0x6, 0x3, 0x4, 0x8, 0xA, 0xE], 4000, p=[*[0.2485] * 4, *[0.0012] * 5]
+        )
+        low = (np.cumsum(kinds == 0x6) & 0xFFF) * (kinds == 0x6)
+        value = np.where(kinds == 0x6, low, rng.integers(0, 660, len(kinds)))
+        value[kinds == 0x8] = np.cumsum(kinds == 0x8)[kinds == 0x8] // 2
+        array = np.concatenate([[0x8000], kinds << 12 | value]).astype("<u2")
+        events, triggers, decoder = decode("EVT3", array, [1000], capacity, at=100)
+        twin = TWINS["EVT3"](array.tobytes(), WIDTH, HEIGHT, 100)
+        assert len(twin.events) > 1000
+        assert rows(events, ("t_us", "x", "y", "p")) == twin.events
+        assert rows(triggers, ("t_us", "channel", "value")) == twin.triggers
+        assert {kind: (loss.count, loss.first) for kind, loss in decoder.losses.items()} == twin.losses
+
+
 def test_low_time_is_zero_after_time_high_changes_and_stays_when_it_is_repeated():
     words = np.array([0x8001, 0x6123, 0x8001, 0x0005, 0x2007, 0x8002, 0x2007], "<u2")
     events, _, _ = decode("EVT3", words, [])
