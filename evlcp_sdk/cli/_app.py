@@ -8,6 +8,7 @@ import typer
 from typer.core import TyperGroup
 
 from evlcp_sdk.cli._common import echo, hush, log_on_stderr
+from evlcp_sdk.cli._front import print_front
 from evlcp_sdk.printable import printable
 
 if TYPE_CHECKING:
@@ -38,6 +39,9 @@ class _Commands(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         with _printable_faults():
             return super().invoke(ctx)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        print_front(self, ctx)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         found = super().resolve_command(ctx, args)
