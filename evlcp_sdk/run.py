@@ -43,13 +43,14 @@ from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.signals import Stopped, stop_on_request
-from evlcp_sdk.study.diagnosis.diagnose import Diagnosis, diagnosis_of
 from evlcp_sdk.utc import ClockZero, PulseClock
 from evlcp_sdk.values import Events, Frame, Packet
 
 if TYPE_CHECKING:
     import pandas
     import pyarrow
+
+    from evlcp_sdk.study.diagnosis.diagnose import Diagnosis
 
 __all__ = [
     "Advance",
@@ -544,7 +545,7 @@ def diagnose(
     *,
     registry: Registry | None = None,
     advance: Advance = lambda _done, _of: None,
-) -> Diagnosis:
+) -> "Diagnosis":
     """Say why a recording is read, or is not: what blinks in it, and which stage of the receiver stops it.
 
     Args:
@@ -557,6 +558,9 @@ def diagnose(
         InputError: The source cannot be opened, or read on.
         ConfigError: The file does not describe a link, or the recording's sensor is not the link's.
     """
+    # What it needs of SciPy takes long to import, and no other use case needs it.
+    from evlcp_sdk.study.diagnosis.diagnose import diagnosis_of
+
     registry = Registry.load() if registry is None else registry
     link = link if isinstance(link, Link) else load_link(link, registry=registry)
     url = str(source.path if isinstance(source, EventSource) else source)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import RegionSpec
@@ -21,8 +20,11 @@ from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
 
 if TYPE_CHECKING:
+    from scipy import ndimage
+
     from evlcp_sdk.rx import _kernels
 else:
+    ndimage = Late("scipy.ndimage")
     _kernels = Late("evlcp_sdk.rx._kernels")
 
 __all__ = ["BACKFILL_STEPS", "SAME_PX", "Followed", "RegionFollower", "same_place"]

@@ -2,10 +2,17 @@
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
+
+from evlcp_sdk.late import Late
+
+if TYPE_CHECKING:
+    from scipy import special
+else:
+    special = Late("scipy.special")
 
 __all__ = ["Blur", "airy_blur", "step"]
 
@@ -70,7 +77,7 @@ def airy_blur(unit_px: float, other_px: float) -> Blur:
 def _integral(z: Floats, sigma: Floats | float) -> Floats:
     """Integral of the normal distribution function with this sigma up to z."""
     density = np.exp(-0.5 * (z / sigma) ** 2) / math.sqrt(2 * math.pi)
-    total: Floats = z * ndtr(z / sigma) + sigma * density
+    total: Floats = z * special.ndtr(z / sigma) + sigma * density
     return total
 
 

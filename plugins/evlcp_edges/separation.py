@@ -2,17 +2,22 @@
 
 from dataclasses import dataclass
 from math import log
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy import ndimage
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Separate, Separation
 from evlcp_sdk.values import PresenceMap
+
+if TYPE_CHECKING:
+    from scipy import ndimage
+else:
+    ndimage = Late("scipy.ndimage")
 
 __all__ = ["EdgeSeparation", "cell_sums", "to_pixels"]
 

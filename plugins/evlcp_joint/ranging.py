@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy import special
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
@@ -20,8 +19,11 @@ from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Bend, FrameView, PresenceMap, Range, changed
 
 if TYPE_CHECKING:
+    from scipy import special
+
     from evlcp_joint import _kernels
 else:
+    special = Late("scipy.special")
     _kernels = Late("evlcp_joint._kernels")
 
 __all__ = ["JointScaleRanging"]

@@ -1,6 +1,7 @@
 """CRC-aided polar code."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from math import ceil, floor, log
 from typing import Annotated
 
@@ -71,8 +72,6 @@ class Polar(ErrorCorrection):
             ConfigError: A codeword has no room for a byte beside the CRC, or for what a plausible one has
                 beyond its message.
         """
-        from evlcp_polar import _kernels
-
         words = max(-(-coded_bits // _MOST_BITS), 1)
         length = coded_bits // words
         # A rate such as 0.35 has no exact double: the little more keeps 0.35 * 320 from being 111.99.
@@ -98,8 +97,6 @@ class Polar(ErrorCorrection):
             size *= 2
         sizes.append(self.max_list_size)
         information = information_set(length, message_bits + CRC_BITS)
-        nodes = np.empty((len(information), 3), np.int64)
-        nodes = nodes[: _kernels.schedule(information, nodes)].copy()
         return _PolarCode(
             message_bits=words * message_bits,
             coded_bits=coded_bits,
@@ -108,7 +105,6 @@ class Polar(ErrorCorrection):
             information=information,
             sent=sent_bits(length, message_bits + CRC_BITS),
             punctured=_punctured(length, message_bits + CRC_BITS),
-            nodes=nodes,
             list_sizes=tuple(dict.fromkeys(sizes)),
             log_share=log_share,
         )
@@ -162,9 +158,16 @@ class _PolarCode:
     information: NDArray[np.bool_]
     sent: NDArray[np.int64]
     punctured: bool
-    nodes: NDArray[np.int64]
     list_sizes: tuple[int, ...]
     log_share: float
+
+    @cached_property
+    def nodes(self) -> NDArray[np.int64]:
+        """The order of decoding; found with the first block, as that takes a kernel."""
+        from evlcp_polar import _kernels
+
+        nodes = np.empty((len(self.information), 3), np.int64)
+        return nodes[: _kernels.schedule(self.information, nodes)].copy()
 
     def encode(self, bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
         from evlcp_polar import _kernels

@@ -79,6 +79,15 @@ def test_help_imports_nothing_heavy() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
+def test_what_receives_is_imported_without_what_only_some_of_it_needs() -> None:
+    code = (
+        "import sys, evlcp_sdk.run\n"
+        "heavy = {'scipy.ndimage', 'scipy.special', 'scipy.linalg', 'scipy.optimize'} & set(sys.modules)\n"
+        "sys.exit(f'imported {heavy}' if heavy else 0)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_version(evlcp: Evlcp) -> None:
     assert evlcp("--version").out.startswith("evlcp-sdk ")
 
