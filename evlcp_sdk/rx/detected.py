@@ -130,6 +130,10 @@ class DetectedRegions:
         followed.size_px = size_px
         return 0.0
 
+    def light(self, followed: Followed, lit_px: tuple[float, float] | None) -> None:
+        """Note which part of a bar a frame showed."""
+        followed.lit_px = lit_px
+
     def gather(self, followed: Followed, from_us: float = -np.inf, until_us: float = np.inf) -> None:
         """Take a region's events once more: they are those that it has."""
 

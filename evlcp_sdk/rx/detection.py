@@ -63,6 +63,9 @@ _LEFT_STEPS = 6
 """Steps in which what is left of a region that turned out to be smaller may become one: it blinks all the
 time. What wakes there later is a halo, or leaves that its light falls on."""
 
+_SHOWN = 0.5
+"""Pixels a row, by those of rows that are lit, from which on rows that were dark are lit again: half."""
+
 _SEAM_PX = 2
 """Columns at either side of a box that a bar should leave dark: some of the least seam of a region."""
 
@@ -96,6 +99,8 @@ class Followed:
         filter: State of the filter of its centre, None without one.
         heights: As measured lately, px; of a bar of known size, those of steps in which both ends were seen.
         size_px: (width, height) of the whole bar, by what its frames show, px; None before the first.
+        lit_px: Upper and lower edge, from the bar's centre, of the part that its newest frame showed, px;
+            None where it showed both ends.
         outgrown: The region before that, which may have held other bars: (right, down) of its centre from
             this one's, width and height, px, and until when that matters, us.
         released: True once it has faded or was merged into another; it gets no more events.
@@ -112,6 +117,7 @@ class Followed:
     filter: Any = None
     heights: deque[float] = field(default_factory=lambda: deque(maxlen=_HEIGHTS))
     size_px: tuple[float, float] | None = None
+    lit_px: tuple[float, float] | None = None
     outgrown: tuple[float, float, float, float, float] | None = None
     opened_us: int = 0
     cut_us: int | None = None
@@ -483,6 +489,13 @@ class RegionFollower:
         self.counts["regions_left_out"] += not room
         return room
 
+    def light(self, followed: Followed, lit_px: tuple[float, float] | None) -> None:
+        """Say which part of a region's bar its newest frame showed: see `Followed.lit_px`."""
+        before, followed.lit_px = followed.lit_px, lit_px
+        if before != lit_px and abs(_height(before) - _height(lit_px)) > _STRAY_PX:
+            # Heights of another part.
+            followed.heights.clear()
+
     def drop(self, followed: Followed) -> None:
         """Let a region go at once."""
         followed.released = True
@@ -506,34 +519,42 @@ class RegionFollower:
         """A region of the height that it lately had; `rows`: its pixels in each row from `top` on.
 
         Where few pixels are awake, an end is dark; where noise wakes pixels that a fast bar has left, there
-        is one too many. Of the places that the edges allow, or that hold the most pixels, the nearest to the
-        expected one is taken. Where more of a bar of known size is missing, an end is hidden: the one that is
-        nearer to its place counts alone.
+        is one too many. Of the places that the edges allow, the nearest to the expected one is taken; of more
+        rows than the bar has, those that are likeliest to be its own. Where more of a bar of known size is
+        missing, an end is hidden: the one that is nearer to its place counts alone.
         """
-        known = followed.size_px
+        known, lit = followed.size_px, followed.lit_px
         _, expected_px = self._expected(followed, measured.t_us)
-        if known is None or -_STRAY_PX <= measured.height_px - known[1] <= 2 * _BLUR_PX:
-            followed.heights.append(measured.height_px)
+        heights = followed.heights
+        if lit is not None and known is not None and _shows_again(rows, expected_px - top, known[1], lit):
+            # Those before are of the part.
+            lit, heights = None, deque()
+        whole_px = measured.height_px if known is None else known[1] if lit is None else lit[1] - lit[0]
+        # Of a bar with a hidden end, the part that is seen is found, and says where the whole is.
+        off_px = 0.0 if lit is None else (lit[0] + lit[1]) / 2
+        expected_px += off_px
+        if known is None or -_STRAY_PX <= measured.height_px - whole_px <= 2 * _BLUR_PX:
+            heights.append(measured.height_px)
         # A part of the bar says nothing of its height, once that is known.
-        height_px = _median(followed.heights) if followed.heights else (known or (0, measured.height_px))[1]
+        height_px = _median(heights) if heights else whole_px
         excess_px = measured.height_px - height_px
         if excess_px > _STRAY_PX:
             n = min(round(height_px), len(rows))
             total = np.concatenate([[0], np.cumsum(rows)])
             inside = total[n:] - total[:-n]
-            places_px = top + np.flatnonzero(inside == inside.max()) + (n - 1) / 2
-            y_px = float(places_px[np.abs(places_px - expected_px).argmin()])
+            first_px = top + (n - 1) / 2
+            y_px = first_px + _likeliest(inside, n, int(total[-1]), expected_px - first_px)
         elif known is not None and excess_px < -2 * self._spec.margin_px:
             # By its upper end, and by its lower one.
             ends_px = measured.y_px - excess_px / 2, measured.y_px + excess_px / 2
             y_px = min(ends_px, key=lambda end_px: abs(end_px - expected_px))
             if abs(y_px - expected_px) > self._spec.margin_px:
-                y_px = followed.latest.y_px
+                y_px = followed.latest.y_px + off_px
         else:
             slack_px = abs(excess_px) / 2
             y_px = measured.y_px + min(max(expected_px - measured.y_px, -slack_px), slack_px)
         size_px = known or (measured.width_px, height_px + min(max(excess_px, 0.0), _STRAY_PX))
-        return region_of(measured.id, measured.t_us, measured.x_px, y_px, *size_px)
+        return region_of(measured.id, measured.t_us, measured.x_px, y_px - off_px, *size_px)
 
     def _filtered(self, followed: Followed, measured: Region) -> tuple[Any, Region]:
         """State of a region's filter after a measurement, and its place by it."""
@@ -767,6 +788,44 @@ def _median(values: Iterable[float]) -> float:
     ordered = sorted(values)
     many = len(ordered)
     return ordered[many // 2] if many % 2 else (ordered[many // 2 - 1] + ordered[many // 2]) / 2
+
+
+def _likeliest(inside: NDArray[np.int64], n: int, total: int, expected: float) -> int:
+    """Which of the places of a bar of `n` rows is the likeliest, by pixels and by where it should be.
+
+    Pixels of its rows and of the others are Poisson variables.
+
+    Args:
+        inside: Pixels in its rows at each place, int64 (places,).
+        n: Its rows.
+        total: Pixels in all rows.
+        expected: Number of the place where it should be.
+    """
+    most = int(inside.max())
+    lit, other = most / n, (total - most) / max(len(inside) - 1, 1)
+    # Half a pixel in the rows: none was seen there, but one may be.
+    told = max(math.log((lit + 0.5 / n) / (other + 0.5 / n)), 0.0)
+    places = np.arange(len(inside))
+    return int((told * inside - ((places - expected) / _STRAY_PX) ** 2 / 2).argmax())
+
+
+def _shows_again(
+    rows: NDArray[np.int64], centre: float, height_px: float, lit_px: tuple[float, float]
+) -> bool:
+    """Whether rows of a bar that were dark in its newest frame hold half as many pixels as the others."""
+    edges = centre + np.array([-height_px / 2, *lit_px, height_px / 2])
+    first, upper, lower, last = np.clip(np.round(edges).astype(int), 0, len(rows))
+    hidden, lit = max(upper - first, 0) + max(last - lower, 0), lower - upper
+    if hidden <= 0 or lit <= 0:
+        return False
+    inside = int(rows[upper:lower].sum())
+    outside = int(rows[first:upper].sum()) + int(rows[lower:last].sum())
+    return bool(outside * lit > _SHOWN * inside * hidden)
+
+
+def _height(lit_px: tuple[float, float] | None) -> float:
+    """Of a part of a bar, px; infinite of the whole."""
+    return math.inf if lit_px is None else lit_px[1] - lit_px[0]
 
 
 def _grown(box: Box, by: int) -> Box:

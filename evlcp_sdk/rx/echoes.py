@@ -25,6 +25,10 @@ from evlcp_sdk.values import Frame, Packet, changed
 
 __all__ = ["EchoQueue", "Echoes", "Sighting", "brighter", "originals", "repeats"]
 
+_TAIL_CHIPS = 2
+"""The last events of a frame come late, some later than its clock says: it is whole if the stream goes on for
+this long after those due."""
+
 _REPEATED = 0.25
 """Share of the symbols that a reflection repeats at the least; with fewer, nothing would be read of it."""
 
@@ -319,9 +323,13 @@ class EchoQueue:
 
     Attributes:
         echoes: The judge.
+        ends_us: When the stream ends, us: a frame is whole if it goes on for some chips after it.
+        cut: Frames so near to the end of the stream that they were not given.
     """
 
     echoes: Echoes
+    ends_us: float = math.inf
+    cut: int = 0
     _old: list[_Waiting] = field(default_factory=list)
     _new: list[_Waiting] = field(default_factory=list)
 
@@ -351,8 +359,11 @@ class EchoQueue:
     def _emit(self, waiting: _Waiting) -> list[Packet]:
         if waiting.sighting is None or waiting.due is None:
             return waiting.packets.flush()
-        frame = waiting.sighting.frame
+        due, frame = waiting.due, waiting.sighting.frame
+        if due.end_us + _TAIL_CHIPS * due.lock.chip_us > self.ends_us:
+            self.cut += 1
+            return []
         echo_of = self.echoes.echo_of(frame.transmitter)
         if echo_of != frame.echo_of:
             frame = changed(frame, echo_of=echo_of)
-        return waiting.packets.add(frame, waiting.due.packet_us, waiting.due.lock.chip_us)
+        return waiting.packets.add(frame, due.packet_us, due.lock.chip_us)

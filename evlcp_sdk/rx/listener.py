@@ -119,6 +119,8 @@ class LinkListener:
         """What was found so far, and dropped."""
         messages = self._messages.counts if self._messages is not None else {}
         found = self._regions.counts | self._framing.counts
+        found["frames"] -= self._judged.cut
+        found["frames_at_end"] = self._judged.cut
         if self.name:
             found["frames"] -= self._of_others
             found["frames_of_others"] = self._of_others + self._rejected_of_others
@@ -155,6 +157,11 @@ class LinkListener:
             self._announcer.lap("regions", region.latest)
         self._framing.step(regions, step)
         return self._judged.step()
+
+    def end_at(self, end_us: float) -> None:
+        """Let the stream end at a time, us: frames that are cut by it are not given."""
+        if isinstance(self._framing, PacketFraming):
+            self._judged.ends_us = end_us
 
     def finish(self) -> list[Packet]:
         """End the stream's events; give the packets that were still incomplete."""

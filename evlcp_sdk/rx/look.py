@@ -188,6 +188,30 @@ class Looker:
             look: A frame.
             placement: The bar's own or that of another instance, taken to be as wide.
         """
+        places, right_px, down_px = self._spots(look, placement)
+        left, right, top, bottom = _kernels.bounds_of(places)
+        left, right, top, bottom = left - right_px, right + right_px, top - down_px, bottom + down_px
+        x, y = look.corner_px
+        return (x + (left + right) / 2, y + (top + bottom) / 2), (right - left, bottom - top)
+
+    def lit_rows(self, look: Look) -> tuple[float, float] | None:
+        """Upper and lower edge of the clusters that a frame shows, from the whole bar's centre, px.
+
+        None where it shows both ends.
+        """
+        placement = look.placement
+        if placement.scale == 0 or placement.seen.all():
+            return None
+        places, _, down_px = self._spots(look, placement)
+        _, _, top, bottom = _kernels.bounds_of(places)
+        rows = places.imag[placement.seen]
+        first, last, centre = float(rows.min()), float(rows.max()), (top + bottom) / 2
+        if first <= top and last >= bottom:
+            return None
+        return first - down_px - centre, last + down_px - centre
+
+    def _spots(self, look: Look, placement: Placement) -> tuple[NDArray[np.complex128], float, float]:
+        """Where an instance's clusters are in the image, and how far each reaches to its sides, px."""
         selected, grid = look.presence.selected, look.presence.grid_px
         own, layout = look.placement, self._layout
         if own.scale == 0:
@@ -205,10 +229,7 @@ class Looker:
             places = placement.places(layout)
             right_px = along_px * abs(way.real) + across_px * abs(way.imag)
             down_px = along_px * abs(way.imag) + across_px * abs(way.real)
-        left, right, top, bottom = _kernels.bounds_of(places)
-        left, right, top, bottom = left - right_px, right + right_px, top - down_px, bottom + down_px
-        x, y = look.corner_px
-        return (x + (left + right) / 2, y + (top + bottom) / 2), (right - left, bottom - top)
+        return places, right_px, down_px
 
     def _size(self, width_px: float, height_px: float) -> tuple[int, int]:
         """Of the image: a region's, its seam on both sides, made even."""

@@ -89,7 +89,8 @@ class Places:
     ) -> "Places":
         """The same elsewhere, all of one size, under a number.
 
-        Where the height was off the new one by more than `most_px`, the row is `row_px`.
+        Where the height was off the new one by more than `most_px`, by how much more says how much farther
+        than that its middle may be from the place's: within it, the row that is nearest to `row_px` is taken.
         """
         other = object.__new__(Places)
         held = self._held()
@@ -100,7 +101,9 @@ class Places:
         columns[1, :many] = held[1] + right_px
         columns[2, :many] = held[2] + down_px
         if most_px < np.inf:
-            columns[2, :many][np.abs(held[4] - size_px[1]) > most_px] = row_px
+            slack_px = np.maximum(np.abs(held[4] - size_px[1]) - most_px, 0.0) / 2
+            off_px = row_px - columns[2, :many]
+            columns[2, :many] += np.minimum(np.maximum(off_px, -slack_px), slack_px)
         columns[3, :many], columns[4, :many] = size_px
         other.latest = region_of(id, *columns[:, many - 1].tolist())
         return other

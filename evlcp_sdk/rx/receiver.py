@@ -41,10 +41,10 @@ class Receiver:
         clock_zero: UTC of the camera clock's 0, for the age of signed beacons; None if it is not known.
         limits: How much it holds at the most.
         on_frame: Gets each frame as soon as it is decoded, within `feed` or `close`, in order of a
-            transmitter's frames. Its packet has the same later; only `echo_of` is by what is known then. Of
-            several links, frames come with their packet until their transmitter holds its place; where
-            another link takes that from it, the count `frames_withdrawn` has those told of packets that are
-            not given. None for nobody.
+            transmitter's frames. Its packet has the same later, unless the stream ends before the frame's
+            late events can have come; only `echo_of` is by what is known then. Of several links, frames come
+            with their packet until their transmitter holds its place; where another link takes that from it,
+            the count `frames_withdrawn` has those told of packets that are not given. None for nobody.
 
     Raises:
         ConfigError: Links that cannot be received together, or nothing tells them apart.
@@ -160,6 +160,8 @@ class Receiver:
         if self._closed:
             return []
         self._closed = True
+        for listener in self._listeners:
+            listener.end_at(self._clock.last_us)
         packets = [packet for step in self._timeline.close() for packet in self._run(step)]
         ends = [listener.finish() for listener in self._listeners]
         if self._contest is None:

@@ -66,6 +66,18 @@ def check_symbols(packets: list[Packet], bar: IdealBar, link: Link, *, t0_us: in
     return len(frames)
 
 
+@pytest.mark.parametrize(("chips", "cut"), [(1, 1), (4, 0)])
+def test_a_frame_whose_late_events_the_stream_does_not_hold_is_not_given(chips: int, cut: int) -> None:
+    bar = IdealBar(random_symbols(LINK, 2), start_us=0)
+    events = ideal_events(LINK, bar)
+    # The fifth frame of the second packet, and some chips more.
+    end_us = (LINK.packet.packet_chips + LINK.packet.frame_start_chip(5) + chips) * LINK.packet.chip_us
+    receiver = Receiver(LINK)
+    packets = receiver.feed(events[events.t_us < end_us]) + receiver.close()
+    assert check_symbols(packets, bar, LINK) == receiver.counts["frames"] == 15 - cut
+    assert receiver.counts["frames_at_end"] == cut
+
+
 @pytest.mark.parametrize("profile", ["wh4x2", "wh8", "raw8"])
 @pytest.mark.parametrize("ppm", [-100, 0, 100])
 def test_every_profile_with_both_clocks_off(profile: str, ppm: float) -> None:
