@@ -692,9 +692,9 @@ class RegionFollower:
                 if not _overlap(boxes[i], boxes[k]) or younger.released:
                     continue
                 one, other = older.latest, younger.latest
-                shown = older.size_px is not None and younger.size_px is not None
+                shown = (older.size_px is not None) + (younger.size_px is not None)
                 apart_px = max(abs(one.x_px - other.x_px), abs(one.y_px - other.y_px))
-                if not shown or apart_px <= SAME_PX:
+                if shown == 0 or apart_px <= SAME_PX or (shown == 1 and same_place(one, other)):
                     younger.released = True
         # The survivor reaches over both within a few steps, as its seam finds the other's pixels.
 
