@@ -543,7 +543,9 @@ class RegionFollower:
             total = np.concatenate([[0], np.cumsum(rows)])
             inside = total[n:] - total[:-n]
             first_px = top + (n - 1) / 2
-            y_px = first_px + _likeliest(inside, n, int(total[-1]), expected_px - first_px)
+            # What is not known yet may grow to either side.
+            told = 0.0 if known is None else _told(n, int(inside.max()), int(total[-1]), len(rows))
+            y_px = first_px + _likeliest(inside, told, expected_px - first_px)
         elif known is not None and excess_px < -2 * self._spec.margin_px:
             # By its upper end, and by its lower one.
             ends_px = measured.y_px - excess_px / 2, measured.y_px + excess_px / 2
@@ -790,23 +792,25 @@ def _median(values: Iterable[float]) -> float:
     return ordered[many // 2] if many % 2 else (ordered[many // 2 - 1] + ordered[many // 2]) / 2
 
 
-def _likeliest(inside: NDArray[np.int64], n: int, total: int, expected: float) -> int:
-    """Which of the places of a bar of `n` rows is the likeliest, by pixels and by where it should be.
+def _told(n: int, most: int, total: int, rows: int) -> float:
+    """What a pixel more says for a place of a bar of `n` rows: the logarithm of how many more are in its rows.
 
-    Pixels of its rows and of the others are Poisson variables.
-
-    Args:
-        inside: Pixels in its rows at each place, int64 (places,).
-        n: Its rows.
-        total: Pixels in all rows.
-        expected: Number of the place where it should be.
+    Pixels of its rows and of others are Poisson variables. Where `most` of all are inside, half a pixel stands
+    for none outside.
     """
-    most = int(inside.max())
-    lit, other = most / n, (total - most) / max(len(inside) - 1, 1)
-    # Half a pixel in the rows: none was seen there, but one may be.
-    told = max(math.log((lit + 0.5 / n) / (other + 0.5 / n)), 0.0)
-    places = np.arange(len(inside))
-    return int((told * inside - ((places - expected) / _STRAY_PX) ** 2 / 2).argmax())
+    lit, other = most / n, (total - most) / max(rows - n, 1)
+    return max(math.log((lit + 0.5 / n) / (other + 0.5 / n)), 0.0)
+
+
+def _likeliest(inside: NDArray[np.int64], told: float, expected: float) -> int:
+    """Which place holds a bar: by the pixels inside at each, int64 (places,), and by the expected place.
+
+    Where it is not told what a pixel says, those with the most pixels, and of them the nearest one.
+    """
+    off = np.arange(len(inside)) - expected
+    if told == 0:
+        return int(np.where(inside == inside.max(), np.abs(off), np.inf).argmin())
+    return int((told * inside - (off / _STRAY_PX) ** 2 / 2).argmax())
 
 
 def _shows_again(
