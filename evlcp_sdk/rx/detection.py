@@ -793,10 +793,15 @@ def _median(values: Iterable[float]) -> float:
 
 
 def _told(n: int, most: int, total: int, rows: int) -> float:
-    """What a pixel more says for a place of a bar of `n` rows: the logarithm of how many more are in its rows.
+    """What a pixel more inside says for a place of a bar: the logarithm of the ratio of pixels a row.
 
-    Pixels of its rows and of others are Poisson variables. Where `most` of all are inside, half a pixel stands
-    for none outside.
+    Pixels in the bar's rows and in others are Poisson variables; half a pixel stands for none.
+
+    Args:
+        n: Rows of the bar.
+        most: Pixels inside where most of them are.
+        total: Pixels in all rows.
+        rows: How many rows these are.
     """
     lit, other = most / n, (total - most) / max(rows - n, 1)
     return max(math.log((lit + 0.5 / n) / (other + 0.5 / n)), 0.0)

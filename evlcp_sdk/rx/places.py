@@ -89,8 +89,8 @@ class Places:
     ) -> "Places":
         """The same elsewhere, all of one size, under a number.
 
-        Where the height was off the new one by more than `most_px`, by how much more says how much farther
-        than that its middle may be from the place's: within it, the row that is nearest to `row_px` is taken.
+        Where the height was off the new one by more than `most_px`, the middle may be off by half of what is
+        more: of those rows, the nearest to `row_px` is taken.
         """
         other = object.__new__(Places)
         held = self._held()
