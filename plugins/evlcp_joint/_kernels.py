@@ -1,6 +1,6 @@
 """Where a bar's clusters lie, the values of its rows, and the fit of its boundaries: compiled."""
 
-from math import exp
+from math import exp, sqrt
 from typing import Any
 
 import numpy as np
@@ -932,3 +932,137 @@ def fit_bar(
     if spread <= 0:
         return np.nan
     return (by_row * rows / max(rows - _FITTED, 1) + left_over / max(n - 2, 1) / spread) / 2
+
+
+@njit(cache=True, nogil=True)
+def measure_column(
+    selected: Array,
+    grid: int,
+    sums: Array,
+    offset: Array,
+    symbols: Array,
+    pilots: Array,
+    words: Array,
+    when: Array,
+    profile: Array,
+    prior: Array,
+    pixels: tuple[float, float, float, float, float],
+    search: tuple[int, int, float, float],
+    limits: tuple[int, float, float, float],
+    by_boundary: Array,
+) -> tuple[float, float, float]:
+    """Spacing of a bar's clusters in the image along its axis, its standard deviation, px, and columns a row.
+
+    From the cells that are `selected`, of `grid` px, and the sums of a frame (chips, rows, columns), with
+    `offset` (2, chips) the place of the bar's centre in each; by `fit_bar` of what `read_bar` finds. `pixels`
+    are a boundary's blur, px, events of a full value, the share of a veil, the gain to begin with, and the
+    residual beyond which a row weighs less.
+
+    Returns:
+        NaN where there are too few cells in line, no fit, or one that leaves the cells.
+    """
+    line, seen = np.empty(5), np.empty(len(selected), np.bool_)
+    way = lie_of_cells(selected, line, seen)
+    if way == 0:
+        return np.nan, np.nan, np.nan
+    middle = (grid - 1) / 2
+    line[0] = line[0] * grid + middle
+    line[1] *= grid
+    line[2] = line[2] * grid + middle - line[3] * middle
+    # In whole cells, as wide as the core is.
+    line[4] = (line[4] + 0.5) * grid
+    fit = np.empty(_FITTED)
+    most = grid + 1
+    if way == 1:
+        variance = _measured(
+            sums,
+            offset[1],
+            line,
+            seen,
+            symbols,
+            pilots,
+            words,
+            when,
+            profile,
+            prior,
+            pixels,
+            search,
+            limits,
+            most,
+            fit,
+            by_boundary,
+        )
+    else:
+        # A bar that lies across the image: rows and columns are exchanged.
+        chips, rows, columns = sums.shape
+        turned = np.empty((chips, columns, rows), sums.dtype)
+        for i in range(chips):
+            for c in range(columns):
+                for r in range(rows):
+                    turned[i, c, r] = sums[i, r, c]
+        variance = _measured(
+            turned,
+            offset[0],
+            line,
+            seen,
+            symbols,
+            pilots,
+            words,
+            when,
+            profile,
+            prior,
+            pixels,
+            search,
+            limits,
+            most,
+            fit,
+            by_boundary,
+        )
+    return fit[0], sqrt(max(variance, 0.0)) if variance == variance else np.nan, line[3]
+
+
+@njit(cache=True, nogil=True)
+def _measured(
+    sums: Array,
+    offset: Array,
+    line: Array,
+    seen: Array,
+    symbols: Array,
+    pilots: Array,
+    words: Array,
+    when: Array,
+    profile: Array,
+    prior: Array,
+    pixels: tuple[float, float, float, float, float],
+    search: tuple[int, int, float, float],
+    limits: tuple[int, float, float, float],
+    most: float,
+    fit: Array,
+    by_boundary: Array,
+) -> float:
+    """Variance of the spacing of a bar that lies along the rows, and its fit; NaN where there is none."""
+    blur, full, veil, gain, huber = pixels
+    clusters, height, n = len(pilots), sums.shape[1], when.size
+    codes, known = np.empty((clusters, n)), np.empty((clusters + 1, n), np.bool_)
+    values, moved = np.empty((n, height)), np.empty(n)
+    # A value is read from its second chip, whose events follow the edge at its start, half a chip before the
+    # middle that an offset is for. Images are held still by whole pixels, so offsets jump by one.
+    for i in range(n):
+        step = offset[2 * i + 1] - offset[2 * i]
+        moved[i] = offset[2 * i + 1] - (step - np.rint(step)) / 2
+    dim = read_bar(sums, pilots, words, symbols, seen, line, full, veil, codes, known, moved, values)
+    first, spacing = line[0], line[1]
+    if spacing < 0:
+        # A bar upside down is mirrored.
+        spacing, first = -spacing, height - 1 - first
+    centre = first + spacing * (clusters - 1) / 2 - (height - 1) / 2
+    for a in range(_FITTED):
+        fit[a] = 0.0
+    fit[0], fit[1], fit[3] = spacing, centre, gain
+    variance = fit_bar(
+        codes, known, moved, when, profile, blur, dim, huber, prior, values, search, limits, fit, by_boundary
+    )
+    # From the start, which cells gave, an end moves by the size of a cell and a pixel of blur.
+    if abs(fit[0] - spacing) * (clusters - 1) / 2 + abs(fit[1] - centre) > most:
+        return np.nan
+    return variance

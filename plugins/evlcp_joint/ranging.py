@@ -16,7 +16,7 @@ from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import Bend, FrameView, PresenceMap, Range, changed
+from evlcp_sdk.values import Bend, FrameView, Range, changed
 
 if TYPE_CHECKING:
     from scipy import special
@@ -70,9 +70,6 @@ _LEAST_OUTLIER_PX = 0.25
 _LEAST_EXPLAINED = 0.3
 """Share of the values' energy that a fit explains at the least: fits of noise reach a tenth, and dim bars
 in a bright scene three quarters."""
-
-_ACROSS = 2
-"""What `_kernels.lie_of_cells` says of a bar that lies across the image."""
 
 Floats = NDArray[np.float64]
 
@@ -159,106 +156,46 @@ class JointScaleRanging(Ranging):
         words = codebook.codeword_edges.astype(np.float64)
         boundaries = np.arange(1.0, clusters) - clusters / 2
 
+        when = (np.arange(n := pilots.shape[1] + words.shape[1]) + 0.5) / n - 0.5
+        pixels = self.blur_px, self.full_events, _VEIL, _STARTING_GAIN, self.huber
+        search = _STEPS, _ROUNDS, _CLOSE, _EXACT
+        limits = least, _OUTLIER, _LEAST_OUTLIER_PX, _LEAST_EXPLAINED
+
         def measure(view: FrameView) -> Range:
-            placed = _place(view.presence)
-            if placed is None:
-                return _NONE
-            place, across = placed
-            sums, offset = view.sums, _offsets(view.offset_px)
-            if across:
-                # A bar that lies across the image: exchange rows and columns.
-                sums, offset = np.ascontiguousarray(sums.transpose(0, 2, 1)), offset[::-1]
-            height, n = sums.shape[1], pilots.shape[1] + words.shape[1]
-            codes, known = np.empty((clusters, n)), np.empty((clusters + 1, n), np.bool_)
-            values, moved = np.empty((n, height)), np.ascontiguousarray(offset[1])
-            dim = _kernels.read_bar(
-                sums,
+            by_boundary = np.empty((2, clusters + 1))
+            spacing_px, sigma_px, tilt = _kernels.measure_column(
+                view.presence.selected,
+                view.presence.grid_px,
+                view.sums,
+                view.offset_px,
+                view.soft.symbols,
                 pilots,
                 words,
-                view.soft.symbols,
-                place.seen,
-                place.lie,
-                self.full_events,
-                _VEIL,
-                codes,
-                known,
-                moved,
-                values,
+                when,
+                _profile(self.core_share),
+                _PRIOR,
+                pixels,
+                search,
+                limits,
+                by_boundary,
             )
-            first, spacing, _, tilt, _ = place.lie.tolist()
-            if spacing < 0:
-                # A bar upside down is mirrored.
-                spacing, first = -spacing, height - 1 - first
-            centre = first + spacing * (clusters - 1) / 2 - (height - 1) / 2
-            fit = np.array([spacing, centre, 0.0, _STARTING_GAIN, 0.0, 0.0, 0.0])
-            fitted = self._fit(codes, known, moved, dim, values, fit, least)
-            if fitted is None:
-                return _NONE
-            fit, sigma_px, off = fitted
-            # From the start, which cells gave, an end moves by the size of a cell and a pixel of blur.
-            most_px = view.presence.grid_px + 1
-            if abs(fit[0] - spacing) * (clusters - 1) / 2 + abs(fit[1] - centre) > most_px:
+            if math.isnan(sigma_px):
                 return _NONE
             # Rows measure the bar along one axis; a tilted bar is longer by its slope.
             stretch = math.hypot(1.0, tilt)
-            distance = camera.distance_m(spacing_m, float(fit[0]) * stretch)
-            late_chips = (len(sums) - 2 * pilots.shape[1]) / 2
-            one_px = spacing_m * float(fit[0]) * stretch / distance
+            distance = camera.distance_m(spacing_m, spacing_px * stretch)
+            late_chips = (len(view.sums) - 2 * pilots.shape[1]) / 2
+            one_px = spacing_m * spacing_px * stretch / distance
+            off, weight = by_boundary[:, 1:-1]
             return Range(
                 distance,
-                distance * sigma_px / float(fit[0]),
-                int(np.count_nonzero(off[1])),
+                distance * sigma_px / spacing_px,
+                int(np.count_nonzero(weight)),
                 late_chips,
-                Bend(boundaries.copy(), off[0] / one_px, off[1] * one_px**2),
+                Bend(boundaries.copy(), off / one_px, weight * one_px**2),
             )
 
         return measure
-
-    def _fit(
-        self,
-        codes: Floats,
-        known: NDArray[np.bool_],
-        offset: Floats,
-        dim: float,
-        values: Floats,
-        fit: Floats,
-        least: int,
-    ) -> tuple[Floats, float, Floats] | None:
-        """The fit, its spacing's standard deviation, px, and where boundaries lie off it.
-
-        Of each boundary, float64 (2, K - 1), the shift, px, and its weight, 0 where it does not count.
-        """
-        fit, by_boundary = fit.copy(), np.empty((2, len(known)))
-        variance = _kernels.fit_bar(
-            codes,
-            known,
-            offset,
-            _when(len(values)),
-            _profile(self.core_share),
-            self.blur_px,
-            dim,
-            self.huber,
-            _PRIOR,
-            values,
-            (_STEPS, _ROUNDS, _CLOSE, _EXACT),
-            (least, _OUTLIER, _LEAST_OUTLIER_PX, _LEAST_EXPLAINED),
-            fit,
-            by_boundary,
-        )
-        if math.isnan(variance):
-            return None
-        return fit, math.sqrt(max(variance, 0.0)), by_boundary[:, 1:-1]
-
-
-def _offsets(offset_px: Floats) -> Floats:
-    """Where the bar's centre stands in the image of each value's second chip, px, float64 (2, values).
-
-    A value is read from its second chip, whose events follow the edge at its start, half a chip before the
-    middle that an offset is for. Images are held still by whole pixels, so offsets jump by one.
-    """
-    second = offset_px[:, 1::2]
-    step = second - offset_px[:, 0::2]
-    return second - (step - np.rint(step)) / 2
 
 
 @cache
@@ -276,12 +213,6 @@ def _profile(core_share: float) -> Floats:
         2 * np.pi
     )
     return np.stack([across, slope])
-
-
-@cache
-def _when(n: int) -> Floats:
-    """Times of the values, in frames, from the middle of the frame."""
-    return (np.arange(n) + 0.5) / n - 0.5
 
 
 def _part(view: FrameView, clusters: NDArray[np.int64]) -> FrameView:
@@ -316,33 +247,3 @@ def _instead(bar: BarLayout) -> str:
     if bar.clusters < 2:
         return "no ranging measures the distance of one cluster: use 'none' for this layout"
     return f"use '{ROLES['ranging'].default_for(bar)}' for this layout"
-
-
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """How a bar lies in an image whose rows run along it.
-
-    Attributes:
-        lie: Row of the first cluster's middle, px; rows from one to the next, px, less than 0 for a bar
-            upside down; column of its middle in row 0, px; columns a row; half its width, px; float64 (5,).
-        seen: Which clusters are seen where they are expected, bool (K,).
-    """
-
-    lie: Floats
-    seen: NDArray[np.bool_]
-
-
-def _place(presence: PresenceMap) -> tuple[_Place, bool] | None:
-    """Where the bar lies by its cells, and whether it lies across the image; None with too few in line."""
-    selected = presence.selected
-    line, seen = np.empty(5), np.empty(len(selected), np.bool_)
-    way = _kernels.lie_of_cells(selected, line, seen)
-    if not way:
-        return None
-    first, spacing, left, tilt, half = line.tolist()
-    grid = presence.grid_px
-    middle = (grid - 1) / 2
-    line[:3] = first * grid + middle, spacing * grid, left * grid + middle - tilt * middle
-    # In whole cells, as wide as the core is.
-    line[4] = (half + 0.5) * grid
-    return _Place(line, seen), way == _ACROSS

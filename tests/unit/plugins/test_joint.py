@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from evlcp_joint import _kernels
-from evlcp_joint.ranging import JointScaleRanging, _profile, _together
+from evlcp_joint.ranging import _PRIOR, JointScaleRanging, _profile, _together
 from numpy.testing import assert_allclose
 from scipy.stats import norm, theilslopes
 
@@ -662,6 +662,17 @@ def test_a_bar_is_read_upright(spacing: float) -> None:
     assert dim == _kernels.dimmer(sums, pilots, seen, place)
 
 
+def fit_of(codes, known, dim, values, start):
+    """The fit of a frame's values, of boundaries .45 px wide without tails, and where they lie off it."""
+    fit, by_boundary = start.copy(), np.empty((2, K + 1))
+    variance = _kernels.fit_bar(
+        codes, known, np.zeros(16), (np.arange(16) + 0.5) / 16 - 0.5, _profile(1.0), 0.45, dim, 9.0, _PRIOR,
+        values, (12, 2, 1e-3, 1e-5), (6, 4.0, 0.25, 0.3), fit, by_boundary,
+    )  # fmt: skip
+    assert variance > 0
+    return fit, by_boundary[:, 1:-1]
+
+
 @pytest.mark.parametrize("dim", [0.05, 0.5, 2.0])
 def test_boundaries_stay_where_one_sign_is_missed(dim: float) -> None:
     """Pilots, and symbols, say more steps of one sign at some boundaries."""
@@ -675,11 +686,9 @@ def test_boundaries_stay_where_one_sign_is_missed(dim: float) -> None:
     values *= np.where(values < 0, dim, 1)
     known = np.ones((K + 1, 16), np.bool_)
     known[[0, K]] = False
-    joint = JointScaleRanging(huber=9.0, blur_px=0.45, core_share=1.0)
     start = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
-    found = joint._fit(codes, known, np.zeros(16), dim, values, start, 6)
-    assert found is not None
-    assert found[0][0] == pytest.approx(spacing, rel=2e-5)
+    fit, _ = fit_of(codes, known, dim, values, start)
+    assert fit[0] == pytest.approx(spacing, rel=2e-5)
 
 
 def test_shifts_by_sign_and_by_repeated_values_are_found() -> None:
@@ -696,11 +705,8 @@ def test_shifts_by_sign_and_by_repeated_values_are_found() -> None:
         values[i] = 0.6 * (codes[0, i] + share @ np.diff(codes[:, i]))
     known = np.ones((K + 1, 16), np.bool_)
     known[[0, K]] = False
-    joint = JointScaleRanging(huber=9.0, blur_px=0.45, core_share=1.0)
     start = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
-    found = joint._fit(codes, known, np.zeros(16), 1.0, values, start, 6)
-    assert found is not None
-    fit, _, (off, weight) = found
+    fit, (off, weight) = fit_of(codes, known, 1.0, values, start)
     assert fit[0] == pytest.approx(spacing, rel=2e-5)
     # The prior takes up to a tenth of them.
     assert_allclose(fit[5:], [0.04, 0.05], rtol=0.12)
@@ -723,10 +729,8 @@ def noisy_fit(distance_m: float, noise: float, seed: int) -> tuple[float, np.nda
     known = np.ones((K + 1, 16), np.bool_)
     known[[0, K]] = False
     # With the profile of the bound: a normal distribution.
-    joint = JointScaleRanging(huber=9.0, blur_px=0.45, core_share=1.0)
-    found = joint._fit(codes, known, np.zeros(16), 1.0, values, start, 6)
-    assert found is not None
-    return LINK.camera.focal_px * 0.06 / found[0][0], symbols
+    fit, _ = fit_of(codes, known, 1.0, values, start)
+    return LINK.camera.focal_px * 0.06 / fit[0], symbols
 
 
 def test_the_fit_reaches_the_cramer_rao_bound() -> None:
