@@ -265,19 +265,21 @@ class Echoes:
         self._forget()
         self._decide()
 
-    def _beside(self, sighting: Sighting, known: Iterable[Sighting]) -> Sighting | None:
+    def _beside(self, sighting: Sighting, known: deque[Sighting]) -> Sighting | None:
         """Another transmitter's frame elsewhere in the image, begun within half a chip; None without one."""
         frame = sighting.frame
-
-        def apart_us(other: Sighting) -> float:
-            return abs(other.frame.t_us - frame.t_us)
-
-        nearest = min(known, key=apart_us, default=None)
+        nearest, least_us = None, math.inf
+        # In order of time: from the newest back, until they are farther away again.
+        for other in reversed(known):
+            apart_us = abs(other.frame.t_us - frame.t_us)
+            if apart_us > least_us:
+                break
+            nearest, least_us = other, apart_us
         if nearest is None:
             return None
         within_us = self._chip_us / 2 + LONGEST_ROW_US * abs(nearest.frame.y_px - frame.y_px)
         off_px = max(abs(nearest.frame.x_px - frame.x_px), abs(nearest.frame.y_px - frame.y_px))
-        return nearest if apart_us(nearest) < within_us and off_px > SAME_PX else None
+        return nearest if least_us < within_us and off_px > SAME_PX else None
 
     def _forget(self) -> None:
         for known in self._seen.values():

@@ -157,8 +157,7 @@ class Looker:
             offset_px = np.concatenate([pilot.offset_px, offset_px], axis=1)
         # The image shows the pilot's mean, read from the chips behind edges that tell codes apart; the bar's
         # centre at the instant is that of its region.
-        told = pilot.offset_px[:, 1 :: self._every]
-        rest_x, rest_y = (np.add.reduce(told, 1) / told.shape[1]).tolist()
+        rest_x, rest_y = (sum(told) / len(told) for told in pilot.offset_px[:, 1 :: self._every].tolist())
         corner_px = (
             float(x[middle]) - (size[0] - 1) / 2 - rest_x,
             float(y[middle]) - (size[1] - 1) / 2 - rest_y,

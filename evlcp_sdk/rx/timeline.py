@@ -130,7 +130,7 @@ class Timeline:
                 due = due_us()
                 within = max(self._start_us, self._part_us) < due < self._start_us + self._step_us
                 self._due_us = math.ceil(due) if within else _LATER_US
-            part = int(np.searchsorted(t_us, self._due_us))
+            part = int(t_us.searchsorted(self._due_us))
             if part == end:
                 return
             self._part_us, self._due_us = self._due_us, None

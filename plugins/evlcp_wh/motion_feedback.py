@@ -94,7 +94,7 @@ class MotionFeedback(Decoding):
                 worth = learned_worth(presence, aligned, pilots, self.max_events, self.prior_count)
                 soft, _ = self._decided(presence, aligned, pilots, words, worth)
                 known = np.concatenate([pilots, words[soft.symbols].astype(np.int64)], axis=1)
-            return self._decided(presence, aligned, pilots, words, worth)[0]
+            return soft
 
         return decode
 
