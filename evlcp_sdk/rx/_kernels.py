@@ -52,6 +52,7 @@ def score_rises(
     soon: int,
     tick_shift: int,
     min_score: int,
+    most_same: int,
     cell_shift: int,
 ) -> int:
     """Score each pixel by the rhythm of its rises; add those of candidates to their cell's `hits`; how many.
@@ -59,12 +60,13 @@ def score_rises(
     `pixels` (height, width) are uint32, see `Rhythm`. A rise sooner than `soon` ticks after the one before is
     the same; `kinds` says what a number of ticks is, the last, 0, for all beyond, and `lows` what becomes of
     time and score, and in the bit above whether it is the same time again. A tick is 2^tick_shift us. A rise
-    beyond is no hit.
+    beyond is no hit, nor is one after the same time `most_same` times.
     """
     width, columns = np.uint32(pixels.shape[1]), np.uint32(hits.shape[1])
     states, cells = pixels.reshape(-1), hits.reshape(-1)
     longest, least = np.uint32(kinds.size - 1), np.uint32(min_score)
     first, shift, ticks = np.uint32(soon), np.uint32(cell_shift), np.uint64(tick_shift)
+    lamp = np.uint32(most_same)
     # What counts is as good as random at each stage, so that it is found without a branch; and indices are
     # unsigned, as those below 0 would count from the end.
     where, runs = np.empty(t_us.size + 1, np.uint32), np.empty(t_us.size + 1, np.uint32)
@@ -93,7 +95,7 @@ def score_rises(
         same = _SAMES[(low >> np.uint32(SAME_AT) << np.uint32(3)) | same]
         states[at] = (state & _HIGH) | (same << np.uint32(SAME_AT)) | (low & _PART)
         # One that comes after long is no blinking yet, however a pixel blinked when a bar was there.
-        if (low & np.uint32(SCORES)) >= least and kind != np.uint32(0):
+        if (low & np.uint32(SCORES)) >= least and kind != np.uint32(0) and same < lamp:
             row = at // width
             cells[(row >> shift) * columns + ((at - row * width) >> shift)] += 1
             candidates += 1

@@ -645,10 +645,13 @@ class RegionFollower:
 
     def _start(self, box: Box, end_us: int) -> None:
         region = self._measure(self._next_id, box, end_us, np.empty(box[3] - box[1], np.int64))
-        if region is None or not self._place_for_one(end_us):
+        if region is None:
+            return
+        reach = self._reach(region.x_px, region.y_px, region.width_px, region.height_px)
+        # Lamps whose pixels were not known as such in the step before: nothing of them is listened to.
+        if not len(self._rhythmic(select(self._recent[-1][1], reach))) or not self._place_for_one(end_us):
             return
         self._next_id += 1
-        reach = self._reach(region.x_px, region.y_px, region.width_px, region.height_px)
         for like in self.alive:
             if _left_by(like, region):
                 # It was seen as long as the one that it was taken to be a part of.

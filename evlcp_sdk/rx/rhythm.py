@@ -9,9 +9,9 @@ moving texture, lowers it by three: more than the two that chance, which is on t
 would bring. One after the very same number of chips as before lowers it by two from five chips on: a lamp of
 1 or 2 kHz repeats its period, a code with missing events does not.
 A lamp whose period is near two, three or four chips is in rhythm, too, as far as a score tells; but its time
-comes again and again, to half a chip, which one of a code does not for long: before a frame shows where the
-bar is, such pixels are not listened to. Falls are not looked at: they come later or sooner than rises by the
-light, they are the first to go missing, and some cameras send none.
+comes again and again, to half a chip, which one of a code does not for long: such pixels open no region, and
+before a frame shows where the bar is, they are not listened to. Falls are not looked at: they come later or
+sooner than rises by the light, they are the first to go missing, and some cameras send none.
 
 A pixel that a bar has left keeps its score, as it hardly rises any more; but where the camera shakes, the
 veil around the bar comes nearer again, and all pixels of the trail rise once, with a chip. So a region is
@@ -141,6 +141,7 @@ class Rhythm:
             self._soon,
             self._shift,
             self._min_score,
+            _SAME,
             cell_shift,
         )
         self._taken = len(events)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 
-def score_rises(events, shape, start, chip_us, min_score, cell_shift):
+def score_rises(events, shape, start, chip_us, min_score, cell_shift, most_same=5):
     """Last rise, time before it, how often that again, score of each pixel; and hits. `start`: before.
 
     Times by number, 0: beyond what counts.
@@ -34,7 +34,7 @@ def score_rises(events, shape, start, chip_us, min_score, cell_shift):
         again = apart == 0 or (apart == 1 and min(number, time[v, u]) > 0 and max(number, time[v, u]) <= 6)
         same[v, u] = min(same[v, u] + 1, 7) if again else max(same[v, u] - 2, 0)
         rose[v, u], time[v, u] = t, number
-        if score[v, u] >= min_score and number:
+        if score[v, u] >= min_score and number and same[v, u] < most_same:
             cell = v >> cell_shift, u >> cell_shift
             hits[cell] = hits.get(cell, 0) + 1
     return (rose, time, same, score), hits

@@ -206,6 +206,14 @@ def test_lamps_and_noise_are_no_regions(hz: float, duty: float) -> None:
     assert not any(by_step.values())
 
 
+@pytest.mark.parametrize("later_us", range(0, STEP_US, 125))
+def test_a_lamp_of_two_chips_is_no_region(later_us: int) -> None:
+    """Wherever in a step its pixels are known as a lamp's, having been candidates in the step before."""
+    lamp = lamp_events(300, 300, 20, 1e6 / (2 * LINK.packet.chip_us), 30_000)
+    lamp = Events.of(lamp.t_us + later_us, lamp.x, lamp.y, lamp.p)
+    assert not any(followed(lamp, 29_000).values())
+
+
 def test_a_moving_edge_is_no_region() -> None:
     """A bright post that crosses the image at 3 px/ms: each pixel sees it come and go once."""
     column, row = np.meshgrid(np.arange(100, 400), np.arange(100, 500))
