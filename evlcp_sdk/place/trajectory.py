@@ -45,7 +45,8 @@ _SPEED_M_S = 30.0
 """Speeds that are likely at first (sigma): a car's."""
 
 _MOST_MISSES = 10
-"""Fixes in a row that are left out before the trajectory starts anew: so many are not outliers."""
+"""Fixes in a row that are left out before the trajectory starts anew: so many are not outliers. Of a young
+one, no more than it has taken: an outlier among its first fixes points it elsewhere."""
 
 _MOTION = 6
 _SLOW = slice(6, 9)
@@ -124,6 +125,7 @@ class TrajectoryPoint:
         swing: How the camera turned from the point before to this one.
         misses: Fixes in a row that were left out, this one included; 0 where it counts.
         starts: A trajectory starts here.
+        taken: Fixes that count since then, this one included, as far as that matters.
         fix: What was taken, or left out.
         course: How the fixes of the same bars go on, with little of their noise.
         recent: The points from the one before that course on, as long as it is short.
@@ -139,6 +141,7 @@ class TrajectoryPoint:
     swing: Swing | None = None
     misses: int = 0
     starts: bool = False
+    taken: int = 1
     fix: Fix | None = None
     course: Course | None = None
     recent: tuple["TrajectoryPoint", ...] = ()
@@ -190,7 +193,7 @@ def trajectory_step(
     spread = seen @ ahead.covariance @ seen.T + fix.noise_m2
     limit = chi_square(spec.false_alarm, 3) if fix.source == GNSS else spec.gate_sigmas**2
     if innovation @ np.linalg.solve(spread, innovation) > limit:
-        if state.misses + 1 > _MOST_MISSES:
+        if state.misses + 1 > min(_MOST_MISSES, state.taken):
             return _first(fix)
         return _caught_up(state, replace(_faced(ahead, fix), misses=state.misses + 1), spec)
     return _caught_up(state, _taken(ahead, fix, seen), spec)
@@ -220,7 +223,8 @@ def _taken(ahead: TrajectoryPoint, fix: Fix, seen: Floats) -> TrajectoryPoint:
     after = ahead.covariance - change - change.T + gain @ spread @ gain.T
     mean = ahead.mean + gain @ (fix.enu_m - seen @ ahead.mean)
     after = (after + after.T) / 2
-    return replace(_faced(ahead, fix), mean=mean, covariance=after, misses=0)
+    taken = min(ahead.taken + 1, _MOST_MISSES)
+    return replace(_faced(ahead, fix), mean=mean, covariance=after, misses=0, taken=taken)
 
 
 def filter_fixes(
@@ -267,7 +271,7 @@ def _again(
             seen = _seen(ahead.causes, point.fix)
             seen = _seen(ahead.causes, _moved(point.fix, point.fix.enu_m - seen @ _still(there)))
             taken = _faced(ahead, point.fix) if point.misses else _taken(ahead, point.fix, seen)
-            again[i] = replace(taken, misses=point.misses, course=point.course)
+            again[i] = replace(taken, misses=point.misses, course=point.course, taken=point.taken)
     return again
 
 

@@ -110,7 +110,8 @@ def test_an_outlier_is_left_out_and_a_new_place_starts_a_trajectory() -> None:
     assert abs(points[5].mean[0] - 5) < 0.5
     jumped = fixes[:5] + [fix((5 + i) * 1e5, np.array([1000.0 + i, 0, 0])) for i in range(15)]
     points = filter_fixes(jumped, SPEC)
-    assert [i for i, p in enumerate(points) if p.starts] == [0, 15]
+    # As many as it had taken are left out.
+    assert [i for i, p in enumerate(points) if p.starts] == [0, 10]
     smooth = smooth_trajectory(points, SPEC)
     assert max(p.mean[0] for p in smooth[:5]) < 10
 
@@ -353,3 +354,19 @@ def test_noise_does_not_show_errors_that_stay() -> None:
     # By chance alone the mean of 60 is below 4.4 but for one in a thousand.
     assert max(np.mean(kept["forward"]), np.mean(kept["smoothed"])) < 4.4
     assert min(np.mean(kept["as they are"]), np.mean(kept["smoothed so"])) > 8
+
+
+def test_a_young_track_is_not_believed_against_more_fixes_than_it_has() -> None:
+    """Its second fix is off, so that it points elsewhere; those after it agree with one another."""
+    t_us = np.arange(12) * 35e3
+    seen = np.outer(t_us * 1e-6, [10.0, 0.0, 0.0])
+    seen[1] += 12 * SIGMA_M
+    points = filter_fixes([fix(t, p) for t, p in zip(t_us, seen, strict=True)], SPEC)
+    assert [p.starts for p in points].index(True, 1) <= 5
+    assert points[-1].misses == 0
+    assert (abs(points[-1].mean[:3] - seen[-1]) < 5 * np.sqrt(np.diag(points[-1].covariance_m2))).all()
+    # One that has taken many is left by as many as ever.
+    seen = np.outer(np.arange(40) * 35e-3, [10.0, 0.0, 0.0])
+    seen[25:] += 20 * SIGMA_M
+    points = filter_fixes([fix(t * 35e3, p) for t, p in enumerate(seen)], SPEC)
+    assert [p.starts for p in points].index(True, 1) == 35
