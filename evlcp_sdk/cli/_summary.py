@@ -41,6 +41,10 @@ def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) 
                 + _or_dash(t["distance_last_m"], "{:.2f} m"),
             )
         out.print(table)
+    for t in summary["transmitters"]:
+        if said := t.get("text"):
+            more = "..." if len(said) > _MOST_SAID else ""
+            out.print(Text(f"text of {_who(t)}: {said[:_MOST_SAID]!r}{more}"))
     if text := _messages(summary["counts"]):
         out.print(text)
     for told in summary["messages"][-_MOST_SHOWN:]:

@@ -1,210 +1,175 @@
-"""Lists of events without coordinates: time and polarity of one group of pixels, as CSV or NPZ."""
+"""Lists of events as people keep them: times, polarities, perhaps places; as CSV, NPZ, NPY or MAT.
+
+What is not said (which column is what, the unit of the times) is guessed from names and values, and the
+source's header says how.
+"""
 
 import gzip
+import itertools
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io._sieve import Sieve
-from evlcp_sdk.io.tables import DAMAGE, NpzColumn, said, show
-from evlcp_sdk.io.writers import LAST_TIME_US
-from evlcp_sdk.plugin.source import EventSource
+from evlcp_sdk.io.fields import (
+    UNITS_US,
+    Fields,
+    TimeUnit,
+    fields_of,
+    fields_of_values,
+    polarities,
+    time_unit,
+)
+from evlcp_sdk.io.tables import COLUMNS, CSV_HEADER, DAMAGE, NpzColumn, said, show
+from evlcp_sdk.io.urls import flag, split_options
+from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["ListColumns", "ListSource", "TimeUnit", "columns_of", "is_list", "time_unit"]
-
-UNITS_US: Final = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
-_TIME: Final = re.compile(r"(?:t|ts|time|timestamp)[ _]?[(\[]?(s|ms|us|µs|ns)?[)\]]?")
-_POLARITY: Final = ("p", "pol", "polarity")
-_PLACE: Final = ("x", "y")
-_WORDS: Final = ((b"true", b"1"), (b"false", b"0"))
+__all__ = ["SUFFIXES", "ListSource", "is_list", "open_list"]
 
 PIECE_BYTES: Final = 1 << 20
+PIECE_ROWS: Final = 1 << 16
 LOOKED_AT: Final = 1 << 14
-"""Times at the start from which the unit is recognized."""
+"""Rows at the start from which units are recognized."""
 
-LEAST_RATE_HZ: Final = 20.0
-MOST_RATE_HZ: Final = 5e7
-"""Events a second of pixels that see a blinking light: with fewer, or more, the unit is another."""
+MOST_WAITING: Final = 1 << 20
+"""Rows that wait for earlier ones: a list of fewer may be in any order."""
+
+_PLACES: Final = 1 << 16
+_COMMENTS: Final = (b"#", b"%", b"//")
+_SEPARATORS: Final = (b";", b"\t", b",")
+_DECIMAL_COMMA: Final = re.compile(rb"(?<=\d),(?=\d)")
+_TEXT: Final = re.compile(rb"[\t\r\n -~\x80-\xff]+")
+_NPY: Final = b"\x93NUMPY"
+_MAT: Final = b"MATLAB "
+SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".txt", ".txt.gz", ".dat", ".npy", ".mat")
+"""Of names, where the content alone does not say that it is a list."""
+
+Piece = tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, int]
+"""Times, polarities, places (n, 2) or None, and the line or row of the first."""
 
 
-@dataclass(frozen=True)
-class TimeUnit:
-    """What the times of a list count.
+def open_list(url: str) -> "ListSource":
+    """Open `list:PATH`, with `?columns=t,p`, `unit=ms` and `inverted=1` where the file does not say so.
 
-    Attributes:
-        name: `s`, `ms`, `us` or `ns`.
-        why: How that is known, for `evlcp info`.
+    Raises:
+        InputError: As for `ListSource`, or an option is wrong.
     """
-
-    name: str
-    why: str
-
-    def us(self, times: NDArray[Any]) -> NDArray[np.int64]:
-        """Times in us, int64 (n,), rounded down."""
-        if times.dtype.kind == "f":
-            # To a thousandth before that: 0.000057 s times 1e6 is a little less than 57.
-            scaled = np.round(times * UNITS_US[self.name], 3)
-            if not np.isfinite(scaled).all() or np.abs(scaled).max(initial=0.0) > LAST_TIME_US:
-                raise ValueError("a time that is no number or too large")
-            return np.floor(scaled).astype(np.int64)
-        if self.name == "ns":
-            return times // 1000
-        factor = round(UNITS_US[self.name])
-        if len(times) and max(int(times.max()), -int(times.min())) > LAST_TIME_US // factor:
-            raise ValueError("a time that is too large")
-        return times * factor
+    name, options = split_options(url, {"columns": _order, "unit": _unit, "inverted": flag})
+    path = name.partition(":")[2]
+    return ListSource(
+        path, fields=options.get("columns"), unit=options.get("unit"), inverted=options.get("inverted", False)
+    )
 
 
-@dataclass(frozen=True)
-class ListColumns:
-    """Which columns of a table are time and polarity.
-
-    Attributes:
-        time: Number of the column of times.
-        polarity: Number of the column of polarities.
-        unit: The unit that the name of the first one says; None where it says none.
-    """
-
-    time: int
-    polarity: int
-    unit: str | None
+def _order(text: str) -> Fields:
+    names = [name.strip().lower() for name in text.split(",")]
+    given = [name for name in names if name != "-"]
+    if sorted(given) not in (["p", "t"], ["p", "t", "x", "y"]):
+        raise ValueError(
+            "t and p, or t, x, y and p, in the order of the columns, - for others, such as t,-,p"
+        )
+    places = (names.index("x"), names.index("y")) if "x" in names else None
+    return Fields(names.index("t"), names.index("p"), places)
 
 
-def columns_of(names: Sequence[str]) -> ListColumns | None:
-    """The columns of a list of events by their names; None where it has no time or polarity, or has places.
-
-    >>> columns_of(["p", "t_ms"])
-    ListColumns(time=1, polarity=0, unit='ms')
-    >>> columns_of(["t", "x", "y", "p"]) is None
-    True
-    """
-    plain = [name.strip().strip('"').lower() for name in names]
-    times = [(k, match) for k, name in enumerate(plain) if (match := _TIME.fullmatch(name))]
-    polarities = [k for k, name in enumerate(plain) if name in _POLARITY]
-    if len(times) != 1 or len(polarities) != 1 or any(name in _PLACE for name in plain):
-        return None
-    (time, match), (polarity,) = times[0], polarities
-    unit = match[1]
-    return ListColumns(time, polarity, "us" if unit == "µs" else unit)
-
-
-def time_unit(times: NDArray[Any], named: str | None) -> TimeUnit:
-    """The unit of times: the one that their column's name says, or else what cameras do.
-
-    A camera counts microseconds, whole ones: nanoseconds of one are multiples of 1000, milliseconds have
-    three decimals, seconds six. A unit by which less than 20 or more than 50 million events come a second is
-    another one.
-
-    Args:
-        times: The first ones, in any order, int64 or float64 (n,).
-        named: The unit of the name; None for none.
-
-    >>> time_unit(np.array([0.000125, 0.000893, 0.00131]), None).name
-    's'
-    >>> time_unit(np.array([125, 893, 1310]), None).name
-    'us'
-    """
-    if named is not None:
-        return TimeUnit(named, "as its column says")
-    inside = np.sort(times)
-    span = float(inside[-1] - inside[0]) if len(inside) > 1 else 0.0
-
-    def rate_hz(unit: str) -> float:
-        return (len(inside) - 1) / (span * UNITS_US[unit] * 1e-6) if span > 0 else LEAST_RATE_HZ
-
-    if times.dtype.kind != "f" or (times == np.round(times)).all():
-        whole = inside - inside[:1]
-        if span > 0 and (whole % 1000 == 0).all() and rate_hz("ns") <= MOST_RATE_HZ:
-            return TimeUnit("ns", "guessed: whole numbers, all multiples of 1000")
-        if rate_hz("us") > MOST_RATE_HZ:
-            return TimeUnit("ns", "guessed: whole numbers, too close for us")
-        return TimeUnit("us", "guessed: whole numbers")
-    decimals = 3 if np.abs(times * 1e3 - np.round(times * 1e3)).max() < 1e-4 else 6
-    likely = ("ms", "us") if decimals == 3 else ("s", "ms", "us")
-    for unit in likely:
-        if rate_hz(unit) >= LEAST_RATE_HZ:
-            return TimeUnit(unit, f"guessed: {decimals} decimals or more, {rate_hz(unit):.3g} events/s")
-    return TimeUnit("us", "guessed: too far apart for ms")
-
-
-def _polarities(values: NDArray[Any]) -> NDArray[np.uint8]:
-    """Polarities of 0 and 1, or -1 and 1, uint8 (n,)."""
-    wrong = ~np.isin(values, (-1, 0, 1))
-    if wrong.any():
-        raise ValueError(f"polarity {values[int(wrong.argmax())]}, expected 0 or 1, or -1 or 1")
-    return (values > 0).astype(np.uint8)
-
-
-Piece = tuple[NDArray[Any], NDArray[Any], int]
-"""Times, polarities, and the line or row of the first."""
+def _unit(text: str) -> str:
+    if text not in UNITS_US:
+        raise ValueError(f"{', '.join(UNITS_US)}")
+    return text
 
 
 class ListSource(EventSource):
-    """A table of times and polarities of events, without places: every event is of pixel (0, 0).
+    """A table of times and polarities of events, and of places where it has them.
 
-    A CSV file, plain or gzipped, with columns named `t` (or `time`, `timestamp`) and `p` (or `polarity`), or
-    of two columns without names; or an NPZ file of such arrays. The unit of the times is the one that the
-    name says (`t_us`, `t_ms`, `t_s`, `t_ns`), or else guessed, see `time_unit`; `header` says which, and why.
+    CSV (`,` `;` tab or blanks, plain or gzipped, `#` `%` `//` before comments), NPZ and MAT of arrays, of
+    one structured or (n, 2) or (n, 4) array, and NPY of such a one. Columns are known by their names, or
+    else by their values. The unit of the times is the one that the name says (`t_us`, `time [ms]`), or else
+    guessed, see `time_unit`; `header` says which, and why. Without places every event is of pixel (0, 0).
+    Rows may be in any order as far as a million of them go; they are sorted, and counted.
 
     Args:
         path: The file.
+        fields: Which column is what; None: as the file says or shows.
+        unit: Of the times, `s`, `ms`, `us` or `ns`; None likewise.
+        inverted: The larger polarity is OFF.
 
     Raises:
         InputError: The file cannot be read, or has no such columns.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(
+        self,
+        path: Path | str,
+        *,
+        fields: Fields | None = None,
+        unit: str | None = None,
+        inverted: bool = False,
+    ) -> None:
         target = Path(path)
-        self.path, self._position = target, 0
+        self.path, self._position, self._inverted = target, 0, inverted
+        self._counts = {"rows_out_of_order": 0, "rows_cut": 0}
+        self._fields = fields
         try:
             size = target.stat().st_size
-            is_npz = zipfile.is_zipfile(target)
+            kind = _kind(target)
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}") from error
+        readers = {"NPZ": self._npz, "NPY": self._npy, "MAT": self._mat, "CSV": self._csv}
         with ExitStack() as stack:
-            self._unit_of: str | None = None
-            self._pieces = self._npz(target, stack) if is_npz else self._csv(target, stack)
-            self._where = "row" if is_npz else "line"
-            self._sieve = Sieve(self._where, None, None)
+            self._where = "line" if kind == "CSV" else "row"
             try:
-                first = next(self._pieces, None)
+                pieces = readers[kind](target, stack)
+                first = next(pieces, None)
             except (*DAMAGE, zlib.error) as error:
                 raise InputError(f"{path}: {said(error)}") from error
-            self._first = first
+            self._pieces = iter(()) if first is None else itertools.chain((first,), pieces)
             times = np.empty(0, np.int64) if first is None else first[0][:LOOKED_AT]
-            self._unit = time_unit(times, self._unit_of)
-            header = {"pixels": "none given: x = y = 0", "time": f"in {self._unit.name}, {self._unit.why}"}
-            kind = "NPZ" if is_npz else "CSV"
-            super().__init__(target, kind, header=header, size_bytes=size, ledger=self._sieve)
+            named = unit if unit is not None else (self._fields.unit if self._fields else None)
+            self._unit = time_unit(times, named)
+            if unit is not None:
+                self._unit = TimeUnit(unit, "as told")
+            self._sieve = Sieve(self._where, None, None)
+            self._waiting: list[Events] = []
+            self._row = first[3] if first is not None else 1
+            self._latest_us: int | None = None
+            self._open = True
+            header = {
+                "pixels": "as its columns x and y say"
+                if first is not None and first[2] is not None
+                else "none given: x = y = 0",
+                "time": f"in {self._unit.name}, {self._unit.why}",
+            }
+            super().__init__(target, kind, header=header, size_bytes=size)
             self._stack = stack.pop_all()
+
+    # -- readers, each an iterator of pieces
 
     def _csv(self, target: Path, stack: ExitStack) -> Iterator[Piece]:
         raw = stack.enter_context(target.open("rb"))
         zipped = raw.read(2) == b"\x1f\x8b"
         raw.seek(0)
         file: Any = stack.enter_context(gzip.GzipFile(fileobj=raw)) if zipped else raw
-        text = file.read(PIECE_BYTES).removeprefix(b"\xef\xbb\xbf")
-        head, _, rest = text.partition(b"\n")
-        columns, separator, named = _heading(head)
-        if columns is None:
-            raise InputError(f"{target}: line 1: found {show(head)}, expected the columns t and p")
-        line, rest = (2, rest) if named else (1, text)
-        self._unit_of = columns.unit
-        return self._csv_pieces(raw, file, rest, separator, columns, line)
+        text = file.read(PIECE_BYTES)
+        table = _Text(text, self._fields)
+        if table.fields is None:
+            raise InputError(
+                f"{target}: line {table.line}: found {show(table.heading)}, expected the columns t and p"
+                " (or say which they are, as by list:PATH?columns=t,p)"
+            )
+        self._fields = table.fields
+        return self._csv_pieces(raw, file, text, table)
 
-    def _csv_pieces(
-        self, raw: Any, file: Any, text: bytes, separator: bytes, columns: ListColumns, line: int
-    ) -> Iterator[Piece]:
+    def _csv_pieces(self, raw: Any, file: Any, text: bytes, table: "_Text") -> Iterator[Piece]:
+        line = 1
         while True:
             more = file.read(PIECE_BYTES)
             self._position = raw.tell()
@@ -212,8 +177,11 @@ class ListSource(EventSource):
             whole = text if not more else text[: text.rfind(b"\n") + 1]
             text = text[len(whole) :]
             lines = whole.splitlines()
-            if any(map(bytes.strip, lines)):
-                yield (*_numbers(self._fault, lines, separator, columns, line), line)
+            last_is_cut = not more and not whole.endswith((b"\n", b"\r"))
+            rows, cut = table.rows(lines, line, last_is_cut, self._fault)
+            self._counts["rows_cut"] += cut
+            if len(rows[0]):
+                yield (*rows, max(line, table.line))
             line += len(lines)
             if not more:
                 return
@@ -221,33 +189,94 @@ class ListSource(EventSource):
     def _npz(self, target: Path, stack: ExitStack) -> Iterator[Piece]:
         archive = stack.enter_context(zipfile.ZipFile(target))
         names = [member.removesuffix(".npy") for member in archive.namelist()]
-        columns = columns_of(names)
-        if columns is None:
-            raise InputError(f"{target}: found the arrays {', '.join(sorted(names))}, expected t and p")
-        self._unit_of = columns.unit
-        of_time, of_polarity = (
+        if self._fields is None and (len(names) == 1 or fields_of(names) is None):
+            for name in sorted(names, key=len):
+                if _is_table(archive, f"{name}.npy"):
+                    break
+            else:
+                raise InputError(f"{target}: found the arrays {', '.join(sorted(names))}, expected t and p")
+            return self._table(_Array(target, stack.enter_context(archive.open(f"{name}.npy"))))
+        fields = self._fields = self._fields or fields_of(names)
+        assert fields is not None
+        if max(fields.which) >= len(names):
+            raise InputError(f"{target}: found {len(names)} arrays, expected {max(fields.which) + 1}")
+        columns = [
             NpzColumn(target, archive, names[k], stack, kinds=kinds, bounded=False)
-            for k, kinds in ((columns.time, "iuf"), (columns.polarity, "iubf"))
-        )
-        if of_time.rows != of_polarity.rows:
+            for k, kinds in zip(fields.which, ("iuf", "iubfUS", "iuf", "iuf"), strict=False)
+        ]
+        lengths = [column.rows for column in columns]
+        if len(set(lengths)) > 1:
             raise InputError(
-                f"{target}: found {of_time.rows} times and {of_polarity.rows} polarities, expected one length"
+                f"{target}: found {lengths[0]} times and {lengths[1]} polarities, expected one length"
+                if lengths[0] != lengths[1]
+                else f"{target}: found {lengths[0]} times and {lengths[2:]} places, expected one length"
             )
-        return self._npz_pieces(of_time, of_polarity)
+        return self._npz_pieces(columns, target.stat().st_size)
 
-    def _npz_pieces(self, of_time: NpzColumn, of_polarity: NpzColumn) -> Iterator[Piece]:
-        size = self._size_of(of_time)
-        while of_time.row < of_time.rows:
-            row = of_time.row + 1
-            times, polarities = of_time.take(1 << 16), of_polarity.take(1 << 16)
-            self._position = round(size * of_time.row / of_time.rows)
-            yield (times if times.dtype.kind == "f" else times.astype(np.int64)), polarities, row
+    def _npz_pieces(self, columns: list[NpzColumn], size: int) -> Iterator[Piece]:
+        time = columns[0]
+        while time.row < time.rows:
+            row = time.row + 1
+            taken = [column.take(PIECE_ROWS) for column in columns]
+            self._position = round(size * time.row / time.rows)
+            yield _piece(taken, row)
 
-    def _size_of(self, column: NpzColumn) -> int:
-        return column.rows * column.dtype.itemsize
+    def _npy(self, target: Path, stack: ExitStack) -> Iterator[Piece]:
+        return self._table(_Array(target, stack.enter_context(target.open("rb"))))
+
+    def _table(self, array: "_Array") -> Iterator[Piece]:
+        fields = self._fields or array.fields()
+        if fields is None:
+            raise InputError(
+                f"{array.path}: found an array of {array.what}, expected columns of times and polarities"
+                " (or say which they are, as by list:PATH?columns=t,p)"
+            )
+        self._fields = fields
+        return self._array_pieces(array, fields)
+
+    def _array_pieces(self, array: "_Array", fields: Fields) -> Iterator[Piece]:
+        row = 1
+        while len((taken := array.take(PIECE_ROWS))[0]):
+            self._position = round(array.path.stat().st_size * array.done)
+            yield _piece([taken[k] for k in fields.which], row)
+            row += len(taken[0])
+
+    def _mat(self, target: Path, stack: ExitStack) -> Iterator[Piece]:
+        arrays = _mat_arrays(target)
+        names = list(arrays)
+        if (fields := self._fields or fields_of(names)) is not None and max(fields.which) < len(names):
+            columns = [_flat(arrays[names[k]]) for k in fields.which]
+        else:
+            tables = {
+                name: array
+                for name, array in arrays.items()
+                if array.dtype.names or (array.ndim == 2 and 1 < min(array.shape) <= 8)
+            }
+            found = next(
+                (
+                    (parts, known)
+                    for parts in (_columns_of(array) for array in tables.values())
+                    if (known := self._fields or fields_of_values([part[:LOOKED_AT] for part in parts]))
+                ),
+                None,
+            )
+            if found is None:
+                raise InputError(f"{target}: found {', '.join(sorted(names)) or 'nothing'}, expected t and p")
+            parts, fields = found
+            columns = [parts[k] for k in fields.which]
+        self._fields = fields
+        if len({len(column) for column in columns}) > 1:
+            lengths = [len(column) for column in columns]
+            raise InputError(f"{target}: found columns of the lengths {lengths}, expected one length")
+        return (
+            _piece([column[k : k + PIECE_ROWS] for column in columns], k + 1)
+            for k in range(0, len(columns[0]), PIECE_ROWS)
+        )
 
     def _fault(self, line: int, what: str) -> InputError:
         return InputError(f"{self.path}: line {line}: {what}")
+
+    # -- what is given out
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
         """As `EventSource.take`.
@@ -255,21 +284,60 @@ class ListSource(EventSource):
         Raises:
             InputError: The file cannot be read on, or a row is none of a time and a polarity.
         """
-        piece, self._first = self._first, None
+        if not self._open:
+            return None
+        while sum(map(len, self._waiting)) < MOST_WAITING:
+            events = self._next()
+            if events is None:
+                self._open = False
+                break
+            self._waiting.append(events)
+        events = Events.concat(self._waiting)
+        if (np.diff(events.t_us) < 0).any():
+            order = np.argsort(events.t_us, kind="stable")
+            events = Events(events.t_us[order], events.x[order], events.y[order], events.p[order])
+        # What may still be earlier waits, unless all is read.
+        due = len(events) if not self._open else len(events) // 2
+        self._waiting = [events[due:]] if self._open else []
+        given = self._sieve.sift(events[:due], self._row)
+        self._row += due
+        if not self._open:
+            given = Events.concat([given, self._sieve.close()])
+            if not len(given):
+                return None
+        return given, Triggers.empty()
+
+    def _next(self) -> Events | None:
+        """The events of the next piece, in its order; None at the end."""
         try:
-            piece = next(self._pieces, None) if piece is None else piece
+            piece = next(self._pieces, None)
         except (*DAMAGE, zlib.error) as error:
             raise InputError(f"{self.path}: damaged or closed file: {said(error)}") from error
         if piece is None:
-            events = self._sieve.close()
-            return (events, Triggers.empty()) if len(events) else None
-        times, polarities, first = piece
+            return None
+        times, values, places, first = piece
         try:
-            t_us, p = self._unit.us(times), _polarities(polarities)
+            t_us, p = self._unit.us(times), polarities(values)
+            x, y = _places(places, len(t_us))
         except ValueError as error:
             raise InputError(f"{self.path}: from {self._where} {first} on: {error}") from error
-        nowhere = np.zeros(len(t_us), np.uint16)
-        return self._sieve.sift(Events(t_us, nowhere, nowhere.copy(), p), first), Triggers.empty()
+        if len(t_us):
+            before = t_us[0] if self._latest_us is None else np.int64(self._latest_us)
+            latest = np.maximum.accumulate(np.concatenate([[before], t_us]))
+            self._counts["rows_out_of_order"] += int((t_us < latest[:-1]).sum())
+            self._latest_us = int(latest[-1])
+        return Events(t_us, x, y, 1 - p if self._inverted else p)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """As `EventSource.counts`, with `rows_out_of_order` and `rows_cut` where there were any."""
+        counted = {name: count for name, count in self._counts.items() if count}
+        return self._given | self._sieve.counts | counted
+
+    @property
+    def losses(self) -> dict[str, Loss]:
+        """As `EventSource.losses`."""
+        return self._sieve.losses
 
     @property
     def position_bytes(self) -> int:
@@ -282,36 +350,351 @@ class ListSource(EventSource):
 
 
 def is_list(path: Path) -> bool:
-    """Whether a file is a CSV or NPZ file of times and polarities without places.
+    """Whether a file is a list of times and polarities, and no table in the SDK's own layout.
 
     Raises:
         OSError: It cannot be read.
     """
-    if zipfile.is_zipfile(path):
-        try:
-            with zipfile.ZipFile(path) as archive:
-                return columns_of([name.removesuffix(".npy") for name in archive.namelist()]) is not None
-        except DAMAGE:
-            return False
     try:
+        kind = _kind(path)
+        if kind in ("NPY", "MAT"):
+            return True
+        if kind == "NPZ":
+            with zipfile.ZipFile(path) as archive:
+                names = [member.removesuffix(".npy") for member in archive.namelist()]
+                if fields_of(names) is None:
+                    return any(_is_table(archive, name) for name in archive.namelist())
+            return not set(COLUMNS) <= set(names)
         with path.open("rb") as file:
-            start = file.read(512)
+            start = file.read(1 << 13)
         if start.startswith(b"\x1f\x8b"):
             with gzip.open(path) as zipped:
-                start = zipped.read(512)
-    except (EOFError, zlib.error, gzip.BadGzipFile):
+                start = zipped.read(1 << 13)
+    except (*DAMAGE, gzip.BadGzipFile) as error:
+        if isinstance(error, OSError) and not isinstance(error, gzip.BadGzipFile):
+            raise
         return False
-    return _heading(start.removeprefix(b"\xef\xbb\xbf").partition(b"\n")[0])[0] is not None
+    if start.removeprefix(b"\xef\xbb\xbf").split(b"\n")[0].strip() == CSV_HEADER:
+        return False
+    return _TEXT.fullmatch(start) is not None and _Text(start, None).fields is not None
 
 
-def _heading(line: bytes) -> tuple[ListColumns | None, bytes, bool]:
-    """What the first line of a CSV file says: its columns, what separates them, whether it names them."""
-    separator = next((mark for mark in (b",", b";", b"\t") if mark in line), b" ")
-    cells = line.decode("utf-8", "replace").strip().split(separator.decode())
-    columns = columns_of(cells)
-    if columns is None and len(cells) == 2 and all(map(_is_number, cells)):
-        return ListColumns(0, 1, None), separator, False
-    return columns, separator, True
+def _is_table(archive: zipfile.ZipFile, name: str) -> bool:
+    try:
+        with archive.open(name) as member:
+            shape, _, dtype = _npy_header(member)
+    except (ValueError, *DAMAGE):
+        return False
+    return bool(dtype.names) or (len(shape) == 2 and 1 < min(shape) <= 8)
+
+
+def _kind(path: Path) -> str:
+    if zipfile.is_zipfile(path):
+        return "NPZ"
+    with path.open("rb") as file:
+        start = file.read(16)
+    if start.startswith(_NPY):
+        return "NPY"
+    return "MAT" if start.startswith(_MAT) or path.suffix.lower() == ".mat" else "CSV"
+
+
+def _piece(columns: list[NDArray[Any]], row: int) -> Piece:
+    times = columns[0] if columns[0].dtype.kind == "f" else columns[0].astype(np.int64)
+    return times, columns[1], np.stack(columns[2:], 1) if len(columns) > 2 else None, row
+
+
+def _places(places: NDArray[Any] | None, n: int) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+    if places is None:
+        return np.zeros(n, np.uint16), np.zeros(n, np.uint16)
+    whole = np.rint(places.astype(np.float64))
+    wrong = ~((whole >= 0) & (whole < _PLACES) & (whole == places))
+    if wrong.any():
+        raise ValueError(f"place {places[wrong][0]}, expected whole numbers from 0 to {_PLACES - 1}")
+    found = whole.astype(np.uint16)
+    return np.ascontiguousarray(found[:, 0]), np.ascontiguousarray(found[:, 1])
+
+
+def _flat(array: NDArray[Any]) -> NDArray[Any]:
+    return array.ravel()
+
+
+def _columns_of(array: NDArray[Any]) -> list[NDArray[Any]]:
+    if array.dtype.names:
+        return [array[name].ravel() for name in array.dtype.names]
+    return list(array.T if array.shape[0] >= array.shape[1] else array)
+
+
+def _mat_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Arrays of a MATLAB file by their names, those inside of structures too."""
+    with path.open("rb") as file:
+        start = file.read(128)
+    if start.startswith(b"MATLAB 7.3"):
+        try:
+            import h5py
+        except ImportError as fault:
+            raise InputError(f"{path}: needs the extra: pip install 'evlcp-sdk[hdf5]'") from fault
+        with h5py.File(path, "r") as stored:
+            # A matrix lies on its side there.
+            return {name: np.asarray(node).T for name, node in stored.items() if hasattr(node, "shape")}
+    from scipy.io import loadmat
+
+    try:
+        found = loadmat(path, simplify_cells=True)
+    except (ValueError, TypeError, NotImplementedError, OSError, IndexError, KeyError, zlib.error) as error:
+        raise InputError(f"{path}: found no MAT file, expected one ({said(error)})") from error
+
+    arrays: dict[str, NDArray[Any]] = {}
+
+    def collect(inside: Mapping[str, Any]) -> None:
+        for name, value in inside.items():
+            if isinstance(value, Mapping):
+                collect(value)
+            elif not name.startswith("__") and isinstance(value, np.ndarray) and value.dtype.kind in "biufU":
+                arrays.setdefault(name, value)
+
+    collect(found)
+    return arrays
+
+
+def _npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, whether columns lie on end, and type.
+
+    Raises:
+        ValueError: It is no array of numbers.
+    """
+    try:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0
+        found = (read if version == (1, 0) else np.lib.format.read_array_header_2_0)(file)
+    except Exception as error:
+        # NumPy evaluates the header as a piece of Python, which may fail in any way.
+        raise ValueError(said(error)) from error
+    shape, on_end, dtype = found
+    return shape, on_end, dtype
+
+
+class _Array:
+    """A table in one array, structured, (n, k) or (k, n), read from front to back."""
+
+    def __init__(self, path: Path, file: IO[bytes]) -> None:
+        self.path = path
+        try:
+            self._shape, on_end, self._dtype = _npy_header(file)
+        except ValueError as error:
+            raise InputError(f"{path}: {error}") from error
+        self.what = f"{self._dtype} {self._shape}"
+        many = len(self._shape) == 2 and not self._dtype.names
+        if self._dtype.hasobject or not (self._dtype.names or many) or 0 in self._shape:
+            raise InputError(
+                f"{path}: found an array of {self.what}, expected columns of times and polarities"
+            )
+        self._file, self._row = file, 0
+        self._rows = max(self._shape)
+        self._whole: list[NDArray[Any]] | None = None
+        on_its_side = many and self._shape[0] < self._shape[1]
+        if on_its_side or (many and on_end):
+            # Its columns lie one behind the other.
+            data = file.read()
+            order: Literal["F", "C"] = "F" if on_end else "C"
+            if len(data) != self._dtype.itemsize * int(np.prod(self._shape)):
+                raise InputError(f"{path}: found {len(data)} bytes, expected an array of {self.what}")
+            self._whole = _columns_of(
+                np.frombuffer(data, self._dtype).reshape(self._shape[0], self._shape[-1], order=order)
+            )
+        self._ahead: list[NDArray[Any]] = []
+
+    @property
+    def done(self) -> float:
+        """Share of the rows that is read."""
+        return self._row / self._rows
+
+    def fields(self) -> Fields | None:
+        """Which column is what, by their names, or else by the first rows."""
+        self._ahead = self._read(LOOKED_AT)
+        return fields_of(self._dtype.names) if self._dtype.names else fields_of_values(self._ahead)
+
+    def take(self, rows: int) -> list[NDArray[Any]]:
+        """The next rows of every column."""
+        ahead, self._ahead = self._ahead, []
+        return ahead or self._read(rows)
+
+    def _read(self, rows: int) -> list[NDArray[Any]]:
+        first, last = self._row, min(self._row + rows, self._rows)
+        self._row = last
+        if self._whole is not None:
+            return [column[first:last] for column in self._whole]
+        width = 1 if self._dtype.names else self._shape[1]
+        size = (last - first) * width * self._dtype.itemsize
+        data = self._file.read(size)
+        if len(data) < size:
+            raise InputError(f"{self.path}: row {first + 1}: the file ends, expected {self._rows} rows")
+        values = np.frombuffer(data, self._dtype)
+        if self._dtype.names:
+            return [values[name] for name in self._dtype.names]
+        return list(values.reshape(-1, width).T)
+
+
+class _Text:
+    """How the lines of a text are read: what separates cells, and which is what.
+
+    Args:
+        start: The first bytes.
+        fields: Which column is what; None: as its heading or its values say.
+    """
+
+    def __init__(self, start: bytes, fields: Fields | None) -> None:
+        self._mark = start.removeprefix(b"\xef\xbb\xbf") != start
+        lines = start.removeprefix(b"\xef\xbb\xbf").splitlines()[:512]
+        data = [(k, line) for k, line in enumerate(lines, 1) if _is_data(line)]
+        # A heading may stand in a comment, as numpy.savetxt writes it.
+        above = [
+            line.strip().lstrip(b"#%/").strip()
+            for line in lines[: data[0][0] - 1 if data else len(lines)]
+            if line.strip()
+        ]
+        self.line, self.heading = data[0] if data else (1, lines[0] if lines else b"")
+        sample = [line for _, line in data[:256]]
+        self._separator = _separator(sample)
+        self.is_named = False
+        self.fields = fields
+        head = self.cells(self.heading)
+        if data and not any(_is_number(cell) for cell in head) and fields_of(head) is not None:
+            self.is_named = True
+            self.fields = fields or fields_of(head)
+        elif fields is None and data:
+            named = next((found for text in above[::-1] if (found := self._said(text, len(head)))), None)
+            self.fields = named or self._shown(sample)
+        elif (
+            fields is not None
+            and data
+            and not _is_number(head[fields.time] if len(head) > fields.time else "")
+        ):
+            self.is_named = True
+        self.first = self.line + self.is_named
+        self.line = self.first if self.fields is not None else self.line
+
+    def _said(self, text: bytes, many: int) -> Fields | None:
+        for cells in (self.cells(text), re.split(r"[,;\s]+", text.decode("utf-8", "replace"))):
+            found = fields_of(cells)
+            if found is not None and len(cells) == many:
+                return found
+        return None
+
+    def _shown(self, sample: list[bytes]) -> Fields | None:
+        rows = [self.cells(line) for line in sample]
+        if len({len(row) for row in rows}) != 1:
+            # The last one may be cut.
+            rows = rows[:-1]
+        if not rows or len({len(row) for row in rows}) != 1:
+            return None
+        columns: list[NDArray[Any]] = []
+        for cells in zip(*rows, strict=True):
+            try:
+                columns.append(np.array([float(cell) for cell in cells]))
+            except ValueError:
+                columns.append(np.array(cells))
+        return fields_of_values(columns)
+
+    def cells(self, line: bytes) -> list[str]:
+        """What stands between the separators of a line."""
+        text = line.decode("utf-8", "replace").strip()
+        if self._separator == b" ":
+            return [self._plain(cell) for cell in text.split()]
+        return [self._plain(cell) for cell in text.split(self._separator.decode())]
+
+    def _plain(self, cell: str) -> str:
+        cell = cell.strip().strip("\"'").strip()
+        return cell if self._separator == b"," else re.sub(r"(?<=\d),(?=\d)", ".", cell)
+
+    def rows(
+        self, lines: list[bytes], first: int, last_is_cut: bool, fault: Callable[[int, str], InputError]
+    ) -> tuple[tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None], int]:
+        """Times, polarities and places of some lines, and how many cut ones at the end are left out.
+
+        Args:
+            lines: The lines.
+            first: Number of the first.
+            last_is_cut: The last one has no end, so it may be cut.
+            fault: Makes the error of a line.
+
+        Raises:
+            InputError: A line is no row of the table.
+        """
+        assert self.fields is not None
+        which = self.fields.which
+        kept = [line for k, line in enumerate(lines, first) if k >= self.first and _is_data(line)]
+        if not kept:
+            return (np.empty(0, np.int64), np.empty(0, np.int64), None), 0
+        if self._separator != b",":
+            kept = [_DECIMAL_COMMA.sub(b".", line) for line in kept] if b"," in kept[0] else kept
+        if found := self._loaded(kept, which):
+            return found, 0
+        cut = 0
+        if last_is_cut and not self._is_row(kept[-1]):
+            # Whoever wrote it was stopped.
+            kept, cut = kept[:-1], 1
+            if not kept or (found := self._loaded(kept, which)):
+                return found or (np.empty(0, np.int64), np.empty(0, np.int64), None), cut
+        table = []
+        for number, line in enumerate(lines, first):
+            if number < self.first or not _is_data(line):
+                continue
+            if not self._is_row(line):
+                if cut and number == first + len(lines) - 1:
+                    continue
+                more = ", x and y" if self.fields.places else ""
+                raise fault(number, f"found {show(line)}, expected a time and a polarity{more}")
+            cells = self.cells(line)
+            table.append([cells[k] for k in which])
+        whole = all(re.fullmatch(r"[+-]?\d{1,18}", row[0]) for row in table)
+        times = np.array([int(row[0]) for row in table] if whole else [float(row[0]) for row in table])
+        places = np.array([[float(cell) for cell in row[2:]] for row in table]) if len(which) > 2 else None
+        return (times, np.array([row[1] for row in table]), places), cut
+
+    def _loaded(
+        self, lines: list[bytes], which: tuple[int, ...]
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None] | None:
+        """The same by NumPy, where all cells are plain numbers; None where they are not."""
+        mark = None if self._separator == b" " else self._separator.decode()
+        for kind in (np.dtype(np.int64), np.dtype(np.float64)):
+            try:
+                found = np.loadtxt(lines, kind, None, mark, usecols=which, ndmin=2)
+            except (ValueError, OverflowError):
+                continue
+            return found[:, 0], found[:, 1], found[:, 2:] if len(which) > 2 else None
+        return None
+
+    def _is_row(self, line: bytes) -> bool:
+        assert self.fields is not None
+        cells = self.cells(line)
+        which = self.fields.which
+        if len(cells) <= max(which):
+            return False
+        if not all(_is_number(cells[k]) for k in which if k != self.fields.polarity):
+            return False
+        try:
+            polarities(np.array([cells[self.fields.polarity]]))
+        except ValueError:
+            return _is_number(cells[self.fields.polarity])
+        return True
+
+
+def _separator(lines: list[bytes]) -> bytes:
+    """What stands between the cells of most lines."""
+
+    def in_most(found: Callable[[bytes], Any]) -> bool:
+        return 2 * sum(bool(found(line)) for line in lines) > len(lines)
+
+    mark = next((mark for mark in _SEPARATORS if in_most(lambda line, mark=mark: mark in line)), b" ")  # type: ignore[misc]
+    if mark == b"," and in_most(lambda line: re.fullmatch(rb"\s*\d+,\d+(\s+[^\s,]+)+\s*", line)):
+        # A comma for the point, and blanks between.
+        return b" "
+    return mark
+
+
+def _is_data(line: bytes) -> bool:
+    plain = line.strip()
+    return bool(plain) and not plain.startswith(_COMMENTS)
 
 
 def _is_number(text: str) -> bool:
@@ -320,30 +703,3 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _numbers(
-    fault: Callable[[int, str], InputError],
-    lines: list[bytes],
-    separator: bytes,
-    columns: ListColumns,
-    first: int,
-) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Times and polarities of lines of text, int64 where all times are whole numbers, else float64."""
-    kept = [line for line in lines if line.strip()]
-    mark = None if separator == b" " else separator.decode()
-    if any(word in line.lower() for line in kept[:2] for word, _ in _WORDS):
-        for word, digit in _WORDS:
-            kept = [line.lower().replace(word, digit) for line in kept]
-    which = (columns.time, columns.polarity)
-    for kind in (np.dtype(np.int64), np.dtype(np.float64)):
-        try:
-            found = np.loadtxt(kept, kind, None, mark, usecols=which, ndmin=2)
-        except (ValueError, OverflowError):
-            continue
-        return found[:, 0], found[:, 1]
-    for number, line in enumerate(lines, first):
-        cells = line.decode("utf-8", "replace").split(mark)
-        if line.strip() and not (len(cells) > max(which) and all(_is_number(cells[k]) for k in which)):
-            raise fault(number, f"found {show(line)}, expected a time and a polarity")
-    raise fault(first, "found something else than times and polarities")

@@ -12,7 +12,7 @@ from evlcp_sdk.io.bags import is_bag, open_bag
 from evlcp_sdk.io.camera import open_camera
 from evlcp_sdk.io.faery import FORMATS, FaerySource
 from evlcp_sdk.io.hdf5 import MAGIC, Hdf5Source, open_hdf5
-from evlcp_sdk.io.lists import ListSource, is_list
+from evlcp_sdk.io.lists import SUFFIXES, ListSource, is_list, open_list
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
 from evlcp_sdk.io.replay import LoopSource, ReplaySource
 from evlcp_sdk.io.ros import EventBagWriter
@@ -31,7 +31,7 @@ WRITABLE: Final = {".raw": "EVT3", ".mcap": "BAG", ".npz": "NPZ", ".csv": "CSV",
 STDIN: Final = "-"
 """What is opened as standard input."""
 
-OWN: Final = ("file", "replay", "bag", "hdf5", "camera", *SCHEMES)
+OWN: Final = ("file", "replay", "bag", "hdf5", "list", "camera", *SCHEMES)
 """Schemes that are opened without a plugin."""
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
@@ -71,6 +71,8 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
         return open_bag(str(url))
     if scheme[1].lower() == "hdf5":
         return open_hdf5(str(url))
+    if scheme[1].lower() == "list":
+        return open_list(str(url))
     if scheme[1].lower() == "camera":
         return open_camera(str(url))
     if scheme[1].lower() in SCHEMES:
@@ -154,12 +156,17 @@ def _open_file(path: Path | str) -> EventSource:
         return open_bag(target)
     if start.startswith(MAGIC):
         return Hdf5Source(path)
-    if start.startswith(b"% "):
+    if start.startswith(b"% ") and suffix not in SUFFIXES:
         return RawSource(path)
     if start.startswith(b"PK\x03\x04") or suffix == ".npz":
         return ListSource(path) if start and is_list(target) else NpzSource(path)
-    if start.startswith((b"\x1f\x8b", CSV_HEADER)) or suffix in (".csv", ".csv.gz"):
+    if start.startswith(CSV_HEADER):
+        return CsvSource(path)
+    if start.startswith(b"\x1f\x8b") or suffix in (".csv", ".csv.gz"):
+        # Of what is neither the list says more.
         return ListSource(path) if start and is_list(target) else CsvSource(path)
+    if start and not special and is_list(target):
+        return ListSource(path)
     return RawSource(path)  # which says what is wrong
 
 

@@ -101,6 +101,9 @@ class NpzColumn:
         except Exception as error:
             # NumPy evaluates the header as a piece of Python, which may fail in any way.
             raise InputError(f"{path}: array {name}: {said(error)}") from error
+        if not bounded and len(shape) == 2 and 1 in shape:
+            # One column or one row of a table is a column, too.
+            shape = (shape[0] * shape[1],)
         if dtype.kind not in kinds or len(shape) > 1 or min(shape, default=0) < 0:
             what = "numbers" if "f" in kinds else "integers"
             raise InputError(f"{path}: array {name}: found {dtype} {shape}, expected {what} (n,)")

@@ -104,6 +104,12 @@ class Link:
         codes = f"{book.profile}, {book.clusters} clusters, {packet.frames} frames a packet"
         return f"Link({codes}, {self.air.chip_rate_hz:g} chips/s, digest {self.digest[:12]})"
 
+    @property
+    def characters_on_air(self) -> bool:
+        """Whether a symbol is the code of a character, as its framing says."""
+        framing = self.algorithms.get("framing")
+        return framing is not None and bool(framing.characters_on_air)
+
     @overload
     def algorithm(self, role: Literal["detection"]) -> Detection: ...
     @overload

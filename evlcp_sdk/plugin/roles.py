@@ -136,10 +136,12 @@ class Framing(ABC):
     Attributes:
         roles: The roles that do its steps; a link has tables of these only, of those in `STEPS`.
         detection: Id of the detection of a link that names none; empty for the role's default.
+        characters_on_air: A symbol is the code of a character, so that packets without a block say a text.
     """
 
     roles: ClassVar[frozenset[str]] = frozenset()
     detection: ClassVar[str] = ""
+    characters_on_air: ClassVar[bool] = False
 
     @abstractmethod
     def codebook(self, clusters: int) -> Codebook | None:

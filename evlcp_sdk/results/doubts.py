@@ -586,6 +586,10 @@ def _codewords(
     number: int, one: TransmitterTally, link: Link, counts: Mapping[str, int], seen: Seen
 ) -> Iterator[Doubt]:
     """Codewords that never occur, and the modulation that they are all of."""
+    if link.characters_on_air and not one.blocks:
+        # Of characters a text has few.
+        yield from _turned_bits(number, one, link)
+        return
     never = codewords_never(one, link)
     if not never:
         return
@@ -613,6 +617,32 @@ def _codewords(
         "data that repeats, or another modulation than modulation.id",
         number,
     )
+
+
+def _turned_bits(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
+    """Characters that are text if their bits come the other way round."""
+    each = link.codebook.bits_per_symbol
+    text = {*range(0x20, 0x7F), 0x09, 0x0A, 0x0D}
+    # Blanks and small letters are most of any text.
+    usual = {0x20, *range(0x61, 0x7B)}
+    shares = []
+    for turned in (False, True):
+        codes = {s: int(f"{s:0{each}b}"[::-1], 2) if turned else s for s in one.values}
+        shares.append(
+            [
+                sum(one.values[s] for s, code in codes.items() if code in of) / one.given
+                for of in (text, usual)
+            ]
+        )
+    own, other = shares
+    if one.given >= _FEW_FRAMES and other[0] > _SPLIT > own[0] + 0.1 and other[1] > own[1]:
+        yield Doubt(
+            "bit-order",
+            f"{own[0]:.0%} of its characters are printable, and {other[0]:.0%} if their bits come the other"
+            " way round",
+            "compare framing.first_bit with the transmitter",
+            number,
+        )
 
 
 def _unsure(number: int, one: TransmitterTally, link: Link, seen: Seen) -> Iterator[Doubt]:

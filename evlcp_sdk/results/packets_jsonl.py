@@ -3,11 +3,11 @@
 import json
 from typing import Any
 
-from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import PluginError
+from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.results.text import symbol_list
+from evlcp_sdk.results.text import characters, symbol_list
 from evlcp_sdk.values import Packet, ReceivedMessage
 
 __all__ = ["PacketsJsonl", "message_line", "packet_line"]
@@ -22,13 +22,17 @@ class PacketsJsonl(Sink):
 
     def packet(self, packet: Packet) -> None:
         """Write the packet's line, and those of its messages."""
-        self._file.write(json.dumps(packet_line(packet, self.run.link_of(packet.link).codebook)) + "\n")
+        self._file.write(json.dumps(packet_line(packet, self.run.link_of(packet.link))) + "\n")
         for message in packet.messages:
             self._file.write(message_line(message) + "\n")
 
 
-def packet_line(packet: Packet, codebook: Codebook) -> dict[str, Any]:
-    """A packet's line, as JSON values; null and `?` for what was not received."""
+def packet_line(packet: Packet, link: Link) -> dict[str, Any]:
+    """A packet's line, as JSON values; null and `?` for what was not received.
+
+    Where the framing's symbols are characters, `text` is what they say.
+    """
+    codebook = link.codebook
     symbols: list[list[int | None] | None] = [None] * packet.sent
     each = codebook.bits_per_symbol
     unknown, ones = "?" * each, (1 << each) - 1
@@ -48,6 +52,7 @@ def packet_line(packet: Packet, codebook: Codebook) -> dict[str, Any]:
         "frames_received": len(packet.frames),
         "symbols": symbols,
         "bits": "".join(bits),
+        **({"text": characters(s[0] if s else None for s in symbols)} if link.characters_on_air else {}),
     }
 
 

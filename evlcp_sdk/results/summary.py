@@ -12,6 +12,7 @@ from evlcp_sdk.plugin.records import SUMMARY
 from evlcp_sdk.results.doubts import Doubt, LinkPart, Seen, notes_of, warnings_of, warnings_of_links
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.tallies import RunTally
+from evlcp_sdk.results.text import characters
 
 __all__ = ["Status", "messages_off", "summary_of", "write_summary"]
 
@@ -75,7 +76,7 @@ def summary_of(
         "status": status,
         "error": error,
         "result": tally.headline(),
-        "transmitters": tally.to_list(),
+        "transmitters": [one | _text(tally, one, links) for one in tally.to_list()],
         "recording": dict(recording),
         "processing": dict(processing),
         "counts": dict(counts),
@@ -91,6 +92,15 @@ def summary_of(
         **({"pps": dict(pps)} if pps is not None else {}),
         **({"live": dict(live)} if live is not None else {}),
     }
+
+
+def _text(tally: RunTally, told: Mapping[str, Any], links: Mapping[str, LinkPart]) -> dict[str, Any]:
+    """What a transmitter says in characters, if its framing sends such and it sends no blocks."""
+    part = links.get(told.get("link", ""), next(iter(links.values())))
+    one = tally.transmitters[told["transmitter"]]
+    if not part.link.characters_on_air or one.blocks:
+        return {}
+    return {"text": characters(one.firsts)}
 
 
 def _described(link: Link) -> dict[str, Any]:

@@ -29,7 +29,7 @@ MOST_MESSAGES = 20
 """Messages that a summary shows, the newest."""
 
 _MOST_SAID = 2000
-"""Characters of a message that it shows; `packets.jsonl` has all."""
+"""Characters of a message, or of a transmitter of characters, that it shows; `packets.jsonl` has all."""
 
 
 @dataclass
@@ -47,6 +47,7 @@ class TransmitterTally:
             and the last cluster are in the image, px.
         along_px: Sum of the ways from the first to the last, right and down, px.
         blocks: Packets whose block is read.
+        firsts: Its first symbols, where a frame has one; -1 for one that was not received.
         last_px: Where it is in the image in its newest frame, column and row.
         beacon_m: Length of the bar by its newest beacon, m; NaN without.
     """
@@ -76,6 +77,7 @@ class TransmitterTally:
     along_px: tuple[float, float] = (0.0, 0.0)
     beacon_m: float = math.nan
     blocks: int = 0
+    firsts: list[int] = field(default_factory=list)
     last_px: tuple[float, float] = (math.nan, math.nan)
     link: str = ""
 
@@ -104,6 +106,8 @@ class TransmitterTally:
             self.echo_of = frame.echo_of
             symbols = frame.soft.symbols.tolist()
             self.values.update([s for s in symbols if s >= 0])
+            if len(symbols) == 1 and len(self.firsts) < _MOST_SAID:
+                self.firsts += symbols
             self.unseen.update([k for k, s in enumerate(symbols) if s < 0])
             distance_m = frame.range.distance_m
             if math.isfinite(distance_m):

@@ -1,6 +1,8 @@
 """Numbers as the result's files write them."""
 
 import math
+from collections.abc import Iterable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -8,7 +10,15 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.values import Fix
 
-__all__ = ["covariances", "integrity", "number_or_none", "sigmas", "symbol_list", "text_or_empty"]
+__all__ = [
+    "characters",
+    "covariances",
+    "integrity",
+    "number_or_none",
+    "sigmas",
+    "symbol_list",
+    "text_or_empty",
+]
 
 
 def text_or_empty(value: float, digits: int) -> str:
@@ -24,6 +34,21 @@ def number_or_none(value: float, digits: int) -> float | None:
 def symbol_list(symbols: NDArray[np.int64]) -> list[int | None]:
     """A frame's symbols; None for one that is not given, which is negative."""
     return [symbol if symbol >= 0 else None for symbol in symbols.tolist()]
+
+
+def characters(symbols: Iterable[int | None]) -> str:
+    """The text of codes of characters; the replacement character for one that was not received.
+
+    Codes of ASCII are what they are; bytes beyond are UTF-8 where they are such, else Latin-1.
+
+    >>> characters([72, 105, None, 33])
+    'Hi\ufffd!'
+    """
+    codes = [0xFFFD if symbol is None or symbol < 0 else symbol for symbol in symbols]
+    if max(codes, default=0) > 0x7F and 0xFFFD not in codes and max(codes) < 256:
+        with suppress(UnicodeDecodeError):
+            return bytes(codes).decode()
+    return "".join(map(chr, codes))
 
 
 def sigmas(covariance: NDArray[np.float64]) -> list[float]:

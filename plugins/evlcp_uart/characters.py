@@ -9,22 +9,28 @@ from numpy.typing import NDArray
 
 from evlcp_uart.light import BEFORE
 
-__all__ = ["Characters", "Parity"]
+__all__ = ["BitOrder", "Characters", "Parity"]
 
 Parity = Literal["none", "even", "odd"]
+BitOrder = Literal["lowest", "highest"]
 
 
 @dataclass(frozen=True)
 class Characters:
-    """The format of a character: a start bit, data bits from the least significant on, parity, stop bits.
+    """The format of a character: a start bit, data bits, parity, stop bits.
 
-    >>> Characters(7, "even", 2).levels()[0x41].tolist()
-    [0, 1, 0, 0, 0, 0, 0, 1, 0, 1, 1]
+    Data begin with the least significant bit, as a serial port's do, or with the most significant one.
+
+    >>> Characters(7, "even", 2).levels()[0x43].tolist()
+    [0, 1, 1, 0, 0, 0, 0, 1, 1, 1, 1]
+    >>> Characters(7, "even", 2, "highest").levels()[0x43].tolist()
+    [0, 1, 0, 0, 0, 0, 1, 1, 1, 1, 1]
     """
 
     data_bits: int = 8
     parity: Parity = "none"
     stop_bits: int = 1
+    first: BitOrder = "lowest"
 
     @property
     def bits(self) -> int:
@@ -34,7 +40,8 @@ class Characters:
     def levels(self) -> NDArray[np.uint8]:
         """Every character, 1 for mark, uint8 (2**data_bits, bits)."""
         values = np.arange(1 << self.data_bits)
-        data = (values[:, None] >> np.arange(self.data_bits)) & 1
+        shifts = np.arange(self.data_bits)
+        data = (values[:, None] >> (shifts if self.first == "lowest" else shifts[::-1])) & 1
         found = np.ones((len(values), self.bits), np.uint8)
         found[:, 0] = 0
         found[:, 1 : 1 + self.data_bits] = data

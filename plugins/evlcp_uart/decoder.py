@@ -29,6 +29,12 @@ _MORE, _SURE = 4, 0.95
 """Blocks of a stretch where the characters of one are not that sure on the average: dim light takes long to
 learn."""
 
+_BEFORE_FIRST = TICKS // 4
+"""Ticks before a stream's first event of which that event tells: it may be an edge's, which is late."""
+
+_TELLING = 0.6
+"""How sure the last character must be that goes on behind the last event: its rest may not have been seen."""
+
 _AHEAD = 4
 """Characters that are looked ahead: where one starts is known only by those after it."""
 
@@ -210,7 +216,7 @@ class CharacterDecoder:
             if not len(t_us):
                 return state
             # A character may have begun before its first event.
-            seen = int(t_us[0] // tick_us)
+            seen = int(t_us[0] // tick_us) - _BEFORE_FIRST
             first = seen - self._length - TICKS
             state = replace(state, seen=seen)
         ticks = np.floor_divide(t_us, tick_us).astype(np.int64) - first
@@ -231,7 +237,8 @@ class CharacterDecoder:
         first, light = state.first, state.light
         # No more than that, however much there is: any split of the stream gives the same.
         counts = state.counts[:, : due + self._ahead]
-        end = counts.shape[1] - (TICKS if last else _TAIL)
+        # At the end it was dark for a bit more: else an edge would have been its last event.
+        end = counts.shape[1] - (0 if last else _TAIL)
         # A character may go on behind what is known.
         counts = np.pad(counts, ((0, 0), (0, self._length + 2 * _TAIL)))
         events = int(counts[:, :due].sum())
@@ -256,11 +263,12 @@ class CharacterDecoder:
             light = self._learned(stretch, light, starts, evidence, _MEMORY ** (due / self._block))
             starts, evidence, _ = self._path(stretch, light, False)
             kept = (starts < due) & (starts + EARLY >= stretch.seen)
-            if last:
-                # Its last edge may be that before the first stop bit.
-                kept &= starts + (self.characters.bits - self.characters.stop_bits) * TICKS < end
             ahead = starts[starts < due]
             found = list(self._given(first, starts[kept], evidence, light))
+            if last and found and found[-1].quality < _TELLING:
+                # Its last edge may be that before the first stop bit.
+                seen_to = int(starts[kept][-1]) + (self.characters.bits - self.characters.stop_bits) * TICKS
+                found = found[:-1] if seen_to >= end else found
             by_chance = 0
             if state.light is None:
                 by_chance, found = len(found), _without_chance(found)

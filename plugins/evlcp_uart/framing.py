@@ -14,7 +14,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Deframer, Framing
 from evlcp_sdk.values import Events, Heard, SoftSymbols
-from evlcp_uart.characters import Characters, Parity
+from evlcp_uart.characters import BitOrder, Characters, Parity
 from evlcp_uart.decoder import Character, CharacterDecoder, CharacterState
 
 __all__ = ["Uart", "read_characters"]
@@ -25,13 +25,14 @@ _PIECE = 1 << 16
 
 @dataclass(frozen=True)
 class Uart(Framing):
-    """Asynchronous characters of one LED: start bit, data from the lowest bit on, parity, stop bits.
+    """Asynchronous characters of one LED: start bit, data bits, parity, stop bits.
 
     The rate of the bits is `air.chip_rate_hz`, the characters of a packet are `air.frames_per_packet`.
     """
 
     roles: ClassVar[frozenset[str]] = frozenset()
     detection: ClassVar[str] = "spots"
+    characters_on_air: ClassVar[bool] = True
 
     data_bits: Annotated[int, Field(ge=5, le=9, description="Data bits of a character.")] = 8
     parity: Annotated[Parity, Field(description="The parity bit makes the number of ones so.")] = "none"
@@ -39,12 +40,15 @@ class Uart(Framing):
     idle: Annotated[Literal["on", "off"], Field(description="What the LED does for a one and in pauses.")] = (
         "on"
     )
+    first_bit: Annotated[
+        BitOrder, Field(description="The data bit that comes first; of a serial port the lowest.")
+    ] = "lowest"
     pause_bits: Annotated[int, Field(ge=2, le=4096, description="Pause before a packet that is sent.")] = 16
 
     @property
     def characters(self) -> Characters:
         """The format of a character."""
-        return Characters(self.data_bits, self.parity, self.stop_bits)
+        return Characters(self.data_bits, self.parity, self.stop_bits, self.first_bit)
 
     def codebook(self, clusters: int) -> Codebook:
         """A codeword a character, the pause as preamble, no pilots.
@@ -58,7 +62,8 @@ class Uart(Framing):
             )
         mark = self.idle == "on"
         levels = self.characters.levels()
-        profile = f"uart-{self.data_bits}{self.parity[0].upper()}{self.stop_bits}"
+        order = "" if self.first_bit == "lowest" else "-highest"
+        profile = f"uart-{self.data_bits}{self.parity[0].upper()}{self.stop_bits}{order}"
         pause = np.full(self.pause_bits, mark, np.uint8)
         return Codebook(profile, pause, np.empty((1, 0), np.uint8), levels if mark else 1 - levels)
 

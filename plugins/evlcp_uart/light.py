@@ -46,6 +46,10 @@ _BLUR = np.array([1.0, 2.0, 3.0, 4.0, 3.0, 2.0, 1.0]) / 16
 """What is learned of a tick tells of those beside it: cameras read events out in bursts, and a character's
 start is known to a tick or two. Without it bits would be told apart by when their events were read out."""
 
+_QUARTER, _STEADY_SHARE = TICKS // 4, 0.4
+"""Ticks of a quarter of a bit, and the share of these that are surely without a burst: what comes in them is of
+something else."""
+
 _PAUSES = 6.0
 """Characters for which a stream without pauses stands."""
 
@@ -93,7 +97,9 @@ class Light:
     @cached_property
     def share(self) -> float:
         """What an event counts."""
-        return min(self.most, _ENOUGH / float(self.rates.sum((1, 2)).max()))
+        # What comes in every context is of something else than the light.
+        telling = self.rates - self.rates.min(0)
+        return min(self.most, _ENOUGH / max(float(telling.sum((1, 2)).max()), 1e-9))
 
     @cached_property
     def logs(self) -> NDArray[np.float64]:
@@ -191,9 +197,12 @@ def guesses(counts: NDArray[np.int32], mark_on: bool) -> Iterator[Light]:
     n = counts.shape[1]
     ticks = np.arange(2 * TICKS)
     total = counts.sum(1) + 1.0
+    # In half of the quarters of bits there is no edge's burst, whatever is sent.
+    quarters = counts[:, : n - n % _QUARTER].reshape(2, -1, _QUARTER).sum(2)
+    steady = np.quantile(quarters, _STEADY_SHARE, axis=1) / _QUARTER
+    noise = np.maximum(np.maximum(0.2 * total / n, steady), 1e-3)
     # A rise in four bits or so.
-    events = np.maximum(total / (n / TICKS / 4), 1.0)
-    noise = np.maximum(0.2 * total / n, 1e-3)
+    events = np.maximum((total - np.maximum(steady - 0.2 * total / n, 0.0) * n) / (n / TICKS / 4), 1.0)
     shares = np.tile(2 * _SHARES, (CONTEXTS, 1))
     for glow, trail, lates in (
         (0.0, 0.0, (-1.0, -0.5, 0.0, 0.5, 1.0)),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io.lists import columns_of, time_unit
+from evlcp_sdk.io.fields import fields_of, time_unit
 from evlcp_sdk.io.open import open_source, read_events
 
 RNG = np.random.default_rng(5)
@@ -98,11 +98,204 @@ def test_an_empty_list_has_no_events(tmp_path: Path) -> None:
 
 def test_the_name_of_the_column_counts_more_than_a_guess() -> None:
     assert time_unit(T_US, "ms").name == "ms"
-    columns = columns_of(["Time [ms]", "Polarity"])
+    columns = fields_of(["Time [ms]", "Polarity"])
     assert columns is not None
     assert columns.unit == "ms"
 
 
-def test_a_table_with_places_is_none() -> None:
-    assert columns_of(["t_us", "x", "y", "p"]) is None
-    assert columns_of(["a", "b"]) is None
+T_S = T_US * 1e-6
+EPOCH_US = 1_600_000_000_000_000
+X = RNG.integers(300, 340, 3000)
+Y = RNG.integers(200, 240, 3000)
+SIGNS = P.astype(int) * 2 - 1
+WORDS = np.where(P == 1, "ON", "OFF")
+
+
+def text(*columns: np.ndarray, head: str = "", mark: str = ",", form: str = "%s") -> str:
+    rows = [
+        mark.join(form % c if isinstance(c, float) else str(c) for c in row)
+        for row in zip(*columns, strict=True)
+    ]
+    return "\n".join([head, *rows] if head else rows) + "\n"
+
+
+ODD = {
+    "of a plot": text(P, T_S, head="Polarity,Time [s]", form="%.6f"),
+    "seconds, spelled": text(T_S, SIGNS, head='"timestamp (seconds)","event"', form="%.6f"),
+    "as the beacon's authors call them": text(T_S, SIGNS, head="event_t,event", form="%.6f"),
+    "words": text(T_US, WORDS, head="time_us,polarity"),
+    "words, no heading": text(WORDS, T_US, mark="\t"),
+    "with an index": text(np.arange(3000), T_US, P, head=",t,p"),
+    "polarity first, no heading": text(SIGNS, T_S, mark=" ", form="%.6f"),
+    "floats throughout": text(T_US * 1.0, P * 1.0, form="%.1f"),
+    "comments": "# a beacon, 30 m\n% t p\n\n" + text(T_US, P, mark="  ") + "// end\n",
+    "savetxt": "# t,p\n" + text(T_US * 1.0, SIGNS * 1.0, form="%.18e"),
+    "decimal comma": text(T_S, P, head="t;p", mark=";", form="%.6f").replace(".", ","),
+    "decimal comma and blanks": text(T_S, P, mark=" ", form="%.6f").replace(".", ","),
+    "blanks around": text(T_US, P, head="t , p", mark=" , "),
+    "right-aligned": "".join(f"{t:>12d} {p:>3d}\n" for t, p in zip(T_US, SIGNS, strict=True)),
+    "minutes of nanoseconds": text(T_US * 1000 + 7, P, head="t,p"),
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_lists_as_people_write_them(name: str, tmp_path: Path) -> None:
+    for suffix in (".csv", ".txt"):
+        (tmp_path / f"a{suffix}").write_text(ODD[name])
+        with open_source(tmp_path / f"a{suffix}") as source:
+            events, _ = source.read()
+            assert source.counts["events"] == 3000
+            assert not source.losses
+        np.testing.assert_array_equal(events.t_us, T_US)
+        np.testing.assert_array_equal(events.p, P)
+
+
+PLACED = {
+    "x,y,t,p": text(X, Y, T_US, P, head="x,y,t,p"),
+    "t x y p": text(T_S, X, Y, P, mark=" ", form="%.9f"),
+    "x y t p": text(X, Y, T_US, SIGNS, mark="\t"),
+    "t p x y": text(T_US, P, X, Y, mark=";"),
+    "named": text(P, X, Y, T_S * 1e3, head="pol,col,row,time (ms)", form="%.3f"),
+}
+
+
+@pytest.mark.parametrize("name", PLACED)
+def test_a_list_with_places_keeps_them(name: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(PLACED[name])
+    with open_source(tmp_path / "a.csv") as source:
+        assert source.header["pixels"] == "as its columns x and y say"
+        events, _ = source.read()
+    for found, wanted in zip((events.t_us, events.x, events.y, events.p), (T_US, X, Y, P), strict=True):
+        np.testing.assert_array_equal(found, wanted)
+
+
+def records(names: list[str], *columns: np.ndarray) -> np.ndarray:
+    out = np.empty(3000, [(name, c.dtype) for name, c in zip(names, columns, strict=True)])
+    for name, column in zip(names, columns, strict=True):
+        out[name] = column
+    return out
+
+
+ARRAYS = {
+    "records": records(["t", "p"], T_US, P),
+    "records with places": records(["x", "y", "p", "t"], X.astype(np.int16), Y.astype(np.int16), P, T_US),
+    "n by 2": np.stack([T_S, SIGNS], 1),
+    "2 by n": np.stack([T_US, P.astype(np.int64)]),
+    "columns on end": np.asfortranarray(np.stack([P * 1.0, T_S], 1)),
+    "n by 4": np.stack([T_US, X, Y, P], 1),
+    "x y t p": np.stack([X, Y, T_US, SIGNS], 1) * 1.0,
+}
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+@pytest.mark.parametrize("kind", ["npy", "npz", "mat"])
+def test_an_array_is_a_list(name: str, kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a.{kind}"
+    if kind == "npy":
+        np.save(path, ARRAYS[name])
+    elif kind == "npz":
+        np.savez(path, events=ARRAYS[name])
+    else:
+        from scipy.io import savemat
+
+        array = ARRAYS[name]
+        named = {key: array[key] for key in array.dtype.names} if array.dtype.names else array
+        savemat(path, {"beacon": named, "note": "30 m"})
+    events = read_events(path)
+    np.testing.assert_array_equal(events.t_us, T_US)
+    np.testing.assert_array_equal(events.p, P)
+    if name in ("records with places", "n by 4", "x y t p"):
+        np.testing.assert_array_equal(events.x, X)
+
+
+def test_arrays_of_a_matlab_file_by_name(tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    savemat(tmp_path / "a.mat", {"event_t": T_S, "event": SIGNS * 1.0})
+    with open_source(tmp_path / "a.mat") as source:
+        assert source.header["time"].startswith("in s,")
+        events, _ = source.read()
+    np.testing.assert_array_equal(events.t_us, T_US)
+    np.testing.assert_array_equal(events.p, P)
+    # And what scipy makes of it, saved by NumPy: rows of one.
+    np.savez(tmp_path / "b.npz", allow_pickle=False, event_t=T_S[:, None], event=SIGNS[None])
+    np.testing.assert_array_equal(read_events(tmp_path / "b.npz").p, P)
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit", "form"),
+    [(1e-6, "s", "%.6f"), (1e-3, "ms", "%.3f"), (1, "us", "%d"), (1000, "ns", "%d")],
+)
+def test_times_since_1970_say_their_unit(factor: float, unit: str, form: str, tmp_path: Path) -> None:
+    rows = [f"{form % ((EPOCH_US + int(t)) * factor)},{p}" for t, p in zip(T_US, P, strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(["t,p", *rows]))
+    with open_source(tmp_path / "a.csv") as source:
+        assert source.header["time"].startswith(f"in {unit}, guessed: times since 1970")
+        events, _ = source.read()
+    np.testing.assert_allclose(events.t_us - EPOCH_US, T_US, atol=1)
+
+
+def test_rows_in_any_order_are_sorted_and_counted(tmp_path: Path) -> None:
+    order = np.random.default_rng(1).permutation(3000)
+    shuffled = text(T_US[order], P[order], head="t_us,p")
+    by_polarity = np.argsort(P, kind="stable")
+    for name, rows in (
+        ("shuffled", shuffled),
+        ("one by one", text(T_US[by_polarity], P[by_polarity], head="t_us,p")),
+    ):
+        (tmp_path / "a.csv").write_text(rows)
+        with open_source(tmp_path / "a.csv") as source:
+            events, _ = source.read()
+            late = source.counts["rows_out_of_order"]
+            assert not source.losses
+        np.testing.assert_array_equal(events.t_us, T_US)
+        np.testing.assert_array_equal(events.p, P)
+        t = T_US[order] if name == "shuffled" else T_US[by_polarity]
+        assert late == (t < np.maximum.accumulate(t)).sum()
+
+
+def test_what_a_list_does_not_say_is_told(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(text(np.arange(3000) % 7, SIGNS, T_US))
+    with pytest.raises(
+        InputError, match=r"expected the columns t and p \(or say which they are, as by list:"
+    ):
+        read_events(f"list:{tmp_path / 'a.csv'}")
+    events = read_events(f"list:{tmp_path / 'a.csv'}?columns=-,p,t&unit=ms&inverted=1")
+    np.testing.assert_array_equal(events.t_us, T_US * 1000)
+    np.testing.assert_array_equal(events.p, 1 - P)
+    with pytest.raises(InputError, match="unit = 'hours': expected s, ms, us, ns"):
+        read_events(f"list:{tmp_path / 'a.csv'}?unit=hours")
+    with pytest.raises(InputError, match="columns = 't,q': expected t and p, or t, x, y and p"):
+        read_events(f"list:{tmp_path / 'a.csv'}?columns=t,q")
+
+
+def test_a_last_line_that_is_cut_is_left_out_and_counted(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(text(T_US, P, head="t,p") + "413")
+    with open_source(tmp_path / "a.csv") as source:
+        assert len(source.read()[0]) == 3000
+        assert source.counts["rows_cut"] == 1
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("t,p\n1,1\n2,up\n3,sideways\n4,1\n", "line 4: found '3,sideways', expected a time and a polarity"),
+        ("t,x,y,p\n1,1,1,1\n2,99999,1,0\n", "place 99999, expected whole numbers from 0 to 65535"),
+        (
+            "t,x,y,p\n1,1,1,1\n2,1,0\n3,1,1,1\n",
+            "line 3: found '2,1,0', expected a time and a polarity, x and y",
+        ),
+    ],
+)
+def test_faults_of_words_and_places(rows: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(rows)
+    with pytest.raises(InputError, match=message):
+        read_events(tmp_path / "a.csv")
+
+
+def test_names_that_do_not_tell() -> None:
+    assert fields_of(["a", "b"]) is None
+    assert fields_of(["t", "x", "y"]) is None
+    fields = fields_of(["timestamp_ms", "t", "sign", "p"])
+    assert fields is not None
+    assert fields.which == (1, 3)

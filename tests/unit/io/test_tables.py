@@ -191,7 +191,7 @@ def test_bad_npz_is_an_error(data, message, tmp_path):
 HEAD = b"t_us,x,y,p\n"
 BAD_CSV = {
     "empty": (b"", r"line 1: found '', expected 't_us,x,y,p'"),
-    "another header": (b"t,x,y,p\n1,2,3,1\n", r"line 1: found 't,x,y,p', expected 't_us,x,y,p'"),
+    "another header": (b"t,x,y,on air\n1,2,3,1\n", r"line 1: found 't,x,y,on air', expected 't_us,x,y,p'"),
     "no header": (b"1,2,3,1\n", "line 1: found '1,2,3,1'"),
     "a column missing": (HEAD + b"1,2,3\n", "line 2: found '1,2,3', expected four integers"),
     "a column more": (HEAD + b"1,2,3,1\n1,2,3,1,5\n", "line 3: found '1,2,3,1,5', expected"),

@@ -1,8 +1,11 @@
 """Characters of one LED, against a generator of events that shares nothing with the receiver."""
 
 import itertools
+import json
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -358,3 +361,38 @@ def test_tables_of_steps_that_it_has_not_are_refused() -> None:
     assert resolve(link.table) == link
     with pytest.raises(ConfigError, match=r"^ranging: no step of framing 'uart'"):
         link.algorithm("ranging")
+
+
+def test_text_is_given_as_it_is_read(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+    """The highest bit first, as a home-made transmitter may send; and what is said where it is not told."""
+    text = "Rough winds do shake the darling buds of May, " * 3
+    codes = np.frombuffer(text.encode(), np.uint8).astype(int)
+    levels = np.concatenate(
+        [[0, *(b := [int(c) for c in f"{code:07b}"]), sum(b) % 2, 1, 1] for code in codes.tolist()]
+    ).tolist()
+    events = seen(np.random.default_rng(2), levels, 320.0)
+    rows = "".join(f"{t},{p}\n" for t, p in zip(events.t_us.tolist(), events.p.tolist(), strict=True))
+    (tmp_path / "list.csv").write_text(rows)
+    link = "\n".join(
+        [
+            "[bar]\nrows = 6\ncolumns = 1\ncluster_rows = 6\ncluster_columns = 1",
+            "[air]\nchip_rate_hz = 3125.0\nframes_per_packet = 50",
+            '[framing]\nid = "uart"\ndata_bits = 7\nparity = "even"\nstop_bits = 2\nfirst_bit = "highest"',
+            '[detection]\nid = "whole"',
+        ]
+    )
+    (tmp_path / "uart.toml").write_text(link)
+    command = ["receive", f"{tmp_path}/list.csv", "-c", f"{tmp_path}/uart.toml", "-o", f"{tmp_path}/out"]
+    run = evlcp(*command)
+    assert run.code == 0
+    assert "text of 0: 'Rough winds do shake" in run.out
+    lines = [json.loads(line) for line in (tmp_path / "out" / "packets.jsonl").read_text().splitlines()]
+    # Of the last packet only the first characters were sent.
+    assert "".join(line["text"] for line in lines).rstrip("\ufffd") == text
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [one["text"] for one in summary["transmitters"]] == [text]
+    assert summary["warnings"] == []
+    (tmp_path / "uart.toml").write_text(link.replace("highest", "lowest"))
+    assert evlcp(*command).code == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [one["code"] for one in summary["warnings"]] == ["bit-order"]

@@ -1,0 +1,267 @@
+"""What the columns of somebody's list of events mean: names, units of time, words for polarities."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.io.writers import LAST_TIME_US
+
+__all__ = ["Fields", "TimeUnit", "fields_of", "fields_of_values", "polarities", "time_unit"]
+
+UNITS_US: Final = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
+
+_UNITS: Final = {
+    "s": "s|secs?|seconds?",
+    "ms": "ms|msecs?|millis|milliseconds?",
+    "us": "us|µs|μs|usecs?|micros|microseconds?",
+    "ns": "ns|nsecs?|nanos|nanoseconds?",
+}
+_TIME: Final = re.compile(
+    r"(?:events?[ _.]?)?(?:t|ts|times?|timestamps?|time[ _]stamps?)[ _.]?[(\[]?"
+    + f"(?:{'|'.join(f'(?P<{unit}>{words})' for unit, words in _UNITS.items())})?"
+    + r"[)\]]?"
+)
+_NAMES: Final = {
+    "p": re.compile(
+        r"(?:events?[ _.]?)?(?:p|ps|pol|pols|polarity|polarities|on|on[ _/]?off|sign|value|level)"
+    ),
+    "x": re.compile(r"(?:events?[ _.]?)?(?:x|xs|x[ _]?px|col|column)"),
+    "y": re.compile(r"(?:events?[ _.]?)?(?:y|ys|y[ _]?px|row|line)"),
+}
+_EVENT: Final = ("event", "events")
+"""Polarities by this name, where no other column is: signs of events beside their times."""
+
+_ON: Final = frozenset({"1", "+1", "true", "t", "on", "pos", "positive", "+", "up", "rise"})
+_OFF: Final = frozenset({"0", "-1", "false", "f", "off", "neg", "negative", "-", "down", "fall"})
+
+LEAST_RATE_HZ: Final = 20.0
+MOST_RATE_HZ: Final = 5e7
+"""Events a second of pixels that see a blinking light: with fewer, or more, the unit is another."""
+
+_EPOCH_S: Final = (0.9e9, 4.2e9)
+"""Seconds since 1970 of a clock of today's computers: from 1998 to 2103."""
+
+
+@dataclass(frozen=True)
+class TimeUnit:
+    """What the times of a list count.
+
+    Attributes:
+        name: `s`, `ms`, `us` or `ns`.
+        why: How that is known, for `evlcp info`.
+        others: Units that would do, too, where it is guessed.
+    """
+
+    name: str
+    why: str
+    others: tuple[str, ...] = ()
+
+    def us(self, times: NDArray[Any]) -> NDArray[np.int64]:
+        """Times in us, int64 (n,), rounded down.
+
+        Raises:
+            ValueError: One is no number, or too large.
+        """
+        if times.dtype.kind == "f":
+            # To a thousandth before that: 0.000057 s times 1e6 is a little less than 57.
+            scaled = np.round(times.astype(np.float64) * UNITS_US[self.name], 3)
+            if not np.isfinite(scaled).all() or np.abs(scaled).max(initial=0.0) > LAST_TIME_US:
+                raise ValueError("a time that is no number or too large")
+            if times.dtype.itemsize < 8:
+                # Fewer digits than a microsecond needs: the nearest one.
+                return np.rint(scaled).astype(np.int64)
+            return np.floor(scaled).astype(np.int64)
+        if self.name == "ns":
+            return times.astype(np.int64) // 1000
+        factor = round(UNITS_US[self.name])
+        if len(times) and max(int(times.max()), -int(times.min())) > LAST_TIME_US // factor:
+            raise ValueError("a time that is too large")
+        return times.astype(np.int64) * factor
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Which columns of a table are time, polarity and place.
+
+    Attributes:
+        time: Number of the column of times.
+        polarity: Number of the column of polarities.
+        places: Numbers of the columns x and y; None where there are none.
+        unit: The unit that the name of the first one says; None where it says none.
+    """
+
+    time: int
+    polarity: int
+    places: tuple[int, int] | None = None
+    unit: str | None = None
+
+    @property
+    def which(self) -> tuple[int, ...]:
+        """Numbers of the columns: time, polarity, and x and y where there are places."""
+        return (self.time, self.polarity, *(self.places or ()))
+
+
+def fields_of(names: Sequence[str]) -> Fields | None:
+    """The columns of a list of events by their names; None where they do not say time and polarity.
+
+    Others are left out; of places both or none.
+
+    >>> fields_of(["p", "t_ms"])
+    Fields(time=1, polarity=0, places=None, unit='ms')
+    >>> fields_of(["Timestamp [us]", "x", "y", "ON/OFF"])
+    Fields(time=0, polarity=3, places=(1, 2), unit='us')
+    >>> fields_of(["a", "b"]) is None
+    True
+    """
+    plain = [name.strip().strip("\"'").strip().lower() for name in names]
+    times = [(k, match) for k, name in enumerate(plain) if (match := _TIME.fullmatch(name))]
+    found = {key: [k for k, name in enumerate(plain) if word.fullmatch(name)] for key, word in _NAMES.items()}
+    # `t` and `p` before longer names that may mean something else.
+    if len(times) > 1:
+        times = [one for one in times if plain[one[0]] in ("t", "ts", "time", "timestamp")]
+    of_p = found["p"] or [k for k, name in enumerate(plain) if name in _EVENT]
+    if len(of_p) > 1:
+        of_p = [k for k in of_p if plain[k] in ("p", "pol", "polarity")]
+    if len(times) != 1 or len(of_p) != 1:
+        return None
+    (time, match), (polarity,) = times[0], of_p
+    places = (found["x"][0], found["y"][0]) if len(found["x"]) == len(found["y"]) == 1 else None
+    unit = next((unit for unit in _UNITS if match[unit]), None)
+    return Fields(time, polarity, places, unit)
+
+
+def fields_of_values(columns: Sequence[NDArray[Any]]) -> Fields | None:
+    """The columns of a table without names, by what is in them: two, or four with places.
+
+    Polarities are two values at most, times rise or have decimals; None where that does not tell them apart.
+
+    Args:
+        columns: Some rows of each, numbers or words, (n,).
+
+    >>> fields_of_values([np.array([1, 0, 1]), np.array([7, 9, 12])])
+    Fields(time=1, polarity=0, places=None, unit=None)
+    """
+    signs = [k for k, column in enumerate(columns) if _are_signs(column)]
+    if len(columns) == 2:
+        if not signs:
+            return None
+        if len(signs) == 1:
+            return Fields(1 - signs[0], signs[0])
+        return Fields(0, 1) if columns[0].dtype.kind in "iuf" else Fields(1, 0)
+    if len(columns) != 4 or not signs:
+        return None
+    # The last one, or the last but one, where places are 0 and 1, too.
+    rest = [k for k in range(4) if k not in signs] if len(signs) == 1 else list(range(4))
+    if len(signs) > 1:
+        signs = [k for k in signs if k >= 2][-1:] or signs[-1:]
+        rest = [k for k in range(4) if k != signs[0]]
+    numbers = [k for k in rest if columns[k].dtype.kind in "iuf"]
+    if len(numbers) < 3:
+        return None
+
+    def is_place(column: NDArray[Any]) -> bool:
+        return bool((column == np.floor(column)).all() and column.min() >= 0 and column.max() < 1 << 16)
+
+    times = [k for k in rest if not is_place(columns[k])]
+    if not times:
+        # Small whole numbers throughout: the one that rises.
+        times = [k for k in rest if (np.diff(columns[k].astype(np.float64)) >= 0).all()]
+    if len(times) != 1:
+        return None
+    x, y = (k for k in rest if k != times[0])
+    return Fields(times[0], signs[0], (x, y))
+
+
+def _are_signs(values: NDArray[Any]) -> bool:
+    if values.dtype.kind == "b":
+        return True
+    if values.dtype.kind in "US":
+        return all(str(word).strip().lower() in _ON | _OFF for word in np.unique(values).tolist())
+    return bool(np.isin(values, (-1, 0, 1)).all())
+
+
+def time_unit(times: NDArray[Any], named: str | None) -> TimeUnit:
+    """The unit of times: the one that their column's name says, or else what cameras do.
+
+    A camera counts microseconds, whole ones: nanoseconds of one are multiples of 1000, milliseconds have
+    three decimals, seconds six. A unit by which less than 20 or more than 50 million events come a second is
+    another one. Times since 1970 say their unit by themselves.
+
+    Args:
+        times: The first ones, in any order, int64 or float64 (n,).
+        named: The unit of the name; None for none.
+
+    >>> time_unit(np.array([0.000125, 0.000893, 0.00131]), None).name
+    's'
+    >>> time_unit(np.array([125, 893, 1310]), None).name
+    'us'
+    >>> time_unit(np.array([1_600_000_000_125_000, 1_600_000_000_893_100]), None).name
+    'us'
+    """
+    if named is not None:
+        return TimeUnit(named, "as its column says")
+    inside = np.sort(times[np.isfinite(times)] if times.dtype.kind == "f" else times)
+    span = float(inside[-1] - inside[0]) if len(inside) > 1 else 0.0
+
+    def rate_hz(unit: str) -> float:
+        return (len(inside) - 1) / (span * UNITS_US[unit] * 1e-6) if span > 0 else LEAST_RATE_HZ
+
+    def likely(unit: str) -> bool:
+        return LEAST_RATE_HZ <= rate_hz(unit) <= MOST_RATE_HZ
+
+    for unit in UNITS_US:
+        # Whole microseconds of twenty minutes on are no seconds of today: those lie near one another.
+        if (
+            len(inside)
+            and (unit != "s" or span < 1e6)
+            and all(
+                _EPOCH_S[0] < float(t) * UNITS_US[unit] * 1e-6 < _EPOCH_S[1] for t in (inside[0], inside[-1])
+            )
+        ):
+            return TimeUnit(unit, "guessed: times since 1970")
+    others = tuple(unit for unit in UNITS_US if span > 0 and likely(unit))
+    if times.dtype.kind != "f" or (inside == np.round(inside)).all():
+        whole = inside - inside[:1]
+        if span > 0 and (whole % 1000 == 0).all() and rate_hz("ns") <= MOST_RATE_HZ:
+            return TimeUnit("ns", "guessed: whole numbers, all multiples of 1000", others)
+        if rate_hz("us") > MOST_RATE_HZ:
+            return TimeUnit("ns", "guessed: whole numbers, too close for us", others)
+        if not likely("us") and likely("ns"):
+            return TimeUnit("ns", "guessed: whole numbers, too far apart for us", others)
+        return TimeUnit("us", "guessed: whole numbers", others)
+    decimals = 3 if np.abs(inside * 1e3 - np.round(inside * 1e3)).max() < 1e-4 else 6
+    tried = ("ms", "us") if decimals == 3 else ("s", "ms", "us")
+    for unit in tried:
+        if rate_hz(unit) >= LEAST_RATE_HZ:
+            why = f"guessed: {decimals} decimals or more, {rate_hz(unit):.3g} events/s"
+            return TimeUnit(unit, why, others)
+    return TimeUnit("us", "guessed: too far apart for ms", others)
+
+
+def polarities(values: NDArray[Any]) -> NDArray[np.uint8]:
+    """Polarities of 0 and 1, -1 and 1, false and true, or words such as ON and OFF, uint8 (n,).
+
+    Raises:
+        ValueError: One is none of them.
+
+    >>> polarities(np.array(["ON", "off"])).tolist()
+    [1, 0]
+    """
+    if values.dtype.kind in "US":
+        words = {}
+        for word in np.unique(values).tolist():
+            text = (word.decode("utf-8", "replace") if isinstance(word, bytes) else word).strip().strip("\"'")
+            plain = text.lower().removesuffix(".0")
+            if plain not in _ON and plain not in _OFF:
+                raise ValueError(f"polarity {text!r}, expected 0 or 1, or -1 or 1, or ON or OFF")
+            words[word] = plain in _ON
+        kinds, which = np.unique(values, return_inverse=True)
+        return np.array([words[kind] for kind in kinds.tolist()], np.uint8)[which.ravel()]
+    wrong = ~np.isin(values, (-1, 0, 1))
+    if wrong.any():
+        raise ValueError(f"polarity {values[int(wrong.argmax())]}, expected 0 or 1, or -1 or 1")
+    return (values > 0).astype(np.uint8)
