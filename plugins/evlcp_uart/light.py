@@ -47,8 +47,8 @@ _BLUR = np.array([1.0, 2.0, 3.0, 4.0, 3.0, 2.0, 1.0]) / 16
 start is known to a tick or two. Without it bits would be told apart by when their events were read out."""
 
 _QUARTER, _STEADY_SHARE = TICKS // 4, 0.4
-"""Ticks of a quarter of a bit, and the share of these that are surely without a burst: what comes in them is of
-something else."""
+"""Ticks of a quarter of a bit, and the share of these that are surely without a burst: what comes in them is
+of something else."""
 
 _PAUSES = 6.0
 """Characters for which a stream without pauses stands."""
