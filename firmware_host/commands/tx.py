@@ -67,9 +67,11 @@ def frames(
 
 
 def _words(codes: "NDArray[np.uint8]") -> list[str]:
-    """Codes as words in hex, the last chip the least significant bit."""
+    """Codes as words in hex, the last chip the least significant bit; empty ones of no chips."""
     from evlcp_sdk.air.codebook import word_of_chips
 
+    if not codes.shape[1]:
+        return [""] * len(codes)
     width = -(-codes.shape[1] // 4)
     return [f"{word_of_chips(code):0{width}x}" for code in codes]
 
@@ -81,7 +83,7 @@ def _table(symbols: "NDArray[np.int64]", link: "Link") -> str:
     for p, packet in enumerate(symbols.tolist()):
         for f, frame in enumerate(packet):
             for k, symbol in enumerate(frame):
-                pilot = pilots[k] if link.packet.has_pilot(f) else none
+                pilot = (pilots[k] if link.packet.has_pilot(f) else "") or none
                 lines.append(f"{p:6} {f:5} {k:7} {symbol:6}  {pilot} {info[symbol]}")
     return "\n".join(lines)
 

@@ -83,13 +83,18 @@ class Light:
     def rates(self) -> NDArray[np.float64]:
         """Mean events of each context, by polarity and tick, at a gain of one, float64 (C, 2, TICKS)."""
         mean = self.events.sum(0) / max(float(self.windows.sum()), 1.0)
+        bits = self.gains.sum(1)
         found = mean[None]
         for depth in range(1, BEFORE + 2):
             # Those with one more bit before, where there are too few of them stand those without.
             events = self.events.reshape(-1, 1 << depth, 2, TICKS).sum(0)
             windows = self.windows.reshape(-1, 1 << depth).sum(0)
+            many = bits.reshape(-1, 1 << depth).sum(0)
+            # Windows are counted by their gain: of bits that are silent as a rule those of the prior are, too.
+            known = _PRIOR_WINDOWS * np.where(many > 0, windows / np.maximum(many, 1e-9), 1.0)
+            known = np.maximum(known, _PRIOR_WINDOWS * GAINS[0])
             prior = np.tile(found, (2, 1, 1))
-            found = (events + _PRIOR_WINDOWS * prior) / (windows + _PRIOR_WINDOWS)[:, None, None]
+            found = (events + known[:, None, None] * prior) / (windows + known)[:, None, None]
         floor = _FLOOR * float(mean.mean()) + 1e-5
         rates: NDArray[np.float64] = _smooth(found) + floor
         return rates
