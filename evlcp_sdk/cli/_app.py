@@ -54,7 +54,7 @@ def _expect_once(ctx: Any, name: str | None, command: Any, args: list[str]) -> N
     """Refuse an option that takes one value and is given two, of which all but the last would be ignored."""
     with command.context_class(command, info_name=name, parent=ctx) as inner:
         try:
-            *_, order = command.make_parser(inner).parse_args(list(args))
+            _, rest, order = command.make_parser(inner).parse_args(list(args))
         except Exception:
             # The command itself says what is wrong with them.
             return
@@ -67,6 +67,10 @@ def _expect_once(ctx: Any, name: str | None, command: Any, args: list[str]) -> N
                 if "--config" in option.opts:
                     said += f": {name} goes by one link; run it once for each"
                 inner.fail(said)
+        if isinstance(command, TyperGroup) and rest:
+            nested = command.get_command(inner, rest[0])
+            if nested is not None:
+                _expect_once(inner, rest[0], nested, rest[1:])
 
 
 @contextmanager

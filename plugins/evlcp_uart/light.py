@@ -90,7 +90,7 @@ class Light:
             events = self.events.reshape(-1, 1 << depth, 2, TICKS).sum(0)
             windows = self.windows.reshape(-1, 1 << depth).sum(0)
             many = bits.reshape(-1, 1 << depth).sum(0)
-            # Windows are counted by their gain: of bits that are silent as a rule those of the prior are, too.
+            # Windows count by their gain: where bits are silent as a rule, those of the prior do, too.
             known = _PRIOR_WINDOWS * np.where(many > 0, windows / np.maximum(many, 1e-9), 1.0)
             known = np.maximum(known, _PRIOR_WINDOWS * GAINS[0])
             prior = np.tile(found, (2, 1, 1))

@@ -214,6 +214,10 @@ def test_what_goes_by_one_link_refuses_another(evlcp: Evlcp) -> None:
     done = evlcp("diagnose", "never-read.raw", "-c", "a.toml", "-c", "b.toml")
     assert done.code == 2
     assert "--config is given 2 times, expected once: diagnose goes by one link" in " ".join(done.err.split())
+    for group, command in (("board", "program"), ("tx", "message")):
+        done = evlcp(group, command, "-c", "a.toml", "-c", "b.toml")
+        assert done.code == 2
+        assert f"--config is given 2 times, expected once: {command} goes by" in " ".join(done.err.split())
 
 
 def test_every_fault_of_a_link_is_one_line(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:
