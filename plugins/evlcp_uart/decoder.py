@@ -32,9 +32,8 @@ learn."""
 _BEFORE_FIRST = TICKS
 """Ticks before a stream's first event of which that event tells: it may be an edge's, which is late."""
 
-_TELLING, _CUT = 0.6, 2 / 3
-"""How sure the last character must be that goes on behind the last event, as its rest may not have been seen;
-and how sure it is at the most: one that was cut has the right parity by chance."""
+_TELLING = 0.95
+"""How sure the last character must be that goes on behind the last event: its rest may not have been seen."""
 
 _AHEAD = 4
 """Characters that are looked ahead: where one starts is known only by those after it."""
@@ -238,10 +237,7 @@ class CharacterDecoder:
         first, light = state.first, state.light
         # No more than that, however much there is: any split of the stream gives the same.
         counts = state.counts[:, : due + self._ahead]
-        end = over = counts.shape[1] - (0 if last else _TAIL)
-        if last and self.characters.parity != "none":
-            # Silence behind the last event ends a character, or somebody cut it: its parity tells.
-            end += self._length
+        end = counts.shape[1] - (0 if last else _TAIL)
         # A character may go on behind what is known.
         counts = np.pad(counts, ((0, 0), (0, self._length + 2 * _TAIL)))
         events = int(counts[:, :due].sum())
@@ -271,10 +267,8 @@ class CharacterDecoder:
             if last and found:
                 # Its last edge may be that before the first stop bit.
                 needs = int(starts[kept][-1]) + (self.characters.bits - self.characters.stop_bits) * TICKS
-                if needs >= over:
-                    one = found.pop()
-                    if one.quality >= _TELLING and not one.wrong_parity:
-                        found.append(replace(one, quality=min(one.quality, _CUT)))
+                if needs >= end and (found[-1].quality < _TELLING or found[-1].wrong_parity):
+                    found.pop()
             by_chance = 0
             if state.light is None:
                 by_chance, found = len(found), _without_chance(found)
