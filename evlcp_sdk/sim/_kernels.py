@@ -20,9 +20,6 @@ the log signal behind the source follower, where that has a time constant."""
 DRAW, ARMED, BLOCK = range(3)
 """Columns of a pixel's counters."""
 
-POSE, SHADE = -1, -2
-"""Entries of the time line that are no source: the image moves, or the share of all light that passes."""
-
 LIGHT_STEP = 1e-3
 """Relative change of a pixel's light that is not worth a new piece: the light stays until it is more."""
 
@@ -32,6 +29,9 @@ COLUMN_BITS = 12
 _PLACES = np.empty(64, np.int64)
 """Place of the only bit of a word, by the upper bits of its product with a de Bruijn sequence."""
 _PLACES[[(0x03F79D71B4CB0A89 << k & (1 << 64) - 1) >> 58 for k in range(64)]] = np.arange(64)
+
+_AHEAD = 16
+"""Draws made together: a pixel takes some sixty in a block of time, and needs the noise of every second."""
 
 NOISE_LIMIT = 4.0
 """Where the normal distribution of every draw is cut off, standard deviations."""
@@ -238,6 +238,16 @@ def _decay(ages: Array, bits: Array, out: Array, n: int) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _draw_ahead(key: Any, draw: int, shifts: Array, shift: Array, fate: Array) -> None:
+    """Write what draws from this one on give: the factor of noise, and the number that may lose an event."""
+    first = key + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03)
+    for i in range(shift.size):
+        word = _mix(first + np.uint64(i) * np.uint64(0xD1B54A32D192ED03))
+        shift[i] = _table_at(shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10)
+        fate[i] = float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _run_pieces(
     pieces: int,
     t_us: Array,
@@ -245,6 +255,7 @@ def _run_pieces(
     draws: Array,
     room: Array,
     room_bits: Array,
+    ahead: Array,
     s: Array,
     c: Array,
     code: int,
@@ -264,7 +275,8 @@ def _run_pieces(
     are the quantiles of the factor by which noise moves both thresholds. One word of random bits a draw, from
     the pixel's `key`: the upper half decides on the noise, the lower on whether the event goes missing.
     `draws[i]` draws pass as piece i begins. `room` float64 (3, pieces or more) is overwritten, `room_bits` is
-    its int64 view; `s` and `c` are the pixel's state and counters.
+    its int64 view; `ahead` float64 (2, n) is room for n draws, which are made together by vector
+    instructions. `s` and `c` are the pixel's state and counters.
     """
     charge, refractory = sensor[0], sensor[1]
     delay_on, delay_off, jitter = sensor[2], sensor[3], sensor[4]
@@ -288,6 +300,8 @@ def _run_pieces(
         s[FOLLOWER] = z
         pieces = 0
     per_charge = 1.0 / charge
+    shift_ahead, fate_ahead = ahead[0], ahead[1]
+    drawn = draw - shift_ahead.size
     ages, kept = room[0], room[1]
     for i in range(pieces):
         ages[i] = light[i] * per_charge * (t_us[i + 1] - t_us[i])
@@ -321,8 +335,11 @@ def _run_pieces(
                 draw += 1
             if u_end > reference * widest_on and u_end < reference * widest_off:
                 break
-            word = _mix(key + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03))
-            shift = _table_at(shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10)
+            k = draw - drawn
+            if k >= shift_ahead.size:
+                drawn, k = draw, 0
+                _draw_ahead(key, draw, shifts, shift_ahead, fate_ahead)
+            shift = shift_ahead[np.uint64(k)]
             low = reference * on_factor * shift
             high = reference * off_factor * shift
             t = max(t_base, t_ready)
@@ -356,8 +373,7 @@ def _run_pieces(
             out_code[n] = code + on
             if out_cross.size:
                 out_cross[n] = t
-            missed = float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10
-            n += int(missed >= (miss_on if on else miss_off))
+            n += int(fate_ahead[np.uint64(k)] >= (miss_on if on else miss_off))
         u_base = u_end
     s[U_BASE], s[REFERENCE] = u_base, reference
     s[T_READY], s[T_LAST_OUT] = t_ready, t_last_out
@@ -409,8 +425,8 @@ def run_given_light(
     room = np.empty((3, pieces))
     return int(
         _run_pieces(
-            pieces, t_us, light, draws, room, room.view(np.int64), s, c, 0, key, quantiles, shifts, sensor,
-            out_t, out_code, out_cross, 0,
+            pieces, t_us, light, draws, room, room.view(np.int64), np.empty((2, _AHEAD)), s, c, 0, key,
+            quantiles, shifts, sensor, out_t, out_code, out_cross, 0,
         )
     )  # fmt: skip
 
@@ -428,24 +444,6 @@ def _step(table: Array, per_px: float, z: float) -> float:
     return float(table[i] + (at - i) * (table[i + 1] - table[i]))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _beside(tables: Array, row: Any, columns: Any, between: float, scale: float, z: float) -> float:
-    """Share of a pixel lit by a strip's part beyond an edge, `z` px before the pixel; see `strip_table`.
-
-    `row` is where in `tables` a row of so many columns begins, `between` the way to the next.
-    """
-    nodes: Any = np.int64(columns)
-    half = 0.5 * (nodes - 1)
-    at = half + half * z / (abs(z) + scale)
-    i = min(int(at), nodes - 2)
-    part = at - i
-    k = row + np.uint64(i)
-    low = tables[k] + part * (tables[k + np.uint64(1)] - tables[k])
-    k += columns
-    high = tables[k] + part * (tables[k + np.uint64(1)] - tables[k])
-    return float(low + between * (high - low))
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def texture_at(field: Array, u: float, v: float) -> float:
     """Bilinear value of the periodic texture (size a power of two) at column u, row v."""
@@ -460,6 +458,114 @@ def texture_at(field: Array, u: float, v: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _place(x: float, y: float, origin: Array, axis: Array, along: Array, across: Array) -> None:
+    """Write where a pixel is from a strip's first end, along it and to its right, in each pose, px."""
+    for p in range(along.size):
+        dx, dy = x - origin[0, p], y - origin[1, p]
+        along[p] = dx * axis[0, p] + dy * axis[1, p]
+        across[p] = dx * axis[1, p] - dy * axis[0, p]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _near_weights(
+    along: Array,
+    across: Array,
+    strip_px: Array,
+    edges: Array,
+    gain: float,
+    table: Array,
+    scale: float,
+    reach: float,
+    rows: Array,
+    row_part: Array,
+    nodes: Array,
+    node_part: Array,
+    beside: Array,
+    weight: Array,
+) -> None:
+    """Write how much light each of a strip's clusters gives a pixel in each pose, when it shines.
+
+    `edges` (clusters + 1, poses) are where they start and end along it, px; `table` is that of `strip_table`,
+    followed for `reach` px. `rows` and `nodes`, int32, `row_part` and `node_part`, all (poses,), and `beside`
+    (clusters + 1, poses) are overwritten; `weight` (clusters, poses) is the result, W/m2.
+    """
+    poses = along.size
+    columns = table.shape[1]
+    flat = table.reshape(-1)
+    most = table.shape[0] - 1
+    for p in range(poses):
+        aside = abs(across[p])
+        side = most * aside / (aside + scale)
+        row = min(np.int32(side), np.int32(most - 1))
+        row_part[p] = side - row
+        rows[p] = row * columns
+    half = 0.5 * (columns - 1)
+    below = np.uint64(columns)
+    one = np.uint64(1)
+    for b in range(edges.shape[0]):
+        # Apart, the first loop is one of vector instructions.
+        for p in range(poses):
+            z = along[p] - edges[b, p]
+            at = half + half * z / (abs(z) + scale)
+            node = min(np.int32(at), np.int32(columns - 2))
+            node_part[p] = at - node
+            nodes[p] = rows[p] + node
+        for p in range(poses):
+            k = np.uint64(nodes[p])
+            low = flat[k] + node_part[p] * (flat[k + one] - flat[k])
+            k += below
+            high = flat[k] + node_part[p] * (flat[k + one] - flat[k])
+            beside[b, p] = low + row_part[p] * (high - low)
+    for b in range(weight.shape[0]):
+        for p in range(poses):
+            seen = (
+                (edges[b + 1, p] > along[p] - reach)
+                & (edges[b, p] < along[p] + reach)
+                & (abs(across[p]) < reach + 0.5 * strip_px[p])
+            )
+            weight[b, p] = gain * (beside[b, p] - beside[b + 1, p]) if seen else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_near(weight: Array, levels: Array, pose: Array, light: Array) -> None:
+    """Add the light of clusters (clusters, entries) that weigh (clusters, poses), each entry in its pose."""
+    for b in range(weight.shape[0]):
+        for j in range(light.size):
+            light[j] += weight[b, np.uint64(pose[j])] * levels[b, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_halo(far: float, low: Array, high: Array, between: float, light: Array) -> None:
+    """Add the light of a halo between two places of its grid."""
+    for j in range(light.size):
+        light[j] += far * (low[j] + between * (high[j] - low[j]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_pieces(
+    t: Array, total: Array, switched: Array, first: int, t_us: Array, light: Array, draws: Array
+) -> int:
+    """Write when the light changes by more than `LIGHT_STEP`, from entry `first` on; return the last piece.
+
+    The first piece is there; a change at the time of a piece's begin is its own.
+    """
+    piece = 0
+    now = light[0]
+    begin = t_us[0]
+    for j in range(first, t.size):
+        if abs(total[j] - now) <= LIGHT_STEP * now:
+            continue
+        now = total[j]
+        if t[j] > begin:
+            piece += 1
+            begin = t_us[piece] = t[j]
+            draws[piece] = 0
+        light[piece] = now
+        draws[piece] += switched[j]
+    return piece
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def run_pixels(
     first: int,
     last: int,
@@ -471,18 +577,25 @@ def run_pixels(
     block: int,
     begin_us: float,
     end_us: float,
+    own_first: Array,
+    own_t: Array,
+    own_pose: Array,
+    own_switched: Array,
+    own_shade: Array,
+    own_begins: Array,
+    levels: Array,
+    halo: Array,
     line_t: Array,
-    line_source: Array,
-    line_row: Array,
-    first_rows: Array,
+    line_pose: Array,
+    line_switched: Array,
+    line_shade: Array,
+    line_own: Array,
     origin: Array,
     axis: Array,
     bounds: Array,
     strip_px: Array,
     clusters: Array,
     gain: Array,
-    levels: Array,
-    halo: Array,
     halo_first: Array,
     halo_per_px: Array,
     halo_share: Array,
@@ -493,7 +606,7 @@ def run_pixels(
     near_reach: Array,
     wide_table: Array,
     wide_per_px: Array,
-    shade: Array,
+    wiped: bool,
     turn_px: Array,
     texture_every: int,
     field: Array,
@@ -508,49 +621,51 @@ def run_pixels(
 ) -> tuple[int, int]:
     """Run pixels [first, last) through one block of time; return (next pixel, number of events).
 
-    The light on a pixel is constant between the entries of the time line: an entry with `line_source` >= 0
-    switches that source to row `line_row` of `levels`; `POSE` moves the image to pose `line_row`; from
-    `SHADE` on, `shade[line_row]` is the share of all light that passes, `shade[0]` as the block begins.
-    It ends early, at a pixel for which the output might have no room.
+    It ends early, at a pixel for which the output might have no room. Bit i of `masks[j]` says that source i
+    lights pixel j.
 
-    Bit i of `masks[j]` says that source i lights pixel j. `first_rows` are the rows of `levels` in force when
-    the block begins; pose 0 holds then. (pose, source) arrays say where each strip is: `origin`, its first
-    end, px; `axis`, the unit vector along it; `bounds`, where its clusters start and end along it, px;
-    `strip_px`, its width; `turn_px` is how far the texture has moved, looked up every `texture_every` poses.
-    `halo_share` of the light is in each halo and `near_share` in the rest of the image of a point, which
-    `near_tables` hold, from `strip_table`, followed for `near_reach` px. `halo[q]` is the light of halo q of
-    each row of `levels` on a grid along the strip, as a share of full light; it stands where the strip is
-    in the pose in the middle, or follows it every `halo_every[q]` poses where that is not 0. `background` is
-    (irradiance on the sensor, dark current as light), W/m2; `sensor` comes from `sensor_vector`.
+    The light on a pixel is constant between the entries of a time line, the first at `begin_us`. A source has
+    one of its own, entries [own_first[i], own_first[i + 1]) of the flat `own_` arrays: when the image moves,
+    when the share of all light that passes changes, and when it switches. `own_pose` is the image's pose from
+    then on, `own_shade` that share, `own_switched` 1 where it is a switch; `levels` (clusters, entries) are
+    those of its clusters, `halo` (halos, places, entries) is the light of each halo on a grid along the
+    strip, as a share of full light. `own_begins` (sources + 1, poses + 1) is the entry with which a pose
+    begins, from the source's first. The last line is one without a source. The `line_` arrays are one line of
+    all entries, `line_own` (sources, entries) the entry of each source's own line, from its first, that holds
+    then.
+
+    (source, pose) arrays say where each strip is: `origin` (2, sources, poses), its first end, px; `axis`,
+    the unit vector along it; `bounds` (sources, clusters + 1, poses), where its clusters start and end along
+    it, px; `strip_px`, its width; `turn_px` is how far the texture has moved, looked up every `texture_every`
+    poses. `halo_share` of the light is in each halo and `near_share` in the rest of the image of a point,
+    which `near_tables` hold, from `strip_table`, followed for `near_reach` px. A halo stands where the strip
+    is in the pose in the middle, or follows it every `halo_every[q]` poses where that is not 0. `background`
+    is (irradiance on the sensor, dark current as light), W/m2; `sensor` comes from `sensor_vector`.
     """
     sources = gain.size
     halos = halo_share.size
-    halfway = origin.shape[0] // 2
+    poses = turn_px.shape[0]
+    halfway = poses // 2
     followed = sensor[12] > 0.0
     none = np.empty(0)
-    # As in `_table_at`.
-    most_clusters = np.uint64(levels.shape[1])
-    all_levels = levels.reshape(-1)
-    rows, columns = np.uint64(near_tables.shape[1]), np.uint64(near_tables.shape[2])
-    nears = near_tables.reshape(-1)
-    grids = np.uint64(halo.shape[2])
-    all_halo = halo.reshape(-1)
-    halo_rows = np.uint64(halo.shape[1])
-    beside = np.empty(levels.shape[1] + 1)
-    weight = np.zeros((sources, levels.shape[1]))
-    weights = np.zeros(sources, np.int64)
-    weight_first = np.zeros(sources, np.int64)
-    near_gain = gain * near_share
-    far = np.zeros((halos, sources))
-    grid = np.zeros((halos, sources), np.int64)
-    between = np.zeros((halos, sources))
-    row = np.zeros(sources, np.int64)
-    part = np.zeros(sources)
-    lit = np.zeros(sources, np.int64)
-    room = np.empty((3, line_t.size + 2))
+    along, across = np.empty((sources, poses)), np.empty((sources, poses))
+    rows, row_part = np.empty(poses, np.int32), np.empty(poses)
+    nodes, node_part = np.empty(poses, np.int32), np.empty(poses)
+    beside = np.empty((levels.shape[0] + 1, poses))
+    weight = np.empty((levels.shape[0], poses))
+    around = np.empty(poses)
+    part = np.empty(own_t.size)
+    lit = np.zeros(sources + 1, np.int64)
+    room = np.empty((3, line_t.size + 1))
     room_bits = room.view(np.int64)
-    t_us, light = np.empty(line_t.size + 2), np.empty(line_t.size + 2)
-    draws = np.empty(line_t.size + 2, np.int64)
+    ahead = np.empty((2, _AHEAD))
+    total = np.empty(line_t.size)
+    t_us, light = np.empty(line_t.size + 2), np.empty(line_t.size + 1)
+    draws = np.empty(line_t.size + 1, np.int64)
+    lowest, highest = np.empty((sources, levels.shape[0] + 1)), np.empty((sources, levels.shape[0] + 1))
+    for g in range(sources):
+        for b in range(clusters[g] + 1):
+            lowest[g, b], highest[g, b] = bounds[g, b].min(), bounds[g, b].max()
     n = 0
     for j in range(first, last):
         if n + most_events > out_t.size:
@@ -567,122 +682,99 @@ def run_pixels(
         if new and s[ON_FACTOR] == 0.0:
             s[ON_FACTOR], s[OFF_FACTOR] = pixel_factors(seed, pixel, sensor, quantiles)
             s[T_LAST_OUT] = -1e18
-        around = 0.0
-        passing = shade[0]
         shining = 0
         for g in range(sources):
-            row[g] = first_rows[g]
             if (mask >> np.uint64(g)) & np.uint64(1):
                 lit[shining] = g
                 shining += 1
-        # The pieces of time in which its light stays as it is.
-        piece = 0
-        t_us[0], light[0], draws[0] = begin_us, s[LIGHT], 0
-        for e in range(-1, line_t.size):
-            source = line_source[e] if e >= 0 else POSE
-            if source >= 0 and not (mask >> np.uint64(source)) & np.uint64(1):
-                continue
-            t = line_t[e] if e >= 0 else begin_us
-            if source == SHADE:
-                passing = shade[line_row[e]]
-            elif source == POSE:
-                pose = line_row[e] if e >= 0 else 0
-                for q in range(halos):
-                    if pose != 0 and (halo_every[q] == 0 or pose % halo_every[q] != 0):
-                        continue
+        now = 0.0
+        for p in range(poses):
+            if p % texture_every == 0:
+                now = background[1] + background[0] * texture_at(field, x + turn_px[p, 0], y + turn_px[p, 1])
+            around[p] = now
+        for a in range(shining):
+            g = lit[a]
+            begin, end = own_first[g], own_first[g + 1]
+            mine = part[begin:end]
+            mine[:] = 0.0
+            _place(x, y, origin[:, g], axis[:, g], along[g], across[g])
+            reach = near_reach[g]
+            nearest, furthest, beyond = along[g, 0], along[g, 0], False
+            for p in range(poses):
+                nearest, furthest = min(nearest, along[g, p]), max(furthest, along[g, p])
+                beyond |= abs(across[g, p]) < reach + 0.5 * strip_px[g, p]
+            if beyond:
+                k = 0
+                while k < clusters[g] and highest[g, k + 1] <= nearest - reach:
+                    k += 1
+                m = k
+                while m < clusters[g] and lowest[g, m] < furthest + reach:
+                    m += 1
+                if m > k:
+                    _near_weights(
+                        along[g], across[g], strip_px[g], bounds[g, k : m + 1], gain[g] * near_share,
+                        near_tables[g], near_scale[g], reach, rows, row_part, nodes, node_part,
+                        beside[: m - k + 1],
+                        weight[: m - k],
+                    )  # fmt: skip
+                    _add_near(weight[: m - k], levels[k:m, begin:end], own_pose[begin:end], mine)
+            for q in range(halos):
+                every = poses if halo_every[q] == 0 else halo_every[q]
+                for pose in range(0, poses, every):
                     seen = halfway if halo_every[q] == 0 else pose
-                    for a in range(shining):
-                        g = lit[a]
-                        dx, dy = x - origin[seen, g, 0], y - origin[seen, g, 1]
-                        ax, ay = axis[seen, g, 0], axis[seen, g, 1]
-                        across = dx * ay - dy * ax
-                        half = 0.5 * strip_px[seen, g]
-                        far[q, g] = (
-                            gain[g]
-                            * halo_share[q]
-                            * (
-                                _step(wide_table[q], wide_per_px[q], across + half)
-                                - _step(wide_table[q], wide_per_px[q], across - half)
-                            )
+                    half = 0.5 * strip_px[g, seen]
+                    far = (
+                        gain[g]
+                        * halo_share[q]
+                        * (
+                            _step(wide_table[q], wide_per_px[q], across[g, seen] + half)
+                            - _step(wide_table[q], wide_per_px[q], across[g, seen] - half)
                         )
-                        at = (dx * ax + dy * ay - halo_first[q]) * halo_per_px[q]
-                        at = min(max(at, 0.0), halo.shape[2] - 1.001)
-                        grid[q, g] = int(at)
-                        between[q, g] = at - grid[q, g]
-                if pose % texture_every == 0:
-                    around = background[1] + background[0] * texture_at(
-                        field, x + turn_px[pose, 0], y + turn_px[pose, 1]
                     )
-                for a in range(shining):
-                    g = lit[a]
-                    dx, dy = x - origin[pose, g, 0], y - origin[pose, g, 1]
-                    ax, ay = axis[pose, g, 0], axis[pose, g, 1]
-                    along = dx * ax + dy * ay
-                    across = abs(dx * ay - dy * ax)
-                    weights[g] = 0
-                    reach = near_reach[g]
-                    if across < reach + 0.5 * strip_px[pose, g]:
-                        scale = near_scale[g]
-                        side = (near_tables.shape[1] - 1) * across / (across + scale)
-                        i = min(int(side), near_tables.shape[1] - 2)
-                        side -= i
-                        edges = bounds[pose, g]
-                        k = weight_first[g]
-                        while k > 0 and edges[k] > along - reach:
-                            k -= 1
-                        while k < clusters[g] and edges[k + 1] <= along - reach:
-                            k += 1
-                        weight_first[g] = k
-                        m = 0
-                        while k + m < clusters[g] and edges[k + m] < along + reach:
-                            m += 1
-                        weights[g] = m
-                        if m > 0:
-                            at_row = (np.uint64(g) * rows + np.uint64(i)) * columns
-                            for b in range(m + 1):
-                                beside[b] = _beside(nears, at_row, columns, side, scale, along - edges[k + b])
-                            for b in range(m):
-                                weight[g, b] = near_gain[g] * (beside[b] - beside[b + 1])
-            moved = source == POSE
-            total = around
+                    at = (along[g, seen] - halo_first[q]) * halo_per_px[q]
+                    at = min(max(at, 0.0), halo.shape[1] - 1.001)
+                    i = int(at)
+                    start, stop = own_begins[g, pose], own_begins[g, min(pose + every, poses)]
+                    _add_halo(
+                        far, halo[q, i, begin + start : begin + stop],
+                        halo[q, i + 1, begin + start : begin + stop], at - i, mine[start:stop],
+                    )  # fmt: skip
+        # The pieces of time in which its light stays as it is.
+        if shining > 1:
+            entries = line_t.size
+            when, switched, pose_of, shade = line_t, line_switched, line_pose, line_shade
+            for e in range(entries):
+                total[e] = around[np.uint64(line_pose[e])]
             for a in range(shining):
                 g = lit[a]
-                if moved or source == g:
-                    if not moved:
-                        row[g] = line_row[e]
-                    now = 0.0
-                    at_level = np.uint64(row[g]) * most_clusters + np.uint64(weight_first[g])
-                    for b in range(weights[g]):
-                        now += weight[g, b] * all_levels[at_level + np.uint64(b)]
-                    for q in range(halos):
-                        at_halo = (np.uint64(q) * halo_rows + np.uint64(row[g])) * grids + np.uint64(
-                            grid[q, g]
-                        )
-                        now += far[q, g] * (
-                            all_halo[at_halo]
-                            + between[q, g] * (all_halo[at_halo + np.uint64(1)] - all_halo[at_halo])
-                        )
-                    part[g] = now
-                total += part[g]
-            if passing != 1.0:
-                total = background[1] + passing * (total - background[1])
-            if new:
-                new = False
-                _rest(total, t, followed, s, c)
-                light[0], draws[0] = total, 1
-                continue
-            if abs(total - light[piece]) <= LIGHT_STEP * light[piece]:
-                continue
-            if t > t_us[piece]:
-                piece += 1
-                t_us[piece], draws[piece] = t, 0
-            light[piece] = total
-            if source >= 0:
-                draws[piece] += 1
+                begin = own_first[g]
+                for e in range(entries):
+                    total[e] += part[np.uint64(begin + line_own[g, e])]
+        else:
+            g = lit[0] if shining == 1 else sources
+            begin, end = own_first[g], own_first[g + 1]
+            entries = end - begin
+            when, switched = own_t[begin:end], own_switched[begin:end]
+            pose_of, shade = own_pose[begin:end], own_shade[begin:end]
+            if shining == 1:
+                for e in range(entries):
+                    total[e] = around[np.uint64(pose_of[e])] + part[np.uint64(begin + e)]
+            else:
+                for e in range(entries):
+                    total[e] = around[np.uint64(pose_of[e])]
+        if wiped:
+            for e in range(entries):
+                if shade[e] != 1.0:
+                    total[e] = background[1] + shade[e] * (total[e] - background[1])
+        t_us[0], light[0], draws[0] = begin_us, s[LIGHT], 0
+        if new:
+            _rest(total[0], begin_us, followed, s, c)
+            light[0], draws[0] = total[0], 1
+        piece = _find_pieces(when, total, switched, int(new), t_us, light, draws)
         t_us[piece + 1] = end_us
         n = _run_pieces(
-            piece + 1, t_us, light, draws, room, room_bits, s, c, code, _key_of(seed, pixel), quantiles,
-            shifts, sensor, out_t, out_code, none, n,
+            piece + 1, t_us, light, draws, room, room_bits, ahead, s, c, code, _key_of(seed, pixel),
+            quantiles, shifts, sensor, out_t, out_code, none, n,
         )  # fmt: skip
         s[T_BASE], s[LIGHT] = end_us, light[piece]
     return last, n

@@ -18,7 +18,7 @@ from evlcp_sdk.scene.optics import Blur
 from evlcp_sdk.sim import _kernels
 from evlcp_sdk.sim.light import Source, sources_of, wiper_switches
 from evlcp_sdk.sim.motion import CameraPath, project
-from evlcp_sdk.sim.optics import blur_of, step_table, strip_table
+from evlcp_sdk.sim.optics import blur_of, step_table, strip_profiles, strip_table
 from evlcp_sdk.sim.scene import NEAREST_M, Scene, SensorSpec
 from evlcp_sdk.values import Events
 
@@ -110,6 +110,7 @@ class _Halo:
     Attributes:
         share: Share of the light.
         reach_px: How far it is sampled around an edge.
+        nodes_px: Where, float64 (1025,).
         table: Share of a pixel lit beyond an edge, float64 (1025,), at -reach_px to reach_px.
         per_px: Samples a pixel along a strip.
         every: Poses after which its place in the image is computed anew; 0: it stays for a block of time.
@@ -117,6 +118,7 @@ class _Halo:
 
     share: float
     reach_px: float
+    nodes_px: Floats
     table: Floats
     per_px: float
     every: int
@@ -124,11 +126,12 @@ class _Halo:
     @classmethod
     def of(cls, share: float, sigma_px: float, every: int) -> "_Halo":
         reach = 4.5 * sigma_px + 1
-        return cls(share, reach, step_table(sigma_px, reach, _WIDE_NODES), 8 / sigma_px, every)
+        nodes = np.linspace(-reach, reach, _WIDE_NODES)
+        return cls(share, reach, nodes, step_table(sigma_px, reach, _WIDE_NODES), 8 / sigma_px, every)
 
     def step(self, at_px: Floats) -> Floats:
         """Share of a pixel lit that is so far beyond an edge."""
-        return np.interp(at_px, np.linspace(-self.reach_px, self.reach_px, _WIDE_NODES), self.table)
+        return np.interp(at_px, self.nodes_px, self.table)
 
     def along(self, cuts_px: Floats) -> Floats:
         """Share of each cluster's light, float64 (clusters, n), along a strip with these cuts."""
@@ -136,6 +139,65 @@ class _Halo:
         edge = self.step(grid[:, None] - cuts_px)
         found: Floats = (edge[:, :-1] - edge[:, 1:]).T
         return found
+
+
+def _time_lines(
+    starts_us: Floats,
+    wiped_us: Floats,
+    shade: Floats,
+    switches: list[Floats],
+    levels_of: list[Floats],
+    halos_of: list[list[Floats]],
+    most: int,
+) -> tuple[NDArray[Any], ...]:
+    """When the light changes in a block: a line of each source and one without, and one of all.
+
+    Args:
+        starts_us: When each pose begins, the block's begin first, float64 (poses,).
+        wiped_us: When the share of all light that passes changes, float64 (n,).
+        shade: That share, from the block's begin on, float64 (n + 1,).
+        switches: When each source switches, float64 (m,).
+        levels_of: Levels of its clusters, from the block's begin on, float64 (m + 1, clusters).
+        halos_of: Its light in each halo on a grid, float64 (m + 1, places), halo by halo.
+        most: Clusters of the source with the most.
+
+    Returns:
+        The arguments of `run_pixels` from `own_first` to `line_own`.
+    """
+    poses, sources = len(starts_us), len(switches)
+    moves = np.concatenate([starts_us[1:], wiped_us])
+    when = np.concatenate([starts_us[:1], moves, *switches])
+    # What an entry is: a pose, a wiper's step, or a switch of the source of this number.
+    kind = np.repeat(np.arange(-2, sources), [poses, len(wiped_us), *map(len, switches)])
+    order = np.argsort(when, kind="stable")
+    when, kind = when[order], kind[order]
+    pose, wipes = np.cumsum(kind == -2) - 1, np.cumsum(kind == -1)
+    all_own = np.empty((sources, len(when)), np.int64)
+    parts: list[NDArray[np.int64]] = []
+    begins = np.empty((sources + 1, poses + 1), np.int64)
+    rows: list[NDArray[np.int64]] = []
+    for i in range(sources + 1):
+        mine = (kind < 0) | (kind == i)
+        part = np.flatnonzero(mine)
+        begins[i] = np.append(np.flatnonzero(kind[part] == -2), len(part))
+        if i < sources:
+            all_own[i] = np.cumsum(mine) - 1
+            rows.append(np.cumsum(kind[part] == i))
+        parts.append(part)
+    own = np.concatenate(parts)
+    first = np.cumsum([0, *map(len, parts)])
+    levels = np.zeros((most, len(own)))
+    places = max((h.shape[1] for of in halos_of for h in of), default=1) + 1
+    halo = np.zeros((len(halos_of), places, len(own)))
+    for i, row in enumerate(rows):
+        levels[:, first[i] : first[i + 1]] = levels_of[i][row].T
+        for q, of in enumerate(halos_of):
+            halo[q, : of[i].shape[1], first[i] : first[i + 1]] = of[i][row].T
+    switched = (kind >= 0).astype(np.int64)
+    return (
+        *(first, when[own], pose[own], switched[own], shade[wipes[own]], begins, levels, halo),
+        *(when, pose, switched, shade[wipes], all_own),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +247,8 @@ class Simulation:
         self._quantiles = quantile_table()
         self._shifts = np.exp(scene.sensor.noise_ln * self._quantiles)
         self._texture = _texture(scene)
+        self._darkest_texture = float(self._texture.min())
+        self._ends_m = np.array([s.strip.cuts_m()[[0, -1]] for s in self._sources]).reshape(-1, 3)
         size = scene.camera.width * scene.camera.height
         self._state = np.zeros((size, 9))
         self._counters = np.zeros((size, 3), np.int64)
@@ -327,14 +391,13 @@ class Simulation:
 
     def _moves(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
         """When the image has moved by a step: starts and middles of the poses, us, float64 (n,)."""
-        ends = np.array([s.strip.cuts_m()[[0, -1]] for s in self._sources]).reshape(-1, 3)
         cells = np.append(np.arange(begin_us, end_us, _CELL_US), end_us)
         t = np.linspace(cells[:-1], cells[1:], 3, axis=1)
         position, attitude = self.path.at(t.ravel())
         turned = np.diff(attitude[:, :2].reshape(-1, 3, 2), axis=1)
         moved = np.abs(turned).max((1, 2)) * self.scene.camera.focal_px
-        if len(ends):
-            place, depth = project(ends, position, attitude, self.scene.camera)
+        if len(self._ends_m):
+            place, depth = project(self._ends_m, position, attitude, self.scene.camera)
             shown = (depth > NEAREST_M).all(0) & (np.abs(place) < 4 * self.scene.camera.width).all((0, 2))
             if shown.any():
                 step = np.diff(place[:, shown].reshape(len(t), 3, -1, 2), axis=1)
@@ -358,7 +421,7 @@ class Simulation:
         if scene.wiper.share > 0:
             wiped_us, shade = wiper_switches(scene.wiper, begin_us, end_us)
         lightest = float(shade.max())
-        darkest = sensor.dark_w_m2 + scene.background.light_w_m2 * float(self._texture.min() * shade.min())
+        darkest = sensor.dark_w_m2 + scene.background.light_w_m2 * float(self._darkest_texture * shade.min())
         shown: list[tuple[Source, Floats, Floats, Blur]] = []
         marked: list[NDArray[np.int64]] = []
         for source in self._sources:
@@ -384,55 +447,38 @@ class Simulation:
         g = len(shown)
         most = max((source.strip.clusters for source, *_ in shown), default=1)
         poses = len(starts)
-        origin, axis = np.empty((poses, g, 2)), np.empty((poses, g, 2))
-        bounds, strips = np.zeros((poses, g, most + 1)), np.empty((poses, g))
+        origin, axis = np.empty((2, g, poses)), np.empty((2, g, poses))
+        bounds, strips = np.zeros((g, most + 1, poses)), np.empty((g, poses))
         clusters, gain = np.empty(g, np.int64), np.empty(g)
         near = np.empty((g, _NEAR_NODES + 1, 2 * _NEAR_NODES + 1))
         near_scale, near_reach = np.empty(g), np.empty(g)
-        first_rows = np.empty(g, np.int64)
-        lines_t, lines_source = [starts[1:], wiped_us], [np.full(poses - 1, _kernels.POSE)]
-        lines_source.append(np.full(len(wiped_us), _kernels.SHADE))
-        lines_row = [np.arange(1, poses), np.arange(1, len(shade))]
+        switches: list[Floats] = []
         levels_of: list[Floats] = []
         halos_of: list[list[Floats]] = [[] for _ in self._halos]
-        total = 0
         for i, (source, place, strip_px, blur) in enumerate(shown):
             k = source.strip.clusters
             vector = place[:, -1] - place[:, 0]
-            axis[:, i] = vector / np.hypot(*vector.T)[:, None]
-            origin[:, i] = place[:, 0]
-            bounds[:, i, : k + 1] = ((place - place[:, :1]) * axis[:, i, None]).sum(-1)
-            strips[:, i], clusters[i], gain[i] = strip_px, k, source.light_w_m2
+            axis[:, i] = vector.T / np.hypot(*vector.T)
+            origin[:, i] = place[:, 0].T
+            bounds[i, : k + 1] = ((place - place[:, :1]) * axis[:, i].T[:, None]).sum(-1).T
+            strips[i], clusters[i], gain[i] = strip_px, k, source.light_w_m2
             near_scale[i], near_reach[i] = _NEAR_SCALE * blur.sigma_px[0], blur.reach_px
             near[i] = strip_table(blur, float(strip_px[poses // 2]), near_scale[i], _NEAR_NODES)
             when, levels = source.switches(begin_us, end_us)
-            lines_t.append(when)
-            lines_source.append(np.full(len(when), i))
-            lines_row.append(total + np.arange(1, len(levels)))
-            first_rows[i] = total
-            total += len(levels)
+            switches.append(when)
             levels_of.append(np.pad(levels, ((0, 0), (0, most - k))))
-            cut = bounds[poses // 2, i, : k + 1]
+            cut = bounds[i, : k + 1, poses // 2]
             for one, of in zip(self._halos, halos_of, strict=True):
                 of.append(levels @ one.along(cut))
-        longest = max((h.shape[1] for of in halos_of for h in of), default=1) + 1
-        halo = np.zeros((len(self._halos), total, longest))
-        for q, of in enumerate(halos_of):
-            for i, h in enumerate(of):
-                halo[q, first_rows[i] : first_rows[i] + len(h), : h.shape[1]] = h
-        when = np.concatenate(lines_t)
-        order = np.argsort(when, kind="stable")
         shared = (
-            when[order],
-            np.concatenate(lines_source)[order].astype(np.int64),
-            np.concatenate(lines_row)[order].astype(np.int64),
-            first_rows, origin, axis, bounds, strips, clusters, gain,
-            np.concatenate([np.zeros((0, most)), *levels_of]), halo,
+            *_time_lines(starts, wiped_us, shade, switches, levels_of, halos_of, most),
+            origin, axis, bounds, strips, clusters, gain,
             np.array([-one.reach_px for one in self._halos]), np.array([one.per_px for one in self._halos]),
             np.array([one.share for one in self._halos]), np.array([one.every for one in self._halos]),
             self._near_share, near, near_scale, near_reach, np.stack([one.table for one in self._halos]),
-            np.array([(_WIDE_NODES - 1) / (2 * one.reach_px) for one in self._halos]), shade, turn,
-            self._texture_every, self._texture, np.array([scene.background.light_w_m2, sensor.dark_w_m2]),
+            np.array([(_WIDE_NODES - 1) / (2 * one.reach_px) for one in self._halos]), scene.wiper.share > 0,
+            turn, self._texture_every, self._texture,
+            np.array([scene.background.light_w_m2, sensor.dark_w_m2]),
         )  # fmt: skip
         return _Block(pixels, masks, shared)
 
@@ -472,10 +518,10 @@ class Simulation:
         z = np.arange(0, self._wide_reach, 0.25)
         half = strip_px / 2
         scale = _NEAR_SCALE * float(blur.sigma_px[0])
-        table = strip_table(blur, strip_px, scale, _NEAR_NODES)
+        beside, before = strip_profiles(blur, strip_px, scale, _NEAR_NODES)
         node, nodes = _NEAR_NODES * z / (z + scale), np.arange(_NEAR_NODES + 1)
-        across = self._near_share * np.interp(node, nodes, table[:, -1])
-        along = self._near_share * np.interp(node, nodes, table[0, _NEAR_NODES::-1])
+        across = self._near_share * np.interp(node, nodes, beside)
+        along = self._near_share * np.interp(node, nodes, before)
         for halo in self._halos:
             part = halo.step(z + half) - halo.step(z - half)
             across += halo.share * part
@@ -499,8 +545,7 @@ class Simulation:
         vector = middle[-1] - middle[0]
         length = float(np.hypot(*vector))
         axis = vector / length
-        y, x = np.mgrid[top:low, left:right]
-        dx, dy = x - middle[0, 0], y - middle[0, 1]
+        dx, dy = np.arange(left, right) - middle[0, 0], (np.arange(top, low) - middle[0, 1])[:, None]
         s, n = dx * axis[0] + dy * axis[1], dx * axis[1] - dy * axis[0]
         # How far the strip wanders across itself and along itself, from its place in the middle pose.
         away = place[:, [0, -1]] - middle[[0, -1]]
@@ -508,7 +553,8 @@ class Simulation:
         wander_across = float(np.abs(away @ np.array([axis[1], -axis[0]])).max())
         inside = np.abs(n) <= reach_across + wander_across
         inside &= (s >= -reach_along - wander_along) & (s <= length + reach_along + wander_along)
-        found: NDArray[np.int64] = (y * width + x)[inside]
+        y, x = np.nonzero(inside)
+        found: NDArray[np.int64] = (y + top) * width + x + left
         return found
 
 

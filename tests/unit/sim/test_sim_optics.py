@@ -134,12 +134,23 @@ def test_the_kernel_looks_up_what_the_table_says() -> None:
     across, along = rng.normal(0, 5, 200), rng.normal(0, 20, 200)
     along[0] = 1e20
     expected = table_at(table, 1.9, across, along)
-    for n, z, value in zip(np.abs(across), along, expected, strict=True):
-        at = 64 * n / (n + 1.9)
-        row, columns = np.uint64(int(at) * table.shape[1]), np.uint64(table.shape[1])
-        assert _kernels._beside.py_func(table.ravel(), row, columns, at - int(at), 1.9, z) == pytest.approx(
-            value, abs=1e-12
-        )
+    # One cluster that begins here and ends at infinity, each place a pose.
+    poses = len(along)
+    edges = np.array([np.zeros(poses), np.full(poses, 1e30)])
+    weight = np.empty((1, poses))
+    room = (np.empty(poses, np.int32), np.empty(poses), np.empty(poses, np.int32), np.empty(poses))
+    _kernels._near_weights.py_func(
+        along, across, np.full(poses, 0.7), edges, 3.0, table, 1.9, 1e40, *room, np.empty((2, poses)), weight
+    )
+    np.testing.assert_allclose(weight[0], 3.0 * expected, rtol=0, atol=1e-11)
+    # What is further away than it is followed is not there.
+    _kernels._near_weights.py_func(
+        along, across, np.full(poses, 0.7), edges, 3.0, table, 1.9, 6.0, *room, np.empty((2, poses)), weight
+    )
+    near = (np.abs(across) < 6.35) & (along > -6.0)
+    assert near.any()
+    assert not near.all()
+    np.testing.assert_allclose(weight[0], np.where(near, 3.0 * expected, 0.0), rtol=0, atol=1e-11)
 
 
 def test_the_light_on_each_pixel_is_that_of_the_lens(tmp_path: Path) -> None:
