@@ -18,7 +18,7 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.study.plane_bound import plane_frame_bound
+from evlcp_sdk.study.plane_bound import LEAST_GAIN, MOST_OFF, codes_of, plane_frame_bound
 from evlcp_sdk.values import FrameView, PresenceMap, Range
 
 __all__ = ["cramer_rao_sigma_m", "frame_bound", "lean_sigma_deg"]
@@ -30,12 +30,6 @@ _CORE_SHARE = 0.3
 
 _LEAST_BOUNDARIES = 3
 """Boundaries without which spacing, position and drift cannot be separated."""
-
-_MOST_OFF = 0.2
-"""How far, as a share, a fit's spacing may lie from that of the clusters' middles: not a fit beyond."""
-
-_LEAST_GAIN = 0.01
-"""Share of a full value below which a fit has found no light: one event in some thirty values."""
 
 Array = NDArray[np.float64]
 
@@ -156,7 +150,7 @@ def _frame_slopes(
         if not quantity > 0:
             raise ConfigError(f"{name} = {quantity}: expected a positive number")
     spacing = camera.focal_px * _spacing_m(bar) / distance_m
-    codes = _codes(codebook, np.asarray(symbols, np.int64))
+    codes = codes_of(codebook, np.asarray(symbols, np.int64))
     clusters, values = codes.shape
     rows = _rows(2 * int(spacing * clusters / 2 + 4))
     fit = np.array([spacing, shift_px, 0.0, gain, blur_px, 0.0])
@@ -213,7 +207,7 @@ def frame_bound(
         tilt, left = _line(light)
         spacing, first = theilslopes(at_row[k], k)[:2]
         values, columns = _row_values(sums, tilt, left, width / 2, full_events)
-        codes = _codes(codebook, view.soft.symbols)
+        codes = codes_of(codebook, view.soft.symbols)
         rows, down = _rows(sums.shape[1]), offset[1]
         centre = first + spacing * (len(codes) - 1) / 2 - (sums.shape[1] - 1) / 2
         if spacing < 0:
@@ -261,12 +255,6 @@ def _spacing_m(bar: BarLayout) -> float:
             "this Cramer-Rao bound needs one even column of two clusters or more; layout_bound takes any"
         )
     return bar.column_pitch_m
-
-
-def _codes(codebook: Codebook, symbols: NDArray[np.int64]) -> Array:
-    """What each cluster sends in a frame, pilot and info, float64 (K, values)."""
-    said = codebook.codeword_edges[symbols]
-    return np.concatenate([codebook.pilot_edges, said], axis=1).astype(np.float64)
 
 
 def _rows(height: int) -> Array:
@@ -338,7 +326,7 @@ def _fit(
     found = least_squares(residuals, start, slopes, method="lm", x_scale=[0.1, 1, 1, 1, 0.3, 1])
     variance = 2 * found.cost / (counts.sum() - len(start))
     spacing, blur = found.x[0], found.x[4]
-    seen_well = found.x[3] > _LEAST_GAIN and blur > 0 and abs(spacing / start[0] - 1) < _MOST_OFF
+    seen_well = found.x[3] > LEAST_GAIN and blur > 0 and abs(spacing / start[0] - 1) < MOST_OFF
     if not (found.success and seen_well and variance > 0):
         return None
     return found.x, float(np.sqrt(variance))

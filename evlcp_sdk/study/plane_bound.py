@@ -20,7 +20,7 @@ from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, PresenceMap, Range
 
-__all__ = ["LayoutBound", "layout_bound", "plane_frame_bound"]
+__all__ = ["LEAST_GAIN", "MOST_OFF", "LayoutBound", "codes_of", "layout_bound", "plane_frame_bound"]
 
 Floats = NDArray[np.float64]
 
@@ -39,9 +39,11 @@ _SEAM_SIGMAS = 4.0
 _UNKNOWN = 1e-9
 """Share of a parameter's own information below which what others leave of it is none."""
 
-_LEAST_GAIN = 0.01
-_MOST_OFF = 0.2
-"""As in `bound`: a fit that has found no light, or another scale than the clusters' middles, is none."""
+LEAST_GAIN = 0.01
+"""Share of a full value below which a fit has found no light: one event in some thirty values."""
+
+MOST_OFF = 0.2
+"""How far, as a share, a fit's scale may lie from that of the clusters' middles: not a fit beyond."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def layout_bound(
     for name, quantity in quantities.items():
         if not quantity > 0:
             raise ConfigError(f"{name} = {quantity}: expected a positive number")
-    codes = _codes(codebook, np.asarray(symbols, np.int64))
+    codes = codes_of(codebook, np.asarray(symbols, np.int64))
     image = _Image.around(bar, camera.focal_px / distance_m, blur_px, codes, distance_m)
     fit = {
         "x_px": shift_px[0],
@@ -220,7 +222,7 @@ def _sigmas(information: Floats) -> Floats:
     return found
 
 
-def _codes(codebook: Codebook, symbols: NDArray[np.int64]) -> Floats:
+def codes_of(codebook: Codebook, symbols: NDArray[np.int64]) -> Floats:
     """What each cluster sends in a frame, pilot and info, float64 (K, values)."""
     said = codebook.codeword_edges[symbols]
     return np.concatenate([codebook.pilot_edges, said], axis=1).astype(np.float64)
@@ -261,7 +263,7 @@ def plane_frame_bound(
         symbols = np.where(view.soft.symbols < 0, 0, view.soft.symbols)
         columns, rows = (np.arange(n) - (n - 1) / 2 for n in (width, height))
         distance_m = camera.focal_px / abs(scale)
-        image = _Image.of(bar, _codes(codebook, symbols), columns, rows, distance_m)
+        image = _Image.of(bar, codes_of(codebook, symbols), columns, rows, distance_m)
         middle = shift - complex(width - 1, height - 1) / 2
         names = (*_POSE, "gain", "dark", "blur")
         first = [middle.real, middle.imag, math.log(abs(scale)), float(np.angle(scale))]
@@ -275,7 +277,7 @@ def plane_frame_bound(
         found = least_squares(off, first, x_scale=[1, 1, 0.01, 0.01, 0.3, 1, 0.3], max_nfev=30)
         fit = dict(zip(names, found.x.tolist(), strict=True))
         noise = math.sqrt(2 * found.cost / max(found.fun.size - len(first), 1))
-        if fit["gain"] < _LEAST_GAIN or abs(fit["scale"] - first[2]) > _MOST_OFF or not noise > 0:
+        if fit["gain"] < LEAST_GAIN or abs(fit["scale"] - first[2]) > MOST_OFF or not noise > 0:
             return _NONE
         distance_m = camera.focal_px / math.exp(fit["scale"])
         slopes = np.stack([image.slope(fit, name) for name in (*_POSE, *_LENS)])
