@@ -16,14 +16,23 @@ __all__ = ["open_until", "pieces_until"]
 def open_until(source: EventSource | str | Path, registry: Registry, stopped: Stopped) -> EventSource:
     """Open a source, or give one that is open; a request to stop ends the wait for a sender.
 
+    A file is there at once, and is opened whatever was asked: who reads it ends when he asks.
+
     Raises:
         InputError: It cannot be opened.
-        KeyboardInterrupt: It was asked to stop.
+        KeyboardInterrupt: It was asked to stop, and the source is no file.
     """
     if isinstance(source, EventSource):
         return source
-    with waiting(stopped):
+    with nullcontext() if _is_file(source) else waiting(stopped):
         return open_source(source, registry)
+
+
+def _is_file(source: str | Path) -> bool:
+    try:
+        return Path(source).is_file()
+    except OSError:
+        return False
 
 
 def pieces_until(source: EventSource, stopped: Stopped) -> Iterator[tuple[Events, Triggers]]:
