@@ -3,8 +3,8 @@
 It answers what libusb asks the kernel for a device of the driver `neuromorphic-drivers`: control requests,
 registers (endpoints 0x02 and 0x82), and events, EVT3 words, on 0x81 once output is on. Its first line is the
 folder for `UMOCKDEV_DIR`; a program with that and `LD_PRELOAD=libumockdev-preload.so.0` sees the camera.
-Further lines tell what happens: `open`, `sent`, and `register ADDRESS VALUE` for those of --tell. Commands on
-stdin, a line each: `unplug`, `plug`, `end`.
+Further lines tell what happens: `open`, `sent`, `unplugged`, `let go` once all that was in flight is given back,
+`plugged`, and `register ADDRESS VALUE` for those of --tell. Commands on stdin, a line each: `unplug`, `plug`, `end`.
 """
 
 import argparse
@@ -81,7 +81,7 @@ class Camera:
         self.waiting = deque()
         self.done = deque()
         self.answers = deque()
-        self.gone = False
+        self.gone = self.let_go = False
         self.sent = 0
         self.since = None
         self.opened = False
@@ -95,6 +95,9 @@ class Camera:
             self.say("open")
         request = client.get_request() & 0xFFFFFFFF
         if self.gone and not (self.done and request in (REAP, REAP_NDELAY)):
+            if not self.done and not self.let_go:
+                self.let_go = True
+                self.say("let go")
             client.complete(-1, ENODEV)
             return True
         if request == SUBMIT:

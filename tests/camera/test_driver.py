@@ -139,7 +139,7 @@ def test_it_goes_on_when_the_camera_is_back(demo_raw: Path, tmp_path: Path) -> N
         camera.tell("unplug")
         camera.wait("unplugged")
         # What was in flight is given back first.
-        threading.Event().wait(1.0)
+        camera.wait("let go")
         camera.tell("plug")
         camera.wait("sent")
         threading.Event().wait(1.0)
