@@ -3,8 +3,9 @@
 It answers what libusb asks the kernel for a device of the driver `neuromorphic-drivers`: control requests,
 registers (endpoints 0x02 and 0x82), and events, EVT3 words, on 0x81 once output is on. Its first line is the
 folder for `UMOCKDEV_DIR`; a program with that and `LD_PRELOAD=libumockdev-preload.so.0` sees the camera.
-Further lines tell what happens: `open`, `sent`, `unplugged`, `let go` once all that was in flight is given back,
-`plugged`, and `register ADDRESS VALUE` for those of --tell. Commands on stdin, a line each: `unplug`, `plug`, `end`.
+Further lines tell what happens: `open`, `sent`, `unplugged`, `let go` once all that was in flight is given
+back, `plugged`, and `register ADDRESS VALUE` for those of --tell. Commands on stdin, a line each: `unplug`,
+`plug`, `end`.
 """
 
 import argparse
