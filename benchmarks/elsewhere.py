@@ -10,8 +10,8 @@ blindness) are drawn anew by the seed. Figures to reach are those of the recordi
 with its square. The last conditions are mixtures, which have no figures of their own: there must be no ghost,
 and a warning where half of a bar's frames or more are missing. Received by the default link.
 
-`--keep` keeps the recordings and results, and takes recordings that are there; `--frames` prints frames. Five
-minutes of processor time. The exit code is 1 where a figure is missed.
+`--keep` keeps the recordings and results, and takes recordings that are there; `--frames` prints frames. A
+minute of processor time. The exit code is 1 where a figure is missed.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from road import TARGETS, beside, missed, number, show, targets_of
+from road import TARGETS, cells_of, missed, number, show, targets_of
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.link.resolve import load_link
@@ -38,8 +38,8 @@ from evlcp_sdk.study.tally import Statistics
 
 Table = dict[str, Any]
 
-FOCAL_PX = load_link().camera.focal_px
-BAR_M = 0.96
+LINK = load_link()
+FOCAL_PX, BAR_M = LINK.camera.focal_px, LINK.bar.length_m
 
 
 @dataclass(frozen=True)
@@ -342,7 +342,7 @@ def lines_of(
     """The rows of a scene, one a bar, and what was counted of each."""
     path, distance_m = rendered(name, seed, folder, args.near, args.far)
     truth, out = read_truth(truth_path(path)), folder / f"{path.stem}-out"
-    summary = receive_to_folder(path, out, load_link())
+    summary = receive_to_folder(path, out, LINK)
     frames = read_frames(out)
     score = Score.of(frames, truth, road=True)
     if args.frames:
@@ -365,12 +365,7 @@ def lines_of(
                 str(seed) if i == 0 else "",
                 f"{distance_m:.1f}" if i == 0 else "",
                 f"{tally.frames_found}/{tally.frames_sent}",
-                beside(tally.ber, targets.get("ber"), 5),
-                number(tally.erased_share),
-                beside(tally.claimed_share, targets.get("claimed") if tally.hidden else None),
-                str(tally.ranged),
-                beside(tally.rmse_m, targets.get("rmse_m"), 4),
-                number(tally.bias_m),
+                *cells_of(tally, targets),
                 number(tally.worst_m),
                 number(tally.nees, 2),
                 str(score.unmatched) if i == 0 else "",

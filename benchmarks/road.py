@@ -246,6 +246,18 @@ HEAD = [
 ]
 
 
+def cells_of(tally: Tally, targets: Mapping[str, Any]) -> list[str]:
+    """What a table says of a bar from its wrong bits to the bias of its distances."""
+    return [
+        beside(tally.ber, targets.get("ber"), 5),
+        number(tally.erased_share),
+        beside(tally.claimed_share, targets.get("claimed") if tally.hidden else None),
+        str(tally.ranged),
+        beside(tally.rmse_m, targets.get("rmse_m"), 4),
+        number(tally.bias_m),
+    ]
+
+
 def lines_of(result: Plain, link: str) -> list[list[str]]:
     """The rows of a recording."""
     if "fault" in result:
@@ -272,12 +284,7 @@ def lines_of(result: Plain, link: str) -> list[list[str]]:
                 link,
                 result["recording"] if i == 0 else "  bar " + str(i),
                 frames,
-                beside(tally.ber, targets.get("ber"), 5),
-                number(tally.erased_share),
-                beside(tally.claimed_share, targets.get("claimed") if tally.hidden else None),
-                str(tally.ranged),
-                beside(tally.rmse_m, targets.get("rmse_m"), 4),
-                number(tally.bias_m),
+                *cells_of(tally, targets),
                 beside(tally.worst_m, targets.get("worst_m")),
                 number(tally.filtered_rmse_m),
                 nees,

@@ -610,20 +610,10 @@ def tested(
 def _above(matrix: Array, least: float) -> bool:
     """Whether all eigenvalues are above `least`: what is left without it has a root."""
     n = len(matrix)
-    low = np.zeros((n, n))
+    left = matrix.copy()
     for i in range(n):
-        for j in range(i + 1):
-            value = matrix[i, j]
-            for k in range(j):
-                value -= low[i, k] * low[j, k]
-            if i == j:
-                value -= least
-                if not value > 0:
-                    return False
-                low[i, i] = math.sqrt(value)
-            else:
-                low[i, j] = value / low[j, j]
-    return True
+        left[i, i] -= least
+    return bool(rooted(left, 0.0, 0.0, np.empty(n), np.zeros((n, n))))
 
 
 @njit(cache=True, nogil=True)

@@ -973,51 +973,33 @@ def measure_column(
     line[4] = (line[4] + 0.5) * grid
     fit = np.empty(_FITTED)
     most = grid + 1
-    if way == 1:
-        variance = _measured(
-            sums,
-            offset[1],
-            line,
-            seen,
-            symbols,
-            pilots,
-            words,
-            when,
-            profile,
-            prior,
-            pixels,
-            search,
-            limits,
-            most,
-            fit,
-            by_boundary,
-        )
-    else:
+    upright = sums
+    if way != 1:
         # A bar that lies across the image: rows and columns are exchanged.
         chips, rows, columns = sums.shape
-        turned = np.empty((chips, columns, rows), sums.dtype)
+        upright = np.empty((chips, columns, rows), sums.dtype)
         for i in range(chips):
             for c in range(columns):
                 for r in range(rows):
-                    turned[i, c, r] = sums[i, r, c]
-        variance = _measured(
-            turned,
-            offset[0],
-            line,
-            seen,
-            symbols,
-            pilots,
-            words,
-            when,
-            profile,
-            prior,
-            pixels,
-            search,
-            limits,
-            most,
-            fit,
-            by_boundary,
-        )
+                    upright[i, c, r] = sums[i, r, c]
+    variance = _measured(
+        upright,
+        offset[1 if way == 1 else 0],
+        line,
+        seen,
+        symbols,
+        pilots,
+        words,
+        when,
+        profile,
+        prior,
+        pixels,
+        search,
+        limits,
+        most,
+        fit,
+        by_boundary,
+    )
     return fit[0], sqrt(max(variance, 0.0)) if variance == variance else np.nan, line[3]
 
 
