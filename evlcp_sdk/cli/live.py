@@ -287,6 +287,8 @@ def _going_on(outlet: "Outlet", *, silent: bool) -> "Iterator[None]":
 
 def going_text(status: "LiveStatus") -> str:
     """How a live run goes, in a line."""
+    from evlcp_sdk.live.budget import LEVELS
+
     text = f"{status.elapsed_s:.0f} s, {status.events_per_s / 1e6:.1f} Mev/s"
     if frames := status.counts.get("frames", 0):
         text += f", {frames} frames"
@@ -296,7 +298,9 @@ def going_text(status: "LiveStatus") -> str:
         text += f", delay {delays_text(recent)}"
     if lost := sum(loss.count for loss in status.losses.values()):
         text += f", {lost} lost"
-    return f"{text}; {status.level_text}" if status.level else text
+    # Each level says what it adds to those before.
+    shed = ", ".join(LEVELS[1 : status.level + 1])
+    return f"{text}; {shed}" if shed else text
 
 
 def _say_where(services: "Services") -> None:

@@ -1,5 +1,6 @@
 """A live run gives what a run over the file gives, and leaves out what it has no time for, counted."""
 
+import dataclasses
 import json
 import threading
 import time
@@ -78,6 +79,8 @@ def test_a_replay_gives_what_the_file_gives(
     text = going_text(last)
     assert text.startswith(f"{last.elapsed_s:.0f} s, ")
     assert f", {last.counts['frames']} frames" in text
+    shed = going_text(dataclasses.replace(last, level=2))
+    assert shed == f"{text}; rows outside of regions are shed, and distances of most frames"
     show(summary, None)
     total = summary["live"]["delays"]["total"]
     told = f"delay of {total['count']} frames, from the last chip: p50 {total['p50_ms']:.1f}, p99"
