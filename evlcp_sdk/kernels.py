@@ -11,6 +11,7 @@ import fcntl
 import gc
 import hashlib
 import importlib
+import io
 import logging
 import os
 import pickle
@@ -35,7 +36,9 @@ import numba
 import numpy as np
 from numba.core.caching import FunctionCache
 from numba.core.compiler import CompileResult
+from numba.core.environment import Environment, _rebuild_env
 from numba.core.event import Event, Listener, register, trigger_event
+from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 from numba.core.sigutils import normalize_signature
 
@@ -155,8 +158,8 @@ class _Packed:
             if place is None or not self._is_same(module):
                 return None
             part = os.pread(self._file, place[1], self._begin + place[0])
-            state = pickle.loads(zlib.decompress(part))
-            target_context.refresh()
+            state = _unpickled(zlib.decompress(part))
+            _make_ready(target_context)
             return CompileResult._rebuild(target_context, *state)  # type: ignore[no-untyped-call]
         except Exception:
             # Whatever is wrong with the file: kernels are compiled as if it were not there.
@@ -310,7 +313,14 @@ class _Folder(FunctionCache):
 
         Two processes that keep a kernel at the same time may take the same file for two signatures.
         """
-        found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        found = None
+        _make_ready(target_context)
+        with self._guard_against_spurious_io_errors():
+            key = self._index_key(sig, target_context.codegen())  # type: ignore[no-untyped-call]
+            name = self._cache_file._load_index().get(key)  # type: ignore[no-untyped-call]
+            if name is not None:
+                kept = Path(self._cache_file._data_path(name)).read_bytes()  # type: ignore[no-untyped-call]
+                found = CompileResult._rebuild(target_context, *_unpickled(kept))  # type: ignore[no-untyped-call]
         wanted, _ = normalize_signature(sig)  # type: ignore[no-untyped-call]
         return None if found is None or tuple(found.signature.args) != tuple(wanted) else found
 
@@ -353,6 +363,44 @@ class _Patience(Listener):
         if self._spent_s > _LONG_S and not self._told:
             self._told = True
             logging.getLogger(__name__).info("compiling kernels, once on a machine; up to a minute in all")
+
+
+def _make_ready(target_context: Any) -> None:
+    """Let kernels that were compiled before be loaded.
+
+    They need the symbols that Numba's runtime adds. What `target_context.refresh()` brings beside, all that
+    Numba can compile, takes longer than to load every kernel; it comes with the first that is compiled here.
+    """
+    rtsys.initialize(target_context)
+
+
+class _Unpickler(pickle.Unpickler):
+    """Reads a kernel without the modules of Numba's that were needed to compile it."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """What a name in it stands for."""
+        if (module, name) == (_rebuild_env.__module__, _rebuild_env.__name__):
+            return _environment
+        return super().find_class(module, name)
+
+
+def _unpickled(kept: bytes) -> Any:
+    """What is kept of a kernel."""
+    return _Unpickler(io.BytesIO(kept)).load()
+
+
+def _environment(module: str, constants: list[Any], name: str) -> Environment:
+    """What compiled code finds its constants in; it looks up no global of the module that it is from.
+
+    Those that came from Numba are not imported for it: some bring half of SciPy.
+    """
+    if module in sys.modules or module.partition(".")[0] != "numba" or name in Environment._memo:
+        return _rebuild_env(module, constants, name)  # type: ignore[no-untyped-call, no-any-return]
+    environment = Environment({"__name__": module})
+    environment.consts[:] = constants
+    environment.env_name = name
+    Environment._memo[name] = environment
+    return environment
 
 
 class _Compiler:

@@ -490,6 +490,50 @@ def fit_rows(counts: Array, chips: Array, chip_steps: int, fit: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _connected(selected: Array, done: Array, cells: Array, row: int, column: int) -> int:
+    """Cells that are selected and connected (8 neighbours) with one, which is the first; how many."""
+    rows, columns = selected.shape
+    done[row, column] = True
+    cells[0, 0], cells[0, 1] = row, column
+    at, many = 0, 1
+    while at < many:
+        a, b = cells[at, 0], cells[at, 1]
+        at += 1
+        for v in range(max(a - 1, 0), min(a + 2, rows)):
+            for u in range(max(b - 1, 0), min(b + 2, columns)):
+                if selected[v, u] and not done[v, u]:
+                    done[v, u] = True
+                    cells[many, 0], cells[many, 1] = v, u
+                    many += 1
+    return many
+
+
+@njit(cache=True, nogil=True)
+def areas(selected: Array, hits: Array, boxes: Array, total: Array) -> int:
+    """Rectangles (left, top, right, bottom) around connected cells (8 neighbours), and their hits.
+
+    In the order of their first cells, by rows and columns. It returns how many there are.
+    """
+    rows, columns = selected.shape
+    done = np.zeros((rows, columns), np.bool_)
+    cells = np.empty((rows * columns, 2), np.int64)
+    n = 0
+    for r in range(rows):
+        for c in range(columns):
+            if not selected[r, c] or done[r, c]:
+                continue
+            many = _connected(selected, done, cells, r, c)
+            left, right, bottom, total[n] = c, c, r, 0
+            for i in range(many):
+                total[n] += hits[cells[i, 0], cells[i, 1]]
+                left, right = min(left, cells[i, 1]), max(right, cells[i, 1])
+                bottom = max(bottom, cells[i, 0])
+            boxes[n, 0], boxes[n, 1], boxes[n, 2], boxes[n, 3] = left, r, right + 1, bottom + 1
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
 def blobs(selected: Array, at: Array, cluster: Array, cells: Array) -> int:
     """Connected cells (8 neighbours) of each cluster, most first: mean column + row * 1j, cluster, number.
 
@@ -499,7 +543,7 @@ def blobs(selected: Array, at: Array, cluster: Array, cells: Array) -> int:
     some = np.empty(at.size, np.complex128)
     of = np.empty((2, at.size), np.int64)
     done = np.zeros((rows, columns), np.bool_)
-    stack = np.empty((rows * columns, 2), np.int64)
+    found = np.empty((rows * columns, 2), np.int64)
     n = 0
     for k in range(clusters):
         first, last = rows_of(selected[k])
@@ -508,21 +552,11 @@ def blobs(selected: Array, at: Array, cluster: Array, cells: Array) -> int:
             for c in range(columns):
                 if not selected[k, r, c] or done[r, c]:
                     continue
-                done[r, c] = True
-                stack[0, 0], stack[0, 1] = r, c
-                top, count, down, right = 1, 0, 0, 0
-                while top > 0:
-                    top -= 1
-                    a, b = stack[top, 0], stack[top, 1]
-                    count += 1
-                    down += a
-                    right += b
-                    for v in range(max(a - 1, 0), min(a + 2, rows)):
-                        for u in range(max(b - 1, 0), min(b + 2, columns)):
-                            if selected[k, v, u] and not done[v, u]:
-                                done[v, u] = True
-                                stack[top, 0], stack[top, 1] = v, u
-                                top += 1
+                count = _connected(selected[k], done, found, r, c)
+                down, right = 0, 0
+                for i in range(count):
+                    down += found[i, 0]
+                    right += found[i, 1]
                 some[n] = complex(right / count, down / count)
                 of[0, n], of[1, n] = k, count
                 n += 1

@@ -20,11 +20,8 @@ from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
 
 if TYPE_CHECKING:
-    from scipy import ndimage
-
     from evlcp_sdk.rx import _kernels
 else:
-    ndimage = Late("scipy.ndimage")
     _kernels = Late("evlcp_sdk.rx._kernels")
 
 __all__ = ["BACKFILL_STEPS", "SAME_PX", "Followed", "RegionFollower", "same_place"]
@@ -616,14 +613,7 @@ class RegionFollower:
             if rises:
                 hits[:] = 0
             return
-        areas, many = ndimage.label(hits, np.ones((3, 3), bool))
-        found = ndimage.find_objects(areas)
-        if many > self._limits.areas:
-            self.counts["areas_left_out"] += many - self._limits.areas
-            of_area = np.bincount(areas.ravel(), hits.ravel(), many + 1)[1:]
-            best = np.sort(np.argsort(-of_area, kind="stable")[: self._limits.areas])
-            found = [found[k] for k in best]
-        lit = [self._lit(where, end_us) for where in found]
+        lit = [self._lit(cells, end_us) for cells in self._areas(hits)]
         joined = _joined([box for box in lit if box is not None], merge)
         boxes = [box for box in joined if _inside(hits, box).sum() >= self._spec.min_rises]
         hits[:] = 0
@@ -634,12 +624,26 @@ class RegionFollower:
             else:
                 self._fresh.append(box)
 
-    def _lit(self, cells: tuple[slice, ...], end_us: int) -> Box | None:
+    def _areas(self, hits: NDArray[np.int32]) -> list[list[int]]:
+        """Rectangles (left, top, right, bottom) around connected cells with hits; as many as there may be."""
+        # Of 2 x 2 cells, one at the most begins an area.
+        rows, columns = hits.shape
+        most = ((rows + 1) // 2) * ((columns + 1) // 2)
+        boxes, total = np.empty((most, 4), np.int64), np.empty(most, np.int64)
+        many = _kernels.areas(hits > 0, hits, boxes, total)
+        boxes = boxes[:many]
+        if many > self._limits.areas:
+            self.counts["areas_left_out"] += many - self._limits.areas
+            best = np.sort(np.argsort(-total[:many], kind="stable")[: self._limits.areas])
+            boxes = boxes[best]
+        found: list[list[int]] = boxes.tolist()
+        return found
+
+    def _lit(self, cells: Sequence[int], end_us: int) -> Box | None:
         """The box around the pixels that blink in a rectangle of cells, None if there are none."""
-        v, u = cells
-        left, top = u.start << _CELL_SHIFT, v.start << _CELL_SHIFT
-        right = min(u.stop << _CELL_SHIFT, self._camera.width)
-        bottom = min(v.stop << _CELL_SHIFT, self._camera.height)
+        left, top = cells[0] << _CELL_SHIFT, cells[1] << _CELL_SHIFT
+        right = min(cells[2] << _CELL_SHIFT, self._camera.width)
+        bottom = min(cells[3] << _CELL_SHIFT, self._camera.height)
         region = self._measure(0, (left, top, right, bottom), end_us, np.empty(bottom - top, np.int64))
         return None if region is None else _box_of(region)
 

@@ -19,11 +19,8 @@ from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Bend, FrameView, Range, changed
 
 if TYPE_CHECKING:
-    from scipy import special
-
     from evlcp_joint import _kernels
 else:
-    special = Late("scipy.special")
     _kernels = Late("evlcp_joint._kernels")
 
 __all__ = ["JointScaleRanging"]
@@ -206,9 +203,11 @@ def _profile(core_share: float) -> Floats:
     """
     from evlcp_joint._kernels import _REACH
 
+    # As SciPy's to the last bits, without the import.
+    erf = np.vectorize(math.erf)
     z = np.linspace(0, _REACH, 2049)
     parts = ((core_share, 1.0), (1 - core_share, _TAIL))
-    across = sum(share * special.erf(z / wide / np.sqrt(2)) for share, wide in parts)
+    across = sum(share * erf(z / wide / np.sqrt(2)) for share, wide in parts)
     slope = sum(share * 2 * np.exp(-0.5 * (z / wide) ** 2) / wide for share, wide in parts) / np.sqrt(
         2 * np.pi
     )

@@ -111,6 +111,13 @@ def blobs(selected):
     return found
 
 
+def areas(hits):
+    """By SciPy: (left, top, right, bottom) of connected cells with hits, and how many hits those have."""
+    labels, n = ndimage.label(hits, np.ones((3, 3)))
+    boxes = [(u.start, v.start, u.stop, v.stop) for v, u in ndimage.find_objects(labels)]
+    return boxes, [hits[labels == i].sum() for i in range(1, n + 1)]
+
+
 def score(at, cluster, cells, layout, s, shift, reach):
     off = np.abs(at - (s * layout[cluster] + shift)) / reach
     return float((cells * np.maximum(1 - off**2, 0)).sum())

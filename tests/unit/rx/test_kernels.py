@@ -299,6 +299,20 @@ def test_connected_cells_of_each_cluster(seed, clusters):
     assert cells[:n].tolist() == [w[2] for w in want]
 
 
+@pytest.mark.parametrize("shape", [(90, 160), (7, 5), (1, 1), (1, 12)])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.25, 0.5, 1.0])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_rectangles_around_connected_cells(seed, share, shape):
+    rng = np.random.default_rng(seed)
+    hits = (rng.integers(1, 9, shape) * (rng.random(shape) < share)).astype(np.int32)
+    most = (shape[0] + 1) // 2 * ((shape[1] + 1) // 2)
+    boxes, total = np.empty((most, 4), np.int64), np.empty(most, np.int64)
+    n = _kernels.areas(hits > 0, hits, boxes, total)
+    want_boxes, want_total = twins.areas(hits)
+    assert boxes[:n].tolist() == [list(box) for box in want_boxes]
+    assert total[:n].tolist() == want_total
+
+
 def some_blobs(rng, clusters):
     """Blobs of a layout in its place, of which some are strays."""
     layout = rng.normal(0, 0.01, clusters) + 0.06j * np.arange(clusters)
