@@ -18,20 +18,25 @@ TIME_AT = 6
 SAME_AT = 10
 """Bit from which is held how often lately the same time came again, 0 to `MOST_SAME`."""
 
-MOST_SAME = 7
+MOST_SAME = 31
 
-CLOCK_AT = 13
+CLOCK_AT = 15
 
 CLOCK_ROUND = 1 << 32 - CLOCK_AT
-"""Ticks after which the clock of 19 bits goes round."""
+"""Ticks after which the clock of 17 bits goes round."""
+
+OTHER, AGAIN, MISSED = 0, 1, 2
+"""A time between rises is another than the one before, the same, or as if one of them missed rises."""
 
 SCORES = (1 << TIME_AT) - 1
 
 _LOW = np.uint32((1 << CLOCK_AT) - 1)
 _HIGH = np.uint32((1 << 32) - (1 << CLOCK_AT))
 _PART = np.uint32((1 << SAME_AT) - 1)
-_SAMES = np.array([max(n - 2, 0) for n in range(8)] + [min(n + 1, MOST_SAME) for n in range(8)], np.uint32)
-"""How often the same time has come again: after another, and after the same."""
+_SAMES = np.clip(np.add.outer([-6, 1, -2], np.arange(MOST_SAME + 1)), 0, MOST_SAME).astype(np.uint32).ravel()
+"""How often the same time has come again, after what the newest was and how often it was before: by the
+logarithm of how much likelier that is of a lamp that misses one rise in ten than of the code of a cluster
+whose pilot repeats itself, in units of what a repetition says, a third."""
 _CLOCK = np.uint32(CLOCK_AT)
 _BLOCK = 32
 """Events that are looked at together: of a bar alone in the dark, every other block has no stray in it."""
@@ -59,8 +64,8 @@ def score_rises(
 
     `pixels` (height, width) are uint32, see `Rhythm`. A rise sooner than `soon` ticks after the one before is
     the same; `kinds` says what a number of ticks is, the last, 0, for all beyond, and `lows` what becomes of
-    time and score, and in the bit above whether it is the same time again. A tick is 2^tick_shift us. A rise
-    beyond is no hit, nor is one after the same time `most_same` times.
+    time and score, and in the bits above whether it is `AGAIN` the same time. A tick is 2^tick_shift us. A
+    rise beyond is no hit, nor is one after the same time `most_same` times.
     """
     width, columns = np.uint32(pixels.shape[1]), np.uint32(hits.shape[1])
     states, cells = pixels.reshape(-1), hits.reshape(-1)
@@ -92,7 +97,7 @@ def score_rises(
         kind = np.uint32(kinds[runs[i]])
         low = np.uint32(lows[(kind << np.uint32(SAME_AT)) | (state & _PART)])
         same = (state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME)
-        same = _SAMES[(low >> np.uint32(SAME_AT) << np.uint32(3)) | same]
+        same = _SAMES[(low >> np.uint32(SAME_AT) << np.uint32(CLOCK_AT - SAME_AT)) | same]
         states[at] = (state & _HIGH) | (same << np.uint32(SAME_AT)) | (low & _PART)
         # One that comes after long is no blinking yet, however a pixel blinked when a bar was there.
         if (low & np.uint32(SCORES)) >= least and kind != np.uint32(0) and same < lamp:

@@ -652,8 +652,9 @@ class RegionFollower:
         if region is None:
             return
         reach = self._reach(region.x_px, region.y_px, region.width_px, region.height_px)
-        # Lamps whose pixels were not known as such in the step before: nothing of them is listened to.
-        if not len(self._rhythmic(select(self._recent[-1][1], reach))) or not self._place_for_one(end_us):
+        # Lamps whose pixels were not known as such in the step before are now.
+        newest = select(self._recent[-1][1], reach)
+        if not self._rhythm.may_open(newest) or not self._place_for_one(end_us):
             return
         self._next_id += 1
         for like in self.alive:

@@ -9,7 +9,9 @@ moving texture, lowers it by three: more than the two that chance, which is on t
 would bring. One after the very same number of chips as before lowers it by two from five chips on: a lamp of
 1 or 2 kHz repeats its period, a code with missing events does not.
 A lamp whose period is near two, three or four chips is in rhythm, too, as far as a score tells; but its time
-comes again and again, to half a chip, which one of a code does not for long: such pixels open no region, and
+comes again and again, to half a chip, or twice or three times as long where it misses a rise, while a code
+changes to another soon. That is counted as a likelihood ratio: up by one a repetition, down by two where
+rises may have been missed, by six for another time. Pixels with some of that open no region, and with more,
 before a frame shows where the bar is, they are not listened to. Falls are not looked at: they come later or
 sooner than rises by the light, they are the first to go missing, and some cameras send none.
 
@@ -47,13 +49,16 @@ _MOST_CHIPS = 15
 _STRAY_CHIPS = 0.3
 """Jitter and latencies that differ from rise to rise put one off the chips by so much."""
 
-_LONGEST_TICKS = 2**16
+_LONGEST_TICKS = 2**15
 """Of what is looked up by its length: a tick is 1 us but for chips slower than 190 a second."""
 
-_SAME = 5
-"""Rises after the same time as before, less two for each other one, from which on a pixel is a lamp: of the
-times of a code half are of two chips, so that a tenth of its pixels, and more in some pilots, are taken for
-one now and then; a lamp that misses one rise in six is not."""
+_SAME, _LAMP = 7, 12
+"""Repetitions of a time, less what speaks against a lamp, from which on a pixel opens no region, and from
+which on it is not listened to before a frame shows where the bar is. Pixels that see a random code are so
+for four per cent of the time by the first, which a bar can spare, as its other clusters open the region; and
+for .8 by the second, but for nine of the one pilot of sixteen that is two chips throughout. A lamp that
+misses one rise in ten is so by both for more than half of the time, one that misses none always. More
+repetitions would spare more of a code, and take longer to know a panel, which costs the frames before."""
 
 _LABEL_SHIFT = 3
 """Cells of 8 x 8 px say which box is near: few, so that they stay in the cache."""
@@ -74,10 +79,10 @@ of a pair code are whole chips apart."""
 class Rhythm:
     """Scores of a sensor's pixels.
 
-    A pixel's state holds when it last rose (19 bits of the clock's ticks), how often the same time came again
-    (3 bits), the time between that and the rise before (4 bits), and its score (6 bits).
-    The clock of 19 bits goes round in half a second; rows are looked at in turn, all in a quarter of that,
-    so that no old rise looks young.
+    A pixel's state holds when it last rose (17 bits of the clock's ticks), how often the same time came again
+    (5 bits), the time between that and the rise before (4 bits), and its score (6 bits).
+    The clock of 17 bits goes round in an eighth of a second; rows are looked at in turn, all in a quarter of
+    that, so that no old rise looks young.
 
     Args:
         width: Columns of the sensor.
@@ -155,9 +160,16 @@ class Rhythm:
         Where leaves move, chance takes a third of their pixels to half of a candidate's score, and a tenth to
         all of it.
         """
+        return events[self._rhythmic(events, _LAMP)]
+
+    def may_open(self, events: Events) -> bool:
+        """Whether any of them is of a candidate that opens a region."""
+        return bool(self._rhythmic(events, _SAME).any())
+
+    def _rhythmic(self, events: Events, most_same: int) -> NDArray[np.bool_]:
         keep = np.empty(len(events), np.bool_)
-        _kernels.in_rhythm(events.x, events.y, self._pixels, self._min_score, _SAME, keep)
-        return events[keep]
+        _kernels.in_rhythm(events.x, events.y, self._pixels, self._min_score, most_same, keep)
+        return keep
 
     def select(self, events: Events, boxes: NDArray[np.int64], filtered: NDArray[np.bool_]) -> list[Events]:
         """Those inside each of some boxes, in no more memory than twice what they need.
@@ -180,7 +192,7 @@ class Rhythm:
             filtered,
             self._pixels,
             self._min_score,
-            _SAME,
+            _LAMP,
             _LABEL_SHIFT,
             self._labels,
             begins,
@@ -259,7 +271,7 @@ def _kinds(chip_us: float, late_us: float, tick_us: int) -> NDArray[np.uint8]:
 def _lows(gap_chips: int) -> NDArray[np.uint16]:
     """Time and score of a pixel after a rise, by the kind of its time and by time and score before it.
 
-    The bit above says whether it is the same time again.
+    The bits above say whether it is the same time again, or rises may have been missed in one of the two.
     """
     kind, before, score = np.meshgrid(np.arange(2 * _OFF), np.arange(16), np.arange(64), indexing="ij")
     time = kind % _OFF
@@ -267,10 +279,24 @@ def _lows(gap_chips: int) -> NDArray[np.uint16]:
     change = np.where(chips < gap_chips + 1, 2, np.where(time == before, -2, 1))
     change[kind >= _OFF] = -3
     change[kind == _LATE] = -1
-    near = (
-        (abs(time - before) <= 1) & (np.minimum(time, before) > _LATE) & (np.maximum(time, before) <= _SHORT)
-    )
-    again = (time == before) | near
-    return np.asarray(
-        (again << 10) | (time << 6) | np.clip(score + change, 0, _MOST_SCORE), np.uint16
-    ).ravel()
+    said = _repeats()[before, time]
+    return np.asarray((said << 10) | (time << 6) | np.clip(score + change, 0, _MOST_SCORE), np.uint16).ravel()
+
+
+def _repeats() -> NDArray[np.int64]:
+    """What a time says after another, by the kinds of both: `_kernels.AGAIN`, `MISSED` or `OTHER`.
+
+    One of them may be two or three of the other, of which rises in between were missed.
+    """
+    said = np.full((16, 16), _kernels.OTHER)
+    ends = [_SOON_CHIPS, *((a + b) / 2 for a, b in pairwise(_TIMES)), _TIMES[-1] + 0.5]
+    for shorter in range(1, len(_TIMES) + 1):
+        for longer in range(shorter, len(_TIMES) + 1):
+            same = longer == shorter or (longer == shorter + 1 and longer <= _SHORT)
+            multiple = any(
+                many * ends[shorter - 1] < ends[longer] and ends[longer - 1] < many * ends[shorter]
+                for many in (2, 3)
+            )
+            what = _kernels.AGAIN if same else _kernels.MISSED if multiple else _kernels.OTHER
+            said[shorter, longer] = said[longer, shorter] = what
+    return said

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 
-def score_rises(events, shape, start, chip_us, min_score, cell_shift, most_same=5):
+def score_rises(events, shape, start, chip_us, min_score, cell_shift, most_same=7):
     """Last rise, time before it, how often that again, score of each pixel; and hits. `start`: before.
 
     Times by number, 0: beyond what counts.
@@ -32,7 +32,13 @@ def score_rises(events, shape, start, chip_us, min_score, cell_shift, most_same=
         score[v, u] = sorted((0, score[v, u], 40))[1]
         apart = abs(number - time[v, u])
         again = apart == 0 or (apart == 1 and min(number, time[v, u]) > 0 and max(number, time[v, u]) <= 6)
-        same[v, u] = min(same[v, u] + 1, 7) if again else max(same[v, u] - 2, 0)
+        low, high = sorted((number, int(time[v, u])))
+        ends = [1.5, *((a + b) / 2 for a, b in pairwise(times)), 13.5]
+        missed = low > 0 and any(
+            max(many * ends[low - 1], ends[high - 1]) < min(many * ends[low], ends[high]) for many in (2, 3)
+        )
+        again = again and low > 0
+        same[v, u] = min(same[v, u] + 1, 31) if again else max(same[v, u] - (2 if missed else 6), 0)
         rose[v, u], time[v, u] = t, number
         if score[v, u] >= min_score and number and same[v, u] < most_same:
             cell = v >> cell_shift, u >> cell_shift

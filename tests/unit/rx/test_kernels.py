@@ -66,7 +66,7 @@ def test_scores_of_pixels(seed, freeze):
     t_us = np.where(rng.random(len(events)) < 0.75, (events.t_us / 100).round() * 100, events.t_us)
     order = np.argsort(t_us, kind="stable")
     events = Events.of(t_us[order], events.x[order], events.y[order], events.p[order])
-    start_us = -(2**18)
+    start_us = -(2**16)
     pixels = states(np.full((HEIGHT, WIDTH), start_us), 0, 0)
     start = (np.full(pixels.shape, start_us), *np.zeros((3, *pixels.shape), int))
     hits = scored(frozen(events, freeze), pixels)
@@ -139,16 +139,16 @@ def test_falls_are_not_looked_at():
 
 def test_scores_do_not_care_how_the_stream_is_cut():
     events = random_events(np.random.default_rng(0), 1000, step_us=8, width=4, height=4)
-    whole, parts = (states(np.full((HEIGHT, WIDTH), -(2**18)), 0, 0) for _ in range(2))
+    whole, parts = (states(np.full((HEIGHT, WIDTH), -(2**16)), 0, 0) for _ in range(2))
     want = scored(events, whole)
     got = sum(scored(events[a:b], parts) for a, b in [(0, 0), (0, 1), (1, 700), (700, 1000)])
     assert_array_equal(parts, whole)
     assert_array_equal(got, want)
 
 
-@pytest.mark.parametrize("gap_us", [1500, 50_000, 140_000, 524_288, 10**10])
+@pytest.mark.parametrize("gap_us", [1500, 12_000, 35_000, 131_072, 10**10])
 def test_no_rise_grows_young(gap_us):
-    """The clock goes round in 2^19 us, while a pixel's age never goes below a quarter of that again."""
+    """The clock goes round in 2^17 us, while a pixel's age never goes below a quarter of that again."""
     rng = np.random.default_rng(0)
     rhythm = Rhythm(WIDTH, HEIGHT, CHIP_US, 8)
     hits, events = np.zeros((4, 6), np.int32), random_events(rng, 500)
@@ -162,8 +162,8 @@ def test_no_rise_grows_young(gap_us):
         rhythm.step(now, Events.empty(), hits, 2)
         age = (now - (rhythm._pixels >> _kernels.CLOCK_AT).astype(int)) % _kernels.CLOCK_ROUND
         true = now - rose
-        assert_array_equal(age[true < 2**17], true[true < 2**17])
-        assert (age[true >= 2**17] >= 2**17).all()
+        assert_array_equal(age[true < 2**15], true[true < 2**15])
+        assert (age[true >= 2**15] >= 2**15).all()
         assert_array_equal(rhythm._pixels & LOW, low)
 
 
@@ -181,9 +181,9 @@ def test_values_within_bounds(dtype):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_old_rises(seed):
     rng = np.random.default_rng(seed)
-    now, rose = 5_000_000, 5_000_000 - rng.integers(0, 2**19, (HEIGHT, WIDTH))
+    now, rose = 5_000_000, 5_000_000 - rng.integers(0, 2**17, (HEIGHT, WIDTH))
     time, score = rng.integers(0, 16, rose.shape), rng.integers(0, 41, rose.shape)
-    same = rng.integers(0, 8, rose.shape)
+    same = rng.integers(0, 32, rose.shape)
     pixels = states(rose, time, score, same)
     # Rows 10 to 15, and 0 to 4.
     _kernels.grow_old(pixels, 10, 11, now, 3000, 4000)
@@ -241,8 +241,8 @@ def test_events_in_many_boxes_at_once(seed, many):
     rng = np.random.default_rng(seed)
     events = random_events(rng, 700)
     shape = (HEIGHT, WIDTH)
-    score, same = rng.integers(0, 41, shape), rng.integers(0, 8, shape)
-    pixels = states(rng.integers(0, 2**19, shape), rng.integers(0, 14, shape), score, same)
+    score, same = rng.integers(0, 41, shape), rng.integers(0, 32, shape)
+    pixels = states(rng.integers(0, 2**17, shape), rng.integers(0, 14, shape), score, same)
     # Empty ones and equal ones among them, and such that overlap.
     left, top = rng.integers(0, WIDTH, many), rng.integers(0, HEIGHT, many)
     right = np.minimum(left + rng.integers(0, 9, many), WIDTH)
@@ -252,7 +252,7 @@ def test_events_in_many_boxes_at_once(seed, many):
     rhythm = Rhythm(WIDTH, HEIGHT, CHIP_US, 20)
     rhythm._pixels[:] = pixels
     found = rhythm.select(events, boxes, filtered)
-    listened = ((score >= 20) & (same < 5))[events.y, events.x]
+    listened = ((score >= 20) & (same < 12))[events.y, events.x]
     assert len(found) == many
     for got, box, only in zip(found, boxes.tolist(), filtered, strict=True):
         want = twins.select_box(events[listened] if only else events, tuple(box))
