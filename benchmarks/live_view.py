@@ -1,12 +1,12 @@
 """What the web view costs the receiver, and how soon it shows something.
 
-    python benchmarks/live_view.py [RECORDING] [--for-s 4] [--rounds 3] [--apart]
+    python benchmarks/live_view.py [RECORDING] [--for-s 4] [--rounds 6] [--apart]
 
 The recording is received as fast as it goes, again and again until so much camera time is over, in turn
-with nobody looking on and with one who takes all that there is (a process of its own, which draws nothing);
-the best of the rounds counts. Then the command is started and timed until the first picture is there, and
-replays the recording at its own pace, again and again without a pause, for pictures a second. Without a name,
-two bars of `../shared`.
+with nobody looking on and with one who takes all that there is (a process of its own, which draws nothing).
+What counts is the ratio of two runs that follow one another, the middle one of all rounds. Then the command
+is started and timed until the first picture is there, and replays the recording at its own pace, again and
+again without a pause, for pictures a second. Without a name, two bars of `../shared`.
 """
 
 import argparse
@@ -19,6 +19,7 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -113,21 +114,30 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("recording", nargs="?", type=Path, default=SHARED)
     parser.add_argument("--for-s", type=float, default=4.0)
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--apart", action="store_true", help="the view in a process of its own")
     given = parser.parse_args()
     alone, viewed = [], []
-    for _ in range(given.rounds):
-        alone.append(received(given.recording, given.for_s, viewed=False, apart=False)[0])
-        times, seen = received(given.recording, given.for_s, viewed=True, apart=given.apart)
-        viewed.append(times)
+    for number in range(given.rounds):
+        # Each is as often the first one.
+        for looked_at in (False, True) if number % 2 else (True, False):
+            told = received(given.recording, given.for_s, viewed=looked_at, apart=given.apart)
+            if looked_at:
+                times, seen = told
+                viewed.append(times)
+            else:
+                alone.append(told[0])
         rate = seen["pictures"] / times["elapsed_s"]
         print(
             f"alone {alone[-1]['elapsed_s']:.2f} s, viewed {times['elapsed_s']:.2f} s, {rate:.1f} pictures/s"
         )
     for name, text in (("elapsed_s", "elapsed"), ("processor_s", "processor time of this process")):
-        a, b = (min(one[name] for one in times) for times in (alone, viewed))
-        print(f"{text}, best: alone {a:.2f} s, viewed {b:.2f} s, {b / a - 1:+.1%}")
+        a, b = (np.array([one[name] for one in times]) for times in (alone, viewed))
+        low, middle, high = np.quantile(b / a - 1, (0.25, 0.5, 0.75))
+        print(
+            f"{text}: {middle:+.1%} ({low:+.1%} to {high:+.1%} of half of the rounds),"
+            f" the best of each {b.min() / a.min() - 1:+.1%}"
+        )
     with TemporaryDirectory() as folder:
         long = Path(folder) / "long.raw"
         without_pause(given.recording, 4.0, long)

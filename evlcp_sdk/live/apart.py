@@ -6,6 +6,7 @@ import multiprocessing
 import signal
 import threading
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 from urllib.parse import urlsplit
@@ -13,11 +14,9 @@ from urllib.parse import urlsplit
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.desk import Desk
-from evlcp_sdk.live.outlet import Outlet
-from evlcp_sdk.live.pictures import Picture, PictureSlot
 from evlcp_sdk.live.recorder import Recorder
-from evlcp_sdk.live.viewer import KINDS_SHOWN, MOST_WAITING, PICTURES_PER_S, Viewer
-from evlcp_sdk.scene.sites import BarSite
+from evlcp_sdk.live.telling import MOST_WAITING, Line, Shot, Teller
+from evlcp_sdk.live.viewer import PICTURES_PER_S, Viewer
 
 __all__ = ["ViewerApart"]
 
@@ -29,7 +28,8 @@ _END_S: Final = 3.0
 class ViewerApart:
     """A `Viewer` in a process of its own, fed by a thread of this one.
 
-    The thread may wait for that process, the receiver never does: of what is too much the oldest goes.
+    The thread may wait for that process, the receiver never does: of what is too much the oldest goes. What
+    is shown is told here, and only then handed on: a line takes less to hand on than what it tells of.
     Arguments are those of `Viewer`.
 
     Attributes:
@@ -38,19 +38,17 @@ class ViewerApart:
 
     def __init__(
         self,
-        outlet: Outlet,
-        pictures: PictureSlot,
+        feed: Teller,
         links: Mapping[str, Link],
         *,
         name: str,
-        sites: Sequence[BarSite] = (),
+        sites: int = 0,
         host: str = "127.0.0.1",
         port: int = 0,
         recorder: Recorder | None = None,
     ) -> None:
-        self._outlet, self._pictures, self._recorder = outlet, pictures, recorder
-        self._given = (dict(links), name, tuple(sites), host, port, recorder is not None)
-        self._mine = outlet.subscribe(KINDS_SHOWN, most=MOST_WAITING)
+        self._teller, self._recorder = feed, recorder
+        self._given = (dict(links), name, sites, host, port, recorder is not None)
         self._told = 0
         self.url = ""
 
@@ -62,7 +60,7 @@ class ViewerApart:
     @property
     def dropped(self) -> int:
         """Results that browsers were not sent as they did not take them, or as there was no time, so far."""
-        return self._told + self._mine.dropped
+        return self._told + self._teller.dropped
 
     async def start(self) -> None:
         """Start the process, and wait until it listens.
@@ -81,7 +79,7 @@ class ViewerApart:
         except EOFError:
             told, text = "fault", "the process of the view has ended"
         if told == "fault":
-            self._outlet.leave(self._mine)
+            self._teller.leave()
             raise ConfigError(text)
         self.url = text
         self._thread = threading.Thread(target=self._feed, name="evlcp-view", daemon=True)
@@ -99,31 +97,32 @@ class ViewerApart:
         number, wanted, told_s = -1, False, 0.0
         with contextlib.suppress(OSError, EOFError):
             while True:
-                ended = self._mine.ended
-                if self._pipe.poll(0.0 if ended else _TURN_S):
+                ended = self._teller.ended
+                rest_s = told_s + 1 / PICTURES_PER_S - time.monotonic()
+                if self._pipe.poll(0.0 if ended else max(0.0, min(rest_s, _TURN_S if wanted else rest_s))):
                     kind, value = self._pipe.recv()
                     if kind == "ask":
                         wanted = True
-                        self._pictures.ask()
+                        self._teller.ask()
                     elif kind == "dropped":
                         self._told = value
                     elif self._recorder is not None:
                         (self._recorder.start if value else self._recorder.stop)()
-                picture = self._pictures.newest if wanted else None
-                if picture is not None and picture.number == number:
-                    picture = None
+                shot = self._teller.shot() if wanted else None
+                if shot is not None and shot.number == number:
+                    shot = None
                 now_s = time.monotonic()
-                if picture is None and not ended and now_s < told_s + 1 / PICTURES_PER_S:
+                if shot is None and not ended and now_s < told_s + 1 / PICTURES_PER_S:
                     continue
-                if picture is not None:
-                    number, wanted = picture.number, False
+                if shot is not None:
+                    number, wanted = shot.number, False
                 told_s = now_s
                 state = None if self._recorder is None else self._recorder.state
-                self._pipe.send((self._mine.take(0), picture, state))
+                self._pipe.send((self._teller.take(frames=True), shot, state))
                 if ended:
                     self._pipe.send(None)
                     break
-        self._outlet.leave(self._mine)
+        self._teller.leave()
 
 
 class _Wire:
@@ -139,18 +138,32 @@ class _Wire:
             self.pipe.send((kind, value))
 
 
-class _FarPictures:
-    """Asks the receiver's process for pictures, one at a time."""
+class _FarFeed:
+    """What the receiver's process tells, as it comes; asks for pictures, one at a time."""
 
     def __init__(self, wire: _Wire) -> None:
         self._wire = wire
-        self._asked = False
-        self._newest: Picture | None = None
+        self._asked = self._over = False
+        self._waiting: deque[Line] = deque(maxlen=MOST_WAITING)
+        self._lock = threading.Lock()
+        self._shot: Shot | None = None
+        self.dropped = 0
 
     @property
-    def newest(self) -> Picture | None:
+    def ended(self) -> bool:
+        """Nothing more will come, and nothing is left."""
+        return self._over and not self._waiting
+
+    def take(self, *, frames: bool) -> list[Line]:
+        """What has come; frames are told in any case, as a browser may have come since."""
+        with self._lock:
+            lines = list(self._waiting)
+            self._waiting.clear()
+        return lines
+
+    def shot(self) -> Shot | None:
         """The last picture that came."""
-        return self._newest
+        return self._shot
 
     def ask(self) -> None:
         """Have a picture drawn, where none is under way."""
@@ -158,9 +171,17 @@ class _FarPictures:
             self._asked = True
             self._wire.say("ask")
 
-    def take(self, picture: Picture) -> None:
-        """Keep a picture that has come."""
-        self._newest, self._asked = picture, False
+    def put(self, lines: Sequence[Line], shot: Shot | None) -> None:
+        """Keep what has come."""
+        with self._lock:
+            self.dropped += max(len(self._waiting) + len(lines) - MOST_WAITING, 0)
+            self._waiting.extend(lines)
+        if shot is not None:
+            self._shot, self._asked = shot, False
+
+    def leave(self) -> None:
+        """Nothing more will come."""
+        self._over = True
 
 
 class _FarRecorder:
@@ -183,7 +204,7 @@ def _serve(
     pipe: Any,
     links: Mapping[str, Link],
     name: str,
-    sites: tuple[BarSite, ...],
+    sites: int,
     host: str,
     port: int,
     may_record: bool,
@@ -191,9 +212,9 @@ def _serve(
     """Serve the view in this process until all is said, or the receiver's process has gone."""
     # Ctrl-C is for the receiver, which ends this.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    wire, outlet = _Wire(pipe), Outlet()
-    pictures, recorder = _FarPictures(wire), _FarRecorder(wire) if may_record else None
-    viewer = Viewer(outlet, pictures, links, name=name, sites=sites, host=host, port=port, recorder=recorder)
+    wire = _Wire(pipe)
+    feed, recorder = _FarFeed(wire), _FarRecorder(wire) if may_record else None
+    viewer = Viewer(feed, links, name=name, sites=sites, host=host, port=port, recorder=recorder)
     with Desk() as desk:
         try:
             desk.call(viewer.start())
@@ -204,15 +225,12 @@ def _serve(
         dropped = 0
         with contextlib.suppress(OSError, EOFError):
             while (told := pipe.recv()) is not None:
-                news, picture, state = told
-                for one in news:
-                    outlet.publish(one.kind, one.t_us, one.value, one.late_ms)
-                if picture is not None:
-                    pictures.take(picture)
+                lines, shot, state = told
+                feed.put(lines, shot)
                 if recorder is not None:
                     recorder.state = state
                 if viewer.dropped != dropped:
                     dropped = viewer.dropped
                     wire.say("dropped", dropped)
-        outlet.close()
+        feed.leave()
         desk.call(viewer.finish())

@@ -9,11 +9,13 @@ let zero = null, bins = new Map(), rates = [], rows = [], messages = [], status 
 let fixes = [], track = [], sites = [], refused = null, record = null, dirty = false, counted = [];
 const distances = new Map();
 
-const ms = (us) => (us / 1e3).toFixed(1);
+// No number is "-0.00".
+const fixed = (value, n) => value.toFixed(n).replace(/^-(?=[0.]+$)/, "");
+const ms = (us) => fixed(us / 1e3, 1);
 const cell = (row, text) => { const td = row.insertCell(); td.textContent = text; return td; };
-const meters = (news, n) => (news && news.ranged ? news.ranged.distance_m.toFixed(n) : "-");
+const meters = (news, n) => (news && news.ranged ? fixed(news.ranged.distance_m, n) : "-");
 const colour = (bar) => about.colours[bar % about.colours.length];
-const digits = (value, n) => (value === null || value === undefined ? "-" : value.toFixed(n));
+const digits = (value, n) => (value === null || value === undefined ? "-" : fixed(value, n));
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
 // What comes
@@ -73,7 +75,7 @@ function take(news) {
 function said(message) {
   for (const key of ["text", "data", "time", "signal"]) if (message[key] !== undefined) return String(message[key]);
   if (message.latitude_deg !== undefined) {
-    return `${message.latitude_deg.toFixed(7)}, ${message.longitude_deg.toFixed(7)} deg, ${message.height_m.toFixed(2)} m`;
+    return `${fixed(message.latitude_deg, 7)}, ${fixed(message.longitude_deg, 7)} deg, ${fixed(message.height_m, 2)} m`;
   }
   const known = ["line", "kind", "transmitter", "packet", "t_us", "transmitter_id", "sequence", "verified", "trust",
     "reason", "age_s"];
@@ -129,7 +131,7 @@ function drawImage() {
     const at = Math.min((bar.x_px + 12) * scale, wide - pen.measureText(text).width - 4 * dpr);
     pen.fillText(text, at, bar.y_px * scale);
   }
-  caption.textContent = `events of ${told.window_us / 1e3} ms at ${(told.t_us / 1e6).toFixed(3)} s; `
+  caption.textContent = `events of ${told.window_us / 1e3} ms at ${fixed(told.t_us / 1e6, 3)} s; `
     + "yellow: brighter, blue: darker; boxes: regions";
   drawZooms();
 }
@@ -161,7 +163,7 @@ function drawZooms() {
     pen.fillRect(0, 0, w, w * high / wide);
     pen.drawImage(bitmap, left, top, wide, high, 0, 0, w, w * high / wide);
     dots(pen, bar, scale, left, top);
-    figure.lastChild.textContent = `bar ${bar.transmitter}` + (news ? `: ${meters(news, 2)} m, quality ${news.quality.toFixed(2)}` : "");
+    figure.lastChild.textContent = `bar ${bar.transmitter}` + (news ? `: ${meters(news, 2)} m, quality ${fixed(news.quality, 2)}` : "");
   }
 }
 
@@ -179,7 +181,7 @@ function chart(id, series, data, range) {
       width: wide, height: 170, cursor: { y: false },
       scales: { x: { time: false }, y: { range } },
       axes: [{ ...axis, size: 32 }, { ...axis, size: 52 }],
-      series: [{ label: "s", value: (_, v) => (v === null ? "" : v.toFixed(1)) }, ...series],
+      series: [{ label: "s", value: (_, v) => (v === null ? "" : fixed(v, 1)) }, ...series],
     }, data, by(id)) };
     return;
   }
@@ -189,7 +191,7 @@ function chart(id, series, data, range) {
 
 function line(label, stroke, n) {
   return { label, stroke, width: 1.5, spanGaps: false, points: { show: false },
-    value: (_, v) => (v === null || v === undefined ? "" : v.toFixed(n)) };
+    value: (_, v) => (v === null || v === undefined ? "" : fixed(v, n)) };
 }
 
 function span(least) {
@@ -230,9 +232,9 @@ function drawMap() {
   const last = fixes[fixes.length - 1];
   let text = "no position yet";
   if (last) {
-    text = `${last.latitude_deg.toFixed(7)}, ${last.longitude_deg.toFixed(7)} deg, ${last.height_m.toFixed(2)} m`
-      + ` (± ${last.sigma_m.map((v) => digits(v, 2)).join(", ")} m E, N, U), ${(last.t_us / 1e6).toFixed(2)} s`
-      + (last.speed_m_s === null ? "" : `, ${last.speed_m_s.toFixed(1)} m/s`)
+    text = `${fixed(last.latitude_deg, 7)}, ${fixed(last.longitude_deg, 7)} deg, ${fixed(last.height_m, 2)} m`
+      + ` (± ${last.sigma_m.map((v) => digits(v, 2)).join(", ")} m E, N, U), ${fixed(last.t_us / 1e6, 2)} s`
+      + (last.speed_m_s === null ? "" : `, ${fixed(last.speed_m_s, 1)} m/s`)
       + (last.verified ? ", verified" : "") + (last.alarms.length ? `; ${last.alarms.join(", ")}` : "");
   }
   if (refused) text += `; refused now: ${refused.refusal} ${refused.detail}`;
@@ -306,9 +308,9 @@ function drawWords() {
     const total = status.recent.total, all = status.delays.total;
     const first = counted[0], over = counted[counted.length - 1];
     const rate = over[0] > first[0] ? (over[1] - first[1]) / (over[0] - first[0]) : 0;
-    tiles.push(tile("camera clock", (status.t_us / 1e6).toFixed(1), "s"),
-      tile("events", (status.events_per_s / 1e6).toFixed(2), "million/s"),
-      tile("frames", rate.toFixed(0), "/s"),
+    tiles.push(tile("camera clock", fixed(status.t_us / 1e6, 1), "s"),
+      tile("events", fixed(status.events_per_s / 1e6, 2), "million/s"),
+      tile("frames", fixed(rate, 0), "/s"),
       tile("delay, now", digits(total.p50_ms, 1), "ms", `99 %: ${digits(total.p99_ms, 1)} ms`),
       tile("delay, all", digits(all.p50_ms, 1), "ms", `99 %: ${digits(all.p99_ms, 1)}, max ${digits(all.max_ms, 1)} ms`));
     const whole = status.delays.end_to_end;
@@ -320,7 +322,7 @@ function drawWords() {
   const near = [...distances].filter(([, news]) => news.echo_of === null && news.t_us > newest - 1e6);
   for (const [bar, news] of near.sort((a, b) => a[0] - b[0]).slice(-6)) {
     const sigma = news.ranged ? digits(news.ranged.distance_sigma_m, 2) : "-";
-    tiles.push(tile(news.link ? `bar ${bar}, ${news.link}` : `bar ${bar}`, meters(news, 2), "m", `± ${sigma} m, quality ${news.quality.toFixed(2)}`));
+    tiles.push(tile(news.link ? `bar ${bar}, ${news.link}` : `bar ${bar}`, meters(news, 2), "m", `± ${sigma} m, quality ${fixed(news.quality, 2)}`));
   }
   by("tiles").replaceChildren(...tiles);
 
@@ -337,7 +339,7 @@ function drawWords() {
   for (const news of [...rows].reverse()) {
     const row = document.createElement("tr");
     for (const text of [ms(news.t_us), news.transmitter, news.packet, news.frame, digits(news.distance_m, 2),
-      news.quality.toFixed(2)]) cell(row, text);
+      fixed(news.quality, 2)]) cell(row, text);
     const td = cell(row, "");
     for (const symbol of news.symbols) {
       const i = document.createElement("i");
@@ -353,7 +355,7 @@ function drawWords() {
   const table = document.createDocumentFragment();
   for (const message of messages) {
     const row = document.createElement("tr");
-    for (const text of [(message.t_us / 1e6).toFixed(2), message.transmitter, message.transmitter_id, message.kind,
+    for (const text of [fixed(message.t_us / 1e6, 2), message.transmitter, message.transmitter_id, message.kind,
       message.trust, said(message)]) cell(row, text);
     table.append(row);
   }
@@ -383,7 +385,7 @@ function drawWords() {
   button.hidden = !about.may_record || !!ended;
   if (record) {
     button.className = record.recording ? "on" : "";
-    button.textContent = record.recording ? `Stop recording (${(record.events / 1e6).toFixed(1)} M events)` : "Record";
+    button.textContent = record.recording ? `Stop recording (${fixed(record.events / 1e6, 1)} M events)` : "Record";
     button.title = record.file || "";
   }
 }

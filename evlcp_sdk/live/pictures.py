@@ -4,18 +4,12 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.late import Late
+from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.values import Events, Region
-
-if TYPE_CHECKING:
-    from evlcp_sdk.live import _kernels
-else:
-    _kernels = Late("evlcp_sdk.live._kernels")
 
 __all__ = ["Picture", "PictureSlot"]
 
@@ -27,16 +21,44 @@ class Picture:
     Attributes:
         t_us: Its end on the camera's clock, us.
         window_us: How much time it shows, us.
-        cells: What each pixel showed, uint8 (height, width): 0 nothing, 1 OFF, 2 ON, 3 both.
+        pieces: These events; older ones may stand before them in the first piece.
+        width: Of the sensor, px.
+        height: The same.
         regions: The regions that are followed.
         number: Counted from 0.
     """
 
     t_us: int
     window_us: int
-    cells: NDArray[np.uint8]
+    pieces: tuple[Events, ...]
+    width: int
+    height: int
     regions: tuple[Region, ...]
     number: int
+
+    def image(self, over: EventImage | None = None) -> EventImage:
+        """The events, painted: by whoever looks, not by the receiver.
+
+        Args:
+            over: A picture that is no longer needed; memory that is new to a process takes longer to get than
+                a picture takes to paint.
+        """
+        if over is None or (over.width, over.height) != (self.width, self.height):
+            image = EventImage(self.width, self.height)
+        else:
+            image = over
+            image.clear()
+        # Pieces follow one another, and each reaches into the window.
+        oldest = self.pieces[0]
+        first = int(np.searchsorted(oldest.t_us, self.t_us - self.window_us, "right"))
+        for piece in (oldest[first:], *self.pieces[1:]):
+            image.paint(piece)
+        return image
+
+    @property
+    def cells(self) -> NDArray[np.uint8]:
+        """What each pixel showed, uint8 (height, width): 0 nothing, 1 OFF, 2 ON, 3 both."""
+        return self.image().cells
 
 
 class PictureSlot:
@@ -83,11 +105,8 @@ class PictureSlot:
         if not self._asked:
             return
         self._asked = False
-        cells = np.zeros((height, width), np.uint8)
-        for piece in self._recent:
-            first = int(np.searchsorted(piece.t_us, end_us - self.window_us, "right"))
-            _kernels.paint(cells, piece.x[first:], piece.y[first:], piece.p[first:])
-        picture = Picture(end_us, self.window_us, cells, tuple(regions), self._number)
+        pieces = tuple(self._recent)
+        picture = Picture(end_us, self.window_us, pieces, width, height, tuple(regions), self._number)
         self._number += 1
         with self._drawn:
             self._picture = picture

@@ -14,6 +14,7 @@ from evlcp_sdk.live.desk import Desk
 from evlcp_sdk.live.outlet import Outlet
 from evlcp_sdk.live.pictures import PictureSlot
 from evlcp_sdk.live.recorder import Recorder
+from evlcp_sdk.live.telling import Teller
 from evlcp_sdk.live.viewer import Viewer
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.utc import ClockZero
@@ -83,11 +84,10 @@ class Services:
                 camera = next(iter(links.values())).camera
                 self._recorder = Recorder(outlet, serving.record_to, camera.width, camera.height)
             self.view = (ViewerApart if serving.apart else Viewer)(
-                outlet,
-                self.pictures,
+                Teller(outlet, self.pictures, links, sites),
                 links,
                 name=name,
-                sites=sites,
+                sites=len(sites),
                 host=serving.host,
                 port=serving.port,
                 recorder=self._recorder,

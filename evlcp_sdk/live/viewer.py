@@ -11,9 +11,8 @@ import json
 import secrets
 import struct
 from collections import deque
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from email.utils import formatdate
 from http import HTTPStatus
 from importlib.resources import files
@@ -25,37 +24,23 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.budget import LEVELS
 from evlcp_sdk.live.desk import cannot_listen, stop_listening
-from evlcp_sdk.live.loop import LiveStatus
-from evlcp_sdk.live.outlet import News, Outlet, Subscription
-from evlcp_sdk.live.pictures import Picture
+from evlcp_sdk.live.telling import MOST_WAITING, Line, Shot
 from evlcp_sdk.results.colours import TRANSMITTER_COLOURS, cluster_colours
-from evlcp_sdk.results.columns import frame_columns
-from evlcp_sdk.results.lines import fix_line, frame_line
-from evlcp_sdk.results.packets_jsonl import message_line
-from evlcp_sdk.results.picture import png
-from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.study.markup import Markup, document
-from evlcp_sdk.values import Frame
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
     from websockets.http11 import Request, Response
 
-__all__ = ["PictureGiver", "RecordKeeper", "Viewer", "page"]
+__all__ = ["PICTURES_PER_S", "Feed", "RecordKeeper", "Viewer", "page"]
 
 PICTURES_PER_S: Final = 25
-KINDS_SHOWN: Final = frozenset({"frame", "message", "fix", "status", "end"})
-MOST_WAITING: Final = 4000
-"""Results that wait for a browser, some seconds of two bars; the oldest go."""
 _MOST_BROWSERS: Final = 16
 _FINISH_S: Final = 1.0
 _MOST_SAID: Final = 4096
 """Bytes of what a browser says."""
 _KEPT: Final = {"message": 50, "fix": 500}
 """What a browser that comes later is shown of what was before."""
-_LATEST_US: Final = 500_000
-_MOST_BARS: Final = 64
-"""A bar is drawn as its newest frame shows it, for so long, and so many of them."""
 
 
 @dataclass(eq=False)
@@ -64,33 +49,46 @@ class _Browser:
 
     Attributes:
         socket: Its connection.
-        waiting: Results that it has not been sent, as JSON, the newest.
+        waiting: Results that it has not been sent, as JSON values, the newest.
         dropped: How many of them were pushed out.
         ready: It has shown what it was sent.
         picture: Number of the picture that it has.
     """
 
     socket: "ServerConnection"
-    waiting: deque[str] = field(default_factory=lambda: deque(maxlen=MOST_WAITING))
+    waiting: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=MOST_WAITING))
     dropped: int = 0
     ready: bool = False
     picture: int = -1
 
-    def put(self, text: str) -> None:
+    def put(self, line: dict[str, Any]) -> None:
         """Have something sent; of a queue that is full the oldest goes."""
         self.dropped += len(self.waiting) == self.waiting.maxlen
-        self.waiting.append(text)
+        self.waiting.append(line)
 
 
-class PictureGiver(Protocol):
-    """Where a view has pictures from: a `PictureSlot`, or one of another process."""
-
-    def ask(self) -> None:
-        """Have a picture drawn."""
+class Feed(Protocol):
+    """What a view shows: a `Teller`, or one of another process."""
 
     @property
-    def newest(self) -> Picture | None:
-        """The last picture that was drawn."""
+    def dropped(self) -> int:
+        """As of `Teller`."""
+
+    @property
+    def ended(self) -> bool:
+        """The same."""
+
+    def take(self, *, frames: bool) -> list[Line]:
+        """The same."""
+
+    def shot(self) -> Shot | None:
+        """The same."""
+
+    def ask(self) -> None:
+        """The same."""
+
+    def leave(self) -> None:
+        """The same."""
 
 
 class RecordKeeper(Protocol):
@@ -111,11 +109,10 @@ class Viewer:
     """Serves the page and what it shows; runs in the loop of a `Desk`.
 
     Args:
-        outlet: Where results come from.
-        pictures: Where pictures come from.
+        feed: What is shown.
         links: The configurations by name, as `named_links` gives them.
         name: Name of the source, for the title.
-        sites: Where the bars stand, for the map.
+        sites: How many bars the map shows.
         host: Where to listen: of this machine only, unless it is another address of it.
         port: The same; 0 for any that is free.
         recorder: Starts and stops recordings as a browser asks; None: browsers only look on.
@@ -127,31 +124,26 @@ class Viewer:
 
     def __init__(
         self,
-        outlet: Outlet,
-        pictures: PictureGiver,
+        feed: Feed,
         links: Mapping[str, Link],
         *,
         name: str,
-        sites: Sequence[BarSite] = (),
+        sites: int = 0,
         host: str = "127.0.0.1",
         port: int = 0,
         recorder: RecordKeeper | None = None,
     ) -> None:
-        self._outlet, self._pictures, self._recorder = outlet, pictures, recorder
-        self._name, self._links, self._sites = name, links, tuple(sites)
-        self._columns = frame_columns(filtered=False, links=len(links) > 1)
+        self._feed, self._recorder = feed, recorder
+        self._name, self._links, self._sites = name, links, sites
         self._host, self.port = host, port
         self._token = secrets.token_urlsafe(16)
         self._browsers: set[_Browser] = set()
-        self._kept = {kind: deque[str](maxlen=most) for kind, most in _KEPT.items()}
-        self._last: dict[str, str] = {}
-        self._bars: dict[int, Frame] = {}
+        self._kept = {kind: deque[dict[str, Any]](maxlen=most) for kind, most in _KEPT.items()}
+        self._last: dict[str, dict[str, Any]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._pump: asyncio.Task[None] | None = None
         self._body = b""
-        self._sites_told = not self._sites
         self._left = 0
-        self._mine: Subscription | None = None
 
     @property
     def url(self) -> str:
@@ -162,8 +154,7 @@ class Viewer:
     @property
     def dropped(self) -> int:
         """Results that browsers were not sent as they did not take them, or as there was no time, so far."""
-        late = 0 if self._mine is None else self._mine.dropped
-        return late + self._left + sum(browser.dropped for browser in self._browsers)
+        return self._feed.dropped + self._left + sum(browser.dropped for browser in self._browsers)
 
     async def start(self) -> None:
         """Listen.
@@ -178,7 +169,6 @@ class Viewer:
                 "websockets is not installed; it comes with the extra: pip install 'evlcp-sdk[live]'"
             ) from fault
         self._body = page(self._name).encode()
-        mine = self._mine = self._outlet.subscribe(KINDS_SHOWN, most=MOST_WAITING)
         try:
             server: Server = await serve(
                 self._serve,
@@ -190,26 +180,26 @@ class Viewer:
                 server_header=None,
             )
         except OSError as fault:
-            self._outlet.leave(mine)
+            self._feed.leave()
             raise cannot_listen(self._host, self.port, fault) from fault
         self.port = next(iter(server.sockets)).getsockname()[1]
 
         async def pump() -> None:
             turn_s = asyncio.get_running_loop().time()
             try:
-                while not mine.ended:
+                while not self._feed.ended:
                     # At even times, unless they are over already.
                     now_s = asyncio.get_running_loop().time()
                     turn_s = max(turn_s + 1 / PICTURES_PER_S, now_s)
                     await asyncio.sleep(turn_s - now_s)
-                    for news in mine.take(0):
-                        self._tell(news)
-                    await self._send_all()
+                    for kind, line in self._feed.take(frames=bool(self._browsers)):
+                        self._tell(kind, line)
+                    self._send_all()
                 # The last words.
                 await asyncio.sleep(2 / PICTURES_PER_S)
-                await self._send_all()
+                self._send_all()
             finally:
-                self._outlet.leave(mine)
+                self._feed.leave()
                 await stop_listening(server)
 
         self._pump = asyncio.create_task(pump())
@@ -336,104 +326,51 @@ class Viewer:
                 "width": camera.width,
                 "height": camera.height,
                 "levels": list(LEVELS),
-                "sites": len(self._sites),
+                "sites": self._sites,
                 "may_record": self._recorder is not None,
             }
         }
 
     # What browsers are sent
 
-    def _tell(self, news: News) -> None:
+    def _tell(self, kind: str, line: dict[str, Any]) -> None:
         """Send something to all browsers, and keep what later ones are sent."""
-        kind = news.kind
-        if kind == "frame":
-            frame: Frame = news.value
-            self._bars[frame.transmitter] = frame
-            if len(self._bars) > _MOST_BARS:
-                del self._bars[min(self._bars, key=lambda number: self._bars[number].t_us)]
-            if not self._browsers:
-                return
-            text = json.dumps(frame_line(frame, self._columns) | {"late_ms": _rounded(news.late_ms)})
-        elif kind == "message":
-            text = json.dumps({"line": "message"} | json.loads(message_line(news.value)))
-        elif kind == "fix":
-            text = json.dumps(fix_line(news.value.fix) | self._on_the_map(news.value))
-        elif kind == "status":
-            text = json.dumps({"line": "status"} | _status(news.value))
-        else:
-            text = json.dumps(
-                {"line": "end"} | {key: news.value.get(key) for key in ("status", "error", "result")}
-            )
         if kind in self._kept:
-            self._kept[kind].append(text)
+            self._kept[kind].append(line)
         elif kind != "frame":
-            self._last[kind] = text
+            self._last[kind] = line
         for browser in self._browsers:
-            browser.put(text)
+            browser.put(line)
 
-    def _on_the_map(self, placed: Any) -> dict[str, Any]:
-        """A fix in local metres; with the first one that is given, the bars."""
-        fix, place = placed.fix, placed.filtered
-        if place is None:
-            return {}
-        shown: dict[str, Any] = {
-            "enu_m": [round(v, 3) for v in fix.enu_m.tolist()],
-            "covariance_m2": [float(f"{v:.4g}") for v in fix.covariance_m2[:2, :2].ravel().tolist()],
-            "track_m": [round(v, 3) for v in place.enu_m.tolist()],
-            "starts": place.starts,
-            "speed_m_s": None if place.starts else round(place.speed_m_s, 2),
-        }
-        if not self._sites_told:
-            # The axes of a fix turn by 0.009 degrees a kilometre: nothing on a map.
-            here = LocalAxes(fix.latitude_deg, fix.longitude_deg, fix.height_m)
-            bars = [
-                [
-                    one.transmitter_id,
-                    *(here.to_enu(one.latitude_deg, one.longitude_deg, one.height_m) + fix.enu_m),
-                ]
-                for one in self._sites
-            ]
-            text = json.dumps(
-                {"line": "bars", "bars": [[i, *(round(v, 3) for v in place)] for i, *place in bars]}
-            )
-            self._last["bars"], self._sites_told = text, True
-            for browser in self._browsers:
-                browser.put(text)
-        return shown
-
-    async def _send_all(self) -> None:
+    def _send_all(self) -> None:
         """Send a bundle to each browser that is ready for one."""
         ready = [browser for browser in self._browsers if browser.ready]
         if not ready:
             return
-        picture = self._pictures.newest
-        self._pictures.ask()
-        data = b""
-        if picture is not None and any(one.picture != picture.number for one in ready):
-            data = await asyncio.to_thread(png, picture.cells)
-        now_us = picture.t_us if picture is not None else 0
-        bars = [_bar(frame) for frame in self._bars.values() if frame.t_us > now_us - _LATEST_US]
-        late = 0 if self._mine is None else self._mine.dropped
+        from websockets.asyncio.server import broadcast
+
+        shot = self._feed.shot()
+        self._feed.ask()
         for browser in ready:
-            new = picture is not None and browser.picture != picture.number
+            new = shot is not None and browser.picture != shot.number
             if not (new or browser.waiting):
                 continue
-            told = None
-            if picture is not None and new:
-                browser.picture = picture.number
-                told = _told(picture)
-            head = json.dumps(
-                {
-                    "dropped": browser.dropped + late,
-                    "picture": told,
-                    "bars": bars if new else None,
-                    "record": None if self._recorder is None else self._recorder.state,
-                }
-            )
-            text = f'{{"news":[{",".join(browser.waiting)}],{head[1:]}'.encode()
+            head: dict[str, Any] = {
+                "news": list(browser.waiting),
+                "dropped": browser.dropped + self._feed.dropped,
+                "picture": None,
+                "bars": None,
+                "record": None if self._recorder is None else self._recorder.state,
+            }
+            data = b""
+            if shot is not None and new:
+                browser.picture, data = shot.number, shot.png
+                head |= {"picture": shot.told, "bars": shot.bars}
+            text = json.dumps(head).encode()
             browser.waiting.clear()
             browser.ready = False
-            self._keep(asyncio.create_task(_sent(browser, struct.pack("<I", len(text)) + text + data * new)))
+            # It waits for nothing: of one that does not read there is no second bundle under way.
+            broadcast([browser.socket], struct.pack("<I", len(text)) + text + data)
 
 
 def _shown(link: Link) -> dict[str, Any]:
@@ -446,61 +383,6 @@ def _shown(link: Link) -> dict[str, Any]:
             for r, g, b in cluster_colours(book.clusters).tolist()
         ],
     }
-
-
-async def _sent(browser: _Browser, bundle: bytes) -> None:
-    from websockets.exceptions import ConnectionClosed
-
-    # Its other half sees that it has gone, too.
-    with suppress(ConnectionClosed):
-        await browser.socket.send(bundle)
-
-
-def _told(picture: Picture) -> dict[str, Any]:
-    return {
-        "number": picture.number,
-        "t_us": picture.t_us,
-        "window_us": picture.window_us,
-        "regions": [
-            [one.id, *(round(v, 1) for v in (one.x_px, one.y_px, one.width_px, one.height_px))]
-            for one in picture.regions
-        ],
-    }
-
-
-def _bar(frame: Frame) -> dict[str, Any]:
-    """Where a bar's clusters are, and what they said last."""
-    points = [[round(x, 2), round(y, 2)] if x == x and y == y else None for x, y in frame.points_px.tolist()]
-    return {
-        "transmitter": frame.transmitter,
-        "link": frame.link,
-        "echo_of": frame.echo_of,
-        "x_px": round(frame.x_px, 2),
-        "y_px": round(frame.y_px, 2),
-        "points": points,
-        "symbols": frame.soft.symbols.tolist(),
-    }
-
-
-def _status(status: LiveStatus) -> dict[str, Any]:
-    return {
-        "t_us": status.t_us,
-        "elapsed_s": round(status.elapsed_s, 3),
-        "events": status.events,
-        "events_per_s": round(status.events_per_s),
-        "waiting_ms": round(status.waiting_ms, 3),
-        "level": status.level,
-        "level_text": status.level_text,
-        "shed": dict(status.shed),
-        "delays": {stage: dict(told) for stage, told in status.delays.items()},
-        "recent": {stage: dict(told) for stage, told in status.recent.items()},
-        "counts": dict(status.counts),
-        "losses": {kind: asdict(loss) for kind, loss in status.losses.items()},
-    }
-
-
-def _rounded(late_ms: float | None) -> float | None:
-    return None if late_ms is None else round(late_ms, 3)
 
 
 def page(name: str) -> str:

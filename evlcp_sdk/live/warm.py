@@ -23,6 +23,8 @@ def warm_up(links: Sequence[Link]) -> None:
             first_us = int(events.t_us[0]) if first_us is None else first_us
             pictures.ask()
             pictures.add(events, camera.width, camera.height, receiver.regions)
+            if pictures.newest is not None:
+                pictures.newest.image().png()
             receiver.feed(events)
             if int(events.t_us[0]) > first_us + _WARM_US:
                 break

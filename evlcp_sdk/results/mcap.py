@@ -17,7 +17,7 @@ from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.lines import frame_line
-from evlcp_sdk.results.picture import png
+from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.text import integrity
 from evlcp_sdk.scene.attitude import Attitude
@@ -65,7 +65,7 @@ class Mcap(Sink):
         self._writer.start(library="evlcp-sdk")
         self._channels: dict[str, int] = {}
         camera = run.link.camera
-        self._cells = np.zeros((camera.height, camera.width), np.uint8)
+        self._image = EventImage(camera.width, camera.height)
         self._picture: int | None = None
         self._turn: int | None = None
         self._regions: dict[int, Region] = {}
@@ -74,18 +74,15 @@ class Mcap(Sink):
     def events(self, events: Events) -> None:
         """Draw them, and write the pictures that are complete."""
         number, phase_us = np.divmod(events.t_us, _PICTURE_US)
-        height, width = self._cells.shape
-        shown = (phase_us >= _PICTURE_US - _WINDOW_US) & (events.x < width) & (events.y < height)
-        number, x, y, p = number[shown], events.x[shown], events.y[shown], events.p[shown]
+        shown = phase_us >= _PICTURE_US - _WINDOW_US
+        number, events = number[shown], events[shown]
         if not len(number):
             return
         for first, last in pairwise([0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(number)]):
             if self._picture != number[first]:
                 self._write_picture()
                 self._picture = int(number[first])
-            for polarity, bit in ((0, 1), (1, 2)):
-                mine = slice(first, last), p[first:last] == polarity
-                self._cells[y[mine[0]][mine[1]], x[mine[0]][mine[1]]] |= bit
+            self._image.paint(events[first:last])
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
@@ -164,10 +161,10 @@ class Mcap(Sink):
         if self._picture is None:
             return
         end_us = (self._picture + 1) * _PICTURE_US
-        image = CompressedImage(frame_id=CAMERA_ID, data=png(self._cells), format="png")
+        image = CompressedImage(frame_id=CAMERA_ID, data=self._image.png(), format="png")
         image.timestamp.FromNanoseconds(self._at_ns(end_us))
         self._write("/image", end_us, image)
-        self._cells[:] = 0
+        self._image.clear()
         self._picture = None
 
     def _write_regions(self) -> None:

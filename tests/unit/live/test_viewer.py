@@ -28,7 +28,6 @@ from evlcp_sdk.live.recorder import Recorder
 from evlcp_sdk.live.services import Services, Serving
 from evlcp_sdk.live.viewer import page
 from evlcp_sdk.place.navigator import Place, Placed
-from evlcp_sdk.results.picture import png
 from evlcp_sdk.run import live
 from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.values import Events, Fix, Triggers
@@ -103,16 +102,6 @@ def unpacked(bundle: str | bytes) -> tuple[dict[str, Any], bytes]:
 def next_of(link: ClientConnection, timeout_s: float = 5.0) -> tuple[dict[str, Any], bytes]:
     link.send('{"next": true}')
     return unpacked(link.recv(timeout_s))
-
-
-@pytest.mark.parametrize("size", [(5, 4), (3, 7), (16, 1), (1, 2)])
-def test_png_is_read_back(size: tuple[int, int]) -> None:
-    cells = np.random.default_rng(1).integers(0, 4, size).astype(np.uint8)
-    with Image.open(io.BytesIO(png(cells))) as picture:
-        picture.load()
-        assert picture.mode == "P"
-        assert (np.array(picture) == cells).all()
-        assert picture.getpalette()[:12] == [16, 16, 20, 70, 150, 255, 255, 205, 70, 235, 235, 235]
 
 
 def test_the_page_needs_nothing_else_and_names_cannot_write_it() -> None:
@@ -413,6 +402,13 @@ def test_browsers_show_what_the_files_say(demo_raw: Path, tmp_path: Path) -> Non
         assert newest[6:] == last["symbols"].split()
         assert second.value("document.documentElement.scrollWidth") <= 390
         assert "complete" in second.value("document.getElementById('alarm').innerText")
+        assert second.value("[-0.004, -0.5, 0, 12.25, -0].map((v) => digits(v, 2))") == [
+            "0.00",
+            "-0.50",
+            "0.00",
+            "12.25",
+            "0.00",
+        ]
         faults = [m for b in (first, second) for m in b.heard if m["method"] == "Runtime.exceptionThrown"]
         assert not faults
         asked = [

@@ -1,0 +1,199 @@
+"""What browsers are told of a live run: results as values of JSON, pictures with what is drawn on them."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.live.loop import LiveStatus
+from evlcp_sdk.live.outlet import News, Outlet
+from evlcp_sdk.live.pictures import Picture, PictureSlot
+from evlcp_sdk.results.columns import frame_columns
+from evlcp_sdk.results.lines import fix_line, frame_line
+from evlcp_sdk.results.packets_jsonl import message_line
+from evlcp_sdk.results.picture import EventImage
+from evlcp_sdk.scene.sites import BarSite, LocalAxes
+from evlcp_sdk.values import Fix, Frame
+
+__all__ = ["MOST_WAITING", "Line", "Shot", "Teller"]
+
+Line = tuple[str, dict[str, Any]]
+"""A kind of news, or `bars`, and what is said of it, JSON values."""
+
+MOST_WAITING: Final = 4000
+"""Results that wait for a browser, some seconds of two bars; the oldest go."""
+_KINDS: Final = frozenset({"frame", "message", "fix", "status", "end"})
+_LATEST_US: Final = 500_000
+_MOST_BARS: Final = 64
+"""A bar is drawn as its newest frame shows it, for so long, and so many of them."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture as a browser gets it.
+
+    Attributes:
+        number: Counted from 0.
+        told: Its time and its regions, JSON values.
+        bars: Where the bars' clusters are in it, and what they said last, JSON values.
+        png: The events.
+    """
+
+    number: int
+    told: dict[str, Any]
+    bars: list[dict[str, Any]]
+    png: bytes
+
+
+class Teller:
+    """Says what a run finds, in the thread that asks.
+
+    Args:
+        outlet: Where results come from.
+        pictures: Where pictures come from.
+        links: The configurations by name, as `named_links` gives them.
+        sites: Where the bars stand, for the map.
+
+    Attributes:
+        dropped: Results that nobody had the time to tell, so far.
+        ended: Nothing more will come, and all is told.
+    """
+
+    def __init__(
+        self,
+        outlet: Outlet,
+        pictures: PictureSlot,
+        links: Mapping[str, Link],
+        sites: Sequence[BarSite] = (),
+    ) -> None:
+        self._outlet, self._pictures = outlet, pictures
+        self._columns = frame_columns(filtered=False, links=len(links) > 1)
+        self._sites = tuple(sites)
+        self._sites_told = not sites
+        self._bars: dict[int, Frame] = {}
+        self._shot: Shot | None = None
+        self._image: EventImage | None = None
+        self._mine = outlet.subscribe(_KINDS, most=MOST_WAITING)
+
+    @property
+    def dropped(self) -> int:
+        """Results that nobody had the time to tell, so far."""
+        return self._mine.dropped
+
+    @property
+    def ended(self) -> bool:
+        """Nothing more will come, and all is told."""
+        return self._mine.ended
+
+    def ask(self) -> None:
+        """Have a picture drawn."""
+        self._pictures.ask()
+
+    def leave(self) -> None:
+        """Listen no more."""
+        self._outlet.leave(self._mine)
+
+    def take(self, *, frames: bool) -> list[Line]:
+        """What has come since, oldest first; without lines of frames where nobody looks on."""
+        lines: list[Line] = []
+        for news in self._mine.take(0):
+            if news.kind == "frame":
+                self._keep(news.value)
+                if frames:
+                    line = frame_line(news.value, self._columns)
+                    line["late_ms"] = None if news.late_ms is None else round(news.late_ms, 3)
+                    lines.append(("frame", line))
+            else:
+                lines += self._told(news)
+        return lines
+
+    def shot(self) -> Shot | None:
+        """The newest picture; the same again until there is another."""
+        picture = self._pictures.newest
+        if picture is not None and (self._shot is None or self._shot.number != picture.number):
+            latest = [_bar(one) for one in self._bars.values() if one.t_us > picture.t_us - _LATEST_US]
+            self._image = picture.image(self._image)
+            self._shot = Shot(picture.number, _told(picture), latest, self._image.png())
+        return self._shot
+
+    def _keep(self, frame: Frame) -> None:
+        self._bars[frame.transmitter] = frame
+        if len(self._bars) > _MOST_BARS:
+            del self._bars[min(self._bars, key=lambda number: self._bars[number].t_us)]
+
+    def _told(self, news: News) -> list[Line]:
+        kind, value = news.kind, news.value
+        if kind == "message":
+            return [(kind, {"line": kind} | json.loads(message_line(value)))]
+        if kind == "status":
+            return [(kind, {"line": kind} | _status(value))]
+        if kind == "end":
+            return [(kind, {"line": kind} | {key: value.get(key) for key in ("status", "error", "result")})]
+        fix, place = value.fix, value.filtered
+        if place is None:
+            return [(kind, fix_line(fix))]
+        on_the_map = {
+            "enu_m": [round(v, 3) for v in fix.enu_m.tolist()],
+            "covariance_m2": [float(f"{v:.4g}") for v in fix.covariance_m2[:2, :2].ravel().tolist()],
+            "track_m": [round(v, 3) for v in place.enu_m.tolist()],
+            "starts": place.starts,
+            "speed_m_s": None if place.starts else round(place.speed_m_s, 2),
+        }
+        return [*self._bars_of(fix), (kind, fix_line(fix) | on_the_map)]
+
+    def _bars_of(self, fix: Fix) -> list[Line]:
+        """The bars in local metres, with the first fix that is given."""
+        if self._sites_told:
+            return []
+        self._sites_told = True
+        # The axes of a fix turn by 0.009 degrees a kilometre: nothing on a map.
+        here = LocalAxes(fix.latitude_deg, fix.longitude_deg, fix.height_m)
+        bars = []
+        for one in self._sites:
+            place = here.to_enu(one.latitude_deg, one.longitude_deg, one.height_m) + fix.enu_m
+            bars.append([one.transmitter_id, *(round(v, 3) for v in place.tolist())])
+        return [("bars", {"line": "bars", "bars": bars})]
+
+
+def _told(picture: Picture) -> dict[str, Any]:
+    return {
+        "number": picture.number,
+        "t_us": picture.t_us,
+        "window_us": picture.window_us,
+        "regions": [
+            [one.id, *(round(v, 1) for v in (one.x_px, one.y_px, one.width_px, one.height_px))]
+            for one in picture.regions
+        ],
+    }
+
+
+def _bar(frame: Frame) -> dict[str, Any]:
+    """Where a bar's clusters are, and what they said last."""
+    points = frame.points_px.round(2).tolist()
+    return {
+        "transmitter": frame.transmitter,
+        "link": frame.link,
+        "echo_of": frame.echo_of,
+        "x_px": round(frame.x_px, 2),
+        "y_px": round(frame.y_px, 2),
+        "points": [[x, y] if x == x and y == y else None for x, y in points],
+        "symbols": frame.soft.symbols.tolist(),
+    }
+
+
+def _status(status: LiveStatus) -> dict[str, Any]:
+    return {
+        "t_us": status.t_us,
+        "elapsed_s": round(status.elapsed_s, 3),
+        "events": status.events,
+        "events_per_s": round(status.events_per_s),
+        "waiting_ms": round(status.waiting_ms, 3),
+        "level": status.level,
+        "level_text": status.level_text,
+        "shed": dict(status.shed),
+        "delays": {stage: dict(told) for stage, told in status.delays.items()},
+        "recent": {stage: dict(told) for stage, told in status.recent.items()},
+        "counts": dict(status.counts),
+        "losses": {kind: asdict(loss) for kind, loss in status.losses.items()},
+    }
