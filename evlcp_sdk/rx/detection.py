@@ -98,6 +98,7 @@ class Followed:
         size_px: (width, height) of the whole bar, by what its frames show, px; None before the first.
         lit_px: Upper and lower edge, from the bar's centre, of the part that its newest frame showed, px;
             None where it showed both ends.
+        shown_us: When its newest frame showed its place, us; None before the first.
         outgrown: The region before that, which may have held other bars: (right, down) of its centre from
             this one's, width and height, px, and until when that matters, us.
         released: True once it has faded or was merged into another; it gets no more events.
@@ -115,6 +116,7 @@ class Followed:
     heights: deque[float] = field(default_factory=lambda: deque(maxlen=_HEIGHTS))
     size_px: tuple[float, float] | None = None
     lit_px: tuple[float, float] | None = None
+    shown_us: float | None = None
     outgrown: tuple[float, float, float, float, float] | None = None
     opened_us: int = 0
     cut_us: int | None = None
@@ -241,7 +243,8 @@ class RegionFollower:
         rises = self._rhythm.step(start_us, events, self._hits, _CELL_SHIFT)
         end_us = start_us + spec.step_us
         boxes = self._boxes(start_us + spec.step_us / 2, taken)
-        for followed, box, inside in zip(self.alive, boxes, self._select(events, boxes), strict=True):
+        selected = self._select(events, boxes)
+        for followed, box, inside in zip(self.alive, self._own(boxes), selected, strict=True):
             followed.add(start_us, inside)
             rows = np.empty(box[3] - box[1], np.int64)
             width_px = followed.size_px[0] if followed.size_px else math.inf
@@ -282,12 +285,12 @@ class RegionFollower:
         late = 2 * (until_us - start_us) >= self._spec.step_us
         boxes = self._boxes(start_us + self._spec.step_us / 2, ())
         seen_us = until_us - self._age_us
-        for followed, box in zip(self.alive, boxes, strict=True):
+        for followed, box, own in zip(self.alive, boxes, self._own(boxes), strict=True):
             if followed.id not in meant:
                 continue
             followed.add(start_us, select(events, box))
             # Nearer to the place before it, another says little of where the region goes.
-            if late and (place := self._glance(followed, box, until_us)):
+            if late and (place := self._glance(followed, own, until_us)):
                 followed.positions.append(place)
         self._recent.append((start_us, events))
         yield
@@ -323,6 +326,20 @@ class RegionFollower:
         known += [_tight(*place) for place, one in zip(places, self.alive, strict=True) if one.size_px]
         return [
             box if followed.size_px else _clear(box, known)
+            for followed, box in zip(self.alive, boxes, strict=True)
+        ]
+
+    def _own(self, boxes: list[Box]) -> list[Box]:
+        """What of each box shows where its region is: the seam without other bars of known size.
+
+        Rows of a bar below would be as good as its own, so that a region would move on to them.
+        """
+        seam = self._spec.margin_px
+        bars = [_grown(box, -seam) for box, one in zip(boxes, self.alive, strict=True) if one.size_px]
+        if len(bars) < 2:
+            return boxes
+        return [
+            _cut_off(box, _grown(box, -seam), bars) if followed.size_px else box
             for followed, box in zip(self.alive, boxes, strict=True)
         ]
 
@@ -399,7 +416,7 @@ class RegionFollower:
         """
         x, y = followed.positions.place_at(t_us)
         off = centre_px[0] - x, centre_px[1] - y
-        known = followed.size_px
+        known, before_us, followed.shown_us = followed.size_px, followed.shown_us, t_us
         off_px = math.inf
         if known is None:
             followed.heights.clear()
@@ -415,7 +432,12 @@ class RegionFollower:
         # Where less of the bar was seen, or more than it, its place is not that of what was seen.
         most_px = 2 * self._spec.margin_px if known is None else math.inf
         followed.positions = followed.positions.moved(
-            followed.id, *off, size_px, row_px=centre_px[1], most_px=most_px
+            followed.id,
+            *off,
+            size_px,
+            row_px=centre_px[1],
+            most_px=most_px,
+            grown_us=None if known is None or before_us is None else (before_us, t_us),
         )
         followed.filter = self._position.init() if self._position else None
         return off_px
@@ -726,6 +748,31 @@ def _clear(box: Box, others: list[Box]) -> Box:
             if box[0] >= box[2] or box[1] >= box[3]:
                 return u, v, u, v
     return box
+
+
+def _cut_off(box: Box, bar: Box, others: list[Box]) -> Box:
+    """A box around a bar without what belongs to others beside, above or below it.
+
+    Where they seem to overlap, one of them is not where it should be, as two bars do not stand in one place;
+    one that reaches over the middle is one in another column or row, which cuts nothing off.
+    """
+    left, top, right, bottom = box
+    for other in others:
+        if other == bar or not _overlap(box, other):
+            continue
+        beside = max(other[0] - bar[2], bar[0] - other[2]), (bar[2] - bar[0]) / 2
+        below = max(other[1] - bar[3], bar[1] - other[3]), (bar[3] - bar[1]) / 2
+        if below[0] >= beside[0] and -below[0] < below[1]:
+            if other[1] > bar[1]:
+                bottom = min(bottom, other[1])
+            else:
+                top = max(top, other[3])
+        elif beside[0] > below[0] and -beside[0] < beside[1]:
+            if other[0] > bar[0]:
+                right = min(right, other[0])
+            else:
+                left = max(left, other[2])
+    return left, top, right, bottom
 
 
 def _outgrown(followed: Followed) -> tuple[float, float, float, float]:

@@ -42,7 +42,7 @@ as ten steps, and other transmitters would wait."""
 
 _LOOKS = 3
 """Looks at a region's first frame: at what was found of a bar, at the whole of it, and once more, as few
-clusters place it less well than all."""
+clusters place it less well than all. Looks at another one whose region had strayed, too."""
 
 _DARK = 0.25
 """Share of a pilot's events below which a bar that was seen before is out of sight, or hidden."""
@@ -404,7 +404,8 @@ class PacketFraming:
             most_px = max(most_px, off_px)
             if off_px > 0 and not self._join(region, look.middle_us):
                 return None
-            if whole or off_px == 0:
+            # Within half of the seam, motion in the frame is known as well as by its next look.
+            if off_px == 0 or (whole and off_px <= self._seam_px / 2):
                 break
             self._regions.gather(region, due.start_us, due.end_us)
         if most_px > self._seam_px / 2:

@@ -86,11 +86,13 @@ class Places:
         *,
         row_px: float = 0.0,
         most_px: float = np.inf,
+        grown_us: tuple[float, float] | None = None,
     ) -> "Places":
         """The same elsewhere, all of one size, under a number.
 
         Where the height was off the new one by more than `most_px`, the middle may be off by half of what is
-        more: of those rows, the nearest to `row_px` is taken.
+        more: of those rows, the nearest to `row_px` is taken. Between the times `grown_us` they came to be so
+        far off little by little; before the first, they are right.
         """
         other = object.__new__(Places)
         held = self._held()
@@ -98,8 +100,11 @@ class Places:
         other._columns = columns = np.empty((5, max(2 * many, _ROOM)))
         other._first, other._end = 0, many
         columns[0, :many] = held[0]
-        columns[1, :many] = held[1] + right_px
-        columns[2, :many] = held[2] + down_px
+        share = np.ones(many)
+        if grown_us is not None and grown_us[1] > grown_us[0]:
+            share = np.clip((held[0] - grown_us[0]) / (grown_us[1] - grown_us[0]), 0.0, 1.0)
+        columns[1, :many] = held[1] + share * right_px
+        columns[2, :many] = held[2] + share * down_px
         if most_px < np.inf:
             slack_px = np.maximum(np.abs(held[4] - size_px[1]) - most_px, 0.0) / 2
             off_px = row_px - columns[2, :many]

@@ -10,7 +10,7 @@ import pytest
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import RegionSpec
-from evlcp_sdk.rx.detection import Followed, RegionFollower, _clear
+from evlcp_sdk.rx.detection import Followed, RegionFollower, _clear, _cut_off
 from evlcp_sdk.rx.places import Places
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.camera import CameraModel
@@ -395,6 +395,56 @@ def test_what_frames_have_shown_to_be_two_stays_two() -> None:
     assert whole.id in now
     assert len(now) == 2
     assert [round(one.latest.y_px) for one in regions.alive] == pytest.approx([488, 350], abs=2)
+
+
+def test_a_region_does_not_go_on_to_the_bar_below() -> None:
+    """Four dark rows are between them, and the region seems to move there by 7 px a step."""
+    bar = IdealBar(random_symbols(LINK, 2), start_us=0)
+    below = replace(bar, y_px=bar.y_px + 132)
+    size = (4.0, 128.0)
+    regions = RegionFollower(SPEC, CameraModel(), LINK.packet.chip_us)
+    events = merged(ideal_events(LINK, bar), ideal_events(LINK, below, seed=2))
+    for start, part in steps(events, 40_000):
+        regions.step(start, part)
+        if start == 10_000:
+            (own,) = regions.alive
+            t_us = own.latest.t_us
+            regions.shape(own, t_us, (bar.x_px - 0.5, bar.y_px - 0.5), size)
+            other = regions.beside(own, t_us, (below.x_px - 0.5, below.y_px - 0.5), size)
+            own.positions = Places(
+                replace(p, y_px=p.y_px + 7 * k) for k, p in enumerate(own.positions, 1 - len(own.positions))
+            )
+        elif start > 10_000:
+            assert own.latest.y_px == pytest.approx(bar.y_px - 0.5, abs=1)
+            assert other.latest.y_px == pytest.approx(below.y_px - 0.5, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("others", "left"),
+    [
+        ([], (0, 0, 30, 100)),
+        ([(5, 96, 25, 200)], (0, 0, 30, 96)),
+        ([(5, -90, 25, 3)], (0, 3, 30, 100)),
+        ([(27, 20, 50, 300)], (0, 0, 27, 100)),
+        ([(-9, 20, 4, 300), (5, 97, 25, 200)], (4, 0, 30, 97)),
+        # Where it strayed to; over the middle; beside it for all of its height; and out of reach.
+        ([(5, 80, 25, 200)], (0, 0, 30, 80)),
+        ([(5, 45, 25, 200)], (0, 0, 30, 100)),
+        ([(18, -60, 40, 200)], (0, 0, 18, 100)),
+        ([(5, 105, 25, 200)], (0, 0, 30, 100)),
+    ],
+)
+def test_what_other_bars_cut_off(others: list[tuple[int, int, int, int]], left: tuple[int, ...]) -> None:
+    """Of a box with a seam of 5 px around a bar."""
+    assert _cut_off((0, 0, 30, 100), (5, 5, 25, 95), others) == left
+
+
+def test_a_region_that_strayed_did_so_since_the_frame_before() -> None:
+    t_us = np.arange(6) * 1000.0
+    places = Places([Region(0, t, 10.0, 50.0, 4.0, 9.0) for t in t_us])
+    moved = list(places.moved(0, 2.0, -8.0, (4.0, 9.0), grown_us=(1000.0, 3000.0)))
+    assert [p.x_px for p in moved] == [10, 10, 11, 12, 12, 12]
+    assert [p.y_px for p in moved] == [50, 50, 46, 42, 42, 42]
 
 
 def test_of_two_regions_that_follow_the_same_the_older_stays() -> None:
