@@ -1,4 +1,4 @@
-"""What browsers are told of a live run: results as values of JSON, pictures with what is drawn on them."""
+"""What browsers are told of a live run: results as lines of JSON, pictures with what is drawn on them."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ from evlcp_sdk.live.loop import LiveStatus
 from evlcp_sdk.live.outlet import News, Outlet
 from evlcp_sdk.live.pictures import Picture, PictureSlot
 from evlcp_sdk.results.columns import frame_columns
-from evlcp_sdk.results.lines import fix_line, frame_line
+from evlcp_sdk.results.lines import fix_line, frame_text
 from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
@@ -18,8 +18,8 @@ from evlcp_sdk.values import Fix, Frame
 
 __all__ = ["MOST_WAITING", "Line", "Shot", "Teller"]
 
-Line = tuple[str, dict[str, Any]]
-"""A kind of news, or `bars`, and what is said of it, JSON values."""
+Line = tuple[str, str]
+"""A kind of news, or `bars`, and what is said of it, JSON."""
 
 MOST_WAITING: Final = 4000
 """Results that wait for a browser, some seconds of two bars; the oldest go."""
@@ -101,11 +101,12 @@ class Teller:
             if news.kind == "frame":
                 self._keep(news.value)
                 if frames:
-                    line = frame_line(news.value, self._columns)
-                    line["late_ms"] = None if news.late_ms is None else round(news.late_ms, 3)
-                    lines.append(("frame", line))
+                    late = "null" if news.late_ms is None else f"{news.late_ms:.3f}"
+                    lines.append(
+                        ("frame", f'{frame_text(news.value, self._columns)[:-1]}, "late_ms": {late}}}')
+                    )
             else:
-                lines += self._told(news)
+                lines += ((kind, json.dumps(values)) for kind, values in self._told(news))
         return lines
 
     def shot(self) -> Shot | None:
@@ -122,7 +123,7 @@ class Teller:
         if len(self._bars) > _MOST_BARS:
             del self._bars[min(self._bars, key=lambda number: self._bars[number].t_us)]
 
-    def _told(self, news: News) -> list[Line]:
+    def _told(self, news: News) -> list[tuple[str, dict[str, Any]]]:
         kind, value = news.kind, news.value
         if kind == "message":
             return [(kind, {"line": kind} | json.loads(message_line(value)))]
@@ -142,7 +143,7 @@ class Teller:
         }
         return [*self._bars_of(fix), (kind, fix_line(fix) | on_the_map)]
 
-    def _bars_of(self, fix: Fix) -> list[Line]:
+    def _bars_of(self, fix: Fix) -> list[tuple[str, dict[str, Any]]]:
         """The bars in local metres, with the first fix that is given."""
         if self._sites_told:
             return []

@@ -49,19 +49,19 @@ class _Browser:
 
     Attributes:
         socket: Its connection.
-        waiting: Results that it has not been sent, as JSON values, the newest.
+        waiting: Results that it has not been sent, as JSON, the newest.
         dropped: How many of them were pushed out.
         ready: It has shown what it was sent.
         picture: Number of the picture that it has.
     """
 
     socket: "ServerConnection"
-    waiting: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=MOST_WAITING))
+    waiting: deque[str] = field(default_factory=lambda: deque(maxlen=MOST_WAITING))
     dropped: int = 0
     ready: bool = False
     picture: int = -1
 
-    def put(self, line: dict[str, Any]) -> None:
+    def put(self, line: str) -> None:
         """Have something sent; of a queue that is full the oldest goes."""
         self.dropped += len(self.waiting) == self.waiting.maxlen
         self.waiting.append(line)
@@ -138,8 +138,8 @@ class Viewer:
         self._host, self.port = host, port
         self._token = secrets.token_urlsafe(16)
         self._browsers: set[_Browser] = set()
-        self._kept = {kind: deque[dict[str, Any]](maxlen=most) for kind, most in _KEPT.items()}
-        self._last: dict[str, dict[str, Any]] = {}
+        self._kept = {kind: deque[str](maxlen=most) for kind, most in _KEPT.items()}
+        self._last: dict[str, str] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._pump: asyncio.Task[None] | None = None
         self._body = b""
@@ -333,7 +333,7 @@ class Viewer:
 
     # What browsers are sent
 
-    def _tell(self, kind: str, line: dict[str, Any]) -> None:
+    def _tell(self, kind: str, line: str) -> None:
         """Send something to all browsers, and keep what later ones are sent."""
         if kind in self._kept:
             self._kept[kind].append(line)
@@ -356,7 +356,6 @@ class Viewer:
             if not (new or browser.waiting):
                 continue
             head: dict[str, Any] = {
-                "news": list(browser.waiting),
                 "dropped": browser.dropped + self._feed.dropped,
                 "picture": None,
                 "bars": None,
@@ -366,7 +365,7 @@ class Viewer:
             if shot is not None and new:
                 browser.picture, data = shot.number, shot.png
                 head |= {"picture": shot.told, "bars": shot.bars}
-            text = json.dumps(head).encode()
+            text = f'{{"news": [{", ".join(browser.waiting)}], {json.dumps(head)[1:]}'.encode()
             browser.waiting.clear()
             browser.ready = False
             # It waits for nothing: of one that does not read there is no second bundle under way.

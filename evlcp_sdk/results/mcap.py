@@ -16,7 +16,7 @@ from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.lines import frame_line
+from evlcp_sdk.results.lines import frame_text
 from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.text import integrity
@@ -98,7 +98,7 @@ class Mcap(Sink):
     def packet(self, packet: Packet) -> None:
         """Write its frames."""
         for frame in packet.frames:
-            self._write_json("/frames", frame.t_us, frame_line(frame))
+            self._write_json("/frames", frame.t_us, frame_text(frame))
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write a fix that is given, and the filtered place at its time."""
@@ -225,11 +225,11 @@ class Mcap(Sink):
             self._channels[topic] = self._writer.register_channel(topic, "protobuf", schema)
         self._add(topic, t_us, message.SerializeToString())
 
-    def _write_json(self, topic: str, t_us: float, values: dict[str, Any]) -> None:
+    def _write_json(self, topic: str, t_us: float, text: str) -> None:
         if topic not in self._channels:
             schema = self._writer.register_schema("evlcp.Frame", "jsonschema", json.dumps(_FRAME).encode())
             self._channels[topic] = self._writer.register_channel(topic, "json", schema)
-        self._add(topic, t_us, json.dumps(values).encode())
+        self._add(topic, t_us, text.encode())
 
     def _add(self, topic: str, t_us: float, data: bytes) -> None:
         log_ns = self._at_ns(t_us)

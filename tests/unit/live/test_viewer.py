@@ -61,7 +61,7 @@ class Stage:
         return self.services.view.port
 
     def connect(self, **given: Any) -> ClientConnection:
-        return connect(self.url.replace("http", "ws") + "live", compression=None, **given)
+        return connect(self.url.replace("http", "ws") + "live", compression=None, max_size=None, **given)
 
     def ask(self, path: str, **headers: str) -> tuple[int, dict[str, str], str]:
         link = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
