@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError, InputError, UnpluggedError
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source, open_writer
-from evlcp_sdk.io.open import STDIN
+from evlcp_sdk.io.open import STDIN, is_recording
 from evlcp_sdk.io.patience import open_until, pieces_until
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
@@ -347,7 +347,8 @@ def live(
         outlet: Where listeners subscribe; None for nobody. It is closed at the end.
         pictures: Where pictures of events are drawn when they are asked for; None for none.
         budget: When what is left out.
-        warm: Load all kernels before the source is opened: nothing waits for one later.
+        warm: Load all kernels before the first event, and before a source that does not wait is opened:
+            nothing waits for one later.
         stopped: Ends the run.
 
     Returns:
@@ -361,16 +362,20 @@ def live(
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
     outlet = Outlet() if outlet is None else outlet
-    if warm:
-        warm_up(links)
     url = str(source.path if isinstance(source, EventSource) else source)
     try:
+        # A recording waits for its reader, and what is wrong with its name is said at once.
+        waits = not isinstance(source, EventSource) and is_recording(source)
+        if warm and not waits:
+            warm_up(links)
         opened = open_until(source, registry, stopped)
         if not opened.live and opened.size_bytes is not None:
             opened = ReplaySource(opened)
         with opened:
             url = str(opened.path) if url == STDIN else url
             check_sensor(opened, url, links[0].camera)
+            if warm and waits:
+                warm_up(links)
             name = Path(url).name
             kept: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock_zero}
             loop: LiveLoop

@@ -24,7 +24,7 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["STDIN", "open_source", "open_writer", "read_events", "write_events"]
+__all__ = ["STDIN", "is_recording", "open_source", "open_writer", "read_events", "write_events"]
 
 WRITABLE: Final = {".raw": "EVT3", ".mcap": "BAG", ".npz": "NPZ", ".csv": "CSV", ".csv.gz": "CSV"}
 
@@ -35,6 +35,13 @@ OWN: Final = ("file", "replay", "bag", "hdf5", "list", "camera", *SCHEMES)
 """Schemes that are opened without a plugin."""
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
+
+
+def is_recording(url: Path | str) -> bool:
+    """Whether a name is that of a recording, by what stands before its `:`."""
+    scheme = _SCHEME.match(str(url))
+    recorded = scheme is not None and scheme[1].lower() in ("file", "replay", "bag", "hdf5", "list")
+    return str(url) != STDIN and (scheme is None or is_there(url) or recorded)
 
 
 def open_source(url: Path | str, registry: Registry | None = None) -> EventSource:

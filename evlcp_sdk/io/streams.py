@@ -167,13 +167,13 @@ def _address(url: str) -> tuple[str, int]:
     """Host and port of a URL.
 
     Raises:
-        InputError: There is no port in it.
+        InputError: There is no port in it, or 0, which nobody could send to.
     """
     parts = urlsplit(url)
     try:
         port = parts.port
     except ValueError:
         port = None
-    if port is None or not url.partition(":")[2].startswith("//") or parts.path not in ("", "/"):
+    if not port or not url.partition(":")[2].startswith("//") or parts.path not in ("", "/"):
         raise InputError(f"{url}: expected {parts.scheme}://HOST:PORT")
     return parts.hostname or "", port

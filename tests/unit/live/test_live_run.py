@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -12,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evlcp_sdk import run
 from evlcp_sdk.cli._summary import show
 from evlcp_sdk.cli.live import going_text
 from evlcp_sdk.errors import ConfigError, InputError
@@ -25,6 +28,7 @@ from evlcp_sdk.testing.recordings import IdealBar, ideal_events
 from evlcp_sdk.utc import PulseClock
 from evlcp_sdk.values import Events, Frame, Triggers
 
+SHARED = Path(__file__).parents[4] / "shared" / "recordings"
 PATIENT = Budget(waiting_ms=1e6, most_ms=1e7)
 
 
@@ -270,3 +274,39 @@ def test_what_the_page_is_asked_for_needs_a_page(evlcp: Callable[..., Any], demo
 def test_a_replay_that_is_open_is_taken_as_it_is(demo_raw: Path) -> None:
     summary = live(ReplaySource(RawSource(demo_raw), speed=100), budget=PATIENT, warm=False)
     assert summary["status"] == "complete"
+
+
+_WARMED = """
+import sys
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.live.warm import warm_up
+from evlcp_sdk.run import live
+
+def loaded():
+    kernels = [m for name, m in sys.modules.items() if name.endswith("_kernels")]
+    return {f"{m.__name__}.{name}": len(k.overloads) for m in kernels for name, k in vars(m).items()
+            if hasattr(k, "overloads")}
+
+warm_up([load_link()])
+before = loaded()
+live(sys.argv[1], None, load_link(), warm=False)
+print(sorted(name for name, many in loaded().items() if many != before.get(name, 0)))
+"""
+
+
+@pytest.mark.parametrize("name", ["two-bars-60m-75m", "night-50m-30kmh"])
+def test_all_kernels_are_loaded_before_the_first_event(name: str) -> None:
+    """Where they are not kept yet, one that is compiled while events come costs seconds of them."""
+    recording = SHARED / f"{name}.raw"
+    if not recording.exists():
+        pytest.skip("needs ../shared")
+    given = [sys.executable, "-c", _WARMED, f"replay:{recording}"]
+    found = subprocess.run(given, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+
+
+def test_a_wrong_name_is_said_before_kernels_are_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "warm_up", lambda _: pytest.fail("kernels are loaded for nothing"))
+    for name in ("nothing.raw", "replay:nothing.raw", "bag:nothing", "hdf5:nothing.hdf5"):
+        with pytest.raises(InputError, match="No such file"):
+            live(name)
