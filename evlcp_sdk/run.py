@@ -515,6 +515,7 @@ def _run(
             "duration_s": round(duration_s, 6),
             "events_per_s": round(read / duration_s) if duration_s else None,
             "counts": dict(source.counts),
+            "guessed": source.guessed,
         },
         processing={
             "processor_s": round(watch.processor_s, 6),

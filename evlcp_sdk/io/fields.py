@@ -60,6 +60,14 @@ class TimeUnit:
     why: str
     others: tuple[str, ...] = ()
 
+    @property
+    def guess(self) -> str:
+        """What was guessed, in words; empty where the unit is known."""
+        if not self.why.startswith("guessed"):
+            return ""
+        others = [unit for unit in self.others if unit != self.name]
+        return f"times in {self.name}, {self.why}" + (f"; {' or '.join(others)} would do" if others else "")
+
     def us(self, times: NDArray[Any]) -> NDArray[np.int64]:
         """Times in us, int64 (n,), rounded down.
 

@@ -149,6 +149,7 @@ class ListSource(EventSource):
                 "time": f"in {self._unit.name}, {self._unit.why}",
             }
             super().__init__(target, kind, header=header, size_bytes=size)
+            self.guessed = self._unit.guess
             self._stack = stack.pop_all()
 
     # -- readers, each an iterator of pieces

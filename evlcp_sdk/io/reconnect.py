@@ -45,6 +45,7 @@ class ReconnectingSource(EventSource):
         self._sleep = sleep
         self._source = source = opened()
         super().__init__(source.path, source.format, source.width, source.height, source.header)
+        self.guessed = source.guessed
         self.reconnects = 0
         self._closed = False
         self._lost: dict[str, Loss] = {}

@@ -82,6 +82,9 @@ class EventSource(ABC):
     live = False
     """Whether its time goes on by itself, as a camera's: what is not taken soon is late."""
 
+    guessed = ""
+    """What the recording does not say and was guessed, in words; empty for nothing."""
+
     _gives_bits = False
     """Whether a polarity is a single bit of what it reads, so that none can be wrong."""
 

@@ -44,6 +44,14 @@ packet; of three bars, one of another layout is still named."""
 _ASKEW_SHARE = 0.5
 """Of frames that contradict the attitude: fewer are one bar of several that is mounted askew."""
 
+_INVERTED_SHARE = 0.5
+"""Of frames that fit only a light that is on where the link says off: one link says one thing of all."""
+
+_ONE_SIGN_SHARE, _ONE_SIGN_EVENTS = 0.02, 100
+"""Events of the rarer sign, by their share of all, below which nothing is known of one half of the edges, and
+events from which on it is said. A light that goes on goes off again: cameras whose thresholds are unlike
+still give a tenth; noise alone may give a few of either."""
+
 _CRYSTALS_PPM = 200.0
 """Two crystals are this far apart at most, 100 ppm each."""
 
@@ -169,6 +177,7 @@ class Seen:
         readout: Events in each millisecond; None where they were not counted.
         losses: Events and words that the source could not use.
         others: Codewords of other modulations by id, uint8 (symbols, chips); asked where it matters.
+        guessed: What the recording does not say and was guessed; empty for nothing.
     """
 
     first_us: float = math.nan
@@ -177,6 +186,7 @@ class Seen:
     readout: ReadoutTally | None = None
     losses: int = 0
     others: Callable[[], Mapping[str, NDArray[np.uint8]]] = dict
+    guessed: str = ""
 
     @property
     def duration_us(self) -> float:
@@ -284,7 +294,7 @@ def notes_of(
     seen: Seen | None = None,
     reads_messages: bool = True,
 ) -> list[Doubt]:
-    """Plain statements: reflections, what there were no frames of, and that there were no messages.
+    """Plain statements: reflections, what was guessed, what there were no frames of, and of no messages.
 
     Args:
         tally: Figures of the transmitters.
@@ -303,6 +313,10 @@ def notes_of(
         if one.echoes and one.echo_of is not None
     ]
     seen = Seen() if seen is None else seen
+    if seen.guessed:
+        found.append(
+            Doubt("guessed", seen.guessed, "where it is wrong, list:PATH?columns=...&unit=... says it")
+        )
     if not tally.transmitters and counts.get("events", 0):
         found.append(
             Doubt("nothing-found", "no frame was read", "`evlcp diagnose` says what blinks, and what to try")
@@ -506,6 +520,8 @@ def _frames(counts: Mapping[str, int]) -> Iterator[Doubt]:
                 "compare air.chip_rate_hz and [framing] with the transmitter's; `evlcp diagnose` says what"
                 " blinks, and how fast",
             )
+    if frames := counts.get("frames", 0):
+        yield from _signs(counts, blinking, frames)
     rejected, frames = counts.get("frames_rejected", 0), counts.get("frames", 0)
     share = _REJECTED_BESIDE_READ_SHARE if _read(counts) > counts.get("blocks_failed", 0) else _REJECTED_SHARE
     if rejected >= _FEW_FRAMES and rejected > share * (frames + rejected):
@@ -529,6 +545,30 @@ def _frames(counts: Mapping[str, int]) -> Iterator[Doubt]:
             f"{askew} of {frames} frames show bars that do not stand plumb by the camera's attitude, which"
             " does not correct their distances",
             "check pitch and roll, their signs and their sigma",
+        )
+
+
+def _signs(counts: Mapping[str, int], events: int, frames: int) -> Iterator[Doubt]:
+    """Frames of a light that is the other way round than said, or of which one kind of edges is not seen."""
+    inverted = counts.get("frames_inverted", 0)
+    if inverted >= _FEW_FRAMES and inverted > _INVERTED_SHARE * frames:
+        yield Doubt(
+            "polarity",
+            f"{inverted} of {frames} frames fit only a light that is on where the link says off, and were"
+            " read so",
+            "compare framing.idle with the transmitter, and the polarities of a list: "
+            "list:PATH?inverted=1 turns them",
+        )
+    on = counts.get("events_in_regions_on")
+    if on is None or events < _ONE_SIGN_EVENTS:
+        return
+    if min(on, events - on) < _ONE_SIGN_SHARE * events:
+        sign, other = ("ON", "off") if 2 * on > events else ("OFF", "on")
+        yield Doubt(
+            "one-polarity",
+            f"{max(on, events - on)} of {events} events are {sign}: when the light goes {other} is not"
+            " seen, so that most of what it says may be read in several ways",
+            "give events of both polarities: see the list's column of polarity, or the camera's thresholds",
         )
 
 

@@ -165,6 +165,7 @@ class ResultWriter:
             lit_us,
             self._readout,
             sum(loss["count"] for loss in losses.values()),
+            guessed=str(recording.get("guessed", "")),
         )
         parts = {
             name: LinkPart(

@@ -24,6 +24,8 @@ from evlcp_sdk.values import Frame, Heard, Range, Region, SyncLock
 
 __all__ = ["HeardFraming"]
 
+_COUNTED = "events_in_regions", "events_in_regions_on", "regions_opened", "regions_released", "frames"
+
 _NO_RANGE = Range(math.nan, math.nan, 0)
 
 _LOOKBACK_FRAMES = 96
@@ -97,7 +99,7 @@ class HeardFraming:
         self._numbers = count() if numbers is None else numbers
         frames_us = _LOOKBACK_FRAMES * link.packet.info_chips * link.packet.chip_us
         self.patience_us = max(2 * link.packet.packet_chips * link.packet.chip_us, frames_us)
-        self.counts = dict.fromkeys(("events_in_regions", "regions_opened", "regions_released", "frames"), 0)
+        self.counts = dict.fromkeys(_COUNTED, 0)
         self.lit = LitTimes()
         self.ranging_every = 1
 
@@ -114,6 +116,7 @@ class HeardFraming:
                 self._listeners[region.id] = listener
             for start_us, events in pieces:
                 self.counts["events_in_regions"] += len(events)
+                self.counts["events_in_regions_on"] += int(events.p.sum(dtype=np.int64))
                 listener.events += len(events)
                 until_us = min(start_us + self._step_us, step.end_us)
                 with self._guard:

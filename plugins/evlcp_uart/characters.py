@@ -72,6 +72,23 @@ class Characters:
         wrong: NDArray[np.bool_] = _likelihoods(evidence, _contexts(other)).max(1, initial=-np.inf) > right
         return wrong
 
+    def framed(self, evidence: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How much likelier some character is than any bits, start, parity and stop bits free, float64 (n,).
+
+        In nats: where the light says it all, ln 2 for each of these bits.
+        """
+        many, bits, contexts = evidence.shape
+        states = np.full((many, contexts // 2), -np.inf)
+        states[:, -1] = 0.0
+        for bit in range(bits):
+            said = np.repeat(states, 2, 1) + evidence[:, bit]
+            # The oldest bit is forgotten.
+            states = np.logaddexp(said[:, : contexts // 2], said[:, contexts // 2 :])
+        any_bits = np.logaddexp.reduce(states, 1) - bits * np.log(2)
+        words = np.logaddexp.reduce(self.likelihoods(evidence), 1) - self.data_bits * np.log(2)
+        found: NDArray[np.float64] = words - any_bits
+        return found
+
     def soft(
         self, likelihoods: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]:

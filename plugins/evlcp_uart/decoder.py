@@ -59,6 +59,9 @@ each is to be likelier than without."""
 DOUBTFUL = 0.85
 """How sure the first characters are on the average, where they are fewer than that before a pause."""
 
+_INVERTED_BITS = 10.0
+"""How much more must speak for a light the other way round than said: one link of a thousand errs."""
+
 _TRIED, _ROUNDS = 4, 5
 """Guesses of the light that are followed, and how often each is learned anew."""
 
@@ -129,6 +132,7 @@ class CharacterState:
             "characters": 0,
             "characters_by_chance": 0,
             "characters_wrong_parity": 0,
+            "frames_inverted": 0,
             "stretches_without_light": 0,
         }
     )
@@ -280,6 +284,7 @@ class CharacterDecoder:
             given["characters"] += len(found)
             given["characters_by_chance"] += by_chance
             given["characters_wrong_parity"] += sum(c.wrong_parity for c in found)
+            given["frames_inverted"] += len(found) * light.inverted
             if len(ahead):
                 start = int(ahead[-1]) + round(self._length * light.rate) - _NEAR
                 dark = 0
@@ -467,9 +472,37 @@ class CharacterDecoder:
         return float(np.clip(light.rate + gain * (rate - light.rate), 1 - _CLOCK, 1 + _CLOCK))
 
     def _acquire(self, stretch: "Stretch") -> Light | None:
-        """Learn the light from a stretch of which nothing is known; None where it shows no characters."""
+        """Learn the light from a stretch of which nothing is known; None where it shows no characters.
+
+        The light is the other way round than said where its characters have their start, parity and stop bits
+        clearly more often so: only text of few kinds without a pause has them both ways.
+        """
+        told = self._best(stretch, self._learnt(stretch, inverted=False))
+        other = self._best(stretch, self._learnt(stretch, inverted=True))
+        if other is None or (told is not None and told[1] + _INVERTED_BITS >= other[1]):
+            return None if told is None else told[0]
+        return other[0] if told is not None or other[1] >= _INVERTED_BITS else None
+
+    def _best(
+        self, stretch: "Stretch", learned: list[tuple[Light, NDArray[np.int64]]]
+    ) -> tuple[Light, float] | None:
+        """The light that explains most, and how much speaks for its characters' fixed bits, bits."""
+        if not learned:
+            return None
+        # Beside one another only where an event counts the same.
+        least = min(light.share for light, _ in learned)
+        explained = [
+            self._explained(stretch, replace(light, most=least), starts) for light, starts in learned
+        ]
+        light, starts = learned[int(np.argmax(explained))]
+        evidence = self._evidence(stretch, light)[starts[:, None] + self._places(light)]
+        return light, float(self.characters.framed(evidence).sum() / np.log(2))
+
+    def _learnt(self, stretch: "Stretch", inverted: bool) -> list[tuple[Light, NDArray[np.int64]]]:
+        """What the light may be like, on for a mark as said or the other way round, and its characters."""
         tried = []
-        for light in guesses(stretch.counts, self.mark_on):
+        for light in guesses(stretch.counts, self.mark_on != inverted):
+            light = replace(light, inverted=inverted)
             starts = self._path(stretch, light, True)[0]
             tried.append((self._explained(stretch, light, starts), light))
         tried.sort(key=lambda one: -one[0])
@@ -484,12 +517,7 @@ class CharacterDecoder:
             starts, _, worth = self._path(stretch, light, False)
             if worth > 0 and self._told(stretch, light) > 0:
                 learned.append((light, starts))
-        # Beside one another only where an event counts the same.
-        least = min((light.share for light, _ in learned), default=0.0)
-        explained = [
-            self._explained(stretch, replace(light, most=least), starts) for light, starts in learned
-        ]
-        return learned[int(np.argmax(explained))][0] if learned else None
+        return learned
 
     def _told(self, stretch: "Stretch", light: Light) -> float:
         """How much of each half of a stretch the light explains that the other one teaches."""

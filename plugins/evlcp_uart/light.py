@@ -65,6 +65,7 @@ class Light:
         rate: Length of a bit against the nominal one.
         paused: Characters behind a pause, their ticks of pause in all, and characters.
         most: What an event counts at most.
+        inverted: It is on when it is said to be off, and off when on.
     """
 
     events: NDArray[np.float64]
@@ -73,6 +74,7 @@ class Light:
     rate: float = 1.0
     paused: tuple[float, float, float] = (0.0, 0.0, 0.0)
     most: float = _COUNTED
+    inverted: bool = False
 
     @property
     def learned(self) -> float:
@@ -189,6 +191,7 @@ class Light:
             memory * self.gains + gains.sum(0),
             rate,
             self.paused,
+            inverted=self.inverted,
         )
 
 

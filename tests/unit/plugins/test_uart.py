@@ -396,3 +396,95 @@ def test_text_is_given_as_it_is_read(tmp_path: Path, evlcp: Callable[..., Any]) 
     assert evlcp(*command).code == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert [one["code"] for one in summary["warnings"]] == ["bit-order"]
+
+
+@pytest.mark.parametrize(
+    ("data_bits", "parity", "stop_bits", "bit_hz"),
+    [(7, "even", 2, 3125.0), (8, "none", 1, 504.0), (5, "none", 2, 10_000.0)],
+)
+@pytest.mark.parametrize("mark_on", [True, False])
+def test_a_light_the_other_way_round_is_read_as_it_is(
+    data_bits: int, parity: Parity, stop_bits: int, bit_hz: float, mark_on: bool
+) -> None:
+    rng = np.random.default_rng(data_bits + mark_on)
+    sent = rng.integers(0, 1 << data_bits, 70)
+    bit_us = 1e6 / bit_hz
+    levels = levels_of(sent, data_bits, parity, stop_bits)
+    events = seen(rng, levels, bit_us, mark_on=mark_on, late_us=(40.0, 60.0), noise_hz=50.0)
+    for idle in ("on", "off"):
+        decoder = Uart(data_bits, parity, stop_bits, idle=idle).decoder(bit_hz)  # type: ignore[arg-type]
+        state, found = decoder.step(decoder.init(), events.t_us, events.p, int(events.t_us[-1]))
+        state, more = decoder.close(state)
+        assert [c.value for c in found + more] == sent.tolist()
+        assert state.given["frames_inverted"] == (len(sent) if (idle == "on") != mark_on else 0)
+
+
+def test_fixed_bits_speak_as_all_words_say() -> None:
+    """Against a sum over every row of eleven bits, of which some are characters."""
+    evidence = np.random.default_rng(1).normal(size=(3, 11, CONTEXTS))
+    rows = np.array(list(itertools.product((0, 1), repeat=11)))
+    known = np.pad(rows, ((0, 0), (BEFORE, 0)), constant_values=1)
+    contexts = sum(known[:, k : k + 11] << (BEFORE - k) for k in range(BEFORE + 1))
+    worth = np.exp(evidence[:, np.arange(11), contexts].sum(2))
+    fits = (rows[:, 0] == 0) & (rows[:, 1:9].sum(1) % 2 == 0) & rows[:, 9] & rows[:, 10]
+    expected = np.log(worth[:, fits.astype(bool)].mean(1) / worth.mean(1))
+    np.testing.assert_allclose(CHARACTERS.framed(evidence), expected, atol=1e-9)
+
+
+def test_text_that_fits_both_ways_is_read_as_the_link_says() -> None:
+    """Eight bits of ASCII without a pause: the last one is ever 0, as a start bit the other way round."""
+    sent = np.random.default_rng(5).integers(32, 127, 90)
+    events = seen(np.random.default_rng(6), levels_of(sent, 8, "none", 1), 320.0)
+    found = read_characters(events.t_us, events.p, 3125.0, Uart(8))
+    assert [c.value for c in found] == sent.tolist()
+
+
+def _write_list(path: Path, events: Events) -> None:
+    rows = "".join(f"{t},{p}\n" for t, p in zip(events.t_us.tolist(), events.p.tolist(), strict=True))
+    path.write_text("t,p\n" + rows)
+
+
+def test_what_a_list_has_wrong_is_said(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+    """Polarities that are turned, or of one kind alone; and what the list did not say."""
+    sent = np.random.default_rng(4).integers(0, 128, 120)
+    events = seen(np.random.default_rng(3), levels_of(sent, 7, "even", 2), 320.0)
+    (tmp_path / "uart.toml").write_text(
+        "\n".join(
+            [
+                "[bar]\nrows = 6\ncolumns = 1\ncluster_rows = 6\ncluster_columns = 1",
+                "[air]\nchip_rate_hz = 3125.0\nframes_per_packet = 40",
+                '[framing]\nid = "uart"\ndata_bits = 7\nparity = "even"\nstop_bits = 2',
+                '[detection]\nid = "whole"',
+            ]
+        )
+    )
+
+    def told(kept: Events, query: str = "") -> dict[str, Any]:
+        _write_list(tmp_path / "list.csv", kept)
+        url = f"list:{tmp_path}/list.csv{query}"
+        assert evlcp("receive", url, "-c", f"{tmp_path}/uart.toml", "-o", f"{tmp_path}/out").code == 0
+        summary: dict[str, Any] = json.loads((tmp_path / "out" / "summary.json").read_text())
+        return summary
+
+    turned = Events.of(events.t_us, events.x, events.y, 1 - events.p)
+    inverted = told(turned)
+    assert [one["code"] for one in inverted["warnings"]] == ["polarity"]
+    assert inverted["counts"]["frames_inverted"] == inverted["counts"]["frames"] == 120
+    assert "times in us, guessed" in next(n["text"] for n in inverted["notes"] if n["code"] == "guessed")
+    right = told(turned, "?inverted=1&unit=us")
+    assert right["warnings"] == []
+    assert "guessed" not in [one["code"] for one in right["notes"]]
+    assert right["recording"]["guessed"] == ""
+    (on,) = (one for one in told(events[events.p > 0])["warnings"] if one["code"] == "one-polarity")
+    assert "events are ON: when the light goes off is not seen" in on["text"]
+
+
+def test_characters_of_one_polarity_are_not_said_to_be_sure() -> None:
+    """Of rises alone a character has several readings: as many are wrong as quality says, to a fifth."""
+    sent = np.random.default_rng(4).integers(0, 128, 200)
+    events = seen(np.random.default_rng(3), levels_of(sent, 7, "even", 2), 320.0)
+    rises = events[events.p > 0]
+    found = read_characters(rises.t_us, rises.p, 3125.0, Uart(7, "even", 2))
+    begun = {round((c.t_us - 20_000) / (11 * 320)): c for c in found}
+    right = np.mean([k in begun and begun[k].value == value for k, value in enumerate(sent.tolist())])
+    assert np.mean([c.quality for c in found]) == pytest.approx(right, abs=0.2)
