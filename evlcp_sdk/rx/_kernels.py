@@ -25,15 +25,17 @@ CLOCK_AT = 15
 CLOCK_ROUND = 1 << 32 - CLOCK_AT
 """Ticks after which the clock of 17 bits goes round."""
 
-OTHER, AGAIN, MISSED = 0, 1, 2
-"""A time between rises is another than the one before, the same, or as if one of them missed rises."""
+OTHER, AGAIN, MISSED, LONG = 0, 1, 2, 3
+"""A time between rises: another than the one before; the same; as if one missed rises; the same, and long."""
 
 SCORES = (1 << TIME_AT) - 1
 
 _LOW = np.uint32((1 << CLOCK_AT) - 1)
 _HIGH = np.uint32((1 << 32) - (1 << CLOCK_AT))
 _PART = np.uint32((1 << SAME_AT) - 1)
-_SAMES = np.clip(np.add.outer([-6, 1, -2], np.arange(MOST_SAME + 1)), 0, MOST_SAME).astype(np.uint32).ravel()
+_SAMES = (
+    np.clip(np.add.outer([-6, 1, -2, 2], np.arange(MOST_SAME + 1)), 0, MOST_SAME).astype(np.uint32).ravel()
+)
 """How often the same time has come again, after what the newest was and how often it was before: by the
 logarithm of how much likelier that is of a lamp that misses one rise in ten than of the code of a cluster
 whose pilot repeats itself, in units of what a repetition says, a third."""

@@ -10,10 +10,11 @@ would bring. One after the very same number of chips as before lowers it by two 
 1 or 2 kHz repeats its period, a code with missing events does not.
 A lamp whose period is near two, three or four chips is in rhythm, too, as far as a score tells; but its time
 comes again and again, to half a chip, or twice or three times as long where it misses a rise, while a code
-changes to another soon. That is counted as a likelihood ratio: up by one a repetition, down by two where
-rises may have been missed, by six for another time. Pixels with some of that open no region, and with more,
-before a frame shows where the bar is, they are not listened to. Falls are not looked at: they come later or
-sooner than rises by the light, they are the first to go missing, and some cameras send none.
+changes to another soon. That is counted as a likelihood ratio: up by one a repetition, by two from four chips
+on, down by two where rises may have been missed, by six for another time. Pixels with some of that open no
+region, and with more, before a frame shows where the bar is, they are not listened to. Falls are not looked
+at: they come later or sooner than rises by the light, they are the first to go missing, and some cameras send
+none.
 
 A pixel that a bar has left keeps its score, as it hardly rises any more; but where the camera shakes, the
 veil around the bar comes nearer again, and all pixels of the trail rise once, with a chip. So a region is
@@ -52,11 +53,11 @@ _STRAY_CHIPS = 0.3
 _LONGEST_TICKS = 2**15
 """Of what is looked up by its length: a tick is 1 us but for chips slower than 190 a second."""
 
-_SAME, _LAMP = 7, 12
+_SAME, _LAMP = 7, 14
 """Repetitions of a time, less what speaks against a lamp, from which on a pixel opens no region, and from
 which on it is not listened to before a frame shows where the bar is. Pixels that see a random code are so
-for four per cent of the time by the first, which a bar can spare, as its other clusters open the region; and
-for .8 by the second, but for nine of the one pilot of sixteen that is two chips throughout. A lamp that
+for five per cent of the time by the first, which a bar can spare, as its other clusters open the region; and
+for one by the second, but for nine of the one pilot of sixteen that is two chips throughout. A lamp that
 misses one rise in ten is so by both for more than half of the time, one that misses none always. More
 repetitions would spare more of a code, and take longer to know a panel, which costs the frames before."""
 
@@ -70,6 +71,9 @@ _TIMES = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0, *map(float, range(5, 14)))
 """Times between rises that are told apart, by their kinds from 1 on, chips, the last with all beyond. Short
 ones by halves: where many pixels switch at once, the readout puts rises off by a quarter of a chip, and a
 period of 2.3 chips is now two and now three."""
+
+_LONG = 6
+"""Kinds from this one on, four chips, count twice where they are repeated: a code does so half as often."""
 
 _SHORT = 6
 """Kinds up to this one are next to each other where they differ by half a chip: the same time, maybe. Those
@@ -297,6 +301,7 @@ def _repeats() -> NDArray[np.int64]:
                 many * ends[shorter - 1] < ends[longer] and ends[longer - 1] < many * ends[shorter]
                 for many in (2, 3)
             )
-            what = _kernels.AGAIN if same else _kernels.MISSED if multiple else _kernels.OTHER
+            again = _kernels.LONG if shorter >= _LONG else _kernels.AGAIN
+            what = again if same else _kernels.MISSED if multiple else _kernels.OTHER
             said[shorter, longer] = said[longer, shorter] = what
     return said

@@ -38,7 +38,11 @@ def score_rises(events, shape, start, chip_us, min_score, cell_shift, most_same=
             max(many * ends[low - 1], ends[high - 1]) < min(many * ends[low], ends[high]) for many in (2, 3)
         )
         again = again and low > 0
-        same[v, u] = min(same[v, u] + 1, 31) if again else max(same[v, u] - (2 if missed else 6), 0)
+        same[v, u] = (
+            min(same[v, u] + (2 if low >= 6 else 1), 31)
+            if again
+            else max(same[v, u] - (2 if missed else 6), 0)
+        )
         rose[v, u], time[v, u] = t, number
         if score[v, u] >= min_score and number and same[v, u] < most_same:
             cell = v >> cell_shift, u >> cell_shift

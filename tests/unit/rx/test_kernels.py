@@ -252,7 +252,7 @@ def test_events_in_many_boxes_at_once(seed, many):
     rhythm = Rhythm(WIDTH, HEIGHT, CHIP_US, 20)
     rhythm._pixels[:] = pixels
     found = rhythm.select(events, boxes, filtered)
-    listened = ((score >= 20) & (same < 12))[events.y, events.x]
+    listened = ((score >= 20) & (same < 14))[events.y, events.x]
     assert len(found) == many
     for got, box, only in zip(found, boxes.tolist(), filtered, strict=True):
         want = twins.select_box(events[listened] if only else events, tuple(box))
