@@ -16,7 +16,7 @@ knowledge. A row:
 - silent: fixes given whose error is beyond the 99.73 % bound of their own covariance, of the same; with an
   exact covariance chance alone makes it .0027 of those given
 - beyond chance: silent fixes less those; its standard error is .001 at 2900 fixes
-- not covered: silent fixes that have no protection level, or are beyond it
+- not covered: silent fixes that have no protection level, and say so by an alarm, or are beyond it
 - left out: fixes given without a part that is named
 - protected: fixes with both protection levels; their medians; and the share beyond one of them
 
@@ -49,8 +49,14 @@ Floats = NDArray[np.float64]
 
 CAMERA = CameraModel()
 SPEC = PositionSpec()
-POINT_PX = math.hypot(0.05, SPEC.pixel_sigma_px)
+NOISE_PX = 0.05
+PIXEL_PX = 0.05
+POINT_PX = math.hypot(NOISE_PX, PIXEL_PX)
+"""Of a point: new with every fix, what stands until the image has moved, and both."""
 ALONG = (0.5 - (np.arange(16) + 0.5) / 16) * 0.96
+WRONG_FOCAL = 0.005
+"""By what share a focal length is wrong that is."""
+
 CHANCE = 0.0027
 """What is beyond it by chance. For .001, covariances are 16.27 / 14.16 times as large, and NEES is 2.6."""
 
@@ -109,7 +115,7 @@ def scene(world: World, rng: np.random.Generator) -> Scene:
         arm = stands - stands.mean(0)
         said = stands + rng.normal(0, place, 3) + np.cross(rng.normal(0, turn, 3), arm)
         said = said + rng.normal(0, math.hypot(length, SPEC.stretch_share)) * arm
-        views.append(BarView(number, said, points, np.full(16, POINT_PX), world.survey))
+        views.append(BarView(number, said, points, np.full(16, POINT_PX), world.survey, PIXEL_PX))
     off = rng.normal(0, world.attitude_deg, 3)
     known = world.attitude_deg
     told = {
@@ -140,7 +146,7 @@ def swapped(bars: Scene, _rng: np.random.Generator) -> None:
 
 def refocused(lens: Scene, rng: np.random.Generator) -> None:
     """The focal length is half a percent off."""
-    share = 1 + 0.005 * rng.choice([-1, 1])
+    share = 1 + WRONG_FOCAL * rng.choice([-1, 1])
     lens.camera = replace(lens.camera, focal_mm=lens.camera.focal_mm * share)
 
 
@@ -176,12 +182,13 @@ def askew(by: Off) -> Fault:
 
 
 def known_by_points(seen: Scene) -> Floats:
-    """Information of all points on the camera's place, m, and turn, radians, float64 (6, 6).
+    """Information of all points on the camera's place, m, and turn, radians, and on a share of its focal
+    length that is wrong, in `WRONG_FOCAL`: float64 (7, 7).
 
     Written out with every shared error as an unknown of sigma 1, which are then eliminated.
     """
     parts = []
-    shared = 1 + 9 * len(seen.views)
+    shared = 2 + 9 * len(seen.views)
     for b, view in enumerate(seen.views):
         points, slope = project_bars(view.enu_m, np.zeros(3), seen.rotation, seen.camera)
         weight = 1 / view.sigma_px[:, None, None]
@@ -190,10 +197,10 @@ def known_by_points(seen: Scene) -> Floats:
         place, turn, length = view.survey
         rows = np.zeros((len(points), 2, 6 + shared))
         rows[:, :, :6] = slope
-        rows[:, :, 6] = (
-            (points - np.array(seen.camera.centre_px)) * seen.sigma.focal_mm / seen.camera.focal_mm
-        )
-        own = rows[:, :, 7 + 9 * b : 16 + 9 * b]
+        away = points - np.array(seen.camera.centre_px)
+        rows[:, :, 6] = away * WRONG_FOCAL
+        rows[:, :, 7] = away * seen.sigma.focal_mm / seen.camera.focal_mm
+        own = rows[:, :, 8 + 9 * b : 17 + 9 * b]
         own[:, :, :2] = math.hypot(SPEC.shared_sigma_px, SPEC.shared_share * length_px) * np.eye(2)
         own[:, :, 2] = math.hypot(length, SPEC.stretch_share) * np.einsum("nij,nj->ni", by, arm)
         own[:, :, 3:6] = place * by
@@ -201,18 +208,24 @@ def known_by_points(seen: Scene) -> Floats:
         parts.append((rows * weight).reshape(-1, 6 + shared))
     rows = np.concatenate(parts)
     whole = rows.T @ rows
-    whole[6:, 6:] += np.eye(shared)
-    return np.asarray(whole[:6, :6] - whole[:6, 6:] @ np.linalg.solve(whole[6:, 6:], whole[6:, :6]))
+    whole[7:, 7:] += np.eye(shared - 1)
+    return np.asarray(whole[:7, :7] - whole[:7, 7:] @ np.linalg.solve(whole[7:, 7:], whole[7:, :7]))
 
 
-def floor(seen: Scene, off_deg: Floats, world: World, alarms: tuple[float, ...]) -> list[float]:
-    """Chances that no test finds an attitude that is off, and that the fix is silent, too: at least so much.
+def floor(seen: Scene, off_deg: Floats | None, world: World, alarms: tuple[float, ...]) -> list[float]:
+    """Chances that no test finds what is off, and that the fix is silent, too: at least so much.
 
-    Neyman and Pearson: of all tests with a chance of a false alarm, the one for the very angles, sign and
-    size that are off finds it most often. What an error does to the residuals is normal with a mean of `much`
+    Neyman and Pearson: of all tests with a chance of a false alarm, the one for the very part, sign and size
+    that are off finds it most often. What an error does to the residuals is normal with a mean of `much`
     sigmas, and independent of the position's error, which is off by `moved`. Both for each of `alarms`.
+
+    Args:
+        seen: What is seen, and said of the camera.
+        off_deg: By how much the angles are off; None: the focal length is, by `WRONG_FOCAL`.
+        world: What is known.
+        alarms: Chances of a false alarm.
     """
-    known = 3 if world.told == "heading" else 2
+    known = {"none": 0, "gravity": 2, "heading": 3}[world.told]
     step, by_turn = 1e-5, np.zeros((known, 6))
     for k, axis in enumerate(np.eye(3) * step):
         one, two = (
@@ -222,11 +235,17 @@ def floor(seen: Scene, off_deg: Floats, world: World, alarms: tuple[float, ...])
         change = [one.pitch_deg - two.pitch_deg, one.roll_deg - two.roll_deg]
         change.append(((one.heading_deg or 0) - (two.heading_deg or 0) + 180) % 360 - 180)
         by_turn[:, 3 + k] = np.radians(change)[:known] / (2 * step) / math.radians(world.attitude_deg)
-    off = off_deg[:known] / world.attitude_deg
-    spread = np.linalg.inv(known_by_points(seen) + by_turn.T @ by_turn)
-    follow = spread @ by_turn.T
-    much = math.sqrt(max(float(off @ (off - by_turn @ follow @ off)), 0.0))
-    moved = (follow @ off)[:3]
+    points = known_by_points(seen)
+    spread = np.linalg.inv(points[:6, :6] + by_turn.T @ by_turn)
+    if off_deg is None:
+        follow = spread @ points[:6, 6]
+        much = math.sqrt(max(float(points[6, 6] - points[6, :6] @ follow), 0.0))
+        moved = follow[:3]
+    else:
+        off = off_deg[:known] / world.attitude_deg
+        follow = spread @ by_turn.T
+        much = math.sqrt(max(float(off @ (off - by_turn @ follow @ off)), 0.0))
+        moved = (follow @ off)[:3]
     away = float(moved @ np.linalg.solve(spread[:3, :3], moved))
     beyond = 1 - float(special.chndtr(SILENT_NEES, 3, away))
     found = []
@@ -237,19 +256,19 @@ def floor(seen: Scene, off_deg: Floats, world: World, alarms: tuple[float, ...])
 
 
 def floors(fixes: int) -> None:
-    """Print what no test of an attitude that is off can be below, at the default false alarm and at 1 %."""
+    """Print what no test of what is off can be below, at the default false alarm and at 1 %."""
     print("| what | not found | silent | not found, 1 % false alarms | silent |")
     print("|---|---|---|---|---|")
-    for what, by in ATTITUDES.items():
+    for what, by in {REFOCUSED: None, **ATTITUDES}.items():
         for name, world in WORLDS.items():
-            if world.told == "none":
+            if by is not None and world.told == "none":
                 continue
             rng = np.random.default_rng(0)
             known = 3 if world.told == "heading" else 2
             found = []
             for _ in range(fixes):
                 seen = scene(world, rng)
-                off = by(known, rng)
+                off = None if by is None else by(known, rng)
                 found.append(floor(seen, off, world, (SPEC.false_alarm, 0.01)))
             texts = (f"{value:.2g}" for value in np.mean(found, 0))
             print(f"| {name}; {what} | " + " | ".join(texts) + " |", flush=True)
@@ -344,7 +363,7 @@ def drive(world: World, rng: np.random.Generator, spec: PositionSpec) -> tuple[l
         said = stands + rng.normal(0, place, 3) + np.cross(rng.normal(0, turn, 3), arm)
         said = said + rng.normal(0, math.hypot(length, spec.stretch_share)) * arm
         # What the place in a pixel makes of each point changes slowly.
-        bars.append((stands, said, rng.normal(0, spec.pixel_sigma_px, (16, 2))))
+        bars.append((stands, said, rng.normal(0, PIXEL_PX, (16, 2))))
     fade = math.exp(-STEP_S / spec.slow_s)
     ahead = np.array([math.sin(math.radians(heading)), math.cos(math.radians(heading)), 0.0])
     state = np.concatenate([np.zeros(3), SPEED_M_S * ahead])
@@ -354,14 +373,14 @@ def drive(world: World, rng: np.random.Generator, spec: PositionSpec) -> tuple[l
     for step in range(STEPS):
         views = []
         for number, (stands, said, slow) in enumerate(bars):
-            slow[:] = fade * slow + math.sqrt(1 - fade**2) * rng.normal(0, spec.pixel_sigma_px, (16, 2))
+            slow[:] = fade * slow + math.sqrt(1 - fade**2) * rng.normal(0, PIXEL_PX, (16, 2))
             points, _ = project_bars(stands, state[:3], rotation, true)
             length_px = float(np.linalg.norm(points[-1] - points[0])) * 16 / 15
-            points = points + slow + rng.normal(0, 0.05, points.shape)
+            points = points + slow + rng.normal(0, NOISE_PX, points.shape)
             points = points + rng.normal(
                 0, math.hypot(spec.shared_sigma_px, spec.shared_share * length_px), 2
             )
-            views.append(BarView(number, said, points, np.full(16, POINT_PX), world.survey))
+            views.append(BarView(number, said, points, np.full(16, POINT_PX), world.survey, PIXEL_PX))
         found = solve_pose(views, CAMERA, told, spec, sigma)
         if isinstance(found, Pose):
             fixes.append(
@@ -427,11 +446,12 @@ def speeds(fixes: int) -> None:
     print(f"| mean | {np.mean(times_ms):.3f} |")
 
 
+REFOCUSED = "focal length .5 % off"
 ATTITUDES: dict[str, Off] = {"attitude 1 degree off": turned, "attitude 10 ms late": late}
 FAULTS: dict[str, Fault] = {
     "bar .5 m off": moved,
     "sites swapped": swapped,
-    "focal length .5 % off": refocused,
+    REFOCUSED: refocused,
     **{what: askew(by) for what, by in ATTITUDES.items()},
 }
 

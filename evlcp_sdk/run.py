@@ -793,7 +793,7 @@ def _views(
             if number in stands_at:
                 site = stands_at[number]
                 enu = site.layout_positions_m(link.bar, axes)
-                bars.append(BarView(site.transmitter_id, enu, *found, site.survey))
+                bars.append(BarView(site.transmitter_id, enu, *found[:2], site.survey, found[2]))
         views.append(_view(pose, bars, axes))
     return views
 
@@ -809,8 +809,8 @@ def _view(pose: KnownPose, bars: Sequence[BarView], axes: LocalAxes) -> Calibrat
 
 def _seen_at(
     url: str, poses: Sequence[KnownPose], link: Link, registry: Registry, who: Whereabouts
-) -> list[dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]]]:
-    """Image points and their sigmas of each transmitter at the times of known poses."""
+) -> list[dict[int, tuple[NDArray[np.float64], NDArray[np.float64], float]]]:
+    """What `points_at` gives of each transmitter at the times of known poses."""
     clusters, spec = link.bar.clusters, link.position
     period_us = link.packet.packet_chips * link.packet.chip_us
     frames: dict[int, list[Frame]] = {}
@@ -877,7 +877,7 @@ def survey(
         ids = who.ids
         for pose, points in zip(mine, seen, strict=True):
             new = [(ids[n], found) for n, found in points.items() if n in ids and ids[n] not in listed]
-            bars = [BarView(number, np.empty((0, 3)), *found) for number, found in new]
+            bars = [BarView(number, np.empty((0, 3)), *found[:2], pixel_px=found[2]) for number, found in new]
             views.append(_view(pose, bars, axes))
     return survey_bars(views, axes, link.bar.length_m, link.camera, link.camera_sigma, link.position)
 

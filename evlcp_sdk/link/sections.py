@@ -111,7 +111,7 @@ class PositionSpec:
     ] = 0.05
     shared_share: Annotated[
         float, Field(ge=0, le=0.1, description="The same that grows with the bar: a share of its length.")
-    ] = 0.0008
+    ] = 0.0005
     stretch_share: Annotated[
         float, Field(ge=0, le=0.1, description="By how much a bar looks too long, or short, all the time.")
     ] = 0.0005
@@ -121,7 +121,7 @@ class PositionSpec:
             ge=0,
             description="Error of a point that no averaging over frames removes: where in a pixel it is.",
         ),
-    ] = 0.05
+    ] = 0.08
     min_view_deg: Annotated[
         float,
         Field(ge=0, lt=90, description="Angle between a bar and the line of sight that a lone bar needs."),

@@ -383,7 +383,8 @@ def stepped(
     hardly changes on that arc, so that long steps hold.
     """
     angle = math.sqrt(move[3] ** 2 + move[4] ** 2 + move[5] ** 2)
-    turn = np.eye(3)
+    turn = np.zeros((3, 3))
+    turn[0, 0] = turn[1, 1] = turn[2, 2] = 1.0
     if angle > 0:
         x, y, z = move[3] / angle, move[4] / angle, move[5] / angle
         # Rodrigues.
@@ -399,19 +400,26 @@ def stepped(
         turn[1, 2] -= s * x
         turn[2, 0] -= s * y
         turn[2, 1] += s * x
-    turned = turn @ rotation
-    out = position - centre
-    there = position + move[:3] + turn @ out - out
-    there[0] -= move[4] * out[2] - move[5] * out[1]
-    there[1] -= move[5] * out[0] - move[3] * out[2]
-    there[2] -= move[3] * out[1] - move[4] * out[0]
+    turned, there = np.zeros((3, 3)), np.zeros(3)
+    east, north, up = position[0] - centre[0], position[1] - centre[1], position[2] - centre[2]
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                turned[i, j] += turn[i, k] * rotation[k, j]
+        there[i] = centre[i] + move[i] + turn[i, 0] * east + turn[i, 1] * north + turn[i, 2] * up
+    there[0] -= move[4] * up - move[5] * north
+    there[1] -= move[5] * east - move[3] * up
+    there[2] -= move[3] * north - move[4] * east
     own = local.copy()
     for b in range(len(local)):
         for i in range(LOCAL):
             own[b, i] += step[b, i]
             for j in range(GLOBAL):
                 own[b, i] -= gain[b, i, j] * move[j]
-    return there, turned, own, error + move[LENS:]
+    off = error.copy()
+    for i in range(len(off)):
+        off[i] += move[LENS + i]
+    return there, turned, own, off
 
 
 @njit(cache=True, nogil=True)
@@ -1092,14 +1100,14 @@ def flatness(points: Array, bar: Array, bars: int) -> float:
 
 @njit(cache=True, nogil=True)
 def gathered(
-    enu_m: Array, points_px: Array, sigma_px: Array, width: int, height: int, usual: Array, least: int,
-    number: int, at: int, points: Array, bar: Array, sigma: Array,
+    enu_m: Array, points_px: Array, sigma_px: Array, pixel: float, width: int, height: int, usual: Array,
+    least: int, number: int, at: int, points: Array, bar: Array, sigma: Array,
 ) -> int:  # fmt: skip
     """A bar's whole clusters as rows of a `Problem`, where they are `least` or more; how many they are.
 
-    From row `at`, `points` (n, 10) and `bar` (n,). `usual` (4,) are the sigma of a point that its pixel
-    leaves, px, of the image's shift, px, the same as a share of its length, and by how much a bar looks too
-    long, a share; `sigma` (4,) as of `shared`.
+    From row `at`, `points` (n, 10) and `bar` (n,). `pixel` is the sigma of a point that its pixel leaves, px;
+    `usual` (3,) are that of the image's shift, px, the same as a share of its length, and by how much a bar
+    looks too long, a share; `sigma` (4,) as of `shared`.
     """
     count = len(enu_m)
     seen = np.zeros(count, np.bool_)
@@ -1117,7 +1125,7 @@ def gathered(
             points[at, 3], points[at, 4], points[at, 5] = enu_m[i, 0] - x, enu_m[i, 1] - y, enu_m[i, 2] - z
             points[at, 6], points[at, 7] = points_px[i, 0], points_px[i, 1]
             points[at, 8] = 1 / sigma_px[i]
-            points[at, 9] = min((usual[0] / sigma_px[i]) ** 2, 1.0)
+            points[at, 9] = min((pixel / sigma_px[i]) ** 2, 1.0)
             bar[at] = number
             at += 1
     return many
@@ -1136,8 +1144,8 @@ def shared(points_px: Array, seen: Array, usual: Array, sigma: Array) -> None:
             last = i
     dx, dy = points_px[last, 0] - points_px[first, 0], points_px[last, 1] - points_px[first, 1]
     length_px = math.hypot(dx, dy) * len(seen) / (last - first)
-    sigma[0] = math.hypot(usual[1], usual[2] * length_px)
-    sigma[3] = math.hypot(sigma[3], usual[3])
+    sigma[0] = math.hypot(usual[0], usual[1] * length_px)
+    sigma[3] = math.hypot(sigma[3], usual[2])
 
 
 @njit(cache=True, nogil=True)

@@ -50,6 +50,9 @@ _STEPS = 60
 _FREE_SIGMA_RAD = 0.5
 """Sigma of an attitude that is not known, about its closed-form start."""
 
+_MOST_AWAY = 10.0
+"""How many times as far as a bar looks it may be: no lens is mistaken for one ten times as long."""
+
 _MOST_MISFIT = 4.0
 """Mean square of the misses, in sigmas, above which nothing is believed."""
 
@@ -122,6 +125,8 @@ def calibrate(
         ConfigError: Not even the focal length is determined, or the views do not fit their places.
     """
     spec = PositionSpec() if spec is None else spec
+    for view in views:
+        _check_near(view, camera, spec)
     seen = [SeenView.of(view, camera, spec) for view in views]
     seen = [view for view in seen if len(view.points_px)]
     if not seen:
@@ -157,6 +162,25 @@ def calibrate(
         misfit,
         _camera_sigma(covariance + np.outer(off, off)),
     )
+
+
+def _check_near(view: CalibrationView, camera: CameraModel, spec: PositionSpec) -> None:
+    """Raise where a bar looks far nearer than its site and the pose are to each other."""
+    for bar in view.bars:
+        seen = np.flatnonzero(np.isfinite(bar.points_px).all(1))
+        if len(seen) < spec.min_points:
+            continue
+        first, last = seen[0], seen[-1]
+        length_px = float(np.linalg.norm(bar.points_px[last] - bar.points_px[first]))
+        length_m = float(np.linalg.norm(bar.enu_m[last] - bar.enu_m[first]))
+        away_m = float(np.linalg.norm(bar.enu_m.mean(0) - view.enu_m))
+        # Seen at an angle it is nearer than it looks.
+        if away_m * length_px > _MOST_AWAY * camera.focal_px * length_m:
+            looks_m = camera.focal_px * length_m / length_px
+            raise ConfigError(
+                f"the site of bar {bar.transmitter} is {away_m:.0f} m from where the camera is said to be,"
+                f" and in the image it is {looks_m:.0f} m away at the most: one of the places is another's"
+            )
 
 
 def _camera_sigma(covariance: Floats) -> CameraSigma:

@@ -42,6 +42,8 @@ class BarView:
         sigma_px: Their standard deviations, px, float64 (K,).
         survey: Sigmas of the bar's place, m, of a turn of it about each axis, radians, and of its length, as
             a share; 0: exact.
+        pixel_px: The part of `sigma_px` that stands until the image has moved; None: `position.
+            pixel_sigma_px`.
     """
 
     transmitter: int
@@ -49,6 +51,7 @@ class BarView:
     points_px: Floats
     sigma_px: Floats
     survey: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pixel_px: float | None = None
 
 
 def project_bars(
@@ -134,9 +137,10 @@ class Problem:
         for view in views:
             own = bar_sigma[len(kept)]
             own[1:] = view.survey
+            pixel = spec.pixel_sigma_px if view.pixel_px is None else view.pixel_px
             number = _kernels.gathered(
-                view.enu_m, view.points_px, view.sigma_px, width, height, usual, spec.min_points, len(kept),
-                at, points, bar, own,
+                view.enu_m, view.points_px, view.sigma_px, pixel, width, height, usual, spec.min_points,
+                len(kept), at, points, bar, own,
             )  # fmt: skip
             most = max(most, number)
             if number >= spec.min_points:
@@ -263,10 +267,8 @@ def shared_sigmas(view: BarView, seen: NDArray[np.bool_], spec: PositionSpec) ->
 
 
 def _usual(spec: PositionSpec) -> Floats:
-    """What kernels take of it, float64 (4,): see `_kernels.gathered`."""
-    return np.array(
-        [spec.pixel_sigma_px, spec.shared_sigma_px, spec.shared_share, spec.stretch_share], np.float64
-    )
+    """What kernels take of it, float64 (3,): see `_kernels.gathered`."""
+    return np.array([spec.shared_sigma_px, spec.shared_share, spec.stretch_share], np.float64)
 
 
 def _whitening(attitude: Attitude, causes: Floats, angles: int) -> Floats:

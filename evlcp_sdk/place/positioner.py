@@ -207,7 +207,7 @@ class Positioner:
                 unplaced.append(str(fault))
                 continue
             here = LocalAxes.of([site]) if here is None else here
-            sited.append(BarView(number, enu, *points, site.survey))
+            sited.append(BarView(number, enu, *points[:2], site.survey, points[2]))
         if not views:
             return None
         if here is None and unplaced:

@@ -330,8 +330,8 @@ def test_clusters_that_count_and_their_rows() -> None:
     assert _kernels.whole(points, sigma, 1280, 720, seen) == 3
     assert seen.nonzero()[0].tolist() == [1, 2, 7]
     out, bar = np.zeros((5, 10)), np.zeros(5, np.int64)
-    own, usual = np.array([0.0, 0.3, 0.2, 0.03]), np.array([0.05, 0.06, 0.001, 0.04])
-    given = (enu, points, sigma, 1280, 720, usual)
+    own, usual = np.array([0.0, 0.3, 0.2, 0.03]), np.array([0.06, 0.001, 0.04])
+    given = (enu, points, sigma, 0.05, 1280, 720, usual)
     assert _kernels.gathered(*given, 4, 4, 1, out, bar, own.copy()) == 3
     assert not out.any()
     assert _kernels.gathered(*given, 3, 4, 1, out, bar, own) == 3

@@ -58,7 +58,7 @@ def packets_of(bar: BarSite, transmitter: int, count: int, start_us: float = 500
             points[list(dark)] = np.nan
             frames.append(
                 Frame(transmitter, n, k, t_us, SOFT, Range(math.nan, math.nan, 0), None, 0.0, 0.0,
-                      points, np.full(16, 0.1), t_us + 800)
+                      points, np.full(len(points), 0.1), t_us + 800)
             )  # fmt: skip
         heard = (messages or {}).get(n, ())
         found.append(Packet(transmitter, n, start, 100.0, tuple(frames), 10, messages=heard))

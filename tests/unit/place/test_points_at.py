@@ -1,0 +1,92 @@
+"""A bar's image points between frames: their sigmas hold, in a still image, a moving and a shaken one."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.points import points_at
+from evlcp_sdk.values import Frame, Range, SoftSymbols
+
+SPEC = PositionSpec(pixel_sigma_px=0.08)
+SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
+T_US = (np.arange(9) - 4.3) * 3600.0
+BAR_PX = np.stack([np.full(16, 300.0), 200.0 + 8.0 * np.arange(16)], 1)
+LEVER = (np.arange(16) - 7.5) / 7.5
+
+
+def frames(points_px: NDArray[np.float64], sigma_px: float) -> list[Frame]:
+    """As many frames of one bar, float64 (n, 16, 2)."""
+    return [
+        Frame(0, 0, k, t_us, SOFT, Range(math.nan, math.nan, 0), None, 0.0, 0.0, points,
+              np.full(16, sigma_px), t_us)
+        for k, (t_us, points) in enumerate(zip(T_US.tolist(), points_px, strict=True))
+    ]  # fmt: skip
+
+
+def trials(
+    step_px: float, white_px: float, lean: float, stated_px: float, pixel_px: float, seed: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Errors of the shape, float64 (trials, 16, 2), and what is said of them: sigmas, and that of pixels.
+
+    Between two frames the image moves by a step to the right. An error within pixels is a Gaussian process of
+    the place, which forgets within a pixel; beside it white errors, and in each frame another lean.
+    """
+    rng = np.random.default_rng(seed)
+    course = T_US[:, None, None] / 3600.0 * np.array([step_px, 0.0])
+    apart = np.abs(T_US[:, None] - T_US) / 3600.0 * step_px
+    root = np.linalg.cholesky(np.exp(-apart) + 1e-9 * np.eye(9))
+    errors, sigmas, pixels = [], [], []
+    for _ in range(400):
+        pixel = np.einsum("ij,jkl->ikl", root, rng.normal(0, pixel_px, (9, 16, 2)))
+        points = BAR_PX + course + pixel + rng.normal(0, white_px, (9, 16, 2))
+        points[:, :, 0] += 60.0 * LEVER * rng.normal(0, lean, 9)[:, None]
+        found = points_at(frames(points, stated_px), 0.0, 36_000.0, 16, SPEC)
+        assert found is not None
+        error = found[0] - BAR_PX
+        errors.append(error - error.mean(0))
+        sigmas.append(found[1])
+        pixels.append(found[2])
+    return np.array(errors), np.array(sigmas), np.array(pixels)
+
+
+@pytest.mark.parametrize("step_px", [0.0, 0.5, 3.0])
+def test_an_error_within_pixels_stays_as_long_as_the_image_does(step_px: float) -> None:
+    errors, sigmas, pixels = trials(step_px, 0.1, 0.0, 0.1, 0.08, seed=1)
+    # Their mean is taken with the bar's place.
+    drawn = 0.1 * math.sqrt(float((weights() ** 2).sum()))
+    pixel = math.sqrt(errors.var() * 16 / 15 - drawn**2)
+    assert pixels.mean() == pytest.approx(pixel, rel=0.12)
+    # Where it moves, frames scatter by it, too, which is not told from a lean.
+    assert 0.7 < math.sqrt((errors**2).mean() * 16 / 15) / sigmas.mean() < 1.1
+    if step_px == 0:
+        assert pixels == pytest.approx(0.08, abs=0.003)
+
+
+def weights() -> NDArray[np.float64]:
+    """Of frames in a straight line's value at 0, by its normal equations."""
+    line = np.stack([np.ones(9), T_US / 1e4], 1)
+    return np.asarray(np.linalg.solve(line.T @ line, line.T)[0])
+
+
+def test_frames_that_scatter_as_they_say_say_it_all() -> None:
+    _, sigmas, pixels = trials(3.0, 0.1, 0.0, 0.1, 0.0, seed=2)
+    drawn = np.sqrt(sigmas[:, 0] ** 2 - pixels**2)
+    said = 0.1 * math.sqrt(float((weights() ** 2).sum()))
+    assert (drawn >= said * (1 - 1e-9)).all()
+    assert drawn.mean() < 1.25 * said
+
+
+def test_a_bar_that_leans_otherwise_in_each_frame_is_less_sure() -> None:
+    errors, sigmas, _ = trials(3.0, 0.05, 0.01, 0.05, 0.0, seed=3)
+    mode = LEVER / np.linalg.norm(LEVER)
+    lean = errors[:, :, 0] @ mode
+    said = np.sqrt((sigmas**2) @ mode**2)
+    # Of a variance estimated with 7 degrees of freedom: Student's t, 7 / 5, and 3 sigmas .02.
+    assert 0.9 < float(np.mean((lean / said) ** 2)) < 1.7
+    assert float(np.mean(np.abs(lean) > 3 * said)) < 0.04
+    # By what frames state alone it was beyond 4 sigmas in the mean.
+    stated = math.hypot(0.05 * math.sqrt(float((weights() ** 2).sum())), 0.03)
+    assert float(np.mean((lean / stated) ** 2)) > 10
