@@ -228,7 +228,8 @@ def _doubt(doubted: Floats) -> dict[str, Floats]:
     """The position's moves by the doubt, by its name; none where there is none."""
     if not doubted.any():
         return {}
-    values, axes = np.linalg.eigh(doubted)
+    values, axes = np.empty(3), np.empty((3, 3))
+    _kernels.eigen(doubted.copy(), values, axes)
     # The symmetric root changes little from fix to fix.
     return {"doubt": (axes * np.sqrt(np.maximum(values, 0))) @ axes.T}
 
