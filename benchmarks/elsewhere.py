@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 from road import TARGETS, cells_of, missed, number, show, targets_of
+from scipy.stats import chi2
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.link.resolve import load_link
@@ -394,6 +395,32 @@ def print_frames(frames: Sequence[GivenFrame], truth: Any) -> None:
             )
 
 
+def within(blocks: float, low: float = 0.5, high: float = 2.0) -> float:
+    """Probability that the NEES of a recording of honest sigmas is within bounds.
+
+    With so many errors in it that are independent of each other, and normal, it is chi-square over their
+    number: 0.32 of a single standing one, 0.98 of two dozens.
+    """
+    return float(chi2.cdf(high * blocks, blocks) - chi2.cdf(low * blocks, blocks))
+
+
+def honest(nees: Sequence[float]) -> str:
+    """What the NEES of recordings says of their sigmas: its mean, its spread, and how many it explains."""
+    values = np.array([value for value in nees if math.isfinite(value)])
+    if len(values) < 2:
+        return "too few"
+    drawn = np.random.default_rng(0).choice(values, (1000, len(values))).mean(1)
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    # The variance of chi-square over n is 2 / n.
+    blocks = 2 * values.mean() ** 2 / values.var(ddof=1)
+    share = float(((values >= 0.5) & (values <= 2)).mean())
+    mean = float(values.mean())
+    return (
+        f"mean {mean:.2f} ({low:.2f} to {high:.2f}) of {len(values)}, spread as of {blocks:.1f} errors;"
+        f" {share:.0%} within 0.5 to 2, {within(blocks, 0.5 / mean, 2 / mean):.0%} by the closed form"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME")
@@ -425,6 +452,9 @@ def main() -> None:
         f" {number(tally.erased_share)}, RMSE {number(tally.rmse_m)} m, NEES {number(tally.nees, 2)};"
         f" {misses} of {len(rows)} lines miss a figure"
     )
+    nees = [(row[0], bar.total().nees) for row, bar in zip(rows, total, strict=True)]
+    print("NEES, level:", honest([value for name, value in nees if not name.startswith("pitch")]))
+    print("NEES, pitched:", honest([value for name, value in nees if name.startswith("pitch")]))
     sys.exit(misses > 0)
 
 
