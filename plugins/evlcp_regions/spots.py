@@ -29,17 +29,22 @@ _LEAST, _PURE = 6, 0.7
 _TURNS = 6
 """Bursts of the other polarity than the one before, with no long time between, that show a spot."""
 
-_BURST_SHARE = 0.25
-"""Bursts of a spot that is known have at least so much of its usual number of events."""
+_BURST_SHARE = 0.35
+"""Bursts of a spot that is known have at least so much of its usual number of events: what the lens scatters
+of its edges has a third at the most, and must not be taken for it while it is dark for long."""
 
 _AGILE_US = 4000.0
 """Time in which the image of a light that shakes takes another speed."""
 
-_VEIL_PX, _VEIL = 128.0, 4.0
+_VEIL_PX, _VEIL = 128.0, 2.5
 """How far around a light lenses scatter some of it, and how much brighter it is than what they make of it."""
 
 _LARGE_PX = 64.0
 """Three lights so near one another that none is much brighter are places of one that is larger, as a bar."""
+
+_FAINTER = 1.5
+"""How much brighter a light is than those that come later and are but scattered by the lens, or its trail:
+places of a large light are about as bright as one another, and seen at about one time."""
 
 _YOUNG_US = 6000.0
 """Age from which a light is given: until then others may show that it is a place of a larger one."""
@@ -98,7 +103,7 @@ class _Spot:
         right: Columns a us that it moves.
         down: Rows a us.
         size_px: Root mean square of how far from its centre events are.
-        burst: Usual events of a burst.
+        burst: Usual events of a burst in which the light turns; not of the trail, while bright pixels go on.
         lit: The last burst was ON.
         turned_us: When the polarity of its bursts changed last, us.
         found_us: When it was found, us.
@@ -200,9 +205,9 @@ class _SpotDetector:
         burst = self._burst(x, y, slot, on, max(_LEAST, _BURST_SHARE * spot.burst), (x_px, y_px, gate_px))
         if burst is not None:
             u_px, v_px, many, lit = burst
-            usual = spot.burst + _LEARN_BURST * (many - spot.burst)
-            turned_us = now_us if lit != spot.lit else spot.turned_us
-            spot = replace(spot, burst=usual, lit=lit, turned_us=turned_us)
+            if lit != spot.lit:
+                usual = spot.burst + _LEARN_BURST * (many - spot.burst)
+                spot = replace(spot, burst=usual, lit=lit, turned_us=now_us)
         elif spot.lit:
             u_px, v_px = x_px, y_px
         else:
@@ -317,6 +322,7 @@ def _is_part(spot: _Spot, spots: Sequence[_Spot]) -> bool:
         and _apart(spot.x_px, spot.y_px, other) < _LARGE_PX
         and other.burst < _VEIL * spot.burst
         and spot.burst < _VEIL * other.burst
+        and not (other.found_us > spot.found_us + _YOUNG_US and spot.burst > _FAINTER * other.burst)
     ]
     return len(beside) >= 2
 
