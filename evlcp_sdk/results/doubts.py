@@ -550,7 +550,8 @@ def _frames(counts: Mapping[str, int]) -> Iterator[Doubt]:
 
 def _signs(counts: Mapping[str, int], events: int, frames: int) -> Iterator[Doubt]:
     """Frames of a light that is the other way round than said, or of which one kind of edges is not seen."""
-    inverted = counts.get("frames_inverted", 0)
+    # Of several links those that another one fits better may all be among them.
+    inverted = counts.get("frames_inverted", 0) - counts.get("frames_of_others", 0)
     if inverted >= _FEW_FRAMES and inverted > _INVERTED_SHARE * frames:
         yield Doubt(
             "polarity",

@@ -349,6 +349,20 @@ def test_what_blinks_and_has_no_preamble_in_any_case() -> None:
     assert told(nothing, events_in_regions=5_000_000, regions_opened=1, frames=2) == []
 
 
+def test_a_light_that_is_the_other_way_round_than_said() -> None:
+    (line,) = told(tally_of(RANDOM), frames=60, frames_inverted=50)
+    assert line.startswith("50 of 60 frames fit only a light that is on where the link says off")
+    assert told(tally_of(RANDOM), frames=60, frames_inverted=20) == []
+    # Of a bar that another link reads.
+    assert told(tally_of(RANDOM), frames=60, frames_inverted=90, frames_of_others=90) == []
+
+
+def test_light_of_which_one_half_of_the_edges_is_not_seen() -> None:
+    (line,) = told(tally_of(RANDOM), frames=60, events_in_regions=1000, events_in_regions_on=10)
+    assert line.startswith("990 of 1000 events are OFF: when the light goes on is not seen")
+    assert told(tally_of(RANDOM), frames=60, events_in_regions=1000, events_in_regions_on=100) == []
+
+
 def test_frames_without_a_distance() -> None:
     (line,) = told(tally_of(RANDOM, distance=NONE))
     assert line.startswith("transmitter 0: 0 of 60 frames have a distance")
