@@ -95,3 +95,8 @@ async def _gone(loop: asyncio.AbstractEventLoop) -> None:
         seen = running
         quiet = 0 if running else quiet + 1
         await asyncio.sleep(0 if quiet or running - told else 1e-3)
+    # A client that takes nothing more keeps its connection open; asyncio has no public list of them.
+    for transport in list(getattr(loop, "_transports", {}).values()):
+        transport.abort()
+    for _ in range(_QUIET_TURNS):
+        await asyncio.sleep(0)

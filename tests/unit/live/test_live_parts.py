@@ -1,5 +1,8 @@
 """Listeners, delays, pictures, the budget and the reader of a live run, one by one."""
 
+import asyncio
+import gc
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -10,6 +13,7 @@ import pytest
 
 from evlcp_sdk.errors import ConfigError, InputError, StreamError
 from evlcp_sdk.live import Budget, DelayTally, Outlet, PictureSlot, Shedder
+from evlcp_sdk.live.desk import Desk, stop_listening
 from evlcp_sdk.live.reader import ArrivalClock, Reader
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Region, Triggers
@@ -221,3 +225,26 @@ def test_a_reader_that_is_stopped_ends() -> None:
     reader.start()
     time.sleep(0.02)
     assert reader.stop()
+
+
+def test_a_client_that_takes_nothing_is_let_go_at_the_end() -> None:
+    """What waits for it would keep its connection open after the run, with nobody to close it."""
+
+    async def fill(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(bytes(50_000_000))
+        writer.close()
+
+    gc.disable()
+    try:
+        with Desk() as desk:
+            server = desk.call(asyncio.start_server(fill, "127.0.0.1", 0))
+            client = socket.create_connection(server.sockets[0].getsockname(), 5)
+            assert client.recv(1)
+            desk.call(stop_listening(server))
+        with client:
+            taken = 1
+            while some := client.recv(1 << 20):
+                taken += len(some)
+        assert taken < 50_000_000
+    finally:
+        gc.enable()
