@@ -85,7 +85,7 @@ def test_who_reads_results_may_die_at_any_moment(demo_raw: Path) -> None:
             thread.start()
         mine = outlet.subscribe({"frame"}, most=100_000)
         try:
-            replay = f"replay:{demo_raw}?speed=0.05"
+            replay = f"replay:{demo_raw}?speed=0.1"
             given: dict[str, Any] = {"outlet": outlet, "pictures": services.pictures, "budget": PATIENT}
             summary = live(replay, **given, warm=False)
         finally:
