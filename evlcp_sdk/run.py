@@ -9,7 +9,6 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError, InputError, UnpluggedError
 from evlcp_sdk.files import Outputs
@@ -30,7 +29,7 @@ from evlcp_sdk.place.calibration import calibrate as fit_camera
 from evlcp_sdk.place.navigator import Navigator, PositionPlan
 from evlcp_sdk.place.observations import BarView
 from evlcp_sdk.place.own_poses import OwnPoses
-from evlcp_sdk.place.points import points_at
+from evlcp_sdk.place.points import SeenPoints, points_at
 from evlcp_sdk.place.poses import KnownPose
 from evlcp_sdk.place.survey import SurveyedBar
 from evlcp_sdk.place.survey import survey as survey_bars
@@ -793,7 +792,11 @@ def _views(
             if number in stands_at:
                 site = stands_at[number]
                 enu = site.layout_positions_m(link.bar, axes)
-                bars.append(BarView(site.transmitter_id, enu, *found[:2], site.survey, found[2]))
+                bars.append(
+                    BarView(
+                        site.transmitter_id, enu, found.points_px, found.sigma_px, site.survey, found.pixel_px
+                    )
+                )
         views.append(_view(pose, bars, axes))
     return views
 
@@ -809,7 +812,7 @@ def _view(pose: KnownPose, bars: Sequence[BarView], axes: LocalAxes) -> Calibrat
 
 def _seen_at(
     url: str, poses: Sequence[KnownPose], link: Link, registry: Registry, who: Whereabouts
-) -> list[dict[int, tuple[NDArray[np.float64], NDArray[np.float64], float]]]:
+) -> list[dict[int, SeenPoints]]:
     """What `points_at` gives of each transmitter at the times of known poses."""
     clusters, spec = link.bar.clusters, link.position
     period_us = link.packet.packet_chips * link.packet.chip_us
@@ -877,7 +880,10 @@ def survey(
         ids = who.ids
         for pose, points in zip(mine, seen, strict=True):
             new = [(ids[n], found) for n, found in points.items() if n in ids and ids[n] not in listed]
-            bars = [BarView(number, np.empty((0, 3)), *found[:2], pixel_px=found[2]) for number, found in new]
+            bars = [
+                BarView(number, np.empty((0, 3)), found.points_px, found.sigma_px, pixel_px=found.pixel_px)
+                for number, found in new
+            ]
             views.append(_view(pose, bars, axes))
     return survey_bars(views, axes, link.bar.length_m, link.camera, link.camera_sigma, link.position)
 

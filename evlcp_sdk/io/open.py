@@ -31,7 +31,8 @@ WRITABLE: Final = {".raw": "EVT3", ".mcap": "BAG", ".npz": "NPZ", ".csv": "CSV",
 STDIN: Final = "-"
 """What is opened as standard input."""
 
-OWN: Final = ("file", "replay", "bag", "hdf5", "list", "camera", *SCHEMES)
+_RECORDED: Final = ("file", "replay", "bag", "hdf5", "list")
+OWN: Final = (*_RECORDED, "camera", *SCHEMES)
 """Schemes that are opened without a plugin."""
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
@@ -40,7 +41,7 @@ _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 def is_recording(url: Path | str) -> bool:
     """Whether a name is that of a recording, by what stands before its `:`."""
     scheme = _SCHEME.match(str(url))
-    recorded = scheme is not None and scheme[1].lower() in ("file", "replay", "bag", "hdf5", "list")
+    recorded = scheme is not None and scheme[1].lower() in _RECORDED
     return str(url) != STDIN and (scheme is None or is_there(url) or recorded)
 
 

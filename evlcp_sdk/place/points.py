@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +10,29 @@ from numpy.typing import NDArray
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.values import Frame
 
-__all__ = ["points_at"]
+__all__ = ["SeenPoints", "points_at"]
 
 Floats = NDArray[np.float64]
+
+_PIXEL_PX = 1.0
+"""Way of the image on which an error within pixels becomes another one."""
+
+_MODES = 2
+"""Of a bar's shape that a pose hangs on, along it and across: how long it is and how it leans, and a bend."""
+
+
+class SeenPoints(NamedTuple):
+    """A bar's image points.
+
+    Attributes:
+        points_px: Column and row of each cluster, px, float64 (K, 2); NaN where it is not seen.
+        sigma_px: Their standard deviations, px, float64 (K,).
+        pixel_px: The part of these that is within pixels, px.
+    """
+
+    points_px: Floats
+    sigma_px: Floats
+    pixel_px: float
 
 
 def _interpolation(t: Floats) -> Floats:
@@ -22,16 +43,9 @@ def _interpolation(t: Floats) -> Floats:
     return np.asarray(share.prod(1))
 
 
-_PIXEL_PX = 1.0
-"""Way of the image on which an error within pixels becomes another one."""
-
-_MODES = 2
-"""Of a bar's shape that a pose hangs on, along it and across: how long it is and how it leans, and a bend."""
-
-
 def points_at(
     frames: Sequence[Frame], t_us: float, period_us: float, clusters: int, spec: PositionSpec
-) -> tuple[Floats, Floats, float] | None:
+) -> SeenPoints | None:
     """A bar's image points at a time between its frames.
 
     The shape is a straight line in time through all frames within half a period, the place is interpolated
@@ -47,8 +61,7 @@ def points_at(
         spec: Least number of points, and the error within pixels.
 
     Returns:
-        Points, px, float64 (K, 2), sigmas (K,), and the part of these that is within pixels, px; None where
-        the bar is not seen before and after.
+        The points; None where the bar is not seen before and after.
     """
     near = [
         f
@@ -81,7 +94,7 @@ def points_at(
         found[k] = place + (inverse @ shapes[seen, k])[0]
         drawn = math.sqrt(float((inverse[0] ** 2 * sigmas[seen, k] ** 2).sum()))
         sigma[k] = math.hypot(wider * drawn, pixel_px)
-    return found, sigma, pixel_px
+    return SeenPoints(found, sigma, pixel_px)
 
 
 def _line(t: Floats) -> Floats:

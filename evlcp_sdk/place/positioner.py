@@ -207,7 +207,9 @@ class Positioner:
                 unplaced.append(str(fault))
                 continue
             here = LocalAxes.of([site]) if here is None else here
-            sited.append(BarView(number, enu, *points[:2], site.survey, points[2]))
+            sited.append(
+                BarView(number, enu, points.points_px, points.sigma_px, site.survey, points.pixel_px)
+            )
         if not views:
             return None
         if here is None and unplaced:

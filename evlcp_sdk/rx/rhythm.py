@@ -288,7 +288,7 @@ def _lows(gap_chips: int) -> NDArray[np.uint16]:
 
 
 def _repeats() -> NDArray[np.int64]:
-    """What a time says after another, by the kinds of both: `_kernels.AGAIN`, `MISSED` or `OTHER`.
+    """What a time says after another, by the kinds of both: `_kernels.AGAIN`, `LONG`, `MISSED` or `OTHER`.
 
     One of them may be two or three of the other, of which rises in between were missed.
     """
