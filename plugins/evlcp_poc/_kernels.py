@@ -269,6 +269,71 @@ def pairs_in_place(
 
 
 @njit(cache=True, nogil=True)
+def far_pairs(counts: Array, first: Array, second: Array, apart_m: Array, share: float) -> Array:
+    """Which pairs, both of whose clusters count, lie a share of the longest such spacing apart, or more."""
+    longest = 0.0
+    for q in range(first.size):
+        if counts[first[q]] and counts[second[q]]:
+            longest = max(longest, apart_m[q])
+    far = np.zeros(first.size, np.bool_)
+    for q in range(first.size):
+        both = counts[first[q]] and counts[second[q]]
+        far[q] = both and apart_m[q] >= share * longest - 1e-12
+    return far
+
+
+@njit(cache=True, nogil=True)
+def chosen_pairs(
+    maps: Array,
+    min_pixels: int,
+    every: tuple[Array, Array, Array],
+    used: Array,
+    skip: int,
+    pairs: tuple[Array, Array, Array],
+    share: float,
+    neighbour_m: float,
+    middle: Array,
+    which: Array,
+    shifts: Array,
+) -> tuple[float, int]:
+    """The pairs to measure: of clusters that are seen, far apart, and where the scale of all has them.
+
+    Args:
+        maps: Maps of all clusters.
+        min_pixels: Lit pixels that a map needs to be used.
+        every: First and second cluster, and spacing, of all pairs of clusters.
+        used: Clusters to use, rising.
+        skip: How many of those that are seen are left out at each end.
+        pairs: First and second cluster, and spacing, of the pairs of clusters that may be used.
+        share: Least spacing of a pair, as a share of the longest.
+        neighbour_m: Spacing of neighbours, by how much a pair may be out of place.
+        middle: Gets the middles of the maps, (clusters, 2).
+        which: Gets the numbers of the pairs chosen.
+        shifts: Gets their whole-pixel shifts.
+
+    Returns:
+        Scale, px a metre, 0 if there is none; and how many pairs are chosen.
+    """
+    middles(maps, np.arange(len(maps)), min_pixels, middle)
+    lit = middle[:, 0] >= 0
+    i, j, apart_m = every
+    wide = far_pairs(lit, i, j, apart_m, 0.5)
+    px_per_m = median_scale(middle, i[wide], j[wide], apart_m[wide])
+    if px_per_m <= 0:
+        return 0.0, 0
+    seen = used[lit[used]]
+    inner = np.zeros(len(maps), np.bool_)
+    inner[seen[skip : max(len(seen) - skip, 0)]] = True
+    first, second, spacing_m = pairs
+    far = np.flatnonzero(far_pairs(inner, first, second, spacing_m, share))
+    n = pairs_in_place(
+        middle, first[far], second[far], spacing_m[far], px_per_m, px_per_m * neighbour_m, which, shifts
+    )
+    which[:n] = far[which[:n]]
+    return px_per_m, n
+
+
+@njit(cache=True, nogil=True)
 def robust_mean(
     values: Array, weights: Array, first: Array, second: Array, clusters: int, drop: int, iqr: float
 ) -> tuple[float, float, int]:
@@ -316,3 +381,28 @@ def robust_mean(
             square += step * (left - mean)
     sigma = np.sqrt((m - 1) / m * square) if m > 1 else np.nan
     return total / mass, sigma, kept
+
+
+@njit(cache=True, nogil=True)
+def paired_distance(
+    correlation: Array,
+    band: tuple[int, int],
+    reach: int,
+    samples: int,
+    whole_px: Array,
+    apart_m: Array,
+    focal_px: float,
+    power: float,
+    first: Array,
+    second: Array,
+    clusters: int,
+    drop: int,
+    iqr: float,
+) -> tuple[float, float, int]:
+    """Distance by pairs from their correlations and whole-pixel shifts: as `robust_mean` returns it, m."""
+    beyond_px = np.empty((len(first), 2))
+    pair_shifts(correlation, band[0], band[1], reach, samples, beyond_px)
+    apart_px = whole_px + beyond_px
+    length_px = np.hypot(apart_px[:, 0], apart_px[:, 1])
+    distance_m = focal_px * apart_m / np.maximum(length_px, 1e-9)
+    return robust_mean(distance_m, apart_m**power, first, second, clusters, drop, iqr)

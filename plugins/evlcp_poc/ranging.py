@@ -127,11 +127,8 @@ class PocRanging(Ranging):
         skip = 0 if self.clusters else self._skip(bar.clusters)
         centres = bar.cluster_centres_m()
         a, b = np.triu_indices(len(used), 1)
-        all_first, all_second = used[a], used[b]
-        all_spacing = np.hypot(*(centres[all_second] - centres[all_first]).T)
-        most_pairs = _far(all_spacing, self.min_spacing, *_inner(all_first, all_second, used, skip))
+        pairs = used[a], used[b], np.hypot(*(centres[used[b]] - centres[used[a]]).T)
         # The scale that all clusters agree on shows which ones are out of place.
-        every = np.arange(bar.clusters)
         i, j = np.triu_indices(bar.clusters, 1)
         apart = np.hypot(*(centres[j] - centres[i]).T)
         if not bar.alike or not apart.max() > 0:
@@ -142,46 +139,58 @@ class PocRanging(Ranging):
             )
         neighbour = float(apart[apart > 0].min())
 
+        all_pairs = i, j, apart
+        clusters = np.arange(bar.clusters)
+        inner = np.isin(clusters, used[skip : len(used) - skip])
+        least = min(self.min_pairs, max(_far(*pairs, inner, self.min_spacing), 1))
+
         def measure(view: FrameView) -> Range:
             from evlcp_poc import _kernels
 
             maps = view.presence.pixels
-            middle = np.empty((len(every), 2), np.int64)
-            _kernels.middles(maps, every, self.min_pixels, middle)
-            lit = middle[:, 0] >= 0
-            wide = _far(apart, 0.5, lit[i], lit[j])
-            px_per_m = _kernels.median_scale(middle, i[wide], j[wide], apart[wide])
-            if px_per_m <= 0:
-                return _NONE
-            neighbour_px = px_per_m * neighbour
-            seen = used[lit[used]]
-            far = _far(all_spacing, self.min_spacing, *_inner(all_first, all_second, seen, skip))
-            first, second, spacing = all_first[far], all_second[far], all_spacing[far]
-            pairs, apart_px = np.empty(len(first), np.int64), np.empty((len(first), 2))
-            n = _kernels.pairs_in_place(
-                middle, first, second, spacing, px_per_m, neighbour_px, pairs, apart_px
+            middle = np.empty((bar.clusters, 2), np.int64)
+            which, whole_px = np.empty(len(a), np.int64), np.empty((len(a), 2))
+            px_per_m, n = _kernels.chosen_pairs(
+                maps,
+                self.min_pixels,
+                all_pairs,
+                used,
+                skip,
+                pairs,
+                self.min_spacing,
+                neighbour,
+                middle,
+                which,
+                whole_px,
             )
-            if n < min(self.min_pairs, int(most_pairs.sum())):
+            if n < least or px_per_m <= 0:
                 return _NONE
-            pairs, apart_px = pairs[:n], apart_px[:n]
-            a, b, apart_m = first[pairs], second[pairs], spacing[pairs]
+            which, whole_px = which[:n], whole_px[:n]
+            first, second, apart_m = (part[which] for part in pairs)
             # A cut of two spacings and a seam holds a cluster's blob with its blur, wherever it sits in it.
+            neighbour_px = px_per_m * neighbour
             height = _cut_size(2 * neighbour_px + 8)
             width = min(height, _cut_size(maps.shape[2]))
-            cuts = np.zeros((len(every), height, width), np.float32)
-            _kernels.cut_maps(maps, every, middle, cuts)
+            cuts = np.zeros((bar.clusters, height, width), np.float32)
+            _kernels.cut_maps(maps, clusters, middle, cuts)
             most = _full_band(height, width) if self.band == "full" else _blob_band(cuts)
-            correlation = phase_only_correlation(cuts, a, b, most)
-            beyond = np.empty((len(a), 2))
+            correlation = phase_only_correlation(cuts, first, second, most)
             # Two medians of blobs of one spacing are wrong by half a spacing at the most.
             reach = max(int(neighbour_px / 2), 2)
-            _kernels.pair_shifts(correlation, *most, reach, self.peak_samples, beyond)
-            apart_px += beyond
-            length_px = np.hypot(apart_px[:, 0], apart_px[:, 1])
-            distance = camera.focal_px * apart_m / np.maximum(length_px, 1e-9)
-            weight = apart_m**self.weight_power
-            mean, sigma, kept = _kernels.robust_mean(
-                distance, weight, a, b, len(every), self.drop_extremes, self.outlier_iqr
+            mean, sigma, kept = _kernels.paired_distance(
+                correlation,
+                most,
+                reach,
+                self.peak_samples,
+                whole_px,
+                apart_m,
+                camera.focal_px,
+                self.weight_power,
+                first,
+                second,
+                bar.clusters,
+                self.drop_extremes,
+                self.outlier_iqr,
             )
             return Range(float(mean), float(sigma), int(kept))
 
@@ -212,22 +221,16 @@ class PocRanging(Ranging):
         return np.sort(used)
 
 
-def _inner(
-    first: NDArray[np.int64], second: NDArray[np.int64], seen: NDArray[np.int64], skip: int
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Whether the first, and the second, of each pair is seen and not among the outermost that are."""
-    inner = seen[skip : len(seen) - skip]
-    return np.isin(first, inner), np.isin(second, inner)
-
-
 def _far(
-    spacing: NDArray[np.float64], share: float, first: NDArray[np.bool_], second: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """Pairs of which both count, with a share of the longest spacing of these, or more."""
-    both = first & second
-    if not both.any():
-        return both
-    return np.asarray(both & (spacing >= share * spacing[both].max() - 1e-12))
+    first: NDArray[np.int64],
+    second: NDArray[np.int64],
+    spacing: NDArray[np.float64],
+    counts: NDArray[np.bool_],
+    share: float,
+) -> int:
+    """How many pairs, both of whose clusters count, have a share of the longest such spacing, or more."""
+    apart = spacing[counts[first] & counts[second]]
+    return int((apart >= share * apart.max(initial=0.0) - 1e-12).sum())
 
 
 def _full_band(height: int, width: int) -> tuple[int, int]:

@@ -223,19 +223,62 @@ def weighted_values(sums: Array, probability: Array, grid: int, least: float, ou
 
 
 @njit(cache=True, nogil=True)
-def max_log(fit: Array, bits: int, zero: Array, one: Array) -> None:
-    """Best correlation among the codewords with each bit 0 and with each bit 1, `zero`, `one` (K, bits)."""
-    clusters, words = fit.shape
-    zero[:] = -np.inf
-    one[:] = -np.inf
+def _fit_words(values: Array, by_value: Array, fit: Array) -> None:
+    """Correlation of values (n,) with every word, `by_value` (n, words), `fit` (words,)."""
+    fit[:] = 0.0
+    for i in range(values.size):
+        value, column = values[i], by_value[i]
+        for s in range(fit.size):
+            fit[s] += value * column[s]
+
+
+@njit(cache=True, nogil=True)
+def _max_log(fit: Array, scale: float, llr: Array) -> None:
+    """Best correlation of the words with each bit 0, less that with 1, times `scale`; `fit` is used up."""
+    half = fit.size
+    for b in range(llr.size):
+        # A bit that is done leaves the better of the two codewords that it tells apart.
+        half //= 2
+        zero, one = -np.inf, -np.inf
+        for s in range(half):
+            zero = max(zero, fit[s])
+            one = max(one, fit[s + half])
+            fit[s] = max(fit[s], fit[s + half])
+        llr[b] = (zero - one) * scale
+
+
+@njit(cache=True, nogil=True)
+def transformed(
+    sums: Array, probability: Array, grid: int, least: float, by_value: Array, symbols: Array, llr: Array
+) -> float:
+    """Words nearest to the `weighted_values` of a frame, `symbols` (K,), and max-log LLRs, `llr` (K, bits).
+
+    All clusters of a frame have one amplitude, the mean, and one noise: eight values are too few for one
+    each. A dim cluster, whose correlations are small beside them, is unsure. `by_value` are the words
+    (n, words).
+
+    Returns:
+        Share of the energy that the words explain; 0 without any.
+    """
+    length, count = by_value.shape
+    clusters = len(probability)
+    values = np.zeros((clusters, length))
+    weighted_values(sums, probability, grid, least, values)
+    fit = np.empty((clusters, count))
+    energy, explained, amplitude = 0.0, 0.0, 0.0
     for k in range(clusters):
-        for s in range(words):
-            f = fit[k, s]
-            for b in range(bits):
-                if (s >> (bits - 1 - b)) & 1:
-                    one[k, b] = max(one[k, b], f)
-                else:
-                    zero[k, b] = max(zero[k, b], f)
+        _fit_words(values[k], by_value, fit[k])
+        best = int(np.argmax(fit[k]))
+        symbols[k] = best
+        amplitude += fit[k, best] / length / clusters
+        explained += fit[k, best] ** 2 / length
+        for i in range(length):
+            energy += values[k, i] ** 2
+    rest = max(energy - explained, 1e-3 * energy, 1e-9)
+    scale = max(amplitude, 0.0) * values.size / rest
+    for k in range(clusters):
+        _max_log(fit[k], scale, llr[k])
+    return explained / energy if energy > 0 else 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -322,27 +365,13 @@ def read_words(values: Array, words: Array, scale: float, symbols: Array, llr: A
         Share of the values' sizes that agrees with the codewords; 0 without any.
     """
     clusters, length = values.shape
-    count, bits = len(words), llr.shape[1]
-    by_value, fit = np.ascontiguousarray(words.T), np.empty(count)
+    by_value, fit = np.ascontiguousarray(words.T), np.empty(len(words))
     size, agree = 0.0, 0.0
     for k in range(clusters):
-        fit[:] = 0.0
-        for i in range(length):
-            value, column = values[k, i], by_value[i]
-            for s in range(count):
-                fit[s] += value * column[s] * scale
+        _fit_words(values[k], by_value, fit)
         best = int(np.argmax(fit))
         symbols[k] = best
-        # A bit that is done leaves the better of the two codewords that it tells apart.
-        half = count
-        for b in range(bits):
-            half //= 2
-            zero, one = -np.inf, -np.inf
-            for s in range(half):
-                zero = max(zero, fit[s])
-                one = max(one, fit[s + half])
-                fit[s] = max(fit[s], fit[s + half])
-            llr[k, b] = zero - one
+        _max_log(fit, scale, llr[k])
         for i in range(length):
             size += abs(values[k, i])
             if values[k, i] * words[best, i] > 0:

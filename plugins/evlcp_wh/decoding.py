@@ -29,28 +29,23 @@ class WhTransform(Decoding):
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's codewords."""
         codebook.require_pairs("decoding", "wh-transform", "edges")
-        words = np.ascontiguousarray(codebook.codeword_edges.T, np.float64)
-        pilot_chips = codebook.pilots.shape[1]
-        length, m = len(words), codebook.bits_per_symbol
+        by_value = np.ascontiguousarray(codebook.codeword_edges.T, np.float64)
+        pilot_chips, m = codebook.pilots.shape[1], codebook.bits_per_symbol
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             from evlcp_wh import _kernels
 
-            values = np.zeros((len(presence.probability), length))
-            info = sums[pilot_chips:]
-            _kernels.weighted_values(info, presence.probability, presence.grid_px, self.min_weight, values)
-            fit = values @ words
-            symbols = fit.argmax(1)
-            energy = float(np.vdot(values, values))
-            amplitude = fit.max(1) / length
-            explained = float(np.vdot(amplitude, amplitude)) * length
-            # One amplitude and one noise for all clusters of a frame: eight values are too few for one each.
-            # A dim cluster, whose correlations are small beside them, is unsure.
-            rest = max(energy - explained, 1e-3 * energy, 1e-9)
-            scale = max(float(amplitude.mean()), 0.0) * values.size / rest
-            zero, one = np.empty((2, len(values), m))
-            _kernels.max_log(fit, m, zero, one)
-            llr = ((zero - one) * scale).astype(np.float32)
-            return SoftSymbols(symbols, llr, explained / energy if energy else 0.0)
+            symbols = np.empty(len(presence.probability), np.int64)
+            llr = np.empty((len(symbols), m), np.float32)
+            explained = _kernels.transformed(
+                sums[pilot_chips:],
+                presence.probability,
+                presence.grid_px,
+                self.min_weight,
+                by_value,
+                symbols,
+                llr,
+            )
+            return SoftSymbols(symbols, llr, explained)
 
         return decode

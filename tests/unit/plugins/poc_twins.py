@@ -83,6 +83,36 @@ def blob_size(cuts):
     return [4 * np.average(np.broadcast_to(d, cuts.shape), weights=cuts) for d in off]
 
 
+def pairs_of(clusters, at_m):
+    """All pairs of clusters, and their spacing."""
+    first, second = np.triu_indices(len(clusters), 1)
+    first, second = clusters[first], clusters[second]
+    return first, second, np.abs(at_m[second] - at_m[first])
+
+
+def far(counts, pairs, share):
+    """Numbers of the pairs that count and are far apart."""
+    both = [q for q, (a, b, _) in enumerate(zip(*pairs, strict=True)) if {a, b} <= counts]
+    longest = max((pairs[2][q] for q in both), default=0)
+    return [q for q in both if pairs[2][q] >= share * longest - 1e-12]
+
+
+def chosen_pairs(maps, min_pixels, every, used, skip, pairs, share, neighbour_m):
+    """The scale of all that is lit, and the far pairs of what is left without the outermost, in place."""
+    at = np.array([middle(image, min_pixels) for image in maps])
+    lit = {k for k in range(len(maps)) if at[k][0] >= 0}
+
+    def length(these, q):
+        return np.linalg.norm(at[these[1][q]] - at[these[0][q]])
+
+    wide = far(lit, every, 0.5)
+    scale = np.median([length(every, q) / every[2][q] for q in wide]) if wide else 0.0
+    seen = [k for k in used.tolist() if k in lit]
+    inner = set(seen[skip : len(seen) - skip])
+    off = {q: abs(length(pairs, q) - scale * pairs[2][q]) for q in far(inner, pairs, share)}
+    return scale, [q for q, px in off.items() if px <= scale * neighbour_m]
+
+
 def robust_mean(values, weights, first, second, clusters, drop, iqr):
     """Plain means over masks; the sigma by leaving out one cluster after the other."""
     keep = np.ones(len(values), bool)

@@ -185,6 +185,45 @@ def test_pairs_in_place_and_their_scale(unseen):
     assert 0 < n < seen.sum() or not seen.any()
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize(("skip", "share"), [(0, 0.0), (1, 0.5), (2, 0.9), (3, 0.5)])
+def test_pairs_chosen_are_the_far_ones_of_inner_clusters(seed, skip, share):
+    rng = np.random.default_rng(seed)
+    maps = (rng.random((6, 12, 9)) * (rng.random((6, 12, 9)) < 0.3)).astype(np.float32)
+    maps[seed % 6] = 0
+    at = np.arange(6) * 0.25
+    used = np.array([0, 1, 2, 4, 5])
+    every, pairs = twins.pairs_of(np.arange(6), at), twins.pairs_of(used, at)
+    middle, which, shifts = np.empty((6, 2), np.int64), np.empty(10, np.int64), np.empty((10, 2))
+    px_per_m, n = _kernels.chosen_pairs(maps, 4, every, used, skip, pairs, share, 20.0, middle, which, shifts)
+    want_scale, want = twins.chosen_pairs(maps, 4, every, used, skip, pairs, share, 20.0)
+    assert px_per_m == pytest.approx(want_scale)
+    assert which[:n].tolist() == want
+    assert_array_equal(shifts[:n], (middle[pairs[1]] - middle[pairs[0]])[want])
+    assert n or skip > 1
+    assert _kernels.chosen_pairs(
+        0 * maps, 4, every, used, skip, pairs, share, 1.0, middle, which, shifts
+    ) == (
+        0.0,
+        0,
+    )
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_distance_by_pairs(seed):
+    rng = np.random.default_rng(seed)
+    first, second, apart_m = twins.pairs_of(np.arange(5), np.arange(5) * 0.25)
+    correlation = rng.normal(size=(len(first), 12, 10))
+    whole_px = rng.uniform(10, 40, (len(first), 2))
+    got = _kernels.paired_distance(
+        correlation, (5, 4), 3, 2, whole_px, apart_m, 7000.0, 2.0, first, second, 5, 1, 1.5
+    )
+    beyond_px = np.empty((len(first), 2))
+    _kernels.pair_shifts(correlation, 5, 4, 3, 2, beyond_px)
+    distance_m = 7000 * apart_m / np.linalg.norm(whole_px + beyond_px, axis=1)
+    assert_allclose(got, twins.robust_mean(distance_m, apart_m**2, first, second, 5, 1, 1.5), rtol=1e-9)
+
+
 @pytest.mark.parametrize("clusters", [2, 3, 4, 14])
 @pytest.mark.parametrize("drop", [0, 1, 3])
 @pytest.mark.parametrize("seed", SEEDS)

@@ -113,14 +113,6 @@ def test_weighted_values(seed, grid):
     assert out.any()
 
 
-@pytest.mark.parametrize(("clusters", "bits"), [(16, 6), (1, 1), (3, 8), (0, 4)])
-def test_max_log(clusters, bits):
-    fit = np.random.default_rng(bits).normal(size=(clusters, 2**bits))
-    zero, one = np.empty((2, clusters, bits))
-    _kernels.max_log(fit, bits, zero, one)
-    assert_array_equal([zero, one], twins.max_log(fit, bits))
-
-
 @pytest.mark.parametrize(("clusters", "bits", "length"), [(16, 6, 8), (1, 1, 2), (3, 8, 16)])
 def test_words_are_read(clusters, bits, length):
     rng = np.random.default_rng(bits)
