@@ -1,5 +1,6 @@
 """What the `evlcp` command line consists of, plugins' commands included."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
@@ -27,6 +28,10 @@ Exit codes: [bold]0[/] done (also when no transmitter was there), [bold]1[/] fai
 [bold]5[/] a camera that went away,
 [bold]70[/] a fault of evlcp itself, [bold]130[/] interrupted. A broken plugin is left out with a warning.
 """
+
+
+_SOON = frozenset({"receive", "live"})
+"""Commands that need none of a plugin's, and would wait for these a tenth of their start."""
 
 
 class _Commands(TyperGroup):
@@ -227,5 +232,6 @@ def run() -> None:
         warnings.showwarning = show
         hush()
         app = make_app()
-        add_plugin_commands(app, Registry.load())
+        if not _SOON & set(sys.argv[1:2]):
+            add_plugin_commands(app, Registry.load())
         app()

@@ -3,6 +3,7 @@
 It imports nothing that takes time before it can be interrupted.
 """
 
+import gc
 import os
 import sys
 
@@ -13,12 +14,16 @@ __all__ = ["main"]
 _FAILED = 1
 _INTERRUPTED = 130
 
+_GARBAGE = 50_000
+"""New objects before the collector looks for cycles: what modules are made of are more, and stay."""
+
 
 def main() -> None:
     """Run the command line; whatever goes wrong becomes one line per fault on stderr and its exit code."""
     code: object = 0
     # Our matrices are of a dozen rows: a thread a core only spins on them. NumPy reads it when it is loaded.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    gc.set_threshold(_GARBAGE, *gc.get_threshold()[1:])
     try:
         from signal import SIGHUP, SIGTERM
 

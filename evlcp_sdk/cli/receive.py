@@ -214,7 +214,7 @@ def receive(
             pps=pps,
             sinks=asked,
             lines=lines,
-            stopped=stopped if here else None,
+            here=(registry, stopped) if here else None,
         )
         outcomes = stack.enter_context(closing(executor.run(run, _until(stopped, jobs))))
         for outcome in outcomes:
@@ -279,18 +279,19 @@ def _decode_job(
     pps: int | None,
     sinks: tuple[str, ...],
     lines: LinePrinter | None,
-    stopped: "EndRequest | None",
+    here: "tuple[Registry, EndRequest] | None",
 ) -> dict[str, Any]:
-    """Decode a recording here, with a bar; or, without `stopped`, quietly in a worker."""
+    """Decode a recording here, with a bar; or, without `here`, quietly in a worker."""
     from evlcp_sdk.run import receive_to_folder, stop_on_request
 
     clock = clock_of(pps, clock_zero)
     known: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock}
     decode = partial(receive_to_folder, job.url, job.folder, job.link or links, **known, sinks=sinks)
-    if stopped is not None:
+    if here is not None:
+        registry, stopped = here
         ended = stopped.or_when(lambda: job.folder is None and lines is not None and lines.gone)
         with bytes_bar(_named(job.url)) as advance:
-            return decode(lines=lines, advance=advance, stopped=ended)
+            return decode(registry=registry, lines=lines, advance=advance, stopped=ended)
     hush()
     # A terminal sends Ctrl-C to workers, too.
     with stop_on_request() as asked:
