@@ -1,0 +1,146 @@
+"""Links that are not built in, on every board: characters and 4-PPM, to the chip, and to the text."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from evlcp_sdk.link.resolve import Link, load_link
+from firmware_host import build
+from firmware_host.board.bank import bank_of, random_symbols
+from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.session import Session
+from firmware_host.emulators.led_record import LedRecord
+from firmware_host.protocol.client import Timing
+
+pytestmark = pytest.mark.usefixtures("compiler")
+
+Evlcp = Callable[..., Any]
+
+LAMP = ["bar.rows=6", "bar.columns=1", "bar.cluster_rows=6", "bar.cluster_columns=1", "framing.id=uart"]
+SERIAL = [*LAMP, "framing.data_bits=7", "framing.parity=even", "framing.stop_bits=2"]
+TURNED = [*LAMP, "framing.parity=odd", "framing.idle=off", "framing.first_bit=highest"]
+PULSES = ["modulation.id=ppm", "bar.rows=48"]
+
+
+def serial_chips(text: bytes) -> list[int]:
+    """7E2 as a serial port sends it behind a pause of 16 bits: marks are ones."""
+    bits = [1] * 16
+    for byte in text:
+        data = [byte >> k & 1 for k in range(7)]
+        bits += [0, *data, sum(data) % 2, 1, 1]
+    return bits
+
+
+def turned_chips(text: bytes) -> list[int]:
+    """8O1, highest bit first, by an LED that is dark in pauses: a start bit lights it."""
+    bits = [1] * 16
+    for byte in text:
+        data = [byte >> k & 1 for k in reversed(range(8))]
+        bits += [0, *data, 1 - sum(data) % 2, 1]
+    return [1 - bit for bit in bits]
+
+
+def pulse_chips(symbols: NDArray[np.int64], link: Link) -> NDArray[np.uint8]:
+    """4-PPM: in each four chips one is lit, and its place says two bits."""
+    clusters = symbols.shape[1]
+    rows = [[chip] * clusters for chip in link.codebook.preamble.tolist()]
+    for frame in symbols:
+        rows += link.codebook.pilots.T.tolist()
+        for first in (4, 2, 0):
+            places = frame >> first & 3
+            rows += [[int(place == slot) for place in places] for slot in range(4)]
+    return np.array(rows, np.uint8)
+
+
+def packet_of(kind: str) -> tuple[Link, NDArray[np.int64], NDArray[np.uint8]]:
+    """A link, a packet's symbols, and the chips of its LEDs, (chips, LEDs), by the test's own encoders."""
+    text = b"Tempo 30!"
+    if kind == "4-PPM":
+        link = load_link(overrides=[*PULSES, "air.frames_per_packet=3"])
+        symbols = random_symbols(1, 3, link.codebook, np.random.default_rng(2))[0]
+        return link, symbols, np.repeat(pulse_chips(symbols, link), 6, axis=1)
+    chips = serial_chips(text) if kind == "7E2" else turned_chips(text)
+    link = load_link(overrides=[*(SERIAL if kind == "7E2" else TURNED), f"air.frames_per_packet={len(text)}"])
+    return link, np.array([[byte] for byte in text]), np.repeat(np.array(chips, np.uint8)[:, None], 6, axis=1)
+
+
+def on_the_host(link: Link, symbols: NDArray[np.int64], folder: Path) -> NDArray[np.uint8]:
+    from board_lines import board_on
+
+    from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
+
+    device = SimulatedBoard()
+    provision(board_on(SimulatedLine(device)), bank_of(symbols[None], link), Settings())
+    device.run(100_000)
+    return device.records().played().chips(None)
+
+
+def in_qemu(link: Link, symbols: NDArray[np.int64], folder: Path) -> NDArray[np.uint8]:
+    from firmware_host.emulators.processes import start_qemu
+
+    with Session(start_qemu(folder / "leds.bin")) as session:
+        board = Board(session)
+        provision(board, bank_of(symbols[None], link), Settings())
+        while board.status().chips_sent < 300:
+            pass
+        board.stop()
+        board.wait_dark()
+    return LedRecord.read(folder / "leds.bin").played().chips(None)
+
+
+def on_the_model(link: Link, symbols: NDArray[np.int64], folder: Path) -> NDArray[np.uint8]:
+    """The image as it is flashed; rows as they are latched, from START on."""
+    pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
+    from firmware_host.emulators.stm32 import ModelLine, Stm32
+
+    chip = Stm32(build.arm_image("stm32f405"))
+    chip.run(15_000)
+    board = Board(Session(ModelLine(chip), Timing(latency_s=0.02)))
+    provision(board, bank_of(symbols[None], link), Settings(start=False))
+    begin = len(chip.drivers.log)
+    board.start()
+    chip.run(15_000)
+    rows = [shown.row for shown in chip.drivers.log[begin:] if shown.latched and not shown.dark]
+    assert rows[0] == 0, "the latch closes over dark before the first chip"
+    return np.array([[int(bit) for bit in f"{row:096b}"] for row in rows[1:]], np.uint8)
+
+
+BOARDS = {"native": on_the_host, "qemu": in_qemu, "stm32": on_the_model}
+
+
+@pytest.mark.parametrize("kind", ["7E2", "8O1, turned", "4-PPM"])
+@pytest.mark.parametrize("board", BOARDS)
+def test_every_board_plays_the_chips_of_the_link(
+    board: str, kind: str, needs: Callable[..., None], tmp_path: Path
+) -> None:
+    if board != "native":
+        needs("cc", "make", "arm-none-eabi-gcc", *(["qemu-system-arm"] if board == "qemu" else []))
+    link, symbols, told = packet_of(kind)
+    rows = BOARDS[board](link, symbols, tmp_path)
+    leds = told.shape[1]
+    assert len(rows) > len(told), "more than a packet"
+    assert not rows[:, leds:].any()
+    assert (rows[:, :leds] == np.resize(told, (len(rows), leds))).all()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [[*SERIAL, "air.frames_per_packet=80"], [*PULSES, "air.frames_per_packet=20"]],
+    ids=["7E2", "4-PPM"],
+)
+def test_a_text_by_a_board_and_a_camera(settings: list[str], evlcp: Evlcp, tmp_path: Path) -> None:
+    options = [part for one in settings for part in ("--set", one)]
+    done = evlcp("loop", "--text", "Tempo 30!", "--seed", 2, "--json", "-o", tmp_path, *options)
+    assert (done.code, done.err) == (0, ""), done.err
+    said = {step.pop("step"): step for step in map(json.loads, done.out.splitlines())}
+    assert said["text"]["texts"] == ["Tempo 30!"]
+    assert said["receiver"]["bit_errors"] == 0
+    assert said["receiver"]["warnings"] == []
+    assert (
+        said["receiver"]["frames_sent"] - 1 <= said["receiver"]["frames"] <= said["receiver"]["frames_sent"]
+    )
