@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import multiprocessing
+import select
 import signal
 import threading
 import time
@@ -15,12 +16,14 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.desk import Desk
 from evlcp_sdk.live.recorder import Recorder
-from evlcp_sdk.live.telling import MOST_WAITING, Line, Shot, Teller
-from evlcp_sdk.live.viewer import PICTURES_PER_S, Viewer
+from evlcp_sdk.live.telling import MOST_WAITING, PICTURES_PER_S, Line, Shot, Teller
+from evlcp_sdk.live.viewer import Viewer
 
 __all__ = ["ViewerApart"]
 
-_TURN_S: Final = 0.01
+_UNASKED: Final = 5
+"""Bundles from the receiver's process after which it draws no more, as nobody asks for a picture."""
+
 _BEGIN_S: Final = 60.0
 _END_S: Final = 3.0
 
@@ -29,8 +32,8 @@ class ViewerApart:
     """A `Viewer` in a process of its own, fed by a thread of this one.
 
     The thread may wait for that process, the receiver never does: of what is too much the oldest goes. What
-    is shown is told here, and only then handed on: a line takes less to hand on than what it tells of.
-    Arguments are those of `Viewer`.
+    is shown is drawn here, as a picture is less than its events, and written out there, as values take less
+    to hand on than to write. Arguments are those of `Viewer`.
 
     Attributes:
         url: What to open in a browser, once started.
@@ -94,16 +97,19 @@ class ViewerApart:
 
     def _feed(self) -> None:
         """Hand on what comes, and do what is asked, until all is said or the process has gone."""
-        number, wanted, told_s = -1, False, 0.0
+        said = select.poll()
+        said.register(self._pipe.fileno(), select.POLLIN)
+        number, wanted, turn_s = -1, False, time.monotonic()
         with contextlib.suppress(OSError, EOFError):
             while True:
                 ended = self._teller.ended
-                rest_s = told_s + 1 / PICTURES_PER_S - time.monotonic()
-                if self._pipe.poll(0.0 if ended else max(0.0, min(rest_s, _TURN_S if wanted else rest_s))):
+                # At even times, unless they are over already: one wake-up a picture.
+                now_s = time.monotonic()
+                turn_s = max(turn_s + 1 / PICTURES_PER_S, now_s)
+                while said.poll(0.0 if ended else max(0.0, turn_s - time.monotonic()) * 1e3):
                     kind, value = self._pipe.recv()
-                    if kind == "ask":
-                        wanted = True
-                        self._teller.ask()
+                    if kind == "wanted":
+                        wanted = value
                     elif kind == "dropped":
                         self._told = value
                     elif self._recorder is not None:
@@ -111,12 +117,10 @@ class ViewerApart:
                 shot = self._teller.shot() if wanted else None
                 if shot is not None and shot.number == number:
                     shot = None
-                now_s = time.monotonic()
-                if shot is None and not ended and now_s < told_s + 1 / PICTURES_PER_S:
-                    continue
                 if shot is not None:
-                    number, wanted = shot.number, False
-                told_s = now_s
+                    number = shot.number
+                if wanted:
+                    self._teller.ask()
                 state = None if self._recorder is None else self._recorder.state
                 self._pipe.send((self._teller.take(frames=True), shot, state))
                 if ended:
@@ -139,11 +143,13 @@ class _Wire:
 
 
 class _FarFeed:
-    """What the receiver's process tells, as it comes; asks for pictures, one at a time."""
+    """What the receiver's process tells, as it comes; has pictures drawn while somebody asks for them."""
 
-    def __init__(self, wire: _Wire) -> None:
-        self._wire = wire
-        self._asked = self._over = False
+    def __init__(self, wire: _Wire, loop: asyncio.AbstractEventLoop) -> None:
+        self._wire, self._loop = wire, loop
+        self._came = asyncio.Event()
+        self._wanted = self._over = False
+        self._unasked = 0
         self._waiting: deque[Line] = deque(maxlen=MOST_WAITING)
         self._lock = threading.Lock()
         self._shot: Shot | None = None
@@ -153,6 +159,11 @@ class _FarFeed:
     def ended(self) -> bool:
         """Nothing more will come, and nothing is left."""
         return self._over and not self._waiting
+
+    async def turn(self) -> None:
+        """Wait until something has come."""
+        await self._came.wait()
+        self._came.clear()
 
     def take(self, *, frames: bool) -> list[Line]:
         """What has come; frames are told in any case, as a browser may have come since."""
@@ -166,10 +177,14 @@ class _FarFeed:
         return self._shot
 
     def ask(self) -> None:
-        """Have a picture drawn, where none is under way."""
-        if not self._asked:
-            self._asked = True
-            self._wire.say("ask")
+        """Have pictures drawn, until nobody has asked for some time."""
+        self._unasked = 0
+        self._want(True)
+
+    def _want(self, wanted: bool) -> None:
+        if wanted != self._wanted:
+            self._wanted = wanted
+            self._wire.say("wanted", wanted)
 
     def put(self, lines: Sequence[Line], shot: Shot | None) -> None:
         """Keep what has come."""
@@ -177,11 +192,20 @@ class _FarFeed:
             self.dropped += max(len(self._waiting) + len(lines) - MOST_WAITING, 0)
             self._waiting.extend(lines)
         if shot is not None:
-            self._shot, self._asked = shot, False
+            self._shot = shot
+        self._loop.call_soon_threadsafe(self._arrived)
+
+    def _arrived(self) -> None:
+        self._unasked += 1
+        if self._unasked > _UNASKED:
+            self._want(False)
+        self._came.set()
 
     def leave(self) -> None:
         """Nothing more will come."""
         self._over = True
+        with contextlib.suppress(RuntimeError):  # the loop may be closed
+            self._loop.call_soon_threadsafe(self._came.set)
 
 
 class _FarRecorder:
@@ -213,9 +237,10 @@ def _serve(
     # Ctrl-C is for the receiver, which ends this.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     wire = _Wire(pipe)
-    feed, recorder = _FarFeed(wire), _FarRecorder(wire) if may_record else None
-    viewer = Viewer(feed, links, name=name, sites=sites, host=host, port=port, recorder=recorder)
+    recorder = _FarRecorder(wire) if may_record else None
     with Desk() as desk:
+        feed = _FarFeed(wire, desk.loop)
+        viewer = Viewer(feed, links, name=name, sites=sites, host=host, port=port, recorder=recorder)
         try:
             desk.call(viewer.start())
         except ConfigError as fault:

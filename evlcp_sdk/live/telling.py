@@ -1,5 +1,6 @@
 """What browsers are told of a live run: results as lines of JSON, pictures with what is drawn on them."""
 
+import asyncio
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -10,16 +11,21 @@ from evlcp_sdk.live.loop import LiveStatus
 from evlcp_sdk.live.outlet import News, Outlet
 from evlcp_sdk.live.pictures import Picture, PictureSlot
 from evlcp_sdk.results.columns import frame_columns
-from evlcp_sdk.results.lines import fix_line, frame_text
+from evlcp_sdk.results.lines import FrameSaid, fix_line, frame_said, said_text
 from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Fix, Frame
 
-__all__ = ["MOST_WAITING", "Line", "Shot", "Teller"]
+__all__ = ["MOST_WAITING", "PICTURES_PER_S", "FrameNews", "Line", "Shot", "Teller", "line_text"]
 
-Line = tuple[str, str]
-"""A kind of news, or `bars`, and what is said of it, JSON."""
+PICTURES_PER_S: Final = 25
+
+FrameNews = tuple[FrameSaid, float | None]
+"""What is said of a frame, and how late it was, ms."""
+
+Line = tuple[str, str | FrameNews]
+"""A kind of news, or `bars`, and what is said of it: JSON, which of a frame is written by who shows it."""
 
 MOST_WAITING: Final = 4000
 """Results that wait for a browser, some seconds of two bars; the oldest go."""
@@ -35,14 +41,13 @@ class Shot:
 
     Attributes:
         number: Counted from 0.
-        told: Its time and its regions, JSON values.
-        bars: Where the bars' clusters are in it, and what they said last, JSON values.
+        told: Its time and its regions, and where the bars' clusters are in it, and what they said last:
+            members `picture` and `bars` of a JSON object.
         png: The events.
     """
 
     number: int
-    told: dict[str, Any]
-    bars: list[dict[str, Any]]
+    told: str
     png: bytes
 
 
@@ -74,6 +79,7 @@ class Teller:
         self._bars: dict[int, Frame] = {}
         self._shot: Shot | None = None
         self._image: EventImage | None = None
+        self._turn_s = 0.0
         self._mine = outlet.subscribe(_KINDS, most=MOST_WAITING)
 
     @property
@@ -86,6 +92,12 @@ class Teller:
         """Nothing more will come, and all is told."""
         return self._mine.ended
 
+    async def turn(self) -> None:
+        """Wait until it is time to tell: at even times, unless they are over already."""
+        now_s = asyncio.get_running_loop().time()
+        self._turn_s = max(self._turn_s + 1 / PICTURES_PER_S, now_s)
+        await asyncio.sleep(self._turn_s - now_s)
+
     def ask(self) -> None:
         """Have a picture drawn."""
         self._pictures.ask()
@@ -95,16 +107,13 @@ class Teller:
         self._outlet.leave(self._mine)
 
     def take(self, *, frames: bool) -> list[Line]:
-        """What has come since, oldest first; without lines of frames where nobody looks on."""
+        """What has come since, oldest first; without frames where nobody looks on."""
         lines: list[Line] = []
         for news in self._mine.take(0):
             if news.kind == "frame":
                 self._keep(news.value)
                 if frames:
-                    late = "null" if news.late_ms is None else f"{news.late_ms:.3f}"
-                    lines.append(
-                        ("frame", f'{frame_text(news.value, self._columns)[:-1]}, "late_ms": {late}}}')
-                    )
+                    lines.append(("frame", (frame_said(news.value, self._columns), news.late_ms)))
             else:
                 lines += ((kind, json.dumps(values)) for kind, values in self._told(news))
         return lines
@@ -113,9 +122,9 @@ class Teller:
         """The newest picture; the same again until there is another."""
         picture = self._pictures.newest
         if picture is not None and (self._shot is None or self._shot.number != picture.number):
-            latest = [_bar(one) for one in self._bars.values() if one.t_us > picture.t_us - _LATEST_US]
             self._image = picture.image(self._image)
-            self._shot = Shot(picture.number, _told(picture), latest, self._image.png())
+            latest = [one for one in self._bars.values() if one.t_us > picture.t_us - _LATEST_US]
+            self._shot = Shot(picture.number, _told(picture, latest), self._image.png())
         return self._shot
 
     def _keep(self, frame: Frame) -> None:
@@ -157,30 +166,37 @@ class Teller:
         return [("bars", {"line": "bars", "bars": bars})]
 
 
-def _told(picture: Picture) -> dict[str, Any]:
-    return {
-        "number": picture.number,
-        "t_us": picture.t_us,
-        "window_us": picture.window_us,
-        "regions": [
-            [one.id, *(round(v, 1) for v in (one.x_px, one.y_px, one.width_px, one.height_px))]
-            for one in picture.regions
-        ],
-    }
+def line_text(said: str | FrameNews) -> str:
+    """A line as JSON."""
+    if isinstance(said, str):
+        return said
+    frame, late_ms = said
+    return f'{said_text(frame)[:-1]}, "late_ms": {"null" if late_ms is None else f"{late_ms:.3f}"}}}'
 
 
-def _bar(frame: Frame) -> dict[str, Any]:
-    """Where a bar's clusters are, and what they said last."""
-    points = frame.points_px.round(2).tolist()
-    return {
-        "transmitter": frame.transmitter,
-        "link": frame.link,
-        "echo_of": frame.echo_of,
-        "x_px": round(frame.x_px, 2),
-        "y_px": round(frame.y_px, 2),
-        "points": [[x, y] if x == x and y == y else None for x, y in points],
-        "symbols": frame.soft.symbols.tolist(),
-    }
+def _told(picture: Picture, bars: Sequence[Frame]) -> str:
+    # Written out: of so many numbers 25 times a second `json` takes thrice as long.
+    regions = ", ".join(
+        f"[{one.id}, {one.x_px:.1f}, {one.y_px:.1f}, {one.width_px:.1f}, {one.height_px:.1f}]"
+        for one in picture.regions
+    )
+    return (
+        f'"picture": {{"number": {picture.number}, "t_us": {picture.t_us}, "window_us": {picture.window_us},'
+        f' "regions": [{regions}]}}, "bars": [{", ".join(map(_bar, bars))}]'
+    )
+
+
+def _bar(frame: Frame) -> str:
+    """Where a bar's clusters are, and what they said last; JSON."""
+    points = ", ".join(
+        f"[{x:.2f}, {y:.2f}]" if x == x and y == y else "null" for x, y in frame.points_px.tolist()
+    )
+    return (
+        f'{{"transmitter": {frame.transmitter}, "link": {json.dumps(frame.link)},'
+        f' "echo_of": {"null" if frame.echo_of is None else frame.echo_of},'
+        f' "x_px": {frame.x_px:.2f}, "y_px": {frame.y_px:.2f}, "points": [{points}],'
+        f' "symbols": {frame.soft.symbols.tolist()}}}'
+    )
 
 
 def _status(status: LiveStatus) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.budget import LEVELS
 from evlcp_sdk.live.desk import cannot_listen, stop_listening
-from evlcp_sdk.live.telling import MOST_WAITING, Line, Shot
+from evlcp_sdk.live.telling import MOST_WAITING, PICTURES_PER_S, FrameNews, Line, Shot, line_text
 from evlcp_sdk.results.colours import TRANSMITTER_COLOURS, cluster_colours
 from evlcp_sdk.study.markup import Markup, document
 
@@ -32,9 +32,8 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
     from websockets.http11 import Request, Response
 
-__all__ = ["PICTURES_PER_S", "Feed", "RecordKeeper", "Viewer", "page"]
+__all__ = ["Feed", "RecordKeeper", "Viewer", "page"]
 
-PICTURES_PER_S: Final = 25
 _MOST_BROWSERS: Final = 16
 _FINISH_S: Final = 1.0
 _MOST_SAID: Final = 4096
@@ -76,6 +75,9 @@ class Feed(Protocol):
 
     @property
     def ended(self) -> bool:
+        """The same."""
+
+    async def turn(self) -> None:
         """The same."""
 
     def take(self, *, frames: bool) -> list[Line]:
@@ -185,13 +187,9 @@ class Viewer:
         self.port = next(iter(server.sockets)).getsockname()[1]
 
         async def pump() -> None:
-            turn_s = asyncio.get_running_loop().time()
             try:
                 while not self._feed.ended:
-                    # At even times, unless they are over already.
-                    now_s = asyncio.get_running_loop().time()
-                    turn_s = max(turn_s + 1 / PICTURES_PER_S, now_s)
-                    await asyncio.sleep(turn_s - now_s)
+                    await self._feed.turn()
                     for kind, line in self._feed.take(frames=bool(self._browsers)):
                         self._tell(kind, line)
                     self._send_all()
@@ -333,8 +331,11 @@ class Viewer:
 
     # What browsers are sent
 
-    def _tell(self, kind: str, line: str) -> None:
+    def _tell(self, kind: str, said: str | FrameNews) -> None:
         """Send something to all browsers, and keep what later ones are sent."""
+        if kind == "frame" and not self._browsers:
+            return
+        line = line_text(said)
         if kind in self._kept:
             self._kept[kind].append(line)
         elif kind != "frame":
@@ -351,21 +352,17 @@ class Viewer:
 
         shot = self._feed.shot()
         self._feed.ask()
+        record = None if self._recorder is None else self._recorder.state
+        end = f'"record": {json.dumps(record)}}}'
         for browser in ready:
             new = shot is not None and browser.picture != shot.number
             if not (new or browser.waiting):
                 continue
-            head: dict[str, Any] = {
-                "dropped": browser.dropped + self._feed.dropped,
-                "picture": None,
-                "bars": None,
-                "record": None if self._recorder is None else self._recorder.state,
-            }
-            data = b""
+            told, data = '"picture": null, "bars": null', b""
             if shot is not None and new:
-                browser.picture, data = shot.number, shot.png
-                head |= {"picture": shot.told, "bars": shot.bars}
-            text = f'{{"news": [{", ".join(browser.waiting)}], {json.dumps(head)[1:]}'.encode()
+                browser.picture, told, data = shot.number, shot.told, shot.png
+            dropped = browser.dropped + self._feed.dropped
+            text = f'{{"news": [{", ".join(browser.waiting)}], "dropped": {dropped}, {told}, {end}'.encode()
             browser.waiting.clear()
             browser.ready = False
             # It waits for nothing: of one that does not read there is no second bundle under way.
