@@ -5,7 +5,8 @@
 Every scene of a campaign is simulated and received with each decoding. Frames of all of them together are put
 into bins by their quality; a bin shows how many frames it has, what share of them should be wrong by it (the
 mean of 1 - q), and what share is, with an interval of 95 % that is bootstrapped over recordings. Where the
-latter is more than twice the former, or less than half of it, there is a star.
+latter is more than twice the former, or less than half of it, and chance would seldom (1 in 20) take one
+within these bounds so far out, there is a star.
 """
 
 import argparse
@@ -15,6 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import binom
 
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
@@ -29,6 +31,7 @@ DECODINGS = ("motion-feedback", "ml-soft", "wh-transform")
 EDGES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
 BINS = (*pairwise(EDGES), (0.0, 1.0))
 ROUNDS = 1000
+_SELDOM = 0.05
 
 Judged = dict[str, list[tuple[float, bool]]]
 
@@ -69,8 +72,15 @@ def rows(recordings: list[list[tuple[float, bool]]]) -> Iterator[list[str]]:
         share = wrong[drawn].sum(1) / np.maximum(n[drawn].sum(1), 1)
         least, most = np.quantile(share, [0.025, 0.975])
         said, true = doubt.sum() / n.sum(), wrong.sum() / n.sum()
-        star = "" if said / 2 <= true <= said * 2 else "*"
+        star = "*" if _is_off(int(wrong.sum()), int(n.sum()), said) else ""
         yield [str(n.sum()), f"{said:.2g}", f"{true:.2g}{star} ({least:.2g} to {most:.2g})"]
+
+
+def _is_off(wrong: int, frames: int, said: float) -> bool:
+    """Whether so many wrong frames are neither within a factor of 2 of what is said, nor chance."""
+    few = binom.cdf(wrong, frames, said / 2) < _SELDOM
+    many = binom.sf(wrong - 1, frames, min(2 * said, 1.0)) < _SELDOM
+    return bool(few or many)
 
 
 def main() -> None:

@@ -1216,6 +1216,7 @@ def believe(
     expected_worth: float,
     spread: float,
     least: float,
+    together: float,
     symbols: Array,
     scaled: Array,
 ) -> float:
@@ -1224,7 +1225,7 @@ def believe(
     A cluster's variance is pooled with that of all sizes of the frame, which is worth `frame_worth` sizes,
     and with an expected one, `spread` of its mean squared, worth `expected_worth`. Clusters unseen, or with a
     symbol of -1, are given LLRs of 0 and a symbol of -1; so are those less sure than `least`, but for their
-    LLRs.
+    LLRs. Of those that are wrong, `together` are in one frame.
 
     Returns:
         Probability that all that are given are right; 0 if none is.
@@ -1264,7 +1265,7 @@ def believe(
                 symbols[k] = read[k]
                 right *= sure
                 given += 1
-    return right if given else 0.0
+    return right ** (1 / together) if given else 0.0
 
 
 @njit(cache=True, nogil=True)

@@ -227,7 +227,7 @@ def info_activity(sums, weight, grid, pilot_chips, least):
     return (weight * (info - least * pilot)).sum((1, 2))
 
 
-def believe(read, llr, seen, frame_worth, expected_worth, spread, least):
+def believe(read, llr, seen, frame_worth, expected_worth, spread, least, together):
     seen = seen & (read >= 0)
     size = np.abs(llr.astype(float))
     if not size[seen].any():
@@ -241,7 +241,8 @@ def believe(read, llr, seen, frame_worth, expected_worth, spread, least):
     scaled = np.where(seen[:, None], llr * factor[:, None], 0)
     sure = 1 / (1 + np.exp(-np.abs(scaled).min(1)))
     given = seen & (sure >= least)
-    return np.where(given, read, -1), scaled, sure[given].prod() if given.any() else 0.0
+    quality = sure[given].prod() ** (1 / together) if given.any() else 0.0
+    return np.where(given, read, -1), scaled, quality
 
 
 def newest_on_parabola(past, speed_weight, bend_weight, worth, outlier):
