@@ -155,6 +155,10 @@ class Framing(ABC):
     def compile(self, codebook: Codebook, packet: PacketFormat) -> Deframer | None:
         """Precompute for codes and a packet format; None where the receiver reads packets by the roles."""
 
+    def rest(self) -> int | None:
+        """What LEDs must do while nothing is sent, 1 on, 0 off; None where any pattern may stand there."""
+        return None
+
 
 class Pilots(ABC):
     """Codes that find time and tell clusters apart."""

@@ -27,6 +27,7 @@ __all__ = [
     "queue_of",
     "random_symbols",
     "read_masks",
+    "rest_content",
     "symbol_chips",
     "word_limits",
 ]
@@ -77,6 +78,7 @@ class Bank:
         led_clusters: The cluster of each LED, int64 (LEDs,).
         composed: What the board puts packets together with; None if the bank has every chip.
         word_limits: Why it could not.
+        rest: What its LEDs must do while nothing is sent, as the link's framing says.
     """
 
     format: Format
@@ -89,6 +91,7 @@ class Bank:
     led_clusters: NDArray[np.int64]
     composed: Composed | None = None
     word_limits: tuple[str, ...] = ()
+    rest: int | None = None
 
     @classmethod
     def of_symbols(
@@ -254,6 +257,18 @@ def packet_content(like: Bank, symbols: ArrayLike, codebook: Codebook, pilot_eve
     return rows_of_chips(chips, like.led_clusters).tobytes()
 
 
+def rest_content(like: Bank) -> bytes | None:
+    """A packet during which nothing is sent, as it stands in a bank; None if any pattern may stand there."""
+    if like.rest is None:
+        return None
+    chips = np.full((like.packet_chips, like.clusters), like.rest, np.uint8)
+    return (
+        _bits_of_chips(chips)
+        if like.format == Format.CLUSTERS
+        else rows_of_chips(chips, like.led_clusters).tobytes()
+    )
+
+
 def limits(packet: PacketFormat) -> list[str]:
     """What of a link no driver board can play; empty if one can. The rest is for HELLO to say."""
     rate = packet.chip_rate_hz
@@ -292,9 +307,10 @@ def bank_of(symbols: ArrayLike, link: Link) -> Bank:
     Raises:
         ConfigError: The symbols are not the link's, or no board can play it.
     """
-    return Bank.of_symbols(
+    bank = Bank.of_symbols(
         symbols, link.codebook, link.packet.pilot_every, link.packet.chip_rate_hz, link.bar.led_clusters()
     )
+    return replace(bank, rest=link.algorithm("framing").rest())
 
 
 def queue_of(link: Link) -> Bank:
@@ -303,7 +319,10 @@ def queue_of(link: Link) -> Bank:
     Raises:
         ConfigError: No board can play it.
     """
-    return _like(link.codebook, link.packet, link.bar.led_clusters())
+    rest = link.algorithm("framing").rest()
+    like = replace(_like(link.codebook, link.packet, link.bar.led_clusters()), rest=rest)
+    # A board that composes packets has words for no pause.
+    return like if rest is None else like.chip_by_chip()
 
 
 def _refuse(faults: list[str]) -> None:
@@ -343,6 +362,7 @@ def read_masks(path: Path, link: Link) -> Bank:
     check_link(link)
     chips = read_numbers(path)
     try:
-        return Bank.of_chips(chips, link.codebook, link.packet, link.bar.led_clusters())
+        bank = Bank.of_chips(chips, link.codebook, link.packet, link.bar.led_clusters())
+        return replace(bank, rest=link.algorithm("framing").rest())
     except ConfigError as fault:
         raise InputError(f"{path}: {fault}") from fault

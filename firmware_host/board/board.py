@@ -13,7 +13,7 @@ from evlcp_sdk.air.codebook import word_of_chips
 from evlcp_sdk.air.frames import pilot_words
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
-from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank, packet_content, queue_of
+from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank, packet_content, queue_of, rest_content
 from firmware_host.board.session import Session
 from firmware_host.board.stream import AHEAD, Stream
 from firmware_host.errors import IncompatibleError, LineError, RefusedError, VerifyError
@@ -397,7 +397,8 @@ class Board:
     def stream(self, link: Link, ahead: int = AHEAD) -> Stream:
         """Make the spare bank a queue of packets, and play from it: packets as they come.
 
-        The board changes to it between two packets, and shows its idle pattern while the queue is empty.
+        The board changes to it between two packets, and shows its idle pattern while the queue is empty. If
+        the link's framing says what LEDs do while nothing is sent, packets of that keep it from being empty.
 
         Args:
             link: What the packets are sent with.
@@ -417,6 +418,9 @@ class Board:
         self.check_fits(like)
         status = self._settled()
         self._check_rate(like, status)
+        if like.rest:
+            share = min(status.duty_limit / 1000, self.about.mean_max_ma / max(1, status.level_ma))
+            self.check_duty("a pause of this link", 1000, min(1.0, share))
         self.prepare(like)
         bank = 1 if status.active_bank == 0 else 0
         if like.content:
@@ -427,8 +431,6 @@ class Board:
             raise ConfigError(
                 f"ahead = {ahead}, {self.session.name} holds {slots - 1} packets of this length"
             )
-        if status.state != State.PLAYING:
-            self.start()
         acts = status.watchdog != Watchdog.KEEP
 
         def content(symbols: ArrayLike) -> bytes:
@@ -439,7 +441,10 @@ class Board:
 
         packet_s = like.packet_chips / like.chip_rate_hz
         pulse_s = min(0.5, status.watchdog_ms / 3e3) if acts else 0.5
-        return Stream(self.session, bank, content, packet_s, ahead, pulse_s)
+        stream = Stream(self.session, bank, content, packet_s, ahead, pulse_s, rest_content(like))
+        if status.state != State.PLAYING:
+            self.start()
+        return stream
 
     def _check_rate(self, content: Bank, status: StatusReply) -> None:
         """Raise RefusedError if chips run at another rate, which a board that plays keeps."""
@@ -660,6 +665,11 @@ def provision(
         BoardError: See `Board.limit`, `Board.program` and `Board.level`.
         ConfigError: The bank does not fit the board.
     """
+    if bank.rest is not None and settings.watchdog == Watchdog.IDLE:
+        raise ConfigError(
+            "watchdog = idle: LEDs that are on for a chip of two say something in this link's framing;"
+            " use dark, or keep"
+        )
     bank = board.fitted(bank)
     board.check_fits(bank)
     before = status = board.status()

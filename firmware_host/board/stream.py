@@ -49,9 +49,10 @@ class _Piece:
 class Stream:
     """A board's queue of packets; `Board.stream` makes one.
 
-    `send` puts a packet in; the board plays it after those before it, and shows its idle pattern while it has
-    none. As a context manager it ends in the dark: after the last packet, or, if something was raised, after
-    the one that plays.
+    `send` puts a packet in; the board plays it after those before it, and shows its idle pattern while it
+    has none. If it is given a packet of pause, one of these waits whenever nothing else does, so that the
+    board is never without. As a context manager it ends in the dark: after the last packet, or, if something
+    was raised, after the one that plays.
 
     Args:
         session: The session with the board; nothing else may use it meanwhile.
@@ -61,10 +62,12 @@ class Stream:
         ahead: Packets that wait on the board, the one that plays among them: few for a short delay, many for
             a host that may be held up.
         pulse_s: How long the board may hear nothing, s.
+        pause: A packet during which nothing is sent, as it is in the bank; None to leave that to the board.
 
     Attributes:
         sent: Packets that were given to `send`.
-        begun: Packets that have begun to play, as far as the board has said.
+        pauses: Packets of pause that were put in.
+        begun: Packets that have begun to play, pauses among them, as far as the board has said.
         underruns: How often the board had none to play, as far as it has said.
         requests: Requests sent, repeated ones included.
     """
@@ -77,12 +80,14 @@ class Stream:
         packet_s: float,
         ahead: int,
         pulse_s: float,
+        pause: bytes | None = None,
     ) -> None:
         self._session = session
         self._bank = bank
         self._content = content
         self._ahead = ahead
         self._pulse_s = pulse_s
+        self._pause = pause
         self._room = session.max_payload - _PIECE_OVERHEAD
         self._retries = session.client.retries
         self._submitted = 0
@@ -95,8 +100,14 @@ class Stream:
         # the latest at which the newest packet that is known to have begun did so; the first begins at once
         self._begun_s = self._heard_s - self.packet_s
         self.sent = 0
+        self.pauses = 0
         self.begun = 0
         self.underruns = 0
+        if pause is not None:
+            # Before the board starts: it begins with a pause.
+            self._pump(0.0)
+            while self._pieces or self._flight:
+                self._pump(self._pulse_s)
 
     def __enter__(self) -> Self:
         return self
@@ -117,7 +128,7 @@ class Stream:
     @property
     def delay_s(self) -> float:
         """How long a packet that is sent now waits for its first chip, as far as can be told, s."""
-        begins_s = self._begun_s + (self.sent - self.begun + 1) * self.packet_s
+        begins_s = self._begun_s + (self._next - self.begun + 1) * self.packet_s
         return max(0.0, begins_s - self._session.transport.now())
 
     def play(
@@ -163,14 +174,25 @@ class Stream:
             ConfigError: They are not a packet of the link.
             BoardError: The line or the board fails.
         """
-        number, content = self.sent, self._content(symbols)
+        content = self._content(symbols)
+        number = self._put(content)
         self.sent += 1
-        for at in range(0, len(content), self._room):
-            data = content[at : at + self._room]
-            self._pieces.append(_Piece(number, at, data, at + len(data) == len(content)))
         while self._pieces and self._pieces[0].number <= number:
             self._pump(self._pulse_s)
             self._look()
+        return self.sent - 1
+
+    @property
+    def _next(self) -> int:
+        """The number on the line of the next packet."""
+        return self.sent + self.pauses
+
+    def _put(self, content: bytes) -> int:
+        """Let a packet wait for its turn; the number on the line is returned."""
+        number = self._next
+        for at in range(0, len(content), self._room):
+            data = content[at : at + self._room]
+            self._pieces.append(_Piece(number, at, data, at + len(data) == len(content)))
         return number
 
     def wait(self, seconds: float) -> None:
@@ -190,17 +212,19 @@ class Stream:
         Raises:
             BoardError: The line or the board fails.
         """
+        self._pause = None
         while self._pieces or self._flight:
             self._pump(self._pulse_s)
-        if self._position != (self.sent, 0):
+        if self._position != (self._next, 0):
             raise LineError(f"{self._session.name}: the board's queue lost a packet; send it again")
-        self._submit(None, PushRequest(self._bank, self.sent, 0, 1, b""))
+        self._submit(None, PushRequest(self._bank, self._next, 0, 1, b""))
         while self._flight:
             self._pump(self._pulse_s)
-        self._until_dark((self.sent - self.begun + 1) * self.packet_s)
+        self._until_dark((self._next - self.begun + 1) * self.packet_s)
 
     def stop(self) -> None:
         """Dark after the packet that plays; those that wait are not played."""
+        self._pause = None
         self._pieces.clear()
         self._flight.clear()
         self._session.client.forget()
@@ -226,9 +250,9 @@ class Stream:
         self._flight[self._session.client.submit(request)] = (piece, request)
         self._submitted += 1
 
-    def _free_s(self, number: int) -> float:
+    def _free_s(self, number: int, ahead: int) -> float:
         """When a packet may go out, so that `ahead` are on the board with it."""
-        missing = number - self._ahead + 2 - self.begun
+        missing = number - ahead + 2 - self.begun
         return self._hold_s if missing <= 0 else max(self._hold_s, self._begun_s + missing * self.packet_s)
 
     def _pump(self, wait_s: float) -> None:
@@ -236,8 +260,13 @@ class Stream:
         client, line = self._session.client, self._session.transport
         now = line.now()
         free = now + wait_s
+        if self._pause is not None and not self._pieces:
+            free = self._free_s(self._next, 2)
+            if free <= now:
+                self._put(self._pause)
+                self.pauses += 1
         while self._pieces and client.room:
-            free = self._free_s(self._pieces[0].number)
+            free = self._free_s(self._pieces[0].number, self._ahead)
             if free > now:
                 break
             piece = self._pieces.pop(0)

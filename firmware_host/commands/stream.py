@@ -102,7 +102,7 @@ def table_of(stream: "Stream") -> dict[str, Any]:
     return {
         "packets": stream.sent,
         "underruns": stream.underruns,
-        "round_trips": round(stream.requests / max(1, stream.sent), 3),
+        "round_trips": round(stream.requests / max(1, stream.sent + stream.pauses), 3),
     }
 
 

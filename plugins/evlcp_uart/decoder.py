@@ -62,6 +62,10 @@ DOUBTFUL = 0.85
 _INVERTED_BITS = 10.0
 """How much more must speak for a light the other way round than said: one link of a thousand errs."""
 
+_INVERTED_KINDS = 3
+"""Characters of so many kinds at least show which way round the light is: where one or two come again and
+again, pulses are of a length or two, and falls that come a bit late explain the other way, too."""
+
 _TRIED, _ROUNDS = 4, 5
 """Guesses of the light that are followed, and how often each is learned anew."""
 
@@ -496,6 +500,10 @@ class CharacterDecoder:
         ]
         light, starts = learned[int(np.argmax(explained))]
         evidence = self._evidence(stretch, light)[starts[:, None] + self._places(light)]
+        if light.inverted:
+            kinds = np.unique(self.characters.likelihoods(evidence).argmax(1))
+            if len(kinds) < _INVERTED_KINDS:
+                return None
         return light, float(self.characters.framed(evidence).sum() / np.log(2))
 
     def _learnt(self, stretch: "Stretch", inverted: bool) -> list[tuple[Light, NDArray[np.int64]]]:

@@ -60,12 +60,16 @@ class Uart(Framing):
             raise ConfigError(
                 f"framing 'uart': a bar of {clusters} clusters, expected one: set bar.cluster_rows = bar.rows"
             )
-        mark = self.idle == "on"
+        mark = self.rest()
         levels = self.characters.levels()
         order = "" if self.first_bit == "lowest" else "-highest"
         profile = f"uart-{self.data_bits}{self.parity[0].upper()}{self.stop_bits}{order}"
         pause = np.full(self.pause_bits, mark, np.uint8)
         return Codebook(profile, pause, np.empty((1, 0), np.uint8), levels if mark else 1 - levels)
+
+    def rest(self) -> int:
+        """A mark, as in pauses: anything else would be characters."""
+        return int(self.idle == "on")
 
     def decoder(self, bit_rate_hz: float) -> CharacterDecoder:
         """What reads characters from events."""

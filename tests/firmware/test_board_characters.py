@@ -7,15 +7,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from board_lines import board_on
 from numpy.typing import NDArray
 
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, load_link
 from firmware_host import build
 from firmware_host.board.bank import bank_of, random_symbols
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import LedRecord
+from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.errors import RefusedError
 from firmware_host.protocol.client import Timing
+from firmware_host.protocol.requests import Watchdog
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -70,10 +75,6 @@ def packet_of(kind: str) -> tuple[Link, NDArray[np.int64], NDArray[np.uint8]]:
 
 
 def on_the_host(link: Link, symbols: NDArray[np.int64], folder: Path) -> NDArray[np.uint8]:
-    from board_lines import board_on
-
-    from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
-
     device = SimulatedBoard()
     provision(board_on(SimulatedLine(device)), bank_of(symbols[None], link), Settings())
     device.run(100_000)
@@ -144,3 +145,42 @@ def test_a_text_by_a_board_and_a_camera(settings: list[str], evlcp: Evlcp, tmp_p
     assert (
         said["receiver"]["frames_sent"] - 1 <= said["receiver"]["frames"] <= said["receiver"]["frames_sent"]
     )
+
+
+@pytest.mark.parametrize("kind", ["7E2", "8O1, turned"])
+def test_a_stream_rests_while_there_is_nothing_to_send(kind: str) -> None:
+    """The board's idle pattern would be characters: packets of pause keep it from being shown."""
+    device = SimulatedBoard()
+    link, symbols, told = packet_of(kind)
+    with board_on(SimulatedLine(device)).stream(link) as stream:
+        stream.wait(0.05)
+        assert stream.send(symbols) == 0
+        stream.wait(0.1)
+        assert [stream.send(symbols) for _ in range(3)] == [1, 2, 3]
+        assert stream.pauses > 5
+    assert (stream.underruns, stream.sent) == (0, 4)
+    chips = device.records().played().chips(link.bar.led_clusters())
+    packets = chips.reshape(-1, len(told))
+    sent = (packets == told[:, 0]).all(1)
+    assert (packets[~sent] == told[0, 0]).all(), "the level of a pause"
+    assert sent.sum() == 4
+    assert np.flatnonzero(sent)[0] >= 3, "it rests from the first chip on"
+    assert sent[-3:].all(), "behind one another"
+    assert not device.shown().any()
+
+
+def test_what_would_be_characters_is_refused() -> None:
+    device = SimulatedBoard()
+    link, symbols, _ = packet_of("7E2")
+    board = board_on(SimulatedLine(device))
+    bank = bank_of(symbols[None], link)
+    with pytest.raises(
+        ConfigError, match="watchdog = idle: LEDs that are on for a chip of two say something"
+    ):
+        provision(board, bank, Settings(watchdog=Watchdog.IDLE))
+    provision(board, bank, Settings(watchdog=Watchdog.DARK, duty_limit=0.8, start=False))
+    with pytest.raises(RefusedError, match="a pause of this link has a LED on for 1 of the time, the duty"):
+        board.stream(link)
+    turned, symbols, _ = packet_of("8O1, turned")
+    with board.stream(turned) as stream:
+        stream.send(symbols)

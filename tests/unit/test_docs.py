@@ -46,6 +46,8 @@ PAGES = (
     "paper",
     "rates",
     "roles",
+    "air-interface",
+    "uart",
     "conformance",
     "hooks",
     "glossary",
