@@ -13,6 +13,9 @@ from evlcp_sdk.values import Events, Region
 
 __all__ = ["Picture", "PictureSlot"]
 
+_FORGET_EVERY = 16
+"""Slices after which what is too old for a picture is forgotten: to look with each takes as long as to paint."""
+
 
 @dataclass(frozen=True, eq=False)
 class Picture:
@@ -71,6 +74,7 @@ class PictureSlot:
     def __init__(self, window_us: int = 10_000) -> None:
         self.window_us = window_us
         self._recent: deque[Events] = deque()
+        self._kept = 0
         self._asked = False
         self._picture: Picture | None = None
         self._drawn = threading.Condition()
@@ -99,6 +103,10 @@ class PictureSlot:
         if not len(events):
             return
         self._recent.append(events)
+        self._kept += 1
+        if not self._asked and self._kept < _FORGET_EVERY:
+            return
+        self._kept = 0
         end_us = int(events.t_us[-1])
         while int(self._recent[0].t_us[-1]) <= end_us - self.window_us:
             self._recent.popleft()
