@@ -14,7 +14,7 @@ from evlcp_sdk.values import Events, Region
 __all__ = ["Picture", "PictureSlot"]
 
 _FORGET_EVERY = 16
-"""Slices after which what is too old for a picture is forgotten: to look with each takes as long as to paint."""
+"""Slices after which what is too old for a picture is forgotten: to look with each takes longer."""
 
 
 @dataclass(frozen=True, eq=False)
