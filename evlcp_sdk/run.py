@@ -366,7 +366,7 @@ def live(
         # A recording waits for its reader, and what is wrong with its name is said at once.
         waits = not isinstance(source, EventSource) and is_recording(source)
         if warm and not waits:
-            warm_up(links)
+            warm_up(links, positions=plan is not None)
         opened = open_until(source, registry, stopped)
         if not opened.live and opened.size_bytes is not None:
             opened = ReplaySource(opened)
@@ -374,7 +374,7 @@ def live(
             url = str(opened.path) if url == STDIN else url
             check_sensor(opened, url, links[0].camera)
             if warm and waits:
-                warm_up(links)
+                warm_up(links, positions=plan is not None)
             name = Path(url).name
             kept: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock_zero}
             loop: LiveLoop

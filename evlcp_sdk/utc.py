@@ -33,7 +33,9 @@ class PulseClock:
 
     Attributes:
         dated: UTC is known beforehand; the computer's clock is not asked.
+        channel: Of the trigger input.
         counts: `pulses` that are believed, and `pulses_rejected`.
+        others: Channels of the trigger input on which something rose, beside its own.
 
     Raises:
         ConfigError: The channel is not one of 0 to 255.
@@ -47,7 +49,8 @@ class PulseClock:
     def __init__(self, channel: int = 0, near: datetime | None = None) -> None:
         if not 0 <= channel <= 255:
             raise ConfigError(f"pulses on channel {channel}: expected 0 to 255")
-        self._channel = channel
+        self.channel = channel
+        self.others: set[int] = set()
         self.dated = near is not None
         self._near_s = None if near is None else near.timestamp()
         self._approximate_s = self._near_s
@@ -64,7 +67,10 @@ class PulseClock:
             now_s: UTC since 1970 as the computer's clock has it, s.
             now_us: The camera's clock at that time, us.
         """
-        mine = (triggers.channel == self._channel) & (triggers.value == 1)
+        rising = triggers.value == 1
+        mine = rising & (triggers.channel == self.channel)
+        if mine.sum() < rising.sum():
+            self.others |= set(triggers.channel[rising & ~mine].tolist())
         near_s = now_s - now_us * 1e-6 if self._near_s is None else self._near_s
         if self._approximate_s is None:
             self._approximate_s = near_s
@@ -106,10 +112,10 @@ class PulseClock:
         if len(self._t_us) == 2 * _MOST_KEPT:
             del self._t_us[:_MOST_KEPT], self._s[:_MOST_KEPT]
 
-    def to_dict(self) -> dict[str, int | float | None]:
-        """The counts and the rate, as JSON values."""
-        rate_ppm = self.rate_ppm
-        return {**self.counts, "rate_ppm": None if rate_ppm is None else round(rate_ppm, 3)}
+    def to_dict(self) -> dict[str, int | float | list[int] | None]:
+        """The counts, the rate, the channel and the others on which something came, as JSON values."""
+        rate_ppm = None if self.rate_ppm is None else round(self.rate_ppm, 3)
+        return {**self.counts, "rate_ppm": rate_ppm, "channel": self.channel, "others": sorted(self.others)}
 
     def utc_s(self, t_us: float) -> float | None:
         """UTC since 1970 of a time of the camera's clock, s; None before anything is known."""

@@ -95,7 +95,10 @@ def _real_time(summary: Mapping[str, Any]) -> Iterator[tuple[str, str | None]]:
     if pps is not None:
         rate = _or_dash(pps["rate_ppm"], "{:+.3f} ppm")
         text = f"{pps['pulses']} pulses of UTC, {pps['pulses_rejected']} rejected: the camera's clock {rate}"
-        yield (text, None) if pps["pulses"] else ("no pulse of UTC came on the trigger input", "yellow")
+        none = f"no pulse of UTC came on channel {pps['channel']} of the trigger input"
+        if pps["others"]:
+            none += f"; on others something came: {', '.join(map(str, pps['others']))}"
+        yield (text, None) if pps["pulses"] else (none, "yellow")
 
 
 def delays_text(tally: Mapping[str, Any]) -> str:

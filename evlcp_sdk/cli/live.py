@@ -245,6 +245,8 @@ def live(
             budget=Budget(waiting_ms=waiting_ms, most_ms=10 * waiting_ms),
             stopped=stopped.or_when(lambda: out is None and lines is not None and lines.gone),
         )
+        if services.fault:
+            complain(services.fault)
         if lines is not None:
             lines(json.dumps({"line": "summary"} | summary))
         elif as_json:

@@ -17,6 +17,7 @@ from evlcp_sdk.live.recorder import Recorder
 from evlcp_sdk.live.telling import Teller
 from evlcp_sdk.live.viewer import Viewer
 from evlcp_sdk.scene.sites import BarSite
+from evlcp_sdk.spelling import counted
 from evlcp_sdk.utc import ClockZero
 
 __all__ = ["Services", "Serving"]
@@ -78,13 +79,15 @@ class Services:
     ) -> None:
         self.pictures = PictureSlot() if serving.view else None
         self._recorder: Recorder | None = None
+        self._teller: Teller | None = None
         self.view: Viewer | ViewerApart | None = None
         if self.pictures is not None:
             if serving.record_to is not None:
                 camera = next(iter(links.values())).camera
                 self._recorder = Recorder(outlet, serving.record_to, camera.width, camera.height)
+            self._teller = Teller(outlet, self.pictures, links, sites)
             self.view = (ViewerApart if serving.apart else Viewer)(
-                Teller(outlet, self.pictures, links, sites),
+                self._teller,
                 links,
                 name=name,
                 sites=len(sites),
@@ -105,6 +108,15 @@ class Services:
         """Results that clients were not sent as they did not take them, by server."""
         servers = {"view": self.view, "nmea": self.nmea, "gpsd": self.gpsd}
         return {name: server.dropped for name, server in servers.items() if server is not None}
+
+    @property
+    def fault(self) -> str:
+        """What the page could not show, and why; empty for nothing."""
+        if self._teller is None or not self._teller.untold:
+            return ""
+        return (
+            f"{counted(self._teller.untold, 'message')} could not be shown on the page: {self._teller.fault}"
+        )
 
     def __enter__(self) -> Self:
         servers = [one for one in (self.view, self.nmea, self.gpsd) if one is not None]

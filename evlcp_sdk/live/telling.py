@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
+from evlcp_sdk.errors import PluginError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.loop import LiveStatus
 from evlcp_sdk.live.outlet import News, Outlet
@@ -15,7 +16,7 @@ from evlcp_sdk.results.lines import FrameSaid, fix_line, frame_said, said_text
 from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.values import Fix, Frame
+from evlcp_sdk.values import Fix, Frame, ReceivedMessage
 
 __all__ = ["MOST_WAITING", "PICTURES_PER_S", "FrameNews", "Line", "Shot", "Teller", "line_text"]
 
@@ -62,6 +63,8 @@ class Teller:
 
     Attributes:
         dropped: Results that nobody had the time to tell, so far.
+        untold: Messages of a kind that failed to show them, so far.
+        fault: How the last one failed.
         ended: Nothing more will come, and all is told.
     """
 
@@ -80,6 +83,7 @@ class Teller:
         self._shot: Shot | None = None
         self._image: EventImage | None = None
         self._turn_s = 0.0
+        self.untold, self.fault = 0, ""
         self._mine = outlet.subscribe(_KINDS, most=MOST_WAITING)
 
     @property
@@ -135,7 +139,7 @@ class Teller:
     def _told(self, news: News) -> list[tuple[str, dict[str, Any]]]:
         kind, value = news.kind, news.value
         if kind == "message":
-            return [(kind, {"line": kind} | json.loads(message_line(value)))]
+            return [self._message(value)]
         if kind == "status":
             return [(kind, {"line": kind} | _status(value))]
         if kind == "end":
@@ -152,6 +156,17 @@ class Teller:
         }
         return [*self._bars_of(fix), (kind, fix_line(fix) | on_the_map)]
 
+    def _message(self, message: ReceivedMessage) -> tuple[str, dict[str, Any]]:
+        """A message; where its kind, which may be a plugin's, fails to show it, how many did and why."""
+        try:
+            # A page reads no NaN.
+            shown = json.loads(message_line(message), parse_constant=_not_a_number)
+        except (PluginError, ValueError) as fault:
+            self.untold += 1
+            self.fault = str(fault)
+            return "untold", {"line": "untold", "count": self.untold, "fault": self.fault}
+        return "message", {"line": "message"} | shown
+
     def _bars_of(self, fix: Fix) -> list[tuple[str, dict[str, Any]]]:
         """The bars in local metres, with the first fix that is given."""
         if self._sites_told:
@@ -164,6 +179,10 @@ class Teller:
             place = here.to_enu(one.latitude_deg, one.longitude_deg, one.height_m) + fix.enu_m
             bars.append([one.transmitter_id, *(round(v, 3) for v in place.tolist())])
         return [("bars", {"line": "bars", "bars": bars})]
+
+
+def _not_a_number(name: str) -> None:
+    raise ValueError(f"a message kind shows {name}, which JSON has not")
 
 
 def line_text(said: str | FrameNews) -> str:

@@ -113,12 +113,16 @@ def test_pulses_of_a_recording_say_what_utc_it_is(tmp_path: Path, evlcp: Callabl
     given = ("--pps", "0", "--clock-zero", "2026-03-01T12:00:00Z", "--waiting-ms", "100000", "--json")
     done = evlcp("live", f"replay:{tmp_path / 'pps.raw'}?speed=20", *given)
     assert done.code == 0, done.err
-    counted = {"pulses": 4, "pulses_rejected": 1, "rate_ppm": 25.0}
+    counted = {"pulses": 4, "pulses_rejected": 1, "rate_ppm": 25.0, "channel": 0, "others": []}
     assert json.loads(done.out)["pps"] == counted
     # As from the file itself, for which the computer's clock says nothing.
     done = evlcp("receive", tmp_path / "pps.raw", "-o", tmp_path / "out", *given[:4], "--json")
     assert done.code == 0, done.err
     assert json.loads(done.out)["pps"] == counted
+    done = evlcp("receive", tmp_path / "pps.raw", "-o", tmp_path / "out", "--pps", "9", *given[2:4])
+    assert done.code == 0, done.err
+    said = " ".join((done.out + done.err).split())
+    assert "no pulse of UTC came on channel 9 of the trigger input; on others something came: 0" in said
     done = evlcp("receive", tmp_path / "pps.raw", "-o", tmp_path / "out", "--pps", "0")
     assert done.code == 2
     assert "a pulse says when a second of UTC begins, not which one: give --clock-zero" in done.err
@@ -305,8 +309,49 @@ def test_all_kernels_are_loaded_before_the_first_event(name: str) -> None:
     assert found.stdout.strip() == "[]"
 
 
+_PLACED = """
+import numpy as np
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.live.warm import warm_up
+from evlcp_sdk.place import _kernels
+from evlcp_sdk.place.navigator import Navigator, PositionPlan
+from evlcp_sdk.place.pose import solve_pose
+from evlcp_sdk.scene.attitude import Attitude
+from tests.unit.place.test_pose import CAMERA, THREE, UP, bar, views
+from tests.unit.results.test_positions import ATTITUDE, SITE, packets
+
+def loaded():
+    return {name: len(k.overloads) for name, k in vars(_kernels).items() if hasattr(k, "overloads")}
+
+link = load_link()
+warm_up([link], positions=True)
+before = loaded()
+navigator = Navigator(link, PositionPlan((SITE,)), ATTITUDE)
+assert [placed for placed in navigator.feed(packets(5)) if not placed.fix.refusal]
+navigator.close()
+rng, rotation = np.random.default_rng(2), UP.rotation()
+for _ in range(40):
+    bars = [bar(tuple(rng.normal(place, 3.0))) for place in THREE[:rng.integers(1, 4)]]
+    seen = views(bars, np.zeros(3), rotation, rng, rng.choice([0.1, 0.3, 3.0]))
+    for known in (UP, Attitude(5.0), None):
+        solve_pose(seen, CAMERA, known)
+print(sorted(name for name, many in loaded().items() if many != before[name]))
+"""
+
+
+def test_what_positions_need_is_loaded_before_the_first_event() -> None:
+    found = subprocess.run(
+        [sys.executable, "-c", _PLACED],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(__file__).parents[3],
+    )
+    assert found.stdout.strip() == "[]"
+
+
 def test_a_wrong_name_is_said_before_kernels_are_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "warm_up", lambda _: pytest.fail("kernels are loaded for nothing"))
+    monkeypatch.setattr(run, "warm_up", lambda *_, **__: pytest.fail("kernels are loaded for nothing"))
     for name in ("nothing.raw", "replay:nothing.raw", "bag:nothing", "hdf5:nothing.hdf5"):
         with pytest.raises(InputError, match="No such file"):
             live(name)

@@ -19,6 +19,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from evlcp_sdk.air.blocks import Message
+from evlcp_sdk.air.kinds import TextKind
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io.open import open_source
 from evlcp_sdk.link.resolve import load_link
@@ -30,7 +32,7 @@ from evlcp_sdk.live.viewer import page
 from evlcp_sdk.place.navigator import Place, Placed
 from evlcp_sdk.run import live
 from evlcp_sdk.scene.sites import LocalAxes
-from evlcp_sdk.values import Events, Fix, Triggers
+from evlcp_sdk.values import Events, Fix, ReceivedMessage, Triggers
 from tests.unit.results.test_positions import SITE, packets
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
 from tests.unit.study.test_markup import HOSTILE
@@ -209,6 +211,40 @@ def test_what_was_before_is_told_to_who_comes_later(stage: Stage) -> None:
     ((number, *bar),) = lines["bars", None]["bars"]
     assert number == 7
     assert bar == pytest.approx([0, 0, 0], abs=2e-3)
+
+
+class Failing(TextKind):
+    """A kind of messages whose values may not be what it shows."""
+
+    def to_dict(self, value: Any) -> dict[str, Any]:
+        if value == "raises":
+            raise ZeroDivisionError("by nothing")
+        return {"text": value}
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_a_message_that_cannot_be_shown_is_counted_and_said(apart: bool) -> None:
+    outlet = Outlet()
+    with Services(Serving(view=True, apart=apart), outlet, LINKS, name="a name") as services:
+        stage = Stage(outlet, services)
+        with stage.connect() as link:
+            link.recv(5)
+            for number, value in enumerate(("raises", math.nan, "read me")):
+                message = ReceivedMessage(
+                    0, 0, 5.0, Message(2, 7, number, b"-"), Failing(), value, "unverified", ""
+                )
+                outlet.publish("message", 5.0, message)
+            lines: list[dict[str, Any]] = []
+            until_s = time.monotonic() + 10
+            while "message" not in [line["line"] for line in lines] and time.monotonic() < until_s:
+                lines += next_of(link)[0]["news"]
+        outlet.close()
+    assert [line["count"] for line in lines if line["line"] == "untold"] == [1, 2]
+    assert "to_dict() fails: ZeroDivisionError: by nothing" in lines[0]["fault"]
+    assert lines[-1]["text"] == "read me"
+    assert services.fault == (
+        "2 messages could not be shown on the page: a message kind shows NaN, which JSON has not"
+    )
 
 
 def test_browsers_only_look_on(stage: Stage) -> None:
