@@ -25,9 +25,10 @@ from evlcp_sdk.values import Frame, Packet, changed
 
 __all__ = ["EchoQueue", "Echoes", "Sighting", "brighter", "originals", "repeats"]
 
-_TAIL_CHIPS = 2
-"""The last events of a frame come late, some later than its clock says: it is whole if the stream goes on for
-this long after those due."""
+_TAIL_CHIPS = 2.2
+"""The last events of a frame come late, some later than its clock says: it is whole if its light goes on for
+two chips after those due. The stream ends with the latest event, which is later than its light by more than
+the mean of those that the clock is set by: a tenth of a chip to a quarter, as latencies and rows spread."""
 
 _REPEATED = 0.25
 """Share of the symbols that a reflection repeats at the least; with fewer, nothing would be read of it."""
