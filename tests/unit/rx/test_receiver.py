@@ -168,7 +168,7 @@ def test_a_frame_that_the_end_cuts_is_not_given() -> None:
     events = ideal_events(LINK, bar)
     start = LINK.packet.packet_chips + LINK.packet.frame_start_chip(5)
     end_us = bar.start_us + 100 * start
-    for after_us, found, cut in ((-50, 4, 0), (60, 4, 0), (200, 4, 1), (220, 4, 1), (290, 5, 0), (1000, 5, 0)):
+    for after_us, found, cut in ((-50, 4, 0), (60, 4, 0), (220, 4, 1), (290, 5, 0), (1000, 5, 0)):
         receiver = Receiver(LINK)
         packets = receiver.feed(events[events.t_us < end_us + after_us]) + receiver.close()
         assert [f.frame for f in packets[1].frames] == list(range(found)), after_us
