@@ -25,8 +25,8 @@ from evlcp_sdk.values import Packet
 __all__ = ["environment_of", "plan_of", "run_job"]
 
 _PACKAGES = ("air", "link", "place", "plugin", "rx", "scene", "sim")
-_ON_AIR = ("air", "bar", "pilots", "modulation", "error-correction")
-"""Sections of a link that say what a bar sends, and from where."""
+_ON_AIR = ("air", "bar", "framing", "pilots", "modulation", "error-correction")
+"""Sections of a link that say what a bar sends, and from where; those that its framing has."""
 
 _OF_POSITIONS = ("position", "camera_sigma")
 """Sections of a link that a receiver does not read."""
@@ -69,7 +69,7 @@ def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
 def _air_of(link: Case) -> str:
     """Digest of what is on air with a link: a scene is rendered once for all links with the same."""
     said = link.identity
-    sections = {section: said["table"][section] for section in _ON_AIR}
+    sections = {section: said["table"][section] for section in _ON_AIR if section in said["table"]}
     revisions = {role: said["revisions"][role] for role in _ON_AIR if role in said["revisions"]}
     return digest_of([sections, revisions, said["codebook"]])
 
@@ -81,7 +81,7 @@ def _look_of(scene: Case) -> str:
 
 def _sending(scene: Scene, table: Mapping[str, Any]) -> Scene:
     """The scene, its bars that say no link of their own sending with that of the campaign."""
-    link = {section: table[section] for section in _ON_AIR}
+    link = {section: table[section] for section in _ON_AIR if section in table}
     bars = (replace(bar, link=link) if bar.link is None else bar for bar in scene.bars)
     return scene if scene.link is not None else replace(scene, bars=tuple(bars))
 

@@ -55,6 +55,7 @@ def column(clusters: int, leds: int) -> Settings:
 
 
 PANEL = {"rows": 16, "columns": 16, "led_pitch_m": 0.02, "cluster_rows": 4, "cluster_columns": 4}
+LAMP = {"bar.rows": 6, "bar.columns": 1, "bar.cluster_rows": 6, "bar.cluster_columns": 1}
 TWO_COLUMNS = {"rows": 24, "columns": 2, "led_pitch_m": 0.04, "cluster_rows": 3}
 
 LINKS: dict[str, Settings] = {
@@ -71,6 +72,7 @@ LINKS: dict[str, Settings] = {
     "a stranger's modulation": {"modulation.id": "four"},
     "no pair code": {"modulation.id": "nrz"},
     "a quarter of the light": {"modulation.id": "wh4x2-dimmed", "pilots.id": "wh-dimmed"},
+    "characters": {**LAMP, "framing.id": "uart", "framing.parity": "even"},
 }
 DURATIONS_S = {"5 kchip/s": 0.12, "20 kchip/s": 0.06, "a panel": 0.07, "a quarter of the light": 0.13}
 DISTANCE_M, DURATION_S, SEED = 40.0, 0.09, 2
