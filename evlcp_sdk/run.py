@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from evlcp_sdk.errors import ConfigError, InputError, UnpluggedError
+from evlcp_sdk.errors import ConfigError, InputError, PluginError, UnpluggedError
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source, open_writer
 from evlcp_sdk.io.open import STDIN, is_recording
@@ -478,30 +478,45 @@ def _run(
     """Receive a source to its end, or until it is stopped or fails; return the summary."""
     status: Status = "complete"
     error = None
+    broken: PluginError | None = None
+    given = 0
+    pieces = iter(pieces)
     first_us = last_us = None
     watch = Stopwatch()
     with watch.running():
         try:
-            for events, packets in pieces:
+            while True:
+                try:
+                    events, packets = next(pieces)
+                except StopIteration:
+                    break
+                except PluginError as fault:
+                    if not given:
+                        raise
+                    # What it has let through is kept; the receiver cannot be asked for more.
+                    status, error, broken = "failed", str(fault), fault
+                    break
                 if len(events):
                     first_us = int(events.t_us[0]) if first_us is None else first_us
                     last_us = int(events.t_us[-1])
                     writer.events(events)
                 writer.write(packets)
+                given += len(packets)
                 advance(source.position_bytes, source.size_bytes)
                 if stopped():
                     status = "interrupted"
                     break
         except InputError as fault:
             status, error = "failed", str(fault)
-        if (live is not None or source.size_bytes is None) and stopped():
-            status = "interrupted"
-        writer.write(close())
+        if broken is None:
+            if (live is not None or source.size_bytes is None) and stopped():
+                status = "interrupted"
+            writer.write(close())
     if status == "complete" and (told := _much_dropped(source, receiver)):
         status, error = "degraded", f"{url}: {told}"
     read = source.counts["events"]
     duration_s = (last_us - first_us) * 1e-6 if first_us is not None and last_us is not None else 0.0
-    return writer.finish(
+    summary = writer.finish(
         status,
         recording={
             "path": url,
@@ -532,6 +547,9 @@ def _run(
         link_counts=receiver.link_counts,
         live=None if live is None else live(),
     )
+    if broken is not None:
+        raise broken
+    return summary
 
 
 def _much_dropped(source: EventSource, receiver: Receiver) -> str | None:

@@ -318,9 +318,13 @@ def resolve(
             if section == "bar":
                 built[section] = BarLayout.of_table(keys)
                 plain = built[section].table()
-            else:
+            elif section in _SPECS:
                 built[section] = build(cls, keys)
-                plain = head | asdict(built[section])
+                plain = asdict(built[section])
+            else:
+                with _named(section, {section: head}):
+                    built[section] = build(cls, keys)
+                    plain = head | asdict(built[section])
             resolved[section] = json.loads(json.dumps(plain))
             if section == "modulation":
                 pairs = _pairs(built)
@@ -377,8 +381,12 @@ def _assembled(
     bar, air = parts["bar"], parts["air"]
     with _named("framing", table):
         codebook = parts["framing"].codebook(bar.clusters)
+        if not isinstance(codebook, Codebook | None):
+            raise TypeError(f"gave {type(codebook).__name__} at codebook(), expected a Codebook")
         if codebook is not None and codebook.clusters != bar.clusters:
             raise ValueError(f"gave codes of {codebook.clusters} clusters, expected {bar.clusters}")
+        if codebook is not None:
+            _check_alphabet(codebook)
     if codebook is None:
         codebook = _codes_of_roles(parts, table)
     return Link(
@@ -403,7 +411,20 @@ def _codes_of_roles(parts: Mapping[str, Any], table: Mapping[str, Mapping[str, A
             raise ValueError(f"gave {len(codes)} codes, expected {clusters}")
     with _named("modulation", table):
         codewords = modulation.codewords()
-    return Codebook(table["modulation"]["id"], preamble, codes, codewords)
+    try:
+        codebook = Codebook(table["modulation"]["id"], preamble, codes, codewords)
+    except ConfigError as fault:
+        role = "modulation" if str(fault).startswith("codebook codewords") else "pilots"
+        id = table[role]["id"]
+        raise ConfigError(f"{role} algorithm '{id}': {fault}; try: evlcp check {role} {id}") from fault
+    with _named("modulation", table):
+        _check_alphabet(codebook)
+    return codebook
+
+
+def _check_alphabet(codebook: Codebook) -> None:
+    if len(codebook.codewords) < 2:
+        raise ValueError("gave 1 codeword, expected two or more")
 
 
 def _unused(framing: str) -> str:

@@ -41,8 +41,10 @@ class Run:
     @property
     def filtered(self) -> bool:
         """Whether a link filters distances, so that there are columns for them."""
+        from evlcp_sdk.rx.steps import tracker_of
+
         links = self.links.values() or [self.link]
-        return any(link.algorithm("tracking").compile().distance is not None for link in links)
+        return any(tracker_of(link).distance is not None for link in links)
 
 
 class Sink:

@@ -50,8 +50,8 @@ class DetectedRegions:
         What is found in places that are `taken` by others is left out.
         """
         with self._guard:
-            self._state, found = self._detector.step(self._state, start_us, events)
-        self._guard.expect(found, list)
+            given = self._detector.step(self._state, start_us, events)
+        self._state, found = self._guard.expect_step(given, "step()")
         places: dict[int, Region] = {}
         for region in found:
             self._guard.expect(region, Region)

@@ -1,7 +1,7 @@
 """Frames of an algorithm of the role `framing`, from the events of regions to the frames of the receiver."""
 
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 from typing import Any
@@ -43,6 +43,7 @@ class _Listener:
         number: Transmitter number, None before the first frame.
         counts: What the framing counted so far.
         events: Events of the region since its last frame.
+        last: Packet and frame of that.
     """
 
     region: Followed
@@ -51,6 +52,7 @@ class _Listener:
     number: int | None = None
     counts: dict[str, int] | None = None
     events: int = 0
+    last: tuple[int, int] = (-1, -1)
 
 
 class HeardFraming:
@@ -120,7 +122,8 @@ class HeardFraming:
                 listener.events += len(events)
                 until_us = min(start_us + self._step_us, step.end_us)
                 with self._guard:
-                    listener.state, heard = self._deframer.step(listener.state, events, until_us)
+                    given = self._deframer.step(listener.state, events, until_us)
+                listener.state, heard = self._guard.expect_step(given, "step()")
                 self._take(listener, heard)
             region.forget_before(math.inf, self._step_us, step.end_us - self.patience_us)
             if region.released:
@@ -166,20 +169,30 @@ class HeardFraming:
 
     def _end(self, listener: _Listener) -> None:
         with self._guard:
-            listener.state, heard = self._deframer.close(listener.state)
+            given = self._deframer.close(listener.state)
+        listener.state, heard = self._guard.expect_step(given, "close()")
         self._take(listener, heard)
         self._judged.end(listener.packets)
 
     def _take(self, listener: _Listener, heard: list[Heard]) -> None:
         """Number a region's frames, say where they were seen, and hand them on."""
-        self._guard.expect(heard, list)
         self._count(listener)
         for one in heard:
             self._guard.expect(one, Heard)
             self._guard.expect_symbols(one.soft, self._codebook)
             self._guard.expect_number(one.frame, "frame", 0, self._packet.frames - 1)
-            for name in ("t_us", "packet_t_us", "chip_us"):
+            for name in ("t_us", "packet_t_us"):
                 self._guard.expect_number(getattr(one, name), name, -1e18, 1e18)
+            self._guard.expect_number(
+                one.chip_us, "chip_us", self._packet.chip_us / 2, self._packet.chip_us * 2
+            )
+            if (one.packet, one.frame) <= listener.last:
+                self._guard.refuse(
+                    f"frame {one.frame} of packet {one.packet} behind frame {listener.last[1]} of packet"
+                    f" {listener.last[0]}",
+                    "frames in order",
+                )
+            listener.last = one.packet, one.frame
             if listener.number is None:
                 listener.number = next(self._numbers)
             chips = self._packet.info_chips + self._packet.has_pilot(one.frame) * self._packet.pilot_chips
@@ -215,7 +228,13 @@ class HeardFraming:
     def _count(self, listener: _Listener) -> None:
         """Add what a framing has counted since it was asked last."""
         with self._guard:
-            now = dict(self._deframer.counts(listener.state))
+            found = self._deframer.counts(listener.state)
+        self._guard.expect(found, Mapping)
+        now = dict(found)
+        for name, many in now.items():
+            self._guard.expect(name, str)
+            if not isinstance(many, int | np.integer):
+                self._guard.refuse(f"{type(many).__name__} for '{name}' at counts()", "whole numbers")
         before = listener.counts or {}
         for name, many in now.items():
             self.counts[name] = self.counts.get(name, 0) + many - before.get(name, 0)

@@ -103,6 +103,18 @@ class Guard:
             return
         self.refuse(f"{type(found).__name__} at compile()", expected)
 
+    def expect_step(self, found: object, what: str) -> tuple[Any, list[Any]]:
+        """Check what a step function gave: its new state, and a list.
+
+        Raises:
+            PluginError: It gave anything else.
+        """
+        if not isinstance(found, tuple) or len(found) != 2:
+            self.refuse(f"{type(found).__name__} at {what}", "the state and a list")
+        state, some = found
+        self.expect(some, list)
+        return state, some
+
     def expect_array(self, found: object, name: str, shape: tuple[int, ...], kinds: str) -> None:
         """Check an array's shape, and its type by NumPy's letters for kinds, e.g. `"iu"`.
 

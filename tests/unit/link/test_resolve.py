@@ -400,13 +400,21 @@ def exits(_: int) -> Any:
             lambda k: hadamard(8)[: k - 15],
             r"^pilots algorithm 'odd': ValueError: gave 1 codes, expected 16",
         ),
-        ("pilots", lambda k: ["a"] * k, r"^codebook pilots: expected a 2-D array of chips 0 and 1"),
+        (
+            "pilots",
+            lambda k: ["a"] * k,
+            r"^pilots algorithm 'odd': codebook pilots: expected a 2-D array of chips 0 and 1",
+        ),
         ("modulation", exits, r"^modulation algorithm 'odd': SystemExit: 0; try"),
-        ("modulation", lambda _: None, r"^codebook codewords: expected a 2-D array of chips 0 and 1"),
+        (
+            "modulation",
+            lambda _: None,
+            r"^modulation algorithm 'odd': codebook codewords: expected a 2-D array of chips 0 and 1",
+        ),
         (
             "modulation",
             lambda _: [[1, -1], [1]],
-            r"^codebook codewords: expected a 2-D array of chips 0 and 1",
+            r"^modulation algorithm 'odd': codebook codewords: expected a 2-D array of chips 0 and 1",
         ),
     ],
 )
