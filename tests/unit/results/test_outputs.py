@@ -45,7 +45,7 @@ LINK = Link(
     revisions={"ranging": 1},
     codebook=BOOK,
     packet=PacketFormat.of(BOOK, 3),
-    table={"air": {"chip_rate_hz": 10_000.0, "frames_per_packet": 3}},
+    table={"air": {"chip_rate_hz": 10_000.0, "frames_per_packet": 3}, "tracking": {"id": "none"}},
     digest="0" * 64,
 )
 
