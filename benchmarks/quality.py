@@ -6,7 +6,8 @@ Every scene of a campaign is simulated and received with each decoding. Frames o
 into bins by their quality; a bin shows how many frames it has, what share of them should be wrong by it (the
 mean of 1 - q), and what share is, with an interval of 95 % that is bootstrapped over recordings. Where the
 latter is more than twice the former, or less than half of it, and chance would seldom (1 in 20) take one
-within these bounds so far out, there is a star.
+within these bounds so far out, there is a star. Below is how many symbols are wrong in a frame that has a
+wrong one.
 """
 
 import argparse
@@ -33,11 +34,11 @@ BINS = (*pairwise(EDGES), (0.0, 1.0))
 ROUNDS = 1000
 _SELDOM = 0.05
 
-Judged = dict[str, list[tuple[float, bool]]]
+Judged = dict[str, list[tuple[float, int]]]
 
 
 def judged(scene: Scene, seed: int) -> Judged:
-    """Quality of each frame of a simulated scene, and whether it has a wrong bit, by decoding."""
+    """Quality of each frame of a simulated scene, and how many of its symbols are wrong, by decoding."""
     simulation = Simulation(scene, seed)
     events, truth = Events.concat(simulation.stream()), truth_of(simulation)
     found: Judged = {}
@@ -53,11 +54,11 @@ def judged(scene: Scene, seed: int) -> Judged:
             for row, number in pairs:
                 said = np.array(row.symbols)
                 counts = (said >= 0) & ~(sent.cut[number] & ~sent.hidden[number])
-                own.append((quality[id(row)], bool((said != sent.symbols[number])[counts].any())))
+                own.append((quality[id(row)], int((said != sent.symbols[number])[counts].sum())))
     return found
 
 
-def rows(recordings: list[list[tuple[float, bool]]]) -> Iterator[list[str]]:
+def rows(recordings: list[list[tuple[float, int]]]) -> Iterator[list[str]]:
     """Three cells a bin, and those of all."""
     rng = np.random.default_rng(0)
     parts = [np.array(part, float).reshape(-1, 2) for part in recordings]
@@ -67,7 +68,7 @@ def rows(recordings: list[list[tuple[float, bool]]]) -> Iterator[list[str]]:
         if not n.sum():
             yield ["0", "-", "-"]
             continue
-        doubt, wrong = np.array([[(1 - p[:, 0]).sum(), p[:, 1].sum()] for p in kept]).T
+        doubt, wrong = np.array([[(1 - p[:, 0]).sum(), (p[:, 1] > 0).sum()] for p in kept]).T
         drawn = rng.integers(0, len(kept), (ROUNDS, len(kept)))
         share = wrong[drawn].sum(1) / np.maximum(n[drawn].sum(1), 1)
         least, most = np.quantile(share, [0.025, 0.975])
@@ -99,6 +100,11 @@ def main() -> None:
     for (low, high), cells in zip(BINS, tables, strict=True):
         name = "all" if (low, high) == (0.0, 1.0) else f"{low:g} to {high:g}"
         print(f"| {name} | " + " | ".join(cell for part in cells for cell in part) + " |")
+    together = []
+    for decoding in DECODINGS:
+        wrong = [many for part in found for _, many in part[decoding] if many]
+        together.append(f"{decoding} {np.mean(wrong):.1f}" if wrong else f"{decoding} -")
+    print(f"\nwrong symbols in a frame that has any: {', '.join(together)}")
 
 
 if __name__ == "__main__":

@@ -28,8 +28,8 @@ and of those that are less sure, half or more are wrong in recordings."""
 
 _TOGETHER = 1.7
 """Wrong symbols in a frame that has any: what makes one wrong, light, shaking, what stands behind, is there
-for others, too. In `examples/campaigns/road.toml` they are 1.9 to 2.4 by decoding; on a Gaussian channel 1 to
-1.3, as long as less than half of the frames are wrong."""
+for others, too. In `examples/campaigns/road.toml` they are 1.9 to 2.2 by decoding, as `benchmarks/quality.py`
+prints; on a Gaussian channel 1 to 1.3, as long as less than half of the frames are wrong."""
 
 _LEAST_EVENTS = 0.5
 """Share of the events due, by the edges of the codeword with the fewest, that may be missing by chance."""

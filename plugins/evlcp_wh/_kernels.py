@@ -234,8 +234,11 @@ def _fit_words(values: Array, by_value: Array, fit: Array) -> None:
 
 @njit(cache=True, nogil=True)
 def _max_log(fit: Array, scale: float, llr: Array) -> None:
-    """Best correlation of the words with each bit 0, less that with 1, times `scale`; `fit` is used up."""
-    half = fit.size
+    """Best correlation of the words with each bit 0, less that with 1, times `scale`; `fit` is used up.
+
+    Words beyond the 2^bits first carry no bits.
+    """
+    half = 2**llr.size
     for b in range(llr.size):
         # A bit that is done leaves the better of the two codewords that it tells apart.
         half //= 2
@@ -359,7 +362,7 @@ def log_ratio(counts: Array, prior: float, out: Array) -> None:
 def read_words(values: Array, words: Array, scale: float, symbols: Array, llr: Array) -> float:
     """Likeliest codeword of each cluster's values (K, n), `symbols` (K,), and max-log LLRs, `llr` (K, bits).
 
-    `words` are (2^bits, n); `scale` is that of their product with the values.
+    `words` are (2^bits or more, n); `scale` is that of their product with the values.
 
     Returns:
         Share of the values' sizes that agrees with the codewords; 0 without any.

@@ -131,7 +131,7 @@ def soft_symbols(
         presence: Of the frame.
         sums: The frame's polarity sums, pilot first, int16 (chips, height, width).
         pilots: The codes, int64 (K, values).
-        words: The codewords, float64 (2**m, values).
+        words: The codewords, float64 (2**m or more, values).
         worth: As from `learned_worth`.
         min_weight: Presence probability below which a cell is passed over.
         pixel_share: Share of the pixels in a cluster's place that show it.

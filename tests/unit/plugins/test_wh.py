@@ -1,5 +1,7 @@
 """Walsh-Hadamard separation and decoding: kernels against twins; what was sent comes back."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import wh_twins as twins
@@ -113,10 +115,14 @@ def test_weighted_values(seed, grid):
     assert out.any()
 
 
-@pytest.mark.parametrize(("clusters", "bits", "length"), [(16, 6, 8), (1, 1, 2), (3, 8, 16)])
-def test_words_are_read(clusters, bits, length):
+@pytest.mark.parametrize(
+    ("clusters", "bits", "length", "more"),
+    [(16, 6, 8, 0), (1, 1, 2, 0), (3, 8, 16, 0), (5, 2, 8, 2), (5, 2, 8, 3)],
+)
+def test_words_are_read(clusters, bits, length, more):
+    """Words beyond the 2^bits first carry no bits."""
     rng = np.random.default_rng(bits)
-    words = rng.choice([-1.0, 1.0], (2**bits, length))
+    words = rng.choice([-1.0, 1.0], (2**bits + more, length))
     for values in (rng.normal(size=(clusters, length)), np.zeros((clusters, length))):
         symbols, llr = np.empty(clusters, np.int64), np.empty((clusters, bits), np.float32)
         quality = _kernels.read_words(values, words, 0.25, symbols, llr)
@@ -330,11 +336,14 @@ def test_every_symbol_comes_back(profile, silent):
         assert soft.quality == pytest.approx(1, abs=1e-12)
 
 
+@pytest.mark.parametrize("symbols", [None, 6, 7])
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("seed", SEEDS)
-def test_llr_is_the_brute_force_max_log(profile, seed):
+def test_llr_is_the_brute_force_max_log(profile, seed, symbols):
+    """Of all the profile's symbols, or of so many, of which four carry bits."""
     rng = np.random.default_rng(seed)
     book = book_of(profile)
+    book = replace(book, codewords=book.codewords[:symbols])
     sums = random_sums(rng, (16, 12, 8))
     presence = presence_of(rng, CLUSTERS, 6, 4, 2)
     presence.probability[:, 0, 0] = 0.7

@@ -54,7 +54,7 @@ def weighted_values(sums, probability, grid, least):
 
 def max_log(fit, bits):
     zero, one = np.full((2, len(fit), bits), -np.inf)
-    for (k, s), f in np.ndenumerate(fit):
+    for (k, s), f in np.ndenumerate(fit[:, : 2**bits]):
         for b, bit in enumerate(f"{s:0{bits}b}"):
             side = one if bit == "1" else zero
             side[k, b] = max(side[k, b], f)
@@ -77,8 +77,10 @@ def llr(values, words):
     bits = len(words).bit_length() - 1
     out = np.empty((len(values), bits))
     for k, b in np.ndindex(out.shape):
-        zeros = [f"{s:0{bits}b}"[b] == "0" for s in range(len(words))]
-        out[k, b] = (cost[k, np.invert(zeros)].min() - cost[k, zeros].min()) / (2 * variance)
+        # Symbols beyond carry no bits.
+        zeros = np.array([f"{s:0{bits}b}"[b] == "0" for s in range(2**bits)])
+        carrying = cost[k, : 2**bits]
+        out[k, b] = (carrying[~zeros].min() - carrying[zeros].min()) / (2 * variance)
     return cost.argmin(1), out, kept / (kept + rest)
 
 

@@ -29,8 +29,9 @@ def sent_and_read(
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 50.0])
-@pytest.mark.parametrize("noise", [0.6, 0.7, 0.8])
-def test_of_frames_with_quality_q_one_less_q_are_wrong(noise: float, scale: float) -> None:
+@pytest.mark.parametrize(("noise", "least"), [(0.6, 0.5), (0.7, 0.5), (0.8, 0.5), (0.9, 0.4), (1.4, 0.4)])
+def test_of_frames_with_quality_q_one_less_q_are_wrong(noise: float, least: float, scale: float) -> None:
+    """Within a factor of 2; where most are wrong, 0.4 as many are said to be."""
     rng = np.random.default_rng(7)
     wrong, doubt = [], []
     for _ in range(400):
@@ -40,7 +41,7 @@ def test_of_frames_with_quality_q_one_less_q_are_wrong(noise: float, scale: floa
         wrong.append((soft.symbols != sent)[given].any())
         doubt.append(1 - soft.quality)
     assert np.mean(wrong) > 0.05
-    assert 0.5 < np.mean(doubt) / np.mean(wrong) < 2
+    assert least < np.mean(doubt) / np.mean(wrong) < 2
 
 
 def test_what_is_rather_wrong_is_not_given() -> None:
