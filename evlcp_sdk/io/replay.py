@@ -1,6 +1,7 @@
 """A recording given out at the pace of its own clock."""
 
 import time
+from bisect import bisect_right
 from collections.abc import Callable
 
 import numpy as np
@@ -13,6 +14,10 @@ __all__ = ["LoopSource", "ReplaySource"]
 
 SEAM_US = 500_000
 """Dark time between a recording's end and its next pass: what was seen is forgotten, no clock leaps."""
+
+DAMAGE_US = 100_000
+"""Silence beside damage that is taken for damage too: a wrong TIME_HIGH steps by up to 2^24 us, and so does
+the clock behind it, while the noise of its pixels alone keeps a sensor from being silent for so long."""
 
 
 class LoopSource(EventSource):
@@ -87,6 +92,10 @@ class LoopSource(EventSource):
 class ReplaySource(EventSource):
     """A recording given out at the pace of its own clock, as a camera would.
 
+    A silence is waited for, but not one of over `DAMAGE_US` in a piece of the recording with losses, or next
+    to one: its clock has leapt there. `counts` has how many, and their time, as `silences_skipped` and
+    `silences_skipped_us`.
+
     Args:
         source: The recording; closed with the replay.
         speed: Camera seconds for each second that passes.
@@ -124,25 +133,38 @@ class ReplaySource(EventSource):
         self._clock = clock
         self._sleep = sleep
         self._piece = (Events.empty(), Triggers.empty())
-        self._origin: tuple[int, float] | None = (
-            None  # camera clock, us, and own clock, s, of the first piece
-        )
+        self._last_us: int | None = None  # of what was given out
+        self._lost = 0
+        self._damaged = False  # this piece of the recording
+        # Camera clock, us, and own clock, s: of the first piece and of each after a silence that was skipped.
+        self._origins: list[tuple[int, float]] = []
+        self._skipped = {"silences_skipped": 0, "silences_skipped_us": 0}
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
         """Wait until the next slice of time is over and return its events, at most `max_events`."""
+        damaged = self._damaged
         if not any(len(half) for half in self._piece):
             piece = next(self._source.stream(max_events), None)
             if piece is None:
                 return None
             self._piece = piece
+            lost = sum(loss.count for loss in self._source.losses.values())
+            self._damaged, self._lost = lost > self._lost, lost
+            damaged |= self._damaged
         events, triggers = self._piece
         first = min(int(column[0]) for column in (events.t_us, triggers.t_us) if len(column))
-        if self._origin is None:
-            self._origin = first, self._clock()
-        start_us, start_s = self._origin
+        if self._last_us is None:
+            self._origins.append((first, self._clock()))
+        elif damaged and first - self._last_us > DAMAGE_US:
+            self._skipped["silences_skipped"] += 1
+            self._skipped["silences_skipped_us"] += first - self._last_us
+            start_us, start_s = self._origins[-1]
+            self._origins.append((first, start_s + (self._last_us - start_us) * self._s_per_us))
+        start_us, start_s = self._origins[-1]
         end_us = first + self._slice_us - (first - start_us) % self._slice_us
         n, m = (int(np.searchsorted(column, end_us)) for column in (events.t_us, triggers.t_us))
         self._piece = events[n:], triggers[m:]
+        self._last_us = max(int(column[k - 1]) for column, k in ((events.t_us, n), (triggers.t_us, m)) if k)
 
         early_s = start_s + (end_us - start_us) * self._s_per_us - self._clock()
         self.lag_s = max(-early_s, 0.0)
@@ -156,9 +178,10 @@ class ReplaySource(EventSource):
 
     def clock_s(self, t_us: float) -> float | None:
         """When a time of the recording is due, by the clock given; None before the first piece."""
-        if self._origin is None:
+        if not self._origins:
             return None
-        start_us, start_s = self._origin
+        at = bisect_right(self._origins, t_us, key=lambda origin: origin[0])
+        start_us, start_s = self._origins[max(at - 1, 0)]
         return start_s + (t_us - start_us) * self._s_per_us
 
     @property
@@ -173,5 +196,6 @@ class ReplaySource(EventSource):
 
     @property
     def counts(self) -> dict[str, int]:
-        """As the recording's, with the events and triggers replayed so far."""
-        return self._source.counts | self._given
+        """As the recording's, with the events and triggers replayed and the silences skipped so far."""
+        skipped = self._skipped if self._skipped["silences_skipped"] else {}
+        return self._source.counts | self._given | skipped

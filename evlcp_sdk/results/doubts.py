@@ -178,6 +178,7 @@ class Seen:
         losses: Events and words that the source could not use.
         others: Codewords of other modulations by id, uint8 (symbols, chips); asked where it matters.
         guessed: What the recording does not say and was guessed; empty for nothing.
+        skipped: Silences beside damage that a replay did not wait for, and their time, us.
     """
 
     first_us: float = math.nan
@@ -187,6 +188,7 @@ class Seen:
     losses: int = 0
     others: Callable[[], Mapping[str, NDArray[np.uint8]]] = dict
     guessed: str = ""
+    skipped: tuple[int, int] = (0, 0)
 
     @property
     def duration_us(self) -> float:
@@ -294,7 +296,7 @@ def notes_of(
     seen: Seen | None = None,
     reads_messages: bool = True,
 ) -> list[Doubt]:
-    """Plain statements: reflections, what was guessed, what there were no frames of, and of no messages.
+    """Plain statements: reflections, what was guessed or skipped, what had no frames, and no messages.
 
     Args:
         tally: Figures of the transmitters.
@@ -316,6 +318,15 @@ def notes_of(
     if seen.guessed:
         found.append(
             Doubt("guessed", seen.guessed, "where it is wrong, list:PATH?columns=...&unit=... says it")
+        )
+    silences, silent_us = seen.skipped
+    if silences:
+        found.append(
+            Doubt(
+                "pace",
+                f"{counted(silences, 'silence')} of {silent_us * 1e-6:.1f} s in all, where the recording is"
+                " damaged, not waited for",
+            )
         )
     if not tally.transmitters and counts.get("events", 0):
         found.append(

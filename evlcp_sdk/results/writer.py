@@ -159,6 +159,7 @@ class ResultWriter:
                 self._sinks.settle(settled)
             positions = self._positions.to_dict(self._navigator)
         first_us, last_us = recording.get("first_us"), recording.get("last_us")
+        read = recording.get("counts", {})
         seen = Seen(
             math.nan if first_us is None else first_us,
             math.nan if last_us is None else last_us,
@@ -166,6 +167,7 @@ class ResultWriter:
             self._readout,
             sum(loss["count"] for loss in losses.values()),
             guessed=str(recording.get("guessed", "")),
+            skipped=(read.get("silences_skipped", 0), read.get("silences_skipped_us", 0)),
         )
         parts = {
             name: LinkPart(

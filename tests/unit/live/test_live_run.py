@@ -217,6 +217,23 @@ def test_it_ends_when_it_is_asked_to(demo_raw: Path) -> None:
     assert summary["counts"]["frames"] > 0
 
 
+def test_a_damaged_recording_is_not_waited_for(demo_raw: Path, tmp_path: Path) -> None:
+    data = bytearray(demo_raw.read_bytes())
+    noise, middle = np.random.default_rng(1), len(data) // 2
+    data[middle : middle + 20_000] = noise.bytes(20_000)
+    damaged = tmp_path / "damaged.raw"
+    damaged.write_bytes(data)
+    with RawSource(damaged) as source:
+        t_us = source.read()[0].t_us
+    assert t_us[-1] - t_us[0] > 60e6  # Its clock leaps by minutes.
+    mine = (outlet := Outlet()).subscribe(most=100_000)
+    summary = live(damaged, outlet=outlet, budget=PATIENT, warm=False)
+    waited_us = t_us[-1] - t_us[0] - summary["recording"]["counts"]["silences_skipped_us"]
+    assert 0 < waited_us < 10e6
+    assert "pace" in [note["code"] for note in summary["notes"]]
+    assert [key(f) for f in gathered(mine)["frame"]] == [key(f) for p in receive(damaged) for f in p.frames]
+
+
 def test_a_recording_is_replayed_at_its_own_pace(demo_raw: Path) -> None:
     assert live(demo_raw, budget=PATIENT, warm=False)["processing"]["elapsed_s"] > 0.05
 
