@@ -31,6 +31,7 @@ LINKS: dict[str, list[str]] = {
     "25 % dimmed pair codes": ["modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed"],
     "ring of 12 LEDs": ["bar.shape=ring"],
     "two columns, .5 m apart": ["bar.shape=columns"],
+    "two columns, 1.2 m apart": ["bar.shape=columns", "bar.apart_m=1.2", "bar.rows=24"],
     "two columns, 4 cm apart": [
         "bar.rows=24",
         "bar.columns=2",

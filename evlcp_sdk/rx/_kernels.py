@@ -208,7 +208,71 @@ def measure_box(
         lit += n > 0
     if total == 0:
         return 0, 0.0, 0, 0, 0.0, 0.0
-    full = total / lit
+    upper, lower = _edges_of(rows, top, bottom, total / lit)
+    return total, column, first_column, last_column, upper, lower
+
+
+@njit(cache=True, nogil=True)
+def measure_strips(
+    pixels: Array,
+    box: tuple[int, int, int, int],
+    now: int,
+    span: int,
+    min_score: int,
+    expected: float,
+    near: float,
+    strips: Array,
+    rows: Array,
+) -> tuple[int, float, int, int, float, float]:
+    """Where in a box pixels blink, as `measure_box`, of a bar whose light stands in strips of columns.
+
+    `strips` (n, 2) are the middle of each from the bar's centre, and half its width, px. A pixel says how far
+    it is from the middle of its own strip: their mean does not go by how many each strip has awake, as the
+    mean column would. Within `near` of the strips about `expected` first, then about what that says, and
+    within the strips and a pixel; columns between them count nowhere.
+    """
+    left, top, right, bottom = box
+    columns, number = np.zeros(right - left), np.empty(right - left, np.int64)
+    for v in range(top, bottom):
+        for u in range(left, right):
+            columns[u - left] += _blinks(pixels[v, u], now, span, min_score)
+    column, total = expected, 0.0
+    for turn in range(3):
+        more = near if turn == 0 else 1.0
+        off, total = 0.0, 0.0
+        number[:] = -1
+        for k in range(len(strips)):
+            middle, reach = column + strips[k, 0], strips[k, 1] + more
+            for i in range(columns.size):
+                if abs(left + i - middle) <= reach and number[i] < 0:
+                    number[i] = k
+                    total += columns[i]
+                    off += columns[i] * (left + i - middle)
+        if total == 0:
+            break
+        column += off / total
+    rows[:] = 0
+    if total == 0:
+        return 0, 0.0, 0, 0, 0.0, 0.0
+    first_column, last_column = right, left
+    for u in range(left, right):
+        if number[u - left] >= 0 and columns[u - left] > 0:
+            first_column, last_column = min(first_column, u), max(last_column, u)
+    many, lit = 0, 0
+    for v in range(top, bottom):
+        n = 0
+        for u in range(left, right):
+            n += number[u - left] >= 0 and _blinks(pixels[v, u], now, span, min_score)
+        rows[v - top] = n
+        many += n
+        lit += n > 0
+    upper, lower = _edges_of(rows, top, bottom, many / lit)
+    return many, column, first_column, last_column, upper, lower
+
+
+@njit(cache=True, nogil=True)
+def _edges_of(rows: Array, top: int, bottom: int, full: float) -> tuple[float, float]:
+    """Upper and lower edge of what rows (n,) hold: an edge row counts by its share of a full one."""
     v = top
     while rows[v - top] == 0:
         v += 1
@@ -216,8 +280,7 @@ def measure_box(
     v = bottom - 1
     while rows[v - top] == 0:
         v -= 1
-    lower = v + min(rows[v - top] / full, 1.0)
-    return total, column, first_column, last_column, upper, lower
+    return upper, v + min(rows[v - top] / full, 1.0)
 
 
 @njit(cache=True, nogil=True)

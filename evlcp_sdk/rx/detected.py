@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Detector
@@ -130,9 +131,14 @@ class DetectedRegions:
         followed.size_px = size_px
         return 0.0
 
-    def light(self, followed: Followed, lit_px: tuple[float, float] | None) -> None:
+    def light(
+        self,
+        followed: Followed,
+        lit_px: tuple[float, float] | None,
+        strips_px: NDArray[np.float64] | None = None,
+    ) -> None:
         """Note which part of a bar a frame showed."""
-        followed.lit_px = lit_px
+        followed.lit_px, followed.strips_px = lit_px, strips_px
 
     def gather(self, followed: Followed, from_us: float = -np.inf, until_us: float = np.inf) -> None:
         """Take a region's events once more: they are those that it has."""

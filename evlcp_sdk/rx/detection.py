@@ -98,6 +98,8 @@ class Followed:
         size_px: (width, height) of the whole bar, by what its frames show, px; None before the first.
         lit_px: Upper and lower edge, from the bar's centre, of the part that its newest frame showed, px;
             None where it showed both ends.
+        strips_px: Of a bar whose light stands in strips of columns, (middle from the bar's centre, half the
+            width) of each, px, float64 (n, 2); None of others, and before the first frame.
         shown_us: When its newest frame showed its place, us; None before the first.
         outgrown: The region before that, which may have held other bars: (right, down) of its centre from
             this one's, width and height, px, and until when that matters, us.
@@ -116,6 +118,7 @@ class Followed:
     heights: deque[float] = field(default_factory=lambda: deque(maxlen=_HEIGHTS))
     size_px: tuple[float, float] | None = None
     lit_px: tuple[float, float] | None = None
+    strips_px: NDArray[np.float64] | None = None
     shown_us: float | None = None
     outgrown: tuple[float, float, float, float, float] | None = None
     opened_us: int = 0
@@ -247,8 +250,7 @@ class RegionFollower:
         for followed, box, inside in zip(self.alive, self._own(boxes), selected, strict=True):
             followed.add(start_us, inside)
             rows = np.empty(box[3] - box[1], np.int64)
-            width_px = followed.size_px[0] if followed.size_px else math.inf
-            measured = self._measure(followed.id, box, end_us, rows, width_px)
+            measured = self._measured(followed, box, end_us, rows)
             if measured is not None:
                 measured = self._whole(followed, measured, box[1], rows)
                 followed.filter, place = self._filtered(followed, measured)
@@ -304,8 +306,7 @@ class RegionFollower:
     def _glance(self, followed: Followed, box: Box, now_us: int) -> Region | None:
         """Where a region of known size is in the middle of a step."""
         rows = np.empty(box[3] - box[1], np.int64)
-        width_px = followed.size_px[0] if followed.size_px else math.inf
-        measured = self._measure(followed.id, box, now_us, rows, width_px)
+        measured = self._measured(followed, box, now_us, rows)
         if measured is None:
             return None
         heights = followed.heights.copy()
@@ -508,9 +509,15 @@ class RegionFollower:
         self.counts["regions_left_out"] += not room
         return room
 
-    def light(self, followed: Followed, lit_px: tuple[float, float] | None) -> None:
-        """Say which part of a region's bar its newest frame showed: see `Followed.lit_px`."""
+    def light(
+        self,
+        followed: Followed,
+        lit_px: tuple[float, float] | None,
+        strips_px: NDArray[np.float64] | None = None,
+    ) -> None:
+        """Say where a region's bar shines, by its newest frame: see `Followed.lit_px`, `.strips_px`."""
         before, followed.lit_px = followed.lit_px, lit_px
+        followed.strips_px = strips_px
         if before != lit_px and abs(_height(before) - _height(lit_px)) > _STRAY_PX:
             # Heights of another part.
             followed.heights.clear()
@@ -598,16 +605,31 @@ class RegionFollower:
             top, bottom = min(max(top, 0), height), min(max(bottom, 0), height)
         return left, top, right, bottom
 
+    def _measured(self, followed: Followed, box: Box, end_us: int, rows: NDArray[np.int64]) -> Region | None:
+        """What `_measure` says of a region, by what is known of it."""
+        width_px = followed.size_px[0] if followed.size_px else math.inf
+        strips = None
+        if followed.strips_px is not None:
+            expected_px, _ = self._expected(followed, end_us - self._age_us)
+            strips = expected_px, float(self._spec.margin_px), followed.strips_px
+        return self._measure(followed.id, box, end_us, rows, width_px, strips)
+
     def _measure(
-        self, id: int, box: Box, end_us: int, rows: NDArray[np.int64], width_px: float = math.inf
+        self,
+        id: int,
+        box: Box,
+        end_us: int,
+        rows: NDArray[np.int64],
+        width_px: float = math.inf,
+        strips: tuple[float, float, NDArray[np.float64]] | None = None,
     ) -> Region | None:
         """Centre and size of what blinks in a box at the end of a step; `rows`: its pixels in each row.
 
-        Of a bar of known width, rows count no pixels beside it.
+        Of a bar of known width, rows count no pixels beside it, and of strips none between them.
         """
         # Half the score suffices inside a region: its seam is new to the light as the bar moves.
         total, column, left, right, upper, lower = self._rhythm.measure(
-            box, end_us, self._measure_us, _SEAM_PX, width_px / 2 + 1, rows
+            box, end_us, self._measure_us, _SEAM_PX, width_px / 2 + 1, rows, strips
         )
         if total < _MIN_PIXELS:
             return None

@@ -400,7 +400,7 @@ class PacketFraming:
             # What the first look shows beside the bar is out of the second one's sight.
             others += [(look.middle_us, *self._looker.box(look, other)) for other in look.others]
             off_px = self._regions.shape(region, look.middle_us, *self._looker.box(look, look.placement))
-            self._regions.light(region, self._looker.lit_rows(look))
+            self._regions.light(region, self._looker.lit_rows(look), self._looker.strips(look))
             most_px = max(most_px, off_px)
             if off_px > 0 and not self._join(region, look.middle_us):
                 return None

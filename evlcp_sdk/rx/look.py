@@ -25,6 +25,9 @@ else:
 
 __all__ = ["Look", "Looker", "Pilot", "polarity_sums"]
 
+_EVEN = 0.01
+"""Steps from cluster to cluster are a spacing where they are longer by rounding only."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pilot:
@@ -107,6 +110,9 @@ class Looker:
         self._spec = spec
         self._layout = layout_of(centres_m)
         self._pairs = neighbours(self._layout)
+        # Clusters in an even grid are one strip, however near it is.
+        across_m = np.diff(np.sort(centres_m[:, 0]))
+        self._apart = bool((across_m > (1 + _EVEN) * self._layout.spacing_m).any())
         self._pilots = codebook.pilots.astype(np.int64)
         self._edges = codebook.pilot_edges.astype(np.int64)
         self._every = codebook.edge_every
@@ -208,6 +214,23 @@ class Looker:
         if first <= top and last >= bottom:
             return None
         return first - down_px - centre, last + down_px - centre
+
+    def strips(self, look: Look) -> NDArray[np.float64] | None:
+        """Columns that a bar's light stands in: (middle from the bar's centre, half of the width), px.
+
+        float64 (n, 2); None where there is one strip, or none that is dark for as far as a bar may move in a
+        step lies between two.
+        """
+        if not self._apart or look.placement.scale == 0:
+            return None
+        places, right_px, _ = self._spots(look, look.placement)
+        across = np.sort(places.real)
+        ends = np.flatnonzero(np.diff(across) > 2 * (right_px + self._spec.margin_px))
+        if not len(ends):
+            return None
+        first, last = across[[0, *(ends + 1)]], across[[*ends, len(across) - 1]]
+        centre = (across[0] + across[-1]) / 2
+        return np.stack([(first + last) / 2 - centre, (last - first) / 2 + right_px], 1)
 
     def _spots(self, look: Look, placement: Placement) -> tuple[NDArray[np.complex128], float, float]:
         """Where an instance's clusters are in the image, and how far each reaches to its sides, px."""

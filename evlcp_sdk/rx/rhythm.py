@@ -221,6 +221,7 @@ class Rhythm:
         seam_px: int,
         reach_px: float,
         rows: NDArray[np.int64],
+        strips: tuple[float, float, NDArray[np.float64]] | None = None,
     ) -> tuple[int, float, int, int, float, float]:
         """Where in a box pixels blink that rose in a time up to now, by what is enough inside a region.
 
@@ -231,12 +232,16 @@ class Rhythm:
             seam_px: Columns at either side that should be dark.
             reach_px: How far from the mean column rows are counted.
             rows: Takes how many pixels count in each row, int64 (bottom - top,).
+            strips: Of a bar whose light stands in strips of columns: see `measure_strips`, (expected, near,
+                strips); None of others.
 
         Returns:
             (pixels, mean column, first column, last column, upper edge, lower edge).
         """
         score = max(self._min_score // 2, 1)
         now, span = end_us >> self._shift, span_us >> self._shift
+        if strips is not None:
+            return _kernels.measure_strips(self._pixels, box, now, span, score, *strips, rows)
         return _kernels.measure_box(self._pixels, box, now, span, score, seam_px, reach_px, rows)
 
     def _grow_old(self, now: int) -> None:

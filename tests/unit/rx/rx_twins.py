@@ -74,6 +74,28 @@ def measure_box(lit, box, seam, reach):
     return (rows.sum(), column, seen[0], seen[-1], upper, lower), rows
 
 
+def measure_strips(lit, box, expected, near, strips):
+    """What `measure_strips` says of a mask of blinking pixels."""
+    left, top, right, bottom = box
+    inside = lit[top:bottom, left:right]
+    columns, column = np.arange(left, right), expected
+    for more in (near, 1, 1):
+        off = columns - column - strips[:, :1]
+        mine = np.abs(off) <= strips[:, 1:] + more
+        mine &= np.cumsum(mine, 0) == 1
+        counts = mine * inside.sum(0)
+        if not counts.any():
+            return (0, 0.0, 0, 0, 0.0, 0.0), np.zeros(bottom - top, int)
+        column += (counts * off).sum() / counts.sum()
+    kept = inside[:, mine.any(0)]
+    rows = kept.sum(1)
+    seen = columns[mine.any(0)][kept.any(0)]
+    first, last = np.flatnonzero(rows)[[0, -1]]
+    share = np.minimum(rows / rows[rows > 0].mean(), 1)
+    upper, lower = top + first + 1 - share[first], top + last + share[last]
+    return (rows.sum(), column, seen[0], seen[-1], upper, lower), rows
+
+
 def select_box(events, box):
     left, top, right, bottom = box
     return events[(events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)]

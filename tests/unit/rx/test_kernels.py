@@ -211,6 +211,37 @@ def test_what_blinks_in_a_box(box, share, reach):
     assert_array_equal(rows, want_rows)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 1.0])
+@pytest.mark.parametrize("strips", [[[0, 3.03]], [[-8, 1.03], [7, 2.07]], [[-5, 3.03], [0, 0.57], [5, 3.03]]])
+def test_what_blinks_in_strips(strips, share):
+    rng = np.random.default_rng(round(100 * share))
+    box, strips = (1, 2, WIDTH - 1, HEIGHT - 3), np.array(strips, float)
+    blinks = rng.random((HEIGHT, WIDTH)) < share
+    pixels = states(np.full(blinks.shape, 1000), 0, np.where(blinks, 5, 3))
+    rows = np.empty(box[3] - box[1], np.int64)
+    got = rhythm_of(pixels, min_score=10).measure(box, 1100, 200, 2, np.inf, rows, (11.3, 2.0, strips))
+    want, want_rows = twins.measure_strips(blinks, box, 11.3, 2.0, strips)
+    assert_allclose(got, want, rtol=1e-12)
+    assert_array_equal(rows, want_rows)
+
+
+def test_strips_are_measured_whatever_each_has_awake():
+    """Where one of two lamps has a fifth of its pixels awake, the mean column is five columns off."""
+    blinks = np.zeros((HEIGHT, WIDTH), bool)
+    blinks[3:13, 4:7], blinks[4:14:5, 16:19] = True, True
+    blinks[8, 11] = True  # of neither
+    pixels = states(np.full(blinks.shape, 1000), 0, np.where(blinks, 5, 3))
+    box, rows = (0, 0, WIDTH, HEIGHT), np.empty(HEIGHT, np.int64)
+    strips = 12.5, 2.0, np.array([[-6, 1.5], [6, 1.5]])
+    rhythm = rhythm_of(pixels, min_score=10)
+    many, column, first, last, upper, lower = rhythm.measure(box, 1100, 200, 2, np.inf, rows, strips)
+    assert (many, first, last) == (36, 4, 18)
+    assert column == pytest.approx(11)
+    assert rows[8] == 3
+    assert (upper, lower) == pytest.approx((3 + 1 / 6, 13 - 1 / 6))  # 36 pixels in ten rows
+    assert abs(rhythm.measure(box, 1100, 200, 2, np.inf, rows)[1] - 11) > 3
+
+
 def test_an_edge_row_counts_by_its_share():
     pixels = np.zeros((HEIGHT, WIDTH), np.uint32)
     pixels[4:8, 2:10] = pixels[8, 2:4] = states(1000, 0, 40)

@@ -165,6 +165,16 @@ def test_any_layout_is_received_and_measured(layout: list[str], off_m: float) ->
     assert found.rmse_m < off_m
 
 
+def test_lamps_far_apart_are_followed_though_the_image_shakes() -> None:
+    """The mean of all pixels goes to the lamp that has more of them awake, and frames were lost."""
+    layout = ["shape=columns", "apart_m=1.2", "rows=24"]
+    scene = load_scene("night", ["duration_s=0.12", *(f"link.bar.{key}" for key in layout)])
+    found = received(scene)
+    assert found.frames_found == found.frames_sent > 30
+    assert found.bit_errors == 0
+    assert found.erased_share == 0
+
+
 def test_one_bright_led_is_received() -> None:
     settings = ["duration_s=0.06", "motion.vib_rate_rad_s=0.0", "bars.led_mw_sr=500"]
     # One cluster's data resemble a preamble now and then.
