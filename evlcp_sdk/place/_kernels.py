@@ -1114,7 +1114,7 @@ def gathered(
     many = whole(points_px, sigma_px, width, height, seen)
     if many < least:
         return many
-    shared(points_px, seen, usual, sigma)
+    shared(enu_m, points_px, seen, usual, sigma)
     x = y = z = 0.0
     for i in range(count):
         x, y, z = x + enu_m[i, 0] / count, y + enu_m[i, 1] / count, z + enu_m[i, 2] / count
@@ -1132,20 +1132,43 @@ def gathered(
 
 
 @njit(cache=True, nogil=True)
-def shared(points_px: Array, seen: Array, usual: Array, sigma: Array) -> None:
+def shared(enu_m: Array, points_px: Array, seen: Array, usual: Array, sigma: Array) -> None:
     """What a bar's points share, by those `seen` (K,): `sigma` (4,), of the image's shift, px, to length.
 
-    The last three are its survey's, and by how much it looks too long is added to the length's.
+    The last three are its survey's, and by how much it looks too long is added to the length's. The whole is
+    as long as from one of its clusters to the farthest other, and a cluster's own part; its image is so by
+    what is seen of it.
     """
-    first = last = -1
-    for i in range(len(seen)):
-        if seen[i]:
-            first = i if first < 0 else first
-            last = i
-    dx, dy = points_px[last, 0] - points_px[first, 0], points_px[last, 1] - points_px[first, 1]
-    length_px = math.hypot(dx, dy) * len(seen) / (last - first)
+    everything = np.ones(len(seen), np.bool_)
+    i, j = _ends(enu_m, seen)
+    first, last = _ends(enu_m, everything)
+    share = _apart(enu_m, first, last) / _apart(enu_m, i, j) * len(seen) / (len(seen) - 1)
+    length_px = math.hypot(points_px[j, 0] - points_px[i, 0], points_px[j, 1] - points_px[i, 1]) * share
     sigma[0] = math.hypot(usual[0], usual[1] * length_px)
     sigma[3] = math.hypot(sigma[3], usual[2])
+
+
+@njit(cache=True, nogil=True)
+def _apart(places: Array, i: int, j: int) -> float:
+    total = 0.0
+    for k in range(3):
+        total += (places[j, k] - places[i, k]) ** 2
+    return math.sqrt(total)
+
+
+@njit(cache=True, nogil=True)
+def _ends(places: Array, counts: Array) -> tuple[int, int]:
+    """Two of the places (n, 3) that count, as far apart as any: the farthest from the farthest from one."""
+    one = 0
+    while not counts[one]:
+        one += 1
+    other = one
+    for _ in range(2):
+        one, farthest = other, -1.0
+        for i in range(len(places)):
+            if counts[i] and _apart(places, one, i) > farthest:
+                other, farthest = i, _apart(places, one, i)
+    return one, other
 
 
 @njit(cache=True, nogil=True)

@@ -262,7 +262,7 @@ def _told(attitude: Attitude | None, points: Floats, bar: NDArray[np.int64], bar
 def shared_sigmas(view: BarView, seen: NDArray[np.bool_], spec: PositionSpec) -> tuple[float, ...]:
     """Of a bar: its image's shift, px; its place, m, turn, radians, and length, a share."""
     found = np.array([0.0, *view.survey])
-    _kernels.shared(view.points_px, seen, _usual(spec), found)
+    _kernels.shared(view.enu_m, view.points_px, seen, _usual(spec), found)
     return tuple(found.tolist())
 
 

@@ -15,9 +15,10 @@ from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place import _kernels
 from evlcp_sdk.place.fit import FOCAL_UNIT, Fit, data, fit_pose
 from evlcp_sdk.place.judgement import Judged, judged
-from evlcp_sdk.place.observations import BarView, Problem, project_bars
+from evlcp_sdk.place.observations import BarView, Problem, project_bars, shared_sigmas
 from evlcp_sdk.place.starts import likely_starts
 from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid, LedRing
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
 Floats = NDArray[np.float64]
@@ -322,7 +323,7 @@ def test_what_whitens_is_the_inverse_of_the_root() -> None:
 def test_clusters_that_count_and_their_rows() -> None:
     """12 px apart: beside an edge, three quarters of that and half a pixel must be free."""
     rng = np.random.default_rng(10)
-    enu, sigma = rng.normal(size=(8, 3)), rng.uniform(0.04, 0.2, 8)
+    enu, sigma = np.outer(np.arange(8), rng.normal(size=3)) + rng.normal(size=3), rng.uniform(0.04, 0.2, 8)
     points = np.stack([np.full(8, 100.0), 9.0 + 12 * np.arange(8)], 1)
     points[3], sigma[4], sigma[5] = np.nan, 0.0, np.inf
     points[6, 0] = 9.4
@@ -576,3 +577,26 @@ def test_a_fit_that_stalls_far_off_ends() -> None:
     assert short.settled
     assert short.cost > 1000
     assert whole.cost <= short.cost < 3 * whole.cost
+
+
+@pytest.mark.parametrize(
+    ("layout", "length_m"),
+    [
+        (LedGrid(), 0.96),
+        (LedRing(leds=12, radius_m=0.25), 0.5 * 12 / 11),
+        (LedColumns(apart_m=1.2, rows=24), math.hypot(1.2, 0.18) * 8 / 7),
+        (LedGrid(16, 16, 0.02, 4, 4), 0.24 * math.sqrt(2) * 16 / 15),
+    ],
+)
+@pytest.mark.parametrize("dark", [(), (0, 3)])
+def test_what_points_share_grows_with_the_whole_layout(layout, length_m, dark) -> None:
+    """In whatever order clusters stand: the first and the last of a ring are neighbours."""
+    centres_m = BarLayout(layout).cluster_centres_m()
+    enu_m = np.stack([centres_m[:, 0], 0 * centres_m[:, 0], -centres_m[:, 1]], 1)
+    seen = ~np.isin(np.arange(len(enu_m)), dark)
+    points = np.where(seen[:, None], 300 + 250 * centres_m, np.nan)
+    spec = PositionSpec(shared_sigma_px=0.05, shared_share=0.002, stretch_share=0.003)
+    view = BarView(0, enu_m, points, np.full(len(enu_m), 0.1), (0.1, 0.2, 0.004))
+    shift, *site = shared_sigmas(view, seen, spec)
+    assert shift == pytest.approx(math.hypot(0.05, 0.002 * 250 * length_m), rel=1e-9)
+    assert site == pytest.approx([0.1, 0.2, 0.005])
